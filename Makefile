@@ -1,0 +1,70 @@
+# `make demo` and `make test` set everything up by themselves; `make help` lists the rest.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/installed
+DEMO := demo
+
+# The networks are tiny: more threads than one only cost time, and one makes runs repeatable.
+export OMP_NUM_THREADS ?= 1
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test check format bench golden lock clean
+
+help: ## list the targets
+	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
+
+demo: $(STAMP) ## the whole way on robots/rpr.urdf: inspect, build, simulate, train, evaluate, report
+	@rm -rf $(DEMO)
+	@mkdir -p $(DEMO)
+	$(BIN)/spelgen inspect robots/rpr.urdf
+	$(BIN)/spelgen build robots/rpr.urdf -o $(DEMO)/rpr_model.py
+	$(BIN)/spelgen simulate robots/rpr.urdf -o $(DEMO)/logs
+	$(BIN)/spelgen train $(DEMO)/rpr_model.py --data $(DEMO)/logs -o $(DEMO)/run
+	$(BIN)/spelgen evaluate $(DEMO)/run --data $(DEMO)/logs
+	$(BIN)/spelgen report $(DEMO)/run
+
+test: $(STAMP) ## run the tests
+	$(BIN)/python -m pytest
+
+check: $(STAMP) ## format, lint, types, import direction, golden files, examples in the docs
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/python -m pytest -q tests/test_imports.py tests/test_golden.py tests/test_docs.py
+
+format: $(STAMP) ## format the code and sort the imports
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: $(STAMP) ## run every benchmark of tests/bench
+	@for script in tests/bench/*.py; do echo "== $$script"; $(BIN)/python $$script || exit 1; done
+
+golden: $(STAMP) ## rewrite the golden files after an intended change; read the diff before committing
+	$(BIN)/python -m pytest -q tests/test_golden.py --update-golden
+
+lock: ## write requirements.txt anew: the newest versions that the ranges of pyproject.toml admit
+	rm -rf .lock-venv
+	$(PYTHON) -m venv .lock-venv
+	.lock-venv/bin/pip install -qq torch==2.13.0
+	.lock-venv/bin/pip install -qq --editable '.[simulate,dev]'
+	sed -n '/^#/p' requirements.txt > .lock-venv/header
+	.lock-venv/bin/pip freeze --exclude-editable | sed 's/+cpu$$//' | cat .lock-venv/header - > .lock-venv/lock
+	mv .lock-venv/lock requirements.txt
+	rm -rf .lock-venv
+
+clean: ## remove the environment, caches and demo output
+	rm -rf $(VENV) .lock-venv $(DEMO) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+
+# Everything pinned; made once, and again when the pins or the package's metadata change.
+$(STAMP): requirements.txt pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+	    echo "spelgen needs Python 3.11 or newer; $(PYTHON) is $$($(PYTHON) --version 2>&1)." >&2; \
+	    echo "Name another one: make $(MAKECMDGOALS) PYTHON=python3.11" >&2; exit 1; }
+	@echo "Installing the pinned packages into $(VENV): once, then never again." >&2
+	@$(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -m pip install -qq --requirement requirements.txt
+	@$(BIN)/python -m pip install -qq --no-deps --no-build-isolation --editable .
+	@touch $@

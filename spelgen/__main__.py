@@ -1,0 +1,6 @@
+"""`python -m spelgen` is the command `spelgen`."""
+
+from spelgen.cli import main
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,171 @@
+"""ModelSpec -> the source text of the emitted module. Pure: the same spec gives the same bytes.
+
+Text from a URDF reaches the module as identifiers and as JSON strings inside its raw docstring, never as code.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from dataclasses import asdict
+
+from spelgen.labels import joint_ranges
+from spelgen.rendering import render
+from spelgen.spec import JointSpec, ModelSpec
+
+_WIDTH = 100
+_LEAST_UNITS = 4
+_POTENTIAL_SHARE = 0.5
+_FRICTION_HIDDEN = 8
+_SLOW = 0.01
+
+
+def emit(spec: ModelSpec) -> str:
+    """The Python source of the module that ``spec`` describes; it needs torch alone."""
+    n, depth = len(spec.joints), spec.options.depth
+    potential_width = max(_LEAST_UNITS, round(_POTENTIAL_SHARE * spec.options.width))
+    return render(
+        "module.py.jinja",
+        title=f"Port-Hamiltonian model of an arm with {n} joint{'s' * (n > 1)}, written by `spelgen build`.",
+        class_summary=f"The arm's dynamics: {_count(spec)}.",
+        summary=_summary(spec),
+        picture=_picture(spec),
+        joint_table=_joint_table(spec),
+        record=_record(spec),
+        n=n,
+        joints=_table("JOINTS = ", [_joint_row(joint) for joint in spec.joints]),
+        constants=_table(
+            "CONSTANTS: tuple[Constant, ...] = ",
+            [_call("Constant", start=c.start, scale=c.scale, entries=c.basis) for c in spec.constants],
+        ),
+        outputs=spec.outputs
+        and _table(
+            "OUTPUTS = ",
+            [_call("Output", joints=o.joints, mean=o.center, scale=o.scale, entries=o.basis) for o in spec.outputs],
+        ),
+        mass_hidden=_table("MASS_HIDDEN = ", [_literal(row) for row in _hidden(spec)]),
+        depth=depth,
+        guard=spec.guard,
+        potential_joints=_literal(spec.potential) if spec.potential else "",
+        potential_hidden=_literal((potential_width,) * depth),
+        potential_scale=spec.potential_scale,
+        friction_hidden=_FRICTION_HIDDEN,
+        slow=_SLOW,
+        uses_network=bool(spec.outputs or spec.potential),
+    )
+
+
+def _joint_row(joint: JointSpec) -> str:
+    return _call(
+        "Joint",
+        name=joint.identifier,
+        revolute=joint.kind == "revolute",
+        center=joint.center,
+        reach=joint.reach,
+        speed=joint.speed,
+        friction=joint.friction,
+        actuated=joint.actuated,
+    )
+
+
+def _table(start: str, rows: list[str]) -> str:
+    """A tuple with a row a line, or on the line that begins with ``start`` where it fits."""
+    flat = f"({', '.join(rows)}{',' * (len(rows) == 1)})"
+    if len(start) + len(flat) <= _WIDTH and "\n" not in flat:
+        return flat
+    return "(\n" + "".join(f"    {row},\n" for row in rows) + ")"
+
+
+def _call(callee: str, **arguments: object) -> str:
+    """A call with its keywords, as a row of a table: on one line, or on one line an argument."""
+    parts = [f"{key}={_literal(value, indent=8)}" for key, value in arguments.items()]
+    flat = f"{callee}({', '.join(parts)})"
+    if len(flat) < _WIDTH - 4 and "\n" not in flat:
+        return flat
+    return f"{callee}(\n" + "".join(f"        {part},\n" for part in parts) + "    )"
+
+
+def _literal(value: object, indent: int = 0) -> str:
+    """``value`` as source text; a tuple too long for a line has an item a line."""
+    if isinstance(value, str):
+        return json.dumps(value)
+    if not isinstance(value, tuple):
+        return repr(value)
+    parts = [_literal(item, indent + 4) for item in value]
+    flat = f"({parts[0]},)" if len(parts) == 1 else f"({', '.join(parts)})"
+    if indent + len(flat) < _WIDTH - 12:
+        return flat
+    inner = " " * (indent + 4)
+    return "(\n" + "".join(f"{inner}{part},\n" for part in parts) + " " * indent + ")"
+
+
+def _hidden(spec: ModelSpec) -> tuple[tuple[tuple[int, ...], int], ...]:
+    """How many units of a hidden layer read which joints, in proportion to the outputs that do."""
+    shares = Counter(output.joints for output in spec.outputs)
+    total = sum(shares.values())
+    return tuple(
+        (joints, max(_LEAST_UNITS, round(spec.options.width * count / total)))
+        for joints, count in sorted(shares.items(), key=lambda item: (len(item[0]), item[0]))
+    )
+
+
+def _count(spec: ModelSpec) -> str:
+    outputs, constants = len(spec.outputs), len(spec.constants)
+    return (
+        f"{outputs} learned function{'s' * (outputs != 1)} of q and {constants} constant{'s' * (constants != 1)} "
+        "make the mass matrix"
+    )
+
+
+def _summary(spec: ModelSpec) -> str:
+    potential = (
+        f"The potential energy depends on joint{'s' * (len(spec.potential) > 1)} {joint_ranges(spec.potential)}."
+        if spec.potential
+        else "Gravity does no work on it."
+    )
+    start = (
+        "Sizes and starting values are the URDF's inertials."
+        if spec.started_from_urdf
+        else "The URDF's inertials are missing or impossible: sizes and starting values are those of 1 kg links."
+    )
+    return f"{_count(spec)[0].upper()}{_count(spec)[1:]}.\n{potential}\n{start}"
+
+
+def _picture(spec: ModelSpec) -> str:
+    """The lower triangle of M as text: what each entry depends on."""
+    cells = {(row, column): _cell(kind, joints) for row, column, kind, joints in spec.entries}
+    width = max(2, *(len(cell) for cell in cells.values()))
+    lines = ["Mass matrix: the joints each entry depends on, C where it is constant, . where it is always zero.", ""]
+    for row in range(len(spec.joints)):
+        line = "  ".join(cells[row, column].ljust(width) for column in range(row + 1))
+        lines.append(f"    {line}".rstrip())
+    return "\n".join(lines)
+
+
+def _cell(kind: str, joints: tuple[int, ...]) -> str:
+    if kind == "varying":
+        return joint_ranges(joints)
+    return "C" if kind == "constant" else "."
+
+
+def _joint_table(spec: ModelSpec) -> str:
+    lines = ["Joints, in the order of q, qd and tau:", ""]
+    names = [json.dumps(joint.name) for joint in spec.joints]
+    width = max(len(name) for name in names)
+    for index, (joint, name) in enumerate(zip(spec.joints, names, strict=True), start=1):
+        unit = "rad, Nm" if joint.kind == "revolute" else "m, N"
+        limits = "no limits" if joint.lower is None or joint.upper is None else f"{joint.lower:g} .. {joint.upper:g}"
+        lines.append(f"    {index}  {name.ljust(width)}  {joint.kind:9}  {unit:7}  {limits}")
+    return "\n".join(lines)
+
+
+def _record(spec: ModelSpec) -> str:
+    record = {
+        "robot": spec.robot,
+        "urdf": spec.urdf,
+        "urdf_sha256": spec.urdf_sha256,
+        "spec_sha256": spec.sha256,
+    }
+    lines = [f"    {key}: {json.dumps(value)}" for key, value in record.items()]
+    lines += [f"    option {key}: {json.dumps(value)}" for key, value in sorted(asdict(spec.options).items())]
+    return "Record, by which `spelgen check` tells whether this module is up to date:\n\n" + "\n".join(lines)

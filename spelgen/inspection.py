@@ -1,0 +1,154 @@
+"""A derived structure as people and programs read it: text of a given width, and the JSON contract (schema 1)."""
+
+from __future__ import annotations
+
+import textwrap
+from dataclasses import dataclass
+from typing import Any
+
+from spelgen.arm import Arm
+from spelgen.errors import Diagnostic
+from spelgen.labels import joint_ranges
+from spelgen.structure import Entry, Structure
+
+SCHEMA = 1
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What ``spelgen inspect`` tells of an arm."""
+
+    arm: Arm
+    structure: Structure
+    diagnostics: tuple[Diagnostic, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON contract; names are the URDF's, rows and columns count from 1."""
+        structure = self.structure
+        n = len(structure.joints)
+        return {
+            "schema": SCHEMA,
+            "robot": self.arm.name,
+            "assume": structure.assume,
+            "joints": list(structure.joints),
+            "joint_types": [coordinate.kind for coordinate in self.arm.coordinates],
+            "mass_matrix": {
+                "entries": [self._entry(entry) for entry in structure.entries],
+                "outputs": len(structure.outputs),
+                "constants": len(structure.constants),
+                "output_joints": [self._names(output.joints) for output in structure.outputs],
+            },
+            "potential_energy": {
+                "kind": "varying" if structure.potential else "zero",
+                "joints": self._names(structure.potential),
+            },
+            "input_matrix": {"entries": [self._input(row, column) for row in range(n) for column in range(n)]},
+            "base_parameters": structure.base_parameters,
+            "diagnostics": [diagnostic.to_dict() for diagnostic in self.diagnostics],
+        }
+
+    def text(self, width: int = 80) -> str:
+        """A report for a terminal ``width`` columns wide."""
+        parts = [self._heading(), self._joint_table(), self._matrix(width), self._meaning(width)]
+        if self.diagnostics:
+            parts.append(self._remarks(width))
+        return "\n\n".join(parts)
+
+    def _names(self, joints: tuple[int, ...]) -> list[str]:
+        return [self.structure.joints[joint] for joint in joints]
+
+    def _entry(self, entry: Entry) -> dict[str, Any]:
+        return {
+            "row": entry.row + 1,
+            "col": entry.column + 1,
+            "kind": entry.kind,
+            "joints": self._names(entry.joints),
+        }
+
+    def _input(self, row: int, column: int) -> dict[str, Any]:
+        driven = row == column and row not in self.structure.passive
+        return {
+            "row": row + 1,
+            "col": column + 1,
+            "kind": "fixed" if driven else "zero",
+            "value": 1.0 if driven else 0.0,
+        }
+
+    def _heading(self) -> str:
+        believed = "any inertial values" if self.structure.assume == "kinematics" else "the URDF's inertial values"
+        return f"{_printable(self.arm.name)}: structure for {believed}"
+
+    def _joint_table(self) -> str:
+        lines = []
+        for index, coordinate in enumerate(self.arm.coordinates, start=1):
+            unit = "rad" if coordinate.kind == "revolute" else "m"
+            bounds = coordinate.lower, coordinate.upper
+            limits = "continuous" if coordinate.continuous else "no limits"
+            if not coordinate.continuous and None not in bounds:
+                limits = f"{coordinate.lower:g} .. {coordinate.upper:g} {unit}"
+            passive = ", passive" if index - 1 in self.structure.passive else ""
+            name = textwrap.shorten(_printable(coordinate.name), 36, placeholder="...") or '""'
+            lines.append(f"  {index:>2}  {name:<36}  {coordinate.kind:<9}  {limits}{passive}")
+        return "Joints\n" + "\n".join(lines)
+
+    def _matrix(self, width: int) -> str:
+        """The lower triangle of M with each entry's joints, or by letters where that is too wide."""
+        n = len(self.structure.joints)
+        cells = {(e.row, e.column): _cell(e) for e in self.structure.entries}
+        column_widths = [max(len(cells[row, c]) for row in range(c, n)) for c in range(n)]
+        note = "joints each entry depends on; C constant, 0 always zero"
+        if 6 + sum(column_widths) + 2 * n > width:
+            cells = {key: cell if cell in ("0", "C") else "x" for key, cell in cells.items()}
+            column_widths = [max(1, len(str(c + 1))) for c in range(n)]
+            note = "x varies, C constant, 0 always zero"
+        lines = [f"Mass matrix: {note}"]
+        for row in range(n):
+            line = "  ".join(cells[row, c].ljust(column_widths[c]) for c in range(row + 1))
+            lines.append(f"  {row + 1:>2}  {line}".rstrip())
+        return "\n".join(lines)
+
+    def _meaning(self, width: int) -> str:
+        structure = self.structure
+        counts: dict[tuple[int, ...], int] = {}
+        for output in structure.outputs:
+            counts[output.joints] = counts.get(output.joints, 0) + 1
+        told = "; ".join(f"{count} of {_joints(joints)}" for joints, count in counts.items())
+        entries, constants = len(structure.entries), len(structure.constants)
+        facts = {
+            "M(q)": f"{_many(len(structure.outputs), 'output')} and {_many(constants, 'constant')} "
+            f"make all {entries} entries" + (f": {told}" if told else ""),
+            "V(q)": f"depends on {_joints(structure.potential)}" if structure.potential else "zero: gravity does no work",
+            "G": "fixed" + (f", {_joints(structure.passive)} without a drive" if structure.passive else ""),
+            "base": f"{structure.base_parameters} base inertial parameters",
+        }
+        lines = []
+        for name, fact in facts.items():
+            lines += textwrap.wrap(fact, width, initial_indent=f"  {name:<5} ", subsequent_indent=" " * 8)
+        return "The model needs\n" + "\n".join(lines)
+
+    def _remarks(self, width: int) -> str:
+        lines = []
+        for each in self.diagnostics:
+            line = "" if each.line is None else f"line {each.line}: "
+            text = _printable(f"{each.severity}: {line}{each.where}: {each.message}")
+            lines += textwrap.wrap(text, width, initial_indent="  ", subsequent_indent="    ")
+        return "Remarks\n" + "\n".join(lines)
+
+
+def _cell(entry: Entry) -> str:
+    if entry.kind == "varying":
+        return joint_ranges(entry.joints)
+    return "C" if entry.kind == "constant" else "0"
+
+
+def _joints(joints: tuple[int, ...]) -> str:
+    return f"joint{'s' * (len(joints) > 1)} {joint_ranges(joints)}"
+
+
+def _many(count: int, noun: str) -> str:
+    return f"{count} {noun}{'s' * (count != 1)}"
+
+
+def _printable(text: str) -> str:
+    """Text from a file, with what could steer a terminal made visible."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

@@ -1,0 +1,128 @@
+"""Exact poses of joints and links at zero position, and inertias in the frame of the body they move with.
+
+A rotation composed of decimal angles is no rational matrix, so it is composed in float64 over the longest
+stretch that no revolute joint interrupts, and made rational once: 45 degrees, a prismatic joint and another
+45 degrees are exactly 90, and every rotation is exactly orthogonal.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+
+from spelgen.rational import (
+    IDENTITY,
+    ZERO,
+    Matrix,
+    Vector,
+    alignment,
+    exact,
+    exact_rotation,
+    product,
+    rotated,
+    rotated_tensor,
+    rotation_about,
+    summed,
+    transposed,
+)
+from spelgen.robot import Inertial, Joint, Link
+from spelgen.snapping import Snapper
+
+TenVector = tuple[Fraction, ...]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A link's frame at zero position, in the frame of the body it moves with (-1: the root link).
+
+    ``composed`` (3, 3) is its float64 rotation in the frame of the last revolute body on the way,
+    ``rotation`` the exact one in the body's own frame; they differ where prismatic bodies lie between.
+    """
+
+    body: int
+    composed: np.ndarray
+    rotation: Matrix
+    position: Vector
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A joint's own frame, with +z along its axis, in the frame of the body ``parent``."""
+
+    parent: int
+    rotation: Matrix
+    translation: Vector
+
+
+class Placement:
+    """Walks from the root outwards: every joint is either held, or starts a body of its own."""
+
+    def __init__(self, root: str, snapper: Snapper) -> None:
+        self.frames = {root: Frame(-1, np.eye(3), IDENTITY, ZERO)}
+        self._snapper = snapper
+        # each body's exact rotation in the frame of the last revolute body above it, or itself
+        self._stretches: dict[int, Matrix] = {-1: IDENTITY}
+
+    def hold(self, joint: Joint, value: float) -> None:
+        """Place the child of a joint that stays at ``value`` [rad or m]."""
+        at = self._joint_origin(joint)
+        if value and joint.type == "prismatic":
+            axis = self._snapper.axis(joint)
+            x, y, z = (exact(float(component)) * exact(value) for component in axis)
+            shifted = self._snapper.position(summed(at.position, rotated(at.rotation, (x, y, z))))
+            at = Frame(at.body, at.composed, at.rotation, shifted)
+        elif value:
+            turn = rotation_about(self._snapper.axis(joint), self._snapper.angle(value))
+            composed = at.composed @ turn
+            at = Frame(at.body, composed, self._in_body(at.body, composed), at.position)
+        self.frames[joint.child] = at
+
+    def move(self, joint: Joint) -> Pose:
+        """Place a moving joint and its child, which start a body; bodies are numbered by order of calls."""
+        at = self._joint_origin(joint)
+        turned = alignment(self._snapper.axis(joint))
+        along = at.composed @ turned
+        stretch = exact_rotation(along)
+        rotation = product(transposed(self._stretches[at.body]), stretch)
+        body = len(self._stretches) - 1
+        slides = joint.type == "prismatic"
+        composed = at.composed if slides else turned.T
+        self._stretches[body] = stretch if slides else IDENTITY
+        self.frames[joint.child] = Frame(body, composed, self._in_body(body, composed), ZERO)
+        return Pose(at.body, rotation, at.position)
+
+    def inertia(self, link: Link, inertial: Inertial) -> TenVector:
+        """The link's (m, m c, I) about its body's origin, in the body's frame (parallel-axis theorem)."""
+        frame = self.frames[link.name]
+        offset, turn = self._snapper.inertial_origin(link, inertial)
+        rotation = frame.rotation if turn is None else self._in_body(frame.body, frame.composed @ turn)
+        x, y, z = summed(frame.position, rotated(frame.rotation, offset))
+        mass = exact(inertial.mass)
+        a, b, c, d, e, f = (exact(value) for value in inertial.tensor)
+        xx, xy, xz, yy, yz, zz = rotated_tensor(rotation, (a, b, c, d, e, f))
+        return (
+            mass,
+            mass * x,
+            mass * y,
+            mass * z,
+            xx + mass * (y * y + z * z),
+            xy - mass * x * y,
+            xz - mass * x * z,
+            yy + mass * (x * x + z * z),
+            yz - mass * y * z,
+            zz + mass * (x * x + y * y),
+        )
+
+    def _joint_origin(self, joint: Joint) -> Frame:
+        frame = self.frames[joint.parent]
+        offset, turn = self._snapper.joint_origin(joint)
+        position = self._snapper.position(summed(frame.position, rotated(frame.rotation, offset)))
+        if turn is None:
+            return Frame(frame.body, frame.composed, frame.rotation, position)
+        composed = frame.composed @ turn
+        return Frame(frame.body, composed, self._in_body(frame.body, composed), position)
+
+    def _in_body(self, body: int, composed: np.ndarray) -> Matrix:
+        return product(transposed(self._stretches[body]), exact_rotation(composed))

@@ -1,0 +1,88 @@
+"""Structure and nominal sizes -> ModelSpec: the decisions that the emitted module then merely spells out."""
+
+from __future__ import annotations
+
+import keyword
+import re
+
+from spelgen.arm import Arm, Coordinate
+from spelgen.basis import Weights
+from spelgen.nominal import nominal, working_range
+from spelgen.spec import ConstantSpec, Entries, JointSpec, ModelSpec, Options, OutputSpec
+from spelgen.structure import Structure
+
+_GUARD_SHARE = 0.1
+_FRICTION_SHARE = 0.1
+_DEFAULT_SPEED = {"revolute": 2.0, "prismatic": 0.5}  # rad/s, m/s
+
+
+def plan_model(arm: Arm, structure: Structure, options: Options, *, urdf: str, urdf_sha256: str) -> ModelSpec:
+    """The model of ``arm`` under ``options``; ``urdf`` is the file's name without its folder."""
+    sizes = nominal(arm, structure)
+    identifiers = _identifiers([coordinate.name for coordinate in arm.coordinates])
+    torques = zip(arm.coordinates, identifiers, sizes.joint_torque, strict=True)
+    x, y, z = (float(g) for g in arm.gravity)
+    return ModelSpec(
+        robot=arm.name,
+        urdf=urdf,
+        urdf_sha256=urdf_sha256,
+        gravity=(x, y, z),
+        options=options,
+        joints=tuple(_joint(*each) for each in torques),
+        entries=tuple((e.row, e.column, e.kind, e.joints) for e in structure.entries),
+        outputs=tuple(
+            OutputSpec(output.joints, _floats(output.basis), center, scale)
+            for output, center, scale in zip(
+                structure.outputs, sizes.output_means, sizes.output_scales, strict=True
+            )
+        ),
+        constants=tuple(
+            ConstantSpec(_floats(constant.basis), start, scale)
+            for constant, start, scale in zip(
+                structure.constants, sizes.constants, sizes.constant_scales, strict=True
+            )
+        ),
+        potential=structure.potential,
+        potential_scale=sizes.potential_scale,
+        guard=float(f"{max(_GUARD_SHARE * sizes.least_share, 1e-4):.0e}"),
+        started_from_urdf=sizes.from_urdf,
+    )
+
+
+def _joint(coordinate: Coordinate, identifier: str, torque: float) -> JointSpec:
+    low, high = working_range(coordinate)
+    speed = coordinate.velocity if coordinate.velocity and coordinate.velocity < 100 else None
+    return JointSpec(
+        name=coordinate.name,
+        identifier=identifier,
+        kind=coordinate.kind,
+        lower=None if coordinate.continuous else coordinate.lower,
+        upper=None if coordinate.continuous else coordinate.upper,
+        center=float(f"{(low + high) / 2:.6g}"),
+        reach=float(f"{(high - low) / 2:.6g}"),
+        speed=speed or _DEFAULT_SPEED[coordinate.kind],
+        friction=float(f"{_FRICTION_SHARE * torque:.3g}"),
+        actuated=not coordinate.passive,
+    )
+
+
+def _identifiers(names: list[str]) -> list[str]:
+    """Unique ASCII identifiers, recognisable where the name allows it."""
+    taken: set[str] = set()
+    found = []
+    for index, name in enumerate(names, start=1):
+        plain = re.sub(r"[^0-9a-z]+", "_", name.lower()).strip("_")[:40]
+        if not plain or keyword.iskeyword(plain) or keyword.issoftkeyword(plain) or plain[0].isdigit():
+            plain = f"joint_{plain or index}"
+        unique, count = plain, 2
+        while unique in taken:
+            unique, count = f"{plain}_{count}", count + 1
+        taken.add(unique)
+        found.append(unique)
+    return found
+
+
+def _floats(weights: Weights) -> Entries:
+    return tuple((row, column, float(value)) for row, column, value in weights)
+
+

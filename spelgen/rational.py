@@ -1,0 +1,165 @@
+"""Exact rotations and vectors over the rationals, and how a measured angle becomes one of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from fractions import Fraction
+from math import cos, pi, sin
+
+import numpy as np
+
+Vector = tuple[Fraction, Fraction, Fraction]
+Matrix = tuple[Vector, Vector, Vector]
+Tensor = tuple[Fraction, Fraction, Fraction, Fraction, Fraction, Fraction]
+
+_ZERO, _ONE = Fraction(0), Fraction(1)
+IDENTITY: Matrix = ((_ONE, _ZERO, _ZERO), (_ZERO, _ONE, _ZERO), (_ZERO, _ZERO, _ONE))
+ZERO: Vector = (_ZERO, _ZERO, _ZERO)
+
+# Rotations that take +z to +-x, +-y, +-z, by (index, sign); their columns are the joint frame's x, y, z.
+_ALIGNMENTS = {
+    (0, 1): ((0, 0, 1), (1, 0, 0), (0, 1, 0)),
+    (0, -1): ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
+    (1, 1): ((0, 1, 0), (0, 0, 1), (1, 0, 0)),
+    (1, -1): ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
+    (2, 1): ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+    (2, -1): ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
+}
+_FINE_STEPS = (pi / 12, pi / 8, pi / 5)
+_FINE_TOLERANCE = 2e-5
+
+
+def exact(value: float) -> Fraction:
+    """The decimal a float was written as: 0.1 is 1/10."""
+    return Fraction(repr(value))
+
+
+def snapped_angle(angle: float, tolerance: float) -> float:
+    """The multiple of pi/2 within ``tolerance`` [rad], else of pi/12, pi/8, pi/5 within 2e-5, else itself.
+
+    A tolerance of 0 believes every angle as it is written.
+    """
+    if tolerance == 0.0:
+        return angle
+    for step, reach in ((pi / 2, tolerance), *((step, _FINE_TOLERANCE) for step in _FINE_STEPS)):
+        nearest = round(angle / step) * step
+        if abs(nearest - angle) <= reach:
+            return nearest
+    return angle
+
+
+def rotation_from_rpy(rpy: Sequence[float]) -> np.ndarray:
+    """Rz(yaw) Ry(pitch) Rx(roll) of URDF's fixed-axis angles [rad], (3, 3) float64."""
+    (cr, sr), (cp, sp), (cy, sy) = ((cos(angle), sin(angle)) for angle in rpy)
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def rotation_about(axis: np.ndarray, angle: float) -> np.ndarray:
+    """Rotation by ``angle`` [rad] about the unit vector ``axis``, (3, 3) float64 (Rodrigues' formula)."""
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + sin(angle) * cross + (1.0 - cos(angle)) * (cross @ cross)
+
+
+def alignment(axis: np.ndarray) -> np.ndarray:
+    """A rotation (3, 3) that takes +z to the unit vector ``axis``; a signed permutation for +-x, +-y, +-z.
+
+    Other axes are reached from the nearest coordinate axis by the smallest rotation, which keeps what zeros
+    it can.
+    """
+    index = int(np.argmax(np.abs(axis)))
+    sign = 1 if axis[index] > 0 else -1
+    start = np.zeros(3)
+    start[index] = sign
+    cross = np.cross(start, axis)
+    skew = np.array([[0.0, -cross[2], cross[1]], [cross[2], 0.0, -cross[0]], [-cross[1], cross[0], 0.0]])
+    smallest = np.eye(3) + skew + skew @ skew / (1.0 + float(start @ axis))
+    return smallest @ np.array(_ALIGNMENTS[index, sign], dtype=float)
+
+
+def exact_rotation(rotation: np.ndarray) -> Matrix:
+    """A rational rotation within 1e-12 of a float64 one, exactly orthogonal; signed permutations are exact.
+
+    The unit quaternion is divided by its largest component and each ratio replaced by a nearby fraction; the
+    rotation of an unnormalised rational quaternion is rational (Euler-Rodrigues).
+    """
+    ratios = _quaternion_ratios(rotation)
+    for bound in (10**7, 10**10, 10**13):
+        candidate = _rotation_of(*(Fraction(ratio).limit_denominator(bound) for ratio in ratios))
+        if np.abs(np.array(candidate, dtype=float) - rotation).max() < 1e-12:
+            return candidate
+    return candidate
+
+
+def _quaternion_ratios(r: np.ndarray) -> list[float]:
+    """The quaternion (w, x, y, z) over its largest component, noise removed (Shepperd's method)."""
+    trace = float(np.trace(r))
+    squares = np.array([trace, r[0, 0], r[1, 1], r[2, 2]])
+    largest = int(np.argmax(squares))
+    if largest == 0:
+        parts = np.array([1.0 + trace, r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
+    else:
+        i = largest - 1
+        j, k = (i + 1) % 3, (i + 2) % 3
+        parts = np.zeros(4)
+        parts[0] = r[k, j] - r[j, k]
+        parts[1 + i] = 1.0 + r[i, i] - r[j, j] - r[k, k]
+        parts[1 + j] = r[j, i] + r[i, j]
+        parts[1 + k] = r[k, i] + r[i, k]
+    ratios = parts / parts[np.argmax(np.abs(parts))]
+    return [0.0 if abs(ratio) < 1e-12 else float(ratio) for ratio in ratios]
+
+
+def _rotation_of(w: Fraction, x: Fraction, y: Fraction, z: Fraction) -> Matrix:
+    norm = w * w + x * x + y * y + z * z
+    s = 2 / norm
+    return (
+        (1 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y)),
+        (s * (x * y + w * z), 1 - s * (x * x + z * z), s * (y * z - w * x)),
+        (s * (x * z - w * y), s * (y * z + w * x), 1 - s * (x * x + y * y)),
+    )
+
+
+def transposed(a: Matrix) -> Matrix:
+    """The transpose, which is a rotation's inverse."""
+    return (a[0][0], a[1][0], a[2][0]), (a[0][1], a[1][1], a[2][1]), (a[0][2], a[1][2], a[2][2])
+
+
+def product(a: Matrix, b: Matrix) -> Matrix:
+    """The matrix product a b."""
+    if a == IDENTITY:
+        return b
+    x, y, z = (rotated(a, column) for column in transposed(b))
+    return transposed((x, y, z))
+
+
+def rotated(a: Matrix, vector: Vector) -> Vector:
+    """The product of a matrix and a vector."""
+    x, y, z = (_dot(row, vector) for row in a)
+    return x, y, z
+
+
+def summed(a: Vector, b: Vector) -> Vector:
+    """The sum of two vectors."""
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+def rotated_tensor(a: Matrix, tensor: Tensor) -> Tensor:
+    """a T a^T of a symmetric tensor (xx, xy, xz, yy, yz, zz)."""
+    if a == IDENTITY:
+        return tensor
+    xx, xy, xz, yy, yz, zz = tensor
+    half = product(a, ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
+    full = product(half, transposed(a))
+    return full[0][0], full[0][1], full[0][2], full[1][1], full[1][2], full[2][2]
+
+
+def _dot(a: Vector, b: Vector) -> Fraction:
+    # zeros are common here, and skipping them is what makes exact arithmetic cheap
+    return sum((x * y for x, y in zip(a, b, strict=True) if x and y), start=_ZERO)

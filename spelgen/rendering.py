@@ -1,0 +1,30 @@
+"""Templates -> text. Templates lay out; what they lay out is decided in Python."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+_BESIDE_THE_CODE = Path(__file__).parent / "templates"  # in an installed package
+_IN_THE_REPOSITORY = Path(__file__).parent.parent / "templates"
+
+
+@cache
+def _environment(autoescape: bool) -> Environment:
+    folder = _BESIDE_THE_CODE if _BESIDE_THE_CODE.is_dir() else _IN_THE_REPOSITORY
+    return Environment(
+        loader=FileSystemLoader(folder),
+        undefined=StrictUndefined,
+        autoescape=autoescape,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+
+
+def render(template: str, **context: Any) -> str:
+    """The text of ``template`` with ``context``; an undefined name is an error, and HTML templates escape what they show."""
+    return _environment(".html" in template).get_template(template).render(**context)

@@ -1,0 +1,25 @@
+"""What every test shares: one thread for tiny matrices, and where the robots and the reference data lie."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # read by torch and numpy when they are first imported
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="session")
+def robots() -> Path:
+    """The folder of the project's own robots."""
+    return ROOT / "robots"
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """The folder of reference data beside the checkout; tests that read it skip where it is absent."""
+    folder = ROOT.parent / "shared"
+    if not folder.is_dir():
+        pytest.skip("the reference data (../shared) is not on this machine")
+    return folder

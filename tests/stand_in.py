@@ -1,0 +1,89 @@
+r"""A hand-written two-joint planar arm with the interface of an emitted module, small enough to check by eye.
+
+Joints:
+    0  "shoulder"  revolute
+    1  "elbow"  revolute
+
+Record:
+    robot: "stand_in"
+    urdf: "stand_in.urdf"
+    urdf_sha256: "none"
+    spec_sha256: "none"
+    options: {}
+"""
+
+import torch
+from torch import nn
+
+
+class Model(nn.Module):
+    """M = [[a + 2 b cos q2, d + b cos q2], [d + b cos q2, d]], two hanging weights, viscous friction."""
+
+    joint_names = ("shoulder", "elbow")
+    joint_types = ("revolute", "revolute")
+    n = 2
+
+    def __init__(self, seed: int = 0) -> None:
+        super().__init__()
+        generator = torch.Generator().manual_seed(seed)
+        start = 0.01 * torch.randn(5, generator=generator, dtype=torch.float64)
+        self.inertia = nn.Parameter(
+            torch.tensor([0.5, 0.0, 0.0], dtype=torch.float64) + start[:3]
+        )  # b, log d, log e
+        self.weight = nn.Parameter(torch.zeros(2, dtype=torch.float64) + start[3:])
+        self.damping = nn.Parameter(torch.full((2,), -2.0, dtype=torch.float64))
+
+    def _coefficients(self):
+        b, d = self.inertia[0], self.inertia[1].exp()
+        return d + b**2 / d + self.inertia[2].exp(), b, d
+
+    def mass_matrix(self, q):
+        a, b, d = self._coefficients()
+        c = q[..., 1].cos()
+        return torch.stack([a + 2 * b * c, d + b * c, d + b * c, d.expand(c.shape)], -1).unflatten(-1, (2, 2))
+
+    def potential_energy(self, q):
+        return -(self.weight * q.cumsum(-1).cos()).sum(-1)
+
+    def gravity(self, q):
+        torque = self.weight * q.cumsum(-1).sin()
+        return torque.flip(-1).cumsum(-1).flip(-1)
+
+    def dissipation(self, q, qd):
+        return torch.diag_embed(self.damping.exp().expand(q.shape))
+
+    def input_matrix(self, q):
+        return torch.eye(2, dtype=q.dtype).expand(*q.shape, 2)
+
+    def momentum(self, q, qd):
+        return (self.mass_matrix(q) @ qd.unsqueeze(-1)).squeeze(-1)
+
+    def velocity(self, q, p):
+        return torch.linalg.solve(self.mass_matrix(q), p)
+
+    def hamiltonian(self, q, p):
+        return 0.5 * (p * self.velocity(q, p)).sum(-1) + self.potential_energy(q)
+
+    def _kinetic_slope(self, q, qd):
+        """d(1/2 qd^T M qd)/dq (..., 2): only c2 varies."""
+        slope = -self.inertia[0] * q[..., 1].sin() * (qd[..., 0] ** 2 + qd[..., 0] * qd[..., 1])
+        return torch.stack([torch.zeros_like(slope), slope], -1)
+
+    def _mass_rate(self, q, qd):
+        rate = -self.inertia[0] * q[..., 1].sin() * qd[..., 1]
+        return torch.stack([2 * rate, rate, rate, torch.zeros_like(rate)], -1).unflatten(-1, (2, 2))
+
+    def inverse_dynamics(self, q, qd, qdd):
+        coriolis = (self._mass_rate(q, qd) @ qd.unsqueeze(-1)).squeeze(-1) - self._kinetic_slope(q, qd)
+        return self.momentum(q, qdd) + coriolis + self.gravity(q) + self.damping.exp() * qd
+
+    def forward_dynamics(self, q, qd, tau):
+        return self.velocity(q, tau - self.inverse_dynamics(q, qd, torch.zeros_like(qd)))
+
+    def forward(self, t, state):
+        q, p, *inputs = state.split(2, dim=-1)
+        qd = self.velocity(q, p)
+        pd = self._kinetic_slope(q, qd) - self.gravity(q)
+        if not inputs:
+            return torch.cat([qd, pd], -1)
+        return torch.cat([qd, pd - self.damping.exp() * qd + inputs[0], torch.zeros_like(qd)], -1)
