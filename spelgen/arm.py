@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from math import pi
@@ -10,10 +10,10 @@ from typing import Literal
 
 import numpy as np
 
-from spelgen.chain import Chain, Follow, choose_chain, follow
+from spelgen.chain import Chain, Follow, choose_chain, follows
 from spelgen.errors import ArmError, Diagnostic
 from spelgen.placement import Placement, Pose, TenVector
-from spelgen.rational import Matrix, Vector, exact, rotation_from_rpy
+from spelgen.rational import Matrix, Vector, exact, rotation_from_rpy, tamed
 from spelgen.robot import Joint, Link, Robot
 from spelgen.snapping import Snapper
 
@@ -105,8 +105,9 @@ def make_arm(
     indices = {joint.name: index for index, joint in enumerate(chain.joints)}
     moved: list[tuple[Joint, Follow, Pose]] = []
     held: list[Joint] = []
+    following = follows(robot)
     for joint in _chain_first(robot, chain):
-        followed = follow(robot, joint)
+        followed = following[joint.name]
         if joint.moves and followed.leader.name in indices and followed.multiplier:
             moved.append((joint, followed, placement.move(joint)))
         else:
@@ -122,7 +123,7 @@ def make_arm(
         *snapper.diagnostics,
         *_tell_folded(moved),
         *_tell_lumped(moved, lumps),
-        *_tell_locked(robot, held),
+        *_tell_locked(following, held),
         *_tell_dependent(placement, bodies, held),
     ]
     x, y, z = (exact(float(value)) for value in gravity)
@@ -132,7 +133,7 @@ def make_arm(
         bodies=bodies,
         gravity=(x, y, z),
         diagnostics=tuple(sorted(told, key=lambda each: each.line or 0)),
-        locked=tuple(joint.name for joint in held if joint.type != "fixed"),
+        locked=tuple(joint.name for joint in robot.joints if joint in held and joint.type != "fixed"),
     )
 
 
@@ -154,8 +155,13 @@ def _lumps(robot: Robot, placement: Placement, count: int) -> list[list[Link]]:
 
 
 def _total(placement: Placement, links: Sequence[Link]) -> TenVector | None:
-    inertias = [placement.inertia(link, link.inertial) for link in links if link.inertial is not None]
-    return tuple(sum(column, Fraction(0)) for column in zip(*inertias, strict=True)) if inertias else None
+    """The sum of the links' inertias about their body's origin."""
+    total: TenVector | None = None
+    for link in links:
+        if link.inertial is not None:
+            ten = placement.inertia(link, link.inertial)
+            total = ten if total is None else tuple(tamed(a + b) for a, b in zip(total, ten, strict=True))
+    return total
 
 
 def _body(joint: Joint, followed: Follow, coordinate: int, pose: Pose, inertia: TenVector | None) -> Body:
@@ -215,11 +221,11 @@ def _tell_lumped(
             yield _info("lumped", joint, message)
 
 
-def _tell_locked(robot: Robot, held: Sequence[Joint]) -> Iterator[Diagnostic]:
+def _tell_locked(following: Mapping[str, Follow], held: Sequence[Joint]) -> Iterator[Diagnostic]:
     for joint in held:
         if joint.type == "fixed":
             continue
-        followed = follow(robot, joint)
+        followed = following[joint.name]
         if joint.mimic is not None:
             message = f"follows {followed.leader.name!r}: held at {float(followed.offset):g}"
         elif joint.moves:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 from spelgen.errors import ArmError, Diagnostic, Severity, suggestion
-from spelgen.rational import exact
+from spelgen.rational import exact, tamed
 from spelgen.robot import Joint, Robot
 
 _GRIPPER = re.compile(r"gripper|finger|thumb|knuckle|(?:^|[^a-z])jaws?(?:[^a-z]|$)", re.IGNORECASE)
@@ -52,14 +52,21 @@ def choose_chain(robot: Robot, joints: Sequence[str] | None, tip: str | None) ->
     return chain
 
 
-def follow(robot: Robot, joint: Joint) -> Follow:
-    """Return what ``joint`` follows through any number of mimic joints; itself where it follows none."""
-    multiplier, offset = Fraction(1), Fraction(0)
-    while joint.mimic is not None:
-        offset += multiplier * exact(joint.mimic.offset)
-        multiplier *= exact(joint.mimic.multiplier)
-        joint = robot.joint[joint.mimic.joint]
-    return Follow(joint, multiplier, offset)
+def follows(robot: Robot) -> dict[str, Follow]:
+    """Return what each joint follows, through any number of mimic joints; itself where it follows none."""
+    found: dict[str, Follow] = {}
+    for joint in robot.joints:
+        waiting = []
+        while joint.name not in found and joint.mimic is not None:
+            waiting.append((joint.name, joint.mimic))
+            joint = robot.joint[joint.mimic.joint]
+        followed = found.setdefault(joint.name, Follow(joint, Fraction(1), Fraction(0)))
+        for name, mimic in reversed(waiting):
+            multiplier = exact(mimic.multiplier)
+            offset = multiplier * followed.offset + exact(mimic.offset)
+            followed = Follow(followed.leader, tamed(multiplier * followed.multiplier), tamed(offset))
+            found[name] = followed
+    return found
 
 
 def _is_free(joint: Joint) -> bool:
@@ -115,7 +122,7 @@ def _usable(robot: Robot, name: str) -> Joint:
         expected = "a revolute, continuous or prismatic joint"
         raise ArmError(got, file=robot.path, line=joint.line, element=where, expected=expected)
     if joint.mimic is not None:
-        do = f"name {follow(robot, joint).leader.name!r} instead: what follows it moves with it"
+        do = f"name {follows(robot)[name].leader.name!r} instead: what follows it moves with it"
         raise ArmError(
             "a mimic joint", file=robot.path, line=joint.line, element=where, expected="its leader", do=do
         )

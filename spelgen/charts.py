@@ -44,16 +44,15 @@ class Axis:
         """Round values within the axis, about five."""
         if self.log:
             first, last = math.ceil(math.log10(self.low) - 1e-9), math.floor(math.log10(self.high) + 1e-9)
-            step = max(1, math.ceil((last - first + 1) / 5))
-            decades = [10.0**k for k in range(first, last + 1, step)]
-            if len(decades) >= 2:
+            decades = [10.0**k for k in range(first, last + 1, max(1, math.ceil((last - first + 1) / 5)))]
+            if len(decades) >= 3:
                 return decades
-            return [m * 10.0**k for k in range(first - 1, last + 1) for m in (1, 2, 5) if self._holds(m * 10.0**k)]
+            fine = [m * 10.0**k for k in range(first - 1, last + 1) for m in (1, 2, 5)]
+            within = [value for value in fine if self.low * (1 - 1e-9) <= value <= self.high * (1 + 1e-9)]
+            if len(within) >= 3:
+                return within
         step = _round_step((self.high - self.low) / 5)
         return [k * step for k in range(math.ceil(self.low / step - 1e-9), math.floor(self.high / step + 1e-9) + 1)]
-
-    def _holds(self, value: float) -> bool:
-        return self.low * (1 - 1e-9) <= value <= self.high * (1 + 1e-9)
 
     def _scale(self, value: float) -> float:
         return math.log10(value) if self.log else value

@@ -7,7 +7,8 @@ import inspect
 import os
 import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Annotated, Any, NoReturn
 
 import typer
@@ -71,6 +72,17 @@ def _told(error: BaseException, debug: bool) -> str:
         return f"{os.fsdecode(error.filename)}: {(error.strerror or type(error).__name__).lower()}"
     where = "" if debug else "; --debug shows where"
     return f"spelgen: unexpected {type(error).__name__}: {' '.join(str(error).split())}{where}"
+
+
+@contextmanager
+def counted(what: str) -> Iterator[Callable[[int, int], None]]:
+    """A bar on stderr, where that is a terminal; gives a function to call with (done, all)."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty(), transient=True) as bar:
+        task = bar.add_task(what, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 def say(text: str) -> None:

@@ -64,6 +64,8 @@ def _joint_row(joint: JointSpec) -> str:
         reach=joint.reach,
         speed=joint.speed,
         friction=joint.friction,
+        mass_share=joint.mass_share,
+        potential_share=joint.potential_share,
         actuated=joint.actuated,
     )
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 Severity = Literal["info", "warning"]
+_TOLD_AT_MOST = 50
 
 
 class SpelgenError(Exception):
@@ -74,7 +75,9 @@ class SpelgenErrors(SpelgenError):
         self.errors = tuple(errors)
 
     def __str__(self) -> str:
-        return "\n".join(str(error) for error in self.errors)
+        told = [str(error) for error in self.errors[:_TOLD_AT_MOST]]
+        left = len(self.errors) - len(told)
+        return "\n".join(told + ([f"and {left} more like these"] if left else []))
 
 
 def collect(errors: Sequence[SpelgenError]) -> None:

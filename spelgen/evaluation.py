@@ -38,9 +38,9 @@ DRIFT_STATES = 8
 class Errors:
     """Errors at the end of a horizon, root mean square over windows, per joint where a tuple.
 
-    q, qd: [rad, rad/s; m, m/s], revolute positions as angles on the circle. q_share, qd_share: the same relative to
-    how much q and qd change over the horizon. mean_share: mean of all q_share and qd_share. tip_mm: distance of the
-    tip [mm]. None: not finite, or not known.
+    q, qd: [rad, rad/s; m, m/s], revolute positions as angles on the circle. q_share, qd_share: the same
+    relative to how much q and qd change over the horizon. mean_share: mean of all q_share and qd_share.
+    tip_mm: distance of the tip [mm]. None: not finite, or not known.
     """
 
     q: tuple[float | None, ...]
@@ -66,8 +66,8 @@ class Horizon:
 class Torque:
     """Errors of the inverse dynamics of one contender by the protocol of `torque_samples`.
 
-    nmse: per trajectory, mean over joints. mean_nmse: mean over trajectories. rmse: per joint [Nm, N], mean over
-    trajectories.
+    nmse: per trajectory, mean over joints. mean_nmse: mean over trajectories. rmse: per joint [Nm, N], mean
+    over trajectories.
     """
 
     nmse: dict[str, float | None]
@@ -79,9 +79,9 @@ class Torque:
 class Evaluation:
     """What `evaluate` found; `to_dict` is evaluation.json.
 
-    cutoff: of the filter on the test logs [Hz], None without. torque: by contender, empty where the logs are too
-    sparse. energy_drift: of the model without input and dissipation over 1 s by rk4 with dt 1 ms, relative to its
-    kinetic energy; None where the logs never move.
+    cutoff: of the filter on the test logs [Hz], None without. torque: by contender, empty where the logs are
+    too sparse. energy_drift: of the model without input and dissipation over 1 s by rk4 with dt 1 ms,
+    relative to its kinetic energy; None where the logs never move.
     """
 
     robot: str
@@ -111,9 +111,9 @@ def evaluate(
 ) -> Evaluation:
     """Evaluate the best model of a run on logs (a folder's test.* where there are such) and write evaluation.json.
 
-    steps, seconds: horizons in samples and in time; those longer than every trajectory are left out, and said.
-    cutoff: of the filter on the logs [Hz], 0: none; by default the one the run was trained with.
-    The result depends on nothing else: no random numbers. Raises RunError, ModuleError, LogError.
+    steps, seconds: horizons in samples and in time; those longer than every trajectory are left out, and
+    said. cutoff: of the filter on the logs [Hz], 0: none; by default the one the run was trained with. The
+    result depends on nothing else: no random numbers. Raises RunError, ModuleError, LogError.
     """
     torch.set_num_threads(threads)
     run = RunFolder(Path(folder))
@@ -275,7 +275,8 @@ def _tip(run: RunFolder, header: Header, notes: list[Diagnostic]) -> Tip | None:
 def energy_drift(model: EmittedModel, windows: Windows) -> float | None:
     """Largest |H(t) - H(0)| over 1 s without input and dissipation, relative to the largest kinetic energy met.
 
-    From the windows' fastest states, by rk4 with dt 1 ms: what is left is integration error, if H is conserved.
+    From the windows' fastest states, by rk4 with dt 1 ms: what is left is integration error, if H is
+    conserved.
     """
     q, qd = windows.q[:, 0], windows.qd[:, 0]
     p = model.momentum(q, qd)

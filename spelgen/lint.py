@@ -68,7 +68,7 @@ def _lint_placeholders(robot: Robot) -> Iterator[Diagnostic]:
     tensor, count = Counter(each.tensor for each in inertials).most_common(1)[0]
     if count > len(inertials) / 2 and count >= 3:
         first = next(each for each in inertials if each.tensor == tensor)
-        message = f"{count} of {len(inertials)} links have the same inertia tensor: placeholders"
+        message = f"{count} of {len(inertials)} links have the same inertia tensor: perhaps placeholders"
         yield _warning("placeholder-inertial", "robot", first.line, message)
 
 

@@ -21,6 +21,8 @@ _POINTS = 512
 _DIGITS = 6
 _LEAST_SHARE = 0.05
 """An output that the nominal values hardly move is still allowed this share of the entries it enters."""
+_LEAST_SENSITIVITY = 0.02
+"""A joint that M or V hardly depends on nominally is still seen by the network at this share."""
 
 _DEFAULT_MASS = 1.0  # kg
 _DEFAULT_GYRATION = 0.1  # m
@@ -39,6 +41,8 @@ class Nominal:
     constant_scales: tuple[float, ...]
     potential_scale: float
     joint_torque: tuple[float, ...]
+    mass_shares: tuple[float, ...]
+    potential_shares: tuple[float, ...]
     least_share: float
     """Least eigenvalue of M(q) relative to the mean M, over the workspace."""
     from_urdf: bool
@@ -59,6 +63,7 @@ def nominal(arm: Arm, structure: Structure) -> Nominal:
     constants = means @ _matrix(structure, [constant.reads for constant in structure.constants]).T
     constant_sizes = [_LEAST_SHARE * _size(typical, keys, constant.reads) for constant in structure.constants]
     torque = _gravity_torque(arm, q, inertias)
+    changes = _mass_changes(arm, q, inertias, typical)
     inertial = np.sqrt((mass[:, [keys.index((i, i)) for i in range(q.shape[1])]] ** 2).mean(axis=0))
     _, potential = float_energies(arm, q, inertias)
     return Nominal(
@@ -68,6 +73,8 @@ def nominal(arm: Arm, structure: Structure) -> Nominal:
         constant_scales=_rounded(np.maximum(np.abs(constants), constant_sizes)),
         potential_scale=_rounded([max(float(potential.std()), 1e-3)])[0],
         joint_torque=_rounded(np.hypot(torque, inertial)),
+        mass_shares=_shares(changes),
+        potential_shares=_shares(torque),
         least_share=_rounded([_least_share(mass, q.shape[1])])[0],
         from_urdf=from_urdf,
     )
@@ -130,6 +137,23 @@ def _gravity_torque(arm: Arm, q: np.ndarray, inertias: list[list[float]]) -> np.
     return np.sqrt(squares)
 
 
+def _mass_changes(arm: Arm, q: np.ndarray, inertias: list[list[float]], typical: np.ndarray) -> np.ndarray:
+    """Root mean square change of M's entries, relative to their typical size, when a coordinate moves elsewhere."""
+    base, _ = float_energies(arm, q, inertias)
+    changes = []
+    for index in range(q.shape[1]):
+        moved = q.copy()
+        moved[:, index] = np.roll(moved[:, index], 1)
+        changes.append((((float_energies(arm, moved, inertias)[0] - base) / typical) ** 2).mean())
+    return np.sqrt(changes)
+
+
+def _shares(sizes: np.ndarray) -> tuple[float, ...]:
+    """Sizes relative to the largest, but at least ``_LEAST_SENSITIVITY``."""
+    largest = sizes.max()
+    return _rounded(np.maximum(sizes / largest, _LEAST_SENSITIVITY) if largest > 0 else np.ones_like(sizes), 3)
+
+
 def _matrix(structure: Structure, reads: Sequence[Weights]) -> np.ndarray:
     keys = {key: index for index, key in enumerate(triangle(len(structure.joints)))}
     matrix = np.zeros((len(reads), len(keys)))
@@ -143,11 +167,11 @@ def _size(typical: np.ndarray, keys: list[tuple[int, int]], reads: Weights) -> f
     return float(sum(abs(value) * typical[keys.index((i, j))] for i, j, value in reads))
 
 
-def _rounded(values: Sequence[float] | np.ndarray) -> tuple[float, ...]:
-    return tuple(_round(float(value)) for value in values)
+def _rounded(values: Sequence[float] | np.ndarray, digits: int = _DIGITS) -> tuple[float, ...]:
+    return tuple(_round(float(value), digits) for value in values)
 
 
-def _round(value: float) -> float:
+def _round(value: float, digits: int) -> float:
     if abs(value) < 1e-12:
         return 0.0
-    return round(value, _DIGITS - 1 - floor(log10(abs(value))))
+    return round(value, digits - 1 - floor(log10(abs(value))))

@@ -69,7 +69,7 @@ def inspect(
     """Derive the structure of the arm in the URDF at ``path``; arguments and errors as for ``load``."""
     loaded = load(path, joints, tip, snap_tolerance)
     structure = derive(loaded.arm, assume)
-    return Inspection(loaded.arm, structure, _diagnostics(loaded))
+    return Inspection(loaded.arm, structure, (*loaded.robot.diagnostics, *loaded.arm.diagnostics))
 
 
 def build(
@@ -136,8 +136,3 @@ def find_urdf(module: Path, name: str) -> Path:
         file=module,
         do="name it with --robot",
     )
-
-
-def _diagnostics(loaded: Loaded) -> tuple:
-    known = set(loaded.arm.diagnostics)
-    return (*(each for each in loaded.robot.diagnostics if each not in known), *loaded.arm.diagnostics)

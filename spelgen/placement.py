@@ -100,8 +100,7 @@ class Placement:
         rotation = frame.rotation if turn is None else self._in_body(frame.body, frame.composed @ turn)
         x, y, z = summed(frame.position, rotated(frame.rotation, offset))
         mass = exact(inertial.mass)
-        a, b, c, d, e, f = (exact(value) for value in inertial.tensor)
-        xx, xy, xz, yy, yz, zz = rotated_tensor(rotation, (a, b, c, d, e, f))
+        xx, xy, xz, yy, yz, zz = rotated_tensor(rotation, self._snapper.tensor(link, inertial))
         return (
             mass,
             mass * x,

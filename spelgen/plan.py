@@ -7,12 +7,14 @@ import re
 
 from spelgen.arm import Arm, Coordinate
 from spelgen.basis import Weights
-from spelgen.nominal import nominal, working_range
+from spelgen.nominal import Nominal, nominal, working_range
 from spelgen.spec import ConstantSpec, Entries, JointSpec, ModelSpec, Options, OutputSpec
 from spelgen.structure import Structure
 
 _GUARD_SHARE = 0.1
-_FRICTION_SHARE = 0.1
+_FRICTION_OF_EFFORT = 0.02
+_FRICTION_OF_TORQUE = 0.1
+_LARGEST_EFFORT = 1e4  # Nm, N: what stands above is a placeholder
 _DEFAULT_SPEED = {"revolute": 2.0, "prismatic": 0.5}  # rad/s, m/s
 
 
@@ -20,7 +22,6 @@ def plan_model(arm: Arm, structure: Structure, options: Options, *, urdf: str, u
     """The model of ``arm`` under ``options``; ``urdf`` is the file's name without its folder."""
     sizes = nominal(arm, structure)
     identifiers = _identifiers([coordinate.name for coordinate in arm.coordinates])
-    torques = zip(arm.coordinates, identifiers, sizes.joint_torque, strict=True)
     x, y, z = (float(g) for g in arm.gravity)
     return ModelSpec(
         robot=arm.name,
@@ -28,7 +29,7 @@ def plan_model(arm: Arm, structure: Structure, options: Options, *, urdf: str, u
         urdf_sha256=urdf_sha256,
         gravity=(x, y, z),
         options=options,
-        joints=tuple(_joint(*each) for each in torques),
+        joints=tuple(_joint(arm.coordinates[k], identifiers[k], sizes, k) for k in range(len(identifiers))),
         entries=tuple((e.row, e.column, e.kind, e.joints) for e in structure.entries),
         outputs=tuple(
             OutputSpec(output.joints, _floats(output.basis), center, scale)
@@ -49,7 +50,7 @@ def plan_model(arm: Arm, structure: Structure, options: Options, *, urdf: str, u
     )
 
 
-def _joint(coordinate: Coordinate, identifier: str, torque: float) -> JointSpec:
+def _joint(coordinate: Coordinate, identifier: str, sizes: Nominal, index: int) -> JointSpec:
     low, high = working_range(coordinate)
     speed = coordinate.velocity if coordinate.velocity and coordinate.velocity < 100 else None
     return JointSpec(
@@ -61,9 +62,19 @@ def _joint(coordinate: Coordinate, identifier: str, torque: float) -> JointSpec:
         center=float(f"{(low + high) / 2:.6g}"),
         reach=float(f"{(high - low) / 2:.6g}"),
         speed=speed or _DEFAULT_SPEED[coordinate.kind],
-        friction=float(f"{_FRICTION_SHARE * torque:.3g}"),
+        friction=float(f"{_friction(coordinate, sizes, index):.3g}"),
+        mass_share=sizes.mass_shares[index],
+        potential_share=sizes.potential_shares[index],
         actuated=not coordinate.passive,
     )
+
+
+def _friction(coordinate: Coordinate, sizes: Nominal, index: int) -> float:
+    """The size of friction to start from: a share of the drive's effort, or of the torques the nominal arm needs."""
+    if coordinate.effort and coordinate.effort <= _LARGEST_EFFORT:
+        return _FRICTION_OF_EFFORT * coordinate.effort
+    # a wrist may need next to no torque by itself, but its gear rubs like its neighbour's
+    return _FRICTION_OF_TORQUE * max(sizes.joint_torque[index], 0.01 * max(sizes.joint_torque))
 
 
 def _identifiers(names: list[str]) -> list[str]:

@@ -27,11 +27,22 @@ _ALIGNMENTS = {
 }
 _FINE_STEPS = (pi / 12, pi / 8, pi / 5)
 _FINE_TOLERANCE = 2e-5
+_REACH = 1e-11
+_MAX_BITS = 4096
 
 
 def exact(value: float) -> Fraction:
     """The decimal a float was written as: 0.1 is 1/10."""
     return Fraction(repr(value))
+
+
+def tamed(value: Fraction) -> Fraction:
+    """The number itself, or the nearest float to one of thousands of digits.
+
+    Such a number is no exact value but the trace of dozens of rounded rotations in a row; kept, it would make
+    a hostile file take hours.
+    """
+    return value if value.denominator.bit_length() <= _MAX_BITS else Fraction(float(value))
 
 
 def snapped_angle(angle: float, tolerance: float) -> float:
@@ -84,7 +95,7 @@ def alignment(axis: np.ndarray) -> np.ndarray:
 
 
 def exact_rotation(rotation: np.ndarray) -> Matrix:
-    """A rational rotation within 1e-12 of a float64 one, exactly orthogonal; signed permutations are exact.
+    """A rational rotation within 1e-11 of a float64 one, exactly orthogonal; signed permutations are exact.
 
     The unit quaternion is divided by its largest component and each ratio replaced by a nearby fraction; the
     rotation of an unnormalised rational quaternion is rational (Euler-Rodrigues).
@@ -92,7 +103,7 @@ def exact_rotation(rotation: np.ndarray) -> Matrix:
     ratios = _quaternion_ratios(rotation)
     for bound in (10**7, 10**10, 10**13):
         candidate = _rotation_of(*(Fraction(ratio).limit_denominator(bound) for ratio in ratios))
-        if np.abs(np.array(candidate, dtype=float) - rotation).max() < 1e-12:
+        if np.abs(np.array(candidate, dtype=float) - rotation).max() < _REACH:
             return candidate
     return candidate
 

@@ -1,4 +1,4 @@
-"""What a trained model is compared with on the same windows: the velocity stays constant, the URDF's values."""
+"""What a trained model is compared with on the same windows: a constant velocity, the URDF's own values."""
 
 from __future__ import annotations
 

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from spelgen.runs import EmittedModel
 
 SUBSTEPS = (1, 2, 4, 8, 16, 32)
-INTEGRATION_TOLERANCE = 1e-3  # of a loss near 1e-2 at best, this error is a ten-thousandth
+INTEGRATION_SHARE = 0.03  # of the model's own error, what the integrator may add
+LEAST_ERROR = 1e-3  # no model is expected to be better, in units of the scales
 
 
 class Dynamics(Protocol):
@@ -110,17 +111,20 @@ def rollout_loss(model: EmittedModel, windows: Windows, scales: LossScales, subs
 
 
 def integration_error(model: EmittedModel, windows: Windows, scales: LossScales, substeps: int) -> float:
-    """Root mean square difference, in units of `scales`, of rollouts with `substeps` and twice as many."""
+    """Difference between rollouts with `substeps` and with twice as many, relative to the error of the latter.
+
+    Both are root mean squares in units of `scales`; of the model's error, at least LEAST_ERROR is taken.
+    """
     with torch.no_grad():
-        coarse = rollout_errors(model, windows, scales, substeps)
         fine = rollout_errors(model, windows, scales, 2 * substeps)
-    error = (coarse - fine).square().mean().sqrt().item()
+        difference = rollout_errors(model, windows, scales, substeps) - fine
+    error = difference.square().mean().sqrt().item() / max(fine.square().mean().sqrt().item(), LEAST_ERROR)
     return error if math.isfinite(error) else math.inf
 
 
 def choose_substeps(model: EmittedModel, windows: Windows, scales: LossScales, start: int = 1) -> int:
-    """The fewest rk4 steps per sample interval, from `start` on, whose integration error is small enough."""
+    """The fewest rk4 steps per sample interval, from `start` on, that make integration a small part of the error."""
     for substeps in SUBSTEPS:
-        if substeps >= start and integration_error(model, windows, scales, substeps) < INTEGRATION_TOLERANCE:
+        if substeps >= start and integration_error(model, windows, scales, substeps) < INTEGRATION_SHARE:
             return substeps
     return max(start, SUBSTEPS[-1])

@@ -17,7 +17,7 @@ import torch
 from spelgen.errors import ModuleError, RunError
 
 METHODS = (
-    "mass_matrix", "potential_energy", "momentum", "velocity", "hamiltonian",
+    "mass_matrix", "potential_energy", "dissipation", "momentum", "velocity", "hamiltonian",
     "forward_dynamics", "inverse_dynamics", "forward",
 )  # fmt: skip
 
@@ -31,6 +31,8 @@ if TYPE_CHECKING:
         joint_names: tuple[str, ...]
         joint_types: tuple[str, ...]
 
+        def potential_energy(self, q: torch.Tensor) -> torch.Tensor: ...
+        def dissipation(self, q: torch.Tensor, qd: torch.Tensor) -> torch.Tensor: ...
         def momentum(self, q: torch.Tensor, qd: torch.Tensor) -> torch.Tensor: ...
         def velocity(self, q: torch.Tensor, p: torch.Tensor) -> torch.Tensor: ...
         def hamiltonian(self, q: torch.Tensor, p: torch.Tensor) -> torch.Tensor: ...

@@ -18,6 +18,8 @@ FILTER_ORDER = 4
 AUTOMATIC_CUTOFF = 8.0  # [Hz] rigid-body motion of an arm lies below, drive ripple and quantisation above
 AUTOMATIC_RATE = 50.0  # [Hz] logs sampled more slowly are not oversampled enough to be filtered unasked
 
+SAMPLES_PER_PERIOD = 3
+
 
 def rate(trajectory: Trajectory) -> float:
     """Samples per second outside gaps [Hz], from the mean step: the median of jittered steps is biased."""
@@ -37,6 +39,16 @@ def split_at_gaps(trajectory: Trajectory) -> list[Trajectory]:
 def automatic_cutoff(trajectories: Sequence[Trajectory]) -> float | None:
     """8 Hz when every log is sampled above 50 Hz, as measured logs usually are; otherwise None, no filter."""
     return AUTOMATIC_CUTOFF if all(rate(x) > AUTOMATIC_RATE for x in trajectories) else None
+
+
+def automatic_spacing(trajectories: Sequence[Trajectory], cutoff: float | None) -> int:
+    """Samples from one sample of a window to the next: every one, unless filtered logs are much denser than needed.
+
+    What was filtered at `cutoff` is fully described by three samples per period of it.
+    """
+    if cutoff is None:
+        return 1
+    return max(1, int(min(rate(x) for x in trajectories) / (SAMPLES_PER_PERIOD * cutoff)))
 
 
 def low_pass(trajectory: Trajectory, cutoff: float) -> Trajectory:

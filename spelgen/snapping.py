@@ -10,17 +10,19 @@ from math import pi
 import numpy as np
 
 from spelgen.errors import Diagnostic
-from spelgen.rational import Vector, exact, rotation_from_rpy, snapped_angle
+from spelgen.rational import Tensor, Vector, exact, rotation_from_rpy, snapped_angle, tamed
 from spelgen.robot import Inertial, Joint, Link
 
 OFFSET_NOISE = 1e-9
 AXIS_NOISE = 1e-3
+# of a product of inertia, as a share of the largest moment: what rounding in CAD programs leaves
+TENSOR_NOISE = 1e-12
 _TOLD = 1e-9
 
 
 @dataclass(frozen=True)
 class Snapper:
-    """Reads special values out of rounded ones: angles within ``tolerance`` [rad], offsets, axes.
+    """Reads special values out of rounded ones: angles within ``tolerance`` [rad], offsets, axes, tensors.
 
     A tolerance of 0 switches all of it off. What changed is gathered in ``diagnostics``, once per origin or
     axis.
@@ -40,6 +42,17 @@ class Snapper:
         offset = self._offset(inertial.com, where, inertial.line)
         return offset, self._rotation(inertial.rpy, where, inertial.line)
 
+    def tensor(self, link: Link, inertial: Inertial) -> Tensor:
+        """The inertia tensor [kg m2], without products of inertia that are a computation's rounding error."""
+        xx, xy, xz, yy, yz, zz = inertial.tensor
+        noise = TENSOR_NOISE * max(abs(xx), abs(yy), abs(zz)) if self.tolerance else 0.0
+        kept_xy, kept_xz, kept_yz = (0.0 if abs(value) < noise else value for value in (xy, xz, yz))
+        if (kept_xy, kept_xz, kept_yz) != (xy, xz, yz):
+            told = f"{_listed((xy, xz, yz))} kg m2 is taken as {_listed((kept_xy, kept_xz, kept_yz))}"
+            where = f"link {link.name!r} inertial products"
+            self._tell("snapped-inertia", where, inertial.line, told)
+        return exact(xx), exact(kept_xy), exact(kept_xz), exact(yy), exact(kept_yz), exact(zz)
+
     def axis(self, joint: Joint) -> np.ndarray:
         """The joint's axis as a unit vector in the joint's frame, (3,)."""
         unit = np.array(joint.axis) / np.linalg.norm(joint.axis)
@@ -58,9 +71,8 @@ class Snapper:
 
     def position(self, vector: Vector) -> Vector:
         """A composed position [m] without the noise that rounded rotations leave in it."""
-        if self.tolerance == 0.0:
-            return vector
-        x, y, z = (value if abs(value) >= OFFSET_NOISE else Fraction(0) for value in vector)
+        noise = OFFSET_NOISE if self.tolerance else 0.0
+        x, y, z = (tamed(value) if abs(value) >= noise else Fraction(0) for value in vector)
         return x, y, z
 
     def _offset(self, offset: Sequence[float], where: str, line: int) -> Vector:

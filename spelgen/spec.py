@@ -49,6 +49,9 @@ class JointSpec:
     speed: float
     friction: float
     """Size of friction torque the model starts from."""
+    mass_share: float
+    potential_share: float
+    """How much M, or V, changes with this joint, relative to the joint it changes with most."""
     actuated: bool
 
 

@@ -17,9 +17,9 @@ def tip_position(
 ) -> Callable[[torch.Tensor], torch.Tensor]:
     """A function of q, (..., n) [rad, m], to the position of the link `tip`, (..., 3) [m], in the root link's frame.
 
-    tip: by default the link after the last joint, or the end of the fixed links that follow it. Joints other than
-    the n named ones stand at zero. Offsets are single precision in pytorch-kinematics: errors near 1e-7 m.
-    Raises what pytorch-kinematics raises where it cannot read the file.
+    tip: by default the link after the last joint, or the end of the fixed links that follow it. Joints other
+    than the n named ones stand at zero. Offsets are single precision in pytorch-kinematics: errors near 1e-7
+    m. Raises what pytorch-kinematics raises where it cannot read the file.
     """
     robot = read_urdf(urdf)
     link = tip or _last_link(robot, joints)

@@ -1,4 +1,4 @@
-"""Torque errors of inverse dynamics on measured trajectories, by one fixed protocol so that figures can be compared."""
+"""Torque errors of inverse dynamics on measured trajectories, by one protocol: comparable figures."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from spelgen.errors import Diagnostic
 from spelgen.logs import Trajectory, read_logs
 from spelgen.rollout import LossScales, loss_scales
 from spelgen.settings import TrainingSettings
-from spelgen.signals import automatic_cutoff, examine, prepare
+from spelgen.signals import automatic_cutoff, automatic_spacing, examine, prepare
 from spelgen.windows import Windows, cut_windows, split_validation
 
 LARGEST_VALIDATION = 2048  # windows; validation is a measurement, it needs no more
@@ -22,6 +22,7 @@ LARGEST_VALIDATION = 2048  # windows; validation is a measurement, it needs no m
 class TrainingConfig:
     """Settings of one run; see `TrainingSettings` for those that a robot's sidecar file may set.
 
+    every: samples from one sample of a window to the next, None: see `automatic_spacing`.
     substeps: rk4 steps per sample interval, None: chosen by `choose_substeps`.
     filter: cutoff [Hz] of the zero-phase low-pass on q, qd and tau; 0: none; None: see `automatic_cutoff`.
     threads: of torch; the matrices are tiny, more than two rarely help.
@@ -31,6 +32,7 @@ class TrainingConfig:
     objective: Literal["rollout"] = "rollout"
     window: int = 5
     stride: int = 1
+    every: int | None = None
     epochs: int = 400
     batch: int = 256
     learning_rate: float = 1e-3
@@ -82,12 +84,12 @@ def prepare_data(
         message = f"q, qd and tau filtered at {cutoff:g} Hz, zero phase"
         notes.append(Diagnostic("info", "filter", "logs", None, message))
     training, validation = (
-        prepare(x, shortest=config.window, cutoff=cutoff) for x in (split.training, split.validation)
+        prepare(x, shortest=(config.window - 1) * every + 1, cutoff=cutoff) for x in (split.training, split.validation)
     )
-    windows = cut_windows(training, config.window, config.stride, measured=cutoff is not None)
+    windows = cut_windows(training, config.window, config.stride, every, measured=cutoff is not None)
     return TrainingData(
         training=windows,
-        validation=_thin(cut_windows(validation, config.window, config.stride, measured=cutoff is not None)),
+        validation=_thin(cut_windows(validation, config.window, config.stride, every, measured=cutoff is not None)),
         scales=loss_scales(windows, joint_types),
         cutoff=cutoff,
         training_names=tuple(x.name for x in split.training),

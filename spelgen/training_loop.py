@@ -11,7 +11,7 @@ import torch
 
 from spelgen.errors import RunError
 from spelgen.progress import TrainingProgress
-from spelgen.rollout import INTEGRATION_TOLERANCE, choose_substeps, integration_error, rollout_loss
+from spelgen.rollout import INTEGRATION_SHARE, choose_substeps, integration_error, rollout_loss
 from spelgen.runs import RunFolder, write_state
 from spelgen.training_data import TrainingConfig, TrainingData
 from spelgen.windows import Windows
@@ -165,7 +165,7 @@ class TrainingLoop:
         """Take more substeps when what was learned (friction, mostly) is too stiff for the present ones."""
         if self.config.substeps is not None or self.epoch % PROBE_EVERY:
             return
-        if integration_error(self.model, self.probe, self.scales, self.substeps) > INTEGRATION_TOLERANCE:
+        if integration_error(self.model, self.probe, self.scales, self.substeps) > INTEGRATION_SHARE:
             self.substeps = choose_substeps(self.model, self.probe, self.scales, start=2 * self.substeps)
 
     def save(self) -> None:

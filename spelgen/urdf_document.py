@@ -144,7 +144,7 @@ def _check_root(path: Path, root: etree._Element) -> None:
 
 
 def _check_xacro(path: Path, root: etree._Element) -> tuple[int, ...]:
-    """Refuses xacro that still holds structure; the lines of <xacro:property>, which holds none, are returned.
+    """Refuses xacro that still holds structure; returns the lines of <xacro:property>, which holds none.
 
     Expanders leave properties behind; a number that still refers to one is refused where it is read.
     """

@@ -42,33 +42,34 @@ class Windows:
         return Windows(*(x.to(device) for x in (self.dt, self.q, self.qd, self.tau)))
 
 
-def cut_windows(pieces: Sequence[Trajectory], window: int, stride: int, *, measured: bool) -> Windows:
-    """All windows of `window` samples that start at every `stride`-th sample of a piece.
+def cut_windows(
+    pieces: Sequence[Trajectory], window: int, stride: int = 1, every: int = 1, *, measured: bool
+) -> Windows:
+    """All windows of `window` samples, `every` apart, that start at every `stride`-th sample of a piece.
 
-    measured: False holds tau[k] from t[k] to t[k+1], as a simulator with zero-order hold applied it. True
-    takes tau as measured at the sample times and holds the mean of both ends; holding tau[k] would be half
-    a sample late.
+    Between samples the input is held at its mean over time. measured: False reads tau[k] as held from t[k] to
+    t[k+1], as a simulator with zero-order hold applied it. True reads it as measured at t[k] and takes the mean of
+    both ends for a step; holding tau[k] would be half a sample late. Raises LogError when there is no window.
     """
-    cut = [_cut(piece, window, stride, measured) for piece in pieces if len(piece.t) >= window]
+    cut = [_cut(piece, window, stride, every, measured) for piece in pieces if len(piece.t) > (window - 1) * every]
     if not cut:
-        raise LogError(f"no trajectory of {window} samples", expected="one window", do="use a shorter window")
+        raise LogError(f"no trajectory of {(window - 1) * every + 1} samples", expected="one window")
     return Windows(*(torch.from_numpy(np.concatenate(parts)) for parts in zip(*cut, strict=True)))
 
 
-def _cut(piece: Trajectory, window: int, stride: int, measured: bool) -> tuple[np.ndarray, ...]:
+def _cut(piece: Trajectory, window: int, stride: int, every: int, measured: bool) -> tuple[np.ndarray, ...]:
     held = (piece.tau[:-1] + piece.tau[1:]) / 2 if measured else piece.tau[:-1]
-    dt = sliding_window_view(np.diff(piece.t), window - 1)[::stride]
-    return (
-        dt,
-        _slide(piece.q, window, stride),
-        _slide(piece.qd, window, stride),
-        _slide(held, window - 1, stride),
-    )
+    impulse = sliding_window_view(held * np.diff(piece.t)[:, None], every, axis=0).sum(axis=-1)  # (T - every, n)
+    dt = (piece.t[every:] - piece.t[:-every])[:, None]
+    steps = [_slide(x, window - 1, stride, every) for x in (dt, impulse / dt)]
+    states = [_slide(x, window, stride, every) for x in (piece.q, piece.qd)]
+    return steps[0][..., 0], *states, steps[1]
 
 
-def _slide(values: np.ndarray, window: int, stride: int) -> np.ndarray:
+def _slide(values: np.ndarray, window: int, stride: int, every: int) -> np.ndarray:
     """(T, n) -> (W, window, n)."""
-    return sliding_window_view(values, window, axis=0)[::stride].transpose(0, 2, 1)
+    windows = sliding_window_view(values, (window - 1) * every + 1, axis=0)[::stride, :, ::every]
+    return windows.transpose(0, 2, 1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,68 @@
+"""What a trained model has learned that is a plain number: the constants of its mass matrix."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from spelgen.runs import RunFolder, load_model
+
+KEYS = ("constants", "constant_scale", "constant_basis")
+INERTIA_UNITS = {"revolute revolute": "kg m²", "prismatic prismatic": "kg"}
+
+
+@dataclass(frozen=True)
+class Constant:
+    """A trained constant: where it enters M, what it was before training and after, in the unit of that entry."""
+
+    where: str
+    start: float
+    learned: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Learned:
+    """parameters: how many numbers were trained. constants: None when the model's preset has none to show."""
+
+    parameters: int
+    constants: tuple[Constant, ...] | None
+
+
+def read_learned(run: RunFolder) -> Learned:
+    """What the best model of a run has learned. Raises ModuleError or RunError when it cannot be read."""
+    model = load_model(run.module)
+    parameters = sum(parameter.numel() for parameter in model.parameters())
+    before, after = model.state_dict(), run.load_state(run.weights)
+    if not all(key in state for key in KEYS for state in (before, after)):
+        return Learned(parameters, None)
+    basis = after["constant_basis"].reshape(-1, model.n, model.n)
+    values = zip(basis, _values(before), _values(after), strict=True)
+    return Learned(parameters, tuple(_constant(*each, model.joint_types) for each in values))
+
+
+def _values(state: Mapping[str, Any]) -> list[float]:
+    constants = state["constants"]
+    # where the mass matrix is all constants, the module takes their sizes so that it stays positive definite
+    sizes = constants if "output_basis" in state else constants.abs()
+    return (sizes * state["constant_scale"]).tolist()
+
+
+def _constant(basis: torch.Tensor, start: float, learned: float, joint_types: Sequence[str]) -> Constant:
+    entries = [(i, j) for i, j in basis.tril().nonzero().tolist()]
+    where = " ".join(f"{_factor(basis[i, j].item(), k == 0)}M{_index(i, j)}" for k, (i, j) in enumerate(entries))
+    unit = INERTIA_UNITS.get(" ".join(joint_types[k] for k in entries[0]), "kg m")
+    return Constant(where, start, learned, unit)
+
+
+def _index(row: int, column: int) -> str:
+    return f"{row + 1}{column + 1}" if row < 9 else f"({row + 1},{column + 1})"
+
+
+def _factor(value: float, first: bool) -> str:
+    """`2 `, `- 0.5 `, `+ `: a coefficient in a sum of entries."""
+    sign = ("-" if first else "- ") if value < 0 else ("" if first else "+ ")
+    return sign if abs(value) == 1 else f"{sign}{abs(value):.4g} "

@@ -1,0 +1,100 @@
+"""Bytes -> plain YAML values that know their lines; what makes YAML unsafe or ambiguous is refused here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+from yaml.composer import ComposerError
+
+from spelgen.errors import SettingsError
+
+MAX_BYTES = 256 * 1024  # 300 joints, each with every key, take 60 kB
+MAX_DEPTH = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Document:
+    """A YAML file: its node tree, None when the file is empty."""
+
+    path: Path
+    root: yaml.Node | None
+
+    def value(self) -> Any:
+        """Return the file's content as dicts, lists and scalars; raises SettingsError for foreign tags."""
+        if self.root is None:
+            return None
+        try:
+            return yaml.SafeLoader("").construct_document(self.root)
+        except yaml.YAMLError as error:
+            raise _told(error, self.path) from error
+        except ValueError as error:  # e.g. the date 2025-99-99
+            raise SettingsError(f"not plain YAML: {error}", file=self.path) from error
+
+    def line(self, location: tuple[Any, ...]) -> int | None:
+        """Return the line of a key or list item, or of the nearest thing around it that is there."""
+        node, line = self.root, None if self.root is None else self.root.start_mark.line + 1
+        for part in location:
+            if isinstance(node, yaml.MappingNode):
+                found = [(key, value) for key, value in node.value if key.value == str(part)]
+            elif isinstance(node, yaml.SequenceNode) and isinstance(part, int) and part < len(node.value):
+                found = [(node.value[part], node.value[part])]
+            else:
+                break
+            if not found:
+                break
+            line, node = found[0][0].start_mark.line + 1, found[0][1]
+        return line
+
+
+class _Loader(yaml.SafeLoader):
+    """The safe loader, without aliases (a small file could grow huge), deep nesting and repeated keys."""
+
+    depth = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node:
+        mark = self.peek_event().start_mark
+        if self.check_event(yaml.AliasEvent):
+            raise ComposerError(None, None, "an alias", mark)
+        if self.depth == MAX_DEPTH:
+            raise ComposerError(None, None, f"more than {MAX_DEPTH} levels", mark)
+        self.depth += 1
+        node = super().compose_node(parent, index)
+        self.depth -= 1
+        return node
+
+    def compose_mapping_node(self, anchor: Any) -> yaml.Node:
+        node = super().compose_mapping_node(anchor)
+        seen: set[str] = set()
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                raise ComposerError(None, None, "a key that is no plain word", key.start_mark)
+            if key.value in seen:
+                raise ComposerError(None, None, f"the key {key.value!r} a second time", key.start_mark)
+            seen.add(key.value)
+        return node
+
+
+def read_document(path: Path) -> Document:
+    """Return a small YAML file of one document; raises SettingsError where it is no such thing."""
+    try:
+        if not path.is_file():
+            raise SettingsError("no regular file", file=path, expected="a YAML file")
+        if path.stat().st_size > MAX_BYTES:
+            raise SettingsError("a large file", file=path, expected=f"at most {MAX_BYTES} bytes")
+        return Document(path, _Loader(path.read_bytes().decode("utf-8")).get_single_node())
+    except OSError as error:
+        raise SettingsError(f"cannot be read ({error.strerror})", file=path) from error
+    except UnicodeDecodeError as error:
+        raise SettingsError("bytes that are not UTF-8", file=path, expected="YAML text") from error
+    except yaml.YAMLError as error:
+        raise _told(error, path) from error
+
+
+def _told(error: yaml.YAMLError, path: Path) -> SettingsError:
+    mark = getattr(error, "problem_mark", None)
+    problem = getattr(error, "problem", None) or "characters that YAML does not allow"
+    problem = problem.removeprefix("but ")  # of a sentence whose first half PyYAML keeps apart
+    return SettingsError(f"not plain YAML: {problem}", file=path, line=mark.line + 1 if mark else None)

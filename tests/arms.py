@@ -1,0 +1,52 @@
+"""Small arms made by hand, as exact as those read from files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from fractions import Fraction
+
+import numpy as np
+
+from spelgen.arm import Arm, Body, Coordinate
+
+Rows = tuple[tuple[Fraction, Fraction, Fraction], ...]
+
+STRAIGHT = tuple(tuple(Fraction(int(i == j)) for j in range(3)) for i in range(3))
+
+
+def chain(links: Sequence[tuple[str, Rows, Sequence[float]]], gravity: Sequence[float] = (0, 0, -9.81)) -> Arm:
+    """A serial arm from (kind, rotation, translation) by joint; without inertials."""
+    bodies = tuple(
+        Body(f"j{i + 1}", kind, i - 1, i, Fraction(1), 0.0, rotation, tuple(Fraction(str(x)) for x in offset), None)
+        for i, (kind, rotation, offset) in enumerate(links)
+    )
+    coordinates = tuple(
+        Coordinate(body.name, body.kind, body.kind == "revolute", None, None, None, None, 0.0, 0.0, False)
+        for body in bodies
+    )
+    return Arm("arm", coordinates, bodies, tuple(Fraction(str(g)) for g in gravity), (), ())
+
+
+def planar(joints: int) -> Arm:
+    """Parallel vertical axes, half a metre apart."""
+    return chain([("revolute", STRAIGHT, (0.5 * (i > 0), 0, 0)) for i in range(joints)])
+
+
+def random_arm(joints: int, seed: int) -> Arm:
+    """Revolute joints with random rational poses."""
+    rng = np.random.default_rng(seed)
+    return chain(
+        [("revolute", random_rotation(rng), np.round(rng.uniform(-0.5, 0.5, 3), 4).tolist()) for _ in range(joints)]
+    )
+
+
+def random_rotation(rng: np.random.Generator) -> Rows:
+    """An exactly orthogonal rational matrix."""
+    w, x, y, z = (Fraction(int(a), 1000) for a in rng.integers(-1000, 1000, 4))
+    n = w * w + x * x + y * y + z * z
+    rows = (
+        (w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z),
+    )
+    return tuple(tuple(a / n for a in row) for row in rows)

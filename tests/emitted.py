@@ -1,0 +1,129 @@
+"""Emitted modules for tests: built from a URDF, imported by path, and filled with exact functions or random weights."""
+
+from __future__ import annotations
+
+import importlib.util
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import torch
+from flint import fmpq_mpoly
+from torch import nn
+
+from spelgen.emit import emit
+from spelgen.pipeline import load
+from spelgen.plan import plan_model
+from spelgen.spec import Options
+from spelgen.structure import Structure, derive
+from spelgen.symbolic import polynomials
+
+ROBOTS = Path(__file__).parents[1] / "robots"
+SIX = ("two_link", "rpr", "six_dof", "scara", "panda", "ur10e")
+
+
+def import_source(source: str, path: Path) -> ModuleType:
+    """Write ``source`` to ``path`` and import it from there."""
+    path.write_text(source, encoding="utf-8")
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@cache
+def built(robot: str, assume: str = "kinematics") -> tuple[str, Structure]:
+    """Source and structure of one of the robots that come with spelgen."""
+    loaded = load(ROBOTS / f"{robot}.urdf")
+    structure = derive(loaded.arm, assume)
+    spec = plan_model(
+        loaded.arm, structure, Options(assume=assume), urdf=f"{robot}.urdf", urdf_sha256=loaded.robot.digest
+    )
+    return emit(spec), structure
+
+
+def random_model(robot: str, folder: Path, *, seed: int, deviation: float | None = None) -> nn.Module:
+    """The robot's model with random weights, as ``randomise`` draws them."""
+    model = import_source(built(robot)[0], folder / f"{robot}_spel.py").Model(seed=seed)
+    randomise(model, seed, deviation)
+    return model
+
+
+def randomise(model: nn.Module, seed: int, deviation: float | None = None) -> None:
+    """Draw every weight anew: with this standard deviation, or with the inverse root of a layer's inputs."""
+    generator = torch.Generator().manual_seed(seed)
+    for name, parameter in model.named_parameters():
+        draw = torch.randn(parameter.shape, dtype=parameter.dtype, generator=generator)
+        if deviation is not None:
+            parameter.data = deviation * draw
+        elif "network" in name:
+            parameter.data = draw * parameter.shape[-1] ** -0.5
+
+
+def frictionless(model: nn.Module) -> nn.Module:
+    """The model without dissipation."""
+    model.friction.size.zero_()
+    return model
+
+
+class ExactFunctions(nn.Module):
+    """Stands in for a network: y = (polynomial - mean) / scale, with exact derivatives."""
+
+    def __init__(self, functions: list[fmpq_mpoly], mean: torch.Tensor, scale: torch.Tensor, n: int):
+        super().__init__()
+        self.mean, self.scale, self.n = mean, scale, n
+        self.values = [_compiled(f) for f in functions]
+        self.slopes = [[_compiled(f.derivative(3 * k + letter)) for k in range(n) for letter in range(3)] for f in functions]
+
+    def forward(self, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        variables = torch.stack([q.cos(), q.sin(), q], dim=-1).flatten(-2)  # (..., 3 n): c1, s1, q1, c2, ...
+        y = torch.stack([_evaluated(f, variables) for f in self.values], dim=-1)
+        slopes = torch.stack([torch.stack([_evaluated(d, variables) for d in row], dim=-1) for row in self.slopes], dim=-2)
+        by_c, by_s, by_q = slopes.unflatten(-1, (self.n, 3)).unbind(dim=-1)
+        jacobian = by_s * q.cos().unsqueeze(-2) - by_c * q.sin().unsqueeze(-2) + by_q
+        return (y - self.mean) / self.scale, jacobian / self.scale.unsqueeze(-1)
+
+    def pull(self, jacobian: torch.Tensor, cotangent: torch.Tensor) -> torch.Tensor:
+        return (cotangent.unsqueeze(-2) @ jacobian).squeeze(-2)
+
+    def push(self, jacobian: torch.Tensor, qd: torch.Tensor) -> torch.Tensor:
+        return (jacobian @ qd.unsqueeze(-1)).squeeze(-1)
+
+
+def exact_model(robot: str, folder: Path) -> nn.Module:
+    """The robot's emitted model with the URDF's true values: exact functions for networks, exact constants, no friction."""
+    source, structure = built(robot)
+    module = import_source(source, folder / f"{robot}_exact.py")
+    model = frictionless(module.Model())
+    true = polynomials(load(ROBOTS / f"{robot}.urdf").arm, inertials=True)
+    if structure.outputs:
+        functions = [true.combination(output.reads) for output in structure.outputs]
+        model.mass_network = ExactFunctions(functions, model.output_mean, model.output_scale, model.n)
+    if structure.potential:
+        scale = torch.tensor([module.POTENTIAL_SCALE], dtype=torch.float64)
+        model.potential_network = ExactFunctions([true.potential], torch.zeros_like(scale), scale, model.n)
+    constants = [true.combination(constant.reads) for constant in structure.constants]
+    assert all(sum(c.degrees()) == 0 for c in constants), "a constant depends on q"
+    values = torch.tensor([_float(c.leading_coefficient()) for c in constants], dtype=torch.float64)
+    model.constants.data = values / model.constant_scale
+    return model
+
+
+def _compiled(polynomial: fmpq_mpoly) -> tuple[torch.Tensor, torch.Tensor]:
+    terms = list(polynomial.terms())
+    exponents = torch.tensor([e for e, _ in terms] or np.zeros((0, 0)), dtype=torch.float64)
+    return exponents, torch.tensor([_float(c) for _, c in terms], dtype=torch.float64)
+
+
+def _evaluated(compiled: tuple[torch.Tensor, torch.Tensor], variables: torch.Tensor) -> torch.Tensor:
+    exponents, coefficients = compiled
+    if not len(coefficients):
+        return variables.new_zeros(variables.shape[:-1])
+    return (variables.unsqueeze(-2) ** exponents).prod(dim=-1) @ coefficients
+
+
+def _float(x: object) -> float:
+    return int(x.p) / int(x.q)

@@ -1,0 +1,350 @@
+"""The command line as a user meets it: exit codes, one clear line per error, results to stdout, nothing half-written."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from spelgen import __version__
+from spelgen.cli import app
+
+ROOT = Path(__file__).parents[1]
+COMMANDS = ["inspect", "build", "simulate", "train", "evaluate", "report", "check"]
+
+
+@pytest.fixture
+def spelgen(tmp_path, monkeypatch):
+    """Run a command in an empty folder, in this process."""
+    monkeypatch.chdir(tmp_path)
+    return lambda *arguments: CliRunner().invoke(app, [str(each) for each in arguments])
+
+
+def process(*arguments, **options):
+    """Run a command in a process of its own."""
+    command = [sys.executable, "-m", "spelgen", *map(str, arguments)]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=120, **options)
+
+
+def everything(folder: Path) -> list[str]:
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+
+
+# ---- the commands' own face
+
+
+def test_version(spelgen):
+    assert spelgen("--version").stdout == f"spelgen {__version__}\n"
+
+
+@pytest.mark.parametrize("command", ["", *COMMANDS])
+def test_help_fits_80_columns(spelgen, command):
+    result = spelgen(*filter(None, [command]), "--help")
+    assert result.exit_code == 0
+    assert max(map(len, result.stdout.splitlines())) <= 80
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_option_has_a_help_text(spelgen, command):
+    options = re.split(r"^  (?=-)", spelgen(command, "--help").stdout, flags=re.MULTILINE)[1:]
+    assert len(options) >= 2
+    for option in options:
+        assert re.search(r"(\s{2,}|\n\s+)[A-Za-z]\S*[ ,.]", option.split("\n\n")[0]), option
+
+
+def test_help_and_inspect_load_no_torch(robots):
+    code = "import sys; from spelgen.cli import app; app({!r}, standalone_mode=False); print('torch' in sys.modules)"
+    for arguments in (["--help"], ["inspect", str(robots / "rpr.urdf")]):
+        done = subprocess.run(
+            [sys.executable, "-c", code.format(arguments)], capture_output=True, text=True, cwd=ROOT, check=False
+        )
+        assert done.stdout.splitlines()[-1] == "False", done.stderr
+
+
+# ---- what goes where
+
+
+def test_inspect_text_fits_80_columns(spelgen, robots):
+    for urdf in robots.glob("*.urdf"):
+        result = spelgen("inspect", urdf)
+        assert result.exit_code == 0
+        assert max(map(len, result.stdout.splitlines())) <= 80
+
+
+def test_inspect_json_is_the_python_result(spelgen, robots):
+    import spelgen as package
+
+    told = json.loads(spelgen("inspect", robots / "rpr.urdf", "--format", "json").stdout)
+    assert told == json.loads(json.dumps(package.inspect(robots / "rpr.urdf").to_dict()))
+    assert told["schema"] == 1
+
+
+def test_inspect_writes_a_file(spelgen, robots, tmp_path):
+    shown = spelgen("inspect", robots / "rpr.urdf").stdout
+    assert spelgen("inspect", robots / "rpr.urdf", "-o", "deep/er.txt").exit_code == 0
+    assert (tmp_path / "deep" / "er.txt").read_text(encoding="utf-8") == shown
+
+
+def test_strict_fails_on_a_warning_only(spelgen, robots, tmp_path):
+    assert spelgen("inspect", robots / "rpr.urdf", "--strict").exit_code == 0
+    text = (robots / "rpr.urdf").read_text(encoding="utf-8")
+    (tmp_path / "odd.urdf").write_text(text.replace('lower="0.305" upper="1.27"', 'lower="1.27" upper="0.305"'))
+    assert spelgen("inspect", "odd.urdf").exit_code == 0
+    failed = spelgen("inspect", "odd.urdf", "--strict")
+    assert failed.exit_code == 1
+    assert "odd.urdf: 1 warning, and --strict allows none" in failed.stderr
+
+
+def test_build_and_check(spelgen, robots, tmp_path):
+    (tmp_path / "arm.urdf").write_bytes((robots / "scara.urdf").read_bytes())
+    assert spelgen("build", "arm.urdf").stdout == "wrote arm_model.py\n"
+    assert spelgen("build", "arm.urdf").stdout == "arm_model.py is up to date\n"
+    assert spelgen("check", "arm_model.py").stdout == "arm_model.py is up to date with arm.urdf\n"
+    text = (tmp_path / "arm.urdf").read_text(encoding="utf-8")
+    (tmp_path / "arm.urdf").write_text(text + "<!-- changed -->\n", encoding="utf-8")
+    stale = spelgen("check", "arm_model.py")
+    assert stale.exit_code == 1
+    assert "arm.urdf has changed since the module was built" in stale.stderr
+    assert stale.stdout == ""
+
+
+def test_module_run_is_the_command(robots):
+    assert process("--version").stdout == f"spelgen {__version__}\n"
+
+
+# ---- errors: one line on stderr, exit 1, nothing written
+
+
+def refused(result) -> str:
+    """The one line of a refusal."""
+    assert result.exit_code == 1
+    assert result.stdout == ""
+    assert result.stderr.count("\n") == 1
+    assert "Traceback" not in result.stderr
+    return result.stderr.strip()
+
+
+@pytest.mark.parametrize("command", [["inspect"], ["build"], ["simulate", "-o", "logs"]], ids=lambda c: c[0])
+@pytest.mark.parametrize(
+    "content, told",
+    [
+        (None, r"arm\.urdf: .*no such file"),
+        ("no xml at all", r"arm\.urdf:1: .+"),
+        ("<robot name='x'><link name='a'/></robot>", r"arm\.urdf: .*joint.*"),
+    ],
+    ids=["missing", "not-xml", "no-joints"],
+)
+def test_unusable_urdf(spelgen, tmp_path, command, content, told):
+    if content is not None:
+        (tmp_path / "arm.urdf").write_text(content)
+    before = everything(tmp_path)
+    line = refused(spelgen(command[0], "arm.urdf", *command[1:]))
+    assert re.match(told, line, re.IGNORECASE), line
+    assert everything(tmp_path) == before
+
+
+def test_unknown_joint(spelgen, robots):
+    line = refused(spelgen("inspect", robots / "rpr.urdf", "--joints", "joint1,joint9"))
+    assert "'joint9'" in line and "joint3" in line
+
+
+def test_existing_output_is_kept(spelgen, robots, tmp_path):
+    (tmp_path / "rpr_model.py").write_text("mine")
+    line = refused(spelgen("build", robots / "rpr.urdf"))
+    assert line == "rpr_model.py: this output exists already; --force replaces it, -o names another"
+    assert (tmp_path / "rpr_model.py").read_text() == "mine"
+    assert spelgen("build", robots / "rpr.urdf", "--force").exit_code == 0
+    assert (tmp_path / "rpr_model.py").read_text().startswith('r"""')
+
+
+def test_output_that_cannot_be_written(spelgen, robots, tmp_path):
+    (tmp_path / "file").write_text("")
+    line = refused(spelgen("inspect", robots / "rpr.urdf", "-o", "file/below"))
+    assert line.startswith("file: ") or line.startswith("file/below: ")
+
+
+@pytest.mark.parametrize(
+    "content, told",
+    [
+        (None, "logs.csv: got no such file or folder"),
+        ("t,q_joint1\n0,1\n", "logs.csv: missing columns "),
+        ("\x00\x01", "logs.csv: "),
+    ],
+    ids=["missing", "columns", "garbage"],
+)
+def test_unreadable_logs(spelgen, robots, tmp_path, content, told):
+    assert spelgen("build", robots / "rpr.urdf").exit_code == 0
+    if content is not None:
+        (tmp_path / "logs.csv").write_text(content)
+    before = everything(tmp_path)
+    assert refused(spelgen("train", "rpr_model.py", "--data", "logs.csv", "--quiet")).startswith(told)
+    assert everything(tmp_path) == before
+
+
+@pytest.mark.parametrize("command", ["train", "check"])
+def test_foreign_module(spelgen, tmp_path, command):
+    (tmp_path / "other.py").write_text("print('not ours')\n")
+    (tmp_path / "logs.csv").write_text("t\n")
+    data = ["--data", "logs.csv"] if command == "train" else []
+    assert refused(spelgen(command, "other.py", *data)).startswith("other.py: ")
+
+
+@pytest.mark.parametrize("command", [["evaluate", "--data", "logs"], ["report"]], ids=lambda c: c[0])
+def test_no_run(spelgen, tmp_path, command):
+    line = refused(spelgen(command[0], "nothing", *command[1:]))
+    assert line.startswith("nothing: ") and "spelgen train" in line
+    assert everything(tmp_path) == []
+
+
+def test_debug_shows_the_traceback(spelgen):
+    plain, debug = spelgen("inspect", "no.urdf"), spelgen("inspect", "no.urdf", "--debug")
+    assert debug.exit_code == 1
+    assert "Traceback (most recent call last)" in debug.stderr
+    assert debug.stderr.endswith(plain.stderr)
+
+
+def test_unexpected_errors_are_named(spelgen, robots, monkeypatch):
+    def broken(*arguments, **options):
+        raise ZeroDivisionError("division\nby zero")
+
+    monkeypatch.setattr("spelgen.pipeline.inspect", broken)
+    line = refused(spelgen("inspect", robots / "rpr.urdf"))
+    assert line == "spelgen: unexpected ZeroDivisionError: division by zero; --debug shows where"
+
+
+def test_missing_extra_is_named(spelgen, robots, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pinocchio", None)
+    monkeypatch.delitem(sys.modules, "spelgen.simulate", raising=False)
+    assert "pip install 'spelgen[simulate]'" in refused(spelgen("simulate", robots / "rpr.urdf", "-o", "logs"))
+
+
+def test_names_cannot_steer_the_terminal(spelgen, tmp_path):
+    (tmp_path / "a\x1b[31mb.urdf").write_text("no xml")
+    assert "\x1b" not in spelgen("inspect", "a\x1b[31mb.urdf").stderr
+
+
+# ---- usage errors: exit 2
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["inspect"],
+        ["nonsense"],
+        ["inspect", "a.urdf", "--jionts", "x"],
+        ["inspect", "a.urdf", "--format", "yaml"],
+        ["inspect", "a.urdf", "--assume", "everything"],
+        ["inspect", "a.urdf", "--snap-tol", "-1"],
+        ["build", "a.urdf", "--preset", "magic"],
+        ["simulate", "a.urdf"],
+        ["train", "m.py"],
+        ["train", "m.py", "--data", "x", "--epochs", "0"],
+        ["evaluate", "run"],
+    ],
+    ids=" ".join,
+)
+def test_usage_errors(spelgen, arguments):
+    result = spelgen(*arguments)
+    assert result.exit_code == 2
+    assert "Error: " in result.stderr
+    assert result.stdout == ""
+
+
+def test_data_may_be_followed_by_several(spelgen, robots, tmp_path):
+    assert spelgen("build", robots / "rpr.urdf").exit_code == 0
+    result = spelgen("train", "rpr_model.py", "--data", "a.csv", "b.csv")
+    assert result.exit_code == 1
+    assert [line.split(":")[0] for line in result.stderr.splitlines()] == ["a.csv", "b.csv"]
+
+
+# ---- signals and pipes
+
+
+def test_closed_pipe_is_quiet(robots):
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", "spelgen", "inspect", str(robots / "panda.urdf")]
+    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, cwd=ROOT, timeout=60, check=False)
+    os.close(writer)
+    assert done.stderr == b""
+    assert done.returncode == 141
+
+
+def test_interrupt_exits_130(spelgen, robots, monkeypatch):
+    def interrupted(*arguments, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("spelgen.pipeline.inspect", interrupted)
+    result = spelgen("inspect", robots / "rpr.urdf")
+    assert (result.exit_code, result.stderr) == (130, "interrupted\n")
+
+
+# ---- the whole way, small
+
+
+@pytest.fixture(scope="module")
+def trained(robots, tmp_path_factory):
+    """A folder in which the whole way was gone, with very little data and training."""
+    folder = tmp_path_factory.mktemp("whole")
+    for suffix in (".urdf", ".yaml"):
+        text = (robots / f"two_link{suffix}").read_text(encoding="utf-8")
+        (folder / f"arm{suffix}").write_text(re.sub(r"trajectories: \d+", "trajectories: 6", text), encoding="utf-8")
+    steps = {
+        "build": ["build", "arm.urdf"],
+        "simulate": ["simulate", "arm.urdf", "-o", "logs"],
+        "train": ["train", "arm_model.py", "--data", "logs", "-o", "run", "--epochs", "2"],
+        "evaluate": ["evaluate", "run", "--data", "logs"],
+        "report": ["report", "run"],
+    }
+    return folder, {name: process(*arguments, cwd=folder) for name, arguments in steps.items()}
+
+
+def test_the_whole_way_succeeds(trained):
+    folder, results = trained
+    for name, result in results.items():
+        assert result.returncode == 0, (name, result.stderr)
+        assert max(map(len, result.stdout.splitlines())) <= 80, name
+    assert {"arm_model.py", "logs/train.parquet", "logs/test.parquet", "run/report.html"} <= set(everything(folder))
+
+
+def test_simulate_tells_its_integration_error(trained):
+    _, results = trained
+    error = re.search(r"largest integration error: (\S+)", results["simulate"].stdout)
+    assert 0 < float(error[1]) < 1e-8
+
+
+def test_evaluate_tells_rivals(trained):
+    _, results = trained
+    assert "velocity stays constant" in results["evaluate"].stdout
+
+
+def test_a_second_run_needs_force_or_resume(trained):
+    folder, _ = trained
+    again = process("train", "arm_model.py", "--data", "logs", "-o", "run", cwd=folder)
+    assert again.returncode == 1
+    assert again.stderr.startswith("run: ") and "--resume" in again.stderr
+    more = process("train", "arm_model.py", "--data", "logs", "-o", "run", "--resume", "--epochs", "3", cwd=folder)
+    assert more.returncode == 0, more.stderr
+    assert "after 3 epochs" in more.stdout
+
+
+def test_interrupted_training_leaves_a_run(trained, tmp_path):
+    folder, _ = trained
+    run = tmp_path / "run"
+    command = [sys.executable, "-m", "spelgen", "train", "arm_model.py", "--data", "logs", "-o", str(run)]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as started:
+        while not (run / "metrics.jsonl").exists() and started.poll() is None:
+            time.sleep(0.05)
+        started.send_signal(signal.SIGINT)
+        out, err = started.communicate(timeout=60)
+    assert started.returncode == 130, err
+    assert b"interrupted after" in out
+    assert process("report", run, cwd=folder).returncode == 0

@@ -1,0 +1,60 @@
+"""How errors and diagnostics read."""
+
+import json
+
+import pytest
+
+from spelgen.errors import Diagnostic, SpelgenError, SpelgenErrors, UrdfError, collect, suggestion
+
+
+@pytest.mark.parametrize(
+    ("error", "text"),
+    [
+        (SpelgenError("no such file"), "no such file"),
+        (SpelgenError("no such file", file="a.urdf"), "a.urdf: no such file"),
+        (SpelgenError("2", expected="3"), "got 2, expected 3"),
+        (
+            SpelgenError("no joint is named 'a'", do="did you mean 'b'?"),
+            "no joint is named 'a'; did you mean 'b'?",
+        ),
+        (
+            UrdfError(
+                "4 numbers", file="a.urdf", line=7, element="joint 'a'", expected="three", do="remove one"
+            ),
+            "a.urdf:7: joint 'a': got 4 numbers, expected three; remove one",
+        ),
+        (
+            UrdfError("no name", line=7, element="<link>", expected="a name"),
+            "7: <link>: got no name, expected a name",
+        ),
+    ],
+)
+def test_an_error_leaves_out_what_it_does_not_know(error, text):
+    assert str(error) == text
+
+
+def test_collect_raises_nothing_one_or_all():
+    first, second = UrdfError("first", file="a"), UrdfError("second", file="b")
+    collect([])
+    with pytest.raises(UrdfError) as one:
+        collect([first])
+    assert one.value is first
+    with pytest.raises(SpelgenErrors) as all_:
+        collect([first, second])
+    assert str(all_.value) == "a: first\nb: second"
+    assert all_.value.errors == (first, second)
+    assert str(SpelgenErrors([first] * 60)).splitlines()[49:] == ["a: first", "and 10 more like these"]
+
+
+def test_suggestion_is_the_nearest_name_or_the_first_ten():
+    assert suggestion("jiont_1", ["joint_1", "base"]) == "did you mean 'joint_1'?"
+    assert suggestion("x", ["alpha", "beta"]) == "known are 'alpha', 'beta'"
+    assert suggestion("x", [f"joint{i}" for i in range(12)]).endswith("'joint9' and 2 more")
+
+
+def test_a_diagnostic_is_the_public_json_object():
+    diagnostic = Diagnostic("info", "snapped-angle", "joint 'a2' origin", 41, "1.5708 is taken as pi/2")
+    assert json.dumps(diagnostic.to_dict()) == (
+        '{"severity": "info", "code": "snapped-angle", "where": "joint \'a2\' origin", "line": 41, '
+        '"message": "1.5708 is taken as pi/2"}'
+    )

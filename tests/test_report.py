@@ -1,0 +1,200 @@
+"""The report: one complete HTML page from a run folder, whatever the folder holds, and nothing that is not in it."""
+
+import json
+import math
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+import torch
+
+from spelgen import pipeline
+from spelgen.errors import RunError
+from spelgen.report import render_report, write_report
+from spelgen.runs import load_model
+from spelgen.training_data import TrainingConfig
+
+VOID = {"meta", "br"}
+
+
+class Page(HTMLParser):
+    """Checks nesting, and gathers what the tests ask for."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open, self.tags, self.text = [], [], []
+        self.links = []
+        self.feed(text)
+        assert not self.open
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.links += [value for name, value in attrs if name in ("src", "href", "action", "xlink:href")]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.tags.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+
+def errors(share, tip=None):
+    return {"q": [share, 0.02, None], "qd": [0.1, 0.2, 0.3], "q_share": [share] * 3, "qd_share": [share] * 3,
+            "mean_share": share, "tip_mm": tip}  # fmt: skip
+
+
+def example(name):
+    t = [0.05 * k for k in range(21)]
+    wave = [math.sin(3 * x) for x in t]
+    near = [y + 0.05 * x for x, y in zip(t, wave, strict=True)]
+    joints = [
+        {"name": joint, "q_true": wave, "q_pred": near, "qd_true": wave, "qd_pred": [None, *near[1:]]}
+        for joint in ("joint1", "joint2", "joint3")
+    ]
+    return {"trajectory": name, "t": t, "joints": joints}
+
+
+EVALUATION = {
+    "schema": 1,
+    "robot": "rpr",
+    "joints": ["joint1", "joint2", "joint3"],
+    "trajectories": ["traj_00", "traj_02"],
+    "cutoff": 8.0,
+    "substeps": 4,
+    "parameters": 5948,
+    "horizons": [
+        {"name": "1 step", "steps": 1, "seconds": 0.05, "windows": 40,
+         "errors": {"model": errors(0.004), "velocity stays constant": errors(0.6), "URDF": errors(0.003)}},
+        {"name": "1 s", "steps": 20, "seconds": 1.0, "windows": 2,
+         "errors": {"model": errors(0.0123, 0.8), "velocity stays constant": errors(1.0, 26.0), "URDF": errors(None)}},
+    ],
+    "torque": {"model": {"nmse": {}, "mean_nmse": 0.01, "rmse": [1.0, 2.0, 3.0]}},
+    "energy_drift": 8e-10,
+    "diagnostics": [{"severity": "info", "code": "x", "where": "logs", "line": None, "message": "<b>said</b>"}],
+    "examples": [example("traj_00")],
+}  # fmt: skip
+
+
+@pytest.fixture
+def run(robots, tmp_path) -> Path:
+    """A complete run folder, but for the training."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "module.py").write_text(pipeline.build(robots / "rpr.urdf"), encoding="utf-8")
+    torch.save(load_model(folder / "module.py").state_dict(), folder / "model.pt")
+    config = {
+        "schema": 1, "robot": "rpr", "preset": "minimal", "joints": ["joint1", "joint2", "joint3"],
+        "config": vars(TrainingConfig(epochs=30, seed=7)), "data_digest": "d" * 64, "training": ["traj_01", "traj_03"],
+        "validation": ["traj_05"], "training_windows": 34, "validation_windows": 17, "cutoff": None,
+        "scales": {"q": [1, 1, 1], "qd": [1, 1, 1]},
+    }  # fmt: skip
+    (folder / "config.json").write_text(json.dumps(config))
+    lines = [
+        {"epoch": k, "step": 20 * k, "loss": 2.0 * 0.8**k, "validation": 2.0 * 0.8**k + 0.01 * k, "best": 0.1,
+         "rate": 1e-3, "substeps": 4, "rollbacks": 0, "seconds": 2.5 * k}
+        for k in range(1, 31)
+    ]  # fmt: skip
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    (folder / "evaluation.json").write_text(json.dumps(EVALUATION))
+    return folder
+
+
+def test_page_is_complete_and_self_contained(run):
+    path = write_report(run)
+    assert path == run / "report.html"
+    page = Page(path.read_text(encoding="utf-8"))
+    assert not {"script", "link", "img", "iframe", "object", "base"} & set(page.tags)
+    assert all(link.startswith("#") for link in page.links)
+    assert "url(" not in path.read_text(encoding="utf-8")
+    assert page.tags.count("svg") >= 1 + 6
+
+
+def test_same_folder_gives_same_bytes(run):
+    write_report(run)
+    assert write_report(run, run.parent / "again.html").read_bytes() == (run / "report.html").read_bytes()
+
+
+def test_numbers_are_those_of_the_run(run):
+    text = " ".join(" ".join(Page(render_report(run)).text).split())
+    assert "0.0123" in text and "0.800 mm" in text.replace("0.8 mm", "0.800 mm")
+    assert "The model predicts best over 1 s; over 1 step URDF is better." in text
+    assert "34 windows from 2 trajectories" in text
+    assert "8.0e-10" in text
+    assert "--epochs 30 --seed 7" in text
+
+
+def test_best_of_each_row_is_marked(run):
+    rows = re.findall(r"<tr><th scope=\"row\">1 step \(0.05 s\)</th>(.*?)</tr>", render_report(run))
+    assert re.findall(r'class="n( best)?">', rows[0]) == ["", "", " best"]
+
+
+def test_structure_picture_is_the_modules(run):
+    kinds = re.findall(r'<td class="(zero|constant|varying)"', render_report(run))
+    v, c, z = "varying", "constant", "zero"
+    assert kinds == [v, v, v, v, c, z, v, z, c]
+
+
+def test_learned_constants_are_those_of_the_weights(run):
+    state = torch.load(run / "model.pt", weights_only=True)
+    state["constants"] += 1.0
+    torch.save(state, run / "model.pt")
+    page = render_report(run)
+    for start, scale in zip(load_model(run / "module.py").constants.tolist(), state["constant_scale"].tolist(), strict=True):
+        assert f'<td class="n">{start * scale:.4g}</td>\n<td class="n">{(start + 1) * scale:.4g}</td>' in page
+
+
+@pytest.mark.parametrize("lacking, said", [
+    ("evaluation.json", "Not evaluated yet"),
+    ("metrics.jsonl", "No finished epoch"),
+    ("config.json", "No finished epoch"),
+    ("model.pt", "Not trained yet"),
+])  # fmt: skip
+def test_what_is_missing_is_said(run, lacking, said):
+    assert said not in render_report(run)
+    (run / lacking).unlink()
+    assert said in render_report(run)
+
+
+def test_a_module_alone_is_enough(run):
+    for path in run.iterdir():
+        if path.name != "module.py":
+            path.unlink()
+    Page(render_report(run))
+
+
+def test_torn_last_line_of_metrics_is_left_out(run):
+    whole = render_report(run).count("epochs, 600 steps")
+    with (run / "metrics.jsonl").open("a") as file:
+        file.write('{"epoch": 31, "st')
+    assert render_report(run).count("epochs, 600 steps") == whole == 1
+
+
+def test_broken_line_of_metrics_is_an_error(run):
+    lines = (run / "metrics.jsonl").read_text().splitlines()
+    (run / "metrics.jsonl").write_text("\n".join([lines[0], "{", *lines[2:]]))
+    with pytest.raises(RunError, match=r"metrics.jsonl:2: broken JSON"):
+        render_report(run)
+
+
+def test_no_run_is_an_error_that_says_what_to_do(tmp_path):
+    with pytest.raises(RunError) as told:
+        write_report(tmp_path / "nothing")
+    assert str(told.value).endswith("got no run, expected a folder with module.py; make one with `spelgen train`")
+    assert not (tmp_path / "nothing").exists()
+
+
+def test_names_from_files_are_escaped(run):
+    hostile = "<script>alert(1)</script>{{ 7 * 7 }}\"'&"
+    text = json.dumps(EVALUATION).replace("traj_00", json.dumps(hostile)[1:-1])
+    evaluation = json.loads(text) | {"joints": [hostile, "b", "c"]}
+    (run / "evaluation.json").write_text(json.dumps(evaluation))
+    text = render_report(run)
+    assert "script" not in Page(text).tags
+    assert "<b>said</b>" not in text
+    assert "{{ 7 * 7 }}" in text

@@ -1,0 +1,185 @@
+"""The sidecar file: what is read, and what a wrong one is told."""
+
+import subprocess
+import sys
+
+import pytest
+from pydantic import ValidationError
+
+from spelgen.errors import SettingsError, SpelgenErrors
+from spelgen.settings import JointSettings, Settings, check_joint_names, load_settings
+
+
+@pytest.fixture
+def urdf(tmp_path, monkeypatch):
+    """Write a sidecar and return the relative path of the URDF it belongs to (which need not exist)."""
+    monkeypatch.chdir(tmp_path)
+
+    def write(text):
+        data = text if isinstance(text, bytes) else text.encode()
+        (tmp_path / "arm.yaml").write_bytes(data)
+        return "arm.urdf"
+
+    return write
+
+
+def told(path):
+    with pytest.raises(SettingsError) as error:
+        load_settings(path)
+    return str(error.value)
+
+
+def test_without_a_file_everything_has_its_default(tmp_path):
+    assert load_settings(tmp_path / "arm.urdf") == Settings()
+
+
+@pytest.mark.parametrize("text", ["", "# nothing\n"])
+def test_an_empty_file_is_no_settings(urdf, text):
+    assert load_settings(urdf(text)) == Settings()
+
+
+def test_values_are_read(urdf):
+    settings = load_settings(
+        urdf(
+            "gravity: [0, -9.81, 0]\n"
+            "joints:\n"
+            "  a: {rotor_inertia: 1e-4, gear: 101, viscous: 2, coulomb: [0.4, -0.5], inputs: [-1, 1]}\n"
+            "  b: {actuated: false}\n"
+            "simulation: {inputs: [-3, 3], positions: {a: [-1, 2]}, seed: 7}\n"
+            "training: {window: 9}\n"
+        )
+    )
+    assert settings.gravity == (0.0, -9.81, 0.0)
+    assert settings.joint("a") == JointSettings(
+        rotor_inertia=1e-4, gear=101.0, viscous=2.0, coulomb=(0.4, -0.5), inputs=(-1.0, 1.0)
+    )
+    assert not settings.joint("b").actuated
+    assert settings.joint("not in the file") == JointSettings()
+    assert settings.simulation.inputs == (-3.0, 3.0)
+    assert settings.simulation.positions == {"a": (-1.0, 2.0)}
+    assert settings.simulation.seed == 7
+    assert settings.simulation.rate == 20.0
+    assert settings.training.window == 9
+
+
+def test_settings_do_not_change(urdf):
+    settings = load_settings(urdf("gravity: [0, 0, 0]\n"))
+    with pytest.raises(ValidationError, match="frozen"):
+        settings.gravity = (0.0, 0.0, -1.6)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("gravty: [0, 0, 0]", "arm.yaml:1: unknown key 'gravty'; did you mean 'gravity'?"),
+        (
+            "joints:\n  a:\n    gear: 2\n    viscus: 1",
+            "arm.yaml:4: joints.a: unknown key 'viscus'; did you mean 'viscous'?",
+        ),
+        (
+            "training:\n  x: 1",
+            "arm.yaml:2: training: unknown key 'x'; known are 'objective', 'window', 'stride', 'epochs', "
+            "'batch', 'learning_rate', 'weight_decay', 'substeps', 'validation_fraction', 'patience' "
+            "and 1 more",
+        ),
+        (
+            "joints:\n  a: {viscous: -1}",
+            "arm.yaml:2: joints.a.viscous: got -1, expected greater than or equal to 0",
+        ),
+        (
+            "gravity:\n  - 0\n  - 0\n  - up",
+            "arm.yaml:4: gravity.2: got 'up', expected a valid number, unable to parse string as a number",
+        ),
+        ("simulation: {rate: yes}", "arm.yaml:1: simulation.rate: got True, expected a number"),
+        ("simulation: {rate: .nan}", "arm.yaml:1: simulation.rate: got nan, expected a finite number"),
+        (
+            "simulation: {trajectories: 0}",
+            "arm.yaml:1: simulation.trajectories: got 0, expected greater than or equal to 1",
+        ),
+        (
+            "simulation:\n  protocol: pid",
+            "arm.yaml:2: simulation.protocol: got 'pid', expected 'random-inputs'",
+        ),
+        (
+            "joints:\n  a: {coulomb: [0.4, 0.5]}",
+            "arm.yaml:2: joints.a.coulomb: got [0.4, 0.5], expected the torque for qd > 0 (not negative), "
+            "then for qd < 0 (not positive)",
+        ),
+        (
+            "simulation:\n  positions: {a: [1, -1]}",
+            "arm.yaml:2: simulation.positions: got {'a': [1, -1]}, expected the lowest position of 'a' "
+            "first, then the highest",
+        ),
+        ("joints:\n  2: {}", "arm.yaml:2: joints.2: got 2, expected a name; write it in quotes"),
+        ("joints: [a]", "arm.yaml:1: joints: got ['a'], expected keys with values"),
+        ("joints:\n  a: 5", "arm.yaml:2: joints.a: got 5, expected keys with values"),
+        ("42", "arm.yaml:1: got 42, expected keys with values"),
+    ],
+)
+def test_a_wrong_value_is_told_with_its_place(urdf, text, message):
+    assert told(urdf(text)) == message
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a: [1", "arm.yaml:1: not plain YAML: expected ',' or ']', but got '<stream end>'"),
+        ("about: a\nabout: b", "arm.yaml:2: not plain YAML: the key 'about' a second time"),
+        ("about: &x a\ngravity: *x", "arm.yaml:2: not plain YAML: an alias"),
+        ("? [a]\n: 1", "arm.yaml:1: not plain YAML: a key that is no plain word"),
+        (
+            "about: !!python/object/apply:os.system [ls]",
+            "arm.yaml:1: not plain YAML: could not determine a "
+            "constructor for the tag 'tag:yaml.org,2002:python/object/apply:os.system'",
+        ),
+        ("about: 2025-99-99", "arm.yaml: not plain YAML: month must be in 1..12"),
+        ("about: " + 40 * "[", "arm.yaml:1: not plain YAML: more than 16 levels"),
+        ("about: |\n" + 300_000 * " ", "arm.yaml: got a large file, expected at most 262144 bytes"),
+        (b"about: \xff", "arm.yaml: got bytes that are not UTF-8, expected YAML text"),
+        (b"about: \x00", "arm.yaml: not plain YAML: characters that YAML does not allow"),
+        ("about: a\n---\nabout: b", "arm.yaml:2: not plain YAML: found another document"),
+    ],
+)
+def test_what_is_no_plain_yaml_is_refused(urdf, text, message):
+    assert told(urdf(text)) == message
+
+
+def test_all_errors_of_a_file_are_told_at_once(urdf):
+    with pytest.raises(SpelgenErrors) as error:
+        load_settings(urdf("gear: 1\njoints:\n  a: {gear: 0}\n"))
+    assert str(error.value).splitlines() == [
+        "arm.yaml:3: joints.a.gear: got 0, expected greater than 0",
+        "arm.yaml:1: unknown key 'gear'; known are 'about', 'gravity', 'joints', 'simulation', 'training'",
+    ]
+
+
+def test_a_folder_of_that_name_is_refused(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "arm.yaml").mkdir()
+    assert told("arm.urdf") == "arm.yaml: got no regular file, expected a YAML file"
+
+
+def test_the_other_suffix_is_not_passed_over(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "arm.yml").write_text("gravity: [0, 0, 0]\n")
+    assert told("arm.urdf") == "arm.yml: got 'arm.yml', expected 'arm.yaml'; rename it"
+
+
+def test_joints_that_do_not_exist_are_told_with_their_lines(urdf):
+    path = urdf("joints:\n  elbow: {}\n  elbw: {}\nsimulation:\n  positions:\n    wrist: [0, 1]\n")
+    settings = load_settings(path)
+    check_joint_names(settings, ["elbow", "elbw", "wrist", "shoulder"], path)
+    with pytest.raises(SpelgenErrors) as error:
+        check_joint_names(settings, ["shoulder", "elbow"], path)
+    assert str(error.value).splitlines() == [
+        "arm.yaml:3: joints: unknown joint 'elbw'; did you mean 'elbow'?",
+        "arm.yaml:6: simulation.positions: unknown joint 'wrist'; known are 'shoulder', 'elbow'",
+    ]
+
+
+def test_reading_settings_imports_nothing_heavy():
+    script = (
+        "import sys, spelgen.settings; print({'numpy', 'torch', 'sympy', 'flint', 'lxml'} & set(sys.modules))"
+    )
+    shown = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert shown.stdout == "set()\n"

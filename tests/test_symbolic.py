@@ -1,0 +1,89 @@
+"""The polynomials: an independent proof of the structure, and equal to Pinocchio."""
+
+import numpy as np
+import pytest
+from arms import planar, random_arm
+from flint import fmpq_mat
+
+from spelgen.pipeline import load
+from spelgen.recursion import triangle
+from spelgen.structure import derive
+from spelgen.symbolic import Polynomials, polynomials
+
+ROBOTS = ["two_link", "rpr", "scara", "six_dof", "ur10e", "panda"]
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_spans_of_coefficients_agree_with_the_structure(robots, robot):
+    """Every number of the structure once more, from the polynomials' coefficients over the rationals."""
+    arm = load(robots / f"{robot}.urdf").arm
+    _assert_agrees(derive(arm), polynomials(arm), len(arm.coordinates))
+
+
+@pytest.mark.parametrize("arm", [planar(4), random_arm(4, 5)], ids=["planar", "generic"])
+def test_spans_of_made_up_arms(arm):
+    _assert_agrees(derive(arm), polynomials(arm), len(arm.coordinates))
+
+
+def _assert_agrees(structure, poly: Polynomials, n: int) -> None:
+    vectors = _coefficient_vectors(poly, n)
+    everything = [v for v in vectors.values()]
+    assert len(structure.outputs) + len(structure.constants) == _rank(everything)
+    assert len(structure.outputs) == _rank([v for joints, v in vectors.items() if joints[0]])
+    for first in range(n):
+        touching = _rank([v for joints, v in vectors.items() if any(k < first for k in joints[0])])
+        assert structure.outputs_from(first) == len(structure.outputs) - touching
+    for index, entry in enumerate(structure.entries):
+        joints = {k for (read, _), v in vectors.items() if index in v for k in read}
+        assert tuple(sorted(joints)) == entry.joints
+        assert (entry.kind == "zero") == (len(poly.mass[entry.row, entry.column]) == 0)
+    for output in structure.outputs:
+        assert _joints_of(poly.combination(output.reads), n) == set(output.joints)
+    for constant in structure.constants:
+        assert not _joints_of(poly.combination(constant.reads), n)
+    assert _joints_of(poly.potential, n) == set(structure.potential)
+
+
+def _coefficient_vectors(poly: Polynomials, n: int) -> dict:
+    """{(joints, monomial and parameter): {entry: coefficient}}."""
+    vectors: dict = {}
+    for index, key in enumerate(triangle(n)):
+        for exponents, coefficient in poly.mass[key].terms():
+            joints = tuple(k for k in range(n) if any(exponents[3 * k : 3 * k + 3]))
+            vectors.setdefault((joints, tuple(exponents)), {})[index] = coefficient
+    return vectors
+
+
+def _rank(vectors: list[dict]) -> int:
+    # most monomials come with one of few vectors: distinct ones are enough for the rank
+    distinct = {tuple(sorted((index, str(value)) for index, value in v.items())): v for v in vectors}
+    if not distinct:
+        return 0
+    width = 1 + max(index for v in distinct.values() for index in v)
+    return fmpq_mat([[v.get(index, 0) for index in range(width)] for v in distinct.values()]).rank()
+
+
+def _joints_of(polynomial, n: int) -> set[int]:
+    return {k for exponents, _ in polynomial.terms() for k in range(n) if any(exponents[3 * k : 3 * k + 3])}
+
+
+def test_two_link_is_the_papers_equation_20(robots):
+    """M = [[J1 + 5 J2 + 4 m(q), J2 + 2 m(q)], [J2 + 2 m(q), J2]] for links of one metre, half a metre to the mass."""
+    true = polynomials(load(robots / "two_link.urdf").arm, inertials=True)
+    assert {key: str(value) for key, value in true.mass.items()} == {
+        (0, 0): "c2 + 7/2",
+        (1, 0): "1/2*c2 + 5/4",
+        (1, 1): "5/4",
+    }
+
+
+def test_every_sine_is_reduced_under_mimic_joints(shared):
+    """Two bodies that turn with one angle still give polynomials with s to the first power."""
+    arm = load(shared / "arms" / "abb_irb5400.urdf").arm
+    poly = polynomials(arm)
+    sines = [3 * k + 1 for k in range(len(arm.coordinates))]
+    degrees = np.array([value.degrees() for value in (*poly.mass.values(), poly.potential)])
+    assert degrees[:, sines].max() == 1
+    structure = derive(arm)
+    for entry in structure.entries:
+        assert _joints_of(poly.mass[entry.row, entry.column], len(arm.coordinates)) == set(entry.joints)
