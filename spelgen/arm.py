@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from math import pi
 from typing import Literal
 
-import numpy as np
-
-from spelgen.chain import Chain, Follow, choose_chain, follows
+from spelgen.chain import choose_chain
 from spelgen.errors import ArmError, Diagnostic
-from spelgen.placement import Placement, Pose, TenVector
-from spelgen.rational import Matrix, Vector, exact, rotation_from_rpy, tamed
-from spelgen.robot import Joint, Link, Robot
-from spelgen.snapping import Snapper
+from spelgen.placement import TenVector
+from spelgen.rational import Matrix, Vector, exact
+from spelgen.robot import Joint, Robot
+from spelgen.walk import Moved, walk
 
 Kind = Literal["revolute", "prismatic"]
-# sine of the angle below which two axes are meant to be parallel, whatever rounding made of them
-_PARALLEL = 1e-2
 
 
 @dataclass(frozen=True)
@@ -100,81 +96,31 @@ def make_arm(
         got = f"a snap tolerance of {snap_tolerance:g} rad"
         raise ArmError(got, expected="at least 0 and less than pi/4 (0.785)")
     chain = choose_chain(robot, joints, tip)
-    snapper = Snapper(snap_tolerance)
-    placement = Placement(robot.root, snapper)
+    walked = walk(robot, chain, snap_tolerance)
     indices = {joint.name: index for index, joint in enumerate(chain.joints)}
-    moved: list[tuple[Joint, Follow, Pose]] = []
-    held: list[Joint] = []
-    following = follows(robot)
-    for joint in _chain_first(robot, chain):
-        followed = following[joint.name]
-        if joint.moves and followed.leader.name in indices and followed.multiplier:
-            moved.append((joint, followed, placement.move(joint)))
-        else:
-            held.append(joint)
-            placement.hold(joint, float(followed.offset) if joint.moves else 0.0)
-    lumps = _lumps(robot, placement, len(moved))
-    bodies = tuple(
-        _body(joint, followed, indices[followed.leader.name], pose, _total(placement, lump))
-        for (joint, followed, pose), lump in zip(moved, lumps, strict=True)
-    )
-    told = [
-        *chain.diagnostics,
-        *snapper.diagnostics,
-        *_tell_folded(moved),
-        *_tell_lumped(moved, lumps),
-        *_tell_locked(following, held),
-        *_tell_dependent(placement, bodies, held),
-    ]
+    held = {joint.name for joint in walked.held if joint.type != "fixed"}
     x, y, z = (exact(float(value)) for value in gravity)
     return Arm(
         name=robot.name,
         coordinates=tuple(_coordinate(joint) for joint in chain.joints),
-        bodies=bodies,
+        bodies=tuple(_body(each, indices[each.followed.leader.name]) for each in walked.moved),
         gravity=(x, y, z),
-        diagnostics=tuple(sorted(told, key=lambda each: each.line or 0)),
-        locked=tuple(joint.name for joint in robot.joints if joint in held and joint.type != "fixed"),
+        diagnostics=walked.diagnostics,
+        locked=tuple(joint.name for joint in robot.joints if joint.name in held),
     )
 
 
-def _chain_first(robot: Robot, chain: Chain) -> list[Joint]:
-    """All joints, parents first, those on the way to the chain's tip before all others."""
-    path = robot.path_to(chain.joints[-1].child)
-    names = {joint.name for joint in path}
-    return [*path, *(joint for joint in robot.joints_from_root if joint.name not in names)]
-
-
-def _lumps(robot: Robot, placement: Placement, count: int) -> list[list[Link]]:
-    """The links with an inertial that each body carries; what the root carries never moves."""
-    lumps: list[list[Link]] = [[] for _ in range(count)]
-    for link in robot.links:
-        body = placement.frames[link.name].body
-        if body >= 0 and link.inertial is not None:
-            lumps[body].append(link)
-    return lumps
-
-
-def _total(placement: Placement, links: Sequence[Link]) -> TenVector | None:
-    """The sum of the links' inertias about their body's origin."""
-    total: TenVector | None = None
-    for link in links:
-        if link.inertial is not None:
-            ten = placement.inertia(link, link.inertial)
-            total = ten if total is None else tuple(tamed(a + b) for a, b in zip(total, ten, strict=True))
-    return total
-
-
-def _body(joint: Joint, followed: Follow, coordinate: int, pose: Pose, inertia: TenVector | None) -> Body:
+def _body(moved: Moved, coordinate: int) -> Body:
     return Body(
-        name=joint.name,
-        kind=_kind(joint),
-        parent=pose.parent,
+        name=moved.joint.name,
+        kind=_kind(moved.joint),
+        parent=moved.pose.parent,
         coordinate=coordinate,
-        multiplier=followed.multiplier,
-        offset=float(followed.offset),
-        rotation=pose.rotation,
-        translation=pose.translation,
-        inertia=inertia,
+        multiplier=moved.followed.multiplier,
+        offset=float(moved.followed.offset),
+        rotation=moved.pose.rotation,
+        translation=moved.pose.translation,
+        inertia=moved.inertia,
     )
 
 
@@ -195,73 +141,3 @@ def _coordinate(joint: Joint) -> Coordinate:
 
 def _kind(joint: Joint) -> Kind:
     return "prismatic" if joint.type == "prismatic" else "revolute"
-
-
-def _info(code: str, joint: Joint, message: str) -> Diagnostic:
-    return Diagnostic("info", code, f"joint {joint.name!r}", joint.line, message)
-
-
-def _tell_folded(moved: Sequence[tuple[Joint, Follow, Pose]]) -> Iterator[Diagnostic]:
-    for joint, followed, _ in moved:
-        if joint.mimic is not None:
-            offset = f" plus {float(followed.offset):g}" if followed.offset else ""
-            message = f"moves at {float(followed.multiplier):g} times {followed.leader.name!r}{offset}"
-            yield _info("mimic-folded", joint, message)
-
-
-def _tell_lumped(
-    moved: Sequence[tuple[Joint, Follow, Pose]], lumps: Sequence[Sequence[Link]]
-) -> Iterator[Diagnostic]:
-    for (joint, _, _), links in zip(moved, lumps, strict=True):
-        others = [link for link in links if link.name != joint.child]
-        if others:
-            mass = sum(link.inertial.mass for link in others if link.inertial is not None)
-            listed = ", ".join(repr(link.name) for link in others)
-            message = f"also carries {listed} ({mass:.4g} kg) by fixed or locked joints"
-            yield _info("lumped", joint, message)
-
-
-def _tell_locked(following: Mapping[str, Follow], held: Sequence[Joint]) -> Iterator[Diagnostic]:
-    for joint in held:
-        if joint.type == "fixed":
-            continue
-        followed = following[joint.name]
-        if joint.mimic is not None:
-            message = f"follows {followed.leader.name!r}: held at {float(followed.offset):g}"
-        elif joint.moves:
-            message = "not part of the chain: locked at 0"
-        else:
-            message = f"a {joint.type} joint off the chain: held at its origin"
-        yield _info("locked-joint", joint, message)
-
-
-def _tell_dependent(
-    placement: Placement, bodies: Sequence[Body], held: Sequence[Joint]
-) -> Iterator[Diagnostic]:
-    """A locked joint beside a joint of the chain and parallel to it smells of an opened parallelogram."""
-    behind: set[str] = set()
-    for joint in held:
-        if joint.moves or joint.parent in behind:
-            behind.add(joint.child)
-        if joint.parent in behind or joint.type not in ("revolute", "continuous") or joint.mimic is not None:
-            continue
-        beside = _parallel_beside(placement, bodies, joint)
-        if beside is not None:
-            message = (
-                f"turns parallel to {beside.name!r} beside it, and has no <mimic>: "
-                "if a linkage couples the two, add one; locked at 0 until then"
-            )
-            yield Diagnostic("warning", "dependent-joints", f"joint {joint.name!r}", joint.line, message)
-
-
-def _parallel_beside(placement: Placement, bodies: Sequence[Body], joint: Joint) -> Body | None:
-    """The revolute body that starts from the same moving body as ``joint``, with a parallel axis."""
-    frame = placement.frames[joint.parent]
-    axis = np.array(joint.axis) / np.linalg.norm(joint.axis)
-    axis = np.array(frame.rotation, dtype=float) @ rotation_from_rpy(joint.rpy) @ axis
-    for body in bodies:
-        if body.parent == frame.body >= 0 and body.kind == "revolute":
-            other = np.array([float(row[2]) for row in body.rotation])
-            if np.linalg.norm(np.cross(axis, other)) < _PARALLEL:
-                return body
-    return None

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from markupsafe import Markup, escape
+from markupsafe import Markup
 
 MARGIN_LEFT, MARGIN_RIGHT, MARGIN_TOP, MARGIN_BOTTOM = 58, 12, 10, 36
 MAX_POINTS = 600  # per line: more cannot be seen at this size and only makes the file heavy
@@ -16,7 +16,7 @@ MAX_DECADES = 8  # of a logarithmic axis, counted from the largest value
 
 @dataclass(frozen=True, eq=False)
 class Line:
-    """One curve: x and y of equal length; values that are not finite break it. `style` is the CSS class that draws it."""
+    """One curve: x and y of equal length, broken where a value is not finite. `style` is its CSS class."""
 
     label: str
     x: Sequence[float] | np.ndarray
@@ -52,7 +52,10 @@ class Axis:
             if len(within) >= 3:
                 return within
         step = _round_step((self.high - self.low) / 5)
-        return [k * step for k in range(math.ceil(self.low / step - 1e-9), math.floor(self.high / step + 1e-9) + 1)]
+        return [
+            k * step
+            for k in range(math.ceil(self.low / step - 1e-9), math.floor(self.high / step + 1e-9) + 1)
+        ]
 
     def _scale(self, value: float) -> float:
         return math.log10(value) if self.log else value
@@ -71,12 +74,14 @@ def line_chart(
 ) -> Markup:
     """One SVG element with the lines, axes, grid and `marks` (vertical lines: x, text); `log` is the y axis.
 
-    The legend is the page's business (`Line.style` and `Line.label`). Without a finite value the chart says so.
+    The legend is the page's business (`Line.style`, `Line.label`). Without a finite value the chart says so.
     """
     x_values, y_values = _finite(lines, "x"), _finite(lines, "y")
     if log:
         y_values = y_values[y_values > 0]
-    opening = Markup('<svg class="chart" viewBox="0 0 {} {}" role="img" aria-label="{}">').format(width, height, title)
+    opening = Markup('<svg class="chart" viewBox="0 0 {} {}" role="img" aria-label="{}">').format(
+        width, height, title
+    )
     if not x_values.size or not y_values.size:
         empty = Markup('<text x="{}" y="{}" text-anchor="middle">no finite values to show</text></svg>')
         return opening + empty.format(width / 2, height / 2)
@@ -97,7 +102,9 @@ def _axis(values: np.ndarray, start: float, end: float, *, pad: float, log: bool
     low, high = float(values.min()), float(values.max())
     if log:
         low = max(low, high * 10.0**-MAX_DECADES)
-        low, high = (low / 2, high * 2) if low == high else (low / (high / low) ** pad, high * (high / low) ** pad)
+        low, high = (
+            (low / 2, high * 2) if low == high else (low / (high / low) ** pad, high * (high / low) ** pad)
+        )
     elif high - low <= 1e-9 * max(abs(low), abs(high)):
         room = 0.5 * abs(high) or 1.0  # a flat line lies in the middle
         low, high = low - room, high + room
@@ -114,7 +121,10 @@ def _round_step(step: float) -> float:
 
 def _frame(x_axis: Axis, y_axis: Axis, x_label: str, y_label: str) -> Markup:
     bottom, left = y_axis.start, x_axis.start
-    grid, text = Markup('<path class="grid" d="M{:.1f} {:.1f}H{:.1f}"/>'), Markup('<text x="{:.1f}" y="{:.1f}" {}>{}</text>')
+    grid, text = (
+        Markup('<path class="grid" d="M{:.1f} {:.1f}H{:.1f}"/>'),
+        Markup('<text x="{:.1f}" y="{:.1f}" {}>{}</text>'),
+    )
     end, middle = Markup('text-anchor="end"'), Markup('text-anchor="middle"')
     parts = []
     for value, label in _labelled(y_axis):
@@ -123,7 +133,11 @@ def _frame(x_axis: Axis, y_axis: Axis, x_label: str, y_label: str) -> Markup:
     for value, label in _labelled(x_axis):
         parts.append(text.format(x_axis.pixel(value), bottom + 16, middle, label))
     parts.append(Markup('<path class="axis" d="M{:.1f} {:.1f}H{:.1f}"/>').format(left, bottom, x_axis.end))
-    parts.append(text.format((left + x_axis.end) / 2, bottom + 31, Markup('text-anchor="middle" class="label"'), x_label))
+    parts.append(
+        text.format(
+            (left + x_axis.end) / 2, bottom + 31, Markup('text-anchor="middle" class="label"'), x_label
+        )
+    )
     y = (bottom + y_axis.end) / 2
     turned = Markup('text-anchor="middle" class="label" transform="rotate(-90 12 {:.1f})"').format(y)
     return Markup("").join([*parts, text.format(12, y, turned, y_label)])
@@ -131,11 +145,13 @@ def _frame(x_axis: Axis, y_axis: Axis, x_label: str, y_label: str) -> Markup:
 
 def _labelled(axis: Axis) -> list[tuple[float, str | Markup]]:
     ticks = axis.ticks()
-    if axis.log and all(math.isclose(math.log10(t), round(math.log10(t)), abs_tol=1e-9) for t in ticks):
-        power: Callable[[float], Markup] = lambda t: Markup('10<tspan dy="-5" class="power">{}</tspan>').format(round(math.log10(t)))
-        return [(tick, power(tick)) for tick in ticks]
+    powers = [math.log10(tick) for tick in ticks] if axis.log else []
+    if powers and all(math.isclose(power, round(power), abs_tol=1e-9) for power in powers):
+        text = Markup('10<tspan dy="-5" class="power">{}</tspan>')
+        return [(tick, text.format(round(power))) for tick, power in zip(ticks, powers, strict=True)]
     decimals = max((_decimals(tick) for tick in ticks), default=0)
-    return [(tick, f"{tick:.{decimals}f}" if abs(tick) < 1e5 and decimals <= 4 else f"{tick:.0e}") for tick in ticks]
+    plain = decimals <= 4 and max(map(abs, ticks), default=0.0) < 1e5
+    return [(tick, f"{tick:.{decimals}f}" if plain else f"{tick:.0e}") for tick in ticks]
 
 
 def _decimals(value: float) -> int:
@@ -143,10 +159,11 @@ def _decimals(value: float) -> int:
 
 
 def _mark(x: float, text: str, x_axis: Axis, y_axis: Axis) -> Markup:
-    pixel = x_axis.pixel(x)
-    rightmost = pixel > (x_axis.start + x_axis.end) / 2
-    return Markup('<path class="mark" d="M{0:.1f} {1:.1f}V{2:.1f}"/><text x="{3:.1f}" y="{4:.1f}" text-anchor="{5}">{6}</text>').format(
-        pixel, y_axis.start, y_axis.end, pixel + (-5 if rightmost else 5), y_axis.end + 10, "end" if rightmost else "start", text
+    pixel, top = x_axis.pixel(x), y_axis.end
+    side, anchor = (-5, "end") if pixel > (x_axis.start + x_axis.end) / 2 else (5, "start")
+    line = Markup('<path class="mark" d="M{:.1f} {:.1f}V{:.1f}"/>').format(pixel, y_axis.start, top)
+    return line + Markup('<text x="{:.1f}" y="{:.1f}" text-anchor="{}">{}</text>').format(
+        pixel + side, top + 10, anchor, text
     )
 
 
@@ -160,5 +177,5 @@ def _path(line: Line, x_axis: Axis, y_axis: Axis) -> Markup:
             steps.append(f"{'L' if down else 'M'}{x_axis.pixel(x[k]):.1f} {y_axis.pixel(y[k]):.1f}")
         down = drawn
     return Markup('<path class="line {}" d="{}"><title>{}</title></path>').format(
-        escape(line.style), "".join(steps), line.label
+        line.style, "".join(steps), line.label
     )

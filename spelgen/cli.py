@@ -1,6 +1,7 @@
 """The command line: each command is one step of the way from a URDF to a report.
 
-Commands import what they need when they run, so that `spelgen --help` is instant and `spelgen inspect` never loads torch.
+Commands import what they need when they run, so that `spelgen --help` is instant and `spelgen inspect`
+never loads torch.
 """
 
 from __future__ import annotations
@@ -14,7 +15,11 @@ from spelgen import __version__, model_commands, run_commands
 from spelgen.console import say, told
 
 app = typer.Typer(
-    name="spelgen", add_completion=False, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False
+    name="spelgen",
+    add_completion=False,
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
 )
 for command in (
     model_commands.inspect,

@@ -1,4 +1,4 @@
-"""How a command speaks: results to stdout, one line per error to stderr, exit codes that scripts can trust."""
+"""How a command speaks: results to stdout, one line per error to stderr, exit codes to rely on."""
 
 from __future__ import annotations
 
@@ -43,7 +43,9 @@ def told(command: Callable[..., None]) -> Callable[..., None]:
     signature = inspect.signature(command, eval_str=True)
     option = inspect.Parameter("debug", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Debug)
     run.__signature__ = signature.replace(parameters=[*signature.parameters.values(), option])  # type: ignore[attr-defined]
-    run.__annotations__ = {name: each.annotation for name, each in [*signature.parameters.items(), ("debug", option)]}
+    run.__annotations__ = {
+        name: each.annotation for name, each in [*signature.parameters.items(), ("debug", option)]
+    }
     return run
 
 

@@ -16,7 +16,7 @@ INERTIA_UNITS = {"revolute revolute": "kg m²", "prismatic prismatic": "kg"}
 
 @dataclass(frozen=True)
 class Constant:
-    """A trained constant: where it enters M, what it was before training and after, in the unit of that entry."""
+    """A trained constant: where it enters M, its value before training and after, in that entry's unit."""
 
     where: str
     start: float
@@ -53,7 +53,9 @@ def _values(state: Mapping[str, Any]) -> list[float]:
 
 def _constant(basis: torch.Tensor, start: float, learned: float, joint_types: Sequence[str]) -> Constant:
     entries = [(i, j) for i, j in basis.tril().nonzero().tolist()]
-    where = " ".join(f"{_factor(basis[i, j].item(), k == 0)}M{_index(i, j)}" for k, (i, j) in enumerate(entries))
+    where = " ".join(
+        f"{_factor(basis[i, j].item(), k == 0)}M{_index(i, j)}" for k, (i, j) in enumerate(entries)
+    )
     unit = INERTIA_UNITS.get(" ".join(joint_types[k] for k in entries[0]), "kg m")
     return Constant(where, start, learned, unit)
 

@@ -22,7 +22,9 @@ def inspect(
     assume: Assumption = "kinematics",
     snap_tol: SnapTolerance = 2e-3,
     format: Annotated[Literal["text", "json"], typer.Option("--format", help="Of the result.")] = "text",
-    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write to a file.")] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write to a file.")
+    ] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 if there is any warning.")] = False,
 ) -> None:
     """Show the exact structure of an arm's dynamics."""
@@ -50,7 +52,8 @@ def build(
     width: Annotated[int, typer.Option("--width", min=1, max=4096, help="Units in a hidden layer.")] = 64,
     depth: Annotated[int, typer.Option("--depth", min=1, max=16, help="Hidden layers.")] = 2,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="MODULE.py", help="Default: <robot>_model.py here.")
+        Path | None,
+        typer.Option("-o", "--output", metavar="MODULE.py", help="Default: <robot>_model.py here."),
     ] = None,
     force: Force = False,
 ) -> None:
@@ -58,7 +61,14 @@ def build(
     from spelgen import pipeline
 
     source = pipeline.build(
-        robot, options.names(joints), tip, assume, snap_tolerance=snap_tol, preset=preset, width=width, depth=depth
+        robot,
+        options.names(joints),
+        tip,
+        assume,
+        snap_tolerance=snap_tol,
+        preset=preset,
+        width=width,
+        depth=depth,
     )
     path = output or Path(f"{robot.stem}_model.py")
     if path.is_file() and path.read_bytes() == source.encode():

@@ -15,38 +15,56 @@ Robot = Annotated[
     Path, typer.Argument(metavar="ROBOT.urdf", help="The arm's URDF; ROBOT.yaml beside it holds settings.")
 ]
 RobotOption = Annotated[
-    Path | None, typer.Option("--robot", metavar="ROBOT.urdf", help="The module's URDF, where it is not found by name.")
+    Path | None,
+    typer.Option("--robot", metavar="ROBOT.urdf", help="The module's URDF, where it is not found by name."),
 ]
 Module = Annotated[Path, typer.Argument(metavar="MODULE.py", help="A module written by `spelgen build`.")]
 Run = Annotated[Path, typer.Argument(metavar="RUN", help="A run folder of `spelgen train`.")]
 Joints = Annotated[
-    str | None, typer.Option("--joints", metavar="A,B,C", help="The moving joints; all others are locked at zero.")
+    str | None,
+    typer.Option("--joints", metavar="A,B,C", help="The moving joints; all others are locked at zero."),
 ]
-Tip = Annotated[str | None, typer.Option("--tip", metavar="LINK", help="Take the chain from the root to this link.")]
+Tip = Annotated[
+    str | None, typer.Option("--tip", metavar="LINK", help="Take the chain from the root to this link.")
+]
 Assumption = Annotated[
-    Assume, typer.Option("--assume", help="Believe the kinematics only, or also the inertials' zeros and symmetries.")
+    Assume,
+    typer.Option(
+        "--assume", help="Believe the kinematics only, or also the inertials' zeros and symmetries."
+    ),
 ]
 SnapTolerance = Annotated[
     float,
-    typer.Option("--snap-tol", metavar="RAD", min=0.0, max=0.1, help="Angles this near to a special one are that one."),
+    typer.Option(
+        "--snap-tol", metavar="RAD", min=0.0, max=0.1, help="Angles this near to a special one are that one."
+    ),
 ]
 Data = Annotated[
     list[Path] | None,
-    typer.Option("--data", metavar="LOGS...", help="Parquet or CSV files, or folders of them.", show_default=False),
+    typer.Option(
+        "--data", metavar="LOGS...", help="Parquet or CSV files, or folders of them.", show_default=False
+    ),
 ]
 MoreData = Annotated[
-    list[Path] | None, typer.Argument(metavar="LOGS", help="More logs: several may follow --data.", show_default=False)
+    list[Path] | None,
+    typer.Argument(metavar="LOGS", help="More logs: several may follow --data.", show_default=False),
 ]
 Filter = Annotated[
     float | None,
-    typer.Option("--filter", metavar="HZ", min=0.0, help="Cutoff of the zero-phase low-pass on the logs; 0: none."),
+    typer.Option(
+        "--filter", metavar="HZ", min=0.0, help="Cutoff of the zero-phase low-pass on the logs; 0: none."
+    ),
 ]
 Force = Annotated[bool, typer.Option("--force", help="Replace an output that exists.")]
 
 
 def names(text: str | None) -> list[str] | None:
     """`a, b, "c, d"` -> the three names; None stays None."""
-    return None if text is None else [name.strip() for name in next(csv.reader([text], skipinitialspace=True), [])]
+    return (
+        None
+        if text is None
+        else [name.strip() for name in next(csv.reader([text], skipinitialspace=True), [])]
+    )
 
 
 def logs(data: list[Path] | None, more: list[Path] | None) -> list[Path]:
@@ -59,4 +77,6 @@ def logs(data: list[Path] | None, more: list[Path] | None) -> list[Path]:
 def require_free(path: Path, *, force: bool) -> None:
     """Raise SpelgenError where an output exists already, unless it may be replaced."""
     if path.exists() and not force:
-        raise SpelgenError("this output exists already", file=path, do="--force replaces it, -o names another")
+        raise SpelgenError(
+            "this output exists already", file=path, do="--force replaces it, -o names another"
+        )

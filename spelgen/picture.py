@@ -33,7 +33,11 @@ def read_picture(module: Path) -> Picture:
     """The picture in the docstring of the emitted module. Raises ModuleError when there is none."""
     paragraphs = (ast.get_docstring(ast.parse(module.read_bytes())) or "").split("\n\n")
     place = next((k for k, text in enumerate(paragraphs) if text.startswith(_HEADING)), None)
-    lower = [] if place is None else [re.split(r" +", line.strip()) for line in paragraphs[place + 1].splitlines()]
+    lower = (
+        []
+        if place is None
+        else [re.split(r" +", line.strip()) for line in paragraphs[place + 1].splitlines()]
+    )
     if place is None or [len(row) for row in lower] != list(range(1, len(lower) + 1)):
         raise ModuleError("no picture of the mass matrix in the docstring", file=module, do="build it again")
     cells = {(i, j): _cell(text) for i, row in enumerate(lower) for j, text in enumerate(row)}

@@ -1,4 +1,4 @@
-"""A run folder -> one self-contained HTML page. Nothing else is read, and what the folder lacks is said, not guessed."""
+"""A run folder -> one self-contained HTML page. What the folder lacks is said, not guessed."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from typing import Any
 from markupsafe import Markup
 
 from spelgen import __version__
-from spelgen.charts import Line, line_chart
 from spelgen.errors import RunError
 from spelgen.files import write_text
 from spelgen.learned import Learned, read_learned
 from spelgen.picture import Picture, read_picture
+from spelgen.plots import UNITS, joint_charts, loss_chart
 from spelgen.rendering import render
 from spelgen.runs import RunFolder
 from spelgen.spec import Header, Options, read_header
@@ -25,7 +25,6 @@ from spelgen.tables import MODEL, number, result_tables, verdict
 from spelgen.training_data import TrainingConfig
 
 EXAMPLES = 2  # predicted trajectories that are drawn
-UNITS = {"revolute": ("rad", "rad/s"), "prismatic": ("m", "m/s")}
 
 
 @dataclass(frozen=True)
@@ -54,15 +53,6 @@ class Training:
     settings: dict[str, str]
 
 
-@dataclass(frozen=True)
-class JointCharts:
-    """One joint of a predicted trajectory."""
-
-    name: str
-    position: Markup
-    velocity: Markup
-
-
 def write_report(folder: Path | str, output: Path | str | None = None) -> Path:
     """Write the page about a run, by default as report.html in its folder; return its path.
 
@@ -76,7 +66,9 @@ def render_report(folder: Path | str) -> str:
     """The page about a run as HTML; the same folder gives the same text."""
     run = RunFolder(Path(folder))
     if not run.module.is_file():
-        raise RunError("no run", file=run.path, expected="a folder with module.py", do="make one with `spelgen train`")
+        raise RunError(
+            "no run", file=run.path, expected="a folder with module.py", do="make one with `spelgen train`"
+        )
     header, picture = read_header(run.module), read_picture(run.module)
     config = run.read_json(run.config) if run.config.is_file() else None
     metrics = _metrics(run.metrics)
@@ -94,7 +86,13 @@ def render_report(folder: Path | str) -> str:
         training=_training(config, metrics) if config and metrics else None,
         evaluation=evaluation,
         tables=result_tables(evaluation) if evaluation else [],
-        examples=_examples(evaluation or {}, header),
+        examples=[
+            (
+                each["trajectory"],
+                joint_charts(each, dict(zip(header.joints, header.joint_types, strict=True))),
+            )
+            for each in (evaluation or {}).get("examples", [])[:EXAMPLES]
+        ],
         learned=learned,
         files=_files(run.path),
         commands=_commands(header, config),
@@ -105,17 +103,20 @@ def _metrics(path: Path) -> list[dict[str, Any]]:
     """The lines of metrics.jsonl; the last may be torn where a run was killed, and is then left out."""
     lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
     records = []
-    for number, line in enumerate(lines, start=1):
+    for count, line in enumerate(lines, start=1):
         try:
             records.append(json.loads(line))
         except ValueError as error:
-            if number < len(lines):
-                raise RunError(f"broken JSON ({error})", file=path, line=number) from error
+            if count < len(lines):
+                raise RunError(f"broken JSON ({error})", file=path, line=count) from error
     return records
 
 
 def _numbers(
-    picture: Picture, learned: Learned | None, metrics: Sequence[Mapping[str, Any]], evaluation: Mapping[str, Any] | None
+    picture: Picture,
+    learned: Learned | None,
+    metrics: Sequence[Mapping[str, Any]],
+    evaluation: Mapping[str, Any] | None,
 ) -> list[Number]:
     """The figures a reader wants first, as far as the run has come."""
     found = []
@@ -123,9 +124,17 @@ def _numbers(
         last = evaluation["horizons"][-1]
         errors = {name: each["mean_share"] for name, each in last["errors"].items()}
         rivals = ", ".join(f"{name} {number(value)}" for name, value in errors.items() if name != MODEL)
-        found.append(Number(number(errors.get(MODEL)), f"error after {last['name']}, relative to the motion ({rivals})"))
+        found.append(
+            Number(
+                number(errors.get(MODEL)), f"error after {last['name']}, relative to the motion ({rivals})"
+            )
+        )
         if last["errors"][MODEL]["tip_mm"] is not None:
-            found.append(Number(f"{number(last['errors'][MODEL]['tip_mm'])} mm", f"error of the tip after {last['name']}"))
+            found.append(
+                Number(
+                    f"{number(last['errors'][MODEL]['tip_mm'])} mm", f"error of the tip after {last['name']}"
+                )
+            )
     if learned:
         found.append(Number(f"{learned.parameters:,}", "trained parameters"))
     if metrics:
@@ -137,45 +146,20 @@ def _numbers(
 
 
 def _training(config: Mapping[str, Any], metrics: Sequence[Mapping[str, Any]]) -> Training:
-    epochs = [record["epoch"] for record in metrics]
-    best = min(metrics, key=lambda record: record["validation"])
-    lines = [
-        Line("training loss", epochs, [record["loss"] for record in metrics], "train"),
-        Line("validation loss", epochs, [record["validation"] for record in metrics], "model"),
-    ]
-    chart = line_chart(
-        lines, title="Loss by epoch", x_label="epoch", y_label="loss", log=True, marks=[(best["epoch"], "best")], width=860
-    )
-    last = metrics[-1]
+    last, best = metrics[-1], metrics[-1]["best"]
+    best_epoch = next((each["epoch"] for each in metrics if each["validation"] == best), 0)
+    kept = f"epoch {best_epoch}" if best_epoch else "the start: no epoch was better"
     facts = {
         "data": f"{config['training_windows']:,} windows from {_many(config['training'])}",
         "validation": f"{config['validation_windows']:,} windows from {_many(config['validation'])} set aside",
         "filter": f"{config['cutoff']:g} Hz, zero phase" if config["cutoff"] else "none",
         "length": f"{last['epoch']} epochs, {last['step']:,} steps, {_duration(last['seconds'])}",
-        "best": f"validation loss {number(best['validation'])} at epoch {best['epoch']} (first {number(metrics[0]['validation'])})",
+        "kept": f"the model of {kept}, validation loss {number(best)}",
         "integrator": f"rk4, {last['substeps']} steps between samples",
         "setbacks": f"{last['rollbacks']} epochs undone" if last["rollbacks"] else "none",
     }
-    settings = {key.replace("_", " "): str(value) for key, value in config["config"].items() if value is not None}
-    return Training(chart, facts, settings)
-
-
-def _examples(evaluation: Mapping[str, Any], header: Header) -> list[tuple[str, list[JointCharts]]]:
-    """Predicted trajectories against the measured ones."""
-    kinds = dict(zip(header.joints, header.joint_types, strict=True))
-    return [
-        (example["trajectory"], [_joint_charts(joint, example["t"], kinds[joint["name"]]) for joint in example["joints"]])
-        for example in evaluation.get("examples", [])[:EXAMPLES]
-    ]
-
-
-def _joint_charts(joint: Mapping[str, Any], t: Sequence[float], kind: str) -> JointCharts:
-    charts = []
-    for what, name, unit in zip(("q", "qd"), ("position", "velocity"), UNITS[kind], strict=True):
-        lines = [Line("measured", t, joint[f"{what}_true"], "truth"), Line("predicted", t, joint[f"{what}_pred"], "predicted")]
-        title = f"{name.capitalize()} of {joint['name']}"
-        charts.append(line_chart(lines, title=title, x_label="t [s]", y_label=f"{name} [{unit}]", width=330, height=190))
-    return JointCharts(joint["name"], *charts)
+    settings = {key.replace("_", " "): str(x) for key, x in config["config"].items() if x is not None}
+    return Training(loss_chart(metrics, best_epoch), facts, settings)
 
 
 def _files(folder: Path) -> list[File]:
@@ -193,7 +177,9 @@ def _commands(header: Header, config: Mapping[str, Any] | None) -> list[str]:
     options = _flags(asdict(header.options), asdict(Options()))
     commands = [f"spelgen build {shlex.quote(header.urdf)}{options} -o module.py"]
     if config:
-        commands.append(f"spelgen train module.py --data LOGS -o RUN{_flags(config['config'], asdict(TrainingConfig()))}")
+        commands.append(
+            f"spelgen train module.py --data LOGS -o RUN{_flags(config['config'], asdict(TrainingConfig()))}"
+        )
     return [*commands, "spelgen evaluate RUN --data LOGS", "spelgen report RUN"]
 
 
@@ -220,4 +206,6 @@ def _duration(seconds: float) -> str:
 
 
 def _size(count: int) -> str:
-    return f"{count} B" if count < 1000 else f"{count / 1000:.1f} kB" if count < 1e6 else f"{count / 1e6:.1f} MB"
+    return (
+        f"{count} B" if count < 1000 else f"{count / 1000:.1f} kB" if count < 1e6 else f"{count / 1e6:.1f} MB"
+    )

@@ -12,7 +12,19 @@ import typer
 from spelgen import options
 from spelgen.console import INTERRUPTED, counted, note, say
 from spelgen.errors import ModuleError
-from spelgen.options import Data, Filter, Force, Joints, Module, MoreData, Robot, RobotOption, Run, SnapTolerance, Tip
+from spelgen.options import (
+    Data,
+    Filter,
+    Force,
+    Joints,
+    Module,
+    MoreData,
+    Robot,
+    RobotOption,
+    Run,
+    SnapTolerance,
+    Tip,
+)
 from spelgen.spec import read_header
 
 if TYPE_CHECKING:
@@ -23,11 +35,15 @@ WORST_INTEGRATION = 1e-8  # [rad, rad/s; m, m/s] above this simulated logs are n
 
 def simulate(
     robot: Robot,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="LOGS", help="Folder for train and test logs.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="LOGS", help="Folder for train and test logs.")
+    ],
     joints: Joints = None,
     tip: Tip = None,
     snap_tol: SnapTolerance = 2e-3,
-    seed: Annotated[int | None, typer.Option("--seed", min=0, help="Default: that of the robot's settings.")] = None,
+    seed: Annotated[
+        int | None, typer.Option("--seed", min=0, help="Default: that of the robot's settings.")
+    ] = None,
     force: Force = False,
 ) -> None:
     """Make training and test logs with Pinocchio."""
@@ -37,7 +53,9 @@ def simulate(
     loaded = pipeline.load(robot, options.names(joints), tip, snap_tol)
     settings = loaded.settings
     if seed is not None:
-        settings = settings.model_copy(update={"simulation": settings.simulation.model_copy(update={"seed": seed})})
+        settings = settings.model_copy(
+            update={"simulation": settings.simulation.model_copy(update={"seed": seed})}
+        )
     paths = {role: output / f"{role}.parquet" for role in ("train", "test")}
     for path in paths.values():
         options.require_free(path, force=force)
@@ -47,7 +65,8 @@ def simulate(
     for path, trajectories in zip(paths.values(), (result.train, result.test), strict=True):
         if trajectories:
             write_logs(path, trajectories, names)
-            say(f"wrote {path}: {len(trajectories)} trajectories, {sum(len(x.t) for x in trajectories)} samples")
+            samples = sum(len(each.t) for each in trajectories)
+            say(f"wrote {path}: {len(trajectories)} trajectories, {samples} samples")
     say(f"largest integration error: {result.integration_error:.1e} [rad, rad/s; m, m/s]")
     if result.integration_error > WORST_INTEGRATION:
         note(f"warning: more than {WORST_INTEGRATION:g}; do not take these logs as a reference")
@@ -64,16 +83,27 @@ def train(
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in the run folder.")] = False,
     force: Force = False,
     epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="At most so many.")] = None,
-    patience: Annotated[int | None, typer.Option("--patience", min=1, help="Epochs without gain before the end.")] = None,
-    max_minutes: Annotated[float | None, typer.Option("--max-minutes", min=0.0, help="At most so long.")] = None,
+    patience: Annotated[
+        int | None, typer.Option("--patience", min=1, help="Epochs without gain before the end.")
+    ] = None,
+    max_minutes: Annotated[
+        float | None, typer.Option("--max-minutes", min=0.0, help="At most so long.")
+    ] = None,
     batch: Annotated[int | None, typer.Option("--batch", min=1, help="Windows in a step.")] = None,
     window: Annotated[int | None, typer.Option("--window", min=2, help="Samples in a window.")] = None,
-    stride: Annotated[int | None, typer.Option("--stride", min=1, help="Samples from window to window.")] = None,
-    substeps: Annotated[int | None, typer.Option("--substeps", min=1, help="Integrator steps between samples.")] = None,
-    learning_rate: Annotated[float | None, typer.Option("--learning-rate", min=0.0, help="At its largest.")] = None,
+    stride: Annotated[
+        int | None, typer.Option("--stride", min=1, help="Samples from window to window.")
+    ] = None,
+    substeps: Annotated[
+        int | None, typer.Option("--substeps", min=1, help="Integrator steps between samples.")
+    ] = None,
+    learning_rate: Annotated[
+        float | None, typer.Option("--learning-rate", min=0.0, help="At its largest.")
+    ] = None,
     weight_decay: Annotated[float | None, typer.Option("--weight-decay", min=0.0, help="Of AdamW.")] = None,
     validation_fraction: Annotated[
-        float | None, typer.Option("--validation-fraction", min=0.0, max=0.9, help="Part of the trajectories.")
+        float | None,
+        typer.Option("--validation-fraction", min=0.0, max=0.9, help="Part of the trajectories."),
     ] = None,
     filter: Filter = None,
     seed: Annotated[int | None, typer.Option("--seed", min=0, help="Of split, order and batches.")] = None,
@@ -88,14 +118,17 @@ def train(
     flags = {
         "epochs": epochs, "patience": patience, "max_minutes": max_minutes, "batch": batch, "window": window,
         "stride": stride, "substeps": substeps, "learning_rate": learning_rate, "weight_decay": weight_decay,
-        "validation_fraction": validation_fraction, "filter": filter, "seed": seed, "device": device, "threads": threads,
+        "validation_fraction": validation_fraction, "filter": filter, "seed": seed, "device": device,
+        "threads": threads,
     }  # fmt: skip
     paths = options.logs(data, more)
     from spelgen import training
 
     folder = output or Path("runs") / module.stem
     urdf = robot or _unchanged_urdf(module)
-    config = _config(urdf, folder if resume else None, {key: value for key, value in flags.items() if value is not None})
+    config = _config(
+        urdf, folder if resume else None, {key: value for key, value in flags.items() if value is not None}
+    )
     result = training.train(
         module, paths, folder, config, urdf=urdf, resume=resume, force=force, progress=not quiet
     )
@@ -125,7 +158,8 @@ def evaluate(run: Run, more: MoreData = None, data: Data = None, filter: Filter 
 def report(
     run: Run,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="FILE", help="Default: report.html in the run folder.")
+        Path | None,
+        typer.Option("-o", "--output", metavar="FILE", help="Default: report.html in the run folder."),
     ] = None,
 ) -> None:
     """Write one HTML page about a run."""

@@ -29,7 +29,7 @@ class SimulationResult:
     """Simulated logs, split by trajectory.
 
     integration_error: largest difference of any logged q or qd [rad, rad/s; m, m/s] to the same trajectory
-        integrated with 10 times larger tolerances; the error of what is logged is about a tenth of that.
+        integrated with 10 times larger tolerances; the error of what is logged is smaller still.
     """
 
     train: tuple[Trajectory, ...]

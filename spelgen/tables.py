@@ -44,12 +44,16 @@ class Table:
             label = textwrap.shorten(row.label, WIDEST_LABEL, placeholder="...")
             lines.append([label, *(cell.text + (" *" if cell.best else "  ") for cell in row.cells)])
         widths = [max(len(line[k]) for line in lines) for k in range(len(head))]
-        laid = [f"  {line[0]:<{widths[0]}}" + "".join(f"  {x:>{w}}" for x, w in zip(line[1:], widths[1:], strict=True)) for line in lines]
+        laid = [
+            f"  {line[0]:<{widths[0]}}"
+            + "".join(f"  {x:>{w}}" for x, w in zip(line[1:], widths[1:], strict=True))
+            for line in lines
+        ]
         return "\n".join([*textwrap.wrap(self.title, WIDTH), *(line.rstrip() for line in laid)])
 
 
 def result_tables(evaluation: Mapping[str, Any]) -> list[Table]:
-    """The tables of evaluation.json: errors by horizon, then by joint at the longest one, then torque errors."""
+    """The tables of evaluation.json: errors by horizon, by joint at the longest one, torque errors."""
     tables, horizons = [], evaluation["horizons"]
     if horizons:
         heads = [_ahead(horizon) for horizon in horizons]
@@ -59,7 +63,9 @@ def result_tables(evaluation: Mapping[str, Any]) -> list[Table]:
         if any(value is not None for tip in tips for value in tip.values()):
             tables.append(_table("Error of the tip's position [mm]", heads, tips))
         for what, title in (("q", "Position error [rad, m]"), ("qd", "Velocity error [rad/s, m/s]")):
-            tables.append(_by_joint(f"{title} after {heads[-1]}", evaluation["joints"], _of(horizons[-1], what)))
+            tables.append(
+                _by_joint(f"{title} after {heads[-1]}", evaluation["joints"], _of(horizons[-1], what))
+            )
     torque = evaluation["torque"]
     if torque:
         mean = {name: errors["mean_nmse"] for name, errors in torque.items()}
@@ -71,15 +77,17 @@ def result_tables(evaluation: Mapping[str, Any]) -> list[Table]:
 
 def verdict(evaluation: Mapping[str, Any]) -> str:
     """One sentence: at which horizons the model's relative error is the least."""
-    won, lost = [], []
+    best: dict[str, str | None] = {}
     for horizon in evaluation["horizons"]:
         errors = {name: value for name, value in _of(horizon, "mean_share").items() if value is not None}
-        best = min(errors, key=errors.__getitem__, default=None)
-        (won if best == MODEL else lost).append((horizon["name"], best))
+        best[horizon["name"]] = min(errors, key=errors.__getitem__, default=None)
+    won = [name for name, contender in best.items() if contender == MODEL]
+    if not best:
+        return "No horizon was evaluated."
     if not won:
-        return "At no horizon does the model predict better than its rivals." if lost else "No horizon was evaluated."
-    told = f"The model predicts best over {_listed([name for name, _ in won])}"
-    return told + "".join(f"; over {name} {best or 'nothing'} is better" for name, best in lost) + "."
+        return "At no horizon does the model predict better than its rivals."
+    lost = [f"; over {name} {each or 'nothing'} is better" for name, each in best.items() if each != MODEL]
+    return f"The model predicts best over {_listed(won)}{''.join(lost)}."
 
 
 def number(value: float | None) -> str:
@@ -100,7 +108,9 @@ def _of(horizon: Mapping[str, Any], what: str) -> dict[str, Any]:
 
 
 def _by_joint(title: str, joints: Sequence[str], values: Mapping[str, Sequence[float | None]]) -> Table:
-    return _table(title, joints, [{name: each[k] for name, each in values.items()} for k in range(len(joints))])
+    return _table(
+        title, joints, [{name: each[k] for name, each in values.items()} for k in range(len(joints))]
+    )
 
 
 def _table(title: str, labels: Sequence[str], rows: Iterable[Mapping[str, float | None]]) -> Table:

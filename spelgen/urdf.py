@@ -14,7 +14,8 @@ from spelgen.errors import Diagnostic, collect, suggestion
 from spelgen.lint import lint
 from spelgen.robot import Inertial, Joint, Link, Mimic, Robot, Transmission
 from spelgen.urdf_document import read_document
-from spelgen.urdf_elements import Notes, read_joint, read_link, read_name, read_transmission
+from spelgen.urdf_elements import read_joint, read_link, read_name, read_transmission
+from spelgen.urdf_values import Notes
 
 __all__ = ["Inertial", "Joint", "Link", "Mimic", "Robot", "Transmission", "read_urdf"]
 

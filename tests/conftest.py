@@ -23,3 +23,8 @@ def shared() -> Path:
     if not folder.is_dir():
         pytest.skip("the reference data (../shared) is not on this machine")
     return folder
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """``--update`` writes the golden copies anew."""
+    parser.addoption("--update", action="store_true", help="write golden files anew")

@@ -1,4 +1,4 @@
-"""The report: one complete HTML page from a run folder, whatever the folder holds, and nothing that is not in it."""
+"""The report: one complete HTML page from a run folder, whatever the folder holds."""
 
 import json
 import math
@@ -60,6 +60,10 @@ def example(name):
     return {"trajectory": name, "t": t, "joints": joints}
 
 
+def validation(epoch):
+    return 2.0 * 0.8**epoch + 0.01 * epoch
+
+
 EVALUATION = {
     "schema": 1,
     "robot": "rpr",
@@ -72,11 +76,13 @@ EVALUATION = {
         {"name": "1 step", "steps": 1, "seconds": 0.05, "windows": 40,
          "errors": {"model": errors(0.004), "velocity stays constant": errors(0.6), "URDF": errors(0.003)}},
         {"name": "1 s", "steps": 20, "seconds": 1.0, "windows": 2,
-         "errors": {"model": errors(0.0123, 0.8), "velocity stays constant": errors(1.0, 26.0), "URDF": errors(None)}},
+         "errors": {"model": errors(0.0123, 0.8), "velocity stays constant": errors(1.0, 26.0),
+                    "URDF": errors(None)}},
     ],
     "torque": {"model": {"nmse": {}, "mean_nmse": 0.01, "rmse": [1.0, 2.0, 3.0]}},
     "energy_drift": 8e-10,
-    "diagnostics": [{"severity": "info", "code": "x", "where": "logs", "line": None, "message": "<b>said</b>"}],
+    "diagnostics": [{"severity": "info", "code": "x", "where": "logs", "line": None,
+                     "message": "<b>said</b>"}],
     "examples": [example("traj_00")],
 }  # fmt: skip
 
@@ -90,14 +96,15 @@ def run(robots, tmp_path) -> Path:
     torch.save(load_model(folder / "module.py").state_dict(), folder / "model.pt")
     config = {
         "schema": 1, "robot": "rpr", "preset": "minimal", "joints": ["joint1", "joint2", "joint3"],
-        "config": vars(TrainingConfig(epochs=30, seed=7)), "data_digest": "d" * 64, "training": ["traj_01", "traj_03"],
+        "config": vars(TrainingConfig(epochs=30, seed=7)), "data_digest": "d" * 64,
+        "training": ["traj_01", "traj_03"],
         "validation": ["traj_05"], "training_windows": 34, "validation_windows": 17, "cutoff": None,
         "scales": {"q": [1, 1, 1], "qd": [1, 1, 1]},
     }  # fmt: skip
     (folder / "config.json").write_text(json.dumps(config))
     lines = [
-        {"epoch": k, "step": 20 * k, "loss": 2.0 * 0.8**k, "validation": 2.0 * 0.8**k + 0.01 * k, "best": 0.1,
-         "rate": 1e-3, "substeps": 4, "rollbacks": 0, "seconds": 2.5 * k}
+        {"epoch": k, "step": 20 * k, "loss": 2.0 * 0.8**k, "validation": validation(k),
+         "best": min(map(validation, range(1, k + 1))), "rate": 1e-3, "substeps": 4, "rollbacks": 0, "seconds": 2.5 * k}
         for k in range(1, 31)
     ]  # fmt: skip
     (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
@@ -129,6 +136,12 @@ def test_numbers_are_those_of_the_run(run):
     assert "--epochs 30 --seed 7" in text
 
 
+def test_a_run_that_never_got_better_says_so(run):
+    line = json.loads((run / "metrics.jsonl").read_text().splitlines()[0]) | {"best": 0.001}
+    (run / "metrics.jsonl").write_text(json.dumps(line) + "\n")
+    assert "the model of the start: no epoch was better, validation loss 0.001" in render_report(run)
+
+
 def test_best_of_each_row_is_marked(run):
     rows = re.findall(r"<tr><th scope=\"row\">1 step \(0.05 s\)</th>(.*?)</tr>", render_report(run))
     assert re.findall(r'class="n( best)?">', rows[0]) == ["", "", " best"]
@@ -145,7 +158,9 @@ def test_learned_constants_are_those_of_the_weights(run):
     state["constants"] += 1.0
     torch.save(state, run / "model.pt")
     page = render_report(run)
-    for start, scale in zip(load_model(run / "module.py").constants.tolist(), state["constant_scale"].tolist(), strict=True):
+    for start, scale in zip(
+        load_model(run / "module.py").constants.tolist(), state["constant_scale"].tolist(), strict=True
+    ):
         assert f'<td class="n">{start * scale:.4g}</td>\n<td class="n">{(start + 1) * scale:.4g}</td>' in page
 
 
@@ -185,7 +200,9 @@ def test_broken_line_of_metrics_is_an_error(run):
 def test_no_run_is_an_error_that_says_what_to_do(tmp_path):
     with pytest.raises(RunError) as told:
         write_report(tmp_path / "nothing")
-    assert str(told.value).endswith("got no run, expected a folder with module.py; make one with `spelgen train`")
+    assert str(told.value).endswith(
+        "got no run, expected a folder with module.py; make one with `spelgen train`"
+    )
     assert not (tmp_path / "nothing").exists()
 
 

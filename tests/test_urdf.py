@@ -429,12 +429,16 @@ class TestSafety:
         links = "".join(f'<link name="l{i}"/>' for i in range(2001))
         assert refusal(write(links)) == "FILE:1: <robot>: got 2001 links, expected at most 2000"
 
-    def test_three_hundred_joints_are_read_in_seconds(self, write):
+    @pytest.mark.parametrize(("kind", "bodies"), [("revolute", 300), ("fixed", 1)])
+    def test_three_hundred_joints_are_read_in_seconds(self, write, kind, bodies):
         links = "".join(f'<link name="l{i}">{INERTIAL}</link>' for i in range(301))
         turned = '<origin xyz="0.1 0.2 0.3" rpy="0.1 0.2 0.3"/><axis xyz="0.1 0.2 0.3"/>'
-        joints = "".join(joint(turned, name=f"j{i}", parent=f"l{i}", child=f"l{i + 1}") for i in range(300))
+        joints = "".join(
+            joint(turned, name=f"j{i}", kind=kind if i else "revolute", parent=f"l{i}", child=f"l{i + 1}")
+            for i in range(300)
+        )
         start = time.perf_counter()
-        assert len(make_arm(read_urdf(write(links + joints))).bodies) == 300
+        assert len(make_arm(read_urdf(write(links + joints))).bodies) == bodies
         assert time.perf_counter() - start < 5
 
     @given(data=st.data())

@@ -1,0 +1,119 @@
+"""The emitted text: golden copies, the same bytes everywhere, lint-free, and nothing of the URDF in its code."""
+
+import ast
+import difflib
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from emitted import SIX, built, import_source
+
+from spelgen.pipeline import build, check, make_spec
+from spelgen.spec import ModelSpec, Options, read_header
+
+ROOT = Path(__file__).parents[1]
+GOLDEN = Path(__file__).parent / "golden"
+
+
+@pytest.mark.parametrize("robot", ["two_link", "rpr"])
+def test_golden_text(robot, request):
+    """``pytest --update`` writes the golden copies anew."""
+    path = GOLDEN / f"{robot}_spel.py"
+    text = built(robot)[0]
+    if request.config.getoption("--update"):
+        path.write_text(text, encoding="utf-8")
+    expected = path.read_text(encoding="utf-8")
+    difference = difflib.unified_diff(expected.splitlines(), text.splitlines(), "golden", "now", lineterm="")
+    assert text == expected, "\n".join(difference)
+
+
+def test_same_bytes_under_any_hash_seed_and_from_any_folder(tmp_path):
+    shutil.copytree(ROOT / "robots", tmp_path / "elsewhere" / "robots")
+    texts = set()
+    for seed, folder in (("1", ROOT), ("2", tmp_path / "elsewhere")):
+        run = subprocess.run(
+            [sys.executable, "-c", "from spelgen import build; print(build('robots/ur10e.urdf'))"],
+            cwd=folder,
+            env={**os.environ, "PYTHONHASHSEED": seed, "PYTHONPATH": str(ROOT)},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        texts.add(run.stdout)
+    assert len(texts) == 1
+
+
+def test_emitted_code_is_held_to_the_rules_of_written_code(tmp_path):
+    for robot in SIX:
+        (tmp_path / f"{robot}_spel.py").write_text(built(robot)[0], encoding="utf-8")
+    files = sorted(str(path) for path in tmp_path.glob("*.py"))
+    for command in (
+        ["ruff", "check", "--isolated", "--line-length", "100", "--select", "E,F,I,UP,B,SIM,RUF,D1", "--ignore", "D10,RUF002"],
+        ["ruff", "format", "--isolated", "--line-length", "100", "--check"],
+        ["mypy", "--strict", "--no-incremental", "--cache-dir", str(tmp_path / "cache")],
+    ):
+        run = subprocess.run([sys.executable, "-m", *command, *files], cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert run.returncode == 0, run.stdout + run.stderr
+
+
+HOSTILE = [
+    '"""; import os; os.system("true") #',
+    "{{ 7 * 7 }}{% raw %}",
+    "class",
+    "a\\",
+    "../../etc",
+    "Schulter\u00fc\u4e2d",
+    "joint 1",
+    "joint-1",
+]
+
+
+def test_no_text_of_the_urdf_becomes_code(tmp_path):
+    """Hostile joint names end as identifiers and as quoted strings of the docstring, and come back from there unharmed."""
+    from xml.sax.saxutils import quoteattr
+
+    links = "".join(f'<link name="l{k}"/>' for k in range(len(HOSTILE) + 1))
+    joints = "".join(
+        f'<joint name={quoteattr(name)} type="continuous"><parent link="l{k}"/><child link="l{k + 1}"/>'
+        f'<origin xyz="0.1 0 0.2" rpy="{k % 2} 0 0"/><axis xyz="0 0 1"/></joint>'
+        for k, name in enumerate(HOSTILE)
+    )
+    urdf = tmp_path / "hostile.urdf"
+    urdf.write_text(f'<robot name={quoteattr(HOSTILE[0])}>{links}{joints}</robot>', encoding="utf-8")
+    text = build(urdf)
+    path = tmp_path / "hostile_spel.py"
+    model = import_source(text, path).Model()
+    tree = ast.parse(text)
+    strings = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)}
+    docstrings = {ast.get_docstring(node, clean=False) for node in ast.walk(tree) if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)}
+    for string in strings - docstrings:
+        assert string not in HOSTILE or string.isidentifier()
+    assert all(name.isidentifier() for name in model.joint_names)
+    assert len(set(model.joint_names)) == len(HOSTILE)
+    assert read_header(path).joints == tuple(HOSTILE)
+    assert read_header(path).robot == HOSTILE[0]
+
+
+@pytest.mark.parametrize("robot", SIX)
+def test_spec_survives_json(robot):
+    spec = make_spec(ROOT / "robots" / f"{robot}.urdf", Options())
+    assert ModelSpec.from_json(spec.to_json()) == spec
+
+
+def test_check_tells_a_changed_urdf_from_a_fresh_one(tmp_path):
+    urdf = tmp_path / "rpr.urdf"
+    shutil.copy(ROOT / "robots" / "rpr.urdf", urdf)
+    shutil.copy(ROOT / "robots" / "rpr.yaml", tmp_path)
+    module = tmp_path / "rpr_spel.py"
+    module.write_text(build(urdf), encoding="utf-8")
+    assert check(module).fresh
+    urdf.write_text(urdf.read_text().replace("0.0203", "0.0204"))
+    changed = check(module)
+    assert not changed.fresh
+    assert f"{urdf} has changed since the module was built" in changed.reasons
+    shutil.copy(ROOT / "robots" / "rpr.urdf", urdf)
+    module.write_text(module.read_text() + "\n# edited\n", encoding="utf-8")
+    assert check(module).reasons == ("the module's text differs from what `spelgen build` writes now",)

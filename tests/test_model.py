@@ -1,0 +1,261 @@
+"""The emitted module: exact against Pinocchio with true values, and sound for any weights."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import torch
+from emitted import ROBOTS, SIX, built, exact_model, frictionless, import_source, random_model, randomise
+
+from spelgen.settings import load_settings
+
+STATES = 25
+
+
+def states(n: int, count: int, seed: int = 0) -> list[torch.Tensor]:
+    """Random q, qd, qdd and tau."""
+    generator = torch.Generator().manual_seed(seed)
+    return [2 * torch.randn(count, n, dtype=torch.float64, generator=generator) for _ in range(4)]
+
+
+@pytest.mark.parametrize("robot", SIX)
+def test_true_values_give_pinocchio(robot, tmp_path):
+    """With exact functions for networks: M, gravity, forward and inverse dynamics to 1e-10, on Pinocchio's own reading of the URDF."""
+    model = exact_model(robot, tmp_path)
+    reference = pin.buildModelFromUrdf(str(ROBOTS / f"{robot}.urdf"))
+    reference.gravity.linear = np.array(load_settings(ROBOTS / f"{robot}.urdf").gravity)
+    data = reference.createData()
+    q, qd, qdd, tau = states(model.n, STATES)
+    with torch.no_grad():
+        ours = {
+            "mass matrix": model.mass_matrix(q),
+            "gravity": model.gravity(q),
+            "forward dynamics": model.forward_dynamics(q, qd, tau),
+            "inverse dynamics": model.inverse_dynamics(q, qd, qdd),
+        }
+    theirs = {name: [] for name in ours}
+    for i in range(STATES):
+        at = [x[i].numpy() for x in (q, qd, qdd, tau)]
+        upper = np.triu(pin.crba(reference, data, at[0]))
+        theirs["mass matrix"].append(upper + np.triu(upper, 1).T)
+        theirs["gravity"].append(pin.computeGeneralizedGravity(reference, data, at[0]).copy())
+        theirs["forward dynamics"].append(pin.aba(reference, data, at[0], at[1], at[3]).copy())
+        theirs["inverse dynamics"].append(pin.rnea(reference, data, at[0], at[1], at[2]).copy())
+    for name, value in ours.items():
+        expected = np.array(theirs[name])
+        assert np.abs(value.numpy() - expected).max() < 1e-10 * max(1.0, np.abs(expected).max()), name
+
+
+@pytest.mark.parametrize("robot", SIX)
+def test_forward_and_inverse_dynamics_undo_each_other(robot, tmp_path):
+    model = random_model(robot, tmp_path, seed=3)
+    q, qd, _, tau = states(model.n, STATES)
+    back = model.inverse_dynamics(q, qd, model.forward_dynamics(q, qd, tau))
+    assert (back - tau).abs().max() < 1e-10 * tau.abs().max() * 100
+
+
+@pytest.mark.parametrize("deviation", [None, 1.0], ids=["asleep", "awake"])
+@pytest.mark.parametrize("robot", SIX)
+def test_written_out_derivatives_equal_autograd(robot, deviation, tmp_path):
+    """dV/dq, dH/dq and dM/dt, with the guard of M asleep and awake."""
+    model = frictionless(random_model(robot, tmp_path, seed=4, deviation=deviation))
+    n = model.n
+    q, qd, _, _ = states(n, STATES)
+    q.requires_grad_()
+    (gravity,) = torch.autograd.grad(model.potential_energy(q).sum(), q, allow_unused=True)
+    _near(model.gravity(q), torch.zeros_like(q) if gravity is None else gravity)
+    p = model.momentum(q, qd).detach()
+    (slope,) = torch.autograd.grad(model.hamiltonian(q, p).sum(), q)
+    rate = model.forward(torch.zeros(()), torch.cat([q, p], dim=-1))
+    _near(rate[..., n:], -slope)
+    _near(rate[..., :n], qd)
+    _, mass_rate = torch.func.jvp(model.mass_matrix, (q.detach(),), (qd,))
+    _, trace, guard = model._mass(q)
+    _near(model._mass_rate(qd, trace, guard), mass_rate)
+
+
+def _near(ours: torch.Tensor, reference: torch.Tensor) -> None:
+    assert (ours - reference).abs().max() < 1e-10 * max(1.0, reference.abs().max().item())
+
+
+@pytest.mark.parametrize("robot", SIX)
+def test_mass_matrix_is_positive_definite_for_any_weights(robot, tmp_path):
+    """10,000 random q for each of 100 draws of all weights, constants included, with standard deviation 30."""
+    model = random_model(robot, tmp_path, seed=0)
+    generator = torch.Generator().manual_seed(0)
+    lifted = 0
+    with torch.no_grad():
+        for draw in range(100):
+            randomise(model, seed=draw, deviation=30.0)
+            q = 8 * torch.rand(10_000, model.n, dtype=torch.float64, generator=generator) - 4
+            mass = model.mass_matrix(q)
+            assert torch.linalg.eigvalsh(mass)[:, 0].min() > 0
+            lifted += int((model._mass(q)[2] != 0).any())
+    assert lifted > 50, "the draws were to need the guard"
+
+
+@pytest.mark.parametrize("robot", SIX)
+def test_guard_keeps_zeros_and_relations_and_sleeps_at_nominal_values(robot, tmp_path):
+    model = random_model(robot, tmp_path, seed=1, deviation=3.0)
+    structure = built(robot)[1]
+    q = states(model.n, 200)[0]
+    mass = model.mass_matrix(q).detach()
+    for entry in structure.entries:
+        if entry.kind == "zero":
+            assert (mass[:, entry.row, entry.column] == 0).all()
+    basis = torch.cat([model.constant_basis, model.output_basis])
+    residual = mass.flatten(1) - mass.flatten(1) @ torch.linalg.pinv(basis) @ basis
+    assert residual.abs().max() < 1e-9 * mass.abs().max()
+    nominal = exact_model(robot, tmp_path)
+    assert (nominal._mass(q)[2] == 0).all()
+
+
+@pytest.mark.parametrize("robot", SIX)
+def test_outputs_read_their_own_joints_only(robot, tmp_path):
+    """Moving any other joint leaves an output's bits unchanged, and its own joints move it."""
+    model = random_model(robot, tmp_path, seed=2)
+    q = states(model.n, 50)[0]
+    before = model.mass_network(q)[0]
+    for joint in range(model.n):
+        moved = q.clone()
+        moved[:, joint] += 0.7
+        changed = (model.mass_network(moved)[0] != before).any(dim=0)
+        expected = [joint in output.joints for output in built(robot)[1].outputs]
+        assert changed.tolist() == expected
+
+
+@pytest.mark.parametrize("robot", ["two_link", "rpr", "ur10e"])
+def test_energy_stays_without_input_and_dissipation(robot, tmp_path):
+    """Random weights, rk4 with 1 ms over 10 s: relative drift of H below 1e-8."""
+    model = frictionless(random_model(robot, tmp_path, seed=0))
+    q, qd, _, _ = (0.25 * x for x in states(model.n, 4))
+    with torch.no_grad():
+        state = torch.cat([q, model.momentum(q, qd)], dim=-1)
+        start = model.hamiltonian(*state.chunk(2, dim=-1))
+        worst = torch.zeros_like(start)
+        for step in range(10_000):
+            state = _rk4(model, state, 1e-3)
+            if step % 100 == 99:
+                worst = torch.maximum(worst, (model.hamiltonian(*state.chunk(2, dim=-1)) - start).abs())
+        moved = (state[:, : model.n] - q).abs().max()
+    assert (worst / start.abs()).max() < 1e-8
+    assert moved > 0.5, "the arm was to move"
+
+
+def _rk4(model: torch.nn.Module, state: torch.Tensor, step: float) -> torch.Tensor:
+    time = torch.zeros(())
+    k1 = model(time, state)
+    k2 = model(time, state + step / 2 * k1)
+    k3 = model(time, state + step / 2 * k2)
+    k4 = model(time, state + step * k3)
+    return state + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+
+
+@pytest.mark.parametrize("robot", SIX)
+def test_friction_never_gives_energy(robot, tmp_path):
+    model = random_model(robot, tmp_path, seed=0, deviation=3.0)
+    q, qd, _, _ = states(model.n, 1000)
+    damping = torch.diagonal(model.dissipation(q, qd), dim1=-2, dim2=-1)
+    assert (damping >= 0).all()
+    assert (torch.linalg.eigvalsh(model.dissipation(q, qd)) >= 0).all()
+
+
+@pytest.mark.parametrize("batch", [(), (1,), (3,), (0,), (2, 3), (2, 0)])
+@pytest.mark.parametrize("robot", ["two_link", "rpr"])
+def test_any_batch_shape(robot, batch, tmp_path):
+    model = random_model(robot, tmp_path, seed=0)
+    n = model.n
+    q, qd, tau = (torch.rand(*batch, n, dtype=torch.float64) for _ in range(3))
+    shapes = {
+        (n,): [
+            model.gravity(q),
+            model.momentum(q, qd),
+            model.velocity(q, qd),
+            model.forward_dynamics(q, qd, tau),
+            model.inverse_dynamics(q, qd, tau),
+            model.from_group(model.to_group(q)),
+        ],
+        (n, n): [model.mass_matrix(q), model.dissipation(q, qd), model.input_matrix(q)],
+        (): [model.potential_energy(q), model.hamiltonian(q, qd)],
+        (2 * n,): [model(torch.zeros(()), torch.cat([q, qd], -1))],
+        (3 * n,): [model(torch.zeros(()), torch.cat([q, qd, tau], -1))],
+    }
+    for shape, values in shapes.items():
+        for value in values:
+            assert value.shape == (*batch, *shape)
+
+
+def test_group_view_round_trips_and_stays_orthogonal(tmp_path):
+    model = random_model("rpr", tmp_path, seed=0)
+    q = states(3, 100)[0]
+    q[:, [0, 2]] = (q[:, [0, 2]] + torch.pi) % (2 * torch.pi) - torch.pi
+    parts = model.to_group(q)
+    assert [tuple(part.shape[1:]) for part in parts] == [(3, 3), (3,), (3, 3)]
+    for rotation in (parts[0], parts[2]):
+        assert (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64)).abs().max() < 1e-15
+    assert torch.allclose(model.from_group(parts), q, atol=1e-14)
+
+
+def test_held_input_moves_the_momentum(tmp_path):
+    model = random_model("rpr", tmp_path, seed=0)
+    q, p, tau, _ = states(3, 5)
+    time = torch.zeros(())
+    passive = model(time, torch.cat([q, p], -1))
+    driven = model(time, torch.cat([q, p, tau], -1))
+    assert torch.equal(driven[:, 6:], torch.zeros_like(tau))
+    assert torch.allclose(driven[:, 3:6] - passive[:, 3:6], tau)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_backpropagation_reaches_every_parameter(dtype, tmp_path):
+    model = random_model("rpr", tmp_path, seed=0, deviation=0.5).to(dtype)
+    q, qd, _, tau = (x.to(dtype) for x in states(3, 10))
+    loss = model.forward_dynamics(q, qd, tau).pow(2).sum() + model.hamiltonian(q, qd).pow(2).sum()
+    loss.backward()
+    for name, parameter in model.named_parameters():
+        assert parameter.grad is not None, name
+        assert torch.isfinite(parameter.grad).all(), name
+        assert (parameter.grad != 0).any(), name
+
+
+def test_arm_with_a_constant_mass_matrix(tmp_path):
+    """A turning and a sliding joint on one axis: no output, two constants, still a whole model."""
+    urdf = tmp_path / "rp.urdf"
+    link = '<link name="{}"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+    joint = '<joint name="{}" type="{}"><parent link="{}"/><child link="{}"/><axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="9" velocity="1"/></joint>'
+    urdf.write_text(
+        '<robot name="rp">'
+        + "".join(link.format(name) for name in "abc")
+        + joint.format("turn", "revolute", "a", "b")
+        + joint.format("slide", "prismatic", "b", "c")
+        + "</robot>"
+    )
+    from spelgen.pipeline import build
+
+    model = import_source(build(urdf), tmp_path / "rp_spel.py").Model()
+    q, qd, qdd, tau = states(2, 20)
+    mass = model.mass_matrix(q)
+    assert torch.allclose(mass, torch.diag(torch.tensor([2.0, 1.0], dtype=torch.float64)).expand(20, 2, 2), rtol=1e-5)
+    assert torch.allclose(model.gravity(q)[:, 0], torch.zeros(20, dtype=torch.float64))
+    assert torch.allclose(model.inverse_dynamics(q, qd, model.forward_dynamics(q, qd, tau)), tau)
+
+
+def test_module_needs_torch_alone(tmp_path):
+    """It runs in a process that can import neither spelgen nor what spelgen needs."""
+    path = tmp_path / "panda_spel.py"
+    path.write_text(built("panda")[0])
+    program = (
+        "import sys\n"
+        "for name in ('spelgen', 'numpy', 'scipy', 'sympy', 'flint', 'pinocchio', 'lxml', 'yaml', 'jinja2'):\n"
+        "    sys.modules[name] = None\n"
+        "import torch, panda_spel\n"
+        "m = panda_spel.Model()\n"
+        "q = torch.ones(7, dtype=torch.float64)\n"
+        "print(m.forward_dynamics(q, q, q).shape)\n"
+    )
+    run = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert run.stdout.strip() == "torch.Size([7])", run.stderr
