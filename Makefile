@@ -33,7 +33,7 @@ check: $(STAMP) ## format, lint, types, import direction, golden files, examples
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest -q tests/test_imports.py tests/test_golden.py tests/test_docs.py
+	$(BIN)/python -m pytest -q tests/test_imports.py tests/test_docs.py tests/test_emit.py::test_golden_text
 
 format: $(STAMP) ## format the code and sort the imports
 	$(BIN)/ruff check --fix .
@@ -43,7 +43,7 @@ bench: $(STAMP) ## run every benchmark of tests/bench
 	@for script in tests/bench/*.py; do echo "== $$script"; $(BIN)/python $$script || exit 1; done
 
 golden: $(STAMP) ## rewrite the golden files after an intended change; read the diff before committing
-	$(BIN)/python -m pytest -q tests/test_golden.py --update-golden
+	$(BIN)/python -m pytest -q tests/test_emit.py::test_golden_text --update
 
 lock: ## write requirements.txt anew: the newest versions that the ranges of pyproject.toml admit
 	rm -rf .lock-venv

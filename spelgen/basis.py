@@ -98,20 +98,16 @@ def _constants(
 
 def _readings(spans: Spans) -> Iterator[_Reading]:
     """Independent read-outs that together fix every change of M."""
-    coordinates = field.pivots(spans.varying)  # an element of U is known by its values there
-    changes = [basis[:, coordinates] for basis in spans.change_bases]
-    chosen = np.zeros((0, len(coordinates)), dtype=np.uint64)
+    chosen = field.Independent(len(spans.varying))
     for joints in _joint_sets(spans):
-        outside = np.concatenate([changes[k] for k in range(spans.n) if k not in joints] or [chosen[:0]])
-        if field.rank(outside) == len(coordinates):
-            continue
-        target = field.rank(np.concatenate([chosen, field.null_space(outside)]))
-        for weights, values in _candidates(spans, joints):
-            if len(chosen) == target:
-                break
-            grown = np.concatenate([chosen, field.product(weights[None], spans.varying.T)])
-            if field.rank(grown) > len(chosen):
-                chosen = grown
+        kernel = field.null_space(spans.outside(joints))
+        missing = field.rank(np.concatenate([chosen.rows, kernel])) - len(chosen.rows) if len(kernel) else 0
+        candidates = _candidates(spans, joints)
+        while missing:
+            weights, values = next(candidates)
+            support = np.flatnonzero(weights)
+            if chosen.add(field.product(spans.varying[:, support], weights[support, None])[:, 0]):
+                missing -= 1
                 yield _Reading(tuple(sorted(joints)), weights, values)
 
 
@@ -133,18 +129,16 @@ def _candidates(spans: Spans, joints: frozenset[int]) -> Iterator[tuple[np.ndarr
         if spans.entry_joints[index] and spans.entry_joints[index] <= joints:
             yield _single(spans, index)
     outside = frozenset(range(spans.n)) - joints
-    rows = field.row_basis(np.concatenate([spans.change_bases[k] for k in sorted(outside)]))
     # what depends on much is eliminated first, so that the sums keep to simple entries
     order = sorted(range(len(spans.keys)), key=lambda index: (-len(spans.entry_joints[index]), index))
-    kernel = np.zeros((0, len(spans.keys)), dtype=np.uint64)
-    reduced = field.null_space(rows[:, order])
+    rows = field.row_basis(np.concatenate([spans.change_bases[k] for k in sorted(outside)])[:, order])
+    bound = [order[pivot] for pivot in field.pivots(rows)]
+    reduced = field.null_space(rows)
     kernel = np.zeros_like(reduced)
     kernel[:, order] = reduced
-    bound = [order[pivot] for pivot in field.pivots(field.row_basis(rows[:, order]))]
     samples = spans.float_changes(outside)
     for row in sorted(kernel, key=np.count_nonzero):
-        support = np.flatnonzero(row)
-        (free,) = set(support) - set(bound)
+        (free,) = set(np.flatnonzero(row)) - set(bound)
         values = np.zeros(len(row))
         values[free] = 1.0
         values[bound] = -_solved(samples[:, bound], samples[:, [free]])[:, 0]
@@ -158,8 +152,11 @@ def _single(spans: Spans, index: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _solved(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Least-squares solution X of left X = right."""
-    return np.linalg.lstsq(left, right, rcond=None)[0]
+    """Least-squares solution X of left X = right, both tall."""
+    width = left.shape[1]
+    # the triangular factor holds all there is to know, and is small
+    factor = np.linalg.qr(np.concatenate([left, right], axis=1), mode="r")
+    return np.linalg.lstsq(factor[:, :width], factor[:, width:], rcond=None)[0]
 
 
 def _weights(spans: Spans, exact: np.ndarray, values: np.ndarray) -> Weights:

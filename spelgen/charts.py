@@ -63,10 +63,10 @@ class Axis:
 
 def line_chart(
     lines: Sequence[Line],
-    *,
     title: str,
     x_label: str,
     y_label: str,
+    *,
     log: bool = False,
     marks: Sequence[tuple[float, str]] = (),
     width: int = 640,

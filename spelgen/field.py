@@ -7,7 +7,6 @@ odds of about 1e-16 a question, without a tolerance and without writing a polyno
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from fractions import Fraction
 
 import numpy as np
@@ -119,6 +118,28 @@ def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return _array(_matrix(a) * _matrix(b))
 
 
+class Independent:
+    """Independent vectors of length ``width``, gathered one by one; ``rows`` span them, reduced at their pivots."""
+
+    def __init__(self, width: int):
+        self.rows = np.zeros((0, width), dtype=np.uint64)
+        self._pivots: list[int] = []
+
+    def add(self, vector: np.ndarray) -> bool:
+        """Take ``vector`` in, unless it depends on those already there; whether it was."""
+        rest = vector
+        for row, pivot in zip(self.rows, self._pivots, strict=True):
+            if rest[pivot]:
+                rest = difference(rest, _product(row, rest[pivot]))
+        support = np.flatnonzero(rest)
+        if not len(support):
+            return False
+        scale = np.uint64(pow(int(rest[support[0]]), -1, PRIME))
+        self.rows = np.concatenate([self.rows, _product(rest, scale)[None]])
+        self._pivots.append(int(support[0]))
+        return True
+
+
 def inverse(square: np.ndarray) -> np.ndarray:
     """The inverse of a regular matrix in the field."""
     return _array(_matrix(square).inv()) if square.size else square
@@ -129,8 +150,7 @@ def _matrix(rows: np.ndarray) -> nmod_mat:
 
 
 def _array(matrix: nmod_mat) -> np.ndarray:
-    entries: Sequence[int] = [int(x) for x in matrix.entries()]
-    return np.array(entries, dtype=np.uint64).reshape(matrix.nrows(), matrix.ncols())
+    return np.array(list(map(int, matrix.entries())), dtype=np.uint64).reshape(matrix.nrows(), matrix.ncols())
 
 
 def _values(other: Residues | int) -> np.ndarray | np.uint64:

@@ -29,9 +29,9 @@ def loss_chart(metrics: Sequence[Mapping[str, Any]], best_epoch: int) -> Markup:
         Line("training loss", epochs, [record["loss"] for record in metrics], "train"),
         Line("validation loss", epochs, [record["validation"] for record in metrics], "model"),
     ]
-    marks = [(best_epoch, "best")]
-    labels = {"title": "Loss by epoch", "x_label": "epoch", "y_label": "loss"}
-    return line_chart(lines, **labels, log=True, marks=marks, width=860)
+    return line_chart(
+        lines, "Loss by epoch", "epoch", "loss", log=True, marks=[(best_epoch, "best")], width=860
+    )
 
 
 def joint_charts(example: Mapping[str, Any], joint_types: Mapping[str, str]) -> list[JointCharts]:
@@ -54,5 +54,4 @@ def _against_time(joint: Mapping[str, Any], what: str, unit: str, t: Sequence[fl
         Line("predicted", t, joint[f"{what}_pred"], "predicted"),
     ]
     name = QUANTITIES[what]
-    labels = {"title": f"{name} of {joint['name']}", "x_label": "t [s]", "y_label": f"{name} [{unit}]"}
-    return line_chart(lines, **labels, width=330, height=190)
+    return line_chart(lines, f"{name} of {joint['name']}", "t [s]", f"{name} [{unit}]", width=330, height=190)

@@ -151,7 +151,7 @@ def _training(config: Mapping[str, Any], metrics: Sequence[Mapping[str, Any]]) -
     kept = f"epoch {best_epoch}" if best_epoch else "the start: no epoch was better"
     facts = {
         "data": f"{config['training_windows']:,} windows from {_many(config['training'])}",
-        "validation": f"{config['validation_windows']:,} windows from {_many(config['validation'])} set aside",
+        "validation": f"{config['validation_windows']:,} windows from {_many(config['validation'])} held out",
         "filter": f"{config['cutoff']:g} Hz, zero phase" if config["cutoff"] else "none",
         "length": f"{last['epoch']} epochs, {last['step']:,} steps, {_duration(last['seconds'])}",
         "kept": f"the model of {kept}, validation loss {number(best)}",

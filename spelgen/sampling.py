@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from spelgen.arm import Arm
-from spelgen.field import PRIME, Residues, random_circle_points, random_residues, residue
+from spelgen.field import PRIME, Residues, difference, random_circle_points, random_residues, residue
 from spelgen.recursion import Element, Motion, energies, triangle
 
 Assume = Literal["kinematics", "inertials"]
@@ -81,11 +81,10 @@ def regressor_rows(arm: Arm, points: int, seed: int = 1) -> np.ndarray:
     unit = np.tile(np.eye(parameters, dtype=np.uint64), (1, points))
     inertias = [[Residues(unit[10 * body + i]) for i in range(10)] for body in range(len(arm.bodies))]
     result = energies(arm, motions(arm, positions, residue), inertias, residue)
-    shape = (points, parameters)
-    rows = [_residue_values(result.mass[key], points * parameters).reshape(shape) for key in triangle(n)]
-    potential = _residue_values(result.potential, points * parameters).reshape(shape)
-    rows.append((potential + (np.uint64(PRIME) - potential[:1])) % np.uint64(PRIME))
-    return np.concatenate(rows)
+    elements = [result.mass[key] for key in triangle(n)] + [result.potential]
+    rows = np.stack([_residue_values(e, points * parameters).reshape(points, parameters) for e in elements], axis=1)
+    rows[:, -1] = difference(rows[:, -1], rows[0, -1])
+    return rows.reshape(-1, parameters)
 
 
 def float_samples(arm: Arm, assume: Assume, samples: int, seed: int = 2) -> Samples:

@@ -21,7 +21,6 @@ from spelgen.settings import JointSettings, Settings
 
 RTOL, ATOL = 1e-13, 1e-15
 LOOSER = 10.0  # tolerances of the second integration, which the first is compared with
-WIDTHS_PER_STEP = 1.0  # of the friction's jump, in velocity
 
 
 @dataclass(frozen=True)
@@ -141,13 +140,13 @@ def rollout(
 def _finish(solver: DOP853, widths: np.ndarray) -> None:
     """Carry a solver of (q, qd) to the end of its interval.
 
-    No step may change a velocity by much more than the width (n,) of its joint's friction jump: friction is
-    flat beyond it, and the error control would not see a reversal between the stages of a long step.
+    No step may change a velocity by much more than half of it, or than the width (n,) of its joint's friction
+    jump: friction is flat beyond it, and the error control would not see a reversal between a step's stages.
     """
-    failure = None
+    n, failure = widths.size, None
     while solver.status == "running" and failure is None:
-        rate = np.max(np.abs(solver.f[widths.size :]) / widths)
-        solver.max_step = WIDTHS_PER_STEP / rate if rate > 0 else np.inf
+        rate = np.max(np.abs(solver.f[n:]) / np.maximum(widths, 0.5 * np.abs(solver.y[n:])))
+        solver.max_step = 1.0 / rate if rate > 0 else np.inf
         # the step-size control would never come back from a nan
         failure = solver.step() if np.isfinite(solver.f).all() else "an acceleration is not finite"
     if failure is not None:

@@ -59,3 +59,31 @@ class Spans:
         """Rows that span the changes made by ``joints``, in double precision."""
         base = self.floats.mass[0]
         return np.concatenate([self.floats.mass[k + 1] - base for k in sorted(joints)] or [base[:0]])
+
+    def outside(self, joints: frozenset[int]) -> np.ndarray:
+        """Rows that span the changes made by joints outside ``joints``, as coordinates in the basis of U."""
+        first, last = min(joints), max(joints)
+        between = [self._coordinates[k] for k in range(first, last) if k not in joints]
+        return np.concatenate([self._before[first], *between, self._after[last]])
+
+    @cached_property
+    def _coordinates(self) -> list[np.ndarray]:
+        # the basis of U is an echelon form, so an element of U is known by its values at the pivots
+        pivots = field.pivots(self.varying)
+        return [basis[:, pivots] for basis in self.change_bases]
+
+    @cached_property
+    def _before(self) -> list[np.ndarray]:
+        """By joint, a basis of the changes made by the joints before it."""
+        bases = [self._coordinates[0][:0]]
+        for rows in self._coordinates[:-1]:
+            bases.append(field.row_basis(np.concatenate([bases[-1], rows])))
+        return bases
+
+    @cached_property
+    def _after(self) -> list[np.ndarray]:
+        """By joint, a basis of the changes made by the joints after it."""
+        bases = [self._coordinates[0][:0]]
+        for rows in reversed(self._coordinates[1:]):
+            bases.insert(0, field.row_basis(np.concatenate([bases[0], rows])))
+        return bases

@@ -75,14 +75,14 @@ def derive(arm: Arm, assume: Assume = "kinematics") -> Structure:
 
 def base_parameters(arm: Arm) -> int:
     """Rank of the inverse-dynamics regressor: how many combinations of inertial parameters move the arm differently."""
-    points, previous = 4, -1
+    points = 4
     while True:
-        rows = regressor_rows(arm, points)
+        rows = regressor_rows(arm, points + 2)
         found = field.rank(rows)
-        # the rows of one fresh point would have raised an unfinished rank, all but surely
-        if found == previous:
+        # the rows of the last points would have raised an unfinished rank, all but surely
+        if field.rank(rows[: len(rows) * points // (points + 2)]) == found:
             return found
-        previous, points = found, points + max(1, points // 2)
+        points *= 2
 
 
 def _entry(spans: Spans, index: int) -> Entry:

@@ -126,9 +126,8 @@ def _read_origin(notes: Notes, element: etree._Element, where: str) -> tuple[Vec
     origin = first_child(notes, element, "origin", where)
     if origin is None:
         return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    return read_triple(notes, origin, "xyz", f"{where} origin"), read_triple(
-        notes, origin, "rpy", f"{where} origin"
-    )
+    xyz, rpy = (read_triple(notes, origin, key, f"{where} origin") for key in ("xyz", "rpy"))
+    return xyz, rpy
 
 
 def _read_axis(notes: Notes, element: etree._Element, kind: str | None, where: str) -> Vector:
@@ -192,10 +191,7 @@ def _read_mimic(notes: Notes, element: etree._Element, where: str) -> Mimic | No
     if not joint:
         notes.error(mimic.sourceline, where, "no joint", 'joint="..." naming the joint to follow')
         return None
-    multiplier, offset = (
-        read_number(notes, mimic, "multiplier", where),
-        read_number(notes, mimic, "offset", where),
-    )
+    multiplier, offset = (read_number(notes, mimic, key, where) for key in ("multiplier", "offset"))
     return Mimic(joint, 1.0 if multiplier is None else multiplier, 0.0 if offset is None else offset)
 
 

@@ -104,7 +104,8 @@ def run(robots, tmp_path) -> Path:
     (folder / "config.json").write_text(json.dumps(config))
     lines = [
         {"epoch": k, "step": 20 * k, "loss": 2.0 * 0.8**k, "validation": validation(k),
-         "best": min(map(validation, range(1, k + 1))), "rate": 1e-3, "substeps": 4, "rollbacks": 0, "seconds": 2.5 * k}
+         "best": min(map(validation, range(1, k + 1))), "rate": 1e-3, "substeps": 4, "rollbacks": 0,
+         "seconds": 2.5 * k}
         for k in range(1, 31)
     ]  # fmt: skip
     (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))

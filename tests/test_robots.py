@@ -193,7 +193,7 @@ def along(axis, distance):
 
 
 def dh_frames(robot, q):
-    """Base and link frames; the standard convention has the link after its joint, the modified one before it."""
+    """Base and link frames; in the standard convention the link follows its joint, in the modified one not."""
     frames = [np.eye(4)]
     for (a, alpha, d, theta, prismatic), value in zip(STANDARD.get(robot) or MODIFIED[robot], q, strict=True):
         link = along(0, a) @ about(0, alpha)

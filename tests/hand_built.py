@@ -1,0 +1,48 @@
+"""Arms of one or two bodies, small enough to do their mechanics by hand."""
+
+from fractions import Fraction
+
+from spelgen.arm import Arm, Body, Coordinate
+
+UPRIGHT = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+SIDEWAYS = ((0, 0, 1), (1, 0, 0), (0, 1, 0))  # the joint's z along the parent's x
+
+
+def coordinate(name="a", kind="revolute", **changes):
+    """A joint with limits of +-1 and no friction."""
+    known = {"lower": -1.0, "upper": 1.0, "effort": 10.0, "velocity": 10.0, "damping": 0.0, "friction": 0.0}
+    return Coordinate(name=name, kind=kind, **({"continuous": False, "passive": False} | known | changes))
+
+
+def body(name="a", kind="revolute", **changes):
+    """A point of mass 1 in the origin of its joint, on the root."""
+    known = {
+        "parent": -1,
+        "coordinate": 0,
+        "multiplier": Fraction(1),
+        "offset": 0.0,
+        "rotation": UPRIGHT,
+        "translation": (0, 0, 0),
+        "inertia": point(1),
+    }
+    return Body(name=name, kind=kind, **(known | changes))
+
+
+def point(mass, x=0.0):
+    """The ten inertial parameters of a point mass on the x axis."""
+    return (mass, mass * x, 0, 0, 0, 0, 0, mass * x * x, 0, mass * x * x)
+
+
+def arm(coordinates, bodies, gravity=(0, 0, 0)):
+    return Arm("hand_built", tuple(coordinates), tuple(bodies), gravity, diagnostics=(), locked=())
+
+
+def slider(mass=2.0, **changes):
+    """A mass on a rail, without gravity."""
+    rail = body(kind="prismatic", rotation=SIDEWAYS, inertia=point(mass))
+    return arm([coordinate(kind="prismatic", **changes)], [rail])
+
+
+def pendulum(mass=1.5, length=0.7):
+    """A point mass on a rod, at angle q from the horizontal."""
+    return arm([coordinate(continuous=True)], [body(inertia=point(mass, length))], gravity=(0, -9.81, 0))
