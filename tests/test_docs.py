@@ -1,7 +1,7 @@
-"""What the docs show is what happens: every console block is run and compared, every Python block executed.
+"""What the docs show is what happens: on every page, console and Python blocks run in their order.
 
-In a ```console block a line `$ COMMAND` is followed by what it prints. ```text blocks and indented ones are not run: they
-show long runs, or are no commands.
+In a ```console block a line `$ COMMAND` is followed by what it prints; `pytest --update` writes that anew. ```text
+blocks and indented ones are not run: they show long runs, or no commands.
 """
 
 import contextlib
@@ -16,45 +16,47 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")])
-
-
-def blocks(page: Path, language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```$", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
-    """Where the examples run: a folder with the project's robots in it."""
-    path = tmp_path_factory.mktemp("docs")
-    shutil.copytree(ROOT / "robots", path / "robots")
-    return path
+BLOCK = re.compile(r"^```(console|python)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_console_examples(page, folder):
-    for block in blocks(page, "console"):
-        for example in re.split(r"^\$ ", block, flags=re.MULTILINE)[1:]:
-            command, _, expected = example.partition("\n")
-            program, *arguments = shlex.split(command)
-            assert program == "spelgen", f"only spelgen is run here: {command}"
-            done = subprocess.run(
-                [sys.executable, "-m", "spelgen", *arguments],
-                cwd=folder, env={"PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-                check=False,
-            )  # fmt: skip
-            assert done.stdout.strip() == expected.strip(), command
+def test_examples(page, tmp_path, monkeypatch, request):
+    shutil.copytree(ROOT / "robots", tmp_path / "robots")
+    monkeypatch.syspath_prepend(tmp_path)
+    text, names = page.read_text(encoding="utf-8"), {"__name__": "example"}
+    happened = text
+    for language, block in BLOCK.findall(text):
+        if language == "console":
+            happened = happened.replace(block, run_commands(block, tmp_path))
+        else:
+            with contextlib.chdir(tmp_path):
+                exec(compile(block, str(page), "exec"), names)
+    if request.config.getoption("--update"):
+        page.write_text(happened, encoding="utf-8")
+    else:
+        assert text == happened
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_python_examples(page, folder):
-    names = {"__name__": "example"}
-    with contextlib.chdir(folder):
-        for block in blocks(page, "python"):
-            exec(compile(block, str(page), "exec"), names)
+def run_commands(block: str, folder: Path) -> str:
+    """The block as it should be: each command with what it prints."""
+    told = []
+    for command in re.findall(r"^\$ (.*)$", block, re.MULTILINE):
+        program, *arguments = shlex.split(command)
+        assert program == "spelgen", f"only spelgen is run here, not: {command}"
+        done = subprocess.run(
+            [sys.executable, "-m", "spelgen", *arguments],
+            cwd=folder,
+            env={"PYTHONPATH": str(ROOT)},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            check=False,
+        )
+        told.append(f"$ {command}\n{done.stdout}")
+    return "\n".join(told)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_lead_somewhere(page):
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text(encoding="utf-8")):
-        if not target.startswith("http"):
-            assert (page.parent / target).exists(), target
+        assert target.startswith("http") or (page.parent / target).exists(), target

@@ -10,8 +10,8 @@ PACKAGE = Path(__file__).parents[1] / "spelgen"
 # A file may import only from files above it, or to its left.
 ROWS = [
     "errors files labels rendering yaml_document settings",
-    "robot urdf_document urdf_elements lint urdf",
-    "rational snapping placement chain arm",
+    "robot urdf_document urdf_values urdf_elements lint urdf",
+    "rational snapping placement chain walk arm",
     "recursion field sampling spans basis symbolic structure nominal",
     "spec plan emit",
     "logs signals windows engine simulate",

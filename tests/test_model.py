@@ -92,7 +92,7 @@ def test_mass_matrix_is_positive_definite_for_any_weights(robot, tmp_path):
             q = 8 * torch.rand(10_000, model.n, dtype=torch.float64, generator=generator) - 4
             mass = model.mass_matrix(q)
             assert torch.linalg.eigvalsh(mass)[:, 0].min() > 0
-            lifted += int((model._mass(q)[2] != 0).any())
+            lifted += model._mass(q)[2] is not None
     assert lifted > 50, "the draws were to need the guard"
 
 
@@ -109,7 +109,7 @@ def test_guard_keeps_zeros_and_relations_and_sleeps_at_nominal_values(robot, tmp
     residual = mass.flatten(1) - mass.flatten(1) @ torch.linalg.pinv(basis) @ basis
     assert residual.abs().max() < 1e-9 * mass.abs().max()
     nominal = exact_model(robot, tmp_path)
-    assert (nominal._mass(q)[2] == 0).all()
+    assert nominal._mass(q)[2] is None
 
 
 @pytest.mark.parametrize("robot", SIX)

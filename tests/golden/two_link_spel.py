@@ -234,22 +234,21 @@ class Friction(nn.Module):
         shape = (joints, inputs, FRICTION_HIDDEN)
         weight = torch.randn(shape, dtype=torch.float64, generator=generator)
         self.weight = nn.Parameter(weight / inputs**0.5)
-        self.bias = nn.Parameter(torch.zeros(joints, 1, FRICTION_HIDDEN, dtype=torch.float64))
-        self.out = nn.Parameter(torch.zeros(joints, FRICTION_HIDDEN, 1, dtype=torch.float64))
+        self.bias = nn.Parameter(torch.zeros(joints, FRICTION_HIDDEN, dtype=torch.float64))
+        self.out = nn.Parameter(torch.zeros(joints, FRICTION_HIDDEN, dtype=torch.float64))
         self.offset = nn.Parameter(torch.full((joints,), -2.0, dtype=torch.float64))
 
     def forward(self, q: Tensor, qd: Tensor) -> Tensor:
         """d, (..., n) [Nm s/rad, N s/m]: joint i is slowed by d_i qd_i."""
-        slow = SLOW * self.speed
-        direction = qd / torch.sqrt(qd * qd + slow * slow)
+        smooth_speed = torch.sqrt(qd * qd + (SLOW * self.speed) ** 2)
         place = (q - self.center) / self.reach
         first = torch.where(self.revolute, q.cos(), place)
         second = torch.where(self.revolute, q.sin(), place)
-        inputs = torch.stack([first, second, qd / self.speed, direction], dim=-1)
-        hidden = torch.tanh(inputs.unsqueeze(-2) @ self.weight + self.bias)  # (..., n, 1, hidden)
-        dry = F.softplus((hidden @ self.out).squeeze(-1).squeeze(-1) + self.offset)
-        viscous = F.softplus(self.viscous)
-        return self.size * (viscous / self.speed + dry / torch.sqrt(qd * qd + slow * slow))
+        inputs = torch.stack([first, second, qd / self.speed, qd / smooth_speed], dim=-1)
+        # joints are few and their networks small: sums of products beat batched matrix products
+        hidden = torch.tanh((inputs.unsqueeze(-1) * self.weight).sum(dim=-2) + self.bias)
+        dry = F.softplus((hidden * self.out).sum(dim=-1) + self.offset)
+        return self.size * (F.softplus(self.viscous) / self.speed + dry / smooth_speed)
 
 
 class Model(nn.Module):
@@ -273,6 +272,7 @@ class Model(nn.Module):
     output_basis: Tensor
     mean_mass: Tensor
     whitening: Tensor
+    whitening_rows: Tensor  # takes M, as a row, to its eigenproblem relative to its mean
     actuated: Tensor
 
     def __init__(self, seed: int = 0) -> None:
@@ -288,6 +288,7 @@ class Model(nn.Module):
         mean = start @ self.constant_basis + self.output_mean @ self.output_basis
         self.register_buffer("mean_mass", self._square(mean))
         self.register_buffer("whitening", torch.linalg.inv(torch.linalg.cholesky(self.mean_mass)))
+        self.register_buffer("whitening_rows", torch.kron(self.whitening, self.whitening).mT)
         hidden = tuple(frozenset(joints) for joints, units in MASS_HIDDEN for _ in range(units))
         outputs = tuple(frozenset(output.joints) for output in OUTPUTS)
         read = tuple(sorted(frozenset().union(*outputs)))
@@ -308,27 +309,31 @@ class Model(nn.Module):
         """M(q), (..., n, n) [kg m^2, kg m, kg]."""
         return self._mass(q)[0]
 
-    def _mass(self, q: Tensor) -> tuple[Tensor, Trace, Tensor]:
-        """M(q), the network's trace, and the guard's slope dl/dM, (..., n, n)."""
+    def _mass(self, q: Tensor) -> tuple[Tensor, Trace, Tensor | None]:
+        """M(q), the network's trace and, where the guard is awake, its slope dl/dM, (..., n, n)."""
         y, trace = self.mass_network(q)
         outputs = self.output_mean + self.output_scale * y
         constants = (self.constant_scale * self.constants) @ self.constant_basis
-        mass = self._square(constants + outputs @ self.output_basis)
-        lift, slope = self._lift(mass)
-        return mass + lift[..., None, None] * self.mean_mass, trace, slope
+        rows = constants + outputs @ self.output_basis
+        relative = self._square(rows @ self.whitening_rows)
+        if self._sound(relative):
+            return self._square(rows), trace, None
+        lift, slope = self._lift(relative)
+        return self._square(rows) + lift[..., None, None] * self.mean_mass, trace, slope
 
-    def _lift(self, mass: Tensor) -> tuple[Tensor, Tensor]:
+    def _sound(self, relative: Tensor) -> bool:
+        """Whether no eigenvalue of these matrices, (..., n, n), is below GUARD."""
+        least = GUARD * torch.eye(self.n, dtype=relative.dtype, device=relative.device)
+        return not torch.linalg.cholesky_ex(relative.detach() - least).info.any()
+
+    def _lift(self, relative: Tensor) -> tuple[Tensor, Tensor]:
         """l >= 0 that makes M + l M_mean positive definite, (...), and dl/dM, (..., n, n).
 
-        With e_i the eigenvalues of M relative to M_mean and u_i = max(0, 1 - e_i / GUARD),
+        With e_i the eigenvalues of M relative to M_mean, and u_i = max(0, 1 - e_i / GUARD),
         l = GUARD sum_i u_i^5 / (1 + u_i^4). So every e_i + l stays above 0.43 GUARD, l is four
         times differentiable, and l = 0 where all e_i exceed GUARD. M_mean has M's own zeros and
         relations, which therefore hold in the sum.
         """
-        relative = self.whitening @ mass @ self.whitening.mT
-        least = GUARD * torch.eye(self.n, dtype=mass.dtype, device=mass.device)
-        if not torch.linalg.cholesky_ex(relative.detach() - least).info.any():
-            return mass.new_zeros(mass.shape[:-2]), torch.zeros_like(mass)
         values, vectors = torch.linalg.eigh(relative)
         u = F.relu(1 - values / GUARD)
         u4 = u**4
@@ -336,18 +341,21 @@ class Model(nn.Module):
         slope = self.whitening.mT @ (vectors * slopes.unsqueeze(-2)) @ vectors.mT @ self.whitening
         return GUARD * (u * (u4 / (1 + u4))).sum(dim=-1), slope
 
-    def _half_square_gradient(self, qd: Tensor, trace: Trace, slope: Tensor) -> Tensor:
+    def _half_square_gradient(self, qd: Tensor, trace: Trace, slope: Tensor | None) -> Tensor:
         """d/dq of 1/2 qd^T M(q) qd, (..., n)."""
-        square = qd.unsqueeze(-1) * qd.unsqueeze(-2)
-        weight = square + ((square * self.mean_mass).sum(dim=(-2, -1)))[..., None, None] * slope
+        weight = qd.unsqueeze(-1) * qd.unsqueeze(-2)
+        if slope is not None:
+            weight = weight + (weight * self.mean_mass).sum(dim=(-2, -1))[..., None, None] * slope
         cotangent = 0.5 * self.output_scale * (weight.flatten(-2) @ self.output_basis.mT)
         return self.mass_network.pull(trace, cotangent)
 
-    def _mass_rate(self, qd: Tensor, trace: Trace, slope: Tensor) -> Tensor:
+    def _mass_rate(self, qd: Tensor, trace: Trace, slope: Tensor | None) -> Tensor:
         """dM/dt along qd, (..., n, n)."""
         rates = self.output_scale * self.mass_network.push(trace, qd)
         rate = self._square(rates @ self.output_basis)
-        return rate + ((slope * rate).sum(dim=(-2, -1)))[..., None, None] * self.mean_mass
+        if slope is not None:
+            rate = rate + (slope * rate).sum(dim=(-2, -1))[..., None, None] * self.mean_mass
+        return rate
 
     def potential_energy(self, q: Tensor) -> Tensor:
         """V(q), (...) [J]."""
