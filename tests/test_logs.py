@@ -1,0 +1,300 @@
+"""Logs: read back exactly, refused clearly, filtered without delay, split without leaking, cut without crossing gaps."""
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet
+import pytest
+import torch
+
+from spelgen.errors import LogError, SpelgenErrors
+from spelgen.logs import Trajectory, read_logs, write_logs
+from spelgen.signals import automatic_cutoff, automatic_spacing, examine, low_pass, prepare, rate, split_at_gaps
+from spelgen.windows import cut_windows, split_validation
+
+JOINTS = ("a", "b")
+
+
+def swing(name="swing", samples=200, dt=0.01, jitter=0.0, seed=0) -> Trajectory:
+    """Two joints that swing at 0.5 and 0.8 Hz, under a made-up torque."""
+    random = np.random.default_rng(seed)
+    t = np.concatenate([[0.0], np.cumsum(dt * (1 + jitter * random.uniform(-1, 1, samples - 1)))])
+    frequency = 2 * np.pi * np.array([0.5, 0.8])
+    phase = t[:, None] * frequency
+    return Trajectory(name, t, np.sin(phase), frequency * np.cos(phase), 3.0 * np.cos(phase))
+
+
+def csv(path: Path, text: str) -> Path:
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+HEADER = "t,q_a,qd_a,tau_a\n"
+
+
+@pytest.mark.parametrize("suffix", [".parquet", ".csv"])
+def test_what_is_written_is_read_back_exactly(tmp_path, suffix):
+    first, second = swing("first", jitter=0.3), swing("second", samples=7, seed=1)
+    write_logs(tmp_path / f"logs{suffix}", [first, second], JOINTS)
+    found = read_logs([tmp_path / f"logs{suffix}"], JOINTS)
+    assert [x.name for x in found] == ["first", "second"]
+    for written, read in zip([first, second], found, strict=True):
+        for quantity in ("t", "q", "qd", "tau"):
+            np.testing.assert_array_equal(getattr(read, quantity), getattr(written, quantity))
+    assert [x.name for x in tmp_path.iterdir()] == [f"logs{suffix}"]
+
+
+def test_joints_are_read_by_name_in_the_order_asked(tmp_path):
+    write_logs(tmp_path / "x.parquet", [swing()], JOINTS)
+    (found,) = read_logs([tmp_path], ("b", "a"))
+    np.testing.assert_array_equal(found.q, swing().q[:, ::-1])
+
+
+def test_a_folder_gives_the_part_asked_for(tmp_path):
+    for name in ("train", "test"):
+        write_logs(tmp_path / f"{name}.parquet", [swing(name)], JOINTS)
+    assert [x.name for x in read_logs([tmp_path], JOINTS, role="train")] == ["train"]
+    assert [x.name for x in read_logs([tmp_path], JOINTS, role="test")] == ["test"]
+    assert [x.name for x in read_logs([tmp_path], JOINTS)] == ["test", "train"]
+
+
+def test_names_are_unique_across_files(tmp_path):
+    for name in ("monday", "tuesday"):
+        write_logs(tmp_path / f"{name}.parquet", [swing("0"), swing("1")], JOINTS)
+    names = [x.name for x in read_logs([tmp_path], JOINTS)]
+    assert names == ["monday/0", "monday/1", "tuesday/0", "tuesday/1"]
+
+
+BAD = {
+    "empty": ("", "{}: an unreadable csv file (Empty CSV file)"),
+    "header-only": (HEADER, "{}: got no rows, expected at least one window of samples"),
+    "missing-column": (
+        "t,q_a,qd_a,torque_a\n0,0,0,0\n",
+        "{}: missing column tau_a: got only the columns t, q_a, qd_a, torque_a, "
+        "expected t, q_<joint>, qd_<joint>, tau_<joint>; rename the column 'torque_a' to 'tau_a'?",
+    ),
+    "repeated-column": (
+        "t,q_a,q_a,qd_a,tau_a\n0,0,0,0,0\n",
+        "{}: column q_a: got the same column twice, expected it once",
+    ),
+    "text": (
+        HEADER + "0,zero,0,0\n",
+        "{}: column q_a: got values of type string, expected numbers",
+    ),
+    "hole": (
+        HEADER + "0,0,0,0\n0.1,0,,0\n0.2,0,0,nan\n",
+        "{}:3: row 2, column qd_a: got no finite number (2 of 3 rows have such a gap, this is the first), "
+        "expected a number; remove those rows; a gap in t is understood",
+    ),
+    "time-back": (
+        HEADER + "0,0,0,0\n0.1,0,0,0\n0.1,0,0,0\n",
+        "{}:4: row 3, column t: got t = 0.1 s after 0.1 s (1 such steps, this is the first), "
+        "expected increasing times; sort the rows, drop repeats, or split recordings by a column 'trajectory'",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_csv_is_refused_in_one_sentence(tmp_path, case):
+    content, message = BAD[case]
+    path = csv(tmp_path / "log.csv", content)
+    with pytest.raises(LogError) as caught:
+        read_logs([path], ("a",))
+    assert str(caught.value) == message.format(path)
+
+
+def test_missing_files_and_folders_are_told_at_once(tmp_path):
+    (tmp_path / "empty").mkdir()
+    csv(tmp_path / "log.txt", "")
+    with pytest.raises(SpelgenErrors) as caught:
+        read_logs([tmp_path / "none.csv", tmp_path / "empty", tmp_path / "log.txt"], JOINTS)
+    assert str(caught.value).splitlines() == [
+        f"{tmp_path}/none.csv: got no such file or folder, expected a log; check the path",
+        f"{tmp_path}/empty: got a folder without such logs, expected *.parquet or *.csv",
+        f"{tmp_path}/log.txt: got a file of kind '.txt', expected .parquet or .csv",
+    ]
+
+
+def test_a_broken_parquet_file_is_told(tmp_path):
+    path = csv(tmp_path / "log.parquet", "not a Parquet file")
+    with pytest.raises(LogError, match=r"log\.parquet: an unreadable parquet file \("):
+        read_logs([path], JOINTS)
+
+
+def test_two_recordings_in_one_file_need_a_trajectory_column(tmp_path):
+    joined = Trajectory("joined", *(np.concatenate([getattr(swing(), x)] * 2) for x in ("t", "q", "qd", "tau")))
+    write_logs(tmp_path / "x.parquet", [joined], JOINTS)
+    with pytest.raises(LogError, match="row 201, column t: got t = 0 s after 1.99 s"):
+        read_logs([tmp_path], JOINTS)
+
+
+def scaled(trajectory: Trajectory, q=1.0, qd=1.0) -> Trajectory:
+    return Trajectory("x", trajectory.t, q * trajectory.q, qd * trajectory.qd, trajectory.tau)
+
+
+DEGREES = {
+    "q": (
+        scaled(swing(), q=180 / np.pi),
+        "trajectory x, joint 'a': got q that changes 57.3 times as fast as qd says (180/pi is 57.3), "
+        "expected radians and rad/s",
+    ),
+    "qd": (
+        scaled(swing(), qd=180 / np.pi),
+        "trajectory x, joint 'a': got qd that is 57.3 times as large as q changes (180/pi is 57.3), "
+        "expected radians and rad/s",
+    ),
+    "both": (
+        scaled(swing(), q=180 / np.pi, qd=180 / np.pi),
+        "trajectory x, joint 'a': got q from -57.3 to 57.3, more than two turns, expected radians and rad/s",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", DEGREES)
+def test_degrees_are_refused(case):
+    trajectory, message = DEGREES[case]
+    with pytest.raises(SpelgenErrors) as caught:
+        examine([trajectory], JOINTS, ("revolute", "revolute"))
+    advice = "; convert degrees; if the units are right, say so in the Parquet schema's metadata 'units'"
+    assert str(caught.value).splitlines()[0] == message + advice
+
+
+def test_many_turns_are_believed_where_the_units_are_declared(tmp_path):
+    spinning = scaled(swing(), q=180 / np.pi, qd=180 / np.pi)
+    write_logs(tmp_path / "declared.parquet", [spinning], JOINTS)
+    assert examine(read_logs([tmp_path], JOINTS), JOINTS, ("revolute", "revolute")) == []
+    table = pa.parquet.read_table(tmp_path / "declared.parquet").replace_schema_metadata(None)
+    pa.parquet.write_table(table, tmp_path / "declared.parquet")
+    with pytest.raises(SpelgenErrors, match="more than two turns"):
+        examine(read_logs([tmp_path], JOINTS), JOINTS, ("revolute", "revolute"))
+
+
+def test_a_velocity_that_is_no_derivative_is_a_warning():
+    (note,) = examine([scaled(swing(), qd=np.array([1.0, -1.0]))], JOINTS, ("revolute", "revolute"))
+    assert (note.severity, note.code, note.where) == (
+        "warning",
+        "velocity-is-no-derivative",
+        "trajectory x, joint 'b'",
+    )
+    assert note.message.startswith("qd is not dq/dt: the best factor is -1")
+
+
+def with_gap() -> Trajectory:
+    whole = swing(jitter=0.4)
+    t = whole.t + np.where(np.arange(200) >= 120, 0.5, 0.0)
+    return Trajectory("gap", t, whole.q, whole.qd, whole.tau)
+
+
+def test_gaps_split_and_are_said():
+    pieces = split_at_gaps(with_gap())
+    assert [len(x.t) for x in pieces] == [120, 80]
+    notes = examine([with_gap()], JOINTS, ("revolute", "revolute"))
+    assert [(x.code, x.message[:14]) for x in notes] == [("gap", "1 gaps in time")]
+
+
+def test_no_window_crosses_a_gap():
+    pieces = prepare([with_gap()], shortest=5, cutoff=None)
+    windows = cut_windows(pieces, 5, measured=False)
+    assert len(windows) == (120 - 4) + (80 - 4)
+    assert windows.dt.max() < 0.02
+
+
+def test_a_trajectory_without_a_whole_window_is_refused():
+    with pytest.raises(LogError) as caught:
+        prepare([with_gap()], shortest=121, cutoff=None)
+    assert str(caught.value) == (
+        "trajectory gap: got 120 samples without a gap, expected at least 121, one window; "
+        "record longer or train with a shorter window"
+    )
+
+
+def test_the_filter_has_no_delay_and_takes_out_noise():
+    clean = swing(samples=1000, jitter=0.3)
+    random = np.random.default_rng(1)
+    noisy = Trajectory(
+        "noisy", clean.t, *(x + 0.1 * random.standard_normal(x.shape) for x in (clean.q, clean.qd, clean.tau))
+    )
+    smooth = low_pass(noisy, 5.0)
+    np.testing.assert_array_equal(smooth.t, clean.t)
+    middle = slice(50, -50)  # the ends have neighbours on one side only
+    for quantity in ("q", "qd", "tau"):
+        error = getattr(smooth, quantity)[middle] - getattr(clean, quantity)[middle]
+        assert np.sqrt(np.mean(error**2)) < 0.045  # 0.1 sqrt(2 cutoff / rate) = 0.032; a delay of 1 ms costs 0.009
+    np.testing.assert_allclose(low_pass(clean, 8.0).q[middle], clean.q[middle], atol=2e-5)
+
+
+def test_the_filter_needs_more_than_two_samples_per_period():
+    with pytest.raises(LogError) as caught:
+        low_pass(swing(dt=0.1), 8.0)
+    assert str(caught.value) == (
+        "trajectory swing: got a filter of 8 Hz on samples at 10 Hz, expected below 5 Hz; lower or drop the filter"
+    )
+
+
+def test_only_dense_logs_are_filtered_unasked():
+    assert automatic_cutoff([swing(dt=0.01)]) == 8.0
+    assert automatic_cutoff([swing(dt=0.01), swing(dt=0.05)]) is None
+    assert automatic_spacing([swing(dt=0.01)], 8.0) == 4
+    assert automatic_spacing([swing(dt=0.001)], None) == 1
+
+
+def test_the_rate_ignores_gaps():
+    assert rate(with_gap()) == pytest.approx(100, rel=0.05)
+
+
+@pytest.mark.parametrize("every", [1, 3])
+def test_windows_hold_the_log_own_times_and_inputs(every):
+    trajectory = swing(jitter=0.4)
+    windows = cut_windows([trajectory], 4, 2, every, measured=False)
+    start = 2 * 7  # the eighth window starts at sample 14
+    rows = start + every * np.arange(4)
+    np.testing.assert_array_equal(windows.q[7], trajectory.q[rows])
+    np.testing.assert_array_equal(windows.qd[7], trajectory.qd[rows])
+    np.testing.assert_allclose(windows.dt[7], np.diff(trajectory.t[rows]), rtol=1e-12)
+    impulse = np.diff(trajectory.t)[:, None] * trajectory.tau[:-1]
+    held = [impulse[a:b].sum(axis=0) for a, b in zip(rows, rows[1:], strict=False)] / np.diff(trajectory.t[rows])[:, None]
+    np.testing.assert_allclose(windows.tau[7], held, rtol=1e-12)
+
+
+def test_a_measured_input_is_held_at_the_mean_of_both_ends():
+    trajectory = swing()
+    windows = cut_windows([trajectory], 3, measured=True)
+    expected = (trajectory.tau[:-1] + trajectory.tau[1:]) / 2
+    torch.testing.assert_close(windows.tau[:, 0], torch.from_numpy(expected[:-1]))
+
+
+def test_the_split_is_by_trajectory():
+    trajectories = [swing(str(k), seed=k) for k in range(8)]
+    split = split_validation(trajectories, 0.25, seed=3)
+    training, validation = {x.name for x in split.training}, {x.name for x in split.validation}
+    assert len(validation) == 2
+    assert training.isdisjoint(validation)
+    assert training | validation == {str(k) for k in range(8)}
+    assert split.validation == split_validation(trajectories, 0.25, seed=3).validation
+    assert any(split_validation(trajectories, 0.25, seed=k).validation != split.validation for k in range(3))
+
+
+def test_a_gap_does_not_leak_into_validation():
+    trajectories = [with_gap(), swing("other")]
+    split = split_validation(trajectories, 0.5, seed=0)
+    names = [{x.name for x in prepare(part, shortest=5, cutoff=None)} for part in (split.training, split.validation)]
+    assert names[0].isdisjoint(names[1])
+
+
+def test_a_single_trajectory_is_split_in_time():
+    split = split_validation([swing()], 0.25, seed=0)
+    (training,), (validation,) = split.training, split.validation
+    assert training.t[-1] < validation.t[0]
+    assert len(validation.t) == pytest.approx(50, abs=1)
+    assert split.note.severity == "warning"
+    assert split.note.message.startswith("only one trajectory: training on its first 1.4")
+
+
+def test_real_logs_are_read(shared):
+    joints = [f"panda_joint{k}" for k in range(1, 8)]
+    (trajectory,) = read_logs([shared / "logs" / "panda"], joints)
+    assert trajectory.q.shape == (20544, 7)
+    notes = examine([trajectory], joints, ("revolute",) * 7)
+    assert [x.code for x in notes] == ["gap"]
+    assert len(prepare([trajectory], shortest=5, cutoff=8.0)) == 5
