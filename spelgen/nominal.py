@@ -44,19 +44,23 @@ class Nominal:
     mass_shares: tuple[float, ...]
     potential_shares: tuple[float, ...]
     least_share: float
-    """Least eigenvalue of M(q) relative to the mean M, over the workspace."""
+    """Least eigenvalue of the links' own M(q), without rotors, relative to the mean M, over the workspace."""
     from_urdf: bool
     """Whether the URDF's inertials were usable."""
 
 
-def nominal(arm: Arm, structure: Structure) -> Nominal:
-    """Nominal sizes of ``arm`` in terms of ``structure``'s outputs and constants."""
+def nominal(arm: Arm, structure: Structure, rotors: Sequence[float]) -> Nominal:
+    """Nominal sizes of ``arm`` in terms of ``structure``'s outputs and constants.
+
+    ``rotors`` [kg m^2, kg], by coordinate, is what the drives add to M's diagonal as felt at the joint.
+    """
     rng = np.random.default_rng(0)
     q = np.stack([rng.uniform(*working_range(c), _POINTS) for c in arm.coordinates], axis=-1)
-    mass, from_urdf = _mass_samples(arm, q)
+    bare, from_urdf = _mass_samples(arm, q)
     inertias = _inertias(arm, from_urdf)
-    means = mass.mean(axis=0)
     keys = triangle(len(arm.coordinates))
+    mass = _with_rotors(bare, structure, rotors)
+    means = mass.mean(axis=0)
     typical = np.sqrt([means[keys.index((i, i))] * means[keys.index((j, j))] for i, j in keys])
     outputs = mass @ _matrix(structure, [output.reads for output in structure.outputs]).T
     output_sizes = [_LEAST_SHARE * _size(typical, keys, output.reads) for output in structure.outputs]
@@ -75,7 +79,7 @@ def nominal(arm: Arm, structure: Structure) -> Nominal:
         joint_torque=_rounded(np.hypot(torque, inertial)),
         mass_shares=_shares(changes),
         potential_shares=_shares(torque),
-        least_share=_rounded([_least_share(mass, q.shape[1])])[0],
+        least_share=_rounded([_least_share(bare, means, q.shape[1])])[0],
         from_urdf=from_urdf,
     )
 
@@ -92,7 +96,7 @@ def _mass_samples(arm: Arm, q: np.ndarray) -> tuple[np.ndarray, bool]:
     """Lower triangles of M at ``q``, and whether the URDF's inertials gave them."""
     if arm.has_inertials:
         mass, _ = float_energies(arm, q, _inertias(arm, True))
-        if _least_share(mass, q.shape[1]) > 1e-6:
+        if _least_share(mass, mass.mean(axis=0), q.shape[1]) > 1e-6:
             return mass, True
     return float_energies(arm, q, _inertias(arm, False))[0], False
 
@@ -113,16 +117,26 @@ def _default_inertia(arm: Arm, index: int) -> list[float]:
     return [_DEFAULT_MASS, *(_DEFAULT_MASS * center), *tensor[np.triu_indices(3)]]
 
 
-def _least_share(mass: np.ndarray, n: int) -> float:
-    """Least eigenvalue, over the samples, of M relative to its mean; 0 where the mean is not positive definite."""
-    full = np.zeros((len(mass), n, n))
+def _with_rotors(bare: np.ndarray, structure: Structure, rotors: Sequence[float]) -> np.ndarray:
+    """M with rotors on its diagonal, as far as the smallest form can hold them."""
+    keys = triangle(len(rotors))
+    loaded = bare.copy()
+    loaded[:, [keys.index((i, i)) for i in range(len(rotors))]] += np.array(rotors)
+    terms = [*structure.outputs, *structure.constants]
+    held = loaded @ _matrix(structure, [t.reads for t in terms]).T @ _matrix(structure, [t.basis for t in terms])
+    # entries that share a constant with a diagonal one (a SCARA's wrist) would take the rotor over
+    return held if np.allclose(held, loaded, rtol=1e-9, atol=1e-12) else bare
+
+
+def _least_share(mass: np.ndarray, mean: np.ndarray, n: int) -> float:
+    """Least eigenvalue, over the samples, of M relative to ``mean``; 0 where the mean is not positive definite."""
+    full = np.zeros((len(mass) + 1, n, n))
     rows, columns = np.tril_indices(n)
-    full[:, rows, columns] = full[:, columns, rows] = mass
-    mean = full.mean(axis=0)
-    if np.linalg.eigvalsh(mean)[0] <= 0:
+    full[:, rows, columns] = full[:, columns, rows] = np.concatenate([mass, mean[None]])
+    if np.linalg.eigvalsh(full[-1])[0] <= 0:
         return 0.0
-    whitening = np.linalg.inv(np.linalg.cholesky(mean))
-    return float(np.linalg.eigvalsh(whitening @ full @ whitening.T)[:, 0].min())
+    whitening = np.linalg.inv(np.linalg.cholesky(full[-1]))
+    return float(np.linalg.eigvalsh(whitening @ full[:-1] @ whitening.T)[:, 0].min())
 
 
 def _gravity_torque(arm: Arm, q: np.ndarray, inertias: list[list[float]]) -> np.ndarray:

@@ -13,7 +13,7 @@ from spelgen.inspection import Inspection
 from spelgen.plan import plan_model
 from spelgen.robot import Robot
 from spelgen.settings import Settings, check_joint_names, load_settings
-from spelgen.spec import Assume, ModelSpec, Options, read_header
+from spelgen.spec import Assume, ModelSpec, Options, Preset, read_header
 from spelgen.structure import derive
 from spelgen.urdf import read_urdf
 
@@ -79,7 +79,7 @@ def build(
     assume: Assume = "kinematics",
     *,
     snap_tolerance: float = 2e-3,
-    preset: str = "minimal",
+    preset: Preset = "minimal",
     width: int = 64,
     depth: int = 2,
 ) -> str:
@@ -100,8 +100,14 @@ def make_spec(path: str | Path, options: Options) -> ModelSpec:
     """The spec of the module that ``options`` ask for."""
     loaded = load(path, options.joints, options.tip, options.snap_tolerance)
     structure = derive(loaded.arm, options.assume)
+    drives = {c.name: loaded.settings.joint(c.name) for c in loaded.arm.coordinates}
     return plan_model(
-        loaded.arm, structure, options, urdf=Path(path).name, urdf_sha256=loaded.robot.digest
+        loaded.arm,
+        structure,
+        options,
+        urdf=Path(path).name,
+        urdf_sha256=loaded.robot.digest,
+        rotors={name: drive.rotor_inertia * drive.gear**2 for name, drive in drives.items()},
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import keyword
 import re
+from collections.abc import Mapping
 
 from spelgen.arm import Arm, Coordinate
 from spelgen.basis import Weights
@@ -15,12 +16,26 @@ _GUARD_SHARE = 0.1
 _FRICTION_OF_EFFORT = 0.02
 _FRICTION_OF_TORQUE = 0.1
 _LARGEST_EFFORT = 1e4  # Nm, N: what stands above is a placeholder
+_LARGEST_SPEED = 100.0  # rad/s, m/s: likewise
+_RISE = 0.02  # s
 _DEFAULT_SPEED = {"revolute": 2.0, "prismatic": 0.5}  # rad/s, m/s
 
 
-def plan_model(arm: Arm, structure: Structure, options: Options, *, urdf: str, urdf_sha256: str) -> ModelSpec:
-    """The model of ``arm`` under ``options``; ``urdf`` is the file's name without its folder."""
-    sizes = nominal(arm, structure)
+def plan_model(
+    arm: Arm,
+    structure: Structure,
+    options: Options,
+    *,
+    urdf: str,
+    urdf_sha256: str,
+    rotors: Mapping[str, float] | None = None,
+) -> ModelSpec:
+    """The model of ``arm`` under ``options``; ``urdf`` is the file's name without its folder.
+
+    ``rotors`` [kg m^2, kg] are known rotor inertias as felt at the joint; where there is none, one is guessed.
+    """
+    known = rotors or {}
+    sizes = nominal(arm, structure, [known.get(c.name) or _guessed_rotor(c) for c in arm.coordinates])
     identifiers = _identifiers([coordinate.name for coordinate in arm.coordinates])
     x, y, z = (float(g) for g in arm.gravity)
     return ModelSpec(
@@ -52,7 +67,7 @@ def plan_model(arm: Arm, structure: Structure, options: Options, *, urdf: str, u
 
 def _joint(coordinate: Coordinate, identifier: str, sizes: Nominal, index: int) -> JointSpec:
     low, high = working_range(coordinate)
-    speed = coordinate.velocity if coordinate.velocity and coordinate.velocity < 100 else None
+    speed = coordinate.velocity if coordinate.velocity and coordinate.velocity <= _LARGEST_SPEED else None
     return JointSpec(
         name=coordinate.name,
         identifier=identifier,
@@ -67,6 +82,14 @@ def _joint(coordinate: Coordinate, identifier: str, sizes: Nominal, index: int) 
         potential_share=sizes.potential_shares[index],
         actuated=not coordinate.passive,
     )
+
+
+def _guessed_rotor(coordinate: Coordinate) -> float:
+    """A geared drive's own inertia: such that its full effort takes ``_RISE`` seconds to reach its full speed."""
+    effort, speed = coordinate.effort, coordinate.velocity
+    if not effort or not speed or effort > _LARGEST_EFFORT or speed > _LARGEST_SPEED:
+        return 0.0
+    return _RISE * effort / speed
 
 
 def _friction(coordinate: Coordinate, sizes: Nominal, index: int) -> float:

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import time
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from spelgen.errors import Diagnostic
+
+if TYPE_CHECKING:
+    import torch
 
 LINE_EVERY = 10.0  # [s] between lines where no bar can be drawn
 
@@ -42,6 +45,15 @@ class TrainingProgress:
         if self._show:
             text = f"{diagnostic.severity}: {diagnostic.where}: {diagnostic.message}"
             self._console.print("".join(c if c.isprintable() else "?" for c in text), markup=False)
+
+    def warm_up(self, step: int, steps: int, loss: torch.Tensor) -> None:
+        """Show how far the momentum steps are."""
+        if not self._show or step % 100:
+            return
+        state = f"momentum {step}/{steps}, loss {loss.item():.3g}"
+        self._bar.update(self._task, state=escape(state))
+        if not self._console.is_terminal and (step == steps or step % 1000 == 0):
+            self._console.print(state, markup=False)
 
     def epoch(self, record: dict[str, Any]) -> None:
         """Show one line of metrics.jsonl."""

@@ -94,6 +94,7 @@ def train(
     stride: Annotated[
         int | None, typer.Option("--stride", min=1, help="Samples from window to window.")
     ] = None,
+    every: Annotated[int | None, typer.Option("--every", min=1, help="Take one sample of so many.")] = None,
     substeps: Annotated[
         int | None, typer.Option("--substeps", min=1, help="Integrator steps between samples.")
     ] = None,
@@ -117,7 +118,7 @@ def train(
     """
     flags = {
         "epochs": epochs, "patience": patience, "max_minutes": max_minutes, "batch": batch, "window": window,
-        "stride": stride, "substeps": substeps, "learning_rate": learning_rate, "weight_decay": weight_decay,
+        "stride": stride, "every": every, "substeps": substeps, "learning_rate": learning_rate, "weight_decay": weight_decay,
         "validation_fraction": validation_fraction, "filter": filter, "seed": seed, "device": device,
         "threads": threads,
     }  # fmt: skip

@@ -93,11 +93,13 @@ class TrainingSettings(_Group):
     window: samples predicted together. stride: samples from the start of one window to the next.
     batch: windows per step. epochs: passes over all windows, at most.
     patience: epochs without a better validation loss before stopping.
+    momentum_steps: steps on the weak form (see `momentum_loss`) before windows are predicted.
     substeps: integrator steps per sample interval; None: as many as the robot needs.
     validation_fraction: part of the training trajectories held out to watch the validation loss.
     """
 
     objective: Literal["rollout"] = "rollout"
+    momentum_steps: Annotated[int, BeforeValidator(_no_bool), Field(ge=0)] = 2000
     window: Annotated[Count, Field(ge=2)] = 5
     stride: Count = 1
     epochs: Count = 400

@@ -22,6 +22,7 @@ LARGEST_VALIDATION = 2048  # windows; validation is a measurement, it needs no m
 class TrainingConfig:
     """Settings of one run; see `TrainingSettings` for those that a robot's sidecar file may set.
 
+    momentum_steps: steps on the weak form of the equations before windows are predicted; 0: none.
     every: samples from one sample of a window to the next, None: see `automatic_spacing`.
     substeps: rk4 steps per sample interval, None: chosen by `choose_substeps`.
     filter: cutoff [Hz] of the zero-phase low-pass on q, qd and tau; 0: none; None: see `automatic_cutoff`.
@@ -30,6 +31,7 @@ class TrainingConfig:
     """
 
     objective: Literal["rollout"] = "rollout"
+    momentum_steps: int = 2000
     window: int = 5
     stride: int = 1
     every: int | None = None
@@ -83,6 +85,7 @@ def prepare_data(
     if cutoff is not None:
         message = f"q, qd and tau filtered at {cutoff:g} Hz, zero phase"
         notes.append(Diagnostic("info", "filter", "logs", None, message))
+    every = config.every or automatic_spacing(trajectories, cutoff)
     training, validation = (
         prepare(x, shortest=(config.window - 1) * every + 1, cutoff=cutoff) for x in (split.training, split.validation)
     )

@@ -11,7 +11,7 @@ import torch
 
 from spelgen.errors import RunError
 from spelgen.progress import TrainingProgress
-from spelgen.rollout import INTEGRATION_SHARE, choose_substeps, integration_error, rollout_loss
+from spelgen.rollout import INTEGRATION_SHARE, choose_substeps, integration_error, momentum_loss, rollout_loss
 from spelgen.runs import RunFolder, write_state
 from spelgen.training_data import TrainingConfig, TrainingData
 from spelgen.windows import Windows
@@ -19,6 +19,8 @@ from spelgen.windows import Windows
 if TYPE_CHECKING:
     from spelgen.runs import EmittedModel
 
+VECTOR_FACTOR = 5.0  # on the learning rate of constants and biases
+MOMENTUM_FACTOR = 5.0  # on the learning rate of the momentum steps, which are cheap and noisy
 GRADIENT_NORM = 1.0  # of the scaled loss; larger gradients are shortened to it
 WARM_UP = 0.02  # part of all steps over which the learning rate rises
 FINAL_RATE = 0.01  # the cosine ends at this part of the learning rate
@@ -29,7 +31,7 @@ MAX_ROLLBACKS = 8
 
 PLAIN = (
     "epoch", "step", "best_epoch", "best_loss", "best_weights",
-    "rollbacks", "rate_factor", "seconds", "substeps",
+    "rollbacks", "rate_factor", "seconds", "substeps", "warm",
 )  # fmt: skip
 
 Status = Literal["finished", "stopped early", "out of time", "interrupted"]
@@ -45,24 +47,23 @@ class TrainingLoop:
         self.model = model.to(config.device)
         self.training, self.validation = data.training.to(config.device), data.validation.to(config.device)
         self.scales = data.scales.to(config.device)
-        self.optimiser = torch.optim.AdamW(
-            self.model.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
-        )
+        self.optimiser = self._optimiser()
         self.generator = torch.Generator().manual_seed(config.seed)
         self.batch = min(config.batch, len(self.training))
         self.epoch_steps = max(EPOCH_STEPS, -(-len(self.training) // self.batch))
         self.probe = self.training[:: -(-len(self.training) // PROBE)]
         self.epoch = self.step = self.best_epoch = self.rollbacks = 0
         self.rate_factor, self.seconds = 1.0, 0.0
-        self.substeps = config.substeps or choose_substeps(self.model, self.probe, self.scales)
-        self.best_loss = self._validate()
-        self.best_weights = copy.deepcopy(self.model.state_dict())
+        self.warm = not config.momentum_steps
+        self._measure()
 
     def run(self, progress: TrainingProgress) -> Status:
         """Train until an end is reached; Ctrl-C is one and leaves the checkpoint of the last whole epoch."""
         since = time.monotonic() - self.seconds
         try:
             self.save()
+            if not self.warm:
+                self._warm_up(progress)
             while (end := self._end()) is None:
                 record = self._run_epoch()
                 self.seconds = record["seconds"] = time.monotonic() - since
@@ -72,6 +73,55 @@ class TrainingLoop:
         except KeyboardInterrupt:
             return "interrupted"
         return end
+
+    def _measure(self) -> None:
+        """Begin anew from the present weights: substeps, validation loss and best so far."""
+        self.substeps = self.config.substeps or choose_substeps(self.model, self.probe, self.scales)
+        self.best_loss = self._validate()
+        self.best_weights = copy.deepcopy(self.model.state_dict())
+
+    def _optimiser(self) -> torch.optim.AdamW:
+        """AdamW; single numbers (constants, viscous friction) learn faster than weights and do not decay."""
+        groups: dict[bool, list[torch.nn.Parameter]] = {True: [], False: []}
+        for parameter in self.model.parameters():
+            groups[parameter.dim() > 1].append(parameter)
+        return torch.optim.AdamW(
+            [
+                {"params": groups[True], "weight_decay": self.config.weight_decay, "factor": 1.0},
+                {"params": groups[False], "weight_decay": 0.0, "factor": VECTOR_FACTOR},
+            ]
+        )
+
+    def _set_rate(self, optimiser: torch.optim.AdamW, rate: float) -> None:
+        for group in optimiser.param_groups:
+            group["lr"] = rate * group["factor"]
+
+    def _warm_up(self, progress: TrainingProgress) -> None:
+        """Momentum first: the weak form needs no ODE solve and brings the model near before windows are predicted.
+
+        Kept only if it predicts the validation windows better. An interruption here starts it again on resumption.
+        """
+        before = copy.deepcopy(self.model.state_dict()), self.best_loss
+        generator = torch.Generator().manual_seed(self.config.seed)
+        optimiser, steps = self._optimiser(), self.config.momentum_steps
+        for step in range(steps):
+            part = step / steps
+            fall = FINAL_RATE + (1 - FINAL_RATE) * (1 + math.cos(math.pi * part)) / 2
+            self._set_rate(optimiser, MOMENTUM_FACTOR * self.config.learning_rate * min(1.0, part / WARM_UP) * fall)
+            rows = torch.randint(len(self.training), (self.batch,), generator=generator)
+            optimiser.zero_grad()
+            loss = momentum_loss(self.model, self.training[rows.to(self.config.device)])
+            loss.backward()
+            norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), GRADIENT_NORM)
+            if torch.isfinite(norm):
+                optimiser.step()
+            progress.warm_up(step + 1, steps, loss)
+        self._measure()
+        if not self.best_loss < before[1]:
+            self.model.load_state_dict(before[0])
+            self._measure()
+        self.warm = True
+        self.save()
 
     def _end(self) -> Status | None:
         if self.epoch >= self.config.epochs:
@@ -119,10 +169,12 @@ class TrainingLoop:
         return total / self.epoch_steps
 
     def _train_step(self, windows: Windows) -> float:
-        for group in self.optimiser.param_groups:
-            group["lr"] = self._rate()
+        self._set_rate(self.optimiser, self._rate())
         self.optimiser.zero_grad()
-        loss = rollout_loss(self.model, windows, self.scales, self.substeps)
+        try:
+            loss = rollout_loss(self.model, windows, self.scales, self.substeps)
+        except torch.linalg.LinAlgError:  # numbers blew up within the rollout
+            return math.nan
         loss.backward()
         norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), GRADIENT_NORM)
         if not torch.isfinite(norm):
@@ -142,9 +194,12 @@ class TrainingLoop:
 
     def _validate(self) -> float:
         """Loss on the validation windows."""
-        with torch.no_grad():
-            parts = self.validation.split(4 * self.batch)
-            losses = [rollout_loss(self.model, x, self.scales, self.substeps).item() * len(x) for x in parts]
+        parts = self.validation.split(4 * self.batch)
+        try:
+            with torch.no_grad():
+                losses = [rollout_loss(self.model, x, self.scales, self.substeps).item() * len(x) for x in parts]
+        except torch.linalg.LinAlgError:
+            return math.inf
         return sum(losses) / len(self.validation)
 
     def _roll_back(self, weights: dict[str, Any], optimiser: dict[str, Any], step: int) -> None:

@@ -1,0 +1,158 @@
+"""Random arms: what spelgen derives from a URDF against Pinocchio's own reading of the same text."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, assume, event, given, settings
+from random_arms import DrawnArm, arms
+
+from spelgen.arm import make_arm
+from spelgen.structure import Structure, derive
+from spelgen.urdf import read_urdf
+
+pin = pytest.importorskip("pinocchio", reason="Pinocchio (pip install spelgen[simulate]) reads the other side")
+
+# sizes relative to the largest: above the first is something, below the second is nothing
+SOMETHING, NOTHING = 1e-8, 1e-11
+
+
+class Reading:
+    """The arm as Pinocchio reads it: all joints free, those that follow tied to their leaders, the others at 0."""
+
+    def __init__(self, arm: DrawnArm) -> None:
+        self.model = pin.buildModelFromXML(arm.text)
+        self.data = self.model.createData()
+        columns = {name: self._column(name) for name in arm.joints}
+        self.ties = np.zeros((self.model.nv, len(arm.joints)))
+        self.rest = np.zeros(self.model.nv)
+        for k, column in enumerate(columns.values()):
+            self.ties[column, k] = 1.0
+        for follower in arm.followers:
+            column = self._column(follower.name)
+            self.ties[column] = follower.multiplier * self.ties[columns[follower.leader]]
+            self.rest[column] = follower.offset
+        self.neutral = pin.neutral(self.model)
+
+    def _column(self, name: str) -> int:
+        return self.model.joints[self.model.getJointId(name)].idx_v
+
+    def draw_inertias(self, rng: np.random.Generator) -> None:
+        """Give every joint's body other, physically possible inertial values."""
+        for k in range(1, self.model.njoints):
+            points = rng.normal(scale=0.5, size=(4, 3))  # four point masses
+            tensor = np.eye(3) * (points**2).sum() - points.T @ points
+            self.model.inertias[k] = pin.Inertia(rng.uniform(1.0, 4.0), rng.uniform(-0.5, 0.5, 3), tensor)
+
+    def configuration(self, q: np.ndarray) -> np.ndarray:
+        return pin.integrate(self.model, self.neutral, self.ties @ q + self.rest)
+
+    def mass(self, q: np.ndarray) -> np.ndarray:
+        """The lower triangle of M."""
+        full = pin.crba(self.model, self.data, self.configuration(q))
+        full = np.triu(full) + np.triu(full, 1).T
+        return (self.ties.T @ full @ self.ties)[np.tril_indices(len(q))]
+
+    def potential(self, q: np.ndarray) -> float:
+        return pin.computePotentialEnergy(self.model, self.data, self.configuration(q))
+
+    def regressor(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+        full = pin.computeJointTorqueRegressor(
+            self.model, self.data, self.configuration(q), self.ties @ v, self.ties @ a
+        )
+        return self.ties.T @ full
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What is compared."""
+
+    entries: tuple[tuple[str, tuple[int, ...]], ...]
+    potential: tuple[int, ...]
+    outputs_from: tuple[int, ...]
+    constants: int
+    base_parameters: int
+
+
+def measured(arm: DrawnArm, *, inertials: bool, rng: np.random.Generator) -> Facts:
+    """The facts as Pinocchio shows them at random configurations, with random inertias or the URDF's."""
+    reading = Reading(arm)
+    n = len(arm.joints)
+    entries = n * (n + 1) // 2
+    base, levels, changes, lifts = [], [], [[] for _ in range(n)], [[] for _ in range(n)]
+    for _ in range(2 * entries + 6):
+        if not inertials:
+            reading.draw_inertias(rng)
+        q = rng.uniform(-3.0, 3.0, n)
+        base.append(reading.mass(q))
+        levels.append(reading.potential(q))
+        for k in range(n):
+            moved = q.copy()
+            moved[k] = rng.uniform(-3.0, 3.0)
+            changes[k].append(reading.mass(moved) - base[-1])
+            lifts[k].append(reading.potential(moved) - levels[-1])
+    rows, steps = np.array(base), np.array(changes)
+    size, height = np.abs(rows).max(), max(1.0, np.abs(levels).max())
+    kinds = []
+    for index in range(entries):
+        joints = tuple(k for k in range(n) if _is_something(steps[k][:, index], size))
+        kinds.append(("varying" if joints else "constant" if _is_something(rows[:, index], size) else "zero", joints))
+    ranks = [rank(steps[:k].reshape(-1, entries), size) for k in range(n + 1)]
+    return Facts(
+        entries=tuple(kinds),
+        potential=tuple(k for k in range(n) if _is_something(np.array(lifts[k]), height)),
+        outputs_from=tuple(ranks[n] - found for found in ranks[:n]),
+        constants=rank(rows, size) - ranks[n],
+        base_parameters=_base_parameters(reading, n, rng),
+    )
+
+
+def _base_parameters(reading: Reading, n: int, rng: np.random.Generator) -> int:
+    rows = [reading.regressor(*rng.uniform(-3.0, 3.0, (3, n))) for _ in range(20 * reading.model.njoints)]
+    return rank(np.concatenate(rows), np.abs(rows).max())
+
+
+def rank(rows: np.ndarray, size: float) -> int:
+    """The rank of rows that hold numbers of this ``size`` where they are not zero."""
+    return _count(np.linalg.svd(rows, compute_uv=False) / size / np.sqrt(len(rows) or 1))
+
+
+def _is_something(values: np.ndarray, size: float) -> bool:
+    return bool(_count(np.array([np.abs(values).max() / size])))
+
+
+def _count(sizes: np.ndarray) -> int:
+    clear = not ((sizes > NOTHING) & (sizes < SOMETHING)).any()
+    event("sizes tell zeros" if clear else "sizes leave zeros open")
+    assume(clear)
+    return int((sizes > SOMETHING).sum())
+
+
+def told(structure: Structure) -> Facts:
+    """The facts as spelgen derives them."""
+    n = len(structure.joints)
+    return Facts(
+        entries=tuple((entry.kind, entry.joints) for entry in structure.entries),
+        potential=structure.potential,
+        outputs_from=tuple(structure.outputs_from(k) for k in range(n)),
+        constants=len(structure.constants),
+        base_parameters=structure.base_parameters,
+    )
+
+
+@settings(
+    max_examples=60,
+    derandomize=True,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow, HealthCheck.data_too_large],
+)
+@given(drawn=arms())
+def test_structure_is_what_pinocchio_shows(tmp_path, drawn):
+    path = tmp_path / "drawn.urdf"
+    path.write_text(drawn.text)
+    arm = make_arm(read_urdf(path), joints=drawn.joints)
+    for inertials in (False, True):
+        seen = measured(drawn, inertials=inertials, rng=np.random.default_rng(0))
+        assert told(derive(arm, "inertials" if inertials else "kinematics")) == seen
