@@ -1,8 +1,10 @@
-"""The smallest exact form M(q) = sum_k c_k A_k + sum_j f_j(q) B_j, with every f_j on as few joints as possible.
+"""The smallest exact form M(q) = sum_k c_k A_k + sum_j f_j(q) B_j, with every f_j on as few joints as
+possible.
 
-U is the span of all changes of M, W the span of M. A read-out is a weighting of M's entries; on the joints J only depends exactly that which vanishes
-on the changes made by every joint outside J. Read-outs are taken greedily, sets of joints nearest the tip first and small sets before
-large ones (the independent sets of a matroid, so no later choice could have done better), single entries of M before sums of them.
+U is the span of all changes of M, W the span of M. A read-out is a weighting of M's entries; on the joints
+J only depends exactly that which vanishes on the changes made by every joint outside J. Read-outs are
+taken greedily, sets of joints nearest the tip first and small sets before large ones (the independent sets
+of a matroid, so no later choice could have done better), single entries of M before sums of them.
 """
 
 from __future__ import annotations
@@ -27,7 +29,9 @@ Weights = tuple[tuple[int, int, Fraction], ...]
 
 @dataclass(frozen=True)
 class Output:
-    """One function f(q) of ``joints`` that is left open: f = sum of ``reads`` x M, and it enters M through ``basis``."""
+    """One function f(q) of ``joints`` that is left open: f = sum of ``reads`` x M, and it enters M through
+    ``basis``.
+    """
 
     joints: tuple[int, ...]
     reads: Weights
@@ -75,7 +79,9 @@ def _constants(
     rest: tuple[np.ndarray, np.ndarray],
     basis: tuple[np.ndarray, np.ndarray],
 ) -> tuple[Constant, ...]:
-    """A basis of what the outputs leave of W; entries that are constant themselves are the first choice for a constant."""
+    """A basis of what the outputs leave of W; entries that are constant themselves are the first choice for a
+    constant.
+    """
     order = sorted(range(len(spans.keys)), key=lambda index: (len(spans.entry_joints[index]), -index))
     echelon = field.row_basis(rest[0][:, order])
     bound = [order[pivot] for pivot in field.pivots(echelon)]
@@ -155,27 +161,32 @@ def _solved(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Least-squares solution X of left X = right, both tall."""
     width = left.shape[1]
     # the triangular factor holds all there is to know, and is small
-    factor = np.linalg.qr(np.concatenate([left, right], axis=1), mode="r")
+    factor = np.asarray(np.linalg.qr(np.concatenate([left, right], axis=1), mode="r"))
     return np.linalg.lstsq(factor[:, :width], factor[:, width:], rcond=None)[0]
 
 
 def _weights(spans: Spans, exact: np.ndarray, values: np.ndarray) -> Weights:
     return tuple(
-        (*spans.keys[index], _fraction(int(exact[index]), float(values[index]))) for index in np.flatnonzero(exact)
+        (*spans.keys[index], _fraction(int(exact[index]), float(values[index])))
+        for index in np.flatnonzero(exact)
     )
 
 
 def _fraction(element: int, value: float) -> Fraction:
     """The rational number behind a field element, near ``value``.
 
-    Rational reconstruction finds it when numerator and denominator are below 2^30 (von zur Gathen and Gerhard, *Modern Computer Algebra*,
-    section 5.10). Geometry with irrational sizes gives longer fractions; there the double itself is as exact as the URDF.
+    Rational reconstruction finds it when numerator and denominator are below 2^30 (von zur Gathen and
+    Gerhard, *Modern Computer Algebra*, section 5.10). Geometry with irrational sizes gives longer
+    fractions; there the double itself is as exact as the URDF.
     """
     bound = 2**30
     previous, current = (field.PRIME, 0), (element, 1)
     while current[0] > bound:
         quotient = previous[0] // current[0]
-        previous, current = current, (previous[0] - quotient * current[0], previous[1] - quotient * current[1])
+        previous, current = (
+            current,
+            (previous[0] - quotient * current[0], previous[1] - quotient * current[1]),
+        )
     numerator, denominator = current
     if denominator and gcd(numerator, denominator) == 1:
         found = Fraction(numerator, denominator)

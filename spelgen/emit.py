@@ -1,6 +1,7 @@
 """ModelSpec -> the source text of the emitted module. Pure: the same spec gives the same bytes.
 
-Text from a URDF reaches the module as identifiers and as JSON strings inside its raw docstring, never as code.
+Text from a URDF reaches the module as identifiers and as JSON strings inside its raw docstring, never as
+code.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ _WIDTH = 100
 _LEAST_UNITS = 4
 _POTENTIAL_SHARE = 0.5
 _FRICTION_HIDDEN = 8
-_SLOW = 0.01
+_SLOW = 0.03
 
 
 def emit(spec: ModelSpec) -> str:
@@ -41,7 +42,10 @@ def emit(spec: ModelSpec) -> str:
         outputs=spec.outputs
         and _table(
             "OUTPUTS = ",
-            [_call("Output", joints=o.joints, mean=o.center, scale=o.scale, entries=o.basis) for o in spec.outputs],
+            [
+                _call("Output", joints=o.joints, mean=o.center, scale=o.scale, entries=o.basis)
+                for o in spec.outputs
+            ],
         ),
         mass_hidden=_table("MASS_HIDDEN = ", [_literal(row) for row in _hidden(spec)]),
         depth=depth,
@@ -137,7 +141,10 @@ def _picture(spec: ModelSpec) -> str:
     """The lower triangle of M as text: what each entry depends on."""
     cells = {(row, column): _cell(kind, joints) for row, column, kind, joints in spec.entries}
     width = max(2, *(len(cell) for cell in cells.values()))
-    lines = ["Mass matrix: the joints each entry depends on, C where it is constant, . where it is always zero.", ""]
+    lines = [
+        "Mass matrix: the joints each entry depends on, C where it is constant, . where it is always zero.",
+        "",
+    ]
     for row in range(len(spec.joints)):
         line = "  ".join(cells[row, column].ljust(width) for column in range(row + 1))
         lines.append(f"    {line}".rstrip())
@@ -156,7 +163,11 @@ def _joint_table(spec: ModelSpec) -> str:
     width = max(len(name) for name in names)
     for index, (joint, name) in enumerate(zip(spec.joints, names, strict=True), start=1):
         unit = "rad, Nm" if joint.kind == "revolute" else "m, N"
-        limits = "no limits" if joint.lower is None or joint.upper is None else f"{joint.lower:g} .. {joint.upper:g}"
+        limits = (
+            "no limits"
+            if joint.lower is None or joint.upper is None
+            else f"{joint.lower:g} .. {joint.upper:g}"
+        )
         lines.append(f"    {index}  {name.ljust(width)}  {joint.kind:9}  {unit:7}  {limits}")
     return "\n".join(lines)
 

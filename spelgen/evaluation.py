@@ -109,7 +109,8 @@ def evaluate(
     cutoff: float | None = None,
     threads: int = 1,
 ) -> Evaluation:
-    """Evaluate the best model of a run on logs (a folder's test.* where there are such) and write evaluation.json.
+    """Evaluate the best model of a run on logs (a folder's test.* where there are such) and write
+    evaluation.json.
 
     steps, seconds: horizons in samples and in time; those longer than every trajectory are left out, and
     said. cutoff: of the filter on the logs [Hz], 0: none; by default the one the run was trained with. The
@@ -273,7 +274,8 @@ def _tip(run: RunFolder, header: Header, notes: list[Diagnostic]) -> Tip | None:
 
 
 def energy_drift(model: EmittedModel, windows: Windows) -> float | None:
-    """Largest |H(t) - H(0)| over 1 s without input and dissipation, relative to the largest kinetic energy met.
+    """Largest |H(t) - H(0)| over 1 s without input and dissipation, relative to the largest kinetic energy
+    met.
 
     From the windows' fastest states, by rk4 with dt 1 ms: what is left is integration error, if H is
     conserved.

@@ -1,8 +1,9 @@
 """Batches of numbers in the prime field of 2^61 - 1, and linear algebra over it.
 
-A polynomial that is not zero vanishes at a random point of this field with probability at most degree / 2^61 (Schwartz 1980,
-Zippel 1979), and a rank found here is never above the rank over the rationals. So what holds here at random points holds exactly, but for
-odds of about 1e-16 a question, without a tolerance and without writing a polynomial down.
+A polynomial that is not zero vanishes at a random point of this field with probability at most degree /
+2^61 (Schwartz 1980, Zippel 1979), and a rank found here is never above the rank over the rationals. So
+what holds here at random points holds exactly, but for odds of about 1e-16 a question, without a tolerance
+and without writing a polynomial down.
 """
 
 from __future__ import annotations
@@ -119,7 +120,9 @@ def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 class Independent:
-    """Independent vectors of length ``width``, gathered one by one; ``rows`` span them, reduced at their pivots."""
+    """Independent vectors of length ``width``, gathered one by one; ``rows`` span them, reduced at their
+    pivots.
+    """
 
     def __init__(self, width: int):
         self.rows = np.zeros((0, width), dtype=np.uint64)
@@ -146,7 +149,7 @@ def inverse(square: np.ndarray) -> np.ndarray:
 
 
 def _matrix(rows: np.ndarray) -> nmod_mat:
-    return nmod_mat(*rows.shape, rows.ravel().tolist(), PRIME)
+    return nmod_mat(rows.shape[0], rows.shape[1], rows.ravel().tolist(), PRIME)
 
 
 def _array(matrix: nmod_mat) -> np.ndarray:
@@ -166,5 +169,10 @@ def _product(a: np.ndarray, b: np.ndarray | np.uint64) -> np.ndarray:
     """Products modulo 2^61 - 1 in 64-bit arithmetic: halves of 30 and 31 bits, and 2^61 = 1."""
     a_high, a_low, b_high, b_low = a >> _BITS_31, a & _LOW_31, b >> _BITS_31, b & _LOW_31
     middle = a_high * b_low + a_low * b_high
-    total = (a_high * b_high << np.uint64(1)) + (middle >> _BITS_30) + ((middle & _LOW_30) << _BITS_31) + a_low * b_low
+    total = (
+        (a_high * b_high << np.uint64(1))
+        + (middle >> _BITS_30)
+        + ((middle & _LOW_30) << _BITS_31)
+        + a_low * b_low
+    )
     return _folded((total & _P) + (total >> _BITS_61))

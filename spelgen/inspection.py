@@ -1,4 +1,6 @@
-"""A derived structure as people and programs read it: text of a given width, and the JSON contract (schema 1)."""
+"""A derived structure as people and programs read it: text of a given width, and the JSON contract (schema
+1).
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,9 @@ class Inspection:
                 "kind": "varying" if structure.potential else "zero",
                 "joints": self._names(structure.potential),
             },
-            "input_matrix": {"entries": [self._input(row, column) for row in range(n) for column in range(n)]},
+            "input_matrix": {
+                "entries": [self._input(row, column) for row in range(n) for column in range(n)]
+            },
             "base_parameters": structure.base_parameters,
             "diagnostics": [diagnostic.to_dict() for diagnostic in self.diagnostics],
         }
@@ -75,7 +79,9 @@ class Inspection:
         }
 
     def _heading(self) -> str:
-        believed = "any inertial values" if self.structure.assume == "kinematics" else "the URDF's inertial values"
+        believed = (
+            "any inertial values" if self.structure.assume == "kinematics" else "the URDF's inertial values"
+        )
         return f"{_printable(self.arm.name)}: structure for {believed}"
 
     def _joint_table(self) -> str:
@@ -117,7 +123,9 @@ class Inspection:
         facts = {
             "M(q)": f"{_many(len(structure.outputs), 'output')} and {_many(constants, 'constant')} "
             f"make all {entries} entries" + (f": {told}" if told else ""),
-            "V(q)": f"depends on {_joints(structure.potential)}" if structure.potential else "zero: gravity does no work",
+            "V(q)": f"depends on {_joints(structure.potential)}"
+            if structure.potential
+            else "zero: gravity does no work",
             "G": "fixed" + (f", {_joints(structure.passive)} without a drive" if structure.passive else ""),
             "base": f"{structure.base_parameters} base inertial parameters",
         }

@@ -12,5 +12,6 @@ def joint_ranges(joints: tuple[int, ...]) -> str:
         else:
             runs.append([joint])
     return ",".join(
-        f"{run[0] + 1}-{run[-1] + 1}" if len(run) > 2 else ",".join(str(joint + 1) for joint in run) for run in runs
+        f"{run[0] + 1}-{run[-1] + 1}" if len(run) > 2 else ",".join(str(joint + 1) for joint in run)
+        for run in runs
     )

@@ -1,6 +1,7 @@
 """What the URDF's own values say about sizes: where the model's numbers start and how they are scaled.
 
-Nothing here has to be right for the model to be: a URDF without inertials, or with impossible ones, is replaced by one-kilogram links.
+Nothing here has to be right for the model to be: a URDF without inertials, or with impossible ones, is
+replaced by one-kilogram links.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from math import floor, log10, pi
 import numpy as np
 
 from spelgen.arm import Arm, Coordinate
-from spelgen.basis import Weights
+from spelgen.basis import Constant, Output, Weights
 from spelgen.recursion import triangle
 from spelgen.sampling import float_energies
 from spelgen.structure import Structure
@@ -32,7 +33,8 @@ _DEFAULT_GYRATION = 0.1  # m
 class Nominal:
     """Sizes over the arm's workspace, rounded to six digits so that they are the same on every machine.
 
-    ``output_*`` go by the structure's outputs, ``constants`` by its constants, ``joint_torque`` [Nm, N] by coordinate.
+    ``output_*`` go by the structure's outputs, ``constants`` by its constants, ``joint_torque`` [Nm, N] by
+    coordinate.
     """
 
     output_means: tuple[float, ...]
@@ -85,7 +87,9 @@ def nominal(arm: Arm, structure: Structure, rotors: Sequence[float]) -> Nominal:
 
 
 def working_range(coordinate: Coordinate) -> tuple[float, float]:
-    """The range a coordinate is taken to move in: its limits where they are usable, else one turn or one metre."""
+    """The range a coordinate is taken to move in: its limits where they are usable, else one turn or one
+    metre.
+    """
     lower, upper = coordinate.lower, coordinate.upper
     if coordinate.continuous or lower is None or upper is None or not 0 < upper - lower < 1e3:
         return (-pi, pi) if coordinate.kind == "revolute" else (-0.5, 0.5)
@@ -122,14 +126,17 @@ def _with_rotors(bare: np.ndarray, structure: Structure, rotors: Sequence[float]
     keys = triangle(len(rotors))
     loaded = bare.copy()
     loaded[:, [keys.index((i, i)) for i in range(len(rotors))]] += np.array(rotors)
-    terms = [*structure.outputs, *structure.constants]
-    held = loaded @ _matrix(structure, [t.reads for t in terms]).T @ _matrix(structure, [t.basis for t in terms])
+    terms: list[Output | Constant] = [*structure.outputs, *structure.constants]
+    reads = _matrix(structure, [term.reads for term in terms])
+    held = loaded @ reads.T @ _matrix(structure, [term.basis for term in terms])
     # entries that share a constant with a diagonal one (a SCARA's wrist) would take the rotor over
     return held if np.allclose(held, loaded, rtol=1e-9, atol=1e-12) else bare
 
 
 def _least_share(mass: np.ndarray, mean: np.ndarray, n: int) -> float:
-    """Least eigenvalue, over the samples, of M relative to ``mean``; 0 where the mean is not positive definite."""
+    """Least eigenvalue, over the samples, of M relative to ``mean``; 0 where the mean is not positive
+    definite.
+    """
     full = np.zeros((len(mass) + 1, n, n))
     rows, columns = np.tril_indices(n)
     full[:, rows, columns] = full[:, columns, rows] = np.concatenate([mass, mean[None]])
@@ -152,7 +159,9 @@ def _gravity_torque(arm: Arm, q: np.ndarray, inertias: list[list[float]]) -> np.
 
 
 def _mass_changes(arm: Arm, q: np.ndarray, inertias: list[list[float]], typical: np.ndarray) -> np.ndarray:
-    """Root mean square change of M's entries, relative to their typical size, when a coordinate moves elsewhere."""
+    """Root mean square change of M's entries, relative to their typical size, when a coordinate moves
+    elsewhere.
+    """
     base, _ = float_energies(arm, q, inertias)
     changes = []
     for index in range(q.shape[1]):
@@ -165,7 +174,9 @@ def _mass_changes(arm: Arm, q: np.ndarray, inertias: list[list[float]], typical:
 def _shares(sizes: np.ndarray) -> tuple[float, ...]:
     """Sizes relative to the largest, but at least ``_LEAST_SENSITIVITY``."""
     largest = sizes.max()
-    return _rounded(np.maximum(sizes / largest, _LEAST_SENSITIVITY) if largest > 0 else np.ones_like(sizes), 3)
+    return _rounded(
+        np.maximum(sizes / largest, _LEAST_SENSITIVITY) if largest > 0 else np.ones_like(sizes), 3
+    )
 
 
 def _matrix(structure: Structure, reads: Sequence[Weights]) -> np.ndarray:

@@ -44,8 +44,9 @@ def load(
 ) -> Loaded:
     """Read the URDF at ``path`` and its sidecar, and take the arm from it.
 
-    ``joints`` names the moving joints, or ``tip`` the last link; else the longest actuated chain. ``snap_tolerance`` is in rad; at 0 the
-    file's numbers are believed as they stand. Raises UrdfError, ArmError or SettingsError.
+    ``joints`` names the moving joints, or ``tip`` the last link; else the longest actuated chain.
+    ``snap_tolerance`` is in rad; at 0 the file's numbers are believed as they stand. Raises UrdfError,
+    ArmError or SettingsError.
     """
     path = Path(path)
     robot = read_urdf(path)
@@ -53,7 +54,8 @@ def load(
     check_joint_names(settings, [joint.name for joint in robot.joints], path)
     arm = make_arm(robot, joints=joints, tip=tip, snap_tolerance=snap_tolerance, gravity=settings.gravity)
     coordinates = tuple(
-        replace(coordinate, passive=not settings.joint(coordinate.name).actuated) for coordinate in arm.coordinates
+        replace(coordinate, passive=not settings.joint(coordinate.name).actuated)
+        for coordinate in arm.coordinates
     )
     return Loaded(robot, settings, replace(arm, coordinates=coordinates))
 
@@ -83,7 +85,9 @@ def build(
     width: int = 64,
     depth: int = 2,
 ) -> str:
-    """The source of the module tailored to the arm in the URDF at ``path``; arguments and errors as for ``load``."""
+    """The source of the module tailored to the arm in the URDF at ``path``; arguments and errors as for
+    ``load``.
+    """
     options = Options(
         preset=preset,
         assume=assume,
@@ -114,8 +118,8 @@ def make_spec(path: str | Path, options: Options) -> ModelSpec:
 def check(module: str | Path, urdf: str | Path | None = None) -> CheckResult:
     """Build the module at ``module`` again, with its own options, and compare.
 
-    Without ``urdf`` the URDF is looked for by name beside the module, in the current folder and in ``robots/``. Raises
-    ModuleError when there is none or when the file is no emitted module.
+    Without ``urdf`` the URDF is looked for by name beside the module, in the current folder and in
+    ``robots/``. Raises ModuleError when there is none or when the file is no emitted module.
     """
     module = Path(module)
     header = read_header(module)

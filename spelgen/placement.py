@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from fractions import Fraction
+from math import inf
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from spelgen.rational import (
     alignment,
     exact,
     exact_rotation,
+    lost_zeros,
     product,
     rotated,
     rotated_tensor,
@@ -48,6 +50,17 @@ class Frame:
 
 
 @dataclass(frozen=True)
+class _Turned:
+    """A frame's rotation in the frame of the last revolute body before it, (3, 3) float64 and rational."""
+
+    composed: np.ndarray
+    exact: Matrix
+
+
+_STRAIGHT = _Turned(np.eye(3), IDENTITY)
+
+
+@dataclass(frozen=True)
 class Pose:
     """A joint's own frame, with +z along its axis, in the frame of the body ``parent``."""
 
@@ -62,8 +75,8 @@ class Placement:
     def __init__(self, root: str, snapper: Snapper) -> None:
         self.frames = {root: Frame(-1, np.eye(3), IDENTITY, ZERO)}
         self._snapper = snapper
-        # each body's exact rotation in the frame of the last revolute body above it, or itself
-        self._stretches: dict[int, Matrix] = {-1: IDENTITY}
+        # by body, the frames from the last revolute body above it, or itself, to its own
+        self._stretches: list[tuple[_Turned, ...]] = [(_STRAIGHT,)]
 
     def hold(self, joint: Joint, value: float) -> None:
         """Place the child of a joint that stays at ``value`` [rad or m]."""
@@ -84,12 +97,13 @@ class Placement:
         at = self._joint_origin(joint)
         turned = alignment(self._snapper.axis(joint))
         along = at.composed @ turned
-        stretch = exact_rotation(along)
-        rotation = product(transposed(self._stretches[at.body]), stretch)
-        body = len(self._stretches) - 1
+        rotation = self._in_body(at.body, along)
         slides = joint.type == "prismatic"
+        stretch = self._stretches[at.body + 1]
+        own = _Turned(along, product(stretch[-1].exact, rotation))
+        body = len(self._stretches) - 1
         composed = at.composed if slides else turned.T
-        self._stretches[body] = stretch if slides else IDENTITY
+        self._stretches.append((*stretch, own) if slides else (_STRAIGHT,))
         self.frames[joint.child] = Frame(body, composed, self._in_body(body, composed), ZERO)
         return Pose(at.body, rotation, at.position)
 
@@ -124,4 +138,22 @@ class Placement:
         return Frame(frame.body, composed, self._in_body(frame.body, composed), position)
 
     def _in_body(self, body: int, composed: np.ndarray) -> Matrix:
-        return product(transposed(self._stretches[body]), exact_rotation(composed))
+        """The exact rotation in the body's frame of what is turned by ``composed`` in its stretch's.
+
+        It is made rational in the frame, of those on the way, in which it then keeps most zeros seen from
+        all of them: an axis of 45 degrees, no rational one, may be square to several.
+        """
+        stretch = self._stretches[body + 1]
+        seen = [frame.composed.T @ composed for frame in stretch]
+        best, fewest = IDENTITY, inf
+        for frame, turned in zip(stretch, seen, strict=True):
+            candidate = product(frame.exact, exact_rotation(turned))
+            lost = sum(
+                lost_zeros(product(transposed(other.exact), candidate), view)
+                for other, view in zip(stretch, seen, strict=True)
+            )
+            if lost < fewest:
+                best, fewest = candidate, lost
+            if not lost:
+                break
+        return product(transposed(stretch[-1].exact), best)

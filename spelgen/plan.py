@@ -32,7 +32,8 @@ def plan_model(
 ) -> ModelSpec:
     """The model of ``arm`` under ``options``; ``urdf`` is the file's name without its folder.
 
-    ``rotors`` [kg m^2, kg] are known rotor inertias as felt at the joint; where there is none, one is guessed.
+    ``rotors`` [kg m^2, kg] are known rotor inertias as felt at the joint; where there is none, one is
+    guessed.
     """
     known = rotors or {}
     sizes = nominal(arm, structure, [known.get(c.name) or _guessed_rotor(c) for c in arm.coordinates])
@@ -85,7 +86,9 @@ def _joint(coordinate: Coordinate, identifier: str, sizes: Nominal, index: int) 
 
 
 def _guessed_rotor(coordinate: Coordinate) -> float:
-    """A geared drive's own inertia: such that its full effort takes ``_RISE`` seconds to reach its full speed."""
+    """A geared drive's own inertia: such that its full effort takes ``_RISE`` seconds to reach its full
+    speed.
+    """
     effort, speed = coordinate.effort, coordinate.velocity
     if not effort or not speed or effort > _LARGEST_EFFORT or speed > _LARGEST_SPEED:
         return 0.0
@@ -93,7 +96,9 @@ def _guessed_rotor(coordinate: Coordinate) -> float:
 
 
 def _friction(coordinate: Coordinate, sizes: Nominal, index: int) -> float:
-    """The size of friction to start from: a share of the drive's effort, or of the torques the nominal arm needs."""
+    """The size of friction to start from: a share of the drive's effort, or of the torques the nominal arm
+    needs.
+    """
     if coordinate.effort and coordinate.effort <= _LARGEST_EFFORT:
         return _FRICTION_OF_EFFORT * coordinate.effort
     # a wrist may need next to no torque by itself, but its gear rubs like its neighbour's
@@ -118,5 +123,3 @@ def _identifiers(names: list[str]) -> list[str]:
 
 def _floats(weights: Weights) -> Entries:
     return tuple((row, column, float(value)) for row, column, value in weights)
-
-

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from fractions import Fraction
-from math import cos, pi, sin
+from math import atan2, cos, pi, sin, tan
 
 import numpy as np
 
@@ -28,6 +28,9 @@ _ALIGNMENTS = {
 _FINE_STEPS = (pi / 12, pi / 8, pi / 5)
 _FINE_TOLERANCE = 2e-5
 _REACH = 1e-11
+_NOISE = 1e-12
+_BOUNDS = (10**7, 10**10, 10**13)
+_EDGE = 0.7  # rad, just below pi/4
 _MAX_BITS = 4096
 
 
@@ -95,17 +98,61 @@ def alignment(axis: np.ndarray) -> np.ndarray:
 
 
 def exact_rotation(rotation: np.ndarray) -> Matrix:
-    """A rational rotation within 1e-11 of a float64 one, exactly orthogonal; signed permutations are exact.
+    """A rational rotation within 1e-11 of a float64 one, exactly orthogonal, with zeros where it has zeros.
 
     The unit quaternion is divided by its largest component and each ratio replaced by a nearby fraction; the
-    rotation of an unnormalised rational quaternion is rational (Euler-Rodrigues).
+    rotation of an unnormalised rational quaternion is rational (Euler-Rodrigues). That may miss a zero which
+    the ratios only make together; one turn before and one behind a signed permutation then keep it.
     """
     ratios = _quaternion_ratios(rotation)
-    for bound in (10**7, 10**10, 10**13):
+    for bound in _BOUNDS:
         candidate = _rotation_of(*(Fraction(ratio).limit_denominator(bound) for ratio in ratios))
         if np.abs(np.array(candidate, dtype=float) - rotation).max() < _REACH:
-            return candidate
-    return candidate
+            break
+    if not lost_zeros(candidate, rotation):
+        return candidate
+    row, column = np.argwhere(np.abs(rotation) < _NOISE)[0].tolist()
+    return _rotation_with_zero(rotation, row, column)
+
+
+def lost_zeros(candidate: Matrix, rotation: np.ndarray) -> int:
+    """How many zeros of a float64 rotation are none in the rational ``candidate``."""
+    return sum(
+        bool(element) and abs(value) < _NOISE
+        for elements, values in zip(candidate, rotation.tolist(), strict=True)
+        for element, value in zip(elements, values, strict=True)
+    )
+
+
+def _rotation_with_zero(r: np.ndarray, i: int, j: int) -> Matrix:
+    """The rational rotation near r, of which element (i, j) is zero: a turn about axis i, a signed
+    permutation, and a turn about axis j, so that the other zeros are those of the turns.
+    """
+    before = _turn(i, r[(i + 1) % 3, j], r[(i + 2) % 3, j])
+    behind = _turn(j, r[i, (j + 1) % 3], -r[i, (j + 2) % 3])
+    between = np.rint(np.array(before, dtype=float).T @ r @ np.array(behind, dtype=float).T).astype(int)
+    x, y, z = ((Fraction(a), Fraction(b), Fraction(c)) for a, b, c in between.tolist())
+    return product(product(before, (x, y, z)), behind)
+
+
+def _turn(axis: int, cosine: float, sine: float) -> Matrix:
+    """The rational rotation about a coordinate axis by the angle of this cosine and sine."""
+    # reduced to one eighth, so that 45 and 135 degrees are a right angle apart; no usual angle is on an edge
+    quarter, angle = divmod(atan2(sine, cosine) + _EDGE, pi / 2)
+    tangent = tan((angle - _EDGE) / 2)
+    for bound in _BOUNDS:
+        t = Fraction(0) if abs(tangent) < _NOISE else Fraction(tangent).limit_denominator(bound)
+        if abs(float(t) - tangent) < _REACH / 4:
+            break
+    c, s = (1 - t * t) / (1 + t * t), 2 * t / (1 + t * t)
+    for _ in range(int(quarter) % 4):
+        c, s = -s, c
+    turned = [[Fraction(int(row == column)) for column in range(3)] for row in range(3)]
+    first, second = (axis + 1) % 3, (axis + 2) % 3
+    turned[first][first], turned[first][second] = c, -s
+    turned[second][first], turned[second][second] = s, c
+    x, y, z = ((a, b, c) for a, b, c in turned)
+    return x, y, z
 
 
 def _quaternion_ratios(r: np.ndarray) -> list[float]:
@@ -124,7 +171,7 @@ def _quaternion_ratios(r: np.ndarray) -> list[float]:
         parts[1 + j] = r[j, i] + r[i, j]
         parts[1 + k] = r[k, i] + r[i, k]
     ratios = parts / parts[np.argmax(np.abs(parts))]
-    return [0.0 if abs(ratio) < 1e-12 else float(ratio) for ratio in ratios]
+    return [0.0 if abs(ratio) < _NOISE else float(ratio) for ratio in ratios]
 
 
 def _rotation_of(w: Fraction, x: Fraction, y: Fraction, z: Fraction) -> Matrix:

@@ -1,9 +1,10 @@
 """M(q) and V(q) of an arm by one recursion, over any ring.
 
-The composite-inertia recursion (Featherstone, *Rigid Body Dynamics Algorithms*, 2008, ch. 6) only adds, negates and multiplies,
-so the same lines serve floating-point numbers (nominal values), a prime field (``structure``) and polynomials (``symbolic``).
-Each body carries ten inertial parameters (m, h = m c, I about its joint's origin), in which M and V are linear. A body turns about or
-slides along the z axis of its own joint frame.
+The composite-inertia recursion (Featherstone, *Rigid Body Dynamics Algorithms*, 2008, ch. 6) only adds,
+negates and multiplies, so the same lines serve floating-point numbers (nominal values), a prime field
+(``structure``) and polynomials (``symbolic``). Each body carries ten inertial parameters (m, h = m c, I
+about its joint's origin), in which M and V are linear. A body turns about or slides along the z axis of
+its own joint frame.
 """
 
 from __future__ import annotations
@@ -36,7 +37,9 @@ class Motion:
 
 @dataclass(frozen=True)
 class Energies:
-    """The arm's mass matrix as its lower triangle, {(row, column): element}, 0-based, and its potential energy."""
+    """The arm's mass matrix as its lower triangle, {(row, column): element}, 0-based, and its potential
+    energy.
+    """
 
     mass: dict[tuple[int, int], Element]
     potential: Element
@@ -80,8 +83,8 @@ def energies(
 ) -> Energies:
     """Mass matrix and potential energy of ``arm``.
 
-    ``motions`` and ``inertias`` (ten elements each) go by body; ``number`` takes the arm's exact constants into the ring.
-    V is zero for a body at the root's origin and grows against ``arm.gravity``.
+    ``motions`` and ``inertias`` (ten elements each) go by body; ``number`` takes the arm's exact constants
+    into the ring. V is zero for a body at the root's origin and grows against ``arm.gravity``.
     """
     poses = [_pose(body, number) for body in arm.bodies]
     composites = [_Inertia(ten[0], tuple(ten[1:4]), tuple(ten[4:10])) for ten in inertias]

@@ -26,5 +26,7 @@ def _environment(autoescape: bool) -> Environment:
 
 
 def render(template: str, **context: Any) -> str:
-    """The text of ``template`` with ``context``; an undefined name is an error, and HTML templates escape what they show."""
+    """The text of ``template`` with ``context``; an undefined name is an error, and HTML templates escape
+    what they show.
+    """
     return _environment(".html" in template).get_template(template).render(**context)

@@ -60,7 +60,9 @@ def urdf_values(urdf: Path, joints: Sequence[str], substeps: int) -> Contender:
 
 
 class PinocchioDynamics:
-    """A URDF's arm of n joints, all others locked at zero, with velocities where an emitted module has momenta."""
+    """A URDF's arm of n joints, all others locked at zero, with velocities where an emitted module has
+    momenta.
+    """
 
     def __init__(self, urdf: Path, joints: Sequence[str]) -> None:
         import pinocchio as pin  # an extra: everything else here works without
@@ -99,6 +101,18 @@ class PinocchioDynamics:
             solved = self._pin.aba(self._model, self._data, position[row], velocity[row], effort[row])
             qdd[row] = solved[self._order]
         return torch.from_numpy(np.concatenate([qd, qdd, np.zeros_like(tau)], axis=1))
+
+    def mass_matrix(self, q: torch.Tensor) -> torch.Tensor:
+        """M (T, n, n) [kg m^2, kg m, kg]."""
+        order = np.ix_(self._order, self._order)
+        upper = [self._pin.crba(self._model, self._data, at)[order] for at in self._configurations(q.numpy())]
+        full = np.array([np.where(m == 0, m.T, m) for m in upper])  # crba fills one triangle in its own order
+        return torch.from_numpy(full)
+
+    def gravity(self, q: torch.Tensor) -> torch.Tensor:
+        """dV/dq (T, n) [Nm, N]."""
+        still = torch.zeros_like(q)
+        return self.inverse_dynamics(q, still, still)
 
     def inverse_dynamics(self, q: torch.Tensor, qd: torch.Tensor, qdd: torch.Tensor) -> torch.Tensor:
         """Torques (T, n)."""

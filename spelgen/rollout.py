@@ -110,24 +110,26 @@ def rollout_loss(model: EmittedModel, windows: Windows, scales: LossScales, subs
     return rollout_errors(model, windows, scales, substeps).square().mean()
 
 
-def momentum_loss(model: EmittedModel, windows: Windows) -> torch.Tensor:
-    """The weak form of the equations: p(t1) - p(t0) against the impulse of all forces along the measured samples.
+def momentum_loss(model: EmittedModel, windows: Windows, scales: LossScales) -> torch.Tensor:
+    """The weak form of the equations: p(t) - p(0) against the impulse of all forces along the measured
+    samples.
 
-    Force between samples is the mean of its values at both ends (trapezium rule); no ODE is solved and no
-    acceleration needed. Scaled per joint by the input's impulses, a hundredth of the largest at least.
+    Forces between samples are the mean of their values at both ends (trapezium rule): no ODE is solved and no
+    acceleration needed. What is missing is told as velocity, M(q)^-1 times it, scaled like `rollout_loss`'s.
     """
     q, qd, n = windows.q, windows.qd, windows.q.shape[-1]  # (W, K, n)
     p = model.momentum(q, qd)
-    passive = model.forward(windows.dt, torch.cat([q, p], dim=-1))[..., n:]
+    force = model.forward(windows.dt, torch.cat([q, p], dim=-1))[..., n:]
     dt = windows.dt.unsqueeze(-1)
-    push = (model.input_matrix(q[:, :-1]) @ windows.tau.unsqueeze(-1)).squeeze(-1) * dt
-    missing = p.diff(dim=1) - push - (passive[:, :-1] + passive[:, 1:]) / 2 * dt
-    scale = push.square().mean(dim=(0, 1)).sqrt()
-    return (missing / scale.clamp(min=max(1e-2 * scale.max().item(), 1e-9))).square().mean()
+    push = (model.input_matrix(q[:, :-1]) @ windows.tau.unsqueeze(-1)).squeeze(-1)
+    impulse = (dt * (push + (force[:, :-1] + force[:, 1:]) / 2)).cumsum(dim=1)  # (W, K-1, n)
+    missing = model.velocity(q[:, 1:], p[:, 1:] - p[:, :1] - impulse)
+    return (missing / scales.qd).square().mean()
 
 
 def integration_error(model: EmittedModel, windows: Windows, scales: LossScales, substeps: int) -> float:
-    """Difference between rollouts with `substeps` and with twice as many, relative to the error of the latter.
+    """Difference between rollouts with `substeps` and with twice as many, relative to the error of the
+    latter.
 
     Both are root mean squares in units of `scales`; of the model's error, at least LEAST_ERROR is taken.
     """
@@ -142,7 +144,9 @@ def integration_error(model: EmittedModel, windows: Windows, scales: LossScales,
 
 
 def choose_substeps(model: EmittedModel, windows: Windows, scales: LossScales, start: int = 1) -> int:
-    """The fewest rk4 steps per sample interval, from `start` on, that make integration a small part of the error."""
+    """The fewest rk4 steps per sample interval, from `start` on, that make integration a small part of the
+    error.
+    """
     for substeps in SUBSTEPS:
         if substeps >= start and integration_error(model, windows, scales, substeps) < INTEGRATION_SHARE:
             return substeps

@@ -1,7 +1,7 @@
 """Mass matrices and potential energies of an arm at random points, in the prime field and in floating point.
 
-Both kinds of sample come as a base block and, for every coordinate, a block in which that coordinate alone has moved: what
-changes between the two depends on the coordinate.
+Both kinds of sample come as a base block and, for every coordinate, a block in which that coordinate alone
+has moved: what changes between the two depends on the coordinate.
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ Ten = Sequence[Element]
 
 @dataclass(frozen=True)
 class Samples:
-    """``mass`` (1 + n, samples, n(n+1)/2) and ``potential`` (1 + n, samples); block 0 is the base, block k has coordinate k moved."""
+    """``mass`` (1 + n, samples, n(n+1)/2) and ``potential`` (1 + n, samples); block 0 is the base, block k
+    has coordinate k moved.
+    """
 
     mass: np.ndarray
     potential: np.ndarray
@@ -47,7 +49,8 @@ def field_samples(arm: Arm, assume: Assume, samples: int, seed: int = 0) -> Samp
     n, blocks = len(arm.coordinates), 1 + len(arm.coordinates)
     positions = []
     for index in range(n):
-        # an angle's cosine and sine and a sliding distance are independent as functions, so each is drawn for itself
+        # an angle's cosine and sine and a sliding distance are independent as functions, so each is drawn for
+        # itself
         c, s = random_circle_points(rng, 2 * samples)
         drawn = (c, s, random_residues(rng, (2 * samples,)))
         parts = [Residues(_one_moved(values, index, blocks)) for values in drawn]
@@ -55,7 +58,8 @@ def field_samples(arm: Arm, assume: Assume, samples: int, seed: int = 0) -> Samp
     inertias: list[Ten]
     if assume == "kinematics":
         inertias = [
-            [Residues(np.tile(random_residues(rng, (samples,)), blocks)) for _ in range(10)] for _ in arm.bodies
+            [Residues(np.tile(random_residues(rng, (samples,)), blocks)) for _ in range(10)]
+            for _ in arm.bodies
         ]
     else:
         inertias = [[residue(x) for x in body.inertia or (Fraction(0),) * 10] for body in arm.bodies]
@@ -68,8 +72,8 @@ def field_samples(arm: Arm, assume: Assume, samples: int, seed: int = 0) -> Samp
 def regressor_rows(arm: Arm, points: int, seed: int = 1) -> np.ndarray:
     """Rows of the energy regressor in the field, ((n(n+1)/2 + 1) points, 10 bodies).
 
-    M(q) and V(q) - V(q0) are linear in the inertial parameters and fix the torque, so the rows' rank is the number of base
-    parameters (Gautier and Khalil 1990).
+    M(q) and V(q) - V(q0) are linear in the inertial parameters and fix the torque, so the rows' rank is
+    the number of base parameters (Gautier and Khalil 1990).
     """
     rng = np.random.default_rng(seed)
     n, parameters = len(arm.coordinates), 10 * len(arm.bodies)
@@ -82,7 +86,9 @@ def regressor_rows(arm: Arm, points: int, seed: int = 1) -> np.ndarray:
     inertias = [[Residues(unit[10 * body + i]) for i in range(10)] for body in range(len(arm.bodies))]
     result = energies(arm, motions(arm, positions, residue), inertias, residue)
     elements = [result.mass[key] for key in triangle(n)] + [result.potential]
-    rows = np.stack([_residue_values(e, points * parameters).reshape(points, parameters) for e in elements], axis=1)
+    rows = np.stack(
+        [_residue_values(e, points * parameters).reshape(points, parameters) for e in elements], axis=1
+    )
     rows[:, -1] = difference(rows[:, -1], rows[0, -1])
     return rows.reshape(-1, parameters)
 
@@ -105,7 +111,8 @@ def float_energies(arm: Arm, q: np.ndarray, inertias: Sequence[Ten]) -> tuple[np
     """Lower triangles of M, (points, n(n+1)/2), and V [J], (points,), at ``q`` (points, n) [rad, m]."""
     bases = _base_denominators(arm)
     positions = [
-        Position(np.cos(value / base), np.sin(value / base), value) for value, base in zip(q.T, bases, strict=True)
+        Position(np.cos(value / base), np.sin(value / base), value)
+        for value, base in zip(q.T, bases, strict=True)
     ]
     result = energies(arm, motions(arm, positions, float), inertias, float)
     points = len(q)
@@ -147,7 +154,10 @@ def circle_point(angle: float) -> tuple[Fraction, Fraction]:
 def _base_denominators(arm: Arm) -> list[int]:
     """By coordinate, the d for which every body's angle is a whole multiple of q / d."""
     return [
-        lcm(*(b.multiplier.denominator for b in arm.bodies if b.coordinate == index and b.kind == "revolute"), 1)
+        lcm(
+            *(b.multiplier.denominator for b in arm.bodies if b.coordinate == index and b.kind == "revolute"),
+            1,
+        )
         for index in range(len(arm.coordinates))
     ]
 

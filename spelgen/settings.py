@@ -94,12 +94,14 @@ class TrainingSettings(_Group):
     batch: windows per step. epochs: passes over all windows, at most.
     patience: epochs without a better validation loss before stopping.
     momentum_steps: steps on the weak form (see `momentum_loss`) before windows are predicted.
+    prior: weight of staying near the URDF's own M and gravity (see `Prior`); 0: none.
     substeps: integrator steps per sample interval; None: as many as the robot needs.
     validation_fraction: part of the training trajectories held out to watch the validation loss.
     """
 
     objective: Literal["rollout"] = "rollout"
     momentum_steps: Annotated[int, BeforeValidator(_no_bool), Field(ge=0)] = 2000
+    prior: NonNegative = 0.1
     window: Annotated[Count, Field(ge=2)] = 5
     stride: Count = 1
     epochs: Count = 400

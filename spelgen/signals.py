@@ -42,7 +42,8 @@ def automatic_cutoff(trajectories: Sequence[Trajectory]) -> float | None:
 
 
 def automatic_spacing(trajectories: Sequence[Trajectory], cutoff: float | None) -> int:
-    """Samples from one sample of a window to the next: every one, unless filtered logs are much denser than needed.
+    """Samples from one sample of a window to the next: every one, unless filtered logs are much denser than
+    needed.
 
     What was filtered at `cutoff` is fully described by three samples per period of it.
     """

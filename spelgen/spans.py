@@ -15,24 +15,30 @@ _SPARE_SAMPLES = 4
 
 
 class Spans:
-    """Row vectors over the n(n+1)/2 entries of M, in the prime field: ``mass`` spans W, ``changes[k]`` spans T_k."""
+    """Row vectors over the n(n+1)/2 entries of M, in the prime field: ``mass`` spans W, ``changes[k]`` spans
+    T_k.
+    """
 
     def __init__(self, arm: Arm, assume: Assume):
         self.n = len(arm.coordinates)
         self.keys = triangle(self.n)
-        # a span of dimension d shows in d samples, and the spare ones would have shown a larger one, all but surely
+        # a span of dimension d shows in d samples, and the spare ones would have shown a larger one, all but
+        # surely
         count = len(self.keys) + _SPARE_SAMPLES
         samples = field_samples(arm, assume, count)
         self._arm, self._assume, self._count = arm, assume, count
         self.mass = samples.mass[0]
         self.changes = [field.difference(samples.mass[k + 1], samples.mass[0]) for k in range(self.n)]
-        self.potential_changes = [bool((samples.potential[k + 1] != samples.potential[0]).any()) for k in range(self.n)]
+        self.potential_changes = [
+            bool((samples.potential[k + 1] != samples.potential[0]).any()) for k in range(self.n)
+        ]
 
     @cached_property
     def entry_joints(self) -> list[frozenset[int]]:
         """The joints each entry of M depends on."""
         return [
-            frozenset(k for k in range(self.n) if self.changes[k][:, index].any()) for index in range(len(self.keys))
+            frozenset(k for k in range(self.n) if self.changes[k][:, index].any())
+            for index in range(len(self.keys))
         ]
 
     @cached_property
@@ -47,7 +53,9 @@ class Spans:
 
     @cached_property
     def floats(self) -> Samples:
-        """Twice as many samples in double precision, for the sizes of coefficients; their zeros and ranks come from the field."""
+        """Twice as many samples in double precision, for the sizes of coefficients; their zeros and ranks
+        come from the field.
+        """
         return float_samples(self._arm, self._assume, 2 * self._count)
 
     @property

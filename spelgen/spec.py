@@ -1,4 +1,5 @@
-"""ModelSpec: everything an emitted module is made from, as plain frozen data. The wall between deriving and training.
+"""ModelSpec: everything an emitted module is made from, as plain frozen data. The wall between deriving and
+training.
 
 Also reads back the record that an emitted module carries in its docstring.
 """
@@ -20,6 +21,7 @@ Kind = Literal["zero", "constant", "varying"]
 Preset = Literal["minimal"]
 Entries = tuple[tuple[int, int, float], ...]
 """A sparse symmetric matrix by its lower triangle: (row, column, value), 0-based."""
+
 
 @dataclass(frozen=True)
 class Options:

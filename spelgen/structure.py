@@ -1,9 +1,11 @@
-"""Arm -> Structure: which entries of M, V and G are zero, constant or vary, with which joints, and the smallest exact form of M.
+"""Arm -> Structure: which entries of M, V and G are zero, constant or vary, with which joints, and the
+smallest exact form of M.
 
-M(q) = sum_k c_k A_k + sum_j f_j(q) B_j. Let T_k be the span of the changes M(q) - M(q') when joint k alone moves, U the sum of all T_k and
-W the span of M itself. Then dim U networks outputs f_j are needed, and dim W - dim U constants c_k. A linear read-out of M depends on the joints in
-J only, exactly when it vanishes on T_k for every k outside J; the read-outs behind the f_j are chosen by that test.
-All questions are ranks or zeros of samples in a prime field (``field``): exact but for odds of about 1e-16, without tolerances.
+M(q) = sum_k c_k A_k + sum_j f_j(q) B_j. Let T_k be the span of the changes M(q) - M(q') when joint k alone
+moves, U the sum of all T_k and W the span of M itself. Then dim U networks outputs f_j are needed, and dim
+W - dim U constants c_k. A linear read-out of M depends on the joints in J only, exactly when it vanishes
+on T_k for every k outside J; the read-outs behind the f_j are chosen by that test. All questions are ranks
+or zeros of samples in a prime field (``field``): exact but for odds of about 1e-16, without tolerances.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ from spelgen.spans import Spans
 MOST_JOINTS = 24
 """Longest arm that is derived; the work grows with about the fourth power."""
 
+
 @dataclass(frozen=True)
 class Entry:
     """One entry of a symmetric matrix, 0-based, with the coordinates it depends on."""
@@ -33,7 +36,9 @@ class Entry:
 
 @dataclass(frozen=True)
 class Structure:
-    """What holds for every value of the inertial parameters (``kinematics``), or for the URDF's (``inertials``)."""
+    """What holds for every value of the inertial parameters (``kinematics``), or for the URDF's
+    (``inertials``).
+    """
 
     assume: Assume
     joints: tuple[str, ...]
@@ -52,13 +57,20 @@ class Structure:
 
 
 def derive(arm: Arm, assume: Assume = "kinematics") -> Structure:
-    """The structure of ``arm``. Raises ArmError above ``MOST_JOINTS`` joints, or without inertials under ``inertials``."""
+    """The structure of ``arm``. Raises ArmError above ``MOST_JOINTS`` joints, or without inertials under
+    ``inertials``.
+    """
     n = len(arm.coordinates)
     if n > MOST_JOINTS:
-        raise ArmError(f"{n} joints", expected=f"at most {MOST_JOINTS}", do="choose fewer with --joints or --tip")
+        raise ArmError(
+            f"{n} joints", expected=f"at most {MOST_JOINTS}", do="choose fewer with --joints or --tip"
+        )
     if assume == "inertials" and not arm.has_inertials:
-        raise ArmError("links without inertial values", expected="an <inertial> on every moving body",
-                       do="use --assume kinematics, which needs none")
+        raise ArmError(
+            "links without inertial values",
+            expected="an <inertial> on every moving body",
+            do="use --assume kinematics, which needs none",
+        )
     spans = Spans(arm, assume)
     outputs, constants = smallest_form(spans)
     return Structure(
@@ -74,7 +86,9 @@ def derive(arm: Arm, assume: Assume = "kinematics") -> Structure:
 
 
 def base_parameters(arm: Arm) -> int:
-    """Rank of the inverse-dynamics regressor: how many combinations of inertial parameters move the arm differently."""
+    """Rank of the inverse-dynamics regressor: how many combinations of inertial parameters move the arm
+    differently.
+    """
     points = 4
     while True:
         rows = regressor_rows(arm, points + 2)

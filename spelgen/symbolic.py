@@ -1,7 +1,8 @@
-"""M(q) and V(q) of an arm as exact polynomials in the cosines and sines of its angles and in its sliding distances.
+"""M(q) and V(q) of an arm as exact polynomials in the cosines and sines of its angles and in its sliding
+distances.
 
-The same recursion as everywhere, over the rational polynomials. The structure does not need them (``structure`` works with
-values alone): they are its independent proof and the source of closed forms.
+The same recursion as everywhere, over the rational polynomials. The structure does not need them
+(``structure`` works with values alone): they are its independent proof and the source of closed forms.
 """
 
 from __future__ import annotations
@@ -24,8 +25,9 @@ PARAMETERS = ("m", "hx", "hy", "hz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
 class Polynomials:
     """The lower triangle of M(q), by (row, column), and V(q), over the variables ``names``.
 
-    c1, s1 are the cosine and sine of coordinate 1 (of its base angle, where a mimic joint turns by a fraction of it), q1 its value where
-    something slides; m1, hx1, ... Izz1 the inertial parameters of body 1 about its joint, where they are kept as variables.
+    c1, s1 are the cosine and sine of coordinate 1 (of its base angle, where a mimic joint turns by a
+    fraction of it), q1 its value where something slides; m1, hx1, ... Izz1 the inertial parameters of body
+    1 about its joint, where they are kept as variables.
     """
 
     names: tuple[str, ...]
@@ -41,7 +43,9 @@ class Polynomials:
 
 
 def polynomials(arm: Arm, *, inertials: bool = False) -> Polynomials:
-    """The exact polynomials of ``arm``, with its inertial parameters as variables or, under ``inertials``, the URDF's values."""
+    """The exact polynomials of ``arm``, with its inertial parameters as variables or, under ``inertials``,
+    the URDF's values.
+    """
     n, bodies = len(arm.coordinates), len(arm.bodies)
     names = [f"{letter}{k + 1}" for k in range(n) for letter in "csq"]
     if not inertials:
@@ -52,7 +56,9 @@ def polynomials(arm: Arm, *, inertials: bool = False) -> Polynomials:
     one = context.from_dict({(0,) * len(names): 1})
     parameters: list[Sequence[fmpq_mpoly]]
     if inertials:
-        parameters = [[_rational(x) * one for x in body.inertia or (Fraction(0),) * 10] for body in arm.bodies]
+        parameters = [
+            [_rational(x) * one for x in body.inertia or (Fraction(0),) * 10] for body in arm.bodies
+        ]
     else:
         parameters = [variables[3 * n + 10 * body :][:10] for body in range(bodies)]
     result = energies(arm, motions(arm, positions, _rational), parameters, _rational)

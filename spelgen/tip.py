@@ -15,7 +15,8 @@ from spelgen.urdf import read_urdf
 def tip_position(
     urdf: Path, joints: Sequence[str], tip: str | None
 ) -> Callable[[torch.Tensor], torch.Tensor]:
-    """A function of q, (..., n) [rad, m], to the position of the link `tip`, (..., 3) [m], in the root link's frame.
+    """A function of q, (..., n) [rad, m], to the position of the link `tip`, (..., 3) [m], in the root link's
+    frame.
 
     tip: by default the link after the last joint, or the end of the fixed links that follow it. Joints other
     than the n named ones stand at zero. Offsets are single precision in pytorch-kinematics: errors near 1e-7

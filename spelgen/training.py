@@ -9,16 +9,20 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from spelgen.errors import Diagnostic, ModuleError, RunError
+from spelgen.prior import Prior, urdf_prior
 from spelgen.progress import TrainingProgress
 from spelgen.runs import RunFolder, load_model, write_json
 from spelgen.spec import Header, read_header
 from spelgen.training_data import TrainingConfig, TrainingData, prepare_data
 from spelgen.training_loop import Status, TrainingLoop
+
+if TYPE_CHECKING:
+    from spelgen.runs import EmittedModel
 
 MAY_CHANGE = ("epochs", "patience", "max_minutes", "threads", "device")  # between a run and its resumption
 
@@ -83,7 +87,8 @@ def train(
         notes += found
         run.start(module, robot, force=force)
         write_json(run.config, description)
-    loop = TrainingLoop(run, model, prepared, config)
+    prior = _prior(run, header, model, prepared, config, notes)
+    loop = TrainingLoop(run, model, prepared, config, prior)
     if resume:
         loop.restore()
     with TrainingProgress(config.epochs, show=progress) as shown, _termination_as_interrupt():
@@ -106,6 +111,27 @@ def _result(loop: TrainingLoop, status: Status, notes: tuple[Diagnostic, ...]) -
         substeps=loop.substeps,
         diagnostics=notes,
     )
+
+
+def _prior(
+    run: RunFolder,
+    header: Header,
+    model: EmittedModel,
+    data: TrainingData,
+    config: TrainingConfig,
+    notes: list[Diagnostic],
+) -> Prior | None:
+    """The URDF's pull, where it is wanted and can be had."""
+    if not config.prior or not run.urdf.exists():
+        return None
+    try:
+        return urdf_prior(run.urdf, header.joints, model, data.training)
+    except Exception as error:  # Pinocchio and its parser raise many kinds; training goes on without
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        notes.append(
+            Diagnostic("info", "no-prior", "robot.urdf", None, f"trained without the URDF's pull: {reason}")
+        )
+        return None
 
 
 def _use(config: TrainingConfig) -> None:

@@ -23,6 +23,7 @@ class TrainingConfig:
     """Settings of one run; see `TrainingSettings` for those that a robot's sidecar file may set.
 
     momentum_steps: steps on the weak form of the equations before windows are predicted; 0: none.
+    prior: weight of staying near the URDF's own M and gravity (see `Prior`); 0: none.
     every: samples from one sample of a window to the next, None: see `automatic_spacing`.
     substeps: rk4 steps per sample interval, None: chosen by `choose_substeps`.
     filter: cutoff [Hz] of the zero-phase low-pass on q, qd and tau; 0: none; None: see `automatic_cutoff`.
@@ -32,6 +33,7 @@ class TrainingConfig:
 
     objective: Literal["rollout"] = "rollout"
     momentum_steps: int = 2000
+    prior: float = 0.1
     window: int = 5
     stride: int = 1
     every: int | None = None
@@ -87,12 +89,15 @@ def prepare_data(
         notes.append(Diagnostic("info", "filter", "logs", None, message))
     every = config.every or automatic_spacing(trajectories, cutoff)
     training, validation = (
-        prepare(x, shortest=(config.window - 1) * every + 1, cutoff=cutoff) for x in (split.training, split.validation)
+        prepare(x, shortest=(config.window - 1) * every + 1, cutoff=cutoff)
+        for x in (split.training, split.validation)
     )
     windows = cut_windows(training, config.window, config.stride, every, measured=cutoff is not None)
     return TrainingData(
         training=windows,
-        validation=_thin(cut_windows(validation, config.window, config.stride, every, measured=cutoff is not None)),
+        validation=_thin(
+            cut_windows(validation, config.window, config.stride, every, measured=cutoff is not None)
+        ),
         scales=loss_scales(windows, joint_types),
         cutoff=cutoff,
         training_names=tuple(x.name for x in split.training),

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 
 from spelgen.errors import RunError
+from spelgen.prior import Prior
 from spelgen.progress import TrainingProgress
 from spelgen.rollout import INTEGRATION_SHARE, choose_substeps, integration_error, momentum_loss, rollout_loss
 from spelgen.runs import RunFolder, write_state
@@ -41,12 +42,18 @@ class TrainingLoop:
     """The changing state of one run; `save` writes all of it, so a resumed run repeats the same numbers."""
 
     def __init__(
-        self, folder: RunFolder, model: EmittedModel, data: TrainingData, config: TrainingConfig
+        self,
+        folder: RunFolder,
+        model: EmittedModel,
+        data: TrainingData,
+        config: TrainingConfig,
+        prior: Prior | None = None,
     ) -> None:
         self.folder, self.config = folder, config
         self.model = model.to(config.device)
         self.training, self.validation = data.training.to(config.device), data.validation.to(config.device)
         self.scales = data.scales.to(config.device)
+        self.prior = prior
         self.optimiser = self._optimiser()
         self.generator = torch.Generator().manual_seed(config.seed)
         self.batch = min(config.batch, len(self.training))
@@ -97,9 +104,11 @@ class TrainingLoop:
             group["lr"] = rate * group["factor"]
 
     def _warm_up(self, progress: TrainingProgress) -> None:
-        """Momentum first: the weak form needs no ODE solve and brings the model near before windows are predicted.
+        """Momentum first: the weak form needs no ODE solve and brings the model near before windows are
+        predicted.
 
-        Kept only if it predicts the validation windows better. An interruption here starts it again on resumption.
+        Kept only if it predicts the validation windows better. An interruption here starts it again on
+        resumption.
         """
         before = copy.deepcopy(self.model.state_dict()), self.best_loss
         generator = torch.Generator().manual_seed(self.config.seed)
@@ -107,11 +116,13 @@ class TrainingLoop:
         for step in range(steps):
             part = step / steps
             fall = FINAL_RATE + (1 - FINAL_RATE) * (1 + math.cos(math.pi * part)) / 2
-            self._set_rate(optimiser, MOMENTUM_FACTOR * self.config.learning_rate * min(1.0, part / WARM_UP) * fall)
+            self._set_rate(
+                optimiser, MOMENTUM_FACTOR * self.config.learning_rate * min(1.0, part / WARM_UP) * fall
+            )
             rows = torch.randint(len(self.training), (self.batch,), generator=generator)
             optimiser.zero_grad()
-            loss = momentum_loss(self.model, self.training[rows.to(self.config.device)])
-            loss.backward()
+            loss = momentum_loss(self.model, self.training[rows.to(self.config.device)], self.scales)
+            (loss + self._pull()).backward()
             norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), GRADIENT_NORM)
             if torch.isfinite(norm):
                 optimiser.step()
@@ -175,13 +186,17 @@ class TrainingLoop:
             loss = rollout_loss(self.model, windows, self.scales, self.substeps)
         except torch.linalg.LinAlgError:  # numbers blew up within the rollout
             return math.nan
-        loss.backward()
+        (loss + self._pull()).backward()
         norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), GRADIENT_NORM)
         if not torch.isfinite(norm):
             return math.nan
         self.optimiser.step()
         self.step += 1
         return loss.item()
+
+    def _pull(self) -> torch.Tensor | float:
+        """What straying from the URDF costs."""
+        return 0.0 if self.prior is None else self.config.prior * self.prior.loss(self.model)
 
     def _rate(self) -> float:
         """Learning rate of the next step: a linear rise times a cosine down over all steps or minutes."""
@@ -197,7 +212,9 @@ class TrainingLoop:
         parts = self.validation.split(4 * self.batch)
         try:
             with torch.no_grad():
-                losses = [rollout_loss(self.model, x, self.scales, self.substeps).item() * len(x) for x in parts]
+                losses = [
+                    rollout_loss(self.model, x, self.scales, self.substeps).item() * len(x) for x in parts
+                ]
         except torch.linalg.LinAlgError:
             return math.inf
         return sum(losses) / len(self.validation)

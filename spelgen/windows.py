@@ -47,11 +47,16 @@ def cut_windows(
 ) -> Windows:
     """All windows of `window` samples, `every` apart, that start at every `stride`-th sample of a piece.
 
-    Between samples the input is held at its mean over time. measured: False reads tau[k] as held from t[k] to
-    t[k+1], as a simulator with zero-order hold applied it. True reads it as measured at t[k] and takes the mean of
-    both ends for a step; holding tau[k] would be half a sample late. Raises LogError when there is no window.
+    Between samples the input is held at its mean over time. measured: False reads tau[k] as held from t[k]
+    to t[k+1], as a simulator with zero-order hold applied it. True reads it as measured at t[k] and takes
+    the mean of both ends for a step; holding tau[k] would be half a sample late. Raises LogError when
+    there is no window.
     """
-    cut = [_cut(piece, window, stride, every, measured) for piece in pieces if len(piece.t) > (window - 1) * every]
+    cut = [
+        _cut(piece, window, stride, every, measured)
+        for piece in pieces
+        if len(piece.t) > (window - 1) * every
+    ]
     if not cut:
         raise LogError(f"no trajectory of {(window - 1) * every + 1} samples", expected="one window")
     return Windows(*(torch.from_numpy(np.concatenate(parts)) for parts in zip(*cut, strict=True)))
@@ -59,7 +64,9 @@ def cut_windows(
 
 def _cut(piece: Trajectory, window: int, stride: int, every: int, measured: bool) -> tuple[np.ndarray, ...]:
     held = (piece.tau[:-1] + piece.tau[1:]) / 2 if measured else piece.tau[:-1]
-    impulse = sliding_window_view(held * np.diff(piece.t)[:, None], every, axis=0).sum(axis=-1)  # (T - every, n)
+    impulse = sliding_window_view(held * np.diff(piece.t)[:, None], every, axis=0).sum(
+        axis=-1
+    )  # (T - every, n)
     dt = (piece.t[every:] - piece.t[:-every])[:, None]
     steps = [_slide(x, window - 1, stride, every) for x in (dt, impulse / dt)]
     states = [_slide(x, window, stride, every) for x in (piece.q, piece.qd)]

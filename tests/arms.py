@@ -14,10 +14,22 @@ Rows = tuple[tuple[Fraction, Fraction, Fraction], ...]
 STRAIGHT = tuple(tuple(Fraction(int(i == j)) for j in range(3)) for i in range(3))
 
 
-def chain(links: Sequence[tuple[str, Rows, Sequence[float]]], gravity: Sequence[float] = (0, 0, -9.81)) -> Arm:
+def chain(
+    links: Sequence[tuple[str, Rows, Sequence[float]]], gravity: Sequence[float] = (0, 0, -9.81)
+) -> Arm:
     """A serial arm from (kind, rotation, translation) by joint; without inertials."""
     bodies = tuple(
-        Body(f"j{i + 1}", kind, i - 1, i, Fraction(1), 0.0, rotation, tuple(Fraction(str(x)) for x in offset), None)
+        Body(
+            f"j{i + 1}",
+            kind,
+            i - 1,
+            i,
+            Fraction(1),
+            0.0,
+            rotation,
+            tuple(Fraction(str(x)) for x in offset),
+            None,
+        )
         for i, (kind, rotation, offset) in enumerate(links)
     )
     coordinates = tuple(
@@ -36,7 +48,10 @@ def random_arm(joints: int, seed: int) -> Arm:
     """Revolute joints with random rational poses."""
     rng = np.random.default_rng(seed)
     return chain(
-        [("revolute", random_rotation(rng), np.round(rng.uniform(-0.5, 0.5, 3), 4).tolist()) for _ in range(joints)]
+        [
+            ("revolute", random_rotation(rng), np.round(rng.uniform(-0.5, 0.5, 3), 4).tolist())
+            for _ in range(joints)
+        ]
     )
 
 

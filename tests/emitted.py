@@ -1,4 +1,6 @@
-"""Emitted modules for tests: built from a URDF, imported by path, and filled with exact functions or random weights."""
+"""Emitted modules for tests: built from a URDF, imported by path, and filled with exact functions or random
+weights.
+"""
 
 from __future__ import annotations
 
@@ -76,12 +78,17 @@ class ExactFunctions(nn.Module):
         super().__init__()
         self.mean, self.scale, self.n = mean, scale, n
         self.values = [_compiled(f) for f in functions]
-        self.slopes = [[_compiled(f.derivative(3 * k + letter)) for k in range(n) for letter in range(3)] for f in functions]
+        self.slopes = [
+            [_compiled(f.derivative(3 * k + letter)) for k in range(n) for letter in range(3)]
+            for f in functions
+        ]
 
     def forward(self, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         variables = torch.stack([q.cos(), q.sin(), q], dim=-1).flatten(-2)  # (..., 3 n): c1, s1, q1, c2, ...
         y = torch.stack([_evaluated(f, variables) for f in self.values], dim=-1)
-        slopes = torch.stack([torch.stack([_evaluated(d, variables) for d in row], dim=-1) for row in self.slopes], dim=-2)
+        slopes = torch.stack(
+            [torch.stack([_evaluated(d, variables) for d in row], dim=-1) for row in self.slopes], dim=-2
+        )
         by_c, by_s, by_q = slopes.unflatten(-1, (self.n, 3)).unbind(dim=-1)
         jacobian = by_s * q.cos().unsqueeze(-2) - by_c * q.sin().unsqueeze(-2) + by_q
         return (y - self.mean) / self.scale, jacobian / self.scale.unsqueeze(-1)
@@ -94,7 +101,9 @@ class ExactFunctions(nn.Module):
 
 
 def exact_model(robot: str, folder: Path) -> nn.Module:
-    """The robot's emitted model with the URDF's true values: exact functions for networks, exact constants, no friction."""
+    """The robot's emitted model with the URDF's true values: exact functions for networks, exact constants,
+    no friction.
+    """
     source, structure = built(robot)
     module = import_source(source, folder / f"{robot}_exact.py")
     model = frictionless(module.Model())

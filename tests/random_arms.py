@@ -13,7 +13,9 @@ Draw = Callable[[st.SearchStrategy], object]
 RIGHT = tuple(repr(k * pi / 2) for k in (0, 0, 1, -1, 2))
 HALF = tuple(repr(k * pi / 4) for k in (1, -1, 3))
 # far enough from every multiple of pi/2 that sizes tell what is zero
-GENERAL = tuple(f"{k / 100:g}" for k in range(-310, 311) if abs((k / 100 + pi / 4) % (pi / 2) - pi / 4) > 0.05)
+GENERAL = tuple(
+    f"{k / 100:g}" for k in range(-310, 311) if abs((k / 100 + pi / 4) % (pi / 2) - pi / 4) > 0.05
+)
 OFFSETS = ("0", "0", "0.1", "-0.1", "0.25")
 STRAIGHT_AXES = ("0 0 1", "0 0 1", "0 0 -1", "0 1 0", "0 -1 0", "1 0 0", "-1 0 0")
 SKEW_AXES = ("1 1 0", "0 -1 1", "1 2 3", "0.6 0 0.8")
@@ -91,17 +93,17 @@ def _follower(draw: Draw, leader: str) -> Follower:
 
 
 def _mimic(follower: Follower) -> str:
-    return (
-        f'  <mimic joint="{follower.leader}" multiplier="{follower.multiplier!r}" offset="{follower.offset!r}"/>\n'
-    )
+    return f'  <mimic joint="{follower.leader}" multiplier="{follower.multiplier!r}" offset="{follower.offset!r}"/>\n'
 
 
-def _joint(
-    draw: Draw, style: _Style, name: str, kind: str, parent: str, child: str, mimic: str = ""
-) -> str:
+def _joint(draw: Draw, style: _Style, name: str, kind: str, parent: str, child: str, mimic: str = "") -> str:
     """A joint, and its child link."""
     axis = "" if kind == "fixed" else f'  <axis xyz="{draw(st.sampled_from(style.axes))}"/>\n'
-    limit = '  <limit lower="-3" upper="3" effort="10" velocity="2"/>\n' if kind in ("revolute", "prismatic") else ""
+    limit = (
+        '  <limit lower="-3" upper="3" effort="10" velocity="2"/>\n'
+        if kind in ("revolute", "prismatic")
+        else ""
+    )
     return (
         f'<joint name="{name}" type="{kind}">\n  <parent link="{parent}"/>\n  <child link="{child}"/>\n'
         f"{_origin(draw, style)}{axis}{limit}{mimic}</joint>\n{_link(draw, style, child)}"
@@ -117,6 +119,8 @@ def _origin(draw: Draw, style: _Style) -> str:
 def _link(draw: Draw, style: _Style, name: str) -> str:
     """A link with the inertia of a box; at times one that lies straight in the link's frame, or on its axis."""
     a, b, c = (draw(st.integers(2, 60)) for _ in range(3))  # second moments of mass [1e-3 kg m2]
-    tensor = f'ixx="{(b + c) / 1000:g}" iyy="{(a + c) / 1000:g}" izz="{(a + b) / 1000:g}" ixy="0" ixz="0" iyz="0"'
+    tensor = (
+        f'ixx="{(b + c) / 1000:g}" iyy="{(a + c) / 1000:g}" izz="{(a + b) / 1000:g}" ixy="0" ixz="0" iyz="0"'
+    )
     mass = f'<mass value="{draw(st.integers(1, 80)) / 10:g}"/>'
     return f'<link name="{name}">\n <inertial>\n{_origin(draw, style)}  {mass}<inertia {tensor}/>\n </inertial>\n</link>\n'

@@ -51,11 +51,27 @@ def test_emitted_code_is_held_to_the_rules_of_written_code(tmp_path):
         (tmp_path / f"{robot}_spel.py").write_text(built(robot)[0], encoding="utf-8")
     files = sorted(str(path) for path in tmp_path.glob("*.py"))
     for command in (
-        ["ruff", "check", "--isolated", "--line-length", "100", "--select", "E,F,I,UP,B,SIM,RUF,D1", "--ignore", "D10,RUF002"],
+        [
+            "ruff",
+            "check",
+            "--isolated",
+            "--line-length",
+            "100",
+            "--select",
+            "E,F,I,UP,B,SIM,RUF,D1",
+            "--ignore",
+            "D10,RUF002",
+        ],
         ["ruff", "format", "--isolated", "--line-length", "100", "--check"],
         ["mypy", "--strict", "--no-incremental", "--cache-dir", str(tmp_path / "cache")],
     ):
-        run = subprocess.run([sys.executable, "-m", *command, *files], cwd=tmp_path, capture_output=True, text=True, check=False)
+        run = subprocess.run(
+            [sys.executable, "-m", *command, *files],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
         assert run.returncode == 0, run.stdout + run.stderr
 
 
@@ -72,7 +88,9 @@ HOSTILE = [
 
 
 def test_no_text_of_the_urdf_becomes_code(tmp_path):
-    """Hostile joint names end as identifiers and as quoted strings of the docstring, and come back from there unharmed."""
+    """Hostile joint names end as identifiers and as quoted strings of the docstring, and come back from there
+    unharmed.
+    """
     from xml.sax.saxutils import quoteattr
 
     links = "".join(f'<link name="l{k}"/>' for k in range(len(HOSTILE) + 1))
@@ -82,13 +100,21 @@ def test_no_text_of_the_urdf_becomes_code(tmp_path):
         for k, name in enumerate(HOSTILE)
     )
     urdf = tmp_path / "hostile.urdf"
-    urdf.write_text(f'<robot name={quoteattr(HOSTILE[0])}>{links}{joints}</robot>', encoding="utf-8")
+    urdf.write_text(f"<robot name={quoteattr(HOSTILE[0])}>{links}{joints}</robot>", encoding="utf-8")
     text = build(urdf)
     path = tmp_path / "hostile_spel.py"
     model = import_source(text, path).Model()
     tree = ast.parse(text)
-    strings = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)}
-    docstrings = {ast.get_docstring(node, clean=False) for node in ast.walk(tree) if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)}
+    strings = {
+        node.value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    }
+    docstrings = {
+        ast.get_docstring(node, clean=False)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
+    }
     for string in strings - docstrings:
         assert string not in HOSTILE or string.isidentifier()
     assert all(name.isidentifier() for name in model.joint_names)

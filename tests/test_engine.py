@@ -39,7 +39,9 @@ def test_an_arm_is_what_pinocchio_reads_from_the_file(robot, robots):
 def test_rotors_count_by_the_square_of_their_gear(robots):
     path = robots / "two_link.urdf"
     geared = Settings(joints={"joint2": JointSettings(rotor_inertia=0.01, gear=10.0)})
-    plain, with_rotor = (make_engine(make_arm(read_urdf(path)), settings) for settings in (Settings(), geared))
+    plain, with_rotor = (
+        make_engine(make_arm(read_urdf(path)), settings) for settings in (Settings(), geared)
+    )
     q, qd, tau = np.random.default_rng(0).normal(size=(3, 2))
     added = mass_matrix(with_rotor, q) - mass_matrix(plain, q)
     np.testing.assert_allclose(added, [[0, 0], [0, 1]], atol=1e-14)

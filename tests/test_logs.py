@@ -10,7 +10,15 @@ import torch
 
 from spelgen.errors import LogError, SpelgenErrors
 from spelgen.logs import Trajectory, read_logs, write_logs
-from spelgen.signals import automatic_cutoff, automatic_spacing, examine, low_pass, prepare, rate, split_at_gaps
+from spelgen.signals import (
+    automatic_cutoff,
+    automatic_spacing,
+    examine,
+    low_pass,
+    prepare,
+    rate,
+    split_at_gaps,
+)
 from spelgen.windows import cut_windows, split_validation
 
 JOINTS = ("a", "b")
@@ -123,7 +131,9 @@ def test_a_broken_parquet_file_is_told(tmp_path):
 
 
 def test_two_recordings_in_one_file_need_a_trajectory_column(tmp_path):
-    joined = Trajectory("joined", *(np.concatenate([getattr(swing(), x)] * 2) for x in ("t", "q", "qd", "tau")))
+    joined = Trajectory(
+        "joined", *(np.concatenate([getattr(swing(), x)] * 2) for x in ("t", "q", "qd", "tau"))
+    )
     write_logs(tmp_path / "x.parquet", [joined], JOINTS)
     with pytest.raises(LogError, match="row 201, column t: got t = 0 s after 1.99 s"):
         read_logs([tmp_path], JOINTS)
@@ -220,7 +230,9 @@ def test_the_filter_has_no_delay_and_takes_out_noise():
     middle = slice(50, -50)  # the ends have neighbours on one side only
     for quantity in ("q", "qd", "tau"):
         error = getattr(smooth, quantity)[middle] - getattr(clean, quantity)[middle]
-        assert np.sqrt(np.mean(error**2)) < 0.045  # 0.1 sqrt(2 cutoff / rate) = 0.032; a delay of 1 ms costs 0.009
+        assert (
+            np.sqrt(np.mean(error**2)) < 0.045
+        )  # 0.1 sqrt(2 cutoff / rate) = 0.032; a delay of 1 ms costs 0.009
     np.testing.assert_allclose(low_pass(clean, 8.0).q[middle], clean.q[middle], atol=2e-5)
 
 
@@ -253,7 +265,9 @@ def test_windows_hold_the_log_own_times_and_inputs(every):
     np.testing.assert_array_equal(windows.qd[7], trajectory.qd[rows])
     np.testing.assert_allclose(windows.dt[7], np.diff(trajectory.t[rows]), rtol=1e-12)
     impulse = np.diff(trajectory.t)[:, None] * trajectory.tau[:-1]
-    held = [impulse[a:b].sum(axis=0) for a, b in zip(rows, rows[1:], strict=False)] / np.diff(trajectory.t[rows])[:, None]
+    held = [impulse[a:b].sum(axis=0) for a, b in zip(rows, rows[1:], strict=False)] / np.diff(
+        trajectory.t[rows]
+    )[:, None]
     np.testing.assert_allclose(windows.tau[7], held, rtol=1e-12)
 
 
@@ -278,7 +292,10 @@ def test_the_split_is_by_trajectory():
 def test_a_gap_does_not_leak_into_validation():
     trajectories = [with_gap(), swing("other")]
     split = split_validation(trajectories, 0.5, seed=0)
-    names = [{x.name for x in prepare(part, shortest=5, cutoff=None)} for part in (split.training, split.validation)]
+    names = [
+        {x.name for x in prepare(part, shortest=5, cutoff=None)}
+        for part in (split.training, split.validation)
+    ]
     assert names[0].isdisjoint(names[1])
 
 

@@ -22,7 +22,9 @@ def states(n: int, count: int, seed: int = 0) -> list[torch.Tensor]:
 
 @pytest.mark.parametrize("robot", SIX)
 def test_true_values_give_pinocchio(robot, tmp_path):
-    """With exact functions for networks: M, gravity, forward and inverse dynamics to 1e-10, on Pinocchio's own reading of the URDF."""
+    """With exact functions for networks: M, gravity, forward and inverse dynamics to 1e-10, on Pinocchio's
+    own reading of the URDF.
+    """
     model = exact_model(robot, tmp_path)
     reference = pin.buildModelFromUrdf(str(ROBOTS / f"{robot}.urdf"))
     reference.gravity.linear = np.array(load_settings(ROBOTS / f"{robot}.urdf").gravity)
@@ -237,7 +239,9 @@ def test_arm_with_a_constant_mass_matrix(tmp_path):
     model = import_source(build(urdf), tmp_path / "rp_spel.py").Model()
     q, qd, qdd, tau = states(2, 20)
     mass = model.mass_matrix(q)
-    assert torch.allclose(mass, torch.diag(torch.tensor([2.0, 1.0], dtype=torch.float64)).expand(20, 2, 2), rtol=1e-5)
+    assert torch.allclose(
+        mass, torch.diag(torch.tensor([2.0, 1.0], dtype=torch.float64)).expand(20, 2, 2), rtol=1e-5
+    )
     assert torch.allclose(model.gravity(q)[:, 0], torch.zeros(20, dtype=torch.float64))
     assert torch.allclose(model.inverse_dynamics(q, qd, model.forward_dynamics(q, qd, tau)), tau)
 
@@ -256,6 +260,10 @@ def test_module_needs_torch_alone(tmp_path):
         "print(m.forward_dynamics(q, q, q).shape)\n"
     )
     run = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False
+        [sys.executable, "-W", "ignore", "-c", program],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert run.stdout.strip() == "torch.Size([7])", run.stderr

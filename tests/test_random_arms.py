@@ -13,7 +13,9 @@ from spelgen.arm import make_arm
 from spelgen.structure import Structure, derive
 from spelgen.urdf import read_urdf
 
-pin = pytest.importorskip("pinocchio", reason="Pinocchio (pip install spelgen[simulate]) reads the other side")
+pin = pytest.importorskip(
+    "pinocchio", reason="Pinocchio (pip install spelgen[simulate]) reads the other side"
+)
 
 # sizes relative to the largest: above the first is something, below the second is nothing
 SOMETHING, NOTHING = 1e-8, 1e-11
@@ -98,7 +100,9 @@ def measured(arm: DrawnArm, *, inertials: bool, rng: np.random.Generator) -> Fac
     kinds = []
     for index in range(entries):
         joints = tuple(k for k in range(n) if _is_something(steps[k][:, index], size))
-        kinds.append(("varying" if joints else "constant" if _is_something(rows[:, index], size) else "zero", joints))
+        kinds.append(
+            ("varying" if joints else "constant" if _is_something(rows[:, index], size) else "zero", joints)
+        )
     ranks = [rank(steps[:k].reshape(-1, entries), size) for k in range(n + 1)]
     return Facts(
         entries=tuple(kinds),
@@ -146,7 +150,11 @@ def told(structure: Structure) -> Facts:
     max_examples=60,
     derandomize=True,
     deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow, HealthCheck.data_too_large],
+    suppress_health_check=[
+        HealthCheck.function_scoped_fixture,
+        HealthCheck.too_slow,
+        HealthCheck.data_too_large,
+    ],
 )
 @given(drawn=arms())
 def test_structure_is_what_pinocchio_shows(tmp_path, drawn):

@@ -43,9 +43,7 @@ class TestMotion:
         amplitude, t = 2.0, np.linspace(0, 3, 31)
         k, w = np.sin(amplitude / 2), np.sqrt(9.81 / 0.7)
         _, cn, dn, _ = ellipj(w * t, k**2)
-        states = run(
-            pendulum(length=0.7), Settings(), [amplitude - np.pi / 2, 0], t, np.zeros((t.size, 1))
-        )
+        states = run(pendulum(length=0.7), Settings(), [amplitude - np.pi / 2, 0], t, np.zeros((t.size, 1)))
         np.testing.assert_allclose(states[:, 0] + np.pi / 2, 2 * np.arcsin(k * cn / dn), atol=1e-11)
 
     def test_a_slider_under_held_forces_and_viscous_friction(self):
@@ -184,11 +182,15 @@ class TestProtocol:
 
     def test_positions_inputs_and_passive_joints_of_the_sidecar_are_followed(self):
         joints = [coordinate(), coordinate("b"), coordinate("c", continuous=True, passive=True)]
-        bodies = [body(name, parent=k - 1, coordinate=k, inertia=point(1, 0.1)) for k, name in enumerate("abc")]
-        settings = Settings.model_validate({
-            "joints": {"a": {"inputs": [7]}, "b": {"actuated": False}},
-            "simulation": {"trajectories": 20, "duration": 0.05, "positions": {"a": [0.5, 0.6]}},
-        })
+        bodies = [
+            body(name, parent=k - 1, coordinate=k, inertia=point(1, 0.1)) for k, name in enumerate("abc")
+        ]
+        settings = Settings.model_validate(
+            {
+                "joints": {"a": {"inputs": [7]}, "b": {"actuated": False}},
+                "simulation": {"trajectories": 20, "duration": 0.05, "positions": {"a": [0.5, 0.6]}},
+            }
+        )
         logs = simulate(arm(joints, bodies), settings)
         starts = np.array([each.q[0] for each in logs.train + logs.test])
         assert ((starts[:, 0] >= 0.5) & (starts[:, 0] <= 0.6)).all()
@@ -239,10 +241,12 @@ class TestIntegrationError:
 
     def test_no_reversal_goes_unseen_between_the_stages_of_a_step(self):
         """A slider thrown against friction, fast through a narrow jump: exact but for the jump's width."""
-        settings = Settings.model_validate({
-            "joints": {"a": {"coulomb": [1.0, -3.0]}},
-            "simulation": {"friction_velocity": 1e-3},
-        })
+        settings = Settings.model_validate(
+            {
+                "joints": {"a": {"coulomb": [1.0, -3.0]}},
+                "simulation": {"friction_velocity": 1e-3},
+            }
+        )
         t, force = np.array([0.0, 1.0]), np.full((2, 1), -50.0)
         states = run(slider(mass=1.0), settings, [0, 20.0], t, force)
         stops = 20.0 / 51.0

@@ -1,4 +1,6 @@
-"""The derived structure: the project's robots by count, all reference arms by fact, and long arms by time of growth."""
+"""The derived structure: the project's robots by count, all reference arms by fact, and long arms by time of
+growth.
+"""
 
 import json
 from fractions import Fraction
@@ -99,15 +101,20 @@ def test_reference_arms(shared, assume):
 
 @pytest.mark.parametrize(("joints", "seed"), [(6, 0), (7, 1), (8, 2), (10, 3)])
 def test_generic_arms_follow_the_formula(joints, seed):
-    """With random geometry every entry varies but M_nn, and one relation is left: n(n+1)/2 - 1 outputs, one constant."""
+    """With random geometry every entry varies but M_nn, and one relation is left: n(n+1)/2 - 1 outputs, one
+    constant.
+    """
     structure = derive(random_arm(joints, seed))
     assert (len(structure.outputs), len(structure.constants)) == (joints * (joints + 1) // 2 - 1, 1)
-    # Khalil and Dombre, Modeling, Identification and Control of Robots, 2002, section 9.4: 7 n - 4, axis 1 not along gravity
+    # Khalil and Dombre, Modeling, Identification and Control of Robots, 2002, section 9.4: 7 n - 4, axis 1
+    # not along gravity
     assert structure.base_parameters == 7 * joints - 4
 
 
 def test_edo_by_singular_values(shared):
-    """Joints 1-3 of edo change M in 11 ways, the eleventh of which is 1e-10 small; the file's tolerance counts ten."""
+    """Joints 1-3 of edo change M in 11 ways, the eleventh of which is 1e-10 small; the file's tolerance
+    counts ten.
+    """
     joints = [f"joint_{k}" for k in range(1, 7)]
     arm = make_arm(read_urdf(shared / "arms" / "edo.urdf"), joints=joints)
     structure = derive(arm)
@@ -126,9 +133,13 @@ def _facts(structure: Structure) -> dict:
     n = len(structure.joints)
     entries = {(e.row, e.column): e for e in structure.entries}
     return {
-        "kinds": ["".join(letters[entries[row, column].kind] for column in range(row + 1)) for row in range(n)],
+        "kinds": [
+            "".join(letters[entries[row, column].kind] for column in range(row + 1)) for row in range(n)
+        ],
         "joints": {
-            f"{e.row + 1},{e.column + 1}": [k + 1 for k in e.joints] for e in structure.entries if e.kind == "varying"
+            f"{e.row + 1},{e.column + 1}": [k + 1 for k in e.joints]
+            for e in structure.entries
+            if e.kind == "varying"
         },
         "potential": [k + 1 for k in structure.potential],
         "outputs": len(structure.outputs),

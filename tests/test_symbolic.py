@@ -68,7 +68,9 @@ def _joints_of(polynomial, n: int) -> set[int]:
 
 
 def test_two_link_is_the_papers_equation_20(robots):
-    """M = [[J1 + 5 J2 + 4 m(q), J2 + 2 m(q)], [J2 + 2 m(q), J2]] for links of one metre, half a metre to the mass."""
+    """M = [[J1 + 5 J2 + 4 m(q), J2 + 2 m(q)], [J2 + 2 m(q), J2]] for links of one metre, half a metre to the
+    mass.
+    """
     true = polynomials(load(robots / "two_link.urdf").arm, inertials=True)
     assert {key: str(value) for key, value in true.mass.items()} == {
         (0, 0): "c2 + 7/2",

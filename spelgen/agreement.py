@@ -1,0 +1,70 @@
+"""What a numerical check of the derived facts found, as people and programs read it."""
+
+from __future__ import annotations
+
+import textwrap
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+Verdict = Literal["agrees", "differs", "undecided"]
+_MARKS = {"agrees": "ok", "differs": "DIFFERS", "undecided": "open"}
+
+
+@dataclass(frozen=True)
+class Check:
+    """One fact: what was derived, what an independent computation found, and whether the two agree.
+
+    ``undecided`` stands for what double precision, or the other program, cannot tell.
+    """
+
+    fact: str
+    derived: str
+    found: str
+    verdict: Verdict
+
+    def to_dict(self) -> dict[str, str]:
+        """The four fields as a JSON object."""
+        return asdict(self)
+
+    def __str__(self) -> str:
+        return f"{self.fact}: {self.derived}; {self.found}"
+
+
+@dataclass(frozen=True)
+class Verification:
+    """The checks of one arm, made with ``samples`` random configurations from ``seed``."""
+
+    means: str
+    samples: int
+    seed: int
+    checks: tuple[Check, ...]
+
+    @property
+    def agrees(self) -> bool:
+        """Whether nothing that was found contradicts what was derived."""
+        return not self.differences
+
+    @property
+    def differences(self) -> tuple[Check, ...]:
+        """The checks that contradict the derivation, or the reading of the file."""
+        return tuple(check for check in self.checks if check.verdict == "differs")
+
+    def to_dict(self) -> dict[str, Any]:
+        """A JSON object; ``checks`` in the order they were made."""
+        return {
+            "agrees": self.agrees,
+            "means": self.means,
+            "samples": self.samples,
+            "seed": self.seed,
+            "checks": [check.to_dict() for check in self.checks],
+        }
+
+    def text(self, width: int = 80) -> str:
+        """A paragraph for a terminal ``width`` columns wide: one line or more for every check."""
+        lines = textwrap.wrap(f"Verified by {self.means}", width)
+        for check in self.checks:
+            mark = f"  {_MARKS[check.verdict]:<7} "
+            lines += textwrap.wrap(
+                str(check), width, initial_indent=mark, subsequent_indent=" " * 12, break_on_hyphens=False
+            )
+        return "\n".join(lines)

@@ -1,0 +1,394 @@
+"""Training: exact solutions, exact resumption, recovery from blow-ups, interruptions, refusals."""
+
+import json
+import math
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from spelgen.errors import LogError, ModuleError, RunError
+from spelgen.logs import Trajectory, write_logs
+from spelgen.progress import TrainingProgress
+from spelgen.rollout import (
+    choose_substeps,
+    integration_error,
+    loss_scales,
+    momentum_loss,
+    position_difference,
+    roll_out,
+    rollout_loss,
+)
+from spelgen.runs import load_model
+from spelgen.training import train
+from spelgen.training_data import TrainingConfig, prepare_data
+from spelgen.training_loop import TrainingLoop
+from spelgen.windows import Windows, cut_windows
+
+STAND_IN = Path(__file__).with_name("stand_in.py")
+JOINTS = ("shoulder", "elbow")
+QUICK = TrainingConfig(epochs=6, batch=32, learning_rate=1e-2, momentum_steps=20)
+
+
+def truth():
+    """A stand-in with other parameters than the one that is trained."""
+    model = load_model(STAND_IN)
+    with torch.no_grad():
+        model.inertia.copy_(torch.tensor([0.4, -0.5, -1.0]))
+        model.weight.copy_(torch.tensor([3.0, 1.0]))
+        model.damping.copy_(torch.tensor([-1.5, -2.5]))
+    return model.requires_grad_(False)
+
+
+def motions(count=6, samples=21, seed=0) -> list[Trajectory]:
+    """Trajectories of the true arm under random held torques, at jittered times around 20 Hz."""
+    random = torch.Generator().manual_seed(seed)
+    dt = 0.05 * (0.8 + 0.4 * torch.rand(count, samples - 1, generator=random, dtype=torch.float64))
+    q = 4 * torch.rand(count, 1, 2, generator=random, dtype=torch.float64) - 2
+    tau = torch.randint(-2, 3, (count, samples, 2), generator=random).double()
+    start = Windows(dt, q.expand(-1, samples, -1), torch.zeros(count, samples, 2).double(), tau[:, :-1])
+    predicted_q, predicted_qd = roll_out(truth(), start, 16)
+    t = torch.cat([torch.zeros(count, 1), dt.cumsum(dim=1)], dim=1)
+    positions = torch.cat([q, predicted_q], dim=1)
+    velocities = torch.cat([torch.zeros(count, 1, 2), predicted_qd], dim=1)
+    rows = zip(t.numpy(), positions.numpy(), velocities.numpy(), tau.numpy(), strict=True)
+    return [Trajectory(f"motion_{k}", *row) for k, row in enumerate(rows)]
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("logs") / "train.parquet"
+    write_logs(path, motions(), JOINTS)
+    return path
+
+
+def lines(folder: Path) -> list[dict]:
+    """metrics.jsonl without what a clock says."""
+    records = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    return [{key: value for key, value in record.items() if key != "seconds"} for record in records]
+
+
+class Oscillator:
+    """n joints on springs, q'' = -w^2 q + tau: solved exactly by sines and cosines."""
+
+    joint_types = ("revolute", "prismatic")
+    frequency = torch.tensor([2.0, 5.0], dtype=torch.float64)
+
+    def momentum(self, q, qd):
+        return qd
+
+    def velocity(self, q, p):
+        return p
+
+    def forward(self, t, state):
+        q, p, tau = state.split(2, dim=-1)
+        return torch.cat([p, tau - self.frequency**2 * q, torch.zeros_like(tau)], dim=-1)
+
+    def solve(self, windows: Windows):
+        q, p, states = windows.q[:, 0], windows.qd[:, 0], []
+        w = self.frequency
+        for dt, tau in zip(windows.dt.unbind(1), windows.tau.unbind(1), strict=True):
+            c, s, rest = torch.cos(w * dt[:, None]), torch.sin(w * dt[:, None]), tau / w**2
+            q, p = rest + (q - rest) * c + p / w * s, p * c - w * (q - rest) * s
+            states.append((q, p))
+        return tuple(torch.stack(part, dim=1) for part in zip(*states, strict=True))
+
+
+def random_windows(count=3, samples=6, seed=0) -> Windows:
+    random = torch.Generator().manual_seed(seed)
+    draw = lambda *shape: torch.randn(*shape, generator=random, dtype=torch.float64)  # noqa: E731
+    dt = 0.02 + 0.02 * torch.rand(count, samples - 1, generator=random, dtype=torch.float64)
+    return Windows(dt, draw(count, samples, 2), draw(count, samples, 2), draw(count, samples - 1, 2))
+
+
+def test_a_rollout_is_the_exact_solution_at_jittered_times():
+    windows = random_windows()
+    errors = []
+    for substeps in (1, 2, 4):
+        pairs = zip(roll_out(Oscillator(), windows, substeps), Oscillator().solve(windows), strict=True)
+        errors.append(max((got - exact).abs().max().item() for got, exact in pairs))
+    assert errors[2] < 1e-7
+    assert errors[0] / errors[1] == pytest.approx(16, rel=0.3)  # rk4: fourth order
+    assert errors[1] / errors[2] == pytest.approx(16, rel=0.3)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.3, -3.0, 3.2, 2 * math.pi - 0.1, -20.0])
+def test_the_geodesic_distance_is_that_of_the_rotation_matrices(angle):
+    turned = torch.tensor([0.4 + angle, 0.4 + angle], dtype=torch.float64)
+    distance = position_difference(turned, torch.full_like(turned, 0.4), ("revolute", "prismatic"))
+    matrix = torch.linalg.matrix_exp(torch.tensor([[0.0, -angle, 0], [angle, 0, 0], [0, 0, 0]]).double())
+    assert distance[0].abs().item() == pytest.approx(math.acos((matrix.trace().item() - 1) / 2), abs=1e-7)
+    assert distance[1].item() == pytest.approx(angle)
+
+
+def test_the_true_model_has_no_loss():
+    windows = cut_windows(motions(), 5, measured=False)
+    scales = loss_scales(windows, ("revolute", "revolute"))
+    assert rollout_loss(truth(), windows, scales, 4) < 1e-12
+    assert rollout_loss(load_model(STAND_IN), windows, scales, 4) > 0.1
+    fine = cut_windows([x for x in motions(samples=21)], 2, measured=False)
+    assert momentum_loss(truth(), fine, scales) < 1e-2 * momentum_loss(load_model(STAND_IN), fine, scales)
+
+
+def test_standing_still_has_loss_one():
+    class Still(Oscillator):
+        def forward(self, t, state):
+            return torch.zeros_like(state)
+
+        joint_types = ("revolute", "revolute")
+
+    windows = cut_windows(motions(), 5, measured=False)
+    assert rollout_loss(Still(), windows, loss_scales(windows, Still.joint_types), 1) == pytest.approx(1.0)
+
+
+def test_stiff_friction_gets_more_substeps():
+    model = truth()
+    windows = cut_windows(motions(), 5, measured=False)
+    scales = loss_scales(windows, model.joint_types)
+    gentle = choose_substeps(model, windows, scales)
+    model.damping += 5.0  # decays within a few milliseconds, samples are 50 ms apart
+    stiff = choose_substeps(model, windows, scales)
+    assert gentle < stiff
+    assert integration_error(model, windows, scales, stiff) < 0.03 <= integration_error(model, windows, scales, 1)
+
+
+def test_training_finds_the_true_parameters(logs, tmp_path):
+    config = replace(QUICK, epochs=40, momentum_steps=300)
+    result = train(STAND_IN, [logs], tmp_path / "run", config, progress=False)
+    model = load_model(tmp_path / "run" / "module.py")
+    model.load_state_dict(torch.load(tmp_path / "run" / "model.pt", weights_only=True))
+    assert result.status == "finished"
+    assert result.best_validation < 1e-4
+    for name, value in truth().state_dict().items():
+        torch.testing.assert_close(model.state_dict()[name], value, atol=0.05, rtol=0)
+
+
+def test_the_run_folder_tells_what_was_done(logs, tmp_path):
+    result = train(STAND_IN, [logs], tmp_path / "run", replace(QUICK, epochs=2), progress=False)
+    names = {path.name for path in (tmp_path / "run").iterdir()}
+    assert names == {"module.py", "config.json", "metrics.jsonl", "checkpoint.pt", "model.pt"}
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert config["joints"] == list(JOINTS)
+    assert set(config["training"]).isdisjoint(config["validation"])
+    assert len(config["training"]) + len(config["validation"]) == 6
+    assert [record["epoch"] for record in lines(tmp_path / "run")] == [1, 2] == list(range(1, result.epochs + 1))
+    assert result.parameters == 7
+
+
+class Interrupted(TrainingProgress):
+    """Presses Ctrl-C after three epochs."""
+
+    def epoch(self, record):
+        if record["epoch"] == 3:
+            raise KeyboardInterrupt
+
+
+def test_resuming_repeats_what_would_have_been(logs, tmp_path, monkeypatch):
+    straight, broken = tmp_path / "straight", tmp_path / "broken"
+    train(STAND_IN, [logs], straight, QUICK, progress=False)
+    with monkeypatch.context() as patch:
+        patch.setattr("spelgen.training.TrainingProgress", Interrupted)
+        assert train(STAND_IN, [logs], broken, QUICK, progress=False).status == "interrupted"
+    assert len(lines(broken)) == 3
+    result = train(STAND_IN, [logs], broken, QUICK, resume=True, progress=False)
+    assert (result.status, result.epochs) == ("finished", 6)
+    assert lines(broken) == lines(straight)
+    for name in ("checkpoint.pt", "model.pt"):
+        first, second = (torch.load(folder / name, weights_only=True) for folder in (straight, broken))
+        first.pop("seconds", None), second.pop("seconds", None)
+        assert equal(first, second)
+
+
+def equal(first, second) -> bool:
+    """Whether two nested states are the same to the last bit."""
+    if isinstance(first, torch.Tensor):
+        return torch.equal(first, second)
+    if isinstance(first, dict):
+        return first.keys() == second.keys() and all(equal(first[key], second[key]) for key in first)
+    if isinstance(first, (list, tuple)):
+        return len(first) == len(second) and all(map(equal, first, second))
+    return first == second
+
+
+def test_resuming_drops_epochs_after_the_checkpoint(logs, tmp_path):
+    train(STAND_IN, [logs], tmp_path / "run", QUICK, progress=False)
+    with (tmp_path / "run" / "metrics.jsonl").open("a") as file:
+        file.write('{"epoch": 7, "step')  # killed while writing
+    train(STAND_IN, [logs], tmp_path / "run", QUICK, resume=True, progress=False)
+    assert [record["epoch"] for record in lines(tmp_path / "run")] == [1, 2, 3, 4, 5, 6]
+
+
+def test_numbers_that_blow_up_are_rolled_back_at_half_the_rate(logs, tmp_path, monkeypatch):
+    calls = []
+
+    def blown_up_once(model, windows, scales, substeps):
+        loss = rollout_loss(model, windows, scales, substeps)
+        calls.append(torch.is_grad_enabled())
+        return loss * math.nan if sum(calls) == 25 and calls[-1] else loss
+
+    monkeypatch.setattr("spelgen.training_loop.rollout_loss", blown_up_once)
+    result = train(STAND_IN, [logs], tmp_path / "run", QUICK, progress=False)
+    records = lines(tmp_path / "run")
+    assert result.status == "finished"
+    assert [record["rollbacks"] for record in records] == [0, 1, 1, 1, 1, 1]
+    assert [record["step"] for record in records] == [20, 40, 60, 80, 100, 120]
+    assert all(math.isfinite(record["loss"]) for record in records)
+
+
+def test_numbers_that_never_recover_end_the_run(logs, tmp_path, monkeypatch):
+    def blown_up(model, windows, scales, substeps):
+        loss = rollout_loss(model, windows, scales, substeps)
+        return loss * math.nan if torch.is_grad_enabled() else loss
+
+    monkeypatch.setattr("spelgen.training_loop.rollout_loss", blown_up)
+    with pytest.raises(RunError) as caught:
+        train(STAND_IN, [logs], tmp_path / "run", QUICK, progress=False)
+    assert str(caught.value) == (
+        f"{tmp_path}/run: losses that are not finite, after 8 attempts at half the learning rate each; "
+        "check units and signs of the logs; the best model so far is kept in model.pt"
+    )
+
+
+def test_early_stop_and_time_limit(logs, tmp_path):
+    stuck = replace(QUICK, learning_rate=1e-30, patience=2, momentum_steps=0)
+    result = train(STAND_IN, [logs], tmp_path / "stuck", stuck, progress=False)
+    assert (result.status, result.epochs) == ("stopped early", 2)
+    result = train(STAND_IN, [logs], tmp_path / "late", replace(QUICK, max_minutes=1e-6), progress=False)
+    assert (result.status, result.epochs) == ("out of time", 1)
+
+
+CHILD = """
+import sys
+from spelgen.training import train
+from spelgen.training_data import TrainingConfig
+result = train(sys.argv[1], [sys.argv[2]], sys.argv[3], TrainingConfig(epochs=100000, batch=32, patience=100000))
+print(result.status)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_leaves_a_usable_run(logs, tmp_path, number):
+    folder = tmp_path / "run"
+    child = subprocess.Popen(
+        [sys.executable, "-c", CHILD, str(STAND_IN), str(logs), str(folder)],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env=os.environ | {"PYTHONPATH": str(STAND_IN.parents[1])},
+    )  # fmt: skip
+    deadline = time.monotonic() + 60
+    while not (folder / "metrics.jsonl").exists() and child.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.05)
+    child.send_signal(number)
+    output, errors = child.communicate(timeout=30)
+    assert (child.returncode, output) == (0, "interrupted\n"), errors
+    assert "Traceback" not in errors
+    load_model(folder / "module.py").load_state_dict(torch.load(folder / "model.pt", weights_only=True))
+    epoch = torch.load(folder / "checkpoint.pt", weights_only=True)["epoch"]
+    config = TrainingConfig(epochs=epoch + 1, batch=32, patience=100000)
+    assert train(STAND_IN, [logs], folder, config, resume=True, progress=False).epochs == epoch + 1
+    assert not list(folder.glob(".*"))  # no half-written file is left
+
+
+def test_a_run_is_not_overwritten_unasked(logs, tmp_path):
+    config = replace(QUICK, epochs=1)
+    train(STAND_IN, [logs], tmp_path / "run", config, progress=False)
+    before = (tmp_path / "run" / "model.pt").read_bytes()
+    with pytest.raises(RunError) as caught:
+        train(STAND_IN, [logs], tmp_path / "run", config, progress=False)
+    assert str(caught.value) == (
+        f"{tmp_path}/run: there is a run in this folder; --resume it, --force to replace it, or -o another"
+    )
+    assert (tmp_path / "run" / "model.pt").read_bytes() == before
+    train(STAND_IN, [logs], tmp_path / "run", replace(config, seed=5), force=True, progress=False)
+    assert json.loads((tmp_path / "run" / "config.json").read_text())["config"]["seed"] == 5
+
+
+def test_a_run_is_resumed_only_as_it_was_started(logs, tmp_path):
+    train(STAND_IN, [logs], tmp_path / "run", replace(QUICK, epochs=1), progress=False)
+    with pytest.raises(RunError) as caught:
+        train(STAND_IN, [logs], tmp_path / "run", replace(QUICK, seed=1, batch=16), resume=True, progress=False)
+    assert str(caught.value) == (
+        f"{tmp_path}/run: got batch 16 instead of 32, seed 1 instead of 0, "
+        "expected the settings the run was started with; or start a new run"
+    )
+    write_logs(tmp_path / "other.parquet", motions(seed=1), JOINTS)
+    with pytest.raises(RunError) as caught:
+        train(STAND_IN, [tmp_path / "other.parquet"], tmp_path / "run", QUICK, resume=True, progress=False)
+    assert str(caught.value) == (
+        f"{tmp_path}/run: other logs than the run was started with; give the same --data or start a new run"
+    )
+    with pytest.raises(RunError) as caught:
+        train(STAND_IN, [logs], tmp_path / "none", QUICK, resume=True, progress=False)
+    assert str(caught.value) == (
+        f"{tmp_path}/none: got no such run, expected a folder with config.json; spelgen train"
+    )
+
+
+def test_nothing_is_written_when_the_logs_are_bad(tmp_path):
+    (tmp_path / "bad.csv").write_text("t,q_shoulder\n0,0\n")
+    with pytest.raises(LogError):
+        train(STAND_IN, [tmp_path / "bad.csv"], tmp_path / "run", QUICK, progress=False)
+    assert not (tmp_path / "run").exists()
+
+
+def test_what_is_no_module_is_refused(tmp_path):
+    path = tmp_path / "module.py"
+    with pytest.raises(ModuleError) as caught:
+        load_model(path)
+    assert str(caught.value) == f"{path}: got no such file, expected a module made by `spelgen build`"
+    path.write_text("x = 1\n")
+    with pytest.raises(ModuleError, match="got no class Model"):
+        load_model(path)
+    path.write_text("import torch\nclass Model(torch.nn.Module):\n    n = 1\n")
+    with pytest.raises(ModuleError, match="got a class Model without joint_names, joint_types, mass_matrix"):
+        load_model(path)
+    path.write_text("1 / 0\n")
+    with pytest.raises(ModuleError, match=r"import fails \(ZeroDivisionError: division by zero\); build it again"):
+        load_model(path)
+
+
+def test_two_modules_of_the_same_name_do_not_meet(tmp_path):
+    for folder, n in (("a", 3), ("b", 4)):
+        (tmp_path / folder).mkdir()
+        text = STAND_IN.read_text().replace("    n = 2\n", f"    n = {n}\n")
+        (tmp_path / folder / "module.py").write_text(text)
+    models = [load_model(tmp_path / folder / "module.py") for folder in ("a", "b")]
+    assert [model.n for model in models] == [3, 4]
+    assert not list(tmp_path.rglob("__pycache__"))
+
+
+def test_a_changed_urdf_stays_out_of_the_run(logs, tmp_path):
+    module = Path(shutil.copy(STAND_IN, tmp_path / "module.py"))
+    (tmp_path / "stand_in.urdf").write_text("<robot/>")
+    result = train(module, [logs], tmp_path / "run", replace(QUICK, epochs=1), progress=False)
+    assert "changed-urdf" in [note.code for note in result.diagnostics]
+    assert not (tmp_path / "run" / "robot.urdf").exists()
+    with pytest.raises(ModuleError, match="another URDF than the module was built from; build the module again"):
+        train(module, [logs], tmp_path / "new", QUICK, urdf=tmp_path / "stand_in.urdf", progress=False)
+    assert not (tmp_path / "new").exists()
+
+
+def test_validation_windows_come_from_other_trajectories(logs):
+    data = prepare_data([logs], JOINTS, ("revolute", "revolute"), QUICK)
+    seen = {tuple(row) for row in data.training.q.flatten(0, 1).tolist()}
+    assert not any(tuple(row) in seen for row in data.validation.q.flatten(0, 1).tolist())
+    assert len(data.training) + len(data.validation) == 6 * 17
+
+
+def test_the_learning_rate_rises_and_falls(logs, tmp_path):
+    data = prepare_data([logs], JOINTS, ("revolute", "revolute"), QUICK)
+    loop = TrainingLoop(None, load_model(STAND_IN), data, QUICK)
+    rates = []
+    for loop.step in range(QUICK.epochs * loop.epoch_steps):
+        rates.append(loop._rate())
+    peak = int(np.argmax(rates))
+    assert max(rates) == pytest.approx(QUICK.learning_rate, rel=0.01)
+    assert peak < 0.05 * len(rates)
+    assert rates[-1] == pytest.approx(0.01 * QUICK.learning_rate, rel=0.1)
