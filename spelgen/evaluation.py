@@ -12,6 +12,7 @@ import torch
 from torchdiffeq import odeint
 
 from spelgen.errors import Diagnostic
+from spelgen.examples import Example, predict_examples
 from spelgen.logs import Trajectory, read_logs
 from spelgen.rivals import Contender, held_velocity, trained, urdf_values
 from spelgen.rollout import choose_substeps, loss_scales, position_difference
@@ -81,7 +82,7 @@ class Evaluation:
 
     cutoff: of the filter on the test logs [Hz], None without. torque: by contender, empty where the logs are
     too sparse. energy_drift: of the model without input and dissipation over 1 s by rk4 with dt 1 ms,
-    relative to its kinetic energy; None where the logs never move.
+    relative to its kinetic energy; None where the logs never move. examples: over the longest horizon.
     """
 
     robot: str
@@ -93,6 +94,7 @@ class Evaluation:
     horizons: tuple[Horizon, ...]
     torque: dict[str, Torque]
     energy_drift: float | None
+    examples: tuple[Example, ...]
     diagnostics: tuple[Diagnostic, ...]
 
     def to_dict(self) -> dict[str, Any]:
@@ -146,6 +148,7 @@ def evaluate(
             x.name: _torque(torque_errors(x.torque, samples)) for x in contenders if x.torque and samples
         },
         energy_drift=energy_drift(model, probe),
+        examples=_examples(contenders[0], pieces, lengths, header.joints, used),
         diagnostics=tuple(notes),
     )
     write_json(run.evaluation, result.to_dict())
@@ -203,6 +206,18 @@ def _horizon(
     windows = _windows(pieces, steps + 1, max(most, 1), measured=cutoff is not None)
     errors = {x.name: _errors(x, windows, model.joint_types, tip) for x in contenders}
     return Horizon(name, steps, windows.dt.sum(dim=1).mean().item(), len(windows), errors)
+
+
+def _examples(
+    contender: Contender,
+    pieces: Sequence[Trajectory],
+    lengths: dict[str, int],
+    joints: Sequence[str],
+    cutoff: float | None,
+) -> tuple[Example, ...]:
+    if not lengths:
+        return ()
+    return predict_examples(contender, pieces, max(lengths.values()), joints, measured=cutoff is not None)
 
 
 def _errors(contender: Contender, windows: Windows, joint_types: Sequence[str], tip: Tip | None) -> Errors:

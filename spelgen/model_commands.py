@@ -53,7 +53,7 @@ def build(
     depth: Annotated[int, typer.Option("--depth", min=1, max=16, help="Hidden layers.")] = 2,
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", metavar="MODULE.py", help="Default: <robot>_model.py here."),
+        typer.Option("-o", "--output", metavar="MODULE.py", help="Default: <robot>_spel.py here."),
     ] = None,
     force: Force = False,
 ) -> None:
@@ -70,7 +70,7 @@ def build(
         width=width,
         depth=depth,
     )
-    path = output or Path(f"{robot.stem}_model.py")
+    path = output or Path(f"{robot.stem}_spel.py")
     if path.is_file() and path.read_bytes() == source.encode():
         say(f"{path} is up to date")
         return

@@ -105,7 +105,7 @@ class Placement:
         composed = at.composed if slides else turned.T
         self._stretches.append((*stretch, own) if slides else (_STRAIGHT,))
         self.frames[joint.child] = Frame(body, composed, self._in_body(body, composed), ZERO)
-        return Pose(at.body, rotation, at.position)
+        return Pose(at.body, rotation, self._seen_from_both(rotation, at.position))
 
     def inertia(self, link: Link, inertial: Inertial) -> TenVector:
         """The link's (m, m c, I) about its body's origin, in the body's frame (parallel-axis theorem)."""
@@ -136,6 +136,15 @@ class Placement:
             return Frame(frame.body, frame.composed, frame.rotation, position)
         composed = frame.composed @ turn
         return Frame(frame.body, composed, self._in_body(frame.body, composed), position)
+
+    def _seen_from_both(self, rotation: Matrix, position: Vector) -> Vector:
+        """The position of a joint, without noise in its parent's frame nor, where both can be, in its own.
+
+        An offset of (0.1, 0.1, 0) goes exactly along an axis of 45 degrees, but not along a rational one.
+        """
+        own = self._snapper.position(rotated(transposed(rotation), position))
+        moved = self._snapper.position(rotated(rotation, own))
+        return moved if rotated(transposed(rotation), moved) == own else position
 
     def _in_body(self, body: int, composed: np.ndarray) -> Matrix:
         """The exact rotation in the body's frame of what is turned by ``composed`` in its stretch's.

@@ -24,6 +24,9 @@ _ROUNDING = 1e-9
 _AXIS_SNAP = 1.5e-3  # two components below 1e-3 of a unit axis
 _STEPS = (pi / 2, pi / 12, pi / 8, pi / 5)
 
+_Snaps = dict[str, str]
+"""What the arm's diagnostics tell as snapped, by place in the file."""
+
 
 @dataclass(frozen=True)
 class _Load:
@@ -60,7 +63,10 @@ def second_reading(robot: Robot, arm: Arm, *, samples: int = 6, seed: int = 0) -
         told = " ".join(str(problem).split())[:120]
         found = f"yourdfpy cannot say ({type(problem).__name__}: {told})"
         return (Check("reading of the file", "the moving bodies", found, "undecided"),)
-    snapped = {each.where for each in arm.diagnostics if each.code.startswith("snapped-")}
+    snapped: _Snaps = {}
+    for each in arm.diagnostics:
+        if each.code.startswith("snapped-"):
+            snapped[each.where] = f"{snapped.get(each.where, '')}; {each.message}"
     checks = [_frames_agree(robot, arm, readings, snapped)]
     if any(body.inertia is not None for body in arm.bodies):
         checks.append(_loads_agree(robot, arm, readings[0], snapped))
@@ -157,7 +163,7 @@ def _frames(arm: Arm, q: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     return frames
 
 
-def _frames_agree(robot: Robot, arm: Arm, readings: list[_Reading], snapped: set[str]) -> Check:
+def _frames_agree(robot: Robot, arm: Arm, readings: list[_Reading], snapped: _Snaps) -> Check:
     turned, moved, largest, outside = 0.0, 0.0, 0.0, []
     for index, body in enumerate(arm.bodies):
         joint = robot.joint[body.name]
@@ -178,7 +184,7 @@ def _frames_agree(robot: Robot, arm: Arm, readings: list[_Reading], snapped: set
     return _check("frames in the file", derived, found, outside, "joint")
 
 
-def _loads_agree(robot: Robot, arm: Arm, reading: _Reading, snapped: set[str]) -> Check:
+def _loads_agree(robot: Robot, arm: Arm, reading: _Reading, snapped: _Snaps) -> Check:
     worst, largest, outside = 0.0, 0.0, []
     frames = _frames(arm, reading.q)
     for index, (body, load) in enumerate(zip(arm.bodies, reading.loads, strict=True)):
@@ -213,21 +219,22 @@ def _within(angle: float) -> str:
     return f", within the snaps told ({angle:.0e} rad in all)" if angle else ""
 
 
-def _snap_angle(path: Sequence[Joint], snapped: set[str], link: Link | None = None) -> float:
+def _snap_angle(path: Sequence[Joint], snapped: _Snaps, link: Link | None = None) -> float:
     """How far [rad] what the diagnostics tell as snapped may have turned the end of ``path`` in all."""
     total = 0.0
     for joint in path:
         where = f"joint {joint.name!r}"
-        if f"{where} origin" in snapped:
-            total += sum(_to_special(angle) for angle in joint.rpy)
-        if f"{where} axis" in snapped:
-            total += _AXIS_SNAP
+        total += _snapped_share(joint.rpy, snapped.get(f"{where} origin", ""))
+        total += _AXIS_SNAP if f"{where} axis" in snapped else 0.0
         if joint.mimic is not None and joint.type != "prismatic":
             total += _to_special(joint.mimic.offset)  # not worth a diagnostic
     if link is not None and link.inertial is not None:
-        if f"link {link.name!r} inertial origin" in snapped:
-            total += sum(_to_special(angle) for angle in link.inertial.rpy)
+        total += _snapped_share(link.inertial.rpy, snapped.get(f"link {link.name!r} inertial origin", ""))
     return total
+
+
+def _snapped_share(angles: Sequence[float], told: str) -> float:
+    return sum(_to_special(angle) for angle in angles if f"{angle:.10g} is taken as" in told)
 
 
 def _to_special(angle: float) -> float:

@@ -111,12 +111,12 @@ def test_strict_fails_on_a_warning_only(spelgen, robots, tmp_path):
 
 def test_build_and_check(spelgen, robots, tmp_path):
     (tmp_path / "arm.urdf").write_bytes((robots / "scara.urdf").read_bytes())
-    assert spelgen("build", "arm.urdf").stdout == "wrote arm_model.py\n"
-    assert spelgen("build", "arm.urdf").stdout == "arm_model.py is up to date\n"
-    assert spelgen("check", "arm_model.py").stdout == "arm_model.py is up to date with arm.urdf\n"
+    assert spelgen("build", "arm.urdf").stdout == "wrote arm_spel.py\n"
+    assert spelgen("build", "arm.urdf").stdout == "arm_spel.py is up to date\n"
+    assert spelgen("check", "arm_spel.py").stdout == "arm_spel.py is up to date with arm.urdf\n"
     text = (tmp_path / "arm.urdf").read_text(encoding="utf-8")
     (tmp_path / "arm.urdf").write_text(text + "<!-- changed -->\n", encoding="utf-8")
-    stale = spelgen("check", "arm_model.py")
+    stale = spelgen("check", "arm_spel.py")
     assert stale.exit_code == 1
     assert "arm.urdf has changed since the module was built" in stale.stderr
     assert stale.stdout == ""
@@ -163,12 +163,12 @@ def test_unknown_joint(spelgen, robots):
 
 
 def test_existing_output_is_kept(spelgen, robots, tmp_path):
-    (tmp_path / "rpr_model.py").write_text("mine")
+    (tmp_path / "rpr_spel.py").write_text("mine")
     line = refused(spelgen("build", robots / "rpr.urdf"))
-    assert line == "rpr_model.py: this output exists already; --force replaces it, -o names another"
-    assert (tmp_path / "rpr_model.py").read_text() == "mine"
+    assert line == "rpr_spel.py: this output exists already; --force replaces it, -o names another"
+    assert (tmp_path / "rpr_spel.py").read_text() == "mine"
     assert spelgen("build", robots / "rpr.urdf", "--force").exit_code == 0
-    assert (tmp_path / "rpr_model.py").read_text().startswith('r"""')
+    assert (tmp_path / "rpr_spel.py").read_text().startswith('r"""')
 
 
 def test_output_that_cannot_be_written(spelgen, robots, tmp_path):
@@ -191,7 +191,7 @@ def test_unreadable_logs(spelgen, robots, tmp_path, content, told):
     if content is not None:
         (tmp_path / "logs.csv").write_text(content)
     before = everything(tmp_path)
-    assert refused(spelgen("train", "rpr_model.py", "--data", "logs.csv", "--quiet")).startswith(told)
+    assert refused(spelgen("train", "rpr_spel.py", "--data", "logs.csv", "--quiet")).startswith(told)
     assert everything(tmp_path) == before
 
 
@@ -269,7 +269,7 @@ def test_usage_errors(spelgen, arguments):
 
 def test_data_may_be_followed_by_several(spelgen, robots, tmp_path):
     assert spelgen("build", robots / "rpr.urdf").exit_code == 0
-    result = spelgen("train", "rpr_model.py", "--data", "a.csv", "b.csv")
+    result = spelgen("train", "rpr_spel.py", "--data", "a.csv", "b.csv")
     assert result.exit_code == 1
     assert [line.split(":")[0] for line in result.stderr.splitlines()] == ["a.csv", "b.csv"]
 
@@ -311,7 +311,7 @@ def trained(robots, tmp_path_factory):
     steps = {
         "build": ["build", "arm.urdf"],
         "simulate": ["simulate", "arm.urdf", "-o", "logs"],
-        "train": ["train", "arm_model.py", "--data", "logs", "-o", "run", "--epochs", "2"],
+        "train": ["train", "arm_spel.py", "--data", "logs", "-o", "run", "--epochs", "2"],
         "evaluate": ["evaluate", "run", "--data", "logs"],
         "report": ["report", "run"],
     }
@@ -323,7 +323,7 @@ def test_the_whole_way_succeeds(trained):
     for name, result in results.items():
         assert result.returncode == 0, (name, result.stderr)
         assert max(map(len, result.stdout.splitlines())) <= 80, name
-    assert {"arm_model.py", "logs/train.parquet", "logs/test.parquet", "run/report.html"} <= set(
+    assert {"arm_spel.py", "logs/train.parquet", "logs/test.parquet", "run/report.html"} <= set(
         everything(folder)
     )
 
@@ -341,11 +341,11 @@ def test_evaluate_tells_rivals(trained):
 
 def test_a_second_run_needs_force_or_resume(trained):
     folder, _ = trained
-    again = process("train", "arm_model.py", "--data", "logs", "-o", "run", cwd=folder)
+    again = process("train", "arm_spel.py", "--data", "logs", "-o", "run", cwd=folder)
     assert again.returncode == 1
     assert again.stderr.startswith("run: ") and "--resume" in again.stderr
     more = process(
-        "train", "arm_model.py", "--data", "logs", "-o", "run", "--resume", "--epochs", "3", cwd=folder
+        "train", "arm_spel.py", "--data", "logs", "-o", "run", "--resume", "--epochs", "3", cwd=folder
     )
     assert more.returncode == 0, more.stderr
     assert "after 3 epochs" in more.stdout
@@ -354,7 +354,7 @@ def test_a_second_run_needs_force_or_resume(trained):
 def test_interrupted_training_leaves_a_run(trained, tmp_path):
     folder, _ = trained
     run = tmp_path / "run"
-    command = [sys.executable, "-m", "spelgen", "train", "arm_model.py", "--data", "logs", "-o", str(run)]
+    command = [sys.executable, "-m", "spelgen", "train", "arm_spel.py", "--data", "logs", "-o", str(run)]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     with subprocess.Popen(
         command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE

@@ -16,7 +16,7 @@ ROWS = [
     "spec plan emit",
     "logs signals windows engine simulate",
     "runs rollout rivals prior progress training_data training_loop training",
-    "tip torque evaluation",
+    "tip torque examples evaluation",
     "charts plots tables picture learned report",
     "inspection pipeline",
     "console options model_commands run_commands cli",
