@@ -68,3 +68,8 @@ class Verification:
                 str(check), width, initial_indent=mark, subsequent_indent=" " * 12, break_on_hyphens=False
             )
         return "\n".join(lines)
+
+
+def size_told(size: float) -> str:
+    """The order of magnitude of an error: ``3e-12``, or ``0``."""
+    return f"{size:.0e}" if size else "0"

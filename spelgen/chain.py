@@ -39,7 +39,7 @@ def choose_chain(robot: Robot, joints: Sequence[str] | None, tip: str | None) ->
     ``ArmError``.
     """
     if joints is not None and tip is not None:
-        raise ArmError("both joints and a tip", file=robot.path, expected="one of the two")
+        raise ArmError("both joints and a tip", file=robot.told_as, expected="one of the two")
     if joints is not None:
         chain = Chain(_named(robot, joints))
     elif tip is not None:
@@ -47,7 +47,9 @@ def choose_chain(robot: Robot, joints: Sequence[str] | None, tip: str | None) ->
     else:
         chain = _longest(robot)
     if not chain.joints:
-        raise ArmError("no joint that moves by itself", file=robot.path, expected="a serial chain of joints")
+        raise ArmError(
+            "no joint that moves by itself", file=robot.told_as, expected="a serial chain of joints"
+        )
     _refuse_free_joints(robot, chain.joints[-1])
     return chain
 
@@ -78,7 +80,7 @@ def _refuse_free_joints(robot: Robot, last: Joint) -> None:
         if joint.type in ("floating", "planar"):
             raise ArmError(
                 f"a {joint.type} joint on the way to the joint {last.name!r}",
-                file=robot.path,
+                file=robot.told_as,
                 line=joint.line,
                 element=f"joint {joint.name!r}",
                 expected="revolute, continuous, prismatic and fixed joints there",
@@ -90,7 +92,7 @@ def _named(robot: Robot, names: Sequence[str]) -> tuple[Joint, ...]:
     chosen = [_usable(robot, name) for name in names]
     repeated = [name for name in names if list(names).count(name) > 1]
     if repeated:
-        raise ArmError(f"the joint {repeated[0]!r} twice", file=robot.path, expected="each joint once")
+        raise ArmError(f"the joint {repeated[0]!r} twice", file=robot.told_as, expected="each joint once")
     if not chosen:
         return ()
     paths = {joint.name: robot.path_to(joint.child) for joint in chosen}
@@ -100,14 +102,16 @@ def _named(robot: Robot, names: Sequence[str]) -> tuple[Joint, ...]:
         if joint not in ordered:
             raise ArmError(
                 f"the joints {joint.name!r} and {deepest.name!r}, which lie on different branches",
-                file=robot.path,
+                file=robot.told_as,
                 line=joint.line,
                 expected="joints on one path from the root",
             )
     if list(ordered) != chosen:
         told = ",".join(joint.name for joint in ordered)
         got = f"the joints in the order {','.join(names)}"
-        raise ArmError(got, file=robot.path, expected="the order from the root to the tip", do=f"use {told}")
+        raise ArmError(
+            got, file=robot.told_as, expected="the order from the root to the tip", do=f"use {told}"
+        )
     return ordered
 
 
@@ -115,23 +119,23 @@ def _usable(robot: Robot, name: str) -> Joint:
     joint = robot.joint.get(name)
     if joint is None:
         names = [each.name for each in robot.joints if _is_free(each)]
-        raise ArmError(f"no joint is named {name!r}", file=robot.path, do=suggestion(name, names))
+        raise ArmError(f"no joint is named {name!r}", file=robot.told_as, do=suggestion(name, names))
     where = f"joint {name!r}"
     if not joint.moves:
         got = f"a {joint.type} joint"
         expected = "a revolute, continuous or prismatic joint"
-        raise ArmError(got, file=robot.path, line=joint.line, element=where, expected=expected)
+        raise ArmError(got, file=robot.told_as, line=joint.line, element=where, expected=expected)
     if joint.mimic is not None:
         do = f"name {follows(robot)[name].leader.name!r} instead: what follows it moves with it"
         raise ArmError(
-            "a mimic joint", file=robot.path, line=joint.line, element=where, expected="its leader", do=do
+            "a mimic joint", file=robot.told_as, line=joint.line, element=where, expected="its leader", do=do
         )
     return joint
 
 
 def _up_to(robot: Robot, tip: str) -> tuple[Joint, ...]:
     if tip not in robot.link:
-        raise ArmError(f"no link is named {tip!r}", file=robot.path, do=suggestion(tip, robot.link))
+        raise ArmError(f"no link is named {tip!r}", file=robot.told_as, do=suggestion(tip, robot.link))
     return tuple(joint for joint in robot.path_to(tip) if _is_free(joint))
 
 
@@ -190,4 +194,4 @@ def _ambiguous(robot: Robot, chains: Sequence[tuple[Joint, ...]]) -> ArmError:
     )
     more = f" and {len(chains) - 4} more" if len(chains) > 4 else ""
     got = f"{len(chains)} chains of {len(chains[0])} joints: {listed}{more}"
-    return ArmError(got, file=robot.path, expected="one longest chain", do=_CHOOSE)
+    return ArmError(got, file=robot.told_as, expected="one longest chain", do=_CHOOSE)

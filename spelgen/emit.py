@@ -68,6 +68,7 @@ def _joint_row(joint: JointSpec) -> str:
         reach=joint.reach,
         speed=joint.speed,
         friction=joint.friction,
+        rotor=joint.rotor,
         mass_share=joint.mass_share,
         potential_share=joint.potential_share,
         actuated=joint.actuated,

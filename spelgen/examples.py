@@ -17,7 +17,7 @@ MOST = 3
 
 @dataclass(frozen=True)
 class JointExample:
-    """One joint over the samples of an example [rad, rad/s; m, m/s]; None where nothing finite is predicted."""
+    """One joint over the samples of an example [rad, rad/s; m, m/s]; None: prediction not finite."""
 
     name: str
     q_true: tuple[float, ...]

@@ -26,12 +26,20 @@ def inspect(
         Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write to a file.")
     ] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 if there is any warning.")] = False,
+    verify: Annotated[bool, typer.Option("--verify", help="Prove it again by other programs.")] = False,
 ) -> None:
     """Show the exact structure of an arm's dynamics."""
     from spelgen import pipeline
 
     found = pipeline.inspect(robot, options.names(joints), tip, assume, snap_tolerance=snap_tol)
-    text = found.text() if format == "text" else json.dumps(found.to_dict(), indent=2)
+    proof = None
+    if verify:
+        proof = pipeline.verify(robot, options.names(joints), tip, assume, snap_tolerance=snap_tol)
+    if format == "text":
+        text = found.text() + (f"\n\n{proof.text()}" if proof else "")
+    else:
+        data = found.to_dict() | ({"verification": proof.to_dict()} if proof else {})
+        text = json.dumps(data, indent=2)
     if output is None:
         say(text)
     else:
@@ -39,6 +47,9 @@ def inspect(
     warnings = sum(diagnostic.severity == "warning" for diagnostic in found.diagnostics)
     if strict and warnings:
         note(f"{robot}: {warnings} warning{'s' * (warnings > 1)}, and --strict allows none")
+        raise typer.Exit(FAILED)
+    if proof and not proof.agrees:
+        note(f"{robot}: the proof contradicts the derivation; please report this file")
         raise typer.Exit(FAILED)
 
 
@@ -88,4 +99,5 @@ def check(module: Module, robot: RobotOption = None) -> None:
     if not result.fresh:
         note(f"{module}: build it again from {result.urdf}")
         raise typer.Exit(FAILED)
-    say(f"{module} is up to date with {result.urdf}")
+    proved = f"{len(result.proof.checks)} facts proved by {result.proof.means}"
+    say(f"{module} is up to date with {result.urdf}; {proved}")

@@ -13,7 +13,7 @@ from math import floor, log10, pi
 import numpy as np
 
 from spelgen.arm import Arm, Coordinate
-from spelgen.basis import Constant, Output, Weights
+from spelgen.basis import Weights
 from spelgen.recursion import triangle
 from spelgen.sampling import float_energies
 from spelgen.structure import Structure
@@ -46,22 +46,18 @@ class Nominal:
     mass_shares: tuple[float, ...]
     potential_shares: tuple[float, ...]
     least_share: float
-    """Least eigenvalue of the links' own M(q), without rotors, relative to the mean M, over the workspace."""
+    """Least eigenvalue of M(q) relative to the mean M, over the workspace."""
     from_urdf: bool
     """Whether the URDF's inertials were usable."""
 
 
-def nominal(arm: Arm, structure: Structure, rotors: Sequence[float]) -> Nominal:
-    """Nominal sizes of ``arm`` in terms of ``structure``'s outputs and constants.
-
-    ``rotors`` [kg m^2, kg], by coordinate, is what the drives add to M's diagonal as felt at the joint.
-    """
+def nominal(arm: Arm, structure: Structure) -> Nominal:
+    """Nominal sizes of ``arm`` in terms of ``structure``'s outputs and constants."""
     rng = np.random.default_rng(0)
     q = np.stack([rng.uniform(*working_range(c), _POINTS) for c in arm.coordinates], axis=-1)
-    bare, from_urdf = _mass_samples(arm, q)
+    mass, from_urdf = _mass_samples(arm, q)
     inertias = _inertias(arm, from_urdf)
     keys = triangle(len(arm.coordinates))
-    mass = _with_rotors(bare, structure, rotors)
     means = mass.mean(axis=0)
     typical = np.sqrt([means[keys.index((i, i))] * means[keys.index((j, j))] for i, j in keys])
     outputs = mass @ _matrix(structure, [output.reads for output in structure.outputs]).T
@@ -81,7 +77,7 @@ def nominal(arm: Arm, structure: Structure, rotors: Sequence[float]) -> Nominal:
         joint_torque=_rounded(np.hypot(torque, inertial)),
         mass_shares=_shares(changes),
         potential_shares=_shares(torque),
-        least_share=_rounded([_least_share(bare, means, q.shape[1])])[0],
+        least_share=_rounded([_least_share(mass, means, q.shape[1])])[0],
         from_urdf=from_urdf,
     )
 
@@ -119,18 +115,6 @@ def _default_inertia(arm: Arm, index: int) -> list[float]:
         center = np.array([_DEFAULT_GYRATION, 0.0, _DEFAULT_GYRATION])
     tensor = _DEFAULT_MASS * ((_DEFAULT_GYRATION**2 + center @ center) * np.eye(3) - np.outer(center, center))
     return [_DEFAULT_MASS, *(_DEFAULT_MASS * center), *tensor[np.triu_indices(3)]]
-
-
-def _with_rotors(bare: np.ndarray, structure: Structure, rotors: Sequence[float]) -> np.ndarray:
-    """M with rotors on its diagonal, as far as the smallest form can hold them."""
-    keys = triangle(len(rotors))
-    loaded = bare.copy()
-    loaded[:, [keys.index((i, i)) for i in range(len(rotors))]] += np.array(rotors)
-    terms: list[Output | Constant] = [*structure.outputs, *structure.constants]
-    reads = _matrix(structure, [term.reads for term in terms])
-    held = loaded @ reads.T @ _matrix(structure, [term.basis for term in terms])
-    # entries that share a constant with a diagonal one (a SCARA's wrist) would take the rotor over
-    return held if np.allclose(held, loaded, rtol=1e-9, atol=1e-12) else bare
 
 
 def _least_share(mass: np.ndarray, mean: np.ndarray, n: int) -> float:

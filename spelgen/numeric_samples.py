@@ -71,7 +71,7 @@ def draw(arm: Arm, count: int, rng: np.random.Generator, *, random_inertials: bo
 
 
 def regressor(arm: Arm, rng: np.random.Generator) -> np.ndarray:
-    """Rows of the inverse-dynamics regressor at random q, qd, qdd, columns of length 1, (rows, 10 bodies)."""
+    """Rows of the inverse-dynamics regressor at random q, qd, qdd, (rows, 10 bodies)."""
     engine = make_engine(_with_random_inertias(arm, rng), Settings())
     n = len(arm.coordinates)
     rows = []
@@ -79,10 +79,9 @@ def regressor(arm: Arm, rng: np.random.Generator) -> np.ndarray:
         q = engine.jacobian @ _positions(arm, rng) + engine.offset
         v, a = (engine.jacobian @ rng.normal(size=n) for _ in range(2))
         by_joint = pin.computeJointTorqueRegressor(engine.model, engine.data, q, v, a)
-        rows.append(engine.jacobian.T @ by_joint)
-    stacked = np.concatenate(rows)
-    lengths = np.linalg.norm(stacked, axis=0)
-    return stacked / np.where(lengths > 0, lengths, 1.0)
+        # of a single joint Pinocchio gives a vector
+        rows.append(engine.jacobian.T @ by_joint.reshape(len(arm.bodies), -1))
+    return np.concatenate(rows)
 
 
 def _positions(arm: Arm, rng: np.random.Generator) -> np.ndarray:

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from spelgen import verification
+from spelgen.agreement import Verification
 from spelgen.arm import Arm, make_arm
 from spelgen.emit import emit
 from spelgen.errors import ModuleError
@@ -34,6 +36,7 @@ class CheckResult:
     urdf: Path
     fresh: bool
     reasons: tuple[str, ...]
+    proof: Verification
 
 
 def load(
@@ -116,15 +119,17 @@ def make_spec(path: str | Path, options: Options) -> ModelSpec:
 
 
 def check(module: str | Path, urdf: str | Path | None = None) -> CheckResult:
-    """Build the module at ``module`` again, with its own options, and compare.
+    """Build the module at ``module`` again, with its own options, compare, and prove its structure
+    numerically.
 
     Without ``urdf`` the URDF is looked for by name beside the module, in the current folder and in
     ``robots/``. Raises ModuleError when there is none or when the file is no emitted module.
     """
     module = Path(module)
     header = read_header(module)
+    options = header.options
     found = Path(urdf) if urdf is not None else find_urdf(module, header.urdf)
-    spec = make_spec(found, header.options)
+    spec = make_spec(found, options)
     reasons = []
     if spec.urdf_sha256 != header.urdf_sha256:
         reasons.append(f"{found} has changed since the module was built")
@@ -132,7 +137,25 @@ def check(module: str | Path, urdf: str | Path | None = None) -> CheckResult:
         reasons.append("the derived model differs from the one in the module")
     if emit(spec) != module.read_text(encoding="utf-8"):
         reasons.append("the module's text differs from what `spelgen build` writes now")
-    return CheckResult(found, not reasons, tuple(reasons))
+    proof = verify(found, options.joints, options.tip, options.assume, snap_tolerance=options.snap_tolerance)
+    reasons += [str(difference) for difference in proof.differences]
+    return CheckResult(found, not reasons, tuple(reasons), proof)
+
+
+def verify(
+    path: str | Path,
+    joints: Sequence[str] | None = None,
+    tip: str | None = None,
+    assume: Assume = "kinematics",
+    *,
+    snap_tolerance: float = 2e-3,
+) -> Verification:
+    """Prove the structure that ``inspect`` derives once more, by numbers and by other programs.
+
+    Arguments and errors as for ``load``; SpelgenError without Pinocchio.
+    """
+    loaded = load(path, joints, tip, snap_tolerance)
+    return verification.verify(loaded.robot, loaded.arm, derive(loaded.arm, assume))
 
 
 def find_urdf(module: Path, name: str) -> Path:

@@ -112,7 +112,7 @@ class Placement:
         frame = self.frames[link.name]
         offset, turn = self._snapper.inertial_origin(link, inertial)
         rotation = frame.rotation if turn is None else self._in_body(frame.body, frame.composed @ turn)
-        x, y, z = summed(frame.position, rotated(frame.rotation, offset))
+        x, y, z = self._snapper.position(summed(frame.position, rotated(frame.rotation, offset)))
         mass = exact(inertial.mass)
         xx, xy, xz, yy, yz, zz = rotated_tensor(rotation, self._snapper.tensor(link, inertial))
         return (

@@ -36,7 +36,7 @@ def plan_model(
     guessed.
     """
     known = rotors or {}
-    sizes = nominal(arm, structure, [known.get(c.name) or _guessed_rotor(c) for c in arm.coordinates])
+    sizes = nominal(arm, structure)
     identifiers = _identifiers([coordinate.name for coordinate in arm.coordinates])
     x, y, z = (float(g) for g in arm.gravity)
     return ModelSpec(
@@ -45,7 +45,12 @@ def plan_model(
         urdf_sha256=urdf_sha256,
         gravity=(x, y, z),
         options=options,
-        joints=tuple(_joint(arm.coordinates[k], identifiers[k], sizes, k) for k in range(len(identifiers))),
+        joints=tuple(
+            _joint(
+                coordinate, identifiers[k], sizes, k, known.get(coordinate.name) or _guessed_rotor(coordinate)
+            )
+            for k, coordinate in enumerate(arm.coordinates)
+        ),
         entries=tuple((e.row, e.column, e.kind, e.joints) for e in structure.entries),
         outputs=tuple(
             OutputSpec(output.joints, _floats(output.basis), center, scale)
@@ -66,7 +71,7 @@ def plan_model(
     )
 
 
-def _joint(coordinate: Coordinate, identifier: str, sizes: Nominal, index: int) -> JointSpec:
+def _joint(coordinate: Coordinate, identifier: str, sizes: Nominal, index: int, rotor: float) -> JointSpec:
     low, high = working_range(coordinate)
     speed = coordinate.velocity if coordinate.velocity and coordinate.velocity <= _LARGEST_SPEED else None
     return JointSpec(
@@ -79,6 +84,7 @@ def _joint(coordinate: Coordinate, identifier: str, sizes: Nominal, index: int) 
         reach=float(f"{(high - low) / 2:.6g}"),
         speed=speed or _DEFAULT_SPEED[coordinate.kind],
         friction=float(f"{_friction(coordinate, sizes, index):.3g}"),
+        rotor=float(f"{rotor:.3g}"),
         mass_share=sizes.mass_shares[index],
         potential_share=sizes.potential_shares[index],
         actuated=not coordinate.passive,

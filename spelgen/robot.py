@@ -90,10 +90,14 @@ class Transmission:
 
 @dataclass(frozen=True)
 class Robot:
-    """A tree of links and joints in file order; ``digest`` is the SHA-256 of its bytes in hexadecimal."""
+    """A tree of links and joints in file order; ``digest`` is the SHA-256 of its bytes in hexadecimal.
+
+    ``told_as`` is how errors name the file: a xacro file's lines and digest are those of its expansion.
+    """
 
     name: str
     path: Path
+    told_as: Path
     digest: str
     links: tuple[Link, ...]
     joints: tuple[Joint, ...]

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from spelgen.agreement import Check, Verdict
+from spelgen.agreement import Check, Verdict, size_told
 from spelgen.arm import Arm
 from spelgen.robot import Joint, Link, Robot
 
@@ -180,7 +180,7 @@ def _frames_agree(robot: Robot, arm: Arm, readings: list[_Reading], snapped: _Sn
                 outside.append(index)
             turned, moved, largest = max(turned, turn), max(moved, move), max(largest, angle)
     derived = f"axes and origins of the moving bodies as yourdfpy finds them{_within(largest)}"
-    found = f"at most {turned:.0e} rad and {moved:.0e} m apart"
+    found = f"at most {size_told(turned)} rad and {size_told(moved)} m apart"
     return _check("frames in the file", derived, found, outside, "joint")
 
 
@@ -206,7 +206,7 @@ def _loads_agree(robot: Robot, arm: Arm, reading: _Reading, snapped: _Snaps) -> 
         worst, largest = max(worst, share), max(largest, angle)
     derived = f"masses, their centres and tensors as yourdfpy finds them{_within(largest)}"
     return _check(
-        "inertials in the file", derived, f"at most {worst:.0e} of their size apart", outside, "body"
+        "inertials in the file", derived, f"at most {size_told(worst)} of their size apart", outside, "body"
     )
 
 
@@ -216,7 +216,7 @@ def _check(fact: str, derived: str, found: str, outside: list[int], noun: str) -
 
 
 def _within(angle: float) -> str:
-    return f", within the snaps told ({angle:.0e} rad in all)" if angle else ""
+    return f", within the snaps told ({size_told(angle)} rad in all)" if angle else ""
 
 
 def _snap_angle(path: Sequence[Joint], snapped: _Snaps, link: Link | None = None) -> float:

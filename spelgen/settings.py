@@ -101,7 +101,7 @@ class TrainingSettings(_Group):
 
     objective: Literal["rollout"] = "rollout"
     momentum_steps: Annotated[int, BeforeValidator(_no_bool), Field(ge=0)] = 2000
-    prior: NonNegative = 0.1
+    prior: NonNegative = 1.0
     window: Annotated[Count, Field(ge=2)] = 5
     stride: Count = 1
     epochs: Count = 400

@@ -51,6 +51,8 @@ class JointSpec:
     speed: float
     friction: float
     """Size of friction torque the model starts from."""
+    rotor: float
+    """What the drive adds to M, to start from [kg m^2, kg]; 0: nothing."""
     mass_share: float
     potential_share: float
     """How much M, or V, changes with this joint, relative to the joint it changes with most."""

@@ -33,7 +33,7 @@ class TrainingConfig:
 
     objective: Literal["rollout"] = "rollout"
     momentum_steps: int = 2000
-    prior: float = 0.1
+    prior: float = 1.0
     window: int = 5
     stride: int = 1
     every: int | None = None

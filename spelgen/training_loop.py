@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from spelgen.runs import EmittedModel
 
 VECTOR_FACTOR = 5.0  # on the learning rate of constants and biases
-MOMENTUM_FACTOR = 5.0  # on the learning rate of the momentum steps, which are cheap and noisy
+MOMENTUM_FACTOR = 10.0  # on the learning rate of the momentum steps, which are cheap and noisy
 GRADIENT_NORM = 1.0  # of the scaled loss; larger gradients are shortened to it
 WARM_UP = 0.02  # part of all steps over which the learning rate rises
 FINAL_RATE = 0.01  # the cosine ends at this part of the learning rate

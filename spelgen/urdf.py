@@ -26,11 +26,19 @@ Part = TypeVar("Part", Link, Joint)
 def read_urdf(path: Path) -> Robot:
     """Return the robot of a URDF file, with lint diagnostics by line; no other file is opened.
 
+    A file called ``*.xacro`` is a program, and is run: see ``xacro_input``. The lines are then those of the
+    document that it expands to.
+
     Raises ``UrdfError``, or ``SpelgenErrors`` with all that was found, where the file is missing or is not
     one well-formed tree of links and joints.
     """
     document = read_document(path)
-    notes = Notes(path)
+    notes = Notes(document.path)
+    if document.path != path:
+        message = f"expanded by xacro: lines are those of the document that `xacro {path.name}` prints"
+        notes.diagnostics.append(Diagnostic("info", "expanded-xacro", "robot", None, message))
+    for warning in document.warnings:
+        notes.warn(None, "xacro-warning", "robot", warning)
     root = document.root
     name = _robot_name(notes, root)
     if document.leftovers:
@@ -48,6 +56,7 @@ def read_urdf(path: Path) -> Robot:
     robot = Robot(
         name=name,
         path=path,
+        told_as=document.path,
         digest=hashlib.sha256(document.data).hexdigest(),
         links=tuple(links),
         joints=tuple(joints),

@@ -10,30 +10,55 @@ from pathlib import Path
 from lxml import etree
 
 from spelgen.errors import UrdfError, collect
+from spelgen.xacro_input import Expansion, expand, is_xacro
 
 MAX_BYTES = 20_000_000
 _CONFLICT = re.compile(rb"^(?:<{7} |={7}\r?$|>{7} )", re.MULTILINE)
 _UNBOUND = re.compile(r"Namespace prefix (\S+) (?:for \S+ )?on (\S+) is not defined")
-_OTHER_FORMATS = {"mujoco": "an MJCF file", "sdf": "an SDF file", "COLLADA": "a COLLADA mesh"}
+_OTHER_FORMATS = {
+    "mujoco": (
+        "an MJCF file, which is out of scope",
+        "take the URDF that its robot's maker publishes, or convert it, for example with the package "
+        "mjcf-urdf-simple-converter",
+    ),
+    "sdf": ("an SDF file", "convert it to URDF first"),
+    "COLLADA": ("a COLLADA mesh", "name the URDF that uses it"),
+}
 
 
 @dataclass(frozen=True)
 class Document:
-    """The file's bytes, its ``<robot>`` element, and the lines of harmless xacro left in it."""
+    """A URDF's bytes, its ``<robot>`` element, and the lines of harmless xacro left in it.
 
+    ``path`` is how errors name the file. Of a xacro file, the bytes and all lines are those of the document
+    that it expands to, ``path`` says so, and ``warnings`` are xacro's.
+    """
+
+    path: Path
     data: bytes
     root: etree._Element
     leftovers: tuple[int, ...]
+    warnings: tuple[str, ...]
+
+
+def urdf_bytes(path: Path) -> bytes:
+    """The URDF in a file, or the one that a file called ``*.xacro`` expands to. Raises ``UrdfError``."""
+    return _expanded(path).data
 
 
 def read_document(path: Path) -> Document:
     """Return the parsed file; entities are never expanded and nothing else is opened.
 
+    A file called ``*.xacro`` is run first, see ``xacro_input``, and may open what it likes.
+
     Raises ``UrdfError`` for a missing or oversized file, a document type declaration, anything but
     well-formed XML, another root than ``<robot>``, and xacro that was not expanded.
     """
-    data = _bytes(path)
-    _refuse_damage(path, data)
+    expansion = _expanded(path)
+    data = expansion.data
+    if is_xacro(path):
+        path = path.with_name(f"{path.name} (expanded)")
+        _refuse_damage(path, data)
     # huge_tree=False keeps libxml2's own limits on depth (256) and text length
     parser = etree.XMLParser(resolve_entities=False, no_network=True, huge_tree=False, load_dtd=False)
     try:
@@ -45,7 +70,13 @@ def read_document(path: Path) -> Document:
     if root.getroottree().docinfo.internalDTD is not None:
         raise _doctype_error(path, None)
     _check_root(path, root)
-    return Document(data, root, _check_xacro(path, root))
+    return Document(path, data, root, _check_xacro(path, root), expansion.warnings)
+
+
+def _expanded(path: Path) -> Expansion:
+    data = _bytes(path)
+    _refuse_damage(path, data)
+    return expand(path, MAX_BYTES) if is_xacro(path) else Expansion(data, ())
 
 
 def _bytes(path: Path) -> bytes:
@@ -136,11 +167,9 @@ def _check_root(path: Path, root: etree._Element) -> None:
             do=f'remove xmlns="{name.namespace}"',
         )
     if name.localname != "robot":
-        known = _OTHER_FORMATS.get(name.localname)
+        known, do = _OTHER_FORMATS.get(name.localname, ("", "convert it to URDF first"))
         got = f"the root element <{name.localname}>" + (f" of {known}" if known else "")
-        raise UrdfError(
-            got, file=path, line=root.sourceline, expected="<robot>", do="convert it to URDF first"
-        )
+        raise UrdfError(got, file=path, line=root.sourceline, expected="<robot>", do=do)
 
 
 def _check_xacro(path: Path, root: etree._Element) -> tuple[int, ...]:

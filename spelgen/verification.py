@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from spelgen.agreement import Check, Verdict, Verification
+from spelgen.agreement import Check, Verdict, Verification, size_told
 from spelgen.arm import Arm
 from spelgen.basis import Weights
 from spelgen.errors import SpelgenError
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 ROUNDING = 1e-12
 """Share of its scale below which a number is taken for rounding; what is found is told beside it."""
-FORM_ROUNDING = 1e-9
+FORM_ROUNDING = 1e-6
 """The same for the smallest form: its long fractions are kept as doubles, found by least squares."""
 _FINE = 1e-3
 _SPARE = 6
@@ -63,7 +63,7 @@ class _Case:
         """A check of a rank, with the gap between the singular values that decides it."""
         rank, sizes = _rank(rows)
         around = [(number, sizes[number - 1]) for number in (rank, rank + 1) if 0 < number <= len(sizes)]
-        told = " and ".join(f"number {number} is {size:.0e}" for number, size in around)
+        told = " and ".join(f"number {number} is {size_told(size)}" for number, size in around)
         found = f"{rank} by singular values" + (f" ({told} of the first)" if told else "")
         wrong = {"": found}
         nothing: dict[str, str] = {}
@@ -119,8 +119,8 @@ def _fixed_entries(case: _Case) -> Iterator[Check]:
         }
         if chosen:
             names = ", ".join(chosen) if len(chosen) <= 8 else f"{len(chosen)} entries"
-            found = f"none {verb} more than {max(chosen.values()):.0e} of its scale"
-            wrong = {name: f"{verb} {size:.0e}" for name, size in chosen.items() if size > ROUNDING}
+            found = f"none {verb} more than {size_told(max(chosen.values()))} of its scale"
+            wrong = {name: f"{verb} {size_told(size)}" for name, size in chosen.items() if size > ROUNDING}
             yield case.check(f"{kind} entries", names, found, wrong, {})
 
 
@@ -136,16 +136,18 @@ def _dependence(case: _Case) -> Check:
             if expected[joint, index] and size <= ROUNDING:
                 unseen[what] = "is not seen to move"
             if not expected[joint, index] and size > ROUNDING:
-                unexpected[what] = f"moves by {size:.0e}"
-    found = f"no joint moves another entry by more than {moves[~expected].max(initial=0):.0e} of its scale"
+                unexpected[what] = f"moves by {size_told(size)}"
+    found = (
+        f"no joint moves another entry by more than {size_told(moves[~expected].max(initial=0))} of its scale"
+    )
     if expected.any():
-        found = f"the weakest moves its entry by {moves[expected].min():.0e} of its scale; {found}"
+        found = f"the weakest moves its entry by {size_told(moves[expected].min())} of its scale; {found}"
     derived = f"{expected.sum()} of the {expected.size} pairs of a joint and an entry"
     return case.check("dependence on joints", derived, found, unexpected, unseen)
 
 
 def _smallest_form(case: _Case) -> Iterator[Check]:
-    """M = sum c A + sum f B gives M back, and no f moves with a joint that it does not read, no c with any."""
+    """M = sum c A + sum f B gives M back, and no f moves with a joint it does not read, no c with any."""
     structure, samples = case.structure, case.samples
     n = len(structure.joints)
     keys = {key: index for index, key in enumerate(triangle(n))}
@@ -160,12 +162,12 @@ def _smallest_form(case: _Case) -> Iterator[Check]:
         largest = max(largest, moved)
         if moved > FORM_ROUNDING:
             what = f"an output of {_joints(joints)}" if joints else "a constant"
-            wrong[what] = f"moves by {moved:.0e} with another joint"
+            wrong[what] = f"moves by {size_told(moved)} with another joint"
     residual = float(np.abs(rebuilt - samples.mass).max(initial=0.0))
-    found = f"off by {residual:.0e} of an entry's scale at most"
+    found = f"off by {size_told(residual)} of an entry's scale at most"
     derived = f"{len(structure.outputs)} outputs and {len(structure.constants)} constants give M"
     yield case.check("smallest form", derived, found, {"M": found} if residual > FORM_ROUNDING else {}, {})
-    found = f"no other joint moves one by more than {largest:.0e} of its scale"
+    found = f"no other joint moves one by more than {size_told(largest)} of its scale"
     yield case.check("joints of outputs and constants", "as said for each", found, wrong, {})
 
 
@@ -181,7 +183,8 @@ def _ranks(case: _Case) -> Iterator[Check]:
     yield case.rank_check("outputs", changes.reshape(-1, width), outputs)
     together = outputs + len(structure.constants)
     yield case.rank_check("outputs and constants together", case.samples.mass[0], together)
-    fewer, more = {}, {}
+    fewer: dict[str, str] = {}
+    more: dict[str, str] = {}
     for first in range(1, len(structure.joints)):
         left = outputs - _rank(changes[:first].reshape(-1, width))[0]
         derived = structure.outputs_from(first)
@@ -204,8 +207,8 @@ def _potential(case: _Case) -> Check:
         else:
             largest = max(largest, float(size))
             if size > ROUNDING:
-                unexpected[f"joint {joint + 1}"] = f"moves it by {size:.0e}"
-    found = f"any other joint moves it by {largest:.0e} of its size at most"
+                unexpected[f"joint {joint + 1}"] = f"moves it by {size_told(size)}"
+    found = f"any other joint moves it by {size_told(largest)} of its size at most"
     joints = case.structure.potential
     return case.check(
         "potential energy", _joints(joints) if joints else "no joint", found, unexpected, unseen

@@ -59,7 +59,9 @@ def randomise(model: nn.Module, seed: int, deviation: float | None = None) -> No
     generator = torch.Generator().manual_seed(seed)
     for name, parameter in model.named_parameters():
         draw = torch.randn(parameter.shape, dtype=parameter.dtype, generator=generator)
-        if deviation is not None:
+        if name == "rotor":
+            parameter.data = draw
+        elif deviation is not None:
             parameter.data = deviation * draw
         elif "network" in name:
             parameter.data = draw * parameter.shape[-1] ** -0.5
@@ -107,6 +109,7 @@ def exact_model(robot: str, folder: Path) -> nn.Module:
     source, structure = built(robot)
     module = import_source(source, folder / f"{robot}_exact.py")
     model = frictionless(module.Model())
+    model.rotor_size.zero_()
     true = polynomials(load(ROBOTS / f"{robot}.urdf").arm, inertials=True)
     if structure.outputs:
         functions = [true.combination(output.reads) for output in structure.outputs]

@@ -1,14 +1,13 @@
-"""Hypothesis draws arms as URDF text: serial chains of any joint types, with special and with general geometry."""
+"""Random arms as URDF text: chains of any joint types, with special and with general geometry."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from math import pi
+from random import Random
+from typing import Any
 
 from hypothesis import strategies as st
-
-Draw = Callable[[st.SearchStrategy], object]
 
 RIGHT = tuple(repr(k * pi / 2) for k in (0, 0, 1, -1, 2))
 HALF = tuple(repr(k * pi / 4) for k in (1, -1, 3))
@@ -43,84 +42,103 @@ class DrawnArm:
 
 @dataclass(frozen=True)
 class _Style:
-    """What the numbers of one arm are drawn from."""
+    """What the numbers of one arm are drawn from.
+
+    Right angles go with straight sliding axes: several skew ones stand in relations, such as 60 degrees, that
+    no rational rotation has, and that spelgen keeps to 1e-11 only.
+    """
 
     angles: tuple[str, ...]
-    offsets: st.SearchStrategy
+    offsets: tuple[str, ...]
     axes: tuple[str, ...]
 
 
-_GENERAL_OFFSETS = st.integers(-500, 500).filter(lambda k: abs(k) > 20).map(lambda k: f"{k / 1000:g}")
-STYLES = (
-    _Style(RIGHT, st.sampled_from(OFFSETS), STRAIGHT_AXES),
-    _Style(RIGHT + HALF, st.sampled_from(OFFSETS), STRAIGHT_AXES),
-    _Style(RIGHT + HALF, st.sampled_from(OFFSETS), STRAIGHT_AXES + SKEW_AXES),
-    _Style(GENERAL, _GENERAL_OFFSETS, STRAIGHT_AXES + SKEW_AXES),
-    _Style(RIGHT + GENERAL[::60], st.sampled_from(OFFSETS) | _GENERAL_OFFSETS, STRAIGHT_AXES + SKEW_AXES),
-)
+_GENERAL_OFFSETS = tuple(f"{k / 1000:g}" for k in range(-500, 501) if abs(k) > 20)
+STYLES = {
+    "right angles": _Style(RIGHT, OFFSETS, STRAIGHT_AXES),
+    "right and half angles": _Style(RIGHT + HALF, OFFSETS, STRAIGHT_AXES),
+    "skew axes": _Style(RIGHT, OFFSETS, STRAIGHT_AXES + SKEW_AXES),
+    "mixed": _Style(RIGHT * 3 + GENERAL, OFFSETS + _GENERAL_OFFSETS[::200], STRAIGHT_AXES + SKEW_AXES),
+    "general": _Style(GENERAL, _GENERAL_OFFSETS, STRAIGHT_AXES + SKEW_AXES),
+}
 
 
 @st.composite
-def arms(draw: Draw) -> DrawnArm:
-    """An arm of 2 to 6 joints, with fixed links between, a tilted base, a side branch and a mimic joint at times."""
-    style = draw(st.sampled_from(STYLES))
-    count = draw(st.integers(2, 6))
-    names = tuple(f"j{k + 1}" for k in range(count))
-    mimic_at = draw(st.sampled_from((None, None, *range(count))))
-    mimic_in_chain = draw(st.booleans())
-    parts, tip, followers = [_link(draw, style, "base")], "base", []
-    for k, name in enumerate(names):
-        if draw(st.integers(0, 4)) == 0:
-            parts.append(_joint(draw, style, f"fixed{k}", "fixed", tip, f"plate{k}"))
+def arms(draw: Any) -> DrawnArm:
+    """An arm of 2 to 6 joints; at times a plate is fixed between, something branches off, a joint follows.
+
+    Hypothesis draws what kind of arm it is, and the seed of the many numbers in it.
+    """
+    style = STYLES[draw(st.sampled_from(tuple(STYLES)))]
+    kinds = draw(st.lists(st.sampled_from(TYPES), min_size=2, max_size=6))
+    plates = draw(st.sets(st.integers(0, len(kinds) - 1), max_size=2))
+    follows = draw(st.sampled_from(("nothing", "nothing", "in the chain", "on a branch")))
+    side = draw(st.sampled_from((None, None, "fixed", *TYPES)))
+    random = draw(st.randoms(use_true_random=True))
+    return _drawn(_Writer(style, random), kinds, plates, follows, side)
+
+
+def _drawn(write: _Writer, kinds: list[str], plates: set[int], follows: str, side: str | None) -> DrawnArm:
+    names = tuple(f"j{k + 1}" for k in range(len(kinds)))
+    parts, tip, follower = [write.link("base")], "base", None
+    follower_at = write.random.randrange(len(kinds)) if follows != "nothing" else None
+    for k, (name, kind) in enumerate(zip(names, kinds, strict=True)):
+        if k in plates:
+            parts.append(write.joint(f"fixed{k}", "fixed", tip, f"plate{k}"))
             tip = f"plate{k}"
-        parts.append(_joint(draw, style, name, draw(st.sampled_from(TYPES)), tip, f"link{k}"))
+        parts.append(write.joint(name, kind, tip, f"link{k}"))
         tip = f"link{k}"
-        if k == mimic_at:
-            follower = _follower(draw, names[draw(st.integers(0, k))])
-            followers.append(follower)
-            kind = draw(st.sampled_from(TYPES))
-            parts.append(_joint(draw, style, follower.name, kind, tip, "driven", _mimic(follower)))
-            tip = "driven" if mimic_in_chain else tip
-    if draw(st.integers(0, 3)) == 0:
-        kind = draw(st.sampled_from((*TYPES, "fixed")))
-        parts.append(_joint(draw, style, "side", kind, f"link{draw(st.integers(0, count - 1))}", "finger"))
-    return DrawnArm(f'<robot name="drawn">\n{"".join(parts)}</robot>\n', names, tuple(followers))
+        if k == follower_at:
+            follower = write.follower(names[: k + 1])
+            parts.append(write.joint(follower.name, write.random.choice(TYPES), tip, "driven", follower))
+            tip = "driven" if follows == "in the chain" else tip
+    if side is not None:
+        parts.append(write.joint("side", side, f"link{write.random.randrange(len(kinds))}", "finger"))
+    text = f'<robot name="drawn">\n{"".join(parts)}</robot>\n'
+    return DrawnArm(text, names, () if follower is None else (follower,))
 
 
-def _follower(draw: Draw, leader: str) -> Follower:
-    multiplier = draw(st.sampled_from((1.0, -1.0, 2.0, 0.5, -1.5)))
-    return Follower("follower", leader, multiplier, draw(st.sampled_from((0.0, 0.0, pi / 2, 0.3))))
+@dataclass(frozen=True)
+class _Writer:
+    """Writes elements of a URDF with random numbers in a style."""
+
+    style: _Style
+    random: Random
+
+    def joint(self, name: str, kind: str, parent: str, child: str, follower: Follower | None = None) -> str:
+        """A joint, and its child link."""
+        lines = [f'<parent link="{parent}"/>', f'<child link="{child}"/>', self.origin()]
+        if kind != "fixed":
+            axes = STRAIGHT_AXES if kind == "prismatic" and self.style.angles is RIGHT else self.style.axes
+            lines.append(f'<axis xyz="{self.random.choice(axes)}"/>')
+        if kind in ("revolute", "prismatic"):
+            lines.append('<limit lower="-3" upper="3" effort="10" velocity="2"/>')
+        if follower is not None:
+            rule = f'multiplier="{follower.multiplier!r}" offset="{follower.offset!r}"'
+            lines.append(f'<mimic joint="{follower.leader}" {rule}/>')
+        return _element(f'joint name="{name}" type="{kind}"', lines) + self.link(child)
+
+    def link(self, name: str) -> str:
+        """A link with the inertia of a box somewhere in it."""
+        # second moments of mass [1e-3 kg m2]; their sums two by two are what a body can have
+        a, b, c = (self.random.randint(2, 60) for _ in range(3))
+        tensor = f'ixx="{(b + c) / 1000:g}" iyy="{(a + c) / 1000:g}" izz="{(a + b) / 1000:g}"'
+        mass = f'<mass value="{self.random.randint(1, 80) / 10:g}"/>'
+        lines = [self.origin(), mass, f'<inertia {tensor} ixy="0" ixz="0" iyz="0"/>']
+        return f'<link name="{name}">\n{_element("inertial", lines)}</link>\n'
+
+    def origin(self) -> str:
+        """An origin, as the style has it."""
+        xyz = " ".join(self.random.choice(self.style.offsets) for _ in range(3))
+        rpy = " ".join(self.random.choice(self.style.angles) for _ in range(3))
+        return f'<origin xyz="{xyz}" rpy="{rpy}"/>'
+
+    def follower(self, leaders: tuple[str, ...]) -> Follower:
+        """A joint that follows one of the leaders."""
+        multiplier = self.random.choice((1.0, -1.0, 2.0, 0.5, -1.5))
+        offset = self.random.choice((0.0, 0.0, pi / 2, 0.3))
+        return Follower("follower", self.random.choice(leaders), multiplier, offset)
 
 
-def _mimic(follower: Follower) -> str:
-    return f'  <mimic joint="{follower.leader}" multiplier="{follower.multiplier!r}" offset="{follower.offset!r}"/>\n'
-
-
-def _joint(draw: Draw, style: _Style, name: str, kind: str, parent: str, child: str, mimic: str = "") -> str:
-    """A joint, and its child link."""
-    axis = "" if kind == "fixed" else f'  <axis xyz="{draw(st.sampled_from(style.axes))}"/>\n'
-    limit = (
-        '  <limit lower="-3" upper="3" effort="10" velocity="2"/>\n'
-        if kind in ("revolute", "prismatic")
-        else ""
-    )
-    return (
-        f'<joint name="{name}" type="{kind}">\n  <parent link="{parent}"/>\n  <child link="{child}"/>\n'
-        f"{_origin(draw, style)}{axis}{limit}{mimic}</joint>\n{_link(draw, style, child)}"
-    )
-
-
-def _origin(draw: Draw, style: _Style) -> str:
-    xyz = " ".join(draw(style.offsets) for _ in range(3))
-    rpy = " ".join(draw(st.sampled_from(style.angles)) for _ in range(3))
-    return f'  <origin xyz="{xyz}" rpy="{rpy}"/>\n'
-
-
-def _link(draw: Draw, style: _Style, name: str) -> str:
-    """A link with the inertia of a box; at times one that lies straight in the link's frame, or on its axis."""
-    a, b, c = (draw(st.integers(2, 60)) for _ in range(3))  # second moments of mass [1e-3 kg m2]
-    tensor = (
-        f'ixx="{(b + c) / 1000:g}" iyy="{(a + c) / 1000:g}" izz="{(a + b) / 1000:g}" ixy="0" ixz="0" iyz="0"'
-    )
-    mass = f'<mass value="{draw(st.integers(1, 80)) / 10:g}"/>'
-    return f'<link name="{name}">\n <inertial>\n{_origin(draw, style)}  {mass}<inertia {tensor}/>\n </inertial>\n</link>\n'
+def _element(start: str, lines: list[str]) -> str:
+    return f"<{start}>\n" + "".join(f"  {line}\n" for line in lines) + f"</{start.split()[0]}>\n"

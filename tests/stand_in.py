@@ -83,7 +83,7 @@ class Model(nn.Module):
     def forward(self, t, state):
         q, p, *inputs = state.split(2, dim=-1)
         qd = self.velocity(q, p)
-        pd = self._kinetic_slope(q, qd) - self.gravity(q)
+        pd = self._kinetic_slope(q, qd) - self.gravity(q) - self.damping.exp() * qd
         if not inputs:
             return torch.cat([qd, pd], -1)
-        return torch.cat([qd, pd - self.damping.exp() * qd + inputs[0], torch.zeros_like(qd)], -1)
+        return torch.cat([qd, pd + inputs[0], torch.zeros_like(qd)], -1)

@@ -135,7 +135,9 @@ def test_check_tells_a_changed_urdf_from_a_fresh_one(tmp_path):
     shutil.copy(ROOT / "robots" / "rpr.yaml", tmp_path)
     module = tmp_path / "rpr_spel.py"
     module.write_text(build(urdf), encoding="utf-8")
-    assert check(module).fresh
+    fresh = check(module)
+    assert fresh.fresh
+    assert len(fresh.proof.checks) > 5
     urdf.write_text(urdf.read_text().replace("0.0203", "0.0204"))
     changed = check(module)
     assert not changed.fresh

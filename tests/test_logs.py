@@ -1,5 +1,6 @@
-"""Logs: read back exactly, refused clearly, filtered without delay, split without leaking, cut without crossing gaps."""
+"""Logs: read back exactly, refused clearly, filtered without delay, split and cut without leaking."""
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -98,7 +99,8 @@ BAD = {
     "time-back": (
         HEADER + "0,0,0,0\n0.1,0,0,0\n0.1,0,0,0\n",
         "{}:4: row 3, column t: got t = 0.1 s after 0.1 s (1 such steps, this is the first), "
-        "expected increasing times; sort the rows, drop repeats, or split recordings by a column 'trajectory'",
+        "expected increasing times; "
+        "sort the rows, drop repeats, or split recordings by a column 'trajectory'",
     ),
 }
 
@@ -135,7 +137,7 @@ def test_two_recordings_in_one_file_need_a_trajectory_column(tmp_path):
         "joined", *(np.concatenate([getattr(swing(), x)] * 2) for x in ("t", "q", "qd", "tau"))
     )
     write_logs(tmp_path / "x.parquet", [joined], JOINTS)
-    with pytest.raises(LogError, match="row 201, column t: got t = 0 s after 1.99 s"):
+    with pytest.raises(LogError, match=r"row 201, column t: got t = 0 s after 1\.99 s"):
         read_logs([tmp_path], JOINTS)
 
 
@@ -240,7 +242,8 @@ def test_the_filter_needs_more_than_two_samples_per_period():
     with pytest.raises(LogError) as caught:
         low_pass(swing(dt=0.1), 8.0)
     assert str(caught.value) == (
-        "trajectory swing: got a filter of 8 Hz on samples at 10 Hz, expected below 5 Hz; lower or drop the filter"
+        "trajectory swing: got a filter of 8 Hz on samples at 10 Hz, expected below 5 Hz; "
+        "lower or drop the filter"
     )
 
 
@@ -265,9 +268,7 @@ def test_windows_hold_the_log_own_times_and_inputs(every):
     np.testing.assert_array_equal(windows.qd[7], trajectory.qd[rows])
     np.testing.assert_allclose(windows.dt[7], np.diff(trajectory.t[rows]), rtol=1e-12)
     impulse = np.diff(trajectory.t)[:, None] * trajectory.tau[:-1]
-    held = [impulse[a:b].sum(axis=0) for a, b in zip(rows, rows[1:], strict=False)] / np.diff(
-        trajectory.t[rows]
-    )[:, None]
+    held = [impulse[a:b].sum(axis=0) for a, b in pairwise(rows)] / np.diff(trajectory.t[rows])[:, None]
     np.testing.assert_allclose(windows.tau[7], held, rtol=1e-12)
 
 

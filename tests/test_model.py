@@ -103,6 +103,7 @@ def test_guard_keeps_zeros_and_relations_and_sleeps_at_nominal_values(robot, tmp
     model = random_model(robot, tmp_path, seed=1, deviation=3.0)
     structure = built(robot)[1]
     q = states(model.n, 200)[0]
+    model.rotor_size.zero_()
     mass = model.mass_matrix(q).detach()
     for entry in structure.entries:
         if entry.kind == "zero":
@@ -225,8 +226,14 @@ def test_backpropagation_reaches_every_parameter(dtype, tmp_path):
 def test_arm_with_a_constant_mass_matrix(tmp_path):
     """A turning and a sliding joint on one axis: no output, two constants, still a whole model."""
     urdf = tmp_path / "rp.urdf"
-    link = '<link name="{}"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>'
-    joint = '<joint name="{}" type="{}"><parent link="{}"/><child link="{}"/><axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="9" velocity="1"/></joint>'
+    link = (
+        '<link name="{}"><inertial><mass value="1"/>'
+        '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+    )
+    joint = (
+        '<joint name="{}" type="{}"><parent link="{}"/><child link="{}"/><axis xyz="0 0 1"/>'
+        '<limit lower="-1" upper="1" effort="9" velocity="1"/></joint>'
+    )
     urdf.write_text(
         '<robot name="rp">'
         + "".join(link.format(name) for name in "abc")
@@ -237,10 +244,10 @@ def test_arm_with_a_constant_mass_matrix(tmp_path):
     from spelgen.pipeline import build
 
     model = import_source(build(urdf), tmp_path / "rp_spel.py").Model()
-    q, qd, qdd, tau = states(2, 20)
+    q, qd, _, tau = states(2, 20)
     mass = model.mass_matrix(q)
     assert torch.allclose(
-        mass, torch.diag(torch.tensor([2.0, 1.0], dtype=torch.float64)).expand(20, 2, 2), rtol=1e-5
+        mass, torch.diag(torch.tensor([2.18, 1.18], dtype=torch.float64)).expand(20, 2, 2), rtol=1e-5
     )
     assert torch.allclose(model.gravity(q)[:, 0], torch.zeros(20, dtype=torch.float64))
     assert torch.allclose(model.inverse_dynamics(q, qd, model.forward_dynamics(q, qd, tau)), tau)

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
+from math import pi
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, assume, event, given, settings
 from random_arms import DrawnArm, arms
 
-from spelgen.arm import make_arm
+from spelgen.arm import Arm, make_arm
+from spelgen.rational import exact_rotation, rotation_from_rpy
+from spelgen.sampling import float_energies
 from spelgen.structure import Structure, derive
 from spelgen.urdf import read_urdf
 
@@ -22,7 +27,7 @@ SOMETHING, NOTHING = 1e-8, 1e-11
 
 
 class Reading:
-    """The arm as Pinocchio reads it: all joints free, those that follow tied to their leaders, the others at 0."""
+    """The arm as Pinocchio reads it: all joints free, followers tied to their leaders, the others at 0."""
 
     def __init__(self, arm: DrawnArm) -> None:
         self.model = pin.buildModelFromXML(arm.text)
@@ -146,21 +151,51 @@ def told(structure: Structure) -> Facts:
     )
 
 
-@settings(
+RANDOM = settings(
     max_examples=60,
     derandomize=True,
     deadline=None,
-    suppress_health_check=[
-        HealthCheck.function_scoped_fixture,
-        HealthCheck.too_slow,
-        HealthCheck.data_too_large,
-    ],
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
+
+
+def read(drawn: DrawnArm, folder: Path) -> Arm:
+    path = folder / "drawn.urdf"
+    path.write_text(drawn.text, encoding="utf-8")
+    return make_arm(read_urdf(path), joints=drawn.joints)
+
+
+@RANDOM
 @given(drawn=arms())
 def test_structure_is_what_pinocchio_shows(tmp_path, drawn):
-    path = tmp_path / "drawn.urdf"
-    path.write_text(drawn.text)
-    arm = make_arm(read_urdf(path), joints=drawn.joints)
+    arm = read(drawn, tmp_path)
     for inertials in (False, True):
         seen = measured(drawn, inertials=inertials, rng=np.random.default_rng(0))
         assert told(derive(arm, "inertials" if inertials else "kinematics")) == seen
+
+
+@RANDOM
+@given(drawn=arms())
+def test_values_are_those_of_pinocchio(tmp_path, drawn):
+    """The exact geometry and the lumped inertias of the URDF give Pinocchio's M and V."""
+    arm = read(drawn, tmp_path)
+    q = np.random.default_rng(0).uniform(-3.0, 3.0, (20, len(drawn.joints)))
+    inertias = [[float(x) for x in body.inertia or ()] for body in arm.bodies]
+    mass, potential = float_energies(arm, q, inertias)
+    reading = Reading(drawn)
+    assert_close(mass, np.array([reading.mass(each) for each in q]))
+    heights = np.array([reading.potential(each) for each in q])
+    assert_close(potential - potential[0], heights - heights[0])
+
+
+def test_rational_rotations_keep_the_zeros_of_half_right_angles():
+    """Half a right angle has no rational cosine; what several of them make zero stays zero all the same."""
+    for tilt in product(range(8), repeat=3):
+        rotation = rotation_from_rpy([k * pi / 4 for k in tilt])
+        found = exact_rotation(rotation)
+        assert (np.array(found) == 0).tolist() == (np.abs(rotation) < 1e-12).tolist()
+        assert np.abs(np.array(found, dtype=float) - rotation).max() < 1e-11
+
+
+def assert_close(ours: np.ndarray, theirs: np.ndarray) -> None:
+    assert np.abs(ours - theirs).max() < 1e-9 * max(1.0, np.abs(theirs).max())

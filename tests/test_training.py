@@ -48,10 +48,10 @@ def truth():
     return model.requires_grad_(False)
 
 
-def motions(count=6, samples=21, seed=0) -> list[Trajectory]:
-    """Trajectories of the true arm under random held torques, at jittered times around 20 Hz."""
+def motions(count=6, samples=21, seed=0, rate=20.0) -> list[Trajectory]:
+    """Trajectories of the true arm under random held torques, at jittered times."""
     random = torch.Generator().manual_seed(seed)
-    dt = 0.05 * (0.8 + 0.4 * torch.rand(count, samples - 1, generator=random, dtype=torch.float64))
+    dt = (0.8 + 0.4 * torch.rand(count, samples - 1, generator=random, dtype=torch.float64)) / rate
     q = 4 * torch.rand(count, 1, 2, generator=random, dtype=torch.float64) - 2
     tau = torch.randint(-2, 3, (count, samples, 2), generator=random).double()
     start = Windows(dt, q.expand(-1, samples, -1), torch.zeros(count, samples, 2).double(), tau[:, :-1])
@@ -124,7 +124,8 @@ def test_a_rollout_is_the_exact_solution_at_jittered_times():
 def test_the_geodesic_distance_is_that_of_the_rotation_matrices(angle):
     turned = torch.tensor([0.4 + angle, 0.4 + angle], dtype=torch.float64)
     distance = position_difference(turned, torch.full_like(turned, 0.4), ("revolute", "prismatic"))
-    matrix = torch.linalg.matrix_exp(torch.tensor([[0.0, -angle, 0], [angle, 0, 0], [0, 0, 0]]).double())
+    axis = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]], dtype=torch.float64)
+    matrix = torch.linalg.matrix_exp(angle * axis)
     assert distance[0].abs().item() == pytest.approx(math.acos((matrix.trace().item() - 1) / 2), abs=1e-7)
     assert distance[1].item() == pytest.approx(angle)
 
@@ -134,8 +135,17 @@ def test_the_true_model_has_no_loss():
     scales = loss_scales(windows, ("revolute", "revolute"))
     assert rollout_loss(truth(), windows, scales, 4) < 1e-12
     assert rollout_loss(load_model(STAND_IN), windows, scales, 4) > 0.1
-    fine = cut_windows([x for x in motions(samples=21)], 2, measured=False)
-    assert momentum_loss(truth(), fine, scales) < 1e-2 * momentum_loss(load_model(STAND_IN), fine, scales)
+
+
+def test_the_weak_form_tends_to_zero_with_the_step():
+    """Of the true model: the trapezium rule's error is of second order in dt."""
+    losses = []
+    for rate in (200.0, 100.0):
+        windows = cut_windows(motions(rate=rate), 2, measured=False)
+        scales = loss_scales(windows, ("revolute", "revolute"))
+        losses.append(momentum_loss(truth(), windows, scales).sqrt().item())
+    assert losses[0] < 0.01
+    assert losses[0] / losses[1] < 0.4
 
 
 def test_standing_still_has_loss_one():
@@ -157,11 +167,15 @@ def test_stiff_friction_gets_more_substeps():
     model.damping += 5.0  # decays within a few milliseconds, samples are 50 ms apart
     stiff = choose_substeps(model, windows, scales)
     assert gentle < stiff
-    assert integration_error(model, windows, scales, stiff) < 0.03 <= integration_error(model, windows, scales, 1)
+    assert (
+        integration_error(model, windows, scales, stiff)
+        < 0.03
+        <= integration_error(model, windows, scales, 1)
+    )
 
 
 def test_training_finds_the_true_parameters(logs, tmp_path):
-    config = replace(QUICK, epochs=40, momentum_steps=300)
+    config = replace(QUICK, epochs=15, momentum_steps=200)
     result = train(STAND_IN, [logs], tmp_path / "run", config, progress=False)
     model = load_model(tmp_path / "run" / "module.py")
     model.load_state_dict(torch.load(tmp_path / "run" / "model.pt", weights_only=True))
@@ -179,7 +193,9 @@ def test_the_run_folder_tells_what_was_done(logs, tmp_path):
     assert config["joints"] == list(JOINTS)
     assert set(config["training"]).isdisjoint(config["validation"])
     assert len(config["training"]) + len(config["validation"]) == 6
-    assert [record["epoch"] for record in lines(tmp_path / "run")] == [1, 2] == list(range(1, result.epochs + 1))
+    assert (
+        [record["epoch"] for record in lines(tmp_path / "run")] == [1, 2] == list(range(1, result.epochs + 1))
+    )
     assert result.parameters == 7
 
 
@@ -269,7 +285,8 @@ CHILD = """
 import sys
 from spelgen.training import train
 from spelgen.training_data import TrainingConfig
-result = train(sys.argv[1], [sys.argv[2]], sys.argv[3], TrainingConfig(epochs=100000, batch=32, patience=100000))
+config = TrainingConfig(epochs=100000, batch=32, patience=100000, momentum_steps=0)
+result = train(sys.argv[1], [sys.argv[2]], sys.argv[3], config)
 print(result.status)
 """
 
@@ -291,7 +308,7 @@ def test_a_signal_leaves_a_usable_run(logs, tmp_path, number):
     assert "Traceback" not in errors
     load_model(folder / "module.py").load_state_dict(torch.load(folder / "model.pt", weights_only=True))
     epoch = torch.load(folder / "checkpoint.pt", weights_only=True)["epoch"]
-    config = TrainingConfig(epochs=epoch + 1, batch=32, patience=100000)
+    config = TrainingConfig(epochs=epoch + 1, batch=32, patience=100000, momentum_steps=0)
     assert train(STAND_IN, [logs], folder, config, resume=True, progress=False).epochs == epoch + 1
     assert not list(folder.glob(".*"))  # no half-written file is left
 
@@ -313,7 +330,9 @@ def test_a_run_is_not_overwritten_unasked(logs, tmp_path):
 def test_a_run_is_resumed_only_as_it_was_started(logs, tmp_path):
     train(STAND_IN, [logs], tmp_path / "run", replace(QUICK, epochs=1), progress=False)
     with pytest.raises(RunError) as caught:
-        train(STAND_IN, [logs], tmp_path / "run", replace(QUICK, seed=1, batch=16), resume=True, progress=False)
+        train(
+            STAND_IN, [logs], tmp_path / "run", replace(QUICK, seed=1, batch=16), resume=True, progress=False
+        )
     assert str(caught.value) == (
         f"{tmp_path}/run: got batch 16 instead of 32, seed 1 instead of 0, "
         "expected the settings the run was started with; or start a new run"
@@ -350,7 +369,9 @@ def test_what_is_no_module_is_refused(tmp_path):
     with pytest.raises(ModuleError, match="got a class Model without joint_names, joint_types, mass_matrix"):
         load_model(path)
     path.write_text("1 / 0\n")
-    with pytest.raises(ModuleError, match=r"import fails \(ZeroDivisionError: division by zero\); build it again"):
+    with pytest.raises(
+        ModuleError, match=r"import fails \(ZeroDivisionError: division by zero\); build it again"
+    ):
         load_model(path)
 
 
@@ -370,7 +391,9 @@ def test_a_changed_urdf_stays_out_of_the_run(logs, tmp_path):
     result = train(module, [logs], tmp_path / "run", replace(QUICK, epochs=1), progress=False)
     assert "changed-urdf" in [note.code for note in result.diagnostics]
     assert not (tmp_path / "run" / "robot.urdf").exists()
-    with pytest.raises(ModuleError, match="another URDF than the module was built from; build the module again"):
+    with pytest.raises(
+        ModuleError, match="another URDF than the module was built from; build the module again"
+    ):
         train(module, [logs], tmp_path / "new", QUICK, urdf=tmp_path / "stand_in.urdf", progress=False)
     assert not (tmp_path / "new").exists()
 
@@ -386,7 +409,8 @@ def test_the_learning_rate_rises_and_falls(logs, tmp_path):
     data = prepare_data([logs], JOINTS, ("revolute", "revolute"), QUICK)
     loop = TrainingLoop(None, load_model(STAND_IN), data, QUICK)
     rates = []
-    for loop.step in range(QUICK.epochs * loop.epoch_steps):
+    for step in range(QUICK.epochs * loop.epoch_steps):
+        loop.step = step
         rates.append(loop._rate())
     peak = int(np.argmax(rates))
     assert max(rates) == pytest.approx(QUICK.learning_rate, rel=0.01)

@@ -165,7 +165,9 @@ DOCUMENTS = {
     ),
     "other format": (
         "<mujoco/>",
-        "FILE:1: got the root element <mujoco> of an MJCF file, expected <robot>; convert it to URDF first",
+        "FILE:1: got the root element <mujoco> of an MJCF file, which is out of scope, expected <robot>; take "
+        "the URDF that its robot's maker publishes, or convert it, for example with the package "
+        "mjcf-urdf-simple-converter",
     ),
     "entities": (
         '<?xml version="1.0"?>\n<!DOCTYPE robot [<!ENTITY a "b">]>\n<robot name="&a;"/>',

@@ -1,4 +1,4 @@
-"""How long the derivation takes: the panda from URDF text, and arms of random geometry, beside sympy's Lagrange equations.
+"""How long the derivation takes: the panda from its URDF, and random geometry, beside sympy's Lagrange equations.
 
 Medians of repeats in one run. Sympy gets the smallest arms only: it is what a user would do by hand.
 """
@@ -67,7 +67,9 @@ def main() -> None:
         arm = planar(joints)
         ours = median_seconds(lambda arm=arm: derive(arm))
         theirs = median_seconds(lambda joints=joints: lagrange(joints), repeats=1)
-        print(f"planar, {joints} joints              {ours:8.3f} s   sympy {theirs:8.2f} s   {theirs / ours:6.0f}x")
+        print(
+            f"planar, {joints} joints              {ours:8.3f} s   sympy {theirs:8.2f} s   {theirs / ours:6.0f}x"
+        )
 
 
 if __name__ == "__main__":

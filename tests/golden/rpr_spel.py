@@ -21,7 +21,7 @@ Record, by which `spelgen check` tells whether this module is up to date:
     robot: "rpr"
     urdf: "rpr.urdf"
     urdf_sha256: "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d"
-    spec_sha256: "2f12ff316b4f7f67ef2060eedb5a5ecd59221f2734527b0ca170b30403793e90"
+    spec_sha256: "0830195eaa09f089277fa7ea50137cea19adbbdad6dc81e397963ce36c1baf30"
     option assume: "kinematics"
     option depth: 2
     option joints: null
@@ -53,6 +53,7 @@ class Joint(NamedTuple):
     reach: float
     speed: float  # usual speed
     friction: float  # usual size of the friction torque
+    rotor: float  # what its drive adds to M at the start: rotor inertia times gear squared
     mass_share: float  # how much M changes with it, relative to the joint that moves M most
     potential_share: float  # the same of V
     actuated: bool
@@ -83,6 +84,7 @@ JOINTS = (
         reach=2.96706,
         speed=3.0,
         friction=0.4,
+        rotor=0.133,
         mass_share=0.02,
         potential_share=0.02,
         actuated=True,
@@ -94,6 +96,7 @@ JOINTS = (
         reach=0.4825,
         speed=1.0,
         friction=0.4,
+        rotor=0.4,
         mass_share=1.0,
         potential_share=0.02,
         actuated=True,
@@ -105,7 +108,8 @@ JOINTS = (
         reach=2.96706,
         speed=6.0,
         friction=0.4,
-        mass_share=0.192,
+        rotor=0.0667,
+        mass_share=0.518,
         potential_share=1.0,
         actuated=True,
     ),
@@ -113,18 +117,18 @@ JOINTS = (
 
 # M(q) = sum_k c_k A_k + sum_j f_j(q) B_j
 CONSTANTS: tuple[Constant, ...] = (
-    Constant(start=0.0768078, scale=0.0768078, entries=((2, 2, 1.0),)),
-    Constant(start=5.73, scale=5.73, entries=((1, 1, 1.0),)),
+    Constant(start=0.0101411, scale=0.0101411, entries=((2, 2, 1.0),)),
+    Constant(start=5.33, scale=5.33, entries=((1, 1, 1.0),)),
 )
 OUTPUTS = (
-    Output(joints=(2,), mean=-0.00167665, scale=1.41626, entries=((1, 0, 1.0),)),
-    Output(joints=(1, 2), mean=-0.00154309, scale=0.163971, entries=((2, 0, 1.0),)),
-    Output(joints=(1, 2), mean=140.02, scale=12.6351, entries=((0, 0, 1.0),)),
+    Output(joints=(2,), mean=-0.00167665, scale=1.36528, entries=((1, 0, 1.0),)),
+    Output(joints=(1, 2), mean=-0.00154309, scale=0.0595527, entries=((2, 0, 1.0),)),
+    Output(joints=(1, 2), mean=139.887, scale=12.6351, entries=((0, 0, 1.0),)),
 )
 # in each hidden layer: the joints that some units read, and how many units do
 MASS_HIDDEN = (((2,), 21), ((1, 2), 43))
 MASS_DEPTH = 2
-GUARD = 0.01  # least eigenvalue of M, relative to its nominal mean, that is left as it is
+GUARD = 0.08  # least eigenvalue of M, relative to its nominal mean, that is left as it is
 POTENTIAL_JOINTS = (2,)  # the joints that V depends on
 POTENTIAL_HIDDEN = (32, 32)
 POTENTIAL_SCALE = 0.703291  # [J]
@@ -290,6 +294,7 @@ class Model(nn.Module):
     mean_mass: Tensor
     whitening: Tensor
     whitening_rows: Tensor  # takes M, as a row, to its eigenproblem relative to its mean
+    rotor_size: Tensor
     actuated: Tensor
 
     def __init__(self, seed: int = 0) -> None:
@@ -316,7 +321,13 @@ class Model(nn.Module):
         share = vector(joint.potential_share for joint in JOINTS)
         self.potential_network = Network(POTENTIAL_JOINTS, share, layers, generator)
         self.friction = Friction(generator)
+        self.register_buffer("rotor_size", vector(joint.rotor for joint in JOINTS))
+        self.rotor = nn.Parameter(torch.zeros(self.n, dtype=torch.float64))
         self.register_buffer("actuated", vector(float(joint.actuated) for joint in JOINTS))
+
+    def _rotors(self) -> Tensor:
+        """What the drives add to M, (n, n), diagonal and never negative."""
+        return torch.diag(self.rotor_size * self.rotor.exp())
 
     def _square(self, rows: Tensor) -> Tensor:
         """(..., n n) as (..., n, n)."""
@@ -334,9 +345,10 @@ class Model(nn.Module):
         rows = constants + outputs @ self.output_basis
         relative = self._square(rows @ self.whitening_rows)
         if self._sound(relative):
-            return self._square(rows), trace, None
+            return self._square(rows) + self._rotors(), trace, None
         lift, slope = self._lift(relative)
-        return self._square(rows) + lift[..., None, None] * self.mean_mass, trace, slope
+        mass = self._square(rows) + lift[..., None, None] * self.mean_mass + self._rotors()
+        return mass, trace, slope
 
     def _sound(self, relative: Tensor) -> bool:
         """Whether no eigenvalue of these matrices, (..., n, n), is below GUARD."""

@@ -1,0 +1,295 @@
+"""Evaluation: rivals against exact solutions, errors that mean what they say, results that are valid JSON."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from spelgen.errors import LogError, RunError
+from spelgen.evaluation import energy_drift, evaluate
+from spelgen.logs import Trajectory, read_logs, write_logs
+from spelgen.rivals import PinocchioDynamics, held_velocity, urdf_values
+from spelgen.rollout import roll_out
+from spelgen.runs import load_model
+from spelgen.tip import tip_position
+from spelgen.torque import torque_errors, torque_samples
+from spelgen.training import train
+from spelgen.training_data import TrainingConfig
+from spelgen.windows import Windows, cut_windows
+
+STAND_IN = Path(__file__).with_name("stand_in.py")
+JOINTS = ("shoulder", "elbow")
+UR10E = [
+    f"{name}_joint" for name in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+]
+
+# A slider of 3 kg that carries a pendulum of 2 kg at 0.5 m, with 0.1 kg m^2 about its centre; both damped.
+CART = """<robot name="cart">
+  <link name="rail"/>
+  <joint name="swing" type="continuous"><parent link="cart"/><child link="rod"/><axis xyz="0 -1 0"/>
+    <dynamics damping="0.3" friction="0"/></joint>
+  <joint name="slide" type="prismatic"><parent link="rail"/><child link="cart"/><axis xyz="1 0 0"/>
+    <limit lower="-2" upper="2" effort="10" velocity="5"/><dynamics damping="0.7" friction="0"/></joint>
+  <joint name="tip" type="fixed"><parent link="rod"/><child link="weight"/><origin xyz="0 0 -1"/></joint>
+  <link name="cart"><inertial><mass value="3"/>
+    <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
+  <link name="rod"><inertial><origin xyz="0 0 -0.5"/><mass value="2"/>
+    <inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/></inertial></link>
+  <link name="weight"/>
+</robot>"""
+
+
+@pytest.fixture
+def cart(tmp_path) -> Path:
+    pytest.importorskip("pinocchio")
+    path = tmp_path / "cart.urdf"
+    path.write_text(CART)
+    return path
+
+
+def draw(*shape, seed=0) -> torch.Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def cart_torque(q, qd, qdd):
+    """Inverse dynamics of the cart by hand; x = s + 0.5 sin a, z = -0.5 cos a; joints (slide, swing)."""
+    a, length, m, inertia, g = q[:, 1], 0.5, 2.0, 0.1, 9.81
+    push, turn = m * length * a.cos(), m * length * a.sin()
+    slide = (3 + m) * qdd[:, 0] + push * qdd[:, 1] - turn * qd[:, 1] ** 2 + 0.7 * qd[:, 0]
+    swing = push * qdd[:, 0] + (inertia + m * length**2) * qdd[:, 1] + g * turn + 0.3 * qd[:, 1]
+    return torch.stack([slide, swing], dim=-1)
+
+
+def test_the_urdf_rival_has_the_dynamics_of_the_urdf(cart):
+    dynamics = PinocchioDynamics(cart, ("slide", "swing"))
+    q, qd, qdd = draw(20, 2), draw(20, 2, seed=1), draw(20, 2, seed=2)
+    tau = cart_torque(q, qd, qdd)
+    torch.testing.assert_close(dynamics.inverse_dynamics(q, qd, qdd), tau, atol=1e-12, rtol=0)
+    rate = dynamics.forward(torch.zeros(()), torch.cat([q, qd, tau], dim=-1))
+    torch.testing.assert_close(rate, torch.cat([qd, qdd, 0 * tau], dim=-1), atol=1e-11, rtol=0)
+
+
+def test_the_urdf_rival_follows_the_order_of_joints_asked_for(cart):
+    q, qd, qdd = draw(20, 2), draw(20, 2, seed=1), draw(20, 2, seed=2)
+    turned = PinocchioDynamics(cart, ("swing", "slide"))
+    tau = turned.inverse_dynamics(q.flip(-1), qd.flip(-1), qdd.flip(-1))
+    torch.testing.assert_close(tau.flip(-1), cart_torque(q, qd, qdd), atol=1e-12, rtol=0)
+
+
+def test_the_urdf_rival_locks_other_joints(cart):
+    dynamics = PinocchioDynamics(cart, ("swing",))
+    q, qd, qdd = draw(20, 1), draw(20, 1, seed=1), draw(20, 1, seed=2)
+    whole = [torch.cat([torch.zeros(20, 1), x], dim=-1) for x in (q, qd, qdd)]
+    torch.testing.assert_close(
+        dynamics.inverse_dynamics(q, qd, qdd), cart_torque(*whole)[:, 1:], atol=1e-12, rtol=0
+    )
+
+
+def test_mimic_joints_are_no_silent_error(cart):
+    cart.write_text(CART.replace('<axis xyz="0 -1 0"/>', '<axis xyz="0 -1 0"/><mimic joint="slide"/>'))
+    with pytest.raises(ValueError, match="mimic joints are not supported here: swing"):
+        PinocchioDynamics(cart, ("slide",))
+
+
+def test_the_gravity_of_the_settings_counts(cart):
+    cart.with_suffix(".yaml").write_text("gravity: [0, 0, 0]\n")
+    still = torch.zeros(1, 2, dtype=torch.float64)
+    tau = PinocchioDynamics(cart, ("slide", "swing")).inverse_dynamics(still + 1, still, still)
+    torch.testing.assert_close(tau, still, atol=1e-14, rtol=0)
+
+
+def test_the_tip_is_the_end_of_the_fixed_links(cart):
+    q = draw(4, 5, 2)
+    x, z = q[..., 0] + q[..., 1].sin(), -q[..., 1].cos()
+    expected = torch.stack([x, torch.zeros_like(x), z], dim=-1)
+    for tip in (None, "weight"):
+        position = tip_position(cart, ("slide", "swing"), tip)
+        torch.testing.assert_close(position(q), expected, atol=1e-6, rtol=0)
+    with pytest.raises(ValueError, match="the joints swing do not lead to cart"):
+        tip_position(cart, ("slide", "swing"), "cart")
+
+
+def test_a_held_velocity_is_exact_where_nothing_accelerates():
+    dt = 0.1 + 0.05 * torch.rand(4, 3, dtype=torch.float64)
+    qd = draw(4, 1, 2)
+    t = torch.cat([torch.zeros(4, 1), dt.cumsum(dim=1)], dim=1)
+    windows = Windows(dt, t.unsqueeze(-1) * qd, qd.expand(-1, 4, -1), draw(4, 3, 2))
+    q, velocity = held_velocity().roll_out(windows)
+    torch.testing.assert_close(q, windows.q[:, 1:])
+    torch.testing.assert_close(velocity, windows.qd[:, 1:])
+
+
+def motions(model, count=4, samples=25, rate=20.0, seed=0) -> list[Trajectory]:
+    """Trajectories of a model under random held torques."""
+    random = torch.Generator().manual_seed(seed)
+    start = 2 * torch.rand(count, 1, 2, generator=random, dtype=torch.float64) - 1
+    tau = torch.randint(-2, 3, (count, samples, 2), generator=random).double()
+    still = torch.zeros(count, samples, 2, dtype=torch.float64)
+    dt = torch.full((count, samples - 1), 1 / rate, dtype=torch.float64)
+    with torch.no_grad():
+        q, qd = roll_out(model, Windows(dt, start + still, still, tau[:, :-1]), 32)
+    states = [torch.cat([first, rest], dim=1).numpy() for first, rest in ((start, q), (still[:, :1], qd))]
+    t = np.arange(samples) / rate
+    return [
+        Trajectory(f"motion_{seed}{k}", t, states[0][k], states[1][k], tau[k].numpy()) for k in range(count)
+    ]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    """A run whose best model is the one that made the logs."""
+    folder = tmp_path_factory.mktemp("run")
+    model = load_model(STAND_IN)
+    for role, seed in (("train", 0), ("test", 1)):
+        write_logs(folder / "logs" / f"{role}.parquet", motions(model, seed=seed), JOINTS)
+    config = TrainingConfig(epochs=1, batch=32, learning_rate=1e-12, momentum_steps=0)
+    train(STAND_IN, [folder / "logs"], folder / "run", config, progress=False)
+    return folder / "run"
+
+
+def test_the_true_model_is_perfect_and_its_rival_is_not(run):
+    result = evaluate(run, [run.parent / "logs"])
+    assert [(x.name, x.steps, x.windows) for x in result.horizons] == [
+        ("1 step", 1, 4 * 24),
+        ("10 steps", 10, 4 * 15),
+        ("1 s", 20, 4 * 5),
+    ]
+    for horizon in result.horizons:
+        assert horizon.seconds == pytest.approx(horizon.steps / 20)
+        assert horizon.errors["model"].mean_share < 1e-4
+        assert horizon.errors["velocity stays constant"].mean_share > 0.3
+    assert result.energy_drift < 1e-9
+    assert result.parameters == 7
+    assert result.torque == {}  # 20 Hz is too sparse for accelerations
+
+
+def test_errors_are_those_of_the_last_sample(run):
+    result = evaluate(run, [run.parent / "logs"], steps=(3,), seconds=())
+    windows = cut_windows(read_logs([run.parent / "logs"], JOINTS, role="test"), 4, measured=False)
+    error = windows.qd[:, 0] - windows.qd[:, 3]
+    found = result.horizons[0].errors["velocity stays constant"]
+    np.testing.assert_allclose(found.qd, error.square().mean(dim=0).sqrt(), rtol=1e-12)
+    np.testing.assert_allclose(found.qd_share, [1.0, 1.0], rtol=1e-12)
+
+
+def test_the_same_run_and_logs_give_the_same_file(run):
+    files = []
+    for _ in range(2):
+        evaluate(run, [run.parent / "logs"])
+        files.append((run / "evaluation.json").read_bytes())
+    assert files[0] == files[1]
+    found = json.loads(files[0], parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
+    assert found["schema"] == 1
+    assert [x["trajectory"] for x in found["examples"]] == ["motion_10", "motion_12"]
+    joint = found["examples"][0]["joints"][1]
+    assert joint["name"] == "elbow"
+    assert len(joint["q_true"]) == len(found["examples"][0]["t"]) == 21
+    np.testing.assert_allclose(joint["qd_pred"], joint["qd_true"], atol=1e-4)
+
+
+def test_what_could_not_be_done_is_said(run):
+    result = evaluate(run, [run.parent / "logs" / "train.parquet"], seconds=(5.0,))
+    assert {x.code: x.message for x in result.diagnostics} == {
+        "tested-on-training-data": "names also used in training: motion_00, motion_01, motion_02, motion_03; "
+        "errors on training data prove nothing",
+        "horizon-too-long": "no prediction over 5 s: the longest trajectory has 24 steps",
+        "no-urdf-rival": "no comparison with the URDF: the run has no robot.urdf",
+    }
+
+
+def test_a_model_that_runs_away_has_no_error_but_null(run, tmp_path):
+    weights = torch.load(run / "model.pt", weights_only=True)
+    copy = tmp_path / "run"
+    copy.mkdir()
+    for path in run.iterdir():
+        (copy / path.name).write_bytes(path.read_bytes())
+    torch.save(weights | {"damping": torch.tensor([12.0, 12.0], dtype=torch.float64)}, copy / "model.pt")
+    result = evaluate(copy, [run.parent / "logs"])
+    assert result.horizons[-1].errors["model"].mean_share is None
+    assert "NaN" not in (copy / "evaluation.json").read_text()
+
+
+def test_what_is_no_run_is_refused(run, tmp_path):
+    with pytest.raises(RunError) as caught:
+        evaluate(tmp_path / "none", [run.parent / "logs"])
+    assert str(caught.value) == (
+        f"{tmp_path}/none: got no such run, expected a folder with config.json; spelgen train"
+    )
+    with pytest.raises(LogError, match="got no such file or folder, expected a log; check the path"):
+        evaluate(run, [tmp_path / "none.parquet"])
+
+
+def test_energy_drift_is_seen():
+    model = load_model(STAND_IN)
+    with torch.no_grad():
+        model.weight.fill_(1.0)
+    windows = cut_windows(motions(model), 2, measured=False)
+    assert energy_drift(model, windows) < 1e-9
+    # a force that is not the potential's slope
+    model.gravity = lambda q: 1.001 * type(model).gravity(model, q)
+    assert energy_drift(model, windows) > 1e-5
+
+
+def test_a_urdf_run_is_compared_in_torque_and_at_the_tip(cart):
+    """End to end on a URDF: its own dynamics made the logs, so the URDF rival is perfect."""
+    from spelgen import pipeline
+
+    module = cart.with_name("cart_model.py")
+    module.write_text(pipeline.build(cart))
+    names = load_model(module).joint_names
+    dynamics = PinocchioDynamics(cart, names)
+    for role, seed in (("train", 0), ("test", 1)):
+        logs = motions(dynamics, count=2, samples=200, rate=100.0, seed=seed)
+        write_logs(cart.parent / "logs" / f"{role}.parquet", logs, names)
+    config = TrainingConfig(epochs=1, filter=0.0, momentum_steps=0)
+    train(module, [cart.parent / "logs"], cart.parent / "run", config, progress=False)
+    result = evaluate(cart.parent / "run", [cart.parent / "logs"])
+    for horizon in result.horizons:
+        assert horizon.errors["URDF"].mean_share < 1e-4
+        assert horizon.errors["URDF"].tip_mm < 0.01 < horizon.errors["model"].tip_mm
+    assert result.torque["URDF"].mean_nmse < result.torque["model"].mean_nmse
+    assert not [x for x in result.diagnostics if x.code.startswith("no-")]
+
+
+def moving(samples=600, rate=100.0, still=0) -> Trajectory:
+    t = np.arange(samples) / rate
+    phase = 2 * np.pi * np.maximum(t - still / rate, 0.0)
+    q, qd = np.stack([1 - np.cos(phase)] * 2, 1), 2 * np.pi * np.stack([np.sin(phase)] * 2, 1)
+    tau = (2 * np.pi) ** 2 * np.stack([np.cos(phase), 0 * phase], 1)
+    return Trajectory("moving", t, q, qd, tau)
+
+
+def test_torque_errors_by_the_protocol():
+    (samples,) = torque_samples([moving()])
+    exact = torque_errors(lambda q, qd, qdd: torch.stack([qdd[:, 0], 0 * qdd[:, 1]], -1), [samples])
+    assert exact.nmse[0, 0] < 1e-3  # the ends of the filter remain
+    assert math.isnan(exact.nmse[0, 1])  # a torque that never varies has nothing to explain
+    offset = torque_errors(lambda q, qd, qdd: samples.tau + torch.tensor([1.0, 2.0]), [samples])
+    np.testing.assert_allclose(offset.rmse, [[1.0, 2.0]], rtol=1e-12)
+    np.testing.assert_allclose(offset.nmse[0, 0], 1 / samples.tau[:, 0].numpy().var(), rtol=1e-12)
+
+
+def test_only_moving_samples_of_dense_logs_count():
+    (samples,) = torque_samples([moving(still=200)])
+    assert len(samples.q) == pytest.approx(400, abs=15)
+    assert torque_samples([moving(rate=20.0)]) == []
+
+
+def test_the_ur10e_urdf_has_its_known_torque_error(shared):
+    """The mean nMSE of the bare URDF over the nine test trajectories, computed independently: 0.67."""
+    pytest.importorskip("pinocchio")
+    folder = shared / "logs" / "ur10e"
+    trained = ("20_02_10_30sec_12harm", "20_02_12_50sec_12harm", "20_02_05_20sec_8harm")
+    others = ("ptp", "load_2600", "_load", "secLoad")
+    paths = [
+        x
+        for x in folder.glob("*.parquet")
+        if x.stem not in trained and not any(map(x.stem.__contains__, others))
+    ]
+    samples = torque_samples(read_logs(sorted(paths), UR10E))
+    assert len(samples) == 9
+    torque = urdf_values(folder / "ur10e.urdf", UR10E, 1).torque
+    assert torque_errors(torque, samples).nmse.mean() == pytest.approx(0.67, abs=0.005)
