@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from markupsafe import Markup
 
-MARGIN_LEFT, MARGIN_RIGHT, MARGIN_TOP, MARGIN_BOTTOM = 58, 12, 10, 36
+MARGIN_RIGHT, MARGIN_TOP, MARGIN_BOTTOM = 12, 10, 36
+LABEL_ROOM, DIGIT = 28, 7  # left of the y axis: its label, and each character of its ticks
 MAX_POINTS = 600  # per line: more cannot be seen at this size and only makes the file heavy
 MAX_DECADES = 8  # of a logarithmic axis, counted from the largest value
 
@@ -85,8 +86,9 @@ def line_chart(
     if not x_values.size or not y_values.size:
         empty = Markup('<text x="{}" y="{}" text-anchor="middle">no finite values to show</text></svg>')
         return opening + empty.format(width / 2, height / 2)
-    x_axis = _axis(x_values, MARGIN_LEFT, width - MARGIN_RIGHT, pad=0.0)
     y_axis = _axis(y_values, height - MARGIN_BOTTOM, MARGIN_TOP, pad=0.06, log=log)
+    longest = max(len(Markup(label).striptags()) for _, label in _labelled(y_axis))
+    x_axis = _axis(x_values, LABEL_ROOM + DIGIT * longest, width - MARGIN_RIGHT, pad=0.0)
     parts = [opening, _frame(x_axis, y_axis, x_label, y_label)]
     parts += [_mark(x, text, x_axis, y_axis) for x, text in marks if x_axis.low <= x <= x_axis.high]
     parts += [_path(line, x_axis, y_axis) for line in lines]
@@ -151,7 +153,7 @@ def _labelled(axis: Axis) -> list[tuple[float, str | Markup]]:
         return [(tick, text.format(round(power))) for tick, power in zip(ticks, powers, strict=True)]
     decimals = max((_decimals(tick) for tick in ticks), default=0)
     plain = decimals <= 4 and max(map(abs, ticks), default=0.0) < 1e5
-    return [(tick, f"{tick:.{decimals}f}" if plain else f"{tick:.0e}") for tick in ticks]
+    return [(tick, f"{tick:.{decimals}f}" if plain else f"{tick:.2g}") for tick in ticks]
 
 
 def _decimals(value: float) -> int:

@@ -10,14 +10,18 @@ import torch
 
 from spelgen.runs import RunFolder, load_model
 
-KEYS = ("constants", "constant_scale", "constant_basis")
+CONSTANTS = ("constants", "constant_scale", "constant_basis")
+ROTORS = ("rotor", "rotor_size")
 INERTIA_UNITS = {"revolute revolute": "kg m²", "prismatic prismatic": "kg"}
 
 
 @dataclass(frozen=True)
 class Constant:
-    """A trained constant: where it enters M, its value before training and after, in that entry's unit."""
+    """A trained constant: what it is, where it enters M, its value before training and after, in that
+    entry's unit.
+    """
 
+    what: str
     where: str
     start: float
     learned: float
@@ -26,10 +30,10 @@ class Constant:
 
 @dataclass(frozen=True)
 class Learned:
-    """parameters: how many numbers were trained. constants: None when the model's preset has none to show."""
+    """parameters: how many numbers were trained. constants: those of M, none where the preset has none."""
 
     parameters: int
-    constants: tuple[Constant, ...] | None
+    constants: tuple[Constant, ...]
 
 
 def read_learned(run: RunFolder) -> Learned:
@@ -37,18 +41,26 @@ def read_learned(run: RunFolder) -> Learned:
     model = load_model(run.module)
     parameters = sum(parameter.numel() for parameter in model.parameters())
     before, after = model.state_dict(), run.load_state(run.weights)
-    if not all(key in state for key in KEYS for state in (before, after)):
-        return Learned(parameters, None)
-    basis = after["constant_basis"].reshape(-1, model.n, model.n)
-    values = zip(basis, _values(before), _values(after), strict=True)
-    return Learned(parameters, tuple(_constant(*each, model.joint_types) for each in values))
+    found: list[Constant] = []
+    if all(key in state for key in CONSTANTS for state in (before, after)):
+        basis = after["constant_basis"].reshape(-1, model.n, model.n)
+        values = zip(basis, _constants(before), _constants(after), strict=True)
+        found += [_constant(*each, model.joint_types) for each in values]
+    if all(key in state for key in ROTORS for state in (before, after)):
+        drives = zip(_rotors(before), _rotors(after), model.joint_types, strict=True)
+        found += [_rotor(index, *each) for index, each in enumerate(drives)]
+    return Learned(parameters, tuple(found))
 
 
-def _values(state: Mapping[str, Any]) -> list[float]:
+def _constants(state: Mapping[str, Any]) -> list[float]:
     constants = state["constants"]
     # where the mass matrix is all constants, the module takes their sizes so that it stays positive definite
     sizes = constants if "output_basis" in state else constants.abs()
     return (sizes * state["constant_scale"]).tolist()
+
+
+def _rotors(state: Mapping[str, Any]) -> list[float]:
+    return (state["rotor_size"] * state["rotor"].exp()).tolist()
 
 
 def _constant(basis: torch.Tensor, start: float, learned: float, joint_types: Sequence[str]) -> Constant:
@@ -57,7 +69,12 @@ def _constant(basis: torch.Tensor, start: float, learned: float, joint_types: Se
         f"{_factor(basis[i, j].item(), k == 0)}M{_index(i, j)}" for k, (i, j) in enumerate(entries)
     )
     unit = INERTIA_UNITS.get(" ".join(joint_types[k] for k in entries[0]), "kg m")
-    return Constant(where, start, learned, unit)
+    return Constant("links", where, start, learned, unit)
+
+
+def _rotor(index: int, start: float, learned: float, kind: str) -> Constant:
+    unit = INERTIA_UNITS[f"{kind} {kind}"]
+    return Constant(f"drive of joint {index + 1}", f"M{_index(index, index)}", start, learned, unit)
 
 
 def _index(row: int, column: int) -> str:

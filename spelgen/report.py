@@ -152,6 +152,7 @@ def _training(config: Mapping[str, Any], metrics: Sequence[Mapping[str, Any]]) -
     facts = {
         "data": f"{config['training_windows']:,} windows from {_many(config['training'])}",
         "validation": f"{config['validation_windows']:,} windows from {_many(config['validation'])} held out",
+        "start": f"{config['config']['momentum_steps']:,} steps on the momentum along the logs",
         "filter": f"{config['cutoff']:g} Hz, zero phase" if config["cutoff"] else "none",
         "length": f"{last['epoch']} epochs, {last['step']:,} steps, {_duration(last['seconds'])}",
         "kept": f"the model of {kept}, validation loss {number(best)}",

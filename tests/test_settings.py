@@ -80,8 +80,7 @@ def test_settings_do_not_change(urdf):
             "training:\n  x: 1",
             "arm.yaml:2: training: unknown key 'x'; known are 'objective', 'momentum_steps', 'prior', 'window', "
             "'stride', 'epochs', "
-            "'batch', 'learning_rate', 'weight_decay', 'substeps', 'validation_fraction', 'patience' "
-            "and 1 more",
+            "'batch', 'learning_rate', 'weight_decay', 'substeps' and 3 more",
         ),
         (
             "joints:\n  a: {viscous: -1}",

@@ -165,8 +165,8 @@ DOCUMENTS = {
     ),
     "other format": (
         "<mujoco/>",
-        "FILE:1: got the root element <mujoco> of an MJCF file, which is out of scope, expected <robot>; take "
-        "the URDF that its robot's maker publishes, or convert it, for example with the package "
+        "FILE:1: got the root element <mujoco> of an MJCF file, which is out of scope, expected <robot>; "
+        "take the URDF that its robot's maker publishes, or convert it, for example with the package "
         "mjcf-urdf-simple-converter",
     ),
     "entities": (
