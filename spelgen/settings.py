@@ -107,7 +107,7 @@ class TrainingSettings(_Group):
     epochs: Count = 400
     batch: Count = 256
     learning_rate: Positive = 1e-3
-    weight_decay: NonNegative = 1e-4
+    weight_decay: NonNegative = 0.2
     substeps: Count | None = None
     validation_fraction: Fraction = 0.25
     patience: Count = 60

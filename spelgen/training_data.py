@@ -40,7 +40,7 @@ class TrainingConfig:
     epochs: int = 400
     batch: int = 256
     learning_rate: float = 1e-3
-    weight_decay: float = 1e-4
+    weight_decay: float = 0.2
     substeps: int | None = None
     validation_fraction: float = 0.25
     patience: int = 60
