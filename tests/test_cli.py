@@ -308,7 +308,10 @@ def trained(robots, tmp_path_factory):
     for suffix in (".urdf", ".yaml"):
         text = (robots / f"two_link{suffix}").read_text(encoding="utf-8")
         (folder / f"arm{suffix}").write_text(
-            re.sub(r"trajectories: \d+", "trajectories: 6", text), encoding="utf-8"
+            re.sub(r"trajectories: \d+", "trajectories: 6", text).replace(
+                "  window: 5", "  window: 5\n  momentum_steps: 40"
+            ),
+            encoding="utf-8",
         )
     steps = {
         "build": ["build", "arm.urdf"],
