@@ -158,6 +158,25 @@ def verify(
     return verification.verify(loaded.robot, loaded.arm, derive(loaded.arm, assume))
 
 
+def formulas(
+    path: str | Path,
+    joints: Sequence[str] | None = None,
+    tip: str | None = None,
+    assume: Assume = "kinematics",
+    *,
+    snap_tolerance: float = 2e-3,
+    entry: tuple[int, int] | Literal["V"] | None = None,
+    limit: int | None = None,
+) -> Formulas:
+    """Closed forms of M and V, or of one ``entry``: (row, column) counted from 1, or "V".
+
+    ``limit`` is how many terms an entry may have to be written out. Other arguments and errors as for
+    ``load``; ``formula_files`` writes them as text, LaTeX or SymPy.
+    """
+    arm = load(path, joints, tip, snap_tolerance).arm
+    return closed_forms.formulas(arm, derive(arm, assume), entry=entry, limit=limit)
+
+
 def find_urdf(module: Path, name: str) -> Path:
     """The URDF called ``name`` near ``module``. Raises ModuleError."""
     places = [module.parent, Path(), Path("robots"), module.parent / "robots"]

@@ -10,7 +10,7 @@ PACKAGE = Path(__file__).parents[1] / "spelgen"
 # A file may import only from files above it, or to its left.
 ROWS = [
     "errors files labels rendering yaml_document settings",
-    "robot xacro_child xacro_input urdf_document urdf_values urdf_elements lint urdf",
+    "robot xacro_child xacro_input expansion urdf_document urdf_values urdf_elements lint urdf",
     "rational snapping placement chain walk arm",
     "recursion field sampling spans basis symbolic structure nominal",
     "spec plan emit",
@@ -19,6 +19,7 @@ ROWS = [
     "tip torque examples evaluation",
     "charts plots tables picture learned report",
     "agreement axes meaning second_reading numeric_samples verification",
+    "minimal expansion expression shortening formulas formula_files",
     "inspection pipeline",
     "console options model_commands run_commands cli",
     "__init__ __main__",
