@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
+from spelgen import formulas as closed_forms
 from spelgen import verification
 from spelgen.agreement import Verification
 from spelgen.arm import Arm, make_arm
 from spelgen.emit import emit
 from spelgen.errors import ModuleError
+from spelgen.formulas import Formulas
 from spelgen.inspection import Inspection
 from spelgen.plan import plan_model
 from spelgen.robot import Robot

@@ -19,7 +19,7 @@ ROWS = [
     "tip torque examples evaluation",
     "charts plots tables picture learned report",
     "agreement axes meaning second_reading numeric_samples verification",
-    "minimal expansion expression shortening formulas formula_files",
+    "minimal",
     "inspection pipeline",
     "console options model_commands run_commands cli",
     "__init__ __main__",
