@@ -6,17 +6,14 @@ from __future__ import annotations
 
 import textwrap
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 from spelgen.arm import Arm
 from spelgen.errors import Diagnostic
 from spelgen.labels import joint_ranges
-from spelgen.meaning import Fact, facts
 from spelgen.structure import Entry, Structure
 
 SCHEMA = 1
-_MOST_FACTS = 16
 
 
 @dataclass(frozen=True)
@@ -26,11 +23,6 @@ class Inspection:
     arm: Arm
     structure: Structure
     diagnostics: tuple[Diagnostic, ...]
-
-    @cached_property
-    def facts(self) -> tuple[Fact, ...]:
-        """What always holds of M and V, in words, and why."""
-        return facts(self.arm, self.structure)
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON contract; names are the URDF's, rows and columns count from 1."""
@@ -56,15 +48,12 @@ class Inspection:
                 "entries": [self._input(row, column) for row in range(n) for column in range(n)]
             },
             "base_parameters": structure.base_parameters,
-            "facts": [fact.to_dict() for fact in self.facts],
             "diagnostics": [diagnostic.to_dict() for diagnostic in self.diagnostics],
         }
 
     def text(self, width: int = 80) -> str:
         """A report for a terminal ``width`` columns wide."""
         parts = [self._heading(), self._joint_table(), self._matrix(width), self._meaning(width)]
-        if self.facts:
-            parts.append(self._reasons(width))
         if self.diagnostics:
             parts.append(self._remarks(width))
         return "\n\n".join(parts)
@@ -144,13 +133,6 @@ class Inspection:
         for name, fact in facts.items():
             lines += textwrap.wrap(fact, width, initial_indent=f"  {name:<5} ", subsequent_indent=" " * 8)
         return "The model needs\n" + "\n".join(lines)
-
-    def _reasons(self, width: int) -> str:
-        lines = []
-        for fact in self.facts[:_MOST_FACTS]:
-            lines += textwrap.wrap(str(fact), width, initial_indent="  ", subsequent_indent="    ")
-        left = len(self.facts) - _MOST_FACTS
-        return "What always holds\n" + "\n".join(lines + ([f"  and {left} facts more"] if left > 0 else []))
 
     def _remarks(self, width: int) -> str:
         lines = []

@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
-from spelgen import formulas as closed_forms
 from spelgen import verification
 from spelgen.agreement import Verification
 from spelgen.arm import Arm, make_arm
 from spelgen.emit import emit
 from spelgen.errors import ModuleError
-from spelgen.formulas import Formulas
 from spelgen.inspection import Inspection
 from spelgen.plan import plan_model
 from spelgen.robot import Robot
@@ -159,25 +156,6 @@ def verify(
     """
     loaded = load(path, joints, tip, snap_tolerance)
     return verification.verify(loaded.robot, loaded.arm, derive(loaded.arm, assume))
-
-
-def formulas(
-    path: str | Path,
-    joints: Sequence[str] | None = None,
-    tip: str | None = None,
-    assume: Assume = "kinematics",
-    *,
-    snap_tolerance: float = 2e-3,
-    entry: tuple[int, int] | Literal["V"] | None = None,
-    limit: int | None = None,
-) -> Formulas:
-    """Closed forms of M and V, or of one ``entry``: (row, column) counted from 1, or "V".
-
-    ``limit`` is how many terms an entry may have to be written out. Other arguments and errors as for
-    ``load``; ``formula_files`` writes them as text, LaTeX or SymPy.
-    """
-    arm = load(path, joints, tip, snap_tolerance).arm
-    return closed_forms.formulas(arm, derive(arm, assume), entry=entry, limit=limit)
 
 
 def find_urdf(module: Path, name: str) -> Path:

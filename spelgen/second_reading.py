@@ -18,7 +18,6 @@ import numpy as np
 from spelgen.agreement import Check, Verdict, size_told
 from spelgen.arm import Arm
 from spelgen.robot import Joint, Link, Robot
-from spelgen.urdf_document import urdf_bytes
 
 _ROUNDING = 1e-9
 """What composed rotations (1e-11 each) and dropped offsets (below 1e-9 m) may add up to, per joint."""
@@ -75,7 +74,7 @@ def second_reading(robot: Robot, arm: Arm, *, samples: int = 6, seed: int = 0) -
 
 
 def _read_again(robot: Robot, arm: Arm, samples: int, seed: int) -> Iterator[_Reading]:
-    data = urdf_bytes(robot.path)
+    data = robot.path.read_bytes()
     if hashlib.sha256(data).hexdigest() != robot.digest:
         raise ValueError("the file has changed since it was read")
     model = _yourdfpy_model(data)
