@@ -10,9 +10,9 @@ PACKAGE = Path(__file__).parents[1] / "spelgen"
 # A file may import only from files above it, or to its left.
 ROWS = [
     "errors files labels rendering yaml_document settings",
-    "robot xacro_child xacro_input expansion urdf_document urdf_values urdf_elements lint urdf",
+    "robot xacro_child xacro_input urdf_document urdf_values urdf_elements lint urdf",
     "rational snapping placement chain walk arm",
-    "recursion field sampling spans basis symbolic structure nominal",
+    "recursion field sampling spans basis expansion symbolic structure nominal",
     "spec plan emit",
     "logs signals windows engine simulate",
     "runs rollout rivals prior progress training_data training_loop training",
