@@ -1,6 +1,6 @@
 """`python -m spelgen` is the command `spelgen`."""
 
-from spelgen.cli import main
+from spelgen.cli.main import main
 
 if __name__ == "__main__":
     main()

@@ -8,10 +8,10 @@ import textwrap
 from dataclasses import dataclass
 from typing import Any
 
-from spelgen.arm import Arm
+from spelgen.arm.arm import Arm
 from spelgen.errors import Diagnostic
 from spelgen.labels import joint_ranges
-from spelgen.structure import Entry, Structure
+from spelgen.structure.structure import Entry, Structure
 
 SCHEMA = 1
 

@@ -6,18 +6,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from spelgen import verification
-from spelgen.agreement import Verification
-from spelgen.arm import Arm, make_arm
-from spelgen.emit import emit
+from spelgen.arm.arm import Arm, make_arm
+from spelgen.emission.emit import emit
+from spelgen.emission.plan import plan_model
 from spelgen.errors import ModuleError
 from spelgen.inspection import Inspection
-from spelgen.plan import plan_model
-from spelgen.robot import Robot
+from spelgen.proof import verification
+from spelgen.proof.agreement import Verification
 from spelgen.settings import Settings, check_joint_names, load_settings
 from spelgen.spec import Assume, ModelSpec, Options, Preset, read_header
-from spelgen.structure import derive
-from spelgen.urdf import read_urdf
+from spelgen.structure.structure import derive
+from spelgen.urdf.read import read_urdf
+from spelgen.urdf.robot import Robot
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from spelgen.arm import Arm, Body, Coordinate
+from spelgen.arm.arm import Arm, Body, Coordinate
 
 Rows = tuple[tuple[Fraction, Fraction, Fraction], ...]
 

@@ -14,12 +14,12 @@ import torch
 from flint import fmpq_mpoly
 from torch import nn
 
-from spelgen.emit import emit
+from spelgen.emission.emit import emit
+from spelgen.emission.plan import plan_model
 from spelgen.pipeline import load
-from spelgen.plan import plan_model
 from spelgen.spec import Options
-from spelgen.structure import Structure, derive
-from spelgen.symbolic import polynomials
+from spelgen.structure.structure import Structure, derive
+from spelgen.structure.symbolic import polynomials
 
 ROBOTS = Path(__file__).parents[1] / "robots"
 SIX = ("two_link", "rpr", "six_dof", "scara", "panda", "ur10e")

@@ -2,7 +2,7 @@
 
 from fractions import Fraction
 
-from spelgen.arm import Arm, Body, Coordinate
+from spelgen.arm.arm import Arm, Body, Coordinate
 
 UPRIGHT = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 SIDEWAYS = ((0, 0, 1), (1, 0, 0), (0, 1, 0))  # the joint's z along the parent's x

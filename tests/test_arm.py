@@ -10,9 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from spelgen.arm import make_arm
-from spelgen.errors import ArmError
-from spelgen.rational import (
+from spelgen.arm.arm import make_arm
+from spelgen.arm.rational import (
     IDENTITY,
     alignment,
     exact_rotation,
@@ -22,7 +21,8 @@ from spelgen.rational import (
     snapped_angle,
     transposed,
 )
-from spelgen.urdf import read_urdf
+from spelgen.errors import ArmError
+from spelgen.urdf.read import read_urdf
 
 pin = pytest.importorskip("pinocchio")
 

@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from spelgen import __version__
-from spelgen.cli import app
+from spelgen.cli.main import app
 
 ROOT = Path(__file__).parents[1]
 COMMANDS = ["inspect", "build", "simulate", "train", "evaluate", "report", "check"]
@@ -60,7 +60,7 @@ def test_every_option_has_a_help_text(spelgen, command):
 
 
 def test_help_and_inspect_load_no_torch(robots):
-    run = "import sys; from spelgen.cli import app; app({!r}, standalone_mode=False)"
+    run = "import sys; from spelgen.cli.main import app; app({!r}, standalone_mode=False)"
     code = run + "; print('torch' in sys.modules)"
     for arguments in (["--help"], ["inspect", str(robots / "rpr.urdf")]):
         done = subprocess.run(
@@ -229,7 +229,7 @@ def test_unexpected_errors_are_named(spelgen, robots, monkeypatch):
 
 
 def test_missing_extra_is_named(robots, tmp_path):
-    code = "import sys; sys.modules['pinocchio'] = None; from spelgen.cli import main; main()"
+    code = "import sys; sys.modules['pinocchio'] = None; from spelgen.cli.main import main; main()"
     command = [sys.executable, "-c", code, "simulate", str(robots / "rpr.urdf"), "-o", str(tmp_path / "logs")]
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
     assert done.returncode == 1

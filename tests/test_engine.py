@@ -6,11 +6,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from spelgen.arm import make_arm
-from spelgen.engine import bias, forward_dynamics, make_engine, mass_matrix, pinocchio_model
+from spelgen.arm.arm import make_arm
 from spelgen.errors import ArmError, SpelgenErrors
 from spelgen.settings import JointSettings, Settings, load_settings
-from spelgen.urdf import read_urdf
+from spelgen.simulation.engine import bias, forward_dynamics, make_engine, mass_matrix, pinocchio_model
+from spelgen.urdf.read import read_urdf
 from tests.hand_built import SIDEWAYS, arm, body, coordinate, point, slider
 
 SIX = ("two_link", "rpr", "six_dof", "scara", "panda", "ur10e")

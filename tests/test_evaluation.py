@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 import torch
 
+from spelgen.data.logs import Trajectory, read_logs, write_logs
+from spelgen.data.windows import Windows, cut_windows
 from spelgen.errors import LogError, RunError
-from spelgen.evaluation import energy_drift, evaluate
-from spelgen.logs import Trajectory, read_logs, write_logs
-from spelgen.rivals import PinocchioDynamics, held_velocity, urdf_values
-from spelgen.rollout import roll_out
-from spelgen.runs import load_model
-from spelgen.tip import tip_position
-from spelgen.torque import torque_errors, torque_samples
-from spelgen.training import train
-from spelgen.training_data import TrainingConfig
-from spelgen.windows import Windows, cut_windows
+from spelgen.evaluation.evaluate import energy_drift, evaluate
+from spelgen.evaluation.tip import tip_position
+from spelgen.evaluation.torque import torque_errors, torque_samples
+from spelgen.training.data import TrainingConfig
+from spelgen.training.rivals import PinocchioDynamics, held_velocity, urdf_values
+from spelgen.training.rollout import roll_out
+from spelgen.training.runs import load_model
+from spelgen.training.train import train
 
 STAND_IN = Path(__file__).with_name("stand_in.py")
 JOINTS = ("shoulder", "elbow")

@@ -9,9 +9,8 @@ import pyarrow.parquet
 import pytest
 import torch
 
-from spelgen.errors import LogError, SpelgenErrors
-from spelgen.logs import Trajectory, read_logs, write_logs
-from spelgen.signals import (
+from spelgen.data.logs import Trajectory, read_logs, write_logs
+from spelgen.data.signals import (
     automatic_cutoff,
     automatic_spacing,
     examine,
@@ -20,7 +19,8 @@ from spelgen.signals import (
     rate,
     split_at_gaps,
 )
-from spelgen.windows import cut_windows, split_validation
+from spelgen.data.windows import cut_windows, split_validation
+from spelgen.errors import LogError, SpelgenErrors
 
 JOINTS = ("a", "b")
 

@@ -5,9 +5,9 @@ import re
 
 import pytest
 
-from spelgen.arm import make_arm
+from spelgen.arm.arm import make_arm
 from spelgen.errors import SpelgenError
-from spelgen.urdf import read_urdf
+from spelgen.urdf.read import read_urdf
 
 # file -> a part of every line of the refusal
 REFUSED = {

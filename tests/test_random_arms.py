@@ -12,11 +12,11 @@ import pytest
 from hypothesis import HealthCheck, assume, event, given, settings
 from random_arms import DrawnArm, arms
 
-from spelgen.arm import Arm, make_arm
-from spelgen.rational import exact_rotation, rotation_from_rpy
-from spelgen.sampling import float_energies
-from spelgen.structure import Structure, derive
-from spelgen.urdf import read_urdf
+from spelgen.arm.arm import Arm, make_arm
+from spelgen.arm.rational import exact_rotation, rotation_from_rpy
+from spelgen.structure.sampling import float_energies
+from spelgen.structure.structure import Structure, derive
+from spelgen.urdf.read import read_urdf
 
 pin = pytest.importorskip(
     "pinocchio", reason="Pinocchio (pip install spelgen[simulate]) reads the other side"

@@ -11,9 +11,9 @@ import torch
 
 from spelgen import pipeline
 from spelgen.errors import RunError
-from spelgen.report import render_report, write_report
-from spelgen.runs import load_model
-from spelgen.training_data import TrainingConfig
+from spelgen.report.page import render_report, write_report
+from spelgen.training.data import TrainingConfig
+from spelgen.training.runs import load_model
 
 VOID = {"meta", "br"}
 

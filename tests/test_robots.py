@@ -8,9 +8,9 @@ import pytest
 from lxml import etree
 
 from spelgen import inspect
-from spelgen.arm import make_arm
+from spelgen.arm.arm import make_arm
 from spelgen.settings import check_joint_names, load_settings
-from spelgen.urdf import read_urdf
+from spelgen.urdf.read import read_urdf
 
 ROBOTS = Path(__file__).parents[1] / "robots"
 SIX = ("two_link", "rpr", "six_dof", "scara", "panda", "ur10e")

@@ -6,13 +6,13 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.special import ellipj
 
-from spelgen import simulate as simulation
-from spelgen.arm import make_arm
-from spelgen.engine import forward_dynamics, make_engine, mass_matrix
+from spelgen.arm.arm import make_arm
 from spelgen.errors import RunError, SettingsError
 from spelgen.settings import JointSettings, Settings, load_settings
-from spelgen.simulate import make_friction, rollout, simulate
-from spelgen.urdf import read_urdf
+from spelgen.simulation import simulate as simulation
+from spelgen.simulation.engine import forward_dynamics, make_engine, mass_matrix
+from spelgen.simulation.simulate import make_friction, rollout, simulate
+from spelgen.urdf.read import read_urdf
 from tests.hand_built import arm, body, coordinate, pendulum, point, slider
 
 SIX = ("two_link", "rpr", "six_dof", "scara", "panda", "ur10e")

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from arms import planar, random_arm
 
-from spelgen.arm import make_arm
+from spelgen.arm.arm import make_arm
 from spelgen.pipeline import load
-from spelgen.recursion import triangle
-from spelgen.sampling import float_samples
-from spelgen.structure import Structure, derive
-from spelgen.urdf import read_urdf
+from spelgen.structure.recursion import triangle
+from spelgen.structure.sampling import float_samples
+from spelgen.structure.structure import Structure, derive
+from spelgen.urdf.read import read_urdf
 
 COUNTS = {  # outputs, constants, zero entries
     "two_link": (1, 2, 0),

@@ -6,9 +6,9 @@ from arms import planar, random_arm
 from flint import fmpq_mat
 
 from spelgen.pipeline import load
-from spelgen.recursion import triangle
-from spelgen.structure import derive
-from spelgen.symbolic import Polynomials, polynomials
+from spelgen.structure.recursion import triangle
+from spelgen.structure.structure import derive
+from spelgen.structure.symbolic import Polynomials, polynomials
 
 ROBOTS = ["two_link", "rpr", "scara", "six_dof", "ur10e", "panda"]
 

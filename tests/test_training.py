@@ -15,10 +15,13 @@ import numpy as np
 import pytest
 import torch
 
+from spelgen.data.logs import Trajectory, write_logs
+from spelgen.data.windows import Windows, cut_windows
 from spelgen.errors import LogError, ModuleError, RunError
-from spelgen.logs import Trajectory, write_logs
-from spelgen.progress import TrainingProgress
-from spelgen.rollout import (
+from spelgen.training.data import TrainingConfig, prepare_data
+from spelgen.training.loop import TrainingLoop
+from spelgen.training.progress import TrainingProgress
+from spelgen.training.rollout import (
     choose_substeps,
     integration_error,
     loss_scales,
@@ -27,11 +30,8 @@ from spelgen.rollout import (
     roll_out,
     rollout_loss,
 )
-from spelgen.runs import load_model
-from spelgen.training import train
-from spelgen.training_data import TrainingConfig, prepare_data
-from spelgen.training_loop import TrainingLoop
-from spelgen.windows import Windows, cut_windows
+from spelgen.training.runs import load_model
+from spelgen.training.train import train
 
 STAND_IN = Path(__file__).with_name("stand_in.py")
 JOINTS = ("shoulder", "elbow")
@@ -211,7 +211,7 @@ def test_resuming_repeats_what_would_have_been(logs, tmp_path, monkeypatch):
     straight, broken = tmp_path / "straight", tmp_path / "broken"
     train(STAND_IN, [logs], straight, QUICK, progress=False)
     with monkeypatch.context() as patch:
-        patch.setattr("spelgen.training.TrainingProgress", Interrupted)
+        patch.setattr("spelgen.training.train.TrainingProgress", Interrupted)
         assert train(STAND_IN, [logs], broken, QUICK, progress=False).status == "interrupted"
     assert len(lines(broken)) == 3
     result = train(STAND_IN, [logs], broken, QUICK, resume=True, progress=False)
@@ -250,7 +250,7 @@ def test_numbers_that_blow_up_are_rolled_back_at_half_the_rate(logs, tmp_path, m
         calls.append(torch.is_grad_enabled())
         return loss * math.nan if sum(calls) == 25 and calls[-1] else loss
 
-    monkeypatch.setattr("spelgen.training_loop.rollout_loss", blown_up_once)
+    monkeypatch.setattr("spelgen.training.loop.rollout_loss", blown_up_once)
     result = train(STAND_IN, [logs], tmp_path / "run", QUICK, progress=False)
     records = lines(tmp_path / "run")
     assert result.status == "finished"
@@ -264,7 +264,7 @@ def test_numbers_that_never_recover_end_the_run(logs, tmp_path, monkeypatch):
         loss = rollout_loss(model, windows, scales, substeps)
         return loss * math.nan if torch.is_grad_enabled() else loss
 
-    monkeypatch.setattr("spelgen.training_loop.rollout_loss", blown_up)
+    monkeypatch.setattr("spelgen.training.loop.rollout_loss", blown_up)
     with pytest.raises(RunError) as caught:
         train(STAND_IN, [logs], tmp_path / "run", QUICK, progress=False)
     assert str(caught.value) == (
@@ -283,8 +283,8 @@ def test_early_stop_and_time_limit(logs, tmp_path):
 
 CHILD = """
 import sys
-from spelgen.training import train
-from spelgen.training_data import TrainingConfig
+from spelgen.training.train import train
+from spelgen.training.data import TrainingConfig
 config = TrainingConfig(epochs=100000, batch=32, patience=100000, momentum_steps=0)
 result = train(sys.argv[1], [sys.argv[2]], sys.argv[3], config)
 print(result.status)

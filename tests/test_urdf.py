@@ -7,9 +7,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from spelgen.arm import make_arm
+from spelgen.arm.arm import make_arm
 from spelgen.errors import SpelgenError
-from spelgen.urdf import Inertial, Joint, Mimic, Transmission, read_urdf
+from spelgen.urdf.read import Inertial, Joint, Mimic, Transmission, read_urdf
 
 LINKS = '<link name="base"/>\n<link name="arm"/>\n'
 JOINT = (

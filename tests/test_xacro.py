@@ -7,11 +7,11 @@ import time
 
 import pytest
 
-from spelgen import xacro_input
 from spelgen.errors import SpelgenError
 from spelgen.pipeline import build, check
-from spelgen.urdf import read_urdf
-from spelgen.urdf_document import urdf_bytes
+from spelgen.urdf import xacro_input
+from spelgen.urdf.document import urdf_bytes
+from spelgen.urdf.read import read_urdf
 
 ARM = """<?xml version="1.0"?>
 <!-- a comment
@@ -153,7 +153,7 @@ def test_time_and_memory_are_bounded(arm, monkeypatch):
 
 @installed
 def test_what_xacro_writes_is_bounded(arm, monkeypatch):
-    monkeypatch.setattr("spelgen.urdf_document.MAX_BYTES", 800)
+    monkeypatch.setattr("spelgen.urdf.document.MAX_BYTES", 800)
     assert refusal(arm).endswith("bytes of URDF from xacro, expected at most 800")
 
 

@@ -16,7 +16,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from arms import planar, random_arm
 
 from spelgen.pipeline import load
-from spelgen.structure import derive
+from spelgen.structure.structure import derive
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 

@@ -1,0 +1,143 @@
+"""Robot -> Arm: the serial chain, fixed and locked links lumped, mimic joints folded in, geometry exact."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from math import pi
+from typing import Literal
+
+from spelgen.arm.chain import choose_chain
+from spelgen.arm.placement import TenVector
+from spelgen.arm.rational import Matrix, Vector, exact
+from spelgen.arm.walk import Moved, walk
+from spelgen.errors import ArmError, Diagnostic
+from spelgen.urdf.robot import Joint, Robot
+
+Kind = Literal["revolute", "prismatic"]
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """One degree of freedom; limits as in the file (rad or m, N m or N, per second), None where absent."""
+
+    name: str
+    kind: Kind
+    continuous: bool
+    lower: float | None
+    upper: float | None
+    effort: float | None
+    velocity: float | None
+    damping: float
+    friction: float
+    passive: bool
+
+
+@dataclass(frozen=True)
+class Body:
+    """A joint and all that moves rigidly with it.
+
+    ``rotation`` and ``translation`` [m] are the pose of the joint's own frame in the parent body's (the root
+    link's for parent -1) at zero position; the joint turns about, or slides along, the +z of its own frame by
+    multiplier * q + offset, q the coordinate. ``inertia`` is (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) [kg, kg
+    m, kg m2] about the joint frame's origin, in the joint frame; None where no link of the body has an
+    inertial.
+    """
+
+    name: str
+    kind: Kind
+    parent: int
+    coordinate: int
+    multiplier: Fraction
+    offset: float
+    rotation: Matrix
+    translation: Vector
+    inertia: TenVector | None
+
+
+@dataclass(frozen=True)
+class Arm:
+    """A serial arm with n coordinates, root first; ``bodies`` hold the chain in its order, parents first.
+
+    ``gravity`` [m/s2] is in the root link's frame; ``locked`` names the joints held still; ``diagnostics``
+    holds what this step did, the robot's own stay with the robot.
+    """
+
+    name: str
+    coordinates: tuple[Coordinate, ...]
+    bodies: tuple[Body, ...]
+    gravity: Vector
+    diagnostics: tuple[Diagnostic, ...]
+    locked: tuple[str, ...]
+
+    @property
+    def has_inertials(self) -> bool:
+        """Whether every body has an inertial with mass."""
+        return all(body.inertia is not None and body.inertia[0] > 0 for body in self.bodies)
+
+
+def make_arm(
+    robot: Robot,
+    *,
+    joints: Sequence[str] | None = None,
+    tip: str | None = None,
+    snap_tolerance: float = 2e-3,
+    gravity: Sequence[float] = (0.0, 0.0, -9.81),
+) -> Arm:
+    """Return the arm of the named ``joints``, up to the link ``tip``, or of the longest serial chain.
+
+    All other joints are locked at 0.
+
+    ``snap_tolerance`` [rad] is how far an angle may be from a multiple of pi/2 to be taken as one; 0 believes
+    the file in everything. Raises ``ArmError``.
+    """
+    if not 0 <= snap_tolerance < pi / 4:
+        got = f"a snap tolerance of {snap_tolerance:g} rad"
+        raise ArmError(got, expected="at least 0 and less than pi/4 (0.785)")
+    chain = choose_chain(robot, joints, tip)
+    walked = walk(robot, chain, snap_tolerance)
+    indices = {joint.name: index for index, joint in enumerate(chain.joints)}
+    held = {joint.name for joint in walked.held if joint.type != "fixed"}
+    x, y, z = (exact(float(value)) for value in gravity)
+    return Arm(
+        name=robot.name,
+        coordinates=tuple(_coordinate(joint) for joint in chain.joints),
+        bodies=tuple(_body(each, indices[each.followed.leader.name]) for each in walked.moved),
+        gravity=(x, y, z),
+        diagnostics=walked.diagnostics,
+        locked=tuple(joint.name for joint in robot.joints if joint.name in held),
+    )
+
+
+def _body(moved: Moved, coordinate: int) -> Body:
+    return Body(
+        name=moved.joint.name,
+        kind=_kind(moved.joint),
+        parent=moved.pose.parent,
+        coordinate=coordinate,
+        multiplier=moved.followed.multiplier,
+        offset=float(moved.followed.offset),
+        rotation=moved.pose.rotation,
+        translation=moved.pose.translation,
+        inertia=moved.inertia,
+    )
+
+
+def _coordinate(joint: Joint) -> Coordinate:
+    return Coordinate(
+        name=joint.name,
+        kind=_kind(joint),
+        continuous=joint.type == "continuous",
+        lower=joint.lower,
+        upper=joint.upper,
+        effort=joint.effort,
+        velocity=joint.velocity,
+        damping=joint.damping,
+        friction=joint.friction,
+        passive=False,
+    )
+
+
+def _kind(joint: Joint) -> Kind:
+    return "prismatic" if joint.type == "prismatic" else "revolute"

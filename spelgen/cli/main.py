@@ -1,0 +1,57 @@
+"""The command line: each command is one step of the way from a URDF to a report.
+
+Commands import what they need when they run, so that `spelgen --help` is instant and `spelgen inspect`
+never loads torch.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated
+
+import typer
+
+from spelgen import __version__
+from spelgen.cli import model_commands, run_commands
+from spelgen.cli.console import say, told
+
+app = typer.Typer(
+    name="spelgen",
+    add_completion=False,
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+for command in (
+    model_commands.inspect,
+    model_commands.build,
+    run_commands.simulate,
+    run_commands.train,
+    run_commands.evaluate,
+    run_commands.report,
+    model_commands.check,
+):
+    app.command(context_settings={"max_content_width": 80})(told(command))
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        say(f"spelgen {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def common(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """URDF in, a PyTorch model of the arm's dynamics with its exact structure out."""
+
+
+def main() -> None:
+    """Entry point of the command `spelgen`."""
+    for stream in (sys.stdout, sys.stderr):
+        # names from a file may not fit the terminal's encoding
+        stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
+    app(prog_name="spelgen")

@@ -1,0 +1,103 @@
+"""Commands about the model itself: `inspect`, `build`, `check`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from spelgen.cli import options
+from spelgen.cli.console import FAILED, note, say
+from spelgen.cli.options import Assumption, Force, Joints, Module, Robot, RobotOption, SnapTolerance, Tip
+from spelgen.files import write_text
+from spelgen.spec import Preset
+
+
+def inspect(
+    robot: Robot,
+    joints: Joints = None,
+    tip: Tip = None,
+    assume: Assumption = "kinematics",
+    snap_tol: SnapTolerance = 2e-3,
+    format: Annotated[Literal["text", "json"], typer.Option("--format", help="Of the result.")] = "text",
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write to a file.")
+    ] = None,
+    strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 if there is any warning.")] = False,
+    verify: Annotated[bool, typer.Option("--verify", help="Prove it again by other programs.")] = False,
+) -> None:
+    """Show the exact structure of an arm's dynamics."""
+    from spelgen import pipeline
+
+    found = pipeline.inspect(robot, options.names(joints), tip, assume, snap_tolerance=snap_tol)
+    proof = None
+    if verify:
+        proof = pipeline.verify(robot, options.names(joints), tip, assume, snap_tolerance=snap_tol)
+    if format == "text":
+        text = found.text() + (f"\n\n{proof.text()}" if proof else "")
+    else:
+        data = found.to_dict() | ({"verification": proof.to_dict()} if proof else {})
+        text = json.dumps(data, indent=2)
+    if output is None:
+        say(text)
+    else:
+        say(f"wrote {write_text(output, text + chr(10))}")
+    warnings = sum(diagnostic.severity == "warning" for diagnostic in found.diagnostics)
+    if strict and warnings:
+        note(f"{robot}: {warnings} warning{'s' * (warnings > 1)}, and --strict allows none")
+        raise typer.Exit(FAILED)
+    if proof and not proof.agrees:
+        note(f"{robot}: the proof contradicts the derivation; please report this file")
+        raise typer.Exit(FAILED)
+
+
+def build(
+    robot: Robot,
+    joints: Joints = None,
+    tip: Tip = None,
+    assume: Assumption = "kinematics",
+    snap_tol: SnapTolerance = 2e-3,
+    preset: Annotated[Preset, typer.Option("--preset", help="How the model is made.")] = "minimal",
+    width: Annotated[int, typer.Option("--width", min=1, max=4096, help="Units in a hidden layer.")] = 64,
+    depth: Annotated[int, typer.Option("--depth", min=1, max=16, help="Hidden layers.")] = 2,
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="MODULE.py", help="Default: <robot>_spel.py here."),
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Write the PyTorch module tailored to an arm."""
+    from spelgen import pipeline
+
+    source = pipeline.build(
+        robot,
+        options.names(joints),
+        tip,
+        assume,
+        snap_tolerance=snap_tol,
+        preset=preset,
+        width=width,
+        depth=depth,
+    )
+    path = output or Path(f"{robot.stem}_spel.py")
+    if path.is_file() and path.read_bytes() == source.encode():
+        say(f"{path} is up to date")
+        return
+    options.require_free(path, force=force)
+    say(f"wrote {write_text(path, source)}")
+
+
+def check(module: Module, robot: RobotOption = None) -> None:
+    """Tell whether a module is what its URDF gives today."""
+    from spelgen import pipeline
+
+    result = pipeline.check(module, robot)
+    for reason in result.reasons:
+        note(f"{module}: {reason}")
+    if not result.fresh:
+        note(f"{module}: build it again from {result.urdf}")
+        raise typer.Exit(FAILED)
+    proved = f"{len(result.proof.checks)} facts proved by {result.proof.means}"
+    say(f"{module} is up to date with {result.urdf}; {proved}")

@@ -1,0 +1,195 @@
+"""Commands about logs and runs: `simulate`, `train`, `evaluate`, `report`."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from spelgen.cli import options
+from spelgen.cli.console import INTERRUPTED, counted, note, say
+from spelgen.cli.options import (
+    Data,
+    Filter,
+    Force,
+    Joints,
+    Module,
+    MoreData,
+    Robot,
+    RobotOption,
+    Run,
+    SnapTolerance,
+    Tip,
+)
+from spelgen.errors import ModuleError
+from spelgen.spec import read_header
+
+if TYPE_CHECKING:
+    from spelgen.training.data import TrainingConfig
+
+WORST_INTEGRATION = 1e-8  # [rad, rad/s; m, m/s] above this simulated logs are no reference
+
+
+def simulate(
+    robot: Robot,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="LOGS", help="Folder for train and test logs.")
+    ],
+    joints: Joints = None,
+    tip: Tip = None,
+    snap_tol: SnapTolerance = 2e-3,
+    seed: Annotated[
+        int | None, typer.Option("--seed", min=0, help="Default: that of the robot's settings.")
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Make training and test logs with Pinocchio."""
+    from spelgen import pipeline
+    from spelgen.data.logs import write_logs
+    from spelgen.simulation import simulate
+
+    loaded = pipeline.load(robot, options.names(joints), tip, snap_tol)
+    settings = loaded.settings
+    if seed is not None:
+        settings = settings.model_copy(
+            update={"simulation": settings.simulation.model_copy(update={"seed": seed})}
+        )
+    paths = {role: output / f"{role}.parquet" for role in ("train", "test")}
+    for path in paths.values():
+        options.require_free(path, force=force)
+    with counted("simulating") as progress:
+        result = simulate.simulate(loaded.arm, settings, progress=progress)
+    names = [coordinate.name for coordinate in loaded.arm.coordinates]
+    for path, trajectories in zip(paths.values(), (result.train, result.test), strict=True):
+        if trajectories:
+            write_logs(path, trajectories, names)
+            samples = sum(len(each.t) for each in trajectories)
+            say(f"wrote {path}: {len(trajectories)} trajectories, {samples} samples")
+    say(f"largest integration error: {result.integration_error:.1e} [rad, rad/s; m, m/s]")
+    if result.integration_error > WORST_INTEGRATION:
+        note(f"warning: more than {WORST_INTEGRATION:g}; do not take these logs as a reference")
+
+
+def train(
+    module: Module,
+    more: MoreData = None,
+    data: Data = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="RUN", help="Run folder; default: runs/<module>.")
+    ] = None,
+    robot: RobotOption = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in the run folder.")] = False,
+    force: Force = False,
+    epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="At most so many.")] = None,
+    patience: Annotated[
+        int | None, typer.Option("--patience", min=1, help="Epochs without gain before the end.")
+    ] = None,
+    max_minutes: Annotated[
+        float | None, typer.Option("--max-minutes", min=0.0, help="At most so long.")
+    ] = None,
+    batch: Annotated[int | None, typer.Option("--batch", min=1, help="Windows in a step.")] = None,
+    window: Annotated[int | None, typer.Option("--window", min=2, help="Samples in a window.")] = None,
+    stride: Annotated[
+        int | None, typer.Option("--stride", min=1, help="Samples from window to window.")
+    ] = None,
+    every: Annotated[int | None, typer.Option("--every", min=1, help="Take one sample of so many.")] = None,
+    substeps: Annotated[
+        int | None, typer.Option("--substeps", min=1, help="Integrator steps between samples.")
+    ] = None,
+    learning_rate: Annotated[
+        float | None, typer.Option("--learning-rate", min=0.0, help="At its largest.")
+    ] = None,
+    weight_decay: Annotated[float | None, typer.Option("--weight-decay", min=0.0, help="Of AdamW.")] = None,
+    validation_fraction: Annotated[
+        float | None,
+        typer.Option("--validation-fraction", min=0.0, max=0.9, help="Part of the trajectories."),
+    ] = None,
+    filter: Filter = None,
+    seed: Annotated[int | None, typer.Option("--seed", min=0, help="Of split, order and batches.")] = None,
+    device: Annotated[str | None, typer.Option("--device", help="cpu, cuda, ...")] = None,
+    threads: Annotated[int | None, typer.Option("--threads", min=1, help="Of torch.")] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Show no progress.")] = False,
+) -> None:
+    """Train a module on logs.
+
+    What is not given here comes from the settings beside the robot.
+    """
+    flags = {
+        "epochs": epochs, "patience": patience, "max_minutes": max_minutes, "batch": batch, "window": window,
+        "stride": stride, "every": every, "substeps": substeps, "learning_rate": learning_rate,
+        "weight_decay": weight_decay, "validation_fraction": validation_fraction, "filter": filter,
+        "seed": seed, "device": device, "threads": threads,
+    }  # fmt: skip
+    paths = options.logs(data, more)
+    from spelgen.training import train as training
+
+    folder = output or Path("runs") / module.stem
+    urdf = robot or _unchanged_urdf(module)
+    config = _config(
+        urdf, folder if resume else None, {key: value for key, value in flags.items() if value is not None}
+    )
+    result = training.train(
+        module, paths, folder, config, urdf=urdf, resume=resume, force=force, progress=not quiet
+    )
+    say(f"{result.status} after {result.epochs} epochs, {result.steps} steps, {result.seconds:.0f} s")
+    say(f"best validation loss {result.best_validation:.3g}, at epoch {result.best_epoch}")
+    say(f"run folder: {folder}")
+    if result.status == "interrupted":
+        note("the best model so far is in the run folder; --resume goes on")
+        raise typer.Exit(INTERRUPTED)
+
+
+def evaluate(run: Run, more: MoreData = None, data: Data = None, filter: Filter = None) -> None:
+    """Judge a trained run on test logs, beside its rivals."""
+    paths = options.logs(data, more)
+    from spelgen.evaluation import evaluate as evaluation
+    from spelgen.report.tables import result_tables
+
+    result = evaluation.evaluate(run, paths, cutoff=filter)
+    for each in result.diagnostics:
+        note(f"{each.severity}: {each.where}: {each.message}")
+    count = len(result.trajectories)
+    say(f"{result.robot} on {count} test trajector{'ies' if count != 1 else 'y'}; * marks the best of a row")
+    for table in result_tables(result.to_dict()):
+        say("\n" + table.text())
+
+
+def report(
+    run: Run,
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="FILE", help="Default: report.html in the run folder."),
+    ] = None,
+) -> None:
+    """Write one HTML page about a run."""
+    from spelgen.report.page import write_report
+
+    say(f"wrote {write_report(run, output)}")
+
+
+def _unchanged_urdf(module: Path) -> Path | None:
+    """The URDF of the module's name near it, when it is still the one the module was built from."""
+    from spelgen.pipeline import find_urdf
+
+    header = read_header(module)
+    try:
+        path = find_urdf(module, header.urdf)
+    except ModuleError:
+        return None
+    return path if hashlib.sha256(path.read_bytes()).hexdigest() == header.urdf_sha256 else None
+
+
+def _config(urdf: Path | None, resumed: Path | None, flags: dict[str, Any]) -> TrainingConfig:
+    """The flags, and behind them what the run was started with, or the robot's settings."""
+    from spelgen.settings import TrainingSettings, load_settings
+    from spelgen.training.data import TrainingConfig
+    from spelgen.training.runs import RunFolder
+
+    if resumed is not None:
+        run = RunFolder(resumed)
+        return replace(TrainingConfig(**run.read_json(run.config)["config"]), **flags)
+    settings = TrainingSettings() if urdf is None else load_settings(urdf).training
+    return TrainingConfig.from_settings(settings, **flags)

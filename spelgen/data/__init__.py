@@ -1,0 +1,1 @@
+"""Logs: read, doubted, filtered, cut into windows."""

@@ -1,0 +1,1 @@
+"""A Structure to the source of a module."""

@@ -1,0 +1,131 @@
+"""Structure and nominal sizes -> ModelSpec: the decisions that the emitted module then merely spells out."""
+
+from __future__ import annotations
+
+import keyword
+import re
+from collections.abc import Mapping
+
+from spelgen.arm.arm import Arm, Coordinate
+from spelgen.spec import ConstantSpec, Entries, JointSpec, ModelSpec, Options, OutputSpec
+from spelgen.structure.basis import Weights
+from spelgen.structure.nominal import Nominal, nominal, working_range
+from spelgen.structure.structure import Structure
+
+_GUARD_SHARE = 0.1
+_FRICTION_OF_EFFORT = 0.02
+_FRICTION_OF_TORQUE = 0.1
+_LARGEST_EFFORT = 1e4  # Nm, N: what stands above is a placeholder
+_LARGEST_SPEED = 100.0  # rad/s, m/s: likewise
+_RISE = 0.02  # s
+_DEFAULT_SPEED = {"revolute": 2.0, "prismatic": 0.5}  # rad/s, m/s
+
+
+def plan_model(
+    arm: Arm,
+    structure: Structure,
+    options: Options,
+    *,
+    urdf: str,
+    urdf_sha256: str,
+    rotors: Mapping[str, float] | None = None,
+) -> ModelSpec:
+    """The model of ``arm`` under ``options``; ``urdf`` is the file's name without its folder.
+
+    ``rotors`` [kg m^2, kg] are known rotor inertias as felt at the joint; where there is none, one is
+    guessed.
+    """
+    known = rotors or {}
+    sizes = nominal(arm, structure)
+    identifiers = _identifiers([coordinate.name for coordinate in arm.coordinates])
+    x, y, z = (float(g) for g in arm.gravity)
+    return ModelSpec(
+        robot=arm.name,
+        urdf=urdf,
+        urdf_sha256=urdf_sha256,
+        gravity=(x, y, z),
+        options=options,
+        joints=tuple(
+            _joint(
+                coordinate, identifiers[k], sizes, k, known.get(coordinate.name) or _guessed_rotor(coordinate)
+            )
+            for k, coordinate in enumerate(arm.coordinates)
+        ),
+        entries=tuple((e.row, e.column, e.kind, e.joints) for e in structure.entries),
+        outputs=tuple(
+            OutputSpec(output.joints, _floats(output.basis), center, scale)
+            for output, center, scale in zip(
+                structure.outputs, sizes.output_means, sizes.output_scales, strict=True
+            )
+        ),
+        constants=tuple(
+            ConstantSpec(_floats(constant.basis), start, scale)
+            for constant, start, scale in zip(
+                structure.constants, sizes.constants, sizes.constant_scales, strict=True
+            )
+        ),
+        potential=structure.potential,
+        potential_scale=sizes.potential_scale,
+        guard=float(f"{max(_GUARD_SHARE * sizes.least_share, 1e-4):.0e}"),
+        started_from_urdf=sizes.from_urdf,
+    )
+
+
+def _joint(coordinate: Coordinate, identifier: str, sizes: Nominal, index: int, rotor: float) -> JointSpec:
+    low, high = working_range(coordinate)
+    speed = coordinate.velocity if coordinate.velocity and coordinate.velocity <= _LARGEST_SPEED else None
+    return JointSpec(
+        name=coordinate.name,
+        identifier=identifier,
+        kind=coordinate.kind,
+        lower=None if coordinate.continuous else coordinate.lower,
+        upper=None if coordinate.continuous else coordinate.upper,
+        center=float(f"{(low + high) / 2:.6g}"),
+        reach=float(f"{(high - low) / 2:.6g}"),
+        speed=speed or _DEFAULT_SPEED[coordinate.kind],
+        friction=float(f"{_friction(coordinate, sizes, index):.3g}"),
+        rotor=float(f"{rotor:.3g}"),
+        mass_share=sizes.mass_shares[index],
+        potential_share=sizes.potential_shares[index],
+        actuated=not coordinate.passive,
+    )
+
+
+def _guessed_rotor(coordinate: Coordinate) -> float:
+    """A geared drive's own inertia: such that its full effort takes ``_RISE`` seconds to reach its full
+    speed.
+    """
+    effort, speed = coordinate.effort, coordinate.velocity
+    if not effort or not speed or effort > _LARGEST_EFFORT or speed > _LARGEST_SPEED:
+        return 0.0
+    return _RISE * effort / speed
+
+
+def _friction(coordinate: Coordinate, sizes: Nominal, index: int) -> float:
+    """The size of friction to start from: a share of the drive's effort, or of the torques the nominal arm
+    needs.
+    """
+    if coordinate.effort and coordinate.effort <= _LARGEST_EFFORT:
+        return _FRICTION_OF_EFFORT * coordinate.effort
+    # a wrist may need next to no torque by itself, but its gear rubs like its neighbour's
+    return _FRICTION_OF_TORQUE * max(sizes.joint_torque[index], 0.01 * max(sizes.joint_torque))
+
+
+def _identifiers(names: list[str]) -> list[str]:
+    """Unique ASCII identifiers, recognisable where the name allows it."""
+    taken: set[str] = set()
+    found = []
+    for index, name in enumerate(names, start=1):
+        plain = re.sub(r"[^0-9a-z]+", "_", name.lower()).strip("_")[:40]
+        if not plain or keyword.iskeyword(plain) or keyword.issoftkeyword(plain) or plain[0].isdigit():
+            plain = f"joint_{plain or index}"
+        unique, count = plain, 2
+        while unique in taken:
+            unique, count = f"{plain}_{count}", count + 1
+        taken.add(unique)
+        found.append(unique)
+    return found
+
+
+def _floats(weights: Weights) -> Entries:
+    return tuple((row, column, float(value)) for row, column, value in weights)

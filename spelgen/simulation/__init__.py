@@ -1,0 +1,1 @@
+"""An Arm to logs: its motion simulated with Pinocchio, drives and friction."""

@@ -1,0 +1,195 @@
+"""The smallest exact form M(q) = sum_k c_k A_k + sum_j f_j(q) B_j, with every f_j on as few joints as
+possible.
+
+U is the span of all changes of M, W the span of M. A read-out is a weighting of M's entries; on the joints
+J only depends exactly that which vanishes on the changes made by every joint outside J. Read-outs are
+taken greedily, sets of joints nearest the tip first and small sets before large ones (the independent sets
+of a matroid, so no later choice could have done better), single entries of M before sums of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from itertools import combinations
+from math import gcd
+
+import numpy as np
+
+from spelgen.structure import field
+from spelgen.structure.spans import Spans
+
+_ALL_SUBSETS_UP_TO = 8
+"""Arms with more joints are searched over contiguous ranges of joints instead of all subsets."""
+
+Weights = tuple[tuple[int, int, Fraction], ...]
+"""A sparse symmetric matrix by its lower triangle: (row, column, value), 0-based."""
+
+
+@dataclass(frozen=True)
+class Output:
+    """One function f(q) of ``joints`` that is left open: f = sum of ``reads`` x M, and it enters M through
+    ``basis``.
+    """
+
+    joints: tuple[int, ...]
+    reads: Weights
+    basis: Weights
+
+
+@dataclass(frozen=True)
+class Constant:
+    """One constant c = sum of ``reads`` x M, which enters M through ``basis``."""
+
+    reads: Weights
+    basis: Weights
+
+
+@dataclass(frozen=True)
+class _Reading:
+    """A read-out: its exact weights in the field, and the same in double precision."""
+
+    joints: tuple[int, ...]
+    weights: np.ndarray
+    values: np.ndarray
+
+
+def smallest_form(spans: Spans) -> tuple[tuple[Output, ...], tuple[Constant, ...]]:
+    """The outputs and constants of the smallest exact form."""
+    readings = list(_readings(spans))
+    entries = len(spans.keys)
+    weights = np.array([r.weights for r in readings], dtype=np.uint64).reshape(-1, entries)
+    values = np.array([r.values for r in readings]).reshape(-1, entries)
+    basis = field.product(field.inverse(field.product(spans.varying, weights.T)), spans.varying)
+    changes = spans.float_changes(frozenset(range(spans.n)))
+    basis_values = _solved(changes @ values.T, changes)
+    outputs = tuple(
+        Output(r.joints, _weights(spans, r.weights, r.values), _weights(spans, row, row_values))
+        for r, row, row_values in zip(readings, basis, basis_values, strict=True)
+    )
+    rest = field.difference(spans.mass, field.product(field.product(spans.mass, weights.T), basis))
+    rest_values = spans.float_mass - spans.float_mass @ values.T @ basis_values
+    return outputs, _constants(spans, readings, (rest, rest_values), (basis, basis_values))
+
+
+def _constants(
+    spans: Spans,
+    readings: list[_Reading],
+    rest: tuple[np.ndarray, np.ndarray],
+    basis: tuple[np.ndarray, np.ndarray],
+) -> tuple[Constant, ...]:
+    """A basis of what the outputs leave of W; entries that are constant themselves are the first choice for a
+    constant.
+    """
+    order = sorted(range(len(spans.keys)), key=lambda index: (len(spans.entry_joints[index]), -index))
+    echelon = field.row_basis(rest[0][:, order])
+    bound = [order[pivot] for pivot in field.pivots(echelon)]
+    rows = np.zeros_like(echelon)
+    rows[:, order] = echelon
+    row_values = _solved(rest[1][:, bound], rest[1])
+    constants = []
+    for pivot, row, values in zip(bound, rows, row_values, strict=True):
+        # c is the entry at the pivot less what the outputs put there
+        reading, reading_values = _single(spans, pivot)
+        for j, output in enumerate(readings):
+            share = int(basis[0][j, pivot])
+            if share:
+                scaled = field.product(np.array([[share]], dtype=np.uint64), output.weights[None])[0]
+                reading = field.difference(reading, scaled)
+                reading_values = reading_values - basis[1][j, pivot] * output.values
+        constants.append(Constant(_weights(spans, reading, reading_values), _weights(spans, row, values)))
+    return tuple(constants)
+
+
+def _readings(spans: Spans) -> Iterator[_Reading]:
+    """Independent read-outs that together fix every change of M."""
+    chosen = field.Independent(len(spans.varying))
+    for joints in _joint_sets(spans):
+        kernel = field.null_space(spans.outside(joints))
+        missing = field.rank(np.concatenate([chosen.rows, kernel])) - len(chosen.rows) if len(kernel) else 0
+        candidates = _candidates(spans, joints)
+        while missing:
+            weights, values = next(candidates)
+            support = np.flatnonzero(weights)
+            if chosen.add(field.product(spans.varying[:, support], weights[support, None])[:, 0]):
+                missing -= 1
+                yield _Reading(tuple(sorted(joints)), weights, values)
+
+
+def _joint_sets(spans: Spans) -> Iterator[frozenset[int]]:
+    """Sets of joints that M depends on, nearest the tip first, small before large."""
+    active = [k for k in range(spans.n) if len(spans.change_bases[k])]
+    for position in reversed(range(len(active))):
+        first, later = active[position], active[position + 1 :]
+        if spans.n <= _ALL_SUBSETS_UP_TO:
+            tails = [tail for size in range(len(later) + 1) for tail in combinations(later, size)]
+        else:
+            tails = [tuple(later[:size]) for size in range(len(later) + 1)]
+        yield from (frozenset((first, *tail)) for tail in tails)
+
+
+def _candidates(spans: Spans, joints: frozenset[int]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Read-outs that depend on ``joints`` only: single entries of M, then the sparsest sums of entries."""
+    for index in reversed(range(len(spans.keys))):
+        if spans.entry_joints[index] and spans.entry_joints[index] <= joints:
+            yield _single(spans, index)
+    outside = frozenset(range(spans.n)) - joints
+    # what depends on much is eliminated first, so that the sums keep to simple entries
+    order = sorted(range(len(spans.keys)), key=lambda index: (-len(spans.entry_joints[index]), index))
+    rows = field.row_basis(np.concatenate([spans.change_bases[k] for k in sorted(outside)])[:, order])
+    bound = [order[pivot] for pivot in field.pivots(rows)]
+    reduced = field.null_space(rows)
+    kernel = np.zeros_like(reduced)
+    kernel[:, order] = reduced
+    samples = spans.float_changes(outside)
+    for row in sorted(kernel, key=np.count_nonzero):
+        (free,) = set(np.flatnonzero(row)) - set(bound)
+        values = np.zeros(len(row))
+        values[free] = 1.0
+        values[bound] = -_solved(samples[:, bound], samples[:, [free]])[:, 0]
+        yield row, np.where(row != 0, values, 0.0)
+
+
+def _single(spans: Spans, index: int) -> tuple[np.ndarray, np.ndarray]:
+    weights = np.zeros(len(spans.keys), dtype=np.uint64)
+    weights[index] = 1
+    return weights, weights.astype(float)
+
+
+def _solved(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Least-squares solution X of left X = right, both tall."""
+    width = left.shape[1]
+    # the triangular factor holds all there is to know, and is small
+    factor = np.asarray(np.linalg.qr(np.concatenate([left, right], axis=1), mode="r"))
+    return np.linalg.lstsq(factor[:, :width], factor[:, width:], rcond=None)[0]
+
+
+def _weights(spans: Spans, exact: np.ndarray, values: np.ndarray) -> Weights:
+    return tuple(
+        (*spans.keys[index], _fraction(int(exact[index]), float(values[index])))
+        for index in np.flatnonzero(exact)
+    )
+
+
+def _fraction(element: int, value: float) -> Fraction:
+    """The rational number behind a field element, near ``value``.
+
+    Rational reconstruction finds it when numerator and denominator are below 2^30 (von zur Gathen and
+    Gerhard, *Modern Computer Algebra*, section 5.10). Geometry with irrational sizes gives longer
+    fractions; there the double itself is as exact as the URDF.
+    """
+    bound = 2**30
+    previous, current = (field.PRIME, 0), (element, 1)
+    while current[0] > bound:
+        quotient = previous[0] // current[0]
+        previous, current = (
+            current,
+            (previous[0] - quotient * current[0], previous[1] - quotient * current[1]),
+        )
+    numerator, denominator = current
+    if denominator and gcd(numerator, denominator) == 1:
+        found = Fraction(numerator, denominator)
+        if abs(found - Fraction(value)) <= 1e-8 * max(1.0, abs(value)):
+            return found
+    return Fraction(value)

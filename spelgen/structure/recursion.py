@@ -1,0 +1,243 @@
+"""M(q) and V(q) of an arm by one recursion, over any ring.
+
+The composite-inertia recursion (Featherstone, *Rigid Body Dynamics Algorithms*, 2008, ch. 6) only adds,
+negates and multiplies, so the same lines serve floating-point numbers (nominal values), a prime field
+(``structure``) and polynomials (``symbolic``). Each body carries ten inertial parameters (m, h = m c, I
+about its joint's origin), in which M and V are linear. A body turns about or slides along the z axis of
+its own joint frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+from spelgen.arm.arm import Arm, Body
+
+Element = Any
+"""An element of the ring: anything with +, - and * among its own kind and with integers."""
+
+Vector = tuple[Element, Element, Element]
+Terms = tuple[tuple[int, Element], ...]
+
+TENSOR = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+"""Order of the six tensor components of a ten-vector: Ixx, Ixy, Ixz, Iyy, Iyz, Izz."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Where one body's joint stands: the cosine and sine of its angle, or its displacement."""
+
+    cos: Element = 1
+    sin: Element = 0
+    slide: Element = 0
+
+
+@dataclass(frozen=True)
+class Energies:
+    """The arm's mass matrix as its lower triangle, {(row, column): element}, 0-based, and its potential
+    energy.
+    """
+
+    mass: dict[tuple[int, int], Element]
+    potential: Element
+
+
+@dataclass(frozen=True)
+class _Inertia:
+    """A composite inertia: mass, first moment, and tensor about the frame's origin."""
+
+    mass: Element
+    moment: Vector
+    tensor: tuple[Element, ...]
+
+
+@dataclass(frozen=True)
+class _Wrench:
+    """A force and its moment about the frame's origin."""
+
+    force: Vector
+    moment: Vector
+
+
+@dataclass(frozen=True)
+class _Pose:
+    """A body's constant pose in its parent, with zeros left out and +-1 kept as integers."""
+
+    rotation: tuple[Terms, Terms, Terms]
+    translation: Terms
+
+
+def triangle(n: int) -> list[tuple[int, int]]:
+    """Positions of the lower triangle of an n x n matrix, row by row."""
+    return [(row, column) for row in range(n) for column in range(row + 1)]
+
+
+def energies(
+    arm: Arm,
+    motions: Sequence[Motion],
+    inertias: Sequence[Sequence[Element]],
+    number: Callable[[Fraction], Element],
+) -> Energies:
+    """Mass matrix and potential energy of ``arm``.
+
+    ``motions`` and ``inertias`` (ten elements each) go by body; ``number`` takes the arm's exact constants
+    into the ring. V is zero for a body at the root's origin and grows against ``arm.gravity``.
+    """
+    poses = [_pose(body, number) for body in arm.bodies]
+    composites = [_Inertia(ten[0], tuple(ten[1:4]), tuple(ten[4:10])) for ten in inertias]
+    total = _Inertia(0, (0, 0, 0), (0,) * 6)
+    mass: dict[tuple[int, int], Element] = dict.fromkeys(triangle(len(arm.coordinates)), 0)
+    for index in reversed(range(len(arm.bodies))):
+        for ancestor, entry in _column(arm, poses, motions, index, composites[index]):
+            _add_entry(mass, arm.bodies[index], arm.bodies[ancestor], entry, number)
+        body = arm.bodies[index]
+        moved = _posed_inertia(poses[index], _moved_inertia(body, motions[index], composites[index]))
+        if body.parent < 0:
+            total = _sum(total, moved)
+        else:
+            composites[body.parent] = _sum(composites[body.parent], moved)
+    gravity = _terms(arm.gravity, number)
+    return Energies(mass, -_dot(gravity, total.moment))
+
+
+def _column(
+    arm: Arm, poses: Sequence[_Pose], motions: Sequence[Motion], index: int, inertia: _Inertia
+) -> list[tuple[int, Element]]:
+    """The body-level mass-matrix entries of joint ``index`` with itself and each of its ancestors."""
+    body = arm.bodies[index]
+    (hx, hy, _), tensor = inertia.moment, inertia.tensor
+    if body.kind == "revolute":
+        wrench = _Wrench((-hy, hx, 0), (tensor[2], tensor[4], tensor[5]))
+    else:
+        wrench = _Wrench((0, 0, inertia.mass), (hy, -hx, 0))
+    entries = [(index, _along(body, wrench))]
+    while body.parent >= 0:
+        wrench = _posed_wrench(poses[index], _moved_wrench(body, motions[index], wrench))
+        index = body.parent
+        body = arm.bodies[index]
+        entries.append((index, _along(body, wrench)))
+    return entries
+
+
+def _along(body: Body, wrench: _Wrench) -> Element:
+    return wrench.moment[2] if body.kind == "revolute" else wrench.force[2]
+
+
+def _add_entry(
+    mass: dict[tuple[int, int], Element],
+    first: Body,
+    second: Body,
+    entry: Element,
+    number: Callable[[Fraction], Element],
+) -> None:
+    """Adds a body-level entry where its coordinates meet; a mimic joint moves at a multiple of its leader."""
+    multiplier = first.multiplier * second.multiplier
+    if multiplier != 1:
+        entry = number(multiplier) * entry
+    row, column = max(first.coordinate, second.coordinate), min(first.coordinate, second.coordinate)
+    twice = first is not second and row == column
+    mass[row, column] = mass[row, column] + (entry + entry if twice else entry)
+
+
+def _sum(a: _Inertia, b: _Inertia) -> _Inertia:
+    moment = (a.moment[0] + b.moment[0], a.moment[1] + b.moment[1], a.moment[2] + b.moment[2])
+    return _Inertia(a.mass + b.mass, moment, tuple(x + y for x, y in zip(a.tensor, b.tensor, strict=True)))
+
+
+def _moved_inertia(body: Body, motion: Motion, inertia: _Inertia) -> _Inertia:
+    """The inertia seen from the joint's frame at rest, after the joint has moved about or along z."""
+    if body.kind == "prismatic":
+        return _translated(((2, motion.slide),), inertia)
+    c, s = motion.cos, motion.sin
+    hx, hy, hz = inertia.moment
+    xx, xy, xz, yy, yz, zz = inertia.tensor
+    # sin^2 is written as 1 - cos^2 from the start, so no product ever needs reducing
+    cc, cs, difference = c * c, c * s, xx - yy
+    turned_xx = yy + cc * difference - 2 * (cs * xy)
+    return _Inertia(
+        inertia.mass,
+        (c * hx - s * hy, s * hx + c * hy, hz),
+        (
+            turned_xx,
+            cs * difference + 2 * (cc * xy) - xy,
+            c * xz - s * yz,
+            xx + yy - turned_xx,
+            s * xz + c * yz,
+            zz,
+        ),
+    )
+
+
+def _moved_wrench(body: Body, motion: Motion, wrench: _Wrench) -> _Wrench:
+    (fx, fy, fz), (mx, my, mz) = wrench.force, wrench.moment
+    if body.kind == "prismatic":
+        return _Wrench(wrench.force, (mx - motion.slide * fy, my + motion.slide * fx, mz))
+    c, s = motion.cos, motion.sin
+    return _Wrench((c * fx - s * fy, s * fx + c * fy, fz), (c * mx - s * my, s * mx + c * my, mz))
+
+
+def _posed_inertia(pose: _Pose, inertia: _Inertia) -> _Inertia:
+    x, y, z = pose.rotation
+    xx, xy, xz, yy, yz, zz = inertia.tensor
+    columns = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
+    half = tuple(tuple(_dot(row, column) for column in columns) for row in (x, y, z))
+    tensor = tuple(_dot(pose.rotation[j], half[i]) for i, j in TENSOR)
+    return _translated(pose.translation, _Inertia(inertia.mass, _turned(pose, inertia.moment), tensor))
+
+
+def _posed_wrench(pose: _Pose, wrench: _Wrench) -> _Wrench:
+    force, moment = _turned(pose, wrench.force), _turned(pose, wrench.moment)
+    lever: list[Element] = list(moment)
+    for axis, length in pose.translation:
+        following, last = (axis + 1) % 3, (axis + 2) % 3
+        lever[following] = lever[following] - length * force[last]
+        lever[last] = lever[last] + length * force[following]
+    return _Wrench(force, (lever[0], lever[1], lever[2]))
+
+
+def _turned(pose: _Pose, vector: Vector) -> Vector:
+    x, y, z = pose.rotation
+    return _dot(x, vector), _dot(y, vector), _dot(z, vector)
+
+
+def _translated(offset: Terms, inertia: _Inertia) -> _Inertia:
+    """The inertia about an origin that lies ``-offset`` away: h + m p and the parallel-axis terms of I."""
+    if not offset:
+        return inertia
+    moment: list[Element] = list(inertia.moment)
+    tensor = dict(zip(TENSOR, inertia.tensor, strict=True))
+    for axis, length in offset:
+        # with k = h + (h + m p) the shift of I is (p.k) 1 - (p k^T + k p^T)/2, one term per component of p
+        moment[axis] = moment[axis] + length * inertia.mass
+    for axis, length in offset:
+        double = length * (inertia.moment[axis] + moment[axis])
+        for other in range(3):
+            if other != axis:
+                tensor[other, other] = tensor[other, other] + double
+                pair = (min(axis, other), max(axis, other))
+                tensor[pair] = tensor[pair] - length * inertia.moment[other]
+    lengths = dict(offset)
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        if i in lengths and j in lengths:
+            tensor[i, j] = tensor[i, j] - lengths[i] * lengths[j] * inertia.mass
+    return _Inertia(inertia.mass, (moment[0], moment[1], moment[2]), tuple(tensor[key] for key in TENSOR))
+
+
+def _pose(body: Body, number: Callable[[Fraction], Element]) -> _Pose:
+    x, y, z = (_terms(row, number) for row in body.rotation)
+    return _Pose((x, y, z), _terms(body.translation, number))
+
+
+def _terms(row: Sequence[Fraction], number: Callable[[Fraction], Element]) -> Terms:
+    return tuple((i, int(x) if abs(x) == 1 else number(x)) for i, x in enumerate(row) if x)
+
+
+def _dot(terms: Terms, vector: Sequence[Element]) -> Element:
+    total: Element = 0
+    for index, coefficient in terms:
+        value = vector[index]
+        total = total + (value if coefficient == 1 else -value if coefficient == -1 else coefficient * value)
+    return total

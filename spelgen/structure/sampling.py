@@ -1,0 +1,198 @@
+"""Mass matrices and potential energies of an arm at random points, in the prime field and in floating point.
+
+Both kinds of sample come as a base block and, for every coordinate, a block in which that coordinate alone
+has moved: what changes between the two depends on the coordinate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from math import cos, lcm, sin, tan
+from typing import Literal
+
+import numpy as np
+
+from spelgen.arm.arm import Arm
+from spelgen.structure.field import (
+    PRIME,
+    Residues,
+    difference,
+    random_circle_points,
+    random_residues,
+    residue,
+)
+from spelgen.structure.recursion import Element, Motion, energies, triangle
+
+Assume = Literal["kinematics", "inertials"]
+"""Which inertial parameters are believed: none of them, or the URDF's."""
+
+Ten = Sequence[Element]
+
+
+@dataclass(frozen=True)
+class Samples:
+    """``mass`` (1 + n, samples, n(n+1)/2) and ``potential`` (1 + n, samples); block 0 is the base, block k
+    has coordinate k moved.
+    """
+
+    mass: np.ndarray
+    potential: np.ndarray
+
+
+@dataclass(frozen=True)
+class Position:
+    """One coordinate's position: the cosine and sine of its base angle, and its value where something slides."""
+
+    cos: Element
+    sin: Element
+    value: Element
+
+
+def field_samples(arm: Arm, assume: Assume, samples: int, seed: int = 0) -> Samples:
+    """Samples in the field of 2^61 - 1; under ``kinematics`` every sample has inertial parameters of its own."""
+    rng = np.random.default_rng(seed)
+    n, blocks = len(arm.coordinates), 1 + len(arm.coordinates)
+    positions = []
+    for index in range(n):
+        # an angle's cosine and sine and a sliding distance are independent as functions, so each is drawn for
+        # itself
+        c, s = random_circle_points(rng, 2 * samples)
+        drawn = (c, s, random_residues(rng, (2 * samples,)))
+        parts = [Residues(_one_moved(values, index, blocks)) for values in drawn]
+        positions.append(Position(*parts))
+    inertias: list[Ten]
+    if assume == "kinematics":
+        inertias = [
+            [Residues(np.tile(random_residues(rng, (samples,)), blocks)) for _ in range(10)]
+            for _ in arm.bodies
+        ]
+    else:
+        inertias = [[residue(x) for x in body.inertia or (Fraction(0),) * 10] for body in arm.bodies]
+    result = energies(arm, motions(arm, positions, residue), inertias, residue)
+    entries = [_residue_values(result.mass[key], blocks * samples) for key in triangle(n)]
+    potential = _residue_values(result.potential, blocks * samples)
+    return _blocks(entries, potential, blocks)
+
+
+def regressor_rows(arm: Arm, points: int, seed: int = 1) -> np.ndarray:
+    """Rows of the energy regressor in the field, ((n(n+1)/2 + 1) points, 10 bodies).
+
+    M(q) and V(q) - V(q0) are linear in the inertial parameters and fix the torque, so the rows' rank is
+    the number of base parameters (Gautier and Khalil 1990).
+    """
+    rng = np.random.default_rng(seed)
+    n, parameters = len(arm.coordinates), 10 * len(arm.bodies)
+    positions = []
+    for _ in range(n):
+        c, s = random_circle_points(rng, points)
+        value = random_residues(rng, (points,))
+        positions.append(Position(*(Residues(np.repeat(x, parameters)) for x in (c, s, value))))
+    unit = np.tile(np.eye(parameters, dtype=np.uint64), (1, points))
+    inertias = [[Residues(unit[10 * body + i]) for i in range(10)] for body in range(len(arm.bodies))]
+    result = energies(arm, motions(arm, positions, residue), inertias, residue)
+    elements = [result.mass[key] for key in triangle(n)] + [result.potential]
+    rows = np.stack(
+        [_residue_values(e, points * parameters).reshape(points, parameters) for e in elements], axis=1
+    )
+    rows[:, -1] = difference(rows[:, -1], rows[0, -1])
+    return rows.reshape(-1, parameters)
+
+
+def float_samples(arm: Arm, assume: Assume, samples: int, seed: int = 2) -> Samples:
+    """The same kind of samples in double precision."""
+    rng = np.random.default_rng(seed)
+    n, blocks = len(arm.coordinates), 1 + len(arm.coordinates)
+    q = [_one_moved(rng.uniform(-3.0, 3.0, 2 * samples), index, blocks) for index in range(n)]
+    inertias: list[Ten]
+    if assume == "kinematics":
+        inertias = [[np.tile(rng.normal(size=samples), blocks) for _ in range(10)] for _ in arm.bodies]
+    else:
+        inertias = [[float(x) for x in body.inertia or (0,) * 10] for body in arm.bodies]
+    mass, potential = float_energies(arm, np.stack(q, axis=-1), inertias)
+    return _blocks(list(mass.T), potential, blocks)
+
+
+def float_energies(arm: Arm, q: np.ndarray, inertias: Sequence[Ten]) -> tuple[np.ndarray, np.ndarray]:
+    """Lower triangles of M, (points, n(n+1)/2), and V [J], (points,), at ``q`` (points, n) [rad, m]."""
+    bases = _base_denominators(arm)
+    positions = [
+        Position(np.cos(value / base), np.sin(value / base), value)
+        for value, base in zip(q.T, bases, strict=True)
+    ]
+    result = energies(arm, motions(arm, positions, float), inertias, float)
+    points = len(q)
+    mass = np.stack([np.broadcast_to(result.mass[key], points) for key in triangle(q.shape[1])], axis=-1)
+    return mass.astype(float), np.broadcast_to(result.potential, points).astype(float)
+
+
+def motions(arm: Arm, positions: Sequence[Position], number: Callable[[Fraction], Element]) -> list[Motion]:
+    """How every body's joint has moved when the coordinates stand at ``positions``."""
+    bases = _base_denominators(arm)
+    moved = []
+    for body in arm.bodies:
+        position = positions[body.coordinate]
+        if body.kind == "prismatic":
+            slide = position.value
+            if body.multiplier != 1:
+                slide = number(body.multiplier) * slide
+            if body.offset:
+                slide = slide + number(Fraction(str(body.offset)))
+            moved.append(Motion(slide=slide))
+        else:
+            turns = int(body.multiplier * bases[body.coordinate])
+            c, s = _turned(position.cos, position.sin, turns)
+            if body.offset:
+                c0, s0 = (number(x) for x in circle_point(body.offset))
+                c, s = c0 * c - s0 * s, s0 * c + c0 * s
+            moved.append(Motion(c, s))
+    return moved
+
+
+def circle_point(angle: float) -> tuple[Fraction, Fraction]:
+    """The cosine and sine of an angle [rad], as a rational point of the circle within 1e-13 of it."""
+    if abs(cos(angle)) < 1e-12 or abs(sin(angle)) < 1e-12:
+        return Fraction(round(cos(angle))), Fraction(round(sin(angle)))
+    t = Fraction(tan(angle / 2)).limit_denominator(10**7)
+    return (1 - t * t) / (1 + t * t), 2 * t / (1 + t * t)
+
+
+def _base_denominators(arm: Arm) -> list[int]:
+    """By coordinate, the d for which every body's angle is a whole multiple of q / d."""
+    return [
+        lcm(
+            *(b.multiplier.denominator for b in arm.bodies if b.coordinate == index and b.kind == "revolute"),
+            1,
+        )
+        for index in range(len(arm.coordinates))
+    ]
+
+
+def _turned(c: Element, s: Element, turns: int) -> tuple[Element, Element]:
+    """Cosine and sine of ``turns`` times an angle, by repeated doubling."""
+    result: tuple[Element, Element] = (1, 0)
+    for bit in bin(abs(turns))[2:]:
+        x, y = result
+        result = (x * x - y * y, 2 * (x * y))
+        if bit == "1":
+            x, y = result
+            result = (x * c - y * s, y * c + x * s)
+    return (result[0], result[1] if turns > 0 else -result[1])
+
+
+def _one_moved(values: np.ndarray, index: int, blocks: int) -> np.ndarray:
+    """The first half of ``values`` in every block, but the second half in coordinate ``index``'s own."""
+    base, other = np.split(values, 2)
+    return np.concatenate([other if block == index + 1 else base for block in range(blocks)])
+
+
+def _residue_values(element: Residues | int, count: int) -> np.ndarray:
+    if isinstance(element, Residues):
+        return element.values
+    return np.full(count, element % PRIME, dtype=np.uint64)
+
+
+def _blocks(entries: list[np.ndarray], potential: np.ndarray, blocks: int) -> Samples:
+    mass = np.stack(entries, axis=-1)
+    return Samples(mass.reshape(blocks, -1, len(entries)), potential.reshape(blocks, -1))

@@ -1,0 +1,97 @@
+"""The spans that decide an arm's structure: of its mass matrix, and of the changes each joint makes to it."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+
+from spelgen.arm.arm import Arm
+from spelgen.structure import field
+from spelgen.structure.recursion import triangle
+from spelgen.structure.sampling import Assume, Samples, field_samples, float_samples
+
+_SPARE_SAMPLES = 4
+
+
+class Spans:
+    """Row vectors over the n(n+1)/2 entries of M, in the prime field: ``mass`` spans W, ``changes[k]`` spans
+    T_k.
+    """
+
+    def __init__(self, arm: Arm, assume: Assume):
+        self.n = len(arm.coordinates)
+        self.keys = triangle(self.n)
+        # a span of dimension d shows in d samples, and the spare ones would have shown a larger one, all but
+        # surely
+        count = len(self.keys) + _SPARE_SAMPLES
+        samples = field_samples(arm, assume, count)
+        self._arm, self._assume, self._count = arm, assume, count
+        self.mass = samples.mass[0]
+        self.changes = [field.difference(samples.mass[k + 1], samples.mass[0]) for k in range(self.n)]
+        self.potential_changes = [
+            bool((samples.potential[k + 1] != samples.potential[0]).any()) for k in range(self.n)
+        ]
+
+    @cached_property
+    def entry_joints(self) -> list[frozenset[int]]:
+        """The joints each entry of M depends on."""
+        return [
+            frozenset(k for k in range(self.n) if self.changes[k][:, index].any())
+            for index in range(len(self.keys))
+        ]
+
+    @cached_property
+    def change_bases(self) -> list[np.ndarray]:
+        """Echelon bases of T_k, by joint."""
+        return [field.row_basis(change) for change in self.changes]
+
+    @cached_property
+    def varying(self) -> np.ndarray:
+        """Echelon basis of U, all that changes."""
+        return field.row_basis(np.concatenate(self.change_bases))
+
+    @cached_property
+    def floats(self) -> Samples:
+        """Twice as many samples in double precision, for the sizes of coefficients; their zeros and ranks
+        come from the field.
+        """
+        return float_samples(self._arm, self._assume, 2 * self._count)
+
+    @property
+    def float_mass(self) -> np.ndarray:
+        """Rows that span W in double precision."""
+        return self.floats.mass[0]
+
+    def float_changes(self, joints: frozenset[int]) -> np.ndarray:
+        """Rows that span the changes made by ``joints``, in double precision."""
+        base = self.floats.mass[0]
+        return np.concatenate([self.floats.mass[k + 1] - base for k in sorted(joints)] or [base[:0]])
+
+    def outside(self, joints: frozenset[int]) -> np.ndarray:
+        """Rows that span the changes made by joints outside ``joints``, as coordinates in the basis of U."""
+        first, last = min(joints), max(joints)
+        between = [self._coordinates[k] for k in range(first, last) if k not in joints]
+        return np.concatenate([self._before[first], *between, self._after[last]])
+
+    @cached_property
+    def _coordinates(self) -> list[np.ndarray]:
+        # the basis of U is an echelon form, so an element of U is known by its values at the pivots
+        pivots = field.pivots(self.varying)
+        return [basis[:, pivots] for basis in self.change_bases]
+
+    @cached_property
+    def _before(self) -> list[np.ndarray]:
+        """By joint, a basis of the changes made by the joints before it."""
+        bases = [self._coordinates[0][:0]]
+        for rows in self._coordinates[:-1]:
+            bases.append(field.row_basis(np.concatenate([bases[-1], rows])))
+        return bases
+
+    @cached_property
+    def _after(self) -> list[np.ndarray]:
+        """By joint, a basis of the changes made by the joints after it."""
+        bases = [self._coordinates[0][:0]]
+        for rows in reversed(self._coordinates[1:]):
+            bases.insert(0, field.row_basis(np.concatenate([bases[0], rows])))
+        return bases

@@ -1,0 +1,107 @@
+"""Arm -> Structure: which entries of M, V and G are zero, constant or vary, with which joints, and the
+smallest exact form of M.
+
+M(q) = sum_k c_k A_k + sum_j f_j(q) B_j. Let T_k be the span of the changes M(q) - M(q') when joint k alone
+moves, U the sum of all T_k and W the span of M itself. Then dim U networks outputs f_j are needed, and dim
+W - dim U constants c_k. A linear read-out of M depends on the joints in J only, exactly when it vanishes
+on T_k for every k outside J; the read-outs behind the f_j are chosen by that test. All questions are ranks
+or zeros of samples in a prime field (``field``): exact but for odds of about 1e-16, without tolerances.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from spelgen.arm.arm import Arm
+from spelgen.errors import ArmError
+from spelgen.structure import field
+from spelgen.structure.basis import Constant, Output, smallest_form
+from spelgen.structure.sampling import Assume, regressor_rows
+from spelgen.structure.spans import Spans
+
+MOST_JOINTS = 24
+"""Longest arm that is derived; the work grows with about the fourth power."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One entry of a symmetric matrix, 0-based, with the coordinates it depends on."""
+
+    row: int
+    column: int
+    kind: Literal["zero", "constant", "varying"]
+    joints: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class Structure:
+    """What holds for every value of the inertial parameters (``kinematics``), or for the URDF's
+    (``inertials``).
+    """
+
+    assume: Assume
+    joints: tuple[str, ...]
+    entries: tuple[Entry, ...]
+    outputs: tuple[Output, ...]
+    constants: tuple[Constant, ...]
+    potential: tuple[int, ...]
+    """Coordinates the potential energy depends on; none when gravity does no work."""
+    passive: tuple[int, ...]
+    """Coordinates without an actuator: their row of G is zero."""
+    base_parameters: int
+
+    def outputs_from(self, first: int) -> int:
+        """How many outputs read coordinates from ``first`` (0-based) to the tip only."""
+        return sum(not output.joints or min(output.joints) >= first for output in self.outputs)
+
+
+def derive(arm: Arm, assume: Assume = "kinematics") -> Structure:
+    """The structure of ``arm``. Raises ArmError above ``MOST_JOINTS`` joints, or without inertials under
+    ``inertials``.
+    """
+    n = len(arm.coordinates)
+    if n > MOST_JOINTS:
+        raise ArmError(
+            f"{n} joints", expected=f"at most {MOST_JOINTS}", do="choose fewer with --joints or --tip"
+        )
+    if assume == "inertials" and not arm.has_inertials:
+        raise ArmError(
+            "links without inertial values",
+            expected="an <inertial> on every moving body",
+            do="use --assume kinematics, which needs none",
+        )
+    spans = Spans(arm, assume)
+    outputs, constants = smallest_form(spans)
+    return Structure(
+        assume=assume,
+        joints=tuple(coordinate.name for coordinate in arm.coordinates),
+        entries=tuple(_entry(spans, index) for index in range(len(spans.keys))),
+        outputs=outputs,
+        constants=constants,
+        potential=tuple(k for k in range(n) if spans.potential_changes[k]),
+        passive=tuple(k for k, coordinate in enumerate(arm.coordinates) if coordinate.passive),
+        base_parameters=base_parameters(arm),
+    )
+
+
+def base_parameters(arm: Arm) -> int:
+    """Rank of the inverse-dynamics regressor: how many combinations of inertial parameters move the arm
+    differently.
+    """
+    points = 4
+    while True:
+        rows = regressor_rows(arm, points + 2)
+        found = field.rank(rows)
+        # the rows of the last points would have raised an unfinished rank, all but surely
+        if field.rank(rows[: len(rows) * points // (points + 2)]) == found:
+            return found
+        points *= 2
+
+
+def _entry(spans: Spans, index: int) -> Entry:
+    row, column = spans.keys[index]
+    if not spans.mass[:, index].any():
+        return Entry(row, column, "zero")
+    joints = tuple(sorted(spans.entry_joints[index]))
+    return Entry(row, column, "varying" if joints else "constant", joints)

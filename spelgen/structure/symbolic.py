@@ -1,0 +1,90 @@
+"""M(q) and V(q) of an arm as exact polynomials in the cosines and sines of its angles and in its sliding
+distances.
+
+The same recursion as everywhere, over the rational polynomials. The structure does not need them
+(``structure`` works with values alone): they are its independent proof and the source of closed forms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+
+from flint import Ordering, fmpq, fmpq_mpoly, fmpq_mpoly_ctx
+
+from spelgen.arm.arm import Arm
+from spelgen.structure.basis import Weights
+from spelgen.structure.recursion import energies
+from spelgen.structure.sampling import Position, motions
+
+PARAMETERS = ("m", "hx", "hy", "hz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
+
+
+@dataclass(frozen=True)
+class Polynomials:
+    """The lower triangle of M(q), by (row, column), and V(q), over the variables ``names``.
+
+    c1, s1 are the cosine and sine of coordinate 1 (of its base angle, where a mimic joint turns by a
+    fraction of it), q1 its value where something slides; m1, hx1, ... Izz1 the inertial parameters of body
+    1 about its joint, where they are kept as variables.
+    """
+
+    names: tuple[str, ...]
+    mass: dict[tuple[int, int], fmpq_mpoly]
+    potential: fmpq_mpoly
+
+    def combination(self, weights: Weights) -> fmpq_mpoly:
+        """The weighted sum of entries of M."""
+        total = 0 * self.potential
+        for row, column, value in weights:
+            total += _rational(value) * self.mass[row, column]
+        return total
+
+
+def polynomials(arm: Arm, *, inertials: bool = False) -> Polynomials:
+    """The exact polynomials of ``arm``, with its inertial parameters as variables or, under ``inertials``,
+    the URDF's values.
+    """
+    n, bodies = len(arm.coordinates), len(arm.bodies)
+    names = [f"{letter}{k + 1}" for k in range(n) for letter in "csq"]
+    if not inertials:
+        names += [f"{parameter}{body + 1}" for body in range(bodies) for parameter in PARAMETERS]
+    context = fmpq_mpoly_ctx.get(names, Ordering.lex)
+    variables = context.gens()
+    positions = [Position(*variables[3 * k : 3 * k + 3]) for k in range(n)]
+    one = context.from_dict({(0,) * len(names): 1})
+    parameters: list[Sequence[fmpq_mpoly]]
+    if inertials:
+        parameters = [
+            [_rational(x) * one for x in body.inertia or (Fraction(0),) * 10] for body in arm.bodies
+        ]
+    else:
+        parameters = [variables[3 * n + 10 * body :][:10] for body in range(bodies)]
+    result = energies(arm, motions(arm, positions, _rational), parameters, _rational)
+    mass = {key: _reduced(value * one, n) for key, value in result.mass.items()}
+    return Polynomials(tuple(names), mass, _reduced(result.potential * one, n))
+
+
+def _rational(number: Fraction) -> fmpq:
+    return fmpq(number.numerator, number.denominator)
+
+
+def _reduced(polynomial: fmpq_mpoly, n: int) -> fmpq_mpoly:
+    """The same function with s^2 = 1 - c^2 applied until every sine stands to the first power at most.
+
+    Only arms with mimic joints need it: two bodies then turn with the same angle.
+    """
+    context = polynomial.context()
+    for k in range(n):
+        cosine = context.gens()[3 * k]
+        while polynomial.degrees()[3 * k + 1] > 1:
+            total = 0 * polynomial
+            for exponents, coefficient in polynomial.terms():
+                power = exponents[3 * k + 1]
+                kept = list(exponents)
+                kept[3 * k + 1] = power % 2
+                term = context.from_dict({tuple(kept): coefficient})
+                total += term * (1 - cosine * cosine) ** (power // 2)
+            polynomial = total
+    return polynomial

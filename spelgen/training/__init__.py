@@ -1,0 +1,1 @@
+"""Logs and a module to a run folder with a trained model."""

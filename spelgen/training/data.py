@@ -1,0 +1,125 @@
+"""How a run is configured, and the logs it trains on: read, doubted, split, filtered, cut into windows."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Literal
+
+from spelgen.data.logs import Trajectory, read_logs
+from spelgen.data.signals import automatic_cutoff, automatic_spacing, examine, prepare
+from spelgen.data.windows import Windows, cut_windows, split_validation
+from spelgen.errors import Diagnostic
+from spelgen.settings import TrainingSettings
+from spelgen.training.rollout import LossScales, loss_scales
+
+LARGEST_VALIDATION = 2048  # windows; validation is a measurement, it needs no more
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """Settings of one run; see `TrainingSettings` for those that a robot's sidecar file may set.
+
+    momentum_steps: steps on the weak form of the equations before windows are predicted; 0: none.
+    prior: weight of staying near the URDF's own M and gravity (see `Prior`); 0: none.
+    every: samples from one sample of a window to the next, None: see `automatic_spacing`.
+    substeps: rk4 steps per sample interval, None: chosen by `choose_substeps`.
+    filter: cutoff [Hz] of the zero-phase low-pass on q, qd and tau; 0: none; None: see `automatic_cutoff`.
+    threads: of torch; the matrices are tiny, more than two rarely help.
+    max_minutes: the learning rate is annealed within this time too.
+    """
+
+    objective: Literal["rollout"] = "rollout"
+    momentum_steps: int = 2000
+    prior: float = 1.0
+    window: int = 5
+    stride: int = 1
+    every: int | None = None
+    epochs: int = 400
+    batch: int = 256
+    learning_rate: float = 1e-3
+    weight_decay: float = 0.2
+    substeps: int | None = None
+    validation_fraction: float = 0.25
+    patience: int = 60
+    seed: int = 0
+    filter: float | None = None
+    device: str = "cpu"
+    threads: int = 1
+    max_minutes: float | None = None
+
+    @classmethod
+    def from_settings(cls, settings: TrainingSettings, **flags: Any) -> TrainingConfig:
+        """A sidecar file's settings, overridden by every flag that is not None."""
+        known = {field.name for field in fields(cls)}
+        chosen = {name: value for name, value in settings.model_dump().items() if name in known}
+        return cls(**(chosen | {name: value for name, value in flags.items() if value is not None}))
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingData:
+    """Windows of the logs, ready to train on. digest: of every number, to resume on the same data only."""
+
+    training: Windows
+    validation: Windows
+    scales: LossScales
+    cutoff: float | None
+    training_names: tuple[str, ...]
+    validation_names: tuple[str, ...]
+    diagnostics: tuple[Diagnostic, ...]
+    digest: str
+
+
+def prepare_data(
+    paths: Iterable[Path | str], joints: Sequence[str], joint_types: Sequence[str], config: TrainingConfig
+) -> TrainingData:
+    """Read the logs' training part and make windows of it.
+
+    Validation trajectories are set aside before anything is cut, so that no sample is in both parts.
+    Raises LogError.
+    """
+    trajectories = read_logs(paths, joints, role="train")
+    notes = examine(trajectories, joints, joint_types)
+    split = split_validation(trajectories, config.validation_fraction, config.seed)
+    cutoff = filter_cutoff(config.filter, trajectories)
+    if cutoff is not None:
+        message = f"q, qd and tau filtered at {cutoff:g} Hz, zero phase"
+        notes.append(Diagnostic("info", "filter", "logs", None, message))
+    every = config.every or automatic_spacing(trajectories, cutoff)
+    training, validation = (
+        prepare(x, shortest=(config.window - 1) * every + 1, cutoff=cutoff)
+        for x in (split.training, split.validation)
+    )
+    windows = cut_windows(training, config.window, config.stride, every, measured=cutoff is not None)
+    return TrainingData(
+        training=windows,
+        validation=_thin(
+            cut_windows(validation, config.window, config.stride, every, measured=cutoff is not None)
+        ),
+        scales=loss_scales(windows, joint_types),
+        cutoff=cutoff,
+        training_names=tuple(x.name for x in split.training),
+        validation_names=tuple(x.name for x in split.validation),
+        diagnostics=(*notes, split.note),
+        digest=_digest(trajectories),
+    )
+
+
+def filter_cutoff(asked: float | None, trajectories: Sequence[Trajectory]) -> float | None:
+    """The low-pass cutoff [Hz] for what a user asked: None chooses, 0 means no filter."""
+    return automatic_cutoff(trajectories) if asked is None else asked or None
+
+
+def _thin(windows: Windows) -> Windows:
+    """At most LARGEST_VALIDATION windows, evenly spread."""
+    return windows[:: -(-len(windows) // LARGEST_VALIDATION)]
+
+
+def _digest(trajectories: Sequence[Trajectory]) -> str:
+    numbers = hashlib.sha256()
+    for trajectory in trajectories:
+        for array in (trajectory.t, trajectory.q, trajectory.qd, trajectory.tau):
+            numbers.update(array.tobytes())
+    return numbers.hexdigest()

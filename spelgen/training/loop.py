@@ -1,0 +1,269 @@
+"""The loop of a training run: epochs, validation, checkpoints, and what happens when numbers blow up."""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from typing import TYPE_CHECKING, Any, Literal
+
+import torch
+
+from spelgen.data.windows import Windows
+from spelgen.errors import RunError
+from spelgen.training.data import TrainingConfig, TrainingData
+from spelgen.training.prior import Prior
+from spelgen.training.progress import TrainingProgress
+from spelgen.training.rollout import (
+    INTEGRATION_SHARE,
+    choose_substeps,
+    integration_error,
+    momentum_loss,
+    rollout_loss,
+)
+from spelgen.training.runs import RunFolder, write_state
+
+if TYPE_CHECKING:
+    from spelgen.training.runs import EmittedModel
+
+VECTOR_FACTOR = 5.0  # on the learning rate of constants and biases
+MOMENTUM_FACTOR = 10.0  # on the learning rate of the momentum steps, which are cheap and noisy
+GRADIENT_NORM = 1.0  # of the scaled loss; larger gradients are shortened to it
+WARM_UP = 0.02  # part of all steps over which the learning rate rises
+FINAL_RATE = 0.01  # the cosine ends at this part of the learning rate
+EPOCH_STEPS = 20  # at least; few windows are passed over several times between validations
+PROBE = 64  # windows on which the integration error is watched
+PROBE_EVERY = 5  # epochs
+MAX_ROLLBACKS = 8
+
+PLAIN = (
+    "epoch", "step", "best_epoch", "best_loss", "best_weights",
+    "rollbacks", "rate_factor", "seconds", "substeps", "warm",
+)  # fmt: skip
+
+Status = Literal["finished", "stopped early", "out of time", "interrupted"]
+
+
+class TrainingLoop:
+    """The changing state of one run; `save` writes all of it, so a resumed run repeats the same numbers."""
+
+    def __init__(
+        self,
+        folder: RunFolder,
+        model: EmittedModel,
+        data: TrainingData,
+        config: TrainingConfig,
+        prior: Prior | None = None,
+    ) -> None:
+        self.folder, self.config = folder, config
+        self.model = model.to(config.device)
+        self.training, self.validation = data.training.to(config.device), data.validation.to(config.device)
+        self.scales = data.scales.to(config.device)
+        self.prior = prior
+        self.optimiser = self._optimiser()
+        self.generator = torch.Generator().manual_seed(config.seed)
+        self.batch = min(config.batch, len(self.training))
+        self.epoch_steps = max(EPOCH_STEPS, -(-len(self.training) // self.batch))
+        self.probe = self.training[:: -(-len(self.training) // PROBE)]
+        self.epoch = self.step = self.best_epoch = self.rollbacks = 0
+        self.rate_factor, self.seconds = 1.0, 0.0
+        self.warm = not config.momentum_steps
+        self._measure()
+
+    def run(self, progress: TrainingProgress) -> Status:
+        """Train until an end is reached; Ctrl-C is one and leaves the checkpoint of the last whole epoch."""
+        since = time.monotonic() - self.seconds
+        try:
+            self.save()
+            if not self.warm:
+                self._warm_up(progress)
+            while (end := self._end()) is None:
+                record = self._run_epoch()
+                self.seconds = record["seconds"] = time.monotonic() - since
+                self.folder.append_metrics(record)
+                self.save()
+                progress.epoch(record)
+        except KeyboardInterrupt:
+            return "interrupted"
+        return end
+
+    def _measure(self) -> None:
+        """Begin anew from the present weights: substeps, validation loss and best so far."""
+        self.substeps = self.config.substeps or choose_substeps(self.model, self.probe, self.scales)
+        self.best_loss = self._validate()
+        self.best_weights = copy.deepcopy(self.model.state_dict())
+
+    def _optimiser(self) -> torch.optim.AdamW:
+        """AdamW; single numbers (constants, viscous friction) learn faster than weights and do not decay."""
+        groups: dict[bool, list[torch.nn.Parameter]] = {True: [], False: []}
+        for parameter in self.model.parameters():
+            groups[parameter.dim() > 1].append(parameter)
+        return torch.optim.AdamW(
+            [
+                {"params": groups[True], "weight_decay": self.config.weight_decay, "factor": 1.0},
+                {"params": groups[False], "weight_decay": 0.0, "factor": VECTOR_FACTOR},
+            ]
+        )
+
+    def _set_rate(self, optimiser: torch.optim.AdamW, rate: float) -> None:
+        for group in optimiser.param_groups:
+            group["lr"] = rate * group["factor"]
+
+    def _warm_up(self, progress: TrainingProgress) -> None:
+        """Momentum first: the weak form needs no ODE solve and brings the model near before windows are
+        predicted.
+
+        Kept only if it predicts the validation windows better. An interruption here starts it again on
+        resumption.
+        """
+        before = copy.deepcopy(self.model.state_dict()), self.best_loss
+        generator = torch.Generator().manual_seed(self.config.seed)
+        optimiser, steps = self._optimiser(), self.config.momentum_steps
+        for step in range(steps):
+            part = step / steps
+            fall = FINAL_RATE + (1 - FINAL_RATE) * (1 + math.cos(math.pi * part)) / 2
+            self._set_rate(
+                optimiser, MOMENTUM_FACTOR * self.config.learning_rate * min(1.0, part / WARM_UP) * fall
+            )
+            rows = torch.randint(len(self.training), (self.batch,), generator=generator)
+            optimiser.zero_grad()
+            loss = momentum_loss(self.model, self.training[rows.to(self.config.device)], self.scales)
+            (loss + self._pull()).backward()
+            norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), GRADIENT_NORM)
+            if torch.isfinite(norm):
+                optimiser.step()
+            progress.warm_up(step + 1, steps, loss)
+        self._measure()
+        if not self.best_loss < before[1]:
+            self.model.load_state_dict(before[0])
+            self._measure()
+        self.warm = True
+        self.save()
+
+    def _end(self) -> Status | None:
+        if self.epoch >= self.config.epochs:
+            return "finished"
+        if self.epoch - self.best_epoch >= self.config.patience:
+            return "stopped early"
+        if self.config.max_minutes is not None and self.seconds >= 60 * self.config.max_minutes:
+            return "out of time"
+        return None
+
+    def _run_epoch(self) -> dict[str, Any]:
+        """One epoch with finite losses, after as many attempts at a lower learning rate as that takes."""
+        while True:
+            before = copy.deepcopy((self.model.state_dict(), self.optimiser.state_dict(), self.step))
+            loss = self._train_epoch()
+            validation = self._validate() if math.isfinite(loss) else math.nan
+            if math.isfinite(validation):
+                break
+            self._roll_back(*before)
+        self.epoch += 1
+        if validation < self.best_loss:
+            self.best_loss, self.best_epoch = validation, self.epoch
+            self.best_weights = copy.deepcopy(self.model.state_dict())
+        record = {
+            "epoch": self.epoch,
+            "step": self.step,
+            "loss": loss,
+            "validation": validation,
+            "best": self.best_loss,
+        }
+        record |= {"rate": self._rate(), "substeps": self.substeps, "rollbacks": self.rollbacks}
+        self._watch_integration()
+        return record
+
+    def _train_epoch(self) -> float:
+        """Mean loss over the epoch's steps; NaN as soon as a step has no finite loss or gradient."""
+        rows, size = self.epoch_steps * self.batch, len(self.training)
+        passes = [torch.randperm(size, generator=self.generator) for _ in range(-(-rows // size))]
+        total = 0.0
+        for batch in torch.cat(passes)[:rows].split(self.batch):
+            loss = self._train_step(self.training[batch.to(self.config.device)])
+            if not math.isfinite(loss):
+                return math.nan
+            total += loss
+        return total / self.epoch_steps
+
+    def _train_step(self, windows: Windows) -> float:
+        self._set_rate(self.optimiser, self._rate())
+        self.optimiser.zero_grad()
+        try:
+            loss = rollout_loss(self.model, windows, self.scales, self.substeps)
+        except torch.linalg.LinAlgError:  # numbers blew up within the rollout
+            return math.nan
+        (loss + self._pull()).backward()
+        norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), GRADIENT_NORM)
+        if not torch.isfinite(norm):
+            return math.nan
+        self.optimiser.step()
+        self.step += 1
+        return loss.item()
+
+    def _pull(self) -> torch.Tensor | float:
+        """What straying from the URDF costs."""
+        return 0.0 if self.prior is None else self.config.prior * self.prior.loss(self.model)
+
+    def _rate(self) -> float:
+        """Learning rate of the next step: a linear rise times a cosine down over all steps or minutes."""
+        part = self.step / (self.config.epochs * self.epoch_steps)
+        rise = min(1.0, (part + 1e-3) / WARM_UP)
+        if self.config.max_minutes is not None:
+            part = max(part, self.seconds / (60 * self.config.max_minutes))
+        fall = FINAL_RATE + (1 - FINAL_RATE) * (1 + math.cos(math.pi * min(part, 1.0))) / 2
+        return self.config.learning_rate * self.rate_factor * rise * fall
+
+    def _validate(self) -> float:
+        """Loss on the validation windows."""
+        parts = self.validation.split(4 * self.batch)
+        try:
+            with torch.no_grad():
+                losses = [
+                    rollout_loss(self.model, x, self.scales, self.substeps).item() * len(x) for x in parts
+                ]
+        except torch.linalg.LinAlgError:
+            return math.inf
+        return sum(losses) / len(self.validation)
+
+    def _roll_back(self, weights: dict[str, Any], optimiser: dict[str, Any], step: int) -> None:
+        """Undo an epoch whose numbers were not finite, and halve the learning rate from here on."""
+        self.rollbacks += 1
+        if self.rollbacks > MAX_ROLLBACKS:
+            raise RunError(
+                f"losses that are not finite, after {MAX_ROLLBACKS} attempts at half the learning rate each",
+                file=self.folder.path,
+                do="check units and signs of the logs; the best model so far is kept in model.pt",
+            )
+        self.model.load_state_dict(weights)
+        self.optimiser.load_state_dict(optimiser)
+        self.step = step
+        self.rate_factor /= 2
+
+    def _watch_integration(self) -> None:
+        """Take more substeps when what was learned (friction, mostly) is too stiff for the present ones."""
+        if self.config.substeps is not None or self.epoch % PROBE_EVERY:
+            return
+        if integration_error(self.model, self.probe, self.scales, self.substeps) > INTEGRATION_SHARE:
+            self.substeps = choose_substeps(self.model, self.probe, self.scales, start=2 * self.substeps)
+
+    def save(self) -> None:
+        """Write model.pt and checkpoint.pt."""
+        write_state(self.folder.weights, self.best_weights)
+        state = {name: getattr(self, name) for name in PLAIN}
+        state["model"], state["optimiser"] = self.model.state_dict(), self.optimiser.state_dict()
+        write_state(self.folder.checkpoint, state | {"generator": self.generator.get_state()})
+
+    def restore(self) -> None:
+        """Continue from checkpoint.pt."""
+        state = self.folder.load_state(self.folder.checkpoint)
+        try:
+            for name in PLAIN:
+                setattr(self, name, state[name])
+            self.model.load_state_dict(state["model"])
+            self.optimiser.load_state_dict(state["optimiser"])
+            self.generator.set_state(state["generator"])
+        except (KeyError, RuntimeError, ValueError) as error:
+            raise RunError(
+                "a checkpoint of another model", file=self.folder.checkpoint, do="start a new run"
+            ) from error
+        self.folder.keep_metrics(self.epoch)

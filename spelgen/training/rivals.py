@@ -1,0 +1,143 @@
+"""What a trained model is compared with on the same windows: a constant velocity, the URDF's own values."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from spelgen.data.windows import Windows
+from spelgen.settings import load_settings
+from spelgen.training.rollout import roll_out
+from spelgen.urdf.read import read_urdf
+
+if TYPE_CHECKING:
+    from spelgen.training.runs import EmittedModel
+
+FRICTION_VELOCITY = 0.05  # [rad/s, m/s] width of the tanh in place of the jump of a URDF's Coulomb friction
+
+
+@dataclass(frozen=True)
+class Contender:
+    """Something that predicts.
+
+    roll_out: windows of K samples -> predicted q, qd, both (W, K-1, n), from the first sample and the inputs.
+    torque: q, qd, qdd, each (T, n) -> tau (T, n); None for what has no dynamics.
+    """
+
+    name: str
+    roll_out: Callable[[Windows], tuple[torch.Tensor, torch.Tensor]]
+    torque: Callable[[torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor] | None
+
+
+def trained(model: EmittedModel, substeps: int) -> Contender:
+    """The model itself."""
+    return Contender("model", lambda windows: roll_out(model, windows, substeps), model.inverse_dynamics)
+
+
+def held_velocity() -> Contender:
+    """The first velocity stays: what any model of short horizons must beat."""
+
+    def hold(windows: Windows) -> tuple[torch.Tensor, torch.Tensor]:
+        elapsed = windows.dt.cumsum(dim=1).unsqueeze(-1)  # (W, K-1, 1)
+        qd = windows.qd[:, :1]
+        return windows.q[:, :1] + qd * elapsed, qd.expand(-1, elapsed.shape[1], -1)
+
+    return Contender("velocity stays constant", hold, None)
+
+
+def urdf_values(urdf: Path, joints: Sequence[str], substeps: int) -> Contender:
+    """Rigid bodies with the URDF's own inertials, damping and friction, by Pinocchio, in the same integrator.
+
+    Raises what Pinocchio raises where it cannot read the file, and ImportError without Pinocchio.
+    """
+    dynamics = PinocchioDynamics(urdf, joints)
+    return Contender("URDF", lambda windows: roll_out(dynamics, windows, substeps), dynamics.inverse_dynamics)
+
+
+class PinocchioDynamics:
+    """A URDF's arm of n joints, all others locked at zero, with velocities where an emitted module has
+    momenta.
+    """
+
+    def __init__(self, urdf: Path, joints: Sequence[str]) -> None:
+        import pinocchio as pin  # an extra: everything else here works without
+
+        coupled = [
+            joint.name for joint in read_urdf(urdf).joints if joint.mimic and joint.mimic.joint in joints
+        ]
+        if coupled:
+            raise ValueError(f"mimic joints are not supported here: {', '.join(coupled)}")
+        whole = pin.buildModelFromUrdf(str(urdf))
+        locked = [i for i in range(1, whole.njoints) if whole.names[i] not in joints]
+        self._pin: Any = pin
+        self._model = pin.buildReducedModel(whole, locked, pin.neutral(whole))
+        if sorted(self._model.names[1:]) != sorted(joints) or self._model.nv != len(joints):
+            raise ValueError(f"Pinocchio sees the joints {', '.join(self._model.names[1:])}")
+        self._model.gravity.linear = np.array(load_settings(urdf).gravity)
+        self._data = self._model.createData()
+        found = [self._model.joints[self._model.getJointId(name)] for name in joints]
+        self._order = np.array([joint.idx_v for joint in found])
+        self._places = [(joint.idx_q, joint.nq) for joint in found]
+        self._damping, self._friction = self._model.damping[self._order], self._model.friction[self._order]
+
+    def momentum(self, q: torch.Tensor, qd: torch.Tensor) -> torch.Tensor:
+        return qd
+
+    def velocity(self, q: torch.Tensor, p: torch.Tensor) -> torch.Tensor:
+        return p
+
+    def forward(self, t: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
+        """Rate of (q, qd, tau), (W, 3n)."""
+        q, qd, tau = state.numpy().reshape(len(state), 3, -1).transpose(1, 0, 2)
+        force = tau - self._losses(qd)
+        qdd = np.empty_like(qd)
+        position, velocity, effort = self._configurations(q), self._permuted(qd), self._permuted(force)
+        for row in range(len(q)):
+            solved = self._pin.aba(self._model, self._data, position[row], velocity[row], effort[row])
+            qdd[row] = solved[self._order]
+        return torch.from_numpy(np.concatenate([qd, qdd, np.zeros_like(tau)], axis=1))
+
+    def mass_matrix(self, q: torch.Tensor) -> torch.Tensor:
+        """M (T, n, n) [kg m^2, kg m, kg]."""
+        order = np.ix_(self._order, self._order)
+        upper = [self._pin.crba(self._model, self._data, at)[order] for at in self._configurations(q.numpy())]
+        full = np.array([np.where(m == 0, m.T, m) for m in upper])  # crba fills one triangle in its own order
+        return torch.from_numpy(full)
+
+    def gravity(self, q: torch.Tensor) -> torch.Tensor:
+        """dV/dq (T, n) [Nm, N]."""
+        still = torch.zeros_like(q)
+        return self.inverse_dynamics(q, still, still)
+
+    def inverse_dynamics(self, q: torch.Tensor, qd: torch.Tensor, qdd: torch.Tensor) -> torch.Tensor:
+        """Torques (T, n)."""
+        position, velocity = self._configurations(q.numpy()), self._permuted(qd.numpy())
+        acceleration = self._permuted(qdd.numpy())
+        tau = np.empty(qd.shape)
+        for row in range(len(q)):
+            needed = self._pin.rnea(self._model, self._data, position[row], velocity[row], acceleration[row])
+            tau[row] = needed[self._order]
+        return torch.from_numpy(tau + self._losses(qd.numpy()))
+
+    def _losses(self, qd: np.ndarray) -> np.ndarray:
+        return self._damping * qd + self._friction * np.tanh(qd / FRICTION_VELOCITY)
+
+    def _permuted(self, values: np.ndarray) -> np.ndarray:
+        """Our joint order -> Pinocchio's."""
+        permuted = np.empty(values.shape)
+        permuted[:, self._order] = values
+        return permuted
+
+    def _configurations(self, q: np.ndarray) -> np.ndarray:
+        """Pinocchio's configurations: a continuous joint is (cos, sin) there."""
+        configurations = np.empty((len(q), self._model.nq))
+        for (start, size), angle in zip(self._places, q.T, strict=True):
+            configurations[:, start] = angle if size == 1 else np.cos(angle)
+            if size == 2:
+                configurations[:, start + 1] = np.sin(angle)
+        return configurations

@@ -1,0 +1,153 @@
+"""Predict windows with a model: an ODE solve from the first sample, the input held over each step."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+import torch
+from torchdiffeq import odeint
+
+from spelgen.data.windows import Windows
+
+if TYPE_CHECKING:
+    from spelgen.training.runs import EmittedModel
+
+SUBSTEPS = (1, 2, 4, 8, 16, 32)
+INTEGRATION_SHARE = 0.03  # of the model's own error, what the integrator may add
+LEAST_ERROR = 1e-3  # no model is expected to be better, in units of the scales
+
+
+class Dynamics(Protocol):
+    """What a rollout needs of an emitted module; see its docstrings for shapes."""
+
+    def momentum(self, q: torch.Tensor, qd: torch.Tensor) -> torch.Tensor: ...
+
+    def velocity(self, q: torch.Tensor, p: torch.Tensor) -> torch.Tensor: ...
+
+    def forward(self, t: torch.Tensor, state: torch.Tensor) -> torch.Tensor: ...
+
+
+def roll_out(model: Dynamics, windows: Windows, substeps: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Positions and velocities (W, K-1, n) predicted for samples 1..K-1 of each window from its sample 0.
+
+    The state is (q, p), p = M(q) qd, so that no derivative of M in time is needed. Each step between
+    samples is integrated over s in [0, 1] with d(q, p)/ds = dt d(q, p)/dt by `substeps` steps of
+    torchdiffeq's rk4: windows whose sample times differ make one batch, and the input's jumps fall on the
+    ends of steps.
+    """
+    q = windows.q[:, 0]
+    n = q.shape[-1]
+    state = torch.cat([q, model.momentum(q, windows.qd[:, 0])], dim=-1)  # (W, 2n)
+    unit = torch.linspace(0.0, 1.0, substeps + 1, dtype=q.dtype, device=q.device)
+    states = []
+    for dt, tau in zip(windows.dt.unbind(1), windows.tau.unbind(1), strict=True):
+        step = dt.unsqueeze(-1)
+        state = odeint(
+            lambda s, y, step=step: step * model.forward(s, y),
+            torch.cat([state, tau], dim=-1),
+            unit,
+            method="rk4",
+        )[-1]
+        state = state[:, : 2 * n]
+        states.append(state)
+    q, p = torch.stack(states, dim=1).split(n, dim=-1)  # each (W, K-1, n)
+    return q, model.velocity(q, p)
+
+
+def position_difference(
+    predicted: torch.Tensor, measured: torch.Tensor, joint_types: Sequence[str]
+) -> torch.Tensor:
+    """Signed distance (..., n): prismatic the difference, revolute the geodesic distance on SO(3).
+
+    For rotations about one common axis, R = exp(q e), the geodesic distance |log(R^T R')| / sqrt(2) is the
+    wrapped angle |q' - q - 2 pi round((q' - q) / 2 pi)|, so the log map of SPEL eq. 8 needs no matrices
+    here.
+    """
+    turn = torch.tensor(
+        [2 * math.pi if kind == "revolute" else math.inf for kind in joint_types], dtype=predicted.dtype
+    )
+    difference = predicted - measured
+    turns = torch.round(difference.detach() / turn.to(predicted.device))
+    return difference - turns.nan_to_num() * turn.nan_to_num(posinf=0.0).to(predicted.device)
+
+
+@dataclass(frozen=True, eq=False)
+class LossScales:
+    """One unit of error per joint (n,): root mean square change of q, qd from a window's first sample."""
+
+    q: torch.Tensor
+    qd: torch.Tensor
+
+    def to(self, device: str | torch.device) -> LossScales:
+        """The same scales on another device."""
+        return LossScales(self.q.to(device), self.qd.to(device))
+
+
+def loss_scales(windows: Windows, joint_types: Sequence[str]) -> LossScales:
+    """The scales of these windows; for a joint that hardly moves, a hundredth of the largest one."""
+    moved = position_difference(windows.q[:, 1:], windows.q[:, :1], joint_types)
+    changed = windows.qd[:, 1:] - windows.qd[:, :1]
+    scales = [x.square().mean(dim=(0, 1)).sqrt() for x in (moved, changed)]
+    return LossScales(*(x.clamp(min=max(1e-2 * x.max().item(), 1e-9)) for x in scales))
+
+
+def rollout_errors(model: EmittedModel, windows: Windows, scales: LossScales, substeps: int) -> torch.Tensor:
+    """Scaled errors (W, K-1, 2n) of the rollout: of the positions, then of the velocities."""
+    q, qd = roll_out(model, windows, substeps)
+    position = position_difference(q, windows.q[:, 1:], model.joint_types) / scales.q
+    return torch.cat([position, (qd - windows.qd[:, 1:]) / scales.qd], dim=-1)
+
+
+def rollout_loss(model: EmittedModel, windows: Windows, scales: LossScales, substeps: int) -> torch.Tensor:
+    """SPEL eq. 8: squared geodesic distance plus squared velocity error, here scaled per joint and averaged.
+
+    The paper sums over joints and samples in rad and rad/s; scaled, a wrist counts as much as a shoulder,
+    and 1 is the loss of predicting that nothing changes over the window.
+    """
+    return rollout_errors(model, windows, scales, substeps).square().mean()
+
+
+def momentum_loss(model: EmittedModel, windows: Windows, scales: LossScales) -> torch.Tensor:
+    """The weak form of the equations: p(t) - p(0) against the impulse of all forces along the measured
+    samples.
+
+    Forces between samples are the mean of their values at both ends (trapezium rule): no ODE is solved and no
+    acceleration needed. What is missing is told as velocity, M(q)^-1 times it, scaled like `rollout_loss`'s.
+    """
+    q, qd, n = windows.q, windows.qd, windows.q.shape[-1]  # (W, K, n)
+    p = model.momentum(q, qd)
+    force = model.forward(windows.dt, torch.cat([q, p], dim=-1))[..., n:]
+    dt = windows.dt.unsqueeze(-1)
+    push = (model.input_matrix(q[:, :-1]) @ windows.tau.unsqueeze(-1)).squeeze(-1)
+    impulse = (dt * (push + (force[:, :-1] + force[:, 1:]) / 2)).cumsum(dim=1)  # (W, K-1, n)
+    missing = model.velocity(q[:, 1:], p[:, 1:] - p[:, :1] - impulse)
+    return (missing / scales.qd).square().mean()
+
+
+def integration_error(model: EmittedModel, windows: Windows, scales: LossScales, substeps: int) -> float:
+    """Difference between rollouts with `substeps` and with twice as many, relative to the error of the
+    latter.
+
+    Both are root mean squares in units of `scales`; of the model's error, at least LEAST_ERROR is taken.
+    """
+    try:
+        with torch.no_grad():
+            fine = rollout_errors(model, windows, scales, 2 * substeps)
+            difference = rollout_errors(model, windows, scales, substeps) - fine
+    except torch.linalg.LinAlgError:  # numbers blew up
+        return math.inf
+    error = difference.square().mean().sqrt().item() / max(fine.square().mean().sqrt().item(), LEAST_ERROR)
+    return error if math.isfinite(error) else math.inf
+
+
+def choose_substeps(model: EmittedModel, windows: Windows, scales: LossScales, start: int = 1) -> int:
+    """The fewest rk4 steps per sample interval, from `start` on, that make integration a small part of the
+    error.
+    """
+    for substeps in SUBSTEPS:
+        if substeps >= start and integration_error(model, windows, scales, substeps) < INTEGRATION_SHARE:
+            return substeps
+    return max(start, SUBSTEPS[-1])

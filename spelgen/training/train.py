@@ -1,0 +1,218 @@
+"""Train an emitted module on logs by predicting short windows of them (SPEL, Algorithm 1, no PD penalty)."""
+
+from __future__ import annotations
+
+import hashlib
+import signal
+import threading
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from spelgen.errors import Diagnostic, ModuleError, RunError
+from spelgen.spec import Header, read_header
+from spelgen.training.data import TrainingConfig, TrainingData, prepare_data
+from spelgen.training.loop import Status, TrainingLoop
+from spelgen.training.prior import Prior, urdf_prior
+from spelgen.training.progress import TrainingProgress
+from spelgen.training.runs import RunFolder, load_model, write_json
+
+if TYPE_CHECKING:
+    from spelgen.training.runs import EmittedModel
+
+MAY_CHANGE = ("epochs", "patience", "max_minutes", "threads", "device")  # between a run and its resumption
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """How a training run ended. best_validation: of `rollout_loss`, without unit."""
+
+    folder: Path
+    status: Status
+    epochs: int
+    steps: int
+    best_epoch: int
+    best_validation: float
+    seconds: float
+    parameters: int
+    substeps: int
+    diagnostics: tuple[Diagnostic, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON form."""
+        return asdict(self) | {
+            "folder": str(self.folder),
+            "diagnostics": [x.to_dict() for x in self.diagnostics],
+        }
+
+
+def train(
+    module: Path | str,
+    data: Iterable[Path | str],
+    folder: Path | str,
+    config: TrainingConfig,
+    *,
+    urdf: Path | str | None = None,
+    resume: bool = False,
+    force: bool = False,
+    progress: bool = True,
+) -> RunResult:
+    """Train the emitted module on the logs and leave a run folder (see `RunFolder`).
+
+    urdf: the robot the module was built from, for the rivals of `evaluate`; by default the file of that name
+    beside the module. resume: go on from the folder's checkpoint, exactly as if there had been no
+    interruption. Ctrl-C or SIGTERM end the run with status "interrupted"; the folder is usable and
+    resumable. Raises ModuleError, LogError, and RunError when the folder holds a run or cannot be resumed
+    with this.
+    """
+    run = RunFolder(Path(folder))
+    module = Path(module)
+    if resume:
+        run.read_json(run.config)  # a missing run is told before anything is read
+        module = run.module
+    _use(config)
+    model = load_model(module)
+    header = read_header(module)
+    prepared = prepare_data(data, header.joints, model.joint_types, config)
+    description = _describe(config, prepared, header)
+    notes = list(prepared.diagnostics)
+    if resume:
+        _require_same(run, description)
+    else:
+        robot, found = _robot(module, urdf, header)
+        notes += found
+        run.start(module, robot, force=force)
+        write_json(run.config, description)
+    prior = _prior(run, header, model, prepared, config, notes)
+    loop = TrainingLoop(run, model, prepared, config, prior)
+    if resume:
+        loop.restore()
+    with TrainingProgress(config.epochs, show=progress) as shown, _termination_as_interrupt():
+        for note in notes:
+            shown.note(note)
+        status = loop.run(shown)
+    return _result(loop, status, tuple(notes))
+
+
+def _result(loop: TrainingLoop, status: Status, notes: tuple[Diagnostic, ...]) -> RunResult:
+    return RunResult(
+        folder=loop.folder.path,
+        status=status,
+        epochs=loop.epoch,
+        steps=loop.step,
+        best_epoch=loop.best_epoch,
+        best_validation=loop.best_loss,
+        seconds=loop.seconds,
+        parameters=sum(parameter.numel() for parameter in loop.model.parameters()),
+        substeps=loop.substeps,
+        diagnostics=notes,
+    )
+
+
+def _prior(
+    run: RunFolder,
+    header: Header,
+    model: EmittedModel,
+    data: TrainingData,
+    config: TrainingConfig,
+    notes: list[Diagnostic],
+) -> Prior | None:
+    """The URDF's pull, where it is wanted and can be had."""
+    if not config.prior or not run.urdf.exists():
+        return None
+    try:
+        return urdf_prior(run.urdf, header.joints, model, data.training)
+    except Exception as error:  # Pinocchio and its parser raise many kinds; training goes on without
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        notes.append(
+            Diagnostic("info", "no-prior", "robot.urdf", None, f"trained without the URDF's pull: {reason}")
+        )
+        return None
+
+
+def _use(config: TrainingConfig) -> None:
+    torch.set_num_threads(config.threads)
+    try:
+        torch.empty(0, device=config.device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise RunError(
+            f"a device {config.device!r} that torch cannot use ({reason})", do="use --device cpu"
+        ) from error
+
+
+def _describe(config: TrainingConfig, data: TrainingData, header: Header) -> dict[str, Any]:
+    """What goes into config.json."""
+    return {
+        "schema": 1,
+        "robot": header.robot,
+        "preset": header.options.preset,
+        "joints": list(header.joints),
+        "config": asdict(config),
+        "data_digest": data.digest,
+        "training": list(data.training_names),
+        "validation": list(data.validation_names),
+        "training_windows": len(data.training),
+        "validation_windows": len(data.validation),
+        "cutoff": data.cutoff,
+        "scales": {"q": data.scales.q.tolist(), "qd": data.scales.qd.tolist()},
+    }
+
+
+def _require_same(run: RunFolder, description: dict[str, Any]) -> None:
+    """Refuse to resume with other data or settings than the run was started with."""
+    started = run.read_json(run.config)
+    if started["data_digest"] != description["data_digest"]:
+        raise RunError(
+            "other logs than the run was started with",
+            file=run.path,
+            do="give the same --data or start a new run",
+        )
+    before, now = started["config"], description["config"]
+    changed = [name for name in now if name not in MAY_CHANGE and before.get(name) != now[name]]
+    if changed:
+        told = ", ".join(f"{name} {now[name]} instead of {before.get(name)}" for name in changed)
+        raise RunError(
+            told, file=run.path, expected="the settings the run was started with", do="or start a new run"
+        )
+
+
+def _robot(module: Path, urdf: Path | str | None, header: Header) -> tuple[Path | None, list[Diagnostic]]:
+    """The URDF to copy into the run, and what there is to say about it."""
+    path = module.with_name(header.urdf) if urdf is None else Path(urdf)
+    if not path.is_file():
+        if urdf is not None:
+            raise RunError("no such file", file=path, expected="the URDF the module was built from")
+        message = f"no {header.urdf} beside the module; evaluation will miss the URDF's own values as a rival"
+        return None, [Diagnostic("info", "no-urdf", "run", None, message)]
+    if hashlib.sha256(path.read_bytes()).hexdigest() == header.urdf_sha256:
+        return path, []
+    if urdf is not None:
+        raise ModuleError(
+            "another URDF than the module was built from", file=path, do="build the module again"
+        )
+    message = (
+        f"{header.urdf} beside the module has changed since the module was built; it is left out of the run"
+    )
+    return None, [Diagnostic("warning", "changed-urdf", "run", None, message)]
+
+
+@contextmanager
+def _termination_as_interrupt() -> Iterator[None]:
+    """SIGTERM ends training as Ctrl-C does. Only the main thread may set handlers; others change nothing."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def interrupt(signum: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

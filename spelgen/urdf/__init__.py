@@ -1,0 +1,1 @@
+"""A URDF's bytes to a Robot, exactly as written."""

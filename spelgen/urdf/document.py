@@ -1,0 +1,198 @@
+"""Bytes -> XML tree of a URDF: what is unsafe or no URDF at all is refused here."""
+
+from __future__ import annotations
+
+import re
+import stat
+from dataclasses import dataclass
+from pathlib import Path
+
+from lxml import etree
+
+from spelgen.errors import UrdfError, collect
+from spelgen.urdf.xacro_input import Expansion, expand, is_xacro
+
+MAX_BYTES = 20_000_000
+_CONFLICT = re.compile(rb"^(?:<{7} |={7}\r?$|>{7} )", re.MULTILINE)
+_UNBOUND = re.compile(r"Namespace prefix (\S+) (?:for \S+ )?on (\S+) is not defined")
+_OTHER_FORMATS = {
+    "mujoco": (
+        "an MJCF file, which is out of scope",
+        "take the URDF that its robot's maker publishes, or convert it, for example with the package "
+        "mjcf-urdf-simple-converter",
+    ),
+    "sdf": ("an SDF file", "convert it to URDF first"),
+    "COLLADA": ("a COLLADA mesh", "name the URDF that uses it"),
+}
+
+
+@dataclass(frozen=True)
+class Document:
+    """A URDF's bytes, its ``<robot>`` element, and the lines of harmless xacro left in it.
+
+    ``path`` is how errors name the file. Of a xacro file, the bytes and all lines are those of the document
+    that it expands to, ``path`` says so, and ``warnings`` are xacro's.
+    """
+
+    path: Path
+    data: bytes
+    root: etree._Element
+    leftovers: tuple[int, ...]
+    warnings: tuple[str, ...]
+
+
+def urdf_bytes(path: Path) -> bytes:
+    """The URDF in a file, or the one that a file called ``*.xacro`` expands to. Raises ``UrdfError``."""
+    return _expanded(path).data
+
+
+def read_document(path: Path) -> Document:
+    """Return the parsed file; entities are never expanded and nothing else is opened.
+
+    A file called ``*.xacro`` is run first, see ``xacro_input``, and may open what it likes.
+
+    Raises ``UrdfError`` for a missing or oversized file, a document type declaration, anything but
+    well-formed XML, another root than ``<robot>``, and xacro that was not expanded.
+    """
+    expansion = _expanded(path)
+    data = expansion.data
+    if is_xacro(path):
+        path = path.with_name(f"{path.name} (expanded)")
+        _refuse_damage(path, data)
+    # huge_tree=False keeps libxml2's own limits on depth (256) and text length
+    parser = etree.XMLParser(resolve_entities=False, no_network=True, huge_tree=False, load_dtd=False)
+    try:
+        root = etree.fromstring(data, parser)
+    except etree.XMLSyntaxError as error:
+        raise _syntax_error(path, error) from None
+    except ValueError as error:
+        raise UrdfError(f"not readable as XML ({error})", file=path, do="save the file as UTF-8") from None
+    if root.getroottree().docinfo.internalDTD is not None:
+        raise _doctype_error(path, None)
+    _check_root(path, root)
+    return Document(path, data, root, _check_xacro(path, root), expansion.warnings)
+
+
+def _expanded(path: Path) -> Expansion:
+    data = _bytes(path)
+    _refuse_damage(path, data)
+    return expand(path, MAX_BYTES) if is_xacro(path) else Expansion(data, ())
+
+
+def _bytes(path: Path) -> bytes:
+    try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise UrdfError("no regular file", file=path, expected="a URDF file")
+        if status.st_size <= MAX_BYTES:
+            return path.read_bytes()
+    except FileNotFoundError:
+        raise UrdfError("no such file", file=path) from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise UrdfError(f"cannot be read ({reason})", file=path) from None
+    raise UrdfError(
+        f"a file of {status.st_size} bytes",
+        file=path,
+        expected=f"at most {MAX_BYTES}",
+        do="keep meshes in files of their own",
+    )
+
+
+def _line_of(data: bytes, position: int) -> int:
+    return data.count(b"\n", 0, position) + 1
+
+
+def _refuse_damage(path: Path, data: bytes) -> None:
+    """Refuses what an XML parser would misreport, or must not see."""
+    if not data.strip():
+        raise UrdfError("an empty file", file=path, expected="a URDF document")
+    conflict = _CONFLICT.search(data)
+    if conflict:
+        raise UrdfError(
+            "a merge-conflict marker",
+            file=path,
+            line=_line_of(data, conflict.start()),
+            expected="XML",
+            do="resolve the merge conflict first",
+        )
+    if data.lstrip().startswith(b"<?xml") and not data.startswith(b"<?xml"):
+        raise UrdfError(
+            "text or blank lines before the XML declaration",
+            file=path,
+            line=_line_of(data, data.index(b"<?xml")),
+            expected="<?xml ...?> at the very start of the file",
+            do="delete what stands before it",
+        )
+    for declaration in (b"<!DOCTYPE", b"<!ENTITY"):
+        if declaration in data:
+            raise _doctype_error(path, _line_of(data, data.index(declaration)))
+
+
+def _doctype_error(path: Path, line: int | None) -> UrdfError:
+    return UrdfError(
+        "a document type or entity declaration",
+        file=path,
+        line=line,
+        expected="plain XML",
+        do="remove it: entities are never expanded",
+    )
+
+
+def _syntax_error(path: Path, error: etree.XMLSyntaxError) -> UrdfError:
+    message = error.msg or "unknown error"
+    unbound = _UNBOUND.search(message)
+    if unbound:
+        prefix, tag = unbound.groups()
+        return UrdfError(
+            f"the prefix {prefix!r}, which nothing declares",
+            file=path,
+            line=error.lineno,
+            element=f"<{prefix}:{tag}>",
+            expected="well-formed XML",
+            do=f'add xmlns:{prefix}="..." to <robot>, or remove the prefix',
+        )
+    told = re.sub(r",? ?line \d+, column \d+.*", "", message)
+    return UrdfError(f"not well-formed XML ({told})", file=path, line=error.lineno)
+
+
+def _check_root(path: Path, root: etree._Element) -> None:
+    name = etree.QName(root)
+    if name.localname == "robot" and name.namespace:
+        raise UrdfError(
+            f"<robot> in the namespace {name.namespace!r}",
+            file=path,
+            line=root.sourceline,
+            expected="<robot> in no namespace",
+            do=f'remove xmlns="{name.namespace}"',
+        )
+    if name.localname != "robot":
+        known, do = _OTHER_FORMATS.get(name.localname, ("", "convert it to URDF first"))
+        got = f"the root element <{name.localname}>" + (f" of {known}" if known else "")
+        raise UrdfError(got, file=path, line=root.sourceline, expected="<robot>", do=do)
+
+
+def _check_xacro(path: Path, root: etree._Element) -> tuple[int, ...]:
+    """Refuses xacro that still holds structure; returns the lines of <xacro:property>, which holds none.
+
+    Expanders leave properties behind; a number that still refers to one is refused where it is read.
+    """
+    errors, leftovers = [], []
+    for element in root.iter(etree.Element):
+        name = etree.QName(element)
+        if not (name.namespace and name.namespace.endswith("/xacro")):
+            continue
+        if name.localname == "property":
+            leftovers.append(element.sourceline)
+            continue
+        error = UrdfError(
+            "xacro that was not expanded",
+            file=path,
+            line=element.sourceline,
+            element=f"<{element.prefix}:{name.localname}>",
+            expected="plain URDF",
+            do="expand the file with the xacro command first",
+        )
+        errors.append(error)
+    collect(errors)
+    return tuple(leftovers)

@@ -1,0 +1,216 @@
+"""One <link>, <joint> or <transmission> element -> its dataclass; defects are noted, none is repaired."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from lxml import etree
+
+from spelgen.errors import suggestion
+from spelgen.urdf.robot import MOVING, Inertial, Joint, Link, Mimic, Tensor, Transmission, Vector
+from spelgen.urdf.values import (
+    Notes,
+    first_child,
+    note_unexpanded,
+    read_number,
+    read_text_number,
+    read_triple,
+)
+
+JOINT_TYPES = (*MOVING, "fixed", "floating", "planar")
+MAX_NAME = 256
+_DIAGONAL = ("ixx", "iyy", "izz")
+_TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+
+
+def read_name(notes: Notes, element: etree._Element) -> str | None:
+    """The element's usable name; None, with an error noted, where it has none."""
+    name = element.get("name")
+    if not name or not name.strip():
+        got = "no name" if name is None else "an empty name"
+        notes.error(element.sourceline, f"<{element.tag}>", got, "a name", 'add name="..."')
+        return None
+    if len(name) > MAX_NAME:
+        got = f"a name of {len(name)} characters"
+        notes.error(element.sourceline, f"<{element.tag}>", got, f"at most {MAX_NAME}")
+        return None
+    if "${" in name or "$(" in name:
+        note_unexpanded(notes, element, f"<{element.tag}> name", name)
+        return None
+    return name
+
+
+def read_link(notes: Notes, element: etree._Element) -> Link | None:
+    """The link; only its first <inertial> counts."""
+    name = read_name(notes, element)
+    if name is None:
+        return None
+    where = f"link {name!r}"
+    inertials = element.findall("inertial")
+    if len(inertials) > 1:
+        message = f"{len(inertials)} <inertial> elements: the first is taken, the others are ignored"
+        notes.warn(inertials[1].sourceline, "several-inertials", where, message)
+    inertial = _read_inertial(notes, inertials[0], f"{where} inertial") if inertials else None
+    return Link(name, inertial, element.sourceline)
+
+
+def _read_inertial(notes: Notes, element: etree._Element, where: str) -> Inertial | None:
+    mass_element = first_child(notes, element, "mass", where)
+    com, rpy = _read_origin(notes, element, where)
+    tensor = _read_tensor(notes, element, where)
+    if mass_element is None:
+        notes.warn(
+            element.sourceline, "inertial-without-mass", where, "no <mass>: read as no inertial at all"
+        )
+        return None
+    mass = read_number(notes, mass_element, "value", f"{where} mass")
+    if mass is None:
+        if "value" not in mass_element.attrib:
+            notes.error(mass_element.sourceline, f"{where} mass", "no value", "one number [kg]")
+        return None
+    return Inertial(mass, com, rpy, tensor, element.sourceline)
+
+
+def _read_tensor(notes: Notes, element: etree._Element, where: str) -> Tensor:
+    inertia = first_child(notes, element, "inertia", where)
+    if inertia is None:
+        instead = next((e.tag for e in element.iterchildren(etree.Element) if "inertia" in e.tag), None)
+        hint = f" (<{instead}> is a xacro macro that was not expanded)" if instead else ""
+        message = f"no <inertia>: read as a point mass{hint}"
+        notes.warn(element.sourceline, "inertial-without-inertia", where, message)
+        return (0.0,) * 6
+    missing = [key for key in _DIAGONAL if key not in inertia.attrib]
+    if missing:
+        got = f"no {', '.join(missing)}"
+        notes.error(inertia.sourceline, f"{where} inertia", got, "ixx, ixy, ixz, iyy, iyz, izz [kg m2]")
+        return (0.0,) * 6
+    xx, xy, xz, yy, yz, zz = (read_number(notes, inertia, key, f"{where} inertia") or 0.0 for key in _TENSOR)
+    return xx, xy, xz, yy, yz, zz
+
+
+def read_joint(notes: Notes, element: etree._Element) -> Joint | None:
+    """The joint; None, with the errors noted, where it cannot be one."""
+    name = read_name(notes, element)
+    if name is None:
+        return None
+    where = f"joint {name!r}"
+    kind = element.get("type")
+    if kind not in JOINT_TYPES:
+        got = "no type" if kind is None else f"the type {kind!r}"
+        notes.error(element.sourceline, where, got, f"one of {', '.join(JOINT_TYPES)}")
+    parent = _read_end(notes, element, "parent", where)
+    child = _read_end(notes, element, "child", where)
+    xyz, rpy = _read_origin(notes, element, where)
+    axis = _read_axis(notes, element, kind, where)
+    limits = _read_limit(notes, element, kind, where)
+    damping, friction = _read_dynamics(notes, element, where)
+    mimic = _read_mimic(notes, element, where)
+    if kind not in JOINT_TYPES or parent is None or child is None:
+        return None
+    return Joint(
+        name, kind, parent, child, xyz, rpy, axis, *limits, damping, friction, mimic, element.sourceline
+    )
+
+
+def _read_end(notes: Notes, element: etree._Element, tag: str, where: str) -> str | None:
+    ends = element.findall(tag)
+    link = ends[0].get("link") if ends else None
+    if len(ends) != 1 or not link:
+        got = f"{len(ends)} <{tag}> elements" if len(ends) != 1 else f"a <{tag}> without a link"
+        notes.error(element.sourceline, where, got, f'one <{tag} link="..."/>')
+        return None
+    return link
+
+
+def _read_origin(notes: Notes, element: etree._Element, where: str) -> tuple[Vector, Vector]:
+    origin = first_child(notes, element, "origin", where)
+    if origin is None:
+        return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    xyz, rpy = (read_triple(notes, origin, key, f"{where} origin") for key in ("xyz", "rpy"))
+    return xyz, rpy
+
+
+def _read_axis(notes: Notes, element: etree._Element, kind: str | None, where: str) -> Vector:
+    axis = first_child(notes, element, "axis", where)
+    default = (1.0, 0.0, 0.0)
+    if axis is None:
+        return default
+    before = len(notes.errors)
+    xyz = read_triple(notes, axis, "xyz", f"{where} axis", default)
+    if kind in MOVING and len(notes.errors) == before and max(map(abs, xyz)) < 1e-9:
+        got = f"the axis {axis.get('xyz')!r}"
+        notes.error(
+            axis.sourceline, where, got, "a direction", f'give the {kind} joint an axis such as "0 0 1"'
+        )
+    return xyz
+
+
+def _read_limit(
+    notes: Notes, element: etree._Element, kind: str | None, where: str
+) -> tuple[float | None, float | None, float | None, float | None]:
+    limit = first_child(notes, element, "limit", where)
+    wanted = {
+        "revolute": ("lower", "upper", "effort", "velocity"),
+        "prismatic": ("lower", "upper", "effort", "velocity"),
+        "continuous": ("effort", "velocity") if limit is not None else (),
+    }.get(kind or "", ())
+    missing = [key for key in wanted if limit is None or key not in limit.attrib]
+    if missing:
+        told = "no <limit>" if limit is None else f"<limit> lacks {', '.join(missing)}"
+        line = element.sourceline if limit is None else limit.sourceline
+        notes.warn(line, "incomplete-limit", where, f"{told}: read as unlimited")
+    if limit is None:
+        return None, None, None, None
+    told_where = f"{where} limit"
+    lower, upper = (
+        read_number(notes, limit, key, told_where, bounded=False) if kind != "continuous" else None
+        for key in ("lower", "upper")
+    )
+    effort, velocity = (
+        read_number(notes, limit, key, told_where, bounded=False) for key in ("effort", "velocity")
+    )
+    return lower, upper, effort, velocity
+
+
+def _read_dynamics(notes: Notes, element: etree._Element, where: str) -> tuple[float, float]:
+    dynamics = first_child(notes, element, "dynamics", where)
+    if dynamics is None:
+        return 0.0, 0.0
+    damping, friction = (
+        read_number(notes, dynamics, key, f"{where} dynamics") or 0.0 for key in ("damping", "friction")
+    )
+    return damping, friction
+
+
+def _read_mimic(notes: Notes, element: etree._Element, where: str) -> Mimic | None:
+    mimic = first_child(notes, element, "mimic", where)
+    if mimic is None:
+        return None
+    where = f"{where} mimic"
+    joint = mimic.get("joint")
+    if not joint:
+        notes.error(mimic.sourceline, where, "no joint", 'joint="..." naming the joint to follow')
+        return None
+    multiplier, offset = (read_number(notes, mimic, key, where) for key in ("multiplier", "offset"))
+    return Mimic(joint, 1.0 if multiplier is None else multiplier, 0.0 if offset is None else offset)
+
+
+def read_transmission(notes: Notes, element: etree._Element, joints: Sequence[str]) -> Transmission:
+    """The transmission, in the ROS form (<type>, <joint>, <actuator>); unknown joints are said."""
+    name = element.get("name") or ""
+    where = f"transmission {name!r}"
+    driven = []
+    for joint in element.findall("joint"):
+        joint_name = joint.get("name") or ""
+        if joint_name not in joints:
+            message = f"names the unknown joint {joint_name!r}; {suggestion(joint_name, joints)}"
+            notes.warn(joint.sourceline, "unknown-transmission-joint", where, message)
+            continue
+        reduction = read_text_number(notes, joint, "mechanicalReduction", where)
+        driven.append((joint_name, reduction, read_text_number(notes, joint, "offset", where)))
+    actuators = tuple(
+        (actuator.get("name") or "", read_text_number(notes, actuator, "mechanicalReduction", where))
+        for actuator in element.findall("actuator")
+    )
+    kind = (element.findtext("type") or element.get("type") or "").strip()
+    return Transmission(name, kind, tuple(driven), actuators, element.sourceline)

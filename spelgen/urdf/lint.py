@@ -1,0 +1,125 @@
+"""Robot -> warnings about what is impossible or likely a mistake; nothing here stops the reading."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+
+import numpy as np
+
+from spelgen.errors import Diagnostic
+from spelgen.urdf.robot import Inertial, Joint, Link, Robot
+
+# Computed tensors are printed with rounding: what is violated by less than this share is not worth a word.
+_ROUNDING = 1e-6
+_UNIT_AXIS = 1e-3
+
+
+def lint(robot: Robot) -> list[Diagnostic]:
+    """Return the warnings on inertials, joints and rigid groups, in no particular order."""
+    return [*_lint_inertials(robot), *_lint_placeholders(robot), *_lint_joints(robot), *_lint_groups(robot)]
+
+
+def _warning(code: str, where: str, line: int, message: str) -> Diagnostic:
+    return Diagnostic("warning", code, where, line, message)
+
+
+def _lint_inertials(robot: Robot) -> Iterator[Diagnostic]:
+    for link in robot.links:
+        if link.inertial is not None:
+            yield from _lint_inertial(link, link.inertial)
+
+
+def _lint_inertial(link: Link, inertial: Inertial) -> Iterator[Diagnostic]:
+    where, line, tensor = f"link {link.name!r} inertial", inertial.line, inertial.tensor
+    if inertial.mass < 0:
+        yield _warning("negative-mass", where, line, f"the mass is {inertial.mass:g} kg")
+    if not any(tensor):
+        if inertial.mass > 0:
+            yield _warning("zero-inertia", where, line, "the inertia tensor is zero: a point mass")
+        return
+    if tensor == (1.0, 0.0, 0.0, 1.0, 0.0, 1.0):
+        yield _warning("placeholder-inertial", where, line, "the tensor is the unit matrix: a placeholder")
+    smallest, middle, largest = _principal_moments(inertial)
+    if smallest < -_ROUNDING * abs(largest):
+        message = (
+            f"the inertia tensor is not positive semidefinite: its least principal moment is {smallest:.3g}"
+        )
+        yield _warning("non-psd-inertia", where, line, message)
+    elif smallest + middle < largest * (1 - _ROUNDING):
+        told = f"{smallest:.3g} + {middle:.3g} < {largest:.3g}"
+        message = f"no mass distribution has these principal moments: {told}"
+        yield _warning("triangle-inequality", where, line, message)
+
+
+def _principal_moments(inertial: Inertial) -> tuple[float, float, float]:
+    xx, xy, xz, yy, yz, zz = inertial.tensor
+    smallest, middle, largest = np.linalg.eigvalsh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
+    return float(smallest), float(middle), float(largest)
+
+
+def _lint_placeholders(robot: Robot) -> Iterator[Diagnostic]:
+    """One tensor repeated on most links was copied, not computed."""
+    inertials = [
+        link.inertial for link in robot.links if link.inertial is not None and any(link.inertial.tensor)
+    ]
+    if len(inertials) < 3:
+        return
+    tensor, count = Counter(each.tensor for each in inertials).most_common(1)[0]
+    if count > len(inertials) / 2 and count >= 3:
+        first = next(each for each in inertials if each.tensor == tensor)
+        message = f"{count} of {len(inertials)} links have the same inertia tensor: perhaps placeholders"
+        yield _warning("placeholder-inertial", "robot", first.line, message)
+
+
+def _lint_joints(robot: Robot) -> Iterator[Diagnostic]:
+    for joint in robot.joints:
+        if joint.moves:
+            yield from _lint_joint(joint)
+
+
+def _lint_joint(joint: Joint) -> Iterator[Diagnostic]:
+    where = f"joint {joint.name!r}"
+    for name, value in (("damping", joint.damping), ("friction", joint.friction)):
+        if value < 0:
+            message = f"{name} is {value:g}: it would add energy"
+            yield _warning("negative-friction", f"{where} dynamics", joint.line, message)
+    length = float(np.linalg.norm(joint.axis))
+    if abs(length - 1) > _UNIT_AXIS:
+        yield _warning(
+            "non-unit-axis", f"{where} axis", joint.line, f"its length is {length:.6g}: normalised"
+        )
+    if joint.lower is not None and joint.upper is not None and joint.lower > joint.upper:
+        message = f"lower {joint.lower:g} is above upper {joint.upper:g}: perhaps the two were swapped"
+        yield _warning("lower-above-upper", f"{where} limit", joint.line, message)
+
+
+def _lint_groups(robot: Robot) -> Iterator[Diagnostic]:
+    """What each moving joint carries rigidly, its child link and all fixed to it, should have mass."""
+    if all(link.inertial is None for link in robot.links):
+        yield _warning(
+            "missing-inertial", "robot", 1, "no link has an <inertial>: masses and inertias are unknown"
+        )
+        return
+    for joint in robot.joints:
+        if not joint.moves:
+            continue
+        inertials = [link.inertial for link in _rigid_group(robot, joint.child) if link.inertial is not None]
+        line = robot.link[joint.child].line
+        if not inertials:
+            message = (
+                f"joint {joint.name!r} moves it, but neither it nor what is fixed to it has an <inertial>"
+            )
+            yield _warning("missing-inertial", f"link {joint.child!r}", line, message)
+        elif not any(inertial.mass for inertial in inertials):
+            message = f"joint {joint.name!r} moves it, but it and what is fixed to it have no mass"
+            yield _warning("massless-moving-link", f"link {joint.child!r}", line, message)
+
+
+def _rigid_group(robot: Robot, link: str) -> list[Link]:
+    group, pending = [], [link]
+    while pending:
+        name = pending.pop()
+        group.append(robot.link[name])
+        pending.extend(joint.child for joint in robot.joints_below[name] if joint.type == "fixed")
+    return group

@@ -1,0 +1,185 @@
+"""URDF file -> Robot, exactly as written: everything is checked, nothing is repaired silently."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TypeVar
+
+from lxml import etree
+
+from spelgen.errors import Diagnostic, collect, suggestion
+from spelgen.urdf.document import read_document
+from spelgen.urdf.elements import read_joint, read_link, read_name, read_transmission
+from spelgen.urdf.lint import lint
+from spelgen.urdf.robot import Inertial, Joint, Link, Mimic, Robot, Transmission
+from spelgen.urdf.values import Notes
+
+__all__ = ["Inertial", "Joint", "Link", "Mimic", "Robot", "Transmission", "read_urdf"]
+
+MAX_LINKS = 2000
+Part = TypeVar("Part", Link, Joint)
+
+
+def read_urdf(path: Path) -> Robot:
+    """Return the robot of a URDF file, with lint diagnostics by line; no other file is opened.
+
+    A file called ``*.xacro`` is a program, and is run: see ``xacro_input``. The lines are then those of the
+    document that it expands to.
+
+    Raises ``UrdfError``, or ``SpelgenErrors`` with all that was found, where the file is missing or is not
+    one well-formed tree of links and joints.
+    """
+    document = read_document(path)
+    notes = Notes(document.path)
+    if document.path != path:
+        message = f"expanded by xacro: lines are those of the document that `xacro {path.name}` prints"
+        notes.diagnostics.append(Diagnostic("info", "expanded-xacro", "robot", None, message))
+    for warning in document.warnings:
+        notes.warn(None, "xacro-warning", "robot", warning)
+    root = document.root
+    name = _robot_name(notes, root)
+    if document.leftovers:
+        message = f"{len(document.leftovers)} <xacro:property> elements were left behind by xacro: ignored"
+        notes.warn(document.leftovers[0], "unexpanded-xacro", "robot", message)
+    links = _read_links(notes, root)
+    joints = _unique(notes, [read_joint(notes, element) for element in root.findall("joint")])
+    _check_ends(notes, links, joints)
+    _check_mimics(notes, joints)
+    joint_names = [joint.name for joint in joints]
+    transmissions = [read_transmission(notes, each, joint_names) for each in root.findall("transmission")]
+    # a joint that could not be read leaves false roots behind, so these are sought in a sound file only
+    tops = [] if notes.errors else _check_tree(notes, root, links, joints)
+    collect(sorted(notes.errors, key=lambda each: each.line or 0))
+    robot = Robot(
+        name=name,
+        path=path,
+        told_as=document.path,
+        digest=hashlib.sha256(document.data).hexdigest(),
+        links=tuple(links),
+        joints=tuple(joints),
+        transmissions=tuple(transmissions),
+        root=tops[0],
+        diagnostics=(),
+    )
+    return replace(robot, diagnostics=_diagnostics(notes, robot))
+
+
+def _diagnostics(notes: Notes, robot: Robot) -> tuple[Diagnostic, ...]:
+    """What reading and lint found, by line; that an absent tensor is a zero tensor is not said twice."""
+    absent = {each.line for each in notes.diagnostics if each.code == "inertial-without-inertia"}
+    found = [each for each in lint(robot) if each.code != "zero-inertia" or each.line not in absent]
+    return tuple(sorted([*notes.diagnostics, *found], key=lambda each: each.line or 0))
+
+
+def _robot_name(notes: Notes, root: etree._Element) -> str:
+    if root.get("name"):
+        return read_name(notes, root) or ""
+    message = "<robot> has no name: the file's is taken"
+    notes.warn(root.sourceline, "missing-robot-name", "robot", message)
+    return notes.path.stem
+
+
+def _read_links(notes: Notes, root: etree._Element) -> list[Link]:
+    elements = root.findall("link")
+    if len(elements) > MAX_LINKS:
+        notes.error(root.sourceline, "<robot>", f"{len(elements)} links", f"at most {MAX_LINKS}")
+        collect(notes.errors)
+    if not elements:
+        is_xacro = any(uri.endswith("/xacro") for uri in root.nsmap.values())
+        do = "this is a xacro file: expand it with the xacro command first" if is_xacro else None
+        notes.error(root.sourceline, "<robot>", "no <link>", "a tree of links and joints", do)
+    elif root.find("joint") is None:
+        notes.error(root.sourceline, "<robot>", "no <joint>", "a tree of links and joints")
+    return _unique(notes, [read_link(notes, element) for element in elements])
+
+
+def _unique(notes: Notes, parts: Sequence[Part | None]) -> list[Part]:
+    """The parts that could be read; a name used twice is an error (a link and a joint may share one)."""
+    kept: dict[str, Part] = {}
+    for part in parts:
+        if part is None:
+            continue
+        if part.name in kept:
+            kind = type(part).__name__.lower()
+            got = f"a second {kind} of that name (the first is in line {kept[part.name].line})"
+            notes.error(part.line, f"{kind} {part.name!r}", got, "unique names", "rename or remove one")
+        else:
+            kept[part.name] = part
+    return list(kept.values())
+
+
+def _check_ends(notes: Notes, links: Sequence[Link], joints: Sequence[Joint]) -> None:
+    """Both links of a joint exist, and no link hangs from two joints."""
+    names = [link.name for link in links]
+    known = set(names)
+    above: dict[str, Joint] = {}
+    for joint in joints:
+        where = f"joint {joint.name!r}"
+        for role, link in (("parent", joint.parent), ("child", joint.child)):
+            if link not in known:
+                got = f"no link is named {link!r}"
+                notes.error(joint.line, f"{where} {role}", got, do=suggestion(link, names))
+        if joint.child in above:
+            first = above[joint.child]
+            got = f"the link {joint.child!r}, which hangs from {first.name!r} (line {first.line}) already"
+            do = "loops are out of URDF's scope: open them and add <mimic>"
+            notes.error(joint.line, f"{where} child", got, "one parent per link", do)
+        above.setdefault(joint.child, joint)
+
+
+def _check_mimics(notes: Notes, joints: Sequence[Joint]) -> None:
+    """Every leader exists, has one degree of freedom, and leads to no circle."""
+    by_name = {joint.name: joint for joint in joints}
+    for joint in joints:
+        if joint.mimic is None:
+            continue
+        where = f"joint {joint.name!r} mimic"
+        leader = by_name.get(joint.mimic.joint)
+        if leader is None:
+            got = f"no joint is named {joint.mimic.joint!r}"
+            notes.error(joint.line, where, got, do=suggestion(joint.mimic.joint, by_name))
+        elif not leader.moves:
+            got = f"the {leader.type} joint {leader.name!r}"
+            notes.error(joint.line, where, got, "a revolute, continuous or prismatic joint to follow")
+        elif _is_circle(joint, by_name):
+            notes.error(joint.line, where, "a circle of mimic joints", "a leader that moves by itself")
+
+
+def _is_circle(joint: Joint, by_name: dict[str, Joint]) -> bool:
+    """Whether following leaders from ``joint`` comes back to it."""
+    seen: set[str] = set()
+    at: Joint | None = joint
+    while at is not None and at.mimic is not None and at.name not in seen:
+        seen.add(at.name)
+        at = by_name.get(at.mimic.joint)
+    return at is not None and at.name == joint.name and joint.name in seen
+
+
+def _check_tree(
+    notes: Notes, root: etree._Element, links: Sequence[Link], joints: Sequence[Joint]
+) -> list[str]:
+    """The names of the links that hang from no joint: exactly one, from which all others are reached."""
+    children = {joint.child for joint in joints}
+    tops = [link for link in links if link.name not in children]
+    if len(tops) != 1:
+        listed = ", ".join(f"{top.name!r} (line {top.line})" for top in tops[:10])
+        got = f"{len(tops)} root links: {listed}" if tops else "no root link: the joints form a circle"
+        do = "join the trees by a fixed joint" if tops else None
+        notes.error(root.sourceline, "<robot>", got, "one link that is no joint's child", do)
+        return []
+    below: dict[str, list[str]] = {}
+    for joint in joints:
+        below.setdefault(joint.parent, []).append(joint.child)
+    reached = {tops[0].name}
+    pending = [tops[0].name]
+    while pending:
+        pending.extend(each for each in below.get(pending.pop(), []))
+        reached.update(pending)
+    for link in links:
+        if link.name not in reached:
+            got = f"a circle of joints that never meets the root {tops[0].name!r}"
+            notes.error(link.line, f"link {link.name!r}", got, "a tree")
+    return [tops[0].name]
