@@ -19,6 +19,7 @@ _LEAST_UNITS = 4
 _POTENTIAL_SHARE = 0.5
 _FRICTION_HIDDEN = 8
 _SLOW = 0.03
+_PLACE_SHARE = 0.1
 
 
 def emit(spec: ModelSpec) -> str:
@@ -55,6 +56,7 @@ def emit(spec: ModelSpec) -> str:
         potential_scale=spec.potential_scale,
         friction_hidden=_FRICTION_HIDDEN,
         slow=_SLOW,
+        place_share=_PLACE_SHARE,
         uses_network=bool(spec.outputs or spec.potential),
     )
 

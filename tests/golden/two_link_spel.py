@@ -116,6 +116,7 @@ POTENTIAL_HIDDEN = (32, 32)
 POTENTIAL_SCALE = 10.8194  # [J]
 FRICTION_HIDDEN = 8
 SLOW = 0.03  # below this share of its usual speed a joint's dry friction fades to zero
+PLACE_SHARE = 0.1  # how much friction's networks see of where a joint is, relative to its speed
 
 
 def vector(values: Iterable[float]) -> Tensor:
@@ -245,8 +246,8 @@ class Friction(nn.Module):
         """d, (..., n) [Nm s/rad, N s/m]: joint i is slowed by d_i qd_i."""
         smooth_speed = torch.sqrt(qd * qd + (SLOW * self.speed) ** 2)
         place = (q - self.center) / self.reach
-        first = torch.where(self.revolute, q.cos(), place)
-        second = torch.where(self.revolute, q.sin(), place)
+        first = PLACE_SHARE * torch.where(self.revolute, q.cos(), place)
+        second = PLACE_SHARE * torch.where(self.revolute, q.sin(), place)
         inputs = torch.stack([first, second, qd / self.speed, qd / smooth_speed], dim=-1)
         # joints are few and their networks small: sums of products beat batched matrix products
         hidden = torch.tanh((inputs.unsqueeze(-1) * self.weight).sum(dim=-2) + self.bias)
