@@ -109,7 +109,7 @@ class TrainingSettings(_Group):
     learning_rate: Positive = 1e-3
     weight_decay: NonNegative = 0.2
     substeps: Count | None = None
-    validation_fraction: Fraction = 0.25
+    validation_fraction: Annotated[Number, Field(gt=0, lt=1)] = 0.25
     patience: Count = 60
     seed: Seed = 0
 

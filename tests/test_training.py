@@ -277,8 +277,10 @@ def test_early_stop_and_time_limit(logs, tmp_path):
     stuck = replace(QUICK, learning_rate=1e-30, patience=2, momentum_steps=0)
     result = train(STAND_IN, [logs], tmp_path / "stuck", stuck, progress=False)
     assert (result.status, result.epochs) == ("stopped early", 2)
-    result = train(STAND_IN, [logs], tmp_path / "late", replace(QUICK, max_minutes=1e-6), progress=False)
-    assert (result.status, result.epochs) == ("out of time", 1)
+    for momentum_steps, epochs in ((0, 1), (1000, 0)):
+        hurried = replace(QUICK, max_minutes=1e-6, momentum_steps=momentum_steps)
+        result = train(STAND_IN, [logs], tmp_path / f"late{epochs}", hurried, progress=False)
+        assert (result.status, result.epochs) == ("out of time", epochs)
 
 
 CHILD = """

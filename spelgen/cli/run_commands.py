@@ -83,6 +83,10 @@ def train(
     robot: RobotOption = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in the run folder.")] = False,
     force: Force = False,
+    momentum_steps: Annotated[
+        int | None,
+        typer.Option("--momentum-steps", min=0, help="On the weak form, before windows are predicted."),
+    ] = None,
     epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="At most so many.")] = None,
     patience: Annotated[
         int | None, typer.Option("--patience", min=1, help="Epochs without gain before the end.")
@@ -103,9 +107,13 @@ def train(
         float | None, typer.Option("--learning-rate", min=0.0, help="At its largest.")
     ] = None,
     weight_decay: Annotated[float | None, typer.Option("--weight-decay", min=0.0, help="Of AdamW.")] = None,
+    prior: Annotated[
+        float | None,
+        typer.Option("--prior", min=0.0, help="Pull towards the URDF's own M and gravity; 0: none."),
+    ] = None,
     validation_fraction: Annotated[
         float | None,
-        typer.Option("--validation-fraction", min=0.0, max=0.9, help="Part of the trajectories."),
+        typer.Option("--validation-fraction", min=0.01, max=0.9, help="Part of the trajectories."),
     ] = None,
     filter: Filter = None,
     seed: Annotated[int | None, typer.Option("--seed", min=0, help="Of split, order and batches.")] = None,
@@ -118,8 +126,8 @@ def train(
     What is not given here comes from the settings beside the robot.
     """
     flags = {
-        "epochs": epochs, "patience": patience, "max_minutes": max_minutes, "batch": batch, "window": window,
-        "stride": stride, "every": every, "substeps": substeps, "learning_rate": learning_rate,
+        "momentum_steps": momentum_steps, "prior": prior, "epochs": epochs, "patience": patience,
+        "max_minutes": max_minutes, "batch": batch, "window": window, "stride": stride, "every": every, "substeps": substeps, "learning_rate": learning_rate,
         "weight_decay": weight_decay, "validation_fraction": validation_fraction, "filter": filter,
         "seed": seed, "device": device, "threads": threads,
     }  # fmt: skip

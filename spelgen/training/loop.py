@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from spelgen.training.runs import EmittedModel
 
 VECTOR_FACTOR = 5.0  # on the learning rate of constants and biases
+MOMENTUM_SHARE = 0.5  # of the allowed time, what the momentum steps may take
 MOMENTUM_FACTOR = 10.0  # on the learning rate of the momentum steps, which are cheap and noisy
 GRADIENT_NORM = 1.0  # of the scaled loss; larger gradients are shortened to it
 WARM_UP = 0.02  # part of all steps over which the learning rate rises
@@ -119,12 +120,12 @@ class TrainingLoop:
         before = copy.deepcopy(self.model.state_dict()), self.best_loss
         generator = torch.Generator().manual_seed(self.config.seed)
         optimiser, steps = self._optimiser(), self.config.momentum_steps
+        since = time.monotonic()
         for step in range(steps):
-            part = step / steps
-            fall = FINAL_RATE + (1 - FINAL_RATE) * (1 + math.cos(math.pi * part)) / 2
-            self._set_rate(
-                optimiser, MOMENTUM_FACTOR * self.config.learning_rate * min(1.0, part / WARM_UP) * fall
-            )
+            part = max(step / steps, self._spent(time.monotonic() - since) / MOMENTUM_SHARE)
+            if part >= 1.0:
+                break
+            self._set_rate(optimiser, MOMENTUM_FACTOR * self.config.learning_rate * _schedule(part))
             rows = torch.randint(len(self.training), (self.batch,), generator=generator)
             optimiser.zero_grad()
             loss = momentum_loss(self.model, self.training[rows.to(self.config.device)], self.scales)
@@ -138,6 +139,7 @@ class TrainingLoop:
             self.model.load_state_dict(before[0])
             self._measure()
         self.warm = True
+        self.seconds += time.monotonic() - since
         self.save()
 
     def _end(self) -> Status | None:
@@ -145,9 +147,11 @@ class TrainingLoop:
             return "finished"
         if self.epoch - self.best_epoch >= self.config.patience:
             return "stopped early"
-        if self.config.max_minutes is not None and self.seconds >= 60 * self.config.max_minutes:
-            return "out of time"
-        return None
+        return "out of time" if self._spent(self.seconds) >= 1.0 else None
+
+    def _spent(self, seconds: float) -> float:
+        """The part of the allowed time that these seconds are; 0 where any time is allowed."""
+        return 0.0 if self.config.max_minutes is None else seconds / (60 * self.config.max_minutes)
 
     def _run_epoch(self) -> dict[str, Any]:
         """One epoch with finite losses, after as many attempts at a lower learning rate as that takes."""
@@ -205,13 +209,9 @@ class TrainingLoop:
         return 0.0 if self.prior is None else self.config.prior * self.prior.loss(self.model)
 
     def _rate(self) -> float:
-        """Learning rate of the next step: a linear rise times a cosine down over all steps or minutes."""
-        part = self.step / (self.config.epochs * self.epoch_steps)
-        rise = min(1.0, (part + 1e-3) / WARM_UP)
-        if self.config.max_minutes is not None:
-            part = max(part, self.seconds / (60 * self.config.max_minutes))
-        fall = FINAL_RATE + (1 - FINAL_RATE) * (1 + math.cos(math.pi * min(part, 1.0))) / 2
-        return self.config.learning_rate * self.rate_factor * rise * fall
+        """Learning rate of the next step, over all steps or minutes, whichever end sooner."""
+        part = max(self.step / (self.config.epochs * self.epoch_steps), self._spent(self.seconds))
+        return self.config.learning_rate * self.rate_factor * _schedule(part)
 
     def _validate(self) -> float:
         """Loss on the validation windows."""
@@ -267,3 +267,9 @@ class TrainingLoop:
                 "a checkpoint of another model", file=self.folder.checkpoint, do="start a new run"
             ) from error
         self.folder.keep_metrics(self.epoch)
+
+
+def _schedule(part: float) -> float:
+    """The learning rate's factor when this part of training is done: a linear rise times a cosine down."""
+    fall = FINAL_RATE + (1 - FINAL_RATE) * (1 + math.cos(math.pi * min(part, 1.0))) / 2
+    return min(1.0, (part + 1e-3) / WARM_UP) * fall
