@@ -127,9 +127,10 @@ def train(
     """
     flags = {
         "momentum_steps": momentum_steps, "prior": prior, "epochs": epochs, "patience": patience,
-        "max_minutes": max_minutes, "batch": batch, "window": window, "stride": stride, "every": every, "substeps": substeps, "learning_rate": learning_rate,
-        "weight_decay": weight_decay, "validation_fraction": validation_fraction, "filter": filter,
-        "seed": seed, "device": device, "threads": threads,
+        "max_minutes": max_minutes, "batch": batch, "window": window, "stride": stride, "every": every,
+        "substeps": substeps, "learning_rate": learning_rate, "weight_decay": weight_decay,
+        "validation_fraction": validation_fraction, "filter": filter, "seed": seed, "device": device,
+        "threads": threads,
     }  # fmt: skip
     paths = options.logs(data, more)
     from spelgen.training import train as training
