@@ -118,36 +118,46 @@ def examine(
 
     Raises LogError when revolute joints look recorded in degrees, unless the file declares its units.
     """
-    notes: list[Diagnostic] = []
+    notes = [note for trajectory in trajectories for note in _gaps(trajectory)]
     errors: list[SpelgenError] = []
-    for trajectory in trajectories:
-        pieces = split_at_gaps(trajectory)
-        where = f"trajectory {trajectory.name}"
-        if len(pieces) > 1:
-            longest = np.diff(trajectory.t).max()
-            message = f"{len(pieces) - 1} gaps in time, up to {longest:.3g} s long; no window crosses one"
-            notes.append(Diagnostic("info", "gap", where, None, message))
-        for i, (joint, kind) in enumerate(zip(joints, joint_types, strict=True)):
-            slope, agreement = _derivative_check(pieces, i)
-            smell = (
-                None
-                if trajectory.declares_units or kind != "revolute"
-                else _degrees(trajectory.q[:, i], slope, agreement)
-            )
+    for i, (joint, kind) in enumerate(zip(joints, joint_types, strict=True)):
+        smells: list[tuple[Trajectory, str]] = []
+        doubts: list[tuple[Trajectory, str]] = []
+        for trajectory in trajectories:
+            slope, agreement = _derivative_check(split_at_gaps(trajectory), i)
+            doubtful = kind == "revolute" and not trajectory.declares_units
+            smell = _degrees(trajectory.q[:, i], slope, agreement) if doubtful else None
             if smell:
-                errors.append(_degrees_error(trajectory, joint, smell))
+                smells.append((trajectory, smell))
             elif agreement is not None and (agreement < 0.9 or abs(slope - 1) > 0.1):
-                message = (
-                    f"qd is not dq/dt: the best factor is {slope:.3g}, the correlation {agreement:.3g}; "
-                    "check units, signs and the order of the joints"
-                )
-                notes.append(
-                    Diagnostic(
-                        "warning", "velocity-is-no-derivative", f"{where}, joint {joint!r}", None, message
-                    )
-                )
+                doubts.append((trajectory, f"factor is {slope:.3g}, the correlation {agreement:.3g}"))
+        if smells:
+            errors.append(_degrees_error(joint, smells))
+        if doubts:
+            first, found = doubts[0]
+            message = (
+                f"qd is not dq/dt{_counted(doubts)}: the best {found}; "
+                "check units, signs and the order of the joints"
+            )
+            where = f"trajectory {first.name}, joint {joint!r}"
+            notes.append(Diagnostic("warning", "velocity-is-no-derivative", where, None, message))
     collect(errors)
     return notes
+
+
+def _gaps(trajectory: Trajectory) -> list[Diagnostic]:
+    pieces = len(split_at_gaps(trajectory))
+    if pieces == 1:
+        return []
+    longest = np.diff(trajectory.t).max()
+    message = f"{pieces - 1} gaps in time, up to {longest:.3g} s long; no window crosses one"
+    return [Diagnostic("info", "gap", f"trajectory {trajectory.name}", None, message)]
+
+
+def _counted(found: Sequence[tuple[Trajectory, str]]) -> str:
+    """How many trajectories show what the first one of these is told for."""
+    others = len(found) - 1
+    return f" (and in {others} more trajectories)" if others else ""
 
 
 def _derivative_check(pieces: Sequence[Trajectory], joint: int) -> tuple[float, float | None]:
@@ -182,9 +192,10 @@ def _degrees(q: np.ndarray, slope: float, agreement: float | None) -> str | None
     return None
 
 
-def _degrees_error(trajectory: Trajectory, joint: str, smell: str) -> LogError:
+def _degrees_error(joint: str, smells: Sequence[tuple[Trajectory, str]]) -> LogError:
+    first, smell = smells[0]
     return LogError(
-        smell, file=trajectory.file, element=f"trajectory {trajectory.name}, joint {joint!r}",
+        f"{smell}{_counted(smells)}", file=first.file, element=f"trajectory {first.name}, joint {joint!r}",
         expected="radians and rad/s",
         do="convert degrees; if the units are right, say so in the Parquet schema's metadata 'units'",
     )  # fmt: skip
