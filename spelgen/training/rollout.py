@@ -76,21 +76,25 @@ def position_difference(
 
 @dataclass(frozen=True, eq=False)
 class LossScales:
-    """One unit of error per joint (n,): root mean square change of q, qd from a window's first sample."""
+    """One unit of error per joint (n,): root mean square change of q, qd from a window's first sample, and the
+    standard deviation of tau.
+    """
 
     q: torch.Tensor
     qd: torch.Tensor
+    tau: torch.Tensor
 
     def to(self, device: str | torch.device) -> LossScales:
         """The same scales on another device."""
-        return LossScales(self.q.to(device), self.qd.to(device))
+        return LossScales(self.q.to(device), self.qd.to(device), self.tau.to(device))
 
 
 def loss_scales(windows: Windows, joint_types: Sequence[str]) -> LossScales:
     """The scales of these windows; for a joint that hardly moves, a hundredth of the largest one."""
     moved = position_difference(windows.q[:, 1:], windows.q[:, :1], joint_types)
     changed = windows.qd[:, 1:] - windows.qd[:, :1]
-    scales = [x.square().mean(dim=(0, 1)).sqrt() for x in (moved, changed)]
+    varied = windows.tau - windows.tau.mean(dim=(0, 1))
+    scales = [x.square().mean(dim=(0, 1)).sqrt() for x in (moved, changed, varied)]
     return LossScales(*(x.clamp(min=max(1e-2 * x.max().item(), 1e-9)) for x in scales))
 
 
@@ -115,7 +119,9 @@ def momentum_loss(model: EmittedModel, windows: Windows, scales: LossScales) -> 
     samples.
 
     Forces between samples are the mean of their values at both ends (trapezium rule): no ODE is solved and no
-    acceleration needed. What is missing is told as velocity, M(q)^-1 times it, scaled like `rollout_loss`'s.
+    acceleration needed. What is missing is told as mean torque, in units of the torque's standard deviation.
+    (Told as a velocity, M(q)^-1 times it, it would reward an M that is too large: errors of the measured
+    torque would count less.)
     """
     q, qd, n = windows.q, windows.qd, windows.q.shape[-1]  # (W, K, n)
     p = model.momentum(q, qd)
@@ -123,8 +129,8 @@ def momentum_loss(model: EmittedModel, windows: Windows, scales: LossScales) -> 
     dt = windows.dt.unsqueeze(-1)
     push = (model.input_matrix(q[:, :-1]) @ windows.tau.unsqueeze(-1)).squeeze(-1)
     impulse = (dt * (push + (force[:, :-1] + force[:, 1:]) / 2)).cumsum(dim=1)  # (W, K-1, n)
-    missing = model.velocity(q[:, 1:], p[:, 1:] - p[:, :1] - impulse)
-    return (missing / scales.qd).square().mean()
+    missing = (p[:, 1:] - p[:, :1] - impulse) / dt.cumsum(dim=1)
+    return (missing / scales.tau).square().mean()
 
 
 def integration_error(model: EmittedModel, windows: Windows, scales: LossScales, substeps: int) -> float:

@@ -159,7 +159,7 @@ def _describe(config: TrainingConfig, data: TrainingData, header: Header) -> dic
         "training_windows": len(data.training),
         "validation_windows": len(data.validation),
         "cutoff": data.cutoff,
-        "scales": {"q": data.scales.q.tolist(), "qd": data.scales.qd.tolist()},
+        "scales": {name: getattr(data.scales, name).tolist() for name in ("q", "qd", "tau")},
     }
 
 
