@@ -11,6 +11,7 @@ from typing import Any
 from spelgen.arm.arm import Arm
 from spelgen.errors import Diagnostic
 from spelgen.labels import joint_ranges
+from spelgen.proof.meaning import Fact, facts
 from spelgen.structure.structure import Entry, Structure
 
 SCHEMA = 1
@@ -23,6 +24,11 @@ class Inspection:
     arm: Arm
     structure: Structure
     diagnostics: tuple[Diagnostic, ...]
+
+    @property
+    def facts(self) -> tuple[Fact, ...]:
+        """What always holds, in plain words."""
+        return facts(self.arm, self.structure)
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON contract; names are the URDF's, rows and columns count from 1."""
@@ -48,12 +54,14 @@ class Inspection:
                 "entries": [self._input(row, column) for row in range(n) for column in range(n)]
             },
             "base_parameters": structure.base_parameters,
+            "facts": [fact.to_dict() for fact in self.facts],
             "diagnostics": [diagnostic.to_dict() for diagnostic in self.diagnostics],
         }
 
     def text(self, width: int = 80) -> str:
         """A report for a terminal ``width`` columns wide."""
         parts = [self._heading(), self._joint_table(), self._matrix(width), self._meaning(width)]
+        parts += [self._in_words(width)] if self.facts else []
         if self.diagnostics:
             parts.append(self._remarks(width))
         return "\n\n".join(parts)
@@ -133,6 +141,12 @@ class Inspection:
         for name, fact in facts.items():
             lines += textwrap.wrap(fact, width, initial_indent=f"  {name:<5} ", subsequent_indent=" " * 8)
         return "The model needs\n" + "\n".join(lines)
+
+    def _in_words(self, width: int) -> str:
+        lines = []
+        for fact in self.facts:
+            lines += textwrap.wrap(str(fact), width, initial_indent="  ", subsequent_indent="    ")
+        return "In words\n" + "\n".join(lines)
 
     def _remarks(self, width: int) -> str:
         lines = []

@@ -1,6 +1,8 @@
-"""How joints are named in pictures of a structure."""
+"""How joints and entries are named in pictures and sentences about a structure."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 
 def joint_ranges(joints: tuple[int, ...]) -> str:
@@ -15,3 +17,24 @@ def joint_ranges(joints: tuple[int, ...]) -> str:
         f"{run[0] + 1}-{run[-1] + 1}" if len(run) > 2 else ",".join(str(joint + 1) for joint in run)
         for run in runs
     )
+
+
+def entry_name(row: int, column: int) -> str:
+    """How an entry of M is called, from its 0-based place: M21, or M12,1 from ten joints on."""
+    separator = "," if max(row, column) >= 9 else ""
+    return f"M{row + 1}{separator}{column + 1}"
+
+
+def joints_told(joints: Sequence[int]) -> str:
+    """``joint 2``, or ``joints 2, 3 and 5``."""
+    return f"joint{'s' * (len(joints) > 1)} {listed([str(joint + 1) for joint in sorted(joints)])}"
+
+
+def axes_told(joints: Sequence[int]) -> str:
+    """``the axis of joint 2``, or ``the axes of joints 2 and 3``."""
+    return f"the {'axis' if len(joints) == 1 else 'axes'} of {joints_told(joints)}"
+
+
+def listed(parts: Sequence[str]) -> str:
+    """``a``, or ``a, b and c``."""
+    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"

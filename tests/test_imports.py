@@ -19,7 +19,7 @@ simulation: engine simulate
 training: runs rollout rivals prior progress data loop train
 evaluation: tip torque examples evaluate
 report: charts plots tables picture learned page
-proof: agreement axes meaning second_reading numeric_samples verification
+proof: agreement axes reasons meaning second_reading numeric_samples verification
 inspection pipeline
 cli: console options model_commands run_commands main
 __init__ __main__

@@ -49,6 +49,11 @@ class Axes:
             _cross(_difference(at[a], at[b]), axes[a]) == ZERO for axes, at in self._placed
         )
 
+    def opposed(self, a: int, b: int) -> bool:
+        """Whether the two point against each other, for axes that are always parallel."""
+        axes, _ = self._placed[0]
+        return _dot(axes[a], axes[b]) < 0
+
     def move_alike(self, a: int, b: int) -> bool:
         """Whether unit rates of the two joints give the same velocity field, or opposite ones."""
         if self.slides[a] != self.slides[b]:

@@ -15,9 +15,8 @@ import numpy as np
 
 from spelgen.arm.arm import Arm
 from spelgen.errors import SpelgenError
-from spelgen.labels import joint_ranges
+from spelgen.labels import entry_name, joint_ranges
 from spelgen.proof.agreement import Check, Verdict, Verification, size_told
-from spelgen.proof.meaning import entry_name
 from spelgen.proof.second_reading import second_reading
 from spelgen.structure.basis import Weights
 from spelgen.structure.recursion import triangle
