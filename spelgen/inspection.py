@@ -10,6 +10,8 @@ from typing import Any
 
 from spelgen.arm.arm import Arm
 from spelgen.errors import Diagnostic
+from spelgen.formulas.formulas import Entry as PlaceOfEntry
+from spelgen.formulas.formulas import Formulas, formulas
 from spelgen.labels import joint_ranges
 from spelgen.proof.meaning import Fact, facts
 from spelgen.structure.structure import Entry, Structure
@@ -29,6 +31,10 @@ class Inspection:
     def facts(self) -> tuple[Fact, ...]:
         """What always holds, in plain words."""
         return facts(self.arm, self.structure)
+
+    def closed_forms(self, entry: PlaceOfEntry | None = None, *, longest: int | None = None) -> Formulas:
+        """M and V, or one entry, as expressions; arguments and errors as for ``formulas.formulas.formulas``."""
+        return formulas(self.arm, self.structure, entry=entry, longest=longest)
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON contract; names are the URDF's, rows and columns count from 1."""

@@ -20,8 +20,9 @@ training: runs rollout rivals prior progress data loop train
 evaluation: tip torque examples evaluate
 report: charts plots tables picture learned page
 proof: agreement axes reasons meaning second_reading numeric_samples verification
+formulas: expression notation angles harmonics factoring shortening grouping formulas layout text latex sympy_module
 inspection pipeline
-cli: console options model_commands run_commands main
+cli: console options formats model_commands run_commands main
 __init__ __main__
 """
 

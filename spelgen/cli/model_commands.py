@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import FAILED, note, say
-from spelgen.cli.options import Assumption, Force, Joints, Module, Robot, RobotOption, SnapTolerance, Tip
+from spelgen.cli.formats import Format, chosen, rendered
+from spelgen.cli.options import (
+    Assumption,
+    Entry,
+    Force,
+    Joints,
+    Module,
+    Robot,
+    RobotOption,
+    SnapTolerance,
+    Tip,
+)
 from spelgen.files import write_text
 from spelgen.spec import Preset
 
@@ -21,7 +31,18 @@ def inspect(
     tip: Tip = None,
     assume: Assumption = "kinematics",
     snap_tol: SnapTolerance = 2e-3,
-    format: Annotated[Literal["text", "json"], typer.Option("--format", help="Of the result.")] = "text",
+    formulas: Annotated[
+        bool, typer.Option("--formulas", help="Write M and V as expressions in q and base parameters.")
+    ] = False,
+    entry: Entry = None,
+    format: Annotated[
+        Format | None,
+        typer.Option(
+            "--format",
+            help="Of the result; without it, by the suffix of -o: .json, .tex, .py, else text.",
+            show_default=False,
+        ),
+    ] = None,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write to a file.")
     ] = None,
@@ -31,19 +52,16 @@ def inspect(
     """Show the exact structure of an arm's dynamics."""
     from spelgen import pipeline
 
+    wanted = options.entry(entry)
     found = pipeline.inspect(robot, options.names(joints), tip, assume, snap_tolerance=snap_tol)
     proof = None
     if verify:
         proof = pipeline.verify(robot, options.names(joints), tip, assume, snap_tolerance=snap_tol)
-    if format == "text":
-        text = found.text() + (f"\n\n{proof.text()}" if proof else "")
-    else:
-        data = found.to_dict() | ({"verification": proof.to_dict()} if proof else {})
-        text = json.dumps(data, indent=2)
+    text = rendered(found, chosen(format, output), formulas=formulas, entry=wanted, proof=proof)
     if output is None:
-        say(text)
+        say(text.removesuffix("\n"))
     else:
-        say(f"wrote {write_text(output, text + chr(10))}")
+        say(f"wrote {write_text(output, text)}")
     warnings = sum(diagnostic.severity == "warning" for diagnostic in found.diagnostics)
     if strict and warnings:
         note(f"{robot}: {warnings} warning{'s' * (warnings > 1)}, and --strict allows none")

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import csv
+import re
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -39,6 +40,10 @@ SnapTolerance = Annotated[
         "--snap-tol", metavar="RAD", min=0.0, max=0.1, help="Angles this near to a special one are that one."
     ),
 ]
+Entry = Annotated[
+    str | None,
+    typer.Option("--entry", metavar="ROW,COLUMN|V", help="Write this entry of M, or V, as an expression."),
+]
 Data = Annotated[
     list[Path] | None,
     typer.Option(
@@ -65,6 +70,18 @@ def names(text: str | None) -> list[str] | None:
         if text is None
         else [name.strip() for name in next(csv.reader([text], skipinitialspace=True), [])]
     )
+
+
+def entry(text: str | None) -> tuple[int, int] | Literal["V"] | None:
+    """`3,2` -> (3, 2), `V` -> "V"; None stays None. A usage error for anything else."""
+    if text is None:
+        return None
+    if text == "V":
+        return "V"
+    match = re.fullmatch(r"\s*(\d{1,4})\s*,\s*(\d{1,4})\s*", text, re.ASCII)
+    if match is None:
+        raise typer.BadParameter("name it as ROW,COLUMN or V", param_hint="'--entry'")
+    return int(match[1]), int(match[2])
 
 
 def logs(data: list[Path] | None, more: list[Path] | None) -> list[Path]:

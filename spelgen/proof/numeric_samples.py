@@ -54,7 +54,7 @@ def draw(arm: Arm, count: int, rng: np.random.Generator, *, random_inertials: bo
     mass, potential = np.zeros((1 + n, count, n, n)), np.zeros((1 + n, count))
     engine = None if random_inertials else make_engine(arm, Settings())
     for sample in range(count):
-        drawn = engine or make_engine(_with_random_inertias(arm, rng), Settings())
+        drawn = engine or make_engine(with_random_inertias(arm, rng), Settings())
         base, other = _positions(arm, rng), _positions(arm, rng)
         for block in range(1 + n):
             q = base.copy()
@@ -72,7 +72,7 @@ def draw(arm: Arm, count: int, rng: np.random.Generator, *, random_inertials: bo
 
 def regressor(arm: Arm, rng: np.random.Generator) -> np.ndarray:
     """Rows of the inverse-dynamics regressor at random q, qd, qdd, (rows, 10 bodies)."""
-    engine = make_engine(_with_random_inertias(arm, rng), Settings())
+    engine = make_engine(with_random_inertias(arm, rng), Settings())
     n = len(arm.coordinates)
     rows = []
     for _ in range(10 * len(arm.bodies) // n + 10):
@@ -94,7 +94,8 @@ def _potential_energy(engine: Engine, q: np.ndarray) -> float:
     return float(pin.computePotentialEnergy(engine.model, engine.data, positions))
 
 
-def _with_random_inertias(arm: Arm, rng: np.random.Generator) -> Arm:
+def with_random_inertias(arm: Arm, rng: np.random.Generator) -> Arm:
+    """The arm with the inertia of a possible rigid body, drawn anew, on every joint."""
     lengths = [float(np.linalg.norm(np.array(body.translation, dtype=float))) for body in arm.bodies]
     size = float(np.mean(lengths)) or 1.0
     return replace(arm, bodies=tuple(_random_body(body, size, rng) for body in arm.bodies))

@@ -1,0 +1,55 @@
+"""What `inspect` writes: its formats, which one is meant, and the text of each."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from spelgen.cli.console import note
+
+if TYPE_CHECKING:
+    from spelgen.formulas.formulas import Entry, Formulas
+    from spelgen.inspection import Inspection
+    from spelgen.proof.agreement import Verification
+
+Format = Literal["text", "json", "latex", "sympy"]
+_OF_SUFFIX: dict[str, Format] = {".json": "json", ".tex": "latex", ".py": "sympy"}
+
+
+def chosen(format: Format | None, output: Path | None) -> Format:
+    """The format named, else that of the output's suffix, else text."""
+    return format or _OF_SUFFIX.get(output.suffix.lower() if output else "", "text")
+
+
+def rendered(
+    found: Inspection, format: Format, *, formulas: bool, entry: Entry | None, proof: Verification | None
+) -> str:
+    """The text of the result, with a line end; with ``formulas``, or an ``entry``, the closed forms.
+
+    Raises SpelgenError for an entry that M does not have.
+    """
+    from spelgen.formulas import latex, sympy_module, text
+    from spelgen.formulas.formulas import WRITABLE
+
+    longest = WRITABLE if format in ("json", "sympy") else None
+    closed = None
+    if formulas or entry is not None or format in ("latex", "sympy"):
+        closed = found.closed_forms(entry, longest=longest)
+    if closed and format in ("latex", "sympy"):
+        _tell(closed, proof)
+        return latex.latex(closed) if format == "latex" else sympy_module.sympy_source(closed)
+    if format == "text":
+        told = found.text() if closed is None else text.text(closed)
+        return told + (f"\n\n{proof.text()}" if proof else "") + "\n"
+    data = found.to_dict() | ({"formulas": text.to_dict(closed)} if closed else {})
+    return json.dumps(data | ({"verification": proof.to_dict()} if proof else {}), indent=2) + "\n"
+
+
+def _tell(closed: Formulas, proof: Verification | None) -> None:
+    """What has no place in a file of formulas."""
+    names = [formula.name for formula in closed.unwritten]
+    if names:
+        note(f"too long to be written: {', '.join(names)}")
+    if proof:
+        note(proof.text())

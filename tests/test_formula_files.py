@@ -1,0 +1,228 @@
+"""What `inspect --formulas` writes: what a person reads, the files, and names that would be code."""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import re
+import subprocess
+import sys
+
+import pytest
+from arms import random_arm
+from formulas_read import assert_equal_to_pinocchio, read_back
+from typer.testing import CliRunner
+
+from spelgen.cli.main import app
+from spelgen.errors import SpelgenError
+from spelgen.formulas.formulas import formulas
+from spelgen.formulas.sympy_module import sympy_source
+from spelgen.formulas.text import text, to_dict
+from spelgen.pipeline import inspect, load
+from spelgen.structure.structure import derive
+
+TWO_LINK = """\
+two_link: closed forms for any inertial values
+
+M11 = Izz1R + Izz2 + 2*hx2*cos(q2) - 2*hy2*sin(q2)
+M21 = Izz2 + hx2*cos(q2) - hy2*sin(q2)
+M22 = Izz2
+V = 9.81*(hx1R*sin(q1) + hy1*cos(q1) + hx2*sin(q1 + q2) + hy2*cos(q1 + q2))
+
+V is given up to a constant.
+
+Base parameters, and the URDF's values
+  Izz1R = Izz1 + m2 [2.25]
+  hx1R = hx1 + m2 [1.5]
+  hy1 [0]
+  Izz2 [1.25]
+  hx2 [0.5]
+  hy2 [0]
+
+m is the mass [kg], h = m c the first moment [kg m] and I the inertia tensor [kg
+m2] about the origin of the joint's frame, turned so that z is the joint's axis,
+of all that moves rigidly with the joint: 1 joint1, 2 joint2. q is the joint's
+position [rad, m]."""
+
+# What a roboticist would write on a board.
+ON_A_BOARD = {
+    "rpr": {
+        "M11": "Izz1R + m2R*q2**2 + 2*hz2R*q2 + Ixx3R*cos(q3)**2 - Ixy3*sin(2*q3)",
+        "M32": "0",
+        "V": "9.81*(-hx3*cos(q3) + hy3*sin(q3))",
+    },
+    "scara": {
+        "M22": "Izz2R + 0.075625*m3R + Izz4 + 0.55*hx4*cos(q4) - 0.55*hy4*sin(q4)",
+        "M41": "-Izz4 - hx4*(0.325*cos(q2 - q4) + 0.275*cos(q4)) - hy4*(0.325*sin(q2 - q4) - 0.275*sin(q4))",
+    },
+    "ur10e": {
+        "M54": "(Ixz5 - 0.11985*hx5)*sin(q5) + (Iyz5 - 0.11985*hy5R)*cos(q5) - 0.5*Ixx6R*sin(q5)*sin(2*q6) "
+        "- Ixy6*sin(q5)*cos(2*q6) - Ixz6*cos(q5)*sin(q6) - Iyz6*cos(q5)*cos(q6) "
+        "+ hx6*(0.11655*cos(q5)*sin(q6) - 0.11985*sin(q5)*cos(q6)) "
+        "+ hy6*(0.11655*cos(q5)*cos(q6) + 0.11985*sin(q5)*sin(q6))",
+    },
+}
+
+
+@pytest.fixture
+def spelgen(tmp_path, monkeypatch):
+    """Run a command in an empty folder, in this process."""
+    monkeypatch.chdir(tmp_path)
+    return lambda *arguments: CliRunner().invoke(app, [str(each) for each in arguments])
+
+
+def test_small_arms_are_told_whole(robots, spelgen):
+    assert spelgen("inspect", robots / "two_link.urdf", "--formulas").stdout == TWO_LINK + "\n"
+
+
+@pytest.mark.parametrize("robot", ON_A_BOARD)
+def test_entries_as_on_a_board(robots, robot):
+    told = inspect(robots / f"{robot}.urdf").closed_forms()
+    rows = {row["name"]: row["expression"] for row in to_dict(told)["entries"]}
+    assert {name: rows[name] for name in ON_A_BOARD[robot]} == ON_A_BOARD[robot]
+
+
+def test_large_entries_are_counted_and_told_alone(robots, spelgen):
+    whole = spelgen("inspect", robots / "ur10e.urdf", "--formulas").stdout
+    assert "\nM11: 540 terms, not written out\n" in whole
+    assert "--entry 1,1 shows M11 alone" in " ".join(whole.split())
+    assert max(map(len, whole.splitlines())) <= 80
+    alone = spelgen("inspect", robots / "ur10e.urdf", "--entry", "1,1").stdout
+    assert alone.count("\nM") == 1 and "\nM11 = " in alone
+    assert max(map(len, alone.splitlines())) <= 80
+    assert_equal_to_pinocchio(load(robots / "ur10e.urdf").arm, read_back(alone), 36)
+
+
+def test_either_triangle_and_only_the_parameters_in_the_entry(robots, spelgen):
+    one, other = (spelgen("inspect", robots / "panda.urdf", "--entry", e).stdout for e in ("2,7", "7,2"))
+    assert one == other
+    assert_equal_to_pinocchio(load(robots / "panda.urdf").arm, read_back(one), 43)
+    assert re.findall(r"^  (\w+) \[", one, re.MULTILINE) == ["Izz7", "Ixz7", "Iyz7", "hx7", "hy7"]
+
+
+def test_zeros_of_the_inertials_shorten(robots):
+    """The SCARA-like wrist of ur10e: five of six axes do not feel joint 6 turn about its own centre."""
+    told = inspect(robots / "ur10e.urdf", assume="inertials").closed_forms()
+    rows = {row["name"]: row["expression"] for row in to_dict(told)["entries"]}
+    assert (rows["M62"], rows["M63"], rows["M64"], rows["M65"]) == (*3 * ["Izz6*cos(q5)"], "0")
+
+
+def test_json_has_the_same_expressions(robots, spelgen):
+    data = json.loads(spelgen("inspect", robots / "rpr.urdf", "--formulas", "--format", "json").stdout)
+    assert data["schema"] == 1
+    assert data["formulas"]["entries"][0] == {
+        "name": "M11",
+        "row": 1,
+        "col": 1,
+        "terms": 5,
+        "expression": ON_A_BOARD["rpr"]["M11"],
+    }
+    assert data["formulas"]["base_parameters"][0]["definition"] == "Izz1 + Iyy2 + Iyy3"
+    assert "formulas" not in json.loads(spelgen("inspect", robots / "rpr.urdf", "--format", "json").stdout)
+
+
+def test_without_inertials_there_are_no_values(robots, spelgen, tmp_path):
+    bare = re.sub(r"<inertial>.*?</inertial>", "", (robots / "rpr.urdf").read_text(), flags=re.DOTALL)
+    (tmp_path / "bare.urdf").write_text(bare)
+    told = spelgen("inspect", "bare.urdf", "--formulas").stdout
+    assert "Base parameters\n  Izz1R = Izz1 + Iyy2 + Iyy3\n" in told
+
+
+# ---- files
+
+
+@pytest.mark.parametrize(
+    ("name", "begins"),
+    [
+        ("m.tex", "% Closed forms"),
+        ("m.py", '"""Closed forms'),
+        ("m.json", '{\n  "schema": 1'),
+        ("m.txt", "rpr: structure"),
+    ],
+)
+def test_suffix_chooses_the_format(robots, spelgen, tmp_path, name, begins):
+    assert spelgen("inspect", robots / "rpr.urdf", "-o", name).stdout == f"wrote {name}\n"
+    assert (tmp_path / name).read_text().startswith(begins)
+
+
+def test_same_bytes_under_any_hash_seed(robots):
+    told = set()
+    for seed in ("1", "2"):
+        command = [
+            sys.executable,
+            "-m",
+            "spelgen",
+            "inspect",
+            str(robots / "six_dof.urdf"),
+            "--format",
+            "sympy",
+        ]
+        environment = os.environ | {"PYTHONHASHSEED": seed, "PYTHONPATH": str(robots.parent)}
+        told.add(subprocess.run(command, env=environment, capture_output=True, check=True).stdout)
+    assert len(told) == 1
+
+
+def test_a_long_entry_is_missing_and_said():
+    arm = random_arm(4, 0)
+    source = sympy_source(formulas(arm, derive(arm), longest=100))
+    names: dict = {}
+    exec(compile(source, "closed_forms.py", "exec"), names)
+    assert "# M11: 466 terms, not written out\n# M21: 279 terms" in source
+    assert (2, 2) in names["entries"] and (1, 1) not in names["entries"]
+    assert "M" not in names
+
+
+def test_what_is_too_large_is_not_expanded():
+    """The first entries of eight generic joints have more than 10^5 terms."""
+    arm = random_arm(8, 0)
+    found = formulas(arm, derive(arm))
+    terms = {formula.name: formula.terms for formula in found.entries}
+    assert (terms["M11"], terms["M55"], terms["M88"]) == (None, 466, 1)
+    assert "M11: too many terms to be expanded\n" in text(found)
+
+
+EVIL = {
+    "rpr": "coding: utf_7&#10;import os; os.mkdir(&quot;taken&quot;)#",  # a file's encoding, PEP 263
+    "joint1": "&quot;&quot;&quot; + open('taken', 'w') #",
+    "joint2": r"\end{align*}\input{taken}%",
+    "joint3": "taken&#13;&#8232;&#133;x",
+}
+
+
+def test_hostile_names_are_comments_only(robots, spelgen, tmp_path):
+    """Names that are code, TeX or line ends."""
+    urdf = (robots / "rpr.urdf").read_text()
+    for name, evil in EVIL.items():
+        urdf = urdf.replace(f'"{name}"', f'"{evil}"')
+    (tmp_path / "evil.urdf").write_text(urdf)
+    outputs = ("out.py", "out.tex", "out.txt")
+    for name in outputs:
+        result = spelgen("inspect", "evil.urdf", "--formulas", "-o", name)
+        assert result.exit_code == 0, result.stderr
+    source, tex, told = ((tmp_path / name).read_text(encoding="ascii") for name in outputs)
+    assert source.count("taken") == tex.count("taken") == 4
+    assert "taken" not in "".join(line for line in tex.splitlines() if not line.startswith("%"))
+    assert set(re.findall(r"[^ -~]", told)) == {"\n"}
+    tree = ast.parse(source)
+    texts = [x.value for x in ast.walk(tree) if isinstance(x, ast.Constant) and isinstance(x.value, str)]
+    assert all(re.fullmatch(r"[A-Za-z]+\d+R?", each) for each in texts if each != tree.body[0].value.value)
+    assert [x.module for x in ast.walk(tree) if isinstance(x, ast.ImportFrom | ast.Import)] == ["sympy"]
+    assert not any(line.startswith("#") for line in source.splitlines()[:2])
+    subprocess.run([sys.executable, "-I", "out.py"], cwd=tmp_path, check=True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*outputs, "evil.urdf"])
+
+
+# ---- errors
+
+
+def test_entries_that_are_none(robots, spelgen):
+    failed = spelgen("inspect", robots / "rpr.urdf", "--entry", "4,1")
+    assert failed.exit_code == 1
+    assert failed.stderr == "got the entry 4,1 of M, expected a row and a column from 1 to 3, or V\n"
+    with pytest.raises(SpelgenError, match="0,1"):
+        inspect(robots / "rpr.urdf").closed_forms((0, 1))
+    for nonsense in ("x", "1", "1,2,3", "M11", "v"):
+        failed = spelgen("inspect", "no.urdf", "--entry", nonsense)
+        assert failed.exit_code == 2
+        assert "name it as ROW,COLUMN or V" in failed.stderr

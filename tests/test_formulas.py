@@ -1,0 +1,97 @@
+"""Closed forms: each equals Pinocchio, as text, as LaTeX and in the SymPy file."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from formulas_read import assert_close, assert_equal_to_pinocchio, read_back, without_latex
+from hypothesis import HealthCheck, given, settings
+from random_arms import arms
+
+from spelgen.arm.arm import make_arm
+from spelgen.files import write_text
+from spelgen.formulas.formulas import WRITABLE, formulas
+from spelgen.formulas.latex import latex
+from spelgen.formulas.sympy_module import sympy_source
+from spelgen.formulas.text import text
+from spelgen.pipeline import load
+from spelgen.proof.numeric_samples import with_random_inertias
+from spelgen.structure.structure import derive
+from spelgen.urdf.read import read_urdf
+
+ROBOTS = ("two_link", "rpr", "scara", "six_dof", "ur10e")
+
+RUN_ALONE = """
+import json, sys
+sys.path.insert(0, ".")
+sys.modules["spelgen"] = None  # cannot be imported
+import closed_forms as f
+import sympy
+names, numbers = list(f.values), [float(value) for value in f.values.values()]
+matrix = sympy.lambdify([*f.q, *names], f.M.tolist(), "math")
+energy = sympy.lambdify([*f.q, *names], f.V, "math")
+found = [[matrix(*q, *numbers), energy(*q, *numbers)] for q in json.loads(sys.argv[1])]
+assert set(names) == set(f.base_parameters)
+print(json.dumps(found))
+"""
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_sympy_file_alone_equals_pinocchio(robots, robot, tmp_path):
+    """The file is executed where this package cannot be imported; Pinocchio reads the URDF by itself."""
+    urdf = robots / f"{robot}.urdf"
+    arm = load(urdf).arm
+    write_text(tmp_path / "closed_forms.py", sympy_source(formulas(arm, derive(arm), longest=WRITABLE)))
+    model = pin.buildModelFromUrdf(str(urdf))
+    model.gravity.linear = np.array(arm.gravity, dtype=float)
+    points = np.random.default_rng(0).uniform(-2, 2, (3, model.nq))
+    command = [sys.executable, "-I", "-c", RUN_ALONE, json.dumps(points.tolist())]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    masses, energies = zip(*json.loads(done.stdout), strict=True)
+    data = model.createData()
+    for q, mass in zip(points, masses, strict=True):
+        upper = np.triu(pin.crba(model, data, q))
+        assert_close(mass, upper + np.triu(upper, 1).T)
+    true = [pin.computePotentialEnergy(model, data, q) for q in points]
+    assert_close(np.diff(energies), np.diff(true))
+
+
+@pytest.mark.parametrize("assume", ["kinematics", "inertials"])
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_text_read_back_equals_pinocchio(robots, robot, assume):
+    """By any inertial values under ``kinematics``, by the URDF's under ``inertials``."""
+    arm = load(robots / f"{robot}.urdf").arm
+    structure = derive(arm, assume)
+    found = formulas(arm, structure, longest=WRITABLE)
+    assert not found.unwritten
+    if assume == "kinematics":
+        arm = with_random_inertias(arm, np.random.default_rng(1))
+    assert_equal_to_pinocchio(arm, read_back(text(found)), structure.base_parameters)
+
+
+@pytest.mark.parametrize("robot", ["two_link", "rpr", "scara", "six_dof"])
+def test_latex_read_back_equals_pinocchio(robots, robot):
+    arm = load(robots / f"{robot}.urdf").arm
+    structure = derive(arm)
+    rows = without_latex(latex(formulas(arm, structure, longest=WRITABLE)))
+    drawn = with_random_inertias(arm, np.random.default_rng(2))
+    assert_equal_to_pinocchio(drawn, rows, structure.base_parameters)
+
+
+@settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck))
+@given(drawn=arms())
+def test_random_arms_equal_pinocchio(drawn, tmp_path_factory):
+    """Any joint types, tilted and parallel axes, followers in the chain and beside it."""
+    path = tmp_path_factory.mktemp("drawn") / "arm.urdf"
+    path.write_text(drawn.text)
+    arm = make_arm(read_urdf(path), joints=drawn.joints)
+    structure = derive(arm)
+    rows = read_back(text(formulas(arm, structure)))
+    if rows:
+        assert_equal_to_pinocchio(arm, rows, structure.base_parameters, tolerance=1e-8)
