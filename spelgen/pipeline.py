@@ -14,7 +14,7 @@ from spelgen.inspection import Inspection
 from spelgen.proof import verification
 from spelgen.proof.agreement import Verification
 from spelgen.settings import Settings, check_joint_names, load_settings
-from spelgen.spec import Assume, ModelSpec, Options, Preset, read_header
+from spelgen.spec import Assume, ModelSpec, Net, Options, Preset, read_header
 from spelgen.structure.structure import derive
 from spelgen.urdf.read import read_urdf
 from spelgen.urdf.robot import Robot
@@ -85,6 +85,7 @@ def build(
     *,
     snap_tolerance: float = 2e-3,
     preset: Preset = "minimal",
+    net: Net | None = None,
     width: int = 64,
     depth: int = 2,
 ) -> str:
@@ -93,6 +94,7 @@ def build(
     """
     options = Options(
         preset=preset,
+        net=net,
         assume=assume,
         joints=None if joints is None else tuple(joints),
         tip=tip,

@@ -14,13 +14,45 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import yaml
+
 from spelgen.errors import ModuleError
 
 Assume = Literal["kinematics", "inertials"]
 Kind = Literal["zero", "constant", "varying"]
-Preset = Literal["minimal"]
+Preset = Literal["minimal", "spel", "spel-kan", "phnode"]
+Net = Literal["mlp", "kan"]
 Entries = tuple[tuple[int, int, float], ...]
 """A sparse symmetric matrix by its lower triangle: (row, column, value), 0-based."""
+
+_PRESETS = Path(__file__).parent / "presets"
+
+
+@dataclass(frozen=True)
+class Design:
+    """A point in the space of models: how each quantity of the equations of motion is made.
+
+    derived: by the arm's structure. dense: as if nothing were known of the arm (Wang et al., Sci Rep
+    15:33179, 2025, and Duong et al., IEEE T-RO 40:3695, 2024), over all three axes of each joint where it
+    says 3n.
+    """
+
+    mass: Literal["derived", "dense-3n"]
+    potential: Literal["derived", "dense"]
+    dissipation: Literal["per-joint", "dense-n", "dense-3n"]
+    input: Literal["derived", "dense-3n"]
+    net: Net
+    encoding: Literal["own", "group"]
+    """What a network reads: cos q and sin q or scaled q of the joints it depends on, or the nine or three
+    numbers of every joint's R or r.
+    """
+
+
+def load_design(preset: Preset, net: Net | None = None) -> Design:
+    """The design that ``presets/PRESET.yaml`` names, with ``net`` in place of its own network if given."""
+    data = yaml.safe_load((_PRESETS / f"{preset}.yaml").read_text(encoding="utf-8"))
+    del data["about"]
+    return Design(**(data | ({"net": net} if net else {})))
 
 
 @dataclass(frozen=True)
@@ -28,6 +60,8 @@ class Options:
     """What the user chose when building; enough to build the same module again from the same URDF."""
 
     preset: Preset = "minimal"
+    net: Net | None = None
+    """None: the preset's own."""
     assume: Assume = "kinematics"
     joints: tuple[str, ...] | None = None
     tip: str | None = None
@@ -87,6 +121,7 @@ class ModelSpec:
     urdf_sha256: str
     gravity: tuple[float, float, float]
     options: Options
+    design: Design
     joints: tuple[JointSpec, ...]
     entries: tuple[tuple[int, int, Kind, tuple[int, ...]], ...]
     """(row, column, kind, joints) of M's lower triangle: what a reader is shown."""
@@ -107,6 +142,7 @@ class ModelSpec:
         """The spec that ``to_json`` wrote."""
         data = _tupled(json.loads(text))
         data["options"] = Options(**data["options"])
+        data["design"] = Design(**data["design"])
         data["joints"] = tuple(JointSpec(**joint) for joint in data["joints"])
         data["outputs"] = tuple(OutputSpec(**output) for output in data["outputs"])
         data["constants"] = tuple(ConstantSpec(**constant) for constant in data["constants"])

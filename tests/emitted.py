@@ -37,19 +37,29 @@ def import_source(source: str, path: Path) -> ModuleType:
 
 
 @cache
-def built(robot: str, assume: str = "kinematics") -> tuple[str, Structure]:
+def built(
+    robot: str, assume: str = "kinematics", preset: str = "minimal", net: str | None = None
+) -> tuple[str, Structure]:
     """Source and structure of one of the robots that come with spelgen."""
     loaded = load(ROBOTS / f"{robot}.urdf")
     structure = derive(loaded.arm, assume)
-    spec = plan_model(
-        loaded.arm, structure, Options(assume=assume), urdf=f"{robot}.urdf", urdf_sha256=loaded.robot.digest
-    )
+    options = Options(preset=preset, net=net, assume=assume)
+    spec = plan_model(loaded.arm, structure, options, urdf=f"{robot}.urdf", urdf_sha256=loaded.robot.digest)
     return emit(spec), structure
 
 
-def random_model(robot: str, folder: Path, *, seed: int, deviation: float | None = None) -> nn.Module:
+def random_model(
+    robot: str,
+    folder: Path,
+    *,
+    seed: int,
+    deviation: float | None = None,
+    preset: str = "minimal",
+    net: str | None = None,
+) -> nn.Module:
     """The robot's model with random weights, as ``randomise`` draws them."""
-    model = import_source(built(robot)[0], folder / f"{robot}_spel.py").Model(seed=seed)
+    source = built(robot, preset=preset, net=net)[0]
+    model = import_source(source, folder / f"{robot}_spel.py").Model(seed=seed)
     randomise(model, seed, deviation)
     return model
 
@@ -76,30 +86,41 @@ def frictionless(model: nn.Module) -> nn.Module:
 class ExactFunctions(nn.Module):
     """Stands in for a network: y = (polynomial - mean) / scale, with exact derivatives."""
 
-    def __init__(self, functions: list[fmpq_mpoly], mean: torch.Tensor, scale: torch.Tensor, n: int):
+    def __init__(self, functions: list[fmpq_mpoly], mean: torch.Tensor, scale: torch.Tensor, joints: tuple):
         super().__init__()
-        self.mean, self.scale, self.n = mean, scale, n
+        self.mean, self.scale, self.n = mean, scale, len(joints)
+        self.center = torch.tensor([joint.center for joint in joints], dtype=torch.float64)
+        self.reach = torch.tensor([joint.reach for joint in joints], dtype=torch.float64)
         self.values = [_compiled(f) for f in functions]
         self.slopes = [
-            [_compiled(f.derivative(3 * k + letter)) for k in range(n) for letter in range(3)]
+            [_compiled(f.derivative(3 * k + letter)) for k in range(self.n) for letter in range(3)]
             for f in functions
         ]
 
-    def forward(self, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        variables = torch.stack([q.cos(), q.sin(), q], dim=-1).flatten(-2)  # (..., 3 n): c1, s1, q1, c2, ...
+    def prepared(self, outlay: torch.Tensor, offset: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return outlay, offset
+
+    def forward(
+        self, features: torch.Tensor, laid_out: tuple[torch.Tensor, torch.Tensor]
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        outlay, offset = laid_out
+        cos, sin, *rest = features.split(self.n, dim=-1)
+        q = rest[0] * self.reach + self.center if rest else torch.zeros_like(cos)
+        variables = torch.stack([cos, sin, q], dim=-1).flatten(-2)  # (..., 3 n): c1, s1, q1, c2, ...
         y = torch.stack([_evaluated(f, variables) for f in self.values], dim=-1)
         slopes = torch.stack(
             [torch.stack([_evaluated(d, variables) for d in row], dim=-1) for row in self.slopes], dim=-2
         )
         by_c, by_s, by_q = slopes.unflatten(-1, (self.n, 3)).unbind(dim=-1)
-        jacobian = by_s * q.cos().unsqueeze(-2) - by_c * q.sin().unsqueeze(-2) + by_q
-        return (y - self.mean) / self.scale, jacobian / self.scale.unsqueeze(-1)
+        jacobian = torch.cat([by_c, by_s, by_q * self.reach] if rest else [by_c, by_s], dim=-1)
+        y = (y - self.mean) / self.scale
+        return y @ outlay.mT + offset, outlay @ (jacobian / self.scale.unsqueeze(-1))
 
     def pull(self, jacobian: torch.Tensor, cotangent: torch.Tensor) -> torch.Tensor:
         return (cotangent.unsqueeze(-2) @ jacobian).squeeze(-2)
 
-    def push(self, jacobian: torch.Tensor, qd: torch.Tensor) -> torch.Tensor:
-        return (jacobian @ qd.unsqueeze(-1)).squeeze(-1)
+    def push(self, jacobian: torch.Tensor, rate: torch.Tensor) -> torch.Tensor:
+        return (jacobian @ rate.unsqueeze(-1)).squeeze(-1)
 
 
 def exact_model(robot: str, folder: Path) -> nn.Module:
@@ -113,10 +134,12 @@ def exact_model(robot: str, folder: Path) -> nn.Module:
     true = polynomials(load(ROBOTS / f"{robot}.urdf").arm, inertials=True)
     if structure.outputs:
         functions = [true.combination(output.reads) for output in structure.outputs]
-        model.mass_network = ExactFunctions(functions, model.output_mean, model.output_scale, model.n)
+        model.mass_network = ExactFunctions(functions, model.output_mean, model.output_scale, module.JOINTS)
     if structure.potential:
         scale = torch.tensor([module.POTENTIAL_SCALE], dtype=torch.float64)
-        model.potential_network = ExactFunctions([true.potential], torch.zeros_like(scale), scale, model.n)
+        model.potential_network = ExactFunctions(
+            [true.potential], torch.zeros_like(scale), scale, module.JOINTS
+        )
     constants = [true.combination(constant.reads) for constant in structure.constants]
     assert all(sum(c.degrees()) == 0 for c in constants), "a constant depends on q"
     values = torch.tensor([_float(c.leading_coefficient()) for c in constants], dtype=torch.float64)

@@ -74,8 +74,9 @@ def test_written_out_derivatives_equal_autograd(robot, deviation, tmp_path):
     _near(rate[..., n:], -slope)
     _near(rate[..., :n], qd)
     _, mass_rate = torch.func.jvp(model.mass_matrix, (q.detach(),), (qd,))
-    _, trace, guard = model._mass(q)
-    _near(model._mass_rate(qd, trace, guard), mass_rate)
+    features = model._features(q)
+    _, memory = model._mass(features, model.prepare())
+    _near(model._mass_rate(model._features_rate(features, qd), memory), mass_rate)
 
 
 def _near(ours: torch.Tensor, reference: torch.Tensor) -> None:
@@ -94,7 +95,7 @@ def test_mass_matrix_is_positive_definite_for_any_weights(robot, tmp_path):
             q = 8 * torch.rand(10_000, model.n, dtype=torch.float64, generator=generator) - 4
             mass = model.mass_matrix(q)
             assert torch.linalg.eigvalsh(mass)[:, 0].min() > 0
-            lifted += model._mass(q)[2] is not None
+            lifted += _awake(model, q)
     assert lifted > 50, "the draws were to need the guard"
 
 
@@ -112,7 +113,12 @@ def test_guard_keeps_zeros_and_relations_and_sleeps_at_nominal_values(robot, tmp
     residual = mass.flatten(1) - mass.flatten(1) @ torch.linalg.pinv(basis) @ basis
     assert residual.abs().max() < 1e-9 * mass.abs().max()
     nominal = exact_model(robot, tmp_path)
-    assert nominal._mass(q)[2] is None
+    assert not _awake(nominal, q)
+
+
+def _awake(model: torch.nn.Module, q: torch.Tensor) -> bool:
+    """Whether the guard of M acts somewhere in ``q``."""
+    return model._mass(model._features(q), model.prepare())[1][1] is not None
 
 
 @pytest.mark.parametrize("robot", SIX)
@@ -120,11 +126,13 @@ def test_outputs_read_their_own_joints_only(robot, tmp_path):
     """Moving any other joint leaves an output's bits unchanged, and its own joints move it."""
     model = random_model(robot, tmp_path, seed=2)
     q = states(model.n, 50)[0]
-    before = model.mass_network(q)[0]
+    outputs = len(built(robot)[1].outputs)
+    layers = model.mass_network.prepared(torch.eye(outputs, dtype=torch.float64), torch.zeros(outputs))
+    before = model.mass_network(model._features(q), layers)[0]
     for joint in range(model.n):
         moved = q.clone()
         moved[:, joint] += 0.7
-        changed = (model.mass_network(moved)[0] != before).any(dim=0)
+        changed = (model.mass_network(model._features(moved), layers)[0] != before).any(dim=0)
         expected = [joint in output.joints for output in built(robot)[1].outputs]
         assert changed.tolist() == expected
 

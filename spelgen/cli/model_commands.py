@@ -22,7 +22,7 @@ from spelgen.cli.options import (
     Tip,
 )
 from spelgen.files import write_text
-from spelgen.spec import Preset
+from spelgen.spec import Net, Preset
 
 
 def inspect(
@@ -39,7 +39,7 @@ def inspect(
         Format | None,
         typer.Option(
             "--format",
-            help="Of the result; without it, by the suffix of -o: .json, .tex, .py, else text.",
+            help="Of the result; without it, by the suffix of -o: .json, .html, .tex, .py, else text.",
             show_default=False,
         ),
     ] = None,
@@ -78,6 +78,9 @@ def build(
     assume: Assumption = "kinematics",
     snap_tol: SnapTolerance = 2e-3,
     preset: Annotated[Preset, typer.Option("--preset", help="How the model is made.")] = "minimal",
+    net: Annotated[
+        Net | None, typer.Option("--net", help="The kind of networks; default: the preset's own.")
+    ] = None,
     width: Annotated[int, typer.Option("--width", min=1, max=4096, help="Units in a hidden layer.")] = 64,
     depth: Annotated[int, typer.Option("--depth", min=1, max=16, help="Hidden layers.")] = 2,
     output: Annotated[
@@ -96,6 +99,7 @@ def build(
         assume,
         snap_tolerance=snap_tol,
         preset=preset,
+        net=net,
         width=width,
         depth=depth,
     )

@@ -7,7 +7,7 @@ code.
 from __future__ import annotations
 
 import json
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import asdict
 
 from spelgen.labels import joint_ranges
@@ -18,14 +18,19 @@ _WIDTH = 100
 _LEAST_UNITS = 4
 _POTENTIAL_SHARE = 0.5
 _FRICTION_HIDDEN = 8
+_FRICTION_START = 0.35
 _SLOW = 0.03
 _PLACE_SHARE = 0.1
+_GRID = 6
+_KAN_SHARE = 0.25
+_LEAST_KAN_UNITS = 2
+_FRICTION_AXES = {"per-joint": 0, "dense-n": 1, "dense-3n": 3}
+"""Of each joint, over which one matrix D extends."""
 
 
 def emit(spec: ModelSpec) -> str:
     """The Python source of the module that ``spec`` describes; it needs torch alone."""
-    n, depth = len(spec.joints), spec.options.depth
-    potential_width = max(_LEAST_UNITS, round(_POTENTIAL_SHARE * spec.options.width))
+    n, design = len(spec.joints), spec.design
     return render(
         "module.py.jinja",
         title=f"Port-Hamiltonian model of an arm with {n} joint{'s' * (n > 1)}, written by `spelgen build`.",
@@ -36,29 +41,68 @@ def emit(spec: ModelSpec) -> str:
         record=_record(spec),
         n=n,
         joints=_table("JOINTS = ", [_joint_row(joint) for joint in spec.joints]),
-        constants=_table(
-            "CONSTANTS: tuple[Constant, ...] = ",
-            [_call("Constant", start=c.start, scale=c.scale, entries=c.basis) for c in spec.constants],
-        ),
-        outputs=spec.outputs
-        and _table(
-            "OUTPUTS = ",
-            [
-                _call("Output", joints=o.joints, mean=o.center, scale=o.scale, entries=o.basis)
-                for o in spec.outputs
-            ],
-        ),
-        mass_hidden=_table("MASS_HIDDEN = ", [_literal(row) for row in _hidden(spec)]),
-        depth=depth,
-        guard=spec.guard,
-        potential_joints=_literal(spec.potential) if spec.potential else "",
-        potential_hidden=_literal((potential_width,) * depth),
-        potential_scale=spec.potential_scale,
+        sliding=any(joint.kind == "prismatic" for joint in spec.joints),
+        net=design.net,
+        group=design.encoding == "group",
+        input="dense" if design.input == "dense-3n" else "derived",
+        friction_axes=_FRICTION_AXES[design.dissipation],
+        depth=spec.options.depth,
+        width=_units(spec),
+        grid=_GRID,
         friction_hidden=_FRICTION_HIDDEN,
+        friction_start=_FRICTION_START,
         slow=_SLOW,
         place_share=_PLACE_SHARE,
         uses_network=bool(spec.outputs or spec.potential),
+        **_mass(spec),
+        **_potential(spec),
     )
+
+
+def _mass(spec: ModelSpec) -> dict[str, object]:
+    """What the template shows of M."""
+    if spec.design.mass == "dense-3n":
+        return {
+            "mass": "dense",
+            "mean_mass": _table("MEAN_MASS = ", [_literal(row) for row in _mean_mass(spec)]),
+        }
+    constants = [_call("Constant", start=c.start, scale=c.scale, entries=c.basis) for c in spec.constants]
+    outputs = [
+        _call("Output", joints=o.joints, mean=o.center, scale=o.scale, entries=o.basis) for o in spec.outputs
+    ]
+    return {
+        "mass": "derived" if outputs else "constant",
+        "constants": _table("CONSTANTS: tuple[Constant, ...] = ", constants),
+        "outputs": outputs and _table("OUTPUTS = ", outputs),
+        "mass_hidden": _table("MASS_HIDDEN = ", [_literal(row) for row in _hidden(spec)]),
+        "guard": spec.guard,
+    }
+
+
+def _mean_mass(spec: ModelSpec) -> tuple[tuple[float, ...], ...]:
+    """The lower triangle of the nominal mean of M, row by row."""
+    terms = [(c.start, c.basis) for c in spec.constants] + [(o.center, o.basis) for o in spec.outputs]
+    mean: defaultdict[tuple[int, int], float] = defaultdict(float)
+    for size, basis in terms:
+        for row, column, value in basis:
+            mean[row, column] += size * value
+    rows = range(len(spec.joints))
+    return tuple(tuple(float(f"{mean[row, column]:.6g}") for column in range(row + 1)) for row in rows)
+
+
+def _potential(spec: ModelSpec) -> dict[str, object]:
+    """What the template shows of V."""
+    return {
+        "potential_joints": _literal(spec.potential) if spec.potential else "",
+        "potential_width": max(_LEAST_UNITS, round(_POTENTIAL_SHARE * _units(spec))),
+        "potential_scale": spec.potential_scale,
+    }
+
+
+def _units(spec: ModelSpec) -> int:
+    """Units in a hidden layer; those of a Kolmogorov-Arnold network have a grid of numbers on every edge."""
+    width = spec.options.width
+    return width if spec.design.net == "mlp" else max(_LEAST_UNITS, round(_KAN_SHARE * width))
 
 
 def _joint_row(joint: JointSpec) -> str:
@@ -110,15 +154,19 @@ def _literal(value: object, indent: int = 0) -> str:
 
 def _hidden(spec: ModelSpec) -> tuple[tuple[tuple[int, ...], int], ...]:
     """How many units of a hidden layer read which joints, in proportion to the outputs that do."""
+    least = _LEAST_UNITS if spec.design.net == "mlp" else _LEAST_KAN_UNITS
     shares = Counter(output.joints for output in spec.outputs)
     total = sum(shares.values())
     return tuple(
-        (joints, max(_LEAST_UNITS, round(spec.options.width * count / total)))
+        (joints, max(least, round(_units(spec) * count / total)))
         for joints, count in sorted(shares.items(), key=lambda item: (len(item[0]), item[0]))
     )
 
 
 def _count(spec: ModelSpec) -> str:
+    if spec.design.mass == "dense-3n":
+        rows = 3 * len(spec.joints)
+        return f"{rows * (rows + 1) // 2} learned functions of q make M^-1 over all axes"
     outputs, constants = len(spec.outputs), len(spec.constants)
     return (
         f"{outputs} learned function{'s' * (outputs != 1)} of q and {constants} constant{'s' * (constants != 1)} "

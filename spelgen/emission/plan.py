@@ -5,9 +5,10 @@ from __future__ import annotations
 import keyword
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 
 from spelgen.arm.arm import Arm, Coordinate
-from spelgen.spec import ConstantSpec, Entries, JointSpec, ModelSpec, Options, OutputSpec
+from spelgen.spec import ConstantSpec, Entries, JointSpec, ModelSpec, Options, OutputSpec, load_design
 from spelgen.structure.basis import Weights
 from spelgen.structure.nominal import Nominal, nominal, working_range
 from spelgen.structure.structure import Structure
@@ -36,6 +37,8 @@ def plan_model(
     guessed.
     """
     known = rotors or {}
+    design = load_design(options.preset, options.net)
+    everything = tuple(range(len(arm.coordinates)))
     sizes = nominal(arm, structure)
     identifiers = _identifiers([coordinate.name for coordinate in arm.coordinates])
     x, y, z = (float(g) for g in arm.gravity)
@@ -44,7 +47,8 @@ def plan_model(
         urdf=urdf,
         urdf_sha256=urdf_sha256,
         gravity=(x, y, z),
-        options=options,
+        options=replace(options, net=design.net),
+        design=design,
         joints=tuple(
             _joint(
                 coordinate, identifiers[k], sizes, k, known.get(coordinate.name) or _guessed_rotor(coordinate)
@@ -53,7 +57,12 @@ def plan_model(
         ),
         entries=tuple((e.row, e.column, e.kind, e.joints) for e in structure.entries),
         outputs=tuple(
-            OutputSpec(output.joints, _floats(output.basis), center, scale)
+            OutputSpec(
+                everything if design.encoding == "group" else output.joints,
+                _floats(output.basis),
+                center,
+                scale,
+            )
             for output, center, scale in zip(
                 structure.outputs, sizes.output_means, sizes.output_scales, strict=True
             )
@@ -64,7 +73,7 @@ def plan_model(
                 structure.constants, sizes.constants, sizes.constant_scales, strict=True
             )
         ),
-        potential=structure.potential,
+        potential=everything if design.potential == "dense" else structure.potential,
         potential_scale=sizes.potential_scale,
         guard=float(f"{max(_GUARD_SHARE * sizes.least_share, 1e-4):.0e}"),
         started_from_urdf=sizes.from_urdf,

@@ -21,10 +21,11 @@ Record, by which `spelgen check` tells whether this module is up to date:
     robot: "rpr"
     urdf: "rpr.urdf"
     urdf_sha256: "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d"
-    spec_sha256: "0830195eaa09f089277fa7ea50137cea19adbbdad6dc81e397963ce36c1baf30"
+    spec_sha256: "0aaf49956eba9db7b9568ed5f14b5438f52447368c40744b48c2e1de15b8ba5b"
     option assume: "kinematics"
     option depth: 2
     option joints: null
+    option net: "mlp"
     option preset: "minimal"
     option snap_tolerance: 0.002
     option tip: null
@@ -127,11 +128,11 @@ OUTPUTS = (
 )
 # in each hidden layer: the joints that some units read, and how many units do
 MASS_HIDDEN = (((2,), 21), ((1, 2), 43))
-MASS_DEPTH = 2
 GUARD = 0.08  # least eigenvalue of M, relative to its nominal mean, that is left as it is
 POTENTIAL_JOINTS = (2,)  # the joints that V depends on
-POTENTIAL_HIDDEN = (32, 32)
+POTENTIAL_WIDTH = 32
 POTENTIAL_SCALE = 0.703291  # [J]
+DEPTH = 2  # hidden layers of a network
 FRICTION_HIDDEN = 8
 SLOW = 0.03  # below this share of its usual speed a joint's dry friction fades to zero
 PLACE_SHARE = 0.1  # how much friction's networks see of where a joint is, relative to its speed
@@ -152,104 +153,133 @@ def stacked(matrices: list[Entries]) -> Tensor:
     return rows.reshape(len(matrices), n * n)
 
 
-Trace = tuple[Tensor, tuple[Tensor, ...], tuple[Tensor, ...]]
+class Reading(NamedTuple):
+    """The inputs of a network: share * (spread features), (inputs, ...)."""
+
+    joints: tuple[int, ...]  # whose each input is
+    share: Tensor
+    spread: Tensor  # (inputs, features)
+
+
+def reading(joints: Iterable[int], shares: list[float]) -> Reading:
+    """cos q and sin q of turning joints, the scaled q of sliding ones, times each joint's share."""
+    n = len(JOINTS)
+    turning = [joint for joint in joints if JOINTS[joint].revolute]
+    sliding = [joint for joint in joints if not JOINTS[joint].revolute]
+    whose = turning + turning + sliding
+    places = turning + [n + joint for joint in turning] + [2 * n + joint for joint in sliding]
+    spread = torch.eye(3 * n, dtype=torch.float64)[places]
+    return Reading(tuple(whose), vector(shares[joint] for joint in whose), spread)
+
+
+class Layers(NamedTuple):
+    """A network's weights made ready for many states; see ``Network.prepared``."""
+
+    weights: tuple[Tensor, ...]
+    biases: tuple[Tensor, ...]
+
+
+Trace = tuple[tuple[Tensor, ...], Layers]
 
 
 class Network(nn.Module):
-    """A tanh network y(q), with its derivatives written out.
+    """A tanh network, with its derivatives written out.
 
-    It reads cos q and sin q of turning joints and the scaled q of sliding ones, times each joint's
-    ``share``. ``layers`` names, unit by unit, the joints that each layer's units may read; weights
-    between others are masked, so that a unit has no path to a joint it must not depend on.
+    ``layers`` names, unit by unit, the joints that each layer's units may read; weights between
+    others are masked, so that a unit has no path to a joint it must not depend on.
     """
 
-    turning: Tensor
-    sliding: Tensor
-    center: Tensor
-    reach: Tensor
-    select: Tensor
+    spread: Tensor
 
     def __init__(
         self,
-        joints: tuple[int, ...],
-        share: Tensor,
+        reading: Reading,
         layers: tuple[tuple[frozenset[int], ...], ...],
         generator: torch.Generator,
     ) -> None:
         super().__init__()
-        turning = [joint for joint in joints if JOINTS[joint].revolute]
-        sliding = [joint for joint in joints if not JOINTS[joint].revolute]
-        self.register_buffer("turning", torch.tensor(turning, dtype=torch.long))
-        self.register_buffer("sliding", torch.tensor(sliding, dtype=torch.long))
-        self.register_buffer("center", vector(JOINTS[i].center for i in sliding))
-        self.register_buffer("reach", vector(JOINTS[i].reach for i in sliding))
-        # spreads derivatives with respect to the joints read over all of q
-        everything = torch.eye(len(JOINTS), dtype=torch.float64)
-        self.register_buffer("select", everything[turning + sliding])
+        self.register_buffer("spread", reading.spread)
         self.weights = nn.ParameterList()
         self.biases = nn.ParameterList()
-        below = tuple(frozenset((joint,)) for joint in turning + turning + sliding)
+        below = tuple(frozenset((joint,)) for joint in reading.joints)
         for index, units in enumerate(layers):
             allowed = [[float(lower <= upper) for lower in below] for upper in units]
             mask = torch.tensor(allowed, dtype=torch.float64)
             weight = torch.randn(mask.shape, dtype=torch.float64, generator=generator)
             self.weights.append(nn.Parameter(weight / mask.sum(dim=1, keepdim=True).sqrt()))
-            if index == 0:
-                mask = mask * share[turning + turning + sliding]
-            self.register_buffer(f"mask{index}", mask)
+            self.register_buffer(f"mask{index}", mask * reading.share if index == 0 else mask)
             self.biases.append(nn.Parameter(torch.zeros(len(units), dtype=torch.float64)))
             below = units
         nn.init.zeros_(self.weights[-1])  # so that the model starts at its nominal means
 
-    def forward(self, q: Tensor) -> tuple[Tensor, Trace]:
-        """y, (..., outputs), of q, (..., n); and what ``pull`` and ``push`` need."""
-        angle, slide = q[..., self.turning], q[..., self.sliding]
-        features = torch.cat([angle.cos(), angle.sin(), (slide - self.center) / self.reach], dim=-1)
-        weights = tuple(w * self.get_buffer(f"mask{i}") for i, w in enumerate(self.weights))
+    def prepared(self, outlay: Tensor, offset: Tensor) -> Layers:
+        """The weights for the features as they are, and for offset + outlay y in place of y.
+
+        tanh x is computed as 2 sigmoid(2 x) - 1, which takes a fraction of the time.
+        """
+        weights, biases = [], []
+        for index, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            weight = weight * self.get_buffer(f"mask{index}")
+            if index == 0:
+                weight = weight @ self.spread
+            else:
+                bias, weight = bias - weight.sum(dim=1), 2 * weight
+            weights.append(2 * weight)
+            biases.append(2 * bias)
+        weights[-1] = 0.5 * outlay @ weights[-1]
+        biases[-1] = offset + 0.5 * outlay @ biases[-1]
+        return Layers(tuple(weights), tuple(biases))
+
+    def forward(self, features: Tensor, layers: Layers) -> tuple[Tensor, Trace]:
+        """y laid out, (..., rows); and what ``pull`` and ``push`` need."""
         layer, hidden = features, []
-        for weight, bias in zip(weights[:-1], self.biases, strict=False):
-            layer = torch.tanh(F.linear(layer, weight, bias))
+        for weight, bias in zip(layers.weights[:-1], layers.biases, strict=False):
+            layer = torch.sigmoid(F.linear(layer, weight, bias))
             hidden.append(layer)
-        return F.linear(layer, weights[-1], self.biases[-1]), (features, tuple(hidden), weights)
+        return F.linear(layer, layers.weights[-1], layers.biases[-1]), (tuple(hidden), layers)
 
     def pull(self, trace: Trace, cotangent: Tensor) -> Tensor:
-        """The reverse sweep: cotangent, (..., outputs), times dy/dq; (..., n)."""
-        features, hidden, weights = trace
-        layer = cotangent @ weights[-1]
-        for weight, value in zip(reversed(weights[:-1]), reversed(hidden), strict=True):
-            layer = (layer * (1 - value * value)) @ weight
-        turns = len(self.turning)
-        cos, sin, _ = features.tensor_split((turns, 2 * turns), dim=-1)
-        by_cos, by_sin, by_slide = layer.tensor_split((turns, 2 * turns), dim=-1)
-        return torch.cat([by_sin * cos - by_cos * sin, by_slide / self.reach], dim=-1) @ self.select
+        """The reverse sweep: cotangent, (..., rows), times dy/dfeatures; (..., features)."""
+        hidden, layers = trace
+        layer = cotangent @ layers.weights[-1]
+        for weight, value in zip(reversed(layers.weights[:-1]), reversed(hidden), strict=True):
+            layer = (layer * (value * (1 - value))) @ weight
+        return layer
 
-    def push(self, trace: Trace, qd: Tensor) -> Tensor:
-        """The forward sweep: dy/dq times qd, (..., n); (..., outputs)."""
-        features, hidden, weights = trace
-        turns = len(self.turning)
-        cos, sin, _ = features.tensor_split((turns, 2 * turns), dim=-1)
-        rate = qd[..., self.turning]
-        layer = torch.cat([-sin * rate, cos * rate, qd[..., self.sliding] / self.reach], dim=-1)
-        for weight, value in zip(weights[:-1], hidden, strict=True):
-            layer = F.linear(layer, weight) * (1 - value * value)
-        return F.linear(layer, weights[-1])
+    def push(self, trace: Trace, rate: Tensor) -> Tensor:
+        """The forward sweep: dy/dfeatures times the features' rate; (..., rows)."""
+        hidden, layers = trace
+        for weight, value in zip(layers.weights[:-1], hidden, strict=True):
+            rate = F.linear(rate, weight) * (value * (1 - value))
+        return F.linear(rate, layers.weights[-1])
+
+
+class FrictionLayers(NamedTuple):
+    """The friction networks' weights made ready for many states, all joints in one."""
+
+    weight: Tensor
+    bias: Tensor
+    out: Tensor
+    offset: Tensor
+    viscous: Tensor  # [Nm s/rad, N s/m]
 
 
 class Friction(nn.Module):
     """Damping of each joint by its own q_i and qd_i: viscous, a constant, and dry, a network."""
 
-    revolute: Tensor
-    center: Tensor
-    reach: Tensor
+    spread: Tensor  # where the inputs of a joint's network stand, (joints, inputs, features + 2 n)
     speed: Tensor
     size: Tensor
 
     def __init__(self, generator: torch.Generator) -> None:
         super().__init__()
         joints, inputs = len(JOINTS), 4
-        self.register_buffer("revolute", torch.tensor([joint.revolute for joint in JOINTS]))
-        self.register_buffer("center", vector(joint.center for joint in JOINTS))
-        self.register_buffer("reach", vector(joint.reach for joint in JOINTS))
+        spread = torch.zeros(joints, inputs, 5 * joints, dtype=torch.float64)
+        for i, joint in enumerate(JOINTS):
+            cos, sin = (i, joints + i) if joint.revolute else (2 * joints + i, 2 * joints + i)
+            spread[i, 0, cos] = spread[i, 1, sin] = PLACE_SHARE
+            spread[i, 2, i - 2 * joints], spread[i, 3, i - joints] = 1 / joint.speed, 1.0
+        self.register_buffer("spread", spread)
         self.register_buffer("speed", vector(joint.speed for joint in JOINTS))
         self.register_buffer("size", vector(joint.friction for joint in JOINTS))
         self.viscous = nn.Parameter(torch.full((joints,), -2.0, dtype=torch.float64))
@@ -260,17 +290,45 @@ class Friction(nn.Module):
         self.out = nn.Parameter(torch.zeros(joints, FRICTION_HIDDEN, dtype=torch.float64))
         self.offset = nn.Parameter(torch.full((joints,), -2.0, dtype=torch.float64))
 
-    def forward(self, q: Tensor, qd: Tensor) -> Tensor:
+    def prepared(self) -> FrictionLayers:
+        """All joints' networks as one: block matrices are faster than a loop over joints."""
+        own = torch.eye(len(JOINTS), dtype=self.out.dtype, device=self.out.device)
+        return FrictionLayers(
+            weight=(self.weight.mT @ self.spread).flatten(0, 1),
+            bias=self.bias.flatten(),
+            out=(own.unsqueeze(-1) * self.out).flatten(1),
+            offset=self.offset,
+            viscous=self.size * F.softplus(self.viscous) / self.speed,
+        )
+
+    def damping(self, features: Tensor, qd: Tensor, layers: FrictionLayers) -> Tensor:
         """d, (..., n) [Nm s/rad, N s/m]: joint i is slowed by d_i qd_i."""
         smooth_speed = torch.sqrt(qd * qd + (SLOW * self.speed) ** 2)
-        place = (q - self.center) / self.reach
-        first = PLACE_SHARE * torch.where(self.revolute, q.cos(), place)
-        second = PLACE_SHARE * torch.where(self.revolute, q.sin(), place)
-        inputs = torch.stack([first, second, qd / self.speed, qd / smooth_speed], dim=-1)
-        # joints are few and their networks small: sums of products beat batched matrix products
-        hidden = torch.tanh((inputs.unsqueeze(-1) * self.weight).sum(dim=-2) + self.bias)
-        dry = F.softplus((hidden * self.out).sum(dim=-1) + self.offset)
-        return self.size * (F.softplus(self.viscous) / self.speed + dry / smooth_speed)
+        inputs = torch.cat([features, qd, qd / smooth_speed], dim=-1)
+        hidden = torch.tanh(F.linear(inputs, layers.weight, layers.bias))
+        dry = F.softplus(F.linear(hidden, layers.out, layers.offset))
+        return layers.viscous + self.size * dry / smooth_speed
+
+    def forward(self, features: Tensor, qd: Tensor, layers: FrictionLayers) -> Tensor:
+        """The friction torque D qd, (..., n) [Nm, N]."""
+        return self.damping(features, qd, layers) * qd
+
+    def matrix(self, features: Tensor, qd: Tensor, layers: FrictionLayers) -> Tensor:
+        """D, (..., n, n), diagonal."""
+        return torch.diag_embed(self.damping(features, qd, layers))
+
+
+class Prepared(NamedTuple):
+    """What depends on the weights alone, worked out once for many states."""
+
+    mass: Layers
+    rotors: Tensor
+    potential: Layers
+    friction: FrictionLayers
+
+
+# what M's derivatives need of the work done for M
+Memory = tuple[Trace, Tensor | None]
 
 
 class Model(nn.Module):
@@ -287,20 +345,23 @@ class Model(nn.Module):
         "revolute" if joint.revolute else "prismatic" for joint in JOINTS
     )
 
+    center: Tensor
+    reach: Tensor
     constant_scale: Tensor
     constant_basis: Tensor
     output_mean: Tensor
     output_scale: Tensor
     output_basis: Tensor
     mean_mass: Tensor
-    whitening: Tensor
-    whitening_rows: Tensor  # takes M, as a row, to its eigenproblem relative to its mean
+    whitening: Tensor  # takes M to its eigenproblem relative to its mean
     rotor_size: Tensor
     actuated: Tensor
 
     def __init__(self, seed: int = 0) -> None:
         super().__init__()
         generator = torch.Generator().manual_seed(seed)
+        self.register_buffer("center", vector(joint.center for joint in JOINTS))
+        self.register_buffer("reach", vector(joint.reach for joint in JOINTS))
         start = vector(constant.start for constant in CONSTANTS)
         self.register_buffer("constant_scale", vector(constant.scale for constant in CONSTANTS))
         self.register_buffer("constant_basis", stacked([c.entries for c in CONSTANTS]))
@@ -311,52 +372,72 @@ class Model(nn.Module):
         mean = start @ self.constant_basis + self.output_mean @ self.output_basis
         self.register_buffer("mean_mass", self._square(mean))
         self.register_buffer("whitening", torch.linalg.inv(torch.linalg.cholesky(self.mean_mass)))
-        self.register_buffer("whitening_rows", torch.kron(self.whitening, self.whitening).mT)
         hidden = tuple(frozenset(joints) for joints, units in MASS_HIDDEN for _ in range(units))
         outputs = tuple(frozenset(output.joints) for output in OUTPUTS)
-        read = tuple(sorted(frozenset().union(*outputs)))
-        share = vector(joint.mass_share for joint in JOINTS)
-        self.mass_network = Network(read, share, (*((hidden,) * MASS_DEPTH), outputs), generator)
+        shares = [joint.mass_share for joint in JOINTS]
+        read = reading(sorted(frozenset().union(*outputs)), shares)
+        self.mass_network = Network(read, (*((hidden,) * DEPTH), outputs), generator)
         everything = frozenset(POTENTIAL_JOINTS)
-        layers = (*((everything,) * width for width in POTENTIAL_HIDDEN), (everything,))
-        share = vector(joint.potential_share for joint in JOINTS)
-        self.potential_network = Network(POTENTIAL_JOINTS, share, layers, generator)
+        layers = (*(((everything,) * POTENTIAL_WIDTH,) * DEPTH), (everything,))
+        shares = [joint.potential_share for joint in JOINTS]
+        self.potential_network = Network(reading(POTENTIAL_JOINTS, shares), layers, generator)
         self.friction = Friction(generator)
         self.register_buffer("rotor_size", vector(joint.rotor for joint in JOINTS))
         self.rotor = nn.Parameter(torch.zeros(self.n, dtype=torch.float64))
         self.register_buffer("actuated", vector(float(joint.actuated) for joint in JOINTS))
 
-    def _rotors(self) -> Tensor:
-        """What the drives add to M, (n, n), diagonal and never negative."""
-        return torch.diag(self.rotor_size * self.rotor.exp())
+    def prepare(self) -> Prepared:
+        """All that depends on the weights alone; holds until they change."""
+        rotors = torch.diag(self.rotor_size * self.rotor.exp())  # diagonal and never negative
+        constant = (self.constant_scale * self.constants) @ self.constant_basis
+        constant = constant + self.output_mean @ self.output_basis + rotors.flatten()
+        outlay = (self.output_scale.unsqueeze(-1) * self.output_basis).mT
+        scale = self.friction.size.new_full((1, 1), POTENTIAL_SCALE)
+        return Prepared(
+            mass=self.mass_network.prepared(outlay, constant),
+            rotors=rotors,
+            potential=self.potential_network.prepared(scale, 0 * scale[0]),
+            friction=self.friction.prepared(),
+        )
 
     def _square(self, rows: Tensor) -> Tensor:
         """(..., n n) as (..., n, n)."""
         return rows.reshape(*rows.shape[:-1], self.n, self.n)
 
+    def _features(self, q: Tensor) -> Tensor:
+        """What networks read: cos q, sin q and the scaled q, (..., 3 n)."""
+        return torch.cat([q.cos(), q.sin(), (q - self.center) / self.reach], dim=-1)
+
+    def _features_rate(self, features: Tensor, qd: Tensor) -> Tensor:
+        """How fast the features change along qd."""
+        cos, sin, _ = features.chunk(3, dim=-1)
+        return torch.cat([-sin * qd, cos * qd, qd / self.reach], dim=-1)
+
+    def _by_joint(self, features: Tensor, slope: Tensor) -> Tensor:
+        """d/dq, (..., n), of what has this slope d/dfeatures."""
+        cos, sin, _ = features.chunk(3, dim=-1)
+        by_cos, by_sin, by_place = slope.chunk(3, dim=-1)
+        return by_sin * cos - by_cos * sin + by_place / self.reach
+
     def mass_matrix(self, q: Tensor) -> Tensor:
         """M(q), (..., n, n) [kg m^2, kg m, kg]."""
-        return self._mass(q)[0]
+        return self._mass(self._features(q), self.prepare())[0]
 
-    def _mass(self, q: Tensor) -> tuple[Tensor, Trace, Tensor | None]:
+    def _mass(self, features: Tensor, prepared: Prepared) -> tuple[Tensor, Memory]:
         """M(q), the network's trace and, where the guard is awake, its slope dl/dM, (..., n, n)."""
-        y, trace = self.mass_network(q)
-        outputs = self.output_mean + self.output_scale * y
-        constants = (self.constant_scale * self.constants) @ self.constant_basis
-        rows = constants + outputs @ self.output_basis
-        relative = self._square(rows @ self.whitening_rows)
-        if self._sound(relative):
-            return self._square(rows) + self._rotors(), trace, None
-        lift, slope = self._lift(relative)
-        mass = self._square(rows) + lift[..., None, None] * self.mean_mass + self._rotors()
-        return mass, trace, slope
+        rows, trace = self.mass_network(features, prepared.mass)
+        mass = self._square(rows)
+        if self._sound(mass, prepared):
+            return mass, (trace, None)
+        lift, slope = self._lift(mass - prepared.rotors)
+        return mass + lift[..., None, None] * self.mean_mass, (trace, slope)
 
-    def _sound(self, relative: Tensor) -> bool:
-        """Whether no eigenvalue of these matrices, (..., n, n), is below GUARD."""
-        least = GUARD * torch.eye(self.n, dtype=relative.dtype, device=relative.device)
-        return not torch.linalg.cholesky_ex(relative.detach() - least).info.any()
+    def _sound(self, mass: Tensor, prepared: Prepared) -> bool:
+        """Whether no eigenvalue of M less rotors, relative to its mean, is below GUARD."""
+        least = (prepared.rotors + GUARD * self.mean_mass).detach()
+        return not torch.linalg.cholesky_ex(mass.detach() - least).info.any()
 
-    def _lift(self, relative: Tensor) -> tuple[Tensor, Tensor]:
+    def _lift(self, mass: Tensor) -> tuple[Tensor, Tensor]:
         """l >= 0 that makes M + l M_mean positive definite, (...), and dl/dM, (..., n, n).
 
         With e_i the eigenvalues of M relative to M_mean, and u_i = max(0, 1 - e_i / GUARD),
@@ -364,42 +445,48 @@ class Model(nn.Module):
         times differentiable, and l = 0 where all e_i exceed GUARD. M_mean has M's own zeros and
         relations, which therefore hold in the sum.
         """
-        values, vectors = torch.linalg.eigh(relative)
+        values, vectors = torch.linalg.eigh(self.whitening @ mass @ self.whitening.mT)
         u = F.relu(1 - values / GUARD)
         u4 = u**4
         slopes = -u4 * (5 + u4) / (1 + u4) ** 2
         slope = self.whitening.mT @ (vectors * slopes.unsqueeze(-2)) @ vectors.mT @ self.whitening
         return GUARD * (u * (u4 / (1 + u4))).sum(dim=-1), slope
 
-    def _half_square_gradient(self, qd: Tensor, trace: Trace, slope: Tensor | None) -> Tensor:
-        """d/dq of 1/2 qd^T M(q) qd, (..., n)."""
-        weight = qd.unsqueeze(-1) * qd.unsqueeze(-2)
+    def _kinetic_slope(self, qd: Tensor, memory: Memory) -> Tensor:
+        """d/dfeatures of 1/2 qd^T M(q) qd, (..., features)."""
+        trace, slope = memory
+        weight = (0.5 * qd).unsqueeze(-1) * qd.unsqueeze(-2)
         if slope is not None:
             weight = weight + (weight * self.mean_mass).sum(dim=(-2, -1))[..., None, None] * slope
-        cotangent = 0.5 * self.output_scale * (weight.flatten(-2) @ self.output_basis.mT)
-        return self.mass_network.pull(trace, cotangent)
+        return self.mass_network.pull(trace, weight.flatten(-2))
 
-    def _mass_rate(self, qd: Tensor, trace: Trace, slope: Tensor | None) -> Tensor:
-        """dM/dt along qd, (..., n, n)."""
-        rates = self.output_scale * self.mass_network.push(trace, qd)
-        rate = self._square(rates @ self.output_basis)
+    def _mass_rate(self, rate: Tensor, memory: Memory) -> Tensor:
+        """dM/dt where the features change at this rate, (..., n, n)."""
+        trace, slope = memory
+        mass_rate = self._square(self.mass_network.push(trace, rate))
         if slope is not None:
-            rate = rate + (slope * rate).sum(dim=(-2, -1))[..., None, None] * self.mean_mass
-        return rate
+            along = (slope * mass_rate).sum(dim=(-2, -1))[..., None, None]
+            mass_rate = mass_rate + along * self.mean_mass
+        return mass_rate
 
     def potential_energy(self, q: Tensor) -> Tensor:
         """V(q), (...) [J]."""
-        y: Tensor = self.potential_network(q)[0]
-        return POTENTIAL_SCALE * y.squeeze(-1)
+        y: Tensor = self.potential_network(self._features(q), self.prepare().potential)[0]
+        return y.squeeze(-1)
 
     def gravity(self, q: Tensor) -> Tensor:
         """dV/dq, (..., n) [Nm, N]."""
-        y, trace = self.potential_network(q)
-        return self.potential_network.pull(trace, POTENTIAL_SCALE * torch.ones_like(y))
+        features = self._features(q)
+        return self._by_joint(features, self._potential_slope(features, self.prepare()))
+
+    def _potential_slope(self, features: Tensor, prepared: Prepared) -> Tensor:
+        """dV/dfeatures, (..., features)."""
+        y, trace = self.potential_network(features, prepared.potential)
+        return self.potential_network.pull(trace, torch.ones_like(y))
 
     def dissipation(self, q: Tensor, qd: Tensor) -> Tensor:
         """D(q, qd), (..., n, n), diagonal: D qd is the friction torque."""
-        return torch.diag_embed(self.friction(q, qd))
+        return self.friction.matrix(self._features(q), qd, self.prepare().friction)
 
     def input_matrix(self, q: Tensor) -> Tensor:
         """G, (..., n, n): one for each actuated joint."""
@@ -415,8 +502,8 @@ class Model(nn.Module):
 
     @staticmethod
     def _solved(mass: Tensor, force: Tensor) -> Tensor:
-        factor = torch.linalg.cholesky(mass)
-        solution: Tensor = torch.cholesky_solve(force.unsqueeze(-1), factor)
+        # its derivative costs one more solution; a Cholesky factor's would cost several times that
+        solution: Tensor = torch.linalg.solve(mass, force.unsqueeze(-1))
         return solution.squeeze(-1)
 
     def hamiltonian(self, q: Tensor, p: Tensor) -> Tensor:
@@ -425,35 +512,47 @@ class Model(nn.Module):
 
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
         """qdd, (..., n), under the input tau."""
-        mass, bias = self._mass_and_bias(q, qd)
+        prepared, features = self.prepare(), self._features(q)
+        mass, bias = self._mass_and_bias(features, qd, prepared)
         return self._solved(mass, self.actuated * tau - bias)
 
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
         """The torque, (..., n), that gives qdd."""
-        mass, bias = self._mass_and_bias(q, qd)
+        mass, bias = self._mass_and_bias(self._features(q), qd, self.prepare())
         return (mass @ qdd.unsqueeze(-1)).squeeze(-1) + bias
 
-    def _mass_and_bias(self, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
+    def _mass_and_bias(
+        self, features: Tensor, qd: Tensor, prepared: Prepared
+    ) -> tuple[Tensor, Tensor]:
         """M and the torque that holds qd steady: dM/dt qd - d/dq (1/2 qd^T M qd) + dV/dq + D qd."""
-        mass, trace, slope = self._mass(q)
-        coriolis = (self._mass_rate(qd, trace, slope) @ qd.unsqueeze(-1)).squeeze(-1)
-        coriolis = coriolis - self._half_square_gradient(qd, trace, slope)
-        return mass, coriolis + self.gravity(q) + self.friction(q, qd) * qd
+        mass, memory = self._mass(features, prepared)
+        mass_rate = self._mass_rate(self._features_rate(features, qd), memory)
+        slope = self._kinetic_slope(qd, memory) - self._potential_slope(features, prepared)
+        bias = (mass_rate @ qd.unsqueeze(-1)).squeeze(-1) - self._by_joint(features, slope)
+        return mass, bias + self.friction(features, qd, prepared.friction)
 
     def forward(self, t: Tensor, state: Tensor) -> Tensor:
-        """The rate of (q, p), (..., 2 n), or of (q, p, tau), (..., 3 n), where tau is held.
+        """The rate of (q, p), (..., 2 n), or of (q, p, tau), (..., 3 n), where tau is held."""
+        q, p, tau = state.tensor_split((self.n, 2 * self.n), dim=-1)
+        qd, force = self.rates(q, p, tau if tau.shape[-1] else None, self.prepare())
+        return torch.cat([qd, force, torch.zeros_like(tau)], dim=-1)
+
+    def rates(
+        self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Prepared
+    ) -> tuple[Tensor, Tensor]:
+        """q' and p', (..., n), under the input tau, with what ``prepare`` gave.
 
         q' = dH/dp and p' = -dH/dq - D dH/dp + G tau: the port-Hamiltonian form (van der Schaft and
         Jeltsema, Port-Hamiltonian Systems Theory, 2014).
         """
-        q, p, tau = state.tensor_split((self.n, 2 * self.n), dim=-1)
-        mass, trace, slope = self._mass(q)
+        features = self._features(q)
+        mass, memory = self._mass(features, prepared)
         qd = self._solved(mass, p)
-        force = self._half_square_gradient(qd, trace, slope) - self.gravity(q)
-        force = force - self.friction(q, qd) * qd
-        if tau.shape[-1]:
+        slope = self._kinetic_slope(qd, memory) - self._potential_slope(features, prepared)
+        force = self._by_joint(features, slope) - self.friction(features, qd, prepared.friction)
+        if tau is not None:
             force = force + self.actuated * tau
-        return torch.cat([qd, force, torch.zeros_like(tau)], dim=-1)
+        return qd, force
 
     def to_group(self, q: Tensor) -> list[Tensor]:
         """By joint, R in SO(3), (..., 3, 3), or r in R^3, (..., 3), if it slides; z is its axis."""
