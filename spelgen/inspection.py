@@ -8,7 +8,7 @@ import textwrap
 from dataclasses import dataclass
 from typing import Any
 
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Arm, Coordinate
 from spelgen.errors import Diagnostic
 from spelgen.formulas.formulas import Entry as PlaceOfEntry
 from spelgen.formulas.formulas import Formulas, formulas
@@ -101,11 +101,7 @@ class Inspection:
     def _joint_table(self) -> str:
         lines = []
         for index, coordinate in enumerate(self.arm.coordinates, start=1):
-            unit = "rad" if coordinate.kind == "revolute" else "m"
-            bounds = coordinate.lower, coordinate.upper
-            limits = "continuous" if coordinate.continuous else "no limits"
-            if not coordinate.continuous and None not in bounds:
-                limits = f"{coordinate.lower:g} .. {coordinate.upper:g} {unit}"
+            limits = reach(coordinate)
             passive = ", passive" if index - 1 in self.structure.passive else ""
             name = textwrap.shorten(_printable(coordinate.name), 36, placeholder="...") or '""'
             lines.append(f"  {index:>2}  {name:<36}  {coordinate.kind:<9}  {limits}{passive}")
@@ -127,14 +123,15 @@ class Inspection:
             lines.append(f"  {row + 1:>2}  {line}".rstrip())
         return "\n".join(lines)
 
-    def _meaning(self, width: int) -> str:
+    def needs(self) -> dict[str, str]:
+        """What a model of M(q), V(q) and G needs, in words, and the number of base parameters."""
         structure = self.structure
         counts: dict[tuple[int, ...], int] = {}
         for output in structure.outputs:
             counts[output.joints] = counts.get(output.joints, 0) + 1
         told = "; ".join(f"{count} of {_joints(joints)}" for joints, count in counts.items())
         entries, constants = len(structure.entries), len(structure.constants)
-        facts = {
+        return {
             "M(q)": f"{_many(len(structure.outputs), 'output')} and {_many(constants, 'constant')} "
             f"make all {entries} entries" + (f": {told}" if told else ""),
             "V(q)": f"depends on {_joints(structure.potential)}"
@@ -143,8 +140,10 @@ class Inspection:
             "G": "fixed" + (f", {_joints(structure.passive)} without a drive" if structure.passive else ""),
             "base": f"{structure.base_parameters} base inertial parameters",
         }
+
+    def _meaning(self, width: int) -> str:
         lines = []
-        for name, fact in facts.items():
+        for name, fact in self.needs().items():
             lines += textwrap.wrap(fact, width, initial_indent=f"  {name:<5} ", subsequent_indent=" " * 8)
         return "The model needs\n" + "\n".join(lines)
 
@@ -161,6 +160,16 @@ class Inspection:
             text = _printable(f"{each.severity}: {line}{each.where}: {each.message}")
             lines += textwrap.wrap(text, width, initial_indent="  ", subsequent_indent="    ")
         return "Remarks\n" + "\n".join(lines)
+
+
+def reach(coordinate: Coordinate) -> str:
+    """How far a joint can move, with its unit."""
+    unit = "rad" if coordinate.kind == "revolute" else "m"
+    if coordinate.continuous:
+        return "continuous"
+    if coordinate.lower is None or coordinate.upper is None:
+        return "no limits"
+    return f"{coordinate.lower:g} .. {coordinate.upper:g} {unit}"
 
 
 def _cell(entry: Entry) -> str:

@@ -21,7 +21,7 @@ evaluation: tip torque examples evaluate
 report: charts plots tables picture learned page
 proof: agreement axes reasons meaning second_reading numeric_samples verification
 formulas: expression notation angles harmonics factoring shortening grouping formulas layout text latex sympy_module
-inspection pipeline
+inspection inspection_page pipeline
 cli: console options formats model_commands run_commands main
 __init__ __main__
 """

@@ -3,45 +3,17 @@
 import json
 import math
 import re
-from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
 import torch
+from html_page import Page
 
 from spelgen import pipeline
 from spelgen.errors import RunError
 from spelgen.report.page import render_report, write_report
 from spelgen.training.data import TrainingConfig
 from spelgen.training.runs import load_model
-
-VOID = {"meta", "br"}
-
-
-class Page(HTMLParser):
-    """Checks nesting, and gathers what the tests ask for."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.open, self.tags, self.text = [], [], []
-        self.links = []
-        self.feed(text)
-        assert not self.open
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append(tag)
-        self.links += [value for name, value in attrs if name in ("src", "href", "action", "xlink:href")]
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag, attrs):
-        self.tags.append(tag)
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        self.text.append(data)
 
 
 def errors(share, tip=None):

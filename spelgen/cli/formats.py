@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from spelgen.inspection import Inspection
     from spelgen.proof.agreement import Verification
 
-Format = Literal["text", "json", "latex", "sympy"]
-_OF_SUFFIX: dict[str, Format] = {".json": "json", ".tex": "latex", ".py": "sympy"}
+Format = Literal["text", "json", "html", "latex", "sympy"]
+_OF_SUFFIX: dict[str, Format] = {".json": "json", ".html": "html", ".tex": "latex", ".py": "sympy"}
 
 
 def chosen(format: Format | None, output: Path | None) -> Format:
@@ -29,6 +29,7 @@ def rendered(
 
     Raises SpelgenError for an entry that M does not have.
     """
+    from spelgen import inspection_page
     from spelgen.formulas import latex, sympy_module, text
     from spelgen.formulas.formulas import WRITABLE
 
@@ -39,6 +40,8 @@ def rendered(
     if closed and format in ("latex", "sympy"):
         _tell(closed, proof)
         return latex.latex(closed) if format == "latex" else sympy_module.sympy_source(closed)
+    if format == "html":
+        return inspection_page.page(found, closed, proof)
     if format == "text":
         told = found.text() if closed is None else text.text(closed)
         return told + (f"\n\n{proof.text()}" if proof else "") + "\n"

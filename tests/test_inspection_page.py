@@ -1,0 +1,51 @@
+"""The structure as an HTML page: whole, self-contained, and safe whatever the URDF's names are."""
+
+import re
+
+import pytest
+from html_page import Page
+from typer.testing import CliRunner
+
+from spelgen.cli.main import app
+from spelgen.inspection_page import page
+from spelgen.pipeline import inspect, verify
+
+HOSTILE = "<script>alert(1)</script>{{ 7 * 7 }}&quot;'&amp;"
+
+
+@pytest.mark.parametrize("robot", ["two_link", "rpr", "panda"])
+def test_page_tells_what_the_text_tells(robots, robot):
+    found = inspect(robots / f"{robot}.urdf")
+    shown = Page(page(found))
+    told = " ".join(" ".join(shown.text).split())
+    for sentence in (*found.needs().values(), *map(str, found.facts)):
+        assert sentence in told
+    cells = re.findall(r'<td class="(\w+)" title="M(\d),(\d)', page(found))
+    kinds = {(e.row + 1, e.column + 1): e.kind for e in found.structure.entries}
+    assert len(cells) == len(found.structure.joints) ** 2
+    assert all(kinds[max(int(i), int(j)), min(int(i), int(j))] == kind for kind, i, j in cells)
+    assert not shown.links and "script" not in shown.tags
+
+
+def test_formulas_and_proof_only_where_asked(robots, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run = CliRunner().invoke(
+        app, ["inspect", str(robots / "rpr.urdf"), "--formulas", "--verify", "-o", "rpr.html"]
+    )
+    assert run.exit_code == 0, run.stderr
+    text = " ".join(Page((tmp_path / "rpr.html").read_text()).text)
+    assert "\nM22 = m2R\n" in text
+    assert verify(robots / "rpr.urdf").checks[0].found in text
+    plain = page(inspect(robots / "rpr.urdf"))
+    assert "Closed forms" not in plain and "Proof" not in plain
+
+
+def test_names_are_escaped(robots, tmp_path):
+    text = (
+        (robots / "rpr.urdf").read_text().replace('"rpr"', f'"{HOSTILE}"').replace('"joint3"', f'"{HOSTILE}"')
+    )
+    (tmp_path / "evil.urdf").write_text(text.replace(HOSTILE, HOSTILE.replace("<", "&lt;")))
+    found = inspect(tmp_path / "evil.urdf")
+    shown = Page(page(found, found.closed_forms()))
+    assert "script" not in shown.tags
+    assert "".join(shown.text).count("<script>alert(1)</script>{{ 7 * 7 }}\"'&") >= 3
