@@ -14,6 +14,7 @@ from arms import random_arm
 from formulas_read import assert_equal_to_pinocchio, read_back
 from typer.testing import CliRunner
 
+from spelgen.arm.arm import make_arm
 from spelgen.cli.main import app
 from spelgen.errors import SpelgenError
 from spelgen.formulas.formulas import formulas
@@ -21,6 +22,7 @@ from spelgen.formulas.sympy_module import sympy_source
 from spelgen.formulas.text import text, to_dict
 from spelgen.pipeline import inspect, load
 from spelgen.structure.structure import derive
+from spelgen.urdf.read import read_urdf
 
 TWO_LINK = """\
 two_link: closed forms for any inertial values
@@ -127,6 +129,14 @@ def test_without_inertials_there_are_no_values(robots, spelgen, tmp_path):
     (tmp_path / "bare.urdf").write_text(bare)
     told = spelgen("inspect", "bare.urdf", "--formulas").stdout
     assert "Base parameters\n  Izz1R = Izz1 + Iyy2 + Iyy3\n" in told
+
+
+def test_lines_keep_the_width(shared):
+    """Skew axes have twelve digits, and entries begin with long terms."""
+    arm = make_arm(read_urdf(shared / "arms" / "kinova_j2n6s300.urdf"))
+    told = text(formulas(arm, derive(arm, "inertials")))
+    assert re.search(r"\d\.\d{12}\*cos", told)
+    assert max(map(len, told.splitlines())) <= 80
 
 
 # ---- files

@@ -13,15 +13,17 @@ from spelgen.formulas.expression import Sum, Symbol, Term
 from spelgen.formulas.formulas import Formula, Formulas
 from spelgen.structure.minimal import BaseParameter, parameter_name
 
-# before a sign, but not inside an angle; behind a comma
-_GAP = re.compile(r" (?=[+-] )(?![+-] (?:[\d./]+(?:\*| \\, ))?q)|(?<=,) ")
+# before a sign, but not inside an angle; behind a comma, but not inside a fraction
+_GAP = re.compile(r" (?=[+-] )(?![+-] (?:[\d./]+(?:\*| \\, ))?q)|(?<=,) (?!\d)")
 
 
 def broken(parts: list[str], start: str, width: int) -> list[str]:
     """``parts`` in lines of at most ``width``, the first after ``start``; long parts break at their signs."""
     lines, indent = [start], " " * (len(start) - len(start.lstrip()) + 4)
-    short = width - len(indent)
-    pieces = [piece for part in parts for piece in ([part] if len(part) <= short else _GAP.split(part))]
+    pieces: list[str] = []
+    for part in parts:
+        room = width - len(indent) if pieces else width - len(start)
+        pieces += [part] if len(part) <= room else _GAP.split(part)
     for piece in pieces:
         if len(lines[-1]) + len(piece) > width and lines[-1].strip() != start.strip():
             lines.append(indent)

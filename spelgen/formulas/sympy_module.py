@@ -11,9 +11,10 @@ from spelgen.structure.minimal import parameter_name
 _HEAD = '''"""Closed forms of a serial arm's mass matrix M(q) and potential energy V(q), by spelgen.
 
 q: the joints' positions [rad, m]. entries: {(row, column): entry of M}, counted from 1, lower triangle.
-M: the whole matrix, V: the energy [J] up to a constant; both where nothing is missing. base_parameters: what each
-stands for, m being a mass [kg], h = m c a first moment [kg m], I a tensor [kg m2] about the joint's origin in a
-frame whose z is the joint's axis. values: what the URDF gives them, where it has inertials.
+M: the whole matrix, V: the energy [J] up to a constant; both where nothing is missing.
+base_parameters: what each stands for, m being a mass [kg], h = m c a first moment [kg m] and I a tensor
+[kg m2] about the joint's origin, in a frame whose z is the joint's axis.
+values: what the URDF gives them, where it has inertials.
 """
 '''
 _WIDTH = 100

@@ -2,7 +2,8 @@
 distances.
 
 The same recursion as everywhere, over the rational polynomials. The structure does not need them
-(``structure`` works with values alone): they are its independent proof and the source of closed forms.
+(``structure`` works with values alone): they are its independent proof. Closed forms are expanded one
+parameter at a time (``expansion``).
 """
 
 from __future__ import annotations
