@@ -156,11 +156,15 @@ def _hidden(spec: ModelSpec) -> tuple[tuple[tuple[int, ...], int], ...]:
     """How many units of a hidden layer read which joints, in proportion to the outputs that do."""
     least = _LEAST_UNITS if spec.design.net == "mlp" else _LEAST_KAN_UNITS
     shares = Counter(output.joints for output in spec.outputs)
-    total = sum(shares.values())
-    return tuple(
-        (joints, max(least, round(_units(spec) * count / total)))
-        for joints, count in sorted(shares.items(), key=lambda item: (len(item[0]), item[0]))
-    )
+    joints = sorted(shares, key=lambda each: (len(each), each))
+    ideal = [_units(spec) * shares[each] / len(spec.outputs) for each in joints]
+    units = [max(least, round(size)) for size in ideal]
+    # rounding may have taken or left a unit or two: those who gained most give, who lost most take
+    while sum(units) > _units(spec) and max(units) > least:
+        units[max((k for k, u in enumerate(units) if u > least), key=lambda k: units[k] - ideal[k])] -= 1
+    while units and sum(units) < _units(spec):
+        units[max(range(len(units)), key=lambda k: ideal[k] - units[k])] += 1
+    return tuple(zip(joints, units, strict=True))
 
 
 def _count(spec: ModelSpec) -> str:
