@@ -157,16 +157,16 @@ def main() -> None:
     slow = statistics.median(seconds(lambda: published_step(published, data)) for _ in range(SLOW_REPEATS))
     count = sum(parameter.numel() for parameter in published.parameters())
     print(
-        f"{'':12} {'step':>9} {'networks alone':>15} {'published /':>12} {'phnode /':>9} {'parameters':>11}"
+        f"{'':12}      step  networks alone  published /  phnode /  parameters  outputs: M    D    G    V  inputs"
     )
-    print(f"{'published':12} {1e3 * slow:6.0f} ms {'':15} {1:12.0f} {'':9} {count:11d}")
+    print(f"{'published':12} {1e3 * slow:6.0f} ms {1:29} {'':10} {count:11}")
     fast = statistics.median(steps["phnode"])
     for name, model in models.items():
         step, floor = statistics.median(steps[name]), statistics.median(floors[name])
         count = sum(parameter.numel() for parameter in model.parameters())
         print(
-            f"{name:12} {1e3 * step:6.1f} ms {1e3 * floor:8.1f} ms {step / floor:3.1f}x"
-            f"{slow / step:12.0f} {fast / step:9.1f} {count:11d}"
+            f"{name:12} {1e3 * step:6.1f} ms {1e3 * floor:7.1f} ms {step / floor:4.1f}x {slow / step:11.0f}"
+            f" {fast / step:10.1f} {count:11}       {sizes(model)}"
         )
 
 
