@@ -74,7 +74,9 @@ def randomise(model: nn.Module, seed: int, deviation: float | None = None) -> No
         elif deviation is not None:
             parameter.data = deviation * draw
         elif "network" in name:
-            parameter.data = draw * parameter.shape[-1] ** -0.5
+            # a Kolmogorov-Arnold network has a grid of weights for each input
+            inputs = parameter[0].numel() if parameter.dim() == 3 else parameter.shape[-1]
+            parameter.data = draw * inputs**-0.5
 
 
 def frictionless(model: nn.Module) -> nn.Module:

@@ -54,11 +54,12 @@ class Published(nn.Module):
         self.gains = _mlp(rotations, width, axes)
 
     def forward(self, state: Tensor, tau: Tensor) -> Tensor:
+        state = state if state.requires_grad else state.requires_grad_()
         rotation, zeta = state.split((9 * self.n, 3 * self.n), dim=-1)
-        if not rotation.requires_grad:
-            rotation = rotation.requires_grad_()
+        p = torch.linalg.solve(self.inverse_mass(rotation), zeta.unsqueeze(-1)).squeeze(-1)
+        # from here on R and p are independent, so that H is differentiated in each with the other held
+        rotation, p = torch.cat([rotation, p], dim=-1).split((9 * self.n, 3 * self.n), dim=-1)
         inverse = self.inverse_mass(rotation)
-        p = torch.linalg.solve(inverse, zeta.unsqueeze(-1)).squeeze(-1)
         kinetic = 0.5 * (p * (inverse @ p.unsqueeze(-1)).squeeze(-1)).sum(dim=-1)
         energy = kinetic + self.potential(rotation).squeeze(-1)
         by_rotation, by_p = torch.autograd.grad(energy.sum(), (rotation, p), create_graph=True)

@@ -7,22 +7,35 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import get_args
 
 import pytest
 from emitted import SIX, built, import_source
 
 from spelgen.pipeline import build, check, make_spec
-from spelgen.spec import ModelSpec, Options, read_header
+from spelgen.spec import ModelSpec, Options, Preset, read_header
 
 ROOT = Path(__file__).parents[1]
 GOLDEN = Path(__file__).parent / "golden"
 
 
-@pytest.mark.parametrize("robot", ["two_link", "rpr"])
-def test_golden_text(robot, request):
+PRESETS = [
+    ("minimal", "mlp"),
+    ("minimal", "kan"),
+    ("spel", "mlp"),
+    ("spel-kan", "kan"),
+    ("phnode", "mlp"),
+    ("phnode", "kan"),
+]
+
+
+@pytest.mark.parametrize(
+    ("robot", "preset"), [("two_link", "minimal"), *(("rpr", p) for p in get_args(Preset))]
+)
+def test_golden_text(robot, preset, request):
     """``pytest --update`` writes the golden copies anew."""
-    path = GOLDEN / f"{robot}_spel.py"
-    text = built(robot)[0]
+    path = GOLDEN / f"{robot}_{preset.replace('-', '_')}.py"
+    text = built(robot, preset=preset)[0]
     if request.config.getoption("--update"):
         path.write_text(text, encoding="utf-8")
     expected = path.read_text(encoding="utf-8")
@@ -49,6 +62,10 @@ def test_same_bytes_under_any_hash_seed_and_from_any_folder(tmp_path):
 def test_emitted_code_is_held_to_the_rules_of_written_code(tmp_path):
     for robot in SIX:
         (tmp_path / f"{robot}_spel.py").write_text(built(robot)[0], encoding="utf-8")
+    for robot in ("rpr", "six_dof"):  # with and without a sliding joint
+        for preset, net in PRESETS:
+            text = built(robot, preset=preset, net=net)[0]
+            (tmp_path / f"{robot}_{preset}_{net}.py".replace("-", "_")).write_text(text, encoding="utf-8")
     files = sorted(str(path) for path in tmp_path.glob("*.py"))
     for command in (
         [
@@ -123,9 +140,10 @@ def test_no_text_of_the_urdf_becomes_code(tmp_path):
     assert read_header(path).robot == HOSTILE[0]
 
 
+@pytest.mark.parametrize("preset", get_args(Preset))
 @pytest.mark.parametrize("robot", SIX)
-def test_spec_survives_json(robot):
-    spec = make_spec(ROOT / "robots" / f"{robot}.urdf", Options())
+def test_spec_survives_json(robot, preset):
+    spec = make_spec(ROOT / "robots" / f"{robot}.urdf", Options(preset=preset))
     assert ModelSpec.from_json(spec.to_json()) == spec
 
 

@@ -16,7 +16,7 @@ structure: recursion field sampling spans basis expansion symbolic structure nom
 emission: plan emit
 data: logs signals windows
 simulation: engine simulate
-training: runs rollout rivals prior progress data loop train
+training: runs lie_group rollout rivals prior progress data loop train
 evaluation: tip torque examples evaluate
 report: charts plots tables picture learned page
 proof: agreement axes reasons meaning second_reading numeric_samples verification

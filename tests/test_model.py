@@ -262,23 +262,26 @@ def test_arm_with_a_constant_mass_matrix(tmp_path):
 
 
 def test_module_needs_torch_alone(tmp_path):
-    """It runs in a process that can import neither spelgen nor what spelgen needs."""
-    path = tmp_path / "panda_spel.py"
-    path.write_text(built("panda")[0])
+    """Each preset runs in a process that can import neither spelgen nor what spelgen needs."""
+    presets = {"minimal": None, "minimal_kan": "kan", "spel": None, "phnode": None}
+    for name, net in presets.items():
+        source = built("panda", preset=name.removesuffix("_kan"), net=net)[0]
+        (tmp_path / f"panda_{name}.py").write_text(source)
     program = (
-        "import sys\n"
+        "import importlib, sys\n"
         "for name in ('spelgen', 'numpy', 'scipy', 'sympy', 'flint', 'pinocchio', 'lxml', 'yaml', 'jinja2'):\n"
         "    sys.modules[name] = None\n"
-        "import torch, panda_spel\n"
-        "m = panda_spel.Model()\n"
+        "import torch\n"
         "q = torch.ones(7, dtype=torch.float64)\n"
-        "print(m.forward_dynamics(q, q, q).shape)\n"
+        "for name in sys.argv[1:]:\n"
+        "    m = importlib.import_module(f'panda_{name}').Model()\n"
+        "    print(*m.forward_dynamics(q, q, q).shape)\n"
     )
     run = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", program],
+        [sys.executable, "-W", "ignore", "-c", program, *presets],
         cwd=tmp_path,
         capture_output=True,
         text=True,
         check=False,
     )
-    assert run.stdout.strip() == "torch.Size([7])", run.stderr
+    assert run.stdout.split() == ["7"] * len(presets), run.stderr

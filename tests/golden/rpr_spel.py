@@ -1,7 +1,7 @@
 r"""Port-Hamiltonian model of an arm with 3 joints, written by `spelgen build`.
 
 3 learned functions of q and 2 constants make the mass matrix.
-The potential energy depends on joint 3.
+The potential energy depends on joints 1-3.
 Sizes and starting values are the URDF's inertials.
 
 Mass matrix: the joints each entry depends on, C where it is constant, . where it is always zero.
@@ -21,12 +21,12 @@ Record, by which `spelgen check` tells whether this module is up to date:
     robot: "rpr"
     urdf: "rpr.urdf"
     urdf_sha256: "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d"
-    spec_sha256: "0aaf49956eba9db7b9568ed5f14b5438f52447368c40744b48c2e1de15b8ba5b"
+    spec_sha256: "30e06cd646ad21c372b16e549dc7d05d578cebad5f21530608f2259cfe9b1f33"
     option assume: "kinematics"
     option depth: 2
     option joints: null
     option net: "mlp"
-    option preset: "minimal"
+    option preset: "spel"
     option snap_tolerance: 0.002
     option tip: null
     option width: 64
@@ -35,6 +35,7 @@ Record, by which `spelgen check` tells whether this module is up to date:
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import partial
 from typing import ClassVar, NamedTuple
 
 import torch
@@ -122,19 +123,20 @@ CONSTANTS: tuple[Constant, ...] = (
     Constant(start=5.33, scale=5.33, entries=((1, 1, 1.0),)),
 )
 OUTPUTS = (
-    Output(joints=(2,), mean=-0.00167665, scale=1.36528, entries=((1, 0, 1.0),)),
-    Output(joints=(1, 2), mean=-0.00154309, scale=0.0595527, entries=((2, 0, 1.0),)),
-    Output(joints=(1, 2), mean=139.887, scale=12.6351, entries=((0, 0, 1.0),)),
+    Output(joints=(0, 1, 2), mean=-0.00167665, scale=1.36528, entries=((1, 0, 1.0),)),
+    Output(joints=(0, 1, 2), mean=-0.00154309, scale=0.0595527, entries=((2, 0, 1.0),)),
+    Output(joints=(0, 1, 2), mean=139.887, scale=12.6351, entries=((0, 0, 1.0),)),
 )
 # in each hidden layer: the joints that some units read, and how many units do
-MASS_HIDDEN = (((2,), 21), ((1, 2), 43))
+MASS_HIDDEN = (((0, 1, 2), 64),)
 GUARD = 0.08  # least eigenvalue of M, relative to its nominal mean, that is left as it is
-POTENTIAL_JOINTS = (2,)  # the joints that V depends on
+POTENTIAL_JOINTS = (0, 1, 2)  # the joints that V depends on
 POTENTIAL_WIDTH = 32
 POTENTIAL_SCALE = 0.703291  # [J]
 DEPTH = 2  # hidden layers of a network
-FRICTION_HIDDEN = 8
-SLOW = 0.03  # below this share of its usual speed a joint's dry friction fades to zero
+FRICTION_AXES = 1  # of each joint, z the last
+FRICTION_WIDTH = 64
+FRICTION_START = 0.35  # diagonal of D's factor, relative to the joints' usual friction
 PLACE_SHARE = 0.1  # how much friction's networks see of where a joint is, relative to its speed
 
 
@@ -153,23 +155,52 @@ def stacked(matrices: list[Entries]) -> Tensor:
     return rows.reshape(len(matrices), n * n)
 
 
+def lower_entries(rows: int) -> Tensor:
+    """Spreads the numbers of a lower triangle, row by row, over a matrix: (rows, rows, numbers)."""
+    row, column = torch.tril_indices(rows, rows)
+    spread = torch.zeros(rows, rows, len(row), dtype=torch.float64)
+    spread[row, column, torch.arange(len(row))] = 1.0
+    return spread
+
+
 class Reading(NamedTuple):
-    """The inputs of a network: share * (spread features), (inputs, ...)."""
+    """The inputs of a network: share * (spread features + fixed), (inputs, ...)."""
 
     joints: tuple[int, ...]  # whose each input is
     share: Tensor
     spread: Tensor  # (inputs, features)
+    fixed: Tensor
 
 
-def reading(joints: Iterable[int], shares: list[float]) -> Reading:
-    """cos q and sin q of turning joints, the scaled q of sliding ones, times each joint's share."""
-    n = len(JOINTS)
-    turning = [joint for joint in joints if JOINTS[joint].revolute]
-    sliding = [joint for joint in joints if not JOINTS[joint].revolute]
-    whose = turning + turning + sliding
-    places = turning + [n + joint for joint in turning] + [2 * n + joint for joint in sliding]
-    spread = torch.eye(3 * n, dtype=torch.float64)[places]
-    return Reading(tuple(whose), vector(shares[joint] for joint in whose), spread)
+def reading(shares: list[float], axes: int = 0) -> Reading:
+    """Of each joint the nine numbers of R in SO(3) or the three of r in R^3, times its share.
+
+    z is the joint's axis, so R = [[cos q, -sin q, 0], [sin q, cos q, 0], [0, 0, 1]]. Then, with
+    ``axes``, each joint's velocity along so many axes, of which the last is z.
+    """
+    n, zeros = len(JOINTS), partial(torch.zeros, dtype=torch.float64)
+    width = 3 * n + n * (axes > 0)
+    joints, share, spread, fixed = [], [], [], []
+    for i, joint in enumerate(JOINTS):
+        size = 9 if joint.revolute else 3
+        block, rest = zeros(size, width), zeros(size)
+        if joint.revolute:
+            block[[0, 4], i], rest[8] = 1.0, 1.0
+            block[[1, 3], n + i] = vector((-1.0, 1.0))
+        else:
+            block[2, 2 * n + i] = 1.0
+        joints += [i] * size
+        share += [shares[i]] * size
+        spread.append(block)
+        fixed.append(rest)
+    for i in range(n if axes else 0):
+        block = zeros(axes, width)
+        block[-1, 3 * n + i] = 1.0
+        joints += [i] * axes
+        share += [1.0] * axes
+        spread.append(block)
+        fixed.append(zeros(axes))
+    return Reading(tuple(joints), vector(share), torch.cat(spread), torch.cat(fixed))
 
 
 class Layers(NamedTuple):
@@ -190,6 +221,7 @@ class Network(nn.Module):
     """
 
     spread: Tensor
+    fixed: Tensor
 
     def __init__(
         self,
@@ -199,6 +231,7 @@ class Network(nn.Module):
     ) -> None:
         super().__init__()
         self.register_buffer("spread", reading.spread)
+        self.register_buffer("fixed", reading.fixed)
         self.weights = nn.ParameterList()
         self.biases = nn.ParameterList()
         below = tuple(frozenset((joint,)) for joint in reading.joints)
@@ -221,6 +254,7 @@ class Network(nn.Module):
         for index, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             weight = weight * self.get_buffer(f"mask{index}")
             if index == 0:
+                bias = bias + weight @ self.fixed
                 weight = weight @ self.spread
             else:
                 bias, weight = bias - weight.sum(dim=1), 2 * weight
@@ -254,68 +288,46 @@ class Network(nn.Module):
         return F.linear(rate, layers.weights[-1])
 
 
-class FrictionLayers(NamedTuple):
-    """The friction networks' weights made ready for many states, all joints in one."""
-
-    weight: Tensor
-    bias: Tensor
-    out: Tensor
-    offset: Tensor
-    viscous: Tensor  # [Nm s/rad, N s/m]
-
-
 class Friction(nn.Module):
-    """Damping of each joint by its own q_i and qd_i: viscous, a constant, and dry, a network."""
+    """D = L L^T, of all q and qd: a network gives L, with a row and a column for each joint."""
 
-    spread: Tensor  # where the inputs of a joint's network stand, (joints, inputs, features + 2 n)
     speed: Tensor
     size: Tensor
+    outlay: Tensor
+    start: Tensor
 
     def __init__(self, generator: torch.Generator) -> None:
         super().__init__()
-        joints, inputs = len(JOINTS), 4
-        spread = torch.zeros(joints, inputs, 5 * joints, dtype=torch.float64)
-        for i, joint in enumerate(JOINTS):
-            cos, sin = (i, joints + i) if joint.revolute else (2 * joints + i, 2 * joints + i)
-            spread[i, 0, cos] = spread[i, 1, sin] = PLACE_SHARE
-            spread[i, 2, i - 2 * joints], spread[i, 3, i - joints] = 1 / joint.speed, 1.0
-        self.register_buffer("spread", spread)
+        n, rows = len(JOINTS), FRICTION_AXES * len(JOINTS)
         self.register_buffer("speed", vector(joint.speed for joint in JOINTS))
         self.register_buffer("size", vector(joint.friction for joint in JOINTS))
-        self.viscous = nn.Parameter(torch.full((joints,), -2.0, dtype=torch.float64))
-        shape = (joints, inputs, FRICTION_HIDDEN)
-        weight = torch.randn(shape, dtype=torch.float64, generator=generator)
-        self.weight = nn.Parameter(weight / inputs**0.5)
-        self.bias = nn.Parameter(torch.zeros(joints, FRICTION_HIDDEN, dtype=torch.float64))
-        self.out = nn.Parameter(torch.zeros(joints, FRICTION_HIDDEN, dtype=torch.float64))
-        self.offset = nn.Parameter(torch.full((joints,), -2.0, dtype=torch.float64))
+        moving = slice(FRICTION_AXES - 1, None, FRICTION_AXES)
+        entries = lower_entries(rows)
+        self.register_buffer("outlay", entries[moving])
+        self.register_buffer("start", FRICTION_START * torch.eye(rows, dtype=torch.float64)[moving])
+        everything = frozenset(range(n))
+        layers = (*(((everything,) * FRICTION_WIDTH,) * DEPTH), (everything,) * entries.shape[-1])
+        self.network = Network(reading([PLACE_SHARE] * n, FRICTION_AXES), layers, generator)
 
-    def prepared(self) -> FrictionLayers:
-        """All joints' networks as one: block matrices are faster than a loop over joints."""
-        own = torch.eye(len(JOINTS), dtype=self.out.dtype, device=self.out.device)
-        return FrictionLayers(
-            weight=(self.weight.mT @ self.spread).flatten(0, 1),
-            bias=self.bias.flatten(),
-            out=(own.unsqueeze(-1) * self.out).flatten(1),
-            offset=self.offset,
-            viscous=self.size * F.softplus(self.viscous) / self.speed,
-        )
+    def prepared(self) -> Layers:
+        """The network's weights made ready for many states."""
+        size = torch.sqrt(self.size / self.speed).unsqueeze(-1)
+        outlay = (size.unsqueeze(-1) * self.outlay).flatten(0, 1)
+        return self.network.prepared(outlay, (size * self.start).flatten())
 
-    def damping(self, features: Tensor, qd: Tensor, layers: FrictionLayers) -> Tensor:
-        """d, (..., n) [Nm s/rad, N s/m]: joint i is slowed by d_i qd_i."""
-        smooth_speed = torch.sqrt(qd * qd + (SLOW * self.speed) ** 2)
-        inputs = torch.cat([features, qd, qd / smooth_speed], dim=-1)
-        hidden = torch.tanh(F.linear(inputs, layers.weight, layers.bias))
-        dry = F.softplus(F.linear(hidden, layers.out, layers.offset))
-        return layers.viscous + self.size * dry / smooth_speed
+    def _factor(self, features: Tensor, qd: Tensor, layers: Layers) -> Tensor:
+        rows: Tensor = self.network(torch.cat([features, qd / self.speed], dim=-1), layers)[0]
+        return rows.reshape(*qd.shape[:-1], *self.start.shape)
 
-    def forward(self, features: Tensor, qd: Tensor, layers: FrictionLayers) -> Tensor:
+    def forward(self, features: Tensor, qd: Tensor, layers: Layers) -> Tensor:
         """The friction torque D qd, (..., n) [Nm, N]."""
-        return self.damping(features, qd, layers) * qd
+        factor = self._factor(features, qd, layers)
+        return (factor @ (factor.mT @ qd.unsqueeze(-1))).squeeze(-1)
 
-    def matrix(self, features: Tensor, qd: Tensor, layers: FrictionLayers) -> Tensor:
-        """D, (..., n, n), diagonal."""
-        return torch.diag_embed(self.damping(features, qd, layers))
+    def matrix(self, features: Tensor, qd: Tensor, layers: Layers) -> Tensor:
+        """D, (..., n, n)."""
+        factor = self._factor(features, qd, layers)
+        return factor @ factor.mT
 
 
 class Prepared(NamedTuple):
@@ -323,8 +335,9 @@ class Prepared(NamedTuple):
 
     mass: Layers
     rotors: Tensor
+    least: Tensor  # M above this needs no guard
     potential: Layers
-    friction: FrictionLayers
+    friction: Layers
 
 
 # what M's derivatives need of the work done for M
@@ -362,6 +375,7 @@ class Model(nn.Module):
         generator = torch.Generator().manual_seed(seed)
         self.register_buffer("center", vector(joint.center for joint in JOINTS))
         self.register_buffer("reach", vector(joint.reach for joint in JOINTS))
+        everything = frozenset(range(self.n))
         start = vector(constant.start for constant in CONSTANTS)
         self.register_buffer("constant_scale", vector(constant.scale for constant in CONSTANTS))
         self.register_buffer("constant_basis", stacked([c.entries for c in CONSTANTS]))
@@ -375,12 +389,11 @@ class Model(nn.Module):
         hidden = tuple(frozenset(joints) for joints, units in MASS_HIDDEN for _ in range(units))
         outputs = tuple(frozenset(output.joints) for output in OUTPUTS)
         shares = [joint.mass_share for joint in JOINTS]
-        read = reading(sorted(frozenset().union(*outputs)), shares)
-        self.mass_network = Network(read, (*((hidden,) * DEPTH), outputs), generator)
-        everything = frozenset(POTENTIAL_JOINTS)
+        layers = (*((hidden,) * DEPTH), outputs)
+        self.mass_network = Network(reading(shares), layers, generator)
         layers = (*(((everything,) * POTENTIAL_WIDTH,) * DEPTH), (everything,))
         shares = [joint.potential_share for joint in JOINTS]
-        self.potential_network = Network(reading(POTENTIAL_JOINTS, shares), layers, generator)
+        self.potential_network = Network(reading(shares), layers, generator)
         self.friction = Friction(generator)
         self.register_buffer("rotor_size", vector(joint.rotor for joint in JOINTS))
         self.rotor = nn.Parameter(torch.zeros(self.n, dtype=torch.float64))
@@ -396,6 +409,7 @@ class Model(nn.Module):
         return Prepared(
             mass=self.mass_network.prepared(outlay, constant),
             rotors=rotors,
+            least=(rotors + GUARD * self.mean_mass).detach(),
             potential=self.potential_network.prepared(scale, 0 * scale[0]),
             friction=self.friction.prepared(),
         )
@@ -434,8 +448,7 @@ class Model(nn.Module):
 
     def _sound(self, mass: Tensor, prepared: Prepared) -> bool:
         """Whether no eigenvalue of M less rotors, relative to its mean, is below GUARD."""
-        least = (prepared.rotors + GUARD * self.mean_mass).detach()
-        return not torch.linalg.cholesky_ex(mass.detach() - least).info.any()
+        return not torch.linalg.cholesky_ex(mass.detach() - prepared.least).info.any()
 
     def _lift(self, mass: Tensor) -> tuple[Tensor, Tensor]:
         """l >= 0 that makes M + l M_mean positive definite, (...), and dl/dM, (..., n, n).
@@ -481,11 +494,11 @@ class Model(nn.Module):
 
     def _potential_slope(self, features: Tensor, prepared: Prepared) -> Tensor:
         """dV/dfeatures, (..., features)."""
-        y, trace = self.potential_network(features, prepared.potential)
-        return self.potential_network.pull(trace, torch.ones_like(y))
+        _, trace = self.potential_network(features, prepared.potential)
+        return self.potential_network.pull(trace, features.new_ones(1))
 
     def dissipation(self, q: Tensor, qd: Tensor) -> Tensor:
-        """D(q, qd), (..., n, n), diagonal: D qd is the friction torque."""
+        """D(q, qd), (..., n, n): D qd is the friction torque."""
         return self.friction.matrix(self._features(q), qd, self.prepare().friction)
 
     def input_matrix(self, q: Tensor) -> Tensor:

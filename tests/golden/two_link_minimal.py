@@ -242,6 +242,7 @@ class FrictionLayers(NamedTuple):
     out: Tensor
     offset: Tensor
     viscous: Tensor  # [Nm s/rad, N s/m]
+    slow: Tensor  # [rad^2/s^2, m^2/s^2]
 
 
 class Friction(nn.Module):
@@ -270,31 +271,39 @@ class Friction(nn.Module):
         self.offset = nn.Parameter(torch.full((joints,), -2.0, dtype=torch.float64))
 
     def prepared(self) -> FrictionLayers:
-        """All joints' networks as one: block matrices are faster than a loop over joints."""
+        """All joints' networks as one: block matrices are faster than a loop over joints.
+
+        Their tanh x is computed as 2 sigmoid(2 x) - 1, which takes a fraction of the time.
+        """
         own = torch.eye(len(JOINTS), dtype=self.out.dtype, device=self.out.device)
         return FrictionLayers(
-            weight=(self.weight.mT @ self.spread).flatten(0, 1),
-            bias=self.bias.flatten(),
-            out=(own.unsqueeze(-1) * self.out).flatten(1),
-            offset=self.offset,
+            weight=2 * (self.weight.mT @ self.spread).flatten(0, 1),
+            bias=2 * self.bias.flatten(),
+            out=2 * (own.unsqueeze(-1) * self.out).flatten(1),
+            offset=self.offset - self.out.sum(dim=1),
             viscous=self.size * F.softplus(self.viscous) / self.speed,
+            slow=(SLOW * self.speed) ** 2,
         )
 
-    def damping(self, features: Tensor, qd: Tensor, layers: FrictionLayers) -> Tensor:
-        """d, (..., n) [Nm s/rad, N s/m]: joint i is slowed by d_i qd_i."""
-        smooth_speed = torch.sqrt(qd * qd + (SLOW * self.speed) ** 2)
-        inputs = torch.cat([features, qd, qd / smooth_speed], dim=-1)
-        hidden = torch.tanh(F.linear(inputs, layers.weight, layers.bias))
-        dry = F.softplus(F.linear(hidden, layers.out, layers.offset))
-        return layers.viscous + self.size * dry / smooth_speed
+    def _dry(
+        self, features: Tensor, qd: Tensor, direction: Tensor, layers: FrictionLayers
+    ) -> Tensor:
+        """Dry friction relative to its usual size, (..., n)."""
+        inputs = torch.cat([features, qd, direction], dim=-1)
+        hidden = torch.sigmoid(F.linear(inputs, layers.weight, layers.bias))
+        return F.softplus(F.linear(hidden, layers.out, layers.offset))
 
     def forward(self, features: Tensor, qd: Tensor, layers: FrictionLayers) -> Tensor:
         """The friction torque D qd, (..., n) [Nm, N]."""
-        return self.damping(features, qd, layers) * qd
+        direction = qd * torch.rsqrt(qd * qd + layers.slow)  # -1 or 1, smooth where it stands still
+        dry = self._dry(features, qd, direction, layers)
+        return layers.viscous * qd + self.size * direction * dry
 
     def matrix(self, features: Tensor, qd: Tensor, layers: FrictionLayers) -> Tensor:
-        """D, (..., n, n), diagonal."""
-        return torch.diag_embed(self.damping(features, qd, layers))
+        """D, (..., n, n) [Nm s/rad, N s/m], diagonal."""
+        smooth_speed = torch.sqrt(qd * qd + layers.slow)
+        dry = self._dry(features, qd, qd / smooth_speed, layers)
+        return torch.diag_embed(layers.viscous + self.size * dry / smooth_speed)
 
 
 class Prepared(NamedTuple):
@@ -302,6 +311,7 @@ class Prepared(NamedTuple):
 
     mass: Layers
     rotors: Tensor
+    least: Tensor  # M above this needs no guard
     potential: Layers
     friction: FrictionLayers
 
@@ -371,6 +381,7 @@ class Model(nn.Module):
         return Prepared(
             mass=self.mass_network.prepared(outlay, constant),
             rotors=rotors,
+            least=(rotors + GUARD * self.mean_mass).detach(),
             potential=self.potential_network.prepared(scale, 0 * scale[0]),
             friction=self.friction.prepared(),
         )
@@ -409,8 +420,7 @@ class Model(nn.Module):
 
     def _sound(self, mass: Tensor, prepared: Prepared) -> bool:
         """Whether no eigenvalue of M less rotors, relative to its mean, is below GUARD."""
-        least = (prepared.rotors + GUARD * self.mean_mass).detach()
-        return not torch.linalg.cholesky_ex(mass.detach() - least).info.any()
+        return not torch.linalg.cholesky_ex(mass.detach() - prepared.least).info.any()
 
     def _lift(self, mass: Tensor) -> tuple[Tensor, Tensor]:
         """l >= 0 that makes M + l M_mean positive definite, (...), and dl/dM, (..., n, n).
@@ -456,8 +466,8 @@ class Model(nn.Module):
 
     def _potential_slope(self, features: Tensor, prepared: Prepared) -> Tensor:
         """dV/dfeatures, (..., features)."""
-        y, trace = self.potential_network(features, prepared.potential)
-        return self.potential_network.pull(trace, torch.ones_like(y))
+        _, trace = self.potential_network(features, prepared.potential)
+        return self.potential_network.pull(trace, features.new_ones(1))
 
     def dissipation(self, q: Tensor, qd: Tensor) -> Tensor:
         """D(q, qd), (..., n, n), diagonal: D qd is the friction torque."""

@@ -1,0 +1,89 @@
+"""The view of the arm as a system on SO(3)^k x R^3^l: rotation matrices in, rates of all three axes of each joint out.
+
+The emitted module integrates one number for each joint. Here the same equations stand as the paper has them
+(Wang, Chen, Ding, Sci Rep 15:33179, 2025), to compare with models that are trained so and to show that nothing
+is lost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import torch
+
+
+class GroupModel(Protocol):
+    """What the view needs of an emitted module; see its docstrings for shapes."""
+
+    def from_group(self, parts: list[torch.Tensor]) -> torch.Tensor: ...
+
+    def hamiltonian(self, q: torch.Tensor, p: torch.Tensor) -> torch.Tensor: ...
+
+    def dissipation(self, q: torch.Tensor, qd: torch.Tensor) -> torch.Tensor: ...
+
+    def input_matrix(self, q: torch.Tensor) -> torch.Tensor: ...
+
+
+def geodesic_distance(left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
+    """Angle (...,) [rad] of the rotation from ``left`` to ``right``, (..., 3, 3): |log(R^T R')| / sqrt(2) of eq. 8.
+
+    As the arc tangent of sine and cosine it is exact for small angles too, where an arc cosine loses half
+    its digits.
+    """
+    turn = left.mT @ right
+    axis = torch.stack(
+        [
+            turn[..., 2, 1] - turn[..., 1, 2],
+            turn[..., 0, 2] - turn[..., 2, 0],
+            turn[..., 1, 0] - turn[..., 0, 1],
+        ],
+        dim=-1,
+    )
+    return torch.atan2(axis.norm(dim=-1), torch.diagonal(turn, dim1=-2, dim2=-1).sum(dim=-1) - 1)
+
+
+def group_rates(
+    model: GroupModel, parts: Sequence[torch.Tensor], p: torch.Tensor, tau: torch.Tensor
+) -> tuple[list[torch.Tensor], torch.Tensor]:
+    """Rates of the joints' R, (..., 3, 3), or r, (..., 3), and of their momenta p, (..., n, 3), in joint frames.
+
+    tau: (..., n) input. Eq. 18 for a turning joint, with the rows r_1, r_2, r_3 of R, and eq. 15 for a
+    sliding one:
+
+        r_j' = r_j x dH/dp,  p' = p x dH/dp + sum_j r_j x dH/dr_j - D dH/dp + G u
+        r' = dH/dp,          p' = -dH/dr - D dH/dp + G u
+
+    H is differentiated automatically, in all numbers of R and r. A joint moves along its z axis: its bearing
+    holds the others, so H, D and G act on z alone.
+    """
+    with torch.enable_grad():
+        places = [part.detach().requires_grad_() for part in parts]
+        momenta = p.detach().requires_grad_()
+        energy = model.hamiltonian(model.from_group(places), momenta[..., 2])
+        *slopes, velocity = torch.autograd.grad(energy.sum(), (*places, momenta), materialize_grads=True)
+    q, qd = model.from_group(list(parts)), velocity[..., 2]
+    moving = model.input_matrix(q) @ tau.unsqueeze(-1) - model.dissipation(q, qd) @ qd.unsqueeze(-1)
+    rates, forces = [], []
+    for i, (part, slope) in enumerate(zip(parts, slopes, strict=True)):
+        turning = part.dim() == p.dim()  # one axis more than a position has
+        rate, force = (_turning if turning else _sliding)(part, slope, p[..., i, :], velocity[..., i, :])
+        rates.append(rate)
+        forces.append(force + torch.nn.functional.pad(moving[..., i, :], (2, 0)))
+    return rates, torch.stack(forces, dim=-2)
+
+
+def _turning(
+    rotation: torch.Tensor, slope: torch.Tensor, p: torch.Tensor, velocity: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """R' and the torque that H makes."""
+    rate = torch.linalg.cross(rotation, velocity.unsqueeze(-2).expand_as(rotation), dim=-1)
+    torque = torch.linalg.cross(p, velocity, dim=-1) + torch.linalg.cross(rotation, slope, dim=-1).sum(dim=-2)
+    return rate, torque
+
+
+def _sliding(
+    position: torch.Tensor, slope: torch.Tensor, p: torch.Tensor, velocity: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """r' and the force that H makes."""
+    return velocity, -slope

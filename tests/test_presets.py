@@ -1,0 +1,242 @@
+"""Every preset keeps what an emitted module promises, and is the model that the papers write down."""
+
+import math
+from pathlib import Path
+from typing import get_args
+
+import pytest
+import torch
+from emitted import built, frictionless, random_model
+from published_phnode import Published
+
+from spelgen.pipeline import make_spec
+from spelgen.spec import Options, Preset, load_design
+from spelgen.training.lie_group import geodesic_distance, group_rates
+from spelgen.training.rollout import position_difference
+
+ROOT = Path(__file__).parents[1]
+PRESETS = [("phnode", "mlp"), ("phnode", "kan"), ("spel", "mlp"), ("spel-kan", "kan"), ("minimal", "kan")]
+ROBOTS = ("two_link", "rpr", "six_dof")
+each = pytest.mark.parametrize(("preset", "net"), PRESETS)
+each_robot = pytest.mark.parametrize("robot", ROBOTS)
+
+
+def states(n: int, count: int = 20) -> list[torch.Tensor]:
+    """Random q, qd, qdd and tau."""
+    generator = torch.Generator().manual_seed(0)
+    return [1.5 * torch.randn(count, n, dtype=torch.float64, generator=generator) for _ in range(4)]
+
+
+def near(ours: torch.Tensor, reference: torch.Tensor, bound: float = 1e-10) -> None:
+    assert (ours - reference).abs().max() < bound * max(1.0, reference.abs().max().item())
+
+
+def test_presets_are_the_files():
+    files = {path.stem for path in (ROOT / "spelgen" / "presets").glob("*.yaml")}
+    assert {name for name in get_args(Preset) if name in files} == files
+    for name in files:
+        design = load_design(name)
+        assert load_design(name, "kan").net == "kan"
+        assert make_spec(ROOT / "robots" / "rpr.urdf", Options(preset=name)).options.net == design.net
+
+
+@each_robot
+@each
+def test_written_out_derivatives_equal_autograd(robot, preset, net, tmp_path):
+    model = frictionless(random_model(robot, tmp_path, seed=4, preset=preset, net=net))
+    n = model.n
+    q, qd, _, _ = states(n)
+    q.requires_grad_()
+    (gravity,) = torch.autograd.grad(model.potential_energy(q).sum(), q)
+    near(model.gravity(q), gravity)
+    p = model.momentum(q, qd).detach()
+    (slope,) = torch.autograd.grad(model.hamiltonian(q, p).sum(), q)
+    rate = model(torch.zeros(()), torch.cat([q, p], dim=-1))
+    near(rate[..., n:], -slope)
+    near(rate[..., :n], qd)
+    _, mass_rate = torch.func.jvp(model.mass_matrix, (q.detach(),), (qd,))
+    features = model._features(q)
+    _, memory = model._mass(features, model.prepare())
+    near(model._mass_rate(model._features_rate(features, qd), memory), mass_rate)
+
+
+@each_robot
+@each
+def test_forward_and_inverse_dynamics_undo_each_other(robot, preset, net, tmp_path):
+    model = random_model(robot, tmp_path, seed=3, preset=preset, net=net)
+    if preset == "phnode":  # random gains may be next to zero
+        torch.nn.init.zeros_(model.input_network.weights[-1])
+    q, qd, _, tau = states(model.n)
+    near(model.inverse_dynamics(q, qd, model.forward_dynamics(q, qd, tau)), tau, 1e-8)
+
+
+@each_robot
+@each
+def test_mass_matrix_and_dissipation_are_positive(robot, preset, net, tmp_path):
+    # larger weights make U of phnode, 3 n rows of an inverse, too ill-conditioned for 16 digits
+    deviation = None if preset == "phnode" else 3.0
+    for seed in range(5):
+        model = random_model(robot, tmp_path, seed=seed, deviation=deviation, preset=preset, net=net)
+        q, qd, _, _ = states(model.n, 500)
+        with torch.no_grad():
+            assert torch.linalg.eigvalsh(model.mass_matrix(q))[:, 0].min() > 0
+            damping = model.dissipation(q, qd)
+            assert torch.linalg.eigvalsh(damping)[:, 0].min() > -1e-12 * damping.abs().max()
+            torque = model.friction(model._features(q), qd, model.prepare().friction)
+            near(torque, (damping @ qd.unsqueeze(-1)).squeeze(-1))
+
+
+@pytest.mark.parametrize("batch", [(), (1,), (0,), (2, 3), (2, 0)])
+@each
+def test_any_batch_shape(preset, net, batch, tmp_path):
+    model = random_model("rpr", tmp_path, seed=0, preset=preset, net=net)
+    q, qd, tau = (torch.rand(*batch, 3, dtype=torch.float64) for _ in range(3))
+    for value in (model.gravity(q), model.forward_dynamics(q, qd, tau), model.inverse_dynamics(q, qd, tau)):
+        assert value.shape == (*batch, 3)
+    for value in (model.mass_matrix(q), model.dissipation(q, qd), model.input_matrix(q)):
+        assert value.shape == (*batch, 3, 3)
+    assert model.potential_energy(q).shape == batch
+    assert model(torch.zeros(()), torch.cat([q, qd, tau], dim=-1)).shape == (*batch, 9)
+
+
+@each
+def test_backpropagation_reaches_every_weight(preset, net, tmp_path):
+    model = random_model("rpr", tmp_path, seed=0, deviation=0.3, preset=preset, net=net)
+    q, qd, _, tau = states(3)
+    model.forward_dynamics(q, qd, tau).square().sum().backward()
+    for name, parameter in model.named_parameters():
+        # V's own level moves nothing
+        assert name.startswith("potential_network.biases") or parameter.grad.abs().max() > 0, name
+
+
+@pytest.mark.parametrize("robot", ["rpr", "six_dof", "panda"])
+def test_kan_outputs_read_their_own_joints_only(robot, tmp_path):
+    model = random_model(robot, tmp_path, seed=2, net="kan")
+    outputs = built(robot, net="kan")[1].outputs
+    q = states(model.n)[0]
+    layers = model.mass_network.prepared(torch.eye(len(outputs), dtype=q.dtype), q.new_zeros(len(outputs)))
+    before = model.mass_network(model._features(q), layers)[0]
+    for joint in range(model.n):
+        moved = q.clone()
+        moved[:, joint] += 0.7
+        changed = (model.mass_network(model._features(moved), layers)[0] != before).any(dim=0)
+        assert changed.tolist() == [joint in output.joints for output in outputs]
+
+
+@pytest.mark.parametrize("preset", ["spel", "spel-kan"])
+@each_robot
+def test_spel_keeps_zeros_constants_and_relations(robot, preset, tmp_path):
+    """Its networks see all joints, as the paper's do; what the structure fixes stays fixed."""
+    model = random_model(robot, tmp_path, seed=1, preset=preset)
+    q = states(model.n, 100)[0] / 5
+    assert model._mass(model._features(q), model.prepare())[1][1] is None, "the guard was to sleep"
+    mass = model.mass_matrix(q).detach()
+    for entry in built(robot)[1].entries:
+        values = mass[:, entry.row, entry.column]
+        assert entry.kind != "zero" or (values == 0).all()
+        assert entry.kind != "constant" or (values - values[0]).abs().max() < 1e-12 * values[0].abs()
+        assert entry.kind != "varying" or values.std() > 0
+
+
+@pytest.mark.parametrize("network", ["mass_network", "potential_network", "input_network"])
+@pytest.mark.parametrize("net", ["mlp", "kan"])
+def test_networks_read_rotation_matrices(net, network, tmp_path):
+    """Layer by layer as the papers write them, on the 9 numbers of R and the 3 of r."""
+    model = getattr(frictionless(random_model("rpr", tmp_path, seed=5, preset="phnode", net=net)), network)
+    owner = random_model("rpr", tmp_path, seed=5, preset="phnode", net=net)
+    q = states(3)[0]
+    parts = owner.to_group(q)
+    parts[1] = (parts[1] - owner.center[1] * torch.tensor([0, 0, 1.0], dtype=q.dtype)) / owner.reach[1]
+    layer = torch.cat([part.reshape(len(q), -1) for part in parts], dim=-1)
+    count = len(model.weights)
+    for index, (weight, bias) in enumerate(zip(model.weights, model.biases, strict=True)):
+        weight = weight * getattr(model, f"mask{index}")
+        if net == "mlp":
+            layer = layer @ weight.T + bias
+        else:
+            grid = torch.linspace(-1, 1, weight.shape[-1], dtype=torch.float64)
+            bumps = torch.exp(-(((layer.unsqueeze(-1) - grid) / (grid[1] - grid[0])) ** 2))
+            layer = torch.einsum("big,oig->bo", bumps, weight) + bias
+        layer = torch.tanh(layer) if index < count - 1 else layer
+    outputs = len(model.biases[-1])
+    ready = model.prepared(torch.eye(outputs, dtype=q.dtype), q.new_zeros(outputs))
+    near(model(owner._features(q), ready)[0], layer)
+
+
+@pytest.mark.parametrize(("preset", "net"), [*PRESETS, ("minimal", "mlp")])
+@pytest.mark.parametrize("robot", ["rpr", "six_dof"])
+def test_reduced_model_is_the_port_hamiltonian_system_on_rotations(robot, preset, net, tmp_path):
+    """Eq. 15 and 18 over three axes a joint, all derivatives automatic, against the n x n module."""
+    model = random_model(robot, tmp_path, seed=6, preset=preset, net=net)
+    n = model.n
+    q, p, _, tau = states(n)
+    parts = model.to_group(q)
+    rates, forces = group_rates(model, parts, torch.nn.functional.pad(p.unsqueeze(-1), (2, 0)), tau)
+    qd, force, _ = model(torch.zeros(()), torch.cat([q, p, tau], dim=-1)).chunk(3, dim=-1)
+    near(forces[..., 2], force)
+    assert forces[..., :2].abs().max() < 1e-12 * forces.abs().max()
+    for i, (part, rate) in enumerate(zip(parts, rates, strict=True)):
+        if model.joint_types[i] == "prismatic":
+            near(rate, torch.nn.functional.pad(qd[:, i : i + 1], (2, 0)))
+            continue
+        spin = torch.zeros_like(part)
+        spin[:, 1, 0], spin[:, 0, 1] = qd[:, i], -qd[:, i]
+        near(rate, part @ spin)
+
+
+@pytest.mark.parametrize("net", ["mlp", "kan"])
+def test_phnode_is_its_three_axis_model_held_by_bearings(net, tmp_path):
+    """H = 1/2 p^T M^-1 p over 3 n axes: moving along z alone, p_z follows the n x n module."""
+    model = frictionless(random_model("six_dof", tmp_path, seed=7, preset="phnode", net=net))
+    n = model.n
+    q, qd, _, _ = states(n)
+    inverse = model.axes_inverse_mass(q).detach()
+    assert torch.linalg.eigvalsh(inverse)[:, 0].min() > 0
+    axes = torch.zeros(len(q), n, 3, dtype=torch.float64)
+    axes[..., 2] = qd
+    momenta = torch.linalg.solve(inverse, axes.flatten(-2).unsqueeze(-1))
+    q.requires_grad_()
+    kinetic = 0.5 * (momenta.mT @ model.axes_inverse_mass(q) @ momenta).sum()
+    (slope,) = torch.autograd.grad(kinetic + model.potential_energy(q).sum(), q)
+    p = momenta.squeeze(-1)[:, 2::3]
+    rate = model(torch.zeros(()), torch.cat([q, p], dim=-1))
+    near(rate[..., :n], qd)
+    near(rate[..., n:], -slope)
+
+
+def test_geodesic_distance_is_the_angle_between():
+    """For turns about one axis it is the wrapped difference that training uses, small angles included."""
+    angles = torch.tensor([1e-9, 1e-4, 0.5, 3.0, -3.0, math.pi - 1e-6, 7.0], dtype=torch.float64)
+    zero, one = torch.zeros_like(angles), torch.ones_like(angles)
+    c, s = angles.cos(), angles.sin()
+    turned = torch.stack([c, -s, zero, s, c, zero, zero, zero, one], dim=-1).reshape(-1, 3, 3)
+    wrapped = position_difference(angles.unsqueeze(-1), torch.zeros(len(angles), 1), ["revolute"])
+    distance = geodesic_distance(torch.eye(3, dtype=torch.float64), turned)
+    assert ((distance - wrapped.squeeze(-1).abs()).abs() < 1e-12 * (1 + distance)).all()
+    hat = torch.tensor([[0, -0.3, 0.2], [0.3, 0, -0.1], [-0.2, 0.1, 0]], dtype=torch.float64)
+    tilt = torch.linalg.matrix_exp(hat)
+    angle = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64).norm()
+    near(geodesic_distance(turned, turned @ tilt), angle.expand(len(angles)), 1e-14)
+
+
+def test_published_formulation_keeps_its_energy():
+    """The benchmark's rival is the equations it stands for: without friction and input dH/dt = 0."""
+    torch.manual_seed(0)
+    model = Published(2, 8, 8)
+    for network in (model.dissipation.network, model.gains):
+        torch.nn.init.zeros_(network[-1].weight)
+        torch.nn.init.zeros_(network[-1].bias)
+    rotation = torch.linalg.qr(torch.randn(5, 2, 3, 3, dtype=torch.float64))[0].flatten(1)
+    zeta = torch.randn(5, 6, dtype=torch.float64)
+    state = torch.cat([rotation, zeta], dim=-1)
+    rate = model(state, torch.zeros(5, 2, dtype=torch.float64)).detach()
+
+    def energy(x: torch.Tensor) -> torch.Tensor:
+        inverse = model.inverse_mass(x[:, :18])
+        speed = x[:, 18:].unsqueeze(-1)
+        kinetic = 0.5 * (speed.mT @ torch.linalg.solve(inverse, speed)).flatten()
+        return kinetic + model.potential(x[:, :18]).squeeze(-1)
+
+    _, change = torch.func.jvp(energy, (state,), (rate,))
+    assert change.abs().max() < 1e-12
+    assert rate.abs().min() > 0
