@@ -30,7 +30,8 @@ def test_wheel_holds_all_that_the_package_needs(installed):
     files = {str(path.relative_to(installed)) for path in installed.rglob("*") if path.is_file()}
     source = [path for path in (ROOT / "spelgen").rglob("*") if path.is_file() and path.suffix != ".pyc"]
     assert {str(path.relative_to(ROOT)) for path in source} <= files
-    assert {f"spelgen/templates/{path.name}" for path in (ROOT / "templates").iterdir()} <= files
+    templates = [path for path in (ROOT / "templates").rglob("*") if path.is_file()]
+    assert {f"spelgen/{path.relative_to(ROOT)}" for path in templates} <= files
     assert {name.split("/")[0] for name in files if ".dist-info" not in name} == {"spelgen"}
 
 
