@@ -22,6 +22,12 @@ from spelgen.structure.structure import Structure, derive
 from spelgen.structure.symbolic import polynomials
 
 ROBOTS = Path(__file__).parents[1] / "robots"
+GANTRY = """<robot name="gantry"><link name="base"/><link name="bridge"/><link name="trolley"/>
+<joint name="along" type="prismatic"><parent link="base"/><child link="bridge"/><axis xyz="1 0 0"/>
+<limit lower="-1" upper="1" effort="10" velocity="1"/></joint>
+<joint name="across" type="prismatic"><parent link="bridge"/><child link="trolley"/><axis xyz="0 1 0"/>
+<limit lower="-1" upper="1" effort="10" velocity="1"/></joint></robot>"""
+"""Nothing of its M or V depends on q: no network is needed."""
 SIX = ("two_link", "rpr", "six_dof", "scara", "panda", "ur10e")
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
-from emitted import SIX, built, import_source
+from emitted import GANTRY, SIX, built, import_source
 
 from spelgen.pipeline import build, check, make_spec
 from spelgen.spec import ModelSpec, Options, Preset, read_header
@@ -66,6 +66,11 @@ def test_emitted_code_is_held_to_the_rules_of_written_code(tmp_path):
         for preset, net in PRESETS:
             text = built(robot, preset=preset, net=net)[0]
             (tmp_path / f"{robot}_{preset}_{net}.py".replace("-", "_")).write_text(text, encoding="utf-8")
+    urdf = tmp_path / "gantry.urdf"
+    urdf.write_text(GANTRY, encoding="utf-8")
+    for preset in get_args(Preset):
+        text = build(urdf, preset=preset)
+        (tmp_path / f"gantry_{preset}.py".replace("-", "_")).write_text(text, encoding="utf-8")
     files = sorted(str(path) for path in tmp_path.glob("*.py"))
     for command in (
         [

@@ -6,10 +6,10 @@ from typing import get_args
 
 import pytest
 import torch
-from emitted import built, frictionless, random_model
+from emitted import GANTRY, built, frictionless, import_source, random_model
 from published_phnode import Published
 
-from spelgen.pipeline import make_spec
+from spelgen.pipeline import build, make_spec
 from spelgen.spec import Options, Preset, load_design
 from spelgen.training.lie_group import geodesic_distance, group_rates
 from spelgen.training.rollout import position_difference
@@ -107,6 +107,19 @@ def test_backpropagation_reaches_every_weight(preset, net, tmp_path):
     for name, parameter in model.named_parameters():
         # V's own level moves nothing
         assert name.startswith("potential_network.biases") or parameter.grad.abs().max() > 0, name
+
+
+@pytest.mark.parametrize("preset", get_args(Preset))
+def test_arm_whose_mass_matrix_is_constant(preset, tmp_path):
+    """A gantry: M is a diagonal of trained numbers, and gravity does no work."""
+    urdf = tmp_path / "gantry.urdf"
+    urdf.write_text(GANTRY, encoding="utf-8")
+    model = import_source(build(urdf, preset=preset), tmp_path / "gantry.py").Model()
+    q, qd, _, tau = states(2)
+    near(model.mass_matrix(q), model.mass_matrix(q[:1]).expand(len(q), 2, 2))
+    near(model.inverse_dynamics(q, qd, model.forward_dynamics(q, qd, tau)), tau)
+    assert (model.gravity(q) == 0).all()
+    assert model(torch.zeros(()), torch.cat([q, qd, tau], dim=-1)).shape == (len(q), 6)
 
 
 @pytest.mark.parametrize("robot", ["rpr", "six_dof", "panda"])
