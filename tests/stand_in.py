@@ -80,10 +80,15 @@ class Model(nn.Module):
     def forward_dynamics(self, q, qd, tau):
         return self.velocity(q, tau - self.inverse_dynamics(q, qd, torch.zeros_like(qd)))
 
-    def forward(self, t, state):
-        q, p, *inputs = state.split(2, dim=-1)
+    def prepare(self):
+        return None
+
+    def rates(self, q, p, tau, prepared):
         qd = self.velocity(q, p)
         pd = self._kinetic_slope(q, qd) - self.gravity(q) - self.damping.exp() * qd
-        if not inputs:
-            return torch.cat([qd, pd], -1)
-        return torch.cat([qd, pd + inputs[0], torch.zeros_like(qd)], -1)
+        return qd, pd if tau is None else pd + tau
+
+    def forward(self, t, state):
+        q, p, *inputs = state.split(2, dim=-1)
+        rates = self.rates(q, p, inputs[0] if inputs else None, None)
+        return torch.cat([*rates, *map(torch.zeros_like, inputs)], -1)

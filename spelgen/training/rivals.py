@@ -91,16 +91,25 @@ class PinocchioDynamics:
     def velocity(self, q: torch.Tensor, p: torch.Tensor) -> torch.Tensor:
         return p
 
-    def forward(self, t: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
-        """Rate of (q, qd, tau), (W, 3n)."""
-        q, qd, tau = state.numpy().reshape(len(state), 3, -1).transpose(1, 0, 2)
-        force = tau - self._losses(qd)
+    def prepare(self) -> None:
+        """Nothing: there are no weights."""
+
+    def rates(
+        self, q: torch.Tensor, p: torch.Tensor, tau: torch.Tensor | None, prepared: None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Rates of q and qd, each (W, n), under the torques tau (W, n)."""
+        qd = p.numpy()
+        force = -self._losses(qd) if tau is None else tau.numpy() - self._losses(qd)
         qdd = np.empty_like(qd)
-        position, velocity, effort = self._configurations(q), self._permuted(qd), self._permuted(force)
+        position, velocity, effort = (
+            self._configurations(q.numpy()),
+            self._permuted(qd),
+            self._permuted(force),
+        )
         for row in range(len(q)):
             solved = self._pin.aba(self._model, self._data, position[row], velocity[row], effort[row])
             qdd[row] = solved[self._order]
-        return torch.from_numpy(np.concatenate([qd, qdd, np.zeros_like(tau)], axis=1))
+        return p, torch.from_numpy(qdd)
 
     def mass_matrix(self, q: torch.Tensor) -> torch.Tensor:
         """M (T, n, n) [kg m^2, kg m, kg]."""

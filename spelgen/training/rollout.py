@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
-from torchdiffeq import odeint
 
 from spelgen.data.windows import Windows
 
@@ -27,34 +26,50 @@ class Dynamics(Protocol):
 
     def velocity(self, q: torch.Tensor, p: torch.Tensor) -> torch.Tensor: ...
 
-    def forward(self, t: torch.Tensor, state: torch.Tensor) -> torch.Tensor: ...
+    def prepare(self) -> Any: ...
+
+    def rates(
+        self, q: torch.Tensor, p: torch.Tensor, tau: torch.Tensor | None, prepared: Any
+    ) -> tuple[torch.Tensor, torch.Tensor]: ...
 
 
 def roll_out(model: Dynamics, windows: Windows, substeps: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Positions and velocities (W, K-1, n) predicted for samples 1..K-1 of each window from its sample 0.
 
-    The state is (q, p), p = M(q) qd, so that no derivative of M in time is needed. Each step between
-    samples is integrated over s in [0, 1] with d(q, p)/ds = dt d(q, p)/dt by `substeps` steps of
-    torchdiffeq's rk4: windows whose sample times differ make one batch, and the input's jumps fall on the
-    ends of steps.
+    The state is (q, p), p = M(q) qd, so that no derivative of M in time is needed. Between samples stand
+    `substeps` steps of the classical Runge-Kutta method, each window's as long as its own sample times say:
+    windows make one batch, and the input's jumps fall on the ends of steps. Written out here and not left to
+    torchdiffeq, which cannot know that the weights stay the same over the whole window: `prepare` readies
+    them once.
     """
+    prepared = model.prepare()
     q = windows.q[:, 0]
-    n = q.shape[-1]
-    state = torch.cat([q, model.momentum(q, windows.qd[:, 0])], dim=-1)  # (W, 2n)
-    unit = torch.linspace(0.0, 1.0, substeps + 1, dtype=q.dtype, device=q.device)
-    states = []
+    p = model.momentum(q, windows.qd[:, 0])
+    positions, velocities = [], []
     for dt, tau in zip(windows.dt.unbind(1), windows.tau.unbind(1), strict=True):
-        step = dt.unsqueeze(-1)
-        state = odeint(
-            lambda s, y, step=step: step * model.forward(s, y),
-            torch.cat([state, tau], dim=-1),
-            unit,
-            method="rk4",
-        )[-1]
-        state = state[:, : 2 * n]
-        states.append(state)
-    q, p = torch.stack(states, dim=1).split(n, dim=-1)  # each (W, K-1, n)
-    return q, model.velocity(q, p)
+        step = dt.unsqueeze(-1) / substeps
+        for substep in range(substeps):
+            q, p, qd = _runge_kutta(model, q, p, tau, prepared, step)
+            if substep == 0:
+                velocities.append(qd)  # of the sample that the interval starts at
+        positions.append(q)
+    velocities = [*velocities[1:], model.velocity(q, p)]
+    return torch.stack(positions, dim=1), torch.stack(velocities, dim=1)  # each (W, K-1, n)
+
+
+def _runge_kutta(
+    model: Dynamics, q: torch.Tensor, p: torch.Tensor, tau: torch.Tensor, prepared: Any, step: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """q and p (W, n) one `step` (W, 1) [s] later, and q' at its start (Hairer et al., Solving ODEs I, II.1)."""
+    qd1, pd1 = model.rates(q, p, tau, prepared)
+    half = step / 2
+    qd2, pd2 = model.rates(q + half * qd1, p + half * pd1, tau, prepared)
+    qd3, pd3 = model.rates(q + half * qd2, p + half * pd2, tau, prepared)
+    qd4, pd4 = model.rates(q + step * qd3, p + step * pd3, tau, prepared)
+    sixth = step / 6
+    q = q + sixth * (qd1 + 2 * (qd2 + qd3) + qd4)
+    p = p + sixth * (pd1 + 2 * (pd2 + pd3) + pd4)
+    return q, p, qd1
 
 
 def position_difference(
@@ -76,8 +91,8 @@ def position_difference(
 
 @dataclass(frozen=True, eq=False)
 class LossScales:
-    """One unit of error per joint (n,): root mean square change of q, qd from a window's first sample, and the
-    standard deviation of tau.
+    """One unit of error: for each sample but the first and joint (K-1, n), the root mean square change of q and
+    qd since the window's first sample; for each joint (n,) the standard deviation of tau.
     """
 
     q: torch.Tensor
@@ -94,8 +109,11 @@ def loss_scales(windows: Windows, joint_types: Sequence[str]) -> LossScales:
     moved = position_difference(windows.q[:, 1:], windows.q[:, :1], joint_types)
     changed = windows.qd[:, 1:] - windows.qd[:, :1]
     varied = windows.tau - windows.tau.mean(dim=(0, 1))
-    scales = [x.square().mean(dim=(0, 1)).sqrt() for x in (moved, changed, varied)]
-    return LossScales(*(x.clamp(min=max(1e-2 * x.max().item(), 1e-9)) for x in scales))
+    means = moved.square().mean(dim=0), changed.square().mean(dim=0), varied.square().mean(dim=(0, 1))
+    scales = [mean.sqrt() for mean in means]
+    return LossScales(
+        *(torch.maximum(x, (1e-2 * x.amax(dim=-1, keepdim=True)).clamp(min=1e-9)) for x in scales)
+    )
 
 
 def rollout_errors(model: EmittedModel, windows: Windows, scales: LossScales, substeps: int) -> torch.Tensor:
@@ -108,8 +126,8 @@ def rollout_errors(model: EmittedModel, windows: Windows, scales: LossScales, su
 def rollout_loss(model: EmittedModel, windows: Windows, scales: LossScales, substeps: int) -> torch.Tensor:
     """SPEL eq. 8: squared geodesic distance plus squared velocity error, here scaled per joint and averaged.
 
-    The paper sums over joints and samples in rad and rad/s; scaled, a wrist counts as much as a shoulder,
-    and 1 is the loss of predicting that nothing changes over the window.
+    The paper sums over joints and samples in rad and rad/s; scaled, a wrist counts as much as a shoulder and
+    the next sample as much as the last, and 1 is the loss of predicting that nothing changes.
     """
     return rollout_errors(model, windows, scales, substeps).square().mean()
 
@@ -123,9 +141,9 @@ def momentum_loss(model: EmittedModel, windows: Windows, scales: LossScales) -> 
     (Told as a velocity, M(q)^-1 times it, it would reward an M that is too large: errors of the measured
     torque would count less.)
     """
-    q, qd, n = windows.q, windows.qd, windows.q.shape[-1]  # (W, K, n)
+    q, qd = windows.q, windows.qd  # (W, K, n)
     p = model.momentum(q, qd)
-    force = model.forward(windows.dt, torch.cat([q, p], dim=-1))[..., n:]
+    force = model.rates(q, p, None, model.prepare())[1]
     dt = windows.dt.unsqueeze(-1)
     push = (model.input_matrix(q[:, :-1]) @ windows.tau.unsqueeze(-1)).squeeze(-1)
     impulse = (dt * (push + (force[:, :-1] + force[:, 1:]) / 2)).cumsum(dim=1)  # (W, K-1, n)

@@ -18,7 +18,7 @@ from spelgen.errors import ModuleError, RunError
 
 METHODS = (
     "mass_matrix", "potential_energy", "dissipation", "momentum", "velocity", "hamiltonian",
-    "forward_dynamics", "inverse_dynamics", "forward",
+    "forward_dynamics", "inverse_dynamics", "forward", "prepare", "rates",
 )  # fmt: skip
 
 
@@ -41,6 +41,10 @@ if TYPE_CHECKING:
         def hamiltonian(self, q: torch.Tensor, p: torch.Tensor) -> torch.Tensor: ...
         def inverse_dynamics(self, q: torch.Tensor, qd: torch.Tensor, qdd: torch.Tensor) -> torch.Tensor: ...
         def forward(self, t: torch.Tensor, state: torch.Tensor) -> torch.Tensor: ...
+        def prepare(self) -> Any: ...
+        def rates(
+            self, q: torch.Tensor, p: torch.Tensor, tau: torch.Tensor | None, prepared: Any
+        ) -> tuple[torch.Tensor, torch.Tensor]: ...
 
 
 @dataclass(frozen=True)
