@@ -114,6 +114,21 @@ class TrainingSettings(_Group):
     seed: Seed = 0
 
 
+class ComparisonSettings(_Group):
+    """How `spelgen compare` trains every preset on this robot's simulated logs.
+
+    first: only so much of each training trajectory is trained on [s]; None: all. steps: of training, at least.
+    momentum_steps: before these. seeds: runs of each preset. width, depth: of the hidden layers.
+    """
+
+    first: Positive | None = None
+    steps: Count = 1500
+    momentum_steps: Annotated[int, BeforeValidator(_no_bool), Field(ge=0)] = 1000
+    seeds: Count = 5
+    width: Count = 64
+    depth: Count = 2
+
+
 class Settings(_Group):
     """One robot's sidecar file. about: why the robot is here and where its values come from.
 
@@ -125,6 +140,7 @@ class Settings(_Group):
     joints: dict[str, JointSettings] = {}
     simulation: SimulationSettings = SimulationSettings()
     training: TrainingSettings = TrainingSettings()
+    comparison: ComparisonSettings = ComparisonSettings()
 
     def joint(self, name: str) -> JointSettings:
         """Return the settings of a joint, the defaults when the file does not list it."""
@@ -135,6 +151,7 @@ GROUPS: Mapping[str, type[BaseModel]] = {
     "joints": JointSettings,
     "simulation": SimulationSettings,
     "training": TrainingSettings,
+    "comparison": ComparisonSettings,
 }
 
 

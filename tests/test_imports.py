@@ -22,7 +22,8 @@ report: charts plots tables picture learned page
 proof: agreement axes reasons meaning second_reading numeric_samples verification
 formulas: expression notation angles harmonics factoring shortening grouping formulas layout text latex sympy_module
 inspection inspection_page pipeline
-cli: console options formats model_commands run_commands main
+comparison: paper measures study tables page
+cli: console options formats model_commands run_commands compare_command main
 __init__ __main__
 """
 

@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from spelgen import __version__
-from spelgen.cli import model_commands, run_commands
+from spelgen.cli import compare_command, model_commands, run_commands
 from spelgen.cli.console import say, told
 
 app = typer.Typer(
@@ -29,6 +29,7 @@ for command in (
     run_commands.train,
     run_commands.evaluate,
     run_commands.report,
+    compare_command.compare,
     model_commands.check,
 ):
     app.command(context_settings={"max_content_width": 80})(told(command))

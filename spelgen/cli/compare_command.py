@@ -1,0 +1,61 @@
+"""The command `compare`: presets beside one another on one robot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from spelgen.cli.console import counted, note, say
+from spelgen.cli.options import Force, Robot
+from spelgen.errors import SpelgenError, suggestion
+
+
+def compare(
+    robot: Robot,
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="FOLDER", help="Default: comparisons/<robot>."),
+    ] = None,
+    presets: Annotated[
+        str | None, typer.Option("--presets", metavar="A,B,C", help="Only these, of phnode, spel, ...")
+    ] = None,
+    seeds: Annotated[int | None, typer.Option("--seeds", min=1, help="Runs of each preset.")] = None,
+    steps: Annotated[int | None, typer.Option("--steps", min=1, help="Training steps of each run.")] = None,
+    jobs: Annotated[int, typer.Option("--jobs", min=1, help="Runs at a time, one core each.")] = 2,
+    force: Force = False,
+) -> None:
+    """Train every preset on the same simulated logs, and set them beside one another and the paper.
+
+    Started again with the same settings, it goes on where it stopped.
+    """
+    from spelgen.comparison.page import write_comparison
+    from spelgen.comparison.study import VARIANTS, prepare_study, run_study, time_steps
+    from spelgen.comparison.tables import comparison_tables
+
+    known = {variant.name: variant for variant in VARIANTS}
+    chosen = list(known) if presets is None else [name.strip() for name in presets.split(",")]
+    for name in chosen:
+        if name not in known:
+            raise SpelgenError(
+                f"unknown preset {name!r}",
+                expected=", ".join(known),
+                do=suggestion(name, known),
+            )
+    folder = output or Path("comparisons") / robot.stem
+    with counted("simulating") as progress:
+        study = prepare_study(
+            robot,
+            folder,
+            variants=[known[name] for name in chosen],
+            seeds=seeds,
+            steps=steps,
+            force=force,
+            progress=progress,
+        )
+    run_study(study, jobs=jobs, told=note)
+    tables = comparison_tables(study.robot, list(study.results()), time_steps(study))
+    for table in tables:
+        say(table.text() + "\n")
+    say(f"wrote {write_comparison(study, tables)}")

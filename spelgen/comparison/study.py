@@ -1,0 +1,294 @@
+"""A comparison: one robot's logs, a module for each variant, a run for each seed; interrupted, it goes on.
+
+The simulated robot is known to the models by its kinematics alone: they are built from a copy of the URDF without
+inertials, and without the sidecar's drives, so that no model starts from the truth that it is judged by.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from lxml import etree
+
+from spelgen import pipeline
+from spelgen.comparison.measures import laws, predict, sizes, step_seconds, thinned
+from spelgen.data.logs import Trajectory, read_logs, write_logs
+from spelgen.errors import RunError
+from spelgen.evaluation.examples import predict_examples
+from spelgen.files import write_text
+from spelgen.settings import ComparisonSettings, Settings
+from spelgen.spec import Net, Preset, read_header
+from spelgen.structure.nominal import working_range
+from spelgen.training.data import TrainingConfig
+from spelgen.training.loop import EPOCH_STEPS
+from spelgen.training.rivals import trained
+from spelgen.training.rollout import LossScales, loss_scales
+from spelgen.training.runs import RunFolder, load_model, write_json
+from spelgen.training.train import train
+
+SCHEMA = 1
+HORIZON = 1.0  # s, over which trajectories are predicted
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A preset with a kind of network."""
+
+    name: str
+    preset: Preset
+    net: Net | None = None
+
+
+VARIANTS = (
+    Variant("phnode", "phnode"),
+    Variant("spel", "spel"),
+    Variant("spel-kan", "spel-kan"),
+    Variant("minimal", "minimal"),
+    Variant("minimal-kan", "minimal", "kan"),
+)
+
+
+@dataclass(frozen=True)
+class Study:
+    """The files of a comparison.
+
+    logs: train.parquet and test.parquet. kinematics.urdf: what the models are built from. modules and runs
+    by variant and seed; each finished run holds result.json. low, high: range of q [rad; m] in which M is
+    looked at.
+    """
+
+    folder: Path
+    robot: str
+    settings: ComparisonSettings
+    training: TrainingConfig
+    variants: tuple[Variant, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+
+    @property
+    def logs(self) -> Path:
+        return self.folder / "logs"
+
+    @property
+    def urdf(self) -> Path:
+        return self.folder / "kinematics.urdf"
+
+    def module(self, variant: Variant) -> Path:
+        return self.folder / f"{variant.name.replace('-', '_')}.py"
+
+    def run(self, variant: Variant, seed: int) -> Path:
+        return self.folder / "runs" / f"{variant.name}-{seed}"
+
+    def result(self, variant: Variant, seed: int) -> Path:
+        return self.run(variant, seed) / "result.json"
+
+    def results(self) -> Iterator[dict[str, Any]]:
+        """What was measured of every finished run."""
+        for variant in self.variants:
+            for seed in range(self.settings.seeds):
+                if self.result(variant, seed).exists():
+                    yield json.loads(self.result(variant, seed).read_text(encoding="utf-8"))
+
+
+def prepare_study(
+    robot: Path,
+    folder: Path,
+    *,
+    variants: Sequence[Variant] = VARIANTS,
+    seeds: int | None = None,
+    steps: int | None = None,
+    force: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> Study:
+    """Simulate the logs and write the modules, or find them as an earlier call left them.
+
+    Raises RunError where the folder holds another comparison, and what `pipeline.load` and `simulate` raise.
+    """
+    loaded = pipeline.load(robot)
+    chosen = {name: value for name, value in {"seeds": seeds, "steps": steps}.items() if value is not None}
+    settings = loaded.settings.comparison.model_copy(update=chosen)
+    ranges = [working_range(coordinate) for coordinate in loaded.arm.coordinates]
+    study = Study(
+        folder=folder,
+        robot=loaded.arm.name,
+        settings=settings,
+        training=_training(loaded.settings, settings),
+        variants=tuple(variants),
+        low=tuple(low for low, _ in ranges),
+        high=tuple(high for _, high in ranges),
+    )
+    description = _description(study, loaded)
+    if _known(folder, description, force=force):
+        return study
+    _write_logs(study, loaded, progress)
+    study.urdf.write_bytes(_without_inertials(robot))
+    gravity = yaml.safe_dump({"gravity": list(loaded.settings.gravity)})
+    write_text(study.urdf.with_suffix(".yaml"), gravity)
+    for variant in variants:
+        source = pipeline.build(
+            study.urdf, preset=variant.preset, net=variant.net, width=settings.width, depth=settings.depth
+        )
+        write_text(study.module(variant), source)
+    write_json(folder / "study.json", description)
+    return study
+
+
+def run_study(study: Study, *, jobs: int, told: Callable[[str], None]) -> None:
+    """Train and measure what is not yet done, `jobs` runs at a time; `told` hears of each that ends."""
+    waiting = [
+        (variant, seed)
+        for seed in range(study.settings.seeds)
+        for variant in study.variants
+        if not study.result(variant, seed).exists()
+    ]
+    count = len(study.variants) * study.settings.seeds
+    done = count - len(waiting)
+    if done:
+        told(f"{done} of {count} runs are done already")
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        futures = {pool.submit(_run, study, variant, seed): (variant, seed) for variant, seed in waiting}
+        try:
+            for future in as_completed(futures):
+                variant, seed = futures[future]
+                result, done = future.result(), done + 1
+                loss = result["prediction"]["loss"]
+                shown = "not finite" if loss is None else f"{loss:.3g}"
+                took = result["seconds"]
+                told(f"{done}/{count} {variant.name}, seed {seed}: prediction loss {shown}, {took:.0f} s")
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _training(settings: Settings, comparison: ComparisonSettings) -> TrainingConfig:
+    """How every variant is trained: without the URDF's pull, which would tell the answer."""
+    config = TrainingConfig.from_settings(settings.training)
+    epochs = -(-comparison.steps // EPOCH_STEPS)
+    return replace(
+        config,
+        prior=0.0,
+        filter=0.0,
+        epochs=epochs,
+        patience=epochs,
+        momentum_steps=comparison.momentum_steps,
+    )
+
+
+def _description(study: Study, loaded: pipeline.Loaded) -> dict[str, Any]:
+    """What must be the same for a comparison to go on."""
+    return {
+        "schema": SCHEMA,
+        "robot": study.robot,
+        "urdf_sha256": loaded.robot.digest,
+        "simulation": loaded.settings.simulation.model_dump(mode="json"),
+        "comparison": study.settings.model_dump(mode="json"),
+        "training": asdict(study.training),
+        "variants": [variant.name for variant in study.variants],
+    }
+
+
+def _known(folder: Path, description: dict[str, Any], *, force: bool) -> bool:
+    """Whether the folder holds this very comparison; RunError if it holds another that may not be replaced."""
+    path = folder / "study.json"
+    if path.exists() and not force:
+        if json.loads(path.read_text(encoding="utf-8")) == json.loads(json.dumps(description)):
+            return True
+        raise RunError(
+            "a comparison with other settings",
+            file=path,
+            do="--force begins anew, -o names another folder",
+        )
+    for old in sorted(folder.glob("runs/*/result.json")):
+        old.unlink()
+    folder.mkdir(parents=True, exist_ok=True)
+    return False
+
+
+def _write_logs(study: Study, loaded: pipeline.Loaded, progress: Callable[[int, int], None] | None) -> None:
+    from spelgen.simulation.simulate import simulate
+
+    result = simulate(loaded.arm, loaded.settings, progress=progress)
+    names = [coordinate.name for coordinate in loaded.arm.coordinates]
+    first = study.settings.first
+    study.logs.mkdir(parents=True, exist_ok=True)
+    write_logs(study.logs / "train.parquet", [_beginning(x, first) for x in result.train], names)
+    write_logs(study.logs / "test.parquet", result.test, names)
+
+
+def _beginning(trajectory: Trajectory, seconds: float | None) -> Trajectory:
+    """The samples before so many seconds."""
+    if seconds is None:
+        return trajectory
+    elapsed = trajectory.t - trajectory.t[0]
+    return trajectory[: int((elapsed < seconds - 1e-9).sum())]
+
+
+def _without_inertials(robot: Path) -> bytes:
+    """The URDF with nothing but kinematics and limits; it was read before, so it is known to be harmless."""
+    tree = etree.fromstring(
+        robot.read_bytes(), etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True)
+    )
+    for name in ("inertial", "dynamics", "visual", "collision"):
+        for element in tree.findall(f".//{name}"):
+            element.getparent().remove(element)
+    return etree.tostring(tree, xml_declaration=True, encoding="utf-8")
+
+
+def _run(study: Study, variant: Variant, seed: int) -> dict[str, Any]:
+    """Train one variant with one seed, or go on where it was stopped, and measure it."""
+    folder = study.run(variant, seed)
+    run = RunFolder(folder)
+    ended = train(
+        study.module(variant), [study.logs], folder, replace(study.training, seed=seed),
+        urdf=study.urdf, resume=run.checkpoint.exists(), force=not run.checkpoint.exists(), progress=False,
+    )  # fmt: skip
+    model = load_model(run.module)
+    model.load_state_dict(run.load_state(run.weights))
+    model.requires_grad_(False).eval()
+    joints = read_header(run.module).joints
+    config = study.training
+    every = config.every or 1
+    training, testing = (read_logs([study.logs], joints, role=role) for role in ("train", "test"))
+    spacing = float(testing[0].t[1] - testing[0].t[0])
+    far = thinned(testing, round(HORIZON / spacing) + 1, 1)
+    near = {
+        name: thinned(part, config.window, every) for name, part in (("train", training), ("test", testing))
+    }
+    low, high = (torch.tensor(x, dtype=torch.float64) for x in (study.low, study.high))
+    steps = round(HORIZON / spacing)
+    contender = trained(model, ended.substeps)
+    result = {
+        "variant": variant.name,
+        "seed": seed,
+        "seconds": ended.seconds,
+        "substeps": ended.substeps,
+        "sizes": asdict(sizes(model)),
+        "train": asdict(predict(model, near["train"], ended.substeps)),
+        "test": asdict(predict(model, near["test"], ended.substeps)),
+        "prediction": asdict(predict(model, far, ended.substeps)),
+        "laws": asdict(laws(model, far, low, high)),
+        "examples": [asdict(x) for x in predict_examples(contender, testing, steps, joints, measured=False)],
+    }
+    write_json(study.result(variant, seed), result)
+    return result
+
+
+def time_steps(study: Study) -> dict[str, float]:
+    """Seconds of a training step of each variant, one after the other in this process."""
+    joints = read_header(study.module(study.variants[0])).joints
+    training = read_logs([study.logs], joints, role="train")
+    windows = thinned(training, study.training.window, study.training.every or 1)[: study.training.batch]
+    times = {}
+    for variant in study.variants:
+        model = load_model(study.module(variant))
+        scales: LossScales = loss_scales(windows, model.joint_types)
+        times[variant.name] = step_seconds(model, windows, scales, 1)
+    return times
