@@ -90,7 +90,7 @@ def laws(model: EmittedModel, windows: Windows, low: torch.Tensor, high: torch.T
             values = torch.linalg.eigvalsh(model.mass_matrix(part))
             least, mean = min(least, values.min().item()), mean + values.mean().item() / 10
         orthogonality, rise = _free_motion(model, windows)
-    return Laws(least / mean, orthogonality, rise, energy_drift(model, windows))
+    return Laws(least / abs(mean), orthogonality, rise, energy_drift(model, windows))
 
 
 def _free_motion(model: EmittedModel, windows: Windows) -> tuple[float, float | None]:

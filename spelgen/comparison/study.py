@@ -153,16 +153,27 @@ def run_study(study: Study, *, jobs: int, told: Callable[[str], None]) -> None:
     done = count - len(waiting)
     if done:
         told(f"{done} of {count} runs are done already")
+    for variant, seed, result in _finished(study, waiting, jobs):
+        done += 1
+        loss = result["prediction"]["loss"]
+        shown = "not finite" if loss is None else f"{loss:.3g}"
+        took = f"{result['seconds']:.0f} s"
+        told(f"{done}/{count} {variant.name}, seed {seed}: prediction loss {shown}, {took}")
+
+
+def _finished(
+    study: Study, waiting: Sequence[tuple[Variant, int]], jobs: int
+) -> Iterator[tuple[Variant, int, dict[str, Any]]]:
+    """The runs as they end, each in a process of its own where there are several at a time."""
+    if jobs == 1:
+        for variant, seed in waiting:
+            yield variant, seed, _run(study, variant, seed)
+        return
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        futures = {pool.submit(_run, study, variant, seed): (variant, seed) for variant, seed in waiting}
+        futures = {pool.submit(_run, study, *each): each for each in waiting}
         try:
             for future in as_completed(futures):
-                variant, seed = futures[future]
-                result, done = future.result(), done + 1
-                loss = result["prediction"]["loss"]
-                shown = "not finite" if loss is None else f"{loss:.3g}"
-                took = result["seconds"]
-                told(f"{done}/{count} {variant.name}, seed {seed}: prediction loss {shown}, {took:.0f} s")
+                yield *futures[future], future.result()
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise

@@ -1,0 +1,133 @@
+"""A comparison in small: same data for every preset, measures that can fail, resumption, tables beside the paper."""
+
+import json
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+import yaml
+
+from spelgen.comparison import measures
+from spelgen.comparison.paper import PAPER
+from spelgen.comparison.study import VARIANTS, prepare_study, run_study, time_steps
+from spelgen.comparison.tables import comparison_tables
+from spelgen.data.logs import read_logs
+from spelgen.errors import RunError
+from spelgen.training.runs import load_model
+from spelgen.urdf.read import read_urdf
+
+CHOSEN = [variant for variant in VARIANTS if variant.name in ("phnode", "minimal")]
+JOINTS = ("joint1", "joint2")
+
+
+@pytest.fixture(scope="module")
+def quick():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(measures, "POSITIONS", 100)
+        patch.setattr(measures, "FREE_STEPS", 50)
+        yield
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory, robots):
+    """two_link with few trajectories, to be trained for a moment."""
+    folder = tmp_path_factory.mktemp("robot")
+    urdf = folder / "two_link.urdf"
+    urdf.write_bytes((robots / "two_link.urdf").read_bytes())
+    settings = yaml.safe_load((robots / "two_link.yaml").read_text())
+    settings["simulation"]["trajectories"] = 8
+    settings["comparison"] = {"first": 0.25, "steps": 20, "momentum_steps": 5, "seeds": 1, "width": 8}
+    urdf.with_suffix(".yaml").write_text(yaml.safe_dump(settings))
+    return urdf
+
+
+@pytest.fixture(scope="module")
+def told():
+    return []
+
+
+@pytest.fixture(scope="module")
+def study(robot, quick, told, tmp_path_factory):
+    found = prepare_study(robot, tmp_path_factory.mktemp("study"), variants=CHOSEN)
+    run_study(found, jobs=1, told=told.append)
+    return found
+
+
+def test_models_know_the_kinematics_alone(study):
+    known = read_urdf(study.urdf)
+    assert set(JOINTS) <= {joint.name for joint in known.joints}
+    assert all(link.inertial is None for link in known.links)
+    assert "joints" not in yaml.safe_load(study.urdf.with_suffix(".yaml").read_text())
+
+
+def test_training_sees_the_beginning_only(study):
+    names = load_model(study.module(CHOSEN[0])).joint_names
+    training, testing = (read_logs([study.logs], names, role=role) for role in ("train", "test"))
+    assert {len(x.t) for x in training} == {5}
+    assert {len(x.t) for x in testing} == {21}
+    assert not {x.name for x in training} & {x.name for x in testing}
+
+
+def test_every_run_is_told_and_measured(study, told):
+    assert len(told) == 2
+    results = {result["variant"]: result for result in study.results()}
+    assert set(results) == {"phnode", "minimal"}
+    for result in results.values():
+        parts = result["prediction"]
+        assert parts["loss"] == pytest.approx(parts["position"] + parts["velocity"])
+        assert result["laws"]["least_eigenvalue"] > 0
+        assert result["laws"]["orthogonality"] < 1e-14
+    assert results["minimal"]["sizes"]["outputs"] == [1, 2, 0, 1]
+    assert results["phnode"]["sizes"]["outputs"] == list(PAPER["two_link"]["phnode"].outputs)
+    assert results["phnode"]["sizes"]["inputs"] == PAPER["two_link"]["phnode"].inputs
+
+
+def test_a_comparison_goes_on_where_it_stopped(study, robot, quick):
+    lost, kept = study.result(CHOSEN[0], 0), study.result(CHOSEN[1], 0)
+    before = lost.read_text(), kept.stat().st_mtime_ns
+    lost.unlink()
+    told = []
+    again = prepare_study(robot, study.folder, variants=CHOSEN)
+    run_study(again, jobs=1, told=told.append)
+    assert told[0] == "1 of 2 runs are done already"
+    assert kept.stat().st_mtime_ns == before[1]
+    first, second = (json.loads(x) for x in (before[0], lost.read_text()))
+    assert first["prediction"] == second["prediction"]
+
+
+def test_another_comparison_in_the_folder_is_refused(study, robot):
+    with pytest.raises(RunError, match="a comparison with other settings"):
+        prepare_study(robot, study.folder, variants=CHOSEN, seeds=2)
+
+
+def test_tables_stand_beside_the_paper(study):
+    results = list(study.results())
+    tables = comparison_tables("two_link", results, time_steps(study))
+    rows = {row.label: [cell.text for cell in row.cells] for table in tables for row in table.rows}
+    assert rows["outputs of M"] == ["21", "1"]
+    assert rows["paper: prediction loss"] == ["0.194", ""]
+    base, ours = (result["prediction"]["loss"] for result in results)
+    assert rows["phnode's prediction loss / this"] == ["1", f"{base / ours:.3g}"]
+    assert all(line == line.rstrip() and len(line) <= 80 for x in tables for line in x.text().splitlines())
+
+
+def test_a_run_that_is_not_finite_counts_as_worst(study):
+    (result,) = (x for x in study.results() if x["variant"] == "minimal")
+    broken = result | {"seed": 1, "prediction": {"loss": None, "position": None, "velocity": None}}
+    table = comparison_tables("other", [result, broken, broken], {"minimal": 1.0})[1]
+    assert {row.label: row.cells[0].text for row in table.rows}["prediction loss, 1 s"] == "-"
+
+
+def test_laws_notice_what_breaks_them(study, quick):
+    model = load_model(study.module(CHOSEN[1]))
+    testing = read_logs([study.logs], model.joint_names, role="test")
+    still = measures.thinned(testing, 21, 1)
+    windows = replace(still, qd=0.5 + still.qd)
+    low, high = (torch.full((2,), bound, dtype=torch.float64) for bound in (-math.pi, math.pi))
+    kept = measures.laws(model, windows, low, high)
+    assert kept.energy_rise <= 1e-12 < kept.least_eigenvalue
+    model.friction.forward = lambda features, qd, prepared: -5.0 * qd  # drives instead of braking
+    assert measures.laws(model, windows, low, high).energy_rise > 1e-3
+    model.mass_matrix = lambda q: torch.diag_embed(torch.cat([q.cos()[..., :1], 1 + 0 * q[..., :1]], dim=-1))
+    assert measures.laws(model, windows, low, high).least_eigenvalue < -1
