@@ -8,7 +8,7 @@ from fractions import Fraction
 from math import pi
 from typing import Literal
 
-from spelgen.arm.chain import choose_chain
+from spelgen.arm.chain import Chain, choose_chain, follows
 from spelgen.arm.placement import TenVector
 from spelgen.arm.rational import Matrix, Vector, exact
 from spelgen.arm.walk import Moved, walk
@@ -16,6 +16,10 @@ from spelgen.errors import ArmError, Diagnostic
 from spelgen.urdf.robot import Joint, Robot
 
 Kind = Literal["revolute", "prismatic"]
+
+MOST_JOINTS = 16
+"""Longest arm that is taken: what comes after grows with about the fifth power of it."""
+MOST_FOLLOWERS = 48
 
 
 @dataclass(frozen=True)
@@ -96,6 +100,7 @@ def make_arm(
         got = f"a snap tolerance of {snap_tolerance:g} rad"
         raise ArmError(got, expected="at least 0 and less than pi/4 (0.785)")
     chain = choose_chain(robot, joints, tip)
+    _require_small(robot, chain)
     walked = walk(robot, chain, snap_tolerance)
     indices = {joint.name: index for index, joint in enumerate(chain.joints)}
     held = {joint.name for joint in walked.held if joint.type != "fixed"}
@@ -108,6 +113,19 @@ def make_arm(
         diagnostics=walked.diagnostics,
         locked=tuple(joint.name for joint in robot.joints if joint.name in held),
     )
+
+
+def _require_small(robot: Robot, chain: Chain) -> None:
+    """Refuse what would take more than seconds, before any of it is done."""
+    moving = len(chain.joints)
+    if moving > MOST_JOINTS:
+        do = "choose fewer with --joints or --tip"
+        raise ArmError(f"{moving} joints", file=robot.told_as, expected=f"at most {MOST_JOINTS}", do=do)
+    leaders = {joint.name for joint in chain.joints}
+    following = sum(each.leader.name in leaders for each in follows(robot).values()) - moving
+    if following > MOST_FOLLOWERS:
+        got = f"{following} joints that follow others by <mimic>"
+        raise ArmError(got, file=robot.told_as, expected=f"at most {MOST_FOLLOWERS}", do="fix some of them")
 
 
 def _body(moved: Moved, coordinate: int) -> Body:

@@ -142,12 +142,14 @@ def _candidates(spans: Spans, joints: frozenset[int]) -> Iterator[tuple[np.ndarr
     reduced = field.null_space(rows)
     kernel = np.zeros_like(reduced)
     kernel[:, order] = reduced
+    free = [index for index in range(len(spans.keys)) if index not in set(bound)]
     samples = spans.float_changes(outside)
+    shares = _solved(samples[:, bound], samples[:, free])
     for row in sorted(kernel, key=np.count_nonzero):
-        (free,) = set(np.flatnonzero(row)) - set(bound)
+        (own,) = set(np.flatnonzero(row)) - set(bound)
         values = np.zeros(len(row))
-        values[free] = 1.0
-        values[bound] = -_solved(samples[:, bound], samples[:, [free]])[:, 0]
+        values[own] = 1.0
+        values[bound] = -shares[:, free.index(own)]
         yield row, np.where(row != 0, values, 0.0)
 
 

@@ -20,9 +20,6 @@ from spelgen.structure.basis import Constant, Output, smallest_form
 from spelgen.structure.sampling import Assume, regressor_rows
 from spelgen.structure.spans import Spans
 
-MOST_JOINTS = 24
-"""Longest arm that is derived; the work grows with about the fourth power."""
-
 
 @dataclass(frozen=True)
 class Entry:
@@ -57,14 +54,7 @@ class Structure:
 
 
 def derive(arm: Arm, assume: Assume = "kinematics") -> Structure:
-    """The structure of ``arm``. Raises ArmError above ``MOST_JOINTS`` joints, or without inertials under
-    ``inertials``.
-    """
-    n = len(arm.coordinates)
-    if n > MOST_JOINTS:
-        raise ArmError(
-            f"{n} joints", expected=f"at most {MOST_JOINTS}", do="choose fewer with --joints or --tip"
-        )
+    """The structure of ``arm``. Raises ArmError without inertials under ``inertials``."""
     if assume == "inertials" and not arm.has_inertials:
         raise ArmError(
             "links without inertial values",
@@ -79,7 +69,7 @@ def derive(arm: Arm, assume: Assume = "kinematics") -> Structure:
         entries=tuple(_entry(spans, index) for index in range(len(spans.keys))),
         outputs=outputs,
         constants=constants,
-        potential=tuple(k for k in range(n) if spans.potential_changes[k]),
+        potential=tuple(k for k in range(spans.n) if spans.potential_changes[k]),
         passive=tuple(k for k, coordinate in enumerate(arm.coordinates) if coordinate.passive),
         base_parameters=base_parameters(arm),
     )

@@ -152,7 +152,7 @@ def _syntax_error(path: Path, error: etree.XMLSyntaxError) -> UrdfError:
             expected="well-formed XML",
             do=f'add xmlns:{prefix}="..." to <robot>, or remove the prefix',
         )
-    told = re.sub(r",? ?line \d+, column \d+.*", "", message)
+    told = " ".join(re.sub(r",? ?line \d+, column \d+.*", "", message).split())
     return UrdfError(f"not well-formed XML ({told})", file=path, line=error.lineno)
 
 
