@@ -7,6 +7,8 @@ import pytest
 
 from spelgen.arm.arm import make_arm
 from spelgen.errors import SpelgenError
+from spelgen.proof.verification import verify
+from spelgen.structure.structure import derive
 from spelgen.urdf.read import read_urdf
 
 # file -> a part of every line of the refusal
@@ -89,6 +91,29 @@ READ = {
 }
 
 
+# file -> joints, outputs, constants, joints that V depends on, base parameters; each proved by numbers below
+FACTS = {
+    "koch_limit_without_effort": (6, 18, 3, 5, 36),
+    "so100_link_joint_same_name": (5, 12, 3, 4, 29),
+    "lwr4_negative_friction": (7, 27, 1, 6, 43),
+    "lwr4_inertial_without_inertia": (7, 27, 1, 6, 43),
+    "fingerpro_two_inertials": (3, 4, 2, 3, 17),
+    "wam7_nonPSD_inertia": (7, 27, 1, 6, 43),
+    "xarm6_triangle_violation": (6, 19, 2, 5, 36),
+    "al5d_zero_inertia_tensors": (4, 7, 3, 3, 22),
+    "gen3lite_massless_last_body": (6, 19, 2, 5, 36),
+    "irb5400_mimic_in_chain": (6, 19, 2, 5, 43),
+    "irb6640_mimic_side_branch": (6, 20, 1, 5, 44),
+    "scara_lower_gt_upper": (4, 3, 4, 1, 8),
+    "threelinks_nonunit_axis": (2, 2, 1, 1, 8),
+    "edo_axis_noise": (6, 20, 1, 5, 36),
+    "low_cost_arm_space_in_names": (5, 13, 2, 4, 29),
+    "floating_joint_tip": (4, 6, 3, 3, 16),
+    "poppy_two_geometries": (6, 18, 3, 5, 36),
+    "mg400_opened_parallelogram": (5, 12, 3, 4, 29),
+}
+
+
 @pytest.fixture
 def nasty(shared):
     return shared / "nasty"
@@ -117,3 +142,15 @@ def test_read(nasty, name):
     assert [coordinate.name.replace(" ", "_") for coordinate in arm.coordinates] == joints.split()
     assert {each.code for each in robot.diagnostics if each.severity == "warning"} == on_robot
     assert {each.code for each in arm.diagnostics if each.severity == "warning"} == on_arm
+
+
+@pytest.mark.parametrize("name", READ)
+def test_what_is_read_is_right(nasty, name):
+    """Derived, and found again by Pinocchio and by another reader of the file."""
+    robot = read_urdf(nasty / f"{name}.urdf")
+    arm = make_arm(robot)
+    found = derive(arm)
+    sizes = (found.joints, found.outputs, found.constants, found.potential)
+    assert (*map(len, sizes), found.base_parameters) == FACTS[name]
+    proof = verify(robot, arm, found)
+    assert proof.agrees, proof.text()
