@@ -15,6 +15,7 @@ from spelgen.formulas.formulas import Formulas, formulas
 from spelgen.labels import joint_ranges
 from spelgen.proof.meaning import Fact, facts
 from spelgen.structure.structure import Entry, Structure
+from spelgen.urdf.actuation import Actuation
 
 SCHEMA = 1
 
@@ -25,6 +26,7 @@ class Inspection:
 
     arm: Arm
     structure: Structure
+    actuation: Actuation
     diagnostics: tuple[Diagnostic, ...]
 
     @property
@@ -84,13 +86,21 @@ class Inspection:
         }
 
     def _input(self, row: int, column: int) -> dict[str, Any]:
-        driven = row == column and row not in self.structure.passive
-        return {
-            "row": row + 1,
-            "col": column + 1,
-            "kind": "fixed" if driven else "zero",
-            "value": 1.0 if driven else 0.0,
-        }
+        found = [x for x in self.actuation.entries if (x.row, x.column) == (row, column)]
+        kind, value = (found[0].kind, found[0].value) if found else ("zero", 0.0)
+        return {"row": row + 1, "col": column + 1, "kind": kind, "value": value}
+
+    def _inputs(self) -> str:
+        """What is to be said of G."""
+        entries = self.actuation.entries
+        told = ["fixed"]
+        if not self.actuation.direct:
+            told = ["motor torques"]
+            for kind, what in (("fixed", "gear known"), ("gain", "gain trained"), ("coupled", "coupled")):
+                joints = tuple(sorted({entry.row for entry in entries if entry.kind == kind}))
+                told += [f"{what} at {_joints(joints)}"] if joints else []
+        passive = self.structure.passive
+        return ", ".join(told + ([f"{_joints(passive)} without a drive"] if passive else []))
 
     def _heading(self) -> str:
         believed = (
@@ -137,7 +147,7 @@ class Inspection:
             "V(q)": f"depends on {_joints(structure.potential)}"
             if structure.potential
             else "zero: gravity does no work",
-            "G": "fixed" + (f", {_joints(structure.passive)} without a drive" if structure.passive else ""),
+            "G": self._inputs(),
             "base": f"{structure.base_parameters} base inertial parameters",
         }
 

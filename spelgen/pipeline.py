@@ -16,6 +16,7 @@ from spelgen.proof.agreement import Verification
 from spelgen.settings import Settings, check_joint_names, load_settings
 from spelgen.spec import Assume, ModelSpec, Net, Options, Preset, read_header
 from spelgen.structure.structure import derive
+from spelgen.urdf.actuation import Actuation, derive_actuation
 from spelgen.urdf.read import read_urdf
 from spelgen.urdf.robot import Robot
 
@@ -27,6 +28,7 @@ class Loaded:
     robot: Robot
     settings: Settings
     arm: Arm
+    actuation: Actuation
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,8 @@ def load(
         replace(coordinate, passive=not settings.joint(coordinate.name).actuated)
         for coordinate in arm.coordinates
     )
-    return Loaded(robot, settings, replace(arm, coordinates=coordinates))
+    actuation = derive_actuation(robot, settings, [coordinate.name for coordinate in coordinates])
+    return Loaded(robot, settings, replace(arm, coordinates=coordinates), actuation)
 
 
 def inspect(
@@ -74,7 +77,8 @@ def inspect(
     """Derive the structure of the arm in the URDF at ``path``; arguments and errors as for ``load``."""
     loaded = load(path, joints, tip, snap_tolerance)
     structure = derive(loaded.arm, assume)
-    return Inspection(loaded.arm, structure, (*loaded.robot.diagnostics, *loaded.arm.diagnostics))
+    diagnostics = (*loaded.robot.diagnostics, *loaded.arm.diagnostics, *loaded.actuation.diagnostics)
+    return Inspection(loaded.arm, structure, loaded.actuation, diagnostics)
 
 
 def build(
@@ -113,6 +117,7 @@ def make_spec(path: str | Path, options: Options) -> ModelSpec:
     return plan_model(
         loaded.arm,
         structure,
+        loaded.actuation,
         options,
         urdf=Path(path).name,
         urdf_sha256=loaded.robot.digest,

@@ -3,10 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from fractions import Fraction
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from spelgen.errors import SettingsError, collect, suggestion
 from spelgen.yaml_document import Document, read_document
@@ -21,7 +30,7 @@ def _no_bool(value: object) -> object:
 Number = Annotated[float, BeforeValidator(_no_bool), Field(allow_inf_nan=False)]
 Positive = Annotated[Number, Field(gt=0)]
 NonNegative = Annotated[Number, Field(ge=0)]
-Fraction = Annotated[Number, Field(ge=0, lt=1)]
+Share = Annotated[Number, Field(ge=0, lt=1)]
 Count = Annotated[int, BeforeValidator(_no_bool), Field(ge=1)]
 Inputs = Annotated[tuple[Number, ...], Field(min_length=1)]
 Seed = Annotated[int, BeforeValidator(_no_bool), Field(ge=0)]
@@ -39,6 +48,7 @@ class JointSettings(_Group):
     viscous: friction torque per joint velocity, after the gear [Nm s/rad].
     coulomb: friction torque for qd > 0 and for qd < 0, after the gear [Nm], e.g. (0.395, -0.435).
     actuated: False for a passive joint, which never gets an input.
+    gain: "trained" where the gear between logged motor torques and the joint is to be learned; it starts at `gear`.
     inputs: the torques it draws from in a simulation, in place of `simulation.inputs` [Nm].
     """
 
@@ -47,6 +57,7 @@ class JointSettings(_Group):
     viscous: NonNegative = 0.0
     coulomb: tuple[Number, Number] = (0.0, 0.0)
     actuated: bool = True
+    gain: Literal["known", "trained"] = "known"
     inputs: Inputs | None = None
 
     @field_validator("coulomb")
@@ -55,6 +66,21 @@ class JointSettings(_Group):
         if value[0] < 0 or value[1] > 0:
             raise ValueError("the torque for qd > 0 (not negative), then for qd < 0 (not positive)")
         return value
+
+
+class Coupling(_Group):
+    """Joints that the same motors move: their torques are ``matrix`` times the torques of as many motors."""
+
+    joints: Annotated[tuple[str, ...], Field(min_length=2)]
+    matrix: tuple[tuple[Number, ...], ...]
+
+    @model_validator(mode="after")
+    def _invertible(self) -> Coupling:
+        if {len(self.matrix), *map(len, self.matrix)} != {len(self.joints)}:
+            raise ValueError("as many rows, and as many numbers in each, as joints")
+        if not _independent([[Fraction(x) for x in row] for row in self.matrix]):
+            raise ValueError("a matrix with an inverse: as many independent motors as joints")
+        return self
 
 
 class SimulationSettings(_Group):
@@ -73,7 +99,7 @@ class SimulationSettings(_Group):
     duration: Positive = 1.0
     rate: Positive = 20.0
     inputs: Inputs = (-2.0, -1.0, 0.0, 1.0, 2.0)
-    test_fraction: Fraction = 0.5
+    test_fraction: Share = 0.5
     positions: dict[str, tuple[Number, Number]] | None = None
     friction_velocity: Positive = 0.05
     seed: Seed = 0
@@ -133,14 +159,30 @@ class Settings(_Group):
     """One robot's sidecar file. about: why the robot is here and where its values come from.
 
     gravity: in the frame of the root link [m/s^2]. joints: by URDF name; a joint not listed has the defaults.
+    torque: whether the logs' tau are joint torques, or motor torques before the gear. couplings: of motors
+    that move several joints, for motor torques.
     """
 
     about: str = ""
+    torque: Literal["joint", "motor"] = "joint"
+    couplings: tuple[Coupling, ...] = ()
     gravity: tuple[Number, Number, Number] = (0.0, 0.0, -9.81)
     joints: dict[str, JointSettings] = {}
     simulation: SimulationSettings = SimulationSettings()
     training: TrainingSettings = TrainingSettings()
     comparison: ComparisonSettings = ComparisonSettings()
+
+    @model_validator(mode="after")
+    def _drives(self) -> Settings:
+        if self.couplings and self.torque == "joint":
+            raise ValueError("'torque: motor' where there are couplings: joint torques know none")
+        coupled = [name for coupling in self.couplings for name in coupling.joints]
+        for name in coupled:
+            if coupled.count(name) > 1:
+                raise ValueError(f"the joint {name!r} once in all couplings")
+            if not self.joint(name).actuated:
+                raise ValueError(f"the joint {name!r} coupled to motors or 'actuated: false', not both")
+        return self
 
     def joint(self, name: str) -> JointSettings:
         """Return the settings of a joint, the defaults when the file does not list it."""
@@ -149,6 +191,7 @@ class Settings(_Group):
 
 GROUPS: Mapping[str, type[BaseModel]] = {
     "joints": JointSettings,
+    "couplings": Coupling,
     "simulation": SimulationSettings,
     "training": TrainingSettings,
     "comparison": ComparisonSettings,
@@ -178,19 +221,21 @@ def load_settings(urdf_path: Path | str) -> Settings:
 def check_joint_names(settings: Settings, names: Iterable[str], urdf_path: Path | str) -> None:
     """Raise SettingsError when the settings beside this URDF speak of joints that are not among `names`."""
     known = list(names)
-    spoken: list[tuple[str, ...]] = [("joints", name) for name in settings.joints]
-    spoken += [("simulation", "positions", name) for name in settings.simulation.positions or ()]
-    unknown = [location for location in spoken if location[-1] not in known]
+    spoken: list[tuple[tuple[Any, ...], str]] = [(("joints", name), name) for name in settings.joints]
+    spoken += [(("simulation", "positions", name), name) for name in settings.simulation.positions or ()]
+    for number, coupling in enumerate(settings.couplings):
+        spoken += [(("couplings", number, "joints", at), name) for at, name in enumerate(coupling.joints)]
+    unknown = [(location, name) for location, name in spoken if name not in known]
     if unknown:
         document = read_document(Path(urdf_path).with_suffix(".yaml"))  # once more, for the lines
-        collect([_unknown(location, "joint", known, document) for location in unknown])
+        collect([_unknown(location, "joint", name, known, document) for location, name in unknown])
 
 
 def _explain(detail: Mapping[str, Any], document: Document) -> SettingsError:
     location, kind = tuple(detail["loc"]), detail["type"]
     if kind == "extra_forbidden":
         group = GROUPS[str(location[0])] if len(location) > 1 else Settings
-        return _unknown(location, "key", list(group.model_fields), document)
+        return _unknown(location, "key", str(location[-1]), list(group.model_fields), document)
     if location[-1:] == ("[key]",):
         location, kind = location[:-1], "key"
     expected = {
@@ -198,7 +243,7 @@ def _explain(detail: Mapping[str, Any], document: Document) -> SettingsError:
         "model_type": "keys with values",
         "dict_type": "keys with values",
     }.get(kind, detail["msg"].removeprefix("Input should be ").removeprefix("Value error, "))
-    got = repr(detail["input"])
+    got = repr(detail["input"]) if location or kind != "value_error" else "these settings"
     return SettingsError(
         got if len(got) <= 60 else got[:57] + "...",
         file=document.path,
@@ -208,14 +253,27 @@ def _explain(detail: Mapping[str, Any], document: Document) -> SettingsError:
     )
 
 
-def _unknown(location: tuple[Any, ...], kind: str, known: Iterable[str], document: Document) -> SettingsError:
+def _unknown(
+    location: tuple[Any, ...], kind: str, name: str, known: Iterable[str], document: Document
+) -> SettingsError:
     return SettingsError(
-        f"unknown {kind} {str(location[-1])!r}",
+        f"unknown {kind} {name!r}",
         file=document.path,
         line=document.line(location),
         element=_dotted(location[:-1]),
-        do=suggestion(str(location[-1]), known),
+        do=suggestion(name, known),
     )
+
+
+def _independent(rows: list[list[Fraction]]) -> bool:
+    """Whether a square matrix has an inverse, by elimination, exactly."""
+    while rows:
+        pivot = next((row for row in rows if row[0]), None)
+        if pivot is None:
+            return False
+        rows.remove(pivot)
+        rows = [[b - row[0] / pivot[0] * a for a, b in zip(pivot[1:], row[1:], strict=True)] for row in rows]
+    return True
 
 
 def _dotted(location: tuple[Any, ...]) -> str | None:

@@ -132,6 +132,8 @@ class ModelSpec:
     guard: float
     """M is lifted where its least eigenvalue, relative to the nominal mean M, falls below this."""
     started_from_urdf: bool
+    inputs: tuple[tuple[int, int, float, bool], ...] = ()
+    """(row, column, value, trained) of G; none where each torque acts on its own actuated joint as it is."""
 
     def to_json(self) -> str:
         """Canonical JSON; ``from_json`` gives the same spec back."""

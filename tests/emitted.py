@@ -50,7 +50,14 @@ def built(
     loaded = load(ROBOTS / f"{robot}.urdf")
     structure = derive(loaded.arm, assume)
     options = Options(preset=preset, net=net, assume=assume)
-    spec = plan_model(loaded.arm, structure, options, urdf=f"{robot}.urdf", urdf_sha256=loaded.robot.digest)
+    spec = plan_model(
+        loaded.arm,
+        structure,
+        loaded.actuation,
+        options,
+        urdf=f"{robot}.urdf",
+        urdf_sha256=loaded.robot.digest,
+    )
     return emit(spec), structure
 
 

@@ -10,7 +10,7 @@ PACKAGE = Path(__file__).parents[1] / "spelgen"
 # A file may import only from files above it, or to its left.
 ROWS = """
 errors files labels rendering yaml_document settings spec
-urdf: robot xacro_child xacro_input document values elements lint read
+urdf: robot xacro_child xacro_input document values elements lint read actuation
 arm: rational snapping placement chain walk arm
 structure: recursion field sampling spans basis expansion symbolic structure nominal minimal
 emission: plan emit

@@ -61,7 +61,7 @@ def simulate(
     for path in paths.values():
         options.require_free(path, force=force)
     with counted("simulating") as progress:
-        result = simulate.simulate(loaded.arm, settings, progress=progress)
+        result = simulate.simulate(loaded.arm, settings, loaded.actuation.matrix(), progress=progress)
     names = [coordinate.name for coordinate in loaded.arm.coordinates]
     for path, trajectories in zip(paths.values(), (result.train, result.test), strict=True):
         if trajectories:

@@ -226,7 +226,7 @@ def _known(folder: Path, description: dict[str, Any], *, force: bool) -> bool:
 def _write_logs(study: Study, loaded: pipeline.Loaded, progress: Callable[[int, int], None] | None) -> None:
     from spelgen.simulation.simulate import simulate
 
-    result = simulate(loaded.arm, loaded.settings, progress=progress)
+    result = simulate(loaded.arm, loaded.settings, loaded.actuation.matrix(), progress=progress)
     names = [coordinate.name for coordinate in loaded.arm.coordinates]
     first = study.settings.first
     study.logs.mkdir(parents=True, exist_ok=True)

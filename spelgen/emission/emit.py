@@ -20,6 +20,7 @@ _POTENTIAL_SHARE = 0.5
 _FRICTION_HIDDEN = 8
 _FRICTION_START = 0.35
 _SLOW = 0.03
+_INPUT = ("joint", "motor", "value", "trained")
 _PLACE_SHARE = 0.1
 _GRID = 6
 _KAN_SHARE = 0.25
@@ -44,7 +45,11 @@ def emit(spec: ModelSpec) -> str:
         sliding=any(joint.kind == "prismatic" for joint in spec.joints),
         net=design.net,
         group=design.encoding == "group",
-        input="dense" if design.input == "dense-3n" else "derived",
+        input="dense" if design.input == "dense-3n" else "motor" if spec.inputs else "derived",
+        inputs=_table(
+            "INPUTS = ", [_call("Input", **dict(zip(_INPUT, x, strict=True))) for x in spec.inputs]
+        ),
+        gains=any(trained for *_, trained in spec.inputs),
         friction_axes=_FRICTION_AXES[design.dissipation],
         depth=spec.options.depth,
         width=_units(spec),

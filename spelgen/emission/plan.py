@@ -12,6 +12,7 @@ from spelgen.spec import ConstantSpec, Entries, JointSpec, ModelSpec, Options, O
 from spelgen.structure.basis import Weights
 from spelgen.structure.nominal import Nominal, nominal, working_range
 from spelgen.structure.structure import Structure
+from spelgen.urdf.actuation import Actuation
 
 _GUARD_SHARE = 0.1
 _FRICTION_OF_EFFORT = 0.02
@@ -25,6 +26,7 @@ _DEFAULT_SPEED = {"revolute": 2.0, "prismatic": 0.5}  # rad/s, m/s
 def plan_model(
     arm: Arm,
     structure: Structure,
+    actuation: Actuation,
     options: Options,
     *,
     urdf: str,
@@ -77,6 +79,9 @@ def plan_model(
         potential_scale=sizes.potential_scale,
         guard=float(f"{max(_GUARD_SHARE * sizes.least_share, 1e-4):.0e}"),
         started_from_urdf=sizes.from_urdf,
+        inputs=()
+        if actuation.direct
+        else tuple((x.row, x.column, x.value, x.kind == "gain") for x in actuation.entries),
     )
 
 

@@ -79,12 +79,17 @@ def make_friction(arm: Arm, settings: Settings) -> Friction:
 
 
 def simulate(
-    arm: Arm, settings: Settings, *, progress: Callable[[int, int], None] | None = None
+    arm: Arm,
+    settings: Settings,
+    input_matrix: np.ndarray | None = None,
+    *,
+    progress: Callable[[int, int], None] | None = None,
 ) -> SimulationResult:
     """Return random-input trajectories of the arm by `settings.simulation`; same settings, same logs.
 
     Each starts at rest at a random position and has round(duration * rate) + 1 samples; tau[k] acts from t[k]
-    to t[k+1]. progress: called with (trajectories done, all) after each one.
+    to t[k+1]. input_matrix: G (n, n), where the torques drawn and logged are those of motors; the joints get
+    G tau. progress: called with (trajectories done, all) after each one.
     Raises ArmError without inertials, SettingsError for a joint without a range of initial positions, and
     RunError when the motion cannot be integrated.
     """
@@ -99,8 +104,9 @@ def simulate(
         random = np.random.default_rng(seed)
         start = np.concatenate([random.uniform(lowest, highest), np.zeros(lowest.size)])
         tau = np.stack([random.choice(choices, size=t.size) for choices in torques], axis=1)
-        states = rollout(engine, friction, start, t, tau)
-        errors.append(np.abs(states - rollout(engine, friction, start, t, tau, looser=LOOSER)).max())
+        effect = tau if input_matrix is None else tau @ input_matrix.T
+        states = rollout(engine, friction, start, t, effect)
+        errors.append(np.abs(states - rollout(engine, friction, start, t, effect, looser=LOOSER)).max())
         q, qd = np.split(states, 2, axis=1)
         trajectories.append(Trajectory(f"traj_{number:02d}", t, q, qd, tau))
         if progress is not None:

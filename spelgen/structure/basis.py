@@ -146,7 +146,7 @@ def _candidates(spans: Spans, joints: frozenset[int]) -> Iterator[tuple[np.ndarr
     samples = spans.float_changes(outside)
     shares = _solved(samples[:, bound], samples[:, free])
     for row in sorted(kernel, key=np.count_nonzero):
-        (own,) = set(np.flatnonzero(row)) - set(bound)
+        (own,) = {int(index) for index in np.flatnonzero(row)} - set(bound)
         values = np.zeros(len(row))
         values[own] = 1.0
         values[bound] = -shares[:, free.index(own)]

@@ -13,6 +13,7 @@ import torch
 from spelgen.data.windows import Windows
 from spelgen.settings import load_settings
 from spelgen.training.rollout import roll_out
+from spelgen.urdf.actuation import derive_actuation
 from spelgen.urdf.read import read_urdf
 
 if TYPE_CHECKING:
@@ -67,9 +68,8 @@ class PinocchioDynamics:
     def __init__(self, urdf: Path, joints: Sequence[str]) -> None:
         import pinocchio as pin  # an extra: everything else here works without
 
-        coupled = [
-            joint.name for joint in read_urdf(urdf).joints if joint.mimic and joint.mimic.joint in joints
-        ]
+        robot, settings = read_urdf(urdf), load_settings(urdf)
+        coupled = [joint.name for joint in robot.joints if joint.mimic and joint.mimic.joint in joints]
         if coupled:
             raise ValueError(f"mimic joints are not supported here: {', '.join(coupled)}")
         whole = pin.buildModelFromUrdf(str(urdf))
@@ -78,11 +78,12 @@ class PinocchioDynamics:
         self._model = pin.buildReducedModel(whole, locked, pin.neutral(whole))
         if sorted(self._model.names[1:]) != sorted(joints) or self._model.nv != len(joints):
             raise ValueError(f"Pinocchio sees the joints {', '.join(self._model.names[1:])}")
-        self._model.gravity.linear = np.array(load_settings(urdf).gravity)
+        self._model.gravity.linear = np.array(settings.gravity)
         self._data = self._model.createData()
         found = [self._model.joints[self._model.getJointId(name)] for name in joints]
         self._order = np.array([joint.idx_v for joint in found])
         self._places = [(joint.idx_q, joint.nq) for joint in found]
+        self._inputs = derive_actuation(robot, settings, joints).matrix()
         self._damping, self._friction = self._model.damping[self._order], self._model.friction[self._order]
 
     def momentum(self, q: torch.Tensor, qd: torch.Tensor) -> torch.Tensor:
@@ -99,7 +100,7 @@ class PinocchioDynamics:
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Rates of q and qd, each (W, n), under the torques tau (W, n)."""
         qd = p.numpy()
-        force = -self._losses(qd) if tau is None else tau.numpy() - self._losses(qd)
+        force = -self._losses(qd) if tau is None else tau.numpy() @ self._inputs.T - self._losses(qd)
         qdd = np.empty_like(qd)
         position, velocity, effort = (
             self._configurations(q.numpy()),
@@ -121,17 +122,21 @@ class PinocchioDynamics:
     def gravity(self, q: torch.Tensor) -> torch.Tensor:
         """dV/dq (T, n) [Nm, N]."""
         still = torch.zeros_like(q)
-        return self.inverse_dynamics(q, still, still)
+        return torch.from_numpy(self._joint_torque(q, still, still))
 
     def inverse_dynamics(self, q: torch.Tensor, qd: torch.Tensor, qdd: torch.Tensor) -> torch.Tensor:
-        """Torques (T, n)."""
+        """Inputs (T, n); those of a passive joint are the torques that it lacks."""
+        moved = self._inputs + np.diag(~self._inputs.any(axis=1)).astype(float)
+        return torch.from_numpy(np.linalg.solve(moved, self._joint_torque(q, qd, qdd).T).T)
+
+    def _joint_torque(self, q: torch.Tensor, qd: torch.Tensor, qdd: torch.Tensor) -> np.ndarray:
         position, velocity = self._configurations(q.numpy()), self._permuted(qd.numpy())
         acceleration = self._permuted(qdd.numpy())
         tau = np.empty(qd.shape)
         for row in range(len(q)):
             needed = self._pin.rnea(self._model, self._data, position[row], velocity[row], acceleration[row])
             tau[row] = needed[self._order]
-        return torch.from_numpy(tau + self._losses(qd.numpy()))
+        return tau + self._losses(qd.numpy())
 
     def _losses(self, qd: np.ndarray) -> np.ndarray:
         return self._damping * qd + self._friction * np.tanh(qd / FRICTION_VELOCITY)

@@ -137,18 +137,20 @@ def momentum_loss(model: EmittedModel, windows: Windows, scales: LossScales) -> 
     samples.
 
     Forces between samples are the mean of their values at both ends (trapezium rule): no ODE is solved and no
-    acceleration needed. What is missing is told as mean torque, in units of the torque's standard deviation.
-    (Told as a velocity, M(q)^-1 times it, it would reward an M that is too large: errors of the measured
+    acceleration needed. What is missing is told as mean torque, in units of its standard deviation at the
+    joint. (Told as a velocity, M(q)^-1 times it, it would reward an M that is too large: errors of the measured
     torque would count less.)
     """
     q, qd = windows.q, windows.qd  # (W, K, n)
     p = model.momentum(q, qd)
     force = model.rates(q, p, None, model.prepare())[1]
     dt = windows.dt.unsqueeze(-1)
-    push = (model.input_matrix(q[:, :-1]) @ windows.tau.unsqueeze(-1)).squeeze(-1)
+    inputs = model.input_matrix(q[:, :-1])
+    push = (inputs @ windows.tau.unsqueeze(-1)).squeeze(-1)
     impulse = (dt * (push + (force[:, :-1] + force[:, 1:]) / 2)).cumsum(dim=1)  # (W, K-1, n)
     missing = (p[:, 1:] - p[:, :1] - impulse) / dt.cumsum(dim=1)
-    return (missing / scales.tau).square().mean()
+    unit = (inputs.detach().abs() @ scales.tau).mean(dim=(0, 1))  # gears may stand between motor and joint
+    return (missing / torch.maximum(unit, 1e-2 * unit.amax())).square().mean()
 
 
 def integration_error(model: EmittedModel, windows: Windows, scales: LossScales, substeps: int) -> float:

@@ -21,7 +21,7 @@ Record, by which `spelgen check` tells whether this module is up to date:
     robot: "rpr"
     urdf: "rpr.urdf"
     urdf_sha256: "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d"
-    spec_sha256: "0aaf49956eba9db7b9568ed5f14b5438f52447368c40744b48c2e1de15b8ba5b"
+    spec_sha256: "ca0fb2ebd46d10a9f7ecaaaf670129271e756a20784ed6bd291df8bb837b0ceb"
     option assume: "kinematics"
     option depth: 2
     option joints: null

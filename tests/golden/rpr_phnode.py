@@ -21,7 +21,7 @@ Record, by which `spelgen check` tells whether this module is up to date:
     robot: "rpr"
     urdf: "rpr.urdf"
     urdf_sha256: "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d"
-    spec_sha256: "842f1e05036c328a8b71527abbb672230f0e9e828e38933bc48d2ccc6e9360e9"
+    spec_sha256: "27c38d7e3ceae0daaac7cee831bc3ead7412a753890e2d4040b5255031d7b0d1"
     option assume: "kinematics"
     option depth: 2
     option joints: null

@@ -21,7 +21,7 @@ Record, by which `spelgen check` tells whether this module is up to date:
     robot: "rpr"
     urdf: "rpr.urdf"
     urdf_sha256: "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d"
-    spec_sha256: "30e06cd646ad21c372b16e549dc7d05d578cebad5f21530608f2259cfe9b1f33"
+    spec_sha256: "7e4b5523b1eb342e424724947988a742db6d98075e693ec14c98271aaaf50aaa"
     option assume: "kinematics"
     option depth: 2
     option joints: null

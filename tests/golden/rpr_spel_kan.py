@@ -21,7 +21,7 @@ Record, by which `spelgen check` tells whether this module is up to date:
     robot: "rpr"
     urdf: "rpr.urdf"
     urdf_sha256: "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d"
-    spec_sha256: "e1ee56c2528d83f54a4d669d2859b380fc25eab520fe6e589874c94f12bda2ce"
+    spec_sha256: "7e2a57076b6b6e83b093e4dc5d460d724ae0f41f098e007ac4930dc8d71a628f"
     option assume: "kinematics"
     option depth: 2
     option joints: null

@@ -19,7 +19,7 @@ Record, by which `spelgen check` tells whether this module is up to date:
     robot: "two_link"
     urdf: "two_link.urdf"
     urdf_sha256: "d5393c842e189b72219c5ce02e115de571a94cd406b48898ea64b5431a395232"
-    spec_sha256: "1723653ddc9ab09a3b94a52c5d39fbe17a615f1d2683403426f997336f8dc10a"
+    spec_sha256: "cb3d5dda14a947e703f8dfd7fb2325bbbc55d31c3d3b5bce7d083123267bc61b"
     option assume: "kinematics"
     option depth: 2
     option joints: null
