@@ -5,42 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from fractions import Fraction
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    ValidationError,
-    field_validator,
-    model_validator,
-)
+from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 
 from spelgen.errors import SettingsError, collect, suggestion
+from spelgen.log_mapping import LogMapping
+from spelgen.setting_values import Count, Group, NonNegative, Number, Positive, Share, Whole
 from spelgen.yaml_document import Document, read_document
 
-
-def _no_bool(value: object) -> object:
-    if isinstance(value, bool):  # float(True) is 1.0: a misplaced `yes` would pass for a number
-        raise ValueError("a number")
-    return value
-
-
-Number = Annotated[float, BeforeValidator(_no_bool), Field(allow_inf_nan=False)]
-Positive = Annotated[Number, Field(gt=0)]
-NonNegative = Annotated[Number, Field(ge=0)]
-Share = Annotated[Number, Field(ge=0, lt=1)]
-Count = Annotated[int, BeforeValidator(_no_bool), Field(ge=1)]
 Inputs = Annotated[tuple[Number, ...], Field(min_length=1)]
-Seed = Annotated[int, BeforeValidator(_no_bool), Field(ge=0)]
+GroupType = TypeVar("GroupType", bound=BaseModel)
 
 
-class _Group(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class JointSettings(_Group):
+class JointSettings(Group):
     """Drive of one joint; N and m in place of Nm and rad when it is prismatic.
 
     rotor_inertia: of the motor, before the gear [kg m^2]; the joint feels rotor_inertia * gear^2.
@@ -68,7 +46,7 @@ class JointSettings(_Group):
         return value
 
 
-class Coupling(_Group):
+class Coupling(Group):
     """Joints that the same motors move: their torques are ``matrix`` times the torques of as many motors."""
 
     joints: Annotated[tuple[str, ...], Field(min_length=2)]
@@ -83,18 +61,19 @@ class Coupling(_Group):
         return self
 
 
-class SimulationSettings(_Group):
+class SimulationSettings(Group):
     """How `spelgen simulate` makes logs.
 
+    protocol: random-inputs, or tracking: controlled motions, see `TrackingSettings`.
     trajectories: number, each from its own initial position, at rest.
     duration: of each [s]. rate: of samples and of the inputs, which are held in between [Hz].
     inputs: the torques each actuated joint draws from, every sample anew [Nm].
-    test_fraction: part of the trajectories kept for testing.
+    test_fraction: part of the trajectories kept for testing; with tracking, of each trajectory, its end.
     positions: joint -> (lowest, highest) initial position [rad]; not given: its limits, +-pi if continuous.
     friction_velocity: width of the tanh in place of Coulomb friction's jump [rad/s].
     """
 
-    protocol: Literal["random-inputs"] = "random-inputs"
+    protocol: Literal["random-inputs", "tracking"] = "random-inputs"
     trajectories: Count = 64
     duration: Positive = 1.0
     rate: Positive = 20.0
@@ -102,7 +81,7 @@ class SimulationSettings(_Group):
     test_fraction: Share = 0.5
     positions: dict[str, tuple[Number, Number]] | None = None
     friction_velocity: Positive = 0.05
-    seed: Seed = 0
+    seed: Whole = 0
 
     @field_validator("positions")
     @classmethod
@@ -113,10 +92,28 @@ class SimulationSettings(_Group):
         return value
 
 
-class TrainingSettings(_Group):
+class TrackingSettings(Group):
+    """How an arm moves and is seen in `simulation.protocol: tracking`.
+
+    amplitude [rad; m], frequency [Hz]: of each joint's sine about the middle of `simulation.positions`.
+    bandwidths: of the PID controllers of the first, second, ... trajectory, then over again [Hz].
+    control: rate of the controllers, which hold their torques; simulation.rate is a multiple of it [Hz].
+    resolution: of the encoders [rad; m]. cutoff: of the zero-phase low-pass on their positions [Hz].
+    """
+
+    amplitude: Positive = 0.5235987755982988
+    frequency: Positive = 0.125
+    bandwidths: Annotated[tuple[Positive, ...], Field(min_length=1)] = (2.0, 2.5, 3.0, 3.5, 4.0, 4.5)
+    control: Positive = 125.0
+    resolution: Positive = 4.8e-5
+    cutoff: Positive = 30.0
+
+
+class TrainingSettings(Group):
     """Defaults of `spelgen train`; command-line flags override them.
 
     window: samples predicted together. stride: samples from the start of one window to the next.
+    every: samples from one sample of a window to the next; None: as many as filtered logs can spare.
     batch: windows per step. epochs: passes over all windows, at most.
     patience: epochs without a better validation loss before stopping.
     momentum_steps: steps on the weak form (see `momentum_loss`) before windows are predicted.
@@ -126,10 +123,11 @@ class TrainingSettings(_Group):
     """
 
     objective: Literal["rollout"] = "rollout"
-    momentum_steps: Annotated[int, BeforeValidator(_no_bool), Field(ge=0)] = 2000
+    momentum_steps: Whole = 2000
     prior: NonNegative = 1.0
     window: Annotated[Count, Field(ge=2)] = 5
     stride: Count = 1
+    every: Count | None = None
     epochs: Count = 400
     batch: Count = 256
     learning_rate: Positive = 1e-3
@@ -137,10 +135,10 @@ class TrainingSettings(_Group):
     substeps: Count | None = None
     validation_fraction: Annotated[Number, Field(gt=0, lt=1)] = 0.25
     patience: Count = 60
-    seed: Seed = 0
+    seed: Whole = 0
 
 
-class ComparisonSettings(_Group):
+class ComparisonSettings(Group):
     """How `spelgen compare` trains every preset on this robot's simulated logs.
 
     first: only so much of each training trajectory is trained on [s]; None: all. steps: of training, at least.
@@ -149,28 +147,30 @@ class ComparisonSettings(_Group):
 
     first: Positive | None = None
     steps: Count = 1500
-    momentum_steps: Annotated[int, BeforeValidator(_no_bool), Field(ge=0)] = 1000
+    momentum_steps: Whole = 1000
     seeds: Count = 5
     width: Count = 64
     depth: Count = 2
 
 
-class Settings(_Group):
+class Settings(Group):
     """One robot's sidecar file. about: why the robot is here and where its values come from.
 
     gravity: in the frame of the root link [m/s^2]. joints: by URDF name; a joint not listed has the defaults.
     torque: whether the logs' tau are joint torques, or motor torques before the gear. couplings: of motors
-    that move several joints, for motor torques.
+    that move several joints, for motor torques. logs: how this robot's logs are named and measured.
     """
 
     about: str = ""
     torque: Literal["joint", "motor"] = "joint"
     couplings: tuple[Coupling, ...] = ()
     gravity: tuple[Number, Number, Number] = (0.0, 0.0, -9.81)
-    joints: dict[str, JointSettings] = {}
+    joints: dict[str, JointSettings] = Field(default={})
     simulation: SimulationSettings = SimulationSettings()
+    tracking: TrackingSettings = TrackingSettings()
     training: TrainingSettings = TrainingSettings()
     comparison: ComparisonSettings = ComparisonSettings()
+    logs: LogMapping = LogMapping()
 
     @model_validator(mode="after")
     def _drives(self) -> Settings:
@@ -189,15 +189,6 @@ class Settings(_Group):
         return self.joints.get(name, JointSettings())
 
 
-GROUPS: Mapping[str, type[BaseModel]] = {
-    "joints": JointSettings,
-    "couplings": Coupling,
-    "simulation": SimulationSettings,
-    "training": TrainingSettings,
-    "comparison": ComparisonSettings,
-}
-
-
 def load_settings(urdf_path: Path | str) -> Settings:
     """Return the settings beside a URDF (`arm.urdf` -> `arm.yaml`), the defaults when there is no such file.
 
@@ -209,12 +200,27 @@ def load_settings(urdf_path: Path | str) -> Settings:
         if misnamed.exists():
             raise SettingsError(repr(misnamed.name), file=misnamed, expected=repr(path.name), do="rename it")
         return Settings()
-    document = read_document(path)
+    return _validated(read_document(path), Settings)
+
+
+def load_mapping(path: Path | str, joints: Iterable[str]) -> LogMapping:
+    """Return the mapping of logs in a YAML file of its own: what a sidecar file holds under `logs`.
+
+    Raises SettingsError as `load_settings` does, and for joints that are not among `joints`.
+    """
+    document, known = read_document(Path(path)), list(joints)
+    mapping = _validated(document, LogMapping)
+    unknown = [name for name in mapping.joints if name not in known]
+    collect([_unknown(("joints", name), "joint", name, known, document) for name in unknown])
+    return mapping
+
+
+def _validated(document: Document, group: type[GroupType]) -> GroupType:
     content = document.value()
     try:
-        return Settings() if content is None else Settings.model_validate(content)
+        return group() if content is None else group.model_validate(content)
     except ValidationError as error:
-        collect([_explain(detail, document) for detail in error.errors(include_url=False)])
+        collect([_explain(detail, document, group) for detail in error.errors(include_url=False)])
         raise
 
 
@@ -223,6 +229,7 @@ def check_joint_names(settings: Settings, names: Iterable[str], urdf_path: Path 
     known = list(names)
     spoken: list[tuple[tuple[Any, ...], str]] = [(("joints", name), name) for name in settings.joints]
     spoken += [(("simulation", "positions", name), name) for name in settings.simulation.positions or ()]
+    spoken += [(("logs", "joints", name), name) for name in settings.logs.joints]
     for number, coupling in enumerate(settings.couplings):
         spoken += [(("couplings", number, "joints", at), name) for at, name in enumerate(coupling.joints)]
     unknown = [(location, name) for location, name in spoken if name not in known]
@@ -231,11 +238,11 @@ def check_joint_names(settings: Settings, names: Iterable[str], urdf_path: Path 
         collect([_unknown(location, "joint", name, known, document) for location, name in unknown])
 
 
-def _explain(detail: Mapping[str, Any], document: Document) -> SettingsError:
+def _explain(detail: Mapping[str, Any], document: Document, group: type[BaseModel]) -> SettingsError:
     location, kind = tuple(detail["loc"]), detail["type"]
     if kind == "extra_forbidden":
-        group = GROUPS[str(location[0])] if len(location) > 1 else Settings
-        return _unknown(location, "key", str(location[-1]), list(group.model_fields), document)
+        known = list(_group_at(group, location[:-1]).model_fields)
+        return _unknown(location, "key", str(location[-1]), known, document)
     if location[-1:] == ("[key]",):
         location, kind = location[:-1], "key"
     expected = {
@@ -251,6 +258,20 @@ def _explain(detail: Mapping[str, Any], document: Document) -> SettingsError:
         element=_dotted(location),
         expected=expected,
     )
+
+
+def _group_at(group: type[BaseModel], location: tuple[Any, ...]) -> type[BaseModel]:
+    """The group of keys at a place in a file; keys of a dict and numbers of a list lead into the next one."""
+    for part in location:
+        field = group.model_fields.get(str(part))
+        group = next(iter(_groups_in(field.annotation)), group) if field else group
+    return group
+
+
+def _groups_in(annotation: Any) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [found for each in get_args(annotation) for found in _groups_in(each)]
 
 
 def _unknown(

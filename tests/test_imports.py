@@ -9,13 +9,13 @@ PACKAGE = Path(__file__).parents[1] / "spelgen"
 
 # A file may import only from files above it, or to its left.
 ROWS = """
-errors files labels rendering yaml_document settings spec
+errors files labels rendering yaml_document setting_values log_mapping settings spec
 urdf: robot xacro_child xacro_input document values elements lint read actuation
 arm: rational snapping placement chain walk arm
 structure: recursion field sampling spans basis expansion symbolic structure nominal minimal
 emission: plan emit
 data: logs signals windows
-simulation: engine simulate
+simulation: engine simulate tracking protocols
 training: runs lie_group rollout rivals prior progress data loop train
 evaluation: tip torque examples evaluate
 report: charts plots tables picture learned page

@@ -7,7 +7,7 @@ import pytest
 from pydantic import ValidationError
 
 from spelgen.errors import SettingsError, SpelgenErrors
-from spelgen.settings import JointSettings, Settings, check_joint_names, load_settings
+from spelgen.settings import JointSettings, Settings, check_joint_names, load_mapping, load_settings
 
 
 @pytest.fixture
@@ -79,8 +79,8 @@ def test_settings_do_not_change(urdf):
         (
             "training:\n  x: 1",
             "arm.yaml:2: training: unknown key 'x'; known are 'objective', 'momentum_steps', 'prior', 'window', "
-            "'stride', 'epochs', "
-            "'batch', 'learning_rate', 'weight_decay', 'substeps' and 3 more",
+            "'stride', 'every', 'epochs', "
+            "'batch', 'learning_rate', 'weight_decay' and 4 more",
         ),
         (
             "joints:\n  a: {viscous: -1}",
@@ -98,7 +98,7 @@ def test_settings_do_not_change(urdf):
         ),
         (
             "simulation:\n  protocol: pid",
-            "arm.yaml:2: simulation.protocol: got 'pid', expected 'random-inputs'",
+            "arm.yaml:2: simulation.protocol: got 'pid', expected 'random-inputs' or 'tracking'",
         ),
         (
             "joints:\n  a: {coulomb: [0.4, 0.5]}",
@@ -114,6 +114,19 @@ def test_settings_do_not_change(urdf):
         ("joints: [a]", "arm.yaml:1: joints: got ['a'], expected keys with values"),
         ("joints:\n  a: 5", "arm.yaml:2: joints.a: got 5, expected keys with values"),
         ("42", "arm.yaml:1: got 42, expected keys with values"),
+        (
+            "logs:\n  joints:\n    a:\n      gian: 2",
+            "arm.yaml:4: logs.joints.a: unknown key 'gian'; did you mean 'gain'?",
+        ),
+        (
+            "logs:\n  joints:\n    a: {units: {p: deg}}",
+            "arm.yaml:3: logs.joints.a.units: unknown key 'p'; known are 'q', 'qd', 'tau'",
+        ),
+        ("logs:\n  units: {t: h}", "arm.yaml:2: logs.units.t: got 'h', expected 's', 'ms', 'us' or 'ns'"),
+        (
+            "logs:\n  joints:\n    a: {gain: 0}",
+            "arm.yaml:3: logs.joints.a: got {'gain': 0}, expected a gain that is not 0",
+        ),
     ],
 )
 def test_a_wrong_value_is_told_with_its_place(urdf, text, message):
@@ -150,7 +163,7 @@ def test_all_errors_of_a_file_are_told_at_once(urdf):
     assert str(error.value).splitlines() == [
         "arm.yaml:3: joints.a.gear: got 0, expected greater than 0",
         "arm.yaml:1: unknown key 'gear'; known are 'about', 'torque', 'couplings', 'gravity', 'joints', "
-        "'simulation', 'training', 'comparison'",
+        "'simulation', 'tracking', 'training', 'comparison', 'logs'",
     ]
 
 
@@ -176,6 +189,19 @@ def test_joints_that_do_not_exist_are_told_with_their_lines(urdf):
         "arm.yaml:3: joints: unknown joint 'elbw'; did you mean 'elbow'?",
         "arm.yaml:6: simulation.positions: unknown joint 'wrist'; known are 'shoulder', 'elbow'",
     ]
+
+
+def test_a_mapping_may_have_a_file_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "logger.yaml").write_text("units: {q: deg}\njoints:\n  a: {sign: -1}\n  b: {}\n")
+    mapping = load_mapping("logger.yaml", ["a", "b"])
+    assert (mapping.units.q, mapping.joint("a").sign) == ("deg", -1)
+    with pytest.raises(SettingsError) as error:
+        load_mapping("logger.yaml", ["a", "bb"])
+    assert str(error.value) == "logger.yaml:4: joints: unknown joint 'b'; did you mean 'bb'?"
+    (tmp_path / "logger.yaml").write_text("units: {q: grad}\n")
+    with pytest.raises(SettingsError, match=r"^logger\.yaml:1: units\.q: got 'grad', expected 'rad', 'deg'"):
+        load_mapping("logger.yaml", ["a"])
 
 
 def test_reading_settings_imports_nothing_heavy():
