@@ -49,7 +49,7 @@ def simulate(
     """Make training and test logs with Pinocchio."""
     from spelgen import pipeline
     from spelgen.data.logs import write_logs
-    from spelgen.simulation import simulate
+    from spelgen.simulation.protocols import make_logs
 
     loaded = pipeline.load(robot, options.names(joints), tip, snap_tol)
     settings = loaded.settings
@@ -61,7 +61,7 @@ def simulate(
     for path in paths.values():
         options.require_free(path, force=force)
     with counted("simulating") as progress:
-        result = simulate.simulate(loaded.arm, settings, loaded.actuation.matrix(), progress=progress)
+        result = make_logs(loaded.arm, settings, loaded.actuation.matrix(), progress=progress)
     names = [coordinate.name for coordinate in loaded.arm.coordinates]
     for path, trajectories in zip(paths.values(), (result.train, result.test), strict=True):
         if trajectories:

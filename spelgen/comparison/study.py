@@ -110,7 +110,7 @@ def prepare_study(
 ) -> Study:
     """Simulate the logs and write the modules, or find them as an earlier call left them.
 
-    Raises RunError where the folder holds another comparison, and what `pipeline.load` and `simulate` raise.
+    Raises RunError where the folder holds another comparison, and what `pipeline.load` and `make_logs` raise.
     """
     loaded = pipeline.load(robot)
     chosen = {name: value for name, value in {"seeds": seeds, "steps": steps}.items() if value is not None}
@@ -200,6 +200,7 @@ def _description(study: Study, loaded: pipeline.Loaded) -> dict[str, Any]:
         "robot": study.robot,
         "urdf_sha256": loaded.robot.digest,
         "simulation": loaded.settings.simulation.model_dump(mode="json"),
+        "tracking": loaded.settings.tracking.model_dump(mode="json"),
         "comparison": study.settings.model_dump(mode="json"),
         "training": asdict(study.training),
         "variants": [variant.name for variant in study.variants],
@@ -224,9 +225,9 @@ def _known(folder: Path, description: dict[str, Any], *, force: bool) -> bool:
 
 
 def _write_logs(study: Study, loaded: pipeline.Loaded, progress: Callable[[int, int], None] | None) -> None:
-    from spelgen.simulation.simulate import simulate
+    from spelgen.simulation.protocols import make_logs
 
-    result = simulate(loaded.arm, loaded.settings, loaded.actuation.matrix(), progress=progress)
+    result = make_logs(loaded.arm, loaded.settings, loaded.actuation.matrix(), progress=progress)
     names = [coordinate.name for coordinate in loaded.arm.coordinates]
     first = study.settings.first
     study.logs.mkdir(parents=True, exist_ok=True)

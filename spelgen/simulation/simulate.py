@@ -95,7 +95,7 @@ def simulate(
     """
     protocol = settings.simulation
     engine, friction = make_engine(arm, settings), make_friction(arm, settings)
-    lowest, highest = _initial_range(arm, settings)
+    lowest, highest = initial_range(arm, settings)
     torques = [_torques(coordinate, settings) for coordinate in arm.coordinates]
     t = np.arange(round(protocol.duration * protocol.rate) + 1) / protocol.rate
     split_seed, *seeds = np.random.SeedSequence(protocol.seed).spawn(protocol.trajectories + 1)
@@ -173,7 +173,8 @@ def _torques(coordinate: Coordinate, settings: Settings) -> np.ndarray:
     return np.array(joint.inputs or settings.simulation.inputs)
 
 
-def _initial_range(arm: Arm, settings: Settings) -> tuple[np.ndarray, np.ndarray]:
+def initial_range(arm: Arm, settings: Settings) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest and highest positions (n,) [rad; m] to start from; SettingsError where a joint has none."""
     given = settings.simulation.positions or {}
     ranges, errors = [], []
     for joint in arm.coordinates:

@@ -1,0 +1,202 @@
+"""Arm + Settings -> logs as a real arm gives them: controlled along sines, seen by encoders, velocities by differences.
+
+Stands in for the protocol of the paper's real arm (Wang, Chen, Ding, Sci Rep 15:33179, 2025), whose logs are not
+public. What the paper leaves open is ours: gains, phases, encoders and the filter's cutoff.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import butter, sosfiltfilt
+
+from spelgen.arm.arm import Arm
+from spelgen.data.logs import Trajectory
+from spelgen.errors import SettingsError, SpelgenError, collect
+from spelgen.settings import Settings, TrackingSettings
+from spelgen.simulation.engine import Engine, bias, make_engine, mass_matrix
+from spelgen.simulation.simulate import (
+    LOOSER,
+    Friction,
+    SimulationResult,
+    initial_range,
+    make_friction,
+    rollout,
+)
+
+FILTER_ORDER = 4
+INTEGRAL_SHARE = 0.2  # a tenth of what makes a joint without friction unstable
+
+
+@dataclass(frozen=True, eq=False)
+class Sines:
+    """Where n joints shall be: middle + amplitude sin(2 pi frequency t + phase); middle and phase (n,)."""
+
+    middle: np.ndarray
+    phase: np.ndarray
+    amplitude: float
+    frequency: float
+
+    def position(self, t: float) -> np.ndarray:
+        """(n,) [rad; m] at t [s]."""
+        return self.middle + self.amplitude * np.sin(2 * np.pi * self.frequency * t + self.phase)
+
+    def velocity(self, t: float) -> np.ndarray:
+        """(n,) [rad/s; m/s] at t [s]."""
+        rate = 2 * np.pi * self.frequency
+        return self.amplitude * rate * np.cos(rate * t + self.phase)
+
+
+@dataclass(frozen=True, eq=False)
+class Gains:
+    """Of a PID controller at each joint, (n,): torque per error of position, of its integral and of velocity."""
+
+    proportional: np.ndarray
+    integral: np.ndarray
+    derivative: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """One motion of T samples: what happened, and what the arm's own sensors saw of it.
+
+    t: (T,) [s]. states: (T, 2n) true positions and velocities. encoders: (T, n) positions in whole steps of the
+    encoders. tau: (T, n) motor torques, tau[k] held from t[k] to t[k+1], known exactly.
+    """
+
+    t: np.ndarray
+    states: np.ndarray
+    encoders: np.ndarray
+    tau: np.ndarray
+
+
+def track(
+    arm: Arm,
+    settings: Settings,
+    input_matrix: np.ndarray | None = None,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+) -> SimulationResult:
+    """Return logs of the arm controlled along sines, by `settings.simulation` and `settings.tracking`.
+
+    Every recording has its own gains and phases. The last `test_fraction` of each is for testing. Logged are
+    positions from the encoders after a zero-phase low-pass, velocities by central differences of these, and the
+    motors' torques. Arguments, errors and the integration error, here over whole recordings under the same
+    torques, as for `simulate`.
+    """
+    protocol = settings.simulation
+    engine, friction = make_engine(arm, settings), make_friction(arm, settings)
+    inputs = np.eye(len(arm.coordinates)) if input_matrix is None else input_matrix
+    middle = _middle(arm, settings)
+    seeds = np.random.SeedSequence(protocol.seed).spawn(protocol.trajectories)
+    train, test, errors = [], [], []
+    for number, seed in enumerate(seeds):
+        phase = np.random.default_rng(seed).uniform(0, 2 * np.pi, middle.size)
+        sines = Sines(middle, phase, settings.tracking.amplitude, settings.tracking.frequency)
+        bandwidth = settings.tracking.bandwidths[number % len(settings.tracking.bandwidths)]
+        felt = 1 / np.diag(np.linalg.inv(mass_matrix(engine, middle)))  # by a joint when the others are free
+        gains = tuned(felt, bandwidth)
+        recording = record(engine, friction, inputs, sines, gains, settings)
+        effect = recording.tau @ inputs.T
+        again = rollout(engine, friction, recording.states[0], recording.t, effect, looser=LOOSER)
+        errors.append(np.abs(recording.states - again).max())
+        log = measured(recording, settings.tracking, f"traj_{number:02d}")
+        kept = len(log.t) - round(protocol.test_fraction * len(log.t))
+        train.append(log[:kept])
+        if kept < len(log.t):
+            test.append(_renamed(log[kept:], f"{log.name}_end"))
+        if progress is not None:
+            progress(number + 1, protocol.trajectories)
+    return SimulationResult(tuple(train), tuple(test), float(max(errors)))
+
+
+def tuned(inertia: np.ndarray, bandwidth: float) -> Gains:
+    """Return gains for joints of inertia (n,) [kg m^2; kg] with both poles of the position loop at the bandwidth
+    [Hz].
+    """
+    rate = 2 * np.pi * bandwidth
+    return Gains(inertia * rate**2, INTEGRAL_SHARE * inertia * rate**3, 2 * inertia * rate)
+
+
+def record(
+    engine: Engine,
+    friction: Friction,
+    inputs: np.ndarray,
+    sines: Sines,
+    gains: Gains,
+    settings: Settings,
+) -> Recording:
+    """Return a motion along the sines: the controller sees the encoders and holds its torques between its ticks.
+
+    inputs: G (n, n). The arm starts at rest where the sines begin, held against its weight.
+    """
+    tracking, n = settings.tracking, len(sines.middle)
+    tick, held = 1.0 / tracking.control, _samples_of_a_tick(settings)
+    ticks = -(-round(settings.simulation.duration * settings.simulation.rate) // held)
+    to_motors = np.linalg.pinv(inputs)
+    state = np.concatenate([sines.position(0.0), np.zeros(n)])
+    integral = bias(engine, *np.split(state, 2))
+    before = seen = _seen(state[:n], tracking)
+    states, torques = [], []
+    for k in range(ticks):
+        before, seen = seen, _seen(state[:n], tracking)
+        error = sines.position(k * tick) - seen
+        lag = sines.velocity(k * tick) - (seen - before) / tick
+        integral = integral + tick * gains.integral * error
+        tau = to_motors @ (gains.proportional * error + gains.derivative * lag + integral)
+        t = k * tick + np.arange(held + 1) / settings.simulation.rate
+        passed = rollout(engine, friction, state, t, np.tile(inputs @ tau, (held + 1, 1)))
+        states.append(passed[:-1])
+        torques.append(np.tile(tau, (held, 1)))
+        state = passed[-1]
+    true = np.concatenate(states)
+    t = np.arange(len(true)) / settings.simulation.rate
+    return Recording(t, true, _seen(true[:, :n], tracking), np.concatenate(torques))
+
+
+def measured(recording: Recording, tracking: TrackingSettings, name: str) -> Trajectory:
+    """Return what is logged of a motion: filtered positions, their differences, and the torques."""
+    rate = 1.0 / (recording.t[1] - recording.t[0])
+    low_pass = butter(FILTER_ORDER, tracking.cutoff, fs=rate, output="sos")
+    padding = min(len(recording.t) - 1, int(3 * rate / tracking.cutoff))  # as `low_pass` of data/signals.py
+    q = sosfiltfilt(low_pass, recording.encoders, axis=0, padlen=padding)
+    return Trajectory(name, recording.t, q, np.gradient(q, recording.t, axis=0), recording.tau)
+
+
+def _seen(q: np.ndarray, tracking: TrackingSettings) -> np.ndarray:
+    """The nearest whole steps of the encoders."""
+    return np.round(q / tracking.resolution) * tracking.resolution
+
+
+def _renamed(trajectory: Trajectory, name: str) -> Trajectory:
+    return Trajectory(name, trajectory.t, trajectory.q, trajectory.qd, trajectory.tau)
+
+
+def _samples_of_a_tick(settings: Settings) -> int:
+    """How many samples the controller holds a torque."""
+    rate, control = settings.simulation.rate, settings.tracking.control
+    count = round(rate / control)
+    if count < 1 or abs(count * control - rate) > 1e-9 * rate:
+        raise SettingsError(
+            f"{control:g} Hz beside samples at {rate:g} Hz", element="tracking.control",
+            expected="a rate of which simulation.rate is a multiple",
+        )  # fmt: skip
+    return count
+
+
+def _middle(arm: Arm, settings: Settings) -> np.ndarray:
+    """The middle (n,) of each joint's range, which the sines must fit in."""
+    lowest, highest = initial_range(arm, settings)
+    amplitude, errors = settings.tracking.amplitude, list[SpelgenError]()
+    for joint, low, high in zip(arm.coordinates, lowest, highest, strict=True):
+        if high - low < 2 * amplitude:
+            error = SettingsError(
+                f"{amplitude:g} beside the range {low:g} to {high:g} of {joint.name!r}",
+                element="tracking.amplitude", expected="sines within the range",
+                do="make it smaller or give the joint wider simulation.positions",
+            )  # fmt: skip
+            errors.append(error)
+    collect(errors)
+    return (lowest + highest) / 2

@@ -1,0 +1,198 @@
+"""Logs of a controlled arm: it follows its sines, encoders count in steps, what is logged is near what happened."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from spelgen import pipeline
+from spelgen.errors import SettingsError, SpelgenErrors
+from spelgen.settings import Settings
+from spelgen.simulation import tracking
+from spelgen.simulation.engine import forward_dynamics, make_engine
+from spelgen.simulation.protocols import make_logs
+from spelgen.simulation.simulate import make_friction
+from spelgen.simulation.tracking import Sines, measured, record, track, tuned
+from tests.hand_built import arm, body, coordinate, point, slider
+
+N = 6
+
+
+@pytest.fixture(scope="module")
+def loaded(robots):
+    return pipeline.load(robots / "six_dof.urdf")
+
+
+def changed(settings, tracking=None, **protocol):
+    update = {"simulation": settings.simulation.model_copy(update=protocol)}
+    return settings.model_copy(
+        update=update | {"tracking": settings.tracking.model_copy(update=tracking or {})}
+    )
+
+
+@pytest.fixture(scope="module")
+def recordings(loaded):
+    """Whole periods with the softest and with the hardest controller, and the logs made of them."""
+    ends = min(loaded.settings.tracking.bandwidths), max(loaded.settings.tracking.bandwidths)
+    settings = changed(loaded.settings, {"bandwidths": ends}, trajectories=2)
+    kept, inner = [], tracking.record
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            tracking, "record", lambda *given: kept.append((given[3], inner(*given))) or kept[-1][1]
+        )
+        logs = track(loaded.arm, settings)
+    return settings, kept, logs
+
+
+def test_the_protocol_is_the_papers(loaded):
+    """500 Hz samples, 125 Hz control, sines of 30 deg at 1/8 Hz, 6 PID settings, 24,000 samples, 70/30."""
+    protocol, motion = loaded.settings.simulation, loaded.settings.tracking
+    assert (protocol.rate, motion.control, motion.frequency) == (500, 125, 1 / 8)
+    assert motion.amplitude == pytest.approx(np.radians(30))
+    assert protocol.trajectories == len(motion.bandwidths) == 6
+    assert protocol.trajectories * protocol.duration * protocol.rate == 24_000
+    assert protocol.test_fraction == 0.3
+
+
+def test_the_arm_follows_its_sines_to_a_few_degrees(recordings):
+    _, kept, _ = recordings
+    worst = []
+    for sines, recording in kept:
+        wanted = np.array([sines.position(t) for t in recording.t])
+        worst.append(np.degrees(np.abs(recording.states[:, :N] - wanted).max()))
+        assert np.ptp(recording.states[:, :N], axis=0) == pytest.approx(np.radians(60), rel=0.15)
+    assert worst[0] < 5
+    assert worst[1] < worst[0] / 2, "a harder controller follows better"
+
+
+def test_sines_turn_as_fast_as_they_say():
+    sines = Sines(np.array([0.5]), np.array([1.0]), amplitude=0.3, frequency=0.125)
+    t, h = 2.2, 1e-5
+    slope = (sines.position(t + h) - sines.position(t - h)) / (2 * h)
+    np.testing.assert_allclose(sines.velocity(t), slope, rtol=1e-8)
+    np.testing.assert_allclose(sines.position(t + 8.0), sines.position(t), atol=1e-12)
+
+
+def test_encoders_count_in_whole_steps_and_miss_less_than_half_a_step(recordings):
+    settings, kept, _ = recordings
+    step = settings.tracking.resolution
+    for _, recording in kept:
+        np.testing.assert_allclose(np.round(recording.encoders / step), recording.encoders / step, atol=1e-6)
+        missed = np.abs(recording.encoders - recording.states[:, :N])
+        assert 0.49 * step < missed.max() <= 0.5000001 * step
+
+
+def test_what_is_logged_is_near_what_happened(recordings):
+    settings, kept, _ = recordings
+    away = []
+    for _, recording in kept:
+        log = measured(recording, settings.tracking, "x")
+        away.append(log.qd - recording.states[:, N:])
+        assert np.sqrt(np.mean((log.q - recording.states[:, :N]) ** 2)) < 0.3 * settings.tracking.resolution
+    raw = np.gradient(kept[0][1].encoders, kept[0][1].t, axis=0) - kept[0][1].states[:, N:]
+    speed = np.sqrt(np.mean(kept[0][1].states[:, N:] ** 2))
+    assert np.sqrt(np.mean(np.square(away))) < 0.01 * speed
+    assert np.sqrt(np.mean(np.square(away[0][250:-250]))) < 0.25 * np.sqrt(np.mean(raw**2))
+
+
+def test_the_filter_does_not_delay(recordings):
+    """The error of the logged velocity knows no acceleration: a delay of d would add d times it."""
+    settings, kept, _ = recordings
+    _, recording = kept[0]
+    log = measured(recording, settings.tracking, "x")
+    inside = slice(500, -500)
+    error = (log.qd - recording.states[:, N:])[inside]
+    rate = np.gradient(recording.states[:, N:], recording.t, axis=0)[inside]
+    delay = -np.sum(error * rate) / np.sum(rate**2)
+    assert abs(delay) < 2e-4
+
+
+def test_torques_are_held_between_ticks_and_explain_the_motion(recordings, loaded):
+    """Another integrator, from the true state at a tick under the logged torque, ends at the next."""
+    settings, kept, logs = recordings
+    _, recording = kept[1]
+    np.testing.assert_array_equal(np.concatenate([logs.train[1].tau, logs.test[1].tau]), recording.tau)
+    assert (recording.tau.reshape(-1, 4, N) == recording.tau[::4, None]).all()
+    engine, friction = make_engine(loaded.arm, settings), make_friction(loaded.arm, settings)
+    start = 4 * 300
+
+    def derivative(_, state):
+        qd = state[N:]
+        force = recording.tau[start] - friction(qd)
+        return np.concatenate([qd, forward_dynamics(engine, state[:N], qd, force)])
+
+    end = solve_ivp(derivative, (0, 0.008), recording.states[start], rtol=1e-11, atol=1e-13).y[:, -1]
+    np.testing.assert_allclose(recording.states[start + 4], end, atol=1e-9)
+
+
+def test_seventy_percent_train_and_what_follows_tests(recordings):
+    _, _, logs = recordings
+    assert [len(x.t) for x in logs.train] == [2800, 2800]
+    assert [len(x.t) for x in logs.test] == [1200, 1200]
+    assert [x.name for x in logs.train + logs.test] == ["traj_00", "traj_01", "traj_00_end", "traj_01_end"]
+    for first, last in zip(logs.train, logs.test, strict=True):
+        assert last.t[0] - first.t[-1] == pytest.approx(0.002)
+
+
+def test_the_integration_error_is_small_and_measured(recordings):
+    assert 0 < recordings[2].integration_error < 1e-8
+
+
+def test_the_seed_decides_everything(loaded):
+    def logs(**protocol):
+        return make_logs(loaded.arm, changed(loaded.settings, trajectories=1, duration=0.2, **protocol))
+
+    first, again, other = logs(), logs(), logs(seed=1)
+    for quantity in ("q", "qd", "tau"):
+        np.testing.assert_array_equal(getattr(first.train[0], quantity), getattr(again.train[0], quantity))
+    assert not np.array_equal(first.train[0].q, other.train[0].q)
+
+
+def test_motors_behind_gears_get_their_share_and_a_passive_joint_none():
+    """G = diag(20, 0): the logged torque is the motor's, a twentieth of the joint's; the second joint swings free."""
+    joints = [coordinate(), coordinate("b", continuous=True, passive=True)]
+    bodies = [body(name, parent=k - 1, coordinate=k, inertia=point(1, 0.1)) for k, name in enumerate("ab")]
+    two = arm(joints, bodies, gravity=(0, -9.81, 0))
+    settings = changed(Settings(), trajectories=1, duration=0.4, rate=500.0, test_fraction=0.0)
+    plain, geared = (track(two, settings, np.diag([gear, 0.0])).train[0] for gear in (1.0, 20.0))
+    np.testing.assert_allclose(geared.tau, plain.tau / 20, atol=1e-9)
+    np.testing.assert_allclose(geared.q, plain.q, atol=1e-9)
+    assert not plain.tau[:, 1].any()
+    assert plain.tau[:, 0].any()
+
+
+def test_the_arm_is_held_against_its_weight_from_the_start(loaded):
+    """Without gains and without a sine to follow, what the controller starts with keeps the arm at rest."""
+    engine, friction = make_engine(loaded.arm, loaded.settings), make_friction(loaded.arm, loaded.settings)
+    still = Sines(np.full(N, 0.4), np.zeros(N), amplitude=0.0, frequency=0.125)
+    settings = changed(loaded.settings, duration=0.4)
+    held = record(engine, friction, np.eye(N), still, tuned(np.zeros(N), 3.0), settings)
+    np.testing.assert_allclose(held.states[:, :N], 0.4, atol=1e-12)
+    assert np.abs(held.tau).max() > 1
+
+
+@pytest.mark.parametrize(
+    ("tracking", "message"),
+    [
+        (
+            {"control": 150.0},
+            "tracking.control: got 150 Hz beside samples at 500 Hz, expected a rate of which "
+            "simulation.rate is a multiple",
+        ),
+        (
+            {"amplitude": 1.5},
+            "tracking.amplitude: got 1.5 beside the range -1 to 1 of 'a', expected sines within the range; "
+            "make it smaller or give the joint wider simulation.positions",
+        ),
+    ],
+)
+def test_impossible_motions_are_refused(tracking, message):
+    with pytest.raises(SettingsError) as error:
+        track(slider(), changed(Settings(), tracking, rate=500.0))
+    assert str(error.value) == message
+
+
+def test_every_joint_whose_range_is_too_small_is_told():
+    joints = [coordinate(upper=-0.5), coordinate("b", upper=-0.4)]
+    bodies = [body(name, parent=k - 1, coordinate=k, inertia=point(1, 0.1)) for k, name in enumerate("ab")]
+    with pytest.raises(SpelgenErrors, match=r"of 'a'.*\n.*of 'b'"):
+        track(arm(joints, bodies), changed(Settings(), rate=500.0))
