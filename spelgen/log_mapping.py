@@ -120,6 +120,11 @@ class LogMapping(Group):
         pattern: str = getattr(self.columns, quantity)
         return own or pattern.replace("{joint}", self.log_name(joint))
 
+    def of_trajectory(self, text: str) -> LogMapping:
+        """The mapping for one recording of a file: `{trajectory}` in the columns' names is its text."""
+        named = {key: name.replace("{trajectory}", text) for key, name in self.columns.model_dump().items()}
+        return self.model_copy(update={"columns": LogColumns(**named)})
+
     def unit(self, quantity: str, joint: str) -> str | None:
         """The unit of "q", "qd" or "tau" of a joint; None where none was said."""
         own: str | None = getattr(self.joint(joint).units, quantity)
@@ -134,6 +139,11 @@ class LogMapping(Group):
             turn = logged.counts_per_turn
             return logged.sign * (2 * pi / turn if turn else 1.0 / (logged.counts_per_metre or 1.0))
         return logged.sign * {**ANGLES, **LENGTHS, **RATES}[unit or "rad"]
+
+    def offset(self, quantity: str, joint: str) -> float:
+        """What is added after that."""
+        logged = self.joint(joint)
+        return {"q": logged.offset, "tau": logged.torque_offset}.get(quantity, 0.0)
 
     def misfits(self, joints: Sequence[str], joint_types: Sequence[str] | None = None) -> list[SettingsError]:
         """What the mapping lacks for these joints, or says of them that cannot be; empty where it fits."""

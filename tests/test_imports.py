@@ -14,7 +14,7 @@ urdf: robot xacro_child xacro_input document values elements lint read actuation
 arm: rational snapping placement chain walk arm
 structure: recursion field sampling spans basis expansion symbolic structure nominal minimal
 emission: plan emit
-data: logs signals windows
+data: trajectory bags tables logs signals windows
 simulation: engine simulate tracking protocols
 training: runs lie_group rollout rivals prior progress data loop train
 evaluation: tip torque examples evaluate
@@ -22,7 +22,7 @@ report: charts plots tables picture learned page
 proof: agreement axes reasons meaning second_reading numeric_samples verification
 formulas: expression notation angles harmonics factoring shortening grouping formulas layout text latex sympy_module
 inspection inspection_page pipeline
-comparison: paper measures study tables page
+comparison: paper truth measures study tables page
 cli: console options formats model_commands run_commands compare_command main
 __init__ __main__
 """

@@ -119,10 +119,11 @@ def test_missing_files_and_folders_are_told_at_once(tmp_path):
     csv(tmp_path / "log.txt", "")
     with pytest.raises(SpelgenErrors) as caught:
         read_logs([tmp_path / "none.csv", tmp_path / "empty", tmp_path / "log.txt"], JOINTS)
+    kinds = ".parquet, .csv, .npz, .mcap, .db3, or the folder of a ROS 2 bag"
     assert str(caught.value).splitlines() == [
         f"{tmp_path}/none.csv: got no such file or folder, expected a log; check the path",
-        f"{tmp_path}/empty: got a folder without such logs, expected *.parquet or *.csv",
-        f"{tmp_path}/log.txt: got a file of kind '.txt', expected .parquet or .csv",
+        f"{tmp_path}/empty: got a folder without logs, expected {kinds}",
+        f"{tmp_path}/log.txt: got a file of kind '.txt', expected {kinds}",
     ]
 
 

@@ -1,11 +1,11 @@
-"""Log files <-> trajectories, exactly as recorded: no filtering, no resampling, no repair."""
+"""Log files <-> trajectories, in SI units and the URDF's senses: no filtering, no resampling, no repair."""
 
 from __future__ import annotations
 
-import difflib
 import os
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -13,65 +13,43 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
 
+from spelgen.data.tables import SUFFIXES, UNITS, UNITS_KEY, LogTable, is_log, read_tables, wanted_quantities
+from spelgen.data.trajectory import QUANTITIES, Trajectory, gap_ends
 from spelgen.errors import LogError, SpelgenError, collect
+from spelgen.log_mapping import TIMES, LogMapping
 
-SUFFIXES = (".parquet", ".csv")
-QUANTITIES = ("q", "qd", "tau")
-UNITS_KEY = b"units"
-UNITS = b"t s, q rad or m, qd rad/s or m/s, tau Nm or N"
+KINDS = f"{', '.join(SUFFIXES)}, or the folder of a ROS 2 bag"
+EXACT = 2**53  # whole numbers up to here are exact as floating-point numbers
 
-
-@dataclass(frozen=True, eq=False)
-class Trajectory:
-    """One uninterrupted recording of an arm with n joints.
-
-    name: unique among the trajectories read together.
-    t: (T,) sample times [s], strictly increasing, not necessarily regular.
-    q, qd: (T, n) joint positions and velocities [rad, rad/s; m, m/s for prismatic joints].
-    tau: (T, n) joint torques or forces [Nm; N]. In a simulated log tau[k] is held from t[k] to t[k+1]; in a
-        measured one it is the torque measured at t[k].
-    file: where it was read from, None if it was not.
-    declares_units: the file itself says that its columns are in the units above.
-    """
-
-    name: str
-    t: np.ndarray
-    q: np.ndarray
-    qd: np.ndarray
-    tau: np.ndarray
-    file: Path | None = None
-    declares_units: bool = False
-
-    def __post_init__(self) -> None:
-        samples = self.t.shape[0] if self.t.ndim == 1 else -1
-        for name in QUANTITIES:
-            array = getattr(self, name)
-            if array.ndim != 2 or array.shape[0] != samples or array.shape != self.q.shape:
-                raise ValueError(
-                    f"trajectory {self.name}: {name} has shape {array.shape} beside t of shape {self.t.shape}"
-                )
-
-    def __getitem__(self, rows: slice) -> Trajectory:
-        """The same recording, only these rows."""
-        cut = {name: getattr(self, name)[rows] for name in ("t", *QUANTITIES)}
-        return Trajectory(self.name, **cut, file=self.file, declares_units=self.declares_units)
+Named = tuple[tuple[str, str, str], Trajectory]
+"""A trajectory and its possible names, from the shortest to the surely unique one."""
 
 
 def read_logs(
-    paths: Iterable[Path | str], joints: Sequence[str], *, role: str | None = None
+    paths: Iterable[Path | str],
+    joints: Sequence[str],
+    *,
+    role: str | None = None,
+    mapping: LogMapping | None = None,
+    joint_types: Sequence[str] | None = None,
 ) -> list[Trajectory]:
     """All trajectories of the given files and folders, in sorted order of their files.
 
-    joints: the URDF's joint names; joint j has the columns `q_<j>`, `qd_<j>`, `tau_<j>`, beside the time `t`
-    [s]. A column `trajectory` splits one file into several. role "train" or "test": of a folder that holds
-    train.* or test.* files, only those with this stem are read.
-    Raises LogError (or one error that holds several) naming file, row and column.
+    joints: the URDF's joint names; without a mapping, joint j has the columns `q_<j>`, `qd_<j>`, `tau_<j>`,
+    beside the time `t` [s]. A column `trajectory` splits one file into several. role "train" or "test": of a
+    folder that holds train.* or test.* files, only those with this stem are read. joint_types: what the
+    mapping's units are checked against.
+    Raises LogError (or one error that holds several) naming file, row and column, and SettingsError where
+    the mapping does not fit the joints.
     """
+    mapping = mapping or LogMapping()
+    collect(mapping.misfits(joints, joint_types))
     errors: list[SpelgenError] = []
-    labelled: list[tuple[tuple[str, str, str], Trajectory]] = []
-    for file in _log_files(paths, role, errors):
+    labelled: list[Named] = []
+    for file in log_files(paths, role, errors):
         try:
-            labelled += _read_file(file, tuple(joints))
+            for each in read_tables(file, tuple(joints), mapping):
+                labelled += _trajectories(each, file, joints)
         except LogError as error:
             errors.append(error)
     collect(errors)
@@ -102,108 +80,101 @@ def write_logs(path: Path | str, trajectories: Sequence[Trajectory], joints: Seq
 def _writer(path: Path) -> Callable[[pa.Table, Path], None]:
     writers = {".parquet": pa.parquet.write_table, ".csv": pa.csv.write_csv}
     if path.suffix not in writers:
-        raise LogError(f"a log named {path.name!r}", expected=" or ".join(SUFFIXES))
+        raise LogError(f"a log named {path.name!r}", expected=" or ".join(writers))
     return writers[path.suffix]
 
 
-def _log_files(paths: Iterable[Path | str], role: str | None, errors: list[SpelgenError]) -> list[Path]:
+def log_files(paths: Iterable[Path | str], role: str | None, errors: list[SpelgenError]) -> list[Path]:
+    """The files and bags that these paths name, each once; what cannot be one is added to the errors."""
     files: dict[Path, None] = {}
     for path in map(Path, paths):
-        if path.is_dir():
+        if is_log(path) and path.exists():
+            files[path] = None
+        elif path.is_dir():
             found = _folder_files(path, role)
             if not found:
-                wanted = f"{role}.parquet or {role}.csv" if role else "*.parquet or *.csv"
-                errors.append(LogError("a folder without such logs", file=path, expected=wanted))
+                errors.append(LogError("a folder without logs", file=path, expected=KINDS))
             files |= dict.fromkeys(found)
         elif not path.exists():
             errors.append(
                 LogError("no such file or folder", file=path, expected="a log", do="check the path")
             )
-        elif path.suffix not in SUFFIXES:
-            errors.append(
-                LogError(f"a file of kind {path.suffix!r}", file=path, expected=" or ".join(SUFFIXES))
-            )
         else:
-            files[path] = None
+            errors.append(LogError(f"a file of kind {path.suffix!r}", file=path, expected=KINDS))
     return list(files)
 
 
 def _folder_files(folder: Path, role: str | None) -> list[Path]:
-    found = sorted(path for path in folder.iterdir() if path.suffix in SUFFIXES)
+    found = sorted(filter(is_log, folder.iterdir()))
     if role and any(path.stem in ("train", "test") for path in found):
         return [path for path in found if path.stem == role]
     return found
 
 
-def _read_file(file: Path, joints: tuple[str, ...]) -> list[tuple[tuple[str, str, str], Trajectory]]:
-    """The file's trajectories, each with its possible names from the shortest to the surely unique."""
-    table = _read_table(file)
-    wanted = ["t", *(f"{quantity}_{joint}" for quantity in QUANTITIES for joint in joints)]
-    _require_columns(table, wanted, file)
-    data = np.stack([_numbers(table, column, file) for column in wanted], axis=1)  # (T, 1 + 3n)
-    _require_finite(data, wanted, file)
-    declared = UNITS_KEY in (table.schema.metadata or {})
-    labels = (
-        np.array(table["trajectory"].to_pylist(), dtype=str) if "trajectory" in table.column_names else None
-    )
-    names = [file.stem] if labels is None else list(dict.fromkeys(labels.tolist()))
+def _trajectories(part: LogTable, file: Path, joints: Sequence[str]) -> list[Named]:
+    """The trajectories of one table."""
+    if not part.table.num_rows:
+        raise LogError("no rows", file=file, expected="at least one window of samples")
+    data = np.stack([_numbers(part, column, file) for column in part.wanted], axis=1)  # (T, 1 + 3n)
+    require_finite(data, part.wanted, file)
+    labels = None if part.labels is None else np.array(part.table[part.labels].to_pylist(), dtype=str)
+    declared = part.declares_units or all(part.mapping.unit("q", joint) for joint in joints)
+    names = [part.recording or file.stem] if labels is None else list(dict.fromkeys(labels.tolist()))
     found = []
     for name in names:
         rows = np.arange(len(data)) if labels is None else np.flatnonzero(labels == name)
-        _require_increasing_times(data[rows, 0], rows, file)
-        q, qd, tau = np.split(data[rows, 1:], 3, axis=1)
-        trajectory = Trajectory(name, data[rows, 0], q, qd, tau, file=file, declares_units=declared)
+        t = data[rows, 0] * TIMES[part.mapping.units.t]
+        require_increasing_times(t, rows, file, part.wanted[0])
+        trajectory = replace(
+            in_si(t, data[rows, 1:], joints, part.mapping), file=file, declares_units=declared
+        )
         found.append(((name, f"{file.stem}/{name}", f"{file}/{name}"), trajectory))
     return found
 
 
-def _read_table(file: Path) -> pa.Table:
-    reader = pa.parquet.read_table if file.suffix == ".parquet" else pa.csv.read_csv
+def in_si(t: np.ndarray, data: np.ndarray, joints: Sequence[str], mapping: LogMapping) -> Trajectory:
+    """Times (T,) [s] and columns as logged, q, qd (where it is logged) and tau by joint (T, 3n or 2n) -> a
+    trajectory without a name.
+    """
+    logged = wanted_quantities(mapping)
+    values = dict(zip(logged, np.split(data, len(logged), axis=1), strict=True))
+    for quantity, columns in values.items():
+        factors = np.array([mapping.scale(quantity, joint) for joint in joints])
+        offsets = np.array([mapping.offset(quantity, joint) for joint in joints])
+        values[quantity] = columns * factors + offsets
+    qd = values["qd"] if "qd" in values else _differentiated(t, values["q"])
+    return Trajectory("", t, values["q"], qd, values["tau"])
+
+
+def _differentiated(t: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Central differences (T, n) within each gap-free piece; 0 for a sample alone, of which no window is cut."""
+    qd = np.zeros_like(q)
+    for start, stop in pairwise(gap_ends(t)):
+        if stop - start > 1:
+            qd[start:stop] = np.gradient(q[start:stop], t[start:stop], axis=0)
+    return qd
+
+
+def _numbers(part: LogTable, column: str, file: Path) -> np.ndarray:
+    """A column as float64 (T,); times of a wide clock count from the first one, so that no digit is lost."""
+    values = part.table[column]
     try:
-        table = reader(file)
-    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
-        reason = str(error).splitlines()[0].rstrip(".")
-        raise LogError(f"an unreadable {file.suffix[1:]} file ({reason})", file=file) from error
-    if table.num_rows == 0:
-        raise LogError("no rows", file=file, expected="at least one window of samples")
-    return table
-
-
-def _require_columns(table: pa.Table, wanted: Sequence[str], file: Path) -> None:
-    present = table.column_names
-    repeated = sorted({name for name in wanted if present.count(name) > 1})
-    if repeated:
-        raise LogError(
-            "the same column twice", file=file, element=f"column {', '.join(repeated)}", expected="it once"
-        )
-    missing = [name for name in wanted if name not in present]
-    if missing:
-        close = difflib.get_close_matches(missing[0], present, n=1)
-        advice = (
-            f"rename the column {close[0]!r} to {missing[0]!r}?" if close else "add or rename the columns"
-        )
-        what = f"column {missing[0]}" if len(missing) == 1 else f"columns {', '.join(missing)}"
-        there = f"only the columns {', '.join(present)}"
-        raise LogError(
-            there,
-            file=file,
-            element=f"missing {what}",
-            expected="t, q_<joint>, qd_<joint>, tau_<joint>",
-            do=advice,
-        )
-
-
-def _numbers(table: pa.Table, column: str, file: Path) -> np.ndarray:
-    try:
-        return table[column].cast(pa.float64()).to_numpy()
+        if column == part.wanted[0]:
+            if pa.types.is_timestamp(values.type):
+                values = values.cast(pa.timestamp("ns")).cast(pa.int64())
+                return (values.to_numpy() - values[0].as_py()) * 1e-9 / TIMES[part.mapping.units.t]
+            if pa.types.is_integer(values.type) and abs(values[0].as_py()) > EXACT:
+                return (values.to_numpy() - values[0].as_py()).astype(float)
+        return values.cast(pa.float64()).to_numpy()
     except (pa.ArrowException, ValueError) as error:
-        kind = table.schema.field(column).type
+        kind = part.table.schema.field(column).type
         raise LogError(
             f"values of type {kind}", file=file, element=f"column {column}", expected="numbers"
         ) from error
 
 
-def _require_finite(data: np.ndarray, columns: Sequence[str], file: Path) -> None:
+def require_finite(data: np.ndarray, columns: Sequence[str], file: Path) -> None:
+    """Raise LogError where a column of the data (T, C) holds NaN or infinity."""
     bad = ~np.isfinite(data)
     if bad.any():
         row, column = np.argwhere(bad)[0]
@@ -215,13 +186,14 @@ def _require_finite(data: np.ndarray, columns: Sequence[str], file: Path) -> Non
         )  # fmt: skip
 
 
-def _require_increasing_times(t: np.ndarray, rows: np.ndarray, file: Path) -> None:
+def require_increasing_times(t: np.ndarray, rows: np.ndarray, file: Path, column: str) -> None:
+    """Raise LogError unless times (T,), of these rows of the file, increase."""
     back = np.flatnonzero(np.diff(t) <= 0)
     if back.size:
         k = int(back[0])
         raise LogError(
             f"t = {t[k + 1]:g} s after {t[k]:g} s ({back.size} such steps, this is the first)",
-            file=file, line=_line(file, rows[k + 1]), element=f"row {rows[k + 1] + 1}, column t",
+            file=file, line=_line(file, rows[k + 1]), element=f"row {rows[k + 1] + 1}, column {column}",
             expected="increasing times",
             do="sort the rows, drop repeats, or split recordings by a column 'trajectory'",
         )  # fmt: skip
@@ -232,12 +204,9 @@ def _line(file: Path, row: int) -> int | None:
     return int(row) + 2 if file.suffix == ".csv" else None
 
 
-def _with_unique_names(labelled: Sequence[tuple[tuple[str, str, str], Trajectory]]) -> list[Trajectory]:
+def _with_unique_names(labelled: Sequence[Named]) -> list[Trajectory]:
     for level in range(3):
         names = [labels[level] for labels, _ in labelled]
         if len(set(names)) == len(names):
             break
-    return [
-        Trajectory(name, x.t, x.q, x.qd, x.tau, file=x.file, declares_units=x.declares_units)
-        for name, (_, x) in zip(names, labelled, strict=True)
-    ]
+    return [replace(x, name=name) for name, (_, x) in zip(names, labelled, strict=True)]

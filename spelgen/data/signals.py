@@ -4,36 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.signal import butter, sosfiltfilt
 
-from spelgen.data.logs import QUANTITIES, Trajectory
+from spelgen.data.trajectory import QUANTITIES, Trajectory, rate, split_at_gaps
 from spelgen.errors import Diagnostic, LogError, SpelgenError, collect
 
-GAP = 4.0  # a step longer than this many median steps is a hole in the recording, not jitter
 FILTER_ORDER = 4
 AUTOMATIC_CUTOFF = 8.0  # [Hz] rigid-body motion of an arm lies below, drive ripple and quantisation above
 AUTOMATIC_RATE = 50.0  # [Hz] logs sampled more slowly are not oversampled enough to be filtered unasked
 
 SAMPLES_PER_PERIOD = 3
-
-
-def rate(trajectory: Trajectory) -> float:
-    """Samples per second outside gaps [Hz], from the mean step: the median of jittered steps is biased."""
-    steps = np.diff(trajectory.t)
-    return float(1.0 / steps[steps <= GAP * np.median(steps)].mean()) if steps.size else 0.0
-
-
-def split_at_gaps(trajectory: Trajectory) -> list[Trajectory]:
-    """The gap-free pieces, in order, all under the trajectory's name."""
-    steps = np.diff(trajectory.t)
-    if not steps.size:
-        return [trajectory]
-    ends = [0, *(np.flatnonzero(steps > GAP * np.median(steps)) + 1), len(trajectory.t)]
-    return [trajectory[start:stop] for start, stop in pairwise(ends)]
 
 
 def automatic_cutoff(trajectories: Sequence[Trajectory]) -> float | None:

@@ -1,0 +1,377 @@
+"""Every kind of log file and every way to name and measure: the same trajectory, or one clear sentence."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet
+import pytest
+
+from spelgen.data.logs import read_logs, write_logs
+from spelgen.data.trajectory import Trajectory
+from spelgen.errors import LogError, SettingsError, SpelgenErrors
+from spelgen.log_mapping import LogMapping
+
+JOINTS = ("shoulder", "elbow")
+T = np.array([0.0, 0.01, 0.02, 0.03])
+Q = np.array([[0.1, -0.2], [0.11, -0.21], [0.13, -0.23], [0.16, -0.26]])
+QD = np.array([[1.0, -1.0], [1.5, -1.5], [2.5, -2.5], [3.0, -3.0]])
+TAU = np.array([[5.0, 6.0], [5.5, 6.5], [6.0, 7.0], [6.5, 7.5]])
+
+
+def check(found: Trajectory, name: str, *, q=Q, qd=QD, tau=TAU, rtol=0.0):
+    assert found.name == name
+    for values, expected in ((found.t, T), (found.q, q), (found.qd, qd), (found.tau, tau)):
+        np.testing.assert_allclose(values, expected, rtol=rtol, atol=1e-9 if rtol else 0.0)
+
+
+def parquet(path: Path, columns: dict) -> Path:
+    pa.parquet.write_table(pa.table(columns), path)
+    return path
+
+
+def columns(**changed) -> dict:
+    found = {"t": T}
+    for quantity, values in {"q": Q, "qd": QD, "tau": TAU}.items():
+        found |= {f"{quantity}_{joint}": values[:, k] for k, joint in enumerate(JOINTS)}
+    return found | changed
+
+
+# ---- mappings
+
+
+def test_units_signs_offsets_and_gains_are_applied(tmp_path):
+    log = {
+        "time us": (T * 1e6).astype(np.int64),
+        "s pos": np.rad2deg(Q[:, 0] - 0.5),
+        "s vel": np.rad2deg(QD[:, 0]),
+        "s cur": TAU[:, 0] * 1000 / 12.5,
+        "J2.counts": -Q[:, 1] / (2 * np.pi) * 4096,
+        "e vel": -QD[:, 1] * 60 / (2 * np.pi),
+        "e cur": (TAU[:, 1] - 0.25) / 2.0 * 1000,
+    }
+    text = {
+        "columns": {"t": "time us", "q": "{joint} pos", "qd": "{joint} vel", "tau": "{joint} cur"},
+        "units": {"t": "us", "q": "deg", "qd": "deg/s", "tau": "mA"},
+        "joints": {
+            "shoulder": {"name": "s", "offset": 0.5, "gain": 12.5},
+            "elbow": {
+                "name": "e",
+                "columns": {"q": "J2.counts"},
+                "units": {"q": "counts", "qd": "rpm"},
+                "counts_per_turn": 4096,
+                "sign": -1,
+                "gain": -2.0,
+                "torque_offset": 0.25,
+            },
+        },
+    }
+    path = parquet(tmp_path / "robot.parquet", log)
+    (found,) = read_logs([path], JOINTS, mapping=LogMapping.model_validate(text))
+    check(found, "robot", rtol=1e-12)
+    assert found.declares_units
+
+
+def test_prismatic_counts_are_metres(tmp_path):
+    log = {"t": T, "q_slide": Q[:, 0] * 5000, "qd_slide": QD[:, 0] * 1000, "tau_slide": TAU[:, 0]}
+    mapping = {"units": {"q": "counts", "qd": "mm/s"}, "joints": {"slide": {"counts_per_metre": 5000}}}
+    (found,) = read_logs(
+        [parquet(tmp_path / "x.parquet", log)],
+        ("slide",),
+        mapping=LogMapping.model_validate(mapping),
+        joint_types=("prismatic",),
+    )
+    check(found, "x", q=Q[:, :1], qd=QD[:, :1], tau=TAU[:, :1], rtol=1e-12)
+
+
+def test_velocities_are_differentiated_only_where_that_is_asked(tmp_path):
+    t = np.concatenate([np.arange(50) * 0.01, 5 + np.arange(50) * 0.01, [20.0]])  # two gaps
+    log = {"t": t, "q_a": np.sin(t), "tau_a": t}
+    path = parquet(tmp_path / "x.parquet", log)
+    with pytest.raises(LogError, match=r"missing column qd_a: got only the columns t, q_a, tau_a"):
+        read_logs([path], ("a",))
+    (found,) = read_logs([path], ("a",), mapping=LogMapping(velocity="differentiated"))
+    inner = [k for k in range(100) if k % 50 not in (0, 49)]
+    np.testing.assert_allclose(found.qd[inner, 0], np.cos(t[inner]), atol=2e-5)  # dt^2 / 6
+    assert np.abs(found.qd[[0, 49, 50, 99], 0] - np.cos(t[[0, 49, 50, 99]])).max() < 0.006  # dt / 2
+    assert found.qd[100] == 0.0
+
+
+def test_what_spelgen_wrote_is_not_mapped(tmp_path):
+    write_logs(tmp_path / "x.parquet", [Trajectory("x", T, Q, QD, TAU)], JOINTS)
+    mapping = LogMapping.model_validate({"units": {"q": "deg"}, "columns": {"t": "clock"}})
+    (found,) = read_logs([tmp_path / "x.parquet"], JOINTS, mapping=mapping)
+    check(found, "x")
+
+
+def test_timestamps_count_from_the_first(tmp_path):
+    start = 1_700_000_000_000_000_000
+    stamps = start + np.array([0, 10_000_000, 20_000_000, 30_000_000])
+    for values, mapping in (
+        (pa.array(stamps, pa.timestamp("ns")), LogMapping()),
+        (pa.array(stamps), LogMapping.model_validate({"units": {"t": "ns"}})),
+    ):
+        path = parquet(tmp_path / "x.parquet", columns(t=values))
+        check(read_logs([path], JOINTS, mapping=mapping)[0], "x", rtol=1e-15)
+
+
+MISFITS = {
+    "current": (
+        {"units": {"tau": "A"}, "joints": {"elbow": {"gain": 2.0}}},
+        "logs: joint 'shoulder', tau: got the unit A, expected a gain beside it",
+    ),
+    "counts": (
+        {"joints": {"elbow": {"units": {"q": "counts"}, "counts_per_metre": 10}}},
+        "logs: joint 'elbow', q: got the unit counts, expected counts_per_turn beside it",
+    ),
+    "length": (
+        {"joints": {"elbow": {"units": {"qd": "mm/s"}}}},
+        "logs: joint 'elbow', qd: got the unit mm/s, expected one of a revolute joint",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", MISFITS)
+def test_a_mapping_that_does_not_fit_is_refused(tmp_path, case):
+    mapping, message = MISFITS[case]
+    path = parquet(tmp_path / "x.parquet", columns())
+    with pytest.raises(SettingsError) as caught:
+        read_logs([path], JOINTS, mapping=LogMapping.model_validate(mapping), joint_types=("revolute",) * 2)
+    assert str(caught.value) == message
+
+
+def test_a_pattern_without_joint_is_refused(tmp_path):
+    path = parquet(tmp_path / "x.parquet", columns())
+    with pytest.raises(LogError) as caught:
+        read_logs([path], JOINTS, mapping=LogMapping.model_validate({"columns": {"q": "q_elbow"}}))
+    assert str(caught.value) == (
+        f"{path}: column q_elbow: got one column for several joints, "
+        "expected '{joint}' in its name under 'logs'"
+    )
+
+
+# ---- NPZ
+
+
+def test_npz_columns(tmp_path):
+    np.savez(tmp_path / "x.npz", **columns(trajectory=np.array(["a", "a", "b", "b"])))
+    first, second = read_logs([tmp_path], JOINTS)
+    assert (first.name, second.name) == ("a", "b")
+    np.testing.assert_array_equal(np.concatenate([first.q, second.q]), Q)
+
+
+def test_npz_matrices_by_the_arm_s_order_or_by_names(tmp_path):
+    np.savez(tmp_path / "x.npz", t=T, q=Q, qd=QD, tau=TAU)
+    check(read_logs([tmp_path / "x.npz"], JOINTS)[0], "x")
+    turned = {"q": Q[:, ::-1], "qd": QD[:, ::-1], "tau": TAU[:, ::-1]}
+    np.savez(tmp_path / "y.npz", t=T, joints=np.array(JOINTS[::-1]), **turned)
+    check(read_logs([tmp_path / "y.npz"], JOINTS)[0], "y")
+
+
+def test_npz_with_an_array_for_each_recording(tmp_path):
+    arrays = {}
+    for k in (3, 4):
+        arrays |= {f"t_{k}": T[:k], f"qp_{k}": Q[:k], f"qv_{k}": QD[:k], f"tau_{k}": TAU[:k]}
+    np.savez(tmp_path / "x.npz", labels=np.array(["a", "b"]), **arrays)
+    names = {
+        "t": "t_{trajectory}",
+        "q": "qp_{trajectory}",
+        "qd": "qv_{trajectory}",
+        "tau": "tau_{trajectory}",
+    }
+    short, whole = read_logs([tmp_path], JOINTS, mapping=LogMapping.model_validate({"columns": names}))
+    check(whole, "4")
+    np.testing.assert_array_equal(short.q, Q[:3])
+
+
+def test_delan_characters_are_read(shared):
+    names = {
+        "t": "t_{trajectory}",
+        "q": "qp_{trajectory}",
+        "qd": "qv_{trajectory}",
+        "tau": "tau_{trajectory}",
+    }
+    mapping = LogMapping.model_validate({"columns": names})
+    found = read_logs([shared / "logs" / "delan_characters"], JOINTS, mapping=mapping)
+    assert len(found) == 20
+    assert found[0].q.shape == (150, 2)
+
+
+NPZ = {
+    "missing": (
+        {"t": T, "q": Q, "tau": TAU},
+        "{}: missing columns qd_shoulder, qd_elbow: got only the columns t, q, tau, "
+        "expected t, q_<joint>, qd_<joint>, tau_<joint>; "
+        "rename the columns, or say their names under 'logs' in the robot's YAML",
+    ),
+    "short": (
+        {"t": T, "q": Q[:3], "qd": QD, "tau": TAU},
+        "{}: array q[:, 0]: got an array of shape (3,), expected a value for each of the 4 times",
+    ),
+    "wide": (
+        {"t": T, "q": np.ones((4, 3)), "qd": QD, "tau": TAU},
+        "{}: array q: got 3 columns, expected 2, one for each joint; name them by an array 'joints'",
+    ),
+    "unknown": (
+        {"t": T, "q": Q, "qd": QD, "tau": TAU, "joints": np.array(["shoulder", "wrist"])},
+        "{}: array joints: got the joints shoulder, wrist, "
+        "expected elbow among the names of the 2 columns of q",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", NPZ)
+def test_bad_npz_is_refused_in_one_sentence(tmp_path, case):
+    arrays, message = NPZ[case]
+    np.savez(tmp_path / "x.npz", **arrays)
+    with pytest.raises(LogError) as caught:
+        read_logs([tmp_path / "x.npz"], JOINTS)
+    assert str(caught.value) == message.format(tmp_path / "x.npz")
+
+
+def test_npz_never_unpickles(tmp_path):
+    np.savez(tmp_path / "x.npz", **columns(extra=np.array([print], dtype=object)))
+    with pytest.raises(LogError, match=r"x\.npz: an unreadable npz file \(.*pickle"):
+        read_logs([tmp_path], JOINTS)
+    (tmp_path / "x.npz").write_bytes(b"not an archive")
+    with pytest.raises(LogError, match=r"x\.npz: an unreadable npz file"):
+        read_logs([tmp_path], JOINTS)
+
+
+# ---- ROS 2 bags
+
+STATE = "sensor_msgs/msg/JointState"
+
+
+@pytest.fixture(params=["MCAP", "SQLITE3"])
+def bag(request, tmp_path):
+    """Write a bag of (topic, names, position, velocity, effort) messages, 10 ms apart; return its folder."""
+    pytest.importorskip("rosbags", reason="reading ROS 2 bags needs the extra 'ros'")
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    state, header, stamp = (
+        store.types[name] for name in (STATE, "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
+    )
+
+    def write(messages, stamped=True, kind=STATE):
+        folder = tmp_path / "bag"
+        with Writer(folder, version=9, storage_plugin=StoragePlugin[request.param]) as writer:
+            connections = {
+                topic: writer.add_connection(topic, kind, typestore=store)
+                for topic in dict.fromkeys(message[0] for message in messages)
+            }
+            for k, (topic, names, *values) in enumerate(messages):
+                time = 1_700_000_000_000_000_000 + 10_000_000 * k
+                clock = stamp(sec=time // 10**9 * stamped, nanosec=time % 10**9 * stamped)
+                arrays = [np.array(x, dtype=float, order="C") for x in values]
+                message = state(header(stamp=clock, frame_id=""), list(names), *arrays)
+                writer.write(connections[topic], time + 777_777, store.serialize_cdr(message, STATE))
+        return folder
+
+    return write
+
+
+STATES = [("/joint_states", JOINTS[::-1], *(x[::-1] for x in each)) for each in zip(Q, QD, TAU, strict=True)]
+
+
+@pytest.mark.parametrize("stamped", [True, False])
+def test_bags_are_read(bag, stamped):
+    folder = bag(STATES, stamped)
+    (found,) = read_logs([folder], JOINTS)
+    check(found, "bag", rtol=1e-12)
+    (storage,) = [path for path in folder.iterdir() if path.suffix in (".mcap", ".db3")]
+    (alone,) = read_logs([storage], JOINTS)
+    np.testing.assert_array_equal(alone.q, found.q)
+    (in_folder,) = read_logs([folder.parent], JOINTS)
+    assert in_folder.name == "bag"
+
+
+def test_another_device_on_the_topic_is_passed_over(bag):
+    gripper = ("/joint_states", ["finger"], [0.0], [0.0], [0.0])
+    (found,) = read_logs([bag([STATES[0], gripper, *STATES[1:]])], JOINTS)
+    np.testing.assert_array_equal(found.q, Q)
+
+
+def test_names_of_a_bag_are_mapped(bag):
+    states = [(topic, ["s", "e"], *values) for topic, _, *values in STATES]
+    folder = bag(states)
+    mapping = {"joints": {"shoulder": {"name": "e"}, "elbow": {"name": "s"}}}
+    check(read_logs([folder], JOINTS, mapping=LogMapping.model_validate(mapping))[0], "bag", rtol=1e-12)
+    with pytest.raises(LogError, match=r"bag: got joint states of s, e only, expected shoulder, elbow; map"):
+        read_logs([folder], JOINTS)
+
+
+def test_of_several_topics_one_is_named(bag):
+    folder = bag([*STATES, ("/other", JOINTS, [0, 0], [0, 0], [0, 0])])
+    with pytest.raises(LogError) as caught:
+        read_logs([folder], JOINTS)
+    assert str(caught.value) == (
+        f"{folder}: got joint states on the topics /joint_states, /other, expected one of them; "
+        "name it by 'topic' under 'logs'"
+    )
+    check(read_logs([folder], JOINTS, mapping=LogMapping(topic="/joint_states"))[0], "bag", rtol=1e-12)
+    with pytest.raises(
+        LogError, match=r"got no joint states on /left, expected one of /joint_states, /other"
+    ):
+        read_logs([folder], JOINTS, mapping=LogMapping(topic="/left"))
+
+
+def test_empty_fields_of_a_bag_are_missing_columns(bag):
+    folder = bag([(topic, names, q, [], []) for topic, names, q, _, _ in STATES])
+    with pytest.raises(LogError, match=r"missing columns qd_shoulder, qd_elbow, tau_shoulder, tau_elbow"):
+        read_logs([folder], JOINTS)
+
+
+BAD_BAGS = {
+    "part": (
+        [("/a", JOINTS[:1], [0.0], [0.0], [0.0])],
+        "{}: message 1: got a message with the joints shoulder, expected elbow in it too",
+    ),
+    "lengths": (
+        [STATES[0], ("/joint_states", JOINTS, [0.0], [0.0, 0.0], [0.0, 0.0])],
+        "{}: message 2, position: got 1 values for 2 joints, expected one of each",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD_BAGS)
+def test_bad_bags_are_refused_in_one_sentence(bag, case):
+    messages, message = BAD_BAGS[case]
+    folder = bag(messages)
+    with pytest.raises(LogError) as caught:
+        read_logs([folder], JOINTS)
+    assert str(caught.value) == message.format(folder)
+
+
+def test_a_bag_without_joint_states_is_told(bag):
+    folder = bag(STATES, kind="std_msgs/msg/String")
+    with pytest.raises(LogError) as caught:
+        read_logs([folder], JOINTS)
+    assert str(caught.value) == (
+        f"{folder}: got only the topics /joint_states (std_msgs/msg/String), expected one of {STATE}"
+    )
+
+
+def test_a_broken_bag_is_told(tmp_path):
+    pytest.importorskip("rosbags", reason="reading ROS 2 bags needs the extra 'ros'")
+    for name in ("x.mcap", "y.db3"):
+        (tmp_path / name).write_bytes(b"not a bag")
+    with pytest.raises(SpelgenErrors) as caught:
+        read_logs([tmp_path], JOINTS)
+    first, second = str(caught.value).splitlines()
+    assert first.startswith(f"{tmp_path}/x.mcap: an unreadable ROS 2 bag (")
+    assert second.startswith(f"{tmp_path}/y.db3: an unreadable ROS 2 bag (")
+
+
+def test_without_rosbags_the_extra_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
+    (tmp_path / "x.mcap").write_bytes(b"")
+    with pytest.raises(LogError) as caught:
+        read_logs([tmp_path], JOINTS)
+    assert str(caught.value) == (
+        f"{tmp_path}/x.mcap: got a ROS 2 bag, expected the package rosbags to read it; "
+        "pip install 'spelgen[ros]'"
+    )
