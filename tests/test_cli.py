@@ -197,6 +197,21 @@ def test_unreadable_logs(spelgen, robots, tmp_path, content, told):
     assert everything(tmp_path) == before
 
 
+def test_the_settings_name_the_columns_of_logs_and_a_mapping_file_comes_first(spelgen, robots, tmp_path):
+    for suffix in (".urdf", ".yaml"):
+        (tmp_path / f"rpr{suffix}").write_bytes((robots / f"rpr{suffix}").read_bytes())
+    with (tmp_path / "rpr.yaml").open("a") as file:
+        file.write("logs: {columns: {t: clock}}\n")
+    assert spelgen("build", "rpr.urdf").exit_code == 0
+    (tmp_path / "logs.csv").write_text("t,q\n0,1\n")
+    assert "missing columns clock, q_joint1" in refused(spelgen("train", "rpr_spel.py", "--data", "logs.csv"))
+    (tmp_path / "mine.yaml").write_text("columns: {t: stamp}\njoints: {joint1: {name: J1}}\n")
+    command = ["train", "rpr_spel.py", "--data", "logs.csv", "--mapping", "mine.yaml"]
+    assert "missing columns stamp, q_J1" in refused(spelgen(*command))
+    (tmp_path / "mine.yaml").write_text("joints: {joint7: {sign: -1}}\n")
+    assert refused(spelgen(*command)).startswith("mine.yaml:1: joints: unknown joint 'joint7'; did you mean")
+
+
 @pytest.mark.parametrize("command", ["train", "check"])
 def test_foreign_module(spelgen, tmp_path, command):
     (tmp_path / "other.py").write_text("print('not ours')\n")

@@ -18,6 +18,8 @@ import torch
 from spelgen.data.logs import Trajectory, write_logs
 from spelgen.data.windows import Windows, cut_windows
 from spelgen.errors import LogError, ModuleError, RunError
+from spelgen.evaluation.evaluate import evaluate
+from spelgen.log_mapping import LogMapping
 from spelgen.training.data import TrainingConfig, prepare_data
 from spelgen.training.loop import TrainingLoop
 from spelgen.training.progress import TrainingProgress
@@ -271,6 +273,38 @@ def test_numbers_that_never_recover_end_the_run(logs, tmp_path, monkeypatch):
         f"{tmp_path}/run: losses that are not finite, after 8 attempts at half the learning rate each; "
         "check units and signs of the logs; the best model so far is kept in model.pt"
     )
+
+
+def test_mapped_logs_train_as_plain_ones_do(logs, tmp_path):
+    plain = train(STAND_IN, [logs], tmp_path / "plain", QUICK, progress=False)
+    names = {"t": "ms", "trajectory": "run", "q": "pos {joint}", "qd": "vel {joint}", "tau": "cur {joint}"}
+    text = {
+        "columns": names,
+        "units": {"t": "ms", "q": "turns", "tau": "A"},
+        "joints": {"shoulder": {"name": "J1", "gain": 8.0, "sign": -1}, "elbow": {"gain": 0.5}},
+    }
+    columns = {"run": [x.name for x in motions() for _ in x.t]}
+    columns["ms"] = np.concatenate([1000 * x.t for x in motions()])
+    for k, (joint, sign, gain) in enumerate([("J1", -1, 8.0), ("elbow", 1, 0.5)]):
+        for name, factor in (("q", sign / (2 * np.pi)), ("qd", sign), ("tau", sign / gain)):
+            values = np.concatenate([getattr(x, name)[:, k] for x in motions()])
+            columns[names[name].replace("{joint}", joint)] = factor * values
+    np.savez(tmp_path / "train.npz", **columns)
+    mapping = LogMapping.model_validate(text)
+    mapped = train(
+        STAND_IN, [tmp_path / "train.npz"], tmp_path / "run", QUICK, mapping=mapping, progress=False
+    )
+    assert mapped.best_validation == pytest.approx(plain.best_validation, rel=1e-6)
+    again = train(
+        STAND_IN,
+        [tmp_path / "train.npz"],
+        tmp_path / "run",
+        replace(QUICK, epochs=7),
+        resume=True,
+        progress=False,
+    )
+    assert again.epochs == 7
+    assert evaluate(tmp_path / "run", [tmp_path / "train.npz"]).trajectories[0] == "motion_0"
 
 
 def test_early_stop_and_time_limit(logs, tmp_path):

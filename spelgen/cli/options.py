@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import csv
 import re
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from spelgen.errors import SpelgenError
 from spelgen.spec import Assume
+
+if TYPE_CHECKING:
+    from spelgen.log_mapping import LogMapping
 
 Robot = Annotated[
     Path, typer.Argument(metavar="ROBOT.urdf", help="The arm's URDF; ROBOT.yaml beside it holds settings.")
@@ -46,13 +50,17 @@ Entry = Annotated[
 ]
 Data = Annotated[
     list[Path] | None,
-    typer.Option(
-        "--data", metavar="LOGS...", help="Parquet or CSV files, or folders of them.", show_default=False
-    ),
+    typer.Option("--data", metavar="LOGS...", help="Log files, or folders of them.", show_default=False),
 ]
 MoreData = Annotated[
     list[Path] | None,
     typer.Argument(metavar="LOGS", help="More logs: several may follow --data.", show_default=False),
+]
+Mapping = Annotated[
+    Path | None,
+    typer.Option(
+        "--mapping", metavar="FILE", help="YAML: how the logs are named and measured; see docs/logs.md."
+    ),
 ]
 Filter = Annotated[
     float | None,
@@ -89,6 +97,20 @@ def logs(data: list[Path] | None, more: list[Path] | None) -> list[Path]:
     if not data:
         raise typer.BadParameter("name at least one file or folder", param_hint="'--data'")
     return [*data, *(more or [])]
+
+
+def mapping(file: Path | None, urdf: Path | None, joints: Sequence[str]) -> LogMapping | None:
+    """What a mapping file says, else the settings beside the URDF; None without either.
+
+    The file may speak of all joints of the URDF, or of `joints` where there is none.
+    """
+    from spelgen.settings import load_mapping, load_settings
+    from spelgen.urdf.read import read_urdf
+
+    there = urdf is not None and urdf.is_file()
+    if file is not None:
+        return load_mapping(file, [x.name for x in read_urdf(urdf).joints] if urdf and there else joints)
+    return load_settings(urdf).logs if urdf and there else None
 
 
 def require_free(path: Path, *, force: bool) -> None:

@@ -16,6 +16,7 @@ from spelgen.cli.options import (
     Filter,
     Force,
     Joints,
+    Mapping,
     Module,
     MoreData,
     Robot,
@@ -81,6 +82,7 @@ def train(
         Path | None, typer.Option("-o", "--output", metavar="RUN", help="Run folder; default: runs/<module>.")
     ] = None,
     robot: RobotOption = None,
+    mapping: Mapping = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in the run folder.")] = False,
     force: Force = False,
     momentum_steps: Annotated[
@@ -141,7 +143,15 @@ def train(
         urdf, folder if resume else None, {key: value for key, value in flags.items() if value is not None}
     )
     result = training.train(
-        module, paths, folder, config, urdf=urdf, resume=resume, force=force, progress=not quiet
+        module,
+        paths,
+        folder,
+        config,
+        urdf=urdf,
+        mapping=options.mapping(mapping, None if resume else urdf, read_header(module).joints),
+        resume=resume,
+        force=force,
+        progress=not quiet,
     )
     say(f"{result.status} after {result.epochs} epochs, {result.steps} steps, {result.seconds:.0f} s")
     say(f"best validation loss {result.best_validation:.3g}, at epoch {result.best_epoch}")
@@ -151,13 +161,20 @@ def train(
         raise typer.Exit(INTERRUPTED)
 
 
-def evaluate(run: Run, more: MoreData = None, data: Data = None, filter: Filter = None) -> None:
+def evaluate(
+    run: Run, more: MoreData = None, data: Data = None, mapping: Mapping = None, filter: Filter = None
+) -> None:
     """Judge a trained run on test logs, beside its rivals."""
     paths = options.logs(data, more)
     from spelgen.evaluation import evaluate as evaluation
     from spelgen.report.tables import result_tables
+    from spelgen.training.runs import RunFolder
 
-    result = evaluation.evaluate(run, paths, cutoff=filter)
+    folder = RunFolder(run)
+    named = None
+    if mapping is not None:
+        named = options.mapping(mapping, folder.urdf, read_header(folder.module).joints)
+    result = evaluation.evaluate(run, paths, cutoff=filter, mapping=named)
     for each in result.diagnostics:
         note(f"{each.severity}: {each.where}: {each.message}")
     count = len(result.trajectories)

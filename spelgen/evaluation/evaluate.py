@@ -18,6 +18,7 @@ from spelgen.errors import Diagnostic
 from spelgen.evaluation.examples import Example, predict_examples
 from spelgen.evaluation.tip import tip_position
 from spelgen.evaluation.torque import TorqueErrors, torque_errors, torque_samples
+from spelgen.log_mapping import LogMapping
 from spelgen.spec import Header, read_header
 from spelgen.training.data import filter_cutoff
 from spelgen.training.rivals import Contender, held_velocity, trained, urdf_values
@@ -109,20 +110,23 @@ def evaluate(
     steps: Sequence[int] = (1, 10),
     seconds: Sequence[float] = (1.0,),
     cutoff: float | None = None,
+    mapping: LogMapping | None = None,
     threads: int = 1,
 ) -> Evaluation:
     """Evaluate the best model of a run on logs (a folder's test.* where there are such) and write
     evaluation.json.
 
     steps, seconds: horizons in samples and in time; those longer than every trajectory are left out, and
-    said. cutoff: of the filter on the logs [Hz], 0: none; by default the one the run was trained with. The
+    said. cutoff: of the filter on the logs [Hz], 0: none; by default the one the run was trained with.
+    mapping: how the logs are named and measured; by default as those that were trained on. The
     result depends on nothing else: no random numbers. Raises RunError, ModuleError, LogError.
     """
     torch.set_num_threads(threads)
     run = RunFolder(Path(folder))
     config = run.read_json(run.config)
     model, header = _trained_model(run), read_header(run.module)
-    trajectories = read_logs(data, header.joints, role="test")
+    mapping = mapping or LogMapping(**config.get("mapping", {}))
+    trajectories = read_logs(data, header.joints, role="test", mapping=mapping, joint_types=model.joint_types)
     notes = examine(trajectories, header.joints, model.joint_types)
     notes += _seen(trajectories, config)
     used = config["cutoff"] if cutoff is None else filter_cutoff(cutoff, trajectories)

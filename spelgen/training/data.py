@@ -12,6 +12,7 @@ from spelgen.data.logs import Trajectory, read_logs
 from spelgen.data.signals import automatic_cutoff, automatic_spacing, examine, prepare
 from spelgen.data.windows import Windows, cut_windows, split_validation
 from spelgen.errors import Diagnostic
+from spelgen.log_mapping import LogMapping
 from spelgen.settings import TrainingSettings
 from spelgen.training.rollout import LossScales, loss_scales
 
@@ -73,14 +74,18 @@ class TrainingData:
 
 
 def prepare_data(
-    paths: Iterable[Path | str], joints: Sequence[str], joint_types: Sequence[str], config: TrainingConfig
+    paths: Iterable[Path | str],
+    joints: Sequence[str],
+    joint_types: Sequence[str],
+    config: TrainingConfig,
+    mapping: LogMapping | None = None,
 ) -> TrainingData:
-    """Read the logs' training part and make windows of it.
+    """Read the logs' training part, as `mapping` says, and make windows of it.
 
     Validation trajectories are set aside before anything is cut, so that no sample is in both parts.
-    Raises LogError.
+    Raises LogError, and SettingsError where the mapping does not fit.
     """
-    trajectories = read_logs(paths, joints, role="train")
+    trajectories = read_logs(paths, joints, role="train", mapping=mapping, joint_types=joint_types)
     notes = examine(trajectories, joints, joint_types)
     split = split_validation(trajectories, config.validation_fraction, config.seed)
     cutoff = filter_cutoff(config.filter, trajectories)

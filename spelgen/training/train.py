@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from spelgen.errors import Diagnostic, ModuleError, RunError
+from spelgen.log_mapping import LogMapping
 from spelgen.spec import Header, read_header
 from spelgen.training.data import TrainingConfig, TrainingData, prepare_data
 from spelgen.training.loop import Status, TrainingLoop
@@ -57,6 +58,7 @@ def train(
     config: TrainingConfig,
     *,
     urdf: Path | str | None = None,
+    mapping: LogMapping | None = None,
     resume: bool = False,
     force: bool = False,
     progress: bool = True,
@@ -64,7 +66,8 @@ def train(
     """Train the emitted module on the logs and leave a run folder (see `RunFolder`).
 
     urdf: the robot the module was built from, for the rivals of `evaluate`; by default the file of that name
-    beside the module. resume: go on from the folder's checkpoint, exactly as if there had been no
+    beside the module. mapping: how the logs are named and measured; by default as spelgen writes them, and
+    when resumed as before. resume: go on from the folder's checkpoint, exactly as if there had been no
     interruption. Ctrl-C or SIGTERM end the run with status "interrupted"; the folder is usable and
     resumable. Raises ModuleError, LogError, and RunError when the folder holds a run or cannot be resumed
     with this.
@@ -72,13 +75,16 @@ def train(
     run = RunFolder(Path(folder))
     module = Path(module)
     if resume:
-        run.read_json(run.config)  # a missing run is told before anything is read
+        before = run.read_json(run.config)  # a missing run is told before anything is read
+        mapping = mapping or LogMapping(**before.get("mapping", {}))
         module = run.module
     _use(config)
     model = load_model(module)
     header = read_header(module)
-    prepared = prepare_data(data, header.joints, model.joint_types, config)
-    description = _describe(config, prepared, header)
+    prepared = prepare_data(data, header.joints, model.joint_types, config, mapping)
+    description = _describe(config, prepared, header) | {
+        "mapping": (mapping or LogMapping()).model_dump(exclude_defaults=True)
+    }
     notes = list(prepared.diagnostics)
     if resume:
         _require_same(run, description)
