@@ -53,7 +53,7 @@ def plan_model(
         design=design,
         joints=tuple(
             _joint(
-                coordinate, identifiers[k], sizes, k, known.get(coordinate.name) or _guessed_rotor(coordinate)
+                coordinate, identifiers[k], sizes, k, known.get(coordinate.name) or guessed_rotor(coordinate)
             )
             for k, coordinate in enumerate(arm.coordinates)
         ),
@@ -105,7 +105,7 @@ def _joint(coordinate: Coordinate, identifier: str, sizes: Nominal, index: int, 
     )
 
 
-def _guessed_rotor(coordinate: Coordinate) -> float:
+def guessed_rotor(coordinate: Coordinate) -> float:
     """A geared drive's own inertia: such that its full effort takes ``_RISE`` seconds to reach its full
     speed.
     """
@@ -115,12 +115,19 @@ def _guessed_rotor(coordinate: Coordinate) -> float:
     return _RISE * effort / speed
 
 
+def guessed_friction(coordinate: Coordinate) -> float | None:
+    """A share of the drive's effort [Nm, N]; None where the URDF names no believable one."""
+    usable = coordinate.effort and coordinate.effort <= _LARGEST_EFFORT
+    return _FRICTION_OF_EFFORT * coordinate.effort if coordinate.effort and usable else None
+
+
 def _friction(coordinate: Coordinate, sizes: Nominal, index: int) -> float:
     """The size of friction to start from: a share of the drive's effort, or of the torques the nominal arm
     needs.
     """
-    if coordinate.effort and coordinate.effort <= _LARGEST_EFFORT:
-        return _FRICTION_OF_EFFORT * coordinate.effort
+    known = guessed_friction(coordinate)
+    if known is not None:
+        return known
     # a wrist may need next to no torque by itself, but its gear rubs like its neighbour's
     return _FRICTION_OF_TORQUE * max(sizes.joint_torque[index], 0.01 * max(sizes.joint_torque))
 

@@ -1,0 +1,124 @@
+"""The rigid-body regressor Y(q, qd, qdd): the joint torques are Y times the bodies' inertial parameters.
+
+Newton-Euler in body frames (Khalil and Dombre, Modeling, Identification and Control of Robots, 2002, ch. 9 and 12).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from spelgen.arm.arm import Arm, Body
+
+PARAMETERS = ("m", "mx", "my", "mz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
+"""Of a body, about its joint frame's origin and in its axes: [kg], [kg m], [kg m^2]; as ``Body.inertia``."""
+
+_CROSS = np.zeros((3, 3, 3))  # _CROSS @ b applied to a, summed over the last axes, is a x b
+for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+    _CROSS[_i, _j, _k], _CROSS[_i, _k, _j] = 1.0, -1.0
+
+_TENSOR = np.zeros((3, 3, 6))  # the tensor's entries by its six components
+for _component, (_i, _j) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))):
+    _TENSOR[_i, _j, _component] = _TENSOR[_j, _i, _component] = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """How a body's frame stands in its parent's and moves, T samples, in its own axes.
+
+    acceleration: of the origin, less gravity.
+    """
+
+    rotation: np.ndarray  # (T, 3, 3)
+    position: np.ndarray  # (T, 3)
+    velocity: np.ndarray  # (T, 3) angular
+    turning: np.ndarray  # (T, 3) angular acceleration
+    acceleration: np.ndarray  # (T, 3)
+
+
+def regressor(arm: Arm, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
+    """Y (T, n, 10 B) at q, qd, qdd, each (T, n), of the arm's B bodies: tau = Y pi [Nm, N].
+
+    Column 10 b + i belongs to parameter ``PARAMETERS[i]`` of ``arm.bodies[b]``.
+    """
+    states: list[_State] = []
+    result = np.zeros((*q.shape, 10 * len(arm.bodies)))
+    for index, body in enumerate(arm.bodies):
+        states.append(_moved(arm, body, states, q, qd, qdd))
+        force, moment = _wrench(states[index])
+        columns = result[:, :, 10 * index : 10 * index + 10]
+        at = index
+        while at >= 0:
+            link = arm.bodies[at]
+            along = moment if link.kind == "revolute" else force
+            columns[:, link.coordinate] += float(link.multiplier) * along[:, 2]
+            state = states[at]
+            force, moment = state.rotation @ force, state.rotation @ moment
+            moment = moment + _crossing(state.position) @ force
+            at = link.parent
+    return result
+
+
+def urdf_parameters(arm: Arm) -> np.ndarray:
+    """The URDF's own inertial parameters, (10 B,); zero for a body without."""
+    return np.array([[float(x) for x in body.inertia or (0,) * 10] for body in arm.bodies]).ravel()
+
+
+def _moved(
+    arm: Arm, body: Body, states: list[_State], q: np.ndarray, qd: np.ndarray, qdd: np.ndarray
+) -> _State:
+    factor = float(body.multiplier)
+    value = factor * q[:, body.coordinate] + body.offset
+    rate, rise = (factor * x[:, body.coordinate, None] for x in (qd, qdd))
+    pose = np.array([[float(x) for x in row] for row in body.rotation])
+    position = np.broadcast_to(np.array([float(x) for x in body.translation]), (len(q), 3))
+    axis = np.array([0.0, 0.0, 1.0])
+    if body.kind == "revolute":
+        rotation = pose @ _turn(value)
+    else:
+        rotation = np.broadcast_to(pose, (len(q), 3, 3))
+        position = position + value[:, None] * pose[:, 2]
+    if body.parent < 0:
+        velocity = turning = np.zeros((len(q), 3))
+        acceleration = np.broadcast_to(-np.array([float(x) for x in arm.gravity]), (len(q), 3))
+    else:
+        parent = states[body.parent]
+        velocity, turning = parent.velocity, parent.turning
+        swing = np.cross(velocity, np.cross(velocity, position))
+        acceleration = parent.acceleration + np.cross(turning, position) + swing
+    velocity, turning, acceleration = (
+        np.einsum("tij,ti->tj", rotation, x) for x in (velocity, turning, acceleration)
+    )
+    if body.kind == "revolute":
+        turning = turning + rise * axis + rate * np.cross(velocity, axis)
+        velocity = velocity + rate * axis
+    else:
+        acceleration = acceleration + rise * axis + 2 * rate * np.cross(velocity, axis)
+    return _State(rotation, position, velocity, turning, acceleration)
+
+
+def _turn(angle: np.ndarray) -> np.ndarray:
+    """Rotations about z, (T, 3, 3)."""
+    c, s = np.cos(angle), np.sin(angle)
+    zero, one = np.zeros_like(c), np.ones_like(c)
+    return np.stack([c, -s, zero, s, c, zero, zero, zero, one], axis=-1).reshape(-1, 3, 3)
+
+
+def _wrench(state: _State) -> tuple[np.ndarray, np.ndarray]:
+    """Force and moment about the origin by the body's ten parameters, each (T, 3, 10)."""
+    samples = len(state.velocity)
+    spin = _crossing(state.velocity)
+    inertia = np.einsum("ijc,tj->tic", _TENSOR, state.turning)
+    inertia = inertia + spin @ np.einsum("ijc,tj->tic", _TENSOR, state.velocity)
+    force, moment = np.zeros((2, samples, 3, 10))
+    force[:, :, 0] = state.acceleration
+    force[:, :, 1:4] = _crossing(state.turning) + spin @ spin
+    moment[:, :, 1:4] = -_crossing(state.acceleration)
+    moment[:, :, 4:] = inertia
+    return force, moment
+
+
+def _crossing(vector: np.ndarray) -> np.ndarray:
+    """[a]x with [a]x b = a x b, (T, 3, 3)."""
+    return np.einsum("ikj,tk->tij", _CROSS, vector)

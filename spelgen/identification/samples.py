@@ -1,0 +1,73 @@
+"""Logs -> samples on which accelerations can be had: filtered, at one rate, where the arm moves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from spelgen.data.logs import Trajectory
+from spelgen.data.signals import low_pass, rate, resample
+
+FREQUENCY = 100.0  # [Hz] of the common grid
+CUTOFF = 8.0  # [Hz]
+MOVING = 0.02  # [rad/s, m/s] samples at which every joint is slower say nothing of dynamics
+DENSE = 50.0  # [Hz] below this rate accelerations cannot be had from a log
+SHORTEST = 1.0  # [s] pieces below this are all filter transient
+HOLE = 0.25 / CUTOFF  # [s] a shorter one loses nothing that the filter lets through
+JITTER = 4.0  # median steps: a longer one is a hole in the recording, if it is longer than HOLE too
+
+
+@dataclass(frozen=True, eq=False)
+class DynamicsSamples:
+    """Samples (T, n) of one trajectory: q, qd, qdd [rad, s; m, s] and tau [Nm, N] as logged."""
+
+    name: str
+    q: np.ndarray
+    qd: np.ndarray
+    qdd: np.ndarray
+    tau: np.ndarray
+
+
+def dynamics_samples(trajectories: Sequence[Trajectory], *, pauses: bool = False) -> list[DynamicsSamples]:
+    """The moving samples of each dense enough trajectory.
+
+    At 100 Hz, through a zero-phase 4th-order Butterworth low-pass at 8 Hz on q, qd and tau (before the change of
+    rate where the log is denser, after it where not), qdd by central differences of the filtered qd, only samples
+    with some |qd| > 0.02 rad/s; pieces between gaps separately. ``pauses``: all samples from the first that moves
+    to the last, standstill between them included.
+    """
+    return [_samples(x, pauses) for x in trajectories if rate(x) >= DENSE and any(map(_long, _pieces(x)))]
+
+
+def _pieces(trajectory: Trajectory) -> list[Trajectory]:
+    steps = np.diff(trajectory.t)
+    if not steps.size:
+        return [trajectory]
+    holes = steps > max(JITTER * np.median(steps), HOLE)
+    ends = [0, *(np.flatnonzero(holes) + 1), len(trajectory.t)]
+    return [trajectory[start:stop] for start, stop in pairwise(ends)]
+
+
+def _long(piece: Trajectory) -> bool:
+    return bool(piece.t[-1] - piece.t[0] >= SHORTEST)
+
+
+def _samples(trajectory: Trajectory, pauses: bool) -> DynamicsSamples:
+    parts = []
+    for piece in filter(_long, _pieces(trajectory)):
+        if rate(piece) > 1.5 * FREQUENCY:
+            smooth = resample(low_pass(piece, CUTOFF), FREQUENCY)
+        else:
+            smooth = low_pass(resample(piece, FREQUENCY), CUTOFF)
+        qdd = np.gradient(smooth.qd, smooth.t, axis=0)
+        taken = (np.abs(smooth.qd) > MOVING).any(axis=1)
+        if pauses and taken.any():
+            first, *_, last = np.flatnonzero(taken)
+            taken[first:last] = True
+        parts.append([x[taken] for x in (smooth.q, smooth.qd, qdd, smooth.tau)])
+    return DynamicsSamples(
+        trajectory.name, *(np.concatenate(columns) for columns in zip(*parts, strict=True))
+    )

@@ -1,0 +1,280 @@
+"""Identification: the regressor against Pinocchio, least squares against known arms and published figures."""
+
+import json
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from typer.testing import CliRunner
+
+from spelgen.cli.main import app
+from spelgen.data.logs import Trajectory, read_logs, write_logs
+from spelgen.errors import ArmError, LogError
+from spelgen.identification import told
+from spelgen.identification.base import base_parameters
+from spelgen.identification.friction import FrictionModel
+from spelgen.identification.identify import Method, columns, identify
+from spelgen.identification.least_squares import correlation_time
+from spelgen.identification.regressor import regressor, urdf_parameters
+from spelgen.identification.samples import DynamicsSamples, dynamics_samples
+from spelgen.pipeline import inspect, load
+from spelgen.structure.pseudo_inertia import (
+    LOWER,
+    parameters_of,
+    pseudo_inertia,
+    reference_factor,
+    sensitivity,
+)
+
+ROBOTS = ("two_link", "rpr", "scara", "six_dof", "ur10e", "panda")
+
+
+def pinocchio(path, arm):
+    """Pinocchio's model of the same arm, its other joints locked."""
+    names = [coordinate.name for coordinate in arm.coordinates]
+    whole = pin.buildModelFromUrdf(str(path))
+    locked = [i for i in range(1, whole.njoints) if whole.names[i] not in names]
+    model = pin.buildReducedModel(whole, locked, pin.neutral(whole))
+    assert list(model.names[1:]) == names
+    model.gravity.linear = np.array([float(g) for g in arm.gravity])
+    return model
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_regressor_spans_what_pinocchios_does_and_gives_its_torque(robots, robot):
+    path = robots / f"{robot}.urdf"
+    arm = load(path).arm
+    model = pinocchio(path, arm)
+    data = model.createData()
+    states = np.random.default_rng(0).uniform(-2, 2, (3, 60, len(arm.coordinates)))
+    ours = regressor(arm, *states)
+    torque = np.array([pin.rnea(model, data, *state) for state in zip(*states, strict=True)])
+    np.testing.assert_allclose(ours @ urdf_parameters(arm), torque, atol=1e-9 * np.abs(torque).max())
+    theirs = np.concatenate(
+        [pin.computeJointTorqueRegressor(model, data, *state).copy() for state in zip(*states, strict=True)]
+    )
+    ours = ours.reshape(len(theirs), -1)
+    # the same columns in other frames: each side explains the other
+    explained = ours @ np.linalg.lstsq(ours, theirs, rcond=1e-11)[0]
+    np.testing.assert_allclose(explained, theirs, atol=1e-8 * np.abs(theirs).max())
+    assert np.linalg.matrix_rank(ours, tol=1e-8) == np.linalg.matrix_rank(theirs, tol=1e-8)
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_base_parameters_are_as_many_as_derived_exactly(robots, robot):
+    path = robots / f"{robot}.urdf"
+    arm = load(path).arm
+    base = base_parameters(arm, FrictionModel())
+    drives = base.columns >= 10 * len(arm.bodies)
+    full = base.combination[:, : 10 * len(arm.bodies)]
+    assert np.linalg.matrix_rank(full, tol=1e-8) == inspect(path).to_dict()["base_parameters"]
+    assert (~drives).sum() == inspect(path).to_dict()["base_parameters"]
+    # the first joint's rotor cannot be told from the inertia about its axis
+    assert "rotor1" not in [base.names[k] for k in base.columns]
+    assert base.told()["rotor1"] == "in combination"
+    assert base.told()["viscous1"] == "alone"
+
+
+def excited(arm, seconds=20.0, seed=0, noise=0.0, friction=None):
+    """Samples of a smooth random motion with the URDF's torques, friction and rotors added; and the parameters."""
+    friction = friction or FrictionModel()
+    n = len(arm.coordinates)
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, seconds, 0.01)
+    speed = 2 * np.pi * rng.uniform(0.1, 0.7, (5, n))
+    phase, size = rng.uniform(0, 2 * np.pi, (5, n)), rng.uniform(0.2, 0.6, (5, n))
+    angle = speed * t[:, None, None] + phase
+    q, qd, qdd = (size * np.sin(angle)).sum(1), (size * speed * np.cos(angle)).sum(1), None
+    qdd = -(size * speed**2 * np.sin(angle)).sum(1)
+    drives = {"rotor": 0.4, "viscous": 3.0, "coulomb": 2.0, "offset": 0.3, "stribeck": 1.0}
+    added = np.concatenate([np.full(n, drives[effect]) for effect in friction.effects])
+    x = np.concatenate([urdf_parameters(arm), added])
+    tau = columns(arm, friction, q, qd, qdd) @ x
+    # some joints are measured better than others
+    scale = noise * tau.std(0) * np.linspace(0.2, 2.0, n)
+    return DynamicsSamples("known", q, qd, qdd, tau + scale * rng.normal(size=tau.shape)), x
+
+
+def test_a_known_arm_is_found_exactly(robots):
+    arm = load(robots / "six_dof.urdf").arm
+    friction = FrictionModel(stribeck=True)
+    samples, x = excited(arm, friction=friction)
+    found = identify(arm, [samples], Method("range", friction=friction))
+    np.testing.assert_allclose(found.values, found.base.combination @ x, atol=1e-6 * np.abs(x).max())
+    assert found.unseen == 0
+    assert found.condition < 1e4
+    fresh, _ = excited(arm, seed=1, friction=friction)
+    np.testing.assert_allclose(found.torque(fresh.q, fresh.qd, fresh.qdd), fresh.tau, atol=1e-4)
+
+
+def test_standard_deviations_are_those_of_repeated_experiments(robots):
+    arm = load(robots / "rpr.urdf").arm
+    drawn, told_ = [], []
+    for seed in range(40):
+        samples, x = excited(arm, 4.0, seed=7, noise=0.0)
+        rng = np.random.default_rng(seed)
+        noisy = samples.tau + 0.05 * samples.tau.std(0) * rng.normal(size=samples.tau.shape)
+        found = identify(arm, [DynamicsSamples("", samples.q, samples.qd, samples.qdd, noisy)], Method())
+        drawn.append(found.values - found.base.combination @ x)
+        told_.append(found.deviations)
+    ratio = np.std(drawn, axis=0) / np.mean(told_, axis=0)
+    assert (ratio > 0.6).all()
+    assert (ratio < 1.5).all()
+
+
+def test_weights_by_noise_beat_equal_ones_where_joints_are_measured_unequally(robots):
+    arm = load(robots / "six_dof.urdf").arm
+    errors = {}
+    for weights in ("equal", "noise"):
+        away = []
+        for seed in range(5):
+            samples, _ = excited(arm, 5.0, seed=seed, noise=0.2)
+            found = identify(arm, [samples], Method(weights))
+            fresh, _ = excited(arm, seed=100 + seed)
+            error = found.torque(fresh.q, fresh.qd, fresh.qdd) - fresh.tau
+            away.append((error.var(0) / fresh.tau.var(0)).mean())
+        errors[weights] = np.mean(away)
+    assert errors["noise"] < errors["equal"]
+
+
+def test_correlated_errors_count_for_less():
+    rng = np.random.default_rng(0)
+    white = rng.normal(size=(20000, 1))
+    slow = np.empty_like(white)
+    slow[0] = white[0]
+    for k in range(1, len(white)):
+        slow[k] = 0.8 * slow[k - 1] + white[k]
+    assert correlation_time([white])[0] == pytest.approx(1.0, abs=0.15)
+    assert correlation_time([slow])[0] == pytest.approx((1 + 0.8) / (1 - 0.8), rel=0.2)
+
+
+def test_a_prior_helps_where_the_motion_is_short(robots):
+    arm = load(robots / "six_dof.urdf").arm
+    samples, _ = excited(arm, 1.0, noise=0.1)
+    fresh, _ = excited(arm, seed=3)
+    error = {}
+    for prior in (None, 0.2):
+        found = identify(arm, [samples], Method(prior=prior))
+        error[prior] = np.square(found.torque(fresh.q, fresh.qd, fresh.qdd) - fresh.tau).mean()
+    assert error[0.2] < 0.5 * error[None]
+
+
+def test_what_motion_does_not_show_is_said(robots):
+    arm = load(robots / "six_dof.urdf").arm
+    samples, _ = excited(arm)
+    samples.qd[:, 3:], samples.qdd[:, 3:], samples.q[:, 3:] = 0.0, 0.0, 0.4
+    found = identify(arm, [samples], Method("range"))
+    assert found.unseen > 0
+    assert "say nothing in" in told.text(found)
+    assert told.to_dict(found)["condition"] is None
+
+
+def test_errors_tell_what_is_missing(robots):
+    arm = load(robots / "two_link.urdf").arm
+    with pytest.raises(LogError, match="50 Hz"):
+        identify(arm, [], Method())
+
+
+def test_a_prior_needs_inertials(robots, tmp_path):
+    text = (robots / "two_link.urdf").read_text(encoding="utf-8")
+    start, end = (
+        text.index("<inertial>", text.index("link2")),
+        text.rindex("</inertial>") + len("</inertial>"),
+    )
+    (tmp_path / "bare.urdf").write_text(text[:start] + text[end:], encoding="utf-8")
+    arm = load(tmp_path / "bare.urdf").arm
+    with pytest.raises(ArmError, match="no inertials behind the joints"):
+        identify(arm, [excited(load(robots / "two_link.urdf").arm)[0]], Method(prior=0.5))
+
+
+def trajectory(arm, **options):
+    samples, _ = excited(arm, **options)
+    t = 0.01 * np.arange(len(samples.q))
+    return Trajectory("known", t, samples.q, samples.qd, samples.tau)
+
+
+def test_command(robots, tmp_path):
+    robot = robots / "six_dof.urdf"
+    arm = load(robot).arm
+    write_logs(tmp_path / "logs.parquet", [trajectory(arm, noise=0.02)], [c.name for c in arm.coordinates])
+    base = ["identify", str(robot), "--data", str(tmp_path / "logs.parquet")]
+    shown = CliRunner().invoke(app, base)
+    assert shown.exit_code == 0, shown.output
+    assert max(map(len, shown.stdout.splitlines())) <= 80
+    assert "Condition number" in shown.stdout
+    again = CliRunner().invoke(app, [*base, "--format", "json"])
+    data = json.loads(again.stdout)
+    assert data["schema"] == 1
+    viscous = [x for x in data["base_parameters"] if x["name"].startswith("viscous")]
+    assert [x["value"] for x in viscous] == pytest.approx([3.0] * 6, rel=0.1)
+    assert all(x["determined"] == "firm" for x in viscous)
+    both = CliRunner().invoke(app, [*base, "--ridge", "0.1", "--prior", "0.5"])
+    assert both.exit_code == 2
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_pseudo_inertia_is_pinocchios(seed):
+    root = np.random.default_rng(seed).normal(size=(4, 4))
+    ten = parameters_of(root @ root.T)
+    theirs = ten[[0, 1, 2, 3, 4, 5, 7, 6, 8, 9]]  # Pinocchio's order: Ixx, Ixy, Iyy, Ixz, Iyz, Izz
+    matrix = pin.PseudoInertia.FromDynamicParameters(theirs).toMatrix()
+    np.testing.assert_allclose(pseudo_inertia(ten), matrix, atol=1e-12)
+    np.testing.assert_allclose(parameters_of(pseudo_inertia(ten)), ten, atol=1e-12)
+    factor, possible = reference_factor(ten)
+    assert possible
+    step = 1e-6
+    for k, (row, column) in enumerate(LOWER):
+        change = np.eye(4)
+        change[row, column] += step
+        moved = parameters_of(factor @ change @ change.T @ factor.T)
+        np.testing.assert_allclose((moved - ten) / step, sensitivity(factor)[:, k], atol=1e-4)
+
+
+def test_an_impossible_body_is_replaced_by_the_nearest_possible_one():
+    # thinner than any body: Izz > Ixx + Iyy
+    factor, possible = reference_factor(np.array([1.0, 0, 0, 0, 0.1, 0, 0, 0.1, 0, 0.5]))
+    assert not possible
+    ten = parameters_of(factor @ factor.T)
+    assert np.linalg.eigvalsh(pseudo_inertia(ten))[0] > 0
+    assert ten[9] < ten[4] + ten[7]
+    assert ten[0] == pytest.approx(1.0)
+
+
+TRAINING = ("20_02_10_30sec_12harm", "20_02_12_50sec_12harm", "20_02_05_20sec_8harm")
+RIVAL = {  # ../shared/logs/README.md
+    "19_12_23_free": 0.0056, "20_01_31_unload": 0.0138, "20_02_05_20sec_12harm": 0.0092,
+    "20_02_06_20sec_10harm": 0.0118, "20_02_06_20sec_5harm": 0.0080, "20_02_10_20sec_7harm": 0.0138,
+    "20_02_12_40sec_12harm": 0.0039, "20_02_19_14harm50sec": 0.0092, "20_02_19_15harm50sec": 0.0079,
+}  # fmt: skip
+
+
+def nmse(found, sample):
+    error = found.torque(sample.q, sample.qd, sample.qdd) - sample.tau
+    return (np.square(error).mean(0) / sample.tau.var(0)).mean()
+
+
+def read(folder, names, arm):
+    joints = [coordinate.name for coordinate in arm.coordinates]
+    return [read_logs([folder / f"{name}.parquet"], joints)[0] for name in names]
+
+
+def test_ur10e_gives_the_published_figures(shared):
+    folder = shared / "logs" / "ur10e"
+    arm = load(folder / "ur10e.urdf").arm
+    training = dynamics_samples(read(folder, TRAINING, arm))
+    found = identify(arm, training, Method("range"))
+    tests = dynamics_samples(read(folder, RIVAL, arm), pauses=True)
+    measured = {sample.name: nmse(found, sample) for sample in tests}
+    assert np.mean(list(measured.values())) == pytest.approx(0.0092, rel=0.05)
+    assert measured == pytest.approx(RIVAL, rel=0.05)
+    more = identify(arm, training, Method("range", friction=FrictionModel(stribeck=True, polynomial=True)))
+    assert np.mean([nmse(more, sample) for sample in tests]) == pytest.approx(0.0087, rel=0.05)
+
+
+def test_panda_gives_the_published_figure(shared):
+    arm = load(shared / "arms" / "panda_erd.urdf").arm
+    (whole,) = read(shared / "logs" / "panda", ["exciting_traj1"], arm)
+    cut = int(np.searchsorted(whole.t, whole.t[0] + 12.0))
+    training, test = dynamics_samples([whole[:cut]]), dynamics_samples([whole[cut:]])
+    found = identify(arm, training, Method("range", friction=FrictionModel(dry_velocity=0.02)))
+    assert nmse(found, test[0]) == pytest.approx(0.0056, rel=0.05)
