@@ -14,7 +14,7 @@ urdf: robot xacro_child xacro_input document values elements lint read actuation
 arm: rational snapping placement chain walk arm
 structure: recursion field sampling spans basis expansion symbolic structure nominal minimal pseudo_inertia
 emission: plan emit
-data: trajectory bags tables logs signals windows
+data: trajectory bags tables logs doubts signals windows
 simulation: engine simulate tracking protocols
 identification: samples friction regressor base least_squares prior identify told
 training: runs lie_group rollout rivals prior progress data loop train

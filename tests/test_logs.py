@@ -9,11 +9,11 @@ import pyarrow.parquet
 import pytest
 import torch
 
+from spelgen.data.doubts import examine
 from spelgen.data.logs import Trajectory, read_logs, write_logs
 from spelgen.data.signals import (
     automatic_cutoff,
     automatic_spacing,
-    examine,
     low_pass,
     prepare,
     rate,
@@ -169,7 +169,10 @@ def test_degrees_are_refused(case):
     trajectory, message = DEGREES[case]
     with pytest.raises(SpelgenErrors) as caught:
         examine([trajectory], JOINTS, ("revolute", "revolute"))
-    advice = "; convert degrees; if the units are right, say so in the Parquet schema's metadata 'units'"
+    advice = (
+        "; convert degrees, by 'units' under 'logs' in the robot's YAML; if the units are right, say so there, "
+        "or in the Parquet schema's metadata 'units'"
+    )
     assert str(caught.value).splitlines()[0] == message + advice
 
 
@@ -191,6 +194,65 @@ def test_a_velocity_that_is_no_derivative_is_a_warning():
         "trajectory x, joint 'b'",
     )
     assert note.message.startswith("qd is not dq/dt: the best factor is -1")
+
+
+def changed(q=None, qd=None, tau=None) -> Trajectory:
+    """The swing, with columns set to a constant, by joint."""
+    arrays = {name: getattr(swing(), name).copy() for name in ("q", "qd", "tau")}
+    for array, values in zip(arrays.values(), (q, qd, tau), strict=True):
+        for joint, value in (values or {}).items():
+            array[:, joint] = value
+    return Trajectory("x", swing().t, **arrays)
+
+
+@pytest.mark.parametrize(
+    ("trajectory", "got"),
+    [
+        (changed(qd={0: 0.0}), "qd always 0 while q goes from -1 to 1"),
+        (changed(q={0: 0.7}), "q always 0.7 while qd says that it moves by 1"),
+    ],
+)
+def test_a_frozen_column_is_refused(trajectory, got):
+    with pytest.raises(LogError) as caught:
+        examine([trajectory], JOINTS, ("revolute", "revolute"))
+    assert str(caught.value) == (
+        f"trajectory x, joint 'a': got {got}, expected columns that belong together; "
+        "check the logger, and the names of the columns"
+    )
+
+
+def test_what_never_changes_in_any_trajectory_is_said():
+    resting = changed(q={1: 0.5}, qd={1: 0.0}, tau={1: 0.0})
+    notes = examine([resting], JOINTS, ("revolute", "revolute"))
+    assert [(x.severity, x.code, x.where, x.message) for x in notes] == [
+        (
+            "warning", "constant-torque", "trajectory x, joint 'b'",
+            "tau is always 0: right for a joint without a motor only",
+        ),
+        (
+            "info", "joint-at-rest", "trajectory x, joint 'b'",
+            "does not move: the logs say nothing about its own dynamics",
+        ),
+    ]  # fmt: skip
+    assert examine([resting, swing()], JOINTS, ("revolute", "revolute")) == []
+
+
+@pytest.mark.parametrize(
+    ("trajectory", "advice"),
+    [
+        (scaled(swing(), qd=-1.0), "its sign is the opposite of that of q"),
+        (scaled(swing(), qd=1e3), "are the times in ms?"),
+        (Trajectory("x", swing().t, swing().q, swing().qd[:, ::-1], swing().tau), "it fits q of joint 'b'"),
+        (scaled(swing(), qd=1.3), "check units, signs and the order of the joints"),
+    ],
+)
+def test_what_may_be_wrong_with_a_velocity_is_said(trajectory, advice):
+    first, second = examine([trajectory], JOINTS, ("revolute", "revolute"))
+    assert first.message.endswith(f"; {advice}")
+    several = examine([trajectory] * 3, JOINTS, ("revolute", "revolute"))
+    assert [x.message for x in several] == [
+        f"{x.message} (and in 2 more trajectories)" for x in (first, second)
+    ]
 
 
 def with_gap() -> Trajectory:

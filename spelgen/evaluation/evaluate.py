@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torchdiffeq import odeint
 
+from spelgen.data.doubts import examine
 from spelgen.data.logs import Trajectory, read_logs
-from spelgen.data.signals import examine, prepare, rate
+from spelgen.data.signals import prepare, rate
 from spelgen.data.windows import Windows, cut_windows
 from spelgen.errors import Diagnostic
 from spelgen.evaluation.examples import Example, predict_examples

@@ -8,8 +8,9 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
+from spelgen.data.doubts import examine
 from spelgen.data.logs import Trajectory, read_logs
-from spelgen.data.signals import automatic_cutoff, automatic_spacing, examine, prepare
+from spelgen.data.signals import automatic_cutoff, automatic_spacing, prepare
 from spelgen.data.windows import Windows, cut_windows, split_validation
 from spelgen.errors import Diagnostic
 from spelgen.log_mapping import LogMapping
