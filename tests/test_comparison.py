@@ -4,14 +4,18 @@ import json
 import math
 from dataclasses import replace
 
+import numpy as np
+import pinocchio as pin
 import pytest
 import torch
 import yaml
 
 from spelgen.comparison import measures
+from spelgen.comparison.page import write_comparison
 from spelgen.comparison.paper import PAPER
 from spelgen.comparison.study import VARIANTS, prepare_study, run_study, time_steps
 from spelgen.comparison.tables import comparison_tables
+from spelgen.comparison.truth import example_positions, mass_error, true_mass
 from spelgen.data.logs import read_logs
 from spelgen.errors import RunError
 from spelgen.training.runs import load_model
@@ -110,6 +114,40 @@ def test_tables_stand_beside_the_paper(study):
     base, ours = (result["prediction"]["loss"] for result in results)
     assert rows["phnode's prediction loss / this"] == ["1", f"{base / ours:.3g}"]
     assert all(line == line.rstrip() and len(line) <= 80 for x in tables for line in x.text().splitlines())
+
+
+def test_the_true_mass_matrix_is_pinocchios_with_the_rotors(robots):
+    """Pinocchio's own reading of the file, and rotor inertia times gear squared on the diagonal."""
+    urdf = robots / "ur10e.urdf"
+    model = pin.buildModelFromUrdf(str(urdf))
+    q = torch.from_numpy(np.random.default_rng(0).uniform(-3, 3, (5, 6)))
+    rotors = [1.0e-4, 1.0e-4, 6.0e-5, 2.0e-5, 2.0e-5, 2.0e-5]
+    for at, found in zip(q.numpy(), true_mass(urdf, q).numpy(), strict=True):
+        upper = np.triu(pin.crba(model, model.createData(), at))
+        expected = upper + np.triu(upper, 1).T + np.diag(rotors) * 101**2
+        np.testing.assert_allclose(found, expected, atol=1e-10)
+
+
+def test_the_error_of_m_has_no_units():
+    """A tenth too large everywhere is an error of 0.1 on the diagonal of the identity, in any units of the joints."""
+    scale = torch.diag(torch.tensor([1.0, 100.0, 0.01], dtype=torch.float64))
+    true = (scale @ (torch.eye(3, dtype=torch.float64) + 0.2) @ scale).expand(4, 3, 3)
+    assert mass_error(1.1 * true, true) == pytest.approx(0.1 / math.sqrt(3))
+    assert mass_error(true, true) == 0.0
+
+
+def test_the_page_shows_predictions_and_m_beside_the_truth(study):
+    page = write_comparison(study, []).read_text()
+    learned = page[page.index("The mass matrix along this trajectory") :]
+    assert learned.count('<svg class="chart"') == 3
+    for name in ("M11", "M21", "M22"):
+        assert f'aria-label="{name}"' in learned
+    assert learned.count("<title>true</title>") == 3
+    (result,) = (x for x in study.results() if x["variant"] == "minimal")
+    q = example_positions(result["examples"][0])
+    model = load_model(study.module(CHOSEN[1]))
+    model.load_state_dict(torch.load(study.run(CHOSEN[1], 0) / "model.pt"))
+    np.testing.assert_allclose(result["mass"]["along"], model.mass_matrix(q).detach(), rtol=1e-12)
 
 
 def test_a_run_that_is_not_finite_counts_as_worst(study):

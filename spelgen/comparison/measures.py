@@ -64,9 +64,10 @@ class Sizes:
 
 
 def thinned(pieces: Sequence[Trajectory], samples: int, every: int) -> Windows:
-    """At most about ``MOST_WINDOWS`` windows, evenly spread."""
+    """At most about ``MOST_WINDOWS`` windows, evenly spread, a multiple of ``every`` samples apart."""
     starts = sum(max(0, len(x.t) - (samples - 1) * every) for x in pieces)
-    return cut_windows(pieces, samples, max(1, -(-starts // MOST_WINDOWS)), every, measured=False)
+    stride = -(-max(1, -(-starts // MOST_WINDOWS)) // every) * every
+    return cut_windows(pieces, samples, stride, every, measured=False)
 
 
 def predict(model: EmittedModel, windows: Windows, substeps: int) -> Prediction:

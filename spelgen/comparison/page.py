@@ -1,4 +1,4 @@
-"""A comparison -> one self-contained HTML page: the tables, losses while training, predictions against the truth."""
+"""A comparison -> one self-contained HTML page: tables, losses while training, predictions and M against the truth."""
 
 from __future__ import annotations
 
@@ -12,9 +12,11 @@ from markupsafe import Markup
 
 from spelgen import __version__
 from spelgen.comparison.study import Study
+from spelgen.comparison.truth import example_positions, true_mass
 from spelgen.files import write_text
 from spelgen.rendering import render
 from spelgen.report.charts import Line, line_chart
+from spelgen.report.learned import INERTIA_UNITS, entry_index
 from spelgen.report.plots import QUANTITIES, UNITS
 from spelgen.report.tables import Table
 from spelgen.training.runs import RunFolder, load_model
@@ -24,7 +26,7 @@ STYLES = ("c1", "c2", "c3", "c4", "c5")
 
 @dataclass(frozen=True)
 class Panel:
-    """A joint's charts."""
+    """Charts that belong together: a joint's, or a row's of M."""
 
     name: str
     charts: tuple[Markup, ...]
@@ -44,6 +46,7 @@ def write_comparison(study: Study, tables: Sequence[Table]) -> Path:
         styles=styles,
         losses=_losses(study, styles),
         panels=_panels(results, styles, joint_types),
+        entries=_entries(study, results, styles, joint_types),
     )
     return write_text(study.folder / "comparison.html", text)
 
@@ -59,6 +62,32 @@ def _losses(study: Study, styles: Mapping[str, str]) -> Markup:
         steps = [record["step"] for record in records]
         lines.append(Line(variant.name, steps, [record["best"] for record in records], styles[variant.name]))
     return line_chart(lines, "Best validation loss by step", "training step", "loss", log=True, width=860)
+
+
+def _entries(
+    study: Study,
+    results: Sequence[Mapping[str, Any]],
+    styles: Mapping[str, str],
+    joint_types: Sequence[str],
+) -> list[Panel]:
+    """The rows of M's lower triangle along the first example: the true robot's, and what every variant learned."""
+    shown = [result for result in results if result["examples"]]
+    if not shown:
+        return []
+    example = shown[0]["examples"][0]
+    true = true_mass(study.source, example_positions(example)).tolist()
+    rows = []
+    for i, kind in enumerate(joint_types):
+        charts = []
+        for j in range(i + 1):
+            lines = [Line("true", example["t"], [each[i][j] for each in true], "truth")]
+            for result in shown:
+                values = [each[i][j] for each in result["mass"]["along"]]
+                lines.append(Line(result["variant"], example["t"], values, styles[result["variant"]]))
+            name, unit = f"M{entry_index(i, j)}", INERTIA_UNITS.get(f"{kind} {joint_types[j]}", "kg m")
+            charts.append(line_chart(lines, name, "t [s]", f"{name} [{unit}]", width=330, height=190))
+        rows.append(Panel(f"row {i + 1}: {example['joints'][i]['name']}", tuple(charts)))
+    return rows
 
 
 def _panels(

@@ -12,7 +12,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 import yaml
@@ -20,6 +20,7 @@ from lxml import etree
 
 from spelgen import pipeline
 from spelgen.comparison.measures import laws, predict, sizes, step_seconds, thinned
+from spelgen.comparison.truth import example_positions, mass_error, true_mass
 from spelgen.data.logs import Trajectory, read_logs, write_logs
 from spelgen.errors import RunError
 from spelgen.evaluation.examples import predict_examples
@@ -34,7 +35,10 @@ from spelgen.training.rollout import LossScales, loss_scales
 from spelgen.training.runs import RunFolder, load_model, write_json
 from spelgen.training.train import train
 
-SCHEMA = 1
+if TYPE_CHECKING:
+    from spelgen.training.runs import EmittedModel
+
+SCHEMA = 2
 HORIZON = 1.0  # s, over which trajectories are predicted
 
 
@@ -60,12 +64,13 @@ VARIANTS = (
 class Study:
     """The files of a comparison.
 
-    logs: train.parquet and test.parquet. kinematics.urdf: what the models are built from. modules and runs
-    by variant and seed; each finished run holds result.json. low, high: range of q [rad; m] in which M is
-    looked at.
+    source: the robot's own URDF. logs: train.parquet and test.parquet. kinematics.urdf: what the models are
+    built from. modules and runs by variant and seed; each finished run holds result.json. low, high: range of
+    q [rad; m] in which M is looked at.
     """
 
     folder: Path
+    source: Path
     robot: str
     settings: ComparisonSettings
     training: TrainingConfig
@@ -118,6 +123,7 @@ def prepare_study(
     ranges = [working_range(coordinate) for coordinate in loaded.arm.coordinates]
     study = Study(
         folder=folder,
+        source=robot,
         robot=loaded.arm.name,
         settings=settings,
         training=_training(loaded.settings, settings),
@@ -265,32 +271,41 @@ def _run(study: Study, variant: Variant, seed: int) -> dict[str, Any]:
     model = load_model(run.module)
     model.load_state_dict(run.load_state(run.weights))
     model.requires_grad_(False).eval()
-    joints = read_header(run.module).joints
-    config = study.training
-    every = config.every or 1
-    training, testing = (read_logs([study.logs], joints, role=role) for role in ("train", "test"))
-    spacing = float(testing[0].t[1] - testing[0].t[0])
-    far = thinned(testing, round(HORIZON / spacing) + 1, 1)
-    near = {
-        name: thinned(part, config.window, every) for name, part in (("train", training), ("test", testing))
-    }
-    low, high = (torch.tensor(x, dtype=torch.float64) for x in (study.low, study.high))
-    steps = round(HORIZON / spacing)
-    contender = trained(model, ended.substeps)
+    found = _measured(study, model, read_header(run.module).joints, ended.substeps)
     result = {
         "variant": variant.name,
         "seed": seed,
         "seconds": ended.seconds,
         "substeps": ended.substeps,
-        "sizes": asdict(sizes(model)),
-        "train": asdict(predict(model, near["train"], ended.substeps)),
-        "test": asdict(predict(model, near["test"], ended.substeps)),
-        "prediction": asdict(predict(model, far, ended.substeps)),
-        "laws": asdict(laws(model, far, low, high)),
-        "examples": [asdict(x) for x in predict_examples(contender, testing, steps, joints, measured=False)],
+        **found,
     }
     write_json(study.result(variant, seed), result)
     return result
+
+
+def _measured(study: Study, model: EmittedModel, joints: Sequence[str], substeps: int) -> dict[str, Any]:
+    """What result.json holds of a trained model."""
+    every = study.training.every or 1
+    training, testing = (read_logs([study.logs], joints, role=role) for role in ("train", "test"))
+    steps = round(HORIZON / (every * float(testing[0].t[1] - testing[0].t[0])))
+    far = thinned(testing, steps + 1, every)
+    near_train, near_test = (thinned(x, study.training.window, every) for x in (training, testing))
+    low, high = (torch.tensor(x, dtype=torch.float64) for x in (study.low, study.high))
+    examples = predict_examples(trained(model, substeps), testing, steps, joints, every=every, measured=False)
+    along = example_positions(asdict(examples[0])) if examples else torch.zeros(0, len(joints))
+    seen = far.q[:, 0]
+    return {
+        "sizes": asdict(sizes(model)),
+        "train": asdict(predict(model, near_train, substeps)),
+        "test": asdict(predict(model, near_test, substeps)),
+        "prediction": asdict(predict(model, far, substeps)),
+        "laws": asdict(laws(model, far, low, high)),
+        "mass": {
+            "error": mass_error(model.mass_matrix(seen), true_mass(study.source, seen)),
+            "along": model.mass_matrix(along).tolist(),
+        },
+        "examples": [asdict(x) for x in examples],
+    }
 
 
 def time_steps(study: Study) -> dict[str, float]:
@@ -299,6 +314,7 @@ def time_steps(study: Study) -> dict[str, float]:
     training = read_logs([study.logs], joints, role="train")
     windows = thinned(training, study.training.window, study.training.every or 1)[: study.training.batch]
     times = {}
+    torch.set_num_threads(study.training.threads)
     for variant in study.variants:
         model = load_model(study.module(variant))
         scales: LossScales = loss_scales(windows, model.joint_types)

@@ -62,18 +62,18 @@ def _losses(found: Mapping[str, Sequence[Result]], paper: Mapping[str, Published
         _row(label, {name: _median(found[name], *path) for name in names})
         for label, path in quantities.items()
     ]
-    loss = rows[2].label
     if BASELINE in found:
-        base = _median(found[BASELINE], "prediction", "loss")
-        rows.insert(3, Row(f"{BASELINE}'s {loss.split(',')[0]} / this", _ratios(found, names, base)))
+        rows.insert(3, Row(f"{BASELINE}'s prediction loss / this", _ratios(found, names, "loss")))
+        rows.insert(5, Row(f"{BASELINE}'s velocity / this", _ratios(found, names, "velocity")))
+    rows.append(_row("M, relative error", {name: _median(found[name], "mass", "error") for name in names}))
     rows += _published(names, paper, "training loss", lambda each: each.train_loss)
     rows += _published(names, paper, "test loss", lambda each: each.test_loss)
     rows += _published(names, paper, "prediction loss", lambda each: each.prediction_loss)
     rows += _published(names, paper, "velocity", lambda each: each.velocity)
     rows += _published(names, paper, "position", lambda each: each.position)
     title = (
-        "Squared errors summed over joints [rad, m, s], mean over samples and windows, median over seeds; "
-        "below, what the paper reports"
+        "Squared errors summed over joints [rad, m, s], mean over samples and windows, and the error of M, "
+        "relative to M; median over seeds; below, what the paper reports"
     )
     return Table(title, names, tuple(rows))
 
@@ -111,12 +111,12 @@ def _worst(values: Sequence[float | None], pick: Callable[[list[float]], float])
     return pick(known) if len(known) == len(values) else None
 
 
-def _ratios(
-    found: Mapping[str, Sequence[Result]], names: Sequence[str], base: float | None
-) -> tuple[Cell, ...]:
+def _ratios(found: Mapping[str, Sequence[Result]], names: Sequence[str], key: str) -> tuple[Cell, ...]:
+    """How many times worse than each the baseline predicts."""
+    base = _median(found[BASELINE], "prediction", key)
     cells = []
     for name in names:
-        value = _median(found[name], "prediction", "loss")
+        value = _median(found[name], "prediction", key)
         cells.append(Cell("-" if not value or base is None else f"{base / value:.3g}"))
     return tuple(cells)
 

@@ -36,20 +36,34 @@ class Example:
 
 
 def predict_examples(
-    contender: Contender, pieces: Sequence[Trajectory], steps: int, joints: Sequence[str], *, measured: bool
+    contender: Contender,
+    pieces: Sequence[Trajectory],
+    steps: int,
+    joints: Sequence[str],
+    *,
+    every: int = 1,
+    measured: bool,
 ) -> tuple[Example, ...]:
-    """Up to three examples of `steps` steps, each from the middle of another trajectory, evenly chosen."""
-    long_enough = list({x.name: x for x in pieces if len(x.t) > steps}.values())
+    """Up to three examples of `steps` steps of `every` samples, each from the middle of another trajectory,
+    evenly chosen.
+    """
+    long_enough = list({x.name: x for x in pieces if len(x.t) > steps * every}.values())
     chosen = long_enough[:: -(-len(long_enough) // MOST)]
-    return tuple(_example(contender, piece, steps, joints, measured) for piece in chosen)
+    return tuple(_example(contender, piece, steps, joints, every, measured) for piece in chosen)
 
 
 def _example(
-    contender: Contender, piece: Trajectory, steps: int, joints: Sequence[str], measured: bool
+    contender: Contender,
+    piece: Trajectory,
+    steps: int,
+    joints: Sequence[str],
+    every: int,
+    measured: bool,
 ) -> Example:
-    start = (len(piece.t) - 1 - steps) // 2
-    part = piece[start : start + steps + 1]
-    window = cut_windows([part], steps + 1, measured=measured)
+    start = (len(piece.t) - 1 - steps * every) // (2 * every) * every
+    part = piece[start : start + steps * every + 1]
+    window = cut_windows([part], steps + 1, every=every, measured=measured)
+    part = part[::every]
     with torch.no_grad():
         predicted = contender.roll_out(window)  # each (1, steps, n)
     q, qd = (

@@ -66,7 +66,7 @@ def _rotors(state: Mapping[str, Any]) -> list[float]:
 def _constant(basis: torch.Tensor, start: float, learned: float, joint_types: Sequence[str]) -> Constant:
     entries = [(i, j) for i, j in basis.tril().nonzero().tolist()]
     where = " ".join(
-        f"{_factor(basis[i, j].item(), k == 0)}M{_index(i, j)}" for k, (i, j) in enumerate(entries)
+        f"{_factor(basis[i, j].item(), k == 0)}M{entry_index(i, j)}" for k, (i, j) in enumerate(entries)
     )
     unit = INERTIA_UNITS.get(" ".join(joint_types[k] for k in entries[0]), "kg m")
     return Constant("links", where, start, learned, unit)
@@ -74,10 +74,11 @@ def _constant(basis: torch.Tensor, start: float, learned: float, joint_types: Se
 
 def _rotor(index: int, start: float, learned: float, kind: str) -> Constant:
     unit = INERTIA_UNITS[f"{kind} {kind}"]
-    return Constant(f"drive of joint {index + 1}", f"M{_index(index, index)}", start, learned, unit)
+    return Constant(f"drive of joint {index + 1}", f"M{entry_index(index, index)}", start, learned, unit)
 
 
-def _index(row: int, column: int) -> str:
+def entry_index(row: int, column: int) -> str:
+    """`21` for row 1, column 0: how an entry of a matrix is called."""
     return f"{row + 1}{column + 1}" if row < 9 else f"({row + 1},{column + 1})"
 
 

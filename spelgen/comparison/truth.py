@@ -1,0 +1,37 @@
+"""What a simulated robot truly is, to judge what was learned: its mass matrix along measured positions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from spelgen import pipeline
+
+
+def true_mass(robot: Path, q: torch.Tensor) -> torch.Tensor:
+    """M (T, n, n) [kg m^2, kg m, kg] of a URDF and its sidecar, by Pinocchio, at q (T, n); rotors included."""
+    from spelgen.simulation.engine import make_engine, mass_matrix
+
+    loaded = pipeline.load(robot)
+    engine = make_engine(loaded.arm, loaded.settings)
+    return torch.from_numpy(np.array([mass_matrix(engine, each) for each in q.numpy()]))
+
+
+def example_positions(example: Mapping[str, Any]) -> torch.Tensor:
+    """Measured positions (T, n) of one of result.json's examples."""
+    return torch.tensor([joint["q_true"] for joint in example["joints"]], dtype=torch.float64).T
+
+
+def mass_error(learned: torch.Tensor, true: torch.Tensor) -> float:
+    """How far M is off (T, n, n), without unit: root mean square of the entries of L^-1 (learned - true) L^-T.
+
+    L L^T is the mean true M: so every entry counts in the units of its own joints.
+    """
+    factor = torch.linalg.cholesky(true.mean(dim=0))
+    half = torch.linalg.solve_triangular(factor, learned - true, upper=False)
+    whole = torch.linalg.solve_triangular(factor, half.mT, upper=False)
+    return whole.square().mean().sqrt().item()
