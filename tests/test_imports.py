@@ -13,18 +13,19 @@ errors files labels rendering yaml_document setting_values log_mapping settings 
 urdf: robot xacro_child xacro_input document values elements lint read actuation
 arm: rational snapping placement chain walk arm
 structure: recursion field sampling spans basis expansion symbolic structure nominal minimal pseudo_inertia
-emission: plan emit
+emission: bodies plan emit
 data: trajectory bags tables logs doubts signals windows
 simulation: engine simulate tracking protocols
 identification: samples friction regressor base least_squares prior identify told
-training: runs lie_group rollout rivals prior progress data loop train
+training: runs lie_group rollout compiled rivals prior progress data loop train
 evaluation: tip torque examples evaluate
 report: charts plots tables picture learned page
 proof: agreement axes reasons meaning second_reading numeric_samples verification
 formulas: expression notation angles harmonics factoring shortening grouping formulas layout text latex sympy_module
 inspection inspection_page pipeline
+survey: measures gravity survey tables page
 comparison: paper truth measures study tables page
-cli: console options formats model_commands run_commands identify_command compare_command main
+cli: console options formats model_commands run_commands log_commands identify_command compare_command main
 __init__ __main__
 """
 

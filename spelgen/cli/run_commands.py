@@ -121,6 +121,10 @@ def train(
     seed: Annotated[int | None, typer.Option("--seed", min=0, help="Of split, order and batches.")] = None,
     device: Annotated[str | None, typer.Option("--device", help="cpu, cuda, ...")] = None,
     threads: Annotated[int | None, typer.Option("--threads", min=1, help="Of torch.")] = None,
+    compile: Annotated[
+        bool | None,
+        typer.Option("--compile/--no-compile", help="The right-hand side by torch; needs a C++ compiler."),
+    ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="Show no progress.")] = False,
 ) -> None:
     """Train a module on logs.
@@ -132,7 +136,7 @@ def train(
         "max_minutes": max_minutes, "batch": batch, "window": window, "stride": stride, "every": every,
         "substeps": substeps, "learning_rate": learning_rate, "weight_decay": weight_decay,
         "validation_fraction": validation_fraction, "filter": filter, "seed": seed, "device": device,
-        "threads": threads,
+        "threads": threads, "compile": compile,
     }  # fmt: skip
     paths = options.logs(data, more)
     from spelgen.training import train as training

@@ -29,7 +29,7 @@ class TrainingConfig:
     every: samples from one sample of a window to the next, None: see `automatic_spacing`.
     substeps: rk4 steps per sample interval, None: chosen by `choose_substeps`.
     filter: cutoff [Hz] of the zero-phase low-pass on q, qd and tau; 0: none; None: see `automatic_cutoff`.
-    threads: of torch; the matrices are tiny, more than two rarely help.
+    threads: of torch; the matrices are tiny, more than two rarely help. compile: the right-hand side by torch.
     max_minutes: the learning rate is annealed within this time too.
     """
 
@@ -50,6 +50,7 @@ class TrainingConfig:
     filter: float | None = None
     device: str = "cpu"
     threads: int = 1
+    compile: bool = False
     max_minutes: float | None = None
 
     @classmethod

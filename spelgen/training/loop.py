@@ -55,9 +55,11 @@ class TrainingLoop:
         data: TrainingData,
         config: TrainingConfig,
         prior: Prior | None = None,
+        stepped: EmittedModel | None = None,
     ) -> None:
         self.folder, self.config = folder, config
         self.model = model.to(config.device)
+        self.stepped = stepped or self.model  # the same weights, compiled maybe
         self.training, self.validation = data.training.to(config.device), data.validation.to(config.device)
         self.scales = data.scales.to(config.device)
         self.prior = prior
@@ -193,7 +195,7 @@ class TrainingLoop:
         self._set_rate(self.optimiser, self._rate())
         self.optimiser.zero_grad()
         try:
-            loss = rollout_loss(self.model, windows, self.scales, self.substeps)
+            loss = rollout_loss(self.stepped, windows, self.scales, self.substeps)
         except torch.linalg.LinAlgError:  # numbers blew up within the rollout
             return math.nan
         (loss + self._pull()).backward()

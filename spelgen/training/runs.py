@@ -6,6 +6,7 @@ import hashlib
 import io
 import json
 import os
+import sys
 from dataclasses import dataclass
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
@@ -205,7 +206,7 @@ def load_model(path: Path | str) -> EmittedModel:
         raise ModuleError("no such file", file=path, expected="a module made by `spelgen build`")
     name = f"_spelgen_module_{hashlib.sha256(path.read_bytes()).hexdigest()[:16]}"
     loader = _Loader(name, str(path))
-    module = ModuleType(name)
+    module = sys.modules[name] = ModuleType(name)  # torch.compile looks for it there
     try:
         loader.exec_module(module)
         model = module.Model()

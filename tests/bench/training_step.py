@@ -2,28 +2,36 @@
 
 Six joints, 256 windows of 5 samples, hidden layers of 64 units, rk4 with one step from sample to sample, forward
 and backward (the update of the weights is left out). Medians of repeats, taken in turns in one run, on one thread.
-PHNODE as published gets its windows in four parts: in one its graph needs 9 GB and takes as long.
+PHNODE as published gets its windows in four parts: in one its graph needs 9 GB and takes as long. Then the same
+presets with their right-hand side compiled, each with a cold cache; what compiling costs, in s.
 """
 
 from __future__ import annotations
 
+import os
+import shutil
 import statistics
 import sys
 import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from emitted import import_source
 from published_phnode import Published
 
 from spelgen.pipeline import build
+from spelgen.training.compiled import Compiled
 from spelgen.training.rollout import position_difference
+from spelgen.training.runs import load_model
+
+if TYPE_CHECKING:
+    from spelgen.training.runs import EmittedModel
 
 ROBOT = Path(__file__).parents[2] / "robots" / "six_dof.urdf"
 PRESETS = {
@@ -119,15 +127,14 @@ def seconds(work: Callable[[], None]) -> float:
     return time.perf_counter() - start
 
 
-def emitted_models() -> dict[str, nn.Module]:
+def emitted_models() -> dict[str, EmittedModel]:
     """The presets' models of the robot."""
     with tempfile.TemporaryDirectory() as folder:
-        return {
-            name: import_source(
-                build(ROBOT, preset=preset, net=net, width=WIDTH), Path(folder) / "model.py"
-            ).Model()
-            for name, (preset, net) in PRESETS.items()
-        }
+        module, models = Path(folder) / "model.py", {}
+        for name, (preset, net) in PRESETS.items():
+            module.write_text(build(ROBOT, preset=preset, net=net, width=WIDTH), encoding="utf-8")
+            models[name] = load_model(module)
+        return models
 
 
 def sizes(model: nn.Module) -> str:
@@ -168,6 +175,22 @@ def main() -> None:
             f"{name:12} {1e3 * step:6.1f} ms {1e3 * floor:7.1f} ms {step / floor:4.1f}x {slow / step:11.0f}"
             f" {fast / step:10.1f} {count:11}       {sizes(model)}"
         )
+    if shutil.which("g++"):
+        print_compiled(models, data, {name: statistics.median(times) for name, times in steps.items()})
+
+
+def print_compiled(models: dict[str, EmittedModel], data: Data, plain: dict[str, float]) -> None:
+    """Print what compiling brings and costs."""
+    print(f"\n{'compiled':12}      step    gain  compiling")
+    for name, model in models.items():
+        with tempfile.TemporaryDirectory() as folder:
+            os.environ["TORCHINDUCTOR_CACHE_DIR"] = folder
+            ready = Compiled(model)
+            compiling = seconds(lambda ready=ready: training_step(ready, data))
+            step = statistics.median(
+                seconds(lambda ready=ready: training_step(ready, data)) for _ in range(REPEATS)
+            )
+        print(f"{name:12} {1e3 * step:6.1f} ms {plain[name] / step:6.2f}x {compiling:8.1f} s", flush=True)
 
 
 if __name__ == "__main__":
