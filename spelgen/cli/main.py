@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from spelgen import __version__
-from spelgen.cli import compare_command, identify_command, model_commands, run_commands
+from spelgen.cli import compare_command, identify_command, log_commands, model_commands, run_commands
 from spelgen.cli.console import say, told
 
 app = typer.Typer(
@@ -27,6 +27,7 @@ for command in (
     model_commands.build,
     run_commands.simulate,
     identify_command.identify,
+    log_commands.logs,
     run_commands.train,
     run_commands.evaluate,
     run_commands.report,

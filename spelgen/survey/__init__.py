@@ -1,0 +1,1 @@
+"""Logs beside a robot: what they hold, and what to doubt."""
