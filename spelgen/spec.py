@@ -20,10 +20,13 @@ from spelgen.errors import ModuleError
 
 Assume = Literal["kinematics", "inertials"]
 Kind = Literal["zero", "constant", "varying"]
-Preset = Literal["minimal", "spel", "spel-kan", "phnode"]
+Preset = Literal["minimal", "spel", "spel-kan", "phnode", "closed-form"]
 Net = Literal["mlp", "kan"]
 Entries = tuple[tuple[int, int, float], ...]
 """A sparse symmetric matrix by its lower triangle: (row, column, value), 0-based."""
+
+Terms = tuple[tuple[int, float, float], ...]
+"""A sum of waves: (place in ModelSpec.waves, factor of the cosine, factor of the sine), to start from."""
 
 _PRESETS = Path(__file__).parent / "presets"
 
@@ -34,13 +37,15 @@ class Design:
 
     derived: by the arm's structure. dense: as if nothing were known of the arm (Wang et al., Sci Rep
     15:33179, 2025, and Duong et al., IEEE T-RO 40:3695, 2024), over all three axes of each joint where it
-    says 3n.
+    says 3n. closed-form: that of rigid bodies with trained inertial parameters. constants: friction's laws with trained constants.
     """
 
-    mass: Literal["derived", "dense-3n"]
-    potential: Literal["derived", "dense"]
-    dissipation: Literal["per-joint", "dense-n", "dense-3n"]
+    mass: Literal["derived", "dense-3n", "closed-form"]
+    potential: Literal["derived", "dense", "closed-form"]
+    dissipation: Literal["per-joint", "dense-n", "dense-3n", "constants"]
     input: Literal["derived", "dense-3n"]
+    waves: Literal["derived", "none"]
+    """Whether networks add to the sums of waves that a rigid arm's functions are, where those are short."""
     net: Net
     encoding: Literal["own", "group"]
     """What a network reads: cos q and sin q or scaled q of the joints it depends on, or the nine or three
@@ -93,6 +98,23 @@ class JointSpec:
     actuated: bool
 
 
+Triple = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class BodySpec:
+    """A body of a closed-form model, as ``arm.Body`` has it, with the inertial parameters to start from."""
+
+    parent: int
+    joint: int
+    kind: Literal["revolute", "prismatic"]
+    ratio: float
+    offset: float
+    rotation: tuple[Triple, Triple, Triple]
+    position: Triple
+    reference: tuple[float, ...]
+
+
 @dataclass(frozen=True)
 class OutputSpec:
     """One learned function of ``joints``: f(q) = center + scale x network, entering M through ``basis``."""
@@ -101,6 +123,9 @@ class OutputSpec:
     basis: Entries
     center: float
     scale: float
+    level: float | None = None
+    terms: Terms = ()
+    """With a level: f(q) = level + its terms' waves + a part of the network."""
 
 
 @dataclass(frozen=True)
@@ -132,6 +157,12 @@ class ModelSpec:
     guard: float
     """M is lifted where its least eigenvalue, relative to the nominal mean M, falls below this."""
     started_from_urdf: bool
+    waves: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...] = ()
+    """(turns, powers), by joint, of x^powers cos(turns q) and x^powers sin(turns q)."""
+    potential_terms: Terms | None = None
+    """What V is the sum of, beside a part of the network; None: of the network alone."""
+    bodies: tuple[BodySpec, ...] = ()
+    """Of a closed-form model."""
     inputs: tuple[tuple[int, int, float, bool], ...] = ()
     """(row, column, value, trained) of G; none where each torque acts on its own actuated joint as it is."""
 
@@ -147,6 +178,7 @@ class ModelSpec:
         data["design"] = Design(**data["design"])
         data["joints"] = tuple(JointSpec(**joint) for joint in data["joints"])
         data["outputs"] = tuple(OutputSpec(**output) for output in data["outputs"])
+        data["bodies"] = tuple(BodySpec(**body) for body in data["bodies"])
         data["constants"] = tuple(ConstantSpec(**constant) for constant in data["constants"])
         return cls(**data)
 

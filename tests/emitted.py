@@ -104,6 +104,7 @@ class ExactFunctions(nn.Module):
     def __init__(self, functions: list[fmpq_mpoly], mean: torch.Tensor, scale: torch.Tensor, joints: tuple):
         super().__init__()
         self.mean, self.scale, self.n = mean, scale, len(joints)
+        self.revolute = [joint.revolute for joint in joints]
         self.center = torch.tensor([joint.center for joint in joints], dtype=torch.float64)
         self.reach = torch.tensor([joint.reach for joint in joints], dtype=torch.float64)
         self.values = [_compiled(f) for f in functions]
@@ -119,7 +120,8 @@ class ExactFunctions(nn.Module):
         self, features: torch.Tensor, laid_out: tuple[torch.Tensor, torch.Tensor]
     ) -> tuple[torch.Tensor, torch.Tensor]:
         outlay, offset = laid_out
-        cos, sin, *rest = features.split(self.n, dim=-1)
+        base = features[..., : (2 if all(self.revolute) else 3) * self.n]
+        cos, sin, *rest = base.split(self.n, dim=-1)
         q = rest[0] * self.reach + self.center if rest else torch.zeros_like(cos)
         variables = torch.stack([cos, sin, q], dim=-1).flatten(-2)  # (..., 3 n): c1, s1, q1, c2, ...
         y = torch.stack([_evaluated(f, variables) for f in self.values], dim=-1)
@@ -128,6 +130,8 @@ class ExactFunctions(nn.Module):
         )
         by_c, by_s, by_q = slopes.unflatten(-1, (self.n, 3)).unbind(dim=-1)
         jacobian = torch.cat([by_c, by_s, by_q * self.reach] if rest else [by_c, by_s], dim=-1)
+        waves = features.shape[-1] - base.shape[-1]  # not needed here: they are products of the others
+        jacobian = torch.nn.functional.pad(jacobian, (0, waves))
         y = (y - self.mean) / self.scale
         return y @ outlay.mT + offset, outlay @ (jacobian / self.scale.unsqueeze(-1))
 

@@ -12,7 +12,7 @@ ROWS = """
 errors files labels rendering yaml_document setting_values log_mapping settings spec
 urdf: robot xacro_child xacro_input document values elements lint read actuation
 arm: rational snapping placement chain walk arm
-structure: recursion field sampling spans basis expansion symbolic structure nominal minimal pseudo_inertia
+structure: recursion field sampling spans basis expansion symbolic structure nominal waves minimal pseudo_inertia
 emission: bodies plan emit
 data: trajectory bags tables logs doubts signals windows
 simulation: engine simulate tracking protocols

@@ -20,6 +20,8 @@ _POTENTIAL_SHARE = 0.5
 _FRICTION_HIDDEN = 8
 _FRICTION_START = 0.35
 _SLOW = 0.03
+_SLOWEST = 1e-3
+_NETWORK_SHARE = 0.1
 _INPUT = ("joint", "motor", "value", "trained")
 _PLACE_SHARE = 0.1
 _GRID = 6
@@ -32,6 +34,8 @@ _FRICTION_AXES = {"per-joint": 0, "dense-n": 1, "dense-3n": 3}
 def emit(spec: ModelSpec) -> str:
     """The Python source of the module that ``spec`` describes; it needs torch alone."""
     n, design = len(spec.joints), spec.design
+    if design.mass == "closed-form":
+        return _closed_form(spec)
     return render(
         "module.py.jinja",
         title=f"Port-Hamiltonian model of an arm with {n} joint{'s' * (n > 1)}, written by `spelgen build`.",
@@ -57,10 +61,59 @@ def emit(spec: ModelSpec) -> str:
         friction_hidden=_FRICTION_HIDDEN,
         friction_start=_FRICTION_START,
         slow=_SLOW,
+        slowest=_SLOWEST,
+        **_waves(spec),
         place_share=_PLACE_SHARE,
         uses_network=bool(spec.outputs or spec.potential),
         **_mass(spec),
         **_potential(spec),
+    )
+
+
+def _closed_form(spec: ModelSpec) -> str:
+    n, bodies = len(spec.joints), len(spec.bodies)
+    made = f"{bodies} rigid bod{'ies' if bodies > 1 else 'y'} with trained inertial parameters"
+    joints = [
+        _call(
+            "Joint",
+            name=joint.identifier,
+            revolute=joint.kind == "revolute",
+            speed=joint.speed,
+            friction=joint.friction,
+            rotor=joint.rotor,
+            actuated=joint.actuated,
+        )
+        for joint in spec.joints
+    ]
+    rows = [
+        _call(
+            "Body",
+            parent=body.parent,
+            joint=body.joint,
+            revolute=body.kind == "revolute",
+            ratio=body.ratio,
+            offset=body.offset,
+            rotation=body.rotation,
+            position=body.position,
+            reference=body.reference,
+        )
+        for body in spec.bodies
+    ]
+    return render(
+        "closed_form.py.jinja",
+        title=f"Port-Hamiltonian model of an arm with {n} joint{'s' * (n > 1)}, written by `spelgen build`.",
+        class_summary=f"The arm's dynamics: {made}.",
+        summary=_summary(spec),
+        picture=_picture(spec),
+        joint_table=_joint_table(spec),
+        record=_record(spec),
+        n=n,
+        joints=_table("JOINTS = ", joints),
+        bodies=_table("BODIES = ", rows),
+        gravity=_literal(spec.gravity),
+        inputs=spec.inputs
+        and _table("INPUTS = ", [_call("Input", **dict(zip(_INPUT, x, strict=True))) for x in spec.inputs]),
+        gains=any(trained for *_, trained in spec.inputs),
     )
 
 
@@ -73,7 +126,15 @@ def _mass(spec: ModelSpec) -> dict[str, object]:
         }
     constants = [_call("Constant", start=c.start, scale=c.scale, entries=c.basis) for c in spec.constants]
     outputs = [
-        _call("Output", joints=o.joints, mean=o.center, scale=o.scale, entries=o.basis) for o in spec.outputs
+        _call(
+            "Output",
+            joints=output.joints,
+            mean=output.center,
+            scale=output.scale,
+            **({} if output.level is None else {"level": output.level, "terms": output.terms}),
+            entries=output.basis,
+        )
+        for output in spec.outputs
     ]
     return {
         "mass": "derived" if outputs else "constant",
@@ -101,6 +162,21 @@ def _potential(spec: ModelSpec) -> dict[str, object]:
         "potential_joints": _literal(spec.potential) if spec.potential else "",
         "potential_width": max(_LEAST_UNITS, round(_POTENTIAL_SHARE * _units(spec))),
         "potential_scale": spec.potential_scale,
+        "potential_terms": spec.potential_terms and _literal(spec.potential_terms),
+    }
+
+
+def _waves(spec: ModelSpec) -> dict[str, object]:
+    """What the template shows of the waves that M and V are made of."""
+    powers = any(any(powers) for _, powers in spec.waves)
+    rows = [
+        _call("Wave", turns=turns, **({"powers": powers_} if powers else {})) for turns, powers_ in spec.waves
+    ]
+    return {
+        "waves": rows and _table("WAVES = ", rows),
+        "wave_powers": powers,
+        "mass_waves": any(output.level is not None for output in spec.outputs),
+        "network_share": _NETWORK_SHARE,
     }
 
 
@@ -173,6 +249,8 @@ def _hidden(spec: ModelSpec) -> tuple[tuple[tuple[int, ...], int], ...]:
 
 
 def _count(spec: ModelSpec) -> str:
+    if spec.bodies:
+        return f"{len(spec.bodies)} bodies with trained inertial parameters make mass matrix and potential energy"
     if spec.design.mass == "dense-3n":
         rows = 3 * len(spec.joints)
         return f"{rows * (rows + 1) // 2} learned functions of q make M^-1 over all axes"

@@ -8,10 +8,12 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from spelgen.arm.arm import Arm, Coordinate
+from spelgen.emission.bodies import body_specs
 from spelgen.spec import ConstantSpec, Entries, JointSpec, ModelSpec, Options, OutputSpec, load_design
 from spelgen.structure.basis import Weights
-from spelgen.structure.nominal import Nominal, nominal, working_range
+from spelgen.structure.nominal import Nominal, nominal, nominal_inertias, working_range
 from spelgen.structure.structure import Structure
+from spelgen.structure.waves import NO_WAVES, find_waves
 from spelgen.urdf.actuation import Actuation
 
 _GUARD_SHARE = 0.1
@@ -42,6 +44,8 @@ def plan_model(
     design = load_design(options.preset, options.net)
     everything = tuple(range(len(arm.coordinates)))
     sizes = nominal(arm, structure)
+    inertias = nominal_inertias(arm, sizes.from_urdf)
+    waves = find_waves(arm, structure, inertias) if design.waves == "derived" else NO_WAVES
     identifiers = _identifiers([coordinate.name for coordinate in arm.coordinates])
     x, y, z = (float(g) for g in arm.gravity)
     return ModelSpec(
@@ -64,9 +68,14 @@ def plan_model(
                 _floats(output.basis),
                 center,
                 scale,
+                *((sums.level, sums.terms) if sums else ()),
             )
-            for output, center, scale in zip(
-                structure.outputs, sizes.output_means, sizes.output_scales, strict=True
+            for output, center, scale, sums in zip(
+                structure.outputs,
+                sizes.output_means,
+                sizes.output_scales,
+                waves.outputs or [None] * len(structure.outputs),
+                strict=True,
             )
         ),
         constants=tuple(
@@ -79,6 +88,9 @@ def plan_model(
         potential_scale=sizes.potential_scale,
         guard=float(f"{max(_GUARD_SHARE * sizes.least_share, 1e-4):.0e}"),
         started_from_urdf=sizes.from_urdf,
+        waves=tuple((wave.turns, wave.powers) for wave in waves.waves),
+        potential_terms=waves.potential.terms if waves.potential and structure.potential else None,
+        bodies=body_specs(arm, inertias) if design.mass == "closed-form" else (),
         inputs=()
         if actuation.direct
         else tuple((x.row, x.column, x.value, x.kind == "gain") for x in actuation.entries),

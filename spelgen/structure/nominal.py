@@ -56,7 +56,7 @@ def nominal(arm: Arm, structure: Structure) -> Nominal:
     rng = np.random.default_rng(0)
     q = np.stack([rng.uniform(*working_range(c), _POINTS) for c in arm.coordinates], axis=-1)
     mass, from_urdf = _mass_samples(arm, q)
-    inertias = _inertias(arm, from_urdf)
+    inertias = nominal_inertias(arm, from_urdf)
     keys = triangle(len(arm.coordinates))
     means = mass.mean(axis=0)
     typical = np.sqrt([means[keys.index((i, i))] * means[keys.index((j, j))] for i, j in keys])
@@ -95,13 +95,14 @@ def working_range(coordinate: Coordinate) -> tuple[float, float]:
 def _mass_samples(arm: Arm, q: np.ndarray) -> tuple[np.ndarray, bool]:
     """Lower triangles of M at ``q``, and whether the URDF's inertials gave them."""
     if arm.has_inertials:
-        mass, _ = float_energies(arm, q, _inertias(arm, True))
+        mass, _ = float_energies(arm, q, nominal_inertias(arm, True))
         if _least_share(mass, mass.mean(axis=0), q.shape[1]) > 1e-6:
             return mass, True
-    return float_energies(arm, q, _inertias(arm, False))[0], False
+    return float_energies(arm, q, nominal_inertias(arm, False))[0], False
 
 
-def _inertias(arm: Arm, from_urdf: bool) -> list[list[float]]:
+def nominal_inertias(arm: Arm, from_urdf: bool) -> list[list[float]]:
+    """Ten inertial parameters by body: the URDF's, or those of one-kilogram balls."""
     if from_urdf:
         return [[float(x) for x in body.inertia or ()] for body in arm.bodies]
     return [_default_inertia(arm, index) for index in range(len(arm.bodies))]

@@ -21,7 +21,7 @@ Record, by which `spelgen check` tells whether this module is up to date:
     robot: "rpr"
     urdf: "rpr.urdf"
     urdf_sha256: "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d"
-    spec_sha256: "ca0fb2ebd46d10a9f7ecaaaf670129271e756a20784ed6bd291df8bb837b0ceb"
+    spec_sha256: "926929801f301015a755b90fedf3bbc15485d9b782dfd1387e706348975d73e2"
     option assume: "kinematics"
     option depth: 2
     option joints: null
@@ -43,6 +43,8 @@ from torch import Tensor, nn
 
 # the lower triangle of a symmetric matrix: row, column, factor
 Entries = tuple[tuple[int, int, float], ...]
+# a sum of waves: number of the wave, factor of its cosine, factor of its sine, to start from
+Terms = tuple[tuple[int, float, float], ...]
 
 
 class Joint(NamedTuple):
@@ -69,12 +71,24 @@ class Constant(NamedTuple):
 
 
 class Output(NamedTuple):
-    """A learned function f = mean + scale * network of some joints, which enters M as f B."""
+    """A learned function f of some joints, which enters M as f B: a sum of waves and a network.
+
+    f = level + sum of terms + NETWORK_SHARE * scale * network; mean is f's over the workspace.
+    """
 
     joints: tuple[int, ...]
     mean: float
     scale: float
+    level: float
+    terms: Terms
     entries: Entries  # of B
+
+
+class Wave(NamedTuple):
+    """x^powers cos(turns q) and x^powers sin(turns q), with the scaled q of sliding joints as x."""
+
+    turns: tuple[int, ...]
+    powers: tuple[int, ...]
 
 
 JOINTS = (
@@ -116,15 +130,47 @@ JOINTS = (
     ),
 )
 
+# what M and V of a rigid arm are made of, whatever its masses are
+WAVES = (
+    Wave(turns=(0, 0, 0), powers=(0, 0, 0)),
+    Wave(turns=(0, 0, 1), powers=(0, 0, 0)),
+    Wave(turns=(0, 0, 2), powers=(0, 0, 0)),
+    Wave(turns=(0, 0, 0), powers=(0, 1, 0)),
+    Wave(turns=(0, 0, 1), powers=(0, 1, 0)),
+    Wave(turns=(0, 0, 0), powers=(0, 2, 0)),
+)
+NETWORK_SHARE = 0.1  # how much of a function that is a sum of waves is left to its network
+
 # M(q) = sum_k c_k A_k + sum_j f_j(q) B_j
 CONSTANTS: tuple[Constant, ...] = (
     Constant(start=0.0101411, scale=0.0101411, entries=((2, 2, 1.0),)),
     Constant(start=5.33, scale=5.33, entries=((1, 1, 1.0),)),
 )
 OUTPUTS = (
-    Output(joints=(2,), mean=-0.00167665, scale=1.36528, entries=((1, 0, 1.0),)),
-    Output(joints=(1, 2), mean=-0.00154309, scale=0.0595527, entries=((2, 0, 1.0),)),
-    Output(joints=(1, 2), mean=139.887, scale=12.6351, entries=((0, 0, 1.0),)),
+    Output(
+        joints=(2,),
+        mean=-0.00167665,
+        scale=1.36528,
+        level=0.0,
+        terms=((1, -0.09936, 0.0),),
+        entries=((1, 0, 1.0),),
+    ),
+    Output(
+        joints=(1, 2),
+        mean=-0.00154309,
+        scale=0.0595527,
+        level=0.0,
+        terms=((1, 0.0, -0.07288056), (4, 0.0, -0.0479412)),
+        entries=((2, 0, 1.0),),
+    ),
+    Output(
+        joints=(1, 2),
+        mean=139.887,
+        scale=12.6351,
+        level=139.386736,
+        terms=((2, 0.00507056, 0.0), (3, -22.4588744, 0.0), (5, 1.24085731, 0.0)),
+        entries=((0, 0, 1.0),),
+    ),
 )
 # in each hidden layer: the joints that some units read, and how many units do
 MASS_HIDDEN = (((2,), 21), ((1, 2), 43))
@@ -132,9 +178,12 @@ GUARD = 0.08  # least eigenvalue of M, relative to its nominal mean, that is lef
 POTENTIAL_JOINTS = (2,)  # the joints that V depends on
 POTENTIAL_WIDTH = 32
 POTENTIAL_SCALE = 0.703291  # [J]
+POTENTIAL_TERMS: Terms = ((1, 0.0, 0.9747216),)
 DEPTH = 2  # hidden layers of a network
 FRICTION_HIDDEN = 8
-SLOW = 0.03  # below this share of its usual speed a joint's dry friction fades to zero
+SLOW = 0.03  # below this share of its usual speed dry friction fades to zero, to start from
+SLOWEST = 0.001  # and at the least
+FEATURES = 3 * len(JOINTS) + 2 * len(WAVES)  # numbers made of q, which all else is made of
 PLACE_SHARE = 0.1  # how much friction's networks see of where a joint is, relative to its speed
 
 
@@ -168,8 +217,48 @@ def reading(joints: Iterable[int], shares: list[float]) -> Reading:
     sliding = [joint for joint in joints if not JOINTS[joint].revolute]
     whose = turning + turning + sliding
     places = turning + [n + joint for joint in turning] + [2 * n + joint for joint in sliding]
-    spread = torch.eye(3 * n, dtype=torch.float64)[places]
+    spread = torch.eye(FEATURES, dtype=torch.float64)[places]
     return Reading(tuple(whose), vector(shares[joint] for joint in whose), spread)
+
+
+class Series(NamedTuple):
+    """Sums of waves, one for each output of a network, which they go beside."""
+
+    outputs: Tensor  # for each term, to which output it goes
+    features: Tensor  # and which feature it takes
+    start: Tensor
+    size: Tensor  # of the term, in which its trained factor is counted
+    level: Tensor  # by output
+
+
+def series(sums: list[tuple[float, Terms]], scales: list[float], shares: list[float]) -> Series:
+    """The sums (level, terms) in units of their scales; a wave is as large as its joints' shares."""
+    first = FEATURES - 2 * len(WAVES)
+    levels, rows = [], []
+    for output, ((level, terms), scale) in enumerate(zip(sums, scales, strict=True)):
+        levels.append(level / scale)
+        for number, cos, sin in terms:
+            turns = WAVES[number].turns
+            moved = [turn or power for turn, power in zip(turns, WAVES[number].powers, strict=True)]
+            size = min(share for share, moves in zip(shares, moved, strict=True) if moves)
+            rows.append((output, first + number, cos / scale / size, size))
+            rows.append((output, first + len(WAVES) + number, sin / scale / size, size))
+    outputs, features, start, size = zip(*rows, strict=True)
+    return Series(
+        torch.tensor(outputs), torch.tensor(features), vector(start), vector(size), vector(levels)
+    )
+
+
+def lower_powers() -> Tensor:
+    """What takes all waves to their slopes by each joint that slides, (waves, n waves)."""
+    lower = torch.zeros(len(WAVES), len(JOINTS), len(WAVES), dtype=torch.float64)
+    for place, wave in enumerate(WAVES):
+        for joint, power in enumerate(wave.powers):
+            if power:
+                less = tuple(p - (j == joint) for j, p in enumerate(wave.powers))
+                below = WAVES.index(Wave(wave.turns, less))
+                lower[below, joint, place] = power / JOINTS[joint].reach
+    return lower.flatten(1)
 
 
 class Layers(NamedTuple):
@@ -177,6 +266,7 @@ class Layers(NamedTuple):
 
     weights: tuple[Tensor, ...]
     biases: tuple[Tensor, ...]
+    series: Tensor | None  # rows by features
 
 
 Trace = tuple[tuple[Tensor, ...], Layers]
@@ -190,12 +280,14 @@ class Network(nn.Module):
     """
 
     spread: Tensor
+    series_size: Tensor
 
     def __init__(
         self,
         reading: Reading,
         layers: tuple[tuple[frozenset[int], ...], ...],
         generator: torch.Generator,
+        series: Series | None = None,
     ) -> None:
         super().__init__()
         self.register_buffer("spread", reading.spread)
@@ -210,7 +302,14 @@ class Network(nn.Module):
             self.register_buffer(f"mask{index}", mask * reading.share if index == 0 else mask)
             self.biases.append(nn.Parameter(torch.zeros(len(units), dtype=torch.float64)))
             below = units
-        nn.init.zeros_(self.weights[-1])  # so that the model starts at its nominal means
+        nn.init.zeros_(self.weights[-1])  # so that the model starts at its nominal values
+        self.place = None
+        if series is not None:
+            self.place = (series.outputs, series.features)
+            self.series = nn.Parameter(series.start)
+            self.register_buffer("series_size", series.size)
+            self.biases[-1].data = series.level
+            self.get_buffer(f"mask{len(layers) - 1}").mul_(NETWORK_SHARE)
 
     def prepared(self, outlay: Tensor, offset: Tensor) -> Layers:
         """The weights for the features as they are, and for offset + outlay y in place of y.
@@ -228,7 +327,14 @@ class Network(nn.Module):
             biases.append(2 * bias)
         weights[-1] = 0.5 * outlay @ weights[-1]
         biases[-1] = offset + 0.5 * outlay @ biases[-1]
-        return Layers(tuple(weights), tuple(biases))
+        return Layers(tuple(weights), tuple(biases), self._series(outlay))
+
+    def _series(self, outlay: Tensor) -> Tensor | None:
+        """The sums of waves, laid out."""
+        if self.place is None:
+            return None
+        known = outlay.new_zeros(outlay.shape[1], FEATURES)
+        return outlay @ known.index_put(self.place, self.series_size * self.series)
 
     def forward(self, features: Tensor, layers: Layers) -> tuple[Tensor, Trace]:
         """y laid out, (..., rows); and what ``pull`` and ``push`` need."""
@@ -236,7 +342,10 @@ class Network(nn.Module):
         for weight, bias in zip(layers.weights[:-1], layers.biases, strict=False):
             layer = torch.sigmoid(F.linear(layer, weight, bias))
             hidden.append(layer)
-        return F.linear(layer, layers.weights[-1], layers.biases[-1]), (tuple(hidden), layers)
+        y = F.linear(layer, layers.weights[-1], layers.biases[-1])
+        if layers.series is not None:
+            y = y + F.linear(features, layers.series)
+        return y, (tuple(hidden), layers)
 
     def pull(self, trace: Trace, cotangent: Tensor) -> Tensor:
         """The reverse sweep: cotangent, (..., rows), times dy/dfeatures; (..., features)."""
@@ -244,14 +353,16 @@ class Network(nn.Module):
         layer = cotangent @ layers.weights[-1]
         for weight, value in zip(reversed(layers.weights[:-1]), reversed(hidden), strict=True):
             layer = (layer * (value * (1 - value))) @ weight
-        return layer
+        return layer if layers.series is None else layer + cotangent @ layers.series
 
     def push(self, trace: Trace, rate: Tensor) -> Tensor:
         """The forward sweep: dy/dfeatures times the features' rate; (..., rows)."""
         hidden, layers = trace
+        pushed = rate
         for weight, value in zip(layers.weights[:-1], hidden, strict=True):
-            rate = F.linear(rate, weight) * (value * (1 - value))
-        return F.linear(rate, layers.weights[-1])
+            pushed = F.linear(pushed, weight) * (value * (1 - value))
+        pushed = F.linear(pushed, layers.weights[-1])
+        return pushed if layers.series is None else pushed + F.linear(rate, layers.series)
 
 
 class FrictionLayers(NamedTuple):
@@ -275,7 +386,7 @@ class Friction(nn.Module):
     def __init__(self, generator: torch.Generator) -> None:
         super().__init__()
         joints, inputs = len(JOINTS), 4
-        spread = torch.zeros(joints, inputs, 5 * joints, dtype=torch.float64)
+        spread = torch.zeros(joints, inputs, FEATURES + 2 * joints, dtype=torch.float64)
         for i, joint in enumerate(JOINTS):
             cos, sin = (i, joints + i) if joint.revolute else (2 * joints + i, 2 * joints + i)
             spread[i, 0, cos] = spread[i, 1, sin] = PLACE_SHARE
@@ -283,6 +394,7 @@ class Friction(nn.Module):
         self.register_buffer("spread", spread)
         self.register_buffer("speed", vector(joint.speed for joint in JOINTS))
         self.register_buffer("size", vector(joint.friction for joint in JOINTS))
+        self.slow = nn.Parameter(torch.zeros(joints, dtype=torch.float64))
         self.viscous = nn.Parameter(torch.full((joints,), -2.0, dtype=torch.float64))
         shape = (joints, inputs, FRICTION_HIDDEN)
         weight = torch.randn(shape, dtype=torch.float64, generator=generator)
@@ -303,7 +415,7 @@ class Friction(nn.Module):
             out=2 * (own.unsqueeze(-1) * self.out).flatten(1),
             offset=self.offset - self.out.sum(dim=1),
             viscous=self.size * F.softplus(self.viscous) / self.speed,
-            slow=(SLOW * self.speed) ** 2,
+            slow=self.speed**2 * (SLOWEST**2 + (SLOW * self.slow.exp()) ** 2),
         )
 
     def _dry(
@@ -357,6 +469,9 @@ class Model(nn.Module):
 
     center: Tensor
     reach: Tensor
+    turns: Tensor
+    powers: Tensor
+    lower: Tensor  # takes waves to what the slopes by each joint are
     constant_scale: Tensor
     constant_basis: Tensor
     output_mean: Tensor
@@ -372,6 +487,11 @@ class Model(nn.Module):
         generator = torch.Generator().manual_seed(seed)
         self.register_buffer("center", vector(joint.center for joint in JOINTS))
         self.register_buffer("reach", vector(joint.reach for joint in JOINTS))
+        turns = torch.tensor([wave.turns for wave in WAVES], dtype=torch.float64)
+        self.register_buffer("turns", turns.mT)
+        powers = torch.tensor([wave.powers for wave in WAVES], dtype=torch.float64)
+        self.register_buffer("powers", powers)
+        self.register_buffer("lower", lower_powers())
         start = vector(constant.start for constant in CONSTANTS)
         self.register_buffer("constant_scale", vector(constant.scale for constant in CONSTANTS))
         self.register_buffer("constant_basis", stacked([c.entries for c in CONSTANTS]))
@@ -386,11 +506,15 @@ class Model(nn.Module):
         outputs = tuple(frozenset(output.joints) for output in OUTPUTS)
         shares = [joint.mass_share for joint in JOINTS]
         read = reading(sorted(frozenset().union(*outputs)), shares)
-        self.mass_network = Network(read, (*((hidden,) * DEPTH), outputs), generator)
+        sums = [(output.level - output.mean, output.terms) for output in OUTPUTS]
+        known = series(sums, [output.scale for output in OUTPUTS], shares)
+        self.mass_network = Network(read, (*((hidden,) * DEPTH), outputs), generator, known)
         everything = frozenset(POTENTIAL_JOINTS)
         layers = (*(((everything,) * POTENTIAL_WIDTH,) * DEPTH), (everything,))
         shares = [joint.potential_share for joint in JOINTS]
-        self.potential_network = Network(reading(POTENTIAL_JOINTS, shares), layers, generator)
+        known = series([(0.0, POTENTIAL_TERMS)], [POTENTIAL_SCALE], shares)
+        read = reading(POTENTIAL_JOINTS, shares)
+        self.potential_network = Network(read, layers, generator, known)
         self.friction = Friction(generator)
         self.register_buffer("rotor_size", vector(joint.rotor for joint in JOINTS))
         self.rotor = nn.Parameter(torch.zeros(self.n, dtype=torch.float64))
@@ -416,19 +540,43 @@ class Model(nn.Module):
         return rows.reshape(*rows.shape[:-1], self.n, self.n)
 
     def _features(self, q: Tensor) -> Tensor:
-        """What networks read: cos q, sin q and the scaled q, (..., 3 n)."""
-        return torch.cat([q.cos(), q.sin(), (q - self.center) / self.reach], dim=-1)
+        """cos q, sin q, the scaled q, cosines and sines of waves: all that is read of q, (..., features)."""
+        place = (q - self.center) / self.reach
+        angle = q @ self.turns
+        size = (place.unsqueeze(-2) ** self.powers).prod(dim=-1)
+        waves = (size * angle.cos(), size * angle.sin())
+        return torch.cat([q.cos(), q.sin(), place, *waves], dim=-1)
+
+    def _parts(self, features: Tensor) -> tuple[Tensor, ...]:
+        """Cosines, sines, scaled q, cosines and sines of waves."""
+        sizes = [self.n] * 3 + [len(WAVES)] * 2
+        return features.split(sizes, dim=-1)
+
+    def _slide_slopes(self, wave: Tensor) -> Tensor:
+        """d/dq of cosines or sines of waves by sliding joints, (..., n, waves): lower powers of the same."""
+        return (wave @ self.lower).unflatten(-1, (self.n, len(WAVES)))
 
     def _features_rate(self, features: Tensor, qd: Tensor) -> Tensor:
         """How fast the features change along qd."""
-        cos, sin, _ = features.chunk(3, dim=-1)
-        return torch.cat([-sin * qd, cos * qd, qd / self.reach], dim=-1)
+        cos, sin, _, wave_cos, wave_sin = self._parts(features)
+        turn = qd @ self.turns
+        waves = (-wave_sin * turn, wave_cos * turn)
+        along = qd.unsqueeze(-2)
+        waves = (
+            waves[0] + (along @ self._slide_slopes(wave_cos)).squeeze(-2),
+            waves[1] + (along @ self._slide_slopes(wave_sin)).squeeze(-2),
+        )
+        return torch.cat([-sin * qd, cos * qd, qd / self.reach, *waves], dim=-1)
 
     def _by_joint(self, features: Tensor, slope: Tensor) -> Tensor:
         """d/dq, (..., n), of what has this slope d/dfeatures."""
-        cos, sin, _ = features.chunk(3, dim=-1)
-        by_cos, by_sin, by_place = slope.chunk(3, dim=-1)
-        return by_sin * cos - by_cos * sin + by_place / self.reach
+        cos, sin, _, wave_cos, wave_sin = self._parts(features)
+        by_cos, by_sin, by_place, by_wave_cos, by_wave_sin = self._parts(slope)
+        by_turn = by_wave_sin * wave_cos - by_wave_cos * wave_sin
+        slope = by_sin * cos - by_cos * sin + by_place / self.reach + by_turn @ self.turns.mT
+        for wave, by_wave in ((wave_cos, by_wave_cos), (wave_sin, by_wave_sin)):
+            slope = slope + (self._slide_slopes(wave) @ by_wave.unsqueeze(-1)).squeeze(-1)
+        return slope
 
     def mass_matrix(self, q: Tensor) -> Tensor:
         """M(q), (..., n, n) [kg m^2, kg m, kg]."""

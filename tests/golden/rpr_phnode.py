@@ -21,7 +21,7 @@ Record, by which `spelgen check` tells whether this module is up to date:
     robot: "rpr"
     urdf: "rpr.urdf"
     urdf_sha256: "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d"
-    spec_sha256: "27c38d7e3ceae0daaac7cee831bc3ead7412a753890e2d4040b5255031d7b0d1"
+    spec_sha256: "433ae0e5dc62c042be455e649dd800c2947fd4eed322498f890111bbb4f8ae0e"
     option assume: "kinematics"
     option depth: 2
     option joints: null
@@ -382,8 +382,9 @@ class Model(nn.Module):
         )
 
     def _features(self, q: Tensor) -> Tensor:
-        """What networks read: cos q, sin q and the scaled q, (..., 3 n)."""
-        return torch.cat([q.cos(), q.sin(), (q - self.center) / self.reach], dim=-1)
+        """cos q, sin q, the scaled q: all that is read of q, (..., 3 n)."""
+        place = (q - self.center) / self.reach
+        return torch.cat([q.cos(), q.sin(), place], dim=-1)
 
     def _features_rate(self, features: Tensor, qd: Tensor) -> Tensor:
         """How fast the features change along qd."""

@@ -21,7 +21,7 @@ Record, by which `spelgen check` tells whether this module is up to date:
     robot: "rpr"
     urdf: "rpr.urdf"
     urdf_sha256: "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d"
-    spec_sha256: "7e4b5523b1eb342e424724947988a742db6d98075e693ec14c98271aaaf50aaa"
+    spec_sha256: "7987e53cb5a2da2ec5eb6a79988ae8c2a55700154be8ee8f0c0367fc768c9f04"
     option assume: "kinematics"
     option depth: 2
     option joints: null
@@ -419,8 +419,9 @@ class Model(nn.Module):
         return rows.reshape(*rows.shape[:-1], self.n, self.n)
 
     def _features(self, q: Tensor) -> Tensor:
-        """What networks read: cos q, sin q and the scaled q, (..., 3 n)."""
-        return torch.cat([q.cos(), q.sin(), (q - self.center) / self.reach], dim=-1)
+        """cos q, sin q, the scaled q: all that is read of q, (..., 3 n)."""
+        place = (q - self.center) / self.reach
+        return torch.cat([q.cos(), q.sin(), place], dim=-1)
 
     def _features_rate(self, features: Tensor, qd: Tensor) -> Tensor:
         """How fast the features change along qd."""

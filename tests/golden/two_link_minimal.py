@@ -19,7 +19,7 @@ Record, by which `spelgen check` tells whether this module is up to date:
     robot: "two_link"
     urdf: "two_link.urdf"
     urdf_sha256: "d5393c842e189b72219c5ce02e115de571a94cd406b48898ea64b5431a395232"
-    spec_sha256: "cb3d5dda14a947e703f8dfd7fb2325bbbc55d31c3d3b5bce7d083123267bc61b"
+    spec_sha256: "a9423f1a66b0c567ee978db84edfb3e3253f35817a7f8976afa1c10b85cb31a4"
     option assume: "kinematics"
     option depth: 2
     option joints: null
@@ -41,6 +41,8 @@ from torch import Tensor, nn
 
 # the lower triangle of a symmetric matrix: row, column, factor
 Entries = tuple[tuple[int, int, float], ...]
+# a sum of waves: number of the wave, factor of its cosine, factor of its sine, to start from
+Terms = tuple[tuple[int, float, float], ...]
 
 
 class Joint(NamedTuple):
@@ -67,12 +69,23 @@ class Constant(NamedTuple):
 
 
 class Output(NamedTuple):
-    """A learned function f = mean + scale * network of some joints, which enters M as f B."""
+    """A learned function f of some joints, which enters M as f B: a sum of waves and a network.
+
+    f = level + sum of terms + NETWORK_SHARE * scale * network; mean is f's over the workspace.
+    """
 
     joints: tuple[int, ...]
     mean: float
     scale: float
+    level: float
+    terms: Terms
     entries: Entries  # of B
+
+
+class Wave(NamedTuple):
+    """cos(turns q) and sin(turns q)."""
+
+    turns: tuple[int, ...]
 
 
 JOINTS = (
@@ -102,21 +115,37 @@ JOINTS = (
     ),
 )
 
+# what M and V of a rigid arm are made of, whatever its masses are
+WAVES = (Wave(turns=(0, 1)), Wave(turns=(1, 0)), Wave(turns=(1, 1)))
+NETWORK_SHARE = 0.1  # how much of a function that is a sum of waves is left to its network
+
 # M(q) = sum_k c_k A_k + sum_j f_j(q) B_j
 CONSTANTS: tuple[Constant, ...] = (
     Constant(start=1.25, scale=1.25, entries=((1, 1, 1.0),)),
     Constant(start=1.0, scale=1.0, entries=((0, 0, 1.0),)),
 )
-OUTPUTS = (Output(joints=(1,), mean=1.2652, scale=0.343656, entries=((0, 0, 2.0), (1, 0, 1.0))),)
+OUTPUTS = (
+    Output(
+        joints=(1,),
+        mean=1.2652,
+        scale=0.343656,
+        level=1.25,
+        terms=((0, 0.5, 0.0),),
+        entries=((0, 0, 2.0), (1, 0, 1.0)),
+    ),
+)
 # in each hidden layer: the joints that some units read, and how many units do
 MASS_HIDDEN = (((1,), 64),)
 GUARD = 0.07  # least eigenvalue of M, relative to its nominal mean, that is left as it is
 POTENTIAL_JOINTS = (0, 1)  # the joints that V depends on
 POTENTIAL_WIDTH = 32
 POTENTIAL_SCALE = 10.8194  # [J]
+POTENTIAL_TERMS: Terms = ((1, 0.0, 14.715), (2, 0.0, 4.905))
 DEPTH = 2  # hidden layers of a network
 FRICTION_HIDDEN = 8
-SLOW = 0.03  # below this share of its usual speed a joint's dry friction fades to zero
+SLOW = 0.03  # below this share of its usual speed dry friction fades to zero, to start from
+SLOWEST = 0.001  # and at the least
+FEATURES = 2 * len(JOINTS) + 2 * len(WAVES)  # numbers made of q, which all else is made of
 PLACE_SHARE = 0.1  # how much friction's networks see of where a joint is, relative to its speed
 
 
@@ -148,8 +177,35 @@ def reading(joints: Iterable[int], shares: list[float]) -> Reading:
     n = len(JOINTS)
     turning = [joint for joint in joints if JOINTS[joint].revolute]
     whose = turning + turning
-    spread = torch.eye(2 * n, dtype=torch.float64)[turning + [n + joint for joint in turning]]
+    spread = torch.eye(FEATURES, dtype=torch.float64)[turning + [n + joint for joint in turning]]
     return Reading(tuple(whose), vector(shares[joint] for joint in whose), spread)
+
+
+class Series(NamedTuple):
+    """Sums of waves, one for each output of a network, which they go beside."""
+
+    outputs: Tensor  # for each term, to which output it goes
+    features: Tensor  # and which feature it takes
+    start: Tensor
+    size: Tensor  # of the term, in which its trained factor is counted
+    level: Tensor  # by output
+
+
+def series(sums: list[tuple[float, Terms]], scales: list[float], shares: list[float]) -> Series:
+    """The sums (level, terms) in units of their scales; a wave is as large as its joints' shares."""
+    first = FEATURES - 2 * len(WAVES)
+    levels, rows = [], []
+    for output, ((level, terms), scale) in enumerate(zip(sums, scales, strict=True)):
+        levels.append(level / scale)
+        for number, cos, sin in terms:
+            turns = WAVES[number].turns
+            size = min(share for share, turn in zip(shares, turns, strict=True) if turn)
+            rows.append((output, first + number, cos / scale / size, size))
+            rows.append((output, first + len(WAVES) + number, sin / scale / size, size))
+    outputs, features, start, size = zip(*rows, strict=True)
+    return Series(
+        torch.tensor(outputs), torch.tensor(features), vector(start), vector(size), vector(levels)
+    )
 
 
 class Layers(NamedTuple):
@@ -157,6 +213,7 @@ class Layers(NamedTuple):
 
     weights: tuple[Tensor, ...]
     biases: tuple[Tensor, ...]
+    series: Tensor | None  # rows by features
 
 
 Trace = tuple[tuple[Tensor, ...], Layers]
@@ -170,12 +227,14 @@ class Network(nn.Module):
     """
 
     spread: Tensor
+    series_size: Tensor
 
     def __init__(
         self,
         reading: Reading,
         layers: tuple[tuple[frozenset[int], ...], ...],
         generator: torch.Generator,
+        series: Series | None = None,
     ) -> None:
         super().__init__()
         self.register_buffer("spread", reading.spread)
@@ -190,7 +249,14 @@ class Network(nn.Module):
             self.register_buffer(f"mask{index}", mask * reading.share if index == 0 else mask)
             self.biases.append(nn.Parameter(torch.zeros(len(units), dtype=torch.float64)))
             below = units
-        nn.init.zeros_(self.weights[-1])  # so that the model starts at its nominal means
+        nn.init.zeros_(self.weights[-1])  # so that the model starts at its nominal values
+        self.place = None
+        if series is not None:
+            self.place = (series.outputs, series.features)
+            self.series = nn.Parameter(series.start)
+            self.register_buffer("series_size", series.size)
+            self.biases[-1].data = series.level
+            self.get_buffer(f"mask{len(layers) - 1}").mul_(NETWORK_SHARE)
 
     def prepared(self, outlay: Tensor, offset: Tensor) -> Layers:
         """The weights for the features as they are, and for offset + outlay y in place of y.
@@ -208,7 +274,14 @@ class Network(nn.Module):
             biases.append(2 * bias)
         weights[-1] = 0.5 * outlay @ weights[-1]
         biases[-1] = offset + 0.5 * outlay @ biases[-1]
-        return Layers(tuple(weights), tuple(biases))
+        return Layers(tuple(weights), tuple(biases), self._series(outlay))
+
+    def _series(self, outlay: Tensor) -> Tensor | None:
+        """The sums of waves, laid out."""
+        if self.place is None:
+            return None
+        known = outlay.new_zeros(outlay.shape[1], FEATURES)
+        return outlay @ known.index_put(self.place, self.series_size * self.series)
 
     def forward(self, features: Tensor, layers: Layers) -> tuple[Tensor, Trace]:
         """y laid out, (..., rows); and what ``pull`` and ``push`` need."""
@@ -216,7 +289,10 @@ class Network(nn.Module):
         for weight, bias in zip(layers.weights[:-1], layers.biases, strict=False):
             layer = torch.sigmoid(F.linear(layer, weight, bias))
             hidden.append(layer)
-        return F.linear(layer, layers.weights[-1], layers.biases[-1]), (tuple(hidden), layers)
+        y = F.linear(layer, layers.weights[-1], layers.biases[-1])
+        if layers.series is not None:
+            y = y + F.linear(features, layers.series)
+        return y, (tuple(hidden), layers)
 
     def pull(self, trace: Trace, cotangent: Tensor) -> Tensor:
         """The reverse sweep: cotangent, (..., rows), times dy/dfeatures; (..., features)."""
@@ -224,14 +300,16 @@ class Network(nn.Module):
         layer = cotangent @ layers.weights[-1]
         for weight, value in zip(reversed(layers.weights[:-1]), reversed(hidden), strict=True):
             layer = (layer * (value * (1 - value))) @ weight
-        return layer
+        return layer if layers.series is None else layer + cotangent @ layers.series
 
     def push(self, trace: Trace, rate: Tensor) -> Tensor:
         """The forward sweep: dy/dfeatures times the features' rate; (..., rows)."""
         hidden, layers = trace
+        pushed = rate
         for weight, value in zip(layers.weights[:-1], hidden, strict=True):
-            rate = F.linear(rate, weight) * (value * (1 - value))
-        return F.linear(rate, layers.weights[-1])
+            pushed = F.linear(pushed, weight) * (value * (1 - value))
+        pushed = F.linear(pushed, layers.weights[-1])
+        return pushed if layers.series is None else pushed + F.linear(rate, layers.series)
 
 
 class FrictionLayers(NamedTuple):
@@ -255,13 +333,14 @@ class Friction(nn.Module):
     def __init__(self, generator: torch.Generator) -> None:
         super().__init__()
         joints, inputs = len(JOINTS), 4
-        spread = torch.zeros(joints, inputs, 4 * joints, dtype=torch.float64)
+        spread = torch.zeros(joints, inputs, FEATURES + 2 * joints, dtype=torch.float64)
         for i, joint in enumerate(JOINTS):
             spread[i, 0, i] = spread[i, 1, joints + i] = PLACE_SHARE
             spread[i, 2, i - 2 * joints], spread[i, 3, i - joints] = 1 / joint.speed, 1.0
         self.register_buffer("spread", spread)
         self.register_buffer("speed", vector(joint.speed for joint in JOINTS))
         self.register_buffer("size", vector(joint.friction for joint in JOINTS))
+        self.slow = nn.Parameter(torch.zeros(joints, dtype=torch.float64))
         self.viscous = nn.Parameter(torch.full((joints,), -2.0, dtype=torch.float64))
         shape = (joints, inputs, FRICTION_HIDDEN)
         weight = torch.randn(shape, dtype=torch.float64, generator=generator)
@@ -282,7 +361,7 @@ class Friction(nn.Module):
             out=2 * (own.unsqueeze(-1) * self.out).flatten(1),
             offset=self.offset - self.out.sum(dim=1),
             viscous=self.size * F.softplus(self.viscous) / self.speed,
-            slow=(SLOW * self.speed) ** 2,
+            slow=self.speed**2 * (SLOWEST**2 + (SLOW * self.slow.exp()) ** 2),
         )
 
     def _dry(
@@ -334,6 +413,7 @@ class Model(nn.Module):
         "revolute" if joint.revolute else "prismatic" for joint in JOINTS
     )
 
+    turns: Tensor
     constant_scale: Tensor
     constant_basis: Tensor
     output_mean: Tensor
@@ -347,6 +427,8 @@ class Model(nn.Module):
     def __init__(self, seed: int = 0) -> None:
         super().__init__()
         generator = torch.Generator().manual_seed(seed)
+        turns = torch.tensor([wave.turns for wave in WAVES], dtype=torch.float64)
+        self.register_buffer("turns", turns.mT)
         start = vector(constant.start for constant in CONSTANTS)
         self.register_buffer("constant_scale", vector(constant.scale for constant in CONSTANTS))
         self.register_buffer("constant_basis", stacked([c.entries for c in CONSTANTS]))
@@ -361,11 +443,15 @@ class Model(nn.Module):
         outputs = tuple(frozenset(output.joints) for output in OUTPUTS)
         shares = [joint.mass_share for joint in JOINTS]
         read = reading(sorted(frozenset().union(*outputs)), shares)
-        self.mass_network = Network(read, (*((hidden,) * DEPTH), outputs), generator)
+        sums = [(output.level - output.mean, output.terms) for output in OUTPUTS]
+        known = series(sums, [output.scale for output in OUTPUTS], shares)
+        self.mass_network = Network(read, (*((hidden,) * DEPTH), outputs), generator, known)
         everything = frozenset(POTENTIAL_JOINTS)
         layers = (*(((everything,) * POTENTIAL_WIDTH,) * DEPTH), (everything,))
         shares = [joint.potential_share for joint in JOINTS]
-        self.potential_network = Network(reading(POTENTIAL_JOINTS, shares), layers, generator)
+        known = series([(0.0, POTENTIAL_TERMS)], [POTENTIAL_SCALE], shares)
+        read = reading(POTENTIAL_JOINTS, shares)
+        self.potential_network = Network(read, layers, generator, known)
         self.friction = Friction(generator)
         self.register_buffer("rotor_size", vector(joint.rotor for joint in JOINTS))
         self.rotor = nn.Parameter(torch.zeros(self.n, dtype=torch.float64))
@@ -391,19 +477,30 @@ class Model(nn.Module):
         return rows.reshape(*rows.shape[:-1], self.n, self.n)
 
     def _features(self, q: Tensor) -> Tensor:
-        """What networks read: cos q, sin q, (..., 2 n)."""
-        return torch.cat([q.cos(), q.sin()], dim=-1)
+        """cos q, sin q, cosines and sines of waves: all that is read of q, (..., features)."""
+        angle = q @ self.turns
+        waves = (angle.cos(), angle.sin())
+        return torch.cat([q.cos(), q.sin(), *waves], dim=-1)
+
+    def _parts(self, features: Tensor) -> tuple[Tensor, ...]:
+        """Cosines, sines, cosines and sines of waves."""
+        sizes = [self.n] * 2 + [len(WAVES)] * 2
+        return features.split(sizes, dim=-1)
 
     def _features_rate(self, features: Tensor, qd: Tensor) -> Tensor:
         """How fast the features change along qd."""
-        cos, sin = features.chunk(2, dim=-1)
-        return torch.cat([-sin * qd, cos * qd], dim=-1)
+        cos, sin, wave_cos, wave_sin = self._parts(features)
+        turn = qd @ self.turns
+        waves = (-wave_sin * turn, wave_cos * turn)
+        return torch.cat([-sin * qd, cos * qd, *waves], dim=-1)
 
     def _by_joint(self, features: Tensor, slope: Tensor) -> Tensor:
         """d/dq, (..., n), of what has this slope d/dfeatures."""
-        cos, sin = features.chunk(2, dim=-1)
-        by_cos, by_sin = slope.chunk(2, dim=-1)
-        return by_sin * cos - by_cos * sin
+        cos, sin, wave_cos, wave_sin = self._parts(features)
+        by_cos, by_sin, by_wave_cos, by_wave_sin = self._parts(slope)
+        by_turn = by_wave_sin * wave_cos - by_wave_cos * wave_sin
+        slope = by_sin * cos - by_cos * sin + by_turn @ self.turns.mT
+        return slope
 
     def mass_matrix(self, q: Tensor) -> Tensor:
         """M(q), (..., n, n) [kg m^2, kg m, kg]."""
