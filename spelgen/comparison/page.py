@@ -26,7 +26,7 @@ STYLES = ("c1", "c2", "c3", "c4", "c5")
 
 @dataclass(frozen=True)
 class Panel:
-    """Charts that belong together: a joint's, or a row's of M."""
+    """Charts that belong together: a joint's, or that of an entry of M."""
 
     name: str
     charts: tuple[Markup, ...]
@@ -70,24 +70,23 @@ def _entries(
     styles: Mapping[str, str],
     joint_types: Sequence[str],
 ) -> list[Panel]:
-    """The rows of M's lower triangle along the first example: the true robot's, and what every variant learned."""
+    """M's lower triangle along the first example: the true robot's, and what every variant learned."""
     shown = [result for result in results if result["examples"]]
     if not shown:
         return []
     example = shown[0]["examples"][0]
     true = true_mass(study.source, example_positions(example)).tolist()
-    rows = []
-    for i, kind in enumerate(joint_types):
-        charts = []
-        for j in range(i + 1):
-            lines = [Line("true", example["t"], [each[i][j] for each in true], "truth")]
-            for result in shown:
-                values = [each[i][j] for each in result["mass"]["along"]]
-                lines.append(Line(result["variant"], example["t"], values, styles[result["variant"]]))
-            name, unit = f"M{entry_index(i, j)}", INERTIA_UNITS.get(f"{kind} {joint_types[j]}", "kg m")
-            charts.append(line_chart(lines, name, "t [s]", f"{name} [{unit}]", width=330, height=190))
-        rows.append(Panel(f"row {i + 1}: {example['joints'][i]['name']}", tuple(charts)))
-    return rows
+    panels = []
+    for i, j in [(row, column) for row in range(len(joint_types)) for column in range(row + 1)]:
+        lines = [Line("true", example["t"], [each[i][j] for each in true], "truth")]
+        for result in shown:
+            learned = [each[i][j] for each in result["mass"]["along"]]
+            lines.append(Line(result["variant"], example["t"], learned, styles[result["variant"]]))
+        name = f"M{entry_index(i, j)}"
+        unit = INERTIA_UNITS.get(f"{joint_types[i]} {joint_types[j]}", "kg m")
+        chart = line_chart(lines, name, "t [s]", f"{name} [{unit}]", width=330, height=190)
+        panels.append(Panel(name, (chart,)))
+    return panels
 
 
 def _panels(
