@@ -96,6 +96,8 @@ class TrackingSettings(Group):
     """How an arm moves and is seen in `simulation.protocol: tracking`.
 
     amplitude [rad; m], frequency [Hz]: of each joint's sine about the middle of `simulation.positions`.
+    paths: "same": all trajectories follow one closed path, each beginning further on; "own": each has phases of
+    its own, so that its test part lies where no training part was.
     bandwidths: of the PID controllers of the first, second, ... trajectory, then over again [Hz].
     control: rate of the controllers, which hold their torques; simulation.rate is a multiple of it [Hz].
     resolution: of the encoders [rad; m]. cutoff: of the zero-phase low-pass on their positions [Hz].
@@ -103,6 +105,7 @@ class TrackingSettings(Group):
 
     amplitude: Positive = 0.5235987755982988
     frequency: Positive = 0.125
+    paths: Literal["same", "own"] = "same"
     bandwidths: Annotated[tuple[Positive, ...], Field(min_length=1)] = (2.0, 2.5, 3.0, 3.5, 4.0, 4.5)
     control: Positive = 125.0
     resolution: Positive = 4.8e-5

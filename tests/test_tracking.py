@@ -64,6 +64,21 @@ def test_the_arm_follows_its_sines_to_a_few_degrees(recordings):
     assert worst[1] < worst[0] / 2, "a harder controller follows better"
 
 
+@pytest.mark.parametrize("paths", ["same", "own"])
+def test_trajectories_follow_one_path_or_each_its_own(loaded, paths):
+    """On one path, what a trajectory does late another has done before: the whole path is trained on."""
+    settings = changed(loaded.settings, {"paths": paths}, duration=0.02)
+    begun = []
+    with pytest.MonkeyPatch.context() as patch:
+        inner = tracking.record
+        patch.setattr(tracking, "record", lambda *given: begun.append(given[3]) or inner(*given))
+        track(loaded.arm, settings)
+    period = 1 / settings.tracking.frequency
+    later = begun[0].position(2 / 6 * period)
+    assert (np.abs(begun[2].position(0.0) - later).max() < 1e-12) == (paths == "same")
+    assert len({tuple(sines.phase) for sines in begun}) == 6
+
+
 def test_sines_turn_as_fast_as_they_say():
     sines = Sines(np.array([0.5]), np.array([1.0]), amplitude=0.3, frequency=0.125)
     t, h = 2.2, 1e-5

@@ -81,19 +81,17 @@ def track(
 ) -> SimulationResult:
     """Return logs of the arm controlled along sines, by `settings.simulation` and `settings.tracking`.
 
-    Every recording has its own gains and phases. The last `test_fraction` of each is for testing. Logged are
-    positions from the encoders after a zero-phase low-pass, velocities by central differences of these, and the
-    motors' torques. Arguments, errors and the integration error, here over whole recordings under the same
-    torques, as for `simulate`.
+    Every recording has its own gains, and its own phases or place to begin. The last `test_fraction` of each is
+    for testing. Logged are positions from the encoders after a zero-phase low-pass, velocities by central
+    differences of these, and the motors' torques. Arguments, errors and the integration error, here over whole
+    recordings under the same torques, as for `simulate`.
     """
     protocol = settings.simulation
     engine, friction = make_engine(arm, settings), make_friction(arm, settings)
     inputs = np.eye(len(arm.coordinates)) if input_matrix is None else input_matrix
     middle = _middle(arm, settings)
-    seeds = np.random.SeedSequence(protocol.seed).spawn(protocol.trajectories)
     train, test, errors = [], [], []
-    for number, seed in enumerate(seeds):
-        phase = np.random.default_rng(seed).uniform(0, 2 * np.pi, middle.size)
+    for number, phase in enumerate(_phases(settings, middle.size)):
         sines = Sines(middle, phase, settings.tracking.amplitude, settings.tracking.frequency)
         bandwidth = settings.tracking.bandwidths[number % len(settings.tracking.bandwidths)]
         felt = 1 / np.diag(np.linalg.inv(mass_matrix(engine, middle)))  # by a joint when the others are free
@@ -163,6 +161,16 @@ def measured(recording: Recording, tracking: TrackingSettings, name: str) -> Tra
     padding = min(len(recording.t) - 1, int(3 * rate / tracking.cutoff))  # as `low_pass` of data/signals.py
     q = sosfiltfilt(low_pass, recording.encoders, axis=0, padlen=padding)
     return Trajectory(name, recording.t, q, np.gradient(q, recording.t, axis=0), recording.tau)
+
+
+def _phases(settings: Settings, n: int) -> list[np.ndarray]:
+    """The phases (n,) [rad] of each trajectory's sines; no trajectory's own depend on how many there are."""
+    count = settings.simulation.trajectories
+    seeds = np.random.SeedSequence(settings.simulation.seed).spawn(count)
+    drawn = [np.random.default_rng(seed).uniform(0, 2 * np.pi, n) for seed in seeds]
+    if settings.tracking.paths == "own":
+        return drawn
+    return [drawn[0] + 2 * np.pi * number / count for number in range(count)]
 
 
 def _seen(q: np.ndarray, tracking: TrackingSettings) -> np.ndarray:
