@@ -26,6 +26,7 @@ PRESETS = [
     ("spel-kan", "kan"),
     ("phnode", "mlp"),
     ("phnode", "kan"),
+    ("closed-form", "mlp"),
 ]
 
 
