@@ -14,10 +14,10 @@ urdf: robot xacro_child xacro_input document values elements lint read actuation
 arm: rational snapping placement chain walk arm
 structure: recursion field sampling spans basis expansion symbolic structure nominal waves minimal pseudo_inertia
 emission: bodies plan emit
-data: trajectory bags tables logs doubts signals windows
+data: trajectory bags tables logs doubts signals windows parts stream
 simulation: engine simulate tracking protocols
 identification: samples friction regressor base least_squares prior identify told
-training: runs lie_group rollout compiled rivals prior progress data loop train
+training: runs lie_group rollout compiled rivals prior progress data streamed loop train
 evaluation: tip torque examples evaluate
 report: charts plots tables picture learned page
 proof: agreement axes reasons meaning second_reading numeric_samples verification

@@ -16,9 +16,8 @@ from spelgen.data.signals import (
     automatic_spacing,
     low_pass,
     prepare,
-    rate,
-    split_at_gaps,
 )
+from spelgen.data.trajectory import rate, split_at_gaps
 from spelgen.data.windows import cut_windows, split_validation
 from spelgen.errors import LogError, SpelgenErrors
 
@@ -311,10 +310,10 @@ def test_the_filter_needs_more_than_two_samples_per_period():
 
 
 def test_only_dense_logs_are_filtered_unasked():
-    assert automatic_cutoff([swing(dt=0.01)]) == 8.0
-    assert automatic_cutoff([swing(dt=0.01), swing(dt=0.05)]) is None
-    assert automatic_spacing([swing(dt=0.01)], 8.0) == 4
-    assert automatic_spacing([swing(dt=0.001)], None) == 1
+    assert automatic_cutoff([100.0]) == 8.0
+    assert automatic_cutoff([100.0, 20.0]) is None
+    assert automatic_spacing([100.1], 8.0) == 4
+    assert automatic_spacing([1000.0], None) == 1
 
 
 def test_the_rate_ignores_gaps():

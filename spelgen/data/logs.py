@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from spelgen.errors import LogError, SpelgenError, collect
 from spelgen.log_mapping import TIMES, LogMapping
 
 KINDS = f"{', '.join(SUFFIXES)}, or the folder of a ROS 2 bag"
+ROW_GROUP = 2**16  # rows that are written together: a log too large for memory is read by them
 EXACT = 2**53  # whole numbers up to here are exact as floating-point numbers
 
 Named = tuple[tuple[str, str, str], Trajectory]
@@ -78,7 +80,10 @@ def write_logs(path: Path | str, trajectories: Sequence[Trajectory], joints: Seq
 
 
 def _writer(path: Path) -> Callable[[pa.Table, Path], None]:
-    writers = {".parquet": pa.parquet.write_table, ".csv": pa.csv.write_csv}
+    writers: dict[str, Callable[[pa.Table, Path], None]] = {
+        ".parquet": partial(pa.parquet.write_table, row_group_size=ROW_GROUP),
+        ".csv": pa.csv.write_csv,
+    }
     if path.suffix not in writers:
         raise LogError(f"a log named {path.name!r}", expected=" or ".join(writers))
     return writers[path.suffix]
@@ -115,8 +120,7 @@ def _trajectories(part: LogTable, file: Path, joints: Sequence[str]) -> list[Nam
     """The trajectories of one table."""
     if not part.table.num_rows:
         raise LogError("no rows", file=file, expected="at least one window of samples")
-    data = np.stack([_numbers(part, column, file) for column in part.wanted], axis=1)  # (T, 1 + 3n)
-    require_finite(data, part.wanted, file)
+    data = table_values(part, file, clock_start(part))
     labels = None if part.labels is None else np.array(part.table[part.labels].to_pylist(), dtype=str)
     declared = part.declares_units or all(part.mapping.unit("q", joint) for joint in joints)
     names = [part.recording or file.stem] if labels is None else list(dict.fromkeys(labels.tolist()))
@@ -155,16 +159,32 @@ def _differentiated(t: np.ndarray, q: np.ndarray) -> np.ndarray:
     return qd
 
 
-def _numbers(part: LogTable, column: str, file: Path) -> np.ndarray:
-    """A column as float64 (T,); times of a wide clock count from the first one, so that no digit is lost."""
+def clock_start(part: LogTable) -> int:
+    """From where times count: the first one of a clock too wide for floating-point numbers, else 0."""
+    first = part.table[part.wanted[0]][:1]
+    if pa.types.is_timestamp(first.type):
+        return first.cast(pa.timestamp("ns")).cast(pa.int64())[0].as_py() or 0
+    wide = pa.types.is_integer(first.type) and abs(first[0].as_py() or 0) > EXACT
+    return first[0].as_py() if wide else 0
+
+
+def table_values(part: LogTable, file: Path, start: int, row: int = 0) -> np.ndarray:
+    """The wanted columns as logged (T, 1 + 3n or 2n), times from `start` on. row: of the table in its file."""
+    data = np.stack([_numbers(part, column, file, start) for column in part.wanted], axis=1)
+    require_finite(data, part.wanted, file, row)
+    return data
+
+
+def _numbers(part: LogTable, column: str, file: Path, start: int) -> np.ndarray:
+    """A column as float64 (T,)."""
     values = part.table[column]
     try:
         if column == part.wanted[0]:
             if pa.types.is_timestamp(values.type):
-                values = values.cast(pa.timestamp("ns")).cast(pa.int64())
-                return (values.to_numpy() - values[0].as_py()) * 1e-9 / TIMES[part.mapping.units.t]
-            if pa.types.is_integer(values.type) and abs(values[0].as_py()) > EXACT:
-                return (values.to_numpy() - values[0].as_py()).astype(float)
+                nanoseconds = values.cast(pa.timestamp("ns")).cast(pa.int64()).to_numpy()
+                return (nanoseconds - start) * 1e-9 / TIMES[part.mapping.units.t]
+            if start:
+                return (values.to_numpy() - start).astype(float)
         return values.cast(pa.float64()).to_numpy()
     except (pa.ArrowException, ValueError) as error:
         kind = part.table.schema.field(column).type
@@ -173,11 +193,11 @@ def _numbers(part: LogTable, column: str, file: Path) -> np.ndarray:
         ) from error
 
 
-def require_finite(data: np.ndarray, columns: Sequence[str], file: Path) -> None:
-    """Raise LogError where a column of the data (T, C) holds NaN or infinity."""
+def require_finite(data: np.ndarray, columns: Sequence[str], file: Path, first: int = 0) -> None:
+    """Raise LogError where a column of the data (T, C), from row `first` of the file on, is not finite."""
     bad = ~np.isfinite(data)
     if bad.any():
-        row, column = np.argwhere(bad)[0]
+        row, column = np.argwhere(bad)[0] + (first, 0)
         count = int(bad.any(axis=1).sum())
         raise LogError(
             f"no finite number ({count} of {len(data)} rows have such a gap, this is the first)",

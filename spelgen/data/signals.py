@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.signal import butter, sosfiltfilt
 
-from spelgen.data.trajectory import QUANTITIES, Trajectory, rate, split_at_gaps
+from spelgen.data.trajectory import QUANTITIES, Trajectory, split_at_gaps
 from spelgen.errors import LogError, SpelgenError, collect
 
 FILTER_ORDER = 4
@@ -19,12 +19,15 @@ AUTOMATIC_RATE = 50.0  # [Hz] logs sampled more slowly are not oversampled enoug
 SAMPLES_PER_PERIOD = 3
 
 
-def automatic_cutoff(trajectories: Sequence[Trajectory]) -> float | None:
-    """8 Hz when every log is sampled above 50 Hz, as measured logs usually are; otherwise None, no filter."""
-    return AUTOMATIC_CUTOFF if all(rate(x) > AUTOMATIC_RATE for x in trajectories) else None
+def automatic_cutoff(rates: Iterable[float]) -> float | None:
+    """8 Hz when every log is sampled above 50 Hz, as measured logs usually are; otherwise None, no filter.
+
+    rates: of the trajectories [Hz].
+    """
+    return AUTOMATIC_CUTOFF if all(each > AUTOMATIC_RATE for each in rates) else None
 
 
-def automatic_spacing(trajectories: Sequence[Trajectory], cutoff: float | None) -> int:
+def automatic_spacing(rates: Iterable[float], cutoff: float | None) -> int:
     """Samples from one sample of a window to the next: every one, unless filtered logs are much denser than
     needed.
 
@@ -32,7 +35,7 @@ def automatic_spacing(trajectories: Sequence[Trajectory], cutoff: float | None) 
     """
     if cutoff is None:
         return 1
-    return max(1, int(min(rate(x) for x in trajectories) / (SAMPLES_PER_PERIOD * cutoff)))
+    return max(1, int(min(rates) / (SAMPLES_PER_PERIOD * cutoff)))
 
 
 def low_pass(trajectory: Trajectory, cutoff: float) -> Trajectory:

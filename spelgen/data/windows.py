@@ -42,6 +42,23 @@ class Windows:
         return Windows(*(x.to(device) for x in (self.dt, self.q, self.qd, self.tau)))
 
 
+def thinned(windows: Windows, most: int) -> Windows:
+    """At most that many windows, evenly spread."""
+    return windows[:: -(-len(windows) // most)]
+
+
+def joined(parts: Sequence[Windows]) -> Windows:
+    """One batch of all windows, in order."""
+    columns = zip(*((x.dt, x.q, x.qd, x.tau) for x in parts), strict=True)
+    return Windows(*(torch.cat(each) for each in columns))
+
+
+def window_count(samples: int, window: int, stride: int, every: int) -> int:
+    """How many windows `cut_windows` cuts from a piece of so many samples."""
+    starts = samples - (window - 1) * every
+    return max(0, -(-starts // stride))
+
+
 def cut_windows(
     pieces: Sequence[Trajectory], window: int, stride: int = 1, every: int = 1, *, measured: bool
 ) -> Windows:

@@ -13,7 +13,8 @@ from torchdiffeq import odeint
 
 from spelgen.data.doubts import examine
 from spelgen.data.logs import Trajectory, read_logs
-from spelgen.data.signals import prepare, rate
+from spelgen.data.signals import prepare
+from spelgen.data.trajectory import rate
 from spelgen.data.windows import Windows, cut_windows
 from spelgen.errors import Diagnostic
 from spelgen.evaluation.examples import Example, predict_examples
@@ -130,7 +131,7 @@ def evaluate(
     trajectories = read_logs(data, header.joints, role="test", mapping=mapping, joint_types=model.joint_types)
     notes = examine(trajectories, header.joints, model.joint_types)
     notes += _seen(trajectories, config)
-    used = config["cutoff"] if cutoff is None else filter_cutoff(cutoff, trajectories)
+    used = config["cutoff"] if cutoff is None else filter_cutoff(cutoff, map(rate, trajectories))
     pieces = prepare(trajectories, shortest=2, cutoff=used)
     lengths = _lengths(pieces, steps, seconds, notes)
     probe = _windows(pieces, config["config"]["window"], 64, measured=used is not None)

@@ -9,7 +9,8 @@ import numpy as np
 import torch
 
 from spelgen.data.logs import Trajectory
-from spelgen.data.signals import low_pass, rate, resample, split_at_gaps
+from spelgen.data.signals import low_pass, resample
+from spelgen.data.trajectory import rate, split_at_gaps
 
 FREQUENCY = 100.0  # [Hz] of the common grid
 CUTOFF = 8.0  # [Hz]

@@ -9,7 +9,8 @@ from itertools import pairwise
 import numpy as np
 
 from spelgen.data.logs import Trajectory
-from spelgen.data.signals import low_pass, rate, resample
+from spelgen.data.signals import low_pass, resample
+from spelgen.data.trajectory import rate
 
 FREQUENCY = 100.0  # [Hz] of the common grid
 CUTOFF = 8.0  # [Hz]

@@ -11,7 +11,9 @@ from typing import Any, Literal
 from spelgen.data.doubts import examine
 from spelgen.data.logs import Trajectory, read_logs
 from spelgen.data.signals import automatic_cutoff, automatic_spacing, prepare
-from spelgen.data.windows import Windows, cut_windows, split_validation
+from spelgen.data.stream import WindowStream
+from spelgen.data.trajectory import rate
+from spelgen.data.windows import Windows, cut_windows, split_validation, thinned
 from spelgen.errors import Diagnostic
 from spelgen.log_mapping import LogMapping
 from spelgen.settings import TrainingSettings
@@ -63,7 +65,11 @@ class TrainingConfig:
 
 @dataclass(frozen=True, eq=False)
 class TrainingData:
-    """Windows of the logs, ready to train on. digest: of every number, to resume on the same data only."""
+    """Windows of the logs, ready to train on.
+
+    training: all of them, or where the logs are larger than memory an even sample, and `stream` draws those
+    that are trained on. digest: of every number, to resume on the same data only.
+    """
 
     training: Windows
     validation: Windows
@@ -73,6 +79,12 @@ class TrainingData:
     validation_names: tuple[str, ...]
     diagnostics: tuple[Diagnostic, ...]
     digest: str
+    stream: WindowStream | None = None
+
+    @property
+    def size(self) -> int:
+        """Windows there are to train on."""
+        return len(self.training if self.stream is None else self.stream)
 
 
 def prepare_data(
@@ -90,11 +102,10 @@ def prepare_data(
     trajectories = read_logs(paths, joints, role="train", mapping=mapping, joint_types=joint_types)
     notes = examine(trajectories, joints, joint_types)
     split = split_validation(trajectories, config.validation_fraction, config.seed)
-    cutoff = filter_cutoff(config.filter, trajectories)
-    if cutoff is not None:
-        message = f"q, qd and tau filtered at {cutoff:g} Hz, zero phase"
-        notes.append(Diagnostic("info", "filter", "logs", None, message))
-    every = config.every or automatic_spacing(trajectories, cutoff)
+    rates = [rate(x) for x in trajectories]
+    cutoff = filter_cutoff(config.filter, rates)
+    notes += filter_note(cutoff)
+    every = config.every or automatic_spacing(rates, cutoff)
     training, validation = (
         prepare(x, shortest=(config.window - 1) * every + 1, cutoff=cutoff)
         for x in (split.training, split.validation)
@@ -102,29 +113,34 @@ def prepare_data(
     windows = cut_windows(training, config.window, config.stride, every, measured=cutoff is not None)
     return TrainingData(
         training=windows,
-        validation=_thin(
-            cut_windows(validation, config.window, config.stride, every, measured=cutoff is not None)
+        validation=thinned(
+            cut_windows(validation, config.window, config.stride, every, measured=cutoff is not None),
+            LARGEST_VALIDATION,
         ),
         scales=loss_scales(windows, joint_types),
         cutoff=cutoff,
         training_names=tuple(x.name for x in split.training),
         validation_names=tuple(x.name for x in split.validation),
         diagnostics=(*notes, split.note),
-        digest=_digest(trajectories),
+        digest=digest(trajectories),
     )
 
 
-def filter_cutoff(asked: float | None, trajectories: Sequence[Trajectory]) -> float | None:
-    """The low-pass cutoff [Hz] for what a user asked: None chooses, 0 means no filter."""
-    return automatic_cutoff(trajectories) if asked is None else asked or None
+def filter_cutoff(asked: float | None, rates: Iterable[float]) -> float | None:
+    """The low-pass cutoff [Hz] for what a user asked: None chooses, 0 means no filter. rates: of the logs [Hz]."""
+    return automatic_cutoff(rates) if asked is None else asked or None
 
 
-def _thin(windows: Windows) -> Windows:
-    """At most LARGEST_VALIDATION windows, evenly spread."""
-    return windows[:: -(-len(windows) // LARGEST_VALIDATION)]
+def filter_note(cutoff: float | None) -> list[Diagnostic]:
+    """That the logs are filtered, if they are."""
+    if cutoff is None:
+        return []
+    message = f"q, qd and tau filtered at {cutoff:g} Hz, zero phase"
+    return [Diagnostic("info", "filter", "logs", None, message)]
 
 
-def _digest(trajectories: Sequence[Trajectory]) -> str:
+def digest(trajectories: Iterable[Trajectory]) -> str:
+    """A fingerprint of every number."""
     numbers = hashlib.sha256()
     for trajectory in trajectories:
         for array in (trajectory.t, trajectory.q, trajectory.qd, trajectory.tau):

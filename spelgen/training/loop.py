@@ -66,7 +66,9 @@ class TrainingLoop:
         self.optimiser = self._optimiser()
         self.generator = torch.Generator().manual_seed(config.seed)
         self.batch = min(config.batch, len(self.training))
-        self.epoch_steps = max(EPOCH_STEPS, -(-len(self.training) // self.batch))
+        self.stream = data.stream
+        windows = len(self.training) if self.stream is None else len(self.stream) // self.stream.shares
+        self.epoch_steps = max(EPOCH_STEPS, -(-windows // self.batch))
         self.probe = self.training[:: -(-len(self.training) // PROBE)]
         self.epoch = self.step = self.best_epoch = self.rollbacks = 0
         self.rate_factor, self.seconds = 1.0, 0.0
@@ -181,11 +183,14 @@ class TrainingLoop:
 
     def _train_epoch(self) -> float:
         """Mean loss over the epoch's steps; NaN as soon as a step has no finite loss or gradient."""
-        rows, size = self.epoch_steps * self.batch, len(self.training)
+        windows = self.training
+        if self.stream is not None:
+            windows = self.stream.share(self.epoch).to(self.config.device)
+        rows, size = self.epoch_steps * self.batch, len(windows)
         passes = [torch.randperm(size, generator=self.generator) for _ in range(-(-rows // size))]
         total = 0.0
         for batch in torch.cat(passes)[:rows].split(self.batch):
-            loss = self._train_step(self.training[batch.to(self.config.device)])
+            loss = self._train_step(windows[batch.to(self.config.device)])
             if not math.isfinite(loss):
                 return math.nan
             total += loss

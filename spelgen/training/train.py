@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from spelgen.data.parts import large_files
 from spelgen.errors import Diagnostic, ModuleError, RunError
 from spelgen.log_mapping import LogMapping
 from spelgen.spec import Header, read_header
@@ -23,6 +24,7 @@ from spelgen.training.loop import Status, TrainingLoop
 from spelgen.training.prior import Prior, urdf_prior
 from spelgen.training.progress import TrainingProgress
 from spelgen.training.runs import RunFolder, load_model, write_json
+from spelgen.training.streamed import prepare_streamed
 
 if TYPE_CHECKING:
     from spelgen.training.runs import EmittedModel
@@ -90,7 +92,13 @@ def train(
     _use(config)
     model = load_model(module)
     header = read_header(module)
-    prepared = prepare_data(data, header.joints, model.joint_types, config, mapping)
+    paths = list(data)
+    large = large_files(paths, header.joints, role="train")
+    prepared = (
+        prepare_streamed(large, header.joints, model.joint_types, config, mapping)
+        if large
+        else prepare_data(paths, header.joints, model.joint_types, config, mapping)
+    )
     description = _describe(config, prepared, header) | {
         "mapping": (mapping or LogMapping()).model_dump(exclude_defaults=True)
     }
@@ -184,7 +192,7 @@ def _describe(config: TrainingConfig, data: TrainingData, header: Header) -> dic
         "data_digest": data.digest,
         "training": list(data.training_names),
         "validation": list(data.validation_names),
-        "training_windows": len(data.training),
+        "training_windows": data.size,
         "validation_windows": len(data.validation),
         "cutoff": data.cutoff,
         "scales": {name: getattr(data.scales, name).tolist() for name in ("q", "qd", "tau")},

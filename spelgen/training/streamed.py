@@ -1,0 +1,117 @@
+"""Training data from logs larger than memory: one pass to know them, samples to measure on, a stream to learn from."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from spelgen.data.doubts import Doubt, doubts, tell, told_gaps
+from spelgen.data.parts import Part, scan
+from spelgen.data.signals import automatic_spacing
+from spelgen.data.stream import Cutting, WindowStream
+from spelgen.data.trajectory import gap_ends, rate
+from spelgen.errors import Diagnostic, LogError, collect
+from spelgen.log_mapping import LogMapping
+from spelgen.training.data import (
+    LARGEST_VALIDATION,
+    TrainingConfig,
+    TrainingData,
+    filter_cutoff,
+    filter_note,
+)
+from spelgen.training.rollout import loss_scales
+
+SAMPLED = 2**16  # windows on which scales and substeps are chosen, and of the momentum steps
+SAMPLED_PARTS = 32  # that these windows come from
+VALIDATED_PARTS = 16
+
+
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """What one pass over the logs tells. pieces: lengths of the gap-free pieces of each part."""
+
+    parts: list[Part]
+    pieces: list[list[int]]
+    rates: list[float]
+    notes: list[Diagnostic]
+    digest: str
+
+
+def prepare_streamed(
+    files: Sequence[Path],
+    joints: Sequence[str],
+    joint_types: Sequence[str],
+    config: TrainingConfig,
+    mapping: LogMapping | None = None,
+) -> TrainingData:
+    """As `prepare_data`, from Parquet files of which one part at a time is in memory.
+
+    Whole parts (see `scan`) are set aside for validation. Raises LogError, and SettingsError where the mapping
+    does not fit.
+    """
+    mapping = mapping or LogMapping()
+    collect(mapping.misfits(joints, joint_types))
+    known = _read_once(files, joints, joint_types, mapping)
+    cutoff = filter_cutoff(config.filter, known.rates)
+    every = config.every or automatic_spacing(known.rates, cutoff)
+    cutting = Cutting(config.window, config.stride, every, cutoff)
+    counts = [sum(map(cutting.count, pieces)) for pieces in known.pieces]
+    usable = [index for index, count in enumerate(counts) if count]
+    if len(usable) < 2:
+        raise LogError(f"no two parts with {cutting.shortest} samples without a gap", expected="several")
+    size = min(max(1, round(config.validation_fraction * len(usable))), len(usable) - 1)
+    held_out = set(np.random.default_rng(config.seed).permutation(usable)[:size].tolist())
+    training, validation = (
+        WindowStream(
+            tuple(known.parts[index] for index in usable if (index in held_out) == out),
+            tuple(counts[index] for index in usable if (index in held_out) == out),
+            cutting,
+            config.seed,
+        )
+        for out in (False, True)
+    )
+    sample = training.sample(SAMPLED_PARTS, SAMPLED)
+    message = (
+        f"larger than memory: read in {len(known.parts)} parts, {training.shares} epochs pass over all; "
+        f"validation on {size} parts, {len(known.parts) - len(usable)} hold no window"
+    )
+    return TrainingData(
+        training=sample,
+        validation=validation.sample(VALIDATED_PARTS, LARGEST_VALIDATION),
+        scales=loss_scales(sample, joint_types),
+        cutoff=cutoff,
+        training_names=tuple(part.name for part in training.parts),
+        validation_names=tuple(part.name for part in validation.parts),
+        diagnostics=(
+            *known.notes,
+            *filter_note(cutoff),
+            Diagnostic("info", "streamed", "logs", None, message),
+        ),
+        digest=known.digest,
+        stream=training,
+    )
+
+
+def _read_once(
+    files: Sequence[Path], joints: Sequence[str], joint_types: Sequence[str], mapping: LogMapping
+) -> _Known:
+    parts: list[Part] = []
+    pieces: list[list[int]] = []
+    rates: list[float] = []
+    found: list[Doubt] = []
+    gaps: list[Diagnostic] = []
+    numbers = hashlib.sha256()
+    for part, trajectory in scan(files, joints, mapping):
+        parts.append(part)
+        pieces.append(np.diff(gap_ends(trajectory.t)).tolist())
+        rates.append(rate(trajectory))
+        found += doubts(trajectory, joints, joint_types)
+        gaps += told_gaps(trajectory)
+        for array in (trajectory.t, trajectory.q, trajectory.qd, trajectory.tau):
+            numbers.update(array.tobytes())
+    notes = [*gaps[:1], *tell(found, joints, len(parts))]
+    return _Known(parts, pieces, rates, notes, numbers.hexdigest())

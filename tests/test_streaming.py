@@ -1,0 +1,212 @@
+"""Logs larger than memory: the same samples and windows as in memory, drawn part by part, the same when resumed."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet
+import pytest
+import torch
+
+from spelgen.data import parts, stream
+from spelgen.data.logs import read_logs, write_logs
+from spelgen.data.parts import large_files, scan
+from spelgen.data.stream import Cutting, WindowStream
+from spelgen.data.trajectory import QUANTITIES, Trajectory
+from spelgen.errors import LogError
+from spelgen.log_mapping import LogMapping
+from spelgen.training.data import TrainingConfig, prepare_data
+from spelgen.training.streamed import prepare_streamed
+from spelgen.training.train import train
+
+STAND_IN = Path(__file__).with_name("stand_in.py")
+JOINTS = ("shoulder", "elbow")
+KINDS = ("revolute", "revolute")
+CONFIG = TrainingConfig(epochs=4, batch=32, momentum_steps=5, every=2, optimiser="adamw")
+
+
+def recordings(count=8, samples=400, rate=100.0) -> list[Trajectory]:
+    """Smooth motion at jittered times, one with a gap."""
+    random = np.random.default_rng(0)
+    found = []
+    for number in range(count):
+        t = np.cumsum((1 + 0.2 * random.uniform(-1, 1, samples)) / rate)
+        t[samples // 2 :] += 0.5 * (number == 3)
+        speed = random.uniform(2, 5, 2)
+        phase = t[:, None] * speed + random.uniform(0, 6, 2)
+        found.append(Trajectory(f"r{number}", t, np.sin(phase), speed * np.cos(phase), 3 * np.cos(phase)))
+    return found
+
+
+def same(first: Trajectory, second: Trajectory) -> bool:
+    return all(np.array_equal(getattr(first, x), getattr(second, x)) for x in ("t", *QUANTITIES))
+
+
+@pytest.fixture(params=[37, 1000, 10_000])
+def log(request, tmp_path, monkeypatch) -> Path:
+    """A file of row groups of this size that is read as one larger than memory."""
+    monkeypatch.setattr(parts, "IN_MEMORY", 1000)
+    write_logs(tmp_path / "log.parquet", recordings(), JOINTS)
+    table = pa.parquet.read_table(tmp_path / "log.parquet")
+    pa.parquet.write_table(table, tmp_path / "train.parquet", row_group_size=request.param)
+    (tmp_path / "log.parquet").unlink()
+    return tmp_path / "train.parquet"
+
+
+def test_parts_hold_the_samples_of_the_recordings(log):
+    found = list(scan([log], JOINTS, LogMapping()))
+    assert [part.name for part, _ in found] == [f"r{k}" for k in range(8)]
+    for expected, (part, scanned) in zip(read_logs([log], JOINTS), found, strict=True):
+        loaded = part.load()
+        assert same(scanned, expected) and same(loaded, expected)
+        assert (loaded.name, loaded.file, loaded.declares_units) == (part.name, log, True)
+
+
+def test_long_recordings_are_several_parts(log, monkeypatch):
+    monkeypatch.setattr(parts, "LONGEST", 150)
+    found = dict((part.name, part) for part, _ in scan([log], JOINTS, LogMapping()))
+    assert list(found)[:4] == ["r0 [1]", "r0 [2]", "r0 [3]", "r1 [1]"]
+    for whole in read_logs([log], JOINTS):
+        for number, rows in enumerate((slice(0, 150), slice(150, 300), slice(300, 400)), start=1):
+            assert same(found[f"{whole.name} [{number}]"].load(), whole[rows])
+
+
+def test_a_mapping_holds_for_parts_too(tmp_path):
+    clock = pa.array(1_700_000_000_000_000_000 + np.arange(300) * 10_000_000, pa.timestamp("ns"))
+    phase = np.arange(300) / 100
+    columns = {"clock": clock, "J_pos": np.rad2deg(np.sin(phase)), "J_torque": phase, "extra": phase}
+    pa.parquet.write_table(pa.table(columns), tmp_path / "x.parquet", row_group_size=64)
+    mapping = LogMapping.model_validate(
+        {
+            "columns": {"t": "clock", "q": "{joint}_pos", "tau": "{joint}_torque"},
+            "units": {"q": "deg"},
+            "velocity": "differentiated",
+            "joints": {"a": {"name": "J", "sign": -1}},
+        }
+    )
+    ((part, _),) = scan([tmp_path / "x.parquet"], ("a",), mapping)
+    (expected,) = read_logs([tmp_path / "x.parquet"], ("a",), mapping=mapping)
+    assert same(part.load(), expected)
+    np.testing.assert_allclose(expected.q[:, 0], -np.sin(phase), rtol=1e-12)
+
+
+def streamed(log, cutting, **changed) -> WindowStream:
+    found = [part for part, _ in scan([log], JOINTS, LogMapping())]
+    counts = tuple(len(cutting.windows([part.load()])) for part in found)
+    return WindowStream(tuple(found), counts, cutting, seed=0)
+
+
+@pytest.mark.parametrize("cutoff", [None, 8.0])
+def test_a_pass_over_all_shares_gives_every_window_once(log, monkeypatch, cutoff):
+    monkeypatch.setattr(stream, "SHARE", 900)
+    cutting = Cutting(window=5, stride=3, every=2, cutoff=cutoff)
+    expected = cutting.windows(read_logs([log], JOINTS))
+    found = streamed(log, cutting)
+    assert (len(found), found.shares) == (len(expected), -(-len(expected) // 900))
+    for turn in range(2):
+        shares = [found.share(turn * found.shares + k) for k in range(found.shares)]
+        drawn = torch.cat([share.q for share in shares])
+        order, expected_order = drawn[:, 0, 0].argsort(), expected.q[:, 0, 0].argsort()
+        for name in ("dt", "q", "qd", "tau"):
+            values = torch.cat([getattr(share, name) for share in shares])
+            assert torch.equal(values[order], getattr(expected, name)[expected_order])
+    first = [found.share(k).q[0, 0, 0].item() for k in range(2 * found.shares)]
+    assert first[: found.shares] != first[found.shares :]
+    assert torch.equal(found.share(3).q, streamed(log, cutting).share(3).q)
+
+
+def test_preparation_finds_what_it_finds_in_memory(log):
+    config = replace(CONFIG, every=None)
+    plain = prepare_data([log], JOINTS, KINDS, config)
+    found = prepare_streamed([log], JOINTS, KINDS, config)
+    assert (found.cutoff, found.digest) == (plain.cutoff, plain.digest)
+    assert len(found.validation_names) == len(plain.validation_names)
+    assert found.training.dt.mean().item() == pytest.approx(plain.training.dt.mean().item(), rel=0.01)
+    assert set(found.training_names) | set(found.validation_names) == {f"r{k}" for k in range(8)}
+    assert set(found.training_names).isdisjoint(found.validation_names)
+    codes = {each.code for each in found.diagnostics}
+    assert codes == {"gap", "filter", "streamed"}
+    starts = {round(x, 12) for x in found.validation.q[:, 0, 0].tolist()}
+    for number in range(found.stream.shares):
+        assert starts.isdisjoint(round(x, 12) for x in found.stream.share(number).q[:, 0, 0].tolist())
+
+
+def lines(run: Path) -> list[dict]:
+    records = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    return [{key: value for key, value in record.items() if key != "seconds"} for record in records]
+
+
+@pytest.mark.parametrize("log", [1000], indirect=True)
+def test_training_streams_and_resumes_with_the_same_numbers(log, tmp_path, monkeypatch):
+    monkeypatch.setattr(stream, "SHARE", 400)
+    drawn, share = [], WindowStream.share
+
+    def drawing(self, number):
+        drawn.append(number)
+        if len(drawn) == 7:  # in the third epoch of the second run
+            raise KeyboardInterrupt
+        return share(self, number)
+
+    monkeypatch.setattr(WindowStream, "share", drawing)
+    whole = train(STAND_IN, [log], tmp_path / "whole", CONFIG, progress=False)
+    half = train(STAND_IN, [log], tmp_path / "half", CONFIG, progress=False)
+    assert (whole.status, half.status, half.epochs) == ("finished", "interrupted", 2)
+    train(STAND_IN, [log], tmp_path / "half", CONFIG, resume=True, progress=False)
+    assert drawn == [0, 1, 2, 3, 0, 1, 2, 2, 3]
+    assert lines(tmp_path / "half") == lines(tmp_path / "whole")
+    assert json.loads((tmp_path / "whole" / "config.json").read_text())["training_windows"] > 4 * 400
+
+
+def test_only_large_parquet_is_streamed(log, tmp_path, monkeypatch):
+    assert large_files([log], JOINTS) == [log]
+    (tmp_path / "more.csv").write_text("t\n0\n")
+    with pytest.raises(
+        LogError, match=r"more\.csv: got a log beside others too large for memory, expected Parq"
+    ):
+        large_files([log, tmp_path / "more.csv"], JOINTS)
+    monkeypatch.setattr(parts, "IN_MEMORY", 10**6)
+    assert large_files([log, tmp_path / "more.csv"], JOINTS) == []
+
+
+def broken(log: Path, row: int, column: str, value: float) -> Path:
+    table = pa.parquet.read_table(log)
+    values = table[column].to_numpy().copy()
+    values[row] = value
+    index = table.column_names.index(column)
+    pa.parquet.write_table(table.set_column(index, column, pa.array(values)), log, row_group_size=64)
+    return log
+
+
+BROKEN = {
+    "hole": (1234, "qd_elbow", np.nan, r"train\.parquet: row 1235, column qd_elbow: got no finite number"),
+    "back": (450, "t", 0.0, r"train\.parquet: row 451, column t: got t = 0 s after 0\.5"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_errors_tell_the_row_of_the_file(log, monkeypatch, case):
+    row, column, value, message = BROKEN[case]
+    monkeypatch.setattr(
+        parts, "LONGEST", 50
+    )  # row 450 begins a part: its time is compared with the last one's
+    with pytest.raises(LogError, match=message):
+        list(scan([broken(log, row, column, value)], JOINTS, LogMapping()))
+
+
+def test_the_rows_of_a_recording_must_lie_together(log):
+    table = pa.parquet.read_table(log)
+    mixed = pa.concat_tables([table[:100], table[400:500], table[100:200]])
+    pa.parquet.write_table(mixed, log)
+    with pytest.raises(LogError) as caught:
+        list(scan([log], JOINTS, LogMapping()))
+    assert str(caught.value) == (
+        f"{log}: row 201, column trajectory: got trajectory r0 once more, after others, "
+        "expected its rows together, in a log too large for memory; sort the rows"
+    )
+
+
+def test_two_parts_are_needed(log):
+    with pytest.raises(LogError, match="no two parts with 799 samples without a gap"):
+        prepare_streamed([log], JOINTS, KINDS, replace(CONFIG, window=400))
