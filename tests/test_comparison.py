@@ -16,8 +16,10 @@ from spelgen.comparison.paper import PAPER
 from spelgen.comparison.study import VARIANTS, prepare_study, run_study, time_steps
 from spelgen.comparison.tables import comparison_tables
 from spelgen.comparison.truth import example_positions, mass_error, true_mass
-from spelgen.data.logs import read_logs
+from spelgen.data.logs import Trajectory, read_logs
 from spelgen.errors import RunError
+from spelgen.evaluation.examples import predict_examples
+from spelgen.training.rivals import held_velocity
 from spelgen.training.runs import load_model
 from spelgen.urdf.read import read_urdf
 
@@ -155,6 +157,19 @@ def test_a_run_that_is_not_finite_counts_as_worst(study):
     broken = result | {"seed": 1, "prediction": {"loss": None, "position": None, "velocity": None}}
     table = comparison_tables("other", [result, broken, broken], {"minimal": 1.0})[1]
     assert {row.label: row.cells[0].text for row in table.rows}["prediction loss, 1 s"] == "-"
+
+
+def test_windows_and_examples_of_every_fourth_sample_begin_with_a_fourth_one():
+    """Where a controller holds its torque for four samples, a window's input is then exactly what acted."""
+    count = 200
+    q = torch.arange(count, dtype=torch.float64).unsqueeze(-1).numpy()  # a sample's number
+    log = Trajectory("a", 0.002 * q[:, 0], q, q, np.floor(q / 4))
+    windows = measures.thinned([log], 5, 4)
+    assert not (windows.q % 4).any()
+    assert torch.equal(windows.tau, windows.q[:, :-1] / 4)
+    (example,) = predict_examples(held_velocity(), [log], 10, ["joint1"], every=4, measured=False)
+    assert [x % 4 for x in example.joints[0].q_true] == [0] * 11
+    np.testing.assert_allclose(example.t, 0.008 * np.arange(11), atol=1e-12)
 
 
 def test_laws_notice_what_breaks_them(study, quick):
