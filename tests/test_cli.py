@@ -16,7 +16,7 @@ from spelgen import __version__
 from spelgen.cli.main import app
 
 ROOT = Path(__file__).parents[1]
-COMMANDS = ["inspect", "build", "simulate", "logs", "train", "evaluate", "report", "check"]
+COMMANDS = ["inspect", "build", "simulate", "excite", "logs", "train", "evaluate", "report", "check"]
 
 
 @pytest.fixture

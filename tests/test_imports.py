@@ -9,7 +9,7 @@ PACKAGE = Path(__file__).parents[1] / "spelgen"
 
 # A file may import only from files above it, or to its left.
 ROWS = """
-errors files labels rendering yaml_document setting_values log_mapping settings spec
+errors files labels listing rendering yaml_document setting_values log_mapping settings spec
 urdf: robot xacro_child xacro_input document values elements lint read actuation
 arm: rational snapping placement chain walk arm
 structure: recursion field sampling spans basis expansion symbolic structure nominal waves minimal pseudo_inertia
@@ -17,6 +17,7 @@ emission: bodies plan emit
 data: trajectory bags tables logs doubts signals windows parts stream
 simulation: engine simulate tracking protocols
 identification: samples friction regressor base least_squares prior identify told
+excitation: fourier design told
 training: runs lie_group rollout compiled rivals prior progress data streamed loop train
 evaluation: tip torque examples evaluate
 report: charts plots tables picture learned page

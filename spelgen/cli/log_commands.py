@@ -1,4 +1,4 @@
-"""Commands about logs alone: `logs`."""
+"""Commands about logs alone: `excite`, which motion to log, and `logs`, what was logged."""
 
 from __future__ import annotations
 
@@ -9,9 +9,58 @@ from typing import Annotated, Literal
 import typer
 
 from spelgen.cli import options
-from spelgen.cli.console import FAILED, note, say
-from spelgen.cli.options import Joints, Mapping, SnapTolerance, Tip
+from spelgen.cli.console import FAILED, counted, note, say
+from spelgen.cli.options import Force, Joints, Mapping, Robot, SnapTolerance, Tip
 from spelgen.files import write_text
+
+HARMONICS_PER_SECOND = 0.4  # up to 0.4 Hz: what an arm follows well, far below its drives' ripple
+
+
+def excite(
+    robot: Robot,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE.csv", help="The motion.")],
+    joints: Joints = None,
+    tip: Tip = None,
+    snap_tol: SnapTolerance = 2e-3,
+    duration: Annotated[float, typer.Option("--duration", min=2.0, max=600.0, help="In seconds.")] = 30.0,
+    rate: Annotated[float, typer.Option("--rate", min=1.0, max=10000.0, help="Samples a second.")] = 100.0,
+    harmonics: Annotated[
+        int | None, typer.Option("--harmonics", min=2, max=100, help="Default: 0.4 a second, at least 5.")
+    ] = None,
+    reach: Annotated[
+        float, typer.Option("--reach", min=0.05, max=1.0, help="Part of the joints' ranges that is used.")
+    ] = 0.9,
+    speed: Annotated[
+        float, typer.Option("--speed", min=0.05, max=1.0, help="Part of the velocity limits that is used.")
+    ] = 0.7,
+    trials: Annotated[int, typer.Option("--trials", min=1, help="Motions looked at.")] = 1000,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the search.")] = 0,
+    force: Force = False,
+) -> None:
+    """Propose a motion that shows an arm's inertial parameters and friction.
+
+    Collisions are not checked.
+    """
+    from spelgen import pipeline
+    from spelgen.excitation.design import design
+    from spelgen.excitation.told import csv_text, text
+
+    options.require_free(output, force=force)
+    arm = pipeline.load(robot, options.names(joints), tip, snap_tol).arm
+    with counted("searching") as progress:
+        found = design(
+            arm,
+            duration=duration,
+            rate=rate,
+            harmonics=harmonics or max(5, round(HARMONICS_PER_SECOND * duration)),
+            reach=reach,
+            speed=speed,
+            trials=trials,
+            seed=seed,
+            progress=progress,
+        )
+    say(text(found, arm))
+    say(f"wrote {write_text(output, csv_text(found.motion, arm))}")
 
 
 def logs(

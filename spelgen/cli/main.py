@@ -27,6 +27,7 @@ for command in (
     model_commands.build,
     run_commands.simulate,
     identify_command.identify,
+    log_commands.excite,
     log_commands.logs,
     run_commands.train,
     run_commands.evaluate,

@@ -3,39 +3,13 @@
 from __future__ import annotations
 
 import textwrap
-from dataclasses import dataclass
 
 from spelgen.errors import Diagnostic
+from spelgen.listing import WIDTH, Listing
 from spelgen.report.tables import number
 from spelgen.survey.survey import SEEN, JointSurvey, Survey
 
-WIDTH = 80
 MOST = 20  # trajectories that a terminal shows
-LEAST = 8  # characters of a name are always shown
-
-
-@dataclass(frozen=True)
-class Listing:
-    """A table with a name in the first column and text aligned to the right in all others."""
-
-    title: str
-    head: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    note: str = ""
-
-    def text(self) -> str:
-        """For a terminal."""
-        lines = [self.head, *self.rows]
-        widths = [max(len(line[k]) for line in lines) for k in range(len(self.head))]
-        widths[0] = min(widths[0], max(LEAST, WIDTH - 2 - sum(2 + width for width in widths[1:])))
-        lines = [(_shortened(line[0], widths[0]), *line[1:]) for line in lines]
-        laid = [
-            f"  {line[0]:<{widths[0]}}"
-            + "".join(f"  {x:>{w}}" for x, w in zip(line[1:], widths[1:], strict=True))
-            for line in lines
-        ]
-        told = textwrap.wrap(self.note, WIDTH - 2, initial_indent="  ", subsequent_indent="  ")
-        return "\n".join([self.title, *(line.rstrip() for line in laid), *told])
 
 
 def text(found: Survey) -> str:
@@ -130,10 +104,6 @@ def _physics(found: Survey) -> Listing:
 
 def _share(joint: JointSurvey) -> str:
     return "never loaded" if joint.gravity.explained is None else f"{joint.gravity.explained:.0%}"
-
-
-def _shortened(name: str, width: int) -> str:
-    return name if len(name) <= width else f"{name[: width - 3]}..."
 
 
 def _told(finding: Diagnostic) -> str:

@@ -1,0 +1,127 @@
+"""`spelgen excite`: motions within limits, at rest at both ends, that show what a motion at random does not."""
+
+import csv
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from spelgen.cli.main import app
+from spelgen.excitation.design import design
+from spelgen.excitation.fourier import Series, bounds
+from spelgen.pipeline import load
+
+CHOICE = {"duration": 10.0, "rate": 100.0, "harmonics": 5, "reach": 0.8, "speed": 0.6}
+
+
+@pytest.fixture(scope="module")
+def arm(robots):
+    return load(robots / "ur10e.urdf").arm
+
+
+@pytest.fixture(scope="module")
+def found(arm):
+    return design(arm, **CHOICE, trials=300)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_every_series_keeps_limits_and_is_at_rest_at_both_ends(arm, seed):
+    series = Series(7.0, 6, bounds(arm, 0.9, 0.5))
+    numbers = 3 * np.random.default_rng(seed).standard_normal(series.size)
+    motion = series.motion(numbers, np.linspace(0, 7, 5001))
+    for k, coordinate in enumerate(arm.coordinates):
+        assert 0.9 * coordinate.lower <= motion.q[:, k].min()
+        assert motion.q[:, k].max() <= 0.9 * coordinate.upper
+        assert np.abs(motion.qd[:, k]).max() <= 0.5 * coordinate.velocity
+    for ends in (motion.qd[[0, -1]], motion.qdd[[0, -1]], motion.q[0] - motion.q[-1]):
+        np.testing.assert_allclose(ends, 0, atol=1e-12)
+
+
+def test_the_amplitude_is_the_largest_that_fits(arm):
+    limits = bounds(arm, 0.9, 0.5)
+    series = Series(7.0, 6, limits)
+    numbers = np.random.default_rng(0).standard_normal((6, 14))
+    numbers[:, -1] = 0
+    motion = series.motion(numbers.ravel(), np.linspace(0, 7, 5001))
+    used = np.ptp(motion.q, axis=0) / (limits.high - limits.low)
+    np.testing.assert_allclose(np.maximum(used, np.abs(motion.qd).max(axis=0) / limits.speed), 1, atol=4e-3)
+
+
+def test_velocities_and_accelerations_are_derivatives(found):
+    motion = found.motion
+    middle = slice(1, -1)
+    np.testing.assert_allclose(np.gradient(motion.q, motion.t, axis=0)[middle], motion.qd[middle], atol=2e-3)
+    np.testing.assert_allclose(
+        np.gradient(motion.qd, motion.t, axis=0)[middle], motion.qdd[middle], atol=2e-2
+    )
+
+
+def test_the_motion_is_worth_the_search(arm, found):
+    assert found.condition < found.first / 3
+    assert (
+        found.parameters == 36 + 6 * 4 - 2
+    )  # rigid bodies, friction and rotors; what these share counts once
+    assert (found.efforts < 1).all()
+    assert design(arm, **CHOICE, trials=1).first == found.first
+
+
+def test_the_condition_number_is_that_of_the_regressor(arm, found):
+    """By Pinocchio's regressor: no column of friction or rotor, rigid bodies alone, by numerical rank."""
+    pin = pytest.importorskip("pinocchio")
+    from spelgen.settings import Settings
+    from spelgen.simulation.engine import pinocchio_model
+
+    model = pinocchio_model(arm, Settings())
+    data = model.createData()
+    motion = found.motion
+    rows = [
+        pin.computeJointTorqueRegressor(model, data, *state).copy()
+        for state in zip(motion.q[::10], motion.qd[::10], motion.qdd[::10], strict=True)
+    ]
+    values = np.linalg.svd(np.concatenate(rows), compute_uv=False)
+    assert values[35] / values[0] > 1e-3 > 1e-9 > values[36] / values[0]  # all 36 base parameters show
+
+
+def test_the_same_arguments_give_the_same_motion(arm, found):
+    again = design(arm, **CHOICE, trials=300)
+    np.testing.assert_array_equal(again.motion.q, found.motion.q)
+    other = design(arm, **CHOICE, trials=300, seed=1)
+    assert not np.allclose(other.motion.q, found.motion.q)
+
+
+def test_effort_limits_are_kept_where_they_can_be(robots):
+    weak = load(robots / "rpr.urdf").arm
+    choice = CHOICE | {"harmonics": 3}
+    assert (design(weak, **choice, trials=1).efforts > 1).any()
+    assert (design(weak, **choice, trials=1500).efforts < 1).all()
+
+
+def test_an_arm_without_limits_gets_modest_ones(tmp_path):
+    text = """<robot name="r"><link name="a"/><link name="b"><inertial><mass value="1"/>
+      <origin xyz="0.1 0 0"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+      <joint name="turn" type="continuous"><parent link="a"/><child link="b"/><axis xyz="0 1 0"/></joint></robot>"""
+    (tmp_path / "one.urdf").write_text(text)
+    one = design(load(tmp_path / "one.urdf").arm, **CHOICE, trials=50)
+    assert 0.3 < np.abs(one.motion.qd).max() <= 0.6
+    assert np.abs(one.motion.q).max() <= 0.8 * np.pi
+    assert np.isnan(one.efforts).all()
+
+
+def test_the_command(robots, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    command = ["excite", str(robots / "two_link.urdf"), "--duration", "5", "--trials", "60", "-o", "x.csv"]
+    shown = CliRunner().invoke(app, command)
+    assert shown.exit_code == 0, shown.stderr
+    assert max(map(len, shown.stdout.splitlines())) <= 80
+    assert "of the first motion at random" in shown.stdout
+    with open("x.csv", newline="") as file:
+        head, *rows = csv.reader(file)
+    assert head == ["t", "q_joint1", "q_joint2", "qd_joint1", "qd_joint2", "qdd_joint1", "qdd_joint2"]
+    values = np.array(rows, dtype=float)
+    assert (len(values), values[-1, 0]) == (501, 5.0)
+    assert not values[[0, -1], 3:].any()
+    first = (tmp_path / "x.csv").read_bytes()
+    refused = CliRunner().invoke(app, command)
+    assert (refused.exit_code, "--force" in refused.stderr) == (1, True)
+    assert CliRunner().invoke(app, [*command, "--force"]).exit_code == 0
+    assert (tmp_path / "x.csv").read_bytes() == first
