@@ -121,6 +121,8 @@ class TrainingSettings(Group):
     patience: epochs without a better validation loss before stopping.
     momentum_steps: steps on the weak form (see `momentum_loss`) before windows are predicted.
     prior: weight of staying near the URDF's own M and gravity (see `Prior`); 0: none.
+    optimiser: AdamW on batches or L-BFGS on all windows at once; None: L-BFGS where these are few.
+    weight_decay: of AdamW, or the weight of L-BFGS's penalty; None: what suits the optimiser.
     substeps: integrator steps per sample interval; None: as many as the robot needs.
     validation_fraction: part of the training trajectories held out to watch the validation loss.
     """
@@ -134,7 +136,8 @@ class TrainingSettings(Group):
     epochs: Count = 400
     batch: Count = 256
     learning_rate: Positive = 1e-3
-    weight_decay: NonNegative = 0.2
+    weight_decay: NonNegative | None = None
+    optimiser: Literal["adamw", "lbfgs"] | None = None
     substeps: Count | None = None
     validation_fraction: Annotated[Number, Field(gt=0, lt=1)] = 0.25
     patience: Count = 60

@@ -80,7 +80,7 @@ def test_settings_do_not_change(urdf):
             "training:\n  x: 1",
             "arm.yaml:2: training: unknown key 'x'; known are 'objective', 'momentum_steps', 'prior', 'window', "
             "'stride', 'every', 'epochs', "
-            "'batch', 'learning_rate', 'weight_decay' and 4 more",
+            "'batch', 'learning_rate', 'weight_decay' and 5 more",
         ),
         (
             "joints:\n  a: {viscous: -1}",

@@ -21,6 +21,7 @@ from spelgen.errors import LogError, ModuleError, RunError
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.log_mapping import LogMapping
 from spelgen.training.data import TrainingConfig, prepare_data
+from spelgen.training.descent import WholeSet
 from spelgen.training.loop import TrainingLoop
 from spelgen.training.progress import TrainingProgress
 from spelgen.training.rollout import (
@@ -253,7 +254,7 @@ def test_numbers_that_blow_up_are_rolled_back_at_half_the_rate(logs, tmp_path, m
         return loss * math.nan if sum(calls) == 25 and calls[-1] else loss
 
     monkeypatch.setattr("spelgen.training.loop.rollout_loss", blown_up_once)
-    result = train(STAND_IN, [logs], tmp_path / "run", QUICK, progress=False)
+    result = train(STAND_IN, [logs], tmp_path / "run", replace(QUICK, optimiser="adamw"), progress=False)
     records = lines(tmp_path / "run")
     assert result.status == "finished"
     assert [record["rollbacks"] for record in records] == [0, 1, 1, 1, 1, 1]
@@ -261,14 +262,15 @@ def test_numbers_that_blow_up_are_rolled_back_at_half_the_rate(logs, tmp_path, m
     assert all(math.isfinite(record["loss"]) for record in records)
 
 
-def test_numbers_that_never_recover_end_the_run(logs, tmp_path, monkeypatch):
+@pytest.mark.parametrize("optimiser", ["adamw", "lbfgs"])
+def test_numbers_that_never_recover_end_the_run(logs, tmp_path, monkeypatch, optimiser):
     def blown_up(model, windows, scales, substeps):
         loss = rollout_loss(model, windows, scales, substeps)
         return loss * math.nan if torch.is_grad_enabled() else loss
 
     monkeypatch.setattr("spelgen.training.loop.rollout_loss", blown_up)
     with pytest.raises(RunError) as caught:
-        train(STAND_IN, [logs], tmp_path / "run", QUICK, progress=False)
+        train(STAND_IN, [logs], tmp_path / "run", replace(QUICK, optimiser=optimiser), progress=False)
     assert str(caught.value) == (
         f"{tmp_path}/run: losses that are not finite, after 8 attempts at half the learning rate each; "
         "check units and signs of the logs; the best model so far is kept in model.pt"
@@ -308,7 +310,7 @@ def test_mapped_logs_train_as_plain_ones_do(logs, tmp_path):
 
 
 def test_early_stop_and_time_limit(logs, tmp_path):
-    stuck = replace(QUICK, learning_rate=1e-30, patience=2, momentum_steps=0)
+    stuck = replace(QUICK, optimiser="adamw", learning_rate=1e-30, patience=2, momentum_steps=0)
     result = train(STAND_IN, [logs], tmp_path / "stuck", stuck, progress=False)
     assert (result.status, result.epochs) == ("stopped early", 2)
     for momentum_steps, epochs in ((0, 1), (1000, 0)):
@@ -320,6 +322,7 @@ def test_early_stop_and_time_limit(logs, tmp_path):
 CHILD = """
 import sys
 from spelgen.training.train import train
+from spelgen.training.descent import WholeSet
 from spelgen.training.data import TrainingConfig
 config = TrainingConfig(epochs=100000, batch=32, patience=100000, momentum_steps=0)
 result = train(sys.argv[1], [sys.argv[2]], sys.argv[3], config)
@@ -452,3 +455,35 @@ def test_the_learning_rate_rises_and_falls(logs, tmp_path):
     assert max(rates) == pytest.approx(QUICK.learning_rate, rel=0.01)
     assert peak < 0.05 * len(rates)
     assert rates[-1] == pytest.approx(0.01 * QUICK.learning_rate, rel=0.1)
+
+
+def test_few_windows_are_taken_all_at_once(logs, tmp_path):
+    """L-BFGS comes nearer in as many steps, and a weight decay of its own is what it gets."""
+    config = replace(QUICK, momentum_steps=0)
+    assert config.whole(100)
+    assert not config.whole(5000)
+    assert config.decay(100) != config.decay(5000)
+    assert replace(config, weight_decay=0.5).decay(100) == 0.5
+    losses = {}
+    for optimiser in ("adamw", "lbfgs"):
+        train(STAND_IN, [logs], tmp_path / optimiser, replace(config, optimiser=optimiser), progress=False)
+        losses[optimiser] = lines(tmp_path / optimiser)[-1]["best"]
+    assert losses["lbfgs"] < 0.5 * losses["adamw"]
+
+
+def test_the_line_search_turns_back_from_numbers_that_blow_up():
+    """A loss that ends at x = 2, of which the first step would reach 4."""
+    model = torch.nn.Module()
+    model.x = torch.nn.Parameter(torch.tensor([0.0], dtype=torch.float64))
+    tried = []
+
+    def loss(_):
+        tried.append(model.x.item())
+        value = (model.x - 1.9).square().sum()
+        return value if model.x.item() < 2 else value * math.nan
+
+    whole = WholeSet(model, 0.0)
+    group = whole._optimiser.param_groups[0]
+    group["lr"] = 4.0
+    assert whole.descend(loss, None, 30, lambda _: 1.0) < 1e-12
+    assert max(tried) >= 2

@@ -108,7 +108,7 @@ def train(
     learning_rate: Annotated[
         float | None, typer.Option("--learning-rate", min=0.0, help="At its largest.")
     ] = None,
-    weight_decay: Annotated[float | None, typer.Option("--weight-decay", min=0.0, help="Of AdamW.")] = None,
+    weight_decay: Annotated[float | None, typer.Option("--weight-decay", min=0.0, help="Of AdamW; or of the penalty of L-BFGS.")] = None,
     prior: Annotated[
         float | None,
         typer.Option("--prior", min=0.0, help="Pull towards the URDF's own M and gravity; 0: none."),

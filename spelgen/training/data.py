@@ -19,6 +19,10 @@ from spelgen.log_mapping import LogMapping
 from spelgen.settings import TrainingSettings
 from spelgen.training.rollout import LossScales, loss_scales
 
+FEW_WINDOWS = 1024  # of which L-BFGS takes all at once
+WHOLE_DECAY, BATCH_DECAY = 2e-4, 0.2
+Optimiser = Literal["adamw", "lbfgs"]
+
 LARGEST_VALIDATION = 2048  # windows; validation is a measurement, it needs no more
 
 
@@ -29,6 +33,7 @@ class TrainingConfig:
     momentum_steps: steps on the weak form of the equations before windows are predicted; 0: none.
     prior: weight of staying near the URDF's own M and gravity (see `Prior`); 0: none.
     every: samples from one sample of a window to the next, None: see `automatic_spacing`.
+    optimiser: None: by the number of windows. weight_decay: AdamW's, or L-BFGS's penalty; None: by the optimiser.
     substeps: rk4 steps per sample interval, None: chosen by `choose_substeps`.
     filter: cutoff [Hz] of the zero-phase low-pass on q, qd and tau; 0: none; None: see `automatic_cutoff`.
     threads: of torch; the matrices are tiny, more than two rarely help. compile: the right-hand side by torch.
@@ -44,7 +49,8 @@ class TrainingConfig:
     epochs: int = 400
     batch: int = 256
     learning_rate: float = 1e-3
-    weight_decay: float = 0.2
+    weight_decay: float | None = None
+    optimiser: Optimiser | None = None
     substeps: int | None = None
     validation_fraction: float = 0.25
     patience: int = 60
@@ -54,6 +60,16 @@ class TrainingConfig:
     threads: int = 1
     compile: bool = False
     max_minutes: float | None = None
+
+    def whole(self, windows: int) -> bool:
+        """Whether so many windows are trained on all at once."""
+        return self.optimiser == "lbfgs" or (self.optimiser is None and windows <= FEW_WINDOWS)
+
+    def decay(self, windows: int) -> float:
+        """Weight decay for so many windows."""
+        if self.weight_decay is not None:
+            return self.weight_decay
+        return WHOLE_DECAY if self.whole(windows) else BATCH_DECAY
 
     @classmethod
     def from_settings(cls, settings: TrainingSettings, **flags: Any) -> TrainingConfig:

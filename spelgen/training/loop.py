@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import math
 import time
 from typing import TYPE_CHECKING, Any, Literal
@@ -12,6 +13,7 @@ import torch
 from spelgen.data.windows import Windows
 from spelgen.errors import RunError
 from spelgen.training.data import TrainingConfig, TrainingData
+from spelgen.training.descent import Batches, Descent, WholeSet
 from spelgen.training.prior import Prior
 from spelgen.training.progress import TrainingProgress
 from spelgen.training.rollout import (
@@ -26,10 +28,8 @@ from spelgen.training.runs import RunFolder, write_state
 if TYPE_CHECKING:
     from spelgen.training.runs import EmittedModel
 
-VECTOR_FACTOR = 5.0  # on the learning rate of constants and biases
 MOMENTUM_SHARE = 0.5  # of the allowed time, what the momentum steps may take
 MOMENTUM_FACTOR = 10.0  # on the learning rate of the momentum steps, which are cheap and noisy
-GRADIENT_NORM = 1.0  # of the scaled loss; larger gradients are shortened to it
 WARM_UP = 0.02  # part of all steps over which the learning rate rises
 FINAL_RATE = 0.01  # the cosine ends at this part of the learning rate
 EPOCH_STEPS = 20  # at least; few windows are passed over several times between validations
@@ -63,11 +63,11 @@ class TrainingLoop:
         self.training, self.validation = data.training.to(config.device), data.validation.to(config.device)
         self.scales = data.scales.to(config.device)
         self.prior = prior
-        self.optimiser = self._optimiser()
         self.generator = torch.Generator().manual_seed(config.seed)
         self.batch = min(config.batch, len(self.training))
-        self.stream = data.stream
+        self.stream, self.size = data.stream, data.size
         windows = len(self.training) if self.stream is None else len(self.stream) // self.stream.shares
+        self.descent = self._descent(self.generator)
         self.epoch_steps = max(EPOCH_STEPS, -(-windows // self.batch))
         self.probe = self.training[:: -(-len(self.training) // PROBE)]
         self.epoch = self.step = self.best_epoch = self.rollbacks = 0
@@ -98,21 +98,12 @@ class TrainingLoop:
         self.best_loss = self._validate()
         self.best_weights = copy.deepcopy(self.model.state_dict())
 
-    def _optimiser(self) -> torch.optim.AdamW:
-        """AdamW; single numbers (constants, viscous friction) learn faster than weights and do not decay."""
-        groups: dict[bool, list[torch.nn.Parameter]] = {True: [], False: []}
-        for parameter in self.model.parameters():
-            groups[parameter.dim() > 1].append(parameter)
-        return torch.optim.AdamW(
-            [
-                {"params": groups[True], "weight_decay": self.config.weight_decay, "factor": 1.0},
-                {"params": groups[False], "weight_decay": 0.0, "factor": VECTOR_FACTOR},
-            ]
-        )
-
-    def _set_rate(self, optimiser: torch.optim.AdamW, rate: float) -> None:
-        for group in optimiser.param_groups:
-            group["lr"] = rate * group["factor"]
+    def _descent(self, generator: torch.Generator) -> Descent:
+        """From the present weights; ``generator`` orders batches."""
+        decay = self.config.decay(self.size)
+        if self.config.whole(self.size):
+            return WholeSet(self.model, decay)
+        return Batches(self.model, self.batch, decay, generator)
 
     def _warm_up(self, progress: TrainingProgress) -> None:
         """Momentum first: the weak form needs no ODE solve and brings the model near before windows are
@@ -122,22 +113,17 @@ class TrainingLoop:
         resumption.
         """
         before = copy.deepcopy(self.model.state_dict()), self.best_loss
-        generator = torch.Generator().manual_seed(self.config.seed)
-        optimiser, steps = self._optimiser(), self.config.momentum_steps
-        since = time.monotonic()
-        for step in range(steps):
-            part = max(step / steps, self._spent(time.monotonic() - since) / MOMENTUM_SHARE)
-            if part >= 1.0:
+        descent = self._descent(torch.Generator().manual_seed(self.config.seed))
+        since, steps = time.monotonic(), self.config.momentum_steps
+        for done in range(0, steps, EPOCH_STEPS):
+            spent = self._spent(time.monotonic() - since) / MOMENTUM_SHARE
+            if spent >= 1.0:
                 break
-            self._set_rate(optimiser, MOMENTUM_FACTOR * self.config.learning_rate * _schedule(part))
-            rows = torch.randint(len(self.training), (self.batch,), generator=generator)
-            optimiser.zero_grad()
-            loss = momentum_loss(self.model, self.training[rows.to(self.config.device)], self.scales)
-            (loss + self._pull()).backward()
-            norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), GRADIENT_NORM)
-            if torch.isfinite(norm):
-                optimiser.step()
-            progress.warm_up(step + 1, steps, loss)
+            rate = functools.partial(self._warm_rate, done, spent)
+            loss = descent.descend(self._momentum_loss, self.training, min(EPOCH_STEPS, steps - done), rate)
+            if not math.isfinite(loss):
+                break
+            progress.warm_up(min(done + EPOCH_STEPS, steps), steps, loss)
         self._measure()
         if not self.best_loss < before[1]:
             self.model.load_state_dict(before[0])
@@ -145,6 +131,16 @@ class TrainingLoop:
         self.warm = True
         self.seconds += time.monotonic() - since
         self.save()
+
+    def _warm_rate(self, done: int, spent: float, step: int) -> float:
+        part = max((done + step) / self.config.momentum_steps, spent)
+        return MOMENTUM_FACTOR * self.config.learning_rate * _schedule(part)
+
+    def _momentum_loss(self, windows: Windows) -> torch.Tensor:
+        return momentum_loss(self.model, windows, self.scales) + self._pull()
+
+    def _rollout_loss(self, windows: Windows) -> torch.Tensor:
+        return rollout_loss(self.stepped, windows, self.scales, self.substeps) + self._pull()
 
     def _end(self) -> Status | None:
         if self.epoch >= self.config.epochs:
@@ -160,7 +156,7 @@ class TrainingLoop:
     def _run_epoch(self) -> dict[str, Any]:
         """One epoch with finite losses, after as many attempts at a lower learning rate as that takes."""
         while True:
-            before = copy.deepcopy((self.model.state_dict(), self.optimiser.state_dict(), self.step))
+            before = copy.deepcopy((self.model.state_dict(), self.descent.state_dict(), self.step))
             loss = self._train_epoch()
             validation = self._validate() if math.isfinite(loss) else math.nan
             if math.isfinite(validation):
@@ -186,38 +182,18 @@ class TrainingLoop:
         windows = self.training
         if self.stream is not None:
             windows = self.stream.share(self.epoch).to(self.config.device)
-        rows, size = self.epoch_steps * self.batch, len(windows)
-        passes = [torch.randperm(size, generator=self.generator) for _ in range(-(-rows // size))]
-        total = 0.0
-        for batch in torch.cat(passes)[:rows].split(self.batch):
-            loss = self._train_step(windows[batch.to(self.config.device)])
-            if not math.isfinite(loss):
-                return math.nan
-            total += loss
-        return total / self.epoch_steps
-
-    def _train_step(self, windows: Windows) -> float:
-        self._set_rate(self.optimiser, self._rate())
-        self.optimiser.zero_grad()
-        try:
-            loss = rollout_loss(self.stepped, windows, self.scales, self.substeps)
-        except torch.linalg.LinAlgError:  # numbers blew up within the rollout
-            return math.nan
-        (loss + self._pull()).backward()
-        norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), GRADIENT_NORM)
-        if not torch.isfinite(norm):
-            return math.nan
-        self.optimiser.step()
-        self.step += 1
-        return loss.item()
+        loss = self.descent.descend(self._rollout_loss, windows, self.epoch_steps, self._rate)
+        self.step += self.epoch_steps
+        return loss
 
     def _pull(self) -> torch.Tensor | float:
         """What straying from the URDF costs."""
         return 0.0 if self.prior is None else self.config.prior * self.prior.loss(self.model)
 
-    def _rate(self) -> float:
-        """Learning rate of the next step, over all steps or minutes, whichever end sooner."""
-        part = max(self.step / (self.config.epochs * self.epoch_steps), self._spent(self.seconds))
+    def _rate(self, ahead: int = 0) -> float:
+        """Learning rate so many steps ahead, over all steps or minutes, whichever end sooner."""
+        steps = self.config.epochs * self.epoch_steps
+        part = max((self.step + ahead) / steps, self._spent(self.seconds))
         return self.config.learning_rate * self.rate_factor * _schedule(part)
 
     def _validate(self) -> float:
@@ -242,7 +218,7 @@ class TrainingLoop:
                 do="check units and signs of the logs; the best model so far is kept in model.pt",
             )
         self.model.load_state_dict(weights)
-        self.optimiser.load_state_dict(optimiser)
+        self.descent.load_state_dict(optimiser)
         self.step = step
         self.rate_factor /= 2
 
@@ -257,7 +233,7 @@ class TrainingLoop:
         """Write model.pt and checkpoint.pt."""
         write_state(self.folder.weights, self.best_weights)
         state = {name: getattr(self, name) for name in PLAIN}
-        state["model"], state["optimiser"] = self.model.state_dict(), self.optimiser.state_dict()
+        state["model"], state["optimiser"] = self.model.state_dict(), self.descent.state_dict()
         write_state(self.folder.checkpoint, state | {"generator": self.generator.get_state()})
 
     def restore(self) -> None:
@@ -267,7 +243,7 @@ class TrainingLoop:
             for name in PLAIN:
                 setattr(self, name, state[name])
             self.model.load_state_dict(state["model"])
-            self.optimiser.load_state_dict(state["optimiser"])
+            self.descent.load_state_dict(state["optimiser"])
             self.generator.set_state(state["generator"])
         except (KeyError, RuntimeError, ValueError) as error:
             raise RunError(

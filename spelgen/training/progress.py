@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from spelgen.errors import Diagnostic
 
 if TYPE_CHECKING:
-    import torch
+    pass
 
 LINE_EVERY = 10.0  # [s] between lines where no bar can be drawn
 
@@ -46,11 +46,11 @@ class TrainingProgress:
             text = f"{diagnostic.severity}: {diagnostic.where}: {diagnostic.message}"
             self._console.print("".join(c if c.isprintable() else "?" for c in text), markup=False)
 
-    def warm_up(self, step: int, steps: int, loss: torch.Tensor) -> None:
+    def warm_up(self, step: int, steps: int, loss: float) -> None:
         """Show how far the momentum steps are."""
         if not self._show or step % 100:
             return
-        state = f"momentum {step}/{steps}, loss {loss.item():.3g}"
+        state = f"momentum {step}/{steps}, loss {loss:.3g}"
         self._bar.update(self._task, state=escape(state))
         if not self._console.is_terminal and (step == steps or step % 1000 == 0):
             self._console.print(state, markup=False)
