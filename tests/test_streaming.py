@@ -159,6 +159,26 @@ def test_training_streams_and_resumes_with_the_same_numbers(log, tmp_path, monke
     assert json.loads((tmp_path / "whole" / "config.json").read_text())["training_windows"] > 4 * 400
 
 
+@pytest.mark.parametrize("group", [4096, 1_600_000])
+def test_a_log_is_never_in_memory_as_a_whole(tmp_path, monkeypatch, group):
+    monkeypatch.setattr(parts, "LONGEST", 4096)
+    monkeypatch.setattr(parts, "ROW_GROUP", 4096)
+    random = np.random.default_rng(0)
+    columns = {name: random.standard_normal(1_600_000) for name in ("q_a", "qd_a", "tau_a")}
+    table = pa.table({"t": np.arange(1_600_000.0), **columns})
+    pa.parquet.write_table(table, tmp_path / "x.parquet", row_group_size=group)
+    size = table.nbytes
+    del table
+    pool, most = pa.default_memory_pool(), 0
+    before = pool.bytes_allocated()
+    for part, _ in scan([tmp_path / "x.parquet"], ("a",), LogMapping()):
+        most = max(most, pool.bytes_allocated() - before)
+        if part.first % 409_600 == 0:
+            part.load()
+            most = max(most, pool.bytes_allocated() - before)
+    assert 0 < most < size / 4
+
+
 def test_only_large_parquet_is_streamed(log, tmp_path, monkeypatch):
     assert large_files([log], JOINTS) == [log]
     (tmp_path / "more.csv").write_text("t\n0\n")

@@ -34,6 +34,7 @@ from spelgen.errors import LogError, SpelgenError, collect
 from spelgen.log_mapping import TIMES, LogMapping
 
 IN_MEMORY = 100_000_000  # bytes of numbers up to which logs are held in memory; windows take five times that
+BUFFER = 2**16  # bytes read ahead of each column
 LONGEST = 2**16  # samples of a part: of 7 joints, 12 MB, and 53 MB as windows
 
 
@@ -61,7 +62,7 @@ class Part:
 
     def load(self) -> Trajectory:
         """The part's samples, the same as `scan` gave."""
-        source = pa.parquet.ParquetFile(self.log.file)
+        source = _source(self.log.file)
         groups, row = _row_groups(source, self.first, self.stop)
         found = []
         for batch in source.iter_batches(ROW_GROUP, row_groups=groups, columns=list(self.log.columns)):
@@ -119,7 +120,7 @@ def _opened_log(file: Path, joints: tuple[str, ...], mapping: LogMapping) -> Par
     schema, mapping = read_schema(file, mapping)
     columns = wanted_names(joints, mapping)
     require_columns(schema.names, columns, file, mapping)
-    head = next(pa.parquet.ParquetFile(file).iter_batches(1, columns=[columns[0]]), None)
+    head = next(_source(file).iter_batches(1, columns=[columns[0]]), None)
     if head is None:
         raise LogError("no rows", file=file, expected="at least one window of samples")
     declared = UNITS_KEY in (schema.metadata or {}) or all(mapping.unit("q", joint) for joint in joints)
@@ -134,7 +135,7 @@ def _stretches(log: ParquetLog, place: str, several: bool) -> Iterator[tuple[Par
         for recording, start, end in _recordings(log, place, several)
         for name, first, stop in _cut(recording, start, end)
     ]
-    batches = pa.parquet.ParquetFile(log.file).iter_batches(ROW_GROUP, columns=list(log.columns))
+    batches = _source(log.file).iter_batches(ROW_GROUP, columns=list(log.columns))
     held, row = np.zeros((0, len(log.columns))), 0  # what was read and not yet given, and its first row
     for part, recording in parts:
         while row + len(held) < part.stop:
@@ -154,7 +155,7 @@ def _cut(recording: str, start: int, end: int) -> Iterator[tuple[str, int, int]]
 
 def _recordings(log: ParquetLog, place: str, several: bool) -> list[tuple[str, int, int]]:
     """Name, first row and end of each recording of a file; the rows of one must lie together."""
-    source = pa.parquet.ParquetFile(log.file)
+    source = _source(log.file)
     if log.labels is None:
         return [(place, 0, source.metadata.num_rows)]
     runs: list[tuple[str, int]] = []  # a label and where its run ends
@@ -177,6 +178,11 @@ def _recordings(log: ParquetLog, place: str, several: bool) -> list[tuple[str, i
     starts = [0, *(end for _, end in runs)]
     names = [f"{place}/{label}" if several else label for label in labels]
     return [(name, start, end) for name, start, (_, end) in zip(names, starts, runs, strict=False)]
+
+
+def _source(file: Path) -> pa.parquet.ParquetFile:
+    """A file that is read page by page: by default pyarrow keeps all row groups, and a row group at once."""
+    return pa.parquet.ParquetFile(file, pre_buffer=False, buffer_size=BUFFER)
 
 
 def _row_groups(source: pa.parquet.ParquetFile, first: int, stop: int) -> tuple[list[int], int]:

@@ -70,7 +70,8 @@ class WindowStream:
         """About `most` windows, evenly spread over at most so many parts, evenly spread themselves."""
         chosen = range(0, len(self.parts), -(-len(self.parts) // most_parts))
         each = max(1, most // len(chosen))
-        return joined([thinned(self._windows([index]), each) for index in chosen])
+        # joined one by one: a slice would keep all windows of its part
+        return joined([joined([thinned(self._windows([index]), each)]) for index in chosen])
 
     def _windows(self, parts: Sequence[int]) -> Windows:
         found = joined([self.cutting.windows([self.parts[index].load()]) for index in parts])
