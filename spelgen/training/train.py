@@ -25,6 +25,7 @@ from spelgen.training.prior import Prior, urdf_prior
 from spelgen.training.progress import TrainingProgress
 from spelgen.training.runs import RunFolder, load_model, write_json
 from spelgen.training.streamed import prepare_streamed
+from spelgen.training.torque_start import start_from_torque
 
 if TYPE_CHECKING:
     from spelgen.training.runs import EmittedModel
@@ -111,7 +112,9 @@ def train(
         notes += found
         run.start(module, robot, force=force)
         write_json(run.config, description)
-    prior = _prior(run, header, model, prepared, config, notes)
+    config, told = start_from_torque(model, prepared, config, fit=not resume)
+    notes += told
+    prior = _prior(run, header, model, prepared, config, notes) if config.epochs else None
     loop = TrainingLoop(run, model, prepared, config, prior, stepped)
     if resume:
         loop.restore()
@@ -163,8 +166,10 @@ def _compiled(
 ) -> EmittedModel:
     """The model as training steps use it, compiled before anything is written."""
     since = time.monotonic()
-    batch = data.training[: config.batch].to(config.device)
-    ready = compiled(model.to(config.device), batch, data.scales.to(config.device))
+    windows = (
+        data.training if config.whole(data.size) else data.training[: config.batch]
+    )  # as steps take them
+    ready = compiled(model.to(config.device), windows.to(config.device), data.scales.to(config.device))
     message = f"right-hand side compiled in {time.monotonic() - since:.0f} s"
     notes.append(Diagnostic("info", "compiled", "training", None, message))
     return ready
