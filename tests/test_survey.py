@@ -163,6 +163,24 @@ def test_the_command_fails_where_logs_cannot_be_trained_on(spelgen, robots, arm,
     assert (strict.exit_code, strict.stderr) == (1, "3 warnings, and --strict allows none\n")
 
 
+def test_logs_larger_than_memory_are_told_by_parts(spelgen, robots, arm, log, tmp_path, monkeypatch):
+    names = [coordinate.name for coordinate in arm.coordinates]
+    write_logs(tmp_path / "logs.parquet", [log], names)
+    command = ["logs", "logs.parquet", "--robot", robots / "rpr.urdf", "--format", "json"]
+    whole = json.loads(spelgen(*command).stdout)
+    monkeypatch.setattr("spelgen.data.parts.IN_MEMORY", 1000)
+    monkeypatch.setattr("spelgen.data.parts.LONGEST", 600)
+    told = json.loads(spelgen(*command).stdout)
+    assert [x["name"] for x in told["trajectories"]] == [f"motion [{k}]" for k in range(1, 5)]
+    assert [x["low"] for x in told["joints"]] == [x["low"] for x in whole["joints"]]
+
+
+def test_a_few_samples_are_told_without_judgement(arm, log):
+    result = found(arm, log[:20])
+    assert [x.gravity.explained for x in result.joints] == [None] * 3
+    assert "Nothing is odd." in text(result)
+
+
 def test_real_arms_are_believed(shared):
     from spelgen.data.logs import read_logs
 

@@ -82,6 +82,7 @@ def logs(
     """
     from spelgen import pipeline
     from spelgen.data.logs import read_logs
+    from spelgen.data.parts import large_files, scan
     from spelgen.survey.page import page
     from spelgen.survey.survey import survey
     from spelgen.survey.tables import text
@@ -90,9 +91,15 @@ def logs(
     names = [coordinate.name for coordinate in loaded.arm.coordinates]
     kinds = [coordinate.kind for coordinate in loaded.arm.coordinates]
     mapped = options.mapping(mapping, robot, names)
-    trajectories = read_logs(paths, names, mapping=mapped, joint_types=kinds)
     inputs = loaded.actuation.matrix()
-    found = survey(trajectories, loaded.arm, inputs)
+    large = large_files(paths, names)
+    found = survey(
+        (each for _, each in scan(large, names, mapped, kinds))
+        if large
+        else read_logs(paths, names, mapping=mapped, joint_types=kinds),
+        loaded.arm,
+        inputs,
+    )
     say(text(found) if format == "text" else json.dumps(found.to_dict(), indent=2))
     if html is not None:
         note(f"wrote {write_text(html, page(found, loaded.arm, inputs))}")

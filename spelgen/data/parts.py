@@ -95,12 +95,18 @@ def large_files(paths: Iterable[Path | str], joints: Sequence[str], role: str | 
 
 
 def scan(
-    files: Sequence[Path], joints: Sequence[str], mapping: LogMapping
+    files: Sequence[Path],
+    joints: Sequence[str],
+    mapping: LogMapping | None = None,
+    joint_types: Sequence[str] | None = None,
 ) -> Iterator[tuple[Part, Trajectory]]:
     """Every part with its samples, read once in the files' order; the caller keeps what it needs of them.
 
-    A recording of more than LONGEST samples is several parts. Raises LogError as `read_logs` does.
+    A recording of more than LONGEST samples is several parts. Raises LogError and SettingsError as `read_logs`
+    does.
     """
+    mapping = mapping or LogMapping()
+    collect(mapping.misfits(joints, joint_types))
     stems = [file.stem for file in files]
     for file in files:
         log = _opened_log(file, tuple(joints), mapping)

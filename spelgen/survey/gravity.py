@@ -12,7 +12,7 @@ from spelgen.data.trajectory import Trajectory, split_at_gaps
 from spelgen.identification.regressor import regressor, urdf_parameters
 
 SAMPLES = 400  # of one trajectory
-MOST = 6000  # of all
+LEAST, MOST = 100, 6000  # of all
 DRY = 0.02  # [rad/s, m/s] width of Coulomb friction's jump
 DEPENDENT = 1e-8
 
@@ -32,9 +32,10 @@ class GravityShare:
     """What gravity has to do with the torque of one joint.
 
     explained: part of the torque's variance, beside friction and the joint's own acceleration, that some
-    inertial values explain as gravity (0..1); None where gravity never loads the joint. factor: by what the
-    URDF's gravity torque must be multiplied to fit best, correlation: of both, beside the same. expected: the
-    standard deviation of the URDF's, relative to that of the torque; all three None without inertials.
+    inertial values explain as gravity (0..1); None where gravity never loads the joint, or where there is
+    too little to tell. factor: by what the URDF's gravity torque must be multiplied to fit best, correlation:
+    of both, beside the same. expected: the standard deviation of the URDF's, relative to that of the torque;
+    all three None without inertials.
     """
 
     explained: float | None
@@ -60,7 +61,9 @@ def gravity_shares(arm: Arm, parts: Sequence[StateSamples]) -> list[GravityShare
     q, qd, qdd, tau = (
         np.concatenate([getattr(part, name) for part in parts]) for name in ("q", "qd", "qdd", "tau")
     )
-    every = -(-max(1, len(q)) // MOST)
+    if len(q) < LEAST:
+        return [GravityShare(None, None, None, None)] * q.shape[1]
+    every = -(-len(q) // MOST)
     q, qd, qdd, tau = (x[::every] for x in (q, qd, qdd, tau))
     still = np.zeros_like(q)
     rows = regressor(arm, q, still, still)  # (S, n, 10 B)

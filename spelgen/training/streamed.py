@@ -14,7 +14,7 @@ from spelgen.data.parts import Part, scan
 from spelgen.data.signals import automatic_spacing
 from spelgen.data.stream import Cutting, WindowStream
 from spelgen.data.trajectory import gap_ends, rate
-from spelgen.errors import Diagnostic, LogError, collect
+from spelgen.errors import Diagnostic, LogError
 from spelgen.log_mapping import LogMapping
 from spelgen.training.data import (
     LARGEST_VALIDATION,
@@ -53,8 +53,6 @@ def prepare_streamed(
     Whole parts (see `scan`) are set aside for validation. Raises LogError, and SettingsError where the mapping
     does not fit.
     """
-    mapping = mapping or LogMapping()
-    collect(mapping.misfits(joints, joint_types))
     known = _read_once(files, joints, joint_types, mapping)
     cutoff = filter_cutoff(config.filter, known.rates)
     every = config.every or automatic_spacing(known.rates, cutoff)
@@ -97,7 +95,7 @@ def prepare_streamed(
 
 
 def _read_once(
-    files: Sequence[Path], joints: Sequence[str], joint_types: Sequence[str], mapping: LogMapping
+    files: Sequence[Path], joints: Sequence[str], joint_types: Sequence[str], mapping: LogMapping | None
 ) -> _Known:
     parts: list[Part] = []
     pieces: list[list[int]] = []
@@ -105,7 +103,7 @@ def _read_once(
     found: list[Doubt] = []
     gaps: list[Diagnostic] = []
     numbers = hashlib.sha256()
-    for part, trajectory in scan(files, joints, mapping):
+    for part, trajectory in scan(files, joints, mapping, joint_types):
         parts.append(part)
         pieces.append(np.diff(gap_ends(trajectory.t)).tolist())
         rates.append(rate(trajectory))
