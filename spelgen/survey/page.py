@@ -38,10 +38,11 @@ def page(found: Survey, arm: Arm, inputs: np.ndarray) -> str:
 def charts(trajectory: Trajectory, arm: Arm, inputs: np.ndarray) -> list[JointCharts]:
     """By joint: q; qd beside dq/dt; the joint's torque beside the URDF's gravity torque."""
     every = -(-len(trajectory.t) // DRAWN)
-    slopes = np.concatenate([_slope(piece) for piece in split_at_gaps(trajectory)])
-    t, q, qd, slope, tau = (
-        x[::every] for x in (trajectory.t, trajectory.q, trajectory.qd, slopes, trajectory.tau @ inputs.T)
+    pieces = [piece[::every] for piece in split_at_gaps(trajectory)]
+    t, q, qd, tau = (
+        np.concatenate([getattr(piece, name) for piece in pieces]) for name in ("t", "q", "qd", "tau")
     )
+    slope, tau = np.concatenate([_slope(piece) for piece in pieces]), tau @ inputs.T
     still = np.zeros_like(q)
     gravity = regressor(arm, q, still, still) @ urdf_parameters(arm)  # (T, n)
     believed = any(body.inertia for body in arm.bodies)
@@ -69,7 +70,7 @@ def _chart(what: str, unit: str, joint: str, lines: list[Line]) -> Markup:
 
 
 def _slope(piece: Trajectory) -> np.ndarray:
-    """dq/dt (T, n) by differences over what a chart can show; NaN for a sample alone."""
+    """dq/dt (T, n) by differences of what is drawn; NaN for a sample alone."""
     if len(piece.t) < 2:
         return np.full_like(piece.q, np.nan)
     return np.gradient(piece.q, piece.t, axis=0)
