@@ -115,6 +115,7 @@ class TrackingSettings(Group):
 class TrainingSettings(Group):
     """Defaults of `spelgen train`; command-line flags override them.
 
+    objective: what is fitted: the torque (closed-form models only, their default) or predicted windows.
     window: samples predicted together. stride: samples from the start of one window to the next.
     every: samples from one sample of a window to the next; None: as many as filtered logs can spare.
     batch: windows per step. epochs: passes over all windows, at most.
@@ -127,7 +128,7 @@ class TrainingSettings(Group):
     validation_fraction: part of the training trajectories held out to watch the validation loss.
     """
 
-    objective: Literal["rollout"] = "rollout"
+    objective: Literal["torque", "rollout"] | None = None
     momentum_steps: Whole = 2000
     prior: NonNegative = 1.0
     window: Annotated[Count, Field(ge=2)] = 5

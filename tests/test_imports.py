@@ -18,7 +18,7 @@ data: trajectory bags tables logs doubts signals windows parts stream
 simulation: engine simulate tracking protocols
 identification: samples friction regressor base least_squares prior identify told
 excitation: fourier design told
-training: runs torque_fit lie_group rollout compiled rivals prior progress data streamed descent loop train
+training: runs belief torque_fit lie_group rollout compiled rivals prior progress data streamed descent torque_start loop train
 evaluation: tip torque examples evaluate
 report: charts plots tables picture learned page
 proof: agreement axes reasons meaning second_reading numeric_samples verification

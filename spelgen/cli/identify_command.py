@@ -76,7 +76,7 @@ def _samples(trajectories: list[Trajectory], loaded: Loaded) -> list[DynamicsSam
     """Moving samples with joint torques, whatever the logs' torques act on; odd logs are told."""
     from dataclasses import replace
 
-    from spelgen.data.signals import examine
+    from spelgen.data.doubts import examine
     from spelgen.identification.samples import dynamics_samples
 
     coordinates = loaded.arm.coordinates

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -85,6 +85,10 @@ def train(
     mapping: Mapping = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in the run folder.")] = False,
     force: Force = False,
+    objective: Annotated[
+        Literal["torque", "rollout"] | None,
+        typer.Option("--objective", help="Of closed-form models, torque unless this says rollout."),
+    ] = None,
     momentum_steps: Annotated[
         int | None,
         typer.Option("--momentum-steps", min=0, help="On the weak form, before windows are predicted."),
@@ -108,7 +112,10 @@ def train(
     learning_rate: Annotated[
         float | None, typer.Option("--learning-rate", min=0.0, help="At its largest.")
     ] = None,
-    weight_decay: Annotated[float | None, typer.Option("--weight-decay", min=0.0, help="Of AdamW; or of the penalty of L-BFGS.")] = None,
+    weight_decay: Annotated[
+        float | None,
+        typer.Option("--weight-decay", min=0.0, help="Of AdamW; or of the penalty of L-BFGS."),
+    ] = None,
     prior: Annotated[
         float | None,
         typer.Option("--prior", min=0.0, help="Pull towards the URDF's own M and gravity; 0: none."),
@@ -132,9 +139,9 @@ def train(
     What is not given here comes from the settings beside the robot.
     """
     flags = {
-        "momentum_steps": momentum_steps, "prior": prior, "epochs": epochs, "patience": patience,
-        "max_minutes": max_minutes, "batch": batch, "window": window, "stride": stride, "every": every,
-        "substeps": substeps, "learning_rate": learning_rate, "weight_decay": weight_decay,
+        "objective": objective, "momentum_steps": momentum_steps, "prior": prior, "epochs": epochs,
+        "patience": patience, "max_minutes": max_minutes, "batch": batch, "window": window, "stride": stride,
+        "every": every, "substeps": substeps, "learning_rate": learning_rate, "weight_decay": weight_decay,
         "validation_fraction": validation_fraction, "filter": filter, "seed": seed, "device": device,
         "threads": threads, "compile": compile,
     }  # fmt: skip

@@ -30,6 +30,7 @@ LARGEST_VALIDATION = 2048  # windows; validation is a measurement, it needs no m
 class TrainingConfig:
     """Settings of one run; see `TrainingSettings` for those that a robot's sidecar file may set.
 
+    objective: torque (see `start_from_torque`) or rollout; None: torque for a closed-form model, else rollout.
     momentum_steps: steps on the weak form of the equations before windows are predicted; 0: none.
     prior: weight of staying near the URDF's own M and gravity (see `Prior`); 0: none.
     every: samples from one sample of a window to the next, None: see `automatic_spacing`.
@@ -40,7 +41,7 @@ class TrainingConfig:
     max_minutes: the learning rate is annealed within this time too.
     """
 
-    objective: Literal["rollout"] = "rollout"
+    objective: Literal["torque", "rollout"] | None = None
     momentum_steps: int = 2000
     prior: float = 1.0
     window: int = 5
@@ -84,7 +85,8 @@ class TrainingData:
     """Windows of the logs, ready to train on.
 
     training: all of them, or where the logs are larger than memory an even sample, and `stream` draws those
-    that are trained on. digest: of every number, to resume on the same data only.
+    that are trained on. digest: of every number, to resume on the same data only. recordings: what all was cut
+    from, validation included, where it fits into memory.
     """
 
     training: Windows
@@ -96,6 +98,7 @@ class TrainingData:
     diagnostics: tuple[Diagnostic, ...]
     digest: str
     stream: WindowStream | None = None
+    recordings: tuple[Trajectory, ...] = ()
 
     @property
     def size(self) -> int:
@@ -139,6 +142,7 @@ def prepare_data(
         validation_names=tuple(x.name for x in split.validation),
         diagnostics=(*notes, split.note),
         digest=digest(trajectories),
+        recordings=tuple(trajectories),
     )
 
 

@@ -3,63 +3,41 @@
 The torque is linear in the bodies' parameters, which the log-Cholesky weights make possible ones, and smooth in the
 few constants of each joint: seconds are enough, and no step size is to be chosen. What is minimised is
 
-    sum over joints and samples of (missing torque / noise)^2 + sum of (weight - start)^2 / deviation^2,
+    sum over joints and samples of (missing torque / noise)^2 + (weights - start)^T covariance^-1 (weights - start),
 
-a Gaussian prior around the URDF's bodies and usual friction. The noise of a joint is what is left of its torque, found
-in rounds, and counted once for as many samples as it stays alike (see ``least_squares.deviations``).
+a Gaussian prior (see ``Belief``). The noise of a joint is what is left of its torque, found in rounds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch.func import functional_call, jacfwd, jvp
 
-from spelgen.identification.least_squares import deviations
 from spelgen.identification.samples import DynamicsSamples
+from spelgen.training.belief import Belief
 
 if TYPE_CHECKING:
     from spelgen.training.runs import EmittedModel
 
 EVERY = 2  # samples taken of so many: filtered at 8 Hz and sampled at 100 Hz they say all that is to be said
+ALIKE = 20.0  # of those: so many in a row err alike and count once
 ROUNDS = 6  # of weighing joints by what is left of their torque
 STEPS = 8  # at most in a round
 GAIN = 1e-4  # relative: a step that gains less ends a round
-LEAST_NOISE = 0.02  # of a joint's torque range: few samples may be fitted better than the model deserves
+FIRST_NOISE = 0.1  # of a joint's torque range
+LEAST_NOISE = 0.02  # likewise: few samples may be fitted better than the model deserves
 DAMPING = (1e-9, 1e-3, 1e6)  # of the steps, relative to the curvature: least, first, most
-
-
-@dataclass(frozen=True)
-class Belief:
-    """Standard deviations of the weights around their start; each is a logarithm or a share, so they have no unit.
-
-    bodies: in the affine-invariant metric, 0.1 is about 20 % in mass. offset: in usual sizes of friction.
-    """
-
-    bodies: float = 0.5
-    rotor: float = 1.5
-    sizes: float = 1.5
-    speeds: float = 0.7
-    offset: float = 0.5
-    gains: float = 0.3
-
-    def of(self, name: str) -> float:
-        """The deviation of the weights called ``name``, as in ``named_parameters``."""
-        last = name.rsplit(".", 1)[-1]
-        if last in ("bodies", "rotor", "offset", "gains"):
-            return float(getattr(self, last))
-        return self.speeds if last in ("bend_speed", "fading", "jump") else self.sizes
 
 
 @dataclass(frozen=True, eq=False)
 class TorqueFit:
-    """How a fit ended. noise: (n,) of each joint, as if independent [Nm, N]; residual: (n,) root mean square."""
+    """How a fit ended. residual: (n,) root mean square of the torque that is missed [Nm, N]."""
 
-    noise: np.ndarray
     residual: np.ndarray
     steps: int
     cost: float
@@ -69,19 +47,16 @@ def fit_torque(
     model: EmittedModel,
     samples: Sequence[DynamicsSamples],
     belief: Belief | None = None,
-    only: Sequence[str] = (),
-    bodies: Sequence[int] = (),
+    only_bodies: Sequence[int] | None = None,
 ) -> TorqueFit:
-    """Set the weights of a closed-form ``model`` to the most probable ones after ``samples``.
+    """Set the weights of a closed-form ``model`` to the most probable ones after ``samples`` (torques as logged).
 
-    The prior is centred on the weights as they are. ``only``: names of the weights that may move, all by default;
-    ``bodies``: of the bodies, which; all by default.
+    The prior is centred on the weights as they are. ``only_bodies``: nothing moves but these bodies' parameters.
     """
-    problem = _Problem(model, samples, belief or Belief(), only, bodies)
-    x = problem.start
+    problem = _Problem(model, samples, belief or Belief(), only_bodies)
+    x, damping, steps, cost = problem.start, DAMPING[1], 0, float("inf")
     left = problem.missing(x)
-    noise = problem.noise(left) if only else 0.1 * problem.range
-    damping, steps, cost = DAMPING[1], 0, float("inf")
+    noise = ALIKE**0.5 * FIRST_NOISE * problem.range
     for _ in range(ROUNDS):
         cost = problem.cost(x, left, noise)
         for _ in range(STEPS):
@@ -94,23 +69,7 @@ def fit_torque(
                 break
         noise = problem.noise(left)
     problem.write(x)
-    return TorqueFit(noise.numpy(), left.square().mean(dim=0).sqrt().numpy(), steps, cost)
-
-
-class _Torque(torch.nn.Module):
-    """The torque that a model misses at samples whose regressors are known."""
-
-    def __init__(self, model: EmittedModel) -> None:
-        super().__init__()
-        self.model: Any = model
-
-    def forward(self, data: _Data) -> torch.Tensor:
-        model = self.model
-        prepared = model.prepare()
-        ten = model.inertial_parameters().flatten()
-        friction = model.friction(data.qd, data.heavy @ ten, prepared.friction)
-        given = (data.tau - model.torque_offset()) @ prepared.input.mT
-        return given - data.rows @ ten - prepared.rotors * data.qdd - friction
+    return TorqueFit(left.square().mean(dim=0).sqrt().numpy(), steps, cost)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +81,17 @@ class _Data:
     tau: torch.Tensor
     rows: torch.Tensor
     heavy: torch.Tensor
-    ends: tuple[int, ...] = field(default=())
+
+
+class _Asked(torch.nn.Module):
+    """Answers questions about a model, so that ``functional_call`` can ask them under other weights."""
+
+    def __init__(self, model: EmittedModel) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(self, question: Callable[[Any], Any]) -> Any:
+        return question(self.model)
 
 
 class _Problem:
@@ -131,55 +100,46 @@ class _Problem:
         model: EmittedModel,
         samples: Sequence[DynamicsSamples],
         belief: Belief,
-        only: Sequence[str],
-        bodies: Sequence[int],
+        only_bodies: Sequence[int] | None,
     ) -> None:
         self.model: Any = model
-        self.torque = _Torque(model)
+        self.asked = _Asked(model)
         self.data = _data(model, samples)
         self.weights = {name: x.detach().clone() for name, x in model.named_parameters()}
-        self.names = [name for name in self.weights if not only or name in only]
-        free = []
-        for name in self.names:
-            mask = torch.ones_like(self.weights[name], dtype=torch.bool)
-            if name == "bodies" and bodies:
-                mask[:] = False
-                mask[list(bodies)] = True
-            free.append(mask.flatten())
-        self.free = torch.cat(free)
-        self.start = torch.cat([self.weights[name].flatten() for name in self.names])
-        spread = [torch.full_like(self.weights[name], belief.of(name)).flatten() for name in self.names]
-        self.precision = torch.cat(spread).pow(-2)
-        given = self.data.tau @ model.prepare().input.mT.detach()
-        spread_ = given.std(dim=0)
-        self.range = torch.maximum(spread_, 1e-3 * spread_.max())
+        self.start = torch.cat([x.flatten() for x in self.weights.values()])
+        self.precision = torch.linalg.inv(belief.covariance(self.weights))
+        self.free = torch.ones_like(self.start, dtype=torch.bool)
+        if only_bodies is not None:
+            chosen = {name: torch.zeros_like(x, dtype=torch.bool) for name, x in self.weights.items()}
+            chosen["bodies"][list(only_bodies)] = True
+            self.free = torch.cat([x.flatten() for x in chosen.values()])
+        spread = (self.data.tau @ model.prepare().input.mT.detach()).std(dim=0)
+        self.range = torch.maximum(spread, 1e-3 * spread.max())
 
     def missing(self, x: torch.Tensor) -> torch.Tensor:
-        """(T, n)."""
-        return functional_call(self.torque, self._named(x), (self.data,)).detach()
+        """The torque that the model does not explain, (T, n)."""
+        return self._ask(self._named(x), self._missing).detach()
 
     def noise(self, left: torch.Tensor) -> torch.Tensor:
-        """(n,)."""
-        parts = np.split(left.numpy(), self.data.ends)
-        return torch.maximum(torch.from_numpy(deviations(parts, 0)), LEAST_NOISE * self.range)
+        """Standard deviations (n,) of errors as if they were independent from sample to sample."""
+        found = left.square().mean(dim=0).sqrt()
+        return ALIKE**0.5 * torch.maximum(found, LEAST_NOISE * self.range)
 
     def cost(self, x: torch.Tensor, left: torch.Tensor, noise: torch.Tensor) -> float:
-        away = (self.precision * (x - self.start).square()).sum()
-        return float(((left / noise).square().sum() + away) / 2)
+        away = x - self.start
+        return float(((left / noise).square().sum() + away @ self.precision @ away) / 2)
 
     def step(
         self, x: torch.Tensor, left: torch.Tensor, noise: torch.Tensor, cost: float, damping: float
     ) -> tuple[torch.Tensor, torch.Tensor, float, float] | None:
         """Weights, missing torque, cost and damping after a step that lowers the cost; None: there is none."""
-        slope = (self._slope(x) / noise[:, None]).flatten(0, 1)[:, self.free]
-        precision = self.precision[self.free]
-        curvature = slope.mT @ slope + torch.diag(precision)
-        target = slope.mT @ (left / noise).flatten() - precision * (x - self.start)[self.free]
+        slope = (self._slope(self._named(x)) / noise[:, None]).flatten(0, 1)[:, self.free]
+        curvature = slope.mT @ slope + self.precision[self.free][:, self.free]
+        target = slope.mT @ (left / noise).flatten() - (self.precision @ (x - self.start))[self.free]
         while damping < DAMPING[2]:
+            damped = curvature + damping * torch.diag(curvature.diagonal())
             moved = x.clone()
-            moved[self.free] += torch.linalg.solve(
-                curvature + damping * torch.diag(curvature.diagonal()), target
-            )
+            moved[self.free] += torch.linalg.solve(damped, target)
             after = self.missing(moved)
             lower = self.cost(moved, after, noise)
             if lower < cost:
@@ -192,32 +152,39 @@ class _Problem:
         named = self._named(x)
         with torch.no_grad():
             for name, parameter in self.model.named_parameters():
-                parameter.copy_(named[f"model.{name}"])
+                parameter.copy_(named[name])
 
     def _named(self, x: torch.Tensor) -> dict[str, torch.Tensor]:
-        named = dict(self.weights)
-        parts = x.split([self.weights[name].numel() for name in self.names])
-        named |= {
-            name: part.view_as(self.weights[name]) for name, part in zip(self.names, parts, strict=True)
+        parts = x.split([weight.numel() for weight in self.weights.values()])
+        return {
+            name: part.view_as(weight)
+            for (name, weight), part in zip(self.weights.items(), parts, strict=True)
         }
-        return {f"model.{name}": value for name, value in named.items()}
 
-    def _slope(self, x: torch.Tensor) -> torch.Tensor:
+    def _ask(self, named: dict[str, torch.Tensor], question: Callable[[Any], Any]) -> Any:
+        return functional_call(self.asked, {f"model.{name}": x for name, x in named.items()}, (question,))
+
+    def _missing(self, model: Any) -> torch.Tensor:
+        data, prepared = self.data, model.prepare()
+        ten = model.inertial_parameters().flatten()
+        friction = model.friction(data.qd, data.heavy @ ten, prepared.friction)
+        given: torch.Tensor = (data.tau - model.torque_offset()) @ prepared.input.mT
+        return given - data.rows @ ten - prepared.rotors * data.qdd - friction
+
+    def _slope(self, named: dict[str, torch.Tensor]) -> torch.Tensor:
         """Minus d(missing torque) / d(weights), (T, n, weights)."""
-        named = self._named(x)
         parts = [
-            self._body_slope(named) if name == "bodies" else self._own(named, name) for name in self.names
+            self._body_slope(named) if name == "bodies" else self._own_slope(named, name) for name in named
         ]
         return torch.cat(parts, dim=-1)
 
-    def _own(self, named: dict[str, torch.Tensor], name: str) -> torch.Tensor:
-        """Of weights of which each joint has its own: all at once."""
-        key = f"model.{name}"
+    def _own_slope(self, named: dict[str, torch.Tensor], name: str) -> torch.Tensor:
+        """By weights of which each joint has its own, which move its own torque alone: all at once."""
 
         def missing(value: torch.Tensor) -> torch.Tensor:
-            return functional_call(self.torque, named | {key: value}, (self.data,))
+            return self._ask(named | {name: value}, self._missing)
 
-        change = jvp(missing, (named[key],), (torch.ones_like(named[key]),))[1].detach()
+        change = jvp(missing, (named[name],), (torch.ones_like(named[name]),))[1].detach()
         rows = torch.arange(change.shape[1])
         if name == "gains":
             rows = self.model.trained_inputs.any(dim=1).nonzero().squeeze(-1)
@@ -226,44 +193,26 @@ class _Problem:
         return slope
 
     def _body_slope(self, named: dict[str, torch.Tensor]) -> torch.Tensor:
-        model, data = self.model, self.data
-        own = {key.removeprefix("model."): value for key, value in named.items()}
-        parameters = _Parameters(model)
+        """By the bodies' weights: through the torque and through the load that friction grows with."""
 
         def ten(bodies: torch.Tensor) -> torch.Tensor:
-            return functional_call(parameters, named | {"model.bodies": bodies}, ())
+            return self._ask(named | {"bodies": bodies}, lambda model: model.inertial_parameters().flatten())
 
-        change = jacfwd(ten)(own["bodies"]).flatten(1).detach()  # (10 B, weights)
-        constants = functional_call(_Constants(model), named, ())
-        weight = data.heavy @ ten(own["bodies"])
-        load = jvp(lambda w: model.friction(data.qd, w, constants), (weight,), (torch.ones_like(weight),))[1]
-        return ((data.rows + load.unsqueeze(-1) * data.heavy) @ change).detach()
-
-
-class _Parameters(torch.nn.Module):
-    def __init__(self, model: EmittedModel) -> None:
-        super().__init__()
-        self.model: Any = model
-
-    def forward(self) -> torch.Tensor:
-        ten: torch.Tensor = self.model.inertial_parameters()
-        return ten.flatten()
+        change = jacfwd(ten)(named["bodies"]).flatten(1).detach()  # (10 B, weights)
+        constants = self._ask(named, lambda model: model.friction.prepared())
+        weight = self.data.heavy @ ten(named["bodies"])
+        by_load = jvp(
+            lambda each: self.model.friction(self.data.qd, each, constants),
+            (weight,),
+            (torch.ones_like(weight),),
+        )[1]
+        return ((self.data.rows + by_load.unsqueeze(-1) * self.data.heavy) @ change).detach()
 
 
-class _Constants(torch.nn.Module):
-    def __init__(self, model: EmittedModel) -> None:
-        super().__init__()
-        self.model: Any = model
-
-    def forward(self) -> Any:
-        return self.model.prepare().friction
-
-
-def _data(model: EmittedModel, samples: Sequence[DynamicsSamples]) -> _Data:
-    taken = [[x[::EVERY] for x in (s.q, s.qd, s.qdd, s.tau)] for s in samples]
+def _data(model: Any, samples: Sequence[DynamicsSamples]) -> _Data:
+    taken = [[x[::EVERY] for x in (each.q, each.qd, each.qdd, each.tau)] for each in samples]
     q, qd, qdd, tau = (torch.from_numpy(np.concatenate(columns)) for columns in zip(*taken, strict=True))
     still = torch.zeros_like(q)
-    regressor: Any = getattr(model, "regressor")  # noqa: B009
     with torch.no_grad():
-        rows, heavy = regressor(q, qd, qdd), regressor(q, still, still)
-    return _Data(qd, qdd, tau, rows, heavy, tuple(np.cumsum([len(x[0]) for x in taken])[:-1].tolist()))
+        rows, heavy = model.regressor(q, qd, qdd), model.regressor(q, still, still)
+    return _Data(qd, qdd, tau, rows, heavy)
