@@ -133,6 +133,15 @@ def test_preparation_finds_what_it_finds_in_memory(log):
         assert starts.isdisjoint(round(x, 12) for x in found.stream.share(number).q[:, 0, 0].tolist())
 
 
+def test_a_last_sample_alone_changes_nothing(log, monkeypatch):
+    monkeypatch.setattr(parts, "LONGEST", 399)
+    config = replace(CONFIG, every=None)
+    found, plain = prepare_streamed([log], JOINTS, KINDS, config), prepare_data([log], JOINTS, KINDS, config)
+    assert found.cutoff == plain.cutoff == 8.0
+    assert found.training.dt.mean().item() == pytest.approx(plain.training.dt.mean().item(), rel=0.01)
+    assert "validation on 2 parts, 8 hold no window" in found.diagnostics[-1].message
+
+
 def lines(run: Path) -> list[dict]:
     records = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     return [{key: value for key, value in record.items() if key != "seconds"} for record in records]

@@ -32,7 +32,9 @@ VALIDATED_PARTS = 16
 
 @dataclass(frozen=True, eq=False)
 class _Known:
-    """What one pass over the logs tells. pieces: lengths of the gap-free pieces of each part."""
+    """What one pass over the logs tells. pieces: lengths of the gap-free pieces of each part. rates: of parts
+    that are long enough [Hz].
+    """
 
     parts: list[Part]
     pieces: list[list[int]]
@@ -57,26 +59,14 @@ def prepare_streamed(
     cutoff = filter_cutoff(config.filter, known.rates)
     every = config.every or automatic_spacing(known.rates, cutoff)
     cutting = Cutting(config.window, config.stride, every, cutoff)
-    counts = [sum(map(cutting.count, pieces)) for pieces in known.pieces]
-    usable = [index for index, count in enumerate(counts) if count]
-    if len(usable) < 2:
-        raise LogError(f"no two parts with {cutting.shortest} samples without a gap", expected="several")
-    size = min(max(1, round(config.validation_fraction * len(usable))), len(usable) - 1)
-    held_out = set(np.random.default_rng(config.seed).permutation(usable)[:size].tolist())
-    training, validation = (
-        WindowStream(
-            tuple(known.parts[index] for index in usable if (index in held_out) == out),
-            tuple(counts[index] for index in usable if (index in held_out) == out),
-            cutting,
-            config.seed,
-        )
-        for out in (False, True)
-    )
+    training, validation = _split(known, cutting, config)
     sample = training.sample(SAMPLED_PARTS, SAMPLED)
+    unused = len(known.parts) - len(training.parts) - len(validation.parts)
     message = (
         f"larger than memory: read in {len(known.parts)} parts, {training.shares} epochs pass over all; "
-        f"validation on {size} parts, {len(known.parts) - len(usable)} hold no window"
+        f"validation on {len(validation.parts)} parts, {unused} hold no window"
     )
+    note = Diagnostic("info", "streamed", "logs", None, message)
     return TrainingData(
         training=sample,
         validation=validation.sample(VALIDATED_PARTS, LARGEST_VALIDATION),
@@ -84,13 +74,28 @@ def prepare_streamed(
         cutoff=cutoff,
         training_names=tuple(part.name for part in training.parts),
         validation_names=tuple(part.name for part in validation.parts),
-        diagnostics=(
-            *known.notes,
-            *filter_note(cutoff),
-            Diagnostic("info", "streamed", "logs", None, message),
-        ),
+        diagnostics=(*known.notes, *filter_note(cutoff), note),
         digest=known.digest,
         stream=training,
+    )
+
+
+def _split(known: _Known, cutting: Cutting, config: TrainingConfig) -> tuple[WindowStream, WindowStream]:
+    """Training and validation, which share no part; parts without a window are left out."""
+    counts = [sum(map(cutting.count, pieces)) for pieces in known.pieces]
+    usable = [index for index, count in enumerate(counts) if count]
+    if len(usable) < 2:
+        raise LogError(f"no two parts with {cutting.shortest} samples without a gap", expected="several")
+    size = min(max(1, round(config.validation_fraction * len(usable))), len(usable) - 1)
+    validated = set(np.random.default_rng(config.seed).permutation(usable)[:size].tolist())
+
+    def stream(chosen: list[int]) -> WindowStream:
+        parts = tuple(known.parts[index] for index in chosen)
+        return WindowStream(parts, tuple(counts[index] for index in chosen), cutting, config.seed)
+
+    return (
+        stream([index for index in usable if index not in validated]),
+        stream([index for index in usable if index in validated]),
     )
 
 
@@ -100,16 +105,20 @@ def _read_once(
     parts: list[Part] = []
     pieces: list[list[int]] = []
     rates: list[float] = []
+    lengths: list[int] = []
     found: list[Doubt] = []
     gaps: list[Diagnostic] = []
     numbers = hashlib.sha256()
     for part, trajectory in scan(files, joints, mapping, joint_types):
         parts.append(part)
         pieces.append(np.diff(gap_ends(trajectory.t)).tolist())
+        lengths.append(len(trajectory.t))
         rates.append(rate(trajectory))
         found += doubts(trajectory, joints, joint_types)
         gaps += told_gaps(trajectory)
         for array in (trajectory.t, trajectory.q, trajectory.qd, trajectory.tau):
             numbers.update(array.tobytes())
     notes = [*gaps[:1], *tell(found, joints, len(parts))]
-    return _Known(parts, pieces, rates, notes, numbers.hexdigest())
+    # the last samples of a recording may be a part of their own, too short to tell a rate
+    told = [each for each, length in zip(rates, lengths, strict=True) if length > max(lengths) / 10]
+    return _Known(parts, pieces, told, notes, numbers.hexdigest())
