@@ -116,6 +116,22 @@ def test_timestamps_count_from_the_first(tmp_path):
         check(read_logs([path], JOINTS, mapping=mapping)[0], "x", rtol=1e-15)
 
 
+def test_measured_currents_times_gains_are_the_recorded_torques(shared):
+    gains = {"shoulder_pan": 14.87, "shoulder_lift": 13.26, "elbow": 11.13, "wrist_1": 10.62}
+    gains |= {"wrist_2": 11.03, "wrist_3": 11.47}  # [Nm/A], logs/README.md
+    joints = [f"{name}_joint" for name in gains]
+    text = {
+        "columns": {"tau": "i_{joint}"},
+        "units": {"tau": "A"},
+        "joints": {joint: {"gain": gain} for joint, gain in zip(joints, gains.values(), strict=True)},
+    }
+    path = shared / "logs" / "ur10e" / "19_12_23_free.parquet"
+    (plain,), (mapped,) = (
+        read_logs([path], joints, mapping=mapping) for mapping in (None, LogMapping.model_validate(text))
+    )
+    np.testing.assert_allclose(mapped.tau, plain.tau, atol=1e-6)
+
+
 MISFITS = {
     "current": (
         {"units": {"tau": "A"}, "joints": {"elbow": {"gain": 2.0}}},
