@@ -24,6 +24,7 @@ _SLOWEST = 1e-3
 _NETWORK_SHARE = 0.1
 _INPUT = ("joint", "motor", "value", "trained")
 _PLACE_SHARE = 0.1
+_LEAST_ROTOR = 0.01
 _GRID = 6
 _KAN_SHARE = 0.25
 _LEAST_KAN_UNITS = 2
@@ -72,6 +73,7 @@ def emit(spec: ModelSpec) -> str:
 
 def _closed_form(spec: ModelSpec) -> str:
     n, bodies = len(spec.joints), len(spec.bodies)
+    mean = _mean_mass(spec)
     made = f"{bodies} rigid bod{'ies' if bodies > 1 else 'y'} with trained inertial parameters"
     joints = [
         _call(
@@ -80,10 +82,11 @@ def _closed_form(spec: ModelSpec) -> str:
             revolute=joint.kind == "revolute",
             speed=joint.speed,
             friction=joint.friction,
-            rotor=joint.rotor,
+            # one that nothing is known of still has somewhere to start
+            rotor=joint.rotor or float(f"{_LEAST_ROTOR * mean[index][index]:.3g}"),
             actuated=joint.actuated,
         )
-        for joint in spec.joints
+        for index, joint in enumerate(spec.joints)
     ]
     rows = [
         _call(

@@ -25,12 +25,12 @@ if TYPE_CHECKING:
     from spelgen.training.runs import EmittedModel
 
 EVERY = 2  # samples taken of so many: filtered at 8 Hz and sampled at 100 Hz they say all that is to be said
-ALIKE = 20.0  # of those: so many in a row err alike and count once
+ALIKE = 20.0  # of those: so many in a row, 0.4 s, err alike and count once
 ROUNDS = 6  # of weighing joints by what is left of their torque
 STEPS = 8  # at most in a round
 GAIN = 1e-4  # relative: a step that gains less ends a round
 FIRST_NOISE = 0.1  # of a joint's torque range
-LEAST_NOISE = 0.02  # likewise: few samples may be fitted better than the model deserves
+LEAST_NOISE = 1e-4  # likewise: noise-free samples are fitted to four digits of their torque's range
 DAMPING = (1e-9, 1e-3, 1e6)  # of the steps, relative to the curvature: least, first, most
 
 

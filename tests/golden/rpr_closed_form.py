@@ -473,7 +473,7 @@ class Model(nn.Module):
         momenta = torch.tensordot(twists, self.basis, dims=([-1], [2])).mT
         wrenches = rises - self._cross(twists).mT @ momenta
         rows: Tensor = (motion.twists.mT @ wrenches).transpose(-3, -2)
-        return rows.reshape(*q.shape, -1)
+        return rows.reshape(*q.shape, 10 * len(BODIES))
 
     def dissipation(self, q: Tensor, qd: Tensor) -> Tensor:
         """D(q, qd), (..., n, n), diagonal: D qd is the friction torque."""
