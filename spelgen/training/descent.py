@@ -17,13 +17,17 @@ from spelgen.data.windows import Windows
 VECTOR_FACTOR = 5.0  # on the learning rate of constants and biases
 GRADIENT_NORM = 1.0  # of the scaled loss; larger gradients are shortened to it
 HISTORY = 50  # steps that L-BFGS remembers
+STALLED = 1 - 1e-4  # of the loss before a call: what ends above it has found next to nothing
 TOO_LARGE = 1e12  # told to the line search where a loss is not finite, so that it turns back
 
 Loss = Callable[[Windows], torch.Tensor]
 
 
 class Descent(Protocol):
-    """Moves the weights of one model."""
+    """Moves the weights of one model. stalled: whether there is no way down from here."""
+
+    @property
+    def stalled(self) -> bool: ...
 
     def descend(self, loss: Loss, windows: Windows, steps: int, rate: Callable[[int], float]) -> float:
         """Take ``steps`` steps on ``loss`` with the learning rates rate(0), rate(1) ... Return the mean loss,
@@ -54,6 +58,8 @@ class Batches:
                 {"params": numbers, "weight_decay": 0.0, "factor": VECTOR_FACTOR},
             ]
         )
+
+    stalled = False
 
     def descend(self, loss: Loss, windows: Windows, steps: int, rate: Callable[[int], float]) -> float:
         """See ``Descent``."""
@@ -102,6 +108,7 @@ class WholeSet:
         self._parameters = list(model.parameters())
         self._weights = [parameter for parameter in self._parameters if parameter.dim() > 1]
         self._decay, self._sound = decay, True
+        self._waits, self._reached = 0, math.inf
         self._optimiser = torch.optim.LBFGS(
             self._parameters,
             history_size=HISTORY,
@@ -120,9 +127,18 @@ class WholeSet:
             return math.nan
         try:
             with torch.no_grad():
-                return loss(windows).item()
+                found = loss(windows)
+                reached = (found + self._penalty()).item()
         except torch.linalg.LinAlgError:
             return math.nan
+        self._waits = self._waits + 1 if reached > STALLED * self._reached else 0
+        self._reached = reached
+        return found.item()
+
+    @property
+    def stalled(self) -> bool:
+        """Whether two calls in a row found next to nothing."""
+        return self._waits > 1
 
     def _evaluated(self, loss: Loss, windows: Windows) -> torch.Tensor:
         self._optimiser.zero_grad()
@@ -143,8 +159,13 @@ class WholeSet:
 
     def state_dict(self) -> dict[str, Any]:
         """All that a resumed run needs."""
-        return self._optimiser.state_dict()
+        return {
+            "optimiser": self._optimiser.state_dict(),
+            "reached": self._reached,
+            "waits": self._waits,
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from a ``state_dict``."""
-        self._optimiser.load_state_dict(state)
+        self._optimiser.load_state_dict(state["optimiser"])
+        self._reached, self._waits = state["reached"], state["waits"]

@@ -68,7 +68,9 @@ class TrainingLoop:
         self.stream, self.size = data.stream, data.size
         windows = len(self.training) if self.stream is None else len(self.stream) // self.stream.shares
         self.descent = self._descent(self.generator)
-        self.epoch_steps = max(EPOCH_STEPS, -(-windows // self.batch))
+        self.epoch_steps = (
+            EPOCH_STEPS if config.whole(self.size) else max(EPOCH_STEPS, -(-windows // self.batch))
+        )
         self.probe = self.training[:: -(-len(self.training) // PROBE)]
         self.epoch = self.step = self.best_epoch = self.rollbacks = 0
         self.rate_factor, self.seconds = 1.0, 0.0
@@ -121,7 +123,7 @@ class TrainingLoop:
                 break
             rate = functools.partial(self._warm_rate, done, spent)
             loss = descent.descend(self._momentum_loss, self.training, min(EPOCH_STEPS, steps - done), rate)
-            if not math.isfinite(loss):
+            if descent.stalled or not math.isfinite(loss):
                 break
             progress.warm_up(min(done + EPOCH_STEPS, steps), steps, loss)
         self._measure()
@@ -143,7 +145,7 @@ class TrainingLoop:
         return rollout_loss(self.stepped, windows, self.scales, self.substeps) + self._pull()
 
     def _end(self) -> Status | None:
-        if self.epoch >= self.config.epochs:
+        if self.epoch >= self.config.epochs or self.descent.stalled:
             return "finished"
         if self.epoch - self.best_epoch >= self.config.patience:
             return "stopped early"

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 SUBSTEPS = (1, 2, 4, 8, 16, 32)
 INTEGRATION_SHARE = 0.03  # of the model's own error, what the integrator may add
-LEAST_ERROR = 1e-3  # no model is expected to be better, in units of the scales
+LEAST_ERROR = 1e-2  # no model is expected to be better, in units of the scales
 
 
 class Dynamics(Protocol):
