@@ -7,6 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from spelgen.cli.main import app
+from spelgen.errors import SpelgenErrors
 from spelgen.excitation.design import design
 from spelgen.excitation.fourier import Series, bounds
 from spelgen.pipeline import load
@@ -105,6 +106,17 @@ def test_an_arm_without_limits_gets_modest_ones(tmp_path):
     assert 0.3 < np.abs(one.motion.qd).max() <= 0.6
     assert np.abs(one.motion.q).max() <= 0.8 * np.pi
     assert np.isnan(one.efforts).all()
+
+
+def test_a_joint_without_room_is_refused(robots, tmp_path):
+    text = (robots / "two_link.urdf").read_text()
+    (tmp_path / "stuck.urdf").write_text(text.replace("3.141592653589793", "0"))
+    with pytest.raises(SpelgenErrors) as caught:
+        design(load(tmp_path / "stuck.urdf").arm, **CHOICE, trials=1)
+    assert str(caught.value).splitlines()[0] == (
+        "joint 'joint1': got the limits 0 .. 0, expected room to move; "
+        "correct them, or leave the joint out by --joints"
+    )
 
 
 def test_the_command(robots, tmp_path, monkeypatch):

@@ -11,6 +11,7 @@ from math import cos, pi
 import numpy as np
 
 from spelgen.arm.arm import Arm, Coordinate
+from spelgen.errors import ArmError, collect
 
 DENSITY = 40  # points of a grid for each harmonic
 BETWEEN = cos(pi / DENSITY)
@@ -28,7 +29,18 @@ class Bounds:
 
 
 def bounds(arm: Arm, reach: float, speed: float) -> Bounds:
-    """The arm's limits, of the range the middle part `reach`, of the velocity limits the part `speed`."""
+    """The arm's limits, of the range the middle part `reach`, of the velocity limits the part `speed`.
+
+    Raises ArmError where a joint has no room between its limits.
+    """
+    stuck = [c for c in arm.coordinates if _range(c)[0] == _range(c)[1]]
+    collect([
+        ArmError(
+            f"the limits {c.lower:g} .. {c.upper:g}", element=f"joint {c.name!r}", expected="room to move",
+            do="correct them, or leave the joint out by --joints",
+        )
+        for c in stuck
+    ])  # fmt: skip
     ranges = np.array([_range(coordinate) for coordinate in arm.coordinates])
     middle, half = ranges.mean(axis=1), np.diff(ranges, axis=1)[:, 0] / 2
     limits = np.array([c.velocity or SPEEDS[c.kind] for c in arm.coordinates])

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import csv
 import io
+import textwrap
 
 import numpy as np
 
 from spelgen.arm.arm import Arm
 from spelgen.excitation.design import Excitation
 from spelgen.excitation.fourier import Motion
-from spelgen.listing import Listing
+from spelgen.listing import WIDTH, Listing
 
 WARNING = (
     "Not checked: collisions of the arm with itself, its load and its surroundings. Look at the motion, then run "
@@ -49,7 +50,8 @@ def text(found: Excitation, arm: Arm) -> str:
     if (found.efforts > 1).any():
         parts.append("warning: effort limits are overrun: no motion was found that keeps them")
     if lacking:
-        parts.append(f"no velocity limit, 1 rad/s or 0.25 m/s taken: {', '.join(lacking)}")
+        told = f"no velocity limit, 1 rad/s or 0.25 m/s taken: {', '.join(lacking)}"
+        parts.append(textwrap.fill(told, WIDTH, subsequent_indent="  "))
     return "\n\n".join(parts)
 
 
