@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from markupsafe import Markup
 
-MARGIN_RIGHT, MARGIN_TOP, MARGIN_BOTTOM = 12, 10, 36
+MARGIN_RIGHT, MARGIN_TOP, MARGIN_BOTTOM = 18, 10, 36
 LABEL_ROOM, DIGIT = 28, 7  # left of the y axis: its label, and each character of its ticks
 MAX_POINTS = 600  # per line: more cannot be seen at this size and only makes the file heavy
 MAX_DECADES = 8  # of a logarithmic axis, counted from the largest value
