@@ -24,9 +24,10 @@ report: charts plots tables picture learned page
 proof: agreement axes reasons meaning second_reading numeric_samples verification
 formulas: expression notation angles harmonics factoring shortening grouping formulas layout text latex sympy_module
 inspection inspection_page pipeline
+export: twin urdf_file
 survey: measures gravity survey tables page
 comparison: paper truth measures study tables page
-cli: console options formats model_commands run_commands log_commands identify_command compare_command main
+cli: console options formats model_commands run_commands log_commands identify_command compare_command export_command main
 __init__ __main__
 """
 

@@ -12,7 +12,14 @@ from typing import Annotated
 import typer
 
 from spelgen import __version__
-from spelgen.cli import compare_command, identify_command, log_commands, model_commands, run_commands
+from spelgen.cli import (
+    compare_command,
+    export_command,
+    identify_command,
+    log_commands,
+    model_commands,
+    run_commands,
+)
 from spelgen.cli.console import say, told
 
 app = typer.Typer(
@@ -32,6 +39,7 @@ for command in (
     run_commands.train,
     run_commands.evaluate,
     run_commands.report,
+    export_command.export,
     compare_command.compare,
     model_commands.check,
 ):

@@ -1,0 +1,103 @@
+"""Twin -> a URDF and the settings beside it: the run's own files with other numbers in them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import yaml
+from lxml import etree
+
+from spelgen.arm.rational import alignment
+from spelgen.arm.snapping import Snapper
+from spelgen.export.twin import Twin
+from spelgen.settings import load_settings
+from spelgen.urdf.document import urdf_bytes
+from spelgen.urdf.read import read_urdf
+from spelgen.urdf.robot import Robot
+
+TEN = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+
+
+def urdf_text(twin: Twin, urdf: Path, snap_tolerance: float) -> bytes:
+    """The URDF at ``urdf`` with the twin's inertials and friction.
+
+    A link that a joint moves gets all that moves with it; the links it carries by fixed or locked joints lose
+    their inertials to it.
+    """
+    robot = read_urdf(urdf)
+    parser = etree.XMLParser(resolve_entities=False, no_network=True)
+    root = etree.fromstring(urdf_bytes(urdf), parser)
+    links = {element.get("name"): element for element in root.findall("link")}
+    joints = {element.get("name"): element for element in root.findall("joint")}
+    moved = {robot.joint[body.name].child for body in twin.arm.bodies}
+    for name in _carried(robot, moved):
+        for element in links[name].findall("inertial"):
+            links[name].remove(element)
+    snapper = Snapper(snap_tolerance)
+    for body, ten in zip(twin.arm.bodies, twin.inertias, strict=True):
+        joint = robot.joint[body.name]
+        _set_inertial(links[joint.child], _in_link(ten, alignment(snapper.axis(joint))))
+    for index, coordinate in enumerate(twin.arm.coordinates):
+        mean = (twin.forward[index] - twin.backward[index]) / 2
+        element = joints[coordinate.name]
+        for old in element.findall("dynamics"):
+            element.remove(old)
+        values = {"damping": _number(twin.viscous[index]), "friction": _number(mean)}
+        etree.SubElement(element, "dynamics", values)
+    return etree.tostring(root, xml_declaration=True, encoding="utf-8") + b"\n"
+
+
+def settings_text(twin: Twin, urdf: Path) -> str:
+    """The settings beside ``urdf`` with the twin's drives and friction, in both directions."""
+    beside = urdf.with_suffix(".yaml")
+    content = (yaml.safe_load(beside.read_text(encoding="utf-8")) if beside.exists() else None) or {}
+    settings = load_settings(urdf)
+    joints = content.setdefault("joints", {})
+    for index, coordinate in enumerate(twin.arm.coordinates):
+        joint = joints.setdefault(coordinate.name, {})
+        gear = settings.joint(coordinate.name).gear
+        joint["rotor_inertia"] = _rounded(twin.rotors[index] / gear**2)
+        joint["viscous"] = _rounded(twin.viscous[index])
+        joint["coulomb"] = [_rounded(twin.forward[index]), _rounded(twin.backward[index])]
+    return yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+
+
+def _carried(robot: Robot, moved: set[str]) -> list[str]:
+    """Links with an inertial that move with another link."""
+    found = []
+    for link in robot.links:
+        above = {joint.child for joint in robot.path_to(link.name)}
+        if link.inertial is not None and link.name not in moved and above & moved:
+            found.append(link.name)
+    return found
+
+
+def _in_link(ten: np.ndarray, turned: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Mass, centre of mass and tensor about it in the link's frame; ``turned`` takes +z to the joint's axis."""
+    mass, center = ten[0], ten[1:4] / ten[0]
+    xx, xy, xz, yy, yz, zz = ten[4:]
+    about_joint = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    about_center = about_joint - mass * (center @ center * np.eye(3) - np.outer(center, center))
+    return mass, turned @ center, turned @ about_center @ turned.T
+
+
+def _set_inertial(link: etree._Element, values: tuple[float, np.ndarray, np.ndarray]) -> None:
+    mass, center, tensor = values
+    for old in link.findall("inertial"):
+        link.remove(old)
+    inertial = etree.Element("inertial")
+    etree.SubElement(inertial, "origin", xyz=" ".join(map(_number, center)), rpy="0 0 0")
+    etree.SubElement(inertial, "mass", value=_number(mass))
+    etree.SubElement(
+        inertial, "inertia", dict(zip(TEN, map(_number, tensor[np.triu_indices(3)]), strict=True))
+    )
+    link.insert(0, inertial)
+
+
+def _rounded(value: float) -> float:
+    return float(_number(value))
+
+
+def _number(value: float) -> str:
+    return f"{value:.12g}"
