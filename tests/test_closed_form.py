@@ -1,6 +1,7 @@
 """The preset closed-form: rigid bodies against Pinocchio, derivatives against autograd, fits against known arms."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
@@ -12,12 +13,15 @@ from typer.testing import CliRunner
 from spelgen.cli.main import app
 from spelgen.data.logs import read_logs, write_logs
 from spelgen.data.trajectory import Trajectory
+from spelgen.errors import LogError, RunError
 from spelgen.identification.samples import DynamicsSamples, dynamics_samples
 from spelgen.pipeline import build, load
 from spelgen.structure.pseudo_inertia import pseudo_inertia
 from spelgen.structure.sampling import float_energies
 from spelgen.training.belief import SIZES, Belief
+from spelgen.training.data import TrainingConfig
 from spelgen.training.torque_fit import fit_torque
+from spelgen.training.torque_start import start_from_torque
 
 ROBOTS = ("two_link", "rpr", "six_dof", "ur10e", "panda")
 
@@ -257,18 +261,23 @@ def test_belief_shares_what_joints_share():
     assert torch.linalg.eigvalsh(covariance)[0] > 0
 
 
+def write(path, samples, arm):
+    """Samples at 100 Hz as a log."""
+    names = [coordinate.name for coordinate in arm.coordinates]
+    written = [
+        Trajectory(f"known {k}", 0.01 * np.arange(len(x.q)), x.q, x.qd, x.tau) for k, x in enumerate(samples)
+    ]
+    write_logs(path, written, names)
+
+
 @pytest.fixture(scope="module")
 def run(emitted, robots, tmp_path_factory):
     """A run of `spelgen train` on a closed-form module, and the model whose torques its logs hold."""
     folder = tmp_path_factory.mktemp("closed_form_run")
     module, arm = emitted["six_dof"]
     true = drawn(module, seed=4, deviation=0.2)
-    names = [coordinate.name for coordinate in arm.coordinates]
     logs = [recorded(true, 5.0, 0.01, seed=seed) for seed in range(2)]
-    written = [
-        Trajectory(f"known {k}", 0.01 * np.arange(len(x.q)), x.q, x.qd, x.tau) for k, x in enumerate(logs)
-    ]
-    write_logs(folder / "logs.parquet", written, names)
+    write(folder / "logs.parquet", logs, arm)
     robot = str(robots / "six_dof.urdf")
     build_ = ["build", robot, "--preset", "closed-form", "-o", str(folder / "arm.py")]
     train = ["train", str(folder / "arm.py"), "--robot", robot, "--data", str(folder / "logs.parquet")]
@@ -287,12 +296,48 @@ def test_train_fits_torques_and_leaves_a_run(run, emitted):
     assert nmse(model, fresh) < 0.2 * nmse(
         emitted["six_dof"][0].Model(), fresh
     )  # friction, filtered at 8 Hz, differs
-    logs = ["--data", str(folder / "logs.parquet")]
-    done = CliRunner().invoke(app, ["evaluate", str(folder / "run"), *logs])
+    write(folder / "test.parquet", [recorded(true, 1.2, 0.01, seed=8)], emitted["six_dof"][1])
+    done = CliRunner().invoke(app, ["evaluate", str(folder / "run"), "--data", str(folder / "test.parquet")])
     assert done.exit_code == 0, done.output
     result = json.loads((folder / "run" / "evaluation.json").read_text(encoding="utf-8"))
     assert result["torque"]["model"]["mean_nmse"] < 5e-3
     assert CliRunner().invoke(app, ["report", str(folder / "run")]).exit_code == 0
+
+
+def test_a_run_is_adapted_to_a_load(run, emitted, tmp_path):
+    folder, true, _ = run
+    module, arm = emitted["six_dof"]
+    loaded = module.Model()
+    loaded.load_state_dict(true.state_dict())
+    loaded.bodies.data[5, 9] += 1.0  # heavier
+    loaded.bodies.data[5, 6] += 0.5
+    seen = recorded(loaded, 5.0, 0.01, seed=3)
+    write(tmp_path / "loaded.parquet", [seen], arm)
+    command = ["train", "--from", str(folder / "run"), "--data", str(tmp_path / "loaded.parquet")]
+    done = CliRunner().invoke(app, [*command, "-o", str(tmp_path / "adapted"), "--quiet"])
+    assert done.exit_code == 0, done.output
+    before, after = (
+        torch.load(x / "model.pt", weights_only=True) for x in (folder / "run", tmp_path / "adapted")
+    )
+    assert {name for name in before if not torch.equal(before[name], after[name])} == {"bodies"}
+    assert torch.equal(before["bodies"][:5], after["bodies"][:5])
+    errors = []
+    for state in (before, after):
+        model = module.Model()
+        model.load_state_dict(state)
+        errors.append(nmse(model, recorded(loaded, 5.0, 0.0, seed=6)))
+    assert errors[1] < 0.3 * errors[0]
+
+
+def test_what_cannot_be_adapted_is_told(emitted):
+    config, nothing = TrainingConfig(), SimpleNamespace(recordings=())
+    with pytest.raises(RunError, match="a load for a model of networks"):
+        start_from_torque(torch.nn.Linear(1, 1), nothing, config, fit=True, loaded=True)
+    with pytest.raises(LogError, match="no motion to fit a load to"):
+        start_from_torque(emitted["rpr"][0].Model(), nothing, config, fit=True, loaded=True)
+    left, notes = start_from_torque(emitted["rpr"][0].Model(), nothing, config, fit=True)
+    assert left == config  # windows are all there is
+    assert notes[0].code == "no-torque-fit"
 
 
 def test_the_same_logs_give_the_same_weights(run, tmp_path):

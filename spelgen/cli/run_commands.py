@@ -17,7 +17,6 @@ from spelgen.cli.options import (
     Force,
     Joints,
     Mapping,
-    Module,
     MoreData,
     Robot,
     RobotOption,
@@ -75,7 +74,10 @@ def simulate(
 
 
 def train(
-    module: Module,
+    module: Annotated[
+        Path | None,
+        typer.Argument(metavar="MODULE.py", help="A module written by `spelgen build`.", show_default=False),
+    ] = None,
     more: MoreData = None,
     data: Data = None,
     output: Annotated[
@@ -85,6 +87,12 @@ def train(
     mapping: Mapping = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in the run folder.")] = False,
     force: Force = False,
+    source: Annotated[
+        Path | None,
+        typer.Option(
+            "--from", metavar="RUN", help="Adapt a closed-form run to a load at the tip; no MODULE."
+        ),
+    ] = None,
     objective: Annotated[
         Literal["torque", "rollout"] | None,
         typer.Option("--objective", help="Of closed-form models, torque unless this says rollout."),
@@ -145,6 +153,11 @@ def train(
         "validation_fraction": validation_fraction, "filter": filter, "seed": seed, "device": device,
         "threads": threads, "compile": compile,
     }  # fmt: skip
+    if source is not None:
+        more = [*([module] if module else []), *(more or [])]  # all that stands there is logs
+        module, robot = _of_run(source, robot)
+    if module is None:
+        raise typer.BadParameter("name a module, or a run with --from", param_hint="'MODULE.py'")
     paths = options.logs(data, more)
     from spelgen.training import train as training
 
@@ -159,6 +172,7 @@ def train(
         folder,
         config,
         urdf=urdf,
+        source=source,
         mapping=options.mapping(mapping, None if resume else urdf, read_header(module).joints),
         resume=resume,
         force=force,
@@ -205,6 +219,15 @@ def report(
     from spelgen.report.page import write_report
 
     say(f"wrote {write_report(run, output)}")
+
+
+def _of_run(source: Path, robot: Path | None) -> tuple[Path, Path | None]:
+    """The module and the URDF of a run."""
+    from spelgen.training.runs import RunFolder
+
+    run = RunFolder(source)
+    run.read_json(run.config)  # where there is no run, this says so
+    return run.module, robot or (run.urdf if run.urdf.exists() else None)
 
 
 def _unchanged_urdf(module: Path) -> Path | None:

@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from spelgen.errors import Diagnostic, RunError
+from spelgen.errors import Diagnostic, LogError, RunError
 from spelgen.identification.samples import DENSE, dynamics_samples
+from spelgen.training.belief import Belief
 from spelgen.training.data import TrainingConfig, TrainingData
 from spelgen.training.torque_fit import fit_torque
 
 if TYPE_CHECKING:
     from spelgen.training.runs import EmittedModel
+
+
+LOAD = Belief(bodies=10.0)
+"""Nothing is believed of a load."""
+
+
+def last_body(model: Any) -> int:
+    """The body that holds the tip, and what the tip holds."""
+    return int(model.bodies.shape[0]) - 1
 
 
 def is_closed_form(model: EmittedModel) -> bool:
@@ -20,30 +30,35 @@ def is_closed_form(model: EmittedModel) -> bool:
 
 
 def start_from_torque(
-    model: EmittedModel, data: TrainingData, config: TrainingConfig, *, fit: bool
+    model: EmittedModel, data: TrainingData, config: TrainingConfig, *, fit: bool, loaded: bool = False
 ) -> tuple[TrainingConfig, list[Diagnostic]]:
     """Fit a closed-form model to the torques of all recordings; the config for what is left to do, and notes.
 
     Nothing is left unless the objective is ``rollout``. Logs sampled too slowly for accelerations, or larger
-    than memory, leave all to the predicted windows. Without ``fit`` the weights stay, as in a run that is resumed.
-    Raises RunError where the objective is ``torque`` and the model is made of networks.
+    than memory, leave all to the predicted windows. ``loaded``: the weights are those of the arm without a load,
+    and only the last body's move. Without ``fit`` the weights stay, as in a run that is resumed.
+    Raises RunError where a load or the objective ``torque`` meets a model of networks, LogError for a load without
+    samples.
     """
     if not is_closed_form(model):
-        if config.objective == "torque":
-            raise RunError(
-                "the objective 'torque' for a model of networks",
-                expected="a module of the preset closed-form",
-            )
+        if loaded or config.objective == "torque":
+            wanted = "a load" if loaded else "the objective 'torque'"
+            raise RunError(f"{wanted} for a model of networks", expected="a module of the preset closed-form")
         return config, []
     samples = dynamics_samples(data.recordings)
     if not any(len(x.q) for x in samples):
+        if loaded:
+            raise LogError(
+                "no motion to fit a load to", expected=f"samples at {DENSE:g} Hz or more that move"
+            )
         message = f"no torque fit: these logs are sampled below {DENSE:g} Hz, or larger than memory"
         return config, [Diagnostic("warning", "no-torque-fit", "logs", None, message)]
     notes = []
     if fit:
-        found = fit_torque(model, samples)
+        found = fit_torque(model, samples, LOAD if loaded else None, [last_body(model)] if loaded else None)
+        what = "the last body alone fitted" if loaded else "fitted"
         message = (
-            f"fitted to the torques of {sum(len(x.q) for x in samples)} samples, those of validation included"
+            f"{what} to the torques of {sum(len(x.q) for x in samples)} samples, those of validation included"
         )
         notes = [Diagnostic("info", "torque-fit", "logs", None, f"{message}, in {found.steps} steps")]
     if config.objective != "rollout":

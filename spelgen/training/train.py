@@ -70,6 +70,7 @@ def train(
     config: TrainingConfig,
     *,
     urdf: Path | str | None = None,
+    source: Path | str | None = None,
     mapping: LogMapping | None = None,
     resume: bool = False,
     force: bool = False,
@@ -78,9 +79,10 @@ def train(
     """Train the emitted module on the logs and leave a run folder (see `RunFolder`).
 
     urdf: the robot the module was built from, for the rivals of `evaluate`; by default the file of that name
-    beside the module. mapping: how the logs are named and measured; by default as spelgen writes them, and
-    when resumed as before. resume: go on from the folder's checkpoint, exactly as if there had been no
-    interruption. Ctrl-C or SIGTERM end the run with status "interrupted"; the folder is usable and
+    beside the module. source: a run of this module, whose weights are adapted to a load at the tip: of a
+    closed-form model the last body alone moves. mapping: how the logs are named and measured; by default as
+    spelgen writes them, and when resumed as before. resume: go on from the folder's checkpoint, exactly as if
+    there had been no interruption. Ctrl-C or SIGTERM end the run with status "interrupted"; the folder is usable and
     resumable. Raises ModuleError, LogError, and RunError when the folder holds a run or cannot be resumed
     with this.
     """
@@ -92,6 +94,8 @@ def train(
         module = run.module
     _use(config)
     model = load_model(module)
+    if source is not None and not resume:
+        model.load_state_dict(RunFolder(Path(source)).load_state(RunFolder(Path(source)).weights))
     header = read_header(module)
     paths = list(data)
     large = large_files(paths, header.joints, role="train")
@@ -112,7 +116,7 @@ def train(
         notes += found
         run.start(module, robot, force=force)
         write_json(run.config, description)
-    config, told = start_from_torque(model, prepared, config, fit=not resume)
+    config, told = start_from_torque(model, prepared, config, fit=not resume, loaded=source is not None)
     notes += told
     prior = _prior(run, header, model, prepared, config, notes) if config.epochs else None
     loop = TrainingLoop(run, model, prepared, config, prior, stepped)
