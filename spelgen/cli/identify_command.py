@@ -10,7 +10,7 @@ import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import note, say
-from spelgen.cli.options import Data, Joints, MoreData, Robot, SnapTolerance, Tip
+from spelgen.cli.options import Data, Joints, Mapping, MoreData, Robot, SnapTolerance, Tip
 from spelgen.files import write_text
 
 if TYPE_CHECKING:
@@ -23,6 +23,7 @@ def identify(
     robot: Robot,
     more: MoreData = None,
     data: Data = None,
+    mapping: Mapping = None,
     joints: Joints = None,
     tip: Tip = None,
     snap_tol: SnapTolerance = 2e-3,
@@ -62,7 +63,9 @@ def identify(
 
     loaded = pipeline.load(robot, options.names(joints), tip, snap_tol)
     names = [coordinate.name for coordinate in loaded.arm.coordinates]
-    samples = _samples(read_logs(paths, names, role="train"), loaded)
+    kinds = [coordinate.kind for coordinate in loaded.arm.coordinates]
+    named = options.mapping(mapping, robot, names)
+    samples = _samples(read_logs(paths, names, role="train", mapping=named, joint_types=kinds), loaded)
     method = Method(weights, ridge, prior, FrictionModel(dry_velocity, stribeck, polynomial))
     found = identified(loaded.arm, samples, method)
     result = told.text(found) if format == "text" else json.dumps(told.to_dict(found), indent=2)

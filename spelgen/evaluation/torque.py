@@ -9,14 +9,7 @@ import numpy as np
 import torch
 
 from spelgen.data.logs import Trajectory
-from spelgen.data.signals import low_pass, resample
-from spelgen.data.trajectory import rate, split_at_gaps
-
-FREQUENCY = 100.0  # [Hz] of the common grid
-CUTOFF = 8.0  # [Hz]
-MOVING = 0.02  # [rad/s, m/s] samples at which every joint is slower say nothing of dynamics
-DENSE = 50.0  # [Hz] below this rate accelerations cannot be had from a log
-SHORTEST = 1.0  # [s] pieces below this are all filter transient
+from spelgen.identification.samples import dynamics_samples
 
 
 @dataclass(frozen=True)
@@ -43,27 +36,11 @@ class TorqueSamples:
 
 
 def torque_samples(trajectories: Sequence[Trajectory]) -> list[TorqueSamples]:
-    """The moving samples of each dense enough trajectory.
-
-    Resampled to 100 Hz, zero-phase 4th-order Butterworth low-pass at 8 Hz on q, qd and tau, qdd by central
-    differences of the filtered qd, only samples with some |qd| > 0.02 rad/s; pieces between gaps separately.
-    """
-    return [_samples(x) for x in trajectories if rate(x) >= DENSE and any(map(_long, split_at_gaps(x)))]
-
-
-def _long(piece: Trajectory) -> bool:
-    return bool(piece.t[-1] - piece.t[0] >= SHORTEST)
-
-
-def _samples(trajectory: Trajectory) -> TorqueSamples:
-    parts = []
-    for piece in filter(_long, split_at_gaps(trajectory)):
-        smooth = low_pass(resample(piece, FREQUENCY), CUTOFF)
-        qdd = np.gradient(smooth.qd, smooth.t, axis=0)
-        moving = (np.abs(smooth.qd) > MOVING).any(axis=1)
-        parts.append([x[moving] for x in (smooth.q, smooth.qd, qdd, smooth.tau)])
-    q, qd, qdd, tau = (torch.from_numpy(np.concatenate(columns)) for columns in zip(*parts, strict=True))
-    return TorqueSamples(trajectory.name, q, qd, qdd, tau)
+    """The moving samples of each dense enough trajectory, by the protocol of ``dynamics_samples``."""
+    return [
+        TorqueSamples(x.name, *(torch.from_numpy(part) for part in (x.q, x.qd, x.qdd, x.tau)))
+        for x in dynamics_samples(trajectories)
+    ]
 
 
 def torque_errors(
