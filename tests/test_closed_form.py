@@ -340,6 +340,13 @@ def test_what_cannot_be_adapted_is_told(emitted):
     assert notes[0].code == "no-torque-fit"
 
 
+def test_it_has_no_network_to_choose(robots, tmp_path):
+    command = ["build", str(robots / "rpr.urdf"), "--preset", "closed-form", "--net", "kan"]
+    done = CliRunner().invoke(app, [*command, "-o", str(tmp_path / "arm.py")])
+    assert done.exit_code == 2
+    assert "closed-form has no networks" in done.output
+
+
 def test_the_same_logs_give_the_same_weights(run, tmp_path):
     folder, _, train = run
     again = [*train[:-3], "-o", str(tmp_path / "again"), "--quiet"]

@@ -90,6 +90,8 @@ def build(
     force: Force = False,
 ) -> None:
     """Write the PyTorch module tailored to an arm."""
+    if net is not None and preset == "closed-form":
+        raise typer.BadParameter("closed-form has no networks", param_hint="'--net'")
     from spelgen import pipeline
 
     source = pipeline.build(
