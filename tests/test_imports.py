@@ -18,7 +18,8 @@ data: trajectory bags tables logs doubts signals windows parts stream
 simulation: engine simulate tracking protocols
 identification: samples friction regressor base least_squares prior identify told
 excitation: fourier design told
-training: runs belief torque_fit lie_group rollout compiled rivals prior progress data streamed descent torque_start loop train
+training: runs belief torque_fit lie_group rollout compiled rivals prior progress
+training: data streamed descent torque_start loop train
 evaluation: tip torque examples evaluate
 report: charts plots tables picture learned page
 proof: agreement axes reasons meaning second_reading numeric_samples verification
@@ -27,7 +28,8 @@ inspection inspection_page pipeline
 export: twin urdf_file
 survey: measures gravity survey tables page
 comparison: paper truth measures study tables page
-cli: console options formats model_commands run_commands log_commands identify_command compare_command export_command main
+cli: console options formats model_commands run_commands log_commands
+cli: identify_command compare_command export_command main
 __init__ __main__
 """
 

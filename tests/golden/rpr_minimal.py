@@ -232,7 +232,7 @@ class Series(NamedTuple):
 
 
 def series(sums: list[tuple[float, Terms]], scales: list[float], shares: list[float]) -> Series:
-    """The sums (level, terms) in units of their scales; a wave is as large as its joints' shares."""
+    """Sums (level, terms) in units of their scales; a wave counts as its joints' least share."""
     first = FEATURES - 2 * len(WAVES)
     levels, rows = [], []
     for output, ((level, terms), scale) in enumerate(zip(sums, scales, strict=True)):
@@ -540,7 +540,7 @@ class Model(nn.Module):
         return rows.reshape(*rows.shape[:-1], self.n, self.n)
 
     def _features(self, q: Tensor) -> Tensor:
-        """cos q, sin q, the scaled q, cosines and sines of waves: all that is read of q, (..., features)."""
+        """cos q, sin q, the scaled q, those of waves: all that is read of q, (..., features)."""
         place = (q - self.center) / self.reach
         angle = q @ self.turns
         size = (place.unsqueeze(-2) ** self.powers).prod(dim=-1)
@@ -553,7 +553,7 @@ class Model(nn.Module):
         return features.split(sizes, dim=-1)
 
     def _slide_slopes(self, wave: Tensor) -> Tensor:
-        """d/dq of cosines or sines of waves by sliding joints, (..., n, waves): lower powers of the same."""
+        """d/dq of waves by sliding joints, (..., n, waves): lower powers of the same waves."""
         return (wave @ self.lower).unflatten(-1, (self.n, len(WAVES)))
 
     def _features_rate(self, features: Tensor, qd: Tensor) -> Tensor:

@@ -192,7 +192,7 @@ class Series(NamedTuple):
 
 
 def series(sums: list[tuple[float, Terms]], scales: list[float], shares: list[float]) -> Series:
-    """The sums (level, terms) in units of their scales; a wave is as large as its joints' shares."""
+    """Sums (level, terms) in units of their scales; a wave counts as its joints' least share."""
     first = FEATURES - 2 * len(WAVES)
     levels, rows = [], []
     for output, ((level, terms), scale) in enumerate(zip(sums, scales, strict=True)):
@@ -477,7 +477,7 @@ class Model(nn.Module):
         return rows.reshape(*rows.shape[:-1], self.n, self.n)
 
     def _features(self, q: Tensor) -> Tensor:
-        """cos q, sin q, cosines and sines of waves: all that is read of q, (..., features)."""
+        """cos q, sin q, those of waves: all that is read of q, (..., features)."""
         angle = q @ self.turns
         waves = (angle.cos(), angle.sin())
         return torch.cat([q.cos(), q.sin(), *waves], dim=-1)
