@@ -243,9 +243,9 @@ def series(sums: list[tuple[float, Terms]], scales: list[float], shares: list[fl
             size = min(share for share, moves in zip(shares, moved, strict=True) if moves)
             rows.append((output, first + number, cos / scale / size, size))
             rows.append((output, first + len(WAVES) + number, sin / scale / size, size))
-    outputs, features, start, size = zip(*rows, strict=True)
+    outputs, features, starts, sizes = zip(*rows, strict=True)
     return Series(
-        torch.tensor(outputs), torch.tensor(features), vector(start), vector(size), vector(levels)
+        torch.tensor(outputs), torch.tensor(features), vector(starts), vector(sizes), vector(levels)
     )
 
 
@@ -549,12 +549,12 @@ class Model(nn.Module):
 
     def _parts(self, features: Tensor) -> tuple[Tensor, ...]:
         """Cosines, sines, scaled q, cosines and sines of waves."""
-        sizes = [self.n] * 3 + [len(WAVES)] * 2
-        return features.split(sizes, dim=-1)
+        n, waves = self.n, len(WAVES)
+        return tuple(features.tensor_split((n, 2 * n, 3 * n, 3 * n + waves), dim=-1))
 
     def _slide_slopes(self, wave: Tensor) -> Tensor:
         """d/dq of waves by sliding joints, (..., n, waves): lower powers of the same waves."""
-        return (wave @ self.lower).unflatten(-1, (self.n, len(WAVES)))
+        return (wave @ self.lower).reshape(*wave.shape[:-1], self.n, len(WAVES))
 
     def _features_rate(self, features: Tensor, qd: Tensor) -> Tensor:
         """How fast the features change along qd."""

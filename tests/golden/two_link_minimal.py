@@ -202,9 +202,9 @@ def series(sums: list[tuple[float, Terms]], scales: list[float], shares: list[fl
             size = min(share for share, turn in zip(shares, turns, strict=True) if turn)
             rows.append((output, first + number, cos / scale / size, size))
             rows.append((output, first + len(WAVES) + number, sin / scale / size, size))
-    outputs, features, start, size = zip(*rows, strict=True)
+    outputs, features, starts, sizes = zip(*rows, strict=True)
     return Series(
-        torch.tensor(outputs), torch.tensor(features), vector(start), vector(size), vector(levels)
+        torch.tensor(outputs), torch.tensor(features), vector(starts), vector(sizes), vector(levels)
     )
 
 
@@ -484,8 +484,8 @@ class Model(nn.Module):
 
     def _parts(self, features: Tensor) -> tuple[Tensor, ...]:
         """Cosines, sines, cosines and sines of waves."""
-        sizes = [self.n] * 2 + [len(WAVES)] * 2
-        return features.split(sizes, dim=-1)
+        n, waves = self.n, len(WAVES)
+        return tuple(features.tensor_split((n, 2 * n, 2 * n + waves), dim=-1))
 
     def _features_rate(self, features: Tensor, qd: Tensor) -> Tensor:
         """How fast the features change along qd."""
