@@ -17,7 +17,7 @@ from spelgen.data.windows import Windows
 VECTOR_FACTOR = 5.0  # on the learning rate of constants and biases
 GRADIENT_NORM = 1.0  # of the scaled loss; larger gradients are shortened to it
 HISTORY = 50  # steps that L-BFGS remembers
-STALLED = 1 - 1e-4  # of the loss before a call: what ends above it has found next to nothing
+STALLED = 1 - 1e-3  # of the loss before a call: what ends above it has found next to nothing
 TOO_LARGE = 1e12  # told to the line search where a loss is not finite, so that it turns back
 
 Loss = Callable[[Windows], torch.Tensor]
@@ -108,7 +108,7 @@ class WholeSet:
         self._parameters = list(model.parameters())
         self._weights = [parameter for parameter in self._parameters if parameter.dim() > 1]
         self._decay, self._sound = decay, True
-        self._waits, self._reached = 0, math.inf
+        self._waits, self._reached = 0, (math.inf, math.inf)  # loss, and with the penalty
         self._optimiser = torch.optim.LBFGS(
             self._parameters,
             history_size=HISTORY,
@@ -131,8 +131,10 @@ class WholeSet:
                 reached = (found + self._penalty()).item()
         except torch.linalg.LinAlgError:
             return math.nan
-        self._waits = self._waits + 1 if reached > STALLED * self._reached else 0
-        self._reached = reached
+        now = (found.item(), reached)
+        found_nothing = all(x > STALLED * before for x, before in zip(now, self._reached, strict=True))
+        self._waits = self._waits + 1 if found_nothing else 0
+        self._reached = now
         return found.item()
 
     @property
