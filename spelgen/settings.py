@@ -115,7 +115,7 @@ class TrackingSettings(Group):
 class TrainingSettings(Group):
     """Defaults of `spelgen train`; command-line flags override them.
 
-    objective: what is fitted: the torque (closed-form models only, their default) or predicted windows.
+    objective: what is fitted: the torque (the default of closed-form models) or predicted windows.
     window: samples predicted together. stride: samples from the start of one window to the next.
     every: samples from one sample of a window to the next; None: as many as filtered logs can spare.
     batch: windows per step. epochs: passes over all windows, at most.

@@ -357,16 +357,6 @@ def test_the_same_logs_give_the_same_weights(run, tmp_path):
     assert all(torch.equal(first[name], second[name]) for name in first)
 
 
-def test_networks_have_no_torque_objective(run, robots, tmp_path):
-    _, _, train = run
-    robot = str(robots / "six_dof.urdf")
-    CliRunner().invoke(app, ["build", robot, "-o", str(tmp_path / "arm.py")])
-    command = ["train", str(tmp_path / "arm.py"), *train[2:-3], "-o", str(tmp_path / "run")]
-    done = CliRunner().invoke(app, [*command, "--objective", "torque", "--quiet"])
-    assert done.exit_code == 1
-    assert "a model of networks" in done.output
-
-
 def delan(shared):
     """The characters: samples by label, and Coriolis torques."""
     data = np.load(shared / "logs" / "delan_characters" / "character_data.npz", allow_pickle=True)

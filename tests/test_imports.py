@@ -19,7 +19,7 @@ simulation: engine simulate tracking protocols
 identification: samples friction regressor base least_squares prior identify told
 excitation: fourier design told
 training: runs belief torque_fit lie_group rollout compiled rivals prior progress
-training: data streamed descent torque_start loop train
+training: data streamed descent torque_networks torque_start loop train
 evaluation: tip torque examples evaluate
 report: charts plots tables picture learned page
 proof: agreement axes reasons meaning second_reading numeric_samples verification

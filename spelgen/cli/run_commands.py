@@ -95,7 +95,7 @@ def train(
     ] = None,
     objective: Annotated[
         Literal["torque", "rollout"] | None,
-        typer.Option("--objective", help="Of closed-form models, torque unless this says rollout."),
+        typer.Option("--objective", help="Default: of closed-form models torque, else rollout."),
     ] = None,
     momentum_steps: Annotated[
         int | None,

@@ -268,6 +268,8 @@ def _run(study: Study, variant: Variant, seed: int) -> dict[str, Any]:
         study.module(variant), [study.logs], folder, replace(study.training, seed=seed),
         urdf=study.urdf, resume=run.checkpoint.exists(), force=not run.checkpoint.exists(), progress=False,
     )  # fmt: skip
+    if ended.status == "interrupted":
+        raise KeyboardInterrupt
     model = load_model(run.module)
     model.load_state_dict(run.load_state(run.weights))
     model.requires_grad_(False).eval()

@@ -117,7 +117,9 @@ class WholeSet:
             tolerance_change=1e-15,
         )
 
-    def descend(self, loss: Loss, windows: Windows, steps: int, rate: Callable[[int], float]) -> float:
+    def descend(
+        self, loss: Callable[[Any], torch.Tensor], windows: Any, steps: int, rate: Callable[[int], float]
+    ) -> float:
         """See ``Descent``; the loss where it ends, NaN where no evaluation was finite."""
         group = self._optimiser.param_groups[0]
         group["max_iter"], group["max_eval"] = steps, steps
@@ -142,7 +144,7 @@ class WholeSet:
         """Whether two calls in a row found next to nothing."""
         return self._waits > 1
 
-    def _evaluated(self, loss: Loss, windows: Windows) -> torch.Tensor:
+    def _evaluated(self, loss: Callable[[Any], torch.Tensor], windows: Any) -> torch.Tensor:
         self._optimiser.zero_grad()
         try:
             value = loss(windows) + self._penalty()

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from spelgen.errors import Diagnostic, LogError, RunError
-from spelgen.identification.samples import DENSE, dynamics_samples
+from spelgen.identification.samples import DENSE, DynamicsSamples, dynamics_samples
 from spelgen.training.belief import Belief
 from spelgen.training.data import TrainingConfig, TrainingData
+from spelgen.training.prior import Prior
 from spelgen.training.torque_fit import fit_torque
+from spelgen.training.torque_networks import fit_networks
 
 if TYPE_CHECKING:
     from spelgen.training.runs import EmittedModel
@@ -30,21 +33,28 @@ def is_closed_form(model: EmittedModel) -> bool:
 
 
 def start_from_torque(
-    model: EmittedModel, data: TrainingData, config: TrainingConfig, *, fit: bool, loaded: bool = False
+    model: EmittedModel,
+    data: TrainingData,
+    config: TrainingConfig,
+    *,
+    fit: bool,
+    loaded: bool = False,
+    prior: Prior | None = None,
 ) -> tuple[TrainingConfig, list[Diagnostic]]:
-    """Fit a closed-form model to the torques of all recordings; the config for what is left to do, and notes.
+    """Fit a closed-form model, or with the objective ``torque`` any, to the torques of all recordings; the config
+    for what is left to do, and notes.
 
     Nothing is left unless the objective is ``rollout``. Logs sampled too slowly for accelerations, or larger
     than memory, leave all to the predicted windows. ``loaded``: the weights are those of the arm without a load,
     and only the last body's move. Without ``fit`` the weights stay, as in a run that is resumed.
-    Raises RunError where a load or the objective ``torque`` meets a model of networks, LogError for a load without
+    ``prior``: what pulls a model of networks. Raises RunError where a load meets one, LogError for a load without
     samples.
     """
     if not is_closed_form(model):
-        if loaded or config.objective == "torque":
-            wanted = "a load" if loaded else "the objective 'torque'"
-            raise RunError(f"{wanted} for a model of networks", expected="a module of the preset closed-form")
-        return config, []
+        if loaded:
+            raise RunError("a load for a model of networks", expected="a module of the preset closed-form")
+        if config.objective != "torque":
+            return config, []
     samples = dynamics_samples(data.recordings)
     if not any(len(x.q) for x in samples):
         if loaded:
@@ -55,12 +65,30 @@ def start_from_torque(
         return config, [Diagnostic("warning", "no-torque-fit", "logs", None, message)]
     notes = []
     if fit:
-        found = fit_torque(model, samples, LOAD if loaded else None, [last_body(model)] if loaded else None)
+        steps = _fitted(model, samples, config, loaded=loaded, prior=prior)
         what = "the last body alone fitted" if loaded else "fitted"
         message = (
             f"{what} to the torques of {sum(len(x.q) for x in samples)} samples, those of validation included"
         )
-        notes = [Diagnostic("info", "torque-fit", "logs", None, f"{message}, in {found.steps} steps")]
+        notes = [Diagnostic("info", "torque-fit", "logs", None, f"{message}, in {steps} steps")]
     if config.objective != "rollout":
         config = replace(config, epochs=0, momentum_steps=0)
     return config, notes
+
+
+def _fitted(
+    model: EmittedModel,
+    samples: Sequence[DynamicsSamples],
+    config: TrainingConfig,
+    *,
+    loaded: bool,
+    prior: Prior | None,
+) -> int:
+    """Fit the model; the steps it took."""
+    if is_closed_form(model):
+        return fit_torque(
+            model, samples, LOAD if loaded else None, [last_body(model)] if loaded else None
+        ).steps
+    if prior is None:
+        return fit_networks(model, samples, config.decay(0))
+    return fit_networks(model, samples, config.decay(0), lambda: config.prior * prior.loss(model))

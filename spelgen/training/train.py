@@ -25,7 +25,7 @@ from spelgen.training.prior import Prior, urdf_prior
 from spelgen.training.progress import TrainingProgress
 from spelgen.training.runs import RunFolder, load_model, write_json
 from spelgen.training.streamed import prepare_streamed
-from spelgen.training.torque_start import start_from_torque
+from spelgen.training.torque_start import is_closed_form, start_from_torque
 
 if TYPE_CHECKING:
     from spelgen.training.runs import EmittedModel
@@ -116,9 +116,13 @@ def train(
         notes += found
         run.start(module, robot, force=force)
         write_json(run.config, description)
-    config, told = start_from_torque(model, prepared, config, fit=not resume, loaded=source is not None)
+    # a closed-form model has its own beliefs while it is fitted to torques
+    pulled = config.objective == "rollout" or not is_closed_form(model)
+    prior = _prior(run, header, model, prepared, config, notes) if pulled else None
+    config, told = start_from_torque(
+        model, prepared, config, fit=not resume, loaded=source is not None, prior=prior
+    )
     notes += told
-    prior = _prior(run, header, model, prepared, config, notes) if config.epochs else None
     loop = TrainingLoop(run, model, prepared, config, prior, stepped)
     if resume:
         loop.restore()

@@ -28,10 +28,13 @@ from spelgen.identification.friction import FrictionModel
 from spelgen.identification.identify import Identification, Method, identify
 from spelgen.identification.samples import DynamicsSamples, dynamics_samples
 from spelgen.pipeline import build, load
+from spelgen.spec import Preset
 from spelgen.training.belief import Belief
+from spelgen.training.data import WHOLE_DECAY
 from spelgen.training.rollout import roll_out
 from spelgen.training.runs import load_model
 from spelgen.training.torque_fit import fit_torque
+from spelgen.training.torque_networks import fit_networks
 
 Torque = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
@@ -231,27 +234,39 @@ def characters(folder: Path, scratch: Path) -> None:
         DynamicsSamples(x, *(data[f"{k}_{i}"] for k in ("qp", "qv", "qa", "tau")))
         for i, x in enumerate(labels)
     ]
-    fit_torque(model, [x for x in samples if x.name not in "eqv"])
+    networks = emitted(scratch / "planar.urdf", scratch, "minimal")
+    training = [x for x in samples if x.name not in "eqv"]
+    fit_torque(model, training)
+    fit_networks(networks, training, WHOLE_DECAY)
     tests = [i for i, x in enumerate(labels) if x in "eqv"]
     q, qd, qdd = (
         torch.from_numpy(np.concatenate([data[f"{k}_{i}"] for i in tests])) for k in ("qp", "qv", "qa")
     )
     tau, coriolis = (np.concatenate([data[f"{k}_{i}"] for i in tests]) for k in ("tau", "c"))
-    with torch.no_grad():
-        still = torch.zeros_like(q)
-        rows = model.regressor(q, qd, still) - model.regressor(q, still, still)
-        errors = {
-            "torque": (model.inverse_dynamics(q, qd, qdd).numpy(), tau),
-            "Coriolis torque": ((rows @ model.inertial_parameters().flatten()).numpy(), coriolis),
-        }
     print("Characters (DeLaN's data): nMSE, total error by total variance\n")
-    for name, (found, true) in errors.items():
-        print(f"{name:26}{np.square(found - true).sum() / np.square(true - true.mean(axis=0)).sum():15.1e}")
+    print(f"{'':26}{'closed-form':>15}{'minimal':>15}")
+    found = [_torques(each, q, qd, qdd) for each in (model, networks)]
+    for name, true, columns in (
+        ("torque", tau, [each[0] for each in found]),
+        ("Coriolis torque", coriolis, [each[1] for each in found]),
+    ):
+        variance = np.square(true - true.mean(axis=0)).sum()
+        print(f"{name:26}" + "".join(f"{np.square(x - true).sum() / variance:15.1e}" for x in columns))
 
 
-def emitted(urdf: Path, scratch: Path) -> Any:
-    path = scratch / f"{urdf.stem}_closed_form.py"
-    path.write_text(build(urdf, preset="closed-form"), encoding="utf-8")
+def _torques(
+    model: Any, q: torch.Tensor, qd: torch.Tensor, qdd: torch.Tensor
+) -> tuple[np.ndarray, np.ndarray]:
+    """The torque, and what of it is Coriolis and centrifugal."""
+    with torch.no_grad():
+        steady, still = (model.inverse_dynamics(q, x, torch.zeros_like(q)) for x in (qd, torch.zeros_like(q)))
+        friction = (model.dissipation(q, qd) @ qd.unsqueeze(-1)).squeeze(-1)
+        return model.inverse_dynamics(q, qd, qdd).numpy(), (steady - still - friction).numpy()
+
+
+def emitted(urdf: Path, scratch: Path, preset: Preset = "closed-form") -> Any:
+    path = scratch / f"{urdf.stem}_{preset}.py"
+    path.write_text(build(urdf, preset=preset), encoding="utf-8")
     return load_model(path)
 
 
