@@ -36,7 +36,7 @@ Tip = Callable[[torch.Tensor], torch.Tensor]
 PREDICTED_STEPS = 40_000  # per horizon and contender: windows are thinned evenly to about this many
 MOST_WINDOWS = 2000
 DRIFT_SECONDS, DRIFT_TIMES = 1.0, 101
-DRIFT_SOLVER: dict[str, Any] = {"rtol": 1e-12, "atol": 1e-14, "options": {"solver": "DOP853"}}
+DRIFT_SOLVER: dict[str, Any] = {"rtol": 1e-13, "atol": 1e-15, "options": {"solver": "DOP853"}}
 DRIFT_STATES = 8
 
 
@@ -86,7 +86,7 @@ class Evaluation:
     """What `evaluate` found; `to_dict` is evaluation.json.
 
     cutoff: of the filter on the test logs [Hz], None without. torque: by contender, empty where the logs are
-    too sparse. energy_drift: of the model without input and dissipation over 1 s, integrated to twelve digits,
+    too sparse. energy_drift: of the model without input and dissipation over 1 s, integrated to thirteen digits,
     relative to its kinetic energy; None where the logs never move. examples: over the longest horizon.
     """
 
@@ -300,7 +300,7 @@ def energy_drift(model: EmittedModel, windows: Windows) -> float | None:
     """Largest |H(t) - H(0)| over 1 s without input and dissipation, relative to the largest kinetic energy
     met.
 
-    From the windows' fastest states, integrated to twelve digits, so that what is left is the model's own.
+    From the windows' fastest states, integrated to thirteen digits, so that what is left is the model's own.
     None where that cannot be done.
     """
     q, qd = windows.q[:, 0], windows.qd[:, 0]
