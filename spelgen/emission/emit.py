@@ -275,7 +275,13 @@ def _summary(spec: ModelSpec) -> str:
         if spec.started_from_urdf
         else "The URDF's inertials are missing or impossible: sizes and starting values are those of 1 kg links."
     )
-    return f"{_count(spec)[0].upper()}{_count(spec)[1:]}.\n{potential}\n{start}"
+    parts = ["M"] * any(x.level is not None for x in spec.outputs) + ["V"] * bool(spec.potential_terms)
+    sums = (
+        f"\n{' and '.join(parts)}: sums of waves with trained factors, and a part for a network."
+        if parts
+        else ""
+    )
+    return f"{_count(spec)[0].upper()}{_count(spec)[1:]}.\n{potential}{sums}\n{start}"
 
 
 def _picture(spec: ModelSpec) -> str:

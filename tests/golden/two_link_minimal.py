@@ -2,6 +2,7 @@ r"""Port-Hamiltonian model of an arm with 2 joints, written by `spelgen build`.
 
 1 learned function of q and 2 constants make the mass matrix.
 The potential energy depends on joints 1,2.
+M and V: sums of waves with trained factors, and a part for a network.
 Sizes and starting values are the URDF's inertials.
 
 Mass matrix: the joints each entry depends on, C where it is constant, . where it is always zero.
@@ -227,6 +228,9 @@ class Network(nn.Module):
     """
 
     spread: Tensor
+    series: Tensor | None
+    series_outputs: Tensor
+    series_features: Tensor
     series_size: Tensor
 
     def __init__(
@@ -250,10 +254,11 @@ class Network(nn.Module):
             self.biases.append(nn.Parameter(torch.zeros(len(units), dtype=torch.float64)))
             below = units
         nn.init.zeros_(self.weights[-1])  # so that the model starts at its nominal values
-        self.place = None
+        self.register_parameter("series", None)
         if series is not None:
-            self.place = (series.outputs, series.features)
             self.series = nn.Parameter(series.start)
+            self.register_buffer("series_outputs", series.outputs)
+            self.register_buffer("series_features", series.features)
             self.register_buffer("series_size", series.size)
             self.biases[-1].data = series.level
             self.get_buffer(f"mask{len(layers) - 1}").mul_(NETWORK_SHARE)
@@ -278,10 +283,11 @@ class Network(nn.Module):
 
     def _series(self, outlay: Tensor) -> Tensor | None:
         """The sums of waves, laid out."""
-        if self.place is None:
+        if self.series is None:
             return None
         known = outlay.new_zeros(outlay.shape[1], FEATURES)
-        return outlay @ known.index_put(self.place, self.series_size * self.series)
+        place = (self.series_outputs, self.series_features)
+        return outlay @ known.index_put(place, self.series_size * self.series)
 
     def forward(self, features: Tensor, layers: Layers) -> tuple[Tensor, Trace]:
         """y laid out, (..., rows); and what ``pull`` and ``push`` need."""
