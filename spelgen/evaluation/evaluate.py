@@ -37,7 +37,7 @@ PREDICTED_STEPS = 40_000  # per horizon and contender: windows are thinned evenl
 MOST_WINDOWS = 2000
 DRIFT_SECONDS, DRIFT_TIMES = 1.0, 101
 DRIFT_SOLVER: dict[str, Any] = {"rtol": 1e-13, "atol": 1e-15, "options": {"solver": "DOP853"}}
-DRIFT_STATES = 8
+DRIFT_STATES, DRIFT_CALLS = 8, 30_000
 
 
 @dataclass(frozen=True)
@@ -296,6 +296,10 @@ def _tip(run: RunFolder, header: Header, notes: list[Diagnostic]) -> Tip | None:
         return None
 
 
+class _TooStiff(Exception):
+    """An integrator's steps have become too many."""
+
+
 def energy_drift(model: EmittedModel, windows: Windows) -> float | None:
     """Largest |H(t) - H(0)| over 1 s without input and dissipation, relative to the largest kinetic energy
     met.
@@ -309,7 +313,13 @@ def energy_drift(model: EmittedModel, windows: Windows) -> float | None:
     fastest = kinetic.topk(min(DRIFT_STATES, len(windows))).indices
     start = torch.cat([q[fastest], p[fastest]], dim=-1)
 
+    calls = 0
+
     def undamped(t: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
+        nonlocal calls
+        calls += 1
+        if calls > DRIFT_CALLS:
+            raise _TooStiff
         q, p = state.chunk(2, dim=-1)
         qd = model.velocity(q, p)
         friction = (model.dissipation(q, qd) @ qd.unsqueeze(-1)).squeeze(-1)
@@ -318,8 +328,12 @@ def energy_drift(model: EmittedModel, windows: Windows) -> float | None:
     times = torch.linspace(0.0, DRIFT_SECONDS, DRIFT_TIMES, dtype=q.dtype)
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # torchdiffeq hands SciPy an option that has no effect
-        # SciPy's Dormand-Prince of order 8: torchdiffeq's own keeps to eight digits only
-        q, p = odeint(undamped, start, times, method="scipy_solver", **DRIFT_SOLVER).chunk(2, dim=-1)
+        try:
+            # SciPy's Dormand-Prince of order 8: torchdiffeq's own keeps to eight digits only
+            states = odeint(undamped, start, times, method="scipy_solver", **DRIFT_SOLVER)
+        except _TooStiff:
+            return None
+        q, p = states.chunk(2, dim=-1)
         energy = model.hamiltonian(q, p)
         moved = (energy - model.potential_energy(q)).max().item()
         drift = (energy - energy[0]).abs().max().item() / moved if moved > 0 else math.nan
