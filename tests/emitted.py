@@ -120,8 +120,10 @@ class ExactFunctions(nn.Module):
         self, features: torch.Tensor, laid_out: tuple[torch.Tensor, torch.Tensor]
     ) -> tuple[torch.Tensor, torch.Tensor]:
         outlay, offset = laid_out
-        base = features[..., : (2 if all(self.revolute) else 3) * self.n]
-        cos, sin, *rest = base.split(self.n, dim=-1)
+        # waves are not needed here: they are products of the others
+        turning = all(self.revolute)
+        places = (0, features.shape[-1] // 2) if turning else (0, self.n, 2 * self.n)
+        cos, sin, *rest = (features[..., place : place + self.n] for place in places)
         q = rest[0] * self.reach + self.center if rest else torch.zeros_like(cos)
         variables = torch.stack([cos, sin, q], dim=-1).flatten(-2)  # (..., 3 n): c1, s1, q1, c2, ...
         y = torch.stack([_evaluated(f, variables) for f in self.values], dim=-1)
@@ -130,8 +132,10 @@ class ExactFunctions(nn.Module):
         )
         by_c, by_s, by_q = slopes.unflatten(-1, (self.n, 3)).unbind(dim=-1)
         jacobian = torch.cat([by_c, by_s, by_q * self.reach] if rest else [by_c, by_s], dim=-1)
-        waves = features.shape[-1] - base.shape[-1]  # not needed here: they are products of the others
-        jacobian = torch.nn.functional.pad(jacobian, (0, waves))
+        slope = jacobian.new_zeros(*jacobian.shape[:-1], features.shape[-1])
+        for place, part in zip(places, jacobian.split(self.n, dim=-1), strict=True):
+            slope[..., place : place + self.n] = part
+        jacobian = slope
         y = (y - self.mean) / self.scale
         return y @ outlay.mT + offset, outlay @ (jacobian / self.scale.unsqueeze(-1))
 

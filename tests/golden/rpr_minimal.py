@@ -234,7 +234,7 @@ class Series(NamedTuple):
 
 def series(sums: list[tuple[float, Terms]], scales: list[float], shares: list[float]) -> Series:
     """Sums (level, terms) in units of their scales; a wave counts as its joints' least share."""
-    first = FEATURES - 2 * len(WAVES)
+    n = len(JOINTS)
     levels, rows = [], []
     for output, ((level, terms), scale) in enumerate(zip(sums, scales, strict=True)):
         levels.append(level / scale)
@@ -242,8 +242,8 @@ def series(sums: list[tuple[float, Terms]], scales: list[float], shares: list[fl
             turns = WAVES[number].turns
             moved = [turn or power for turn, power in zip(turns, WAVES[number].powers, strict=True)]
             size = min(share for share, moves in zip(shares, moved, strict=True) if moves)
-            rows.append((output, first + number, cos / scale / size, size))
-            rows.append((output, first + len(WAVES) + number, sin / scale / size, size))
+            rows.append((output, 3 * n + number, cos / scale / size, size))
+            rows.append((output, 3 * n + len(WAVES) + number, sin / scale / size, size))
     outputs, features, starts, sizes = zip(*rows, strict=True)
     return Series(
         torch.tensor(outputs), torch.tensor(features), vector(starts), vector(sizes), vector(levels)
@@ -475,7 +475,7 @@ class Model(nn.Module):
 
     center: Tensor
     reach: Tensor
-    turns: Tensor
+    turns: Tensor  # of joints by wave, (n, waves)
     powers: Tensor
     lower: Tensor  # takes waves to what the slopes by each joint are
     constant_scale: Tensor

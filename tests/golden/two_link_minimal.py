@@ -146,7 +146,8 @@ DEPTH = 2  # hidden layers of a network
 FRICTION_HIDDEN = 8
 SLOW = 0.03  # below this share of its usual speed dry friction fades to zero, to start from
 SLOWEST = 0.001  # and at the least
-FEATURES = 2 * len(JOINTS) + 2 * len(WAVES)  # numbers made of q, which all else is made of
+ANGLES = len(JOINTS) + len(WAVES)  # whose cosines and sines all else is made of
+FEATURES = 2 * ANGLES
 PLACE_SHARE = 0.1  # how much friction's networks see of where a joint is, relative to its speed
 
 
@@ -175,10 +176,10 @@ class Reading(NamedTuple):
 
 def reading(joints: Iterable[int], shares: list[float]) -> Reading:
     """cos q and sin q of turning joints, the scaled q of sliding ones, times each joint's share."""
-    n = len(JOINTS)
     turning = [joint for joint in joints if JOINTS[joint].revolute]
     whose = turning + turning
-    spread = torch.eye(FEATURES, dtype=torch.float64)[turning + [n + joint for joint in turning]]
+    places = turning + [ANGLES + joint for joint in turning]
+    spread = torch.eye(FEATURES, dtype=torch.float64)[places]
     return Reading(tuple(whose), vector(shares[joint] for joint in whose), spread)
 
 
@@ -194,15 +195,15 @@ class Series(NamedTuple):
 
 def series(sums: list[tuple[float, Terms]], scales: list[float], shares: list[float]) -> Series:
     """Sums (level, terms) in units of their scales; a wave counts as its joints' least share."""
-    first = FEATURES - 2 * len(WAVES)
+    n = len(JOINTS)
     levels, rows = [], []
     for output, ((level, terms), scale) in enumerate(zip(sums, scales, strict=True)):
         levels.append(level / scale)
         for number, cos, sin in terms:
             turns = WAVES[number].turns
             size = min(share for share, turn in zip(shares, turns, strict=True) if turn)
-            rows.append((output, first + number, cos / scale / size, size))
-            rows.append((output, first + len(WAVES) + number, sin / scale / size, size))
+            rows.append((output, n + number, cos / scale / size, size))
+            rows.append((output, ANGLES + n + number, sin / scale / size, size))
     outputs, features, starts, sizes = zip(*rows, strict=True)
     return Series(
         torch.tensor(outputs), torch.tensor(features), vector(starts), vector(sizes), vector(levels)
@@ -341,7 +342,7 @@ class Friction(nn.Module):
         joints, inputs = len(JOINTS), 4
         spread = torch.zeros(joints, inputs, FEATURES + 2 * joints, dtype=torch.float64)
         for i, joint in enumerate(JOINTS):
-            spread[i, 0, i] = spread[i, 1, joints + i] = PLACE_SHARE
+            spread[i, 0, i] = spread[i, 1, ANGLES + i] = PLACE_SHARE
             spread[i, 2, i - 2 * joints], spread[i, 3, i - joints] = 1 / joint.speed, 1.0
         self.register_buffer("spread", spread)
         self.register_buffer("speed", vector(joint.speed for joint in JOINTS))
@@ -419,7 +420,7 @@ class Model(nn.Module):
         "revolute" if joint.revolute else "prismatic" for joint in JOINTS
     )
 
-    turns: Tensor
+    turns: Tensor  # of joints by angle, (n, angles)
     constant_scale: Tensor
     constant_basis: Tensor
     output_mean: Tensor
@@ -434,6 +435,7 @@ class Model(nn.Module):
         super().__init__()
         generator = torch.Generator().manual_seed(seed)
         turns = torch.tensor([wave.turns for wave in WAVES], dtype=torch.float64)
+        turns = torch.cat([torch.eye(self.n, dtype=torch.float64), turns])
         self.register_buffer("turns", turns.mT)
         start = vector(constant.start for constant in CONSTANTS)
         self.register_buffer("constant_scale", vector(constant.scale for constant in CONSTANTS))
@@ -485,28 +487,19 @@ class Model(nn.Module):
     def _features(self, q: Tensor) -> Tensor:
         """cos q, sin q, those of waves: all that is read of q, (..., features)."""
         angle = q @ self.turns
-        waves = (angle.cos(), angle.sin())
-        return torch.cat([q.cos(), q.sin(), *waves], dim=-1)
-
-    def _parts(self, features: Tensor) -> tuple[Tensor, ...]:
-        """Cosines, sines, cosines and sines of waves."""
-        n, waves = self.n, len(WAVES)
-        return tuple(features.tensor_split((n, 2 * n, 2 * n + waves), dim=-1))
+        return torch.cat([angle.cos(), angle.sin()], dim=-1)
 
     def _features_rate(self, features: Tensor, qd: Tensor) -> Tensor:
         """How fast the features change along qd."""
-        cos, sin, wave_cos, wave_sin = self._parts(features)
+        cos, sin = features.chunk(2, dim=-1)
         turn = qd @ self.turns
-        waves = (-wave_sin * turn, wave_cos * turn)
-        return torch.cat([-sin * qd, cos * qd, *waves], dim=-1)
+        return torch.cat([-sin * turn, cos * turn], dim=-1)
 
     def _by_joint(self, features: Tensor, slope: Tensor) -> Tensor:
         """d/dq, (..., n), of what has this slope d/dfeatures."""
-        cos, sin, wave_cos, wave_sin = self._parts(features)
-        by_cos, by_sin, by_wave_cos, by_wave_sin = self._parts(slope)
-        by_turn = by_wave_sin * wave_cos - by_wave_cos * wave_sin
-        slope = by_sin * cos - by_cos * sin + by_turn @ self.turns.mT
-        return slope
+        cos, sin = features.chunk(2, dim=-1)
+        by_cos, by_sin = slope.chunk(2, dim=-1)
+        return (by_sin * cos - by_cos * sin) @ self.turns.mT
 
     def mass_matrix(self, q: Tensor) -> Tensor:
         """M(q), (..., n, n) [kg m^2, kg m, kg]."""
