@@ -128,7 +128,7 @@ class TrainingSettings(Group):
     validation_fraction: part of the training trajectories held out to watch the validation loss.
     """
 
-    objective: Literal["torque", "rollout"] | None = None
+    objective: Literal["torque", "momentum", "rollout"] | None = None
     momentum_steps: Whole = 2000
     prior: NonNegative = 1.0
     window: Annotated[Count, Field(ge=2)] = 5

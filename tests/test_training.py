@@ -328,7 +328,7 @@ import sys
 from spelgen.training.train import train
 from spelgen.training.descent import WholeSet
 from spelgen.training.data import TrainingConfig
-config = TrainingConfig(epochs=100000, batch=32, patience=100000, momentum_steps=0)
+config = TrainingConfig(epochs=100000, batch=32, patience=100000, momentum_steps=0, optimiser="adamw")
 result = train(sys.argv[1], [sys.argv[2]], sys.argv[3], config)
 print(result.status)
 """
@@ -351,7 +351,7 @@ def test_a_signal_leaves_a_usable_run(logs, tmp_path, number):
     assert "Traceback" not in errors
     load_model(folder / "module.py").load_state_dict(torch.load(folder / "model.pt", weights_only=True))
     epoch = torch.load(folder / "checkpoint.pt", weights_only=True)["epoch"]
-    config = TrainingConfig(epochs=epoch + 1, batch=32, patience=100000, momentum_steps=0)
+    config = TrainingConfig(epochs=epoch + 1, batch=32, patience=100000, momentum_steps=0, optimiser="adamw")
     assert train(STAND_IN, [logs], folder, config, resume=True, progress=False).epochs == epoch + 1
     assert not list(folder.glob(".*"))  # no half-written file is left
 
@@ -491,3 +491,11 @@ def test_the_line_search_turns_back_from_numbers_that_blow_up():
     group["lr"] = 4.0
     assert whole.descend(loss, None, 30, lambda _: 1.0) < 1e-12
     assert max(tried) >= 2
+
+
+def test_the_objective_momentum_predicts_no_windows(logs, tmp_path):
+    config = replace(QUICK, objective="momentum", momentum_steps=200)
+    result = train(STAND_IN, [logs], tmp_path / "run", config, progress=False)
+    start = train(STAND_IN, [logs], tmp_path / "start", replace(config, momentum_steps=1), progress=False)
+    assert (result.status, result.epochs, result.steps) == ("finished", 0, 0)
+    assert result.best_validation < 0.5 * start.best_validation

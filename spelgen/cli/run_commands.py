@@ -94,8 +94,10 @@ def train(
         ),
     ] = None,
     objective: Annotated[
-        Literal["torque", "rollout"] | None,
-        typer.Option("--objective", help="Default: of closed-form models torque, else rollout."),
+        Literal["torque", "momentum", "rollout"] | None,
+        typer.Option(
+            "--objective", help="Default: of closed-form models torque, else rollout, after momentum steps."
+        ),
     ] = None,
     momentum_steps: Annotated[
         int | None,
@@ -119,6 +121,10 @@ def train(
     ] = None,
     learning_rate: Annotated[
         float | None, typer.Option("--learning-rate", min=0.0, help="At its largest.")
+    ] = None,
+    optimiser: Annotated[
+        Literal["adamw", "lbfgs"] | None,
+        typer.Option("--optimiser", help="On batches, or on all windows at once: default where few."),
     ] = None,
     weight_decay: Annotated[
         float | None,
@@ -150,6 +156,7 @@ def train(
         "objective": objective, "momentum_steps": momentum_steps, "prior": prior, "epochs": epochs,
         "patience": patience, "max_minutes": max_minutes, "batch": batch, "window": window, "stride": stride,
         "every": every, "substeps": substeps, "learning_rate": learning_rate, "weight_decay": weight_decay,
+        "optimiser": optimiser,
         "validation_fraction": validation_fraction, "filter": filter, "seed": seed, "device": device,
         "threads": threads, "compile": compile,
     }  # fmt: skip

@@ -41,7 +41,7 @@ class TrainingConfig:
     max_minutes: the learning rate is annealed within this time too.
     """
 
-    objective: Literal["torque", "rollout"] | None = None
+    objective: Literal["torque", "momentum", "rollout"] | None = None
     momentum_steps: int = 2000
     prior: float = 1.0
     window: int = 5

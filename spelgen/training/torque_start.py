@@ -55,6 +55,8 @@ def start_from_torque(
             raise RunError("a load for a model of networks", expected="a module of the preset closed-form")
         if config.objective != "torque":
             return config, []
+    elif config.objective == "momentum":
+        raise RunError("the objective 'momentum' for a closed-form model", expected="torque or rollout")
     samples = dynamics_samples(data.recordings)
     if not any(len(x.q) for x in samples):
         if loaded:

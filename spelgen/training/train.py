@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -123,6 +123,8 @@ def train(
         model, prepared, config, fit=not resume, loaded=source is not None, prior=prior
     )
     notes += told
+    if config.objective == "momentum":
+        config = replace(config, epochs=0)
     loop = TrainingLoop(run, model, prepared, config, prior, stepped)
     if resume:
         loop.restore()
