@@ -196,6 +196,7 @@ def _training(settings: Settings, comparison: ComparisonSettings) -> TrainingCon
         epochs=epochs,
         patience=epochs,
         momentum_steps=comparison.momentum_steps,
+        weight_decay=config.weight_decay if comparison.weight_decay is None else comparison.weight_decay,
     )
 
 

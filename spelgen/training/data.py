@@ -20,7 +20,7 @@ from spelgen.settings import TrainingSettings
 from spelgen.training.rollout import LossScales, loss_scales
 
 FEW_WINDOWS = 1024  # of which L-BFGS takes all at once
-WHOLE_DECAY, BATCH_DECAY = 2e-4, 0.2
+WHOLE_DECAY, BATCH_DECAY = 2e-5, 0.2
 Optimiser = Literal["adamw", "lbfgs"]
 
 LARGEST_VALIDATION = 2048  # windows; validation is a measurement, it needs no more

@@ -30,7 +30,6 @@ from spelgen.identification.samples import DynamicsSamples, dynamics_samples
 from spelgen.pipeline import build, load
 from spelgen.spec import Preset
 from spelgen.training.belief import Belief
-from spelgen.training.data import WHOLE_DECAY
 from spelgen.training.rollout import roll_out
 from spelgen.training.runs import load_model
 from spelgen.training.torque_fit import fit_torque
@@ -49,6 +48,7 @@ SECONDS = (2, 3, 5, 10, 20)
 RIDGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
 LOAD = Belief(bodies=10.0)  # nothing is believed of a load
 AHEAD = {"0.1 s": 10, "0.5 s": 47}  # samples at 94 Hz
+DECAY = 2e-4  # of networks
 WINDOWS = 60  # of each trajectory
 SUBSTEPS = 4
 
@@ -237,7 +237,7 @@ def characters(folder: Path, scratch: Path) -> None:
     networks = emitted(scratch / "planar.urdf", scratch, "minimal")
     training = [x for x in samples if x.name not in "eqv"]
     fit_torque(model, training)
-    fit_networks(networks, training, WHOLE_DECAY)
+    fit_networks(networks, training, DECAY)
     tests = [i for i, x in enumerate(labels) if x in "eqv"]
     q, qd, qdd = (
         torch.from_numpy(np.concatenate([data[f"{k}_{i}"] for i in tests])) for k in ("qp", "qv", "qa")
