@@ -378,8 +378,9 @@ def test_interrupted_training_leaves_a_run(trained, tmp_path):
     command += ["--optimiser", "adamw"]  # L-BFGS would have ended by itself
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     with subprocess.Popen(
-        command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    ) as started:
+        command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # whoever runs the tests may ignore it
+    ) as started:  # fmt: skip
         while not (run / "metrics.jsonl").exists() and started.poll() is None:
             time.sleep(0.05)
         started.send_signal(signal.SIGINT)

@@ -324,10 +324,10 @@ def test_early_stop_and_time_limit(logs, tmp_path):
 
 
 CHILD = """
-import sys
+import signal, sys
 from spelgen.training.train import train
-from spelgen.training.descent import WholeSet
 from spelgen.training.data import TrainingConfig
+signal.signal(signal.SIGINT, signal.default_int_handler)  # whoever runs the tests may ignore it
 config = TrainingConfig(epochs=100000, batch=32, patience=100000, momentum_steps=0, optimiser="adamw")
 result = train(sys.argv[1], [sys.argv[2]], sys.argv[3], config)
 print(result.status)
