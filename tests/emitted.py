@@ -92,6 +92,13 @@ def randomise(model: nn.Module, seed: int, deviation: float | None = None) -> No
             parameter.data = draw * inputs**-0.5
 
 
+def network_inputs(model: nn.Module, q: torch.Tensor) -> torch.Tensor:
+    """What the networks of a model with or without waves read of q, (..., features)."""
+    features = model._features(q)
+    inputs: torch.Tensor = getattr(features, "own", features)
+    return inputs
+
+
 def frictionless(model: nn.Module) -> nn.Module:
     """The model without dissipation."""
     model.friction.size.zero_()
@@ -120,10 +127,7 @@ class ExactFunctions(nn.Module):
         self, features: torch.Tensor, laid_out: tuple[torch.Tensor, torch.Tensor]
     ) -> tuple[torch.Tensor, torch.Tensor]:
         outlay, offset = laid_out
-        # waves are not needed here: they are products of the others
-        turning = all(self.revolute)
-        places = (0, features.shape[-1] // 2) if turning else (0, self.n, 2 * self.n)
-        cos, sin, *rest = (features[..., place : place + self.n] for place in places)
+        cos, sin, *rest = features.split(self.n, dim=-1)
         q = rest[0] * self.reach + self.center if rest else torch.zeros_like(cos)
         variables = torch.stack([cos, sin, q], dim=-1).flatten(-2)  # (..., 3 n): c1, s1, q1, c2, ...
         y = torch.stack([_evaluated(f, variables) for f in self.values], dim=-1)
@@ -132,10 +136,6 @@ class ExactFunctions(nn.Module):
         )
         by_c, by_s, by_q = slopes.unflatten(-1, (self.n, 3)).unbind(dim=-1)
         jacobian = torch.cat([by_c, by_s, by_q * self.reach] if rest else [by_c, by_s], dim=-1)
-        slope = jacobian.new_zeros(*jacobian.shape[:-1], features.shape[-1])
-        for place, part in zip(places, jacobian.split(self.n, dim=-1), strict=True):
-            slope[..., place : place + self.n] = part
-        jacobian = slope
         y = (y - self.mean) / self.scale
         return y @ outlay.mT + offset, outlay @ (jacobian / self.scale.unsqueeze(-1))
 
@@ -163,6 +163,9 @@ def exact_model(robot: str, folder: Path) -> nn.Module:
         model.potential_network = ExactFunctions(
             [true.potential], torch.zeros_like(scale), scale, module.JOINTS
         )
+    for series in ("mass_series", "potential_series"):  # the functions are whole without them
+        if hasattr(model, series):
+            getattr(model, series).size.zero_()
     constants = [true.combination(constant.reads) for constant in structure.constants]
     assert all(sum(c.degrees()) == 0 for c in constants), "a constant depends on q"
     values = torch.tensor([_float(c.leading_coefficient()) for c in constants], dtype=torch.float64)

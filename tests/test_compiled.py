@@ -9,8 +9,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
+from emitted import random_model
+from torch._dynamo.utils import counters
 
 from spelgen.data.logs import write_logs
+from spelgen.data.windows import Windows
+from spelgen.training.compiled import compiled
+from spelgen.training.rollout import loss_scales, rollout_loss
 from spelgen.training.train import train
 from tests.test_training import JOINTS, QUICK, STAND_IN, motions
 
@@ -32,6 +38,43 @@ def test_a_compiled_run_says_so_and_repeats_the_plain_one(tmp_path, monkeypatch)
         assert compile == any(note.code == "compiled" for note in result.diagnostics)
     assert losses[True] == pytest.approx(losses[False], rel=1e-6)
     assert any((tmp_path / "cache").rglob("*.so"))
+
+
+@has_compiler
+def test_all_states_of_a_window_share_what_was_compiled(tmp_path, monkeypatch):
+    """phnode, which has no guard to branch on: one graph, for the first state, a measured one, as for all."""
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path / "cache"))
+    torch._dynamo.reset()
+    counters.clear()
+    _gradients_of_both(random_model("two_link", tmp_path, seed=0, preset="phnode"))
+    assert counters["stats"]["unique_graphs"] == 1
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU to record graphs on")
+@pytest.mark.parametrize("preset", ["phnode", "minimal"])
+def test_on_a_gpu_graphs_are_replayed_with_the_same_result(preset, tmp_path):
+    counters.clear()
+    _gradients_of_both(random_model("two_link", tmp_path, seed=0, preset=preset), "cuda")
+    assert counters["inductor"]["cudagraph_skips"] == 0
+
+
+def _gradients_of_both(model, device="cpu"):
+    """Three training steps' gradients are the same with the right-hand side compiled as without."""
+    q, qd, tau = torch.rand(3, 16, 4, model.n, dtype=torch.float64)
+    windows = Windows(torch.full((16, 3), 0.05, dtype=torch.float64), q, qd, tau[:, 1:])
+    scales = loss_scales(windows, model.joint_types).to(device)
+    model, windows = model.to(device), windows.to(device)
+    ready = compiled(model, windows, scales)
+    for step in range(3):
+        with torch.no_grad():
+            for weights in model.parameters():
+                weights += 0.01 * step
+        found = []
+        for stepped in (model, ready):
+            model.zero_grad()
+            rollout_loss(stepped, windows, scales, 1).backward()
+            found.append(torch.cat([x.grad.flatten() for x in model.parameters() if x.grad is not None]))
+        assert found[1].cpu().numpy() == pytest.approx(found[0].cpu().numpy(), rel=1e-6, abs=1e-9)
 
 
 def test_without_a_compiler_one_error_says_what_to_do_and_nothing_is_written(tmp_path):

@@ -7,7 +7,17 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import torch
-from emitted import ROBOTS, SIX, built, exact_model, frictionless, import_source, random_model, randomise
+from emitted import (
+    ROBOTS,
+    SIX,
+    built,
+    exact_model,
+    frictionless,
+    import_source,
+    network_inputs,
+    random_model,
+    randomise,
+)
 
 from spelgen.settings import load_settings
 
@@ -128,11 +138,11 @@ def test_outputs_read_their_own_joints_only(robot, tmp_path):
     q = states(model.n, 50)[0]
     outputs = len(built(robot)[1].outputs)
     layers = model.mass_network.prepared(torch.eye(outputs, dtype=torch.float64), torch.zeros(outputs))
-    before = model.mass_network(model._features(q), layers)[0]
+    before = model.mass_network(network_inputs(model, q), layers)[0]
     for joint in range(model.n):
         moved = q.clone()
         moved[:, joint] += 0.7
-        changed = (model.mass_network(model._features(moved), layers)[0] != before).any(dim=0)
+        changed = (model.mass_network(network_inputs(model, moved), layers)[0] != before).any(dim=0)
         expected = [joint in output.joints for output in built(robot)[1].outputs]
         assert changed.tolist() == expected
 

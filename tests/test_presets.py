@@ -6,7 +6,7 @@ from typing import get_args
 
 import pytest
 import torch
-from emitted import GANTRY, built, frictionless, import_source, random_model
+from emitted import GANTRY, built, frictionless, import_source, network_inputs, random_model
 from published_phnode import Published
 
 from spelgen.pipeline import build, make_spec
@@ -82,7 +82,7 @@ def test_mass_matrix_and_dissipation_are_positive(robot, preset, net, tmp_path):
             assert torch.linalg.eigvalsh(model.mass_matrix(q))[:, 0].min() > 0
             damping = model.dissipation(q, qd)
             assert torch.linalg.eigvalsh(damping)[:, 0].min() > -1e-12 * damping.abs().max()
-            torque = model.friction(model._features(q), qd, model.prepare().friction)
+            torque = model.friction(network_inputs(model, q), qd, model.prepare().friction)
             near(torque, (damping @ qd.unsqueeze(-1)).squeeze(-1))
 
 
@@ -128,11 +128,11 @@ def test_kan_outputs_read_their_own_joints_only(robot, tmp_path):
     outputs = built(robot, net="kan")[1].outputs
     q = states(model.n)[0]
     layers = model.mass_network.prepared(torch.eye(len(outputs), dtype=q.dtype), q.new_zeros(len(outputs)))
-    before = model.mass_network(model._features(q), layers)[0]
+    before = model.mass_network(network_inputs(model, q), layers)[0]
     for joint in range(model.n):
         moved = q.clone()
         moved[:, joint] += 0.7
-        changed = (model.mass_network(model._features(moved), layers)[0] != before).any(dim=0)
+        changed = (model.mass_network(network_inputs(model, moved), layers)[0] != before).any(dim=0)
         assert changed.tolist() == [joint in output.joints for output in outputs]
 
 
@@ -173,7 +173,7 @@ def test_networks_read_rotation_matrices(net, network, tmp_path):
         layer = torch.tanh(layer) if index < count - 1 else layer
     outputs = len(model.biases[-1])
     ready = model.prepared(torch.eye(outputs, dtype=q.dtype), q.new_zeros(outputs))
-    near(model(owner._features(q), ready)[0], layer)
+    near(model(network_inputs(owner, q), ready)[0], layer)
 
 
 @pytest.mark.parametrize(("preset", "net"), [*PRESETS, ("minimal", "mlp")])

@@ -30,8 +30,8 @@ def test_another_arms_torques_are_met(tmp_path):
     module = import_source(built("two_link")[0], tmp_path / "two_link_spel.py")
     true, model = module.Model(seed=0), module.Model(seed=1)
     with torch.no_grad():
-        true.mass_network.series *= 1.3
-        true.potential_network.series *= 0.8
+        true.mass_series.factors *= 1.3
+        true.potential_series.factors *= 0.8
         true.constants *= 1.5
         true.rotor += 0.5
         true.friction.viscous += 1.0

@@ -1,4 +1,5 @@
-"""A model's right-hand side compiled by torch, for training steps: fewer and larger operations on small matrices.
+"""A model's right-hand side compiled by torch, for training steps: fewer and larger operations on small matrices,
+on a GPU as CUDA graphs.
 
 Only `rates` is compiled: it is nearly all of a step, and it stays the same whatever the window's length and the
 number of substeps, so that it is compiled once.
@@ -18,8 +19,12 @@ if TYPE_CHECKING:
     from spelgen.training.rollout import LossScales
     from spelgen.training.runs import EmittedModel
 
-# torch would compile small programs to find out whether the instructions that the processor reports can be used
-OPTIONS: dict[str, Any] = {"cpp.vec_isa_ok": True}
+OPTIONS: dict[str, dict[str, Any]] = {
+    # torch would compile small programs to find out whether the instructions that the processor reports can be used
+    "cpu": {"cpp.vec_isa_ok": True},
+    # recorded once and replayed: to launch such small kernels one by one takes longer than to run them
+    "cuda": {"triton.cudagraphs": True},
+}
 CURE = "install a C++ compiler (g++), or train without --compile"
 
 
@@ -28,15 +33,26 @@ class Compiled:
 
     def __init__(self, model: EmittedModel) -> None:
         self._model = model
-        self._rates = torch.compile(model.rates, dynamic=False, options=OPTIONS)
+        device = next(model.parameters()).device.type
+        self._rates = torch.compile(model.rates, dynamic=False, options=OPTIONS.get(device))
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._model, name)
 
+    def prepare(self) -> Any:
+        """As the model's. Called once a step, so that CUDA graphs know when the last one's memory is free."""
+        torch.compiler.cudagraph_mark_step_begin()
+        return self._model.prepare()
+
     def rates(
         self, q: torch.Tensor, p: torch.Tensor, tau: torch.Tensor | None, prepared: Any
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """As the model's."""
+        """As the model's. A window's first q, a measured one, is made like all later ones: else it would be compiled
+        for by itself, which doubles the wait.
+        """
+        q = q.contiguous()
+        if torch.is_grad_enabled() and not q.requires_grad:
+            q = q.detach().requires_grad_()
         return self._rates(q, p, tau, prepared)
 
 

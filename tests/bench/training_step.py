@@ -23,6 +23,7 @@ from torch import Tensor, nn
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from emitted import network_inputs
 from published_phnode import Published
 
 from spelgen.pipeline import build
@@ -90,7 +91,7 @@ def networks_alone(model: nn.Module, data: Data) -> None:
     prepared, q, qd = model.prepare(), data.q[:, 0], data.qd[:, 0]
     total = torch.zeros((), dtype=torch.float64)
     for _ in range(4 * (SAMPLES - 1)):
-        features = model._features(q).requires_grad_()
+        features = network_inputs(model, q).requires_grad_()
         total = total + model.mass_network(features, prepared.mass)[0].sum()
         total = total + model.potential_network(features, prepared.potential)[0].sum()
         total = total + model.friction(features, qd, prepared.friction).sum()
@@ -185,6 +186,7 @@ def print_compiled(models: dict[str, EmittedModel], data: Data, plain: dict[str,
     for name, model in models.items():
         with tempfile.TemporaryDirectory() as folder:
             os.environ["TORCHINDUCTOR_CACHE_DIR"] = folder
+            torch._dynamo.reset()  # as in a process of its own
             ready = Compiled(model)
             compiling = seconds(lambda ready=ready: training_step(ready, data))
             step = statistics.median(

@@ -567,9 +567,16 @@ class Model(nn.Module):
         """M and the torque that holds qd steady: dM/dt qd - d/dq (1/2 qd^T M qd) + dV/dq + D qd."""
         mass, memory = self._mass(features, prepared)
         mass_rate = self._mass_rate(self._features_rate(features, qd), memory)
-        slope = self._kinetic_slope(qd, memory) - self._potential_slope(features, prepared)
-        bias = (mass_rate @ qd.unsqueeze(-1)).squeeze(-1) - self._by_joint(features, slope)
+        bias = (mass_rate @ qd.unsqueeze(-1)).squeeze(-1)
+        bias = bias - self._lagrangian_slope(features, qd, memory, prepared)
         return mass, bias + self.friction(features, qd, prepared.friction)
+
+    def _lagrangian_slope(
+        self, features: Tensor, qd: Tensor, memory: Memory, prepared: Prepared
+    ) -> Tensor:
+        """d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
+        slope = self._kinetic_slope(qd, memory) - self._potential_slope(features, prepared)
+        return self._by_joint(features, slope)
 
     def forward(self, t: Tensor, state: Tensor) -> Tensor:
         """The rate of (q, p), (..., 2 n), or of (q, p, tau), (..., 3 n), where tau is held."""
@@ -588,8 +595,8 @@ class Model(nn.Module):
         features = self._features(q)
         mass, memory = self._mass(features, prepared)
         qd = self._solved(mass, p)
-        slope = self._kinetic_slope(qd, memory) - self._potential_slope(features, prepared)
-        force = self._by_joint(features, slope) - self.friction(features, qd, prepared.friction)
+        force = self._lagrangian_slope(features, qd, memory, prepared)
+        force = force - self.friction(features, qd, prepared.friction)
         if tau is not None:
             force = force + self.actuated * tau
         return qd, force

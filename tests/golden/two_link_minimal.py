@@ -146,8 +146,7 @@ DEPTH = 2  # hidden layers of a network
 FRICTION_HIDDEN = 8
 SLOW = 0.03  # below this share of its usual speed dry friction fades to zero, to start from
 SLOWEST = 0.001  # and at the least
-ANGLES = len(JOINTS) + len(WAVES)  # whose cosines and sines all else is made of
-FEATURES = 2 * ANGLES
+FEATURES = 2 * len(JOINTS)  # numbers made of q, which networks read
 PLACE_SHARE = 0.1  # how much friction's networks see of where a joint is, relative to its speed
 
 
@@ -176,38 +175,12 @@ class Reading(NamedTuple):
 
 def reading(joints: Iterable[int], shares: list[float]) -> Reading:
     """cos q and sin q of turning joints, the scaled q of sliding ones, times each joint's share."""
+    n = len(JOINTS)
     turning = [joint for joint in joints if JOINTS[joint].revolute]
     whose = turning + turning
-    places = turning + [ANGLES + joint for joint in turning]
+    places = turning + [n + joint for joint in turning]
     spread = torch.eye(FEATURES, dtype=torch.float64)[places]
     return Reading(tuple(whose), vector(shares[joint] for joint in whose), spread)
-
-
-class Series(NamedTuple):
-    """Sums of waves, one for each output of a network, which they go beside."""
-
-    outputs: Tensor  # for each term, to which output it goes
-    features: Tensor  # and which feature it takes
-    start: Tensor
-    size: Tensor  # of the term, in which its trained factor is counted
-    level: Tensor  # by output
-
-
-def series(sums: list[tuple[float, Terms]], scales: list[float], shares: list[float]) -> Series:
-    """Sums (level, terms) in units of their scales; a wave counts as its joints' least share."""
-    n = len(JOINTS)
-    levels, rows = [], []
-    for output, ((level, terms), scale) in enumerate(zip(sums, scales, strict=True)):
-        levels.append(level / scale)
-        for number, cos, sin in terms:
-            turns = WAVES[number].turns
-            size = min(share for share, turn in zip(shares, turns, strict=True) if turn)
-            rows.append((output, n + number, cos / scale / size, size))
-            rows.append((output, ANGLES + n + number, sin / scale / size, size))
-    outputs, features, starts, sizes = zip(*rows, strict=True)
-    return Series(
-        torch.tensor(outputs), torch.tensor(features), vector(starts), vector(sizes), vector(levels)
-    )
 
 
 class Layers(NamedTuple):
@@ -215,10 +188,15 @@ class Layers(NamedTuple):
 
     weights: tuple[Tensor, ...]
     biases: tuple[Tensor, ...]
-    series: Tensor | None  # rows by features
 
 
 Trace = tuple[tuple[Tensor, ...], Layers]
+
+
+def by_sigmoid(rate: Tensor, value: Tensor) -> Tensor:
+    """rate * value (1 - value), the sigmoid's slope, in one pass: memory is what takes the time."""
+    changed: Tensor = torch.ops.aten.sigmoid_backward(rate, value)
+    return changed
 
 
 class Network(nn.Module):
@@ -229,17 +207,12 @@ class Network(nn.Module):
     """
 
     spread: Tensor
-    series: Tensor | None
-    series_outputs: Tensor
-    series_features: Tensor
-    series_size: Tensor
 
     def __init__(
         self,
         reading: Reading,
         layers: tuple[tuple[frozenset[int], ...], ...],
         generator: torch.Generator,
-        series: Series | None = None,
     ) -> None:
         super().__init__()
         self.register_buffer("spread", reading.spread)
@@ -255,14 +228,6 @@ class Network(nn.Module):
             self.biases.append(nn.Parameter(torch.zeros(len(units), dtype=torch.float64)))
             below = units
         nn.init.zeros_(self.weights[-1])  # so that the model starts at its nominal values
-        self.register_parameter("series", None)
-        if series is not None:
-            self.series = nn.Parameter(series.start)
-            self.register_buffer("series_outputs", series.outputs)
-            self.register_buffer("series_features", series.features)
-            self.register_buffer("series_size", series.size)
-            self.biases[-1].data = series.level
-            self.get_buffer(f"mask{len(layers) - 1}").mul_(NETWORK_SHARE)
 
     def prepared(self, outlay: Tensor, offset: Tensor) -> Layers:
         """The weights for the features as they are, and for offset + outlay y in place of y.
@@ -280,15 +245,7 @@ class Network(nn.Module):
             biases.append(2 * bias)
         weights[-1] = 0.5 * outlay @ weights[-1]
         biases[-1] = offset + 0.5 * outlay @ biases[-1]
-        return Layers(tuple(weights), tuple(biases), self._series(outlay))
-
-    def _series(self, outlay: Tensor) -> Tensor | None:
-        """The sums of waves, laid out."""
-        if self.series is None:
-            return None
-        known = outlay.new_zeros(outlay.shape[1], FEATURES)
-        place = (self.series_outputs, self.series_features)
-        return outlay @ known.index_put(place, self.series_size * self.series)
+        return Layers(tuple(weights), tuple(biases))
 
     def forward(self, features: Tensor, layers: Layers) -> tuple[Tensor, Trace]:
         """y laid out, (..., rows); and what ``pull`` and ``push`` need."""
@@ -296,27 +253,57 @@ class Network(nn.Module):
         for weight, bias in zip(layers.weights[:-1], layers.biases, strict=False):
             layer = torch.sigmoid(F.linear(layer, weight, bias))
             hidden.append(layer)
-        y = F.linear(layer, layers.weights[-1], layers.biases[-1])
-        if layers.series is not None:
-            y = y + F.linear(features, layers.series)
-        return y, (tuple(hidden), layers)
+        return F.linear(layer, layers.weights[-1], layers.biases[-1]), (tuple(hidden), layers)
 
     def pull(self, trace: Trace, cotangent: Tensor) -> Tensor:
         """The reverse sweep: cotangent, (..., rows), times dy/dfeatures; (..., features)."""
         hidden, layers = trace
         layer = cotangent @ layers.weights[-1]
         for weight, value in zip(reversed(layers.weights[:-1]), reversed(hidden), strict=True):
-            layer = (layer * (value * (1 - value))) @ weight
-        return layer if layers.series is None else layer + cotangent @ layers.series
+            layer = by_sigmoid(layer, value) @ weight
+        return layer
 
     def push(self, trace: Trace, rate: Tensor) -> Tensor:
         """The forward sweep: dy/dfeatures times the features' rate; (..., rows)."""
         hidden, layers = trace
-        pushed = rate
         for weight, value in zip(layers.weights[:-1], hidden, strict=True):
-            pushed = F.linear(pushed, weight) * (value * (1 - value))
-        pushed = F.linear(pushed, layers.weights[-1])
-        return pushed if layers.series is None else pushed + F.linear(rate, layers.series)
+            rate = by_sigmoid(F.linear(rate, weight), value)
+        return F.linear(rate, layers.weights[-1])
+
+
+class Series(nn.Module):
+    """Sums of waves with trained factors, one for each output of a network beside it."""
+
+    outputs: Tensor  # for each term, to which output it goes
+    places: Tensor  # and where its wave stands
+    size: Tensor  # in which its factor is counted
+
+    def __init__(self, sums: list[Terms], scales: list[float], shares: list[float]) -> None:
+        """Of terms in units of their output's scale; a wave counts as its joints' least share."""
+        super().__init__()
+        rows = []
+        for output, (terms, scale) in enumerate(zip(sums, scales, strict=True)):
+            for number, cos, sin in terms:
+                turns = WAVES[number].turns
+                size = min(share for share, turn in zip(shares, turns, strict=True) if turn)
+                rows.append((output, number, cos / scale / size, size))
+                rows.append((output, len(WAVES) + number, sin / scale / size, size))
+        outputs, places, starts, sizes = zip(*rows, strict=True)
+        self.register_buffer("outputs", torch.tensor(outputs))
+        self.register_buffer("places", torch.tensor(places))
+        self.register_buffer("size", vector(sizes))
+        self.factors = nn.Parameter(vector(starts))
+
+    def prepared(self, outlay: Tensor) -> Tensor:
+        """What takes waves to outlay y, (rows, 2 waves), where y are the sums."""
+        known = outlay.new_zeros(outlay.shape[1], 2 * len(WAVES))
+        return outlay @ known.index_put((self.outputs, self.places), self.size * self.factors)
+
+
+def leave_to_sums(network: Network, levels: Tensor) -> None:
+    """Leave a network a small share of functions that are sums of waves, and the sums' levels."""
+    network.biases[-1].data = levels
+    network.get_buffer(f"mask{DEPTH}").mul_(NETWORK_SHARE)
 
 
 class FrictionLayers(NamedTuple):
@@ -342,7 +329,7 @@ class Friction(nn.Module):
         joints, inputs = len(JOINTS), 4
         spread = torch.zeros(joints, inputs, FEATURES + 2 * joints, dtype=torch.float64)
         for i, joint in enumerate(JOINTS):
-            spread[i, 0, i] = spread[i, 1, ANGLES + i] = PLACE_SHARE
+            spread[i, 0, i] = spread[i, 1, joints + i] = PLACE_SHARE
             spread[i, 2, i - 2 * joints], spread[i, 3, i - joints] = 1 / joint.speed, 1.0
         self.register_buffer("spread", spread)
         self.register_buffer("speed", vector(joint.speed for joint in JOINTS))
@@ -392,18 +379,27 @@ class Friction(nn.Module):
         return torch.diag_embed(layers.viscous + self.size * dry / smooth_speed)
 
 
+class Features(NamedTuple):
+    """Numbers made of q, which all else is made of."""
+
+    own: Tensor  # cos q, sin q, (..., FEATURES)
+    waves: Tensor  # cosines of all waves, then sines, (..., 2 waves)
+
+
 class Prepared(NamedTuple):
     """What depends on the weights alone, worked out once for many states."""
 
     mass: Layers
+    mass_waves: Tensor
     rotors: Tensor
     least: Tensor  # M above this needs no guard
     potential: Layers
+    potential_waves: Tensor
     friction: FrictionLayers
 
 
 # what M's derivatives need of the work done for M
-Memory = tuple[Trace, Tensor | None]
+Memory = tuple[Trace, Tensor | None, Tensor]
 
 
 class Model(nn.Module):
@@ -420,7 +416,7 @@ class Model(nn.Module):
         "revolute" if joint.revolute else "prismatic" for joint in JOINTS
     )
 
-    turns: Tensor  # of joints by angle, (n, angles)
+    turns: Tensor  # of joints by wave, (n, waves)
     constant_scale: Tensor
     constant_basis: Tensor
     output_mean: Tensor
@@ -435,7 +431,6 @@ class Model(nn.Module):
         super().__init__()
         generator = torch.Generator().manual_seed(seed)
         turns = torch.tensor([wave.turns for wave in WAVES], dtype=torch.float64)
-        turns = torch.cat([torch.eye(self.n, dtype=torch.float64), turns])
         self.register_buffer("turns", turns.mT)
         start = vector(constant.start for constant in CONSTANTS)
         self.register_buffer("constant_scale", vector(constant.scale for constant in CONSTANTS))
@@ -451,15 +446,17 @@ class Model(nn.Module):
         outputs = tuple(frozenset(output.joints) for output in OUTPUTS)
         shares = [joint.mass_share for joint in JOINTS]
         read = reading(sorted(frozenset().union(*outputs)), shares)
-        sums = [(output.level - output.mean, output.terms) for output in OUTPUTS]
-        known = series(sums, [output.scale for output in OUTPUTS], shares)
-        self.mass_network = Network(read, (*((hidden,) * DEPTH), outputs), generator, known)
+        self.mass_network = Network(read, (*((hidden,) * DEPTH), outputs), generator)
+        scales = [output.scale for output in OUTPUTS]
+        self.mass_series = Series([output.terms for output in OUTPUTS], scales, shares)
+        levels = vector((output.level - output.mean) / output.scale for output in OUTPUTS)
+        leave_to_sums(self.mass_network, levels)
         everything = frozenset(POTENTIAL_JOINTS)
         layers = (*(((everything,) * POTENTIAL_WIDTH,) * DEPTH), (everything,))
         shares = [joint.potential_share for joint in JOINTS]
-        known = series([(0.0, POTENTIAL_TERMS)], [POTENTIAL_SCALE], shares)
-        read = reading(POTENTIAL_JOINTS, shares)
-        self.potential_network = Network(read, layers, generator, known)
+        self.potential_network = Network(reading(POTENTIAL_JOINTS, shares), layers, generator)
+        self.potential_series = Series([POTENTIAL_TERMS], [POTENTIAL_SCALE], shares)
+        leave_to_sums(self.potential_network, vector([0.0]))
         self.friction = Friction(generator)
         self.register_buffer("rotor_size", vector(joint.rotor for joint in JOINTS))
         self.rotor = nn.Parameter(torch.zeros(self.n, dtype=torch.float64))
@@ -474,9 +471,11 @@ class Model(nn.Module):
         scale = self.friction.size.new_full((1, 1), POTENTIAL_SCALE)
         return Prepared(
             mass=self.mass_network.prepared(outlay, constant),
+            mass_waves=self.mass_series.prepared(outlay),
             rotors=rotors,
             least=(rotors + GUARD * self.mean_mass).detach(),
             potential=self.potential_network.prepared(scale, 0 * scale[0]),
+            potential_waves=self.potential_series.prepared(scale)[0],
             friction=self.friction.prepared(),
         )
 
@@ -484,35 +483,42 @@ class Model(nn.Module):
         """(..., n n) as (..., n, n)."""
         return rows.reshape(*rows.shape[:-1], self.n, self.n)
 
-    def _features(self, q: Tensor) -> Tensor:
-        """cos q, sin q, those of waves: all that is read of q, (..., features)."""
+    def _features(self, q: Tensor) -> Features:
+        """cos q, sin q; the waves: all that is read of q."""
+        own = torch.cat([q.cos(), q.sin()], dim=-1)
         angle = q @ self.turns
-        return torch.cat([angle.cos(), angle.sin()], dim=-1)
+        return Features(own, torch.cat([angle.cos(), angle.sin()], dim=-1))
 
-    def _features_rate(self, features: Tensor, qd: Tensor) -> Tensor:
+    def _features_rate(self, features: Features, qd: Tensor) -> Features:
         """How fast the features change along qd."""
-        cos, sin = features.chunk(2, dim=-1)
+        cos, sin = features.own.chunk(2, dim=-1)
+        own = torch.cat([-sin * qd, cos * qd], dim=-1)
+        cos, sin = features.waves.chunk(2, dim=-1)
         turn = qd @ self.turns
-        return torch.cat([-sin * turn, cos * turn], dim=-1)
+        return Features(own, torch.cat([-sin * turn, cos * turn], dim=-1))
 
-    def _by_joint(self, features: Tensor, slope: Tensor) -> Tensor:
+    def _by_joint(self, features: Features, slope: Features) -> Tensor:
         """d/dq, (..., n), of what has this slope d/dfeatures."""
-        cos, sin = features.chunk(2, dim=-1)
-        by_cos, by_sin = slope.chunk(2, dim=-1)
-        return (by_sin * cos - by_cos * sin) @ self.turns.mT
+        cos, sin = features.own.chunk(2, dim=-1)
+        by_cos, by_sin = slope.own.chunk(2, dim=-1)
+        by_own = by_sin * cos - by_cos * sin
+        cos, sin = features.waves.chunk(2, dim=-1)
+        by_cos, by_sin = slope.waves.chunk(2, dim=-1)
+        return by_own + (by_sin * cos - by_cos * sin) @ self.turns.mT
 
     def mass_matrix(self, q: Tensor) -> Tensor:
         """M(q), (..., n, n) [kg m^2, kg m, kg]."""
         return self._mass(self._features(q), self.prepare())[0]
 
-    def _mass(self, features: Tensor, prepared: Prepared) -> tuple[Tensor, Memory]:
+    def _mass(self, features: Features, prepared: Prepared) -> tuple[Tensor, Memory]:
         """M(q), the network's trace and, where the guard is awake, its slope dl/dM, (..., n, n)."""
-        rows, trace = self.mass_network(features, prepared.mass)
+        rows, trace = self.mass_network(features.own, prepared.mass)
+        rows = rows + F.linear(features.waves, prepared.mass_waves)
         mass = self._square(rows)
         if self._sound(mass, prepared):
-            return mass, (trace, None)
+            return mass, (trace, None, prepared.mass_waves)
         lift, slope = self._lift(mass - prepared.rotors)
-        return mass + lift[..., None, None] * self.mean_mass, (trace, slope)
+        return mass + lift[..., None, None] * self.mean_mass, (trace, slope, prepared.mass_waves)
 
     def _sound(self, mass: Tensor, prepared: Prepared) -> bool:
         """Whether no eigenvalue of M less rotors, relative to its mean, is below GUARD."""
@@ -533,18 +539,20 @@ class Model(nn.Module):
         slope = self.whitening.mT @ (vectors * slopes.unsqueeze(-2)) @ vectors.mT @ self.whitening
         return GUARD * (u * (u4 / (1 + u4))).sum(dim=-1), slope
 
-    def _kinetic_slope(self, qd: Tensor, memory: Memory) -> Tensor:
-        """d/dfeatures of 1/2 qd^T M(q) qd, (..., features)."""
-        trace, slope = memory
+    def _kinetic_slope(self, qd: Tensor, memory: Memory) -> Features:
+        """d/dfeatures of 1/2 qd^T M(q) qd."""
+        trace, slope, waves = memory
         weight = (0.5 * qd).unsqueeze(-1) * qd.unsqueeze(-2)
         if slope is not None:
             weight = weight + (weight * self.mean_mass).sum(dim=(-2, -1))[..., None, None] * slope
-        return self.mass_network.pull(trace, weight.flatten(-2))
+        weight = weight.flatten(-2)
+        return Features(self.mass_network.pull(trace, weight), weight @ waves)
 
-    def _mass_rate(self, rate: Tensor, memory: Memory) -> Tensor:
+    def _mass_rate(self, rate: Features, memory: Memory) -> Tensor:
         """dM/dt where the features change at this rate, (..., n, n)."""
-        trace, slope = memory
-        mass_rate = self._square(self.mass_network.push(trace, rate))
+        trace, slope, waves = memory
+        pushed = self.mass_network.push(trace, rate.own) + F.linear(rate.waves, waves)
+        mass_rate = self._square(pushed)
         if slope is not None:
             along = (slope * mass_rate).sum(dim=(-2, -1))[..., None, None]
             mass_rate = mass_rate + along * self.mean_mass
@@ -552,22 +560,24 @@ class Model(nn.Module):
 
     def potential_energy(self, q: Tensor) -> Tensor:
         """V(q), (...) [J]."""
-        y: Tensor = self.potential_network(self._features(q), self.prepare().potential)[0]
-        return y.squeeze(-1)
+        features, prepared = self._features(q), self.prepare()
+        y: Tensor = self.potential_network(features.own, prepared.potential)[0]
+        return y.squeeze(-1) + features.waves @ prepared.potential_waves
 
     def gravity(self, q: Tensor) -> Tensor:
         """dV/dq, (..., n) [Nm, N]."""
         features = self._features(q)
         return self._by_joint(features, self._potential_slope(features, self.prepare()))
 
-    def _potential_slope(self, features: Tensor, prepared: Prepared) -> Tensor:
-        """dV/dfeatures, (..., features)."""
-        _, trace = self.potential_network(features, prepared.potential)
-        return self.potential_network.pull(trace, features.new_ones(1))
+    def _potential_slope(self, features: Features, prepared: Prepared) -> Features:
+        """dV/dfeatures."""
+        _, trace = self.potential_network(features.own, prepared.potential)
+        slope = self.potential_network.pull(trace, features.own.new_ones(1))
+        return Features(slope, prepared.potential_waves)
 
     def dissipation(self, q: Tensor, qd: Tensor) -> Tensor:
         """D(q, qd), (..., n, n), diagonal: D qd is the friction torque."""
-        return self.friction.matrix(self._features(q), qd, self.prepare().friction)
+        return self.friction.matrix(self._features(q).own, qd, self.prepare().friction)
 
     def input_matrix(self, q: Tensor) -> Tensor:
         """G, (..., n, n): one for each actuated joint."""
@@ -603,14 +613,23 @@ class Model(nn.Module):
         return (mass @ qdd.unsqueeze(-1)).squeeze(-1) + bias
 
     def _mass_and_bias(
-        self, features: Tensor, qd: Tensor, prepared: Prepared
+        self, features: Features, qd: Tensor, prepared: Prepared
     ) -> tuple[Tensor, Tensor]:
         """M and the torque that holds qd steady: dM/dt qd - d/dq (1/2 qd^T M qd) + dV/dq + D qd."""
         mass, memory = self._mass(features, prepared)
         mass_rate = self._mass_rate(self._features_rate(features, qd), memory)
-        slope = self._kinetic_slope(qd, memory) - self._potential_slope(features, prepared)
-        bias = (mass_rate @ qd.unsqueeze(-1)).squeeze(-1) - self._by_joint(features, slope)
-        return mass, bias + self.friction(features, qd, prepared.friction)
+        bias = (mass_rate @ qd.unsqueeze(-1)).squeeze(-1)
+        bias = bias - self._lagrangian_slope(features, qd, memory, prepared)
+        return mass, bias + self.friction(features.own, qd, prepared.friction)
+
+    def _lagrangian_slope(
+        self, features: Features, qd: Tensor, memory: Memory, prepared: Prepared
+    ) -> Tensor:
+        """d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
+        kinetic = self._kinetic_slope(qd, memory)
+        potential = self._potential_slope(features, prepared)
+        slope = Features(kinetic.own - potential.own, kinetic.waves - potential.waves)
+        return self._by_joint(features, slope)
 
     def forward(self, t: Tensor, state: Tensor) -> Tensor:
         """The rate of (q, p), (..., 2 n), or of (q, p, tau), (..., 3 n), where tau is held."""
@@ -629,8 +648,8 @@ class Model(nn.Module):
         features = self._features(q)
         mass, memory = self._mass(features, prepared)
         qd = self._solved(mass, p)
-        slope = self._kinetic_slope(qd, memory) - self._potential_slope(features, prepared)
-        force = self._by_joint(features, slope) - self.friction(features, qd, prepared.friction)
+        force = self._lagrangian_slope(features, qd, memory, prepared)
+        force = force - self.friction(features.own, qd, prepared.friction)
         if tau is not None:
             force = force + self.actuated * tau
         return qd, force
