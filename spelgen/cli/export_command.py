@@ -29,18 +29,19 @@ def export(
     from spelgen.spec import read_header
     from spelgen.training.runs import RunFolder, write_bytes
 
-    folder = RunFolder(run)
-    beside = output.with_suffix(".yaml")
-    for path in (output, beside):
-        options.require_free(path, force=force)
     if output.suffix == ".yaml":
         raise RunError(f"the name {output.name!r}", expected="FILE.urdf, beside which FILE.yaml is written")
+    folder, beside = RunFolder(run), output.with_suffix(".yaml")
+    for path in (output, beside):
+        options.require_free(path, force=force)
     folder.read_json(folder.config)
     if not folder.urdf.exists():
         raise RunError("no robot.urdf", file=run, expected="a run of `spelgen train --robot FILE.urdf`")
     twin = make_twin(folder)
-    write_bytes(output, urdf_text(twin, folder.urdf, read_header(folder.module).options.snap_tolerance))
-    write_text(beside, settings_text(twin, folder.urdf))
+    robot = urdf_text(twin, folder.urdf, read_header(folder.module).options.snap_tolerance)
+    settings = settings_text(twin, folder.urdf)
+    write_bytes(output, robot)
+    write_text(beside, settings)
     count = len(twin.arm.bodies)
     say(f"wrote {output}: inertials of {count} {'body' if count == 1 else 'bodies'}, friction")
     say(f"wrote {beside}: rotor inertia, friction in both directions")

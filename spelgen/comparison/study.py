@@ -32,7 +32,7 @@ from spelgen.training.data import TrainingConfig
 from spelgen.training.loop import EPOCH_STEPS
 from spelgen.training.rivals import trained
 from spelgen.training.rollout import LossScales, loss_scales
-from spelgen.training.runs import RunFolder, load_model, write_json
+from spelgen.training.runs import RunFolder, load_model, trained_model, write_json
 from spelgen.training.train import train
 
 if TYPE_CHECKING:
@@ -271,10 +271,7 @@ def _run(study: Study, variant: Variant, seed: int) -> dict[str, Any]:
     )  # fmt: skip
     if ended.status == "interrupted":
         raise KeyboardInterrupt
-    model = load_model(run.module)
-    model.load_state_dict(run.load_state(run.weights))
-    model.requires_grad_(False).eval()
-    found = _measured(study, model, read_header(run.module).joints, ended.substeps)
+    found = _measured(study, trained_model(run), read_header(run.module).joints, ended.substeps)
     result = {
         "variant": variant.name,
         "seed": seed,

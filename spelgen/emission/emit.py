@@ -34,27 +34,17 @@ _FRICTION_AXES = {"per-joint": 0, "dense-n": 1, "dense-3n": 3}
 
 def emit(spec: ModelSpec) -> str:
     """The Python source of the module that ``spec`` describes; it needs torch alone."""
-    n, design = len(spec.joints), spec.design
+    design = spec.design
     if design.mass == "closed-form":
         return _closed_form(spec)
     return render(
         "module.py.jinja",
-        title=f"Port-Hamiltonian model of an arm with {n} joint{'s' * (n > 1)}, written by `spelgen build`.",
-        class_summary=f"The arm's dynamics: {_count(spec)}.",
-        summary=_summary(spec),
-        picture=_picture(spec),
-        joint_table=_joint_table(spec),
-        record=_record(spec),
-        n=n,
+        **_common(spec),
         joints=_table("JOINTS = ", [_joint_row(joint) for joint in spec.joints]),
         sliding=any(joint.kind == "prismatic" for joint in spec.joints),
         net=design.net,
         group=design.encoding == "group",
         input="dense" if design.input == "dense-3n" else "motor" if spec.inputs else "derived",
-        inputs=_table(
-            "INPUTS = ", [_call("Input", **dict(zip(_INPUT, x, strict=True))) for x in spec.inputs]
-        ),
-        gains=any(trained for *_, trained in spec.inputs),
         friction_axes=_FRICTION_AXES[design.dissipation],
         depth=spec.options.depth,
         width=_units(spec),
@@ -72,9 +62,7 @@ def emit(spec: ModelSpec) -> str:
 
 
 def _closed_form(spec: ModelSpec) -> str:
-    n, bodies = len(spec.joints), len(spec.bodies)
     mean = _mean_mass(spec)
-    made = f"{bodies} rigid bod{'ies' if bodies > 1 else 'y'} with trained inertial parameters"
     joints = [
         _call(
             "Joint",
@@ -104,20 +92,28 @@ def _closed_form(spec: ModelSpec) -> str:
     ]
     return render(
         "closed_form.py.jinja",
-        title=f"Port-Hamiltonian model of an arm with {n} joint{'s' * (n > 1)}, written by `spelgen build`.",
-        class_summary=f"The arm's dynamics: {made}.",
-        summary=_summary(spec),
-        picture=_picture(spec),
-        joint_table=_joint_table(spec),
-        record=_record(spec),
-        n=n,
+        **_common(spec),
         joints=_table("JOINTS = ", joints),
         bodies=_table("BODIES = ", rows),
         gravity=_literal(spec.gravity),
-        inputs=spec.inputs
-        and _table("INPUTS = ", [_call("Input", **dict(zip(_INPUT, x, strict=True))) for x in spec.inputs]),
-        gains=any(trained for *_, trained in spec.inputs),
     )
+
+
+def _common(spec: ModelSpec) -> dict[str, object]:
+    """What both templates show: the docstring, and G."""
+    n = len(spec.joints)
+    inputs = [_call("Input", **dict(zip(_INPUT, each, strict=True))) for each in spec.inputs]
+    return {
+        "title": f"Port-Hamiltonian model of an arm with {n} joint{'s' * (n > 1)}, written by `spelgen build`.",
+        "class_summary": f"The arm's dynamics: {_class_summary(spec)}.",
+        "summary": _summary(spec),
+        "picture": _picture(spec),
+        "joint_table": _joint_table(spec),
+        "record": _record(spec),
+        "n": n,
+        "inputs": inputs and _table("INPUTS = ", inputs),
+        "gains": any(trained for *_, trained in spec.inputs),
+    }
 
 
 def _mass(spec: ModelSpec) -> dict[str, object]:
@@ -249,6 +245,13 @@ def _hidden(spec: ModelSpec) -> tuple[tuple[tuple[int, ...], int], ...]:
     while units and sum(units) < _units(spec):
         units[max(range(len(units)), key=lambda k: ideal[k] - units[k])] += 1
     return tuple(zip(joints, units, strict=True))
+
+
+def _class_summary(spec: ModelSpec) -> str:
+    bodies = len(spec.bodies)
+    if bodies:
+        return f"{bodies} rigid bod{'ies' if bodies > 1 else 'y'} with trained inertial parameters"
+    return _count(spec)
 
 
 def _count(spec: ModelSpec) -> str:

@@ -26,7 +26,7 @@ from spelgen.spec import Header, read_header
 from spelgen.training.data import filter_cutoff
 from spelgen.training.rivals import Contender, held_velocity, trained, urdf_values
 from spelgen.training.rollout import choose_substeps, loss_scales, position_difference
-from spelgen.training.runs import RunFolder, load_model, write_json
+from spelgen.training.runs import RunFolder, trained_model, write_json
 
 if TYPE_CHECKING:
     from spelgen.training.runs import EmittedModel
@@ -128,7 +128,7 @@ def evaluate(
     torch.set_num_threads(threads)
     run = RunFolder(Path(folder))
     config = run.read_json(run.config)
-    model, header = _trained_model(run), read_header(run.module)
+    model, header = trained_model(run), read_header(run.module)
     mapping = mapping or LogMapping(**config.get("mapping", {}))
     trajectories = read_logs(data, header.joints, role="test", mapping=mapping, joint_types=model.joint_types)
     notes = examine(trajectories, header.joints, model.joint_types)
@@ -161,12 +161,6 @@ def evaluate(
     )
     write_json(run.evaluation, result.to_dict())
     return result
-
-
-def _trained_model(run: RunFolder) -> EmittedModel:
-    model = load_model(run.module)
-    model.load_state_dict(run.load_state(run.weights))
-    return model.requires_grad_(False).eval()
 
 
 def _seen(trajectories: Sequence[Trajectory], config: dict[str, Any]) -> list[Diagnostic]:

@@ -15,7 +15,8 @@ from spelgen import pipeline
 from spelgen.arm.arm import Arm
 from spelgen.spec import Header, read_header
 from spelgen.structure.nominal import working_range
-from spelgen.training.runs import RunFolder, load_model
+from spelgen.training.descent import minimise
+from spelgen.training.runs import RunFolder, load_model, trained_model
 
 if TYPE_CHECKING:
     from spelgen.training.runs import EmittedModel
@@ -50,9 +51,7 @@ class Twin:
 
 def make_twin(run: RunFolder) -> Twin:
     """The twin of a run's best model. Raises RunError for what the run lacks, and what `pipeline.load` raises."""
-    model = load_model(run.module)
-    model.load_state_dict(run.load_state(run.weights))
-    model.requires_grad_(False).eval()
+    model = trained_model(run)
     header = read_header(run.module)
     arm = pipeline.load(run.urdf, header.joints, snap_tolerance=header.options.snap_tolerance).arm
     q = _positions(arm)
@@ -101,24 +100,14 @@ def _fitted(run: RunFolder, header: Header, model: EmittedModel, q: torch.Tensor
     def distance() -> torch.Tensor:
         missed = whitening @ twin.mass_matrix(q) @ whitening.mT - mass
         load = (twin.gravity(q) - gravity) / unit
-        return missed.square().sum(dim=(-2, -1)).mean() / mass.shape[-1] + load.square().sum(dim=-1).mean()
+        stray = torch.cat([parameter.flatten() for parameter in twin.parameters()])
+        return (
+            missed.square().sum(dim=(-2, -1)).mean() / mass.shape[-1]
+            + load.square().sum(dim=-1).mean()
+            + 0.5 * STRAY * stray.square().sum()
+        )
 
-    optimiser = torch.optim.LBFGS(
-        twin.parameters(),
-        max_iter=STEPS,
-        history_size=50,
-        line_search_fn="strong_wolfe",
-        tolerance_change=1e-15,
-    )
-
-    def evaluated() -> torch.Tensor:
-        optimiser.zero_grad()
-        stray = torch.cat([parameter.flatten() for parameter in twin.parameters()]).square().sum()
-        loss = distance() + 0.5 * STRAY * stray
-        loss.backward()
-        return loss
-
-    optimiser.step(evaluated)
+    minimise(twin, distance, STEPS)
     return twin.requires_grad_(False)
 
 

@@ -17,6 +17,7 @@ from spelgen.data.windows import Windows
 VECTOR_FACTOR = 5.0  # on the learning rate of constants and biases
 GRADIENT_NORM = 1.0  # of the scaled loss; larger gradients are shortened to it
 HISTORY = 50  # steps that L-BFGS remembers
+CALL = 20  # evaluations between looks at whether more would help
 STALLED = 1 - 1e-3  # of the loss before a call: what ends above it has found next to nothing
 TOO_LARGE = 1e12  # told to the line search where a loss is not finite, so that it turns back
 
@@ -173,3 +174,14 @@ class WholeSet:
         """Go on from a ``state_dict``."""
         self._optimiser.load_state_dict(state["optimiser"])
         self._reached, self._waits = state["reached"], state["waits"]
+
+
+def minimise(model: torch.nn.Module, loss: Callable[[], torch.Tensor], most: int, decay: float = 0.0) -> int:
+    """Move the model's weights down ``loss`` by ``WholeSet`` until that stalls or about ``most`` evaluations are
+    made; return how many were.
+    """
+    descent, done = WholeSet(model, decay), 0
+    while done < most and not descent.stalled:
+        descent.descend(lambda _: loss(), None, CALL, lambda _: 1.0)
+        done += CALL
+    return done

@@ -188,6 +188,14 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
     write_bytes(path, (json.dumps(content, indent=2) + "\n").encode())
 
 
+def trained_model(run: RunFolder) -> EmittedModel:
+    """A run's module with its best weights, which take no gradients. Raises ModuleError and RunError."""
+    model = load_model(run.module)
+    model.load_state_dict(run.load_state(run.weights))
+    model.requires_grad_(False).eval()
+    return model
+
+
 class _Loader(SourceFileLoader):
     """Leaves no __pycache__ beside the module, nor is misled by one."""
 

@@ -3,29 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from spelgen.identification.samples import DynamicsSamples
-from spelgen.training.descent import WholeSet
+from spelgen.training.descent import minimise
 
 if TYPE_CHECKING:
     from spelgen.training.runs import EmittedModel
 
-CALL, MOST = 20, 2000  # evaluations: between looks at whether more would help, and in all
-
-
-@dataclass(frozen=True, eq=False)
-class _Columns:
-    """All samples, each (T, n)."""
-
-    q: torch.Tensor
-    qd: torch.Tensor
-    qdd: torch.Tensor
-    tau: torch.Tensor
+MOST = 2000  # evaluations
 
 
 def fit_networks(
@@ -39,22 +28,14 @@ def fit_networks(
     The error of each joint is told in standard deviations of its torque. decay: see ``WholeSet``; pull: what else
     is to be small, the distance from a URDF for one.
     """
-    columns = _Columns(
-        *(
-            torch.from_numpy(np.concatenate([getattr(x, name) for x in samples]))
-            for name in _Columns.__annotations__
-        )
-    )
-    scale = columns.tau.std(dim=0)
+    q, qd, qdd, tau = (
+        torch.from_numpy(np.concatenate([getattr(x, name) for x in samples]))
+        for name in ("q", "qd", "qdd", "tau")
+    )  # each (T, n)
+    scale = tau.std(dim=0)
     scale = torch.maximum(scale, 1e-2 * scale.amax())
 
-    def missed(at: _Columns) -> torch.Tensor:
-        torque = model.inverse_dynamics(at.q, at.qd, at.qdd)
-        return ((torque - at.tau) / scale).square().mean() + pull()
+    def missed() -> torch.Tensor:
+        return ((model.inverse_dynamics(q, qd, qdd) - tau) / scale).square().mean() + pull()
 
-    descent = WholeSet(model, decay)
-    evaluations = 0
-    while evaluations < MOST and not descent.stalled:
-        descent.descend(missed, columns, CALL, lambda _: 1.0)
-        evaluations += CALL
-    return evaluations
+    return minimise(model, missed, MOST, decay)

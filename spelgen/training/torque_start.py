@@ -53,7 +53,9 @@ def start_from_torque(
     if not is_closed_form(model):
         if loaded:
             raise RunError("a load for a model of networks", expected="a module of the preset closed-form")
-        if config.objective != "torque":
+        if config.objective == "momentum":
+            return replace(config, epochs=0), []
+        if config.objective == "rollout":
             return config, []
     elif config.objective == "momentum":
         raise RunError("the objective 'momentum' for a closed-form model", expected="torque or rollout")

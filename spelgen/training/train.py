@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -95,7 +95,8 @@ def train(
     _use(config)
     model = load_model(module)
     if source is not None and not resume:
-        model.load_state_dict(RunFolder(Path(source)).load_state(RunFolder(Path(source)).weights))
+        adapted = RunFolder(Path(source))
+        model.load_state_dict(adapted.load_state(adapted.weights))
     header = read_header(module)
     paths = list(data)
     large = large_files(paths, header.joints, role="train")
@@ -123,8 +124,6 @@ def train(
         model, prepared, config, fit=not resume, loaded=source is not None, prior=prior
     )
     notes += told
-    if config.objective == "momentum":
-        config = replace(config, epochs=0)
     loop = TrainingLoop(run, model, prepared, config, prior, stepped)
     if resume:
         loop.restore()

@@ -444,11 +444,12 @@ class Prepared(NamedTuple):
     """What depends on the weights alone, worked out once for many states."""
 
     mass: Layers
-    mass_waves: Tensor
+    mass_waves: Tensor  # takes the waves to M
     rotors: Tensor
     least: Tensor  # M above this needs no guard
     potential: Layers
-    potential_waves: Tensor
+    potential_waves: Tensor  # takes the waves to V
+    gravity_waves: Tensor  # and to dV/dq
     friction: FrictionLayers
 
 
@@ -532,13 +533,15 @@ class Model(nn.Module):
         constant = constant + self.output_mean @ self.output_basis + rotors.flatten()
         outlay = (self.output_scale.unsqueeze(-1) * self.output_basis).mT
         scale = self.friction.size.new_full((1, 1), POTENTIAL_SCALE)
+        heights = self.potential_series.prepared(scale)[0]
         return Prepared(
             mass=self.mass_network.prepared(outlay, constant),
             mass_waves=self.mass_series.prepared(outlay),
             rotors=rotors,
             least=(rotors + GUARD * self.mean_mass).detach(),
             potential=self.potential_network.prepared(scale, 0 * scale[0]),
-            potential_waves=self.potential_series.prepared(scale)[0],
+            potential_waves=heights,
+            gravity_waves=self._gravity_waves(heights),
             friction=self.friction.prepared(),
         )
 
@@ -567,17 +570,28 @@ class Model(nn.Module):
         slid = [(qd.unsqueeze(-2) @ self._slide_slopes(wave)).squeeze(-2) for wave in (cos, sin)]
         return Features(own, torch.cat([slid[0] - sin * turn, slid[1] + cos * turn], dim=-1))
 
-    def _by_joint(self, features: Features, slope: Features) -> Tensor:
-        """d/dq, (..., n), of what has this slope d/dfeatures."""
-        cos, sin, _ = features.own.chunk(3, dim=-1)
-        by_cos, by_sin, by_place = slope.own.chunk(3, dim=-1)
-        by_own = by_sin * cos - by_cos * sin + by_place / self.reach
-        cos, sin = features.waves.chunk(2, dim=-1)
-        by_cos, by_sin = slope.waves.chunk(2, dim=-1)
-        by_own = by_own + (by_sin * cos - by_cos * sin) @ self.turns.mT
+    def _by_joint(self, own: Tensor, slope: Tensor) -> Tensor:
+        """d/dq, (..., n), of what has this slope by cos q, sin q and the scaled q."""
+        cos, sin, _ = own.chunk(3, dim=-1)
+        by_cos, by_sin, by_place = slope.chunk(3, dim=-1)
+        return by_sin * cos - by_cos * sin + by_place / self.reach
+
+    def _waves_by_joint(self, waves: Tensor, slope: Tensor) -> Tensor:
+        """d/dq, (..., n), of what has this slope by waves."""
+        cos, sin = waves.chunk(2, dim=-1)
+        by_cos, by_sin = slope.chunk(2, dim=-1)
+        by_joint = (by_sin * cos - by_cos * sin) @ self.turns.mT
         for wave, by_wave in ((cos, by_cos), (sin, by_sin)):
-            by_own = by_own + (self._slide_slopes(wave) @ by_wave.unsqueeze(-1)).squeeze(-1)
-        return by_own
+            by_joint = by_joint + (self._slide_slopes(wave) @ by_wave.unsqueeze(-1)).squeeze(-1)
+        return by_joint
+
+    def _gravity_waves(self, heights: Tensor) -> Tensor:
+        """What takes the waves to d/dq of waves @ heights, (2 waves, n)."""
+        by_cos, by_sin = heights.unsqueeze(-1).chunk(2)
+        turned = torch.cat([by_sin * self.turns.mT, -by_cos * self.turns.mT])
+        lower = self.lower.reshape(len(WAVES), self.n, len(WAVES))
+        slid = torch.cat([lower @ by_cos, lower @ by_sin]).squeeze(-1)
+        return turned + slid
 
     def mass_matrix(self, q: Tensor) -> Tensor:
         """M(q), (..., n, n) [kg m^2, kg m, kg]."""
@@ -639,14 +653,14 @@ class Model(nn.Module):
 
     def gravity(self, q: Tensor) -> Tensor:
         """dV/dq, (..., n) [Nm, N]."""
-        features = self._features(q)
-        return self._by_joint(features, self._potential_slope(features, self.prepare()))
+        features, prepared = self._features(q), self.prepare()
+        by_network = self._by_joint(features.own, self._potential_slope(features.own, prepared))
+        return by_network + features.waves @ prepared.gravity_waves
 
-    def _potential_slope(self, features: Features, prepared: Prepared) -> Features:
-        """dV/dfeatures."""
-        _, trace = self.potential_network(features.own, prepared.potential)
-        slope = self.potential_network.pull(trace, features.own.new_ones(1))
-        return Features(slope, prepared.potential_waves)
+    def _potential_slope(self, own: Tensor, prepared: Prepared) -> Tensor:
+        """d/dfeatures of the network's part of V, (..., FEATURES)."""
+        _, trace = self.potential_network(own, prepared.potential)
+        return self.potential_network.pull(trace, own.new_ones(1))
 
     def dissipation(self, q: Tensor, qd: Tensor) -> Tensor:
         """D(q, qd), (..., n, n), diagonal: D qd is the friction torque."""
@@ -700,9 +714,10 @@ class Model(nn.Module):
     ) -> Tensor:
         """d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
         kinetic = self._kinetic_slope(qd, memory)
-        potential = self._potential_slope(features, prepared)
-        slope = Features(kinetic.own - potential.own, kinetic.waves - potential.waves)
-        return self._by_joint(features, slope)
+        slope = kinetic.own - self._potential_slope(features.own, prepared)
+        by_joint = self._by_joint(features.own, slope)
+        by_joint = by_joint + self._waves_by_joint(features.waves, kinetic.waves)
+        return by_joint - features.waves @ prepared.gravity_waves
 
     def forward(self, t: Tensor, state: Tensor) -> Tensor:
         """The rate of (q, p), (..., 2 n), or of (q, p, tau), (..., 3 n), where tau is held."""

@@ -435,7 +435,7 @@ class Model(nn.Module):
         return torch.cat([-sin * qd, cos * qd, qd / self.reach], dim=-1)
 
     def _by_joint(self, features: Tensor, slope: Tensor) -> Tensor:
-        """d/dq, (..., n), of what has this slope d/dfeatures."""
+        """d/dq, (..., n), of what has this slope by features."""
         cos, sin, _ = features.chunk(3, dim=-1)
         by_cos, by_sin, by_place = slope.chunk(3, dim=-1)
         return by_sin * cos - by_cos * sin + by_place / self.reach
@@ -500,7 +500,7 @@ class Model(nn.Module):
         return self._by_joint(features, self._potential_slope(features, self.prepare()))
 
     def _potential_slope(self, features: Tensor, prepared: Prepared) -> Tensor:
-        """dV/dfeatures, (..., features)."""
+        """d/dfeatures of V, (..., features)."""
         _, trace = self.potential_network(features, prepared.potential)
         return self.potential_network.pull(trace, features.new_ones(1))
 
