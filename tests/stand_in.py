@@ -55,10 +55,10 @@ class Model(nn.Module):
     def input_matrix(self, q):
         return torch.eye(2, dtype=q.dtype).expand(*q.shape, 2)
 
-    def momentum(self, q, qd):
+    def momentum(self, q, qd, prepared=None):
         return (self.mass_matrix(q) @ qd.unsqueeze(-1)).squeeze(-1)
 
-    def velocity(self, q, p):
+    def velocity(self, q, p, prepared=None):
         return torch.linalg.solve(self.mass_matrix(q), p)
 
     def hamiltonian(self, q, p):

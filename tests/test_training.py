@@ -85,10 +85,10 @@ class Oscillator:
     joint_types = ("revolute", "prismatic")
     frequency = torch.tensor([2.0, 5.0], dtype=torch.float64)
 
-    def momentum(self, q, qd):
+    def momentum(self, q, qd, prepared=None):
         return qd
 
-    def velocity(self, q, p):
+    def velocity(self, q, p, prepared=None):
         return p
 
     def prepare(self):

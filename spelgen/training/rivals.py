@@ -86,10 +86,10 @@ class PinocchioDynamics:
         self._inputs = derive_actuation(robot, settings, joints).matrix()
         self._damping, self._friction = self._model.damping[self._order], self._model.friction[self._order]
 
-    def momentum(self, q: torch.Tensor, qd: torch.Tensor) -> torch.Tensor:
+    def momentum(self, q: torch.Tensor, qd: torch.Tensor, prepared: None = None) -> torch.Tensor:
         return qd
 
-    def velocity(self, q: torch.Tensor, p: torch.Tensor) -> torch.Tensor:
+    def velocity(self, q: torch.Tensor, p: torch.Tensor, prepared: None = None) -> torch.Tensor:
         return p
 
     def prepare(self) -> None:

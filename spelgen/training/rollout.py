@@ -22,9 +22,9 @@ LEAST_ERROR = 1e-2  # no model is expected to be better, in units of the scales
 class Dynamics(Protocol):
     """What a rollout needs of an emitted module; see its docstrings for shapes."""
 
-    def momentum(self, q: torch.Tensor, qd: torch.Tensor) -> torch.Tensor: ...
+    def momentum(self, q: torch.Tensor, qd: torch.Tensor, prepared: Any = None) -> torch.Tensor: ...
 
-    def velocity(self, q: torch.Tensor, p: torch.Tensor) -> torch.Tensor: ...
+    def velocity(self, q: torch.Tensor, p: torch.Tensor, prepared: Any = None) -> torch.Tensor: ...
 
     def prepare(self) -> Any: ...
 
@@ -44,7 +44,7 @@ def roll_out(model: Dynamics, windows: Windows, substeps: int) -> tuple[torch.Te
     """
     prepared = model.prepare()
     q = windows.q[:, 0]
-    p = model.momentum(q, windows.qd[:, 0])
+    p = model.momentum(q, windows.qd[:, 0], prepared)
     positions, velocities = [], []
     for dt, tau in zip(windows.dt.unbind(1), windows.tau.unbind(1), strict=True):
         step = dt.unsqueeze(-1) / substeps
@@ -53,7 +53,7 @@ def roll_out(model: Dynamics, windows: Windows, substeps: int) -> tuple[torch.Te
             if substep == 0:
                 velocities.append(qd)  # of the sample that the interval starts at
         positions.append(q)
-    velocities = [*velocities[1:], model.velocity(q, p)]
+    velocities = [*velocities[1:], model.velocity(q, p, prepared)]
     return torch.stack(positions, dim=1), torch.stack(velocities, dim=1)  # each (W, K-1, n)
 
 
@@ -142,8 +142,9 @@ def momentum_loss(model: EmittedModel, windows: Windows, scales: LossScales) -> 
     torque would count less.)
     """
     q, qd = windows.q, windows.qd  # (W, K, n)
-    p = model.momentum(q, qd)
-    force = model.rates(q, p, None, model.prepare())[1]
+    prepared = model.prepare()
+    p = model.momentum(q, qd, prepared)
+    force = model.rates(q, p, None, prepared)[1]
     dt = windows.dt.unsqueeze(-1)
     inputs = model.input_matrix(q[:, :-1])
     push = (inputs @ windows.tau.unsqueeze(-1)).squeeze(-1)

@@ -385,9 +385,9 @@ class Model(nn.Module):
         rows = twist @ self.crossing.flatten(1)
         return rows.reshape(*twist.shape[:-1], 6, 6)
 
-    def mass_matrix(self, q: Tensor) -> Tensor:
-        """M(q), (..., n, n) [kg m^2, kg m, kg]."""
-        return self._mass(self._motion(q), self.prepare())
+    def mass_matrix(self, q: Tensor, prepared: Prepared | None = None) -> Tensor:
+        """M(q), (..., n, n) [kg m^2, kg m, kg]; with what ``prepare`` gave, where it is at hand."""
+        return self._mass(self._motion(q), prepared or self.prepare())
 
     def _mass(self, motion: Motion, prepared: Prepared) -> Tensor:
         inertia = (motion.twists.mT @ (prepared.inertia @ motion.twists)).sum(dim=-3)
@@ -492,13 +492,13 @@ class Model(nn.Module):
         """What the measured torque shows without any, (n,) [Nm, N]."""
         return self.offset * self.friction.size * self.actuated
 
-    def momentum(self, q: Tensor, qd: Tensor) -> Tensor:
+    def momentum(self, q: Tensor, qd: Tensor, prepared: Prepared | None = None) -> Tensor:
         """p = M(q) qd, (..., n)."""
-        return self._applied(self.mass_matrix(q), qd)
+        return self._applied(self.mass_matrix(q, prepared), qd)
 
-    def velocity(self, q: Tensor, p: Tensor) -> Tensor:
+    def velocity(self, q: Tensor, p: Tensor, prepared: Prepared | None = None) -> Tensor:
         """qd = M(q)^-1 p, (..., n)."""
-        return self._solved(self.mass_matrix(q), p)
+        return self._solved(self.mass_matrix(q, prepared), p)
 
     @staticmethod
     def _solved(mass: Tensor, force: Tensor) -> Tensor:

@@ -403,9 +403,9 @@ class Model(nn.Module):
         by_cos, by_sin, by_place = slope.chunk(3, dim=-1)
         return by_sin * cos - by_cos * sin + by_place / self.reach
 
-    def mass_matrix(self, q: Tensor) -> Tensor:
-        """M(q), (..., n, n) [kg m^2, kg m, kg]."""
-        return self._mass(self._features(q), self.prepare())[0]
+    def mass_matrix(self, q: Tensor, prepared: Prepared | None = None) -> Tensor:
+        """M(q), (..., n, n) [kg m^2, kg m, kg]; with what ``prepare`` gave, where it is at hand."""
+        return self._mass(self._features(q), prepared or self.prepare())[0]
 
     def axes_inverse_mass(self, q: Tensor) -> Tensor:
         """M(q)^-1 over all three axes of every joint, of which z moves; (..., 3 n, 3 n).
@@ -495,13 +495,13 @@ class Model(nn.Module):
         gains: Tensor = self.input_network(features, prepared.input)[0]
         return gains
 
-    def momentum(self, q: Tensor, qd: Tensor) -> Tensor:
+    def momentum(self, q: Tensor, qd: Tensor, prepared: Prepared | None = None) -> Tensor:
         """p = M(q) qd, (..., n)."""
-        return (self.mass_matrix(q) @ qd.unsqueeze(-1)).squeeze(-1)
+        return (self.mass_matrix(q, prepared) @ qd.unsqueeze(-1)).squeeze(-1)
 
-    def velocity(self, q: Tensor, p: Tensor) -> Tensor:
+    def velocity(self, q: Tensor, p: Tensor, prepared: Prepared | None = None) -> Tensor:
         """qd = M(q)^-1 p, (..., n)."""
-        return self._solved(self.mass_matrix(q), p)
+        return self._solved(self.mass_matrix(q, prepared), p)
 
     @staticmethod
     def _solved(mass: Tensor, force: Tensor) -> Tensor:

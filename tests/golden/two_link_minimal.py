@@ -517,9 +517,9 @@ class Model(nn.Module):
         by_cos, by_sin = heights.unsqueeze(-1).chunk(2)
         return torch.cat([by_sin * self.turns.mT, -by_cos * self.turns.mT])
 
-    def mass_matrix(self, q: Tensor) -> Tensor:
-        """M(q), (..., n, n) [kg m^2, kg m, kg]."""
-        return self._mass(self._features(q), self.prepare())[0]
+    def mass_matrix(self, q: Tensor, prepared: Prepared | None = None) -> Tensor:
+        """M(q), (..., n, n) [kg m^2, kg m, kg]; with what ``prepare`` gave, where it is at hand."""
+        return self._mass(self._features(q), prepared or self.prepare())[0]
 
     def _mass(self, features: Features, prepared: Prepared) -> tuple[Tensor, Memory]:
         """M(q), the network's trace and, where the guard is awake, its slope dl/dM, (..., n, n)."""
@@ -594,13 +594,13 @@ class Model(nn.Module):
         """G, (..., n, n): one for each actuated joint."""
         return torch.diag(self.actuated).expand(*q.shape[:-1], self.n, self.n)
 
-    def momentum(self, q: Tensor, qd: Tensor) -> Tensor:
+    def momentum(self, q: Tensor, qd: Tensor, prepared: Prepared | None = None) -> Tensor:
         """p = M(q) qd, (..., n)."""
-        return (self.mass_matrix(q) @ qd.unsqueeze(-1)).squeeze(-1)
+        return (self.mass_matrix(q, prepared) @ qd.unsqueeze(-1)).squeeze(-1)
 
-    def velocity(self, q: Tensor, p: Tensor) -> Tensor:
+    def velocity(self, q: Tensor, p: Tensor, prepared: Prepared | None = None) -> Tensor:
         """qd = M(q)^-1 p, (..., n)."""
-        return self._solved(self.mass_matrix(q), p)
+        return self._solved(self.mass_matrix(q, prepared), p)
 
     @staticmethod
     def _solved(mass: Tensor, force: Tensor) -> Tensor:
