@@ -17,14 +17,12 @@ WHOLE = 0.05  # a difference this near to a whole number of steps is that number
 MOSTLY = 0.95  # of the differences between neighbouring levels are whole steps where a signal is quantised
 
 
-@dataclass(frozen=True, eq=False)
-class Measures:
-    """One trajectory of n joints.
+@dataclass(frozen=True)
+class Clock:
+    """When the samples of one trajectory were taken.
 
-    rate: [Hz], outside gaps. jitter: standard deviation of the steps outside gaps, relative to their mean.
-    longest_gap: [s], 0 without gaps. low, high: of q, qd and tau, each (n,). noise: of q, qd and tau (n,),
-    standard deviation of what changes from sample to sample; None where the log is too sparse to tell.
-    steps: of the quantised signals among them (n,), NaN where a signal is not.
+    duration, longest_gap: [s], the latter 0 without gaps. rate: [Hz], outside gaps. jitter: standard deviation of
+    the steps outside gaps, relative to their mean.
     """
 
     name: str
@@ -35,6 +33,18 @@ class Measures:
     jitter: float
     gaps: int
     longest_gap: float
+
+
+@dataclass(frozen=True, eq=False)
+class Measures:
+    """One trajectory of n joints.
+
+    low, high: of q, qd and tau, each (n,). noise: of q, qd and tau (n,), standard deviation of what changes from
+    sample to sample; None where the log is too sparse to tell. steps: of the quantised signals among them (n,),
+    NaN where a signal is not.
+    """
+
+    clock: Clock
     low: dict[str, np.ndarray]
     high: dict[str, np.ndarray]
     noise: dict[str, np.ndarray] | None
@@ -44,12 +54,25 @@ class Measures:
 
 def measure(trajectory: Trajectory) -> Measures:
     """The numbers of one trajectory."""
-    steps = np.diff(trajectory.t)
-    regular = steps[steps <= GAP * np.median(steps)] if steps.size else np.ones(1)
-    gaps = steps[steps > GAP * np.median(steps)] if steps.size else steps
     signals = {name: getattr(trajectory, name) for name in QUANTITIES}
     dense = rate(trajectory) >= DENSE and len(trajectory.t) > 8
     return Measures(
+        clock=_clock(trajectory),
+        low={name: values.min(axis=0) for name, values in signals.items()},
+        high={name: values.max(axis=0) for name, values in signals.items()},
+        noise={name: noise(trajectory.t, values) for name, values in signals.items()} if dense else None,
+        steps={
+            name: np.array([quantisation(column) for column in values.T]) for name, values in signals.items()
+        },
+        agreement=agreements(trajectory),
+    )
+
+
+def _clock(trajectory: Trajectory) -> Clock:
+    steps = np.diff(trajectory.t)
+    regular = steps[steps <= GAP * np.median(steps)] if steps.size else np.ones(1)
+    gaps = steps[steps > GAP * np.median(steps)] if steps.size else steps
+    return Clock(
         name=trajectory.name,
         file=None if trajectory.file is None else str(trajectory.file),
         samples=len(trajectory.t),
@@ -58,13 +81,6 @@ def measure(trajectory: Trajectory) -> Measures:
         jitter=float(regular.std() / regular.mean()),
         gaps=len(gaps),
         longest_gap=float(gaps.max(initial=0.0)),
-        low={name: values.min(axis=0) for name, values in signals.items()},
-        high={name: values.max(axis=0) for name, values in signals.items()},
-        noise={name: noise(trajectory.t, values) for name, values in signals.items()} if dense else None,
-        steps={
-            name: np.array([quantisation(column) for column in values.T]) for name, values in signals.items()
-        },
-        agreement=agreements(trajectory),
     )
 
 

@@ -13,7 +13,7 @@ from spelgen.data.doubts import doubts, tell, told_gaps
 from spelgen.data.trajectory import QUANTITIES, Trajectory
 from spelgen.errors import Diagnostic, SpelgenError, SpelgenErrors
 from spelgen.survey.gravity import GravityShare, StateSamples, gravity_shares, state_samples
-from spelgen.survey.measures import Measures, measure
+from spelgen.survey.measures import Clock, Measures, measure
 
 EXAMPLES = 2  # trajectories that are drawn
 BEYOND = 1e-3  # [rad, m, of a limit] a limit overrun by less is rounding
@@ -43,27 +43,13 @@ class JointSurvey:
     gravity: GravityShare
 
 
-@dataclass(frozen=True)
-class TrajectorySurvey:
-    """The clock of one trajectory; jitter relative to the mean step, times in s."""
-
-    name: str
-    file: str | None
-    samples: int
-    duration: float
-    rate: float
-    jitter: float
-    gaps: int
-    longest_gap: float
-
-
 @dataclass(frozen=True, eq=False)
 class Survey:
     """What `spelgen logs` tells. errors: why the logs cannot be trained on. examples: to be drawn."""
 
     robot: str
     files: int
-    trajectories: tuple[TrajectorySurvey, ...]
+    trajectories: tuple[Clock, ...]
     joints: tuple[JointSurvey, ...]
     findings: tuple[Diagnostic, ...]
     errors: tuple[SpelgenError, ...]
@@ -126,18 +112,13 @@ def survey(trajectories: Iterable[Trajectory], arm: Arm, inputs: np.ndarray) -> 
         findings += [*_limits(coordinate, joint), *_gravity(joint)]
     return Survey(
         robot=arm.name,
-        files=len({each.file for each in measured}),
-        trajectories=tuple(_trajectory(each) for each in measured),
+        files=len({each.clock.file for each in measured}),
+        trajectories=tuple(each.clock for each in measured),
         joints=tuple(told),
         findings=tuple(findings),
         errors=errors,
         examples=tuple(examples),
     )
-
-
-def _trajectory(measured: Measures) -> TrajectorySurvey:
-    names = TrajectorySurvey.__dataclass_fields__
-    return TrajectorySurvey(**{name: getattr(measured, name) for name in names})
 
 
 def _joint(
