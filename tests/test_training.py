@@ -499,3 +499,12 @@ def test_the_objective_momentum_predicts_no_windows(logs, tmp_path):
     start = train(STAND_IN, [logs], tmp_path / "start", replace(config, momentum_steps=1), progress=False)
     assert (result.status, result.epochs, result.steps) == ("finished", 0, 0)
     assert result.best_validation < 0.5 * start.best_validation
+
+
+@pytest.mark.parametrize("show", [False, True])
+def test_progress_without_a_terminal_prints_no_empty_lines(show, capsys):
+    with TrainingProgress(2, show=show) as progress:
+        progress.epoch({"epoch": 1, "step": 20, "seconds": 1.0, "loss": 0.5, "validation": 0.4, "best": 0.4})
+    printed = capsys.readouterr()
+    told = "epoch 1/2: loss 0.5, validation 0.4 (best 0.4), 20.0 steps/s\n"
+    assert (printed.out, printed.err) == ("", told if show else "")

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import time
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from spelgen.errors import Diagnostic
-
-if TYPE_CHECKING:
-    pass
 
 LINE_EVERY = 10.0  # [s] between lines where no bar can be drawn
 
@@ -38,7 +35,8 @@ class TrainingProgress:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._bar.stop()
+        if self._bar.live.is_started:  # else rich would print an empty line
+            self._bar.stop()
 
     def note(self, diagnostic: Diagnostic) -> None:
         """Tell a diagnostic above the bar."""
