@@ -134,7 +134,7 @@ POTENTIAL_JOINTS = (0, 1, 2)  # the joints that V depends on
 POTENTIAL_WIDTH = 8
 POTENTIAL_SCALE = 0.703291  # [J]
 DEPTH = 2  # hidden layers of a network
-GRID = 6  # bumps on an edge
+GRID = 4  # bumps on an edge
 SPACING = 2 / (GRID - 1)
 FRICTION_AXES = 1  # of each joint, z the last
 FRICTION_WIDTH = 16
@@ -227,7 +227,8 @@ class Network(nn.Module):
 
     Each edge from an input to a unit has a learned function of its own: a sum of Gaussian bumps on
     a grid over [-1, 1] (Li, arXiv 2405.06721, in place of the splines of Liu et al., arXiv
-    2404.19756). tanh keeps what a layer hands on within the grid. ``layers`` names, unit by unit,
+    2404.19756). It starts nearly straight, with a random slope: few samples do not smooth what
+    starts wavy. tanh keeps what a layer hands on within the grid. ``layers`` names, unit by unit,
     the joints that each layer's units may read; edges between others are masked, so that a unit
     has no path to a joint it must not depend on.
     """
@@ -257,9 +258,8 @@ class Network(nn.Module):
         for index, units in enumerate(layers):
             allowed = [[[float(lower <= upper)] for lower in below] for upper in units]
             mask = torch.tensor(allowed, dtype=torch.float64)
-            shape = (len(units), len(below), GRID)
-            weight = torch.randn(shape, dtype=torch.float64, generator=generator)
-            self.weights.append(nn.Parameter(weight / mask.sum(dim=1, keepdim=True).sqrt()))
+            slope = torch.randn(mask.shape, dtype=torch.float64, generator=generator)
+            self.weights.append(nn.Parameter(slope * grid / mask.sum(dim=1, keepdim=True).sqrt()))
             if index == 0:
                 mask = mask * reading.share.unsqueeze(-1)
             self.register_buffer(f"mask{index}", mask)
