@@ -13,7 +13,8 @@ import yaml
 from spelgen.comparison import measures
 from spelgen.comparison.page import write_comparison
 from spelgen.comparison.paper import PAPER
-from spelgen.comparison.study import VARIANTS, prepare_study, run_study, time_steps
+from spelgen.comparison.running import run_study, time_steps
+from spelgen.comparison.study import VARIANTS, prepare_study
 from spelgen.comparison.tables import comparison_tables
 from spelgen.comparison.truth import example_positions, mass_error, true_mass
 from spelgen.data.logs import Trajectory, read_logs

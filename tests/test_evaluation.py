@@ -11,7 +11,8 @@ import torch
 from spelgen.data.logs import Trajectory, read_logs, write_logs
 from spelgen.data.windows import Windows, cut_windows
 from spelgen.errors import LogError, RunError
-from spelgen.evaluation.evaluate import energy_drift, evaluate
+from spelgen.evaluation.drift import energy_drift
+from spelgen.evaluation.evaluate import evaluate
 from spelgen.evaluation.tip import tip_position
 from spelgen.evaluation.torque import torque_errors, torque_samples
 from spelgen.training.data import TrainingConfig

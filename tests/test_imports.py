@@ -13,21 +13,21 @@ errors files labels listing rendering yaml_document setting_values log_mapping s
 urdf: robot xacro_child xacro_input document values elements lint read actuation
 arm: rational snapping placement chain walk arm
 structure: recursion field sampling spans basis expansion symbolic structure nominal waves minimal pseudo_inertia
-emission: bodies plan emit
+emission: bodies plan source docstring emit
 data: trajectory bags tables logs doubts signals windows parts stream
 simulation: engine simulate tracking protocols
 identification: samples friction regressor base least_squares prior identify told
 excitation: fourier design told
 training: runs belief torque_fit lie_group rollout compiled rivals prior progress
 training: data streamed descent torque_networks torque_start loop train
-evaluation: tip torque examples evaluate
+evaluation: tip torque examples drift outcome evaluate
 report: charts plots tables picture learned page
 proof: agreement axes reasons meaning second_reading numeric_samples verification
 formulas: expression notation angles harmonics factoring shortening grouping formulas layout text latex sympy_module
 inspection inspection_page pipeline
 export: twin urdf_file
 survey: measures gravity survey tables page
-comparison: paper truth measures study tables page
+comparison: paper truth measures study running tables page
 cli: console options formats model_commands run_commands log_commands
 cli: identify_command compare_command export_command main
 __init__ __main__

@@ -31,7 +31,8 @@ def compare(
     Started again with the same settings, it goes on where it stopped.
     """
     from spelgen.comparison.page import write_comparison
-    from spelgen.comparison.study import VARIANTS, prepare_study, run_study, time_steps
+    from spelgen.comparison.running import run_study, time_steps
+    from spelgen.comparison.study import VARIANTS, prepare_study
     from spelgen.comparison.tables import comparison_tables
 
     known = {variant.name: variant for variant in VARIANTS}

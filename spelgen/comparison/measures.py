@@ -13,7 +13,7 @@ import torch
 
 from spelgen.data.logs import Trajectory
 from spelgen.data.windows import Windows, cut_windows
-from spelgen.evaluation.evaluate import energy_drift
+from spelgen.evaluation.drift import energy_drift
 from spelgen.training.rollout import LossScales, position_difference, roll_out, rollout_loss
 
 if TYPE_CHECKING:

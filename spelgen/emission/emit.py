@@ -6,15 +6,13 @@ code.
 
 from __future__ import annotations
 
-import json
 from collections import Counter, defaultdict
-from dataclasses import asdict
 
-from spelgen.labels import joint_ranges
+from spelgen.emission import docstring
+from spelgen.emission.source import call, literal, table
 from spelgen.rendering import render
 from spelgen.spec import JointSpec, ModelSpec
 
-_WIDTH = 100
 _LEAST_UNITS = 4
 _POTENTIAL_SHARE = 0.5
 _FRICTION_HIDDEN = 8
@@ -40,7 +38,7 @@ def emit(spec: ModelSpec) -> str:
     return render(
         "module.py.jinja",
         **_common(spec),
-        joints=_table("JOINTS = ", [_joint_row(joint) for joint in spec.joints]),
+        joints=table("JOINTS = ", [_joint_row(joint) for joint in spec.joints]),
         sliding=any(joint.kind == "prismatic" for joint in spec.joints),
         net=design.net,
         group=design.encoding == "group",
@@ -64,7 +62,7 @@ def emit(spec: ModelSpec) -> str:
 def _closed_form(spec: ModelSpec) -> str:
     mean = _mean_mass(spec)
     joints = [
-        _call(
+        call(
             "Joint",
             name=joint.identifier,
             revolute=joint.kind == "revolute",
@@ -77,7 +75,7 @@ def _closed_form(spec: ModelSpec) -> str:
         for index, joint in enumerate(spec.joints)
     ]
     rows = [
-        _call(
+        call(
             "Body",
             parent=body.parent,
             joint=body.joint,
@@ -93,25 +91,25 @@ def _closed_form(spec: ModelSpec) -> str:
     return render(
         "closed_form.py.jinja",
         **_common(spec),
-        joints=_table("JOINTS = ", joints),
-        bodies=_table("BODIES = ", rows),
-        gravity=_literal(spec.gravity),
+        joints=table("JOINTS = ", joints),
+        bodies=table("BODIES = ", rows),
+        gravity=literal(spec.gravity),
     )
 
 
 def _common(spec: ModelSpec) -> dict[str, object]:
     """What both templates show: the docstring, and G."""
     n = len(spec.joints)
-    inputs = [_call("Input", **dict(zip(_INPUT, each, strict=True))) for each in spec.inputs]
+    inputs = [call("Input", **dict(zip(_INPUT, each, strict=True))) for each in spec.inputs]
     return {
         "title": f"Port-Hamiltonian model of an arm with {n} joint{'s' * (n > 1)}, written by `spelgen build`.",
-        "class_summary": f"The arm's dynamics: {_class_summary(spec)}.",
-        "summary": _summary(spec),
-        "picture": _picture(spec),
-        "joint_table": _joint_table(spec),
-        "record": _record(spec),
+        "class_summary": f"The arm's dynamics: {docstring.class_summary(spec)}.",
+        "summary": docstring.summary(spec),
+        "picture": docstring.picture(spec),
+        "joint_table": docstring.joint_table(spec),
+        "record": docstring.record(spec),
         "n": n,
-        "inputs": inputs and _table("INPUTS = ", inputs),
+        "inputs": inputs and table("INPUTS = ", inputs),
         "gains": any(trained for *_, trained in spec.inputs),
     }
 
@@ -121,11 +119,11 @@ def _mass(spec: ModelSpec) -> dict[str, object]:
     if spec.design.mass == "dense-3n":
         return {
             "mass": "dense",
-            "mean_mass": _table("MEAN_MASS = ", [_literal(row) for row in _mean_mass(spec)]),
+            "mean_mass": table("MEAN_MASS = ", [literal(row) for row in _mean_mass(spec)]),
         }
-    constants = [_call("Constant", start=c.start, scale=c.scale, entries=c.basis) for c in spec.constants]
+    constants = [call("Constant", start=c.start, scale=c.scale, entries=c.basis) for c in spec.constants]
     outputs = [
-        _call(
+        call(
             "Output",
             joints=output.joints,
             mean=output.center,
@@ -137,9 +135,9 @@ def _mass(spec: ModelSpec) -> dict[str, object]:
     ]
     return {
         "mass": "derived" if outputs else "constant",
-        "constants": _table("CONSTANTS: tuple[Constant, ...] = ", constants),
-        "outputs": outputs and _table("OUTPUTS = ", outputs),
-        "mass_hidden": _table("MASS_HIDDEN = ", [_literal(row) for row in _hidden(spec)]),
+        "constants": table("CONSTANTS: tuple[Constant, ...] = ", constants),
+        "outputs": outputs and table("OUTPUTS = ", outputs),
+        "mass_hidden": table("MASS_HIDDEN = ", [literal(row) for row in _hidden(spec)]),
         "guard": spec.guard,
     }
 
@@ -158,10 +156,10 @@ def _mean_mass(spec: ModelSpec) -> tuple[tuple[float, ...], ...]:
 def _potential(spec: ModelSpec) -> dict[str, object]:
     """What the template shows of V."""
     return {
-        "potential_joints": _literal(spec.potential) if spec.potential else "",
+        "potential_joints": literal(spec.potential) if spec.potential else "",
         "potential_width": max(_LEAST_UNITS, round(_POTENTIAL_SHARE * _units(spec))),
         "potential_scale": spec.potential_scale,
-        "potential_terms": spec.potential_terms and _literal(spec.potential_terms),
+        "potential_terms": spec.potential_terms and literal(spec.potential_terms),
     }
 
 
@@ -169,10 +167,10 @@ def _waves(spec: ModelSpec) -> dict[str, object]:
     """What the template shows of the waves that M and V are made of."""
     powers = any(any(powers) for _, powers in spec.waves)
     rows = [
-        _call("Wave", turns=turns, **({"powers": powers_} if powers else {})) for turns, powers_ in spec.waves
+        call("Wave", turns=turns, **({"powers": powers_} if powers else {})) for turns, powers_ in spec.waves
     ]
     return {
-        "waves": rows and _table("WAVES = ", rows),
+        "waves": rows and table("WAVES = ", rows),
         "wave_powers": powers,
         "mass_waves": any(output.level is not None for output in spec.outputs),
         "network_share": _NETWORK_SHARE,
@@ -186,7 +184,7 @@ def _units(spec: ModelSpec) -> int:
 
 
 def _joint_row(joint: JointSpec) -> str:
-    return _call(
+    return call(
         "Joint",
         name=joint.identifier,
         revolute=joint.kind == "revolute",
@@ -199,37 +197,6 @@ def _joint_row(joint: JointSpec) -> str:
         potential_share=joint.potential_share,
         actuated=joint.actuated,
     )
-
-
-def _table(start: str, rows: list[str]) -> str:
-    """A tuple with a row a line, or on the line that begins with ``start`` where it fits."""
-    flat = f"({', '.join(rows)}{',' * (len(rows) == 1)})"
-    if len(start) + len(flat) <= _WIDTH and "\n" not in flat:
-        return flat
-    return "(\n" + "".join(f"    {row},\n" for row in rows) + ")"
-
-
-def _call(callee: str, **arguments: object) -> str:
-    """A call with its keywords, as a row of a table: on one line, or on one line an argument."""
-    parts = [f"{key}={_literal(value, indent=8)}" for key, value in arguments.items()]
-    flat = f"{callee}({', '.join(parts)})"
-    if len(flat) < _WIDTH - 4 and "\n" not in flat:
-        return flat
-    return f"{callee}(\n" + "".join(f"        {part},\n" for part in parts) + "    )"
-
-
-def _literal(value: object, indent: int = 0) -> str:
-    """``value`` as source text; a tuple too long for a line has an item a line."""
-    if isinstance(value, str):
-        return json.dumps(value)
-    if not isinstance(value, tuple):
-        return repr(value)
-    parts = [_literal(item, indent + 4) for item in value]
-    flat = f"({parts[0]},)" if len(parts) == 1 else f"({', '.join(parts)})"
-    if indent + len(flat) < _WIDTH - 12:
-        return flat
-    inner = " " * (indent + 4)
-    return "(\n" + "".join(f"{inner}{part},\n" for part in parts) + " " * indent + ")"
 
 
 def _hidden(spec: ModelSpec) -> tuple[tuple[tuple[int, ...], int], ...]:
@@ -245,90 +212,3 @@ def _hidden(spec: ModelSpec) -> tuple[tuple[tuple[int, ...], int], ...]:
     while units and sum(units) < _units(spec):
         units[max(range(len(units)), key=lambda k: ideal[k] - units[k])] += 1
     return tuple(zip(joints, units, strict=True))
-
-
-def _class_summary(spec: ModelSpec) -> str:
-    bodies = len(spec.bodies)
-    if bodies:
-        return f"{bodies} rigid bod{'ies' if bodies > 1 else 'y'} with trained inertial parameters"
-    return _count(spec)
-
-
-def _count(spec: ModelSpec) -> str:
-    if spec.bodies:
-        return f"{len(spec.bodies)} bodies with trained inertial parameters make mass matrix and potential energy"
-    if spec.design.mass == "dense-3n":
-        rows = 3 * len(spec.joints)
-        return f"{rows * (rows + 1) // 2} learned functions of q make M^-1 over all axes"
-    outputs, constants = len(spec.outputs), len(spec.constants)
-    return (
-        f"{outputs} learned function{'s' * (outputs != 1)} of q and {constants} constant{'s' * (constants != 1)} "
-        "make the mass matrix"
-    )
-
-
-def _summary(spec: ModelSpec) -> str:
-    potential = (
-        f"The potential energy depends on joint{'s' * (len(spec.potential) > 1)} {joint_ranges(spec.potential)}."
-        if spec.potential
-        else "Gravity does no work on it."
-    )
-    start = (
-        "Sizes and starting values are the URDF's inertials."
-        if spec.started_from_urdf
-        else "The URDF's inertials are missing or impossible: sizes and starting values are those of 1 kg links."
-    )
-    parts = ["M"] * any(x.level is not None for x in spec.outputs) + ["V"] * bool(spec.potential_terms)
-    sums = (
-        f"\n{' and '.join(parts)}: sums of waves with trained factors, and a part for a network."
-        if parts
-        else ""
-    )
-    return f"{_count(spec)[0].upper()}{_count(spec)[1:]}.\n{potential}{sums}\n{start}"
-
-
-def _picture(spec: ModelSpec) -> str:
-    """The lower triangle of M as text: what each entry depends on."""
-    cells = {(row, column): _cell(kind, joints) for row, column, kind, joints in spec.entries}
-    width = max(2, *(len(cell) for cell in cells.values()))
-    lines = [
-        "Mass matrix: the joints each entry depends on, C where it is constant, . where it is always zero.",
-        "",
-    ]
-    for row in range(len(spec.joints)):
-        line = "  ".join(cells[row, column].ljust(width) for column in range(row + 1))
-        lines.append(f"    {line}".rstrip())
-    return "\n".join(lines)
-
-
-def _cell(kind: str, joints: tuple[int, ...]) -> str:
-    if kind == "varying":
-        return joint_ranges(joints)
-    return "C" if kind == "constant" else "."
-
-
-def _joint_table(spec: ModelSpec) -> str:
-    lines = ["Joints, in the order of q, qd and tau:", ""]
-    names = [json.dumps(joint.name) for joint in spec.joints]
-    width = max(len(name) for name in names)
-    for index, (joint, name) in enumerate(zip(spec.joints, names, strict=True), start=1):
-        unit = "rad, Nm" if joint.kind == "revolute" else "m, N"
-        limits = (
-            "no limits"
-            if joint.lower is None or joint.upper is None
-            else f"{joint.lower:g} .. {joint.upper:g}"
-        )
-        lines.append(f"    {index}  {name.ljust(width)}  {joint.kind:9}  {unit:7}  {limits}")
-    return "\n".join(lines)
-
-
-def _record(spec: ModelSpec) -> str:
-    record = {
-        "robot": spec.robot,
-        "urdf": spec.urdf,
-        "urdf_sha256": spec.urdf_sha256,
-        "spec_sha256": spec.sha256,
-    }
-    lines = [f"    {key}: {json.dumps(value)}" for key, value in record.items()]
-    lines += [f"    option {key}: {json.dumps(value)}" for key, value in sorted(asdict(spec.options).items())]
-    return "Record, by which `spelgen check` tells whether this module is up to date:\n\n" + "\n".join(lines)
