@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -106,6 +107,14 @@ def test_a_comparison_goes_on_where_it_stopped(study, robot, quick):
 def test_another_comparison_in_the_folder_is_refused(study, robot):
     with pytest.raises(RunError, match="a comparison with other settings"):
         prepare_study(robot, study.folder, variants=CHOSEN, seeds=2)
+
+
+def test_begun_anew_nothing_of_the_old_runs_goes_on(study, robot, tmp_path):
+    folder = tmp_path / "study"
+    shutil.copytree(study.folder, folder)
+    again = prepare_study(robot, folder, variants=CHOSEN, force=True)
+    assert not list(again.results())
+    assert not list(folder.rglob("checkpoint.pt"))
 
 
 def test_tables_stand_beside_the_paper(study):

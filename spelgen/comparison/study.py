@@ -177,8 +177,9 @@ def _known(folder: Path, description: dict[str, Any], *, force: bool) -> bool:
             file=path,
             do="--force begins anew, -o names another folder",
         )
-    for old in sorted(folder.glob("runs/*/result.json")):
-        old.unlink()
+    for name in ("result.json", "checkpoint.pt"):  # else another comparison's runs would go on
+        for old in sorted(folder.glob(f"runs/*/{name}")):
+            old.unlink()
     folder.mkdir(parents=True, exist_ok=True)
     return False
 
