@@ -10,7 +10,7 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import yaml
 from lxml import etree
@@ -25,9 +25,6 @@ from spelgen.structure.nominal import working_range
 from spelgen.training.data import TrainingConfig
 from spelgen.training.loop import EPOCH_STEPS
 from spelgen.training.runs import write_json
-
-if TYPE_CHECKING:
-    pass
 
 SCHEMA = 2
 

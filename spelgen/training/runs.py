@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
 import io
 import json
 import os
@@ -232,4 +233,6 @@ def load_model(path: Path | str) -> EmittedModel:
             f"a class Model without {', '.join(missing)}", file=path,
             expected="a module made by `spelgen build`",
         )  # fmt: skip
+    if "prepared" not in inspect.signature(model.momentum).parameters:
+        raise ModuleError("a module of an older spelgen", file=path, do="build it again")
     return cast("EmittedModel", model)
