@@ -55,7 +55,7 @@ def start_from_torque(
             raise RunError("a load for a model of networks", expected="a module of the preset closed-form")
         if config.objective == "momentum":
             return replace(config, epochs=0), []
-        if config.objective == "rollout":
+        if config.objective != "torque":
             return config, []
     elif config.objective == "momentum":
         raise RunError("the objective 'momentum' for a closed-form model", expected="torque or rollout")
