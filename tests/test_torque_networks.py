@@ -65,3 +65,15 @@ def test_what_pulls_is_weighed(tmp_path):
         true.constants *= 1.5
     fit_networks(model, [recorded(true, 5)], 1e-6, lambda: 1e3 * (model.constants - 1).square().sum())
     assert (model.constants - 1).abs().max() < 0.01
+
+
+def test_networks_are_fitted_to_torques_only_where_that_is_asked_for(tmp_path):
+    """Without a word on it windows are predicted; the objective momentum leaves its own steps alone."""
+    model = import_source(built("two_link")[0], tmp_path / "two_link_spel.py").Model()
+    weights = {name: value.clone() for name, value in model.state_dict().items()}
+    samples = SimpleNamespace(recordings=())
+    for objective, epochs in ((None, 200), ("rollout", 200), ("momentum", 0)):
+        config = TrainingConfig(epochs=200, objective=objective)
+        left, notes = start_from_torque(model, samples, config, fit=True)
+        assert (left.epochs, left.momentum_steps, notes) == (epochs, config.momentum_steps, [])
+    assert all(torch.equal(value, weights[name]) for name, value in model.state_dict().items())
