@@ -160,10 +160,10 @@ class Identified:
         self.rotor, self.viscous, self.coulomb, self.offset = drives[:4]
         self.width, self.model = found.method.friction.dry_velocity, model
 
-    def momentum(self, q: torch.Tensor, qd: torch.Tensor) -> torch.Tensor:
+    def momentum(self, q: torch.Tensor, qd: torch.Tensor, prepared: None = None) -> torch.Tensor:
         return qd
 
-    def velocity(self, q: torch.Tensor, p: torch.Tensor) -> torch.Tensor:
+    def velocity(self, q: torch.Tensor, p: torch.Tensor, prepared: None = None) -> torch.Tensor:
         return p
 
     def prepare(self) -> None:
