@@ -233,6 +233,7 @@ def load_model(path: Path | str) -> EmittedModel:
             f"a class Model without {', '.join(missing)}", file=path,
             expected="a module made by `spelgen build`",
         )  # fmt: skip
-    if "prepared" not in inspect.signature(model.momentum).parameters:
+    emitted = cast("EmittedModel", model)
+    if "prepared" not in inspect.signature(emitted.momentum).parameters:
         raise ModuleError("a module of an older spelgen", file=path, do="build it again")
-    return cast("EmittedModel", model)
+    return emitted
