@@ -7,6 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import torch
+from characters import TESTS, read_characters, write_arm
 from emitted import import_source
 from typer.testing import CliRunner
 
@@ -357,35 +358,12 @@ def test_the_same_logs_give_the_same_weights(run, tmp_path):
     assert all(torch.equal(first[name], second[name]) for name in first)
 
 
-def delan(shared):
-    """The characters: samples by label, and Coriolis torques."""
-    data = np.load(shared / "logs" / "delan_characters" / "character_data.npz", allow_pickle=True)
-    keys = ("qp", "qv", "qa", "tau")
-    labels = [str(x) for x in data["labels"]]
-    return [DynamicsSamples(x, *(data[f"{key}_{i}"] for key in keys)) for i, x in enumerate(labels)]
-
-
-CHARACTERS_ARM = """<robot name="planar">
-  <link name="base"/>
-  <link name="upper"><inertial><origin xyz="0.5 0 0"/><mass value="1"/>
-    <inertia ixx="0.01" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/></inertial></link>
-  <link name="lower"><inertial><origin xyz="0.5 0 0"/><mass value="1"/>
-    <inertia ixx="0.01" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/></inertial></link>
-  <joint name="shoulder" type="continuous"><parent link="base"/><child link="upper"/><axis xyz="0 0 1"/></joint>
-  <joint name="elbow" type="continuous"><parent link="upper"/><child link="lower"/><axis xyz="0 0 1"/>
-    <origin xyz="1 0 0"/></joint>
-</robot>"""  # 1 m with 3 m/s^2: the data fix gravity by length alone
-
-
 def test_characters(shared, tmp_path):
-    (tmp_path / "planar.urdf").write_text(CHARACTERS_ARM, encoding="utf-8")
-    (tmp_path / "planar.yaml").write_text("gravity: [0, -3, 0]", encoding="utf-8")
-    model = import_source(
-        build(tmp_path / "planar.urdf", preset="closed-form"), tmp_path / "planar_closed_form.py"
-    ).Model()
-    samples = delan(shared)
-    fit_torque(model, [x for x in samples if x.name not in "eqv"])
-    test = [x for x in samples if x.name in "eqv"]
+    source = build(write_arm(tmp_path), preset="closed-form")
+    model = import_source(source, tmp_path / "planar_closed_form.py").Model()
+    samples, _ = read_characters(shared / "logs" / "delan_characters")
+    fit_torque(model, [x for x in samples if x.name not in TESTS])
+    test = [x for x in samples if x.name in TESTS]
     with torch.no_grad():
         inputs = [torch.from_numpy(np.concatenate([getattr(x, k) for x in test])) for k in ("q", "qd", "qdd")]
         error = model.inverse_dynamics(*inputs).numpy() - np.concatenate([x.tau for x in test])

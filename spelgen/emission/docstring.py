@@ -9,12 +9,17 @@ from spelgen.labels import joint_ranges
 from spelgen.spec import ModelSpec
 
 
+def title(spec: ModelSpec) -> str:
+    """What the module is, in a line."""
+    n = len(spec.joints)
+    return f"Port-Hamiltonian model of an arm with {n} joint{'s' * (n > 1)}, written by `spelgen build`."
+
+
 def class_summary(spec: ModelSpec) -> str:
     """What the model consists of, in a line."""
     bodies = len(spec.bodies)
-    if bodies:
-        return f"{bodies} rigid bod{'ies' if bodies > 1 else 'y'} with trained inertial parameters"
-    return _count(spec)
+    made = f"{bodies} rigid bod{'ies' if bodies > 1 else 'y'} with trained inertial parameters"
+    return f"The arm's dynamics: {made if bodies else _count(spec)}."
 
 
 def _count(spec: ModelSpec) -> str:

@@ -99,16 +99,15 @@ def _closed_form(spec: ModelSpec) -> str:
 
 def _common(spec: ModelSpec) -> dict[str, object]:
     """What both templates show: the docstring, and G."""
-    n = len(spec.joints)
     inputs = [call("Input", **dict(zip(_INPUT, each, strict=True))) for each in spec.inputs]
     return {
-        "title": f"Port-Hamiltonian model of an arm with {n} joint{'s' * (n > 1)}, written by `spelgen build`.",
-        "class_summary": f"The arm's dynamics: {docstring.class_summary(spec)}.",
+        "title": docstring.title(spec),
+        "class_summary": docstring.class_summary(spec),
         "summary": docstring.summary(spec),
         "picture": docstring.picture(spec),
         "joint_table": docstring.joint_table(spec),
         "record": docstring.record(spec),
-        "n": n,
+        "n": len(spec.joints),
         "inputs": inputs and table("INPUTS = ", inputs),
         "gains": any(trained for *_, trained in spec.inputs),
     }

@@ -31,7 +31,8 @@ def energy_drift(model: EmittedModel, windows: Windows) -> float | None:
     None where that cannot be done.
     """
     q, qd = windows.q[:, 0], windows.qd[:, 0]
-    p = model.momentum(q, qd)
+    prepared = model.prepare()
+    p = model.momentum(q, qd, prepared)
     kinetic = model.hamiltonian(q, p) - model.potential_energy(q)
     fastest = kinetic.topk(min(DRIFT_STATES, len(windows))).indices
     start = torch.cat([q[fastest], p[fastest]], dim=-1)
@@ -44,9 +45,9 @@ def energy_drift(model: EmittedModel, windows: Windows) -> float | None:
         if calls > DRIFT_CALLS:
             raise _TooStiff
         q, p = state.chunk(2, dim=-1)
-        qd = model.velocity(q, p)
+        qd, force = model.rates(q, p, None, prepared)
         friction = (model.dissipation(q, qd) @ qd.unsqueeze(-1)).squeeze(-1)
-        return model.forward(t, state) + torch.cat([torch.zeros_like(q), friction], dim=-1)
+        return torch.cat([qd, force + friction], dim=-1)
 
     times = torch.linspace(0.0, DRIFT_SECONDS, DRIFT_TIMES, dtype=q.dtype)
     with torch.no_grad(), warnings.catch_warnings():

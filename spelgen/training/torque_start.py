@@ -89,10 +89,11 @@ def _fitted(
     prior: Prior | None,
 ) -> int:
     """Fit the model; the steps it took."""
+    if loaded:
+        return fit_torque(model, samples, LOAD, [last_body(model)]).steps
     if is_closed_form(model):
-        return fit_torque(
-            model, samples, LOAD if loaded else None, [last_body(model)] if loaded else None
-        ).steps
+        return fit_torque(model, samples).steps
+    decay = config.decay(0)  # that of all samples at once
     if prior is None:
-        return fit_networks(model, samples, config.decay(0))
-    return fit_networks(model, samples, config.decay(0), lambda: config.prior * prior.loss(model))
+        return fit_networks(model, samples, decay)
+    return fit_networks(model, samples, decay, lambda: config.prior * prior.loss(model))

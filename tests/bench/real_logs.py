@@ -9,6 +9,7 @@ how the rivals' published figures were made. Nothing is chosen here: the setting
 
 from __future__ import annotations
 
+import functools
 import sys
 import tempfile
 import time
@@ -19,21 +20,29 @@ from typing import Any
 import numpy as np
 import torch
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from characters import TESTS as CHARACTERS
+from characters import read_characters, write_arm
+
 from spelgen.arm.arm import Arm
 from spelgen.data.logs import read_logs
 from spelgen.data.signals import prepare
 from spelgen.data.trajectory import Trajectory
 from spelgen.data.windows import Windows, cut_windows
+from spelgen.evaluation.outcome import state_errors
 from spelgen.identification.friction import FrictionModel
 from spelgen.identification.identify import Identification, Method, identify
 from spelgen.identification.samples import DynamicsSamples, dynamics_samples
 from spelgen.pipeline import build, load
 from spelgen.spec import Preset
-from spelgen.training.belief import Belief
+from spelgen.training.data import WHOLE_DECAY
+from spelgen.training.rivals import Contender
 from spelgen.training.rollout import roll_out
 from spelgen.training.runs import load_model
 from spelgen.training.torque_fit import fit_torque
 from spelgen.training.torque_networks import fit_networks
+from spelgen.training.torque_start import LOAD, last_body
 
 Torque = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
@@ -46,20 +55,9 @@ OUTSIDE = "20_01_17_ptp_10_points"
 LOADED = ("20_01_13_load_2600", "20_01_31_load", "20_02_19_14harm50secLoad")
 SECONDS = (2, 3, 5, 10, 20)
 RIDGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
-LOAD = Belief(bodies=10.0)  # nothing is believed of a load
 AHEAD = {"0.1 s": 10, "0.5 s": 47}  # samples at 94 Hz
-DECAY = 2e-4  # of networks
 WINDOWS = 60  # of each trajectory
 SUBSTEPS = 4
-
-PLANAR = """<robot name="planar"><link name="base"/>
-  <link name="upper"><inertial><origin xyz="0.5 0 0"/><mass value="1"/>
-    <inertia ixx="0.01" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/></inertial></link>
-  <link name="lower"><inertial><origin xyz="0.5 0 0"/><mass value="1"/>
-    <inertia ixx="0.01" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/></inertial></link>
-  <joint name="shoulder" type="continuous"><parent link="base"/><child link="upper"/><axis xyz="0 0 1"/></joint>
-  <joint name="elbow" type="continuous"><parent link="upper"/><child link="lower"/><axis xyz="0 0 1"/>
-    <origin xyz="1 0 0"/></joint></robot>"""
 
 
 def main() -> None:
@@ -142,7 +140,7 @@ def payload(model: Any, logs: dict[str, Trajectory]) -> None:
             model.load_state_dict(trained)
             seen = dynamics_samples([first(logs[name], seconds)]) if seconds else []
             if sum(len(x.q) for x in seen):
-                fit_torque(model, seen, LOAD, only_bodies=[model.n - 1])
+                fit_torque(model, seen, LOAD, only_bodies=[last_body(model)])
             rest = dynamics_samples([after(logs[name], seconds or 10.0)], pauses=True)
             row.append(mean(torque_of(model), rest))
         print(f"{name:26}" + "".join(f"{x:15.5f}" for x in row))
@@ -203,12 +201,8 @@ def tested(logs: Sequence[Trajectory], steps: int) -> Windows:
 
 
 def strayed(dynamics: Any, windows: Windows) -> float:
-    predicted = roll_out(dynamics, windows, SUBSTEPS)
-    shares = []
-    for values, measured in zip(predicted, (windows.q, windows.qd), strict=True):
-        error, change = values[:, -1] - measured[:, -1], measured[:, -1] - measured[:, 0]
-        shares.append(error.square().mean(dim=0).sqrt() / change.square().mean(dim=0).sqrt())
-    return float(torch.cat(shares).mean())
+    contender = Contender("", functools.partial(roll_out, dynamics, substeps=SUBSTEPS), None)
+    return state_errors(contender, windows, ("revolute",) * windows.q.shape[-1], None).mean_share or np.nan
 
 
 def panda(folder: Path, urdf: Path, scratch: Path) -> None:
@@ -224,25 +218,17 @@ def panda(folder: Path, urdf: Path, scratch: Path) -> None:
 
 
 def characters(folder: Path, scratch: Path) -> None:
-    """The URDF is made here: the data fix a gravity of 3 m/s^2 for links of 1 m, and nothing else of it."""
-    (scratch / "planar.urdf").write_text(PLANAR, encoding="utf-8")
-    (scratch / "planar.yaml").write_text("gravity: [0, -3, 0]\n", encoding="utf-8")
-    model = emitted(scratch / "planar.urdf", scratch)
-    data = np.load(folder / "character_data.npz", allow_pickle=True)
-    labels = [str(x) for x in data["labels"]]
-    samples = [
-        DynamicsSamples(x, *(data[f"{k}_{i}"] for k in ("qp", "qv", "qa", "tau")))
-        for i, x in enumerate(labels)
-    ]
-    networks = emitted(scratch / "planar.urdf", scratch, "minimal")
-    training = [x for x in samples if x.name not in "eqv"]
+    urdf = write_arm(scratch)
+    model, networks = emitted(urdf, scratch), emitted(urdf, scratch, "minimal")
+    samples, forces = read_characters(folder)
+    training = [x for x in samples if x.name not in CHARACTERS]
     fit_torque(model, training)
-    fit_networks(networks, training, DECAY)
-    tests = [i for i, x in enumerate(labels) if x in "eqv"]
+    fit_networks(networks, training, WHOLE_DECAY)
+    tests = [i for i, x in enumerate(samples) if x.name in CHARACTERS]
     q, qd, qdd = (
-        torch.from_numpy(np.concatenate([data[f"{k}_{i}"] for i in tests])) for k in ("qp", "qv", "qa")
+        torch.from_numpy(np.concatenate([getattr(samples[i], k) for i in tests])) for k in ("q", "qd", "qdd")
     )
-    tau, coriolis = (np.concatenate([data[f"{k}_{i}"] for i in tests]) for k in ("tau", "c"))
+    tau, coriolis = (np.concatenate(x) for x in ([samples[i].tau for i in tests], [forces[i] for i in tests]))
     print("Characters (DeLaN's data): nMSE, total error by total variance\n")
     print(f"{'':26}{'closed-form':>15}{'minimal':>15}")
     found = [_torques(each, q, qd, qdd) for each in (model, networks)]
