@@ -39,8 +39,8 @@ format: $(STAMP) ## format the code and sort the imports
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-bench: $(STAMP) ## run every benchmark of tests/bench
-	@for script in tests/bench/*.py; do echo "== $$script"; $(BIN)/python $$script || exit 1; done
+bench: $(STAMP) ## run every script of benchmarks/
+	@for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script || exit 1; done
 
 golden: $(STAMP) ## rewrite the golden files after an intended change; read the diff before committing
 	$(BIN)/python -m pytest -q tests/test_emit.py::test_golden_text --update

@@ -10,10 +10,10 @@ from typing import Any
 
 from spelgen.arm.arm import Arm, Coordinate
 from spelgen.errors import Diagnostic
+from spelgen.explain.facts import Fact, facts
 from spelgen.formulas.formulas import Entry as PlaceOfEntry
 from spelgen.formulas.formulas import Formulas, formulas
 from spelgen.labels import joint_ranges
-from spelgen.proof.meaning import Fact, facts
 from spelgen.structure.structure import Entry, Structure
 from spelgen.urdf.actuation import Actuation
 

@@ -11,14 +11,14 @@ from spelgen.emission.emit import emit
 from spelgen.emission.plan import plan_model
 from spelgen.errors import ModuleError
 from spelgen.inspection import Inspection
-from spelgen.proof import verification
-from spelgen.proof.agreement import Verification
-from spelgen.settings import Settings, check_joint_names, load_settings
+from spelgen.settings.settings import Settings, check_joint_names, load_settings
 from spelgen.spec import Assume, ModelSpec, Net, Options, Preset, read_header
 from spelgen.structure.structure import derive
 from spelgen.urdf.actuation import Actuation, derive_actuation
 from spelgen.urdf.read import read_urdf
 from spelgen.urdf.robot import Robot
+from spelgen.verify import verify as verification
+from spelgen.verify.agreement import Verification
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ import numpy as np
 import pinocchio as pin
 
 from spelgen.arm.arm import Arm
-from spelgen.settings import Settings
-from spelgen.simulation.engine import make_engine, mass_matrix
-from spelgen.structure.minimal import base_parameters
+from spelgen.dynamics.pinocchio_engine import make_engine, mass_matrix
+from spelgen.settings.settings import Settings
+from spelgen.structure.base_parameters import base_parameters
 
 CLOSE = 1e-10
 

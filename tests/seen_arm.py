@@ -8,8 +8,8 @@ import numpy as np
 import pinocchio as pin
 
 from spelgen.arm.arm import Arm
-from spelgen.settings import Settings
-from spelgen.simulation.engine import make_engine, mass_matrix
+from spelgen.dynamics.pinocchio_engine import make_engine, mass_matrix
+from spelgen.settings.settings import Settings
 
 NOTHING = 1e-9  # of a size of 1
 

@@ -11,13 +11,13 @@ from emitted import import_source, randomise
 from typer.testing import CliRunner
 
 from spelgen.cli.main import app
-from spelgen.data.windows import Windows
+from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
+from spelgen.dynamics.pinocchio_engine import forward_dynamics, make_engine
 from spelgen.errors import SettingsError, SpelgenError
+from spelgen.fit.rollout import loss_scales, momentum_loss, roll_out
+from spelgen.logs.windows import Windows
 from spelgen.pipeline import build, inspect, load
-from spelgen.simulation.engine import forward_dynamics, make_engine
 from spelgen.simulation.simulate import make_friction, simulate
-from spelgen.training.rivals import PinocchioDynamics
-from spelgen.training.rollout import loss_scales, momentum_loss, roll_out
 
 pytest.importorskip("pinocchio")
 

@@ -12,17 +12,17 @@ from emitted import import_source
 from typer.testing import CliRunner
 
 from spelgen.cli.main import app
-from spelgen.data.logs import read_logs, write_logs
-from spelgen.data.trajectory import Trajectory
 from spelgen.errors import LogError, RunError
+from spelgen.fit.dataset import TrainingConfig
+from spelgen.fit.gaussian_prior import SIZES, Belief
+from spelgen.fit.torque_fit import fit_torque
+from spelgen.fit.torque_start import start_from_torque
 from spelgen.identification.samples import DynamicsSamples, dynamics_samples
+from spelgen.logs.read import read_logs, write_logs
+from spelgen.logs.trajectory import Trajectory
 from spelgen.pipeline import build, load
 from spelgen.structure.pseudo_inertia import pseudo_inertia
 from spelgen.structure.sampling import float_energies
-from spelgen.training.belief import SIZES, Belief
-from spelgen.training.data import TrainingConfig
-from spelgen.training.torque_fit import fit_torque
-from spelgen.training.torque_start import start_from_torque
 
 ROBOTS = ("two_link", "rpr", "six_dof", "ur10e", "panda")
 

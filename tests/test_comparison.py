@@ -11,18 +11,18 @@ import pytest
 import torch
 import yaml
 
-from spelgen.comparison import measures
-from spelgen.comparison.page import write_comparison
+from spelgen.comparison import metrics
+from spelgen.comparison.formatting import comparison_tables
 from spelgen.comparison.paper import PAPER
-from spelgen.comparison.running import run_study, time_steps
+from spelgen.comparison.runs import run_study, time_steps
 from spelgen.comparison.study import VARIANTS, prepare_study
-from spelgen.comparison.tables import comparison_tables
 from spelgen.comparison.truth import example_positions, mass_error, true_mass
-from spelgen.data.logs import Trajectory, read_logs
 from spelgen.errors import RunError
+from spelgen.evaluation.baselines import held_velocity
 from spelgen.evaluation.examples import predict_examples
-from spelgen.training.rivals import held_velocity
-from spelgen.training.runs import load_model
+from spelgen.fit.run_folder import load_model
+from spelgen.logs.read import Trajectory, read_logs
+from spelgen.render.comparison_page import write_comparison
 from spelgen.urdf.read import read_urdf
 
 CHOSEN = [variant for variant in VARIANTS if variant.name in ("phnode", "minimal")]
@@ -32,8 +32,8 @@ JOINTS = ("joint1", "joint2")
 @pytest.fixture(scope="module")
 def quick():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(measures, "POSITIONS", 100)
-        patch.setattr(measures, "FREE_STEPS", 50)
+        patch.setattr(metrics, "POSITIONS", 100)
+        patch.setattr(metrics, "FREE_STEPS", 50)
         yield
 
 
@@ -174,7 +174,7 @@ def test_windows_and_examples_of_every_fourth_sample_begin_with_a_fourth_one():
     count = 200
     q = torch.arange(count, dtype=torch.float64).unsqueeze(-1).numpy()  # a sample's number
     log = Trajectory("a", 0.002 * q[:, 0], q, q, np.floor(q / 4))
-    windows = measures.thinned([log], 5, 4)
+    windows = metrics.thinned([log], 5, 4)
     assert not (windows.q % 4).any()
     assert torch.equal(windows.tau, windows.q[:, :-1] / 4)
     (example,) = predict_examples(held_velocity(), [log], 10, ["joint1"], every=4, measured=False)
@@ -185,14 +185,14 @@ def test_windows_and_examples_of_every_fourth_sample_begin_with_a_fourth_one():
 def test_laws_notice_what_breaks_them(study, quick):
     model = load_model(study.module(CHOSEN[1]))
     testing = read_logs([study.logs], model.joint_names, role="test")
-    still = measures.thinned(testing, 21, 1)
+    still = metrics.thinned(testing, 21, 1)
     windows = replace(still, qd=0.5 + still.qd)
     low, high = (torch.full((2,), bound, dtype=torch.float64) for bound in (-math.pi, math.pi))
-    kept = measures.laws(model, windows, low, high)
+    kept = metrics.laws(model, windows, low, high)
     assert kept.energy_rise <= 1e-12 < kept.least_eigenvalue
     model.friction.forward = lambda features, qd, prepared: -5.0 * qd  # drives instead of braking
-    assert measures.laws(model, windows, low, high).energy_rise > 1e-3
+    assert metrics.laws(model, windows, low, high).energy_rise > 1e-3
     model.mass_matrix = lambda q, prepared=None: torch.diag_embed(
         torch.cat([q.cos()[..., :1], 1 + 0 * q[..., :1]], dim=-1)
     )
-    assert measures.laws(model, windows, low, high).least_eigenvalue < -1
+    assert metrics.laws(model, windows, low, high).least_eigenvalue < -1

@@ -13,11 +13,11 @@ import torch
 from emitted import random_model
 from torch._dynamo.utils import counters
 
-from spelgen.data.logs import write_logs
-from spelgen.data.windows import Windows
-from spelgen.training.compiled import compiled
-from spelgen.training.rollout import loss_scales, rollout_loss
-from spelgen.training.train import train
+from spelgen.fit.compiled import compiled
+from spelgen.fit.rollout import loss_scales, rollout_loss
+from spelgen.fit.train import train
+from spelgen.logs.read import write_logs
+from spelgen.logs.windows import Windows
 from tests.test_training import JOINTS, QUICK, STAND_IN, motions
 
 has_compiler = pytest.mark.skipif(shutil.which("g++") is None, reason="no g++ to compile with")

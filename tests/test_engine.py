@@ -7,9 +7,16 @@ import pinocchio as pin
 import pytest
 
 from spelgen.arm.arm import make_arm
+from spelgen.dynamics.pinocchio_engine import (
+    bias,
+    forward_dynamics,
+    make_engine,
+    mass_matrix,
+    pinocchio_model,
+)
 from spelgen.errors import ArmError, SpelgenErrors
-from spelgen.settings import JointSettings, Settings, load_settings
-from spelgen.simulation.engine import bias, forward_dynamics, make_engine, mass_matrix, pinocchio_model
+from spelgen.settings.joint import JointSettings
+from spelgen.settings.settings import Settings, load_settings
 from spelgen.urdf.read import read_urdf
 from tests.hand_built import SIDEWAYS, arm, body, coordinate, point, slider
 

@@ -8,18 +8,19 @@ import numpy as np
 import pytest
 import torch
 
-from spelgen.data.logs import Trajectory, read_logs, write_logs
-from spelgen.data.windows import Windows, cut_windows
+from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
+from spelgen.dynamics.tip import tip_position
 from spelgen.errors import LogError, RunError
-from spelgen.evaluation.drift import energy_drift
+from spelgen.evaluation.baselines import held_velocity, urdf_values
 from spelgen.evaluation.evaluate import evaluate
-from spelgen.evaluation.tip import tip_position
+from spelgen.evaluation.invariants import energy_drift
 from spelgen.evaluation.torque import torque_errors, torque_samples
-from spelgen.training.data import TrainingConfig
-from spelgen.training.rivals import PinocchioDynamics, held_velocity, urdf_values
-from spelgen.training.rollout import roll_out
-from spelgen.training.runs import load_model
-from spelgen.training.train import train
+from spelgen.fit.dataset import TrainingConfig
+from spelgen.fit.rollout import roll_out
+from spelgen.fit.run_folder import load_model
+from spelgen.fit.train import train
+from spelgen.logs.read import Trajectory, read_logs, write_logs
+from spelgen.logs.windows import Windows, cut_windows
 
 STAND_IN = Path(__file__).with_name("stand_in.py")
 JOINTS = ("shoulder", "elbow")

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from spelgen.cli.main import app
 from spelgen.errors import SpelgenErrors
 from spelgen.excitation.design import design
-from spelgen.excitation.fourier import Series, bounds
+from spelgen.excitation.trajectory import Series, bounds
 from spelgen.pipeline import load
 
 CHOICE = {"duration": 10.0, "rate": 100.0, "harmonics": 5, "reach": 0.8, "speed": 0.6}
@@ -69,8 +69,8 @@ def test_the_motion_is_worth_the_search(arm, found):
 def test_the_condition_number_is_that_of_the_regressor(arm, found):
     """By Pinocchio's regressor: no column of friction or rotor, rigid bodies alone, by numerical rank."""
     pin = pytest.importorskip("pinocchio")
-    from spelgen.settings import Settings
-    from spelgen.simulation.engine import pinocchio_model
+    from spelgen.dynamics.pinocchio_engine import pinocchio_model
+    from spelgen.settings.settings import Settings
 
     model = pinocchio_model(arm, Settings())
     data = model.createData()

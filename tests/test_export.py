@@ -9,9 +9,9 @@ from emitted import ROBOTS
 from typer.testing import CliRunner
 
 from spelgen.cli.main import app
+from spelgen.dynamics.pinocchio_engine import bias, make_engine, mass_matrix
+from spelgen.fit.run_folder import RunFolder, load_model, write_state
 from spelgen.pipeline import build, load
-from spelgen.simulation.engine import bias, make_engine, mass_matrix
-from spelgen.training.runs import RunFolder, load_model, write_state
 
 pytest.importorskip("pinocchio")
 

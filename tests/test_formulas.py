@@ -20,9 +20,9 @@ from spelgen.formulas.latex import latex
 from spelgen.formulas.sympy_module import sympy_source
 from spelgen.formulas.text import text
 from spelgen.pipeline import load
-from spelgen.proof.numeric_samples import with_random_inertias
 from spelgen.structure.structure import derive
 from spelgen.urdf.read import read_urdf
+from spelgen.verify.numeric_samples import with_random_inertias
 
 ROBOTS = ("two_link", "rpr", "scara", "six_dof", "ur10e")
 

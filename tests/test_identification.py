@@ -8,15 +8,15 @@ import pytest
 from typer.testing import CliRunner
 
 from spelgen.cli.main import app
-from spelgen.data.logs import Trajectory, read_logs, write_logs
+from spelgen.dynamics.regressor import regressor, urdf_parameters
 from spelgen.errors import ArmError, LogError
-from spelgen.identification import told
-from spelgen.identification.base import base_parameters
+from spelgen.identification import formatting
+from spelgen.identification.base_parameters import base_parameters
 from spelgen.identification.friction import FrictionModel
 from spelgen.identification.identify import Method, columns, identify
 from spelgen.identification.least_squares import correlation_time
-from spelgen.identification.regressor import regressor, urdf_parameters
 from spelgen.identification.samples import DynamicsSamples, dynamics_samples
+from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.pipeline import inspect, load
 from spelgen.structure.pseudo_inertia import (
     LOWER,
@@ -165,8 +165,8 @@ def test_what_motion_does_not_show_is_said(robots):
     samples.qd[:, 3:], samples.qdd[:, 3:], samples.q[:, 3:] = 0.0, 0.0, 0.4
     found = identify(arm, [samples], Method("range"))
     assert found.unseen > 0
-    assert "say nothing in" in told.text(found)
-    assert told.to_dict(found)["condition"] is None
+    assert "say nothing in" in formatting.text(found)
+    assert formatting.to_dict(found)["condition"] is None
 
 
 def test_errors_tell_what_is_missing(robots):

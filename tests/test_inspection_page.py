@@ -7,8 +7,8 @@ from html_page import Page
 from typer.testing import CliRunner
 
 from spelgen.cli.main import app
-from spelgen.inspection_page import page
 from spelgen.pipeline import inspect, verify
+from spelgen.render.inspection_page import page
 
 HOSTILE = "<script>alert(1)</script>{{ 7 * 7 }}&quot;'&amp;"
 

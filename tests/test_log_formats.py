@@ -8,10 +8,10 @@ import pyarrow as pa
 import pyarrow.parquet
 import pytest
 
-from spelgen.data.logs import read_logs, write_logs
-from spelgen.data.trajectory import Trajectory
 from spelgen.errors import LogError, SettingsError, SpelgenErrors
-from spelgen.log_mapping import LogMapping
+from spelgen.logs.mapping import LogMapping
+from spelgen.logs.read import read_logs, write_logs
+from spelgen.logs.trajectory import Trajectory
 
 JOINTS = ("shoulder", "elbow")
 T = np.array([0.0, 0.01, 0.02, 0.03])

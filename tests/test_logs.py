@@ -9,17 +9,17 @@ import pyarrow.parquet
 import pytest
 import torch
 
-from spelgen.data.doubts import examine
-from spelgen.data.logs import Trajectory, read_logs, write_logs
-from spelgen.data.signals import (
+from spelgen.errors import LogError, SpelgenErrors
+from spelgen.logs.checks import examine
+from spelgen.logs.filtering import (
     automatic_cutoff,
     automatic_spacing,
     low_pass,
     prepare,
 )
-from spelgen.data.trajectory import rate, split_at_gaps
-from spelgen.data.windows import cut_windows, split_validation
-from spelgen.errors import LogError, SpelgenErrors
+from spelgen.logs.read import Trajectory, read_logs, write_logs
+from spelgen.logs.trajectory import rate, split_at_gaps
+from spelgen.logs.windows import cut_windows, split_validation
 
 JOINTS = ("a", "b")
 

@@ -19,7 +19,7 @@ from emitted import (
     randomise,
 )
 
-from spelgen.settings import load_settings
+from spelgen.settings.settings import load_settings
 
 STATES = 25
 

@@ -7,9 +7,9 @@ import pytest
 
 from spelgen.arm.arm import make_arm
 from spelgen.errors import SpelgenError
-from spelgen.proof.verification import verify
 from spelgen.structure.structure import derive
 from spelgen.urdf.read import read_urdf
+from spelgen.verify.verify import verify
 
 # file -> a part of every line of the refusal
 REFUSED = {

@@ -9,10 +9,10 @@ import torch
 from emitted import GANTRY, built, frictionless, import_source, network_inputs, random_model
 from published_phnode import Published
 
+from spelgen.fit.lie_group import geodesic_distance, group_rates
+from spelgen.fit.rollout import position_difference
 from spelgen.pipeline import build, make_spec
 from spelgen.spec import Options, Preset, load_design
-from spelgen.training.lie_group import geodesic_distance, group_rates
-from spelgen.training.rollout import position_difference
 
 ROOT = Path(__file__).parents[1]
 PRESETS = [("phnode", "mlp"), ("phnode", "kan"), ("spel", "mlp"), ("spel-kan", "kan"), ("minimal", "kan")]

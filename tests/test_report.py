@@ -11,9 +11,9 @@ from html_page import Page
 
 from spelgen import pipeline
 from spelgen.errors import RunError
-from spelgen.report.page import render_report, write_report
-from spelgen.training.data import TrainingConfig
-from spelgen.training.runs import load_model
+from spelgen.fit.dataset import TrainingConfig
+from spelgen.fit.run_folder import load_model
+from spelgen.render.report_page import render_report, write_report
 
 
 def errors(share, tip=None):

@@ -9,7 +9,7 @@ from lxml import etree
 
 from spelgen import inspect
 from spelgen.arm.arm import make_arm
-from spelgen.settings import check_joint_names, load_settings
+from spelgen.settings.settings import check_joint_names, load_settings
 from spelgen.urdf.read import read_urdf
 
 ROBOTS = Path(__file__).parents[1] / "robots"

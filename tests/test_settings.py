@@ -7,7 +7,8 @@ import pytest
 from pydantic import ValidationError
 
 from spelgen.errors import SettingsError, SpelgenErrors
-from spelgen.settings import JointSettings, Settings, check_joint_names, load_mapping, load_settings
+from spelgen.settings.joint import JointSettings
+from spelgen.settings.settings import Settings, check_joint_names, load_mapping, load_settings
 
 
 @pytest.fixture

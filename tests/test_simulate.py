@@ -7,10 +7,11 @@ from scipy.integrate import solve_ivp
 from scipy.special import ellipj
 
 from spelgen.arm.arm import make_arm
+from spelgen.dynamics.pinocchio_engine import forward_dynamics, make_engine, mass_matrix
 from spelgen.errors import RunError, SettingsError
-from spelgen.settings import JointSettings, Settings, load_settings
+from spelgen.settings.joint import JointSettings
+from spelgen.settings.settings import Settings, load_settings
 from spelgen.simulation import simulate as simulation
-from spelgen.simulation.engine import forward_dynamics, make_engine, mass_matrix
 from spelgen.simulation.protocols import make_logs
 from spelgen.simulation.simulate import make_friction, rollout, simulate
 from spelgen.urdf.read import read_urdf

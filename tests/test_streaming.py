@@ -10,16 +10,16 @@ import pyarrow.parquet
 import pytest
 import torch
 
-from spelgen.data import parts, stream
-from spelgen.data.logs import read_logs, write_logs
-from spelgen.data.parts import large_files, scan
-from spelgen.data.stream import Cutting, WindowStream
-from spelgen.data.trajectory import QUANTITIES, Trajectory
 from spelgen.errors import LogError
-from spelgen.log_mapping import LogMapping
-from spelgen.training.data import TrainingConfig, prepare_data
-from spelgen.training.streamed import prepare_streamed
-from spelgen.training.train import train
+from spelgen.fit.dataset import TrainingConfig, prepare_data
+from spelgen.fit.streaming import prepare_streamed
+from spelgen.fit.train import train
+from spelgen.logs import chunks, epoch_windows
+from spelgen.logs.chunks import large_files, scan
+from spelgen.logs.epoch_windows import Cutting, WindowStream
+from spelgen.logs.mapping import LogMapping
+from spelgen.logs.read import read_logs, write_logs
+from spelgen.logs.trajectory import QUANTITIES, Trajectory
 
 STAND_IN = Path(__file__).with_name("stand_in.py")
 JOINTS = ("shoulder", "elbow")
@@ -47,7 +47,7 @@ def same(first: Trajectory, second: Trajectory) -> bool:
 @pytest.fixture(params=[37, 1000, 10_000])
 def log(request, tmp_path, monkeypatch) -> Path:
     """A file of row groups of this size that is read as one larger than memory."""
-    monkeypatch.setattr(parts, "IN_MEMORY", 1000)
+    monkeypatch.setattr(chunks, "IN_MEMORY", 1000)
     write_logs(tmp_path / "log.parquet", recordings(), JOINTS)
     table = pa.parquet.read_table(tmp_path / "log.parquet")
     pa.parquet.write_table(table, tmp_path / "train.parquet", row_group_size=request.param)
@@ -65,7 +65,7 @@ def test_parts_hold_the_samples_of_the_recordings(log):
 
 
 def test_long_recordings_are_several_parts(log, monkeypatch):
-    monkeypatch.setattr(parts, "LONGEST", 150)
+    monkeypatch.setattr(chunks, "LONGEST", 150)
     found = dict((part.name, part) for part, _ in scan([log], JOINTS, LogMapping()))
     assert list(found)[:4] == ["r0 [1]", "r0 [2]", "r0 [3]", "r1 [1]"]
     for whole in read_logs([log], JOINTS):
@@ -100,7 +100,7 @@ def streamed(log, cutting, **changed) -> WindowStream:
 
 @pytest.mark.parametrize("cutoff", [None, 8.0])
 def test_a_pass_over_all_shares_gives_every_window_once(log, monkeypatch, cutoff):
-    monkeypatch.setattr(stream, "SHARE", 900)
+    monkeypatch.setattr(epoch_windows, "SHARE", 900)
     cutting = Cutting(window=5, stride=3, every=2, cutoff=cutoff)
     expected = cutting.windows(read_logs([log], JOINTS))
     found = streamed(log, cutting)
@@ -134,7 +134,7 @@ def test_preparation_finds_what_it_finds_in_memory(log):
 
 
 def test_a_last_sample_alone_changes_nothing(log, monkeypatch):
-    monkeypatch.setattr(parts, "LONGEST", 399)
+    monkeypatch.setattr(chunks, "LONGEST", 399)
     config = replace(CONFIG, every=None)
     found, plain = prepare_streamed([log], JOINTS, KINDS, config), prepare_data([log], JOINTS, KINDS, config)
     assert found.cutoff == plain.cutoff == 8.0
@@ -149,7 +149,7 @@ def lines(run: Path) -> list[dict]:
 
 @pytest.mark.parametrize("log", [1000], indirect=True)
 def test_training_streams_and_resumes_with_the_same_numbers(log, tmp_path, monkeypatch):
-    monkeypatch.setattr(stream, "SHARE", 400)
+    monkeypatch.setattr(epoch_windows, "SHARE", 400)
     drawn, share = [], WindowStream.share
 
     def drawing(self, number):
@@ -170,8 +170,8 @@ def test_training_streams_and_resumes_with_the_same_numbers(log, tmp_path, monke
 
 @pytest.mark.parametrize("group", [4096, 1_600_000])
 def test_a_log_is_never_in_memory_as_a_whole(tmp_path, monkeypatch, group):
-    monkeypatch.setattr(parts, "LONGEST", 4096)
-    monkeypatch.setattr(parts, "ROW_GROUP", 4096)
+    monkeypatch.setattr(chunks, "LONGEST", 4096)
+    monkeypatch.setattr(chunks, "ROW_GROUP", 4096)
     random = np.random.default_rng(0)
     columns = {name: random.standard_normal(1_600_000) for name in ("q_a", "qd_a", "tau_a")}
     table = pa.table({"t": np.arange(1_600_000.0), **columns})
@@ -195,7 +195,7 @@ def test_only_large_parquet_is_streamed(log, tmp_path, monkeypatch):
         LogError, match=r"more\.csv: got a log beside others too large for memory, expected Parq"
     ):
         large_files([log, tmp_path / "more.csv"], JOINTS)
-    monkeypatch.setattr(parts, "IN_MEMORY", 10**6)
+    monkeypatch.setattr(chunks, "IN_MEMORY", 10**6)
     assert large_files([log, tmp_path / "more.csv"], JOINTS) == []
 
 
@@ -218,7 +218,7 @@ BROKEN = {
 def test_errors_tell_the_row_of_the_file(log, monkeypatch, case):
     row, column, value, message = BROKEN[case]
     monkeypatch.setattr(
-        parts, "LONGEST", 50
+        chunks, "LONGEST", 50
     )  # row 450 begins a part: its time is compared with the last one's
     with pytest.raises(LogError, match=message):
         list(scan([broken(log, row, column, value)], JOINTS, LogMapping()))

@@ -9,14 +9,14 @@ from html_page import Page
 from typer.testing import CliRunner
 
 from spelgen.cli.main import app
-from spelgen.data.logs import write_logs
-from spelgen.data.trajectory import Trajectory
-from spelgen.identification.regressor import regressor, urdf_parameters
+from spelgen.dynamics.regressor import regressor, urdf_parameters
+from spelgen.logs.formatting import text
+from spelgen.logs.read import write_logs
+from spelgen.logs.report import survey
+from spelgen.logs.statistics import measure, noise, quantisation
+from spelgen.logs.trajectory import Trajectory
 from spelgen.pipeline import load
-from spelgen.survey.measures import measure, noise, quantisation
-from spelgen.survey.page import page
-from spelgen.survey.survey import survey
-from spelgen.survey.tables import text
+from spelgen.render.logs_page import page
 
 
 @pytest.fixture(scope="module")
@@ -168,8 +168,8 @@ def test_logs_larger_than_memory_are_told_by_parts(spelgen, robots, arm, log, tm
     write_logs(tmp_path / "logs.parquet", [log], names)
     command = ["logs", "logs.parquet", "--robot", robots / "rpr.urdf", "--format", "json"]
     whole = json.loads(spelgen(*command).stdout)
-    monkeypatch.setattr("spelgen.data.parts.IN_MEMORY", 1000)
-    monkeypatch.setattr("spelgen.data.parts.LONGEST", 600)
+    monkeypatch.setattr("spelgen.logs.chunks.IN_MEMORY", 1000)
+    monkeypatch.setattr("spelgen.logs.chunks.LONGEST", 600)
     told = json.loads(spelgen(*command).stdout)
     assert [x["name"] for x in told["trajectories"]] == [f"motion [{k}]" for k in range(1, 5)]
     assert [x["low"] for x in told["joints"]] == [x["low"] for x in whole["joints"]]
@@ -182,7 +182,7 @@ def test_a_few_samples_are_told_without_judgement(arm, log):
 
 
 def test_real_arms_are_believed(shared):
-    from spelgen.data.logs import read_logs
+    from spelgen.logs.read import read_logs
 
     logs = shared / "logs" / "ur10e"
     real = load(logs / "ur10e.urdf").arm

@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import torch
 from emitted import built, import_source
 
+from spelgen.fit.dataset import TrainingConfig
+from spelgen.fit.torque_networks import fit_networks
+from spelgen.fit.torque_start import start_from_torque
 from spelgen.identification.samples import DynamicsSamples
-from spelgen.training.data import TrainingConfig
-from spelgen.training.torque_networks import fit_networks
-from spelgen.training.torque_start import start_from_torque
 
 
 def recorded(model, seed, count=300):
@@ -47,9 +47,7 @@ def test_the_objective_torque_fits_and_leaves_no_windows(tmp_path, monkeypatch):
     true, model = module.Model(seed=0), module.Model(seed=0)
     with torch.no_grad():
         true.constants *= 1.5
-    monkeypatch.setattr(
-        "spelgen.training.torque_start.dynamics_samples", lambda recordings: [recorded(true, 5)]
-    )
+    monkeypatch.setattr("spelgen.fit.torque_start.dynamics_samples", lambda recordings: [recorded(true, 5)])
     config = TrainingConfig(objective="torque")
     left, notes = start_from_torque(model, SimpleNamespace(recordings=()), config, fit=True)
     assert (left.epochs, left.momentum_steps) == (0, 0)

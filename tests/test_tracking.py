@@ -5,10 +5,10 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from spelgen import pipeline
+from spelgen.dynamics.pinocchio_engine import forward_dynamics, make_engine
 from spelgen.errors import SettingsError, SpelgenErrors
-from spelgen.settings import Settings
+from spelgen.settings.settings import Settings
 from spelgen.simulation import tracking
-from spelgen.simulation.engine import forward_dynamics, make_engine
 from spelgen.simulation.protocols import make_logs
 from spelgen.simulation.simulate import make_friction
 from spelgen.simulation.tracking import Sines, measured, record, track, tuned

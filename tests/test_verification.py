@@ -6,8 +6,8 @@ from fractions import Fraction
 import pytest
 
 from spelgen import pipeline
-from spelgen.proof.verification import verify
 from spelgen.structure.structure import Entry, derive
+from spelgen.verify.verify import verify
 
 ROBOTS = ("two_link", "rpr", "six_dof", "scara", "panda", "ur10e")
 

@@ -8,13 +8,13 @@ from hypothesis import HealthCheck, given, settings
 from random_arms import arms
 
 from spelgen.arm.arm import make_arm
+from spelgen.dynamics.pinocchio_engine import bias, make_engine, mass_matrix
 from spelgen.pipeline import load
-from spelgen.simulation.engine import bias, make_engine, mass_matrix
+from spelgen.structure.fourier import find_waves
 from spelgen.structure.nominal import nominal_inertias, working_range
 from spelgen.structure.recursion import triangle
 from spelgen.structure.sampling import float_energies
 from spelgen.structure.structure import derive
-from spelgen.structure.waves import find_waves
 from spelgen.urdf.read import read_urdf
 
 

@@ -9,9 +9,9 @@ from math import pi
 from typing import Literal
 
 from spelgen.arm.chain import Chain, choose_chain, follows
+from spelgen.arm.lump_links import Moved, walk
 from spelgen.arm.placement import TenVector
 from spelgen.arm.rational import Matrix, Vector, exact
-from spelgen.arm.walk import Moved, walk
 from spelgen.errors import ArmError, Diagnostic
 from spelgen.urdf.robot import Joint, Robot
 

@@ -13,6 +13,7 @@ from math import inf
 
 import numpy as np
 
+from spelgen.arm.angle_rounding import Snapper
 from spelgen.arm.rational import (
     IDENTITY,
     ZERO,
@@ -29,7 +30,6 @@ from spelgen.arm.rational import (
     summed,
     transposed,
 )
-from spelgen.arm.snapping import Snapper
 from spelgen.urdf.robot import Inertial, Joint, Link
 
 TenVector = tuple[Fraction, ...]

@@ -30,10 +30,10 @@ def compare(
 
     Started again with the same settings, it goes on where it stopped.
     """
-    from spelgen.comparison.page import write_comparison
-    from spelgen.comparison.running import run_study, time_steps
+    from spelgen.comparison.formatting import comparison_tables
+    from spelgen.comparison.runs import run_study, time_steps
     from spelgen.comparison.study import VARIANTS, prepare_study
-    from spelgen.comparison.tables import comparison_tables
+    from spelgen.render.comparison_page import write_comparison
 
     known = {variant.name: variant for variant in VARIANTS}
     chosen = list(known) if presets is None else [name.strip() for name in presets.split(",")]

@@ -23,11 +23,11 @@ def export(
     Bodies of a closed-form model are written as they are; of other models, the rigid bodies nearest to them.
     """
     from spelgen.errors import RunError
-    from spelgen.export.twin import make_twin
+    from spelgen.export.rigid_body_projection import make_twin
     from spelgen.export.urdf_file import settings_text, urdf_text
     from spelgen.files import write_text
+    from spelgen.fit.run_folder import RunFolder, write_bytes
     from spelgen.spec import read_header
-    from spelgen.training.runs import RunFolder, write_bytes
 
     if output.suffix == ".yaml":
         raise RunError(f"the name {output.name!r}", expected="FILE.urdf, beside which FILE.yaml is written")

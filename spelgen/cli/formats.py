@@ -11,7 +11,7 @@ from spelgen.cli.console import note
 if TYPE_CHECKING:
     from spelgen.formulas.formulas import Entry, Formulas
     from spelgen.inspection import Inspection
-    from spelgen.proof.agreement import Verification
+    from spelgen.verify.agreement import Verification
 
 Format = Literal["text", "json", "html", "latex", "sympy"]
 _OF_SUFFIX: dict[str, Format] = {".json": "json", ".html": "html", ".tex": "latex", ".py": "sympy"}
@@ -29,9 +29,9 @@ def rendered(
 
     Raises SpelgenError for an entry that M does not have.
     """
-    from spelgen import inspection_page
     from spelgen.formulas import latex, sympy_module, text
     from spelgen.formulas.formulas import WRITABLE
+    from spelgen.render import inspection_page
 
     longest = WRITABLE if format in ("json", "sympy") else None
     closed = None

@@ -14,8 +14,8 @@ from spelgen.cli.options import Data, Joints, Mapping, MoreData, Robot, SnapTole
 from spelgen.files import write_text
 
 if TYPE_CHECKING:
-    from spelgen.data.logs import Trajectory
     from spelgen.identification.samples import DynamicsSamples
+    from spelgen.logs.read import Trajectory
     from spelgen.pipeline import Loaded
 
 
@@ -55,11 +55,11 @@ def identify(
     if prior is not None and weights != "noise":
         raise typer.BadParameter("--prior weighs by noise", param_hint="'--weights'")
     from spelgen import pipeline
-    from spelgen.data.logs import read_logs
-    from spelgen.identification import told
+    from spelgen.identification import formatting
     from spelgen.identification.friction import FrictionModel
     from spelgen.identification.identify import Method
     from spelgen.identification.identify import identify as identified
+    from spelgen.logs.read import read_logs
 
     loaded = pipeline.load(robot, options.names(joints), tip, snap_tol)
     names = [coordinate.name for coordinate in loaded.arm.coordinates]
@@ -68,7 +68,7 @@ def identify(
     samples = _samples(read_logs(paths, names, role="train", mapping=named, joint_types=kinds), loaded)
     method = Method(weights, ridge, prior, FrictionModel(dry_velocity, stribeck, polynomial))
     found = identified(loaded.arm, samples, method)
-    result = told.text(found) if format == "text" else json.dumps(told.to_dict(found), indent=2)
+    result = formatting.text(found) if format == "text" else json.dumps(formatting.to_dict(found), indent=2)
     if output is None:
         say(result)
     else:
@@ -79,8 +79,8 @@ def _samples(trajectories: list[Trajectory], loaded: Loaded) -> list[DynamicsSam
     """Moving samples with joint torques, whatever the logs' torques act on; odd logs are told."""
     from dataclasses import replace
 
-    from spelgen.data.doubts import examine
     from spelgen.identification.samples import dynamics_samples
+    from spelgen.logs.checks import examine
 
     coordinates = loaded.arm.coordinates
     for each in examine(trajectories, [c.name for c in coordinates], [c.kind for c in coordinates]):

@@ -43,7 +43,7 @@ def excite(
     """
     from spelgen import pipeline
     from spelgen.excitation.design import design
-    from spelgen.excitation.told import csv_text, text
+    from spelgen.excitation.formatting import csv_text, text
 
     options.require_free(output, force=force)
     arm = pipeline.load(robot, options.names(joints), tip, snap_tol).arm
@@ -81,11 +81,11 @@ def logs(
     Nothing is changed. Exit code 1 where the logs cannot be trained on.
     """
     from spelgen import pipeline
-    from spelgen.data.logs import read_logs
-    from spelgen.data.parts import large_files, scan
-    from spelgen.survey.page import page
-    from spelgen.survey.survey import survey
-    from spelgen.survey.tables import text
+    from spelgen.logs.chunks import large_files, scan
+    from spelgen.logs.formatting import text
+    from spelgen.logs.read import read_logs
+    from spelgen.logs.report import survey
+    from spelgen.render.logs_page import page
 
     loaded = pipeline.load(robot, options.names(joints), tip, snap_tol)
     names = [coordinate.name for coordinate in loaded.arm.coordinates]

@@ -14,7 +14,7 @@ from spelgen.errors import SpelgenError
 from spelgen.spec import Assume
 
 if TYPE_CHECKING:
-    from spelgen.log_mapping import LogMapping
+    from spelgen.logs.mapping import LogMapping
 
 Robot = Annotated[
     Path, typer.Argument(metavar="ROBOT.urdf", help="The arm's URDF; ROBOT.yaml beside it holds settings.")
@@ -104,7 +104,7 @@ def mapping(file: Path | None, urdf: Path | None, joints: Sequence[str]) -> LogM
 
     The file may speak of all joints of the URDF, or of `joints` where there is none.
     """
-    from spelgen.settings import load_mapping, load_settings
+    from spelgen.settings.settings import load_mapping, load_settings
     from spelgen.urdf.read import read_urdf
 
     there = urdf is not None and urdf.is_file()

@@ -28,7 +28,7 @@ from spelgen.errors import ModuleError
 from spelgen.spec import read_header
 
 if TYPE_CHECKING:
-    from spelgen.training.data import TrainingConfig
+    from spelgen.fit.dataset import TrainingConfig
 
 WORST_INTEGRATION = 1e-8  # [rad, rad/s; m, m/s] above this simulated logs are no reference
 
@@ -48,7 +48,7 @@ def simulate(
 ) -> None:
     """Make training and test logs with Pinocchio."""
     from spelgen import pipeline
-    from spelgen.data.logs import write_logs
+    from spelgen.logs.read import write_logs
     from spelgen.simulation.protocols import make_logs
 
     loaded = pipeline.load(robot, options.names(joints), tip, snap_tol)
@@ -166,7 +166,7 @@ def train(
     if module is None:
         raise typer.BadParameter("name a module, or a run with --from", param_hint="'MODULE.py'")
     paths = options.logs(data, more)
-    from spelgen.training import train as training
+    from spelgen.fit import train as training
 
     folder = output or Path("runs") / module.stem
     urdf = robot or _unchanged_urdf(module)
@@ -199,8 +199,8 @@ def evaluate(
     """Judge a trained run on test logs, beside its rivals."""
     paths = options.logs(data, more)
     from spelgen.evaluation import evaluate as evaluation
-    from spelgen.report.tables import result_tables
-    from spelgen.training.runs import RunFolder
+    from spelgen.fit.run_folder import RunFolder
+    from spelgen.render.tables import result_tables
 
     folder = RunFolder(run)
     named = None
@@ -223,14 +223,14 @@ def report(
     ] = None,
 ) -> None:
     """Write one HTML page about a run."""
-    from spelgen.report.page import write_report
+    from spelgen.render.report_page import write_report
 
     say(f"wrote {write_report(run, output)}")
 
 
 def _of_run(source: Path, robot: Path | None) -> tuple[Path, Path | None]:
     """The module and the URDF of a run."""
-    from spelgen.training.runs import RunFolder
+    from spelgen.fit.run_folder import RunFolder
 
     run = RunFolder(source)
     run.read_json(run.config)  # where there is no run, this says so
@@ -251,9 +251,10 @@ def _unchanged_urdf(module: Path) -> Path | None:
 
 def _config(urdf: Path | None, resumed: Path | None, flags: dict[str, Any]) -> TrainingConfig:
     """The flags, and behind them what the run was started with, or the robot's settings."""
-    from spelgen.settings import TrainingSettings, load_settings
-    from spelgen.training.data import TrainingConfig
-    from spelgen.training.runs import RunFolder
+    from spelgen.fit.dataset import TrainingConfig
+    from spelgen.fit.run_folder import RunFolder
+    from spelgen.settings.settings import load_settings
+    from spelgen.settings.training import TrainingSettings
 
     if resumed is not None:
         run = RunFolder(resumed)

@@ -16,15 +16,16 @@ import yaml
 from lxml import etree
 
 from spelgen import pipeline
-from spelgen.data.logs import Trajectory, write_logs
 from spelgen.errors import RunError
 from spelgen.files import write_text
-from spelgen.settings import ComparisonSettings, Settings
+from spelgen.fit.dataset import TrainingConfig
+from spelgen.fit.loop import EPOCH_STEPS
+from spelgen.fit.run_folder import write_json
+from spelgen.logs.read import Trajectory, write_logs
+from spelgen.settings.comparison import ComparisonSettings
+from spelgen.settings.settings import Settings
 from spelgen.spec import Net, Preset
 from spelgen.structure.nominal import working_range
-from spelgen.training.data import TrainingConfig
-from spelgen.training.loop import EPOCH_STEPS
-from spelgen.training.runs import write_json
 
 SCHEMA = 2
 

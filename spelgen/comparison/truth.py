@@ -14,7 +14,7 @@ from spelgen import pipeline
 
 def true_mass(robot: Path, q: torch.Tensor) -> torch.Tensor:
     """M (T, n, n) [kg m^2, kg m, kg] of a URDF and its sidecar, by Pinocchio, at q (T, n); rotors included."""
-    from spelgen.simulation.engine import make_engine, mass_matrix
+    from spelgen.dynamics.pinocchio_engine import make_engine, mass_matrix
 
     loaded = pipeline.load(robot)
     engine = make_engine(loaded.arm, loaded.settings)

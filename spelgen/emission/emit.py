@@ -10,8 +10,8 @@ from collections import Counter, defaultdict
 
 from spelgen.emission import docstring
 from spelgen.emission.source import call, literal, table
-from spelgen.rendering import render
 from spelgen.spec import JointSpec, ModelSpec
+from spelgen.templates import render
 
 _LEAST_UNITS = 4
 _POTENTIAL_SHARE = 0.5

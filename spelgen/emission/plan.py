@@ -11,9 +11,9 @@ from spelgen.arm.arm import Arm, Coordinate
 from spelgen.emission.bodies import body_specs
 from spelgen.spec import ConstantSpec, Entries, JointSpec, ModelSpec, Options, OutputSpec, load_design
 from spelgen.structure.basis import Weights
+from spelgen.structure.fourier import NO_WAVES, find_waves
 from spelgen.structure.nominal import Nominal, nominal, nominal_inertias, working_range
 from spelgen.structure.structure import Structure
-from spelgen.structure.waves import NO_WAVES, find_waves
 from spelgen.urdf.actuation import Actuation
 
 _GUARD_SHARE = 0.1

@@ -1,1 +1,1 @@
-"""A trained model and its rivals, judged on logs."""
+"""A trained model and its baselines, judged on logs."""

@@ -8,26 +8,26 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from spelgen.data.doubts import examine
-from spelgen.data.logs import Trajectory, read_logs
-from spelgen.data.signals import prepare
-from spelgen.data.trajectory import rate
-from spelgen.data.windows import Windows, cut_windows
+from spelgen.dynamics.tip import tip_position
 from spelgen.errors import Diagnostic
-from spelgen.evaluation.drift import energy_drift
+from spelgen.evaluation.baselines import Contender, held_velocity, trained, urdf_values
 from spelgen.evaluation.examples import Example, predict_examples
-from spelgen.evaluation.outcome import Evaluation, Horizon, Tip, state_errors, torque_figures
-from spelgen.evaluation.tip import tip_position
+from spelgen.evaluation.invariants import energy_drift
+from spelgen.evaluation.results import Evaluation, Horizon, Tip, state_errors, torque_figures
 from spelgen.evaluation.torque import torque_errors, torque_samples
-from spelgen.log_mapping import LogMapping
+from spelgen.fit.dataset import filter_cutoff
+from spelgen.fit.rollout import choose_substeps, loss_scales
+from spelgen.fit.run_folder import RunFolder, trained_model, write_json
+from spelgen.logs.checks import examine
+from spelgen.logs.filtering import prepare
+from spelgen.logs.mapping import LogMapping
+from spelgen.logs.read import Trajectory, read_logs
+from spelgen.logs.trajectory import rate
+from spelgen.logs.windows import Windows, cut_windows
 from spelgen.spec import Header, read_header
-from spelgen.training.data import filter_cutoff
-from spelgen.training.rivals import Contender, held_velocity, trained, urdf_values
-from spelgen.training.rollout import choose_substeps, loss_scales
-from spelgen.training.runs import RunFolder, trained_model, write_json
 
 if TYPE_CHECKING:
-    from spelgen.training.runs import EmittedModel
+    from spelgen.fit.run_folder import EmittedModel
 
 PREDICTED_STEPS = 40_000  # per horizon and contender: windows are thinned evenly to about this many
 MOST_WINDOWS = 2000

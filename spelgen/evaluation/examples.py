@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import torch
 
-from spelgen.data.logs import Trajectory
-from spelgen.data.windows import cut_windows
-from spelgen.training.rivals import Contender
+from spelgen.evaluation.baselines import Contender
+from spelgen.logs.read import Trajectory
+from spelgen.logs.windows import cut_windows
 
 MOST = 3
 

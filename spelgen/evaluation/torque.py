@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from spelgen.data.logs import Trajectory
 from spelgen.identification.samples import dynamics_samples
+from spelgen.logs.read import Trajectory
 
 
 @dataclass(frozen=True)

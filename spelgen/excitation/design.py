@@ -9,10 +9,10 @@ from math import exp, inf, log, sqrt
 import numpy as np
 
 from spelgen.arm.arm import Arm
-from spelgen.excitation.fourier import Motion, Series, bounds
-from spelgen.identification.base import base_parameters
+from spelgen.dynamics.regressor import regressor, urdf_parameters
+from spelgen.excitation.trajectory import Motion, Series, bounds
+from spelgen.identification.base_parameters import base_parameters
 from spelgen.identification.friction import FrictionModel
-from spelgen.identification.regressor import regressor, urdf_parameters
 
 PER_HARMONIC = 12  # samples of a motion that is tried
 STARTS = 40  # motions at random, of which the best is improved

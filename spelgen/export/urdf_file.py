@@ -8,10 +8,10 @@ import numpy as np
 import yaml
 from lxml import etree
 
+from spelgen.arm.angle_rounding import Snapper
 from spelgen.arm.rational import alignment
-from spelgen.arm.snapping import Snapper
-from spelgen.export.twin import Twin
-from spelgen.settings import load_settings
+from spelgen.export.rigid_body_projection import Twin
+from spelgen.settings.settings import load_settings
 from spelgen.urdf.document import urdf_bytes
 from spelgen.urdf.read import read_urdf
 from spelgen.urdf.robot import Robot

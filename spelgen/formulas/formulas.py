@@ -19,8 +19,8 @@ from spelgen.formulas.expression import Sum, Symbol
 from spelgen.formulas.grouping import Collected, grouped
 from spelgen.formulas.shortening import Shortener
 from spelgen.labels import entry_name
+from spelgen.structure.base_parameters import BaseParameter, base_parameters
 from spelgen.structure.expansion import Budget, Expansion, TooLarge
-from spelgen.structure.minimal import BaseParameter, base_parameters
 from spelgen.structure.recursion import triangle
 from spelgen.structure.structure import Structure
 

@@ -10,7 +10,7 @@ from flint import fmpq_mpoly
 from spelgen.formulas.expression import Factor, Sum, Symbol, Term
 from spelgen.formulas.factoring import bracketed
 from spelgen.formulas.shortening import Shortener
-from spelgen.structure.minimal import BaseParameter
+from spelgen.structure.base_parameters import BaseParameter
 
 Collected = list[tuple[BaseParameter, fmpq_mpoly]]
 _ONE = Sum((Term(Fraction(1)),))

@@ -11,7 +11,7 @@ import re
 
 from spelgen.formulas.expression import Sum, Symbol, Term
 from spelgen.formulas.formulas import Formula, Formulas
-from spelgen.structure.minimal import BaseParameter, parameter_name
+from spelgen.structure.base_parameters import BaseParameter, parameter_name
 
 # before a sign, but not inside an angle; behind a comma, but not inside a fraction
 _GAP = re.compile(r" (?=[+-] )(?![+-] (?:[\d./]+(?:\*| \\, ))?q)|(?<=,) (?!\d)")

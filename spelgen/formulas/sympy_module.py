@@ -5,7 +5,7 @@ from __future__ import annotations
 from spelgen.formulas.formulas import Formulas
 from spelgen.formulas.layout import broken, comments, definition
 from spelgen.formulas.notation import Sympy
-from spelgen.structure.minimal import parameter_name
+from spelgen.structure.base_parameters import parameter_name
 
 # A docstring first: in a comment of the first two lines a name could pass for the file's encoding (PEP 263).
 _HEAD = '''"""Closed forms of a serial arm's mass matrix M(q) and potential energy V(q), by spelgen.

@@ -1,1 +1,1 @@
-"""Least squares on logs: the rigid-body regressor, friction, base parameters, physically consistent fits."""
+"""Least squares on logs: friction, base parameters, physically consistent fits."""

@@ -9,12 +9,12 @@ from typing import Literal
 import numpy as np
 
 from spelgen.arm.arm import Arm
+from spelgen.dynamics.regressor import regressor
 from spelgen.errors import LogError
-from spelgen.identification.base import BaseParameters, base_parameters
+from spelgen.identification.base_parameters import BaseParameters, base_parameters
 from spelgen.identification.friction import FrictionModel
 from spelgen.identification.least_squares import Solution, Triangles, deviations, reduce, solve
 from spelgen.identification.prior import GaussianPrior, gaussian_prior
-from spelgen.identification.regressor import regressor
 from spelgen.identification.samples import DynamicsSamples
 
 Weights = Literal["equal", "range", "noise"]

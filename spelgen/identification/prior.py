@@ -8,10 +8,10 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from spelgen.arm.arm import Arm
+from spelgen.dynamics.regressor import urdf_parameters
 from spelgen.emission.plan import guessed_friction, guessed_rotor
 from spelgen.errors import ArmError
 from spelgen.identification.friction import FrictionModel
-from spelgen.identification.regressor import urdf_parameters
 from spelgen.structure.pseudo_inertia import parameters_of, reference_factor, sensitivity
 from spelgen.structure.sampling import float_energies
 

@@ -8,9 +8,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from spelgen.data.logs import Trajectory
-from spelgen.data.signals import low_pass, resample
-from spelgen.data.trajectory import rate
+from spelgen.logs.filtering import low_pass, resample
+from spelgen.logs.read import Trajectory
+from spelgen.logs.trajectory import rate
 
 FREQUENCY = 100.0  # [Hz] of the common grid
 CUTOFF = 8.0  # [Hz]

@@ -1,1 +1,1 @@
-"""An Arm to logs: its motion simulated with Pinocchio, drives and friction."""
+"""An Arm to logs: its motion simulated, with drives and friction."""

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from spelgen.arm.arm import Arm
-from spelgen.settings import Settings
+from spelgen.settings.settings import Settings
 from spelgen.simulation.simulate import SimulationResult, simulate
 from spelgen.simulation.tracking import track
 

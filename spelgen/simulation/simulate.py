@@ -14,10 +14,11 @@ import numpy as np
 from scipy.integrate import DOP853
 
 from spelgen.arm.arm import Arm, Coordinate
-from spelgen.data.logs import Trajectory
+from spelgen.dynamics.pinocchio_engine import Engine, forward_dynamics, make_engine
 from spelgen.errors import RunError, SettingsError, collect
-from spelgen.settings import JointSettings, Settings
-from spelgen.simulation.engine import Engine, forward_dynamics, make_engine
+from spelgen.logs.read import Trajectory
+from spelgen.settings.joint import JointSettings
+from spelgen.settings.settings import Settings
 
 RTOL, ATOL = 1e-13, 1e-15
 LOOSER = 100.0  # tolerances of the second integration, which the first is compared with

@@ -13,10 +13,11 @@ import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
 from spelgen.arm.arm import Arm
-from spelgen.data.logs import Trajectory
+from spelgen.dynamics.pinocchio_engine import Engine, bias, make_engine, mass_matrix
 from spelgen.errors import SettingsError, SpelgenError, collect
-from spelgen.settings import Settings, TrackingSettings
-from spelgen.simulation.engine import Engine, bias, make_engine, mass_matrix
+from spelgen.logs.read import Trajectory
+from spelgen.settings.settings import Settings
+from spelgen.settings.simulation import TrackingSettings
 from spelgen.simulation.simulate import (
     LOOSER,
     Friction,
@@ -158,7 +159,7 @@ def measured(recording: Recording, tracking: TrackingSettings, name: str) -> Tra
     """Return what is logged of a motion: filtered positions, their differences, and the torques."""
     rate = 1.0 / (recording.t[1] - recording.t[0])
     low_pass = butter(FILTER_ORDER, tracking.cutoff, fs=rate, output="sos")
-    padding = min(len(recording.t) - 1, int(3 * rate / tracking.cutoff))  # as `low_pass` of data/signals.py
+    padding = min(len(recording.t) - 1, int(3 * rate / tracking.cutoff))  # as `low_pass` of logs/filtering.py
     q = sosfiltfilt(low_pass, recording.encoders, axis=0, padlen=padding)
     return Trajectory(name, recording.t, q, np.gradient(q, recording.t, axis=0), recording.tau)
 

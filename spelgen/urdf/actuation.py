@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from spelgen.errors import Diagnostic, SettingsError, collect
-from spelgen.settings import Settings
+from spelgen.settings.settings import Settings
 from spelgen.urdf.robot import Robot, Transmission
 
 InputKind = Literal["fixed", "gain", "coupled"]

@@ -1,0 +1,291 @@
+"""Real logs, real rivals: every figure of docs/real_logs.md, from the folder of reference logs, in one command.
+
+    python benchmarks/real_logs.py [LOGS]
+
+LOGS is ../shared/logs beside the checkout by default. Torque errors are nMSE (mean squared error by the torque's
+variance, mean of the joints), once over the samples that move and once with the pauses between motions; the second is
+how the rivals' published figures were made. Nothing is chosen here: the settings are the defaults of spelgen.
+"""
+
+from __future__ import annotations
+
+import functools
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from characters import TESTS as CHARACTERS
+from characters import read_characters, write_arm
+
+from spelgen.arm.arm import Arm
+from spelgen.evaluation.baselines import Contender
+from spelgen.evaluation.results import state_errors
+from spelgen.fit.dataset import WHOLE_DECAY
+from spelgen.fit.rollout import roll_out
+from spelgen.fit.run_folder import load_model
+from spelgen.fit.torque_fit import fit_torque
+from spelgen.fit.torque_networks import fit_networks
+from spelgen.fit.torque_start import LOAD, last_body
+from spelgen.identification.friction import FrictionModel
+from spelgen.identification.identify import Identification, Method, identify
+from spelgen.identification.samples import DynamicsSamples, dynamics_samples
+from spelgen.logs.filtering import prepare
+from spelgen.logs.read import read_logs
+from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.windows import Windows, cut_windows
+from spelgen.pipeline import build, load
+from spelgen.spec import Preset
+
+Torque = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+
+TRAINING = ("20_02_10_30sec_12harm", "20_02_12_50sec_12harm", "20_02_05_20sec_8harm")
+TESTS = (
+    "19_12_23_free", "20_01_31_unload", "20_02_05_20sec_12harm", "20_02_06_20sec_10harm", "20_02_06_20sec_5harm",
+    "20_02_10_20sec_7harm", "20_02_12_40sec_12harm", "20_02_19_14harm50sec", "20_02_19_15harm50sec",
+)  # fmt: skip
+OUTSIDE = "20_01_17_ptp_10_points"
+LOADED = ("20_01_13_load_2600", "20_01_31_load", "20_02_19_14harm50secLoad")
+SECONDS = (2, 3, 5, 10, 20)
+RIDGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
+AHEAD = {"0.1 s": 10, "0.5 s": 47}  # samples at 94 Hz
+WINDOWS = 60  # of each trajectory
+SUBSTEPS = 4
+
+
+def main() -> None:
+    torch.set_num_threads(1)
+    logs = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parents[2] / "shared" / "logs"
+    with tempfile.TemporaryDirectory() as scratch:
+        ur10e(logs / "ur10e", Path(scratch))
+        panda(logs / "panda", logs.parent / "arms" / "panda_erd.urdf", Path(scratch))
+        characters(logs / "delan_characters", Path(scratch))
+
+
+def ur10e(folder: Path, scratch: Path) -> None:
+    urdf = folder / "ur10e.urdf"
+    arm, model = load(urdf).arm, emitted(urdf, scratch)
+    logs = {name: read(folder / f"{name}.parquet", arm) for name in (*TRAINING, *TESTS, OUTSIDE, *LOADED)}
+    training = dynamics_samples([logs[name] for name in TRAINING])
+    tests = [
+        (dynamics_samples([logs[x] for x in (*TESTS, OUTSIDE)], pauses=pauses)) for pauses in (True, False)
+    ]
+    rival = identify(arm, training, Method("range"))
+    features = FrictionModel(stribeck=True, polynomial=True)
+    more = identify(arm, training, Method("range", friction=features))
+    weighted = identify(arm, training, Method(friction=features))
+    since = time.perf_counter()
+    fit_torque(model, training)
+    print(
+        f"UR10e: the closed-form model is fitted to 100 s of three logs in {time.perf_counter() - since:.0f} s\n"
+    )
+    contenders = {
+        "least squares": rival.torque,
+        "with features": more.torque,
+        "by noise": weighted.torque,
+        "closed-form": torque_of(model),
+    }
+    for samples, said in zip(tests, ("pauses included", "moving samples alone"), strict=True):
+        table(f"Torque nMSE, {said}", contenders, samples, len(TESTS))
+    rollouts(model, rival, [logs[name] for name in TESTS])
+    payload(model, logs)
+    few(urdf, scratch, arm, logs[TRAINING[0]], [each[: len(TESTS)] for each in tests])
+
+
+def table(
+    title: str, contenders: dict[str, Torque], samples: Sequence[DynamicsSamples], counted: int
+) -> None:
+    print(title + "\n\n" + " " * 26 + "".join(f"{name:>15}" for name in contenders))
+    errors = np.array([[nmse(torque, sample) for torque in contenders.values()] for sample in samples])
+    rows = [*zip((x.name for x in samples), errors, strict=True)]
+    rows.insert(counted, (f"mean of the {counted}", errors[:counted].mean(axis=0)))
+    for name, row in rows:
+        print(f"{name:26}" + "".join(f"{x:15.5f}" for x in row))
+    print()
+
+
+def few(
+    urdf: Path, scratch: Path, arm: Arm, long: Trajectory, tests: Sequence[Sequence[DynamicsSamples]]
+) -> None:
+    print(f"Trained on the first seconds of {long.name}: mean nMSE of the nine, pauses included\n")
+    head = ("best ridge", "URDF as prior", "closed-form", "(moving)")
+    print(f"{'seconds':26}" + "".join(f"{x:>15}" for x in head))
+    for seconds in SECONDS:
+        samples = dynamics_samples([first(long, seconds)])
+        ridges = [identify(arm, samples, Method("range", ridge=x)).torque for x in RIDGES]
+        prior = identify(arm, samples, Method(prior=0.5)).torque
+        model = emitted(urdf, scratch)
+        fit_torque(model, samples)
+        ours = torque_of(model)
+        best = min(mean(x, tests[0]) for x in ridges)  # by the tests themselves: in its favour
+        row = (best, mean(prior, tests[0]), mean(ours, tests[0]), mean(ours, tests[1]))
+        print(f"{seconds:<26}" + "".join(f"{x:15.5f}" for x in row))
+    print()
+
+
+def payload(model: Any, logs: dict[str, Trajectory]) -> None:
+    print("A load at the tip: the last body alone is fitted to the first 10 s, judged on the rest\n")
+    print(f"{'':26}{'as trained':>15}{'adapted':>15}{'adapted, 3 s':>15}")
+    trained = {name: value.clone() for name, value in model.state_dict().items()}
+    for name in LOADED:
+        row = []
+        for seconds in (0.0, 10.0, 3.0):
+            model.load_state_dict(trained)
+            seen = dynamics_samples([first(logs[name], seconds)]) if seconds else []
+            if sum(len(x.q) for x in seen):
+                fit_torque(model, seen, LOAD, only_bodies=[last_body(model)])
+            rest = dynamics_samples([after(logs[name], seconds or 10.0)], pauses=True)
+            row.append(mean(torque_of(model), rest))
+        print(f"{name:26}" + "".join(f"{x:15.5f}" for x in row))
+    model.load_state_dict(trained)
+    print()
+
+
+class Identified:
+    """What least squares found as a system of equations, with velocities where a module has momenta."""
+
+    def __init__(self, found: Identification, model: Any) -> None:
+        bodies = 10 * len(found.arm.bodies)
+        self.ten = torch.from_numpy(found.parameters[:bodies])
+        drives = torch.from_numpy(found.parameters[bodies:]).view(-1, model.n)
+        self.rotor, self.viscous, self.coulomb, self.offset = drives[:4]
+        self.width, self.model = found.method.friction.dry_velocity, model
+
+    def momentum(self, q: torch.Tensor, qd: torch.Tensor, prepared: None = None) -> torch.Tensor:
+        return qd
+
+    def velocity(self, q: torch.Tensor, p: torch.Tensor, prepared: None = None) -> torch.Tensor:
+        return p
+
+    def prepare(self) -> None:
+        return None
+
+    def rates(
+        self, q: torch.Tensor, p: torch.Tensor, tau: torch.Tensor, prepared: None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        still = torch.zeros_like(q)
+        bias = self.model.regressor(q, p, still) @ self.ten
+        weight = self.model.regressor(q, still, still) @ self.ten
+        unit = torch.eye(q.shape[-1], dtype=q.dtype)
+        columns = [self.model.regressor(q, still, x.expand_as(q)) @ self.ten - weight for x in unit]
+        mass = torch.stack(columns, dim=-1) + torch.diag(self.rotor)
+        friction = self.viscous * p + self.coulomb * (p / self.width).tanh() + self.offset
+        return p, torch.linalg.solve(mass, (tau - bias - friction).unsqueeze(-1)).squeeze(-1)
+
+
+def rollouts(model: Any, found: Identification, logs: Sequence[Trajectory]) -> None:
+    print(
+        "Predicted states on the nine, error relative to the motion (mean of joints, position and velocity)\n"
+    )
+    print(f"{'':26}{'least squares':>15}{'closed-form':>15}")
+    for name, steps in AHEAD.items():
+        windows = tested(logs, steps)
+        with torch.no_grad():
+            row = [strayed(x, windows) for x in (Identified(found, model), model)]
+        print(f"{name:26}" + "".join(f"{x:15.4f}" for x in row))
+    print()
+
+
+def tested(logs: Sequence[Trajectory], steps: int) -> Windows:
+    """Evenly spread windows of each trajectory."""
+    pieces = [piece for x in logs for piece in prepare([x], shortest=steps + 1, cutoff=8.0)]
+    cut = [cut_windows([x], steps + 1, max(1, (len(x.t) - steps) // WINDOWS), measured=True) for x in pieces]
+    return Windows(*(torch.cat([getattr(x, k) for x in cut]) for k in ("dt", "q", "qd", "tau")))
+
+
+def strayed(dynamics: Any, windows: Windows) -> float:
+    contender = Contender("", functools.partial(roll_out, dynamics, substeps=SUBSTEPS), None)
+    return state_errors(contender, windows, ("revolute",) * windows.q.shape[-1], None).mean_share or np.nan
+
+
+def panda(folder: Path, urdf: Path, scratch: Path) -> None:
+    arm, model = load(urdf).arm, emitted(urdf, scratch)
+    whole = read(folder / "exciting_traj1.parquet", arm)
+    training, test = dynamics_samples([first(whole, 12.0)]), dynamics_samples([after(whole, 12.0)])
+    fit_torque(model, training)
+    contenders = {
+        f"tanh {width:g}": identify(arm, training, Method("range", friction=FrictionModel(width))).torque
+        for width in (0.02, 0.05)
+    }
+    table("Panda: first 12 s train, last 9 s test", contenders | {"closed-form": torque_of(model)}, test, 1)
+
+
+def characters(folder: Path, scratch: Path) -> None:
+    urdf = write_arm(scratch)
+    model, networks = emitted(urdf, scratch), emitted(urdf, scratch, "minimal")
+    samples, forces = read_characters(folder)
+    training = [x for x in samples if x.name not in CHARACTERS]
+    fit_torque(model, training)
+    fit_networks(networks, training, WHOLE_DECAY)
+    tests = [i for i, x in enumerate(samples) if x.name in CHARACTERS]
+    q, qd, qdd = (
+        torch.from_numpy(np.concatenate([getattr(samples[i], k) for i in tests])) for k in ("q", "qd", "qdd")
+    )
+    tau, coriolis = (np.concatenate(x) for x in ([samples[i].tau for i in tests], [forces[i] for i in tests]))
+    print("Characters (DeLaN's data): nMSE, total error by total variance\n")
+    print(f"{'':26}{'closed-form':>15}{'minimal':>15}")
+    found = [_torques(each, q, qd, qdd) for each in (model, networks)]
+    for name, true, columns in (
+        ("torque", tau, [each[0] for each in found]),
+        ("Coriolis torque", coriolis, [each[1] for each in found]),
+    ):
+        variance = np.square(true - true.mean(axis=0)).sum()
+        print(f"{name:26}" + "".join(f"{np.square(x - true).sum() / variance:15.1e}" for x in columns))
+
+
+def _torques(
+    model: Any, q: torch.Tensor, qd: torch.Tensor, qdd: torch.Tensor
+) -> tuple[np.ndarray, np.ndarray]:
+    """The torque, and what of it is Coriolis and centrifugal."""
+    with torch.no_grad():
+        steady, still = (model.inverse_dynamics(q, x, torch.zeros_like(q)) for x in (qd, torch.zeros_like(q)))
+        friction = (model.dissipation(q, qd) @ qd.unsqueeze(-1)).squeeze(-1)
+        return model.inverse_dynamics(q, qd, qdd).numpy(), (steady - still - friction).numpy()
+
+
+def emitted(urdf: Path, scratch: Path, preset: Preset = "closed-form") -> Any:
+    path = scratch / f"{urdf.stem}_{preset}.py"
+    path.write_text(build(urdf, preset=preset), encoding="utf-8")
+    return load_model(path)
+
+
+def read(path: Path, arm: Arm) -> Trajectory:
+    (trajectory,) = read_logs([path], [coordinate.name for coordinate in arm.coordinates])
+    return trajectory
+
+
+def first(trajectory: Trajectory, seconds: float) -> Trajectory:
+    return trajectory[: int(np.searchsorted(trajectory.t, trajectory.t[0] + seconds))]
+
+
+def after(trajectory: Trajectory, seconds: float) -> Trajectory:
+    return trajectory[int(np.searchsorted(trajectory.t, trajectory.t[0] + seconds)) :]
+
+
+def torque_of(model: Any) -> Torque:
+    def torque(q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
+        with torch.no_grad():
+            found: np.ndarray = model.inverse_dynamics(*(torch.from_numpy(x) for x in (q, qd, qdd))).numpy()
+        return found
+
+    return torque
+
+
+def nmse(torque: Torque, sample: DynamicsSamples) -> float:
+    error = torque(sample.q, sample.qd, sample.qdd) - sample.tau
+    return float((np.square(error).mean(axis=0) / sample.tau.var(axis=0)).mean())
+
+
+def mean(torque: Torque, samples: Sequence[DynamicsSamples]) -> float:
+    return float(np.mean([nmse(torque, sample) for sample in samples]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,156 @@
+"""What a comparison found, as tables: median over seeds, next to the paper's figures."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from spelgen.comparison.paper import PAPER, Published
+from spelgen.render.tables import Cell, Row, Table, number
+
+BASELINE = "phnode"
+Result = Mapping[str, Any]
+
+
+def comparison_tables(
+    robot: str, results: Sequence[Result], step_seconds: Mapping[str, float]
+) -> list[Table]:
+    """The tables of a comparison: sizes and speed (Tables 3 and 4 of the paper), losses (5, 6), laws."""
+    by_variant: dict[str, list[Result]] = {}
+    for result in results:
+        by_variant.setdefault(result["variant"], []).append(result)
+    paper = PAPER.get(robot, {})
+    return [
+        _sizes(by_variant, step_seconds, paper),
+        _losses(by_variant, paper),
+        _spread(by_variant),
+        _laws(by_variant),
+    ]
+
+
+def _sizes(
+    found: Mapping[str, Sequence[Result]], step_seconds: Mapping[str, float], paper: Mapping[str, Published]
+) -> Table:
+    names = tuple(found)
+    first = {name: runs[0]["sizes"] for name, runs in found.items()}
+    rows = [
+        Row(f"outputs of {what}", tuple(Cell(str(first[name]["outputs"][k])) for name in names))
+        for k, what in enumerate("MDGV")
+    ]
+    rows.append(Row("inputs of M", tuple(Cell(str(first[name]["inputs"])) for name in names)))
+    rows.append(_row("parameters", {name: first[name]["parameters"] for name in names}, "{:,.0f}"))
+    milliseconds = {name: 1e3 * step_seconds[name] for name in names}
+    rows.append(_row("training step [ms]", milliseconds, "{:.1f}"))
+    rows += _published(names, paper, "parameters", lambda each: each.parameters, "{:,.0f}")
+    rows += _published(names, paper, "step [s, RTX 4090]", lambda each: each.step_seconds, "{:.2f}")
+    return Table(
+        "Sizes, and the time of a training step here; below, what the paper reports", names, tuple(rows)
+    )
+
+
+def _losses(found: Mapping[str, Sequence[Result]], paper: Mapping[str, Published]) -> Table:
+    names = tuple(found)
+    quantities: dict[str, tuple[str, str]] = {
+        "training loss": ("train", "loss"),
+        "test loss": ("test", "loss"),
+        "prediction loss, 1 s": ("prediction", "loss"),
+        "velocity, 1 s": ("prediction", "velocity"),
+        "position, 1 s": ("prediction", "position"),
+    }
+    rows = [
+        _row(label, {name: _median(found[name], *path) for name in names})
+        for label, path in quantities.items()
+    ]
+    if BASELINE in found:
+        rows.insert(3, Row(f"{BASELINE}'s prediction loss / this", _ratios(found, names, "loss")))
+        rows.insert(5, Row(f"{BASELINE}'s velocity / this", _ratios(found, names, "velocity")))
+    rows.append(_row("M, relative error", {name: _median(found[name], "mass", "error") for name in names}))
+    rows += _published(names, paper, "training loss", lambda each: each.train_loss)
+    rows += _published(names, paper, "test loss", lambda each: each.test_loss)
+    rows += _published(names, paper, "prediction loss", lambda each: each.prediction_loss)
+    rows += _published(names, paper, "velocity", lambda each: each.velocity)
+    rows += _published(names, paper, "position", lambda each: each.position)
+    title = (
+        "Squared errors summed over joints [rad, m, s], mean over samples and windows, and the error of M, "
+        "relative to M; median over seeds; below, what the paper reports"
+    )
+    return Table(title, names, tuple(rows))
+
+
+def _spread(found: Mapping[str, Sequence[Result]]) -> Table:
+    names = tuple(found)
+    seeds = sorted({run["seed"] for runs in found.values() for run in runs})
+    rows = []
+    for seed in seeds:
+        losses = {
+            name: next((x["prediction"]["loss"] for x in found[name] if x["seed"] == seed), None)
+            for name in names
+        }
+        rows.append(_row(f"seed {seed}", losses))
+    return Table("Prediction loss over 1 s of every run", names, tuple(rows))
+
+
+def _laws(found: Mapping[str, Sequence[Result]]) -> Table:
+    names = tuple(found)
+    worst: dict[str, tuple[str, Callable[[list[float]], float]]] = {
+        "least eigenvalue of M / mean": ("least_eigenvalue", min),
+        "|R R^T - I|, 10,000 steps": ("orthogonality", max),
+        "rise of energy, no input": ("energy_rise", max),
+        "energy drift, no friction": ("drift", max),
+    }
+    rows = []
+    for label, (key, pick) in worst.items():
+        values = {name: _worst([run["laws"][key] for run in found[name]], pick) for name in names}
+        rows.append(Row(label, tuple(Cell(number(values[name])) for name in names)))
+    return Table("Laws, worst over seeds; a negative rise is a fall", names, tuple(rows))
+
+
+def _worst(values: Sequence[float | None], pick: Callable[[list[float]], float]) -> float | None:
+    known = [value for value in values if value is not None]
+    return pick(known) if len(known) == len(values) else None
+
+
+def _ratios(found: Mapping[str, Sequence[Result]], names: Sequence[str], key: str) -> tuple[Cell, ...]:
+    """How many times worse than each the baseline predicts."""
+    base = _median(found[BASELINE], "prediction", key)
+    cells = []
+    for name in names:
+        value = _median(found[name], "prediction", key)
+        cells.append(Cell("-" if not value or base is None else f"{base / value:.3g}"))
+    return tuple(cells)
+
+
+def _median(runs: Sequence[Result], group: str, key: str) -> float | None:
+    """Over the seeds; a run that is not finite counts as infinitely bad."""
+    values = [run[group][key] if run[group][key] is not None else float("inf") for run in runs]
+    middle = statistics.median(values)
+    return None if middle == float("inf") else middle
+
+
+def _row(label: str, values: Mapping[str, float | None], form: str | None = None) -> Row:
+    known = [value for value in values.values() if value is not None]
+    least = min(known) if len(known) > 1 else None
+    cells = []
+    for value in values.values():
+        text = number(value) if form is None or value is None else form.format(value)
+        cells.append(Cell(text, best=value is not None and value == least))
+    return Row(label, tuple(cells))
+
+
+def _published(
+    names: Sequence[str],
+    paper: Mapping[str, Published],
+    label: str,
+    of: Callable[[Published], float | None],
+    form: str | None = None,
+) -> list[Row]:
+    """A row of the paper's figures, or none where it has none for this robot."""
+    values = {name: of(paper[name]) if name in paper else None for name in names}
+    if all(value is None for value in values.values()):
+        return []
+    cells = tuple(
+        Cell("" if value is None else number(value) if form is None else form.format(value))
+        for value in values.values()
+    )
+    return [Row(f"paper: {label}", cells)]

@@ -1,1 +1,0 @@
-"""Logs: read, doubted, filtered, cut into windows."""

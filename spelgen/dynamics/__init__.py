@@ -1,0 +1,1 @@
+"""What has M, gravity and friction: Pinocchio's view of an arm or a URDF, the regressor, the tip."""

@@ -1,0 +1,1 @@
+"""The structure said in words: facts, and the reasons for them."""

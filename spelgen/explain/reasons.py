@@ -1,0 +1,115 @@
+"""Why an entry is constant, or equal to another, and why a joint does not matter: the arm's geometry.
+
+M couples joints a and b by the integral of v_a . v_b over the mass that both move, v being the velocity field
+of a unit rate: that integral is what the reasons speak of. Each function gives None where it finds none.
+``{axes}`` in a reason stands for the axes of the other joints concerned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from spelgen.arm.rational import ZERO
+from spelgen.labels import axes_told, entry_name, joints_told
+from spelgen.structure.structure import Entry, Structure
+from spelgen.verify.axes import Axes
+
+
+def constant_reason(axes: Axes, structure: Structure, entry: Entry) -> str | None:
+    """Why ``entry`` is constant."""
+    later, earlier = entry.row, entry.column
+    if later == earlier:
+        return _diagonal_reason(axes, structure, later)
+    if axes.slides[later] and axes.slides[earlier] and axes.fixed_angle(later, earlier):
+        return "the two slide at a fixed angle, and the mass that both move does not change"
+    if axes.slides[later] and not axes.slides[earlier] and axes.keep_offset(later, earlier):
+        return (
+            f"the mass that joint {later + 1} carries keeps its distance from the plane through "
+            f"{axes_told([earlier])} along its slide"
+        )
+    turn = not axes.slides[later] and not axes.slides[earlier]
+    if turn and axes.same_line(later, earlier) and _diagonal_reason(axes, structure, later):
+        sign = "-" if axes.opposed(later, earlier) else ""
+        return (
+            f"{joints_told([earlier, later])} turn about one line, so it is {sign}{entry_name(later, later)}"
+        )
+    return balance_reason(axes, structure, entry)
+
+
+def _diagonal_reason(axes: Axes, structure: Structure, joint: int) -> str | None:
+    behind = range(joint + 1, len(axes.slides))
+    if axes.slides[joint]:
+        return "for a sliding joint the entry is the mass that it carries"
+    if not behind:
+        return f"joint {joint + 1} is the last, so the inertia about its axis stays the same"
+    if all(axes.commute(joint, other) for other in behind):
+        return f"all joints after joint {joint + 1} turn about its axis or slide along it"
+    if len(behind) == 1 and structure.assume == "inertials" and axes.symmetric:
+        return f"what joint {joint + 2} carries is symmetric about its axis"
+    return None
+
+
+def balance_reason(axes: Axes, structure: Structure, entry: Entry) -> str | None:
+    """Why an entry of a balanced last body is what it is: it is Izz times the cosine between the axes."""
+    last, other = len(structure.joints) - 1, entry.column
+    if structure.assume != "inertials" or not axes.balanced or entry.row != last:
+        return None
+    balanced = f"what joint {last + 1} carries is balanced about its axis"
+    if axes.without_inertia:
+        return f"{balanced} and has no moment of inertia about it"
+    if axes.slides[other]:
+        return f"{balanced}, so turning it shifts no mass"
+    if axes.perpendicular(last, other):
+        return f"{balanced}, which is always at right angles to {{axes}}"
+    if axes.fixed_angle(last, other):
+        return f"{balanced}, which keeps its angle to {{axes}}"
+    return None
+
+
+def equality_reason(axes: Axes, structure: Structure, places: Sequence[tuple[int, int]]) -> str | None:
+    """Why entries of one row are equal: their columns' joints move alike what the row's joint carries."""
+    columns = sorted(column for _, column in places)
+    if len({row for row, _ in places}) > 1:
+        return None
+    slides = axes.slides[columns[0]]
+    if all(axes.move_alike(columns[0], column) for column in columns[1:]):
+        return f"{joints_told(columns)} {'slide along one direction' if slides else 'turn about one line'}"
+    last = len(structure.joints) - 1
+    if places[0][0] == last and structure.assume == "inertials" and axes.balanced:
+        turn = not any(axes.slides[column] for column in columns)
+        if turn and all(axes.parallel(columns[0], column) for column in columns[1:]):
+            balanced = f"what joint {last + 1} carries is balanced about its axis"
+            return f"{balanced}, and {joints_told(columns)} are parallel"
+    return None
+
+
+def idle_reason(axes: Axes, structure: Structure, joint: int) -> str | None:
+    """Why M does not depend on ``joint``."""
+    if joint == 0:
+        return "it moves the whole arm as one piece"
+    before = list(range(joint))
+    if all(axes.commute(joint, other) for other in before):
+        return f"it leaves {axes_told(before)} in place, as if it moved the whole arm"
+    if joint == len(axes.slides) - 1 and structure.assume == "inertials" and axes.symmetric:
+        return "what it carries is symmetric about its axis"
+    return None
+
+
+def weightless_reason(axes: Axes, structure: Structure, joint: int) -> str | None:
+    """Why V does not depend on ``joint``."""
+    if axes.lifts_nothing(joint):
+        slides = axes.slides[joint]
+        return "sliding level lifts nothing" if slides else "turning about the vertical lifts nothing"
+    last = joint == len(axes.slides) - 1
+    if last and structure.assume == "inertials" and axes.centred:
+        return "the centre of the mass that it carries lies on its axis"
+    return None
+
+
+def potential_reason(axes: Axes) -> str | None:
+    """Why V is zero."""
+    if axes.arm.gravity == ZERO:
+        return "so is gravity"
+    if all(axes.lifts_nothing(joint) for joint in range(len(axes.slides))):
+        return "every joint turns about gravity's direction or slides across it, which lifts nothing"
+    return None

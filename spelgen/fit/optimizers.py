@@ -1,0 +1,187 @@
+"""How weights move downhill: AdamW on batches, or L-BFGS on all windows at once where these are few.
+
+The gradient of a few hundred windows costs no more than that of a batch and is exact, so curvature pays: simulated
+logs have many digits to find, and an engineer's first log has few windows.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import torch
+
+from spelgen.logs.windows import Windows
+
+VECTOR_FACTOR = 5.0  # on the learning rate of constants and biases
+GRADIENT_NORM = 1.0  # of the scaled loss; larger gradients are shortened to it
+HISTORY = 50  # steps that L-BFGS remembers
+CALL = 20  # evaluations between looks at whether more would help
+STALLED = 1 - 1e-3  # of the loss before a call: what ends above it has found next to nothing
+TOO_LARGE = 1e12  # told to the line search where a loss is not finite, so that it turns back
+
+Loss = Callable[[Windows], torch.Tensor]
+
+
+class Descent(Protocol):
+    """Moves the weights of one model. stalled: whether there is no way down from here."""
+
+    @property
+    def stalled(self) -> bool: ...
+
+    def descend(self, loss: Loss, windows: Windows, steps: int, rate: Callable[[int], float]) -> float:
+        """Take ``steps`` steps on ``loss`` with the learning rates rate(0), rate(1) ... Return the mean loss,
+        NaN as soon as one is not finite.
+        """
+        ...
+
+    def state_dict(self) -> dict[str, Any]: ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None: ...
+
+
+class Batches:
+    """AdamW on batches in random order; single numbers (constants, viscous friction) learn faster than weights
+    and do not decay.
+    """
+
+    def __init__(
+        self, model: torch.nn.Module, batch: int, weight_decay: float, generator: torch.Generator
+    ) -> None:
+        self._parameters = list(model.parameters())
+        self._batch, self._generator = batch, generator
+        weights = [parameter for parameter in self._parameters if parameter.dim() > 1]
+        numbers = [parameter for parameter in self._parameters if parameter.dim() <= 1]
+        self._optimiser = torch.optim.AdamW(
+            [
+                {"params": weights, "weight_decay": weight_decay, "factor": 1.0},
+                {"params": numbers, "weight_decay": 0.0, "factor": VECTOR_FACTOR},
+            ]
+        )
+
+    stalled = False
+
+    def descend(self, loss: Loss, windows: Windows, steps: int, rate: Callable[[int], float]) -> float:
+        """See ``Descent``."""
+        rows, size = steps * self._batch, len(windows)
+        passes = [torch.randperm(size, generator=self._generator) for _ in range(-(-rows // size))]
+        total = 0.0
+        for step, batch in enumerate(torch.cat(passes)[:rows].split(self._batch)):
+            for group in self._optimiser.param_groups:
+                group["lr"] = rate(step) * group["factor"]
+            value = self._step(loss, windows[batch.to(windows.q.device)])
+            if not math.isfinite(value):
+                return math.nan
+            total += value
+        return total / steps
+
+    def _step(self, loss: Loss, windows: Windows) -> float:
+        self._optimiser.zero_grad()
+        try:
+            value = loss(windows)
+        except torch.linalg.LinAlgError:  # numbers blew up within the rollout
+            return math.nan
+        value.backward()
+        norm = torch.nn.utils.clip_grad_norm_(self._parameters, GRADIENT_NORM)
+        if not torch.isfinite(norm):
+            return math.nan
+        self._optimiser.step()
+        return value.item()
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that a resumed run needs."""
+        return self._optimiser.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from a ``state_dict``."""
+        self._optimiser.load_state_dict(state)
+
+
+class WholeSet:
+    """L-BFGS (Liu and Nocedal, Math. Programming 45, 1989) with a strong-Wolfe line search on all windows.
+
+    A step is an evaluation. decay: factor of half the sum of squares of all weights, which is added to the loss;
+    the learning rate is not used.
+    """
+
+    def __init__(self, model: torch.nn.Module, decay: float) -> None:
+        self._parameters = list(model.parameters())
+        self._weights = [parameter for parameter in self._parameters if parameter.dim() > 1]
+        self._decay, self._sound = decay, True
+        self._waits, self._reached = 0, (math.inf, math.inf)  # loss, and with the penalty
+        self._optimiser = torch.optim.LBFGS(
+            self._parameters,
+            history_size=HISTORY,
+            line_search_fn="strong_wolfe",
+            tolerance_grad=1e-12,
+            tolerance_change=1e-15,
+        )
+
+    def descend(
+        self, loss: Callable[[Any], torch.Tensor], windows: Any, steps: int, rate: Callable[[int], float]
+    ) -> float:
+        """See ``Descent``; the loss where it ends, NaN where no evaluation was finite."""
+        group = self._optimiser.param_groups[0]
+        group["max_iter"], group["max_eval"] = steps, steps
+        self._sound = False
+        self._optimiser.step(lambda: self._evaluated(loss, windows))
+        if not self._sound:
+            return math.nan
+        try:
+            with torch.no_grad():
+                found = loss(windows)
+                reached = (found + self._penalty()).item()
+        except torch.linalg.LinAlgError:
+            return math.nan
+        now = (found.item(), reached)
+        found_nothing = all(x > STALLED * before for x, before in zip(now, self._reached, strict=True))
+        self._waits = self._waits + 1 if found_nothing else 0
+        self._reached = now
+        return found.item()
+
+    @property
+    def stalled(self) -> bool:
+        """Whether two calls in a row found next to nothing."""
+        return self._waits > 1
+
+    def _evaluated(self, loss: Callable[[Any], torch.Tensor], windows: Any) -> torch.Tensor:
+        self._optimiser.zero_grad()
+        try:
+            value = loss(windows) + self._penalty()
+            value.backward()
+            slopes = torch.cat([x.grad.flatten() for x in self._parameters if x.grad is not None])
+            if value.isfinite() and slopes.isfinite().all():
+                self._sound = True
+                return value.detach()
+        except torch.linalg.LinAlgError:
+            pass
+        self._optimiser.zero_grad()
+        return torch.tensor(TOO_LARGE, dtype=torch.float64)
+
+    def _penalty(self) -> torch.Tensor | float:
+        return 0.5 * self._decay * sum(weight.square().sum() for weight in self._weights)
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that a resumed run needs."""
+        return {
+            "optimiser": self._optimiser.state_dict(),
+            "reached": self._reached,
+            "waits": self._waits,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from a ``state_dict``."""
+        self._optimiser.load_state_dict(state["optimiser"])
+        self._reached, self._waits = state["reached"], state["waits"]
+
+
+def minimise(model: torch.nn.Module, loss: Callable[[], torch.Tensor], most: int, decay: float = 0.0) -> int:
+    """Move the model's weights down ``loss`` by ``WholeSet`` until that stalls or about ``most`` evaluations are
+    made; return how many were.
+    """
+    descent, done = WholeSet(model, decay), 0
+    while done < most and not descent.stalled:
+        descent.descend(lambda _: loss(), None, CALL, lambda _: 1.0)
+        done += CALL
+    return done

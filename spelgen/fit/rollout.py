@@ -1,0 +1,180 @@
+"""Predict windows with a model: an ODE solve from the first sample, the input held over each step."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+import torch
+
+from spelgen.logs.windows import Windows
+
+if TYPE_CHECKING:
+    from spelgen.fit.run_folder import EmittedModel
+
+SUBSTEPS = (1, 2, 4, 8, 16, 32)
+INTEGRATION_SHARE = 0.03  # of the model's own error, what the integrator may add
+LEAST_ERROR = 1e-2  # no model is expected to be better, in units of the scales
+
+
+class Dynamics(Protocol):
+    """What a rollout needs of an emitted module; see its docstrings for shapes."""
+
+    def momentum(self, q: torch.Tensor, qd: torch.Tensor, prepared: Any = None) -> torch.Tensor: ...
+
+    def velocity(self, q: torch.Tensor, p: torch.Tensor, prepared: Any = None) -> torch.Tensor: ...
+
+    def prepare(self) -> Any: ...
+
+    def rates(
+        self, q: torch.Tensor, p: torch.Tensor, tau: torch.Tensor | None, prepared: Any
+    ) -> tuple[torch.Tensor, torch.Tensor]: ...
+
+
+def roll_out(model: Dynamics, windows: Windows, substeps: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Positions and velocities (W, K-1, n) predicted for samples 1..K-1 of each window from its sample 0.
+
+    The state is (q, p), p = M(q) qd, so that no derivative of M in time is needed. Between samples stand
+    `substeps` steps of the classical Runge-Kutta method, each window's as long as its own sample times say:
+    windows make one batch, and the input's jumps fall on the ends of steps. Written out here and not left to
+    torchdiffeq, which cannot know that the weights stay the same over the whole window: `prepare` readies
+    them once.
+    """
+    prepared = model.prepare()
+    q = windows.q[:, 0]
+    p = model.momentum(q, windows.qd[:, 0], prepared)
+    positions, velocities = [], []
+    for dt, tau in zip(windows.dt.unbind(1), windows.tau.unbind(1), strict=True):
+        step = dt.unsqueeze(-1) / substeps
+        for substep in range(substeps):
+            q, p, qd = _runge_kutta(model, q, p, tau, prepared, step)
+            if substep == 0:
+                velocities.append(qd)  # of the sample that the interval starts at
+        positions.append(q)
+    velocities = [*velocities[1:], model.velocity(q, p, prepared)]
+    return torch.stack(positions, dim=1), torch.stack(velocities, dim=1)  # each (W, K-1, n)
+
+
+def _runge_kutta(
+    model: Dynamics, q: torch.Tensor, p: torch.Tensor, tau: torch.Tensor, prepared: Any, step: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """q and p (W, n) one `step` (W, 1) [s] later, and q' at its start (Hairer et al., Solving ODEs I, II.1)."""
+    qd1, pd1 = model.rates(q, p, tau, prepared)
+    half = step / 2
+    qd2, pd2 = model.rates(q + half * qd1, p + half * pd1, tau, prepared)
+    qd3, pd3 = model.rates(q + half * qd2, p + half * pd2, tau, prepared)
+    qd4, pd4 = model.rates(q + step * qd3, p + step * pd3, tau, prepared)
+    sixth = step / 6
+    q = q + sixth * (qd1 + 2 * (qd2 + qd3) + qd4)
+    p = p + sixth * (pd1 + 2 * (pd2 + pd3) + pd4)
+    return q, p, qd1
+
+
+def position_difference(
+    predicted: torch.Tensor, measured: torch.Tensor, joint_types: Sequence[str]
+) -> torch.Tensor:
+    """Signed distance (..., n): prismatic the difference, revolute the geodesic distance on SO(3).
+
+    For rotations about one common axis, R = exp(q e), the geodesic distance |log(R^T R')| / sqrt(2) is the
+    wrapped angle |q' - q - 2 pi round((q' - q) / 2 pi)|, so the log map of SPEL eq. 8 needs no matrices
+    here.
+    """
+    turn = torch.tensor(
+        [2 * math.pi if kind == "revolute" else math.inf for kind in joint_types], dtype=predicted.dtype
+    )
+    difference = predicted - measured
+    turns = torch.round(difference.detach() / turn.to(predicted.device))
+    return difference - turns.nan_to_num() * turn.nan_to_num(posinf=0.0).to(predicted.device)
+
+
+@dataclass(frozen=True, eq=False)
+class LossScales:
+    """One unit of error: for each sample but the first and joint (K-1, n), the root mean square change of q and
+    qd since the window's first sample; for each joint (n,) the standard deviation of tau.
+    """
+
+    q: torch.Tensor
+    qd: torch.Tensor
+    tau: torch.Tensor
+
+    def to(self, device: str | torch.device) -> LossScales:
+        """The same scales on another device."""
+        return LossScales(self.q.to(device), self.qd.to(device), self.tau.to(device))
+
+
+def loss_scales(windows: Windows, joint_types: Sequence[str]) -> LossScales:
+    """The scales of these windows; for a joint that hardly moves, a hundredth of the largest one."""
+    moved = position_difference(windows.q[:, 1:], windows.q[:, :1], joint_types)
+    changed = windows.qd[:, 1:] - windows.qd[:, :1]
+    varied = windows.tau - windows.tau.mean(dim=(0, 1))
+    means = moved.square().mean(dim=0), changed.square().mean(dim=0), varied.square().mean(dim=(0, 1))
+    scales = [mean.sqrt() for mean in means]
+    return LossScales(
+        *(torch.maximum(x, (1e-2 * x.amax(dim=-1, keepdim=True)).clamp(min=1e-9)) for x in scales)
+    )
+
+
+def rollout_errors(model: EmittedModel, windows: Windows, scales: LossScales, substeps: int) -> torch.Tensor:
+    """Scaled errors (W, K-1, 2n) of the rollout: of the positions, then of the velocities."""
+    q, qd = roll_out(model, windows, substeps)
+    position = position_difference(q, windows.q[:, 1:], model.joint_types) / scales.q
+    return torch.cat([position, (qd - windows.qd[:, 1:]) / scales.qd], dim=-1)
+
+
+def rollout_loss(model: EmittedModel, windows: Windows, scales: LossScales, substeps: int) -> torch.Tensor:
+    """SPEL eq. 8: squared geodesic distance plus squared velocity error, here scaled per joint and averaged.
+
+    The paper sums over joints and samples in rad and rad/s; scaled, a wrist counts as much as a shoulder and
+    the next sample as much as the last, and 1 is the loss of predicting that nothing changes.
+    """
+    return rollout_errors(model, windows, scales, substeps).square().mean()
+
+
+def momentum_loss(model: EmittedModel, windows: Windows, scales: LossScales) -> torch.Tensor:
+    """The weak form of the equations: p(t) - p(0) against the impulse of all forces along the measured
+    samples.
+
+    Forces between samples are the mean of their values at both ends (trapezium rule): no ODE is solved and no
+    acceleration needed. What is missing is told as mean torque, in units of its standard deviation at the
+    joint. (Told as a velocity, M(q)^-1 times it, it would reward an M that is too large: errors of the measured
+    torque would count less.)
+    """
+    q, qd = windows.q, windows.qd  # (W, K, n)
+    prepared = model.prepare()
+    p = model.momentum(q, qd, prepared)
+    force = model.rates(q, p, None, prepared)[1]
+    dt = windows.dt.unsqueeze(-1)
+    inputs = model.input_matrix(q[:, :-1])
+    push = (inputs @ windows.tau.unsqueeze(-1)).squeeze(-1)
+    impulse = (dt * (push + (force[:, :-1] + force[:, 1:]) / 2)).cumsum(dim=1)  # (W, K-1, n)
+    missing = (p[:, 1:] - p[:, :1] - impulse) / dt.cumsum(dim=1)
+    unit = (inputs.detach().abs() @ scales.tau).mean(dim=(0, 1))  # gears may stand between motor and joint
+    return (missing / torch.maximum(unit, 1e-2 * unit.amax())).square().mean()
+
+
+def integration_error(model: EmittedModel, windows: Windows, scales: LossScales, substeps: int) -> float:
+    """Difference between rollouts with `substeps` and with twice as many, relative to the error of the
+    latter.
+
+    Both are root mean squares in units of `scales`; of the model's error, at least LEAST_ERROR is taken.
+    """
+    try:
+        with torch.no_grad():
+            fine = rollout_errors(model, windows, scales, 2 * substeps)
+            difference = rollout_errors(model, windows, scales, substeps) - fine
+    except torch.linalg.LinAlgError:  # numbers blew up
+        return math.inf
+    error = difference.square().mean().sqrt().item() / max(fine.square().mean().sqrt().item(), LEAST_ERROR)
+    return error if math.isfinite(error) else math.inf
+
+
+def choose_substeps(model: EmittedModel, windows: Windows, scales: LossScales, start: int = 1) -> int:
+    """The fewest rk4 steps per sample interval, from `start` on, that make integration a small part of the
+    error.
+    """
+    for substeps in SUBSTEPS:
+        if substeps >= start and integration_error(model, windows, scales, substeps) < INTEGRATION_SHARE:
+            return substeps
+    return max(start, SUBSTEPS[-1])

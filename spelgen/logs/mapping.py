@@ -1,0 +1,170 @@
+"""How a user's logs are named and measured: the group `logs` of a sidecar file, or a mapping file of its own.
+
+q = sign * unit * value + offset, qd = sign * unit * value, tau = sign * gain * unit * value + torque_offset.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import pi
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from spelgen.errors import SettingsError
+from spelgen.settings.values import Group, Number, Positive
+
+PLAIN = {"t": "t", "trajectory": "trajectory", "q": "q_{joint}", "qd": "qd_{joint}", "tau": "tau_{joint}"}
+"""Columns as spelgen itself writes them."""
+
+TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+ANGLES = {"rad": 1.0, "deg": pi / 180, "turns": 2 * pi}
+LENGTHS = {"m": 1.0, "mm": 1e-3}
+RATES = {"rpm": 2 * pi / 60, **{f"{name}/s": value for name, value in {**ANGLES, **LENGTHS}.items()}}
+EFFORTS = {"Nm": 1.0, "mNm": 1e-3, "N": 1.0, "A": 1.0, "mA": 1e-3}
+CURRENTS = ("A", "mA")
+COUNTS = ("counts", "counts/s")
+ONLY = {  # units that a joint of this kind cannot have
+    "revolute": ("m", "mm", "m/s", "mm/s", "N"),
+    "prismatic": ("rad", "deg", "turns", "rad/s", "deg/s", "turns/s", "rpm", "Nm", "mNm"),
+}
+
+Time = Literal["s", "ms", "us", "ns"]
+Position = Literal["rad", "deg", "turns", "counts", "m", "mm"]
+Velocity = Literal["rad/s", "deg/s", "turns/s", "rpm", "counts/s", "m/s", "mm/s"]
+Effort = Literal["Nm", "mNm", "N", "A", "mA"]
+
+
+class LogColumns(Group):
+    """Names of the columns; `{joint}` stands for the joint's `name`, `{trajectory}` (NPZ) for any text."""
+
+    t: str = PLAIN["t"]
+    trajectory: str = PLAIN["trajectory"]
+    q: str = PLAIN["q"]
+    qd: str = PLAIN["qd"]
+    tau: str = PLAIN["tau"]
+
+
+class JointColumns(Group):
+    """Columns of one joint that follow no pattern."""
+
+    q: str | None = None
+    qd: str | None = None
+    tau: str | None = None
+
+
+class JointUnits(Group):
+    """Units of one joint's columns; None: those of all joints."""
+
+    q: Position | None = None
+    qd: Velocity | None = None
+    tau: Effort | None = None
+
+
+class LogUnits(JointUnits):
+    """Units of all columns; None: SI units, and degrees are still smelt."""
+
+    t: Time = "s"
+
+
+class JointLog(Group):
+    """How one joint is logged.
+
+    name: the joint's name in the log; None: the URDF's. counts_per_turn, counts_per_metre: of the joint.
+    sign: -1 where the log's sense is the opposite of the URDF's, of position, velocity and torque.
+    offset: the joint's position where the log says 0 [rad, m]. gain: torque per logged unit, e.g. gear x
+    motor constant [Nm/A]; negative where current and velocity have opposite senses. torque_offset [Nm, N].
+    """
+
+    name: str | None = None
+    columns: JointColumns = JointColumns()
+    units: JointUnits = JointUnits()
+    counts_per_turn: Positive | None = None
+    counts_per_metre: Positive | None = None
+    sign: Literal[1, -1] = 1
+    offset: Number = 0.0
+    gain: Number | None = None
+    torque_offset: Number = 0.0
+
+    @model_validator(mode="after")
+    def _moves(self) -> JointLog:
+        if self.gain == 0.0:
+            raise ValueError("a gain that is not 0")
+        return self
+
+
+class LogMapping(Group):
+    """From a log's columns to t, q, qd, tau in SI units.
+
+    topic: of the ROS 2 bag, where it holds several with joint states. velocity: "differentiated" where the
+    log has none. Files that spelgen wrote itself are read as they are, whatever stands here.
+    """
+
+    topic: str | None = None
+    columns: LogColumns = LogColumns()
+    units: LogUnits = LogUnits()
+    velocity: Literal["logged", "differentiated"] = "logged"
+    joints: dict[str, JointLog] = Field(default={})
+
+    def joint(self, name: str) -> JointLog:
+        """How a joint is logged, by its URDF name."""
+        return self.joints.get(name, JointLog())
+
+    def log_name(self, joint: str) -> str:
+        """A joint's name in the log."""
+        return self.joint(joint).name or joint
+
+    def column(self, quantity: str, joint: str) -> str:
+        """The column that holds "q", "qd" or "tau" of a joint."""
+        own: str | None = getattr(self.joint(joint).columns, quantity)
+        pattern: str = getattr(self.columns, quantity)
+        return own or pattern.replace("{joint}", self.log_name(joint))
+
+    def of_trajectory(self, text: str) -> LogMapping:
+        """The mapping for one recording of a file: `{trajectory}` in the columns' names is its text."""
+        named = {key: name.replace("{trajectory}", text) for key, name in self.columns.model_dump().items()}
+        return self.model_copy(update={"columns": LogColumns(**named)})
+
+    def unit(self, quantity: str, joint: str) -> str | None:
+        """The unit of "q", "qd" or "tau" of a joint; None where none was said."""
+        own: str | None = getattr(self.joint(joint).units, quantity)
+        return own or getattr(self.units, quantity)
+
+    def scale(self, quantity: str, joint: str) -> float:
+        """What a logged value is multiplied with, sign included."""
+        logged, unit = self.joint(joint), self.unit(quantity, joint)
+        if quantity == "tau":
+            return logged.sign * (1.0 if logged.gain is None else logged.gain) * EFFORTS[unit or "Nm"]
+        if unit in COUNTS:
+            turn = logged.counts_per_turn
+            return logged.sign * (2 * pi / turn if turn else 1.0 / (logged.counts_per_metre or 1.0))
+        return logged.sign * {**ANGLES, **LENGTHS, **RATES}[unit or "rad"]
+
+    def offset(self, quantity: str, joint: str) -> float:
+        """What is added after that."""
+        logged = self.joint(joint)
+        return {"q": logged.offset, "tau": logged.torque_offset}.get(quantity, 0.0)
+
+    def misfits(self, joints: Sequence[str], joint_types: Sequence[str] | None = None) -> list[SettingsError]:
+        """What the mapping lacks for these joints, or says of them that cannot be; empty where it fits."""
+        found = []
+        kinds: Sequence[str | None] = joint_types or [None] * len(joints)
+        for joint, kind in zip(joints, kinds, strict=True):
+            for quantity in ("q", "qd", "tau"):
+                unit = self.unit(quantity, joint)
+                missing = self._missing(unit, self.joint(joint), kind)
+                if missing:
+                    where = f"logs: joint {joint!r}, {quantity}"
+                    found.append(SettingsError(f"the unit {unit}", element=where, expected=missing))
+        return found
+
+    def _missing(self, unit: str | None, logged: JointLog, kind: str | None) -> str | None:
+        if unit in CURRENTS and logged.gain is None:
+            return "a gain beside it"
+        if unit in COUNTS:
+            counts = {"revolute": logged.counts_per_turn, "prismatic": logged.counts_per_metre}
+            if not any(counts.values() if kind is None else [counts[kind]]):
+                return f"{'counts_per_metre' if kind == 'prismatic' else 'counts_per_turn'} beside it"
+        if unit in ONLY.get(kind or "", ()):
+            return f"one of a {kind} joint"
+        return None

@@ -1,0 +1,232 @@
+"""Log files <-> trajectories, in SI units and the URDF's senses: no filtering, no resampling, no repair."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+
+from spelgen.errors import LogError, SpelgenError, collect
+from spelgen.logs.mapping import TIMES, LogMapping
+from spelgen.logs.tables import SUFFIXES, UNITS, UNITS_KEY, LogTable, is_log, read_tables, wanted_quantities
+from spelgen.logs.trajectory import QUANTITIES, Trajectory, gap_ends
+
+KINDS = f"{', '.join(SUFFIXES)}, or the folder of a ROS 2 bag"
+ROW_GROUP = 2**16  # rows that are written together: a log too large for memory is read by them
+EXACT = 2**53  # whole numbers up to here are exact as floating-point numbers
+
+Named = tuple[tuple[str, str, str], Trajectory]
+"""A trajectory and its possible names, from the shortest to the surely unique one."""
+
+
+def read_logs(
+    paths: Iterable[Path | str],
+    joints: Sequence[str],
+    *,
+    role: str | None = None,
+    mapping: LogMapping | None = None,
+    joint_types: Sequence[str] | None = None,
+) -> list[Trajectory]:
+    """All trajectories of the given files and folders, in sorted order of their files.
+
+    joints: the URDF's joint names; without a mapping, joint j has the columns `q_<j>`, `qd_<j>`, `tau_<j>`,
+    beside the time `t` [s]. A column `trajectory` splits one file into several. role "train" or "test": of a
+    folder that holds train.* or test.* files, only those with this stem are read. joint_types: what the
+    mapping's units are checked against.
+    Raises LogError (or one error that holds several) naming file, row and column, and SettingsError where
+    the mapping does not fit the joints.
+    """
+    mapping = mapping or LogMapping()
+    collect(mapping.misfits(joints, joint_types))
+    errors: list[SpelgenError] = []
+    labelled: list[Named] = []
+    for file in log_files(paths, role, errors):
+        try:
+            for each in read_tables(file, tuple(joints), mapping):
+                labelled += _trajectories(each, file, joints)
+        except LogError as error:
+            errors.append(error)
+    collect(errors)
+    return _with_unique_names(labelled)
+
+
+def write_logs(path: Path | str, trajectories: Sequence[Trajectory], joints: Sequence[str]) -> None:
+    """Write one Parquet or CSV file (by suffix) with a `trajectory` column, all or nothing.
+
+    `read_logs` gives the same numbers back from either. Parquet files declare their units.
+    """
+    path = Path(path)
+    write = _writer(path)
+    columns: dict[str, np.ndarray | list[str]] = {
+        "trajectory": [x.name for x in trajectories for _ in x.t],
+        "t": np.concatenate([x.t for x in trajectories]),
+    }
+    for quantity in QUANTITIES:
+        values = np.concatenate([getattr(x, quantity) for x in trajectories])
+        columns |= {f"{quantity}_{joint}": values[:, i] for i, joint in enumerate(joints)}
+    table = pa.table(columns).replace_schema_metadata({UNITS_KEY: UNITS})
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(path.name + ".tmp")
+    write(table, unfinished)
+    os.replace(unfinished, path)
+
+
+def _writer(path: Path) -> Callable[[pa.Table, Path], None]:
+    writers: dict[str, Callable[[pa.Table, Path], None]] = {
+        ".parquet": partial(pa.parquet.write_table, row_group_size=ROW_GROUP),
+        ".csv": pa.csv.write_csv,
+    }
+    if path.suffix not in writers:
+        raise LogError(f"a log named {path.name!r}", expected=" or ".join(writers))
+    return writers[path.suffix]
+
+
+def log_files(paths: Iterable[Path | str], role: str | None, errors: list[SpelgenError]) -> list[Path]:
+    """The files and bags that these paths name, each once; what cannot be one is added to the errors."""
+    files: dict[Path, None] = {}
+    for path in map(Path, paths):
+        if is_log(path) and path.exists():
+            files[path] = None
+        elif path.is_dir():
+            found = _folder_files(path, role)
+            if not found:
+                errors.append(LogError("a folder without logs", file=path, expected=KINDS))
+            files |= dict.fromkeys(found)
+        elif not path.exists():
+            errors.append(
+                LogError("no such file or folder", file=path, expected="a log", do="check the path")
+            )
+        else:
+            errors.append(LogError(f"a file of kind {path.suffix!r}", file=path, expected=KINDS))
+    return list(files)
+
+
+def _folder_files(folder: Path, role: str | None) -> list[Path]:
+    found = sorted(filter(is_log, folder.iterdir()))
+    if role and any(path.stem in ("train", "test") for path in found):
+        return [path for path in found if path.stem == role]
+    return found
+
+
+def _trajectories(part: LogTable, file: Path, joints: Sequence[str]) -> list[Named]:
+    """The trajectories of one table."""
+    if not part.table.num_rows:
+        raise LogError("no rows", file=file, expected="at least one window of samples")
+    data = table_values(part, file, clock_start(part))
+    labels = None if part.labels is None else np.array(part.table[part.labels].to_pylist(), dtype=str)
+    declared = part.declares_units or all(part.mapping.unit("q", joint) for joint in joints)
+    names = [part.recording or file.stem] if labels is None else list(dict.fromkeys(labels.tolist()))
+    found = []
+    for name in names:
+        rows = np.arange(len(data)) if labels is None else np.flatnonzero(labels == name)
+        t = data[rows, 0] * TIMES[part.mapping.units.t]
+        require_increasing_times(t, rows, file, part.wanted[0])
+        trajectory = replace(
+            in_si(t, data[rows, 1:], joints, part.mapping), file=file, declares_units=declared
+        )
+        found.append(((name, f"{file.stem}/{name}", f"{file}/{name}"), trajectory))
+    return found
+
+
+def in_si(t: np.ndarray, data: np.ndarray, joints: Sequence[str], mapping: LogMapping) -> Trajectory:
+    """Times (T,) [s] and columns as logged, q, qd (where it is logged) and tau by joint (T, 3n or 2n) -> a
+    trajectory without a name.
+    """
+    logged = wanted_quantities(mapping)
+    values = dict(zip(logged, np.split(data, len(logged), axis=1), strict=True))
+    for quantity, columns in values.items():
+        factors = np.array([mapping.scale(quantity, joint) for joint in joints])
+        offsets = np.array([mapping.offset(quantity, joint) for joint in joints])
+        values[quantity] = columns * factors + offsets
+    qd = values["qd"] if "qd" in values else _differentiated(t, values["q"])
+    return Trajectory("", t, values["q"], qd, values["tau"])
+
+
+def _differentiated(t: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Central differences (T, n) within each gap-free piece; 0 for a sample alone, of which no window is cut."""
+    qd = np.zeros_like(q)
+    for start, stop in pairwise(gap_ends(t)):
+        if stop - start > 1:
+            qd[start:stop] = np.gradient(q[start:stop], t[start:stop], axis=0)
+    return qd
+
+
+def clock_start(part: LogTable) -> int:
+    """From where times count: the first one of a clock too wide for floating-point numbers, else 0."""
+    first = part.table[part.wanted[0]][:1]
+    if pa.types.is_timestamp(first.type):
+        return first.cast(pa.timestamp("ns")).cast(pa.int64())[0].as_py() or 0
+    wide = pa.types.is_integer(first.type) and abs(first[0].as_py() or 0) > EXACT
+    return first[0].as_py() if wide else 0
+
+
+def table_values(part: LogTable, file: Path, start: int, row: int = 0) -> np.ndarray:
+    """The wanted columns as logged (T, 1 + 3n or 2n), times from `start` on. row: of the table in its file."""
+    data = np.stack([_numbers(part, column, file, start) for column in part.wanted], axis=1)
+    require_finite(data, part.wanted, file, row)
+    return data
+
+
+def _numbers(part: LogTable, column: str, file: Path, start: int) -> np.ndarray:
+    """A column as float64 (T,)."""
+    values = part.table[column]
+    try:
+        if column == part.wanted[0]:
+            if pa.types.is_timestamp(values.type):
+                nanoseconds = values.cast(pa.timestamp("ns")).cast(pa.int64()).to_numpy()
+                return (nanoseconds - start) * 1e-9 / TIMES[part.mapping.units.t]
+            if start:
+                return (values.to_numpy() - start).astype(float)
+        return values.cast(pa.float64()).to_numpy()
+    except (pa.ArrowException, ValueError) as error:
+        kind = part.table.schema.field(column).type
+        raise LogError(
+            f"values of type {kind}", file=file, element=f"column {column}", expected="numbers"
+        ) from error
+
+
+def require_finite(data: np.ndarray, columns: Sequence[str], file: Path, first: int = 0) -> None:
+    """Raise LogError where a column of the data (T, C), from row `first` of the file on, is not finite."""
+    bad = ~np.isfinite(data)
+    if bad.any():
+        row, column = np.argwhere(bad)[0] + (first, 0)
+        count = int(bad.any(axis=1).sum())
+        raise LogError(
+            f"no finite number ({count} of {len(data)} rows have such a gap, this is the first)",
+            file=file, line=_line(file, row), element=f"row {row + 1}, column {columns[column]}",
+            expected="a number", do="remove those rows; a gap in t is understood",
+        )  # fmt: skip
+
+
+def require_increasing_times(t: np.ndarray, rows: np.ndarray, file: Path, column: str) -> None:
+    """Raise LogError unless times (T,), of these rows of the file, increase."""
+    back = np.flatnonzero(np.diff(t) <= 0)
+    if back.size:
+        k = int(back[0])
+        raise LogError(
+            f"t = {t[k + 1]:g} s after {t[k]:g} s ({back.size} such steps, this is the first)",
+            file=file, line=_line(file, rows[k + 1]), element=f"row {rows[k + 1] + 1}, column {column}",
+            expected="increasing times",
+            do="sort the rows, drop repeats, or split recordings by a column 'trajectory'",
+        )  # fmt: skip
+
+
+def _line(file: Path, row: int) -> int | None:
+    """The line of a 0-based data row, where the format has lines (a CSV's first is its header)."""
+    return int(row) + 2 if file.suffix == ".csv" else None
+
+
+def _with_unique_names(labelled: Sequence[Named]) -> list[Trajectory]:
+    for level in range(3):
+        names = [labels[level] for labels, _ in labelled]
+        if len(set(names)) == len(names):
+            break
+    return [replace(x, name=name) for name, (_, x) in zip(names, labelled, strict=True)]

@@ -1,0 +1,88 @@
+"""What a trained model has learned that is a plain number: the constants of its mass matrix."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from spelgen.fit.run_folder import RunFolder, load_model
+
+CONSTANTS = ("constants", "constant_scale", "constant_basis")
+ROTORS = ("rotor", "rotor_size")
+INERTIA_UNITS = {"revolute revolute": "kg m²", "prismatic prismatic": "kg"}
+
+
+@dataclass(frozen=True)
+class Constant:
+    """A trained constant: what it is, where it enters M, its value before training and after, in that
+    entry's unit.
+    """
+
+    what: str
+    where: str
+    start: float
+    learned: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Learned:
+    """parameters: how many numbers were trained. constants: those of M, none where the preset has none."""
+
+    parameters: int
+    constants: tuple[Constant, ...]
+
+
+def read_learned(run: RunFolder) -> Learned:
+    """What the best model of a run has learned. Raises ModuleError or RunError when it cannot be read."""
+    model = load_model(run.module)
+    parameters = sum(parameter.numel() for parameter in model.parameters())
+    before, after = model.state_dict(), run.load_state(run.weights)
+    found: list[Constant] = []
+    if all(key in state for key in CONSTANTS for state in (before, after)):
+        basis = after["constant_basis"].reshape(-1, model.n, model.n)
+        values = zip(basis, _constants(before), _constants(after), strict=True)
+        found += [_constant(*each, model.joint_types) for each in values]
+    if all(key in state for key in ROTORS for state in (before, after)):
+        drives = zip(_rotors(before), _rotors(after), model.joint_types, strict=True)
+        found += [_rotor(index, *each) for index, each in enumerate(drives)]
+    return Learned(parameters, tuple(found))
+
+
+def _constants(state: Mapping[str, Any]) -> list[float]:
+    constants = state["constants"]
+    # where the mass matrix is all constants, the module takes their sizes so that it stays positive definite
+    sizes = constants if "output_basis" in state else constants.abs()
+    return (sizes * state["constant_scale"]).tolist()
+
+
+def _rotors(state: Mapping[str, Any]) -> list[float]:
+    return (state["rotor_size"] * state["rotor"].exp()).tolist()
+
+
+def _constant(basis: torch.Tensor, start: float, learned: float, joint_types: Sequence[str]) -> Constant:
+    entries = [(i, j) for i, j in basis.tril().nonzero().tolist()]
+    where = " ".join(
+        f"{_factor(basis[i, j].item(), k == 0)}M{entry_index(i, j)}" for k, (i, j) in enumerate(entries)
+    )
+    unit = INERTIA_UNITS.get(" ".join(joint_types[k] for k in entries[0]), "kg m")
+    return Constant("links", where, start, learned, unit)
+
+
+def _rotor(index: int, start: float, learned: float, kind: str) -> Constant:
+    unit = INERTIA_UNITS[f"{kind} {kind}"]
+    return Constant(f"drive of joint {index + 1}", f"M{entry_index(index, index)}", start, learned, unit)
+
+
+def entry_index(row: int, column: int) -> str:
+    """`21` for row 1, column 0: how an entry of a matrix is called."""
+    return f"{row + 1}{column + 1}" if row < 9 else f"({row + 1},{column + 1})"
+
+
+def _factor(value: float, first: bool) -> str:
+    """`2 `, `- 0.5 `, `+ `: a coefficient in a sum of entries."""
+    sign = ("-" if first else "- ") if value < 0 else ("" if first else "+ ")
+    return sign if abs(value) == 1 else f"{sign}{abs(value):.4g} "

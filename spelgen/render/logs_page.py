@@ -1,0 +1,76 @@
+"""A survey as one self-contained HTML page, with what was logged drawn joint by joint."""
+
+from __future__ import annotations
+
+import numpy as np
+from markupsafe import Markup
+
+from spelgen import __version__
+from spelgen.arm.arm import Arm
+from spelgen.dynamics.regressor import regressor, urdf_parameters
+from spelgen.logs.formatting import heading, listings
+from spelgen.logs.report import Survey
+from spelgen.logs.trajectory import Trajectory, split_at_gaps
+from spelgen.render.charts import Line, line_chart
+from spelgen.render.plots import UNITS, JointCharts
+from spelgen.templates import render
+
+DRAWN = 600  # points of a line: what `line_chart` shows
+
+
+def page(found: Survey, arm: Arm, inputs: np.ndarray) -> str:
+    """The page about ``found``. It has no scripts and needs no other file; names are escaped.
+
+    inputs: G (n, n), which takes logged torques to the joints'.
+    """
+    return render(
+        "logs.html.jinja",
+        version=__version__,
+        robot=found.robot,
+        heading=heading(found),
+        tables=listings(found),
+        findings=found.findings,
+        errors=found.errors,
+        examples=[(each.name, charts(each, arm, inputs)) for each in found.examples],
+    )
+
+
+def charts(trajectory: Trajectory, arm: Arm, inputs: np.ndarray) -> list[JointCharts]:
+    """By joint: q; qd beside dq/dt; the joint's torque beside the URDF's gravity torque."""
+    every = -(-len(trajectory.t) // DRAWN)
+    pieces = [piece[::every] for piece in split_at_gaps(trajectory)]
+    t, q, qd, tau = (
+        np.concatenate([getattr(piece, name) for piece in pieces]) for name in ("t", "q", "qd", "tau")
+    )
+    slope, tau = np.concatenate([_slope(piece) for piece in pieces]), tau @ inputs.T
+    still = np.zeros_like(q)
+    gravity = regressor(arm, q, still, still) @ urdf_parameters(arm)  # (T, n)
+    believed = any(body.inertia for body in arm.bodies)
+    drawn = []
+    for k, coordinate in enumerate(arm.coordinates):
+        units, force = UNITS[coordinate.kind], "Nm" if coordinate.kind == "revolute" else "N"
+        torque = [Line("logged", t, tau[:, k], "truth")]
+        torque += [Line("gravity of the URDF", t, gravity[:, k], "predicted")] if believed else []
+        lines = (
+            ("position", units[0], [Line("logged", t, q[:, k], "truth")]),
+            (
+                "velocity",
+                units[1],
+                [Line("logged", t, qd[:, k], "truth"), Line("dq/dt", t, slope[:, k], "predicted")],
+            ),
+            ("torque", force, torque),
+        )
+        name = coordinate.name
+        drawn.append(JointCharts(name, tuple(_chart(what, unit, name, each) for what, unit, each in lines)))
+    return drawn
+
+
+def _chart(what: str, unit: str, joint: str, lines: list[Line]) -> Markup:
+    return line_chart(lines, f"{what} of {joint}", "t [s]", f"{what} [{unit}]", width=330, height=190)
+
+
+def _slope(piece: Trajectory) -> np.ndarray:
+    """dq/dt (T, n) by differences of what is drawn; NaN for a sample alone."""
+    if len(piece.t) < 2:
+        return np.full_like(piece.q, np.nan)
+    return np.gradient(piece.q, piece.t, axis=0)

@@ -1,0 +1,64 @@
+"""The drive of one joint, and motors that move several joints together."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import Annotated, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from spelgen.settings.values import Group, Inputs, NonNegative, Number, Positive
+
+
+class JointSettings(Group):
+    """Drive of one joint; N and m in place of Nm and rad when it is prismatic.
+
+    rotor_inertia: of the motor, before the gear [kg m^2]; the joint feels rotor_inertia * gear^2.
+    gear: motor turns per joint turn.
+    viscous: friction torque per joint velocity, after the gear [Nm s/rad].
+    coulomb: friction torque for qd > 0 and for qd < 0, after the gear [Nm], e.g. (0.395, -0.435).
+    actuated: False for a passive joint, which never gets an input.
+    gain: "trained" where the gear between logged motor torques and the joint is to be learned; it starts at `gear`.
+    inputs: the torques it draws from in a simulation, in place of `simulation.inputs` [Nm].
+    """
+
+    rotor_inertia: NonNegative = 0.0
+    gear: Positive = 1.0
+    viscous: NonNegative = 0.0
+    coulomb: tuple[Number, Number] = (0.0, 0.0)
+    actuated: bool = True
+    gain: Literal["known", "trained"] = "known"
+    inputs: Inputs | None = None
+
+    @field_validator("coulomb")
+    @classmethod
+    def _resists(cls, value: tuple[float, float]) -> tuple[float, float]:
+        if value[0] < 0 or value[1] > 0:
+            raise ValueError("the torque for qd > 0 (not negative), then for qd < 0 (not positive)")
+        return value
+
+
+class Coupling(Group):
+    """Joints that the same motors move: their torques are ``matrix`` times the torques of as many motors."""
+
+    joints: Annotated[tuple[str, ...], Field(min_length=2)]
+    matrix: tuple[tuple[Number, ...], ...]
+
+    @model_validator(mode="after")
+    def _invertible(self) -> Coupling:
+        if {len(self.matrix), *map(len, self.matrix)} != {len(self.joints)}:
+            raise ValueError("as many rows, and as many numbers in each, as joints")
+        if not _independent([[Fraction(x) for x in row] for row in self.matrix]):
+            raise ValueError("a matrix with an inverse: as many independent motors as joints")
+        return self
+
+
+def _independent(rows: list[list[Fraction]]) -> bool:
+    """Whether a square matrix has an inverse, by elimination, exactly."""
+    while rows:
+        pivot = next((row for row in rows if row[0]), None)
+        if pivot is None:
+            return False
+        rows.remove(pivot)
+        rows = [[b - row[0] / pivot[0] * a for a, b in zip(pivot[1:], row[1:], strict=True)] for row in rows]
+    return True

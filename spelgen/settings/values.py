@@ -1,0 +1,29 @@
+"""What values of a settings file may be, and what its groups of keys have in common."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+
+
+def no_bool(value: object) -> object:
+    """The value; ValueError for true and false."""
+    if isinstance(value, bool):  # float(True) is 1.0: a misplaced `yes` would pass for a number
+        raise ValueError("a number")
+    return value
+
+
+Number = Annotated[float, BeforeValidator(no_bool), Field(allow_inf_nan=False)]
+Positive = Annotated[Number, Field(gt=0)]
+NonNegative = Annotated[Number, Field(ge=0)]
+Share = Annotated[Number, Field(ge=0, lt=1)]
+Whole = Annotated[int, BeforeValidator(no_bool), Field(ge=0)]
+Count = Annotated[int, BeforeValidator(no_bool), Field(ge=1)]
+Inputs = Annotated[tuple[Number, ...], Field(min_length=1)]
+
+
+class Group(BaseModel):
+    """Keys that belong together; an unknown one is an error."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)

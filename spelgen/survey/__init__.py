@@ -1,1 +1,0 @@
-"""Logs beside a robot: what they hold, and what to doubt."""

@@ -1,0 +1,1 @@
+"""The structure derived a second time, by other means."""
