@@ -28,12 +28,12 @@ from characters import read_characters, write_arm
 from spelgen.arm.arm import Arm
 from spelgen.evaluation.baselines import Contender
 from spelgen.evaluation.results import state_errors
-from spelgen.fit.dataset import WHOLE_DECAY
-from spelgen.fit.rollout import roll_out
-from spelgen.fit.run_folder import load_model
-from spelgen.fit.torque_fit import fit_torque
-from spelgen.fit.torque_networks import fit_networks
-from spelgen.fit.torque_start import LOAD, last_body
+from spelgen.fitting.dataset import WHOLE_DECAY
+from spelgen.fitting.rollout import roll_out
+from spelgen.fitting.run_folder import load_model
+from spelgen.fitting.torque_fit import fit_torque
+from spelgen.fitting.torque_networks import fit_networks
+from spelgen.fitting.torque_start import LOAD, last_body
 from spelgen.identification.friction import FrictionModel
 from spelgen.identification.identify import Identification, Method, identify
 from spelgen.identification.samples import DynamicsSamples, dynamics_samples

@@ -26,13 +26,13 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from emitted import network_inputs
 from published_phnode import Published
 
-from spelgen.fit.compiled import Compiled
-from spelgen.fit.rollout import position_difference
-from spelgen.fit.run_folder import load_model
+from spelgen.fitting.compiled import Compiled
+from spelgen.fitting.rollout import position_difference
+from spelgen.fitting.run_folder import load_model
 from spelgen.pipeline import build
 
 if TYPE_CHECKING:
-    from spelgen.fit.run_folder import EmittedModel
+    from spelgen.fitting.run_folder import EmittedModel
 
 ROBOT = Path(__file__).parents[1] / "robots" / "six_dof.urdf"
 PRESETS = {

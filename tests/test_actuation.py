@@ -14,7 +14,7 @@ from spelgen.cli.main import app
 from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
 from spelgen.dynamics.pinocchio_engine import forward_dynamics, make_engine
 from spelgen.errors import SettingsError, SpelgenError
-from spelgen.fit.rollout import loss_scales, momentum_loss, roll_out
+from spelgen.fitting.rollout import loss_scales, momentum_loss, roll_out
 from spelgen.logs.windows import Windows
 from spelgen.pipeline import build, inspect, load
 from spelgen.simulation.simulate import make_friction, simulate

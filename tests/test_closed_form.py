@@ -13,10 +13,10 @@ from typer.testing import CliRunner
 
 from spelgen.cli.main import app
 from spelgen.errors import LogError, RunError
-from spelgen.fit.dataset import TrainingConfig
-from spelgen.fit.gaussian_prior import SIZES, Belief
-from spelgen.fit.torque_fit import fit_torque
-from spelgen.fit.torque_start import start_from_torque
+from spelgen.fitting.dataset import TrainingConfig
+from spelgen.fitting.gaussian_prior import SIZES, Belief
+from spelgen.fitting.torque_fit import fit_torque
+from spelgen.fitting.torque_start import start_from_torque
 from spelgen.identification.samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory

@@ -20,7 +20,7 @@ from spelgen.comparison.truth import example_positions, mass_error, true_mass
 from spelgen.errors import RunError
 from spelgen.evaluation.baselines import held_velocity
 from spelgen.evaluation.examples import predict_examples
-from spelgen.fit.run_folder import load_model
+from spelgen.fitting.run_folder import load_model
 from spelgen.logs.read import Trajectory, read_logs
 from spelgen.render.comparison_page import write_comparison
 from spelgen.urdf.read import read_urdf

@@ -13,9 +13,9 @@ import torch
 from emitted import random_model
 from torch._dynamo.utils import counters
 
-from spelgen.fit.compiled import compiled
-from spelgen.fit.rollout import loss_scales, rollout_loss
-from spelgen.fit.train import train
+from spelgen.fitting.compiled import compiled
+from spelgen.fitting.rollout import loss_scales, rollout_loss
+from spelgen.fitting.train import train
 from spelgen.logs.read import write_logs
 from spelgen.logs.windows import Windows
 from tests.test_training import JOINTS, QUICK, STAND_IN, motions

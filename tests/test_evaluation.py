@@ -15,10 +15,10 @@ from spelgen.evaluation.baselines import held_velocity, urdf_values
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.evaluation.invariants import energy_drift
 from spelgen.evaluation.torque import torque_errors, torque_samples
-from spelgen.fit.dataset import TrainingConfig
-from spelgen.fit.rollout import roll_out
-from spelgen.fit.run_folder import load_model
-from spelgen.fit.train import train
+from spelgen.fitting.dataset import TrainingConfig
+from spelgen.fitting.rollout import roll_out
+from spelgen.fitting.run_folder import load_model
+from spelgen.fitting.train import train
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.windows import Windows, cut_windows
 

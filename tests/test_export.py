@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from spelgen.cli.main import app
 from spelgen.dynamics.pinocchio_engine import bias, make_engine, mass_matrix
-from spelgen.fit.run_folder import RunFolder, load_model, write_state
+from spelgen.fitting.run_folder import RunFolder, load_model, write_state
 from spelgen.pipeline import build, load
 
 pytest.importorskip("pinocchio")

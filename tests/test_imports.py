@@ -33,14 +33,14 @@ logs: trajectory bags tables read checks filtering windows chunks epoch_windows
 simulation: simulate tracking protocols
 identification: samples friction base_parameters least_squares prior identify formatting
 excitation: trajectory design formatting
-fit: run_folder gaussian_prior torque_fit lie_group rollout compiled urdf_regularizer progress
-fit: dataset streaming optimizers torque_networks torque_start loop train
+fitting: run_folder gaussian_prior torque_fit lie_group rollout compiled urdf_regularizer progress
+fitting: dataset streaming optimizers torque_networks torque_start loop train
 evaluation: baselines torque examples invariants results evaluate
 verify: agreement axes urdf_cross_check numeric_samples verify
 explain: reasons facts
 formulas: expression notation angles harmonics factoring shortening grouping formulas layout text latex sympy_module
 inspection pipeline
-export: rigid_body_projection urdf_file
+exporting: rigid_body_projection urdf_file
 render: charts plots tables picture learned report_page inspection_page
 logs: statistics gravity report formatting
 comparison: paper truth metrics study runs formatting
@@ -66,7 +66,7 @@ DERIVES = [
 ]
 BESIDE_A_ROBOT = {"logs.gravity", "logs.report", "logs.formatting"}  # logs held against an arm's own facts
 OF_A_RUN = {f"render.{name}" for name in ("charts", "plots", "tables", "picture", "learned", "report_page")}
-FITS = [x for x in LAYERS if x.startswith(("logs.", "fit.", "evaluation.")) and x not in BESIDE_A_ROBOT]
+FITS = [x for x in LAYERS if x.startswith(("logs.", "fitting.", "evaluation.")) and x not in BESIDE_A_ROBOT]
 NEVER = {
     "spec": {"sympy", "flint", "torch"},
     "pipeline": {"torch"},

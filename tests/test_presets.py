@@ -9,8 +9,8 @@ import torch
 from emitted import GANTRY, built, frictionless, import_source, network_inputs, random_model
 from published_phnode import Published
 
-from spelgen.fit.lie_group import geodesic_distance, group_rates
-from spelgen.fit.rollout import position_difference
+from spelgen.fitting.lie_group import geodesic_distance, group_rates
+from spelgen.fitting.rollout import position_difference
 from spelgen.pipeline import build, make_spec
 from spelgen.spec import Options, Preset, load_design
 

@@ -11,8 +11,8 @@ from html_page import Page
 
 from spelgen import pipeline
 from spelgen.errors import RunError
-from spelgen.fit.dataset import TrainingConfig
-from spelgen.fit.run_folder import load_model
+from spelgen.fitting.dataset import TrainingConfig
+from spelgen.fitting.run_folder import load_model
 from spelgen.render.report_page import render_report, write_report
 
 

@@ -11,9 +11,9 @@ import pytest
 import torch
 
 from spelgen.errors import LogError
-from spelgen.fit.dataset import TrainingConfig, prepare_data
-from spelgen.fit.streaming import prepare_streamed
-from spelgen.fit.train import train
+from spelgen.fitting.dataset import TrainingConfig, prepare_data
+from spelgen.fitting.streaming import prepare_streamed
+from spelgen.fitting.train import train
 from spelgen.logs import chunks, epoch_windows
 from spelgen.logs.chunks import large_files, scan
 from spelgen.logs.epoch_windows import Cutting, WindowStream

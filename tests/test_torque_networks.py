@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import torch
 from emitted import built, import_source
 
-from spelgen.fit.dataset import TrainingConfig
-from spelgen.fit.torque_networks import fit_networks
-from spelgen.fit.torque_start import start_from_torque
+from spelgen.fitting.dataset import TrainingConfig
+from spelgen.fitting.torque_networks import fit_networks
+from spelgen.fitting.torque_start import start_from_torque
 from spelgen.identification.samples import DynamicsSamples
 
 
@@ -47,7 +47,9 @@ def test_the_objective_torque_fits_and_leaves_no_windows(tmp_path, monkeypatch):
     true, model = module.Model(seed=0), module.Model(seed=0)
     with torch.no_grad():
         true.constants *= 1.5
-    monkeypatch.setattr("spelgen.fit.torque_start.dynamics_samples", lambda recordings: [recorded(true, 5)])
+    monkeypatch.setattr(
+        "spelgen.fitting.torque_start.dynamics_samples", lambda recordings: [recorded(true, 5)]
+    )
     config = TrainingConfig(objective="torque")
     left, notes = start_from_torque(model, SimpleNamespace(recordings=()), config, fit=True)
     assert (left.epochs, left.momentum_steps) == (0, 0)

@@ -17,11 +17,11 @@ import torch
 
 from spelgen.errors import LogError, ModuleError, RunError
 from spelgen.evaluation.evaluate import evaluate
-from spelgen.fit.dataset import TrainingConfig, prepare_data
-from spelgen.fit.loop import TrainingLoop
-from spelgen.fit.optimizers import WholeSet
-from spelgen.fit.progress import TrainingProgress
-from spelgen.fit.rollout import (
+from spelgen.fitting.dataset import TrainingConfig, prepare_data
+from spelgen.fitting.loop import TrainingLoop
+from spelgen.fitting.optimizers import WholeSet
+from spelgen.fitting.progress import TrainingProgress
+from spelgen.fitting.rollout import (
     choose_substeps,
     integration_error,
     loss_scales,
@@ -30,8 +30,8 @@ from spelgen.fit.rollout import (
     roll_out,
     rollout_loss,
 )
-from spelgen.fit.run_folder import load_model
-from spelgen.fit.train import train
+from spelgen.fitting.run_folder import load_model
+from spelgen.fitting.train import train
 from spelgen.logs.mapping import LogMapping
 from spelgen.logs.read import Trajectory, write_logs
 from spelgen.logs.windows import Windows, cut_windows
@@ -157,7 +157,7 @@ def test_standing_still_has_loss_one(monkeypatch):
     def still(model, windows, substeps):
         return tuple(x[:, :1].expand_as(x[:, 1:]) for x in (windows.q, windows.qd))
 
-    monkeypatch.setattr("spelgen.fit.rollout.roll_out", still)
+    monkeypatch.setattr("spelgen.fitting.rollout.roll_out", still)
     model, windows = load_model(STAND_IN), cut_windows(motions(), 5, measured=False)
     assert rollout_loss(model, windows, loss_scales(windows, model.joint_types), 1) == pytest.approx(1.0)
 
@@ -212,12 +212,12 @@ class Interrupted(TrainingProgress):
 
 @pytest.mark.parametrize(("optimiser", "steps"), [("adamw", 20), ("lbfgs", 3)])
 def test_resuming_repeats_what_would_have_been(logs, tmp_path, monkeypatch, optimiser, steps):
-    monkeypatch.setattr("spelgen.fit.loop.EPOCH_STEPS", steps)
+    monkeypatch.setattr("spelgen.fitting.loop.EPOCH_STEPS", steps)
     config = replace(QUICK, optimiser=optimiser, momentum_steps=20 if optimiser == "adamw" else 0)
     straight, broken = tmp_path / "straight", tmp_path / "broken"
     train(STAND_IN, [logs], straight, config, progress=False)
     with monkeypatch.context() as patch:
-        patch.setattr("spelgen.fit.train.TrainingProgress", Interrupted)
+        patch.setattr("spelgen.fitting.train.TrainingProgress", Interrupted)
         assert train(STAND_IN, [logs], broken, config, progress=False).status == "interrupted"
     assert len(lines(broken)) == 3
     result = train(STAND_IN, [logs], broken, config, resume=True, progress=False)
@@ -257,7 +257,7 @@ def test_numbers_that_blow_up_are_rolled_back_at_half_the_rate(logs, tmp_path, m
         calls.append(torch.is_grad_enabled())
         return loss * math.nan if sum(calls) == 25 and calls[-1] else loss
 
-    monkeypatch.setattr("spelgen.fit.loop.rollout_loss", blown_up_once)
+    monkeypatch.setattr("spelgen.fitting.loop.rollout_loss", blown_up_once)
     result = train(STAND_IN, [logs], tmp_path / "run", QUICK, progress=False)
     records = lines(tmp_path / "run")
     assert result.status == "finished"
@@ -272,7 +272,7 @@ def test_numbers_that_never_recover_end_the_run(logs, tmp_path, monkeypatch, opt
         loss = rollout_loss(model, windows, scales, substeps)
         return loss * math.nan if torch.is_grad_enabled() else loss
 
-    monkeypatch.setattr("spelgen.fit.loop.rollout_loss", blown_up)
+    monkeypatch.setattr("spelgen.fitting.loop.rollout_loss", blown_up)
     with pytest.raises(RunError) as caught:
         train(STAND_IN, [logs], tmp_path / "run", replace(QUICK, optimiser=optimiser), progress=False)
     assert str(caught.value) == (
@@ -325,8 +325,8 @@ def test_early_stop_and_time_limit(logs, tmp_path):
 
 CHILD = """
 import signal, sys
-from spelgen.fit.train import train
-from spelgen.fit.dataset import TrainingConfig
+from spelgen.fitting.train import train
+from spelgen.fitting.dataset import TrainingConfig
 signal.signal(signal.SIGINT, signal.default_int_handler)  # whoever runs the tests may ignore it
 config = TrainingConfig(epochs=100000, batch=32, patience=100000, momentum_steps=0, optimiser="adamw")
 result = train(sys.argv[1], [sys.argv[2]], sys.argv[3], config)

@@ -23,10 +23,10 @@ def export(
     Bodies of a closed-form model are written as they are; of other models, the rigid bodies nearest to them.
     """
     from spelgen.errors import RunError
-    from spelgen.export.rigid_body_projection import make_twin
-    from spelgen.export.urdf_file import settings_text, urdf_text
+    from spelgen.exporting.rigid_body_projection import make_twin
+    from spelgen.exporting.urdf_file import settings_text, urdf_text
     from spelgen.files import write_text
-    from spelgen.fit.run_folder import RunFolder, write_bytes
+    from spelgen.fitting.run_folder import RunFolder, write_bytes
     from spelgen.spec import read_header
 
     if output.suffix == ".yaml":

@@ -28,7 +28,7 @@ from spelgen.errors import ModuleError
 from spelgen.spec import read_header
 
 if TYPE_CHECKING:
-    from spelgen.fit.dataset import TrainingConfig
+    from spelgen.fitting.dataset import TrainingConfig
 
 WORST_INTEGRATION = 1e-8  # [rad, rad/s; m, m/s] above this simulated logs are no reference
 
@@ -166,7 +166,7 @@ def train(
     if module is None:
         raise typer.BadParameter("name a module, or a run with --from", param_hint="'MODULE.py'")
     paths = options.logs(data, more)
-    from spelgen.fit import train as training
+    from spelgen.fitting import train as training
 
     folder = output or Path("runs") / module.stem
     urdf = robot or _unchanged_urdf(module)
@@ -199,7 +199,7 @@ def evaluate(
     """Judge a trained run on test logs, beside its rivals."""
     paths = options.logs(data, more)
     from spelgen.evaluation import evaluate as evaluation
-    from spelgen.fit.run_folder import RunFolder
+    from spelgen.fitting.run_folder import RunFolder
     from spelgen.render.tables import result_tables
 
     folder = RunFolder(run)
@@ -230,7 +230,7 @@ def report(
 
 def _of_run(source: Path, robot: Path | None) -> tuple[Path, Path | None]:
     """The module and the URDF of a run."""
-    from spelgen.fit.run_folder import RunFolder
+    from spelgen.fitting.run_folder import RunFolder
 
     run = RunFolder(source)
     run.read_json(run.config)  # where there is no run, this says so
@@ -251,8 +251,8 @@ def _unchanged_urdf(module: Path) -> Path | None:
 
 def _config(urdf: Path | None, resumed: Path | None, flags: dict[str, Any]) -> TrainingConfig:
     """The flags, and behind them what the run was started with, or the robot's settings."""
-    from spelgen.fit.dataset import TrainingConfig
-    from spelgen.fit.run_folder import RunFolder
+    from spelgen.fitting.dataset import TrainingConfig
+    from spelgen.fitting.run_folder import RunFolder
     from spelgen.settings.settings import load_settings
     from spelgen.settings.training import TrainingSettings
 

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING
 import torch
 
 from spelgen.evaluation.invariants import energy_drift
-from spelgen.fit.rollout import LossScales, position_difference, roll_out, rollout_loss
+from spelgen.fitting.rollout import LossScales, position_difference, roll_out, rollout_loss
 from spelgen.logs.read import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
 
 if TYPE_CHECKING:
-    from spelgen.fit.run_folder import EmittedModel
+    from spelgen.fitting.run_folder import EmittedModel
 
 MOST_WINDOWS = 512
 POSITIONS = 100_000

@@ -15,14 +15,14 @@ from spelgen.comparison.study import Study, Variant
 from spelgen.comparison.truth import example_positions, mass_error, true_mass
 from spelgen.evaluation.baselines import trained
 from spelgen.evaluation.examples import predict_examples
-from spelgen.fit.rollout import LossScales, loss_scales
-from spelgen.fit.run_folder import RunFolder, load_model, trained_model, write_json
-from spelgen.fit.train import train
+from spelgen.fitting.rollout import LossScales, loss_scales
+from spelgen.fitting.run_folder import RunFolder, load_model, trained_model, write_json
+from spelgen.fitting.train import train
 from spelgen.logs.read import read_logs
 from spelgen.spec import read_header
 
 if TYPE_CHECKING:
-    from spelgen.fit.run_folder import EmittedModel
+    from spelgen.fitting.run_folder import EmittedModel
 
 HORIZON = 1.0  # s, over which trajectories are predicted
 

@@ -18,9 +18,9 @@ from lxml import etree
 from spelgen import pipeline
 from spelgen.errors import RunError
 from spelgen.files import write_text
-from spelgen.fit.dataset import TrainingConfig
-from spelgen.fit.loop import EPOCH_STEPS
-from spelgen.fit.run_folder import write_json
+from spelgen.fitting.dataset import TrainingConfig
+from spelgen.fitting.loop import EPOCH_STEPS
+from spelgen.fitting.run_folder import write_json
 from spelgen.logs.read import Trajectory, write_logs
 from spelgen.settings.comparison import ComparisonSettings
 from spelgen.settings.settings import Settings

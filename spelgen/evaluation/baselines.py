@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 import torch
 
 from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
-from spelgen.fit.rollout import roll_out
+from spelgen.fitting.rollout import roll_out
 from spelgen.logs.windows import Windows
 
 if TYPE_CHECKING:
-    from spelgen.fit.run_folder import EmittedModel
+    from spelgen.fitting.run_folder import EmittedModel
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,9 @@ from spelgen.evaluation.examples import Example, predict_examples
 from spelgen.evaluation.invariants import energy_drift
 from spelgen.evaluation.results import Evaluation, Horizon, Tip, state_errors, torque_figures
 from spelgen.evaluation.torque import torque_errors, torque_samples
-from spelgen.fit.dataset import filter_cutoff
-from spelgen.fit.rollout import choose_substeps, loss_scales
-from spelgen.fit.run_folder import RunFolder, trained_model, write_json
+from spelgen.fitting.dataset import filter_cutoff
+from spelgen.fitting.rollout import choose_substeps, loss_scales
+from spelgen.fitting.run_folder import RunFolder, trained_model, write_json
 from spelgen.logs.checks import examine
 from spelgen.logs.filtering import prepare
 from spelgen.logs.mapping import LogMapping
@@ -27,7 +27,7 @@ from spelgen.logs.windows import Windows, cut_windows
 from spelgen.spec import Header, read_header
 
 if TYPE_CHECKING:
-    from spelgen.fit.run_folder import EmittedModel
+    from spelgen.fitting.run_folder import EmittedModel
 
 PREDICTED_STEPS = 40_000  # per horizon and contender: windows are thinned evenly to about this many
 MOST_WINDOWS = 2000

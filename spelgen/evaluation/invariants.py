@@ -12,7 +12,7 @@ from torchdiffeq import odeint
 from spelgen.logs.windows import Windows
 
 if TYPE_CHECKING:
-    from spelgen.fit.run_folder import EmittedModel
+    from spelgen.fitting.run_folder import EmittedModel
 
 DRIFT_SECONDS, DRIFT_TIMES = 1.0, 101
 DRIFT_SOLVER: dict[str, Any] = {"rtol": 1e-13, "atol": 1e-15, "options": {"solver": "DOP853"}}

@@ -13,7 +13,7 @@ from spelgen.errors import Diagnostic
 from spelgen.evaluation.baselines import Contender
 from spelgen.evaluation.examples import Example
 from spelgen.evaluation.torque import TorqueErrors
-from spelgen.fit.rollout import position_difference
+from spelgen.fitting.rollout import position_difference
 from spelgen.logs.windows import Windows
 
 Tip = Callable[[torch.Tensor], torch.Tensor]

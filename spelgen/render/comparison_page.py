@@ -14,7 +14,7 @@ from spelgen import __version__
 from spelgen.comparison.study import Study
 from spelgen.comparison.truth import example_positions, true_mass
 from spelgen.files import write_text
-from spelgen.fit.run_folder import RunFolder, load_model
+from spelgen.fitting.run_folder import RunFolder, load_model
 from spelgen.render.charts import Line, line_chart
 from spelgen.render.learned import INERTIA_UNITS, entry_index
 from spelgen.render.plots import QUANTITIES, UNITS

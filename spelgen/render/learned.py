@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from spelgen.fit.run_folder import RunFolder, load_model
+from spelgen.fitting.run_folder import RunFolder, load_model
 
 CONSTANTS = ("constants", "constant_scale", "constant_basis")
 ROTORS = ("rotor", "rotor_size")

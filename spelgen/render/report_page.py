@@ -15,8 +15,8 @@ from markupsafe import Markup
 from spelgen import __version__
 from spelgen.errors import RunError
 from spelgen.files import write_text
-from spelgen.fit.dataset import TrainingConfig
-from spelgen.fit.run_folder import RunFolder
+from spelgen.fitting.dataset import TrainingConfig
+from spelgen.fitting.run_folder import RunFolder
 from spelgen.render.learned import Learned, read_learned
 from spelgen.render.picture import Picture, read_picture
 from spelgen.render.plots import UNITS, joint_charts, loss_chart

@@ -10,7 +10,7 @@ from lxml import etree
 
 from spelgen.arm.angle_rounding import Snapper
 from spelgen.arm.rational import alignment
-from spelgen.export.rigid_body_projection import Twin
+from spelgen.exporting.rigid_body_projection import Twin
 from spelgen.settings.settings import load_settings
 from spelgen.urdf.document import urdf_bytes
 from spelgen.urdf.read import read_urdf

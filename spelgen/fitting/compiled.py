@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from spelgen.errors import RunError
-from spelgen.fit.rollout import rollout_loss
+from spelgen.fitting.rollout import rollout_loss
 
 if TYPE_CHECKING:
-    from spelgen.fit.rollout import LossScales
-    from spelgen.fit.run_folder import EmittedModel
+    from spelgen.fitting.rollout import LossScales
+    from spelgen.fitting.run_folder import EmittedModel
     from spelgen.logs.windows import Windows
 
 OPTIONS: dict[str, dict[str, Any]] = {

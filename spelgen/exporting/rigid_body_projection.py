@@ -13,13 +13,13 @@ from scipy.optimize import nnls
 
 from spelgen import pipeline
 from spelgen.arm.arm import Arm
-from spelgen.fit.optimizers import minimise
-from spelgen.fit.run_folder import RunFolder, load_model, trained_model
+from spelgen.fitting.optimizers import minimise
+from spelgen.fitting.run_folder import RunFolder, load_model, trained_model
 from spelgen.spec import Header, read_header
 from spelgen.structure.nominal import working_range
 
 if TYPE_CHECKING:
-    from spelgen.fit.run_folder import EmittedModel
+    from spelgen.fitting.run_folder import EmittedModel
 
 POINTS = 512  # positions at which model and twin are compared
 STEPS = 400

@@ -16,7 +16,7 @@ from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
 from spelgen.logs.windows import Windows
 
 if TYPE_CHECKING:
-    from spelgen.fit.run_folder import EmittedModel
+    from spelgen.fitting.run_folder import EmittedModel
 
 POINTS = 200
 WIDENED = 0.5  # of the logs' range, to both sides: a model is used a little beyond its logs

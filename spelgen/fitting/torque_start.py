@@ -7,15 +7,15 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from spelgen.errors import Diagnostic, LogError, RunError
-from spelgen.fit.dataset import TrainingConfig, TrainingData
-from spelgen.fit.gaussian_prior import Belief
-from spelgen.fit.torque_fit import fit_torque
-from spelgen.fit.torque_networks import fit_networks
-from spelgen.fit.urdf_regularizer import Prior
+from spelgen.fitting.dataset import TrainingConfig, TrainingData
+from spelgen.fitting.gaussian_prior import Belief
+from spelgen.fitting.torque_fit import fit_torque
+from spelgen.fitting.torque_networks import fit_networks
+from spelgen.fitting.urdf_regularizer import Prior
 from spelgen.identification.samples import DENSE, DynamicsSamples, dynamics_samples
 
 if TYPE_CHECKING:
-    from spelgen.fit.run_folder import EmittedModel
+    from spelgen.fitting.run_folder import EmittedModel
 
 
 LOAD = Belief(bodies=10.0)

@@ -12,7 +12,7 @@ import torch
 from spelgen.logs.windows import Windows
 
 if TYPE_CHECKING:
-    from spelgen.fit.run_folder import EmittedModel
+    from spelgen.fitting.run_folder import EmittedModel
 
 SUBSTEPS = (1, 2, 4, 8, 16, 32)
 INTEGRATION_SHARE = 0.03  # of the model's own error, what the integrator may add

@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 
 from spelgen.errors import Diagnostic, LogError
-from spelgen.fit.dataset import (
+from spelgen.fitting.dataset import (
     LARGEST_VALIDATION,
     TrainingConfig,
     TrainingData,
     filter_cutoff,
     filter_note,
 )
-from spelgen.fit.rollout import loss_scales
+from spelgen.fitting.rollout import loss_scales
 from spelgen.logs.checks import Doubt, doubts, tell, told_gaps
 from spelgen.logs.chunks import Part, scan
 from spelgen.logs.epoch_windows import Cutting, WindowStream

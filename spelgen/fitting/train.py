@@ -15,20 +15,20 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from spelgen.errors import Diagnostic, ModuleError, RunError
-from spelgen.fit.compiled import compiled
-from spelgen.fit.dataset import TrainingConfig, TrainingData, prepare_data
-from spelgen.fit.loop import Status, TrainingLoop
-from spelgen.fit.progress import TrainingProgress
-from spelgen.fit.run_folder import RunFolder, load_model, write_json
-from spelgen.fit.streaming import prepare_streamed
-from spelgen.fit.torque_start import is_closed_form, start_from_torque
-from spelgen.fit.urdf_regularizer import Prior, urdf_prior
+from spelgen.fitting.compiled import compiled
+from spelgen.fitting.dataset import TrainingConfig, TrainingData, prepare_data
+from spelgen.fitting.loop import Status, TrainingLoop
+from spelgen.fitting.progress import TrainingProgress
+from spelgen.fitting.run_folder import RunFolder, load_model, write_json
+from spelgen.fitting.streaming import prepare_streamed
+from spelgen.fitting.torque_start import is_closed_form, start_from_torque
+from spelgen.fitting.urdf_regularizer import Prior, urdf_prior
 from spelgen.logs.chunks import large_files
 from spelgen.logs.mapping import LogMapping
 from spelgen.spec import Header, read_header
 
 if TYPE_CHECKING:
-    from spelgen.fit.run_folder import EmittedModel
+    from spelgen.fitting.run_folder import EmittedModel
 
 MAY_CHANGE = (
     "epochs",

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from spelgen.errors import Diagnostic
-from spelgen.fit.rollout import LossScales, loss_scales
+from spelgen.fitting.rollout import LossScales, loss_scales
 from spelgen.logs.checks import examine
 from spelgen.logs.epoch_windows import WindowStream
 from spelgen.logs.filtering import automatic_cutoff, automatic_spacing, prepare

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from spelgen.fit.optimizers import minimise
+from spelgen.fitting.optimizers import minimise
 from spelgen.identification.samples import DynamicsSamples
 
 if TYPE_CHECKING:
-    from spelgen.fit.run_folder import EmittedModel
+    from spelgen.fitting.run_folder import EmittedModel
 
 MOST = 2000  # evaluations
 

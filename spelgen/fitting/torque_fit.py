@@ -18,11 +18,11 @@ import numpy as np
 import torch
 from torch.func import functional_call, jacfwd, jvp
 
-from spelgen.fit.gaussian_prior import Belief
+from spelgen.fitting.gaussian_prior import Belief
 from spelgen.identification.samples import DynamicsSamples
 
 if TYPE_CHECKING:
-    from spelgen.fit.run_folder import EmittedModel
+    from spelgen.fitting.run_folder import EmittedModel
 
 EVERY = 2  # samples taken of so many: filtered at 8 Hz and sampled at 100 Hz they say all that is to be said
 ALIKE = 20.0  # of those: so many in a row, 0.4 s, err alike and count once

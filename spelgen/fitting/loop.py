@@ -11,22 +11,22 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 
 from spelgen.errors import RunError
-from spelgen.fit.dataset import TrainingConfig, TrainingData
-from spelgen.fit.optimizers import Batches, Descent, WholeSet
-from spelgen.fit.progress import TrainingProgress
-from spelgen.fit.rollout import (
+from spelgen.fitting.dataset import TrainingConfig, TrainingData
+from spelgen.fitting.optimizers import Batches, Descent, WholeSet
+from spelgen.fitting.progress import TrainingProgress
+from spelgen.fitting.rollout import (
     INTEGRATION_SHARE,
     choose_substeps,
     integration_error,
     momentum_loss,
     rollout_loss,
 )
-from spelgen.fit.run_folder import RunFolder, write_state
-from spelgen.fit.urdf_regularizer import Prior
+from spelgen.fitting.run_folder import RunFolder, write_state
+from spelgen.fitting.urdf_regularizer import Prior
 from spelgen.logs.windows import Windows
 
 if TYPE_CHECKING:
-    from spelgen.fit.run_folder import EmittedModel
+    from spelgen.fitting.run_folder import EmittedModel
 
 MOMENTUM_SHARE = 0.5  # of the allowed time, what the momentum steps may take
 MOMENTUM_FACTOR = 10.0  # on the learning rate of the momentum steps, which are cheap and noisy
