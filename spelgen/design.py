@@ -1,0 +1,122 @@
+"""Design: how each quantity of a model is made, as a preset names it; checked when it is made."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, get_args, get_type_hints
+
+from spelgen.errors import SettingsError, collect, suggestion
+from spelgen.settings.yaml_document import Document, read_document
+
+Net = Literal["mlp", "kan"]
+
+PRESETS = Path(__file__).parent / "presets"
+PRESET_NAMES = ("minimal", "spel", "spel-kan", "phnode", "closed-form")
+
+
+@dataclass(frozen=True)
+class Design:
+    """A point in the space of models: how each quantity of the equations of motion is made.
+
+    derived: by the arm's structure. dense: as if nothing were known of the arm (Wang et al., Sci Rep
+    15:33179, 2025, and Duong et al., IEEE T-RO 40:3695, 2024), over all three axes of each joint where it
+    says 3n. closed-form: that of rigid bodies with trained inertial parameters. constants: friction's laws with
+    trained constants. Raises SettingsError for a combination that stands for no model.
+    """
+
+    mass: Literal["derived", "dense-3n", "closed-form"]
+    potential: Literal["derived", "dense", "closed-form"]
+    dissipation: Literal["per-joint", "dense-n", "dense-3n", "constants"]
+    input: Literal["derived", "dense-3n"]
+    fourier: Literal["derived", "none"]
+    """Whether networks add to the Fourier series that a rigid arm's functions are, where those are short."""
+    net: Literal["mlp", "kan", "none"]
+    encoding: Literal["joint", "lie-group", "none"]
+    """What a network reads: cos q and sin q or scaled q of the joints it depends on, or the nine or three
+    numbers of every joint's R or r.
+    """
+
+    def __post_init__(self) -> None:
+        validate(asdict(self))
+
+
+CHOICES: dict[str, tuple[str, ...]] = {name: get_args(kind) for name, kind in get_type_hints(Design).items()}
+"""The values of each key of a design."""
+
+
+def load_design(preset: str | Path | Design, net: Net | None = None) -> Design:
+    """The design of a preset: one that comes with spelgen by its name, one of yours by its YAML file.
+
+    ``net`` takes the place of its own networks. Raises SettingsError.
+    """
+    if isinstance(preset, Design):
+        design = preset
+    elif str(preset) in PRESET_NAMES:
+        design = _read(PRESETS / f"{preset}.yaml")
+    elif Path(preset).suffix in (".yaml", ".yml"):
+        design = _read(Path(preset))
+    else:
+        expected = f"one of {', '.join(PRESET_NAMES)}, or a YAML file"
+        raise SettingsError(f"the preset {str(preset)!r}", expected=expected)
+    return design if net is None else replace(design, net=net)
+
+
+def _read(path: Path) -> Design:
+    """The design in a YAML file, which holds every key of ``Design``, and ``about``, which is for people."""
+    document = read_document(path)
+    content = document.value()
+    if not isinstance(content, dict):
+        raise SettingsError("no keys with values", file=path, expected=f"the keys {', '.join(CHOICES)}")
+    values = {key: value for key, value in content.items() if key != "about"}
+    validate(values, document)
+    return Design(**values)
+
+
+def validate(values: Mapping[str, Any], document: Document | None = None) -> None:
+    """Raise SettingsError, or SpelgenErrors of several, unless ``values`` are a design.
+
+    ``document`` is the file that they come from: it is then named, with the lines.
+    """
+    file = None if document is None else document.path
+
+    def line(name: str) -> int | None:
+        return None if document is None else document.line((name,))
+
+    errors = [
+        SettingsError(f"unknown key {name!r}", file=file, line=line(name), do=suggestion(str(name), CHOICES))
+        for name in values
+        if name not in CHOICES
+    ]
+    for name, choices in CHOICES.items():
+        got = repr(values[name]) if name in values else "nothing"
+        if values.get(name) not in choices:
+            expected = f"one of {', '.join(choices)}"
+            errors.append(SettingsError(got, file=file, line=line(name), element=name, expected=expected))
+    collect(errors)
+    errors = [
+        SettingsError(f"{one}: {values[one]} with {other}: {values[other]}", file=file, line=line(one), do=do)
+        for one, other, do in _conflicts(values)
+    ]
+    collect(errors)
+
+
+def _conflicts(values: Mapping[str, str]) -> Iterator[tuple[str, str, str]]:
+    """The pairs of keys whose values contradict each other, and what to do about them."""
+    rigid = values["mass"] == "closed-form"
+    if rigid != (values["potential"] == "closed-form"):
+        yield "mass", "potential", "rigid bodies give both: name closed-form for both or for neither"
+    if rigid != (values["dissipation"] == "constants"):
+        yield "mass", "dissipation", "dissipation: constants goes with mass: closed-form, and with it alone"
+    for key in ("net", "encoding"):
+        if rigid != (values[key] == "none"):
+            yield (
+                "mass",
+                key,
+                f"{key}: none goes with mass: closed-form, which has no networks, and with it alone",
+            )
+    if rigid and values["input"] != "derived":
+        yield "mass", "input", "input: derived goes with mass: closed-form, which has no networks"
+    if values["fourier"] == "derived" and "derived" not in (values["mass"], values["potential"]):
+        yield "fourier", "mass", "fourier: derived needs mass: derived or potential: derived"
