@@ -1,37 +1,78 @@
-"""Tables of text: the same for a terminal and for a page."""
+"""Tables of text and of HTML: the same rows for a terminal, a file, a page and a notebook.
+
+Rich lays them out. Its console is told all that it would else ask the terminal and the environment for (width,
+colours, notebook), so that the same rows give the same text wherever they go.
+"""
 
 from __future__ import annotations
 
+import io
 import textwrap
 from dataclasses import dataclass
+from html import escape
+from typing import Literal
 
 WIDTH = 80
-LEAST = 8  # characters of a name are always shown
+SHORTEST = (
+    8  # characters of a name in one line; a longer name goes on in the next where a table would be too wide
+)
 
 
 @dataclass(frozen=True)
 class Listing:
-    """A table with a name in the first column and text aligned to the right in all others."""
+    """A table with a name in the first column; the columns in `left` are aligned to the left, others to the right.
+
+    text(): a title, the head and the rows, indented by two, then the note, wrapped. Where a table does not fit 80
+    columns its names are folded; numbers never are. html(): the same for notebooks; all text is escaped.
+    """
 
     title: str
     head: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     note: str = ""
+    left: tuple[int, ...] = (0,)
 
     def text(self) -> str:
-        """For a terminal."""
+        """For a terminal or a file, without a line end."""
+        note = textwrap.wrap(self.note, WIDTH - 2, initial_indent="  ", subsequent_indent="  ")
+        return "\n".join([*textwrap.wrap(self.title, WIDTH), *self._lines(), *note])
+
+    def html(self) -> str:
+        """For a notebook."""
+        note = f"<p>{escape(self.note)}</p>" if self.note else ""
+        rows = "".join(self._row(row, "td") for row in self.rows)
+        return (
+            f"<p><b>{escape(self.title)}</b></p><table><thead>{self._row(self.head, 'th')}</thead>"
+            f"<tbody>{rows}</tbody></table>{note}"
+        )
+
+    def _row(self, cells: tuple[str, ...], tag: str) -> str:
+        sides = ["left" if k in self.left else "right" for k in range(len(cells))]
+        told = "".join(
+            f'<{tag} style="text-align: {side}">{escape(cell)}</{tag}>'
+            for side, cell in zip(sides, cells, strict=True)
+        )
+        return f"<tr>{told}</tr>"
+
+    def _lines(self) -> list[str]:
+        from rich.cells import cell_len  # here: `--help` and `import spelgen` stay fast
+        from rich.console import Console
+        from rich.table import Table
+        from rich.text import Text
+
         lines = [self.head, *self.rows]
-        widths = [max(len(line[k]) for line in lines) for k in range(len(self.head))]
-        widths[0] = min(widths[0], max(LEAST, WIDTH - 2 - sum(2 + width for width in widths[1:])))
-        lines = [(_shortened(line[0], widths[0]), *line[1:]) for line in lines]
-        laid = [
-            f"  {line[0]:<{widths[0]}}"
-            + "".join(f"  {x:>{w}}" for x, w in zip(line[1:], widths[1:], strict=True))
-            for line in lines
-        ]
-        told = textwrap.wrap(self.note, WIDTH - 2, initial_indent="  ", subsequent_indent="  ")
-        return "\n".join([self.title, *(line.rstrip() for line in laid), *told])
-
-
-def _shortened(name: str, width: int) -> str:
-    return name if len(name) <= width else f"{name[: width - 3]}..."
+        widths = [max(cell_len(line[k]) for line in lines) for k in range(len(self.head))]
+        widths[0] = min(widths[0], SHORTEST)
+        table = Table(box=None, show_header=False, padding=(0, 0, 0, 2))
+        for k, width in enumerate(widths):
+            side: Literal["left", "right"] = "left" if k in self.left else "right"
+            table.add_column(justify=side, overflow="fold", min_width=width, no_wrap=k > 0)
+        for line in lines:
+            table.add_row(*map(Text, line))
+        file = io.StringIO()
+        console = Console(
+            file=file, width=max(WIDTH, sum(widths) + 2 * len(widths)), color_system=None, force_terminal=False,
+            force_jupyter=False, legacy_windows=False, _environ={},
+        )  # fmt: skip
+        console.print(table, crop=False)
+        return [line.rstrip() for line in file.getvalue().splitlines()]
