@@ -53,7 +53,11 @@ class Actuation:
 
 
 def derive_actuation(robot: Robot, settings: Settings, joints: Sequence[str]) -> Actuation:
-    """G of the arm with these ``joints``. Raises SettingsError for couplings of locked joints."""
+    """G of the arm with these ``joints``.
+
+    Raises SettingsError for couplings with locked joints, UrdfError for a transmission that is needed and
+    has unusable numbers.
+    """
     driven = [name for name in joints if settings.joint(name).actuated]
     notes = tuple(_undriven(robot, settings, driven))
     if settings.torque == "joint":
@@ -92,6 +96,7 @@ def _reduction(robot: Robot, name: str) -> float | None:
     """The reduction of a joint's simple transmission, where the URDF gives one that is not zero."""
     for each in robot.transmissions:
         if _SIMPLE in each.type and [joint for joint, _, _ in each.joints] == [name]:
+            collect(each.errors)
             found = [reduction for _, reduction in each.actuators if reduction]
             if len(found) == 1:
                 return found[0]
@@ -100,13 +105,15 @@ def _reduction(robot: Robot, name: str) -> float | None:
 
 def _couplings(robot: Robot, settings: Settings, joints: Sequence[str]) -> list[list[InputEntry]]:
     """The sidecar's couplings, then the URDF's differential transmissions of joints not coupled there."""
-    collect([_absent(name, joints) for x in settings.couplings for name in x.joints if name not in joints])
-    coupled = {name for coupling in settings.couplings for name in coupling.joints}
-    found = [_block([joints.index(name) for name in x.joints], x.matrix) for x in settings.couplings]
+    taken = [x for x in settings.couplings if set(x.joints) & set(joints)]
+    collect([_absent(name, joints) for x in taken for name in x.joints if name not in joints])
+    coupled = {name for coupling in taken for name in coupling.joints}
+    found = [_block([joints.index(name) for name in x.joints], x.matrix) for x in taken]
     for each in robot.transmissions:
         names = [name for name, _, _ in each.joints]
         two = len(names) == len(each.actuators) == 2
         if _DIFFERENTIAL in each.type and two and set(names) <= set(joints) - coupled:
+            collect(each.errors)
             found.append(_block([joints.index(name) for name in names], _differential(each)))
             coupled |= set(names)
     return found

@@ -17,8 +17,13 @@ from spelgen.urdf.values import (
     read_triple,
 )
 
+Limits = tuple[float | None, float | None, float | None, float | None]
+"""Lower, upper, effort, velocity."""
+
 JOINT_TYPES = (*MOVING, "fixed", "floating", "planar")
 MAX_NAME = 256
+_NO_AXIS: Vector = (1.0, 0.0, 0.0)  # what URDF takes where there is none
+_NO_LIMITS: Limits = (None, None, None, None)
 _DIAGONAL = ("ixx", "iyy", "izz")
 _TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
@@ -101,10 +106,13 @@ def read_joint(notes: Notes, element: etree._Element) -> Joint | None:
     parent = _read_end(notes, element, "parent", where)
     child = _read_end(notes, element, "child", where)
     xyz, rpy = _read_origin(notes, element, where)
-    axis = _read_axis(notes, element, kind, where)
-    limits = _read_limit(notes, element, kind, where)
-    damping, friction = _read_dynamics(notes, element, where)
-    mimic = _read_mimic(notes, element, where)
+    motion = notes if kind in MOVING else Notes(notes.path)  # a joint that is held needs none of it
+    axis = _read_axis(motion, element, kind, where)
+    limits = _read_limit(motion, element, kind, where)
+    damping, friction = _read_dynamics(motion, element, where)
+    mimic = _read_mimic(notes, element, where) if kind in MOVING else None
+    if motion is not notes:
+        _warn_instead(notes, motion)
     if kind not in JOINT_TYPES or parent is None or child is None:
         return None
     return Joint(
@@ -132,11 +140,10 @@ def _read_origin(notes: Notes, element: etree._Element, where: str) -> tuple[Vec
 
 def _read_axis(notes: Notes, element: etree._Element, kind: str | None, where: str) -> Vector:
     axis = first_child(notes, element, "axis", where)
-    default = (1.0, 0.0, 0.0)
     if axis is None:
-        return default
+        return _NO_AXIS
     before = len(notes.errors)
-    xyz = read_triple(notes, axis, "xyz", f"{where} axis", default)
+    xyz = read_triple(notes, axis, "xyz", f"{where} axis", _NO_AXIS)
     if kind in MOVING and len(notes.errors) == before and max(map(abs, xyz)) < 1e-9:
         got = f"the axis {axis.get('xyz')!r}"
         notes.error(
@@ -145,9 +152,7 @@ def _read_axis(notes: Notes, element: etree._Element, kind: str | None, where: s
     return xyz
 
 
-def _read_limit(
-    notes: Notes, element: etree._Element, kind: str | None, where: str
-) -> tuple[float | None, float | None, float | None, float | None]:
+def _read_limit(notes: Notes, element: etree._Element, kind: str | None, where: str) -> Limits:
     limit = first_child(notes, element, "limit", where)
     wanted = {
         "revolute": ("lower", "upper", "effort", "velocity"),
@@ -160,7 +165,7 @@ def _read_limit(
         line = element.sourceline if limit is None else limit.sourceline
         notes.warn(line, "incomplete-limit", where, f"{told}: read as unlimited")
     if limit is None:
-        return None, None, None, None
+        return _NO_LIMITS
     told_where = f"{where} limit"
     lower, upper = (
         read_number(notes, limit, key, told_where, bounded=False) if kind != "continuous" else None
@@ -195,10 +200,22 @@ def _read_mimic(notes: Notes, element: etree._Element, where: str) -> Mimic | No
     return Mimic(joint, 1.0 if multiplier is None else multiplier, 0.0 if offset is None else offset)
 
 
+def _warn_instead(notes: Notes, own: Notes) -> None:
+    """Say what is wrong in a part of the file that may never be needed, as warnings."""
+    notes.diagnostics += own.diagnostics
+    for error in own.errors:
+        message = f"got {error.got}, expected {error.expected}: taken as absent"
+        notes.warn(error.line, "unusable-value", str(error.element), message)
+
+
 def read_transmission(notes: Notes, element: etree._Element, joints: Sequence[str]) -> Transmission:
-    """The transmission, in the ROS form (<type>, <joint>, <actuator>); unknown joints are said."""
+    """The transmission, in the ROS form (<type>, <joint>, <actuator>).
+
+    Unknown joints and unusable numbers are said; whether the latter matter is decided where they are needed.
+    """
     name = element.get("name") or ""
     where = f"transmission {name!r}"
+    own = Notes(notes.path)
     driven = []
     for joint in element.findall("joint"):
         joint_name = joint.get("name") or ""
@@ -206,11 +223,12 @@ def read_transmission(notes: Notes, element: etree._Element, joints: Sequence[st
             message = f"names the unknown joint {joint_name!r}; {suggestion(joint_name, joints)}"
             notes.warn(joint.sourceline, "unknown-transmission-joint", where, message)
             continue
-        reduction = read_text_number(notes, joint, "mechanicalReduction", where)
-        driven.append((joint_name, reduction, read_text_number(notes, joint, "offset", where)))
+        reduction = read_text_number(own, joint, "mechanicalReduction", where)
+        driven.append((joint_name, reduction, read_text_number(own, joint, "offset", where)))
     actuators = tuple(
-        (actuator.get("name") or "", read_text_number(notes, actuator, "mechanicalReduction", where))
+        (actuator.get("name") or "", read_text_number(own, actuator, "mechanicalReduction", where))
         for actuator in element.findall("actuator")
     )
+    _warn_instead(notes, own)
     kind = (element.findtext("type") or element.get("type") or "").strip()
-    return Transmission(name, kind, tuple(driven), actuators, element.sourceline)
+    return Transmission(name, kind, tuple(driven), actuators, element.sourceline, tuple(own.errors))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from spelgen.errors import Diagnostic
+from spelgen.errors import Diagnostic, UrdfError
 
 Vector = tuple[float, float, float]
 Tensor = tuple[float, float, float, float, float, float]
@@ -79,13 +79,17 @@ class Joint:
 
 @dataclass(frozen=True)
 class Transmission:
-    """Which actuators (name, reduction) drive which joints (name, reduction, offset); None where absent."""
+    """Which actuators (name, reduction) drive which joints (name, reduction, offset); None where absent.
+
+    ``errors``: what cannot be read of it, for the step that needs it: most need none of the transmissions.
+    """
 
     name: str
     type: str
     joints: tuple[tuple[str, float | None, float | None], ...]
     actuators: tuple[tuple[str, float | None], ...]
     line: int
+    errors: tuple[UrdfError, ...] = ()
 
 
 @dataclass(frozen=True)
