@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from spelgen.arm.arm import Arm
-from spelgen.dynamics.pinocchio_engine import make_engine, mass_matrix
+from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.settings.settings import Settings
 from spelgen.structure.base_parameters import base_parameters
 
@@ -17,7 +17,7 @@ CLOSE = 1e-10
 
 def assert_equal_to_pinocchio(arm: Arm, rows: dict[str, str], count: int, tolerance: float = CLOSE) -> None:
     """Every expression at random positions, with the base parameters of ``arm``."""
-    engine = make_engine(arm, Settings())
+    engine = arm_dynamics(arm, Settings())
     n = len(arm.coordinates)
     names = {"cos": np.cos, "sin": np.sin}
     names |= {each.name: float(each.value) for each in base_parameters(arm, count)}
@@ -25,7 +25,7 @@ def assert_equal_to_pinocchio(arm: Arm, rows: dict[str, str], count: int, tolera
     points = np.random.default_rng(3).uniform(-2, 2, (3, n))
     for q in points:
         at = names | {f"q{k + 1}": value for k, value in enumerate(q)}
-        mass = mass_matrix(engine, q)
+        mass = engine.mass_matrix(q)
         size = np.sqrt(np.outer(mass.diagonal(), mass.diagonal()))
         for name, expression in rows.items():
             value = eval(expression, {}, at)

@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from spelgen.arm.arm import Arm
-from spelgen.dynamics.pinocchio_engine import make_engine, mass_matrix
+from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.settings.settings import Settings
 
 NOTHING = 1e-9  # of a size of 1
@@ -22,7 +22,7 @@ class Seen:
 
     def __post_init__(self) -> None:
         rng = np.random.default_rng(1)
-        self.engine = make_engine(self.arm, Settings())
+        self.engine = arm_dynamics(self.arm, Settings())
         self.n = self.engine.model.nv
         self.configurations = rng.uniform(-2, 2, (3, self.n))
         self.places = [self._places(q) for q in self.configurations]
@@ -97,4 +97,4 @@ class Seen:
         return sum(inertia.mass for inertia in self.engine.model.inertias[joint:])
 
     def mass(self, row: int) -> np.ndarray:
-        return np.array([mass_matrix(self.engine, q)[row - 1, row - 1] for q in self.configurations])
+        return np.array([self.engine.mass_matrix(q)[row - 1, row - 1] for q in self.configurations])

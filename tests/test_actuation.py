@@ -11,8 +11,8 @@ from emitted import import_source, randomise
 from typer.testing import CliRunner
 
 from spelgen.cli.main import app
-from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
-from spelgen.dynamics.pinocchio_engine import forward_dynamics, make_engine
+from spelgen.dynamics.pinocchio_urdf import urdf_dynamics
+from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.errors import SettingsError, SpelgenError
 from spelgen.fitting.rollout import loss_scales, momentum_loss, roll_out
 from spelgen.logs.windows import Windows
@@ -212,24 +212,24 @@ def test_the_simulation_moves_joints_by_motors(coupled):
     )
     assert np.array_equal(loaded.actuation.matrix(), G.numpy())
     log = simulate(loaded.arm, settings, loaded.actuation.matrix()).train[0]
-    engine, friction = make_engine(loaded.arm, settings), make_friction(loaded.arm, settings)
+    engine, friction = arm_dynamics(loaded.arm, settings), make_friction(loaded.arm, settings)
     q, qd = log.q[0], log.qd[0]
     for _ in range(5000):  # explicit Euler over the first interval, 10 us a step
-        qdd = forward_dynamics(engine, q, qd, G.numpy() @ log.tau[0] - friction(qd))
+        qdd = engine.forward_dynamics(q, qd, G.numpy() @ log.tau[0] - friction(qd))
         q, qd = q + 1e-5 * qd, qd + 1e-5 * qdd
     assert np.abs(q - log.q[1]).max() < 1e-2 * np.abs(log.q[1] - log.q[0]).max()
     assert np.abs(qd - log.qd[1]).max() < 1e-2 * np.abs(log.qd[1]).max()
 
 
 def test_the_urdf_rival_has_the_same_motors(coupled):
-    rival = PinocchioDynamics(coupled[0], ["j1", "pitch", "roll"])
+    rival = urdf_dynamics(coupled[0], ["j1", "pitch", "roll"])
     q, qd, _, tau = states()
     qdd = rival.rates(q, qd, tau, None)[1]
     assert torch.allclose(rival.inverse_dynamics(q, qd, qdd), tau, rtol=0, atol=1e-9)
     loaded = load(coupled[0])
-    engine = make_engine(loaded.arm, loaded.settings)  # the URDF gives no friction
+    engine = arm_dynamics(loaded.arm, loaded.settings)  # the URDF gives no friction
     wanted = [
-        forward_dynamics(engine, q[i].numpy(), qd[i].numpy(), G.numpy() @ tau[i].numpy())
+        engine.forward_dynamics(q[i].numpy(), qd[i].numpy(), G.numpy() @ tau[i].numpy())
         for i in range(len(q))
     ]
     assert np.allclose(qdd.numpy(), wanted, rtol=0, atol=1e-9)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
+from spelgen.dynamics.pinocchio_urdf import urdf_dynamics
 from spelgen.dynamics.tip import tip_position
 from spelgen.errors import LogError, RunError
 from spelgen.evaluation.baselines import held_velocity, urdf_values
@@ -66,7 +66,7 @@ def cart_torque(q, qd, qdd):
 
 
 def test_the_urdf_rival_has_the_dynamics_of_the_urdf(cart):
-    dynamics = PinocchioDynamics(cart, ("slide", "swing"))
+    dynamics = urdf_dynamics(cart, ("slide", "swing"))
     q, qd, qdd = draw(20, 2), draw(20, 2, seed=1), draw(20, 2, seed=2)
     tau = cart_torque(q, qd, qdd)
     torch.testing.assert_close(dynamics.inverse_dynamics(q, qd, qdd), tau, atol=1e-12, rtol=0)
@@ -76,13 +76,13 @@ def test_the_urdf_rival_has_the_dynamics_of_the_urdf(cart):
 
 def test_the_urdf_rival_follows_the_order_of_joints_asked_for(cart):
     q, qd, qdd = draw(20, 2), draw(20, 2, seed=1), draw(20, 2, seed=2)
-    turned = PinocchioDynamics(cart, ("swing", "slide"))
+    turned = urdf_dynamics(cart, ("swing", "slide"))
     tau = turned.inverse_dynamics(q.flip(-1), qd.flip(-1), qdd.flip(-1))
     torch.testing.assert_close(tau.flip(-1), cart_torque(q, qd, qdd), atol=1e-12, rtol=0)
 
 
 def test_the_urdf_rival_locks_other_joints(cart):
-    dynamics = PinocchioDynamics(cart, ("swing",))
+    dynamics = urdf_dynamics(cart, ("swing",))
     q, qd, qdd = draw(20, 1), draw(20, 1, seed=1), draw(20, 1, seed=2)
     whole = [torch.cat([torch.zeros(20, 1), x], dim=-1) for x in (q, qd, qdd)]
     torch.testing.assert_close(
@@ -93,13 +93,13 @@ def test_the_urdf_rival_locks_other_joints(cart):
 def test_mimic_joints_are_no_silent_error(cart):
     cart.write_text(CART.replace('<axis xyz="0 -1 0"/>', '<axis xyz="0 -1 0"/><mimic joint="slide"/>'))
     with pytest.raises(ValueError, match="mimic joints are not supported here: swing"):
-        PinocchioDynamics(cart, ("slide",))
+        urdf_dynamics(cart, ("slide",))
 
 
 def test_the_gravity_of_the_settings_counts(cart):
     cart.with_suffix(".yaml").write_text("gravity: [0, 0, 0]\n")
     still = torch.zeros(1, 2, dtype=torch.float64)
-    tau = PinocchioDynamics(cart, ("slide", "swing")).inverse_dynamics(still + 1, still, still)
+    tau = urdf_dynamics(cart, ("slide", "swing")).inverse_dynamics(still + 1, still, still)
     torch.testing.assert_close(tau, still, atol=1e-14, rtol=0)
 
 
@@ -242,7 +242,7 @@ def test_a_urdf_run_is_compared_in_torque_and_at_the_tip(cart):
     module = cart.with_name("cart_model.py")
     module.write_text(pipeline.build(cart))
     names = load_model(module).joint_names
-    dynamics = PinocchioDynamics(cart, names)
+    dynamics = urdf_dynamics(cart, names)
     for role, seed in (("train", 0), ("test", 1)):
         logs = motions(dynamics, count=2, samples=200, rate=100.0, seed=seed)
         write_logs(cart.parent / "logs" / f"{role}.parquet", logs, names)

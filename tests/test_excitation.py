@@ -69,7 +69,7 @@ def test_the_motion_is_worth_the_search(arm, found):
 def test_the_condition_number_is_that_of_the_regressor(arm, found):
     """By Pinocchio's regressor: no column of friction or rotor, rigid bodies alone, by numerical rank."""
     pin = pytest.importorskip("pinocchio")
-    from spelgen.dynamics.pinocchio_engine import pinocchio_model
+    from spelgen.dynamics.pinocchio_arm import pinocchio_model
     from spelgen.settings.settings import Settings
 
     model = pinocchio_model(arm, Settings())

@@ -9,7 +9,7 @@ from emitted import ROBOTS
 from typer.testing import CliRunner
 
 from spelgen.cli.main import app
-from spelgen.dynamics.pinocchio_engine import bias, make_engine, mass_matrix
+from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.fitting.run_folder import RunFolder, load_model, write_state
 from spelgen.pipeline import build, load
 
@@ -45,12 +45,12 @@ def heavier(model):
 
 def differences(model, loaded):
     """Largest difference of M and of the gravity torque to Pinocchio's from the exported files."""
-    engine = make_engine(loaded.arm, loaded.settings)
+    engine = arm_dynamics(loaded.arm, loaded.settings)
     q = torch.randn(20, model.n, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     with torch.no_grad():
         mass, load_torque = model.mass_matrix(q).numpy(), model.gravity(q).numpy()
     still = np.zeros(model.n)
-    pairs = [(mass_matrix(engine, at), bias(engine, at, still)) for at in q.numpy()]
+    pairs = [(engine.mass_matrix(at), engine.nonlinear_effects(at, still)) for at in q.numpy()]
     true_mass, true_load = (np.array(column) for column in zip(*pairs, strict=True))
     return np.abs(mass - true_mass).max(), np.abs(load_torque - true_load).max()
 

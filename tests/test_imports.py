@@ -21,14 +21,14 @@ errors files labels listing templates
 settings: values yaml_document
 logs: mapping
 settings: joint simulation training comparison messages settings
-spec
+design spec
 urdf: robot xacro_child xacro_input document values elements lint read actuation
 arm: rational angle_rounding placement chain lump_links arm
 structure: recursion field sampling spans basis expansion symbolic structure nominal
 structure: fourier base_parameters pseudo_inertia
 {" ".join(RUNTIME)}
 emission: bodies plan source docstring emit
-dynamics: pinocchio_engine pinocchio_dynamics regressor tip
+dynamics: protocol arrays constraint pinocchio_dynamics pinocchio_arm pinocchio_urdf regressor regressor_dynamics tip
 logs: trajectory bags tables read checks filtering windows chunks epoch_windows
 simulation: simulate tracking protocols
 identification: samples friction base_parameters least_squares prior identify formatting

@@ -7,7 +7,7 @@ from scipy.integrate import solve_ivp
 from scipy.special import ellipj
 
 from spelgen.arm.arm import make_arm
-from spelgen.dynamics.pinocchio_engine import forward_dynamics, make_engine, mass_matrix
+from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.errors import RunError, SettingsError
 from spelgen.settings.joint import JointSettings
 from spelgen.settings.settings import Settings, load_settings
@@ -36,7 +36,7 @@ def load(path):
 
 
 def run(arm, settings, start, t, tau):
-    return rollout(make_engine(arm, settings), make_friction(arm, settings), np.array(start), t, tau)
+    return rollout(arm_dynamics(arm, settings), make_friction(arm, settings), np.array(start), t, tau)
 
 
 class TestMotion:
@@ -71,12 +71,12 @@ class TestMotion:
     def test_an_arm_without_losses_keeps_its_energy(self, robots):
         two_link, _ = load(robots / "two_link.urdf")
         geared = Settings(joints={"joint1": JointSettings(rotor_inertia=0.02, gear=5.0)})
-        engine = make_engine(two_link, geared)
+        engine = arm_dynamics(two_link, geared)
         t = np.linspace(0, 2, 21)
         states = run(two_link, geared, [2.5, -1.0, 0.3, 0.2], t, np.zeros((t.size, 2)))
         data = engine.model.createData()
         energies = [
-            0.5 * qd @ mass_matrix(engine, q) @ qd + pin.computePotentialEnergy(engine.model, data, q)
+            0.5 * qd @ engine.mass_matrix(q) @ qd + pin.computePotentialEnergy(engine.model, data, q)
             for q, qd in np.split(states, 2, axis=1) and zip(states[:, :2], states[:, 2:], strict=True)
         ]
         np.testing.assert_allclose(energies, energies[0], atol=1e-10)
@@ -84,14 +84,14 @@ class TestMotion:
     def test_what_friction_takes_and_motors_give_is_what_the_energy_gains(self, robots):
         """dE/dt = qd (tau - friction(qd)), integrated beside the motion by another solver at other steps."""
         rpr, settings = load(robots / "rpr.urdf")
-        engine, friction = make_engine(rpr, settings), make_friction(rpr, settings)
+        engine, friction = arm_dynamics(rpr, settings), make_friction(rpr, settings)
         tau = np.array([2.0, -1.0, 1.0])
         start = np.array([0.3, 0.8, 1.0, 0.0, 0.2, -0.5, 0.0])  # the last entry is the work
 
         def derivative(_, state):
             q, qd = state[:3], state[3:6]
             force = tau - friction(qd)
-            return np.concatenate([qd, forward_dynamics(engine, q, qd, force), [qd @ force]])
+            return np.concatenate([qd, engine.forward_dynamics(q, qd, force), [qd @ force]])
 
         t = np.array([0.0, 0.5])
         end = rollout(engine, friction, start[:6], t, np.stack([tau, tau]))[-1]
@@ -99,7 +99,7 @@ class TestMotion:
         np.testing.assert_allclose(end, other[:6], atol=1e-8)
         data = engine.model.createData()
         energy = [
-            0.5 * state[3:6] @ mass_matrix(engine, state[:3]) @ state[3:6]
+            0.5 * state[3:6] @ engine.mass_matrix(state[:3]) @ state[3:6]
             + pin.computePotentialEnergy(engine.model, data, state[:3])
             for state in (start, end)
         ]
@@ -146,10 +146,10 @@ class TestProtocol:
     def test_logged_torques_are_held_to_the_next_sample(self, robots, settings):
         two_link, _ = load(robots / "two_link.urdf")
         log = simulate(two_link, settings).train[0]
-        engine = make_engine(two_link, settings)
+        engine = arm_dynamics(two_link, settings)
 
         def derivative(_, state):
-            return np.concatenate([state[2:], forward_dynamics(engine, state[:2], state[2:], log.tau[2])])
+            return np.concatenate([state[2:], engine.forward_dynamics(state[:2], state[2:], log.tau[2])])
 
         start = np.concatenate([log.q[2], log.qd[2]])
         end = solve_ivp(derivative, (0, 0.05), start, method="RK45", rtol=1e-11, atol=1e-12).y[:, -1]

@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from spelgen import pipeline
-from spelgen.dynamics.pinocchio_engine import forward_dynamics, make_engine
+from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.errors import SettingsError, SpelgenErrors
 from spelgen.settings.settings import Settings
 from spelgen.simulation import tracking
@@ -127,13 +127,13 @@ def test_torques_are_held_between_ticks_and_explain_the_motion(recordings, loade
     _, recording = kept[1]
     np.testing.assert_array_equal(np.concatenate([logs.train[1].tau, logs.test[1].tau]), recording.tau)
     assert (recording.tau.reshape(-1, 4, N) == recording.tau[::4, None]).all()
-    engine, friction = make_engine(loaded.arm, settings), make_friction(loaded.arm, settings)
+    engine, friction = arm_dynamics(loaded.arm, settings), make_friction(loaded.arm, settings)
     start = 4 * 300
 
     def derivative(_, state):
         qd = state[N:]
         force = recording.tau[start] - friction(qd)
-        return np.concatenate([qd, forward_dynamics(engine, state[:N], qd, force)])
+        return np.concatenate([qd, engine.forward_dynamics(state[:N], qd, force)])
 
     end = solve_ivp(derivative, (0, 0.008), recording.states[start], rtol=1e-11, atol=1e-13).y[:, -1]
     np.testing.assert_allclose(recording.states[start + 4], end, atol=1e-9)
@@ -177,7 +177,7 @@ def test_motors_behind_gears_get_their_share_and_a_passive_joint_none():
 
 def test_the_arm_is_held_against_its_weight_from_the_start(loaded):
     """Without gains and without a sine to follow, what the controller starts with keeps the arm at rest."""
-    engine, friction = make_engine(loaded.arm, loaded.settings), make_friction(loaded.arm, loaded.settings)
+    engine, friction = arm_dynamics(loaded.arm, loaded.settings), make_friction(loaded.arm, loaded.settings)
     still = Sines(np.full(N, 0.4), np.zeros(N), amplitude=0.0, frequency=0.125)
     settings = changed(loaded.settings, duration=0.4)
     held = record(engine, friction, np.eye(N), still, tuned(np.zeros(N), 3.0), settings)

@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from random_arms import arms
 
 from spelgen.arm.arm import make_arm
-from spelgen.dynamics.pinocchio_engine import bias, make_engine, mass_matrix
+from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.pipeline import load
 from spelgen.structure.fourier import find_waves
 from spelgen.structure.nominal import nominal_inertias, working_range
@@ -124,7 +124,7 @@ def test_an_untrained_module_is_the_urdfs_arm(robot, net, tmp_path):
     pytest.importorskip("pinocchio")
     loaded = load(ROBOTS / f"{robot}.urdf")
     bare = loaded.settings.model_copy(update={"joints": {}})
-    engine = make_engine(loaded.arm, bare)
+    engine = arm_dynamics(loaded.arm, bare)
     model = import_source(built(robot, net=net)[0], tmp_path / f"{robot}_spel.py").Model(seed=0)
     q = torch.randn(20, model.n, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
@@ -132,6 +132,6 @@ def test_an_untrained_module_is_the_urdfs_arm(robot, net, tmp_path):
         mass, load_torque = model.mass_matrix(q).numpy(), model.gravity(q).numpy()
     still = np.zeros(model.n)
     for at, found, torque in zip(q.numpy(), mass, load_torque, strict=True):
-        true = mass_matrix(engine, at)
+        true = engine.mass_matrix(at)
         assert np.abs(found - true).max() < 2e-6 * max(1.0, np.abs(true).max())
-        assert np.abs(torque - bias(engine, at, still)).max() < 1e-7 * 100
+        assert np.abs(torque - engine.nonlinear_effects(at, still)).max() < 1e-7 * 100

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from spelgen import pipeline
@@ -14,11 +13,10 @@ from spelgen import pipeline
 
 def true_mass(robot: Path, q: torch.Tensor) -> torch.Tensor:
     """M (T, n, n) [kg m^2, kg m, kg] of a URDF and its sidecar, by Pinocchio, at q (T, n); rotors included."""
-    from spelgen.dynamics.pinocchio_engine import make_engine, mass_matrix
+    from spelgen.dynamics.pinocchio_arm import arm_dynamics
 
     loaded = pipeline.load(robot)
-    engine = make_engine(loaded.arm, loaded.settings)
-    return torch.from_numpy(np.array([mass_matrix(engine, each) for each in q.numpy()]))
+    return arm_dynamics(loaded.arm, loaded.settings).mass_matrix(q)
 
 
 def example_positions(example: Mapping[str, Any]) -> torch.Tensor:

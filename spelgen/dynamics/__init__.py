@@ -1,1 +1,1 @@
-"""What has M, gravity and friction: Pinocchio's view of an arm or a URDF, the regressor, the tip."""
+"""What has rigid-body dynamics, under one protocol: Pinocchio's view of an arm, the regressor; and the tip."""

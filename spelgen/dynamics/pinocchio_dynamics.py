@@ -1,113 +1,123 @@
-"""A URDF as Pinocchio reads it, by itself, in place of an emitted module."""
+"""Rigid bodies by Pinocchio, with armature, friction, inputs and mimic joints.
+
+    M(q) qdd + h(q, qd) + friction(qd) = G tau        with  M = K^T M_joints(K q + offset) K
+
+K is constant, so it adds no velocity terms; it is a permutation unless joints follow others or are locked.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable
+from typing import TypeVar
 
 import numpy as np
-import torch
+import pinocchio as pin
 
-from spelgen.settings.settings import load_settings
-from spelgen.urdf.actuation import derive_actuation
-from spelgen.urdf.read import read_urdf
+from spelgen.dynamics.arrays import by_state
+from spelgen.dynamics.constraint import Constraint
 
-FRICTION_VELOCITY = 0.05  # [rad/s, m/s] width of the tanh in place of the jump of a URDF's Coulomb friction
+Array = TypeVar("Array")
+"""numpy.ndarray or torch.Tensor: what is returned is of the kind of what is given."""
 
 
 class PinocchioDynamics:
-    """A URDF's arm of n joints, all others locked at zero, with velocities where an emitted module has
-    momenta.
+    """An arm of n coordinates (see ``RigidDynamics``); the model has b joints, the reflected rotors as armature.
+
+    constraint: what its names leave out stands still. friction: torque (n,) by velocity (n,).
+    inputs: G, (n, n); without, each input is its own joint's torque.
     """
 
-    def __init__(self, urdf: Path, joints: Sequence[str]) -> None:
-        import pinocchio as pin  # an extra: everything else here works without
+    def __init__(
+        self,
+        model: pin.Model,
+        constraint: Constraint,
+        friction: Callable[[np.ndarray], np.ndarray] | None = None,
+        inputs: np.ndarray | None = None,
+    ) -> None:
+        self.model, self.data = model, model.createData()
+        self.friction, self.inputs = friction, inputs
+        self.jacobian, self.offset = np.zeros((model.nv, constraint.jacobian.shape[1])), np.zeros(model.nv)
+        circles, lines = list[tuple[int, int]](), list[tuple[int, int]]()
+        for name, row, offset in zip(constraint.names, constraint.jacobian, constraint.offset, strict=True):
+            joint = model.joints[model.getJointId(name)]
+            self.jacobian[joint.idx_v], self.offset[joint.idx_v] = row, offset
+            (lines if joint.nq == 1 else circles).append((joint.idx_q, joint.idx_v))
+        # where a joint's position stands in a configuration, and in a velocity
+        self._circles = circles
+        self._lines = np.array(lines, dtype=np.int64).reshape(-1, 2)
+        self._plain = not circles and model.nq == model.nv == len(lines)
+        identity = np.array_equal(self.jacobian.T @ self.jacobian, np.eye(self.n))
+        self._direct = model.nv == self.n and identity and not self.offset.any()
 
-        robot, settings = read_urdf(urdf), load_settings(urdf)
-        coupled = [joint.name for joint in robot.joints if joint.mimic and joint.mimic.joint in joints]
-        if coupled:
-            raise ValueError(f"mimic joints are not supported here: {', '.join(coupled)}")
-        whole = pin.buildModelFromUrdf(str(urdf))
-        locked = [i for i in range(1, whole.njoints) if whole.names[i] not in joints]
-        self._pin: Any = pin
-        self._model = pin.buildReducedModel(whole, locked, pin.neutral(whole))
-        if sorted(self._model.names[1:]) != sorted(joints) or self._model.nv != len(joints):
-            raise ValueError(f"Pinocchio sees the joints {', '.join(self._model.names[1:])}")
-        self._model.gravity.linear = np.array(settings.gravity)
-        self._data = self._model.createData()
-        found = [self._model.joints[self._model.getJointId(name)] for name in joints]
-        self._order = np.array([joint.idx_v for joint in found])
-        self._places = [(joint.idx_q, joint.nq) for joint in found]
-        self._inputs = derive_actuation(robot, settings, joints).matrix()
-        self._damping, self._friction = self._model.damping[self._order], self._model.friction[self._order]
+    @property
+    def n(self) -> int:
+        """How many coordinates."""
+        return int(self.jacobian.shape[1])
 
-    def momentum(self, q: torch.Tensor, qd: torch.Tensor, prepared: None = None) -> torch.Tensor:
-        return qd
+    def mass_matrix(self, q: Array) -> Array:
+        """M, (..., n, n) [kg m^2, kg m, kg]."""
+        return by_state(self._mass, q)
 
-    def velocity(self, q: torch.Tensor, p: torch.Tensor, prepared: None = None) -> torch.Tensor:
-        return p
+    def nonlinear_effects(self, q: Array, qd: Array) -> Array:
+        """Coriolis, centrifugal and gravity torques, (..., n) [Nm, N]."""
+        return by_state(self._effects, q, qd)
 
-    def prepare(self) -> None:
-        """Nothing: there are no weights."""
+    def gravity(self, q: Array) -> Array:
+        """dV/dq, (..., n) [Nm, N]."""
+        return by_state(lambda each: self._effects(each, np.zeros_like(each)), q)
 
-    def rates(
-        self, q: torch.Tensor, p: torch.Tensor, tau: torch.Tensor | None, prepared: None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Rates of q and qd, each (W, n), under the torques tau (W, n)."""
-        qd = p.numpy()
-        force = -self._losses(qd) if tau is None else tau.numpy() @ self._inputs.T - self._losses(qd)
-        qdd = np.empty_like(qd)
-        position, velocity, effort = (
-            self._configurations(q.numpy()),
-            self._permuted(qd),
-            self._permuted(force),
-        )
-        for row in range(len(q)):
-            solved = self._pin.aba(self._model, self._data, position[row], velocity[row], effort[row])
-            qdd[row] = solved[self._order]
-        return p, torch.from_numpy(qdd)
+    def friction_torque(self, q: Array, qd: Array) -> Array:
+        """What friction takes, (..., n) [Nm, N]."""
+        return by_state(lambda _, each: self._lost(each), q, qd)
 
-    def mass_matrix(self, q: torch.Tensor) -> torch.Tensor:
-        """M (T, n, n) [kg m^2, kg m, kg]."""
-        order = np.ix_(self._order, self._order)
-        upper = [self._pin.crba(self._model, self._data, at)[order] for at in self._configurations(q.numpy())]
-        full = np.array([np.where(m == 0, m.T, m) for m in upper])  # crba fills one triangle in its own order
-        return torch.from_numpy(full)
+    def forward_dynamics(self, q: Array, qd: Array, tau: Array) -> Array:
+        """qdd, (..., n), under the inputs tau."""
+        return by_state(self._forward, q, qd, tau)
 
-    def gravity(self, q: torch.Tensor) -> torch.Tensor:
-        """dV/dq (T, n) [Nm, N]."""
-        still = torch.zeros_like(q)
-        return torch.from_numpy(self._joint_torque(q, still, still))
+    def inverse_dynamics(self, q: Array, qd: Array, qdd: Array) -> Array:
+        """The inputs, (..., n), that make qdd; those of a passive joint are the torques that it lacks."""
+        return by_state(self._inverse, q, qd, qdd)
 
-    def inverse_dynamics(self, q: torch.Tensor, qd: torch.Tensor, qdd: torch.Tensor) -> torch.Tensor:
-        """Inputs (T, n); those of a passive joint are the torques that it lacks."""
-        moved = self._inputs + np.diag(~self._inputs.any(axis=1)).astype(float)
-        return torch.from_numpy(np.linalg.solve(moved, self._joint_torque(q, qd, qdd).T).T)
+    def configuration(self, q: np.ndarray) -> np.ndarray:
+        """Pinocchio's configuration (nq,) at q (n,)."""
+        positions = self.jacobian @ q + self.offset
+        if self._plain:
+            return positions
+        configuration: np.ndarray = pin.neutral(self.model)
+        configuration[self._lines[:, 0]] = positions[self._lines[:, 1]]
+        for place, row in self._circles:  # a continuous joint is (cos, sin) in Pinocchio
+            configuration[place : place + 2] = np.cos(positions[row]), np.sin(positions[row])
+        return configuration
 
-    def _joint_torque(self, q: torch.Tensor, qd: torch.Tensor, qdd: torch.Tensor) -> np.ndarray:
-        position, velocity = self._configurations(q.numpy()), self._permuted(qd.numpy())
-        acceleration = self._permuted(qdd.numpy())
-        tau = np.empty(qd.shape)
-        for row in range(len(q)):
-            needed = self._pin.rnea(self._model, self._data, position[row], velocity[row], acceleration[row])
-            tau[row] = needed[self._order]
-        return tau + self._losses(qd.numpy())
+    def _mass(self, q: np.ndarray) -> np.ndarray:
+        upper = np.triu(pin.crba(self.model, self.data, self.configuration(q)))
+        joints = upper + np.triu(upper, 1).T  # Pinocchio promises the upper triangle only
+        mass: np.ndarray = self.jacobian.T @ joints @ self.jacobian
+        return mass
 
-    def _losses(self, qd: np.ndarray) -> np.ndarray:
-        return self._damping * qd + self._friction * np.tanh(qd / FRICTION_VELOCITY)
+    def _effects(self, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
+        effects = pin.nle(self.model, self.data, self.configuration(q), self.jacobian @ qd)
+        found: np.ndarray = self.jacobian.T @ effects
+        return found
 
-    def _permuted(self, values: np.ndarray) -> np.ndarray:
-        """Our joint order -> Pinocchio's."""
-        permuted = np.empty(values.shape)
-        permuted[:, self._order] = values
-        return permuted
+    def _lost(self, qd: np.ndarray) -> np.ndarray:
+        return np.zeros_like(qd) if self.friction is None else self.friction(qd)
 
-    def _configurations(self, q: np.ndarray) -> np.ndarray:
-        """Pinocchio's configurations: a continuous joint is (cos, sin) there."""
-        configurations = np.empty((len(q), self._model.nq))
-        for (start, size), angle in zip(self._places, q.T, strict=True):
-            configurations[:, start] = angle if size == 1 else np.cos(angle)
-            if size == 2:
-                configurations[:, start + 1] = np.sin(angle)
-        return configurations
+    def _forward(self, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> np.ndarray:
+        force = tau if self.inputs is None else self.inputs @ tau
+        if self.friction is not None:
+            force = force - self.friction(qd)
+        if not self._direct:
+            return np.linalg.solve(self._mass(q), force - self._effects(q, qd))
+        by_joint = (self.jacobian @ x for x in (qd, force))
+        found: np.ndarray = self.jacobian.T @ pin.aba(self.model, self.data, self.configuration(q), *by_joint)
+        return found
+
+    def _inverse(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
+        velocity, acceleration = (self.jacobian @ x for x in (qd, qdd))
+        needed = pin.rnea(self.model, self.data, self.configuration(q), velocity, acceleration)
+        force = self.jacobian.T @ needed + self._lost(qd)
+        if self.inputs is None:
+            return force
+        moved = self.inputs + np.diag(~self.inputs.any(axis=1)).astype(float)
+        return np.linalg.solve(moved, force)

@@ -1,49 +1,73 @@
-"""Where the tip of the arm is: forward kinematics of the run's URDF by pytorch-kinematics."""
+"""Where the tip of an arm is and how it moves: kinematics of a URDF by pytorch-kinematics."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytorch_kinematics as pk
 import torch
 
+from spelgen.dynamics.constraint import mimic_constraint
+from spelgen.urdf.document import urdf_bytes
 from spelgen.urdf.read import read_urdf
 from spelgen.urdf.robot import Robot
 
 
-def tip_position(
-    urdf: Path, joints: Sequence[str], tip: str | None
-) -> Callable[[torch.Tensor], torch.Tensor]:
-    """A function of q, (..., n) [rad, m], to the position of the link `tip`, (..., 3) [m], in the root link's
-    frame.
+class TipKinematics:
+    """Pose and Jacobian of a link in the root link's frame, by the coordinates q (..., n) [rad; m].
 
-    tip: by default the link after the last joint, or the end of the fixed links that follow it. Joints other
-    than the n named ones stand at zero. Offsets are single precision in pytorch-kinematics: errors near 1e-7
-    m. Raises what pytorch-kinematics raises where it cannot read the file.
+    Joints that follow others by <mimic> follow here too, all others stand at zero. What it gives is float64 but
+    errs by about 1e-7 rad and m: pytorch-kinematics rounds the file's offsets to float32 whatever it is asked for.
+    In float32 throughout, the chain's products would add to that ten times over.
     """
-    robot = read_urdf(urdf)
-    link = tip or _last_link(robot, joints)
-    chain = pk.build_serial_chain_from_urdf(urdf.read_bytes(), link).to(dtype=torch.float64)
-    names = chain.get_joint_parameter_names()
-    missing = sorted(set(joints) - set(names))
-    if missing:
-        raise ValueError(f"the joints {', '.join(missing)} do not lead to {link}")
-    places = [names.index(joint) for joint in joints]
 
-    def position(q: torch.Tensor) -> torch.Tensor:
-        angles = q.new_zeros(*q.shape[:-1], len(names))
-        angles[..., places] = q
-        poses = chain.forward_kinematics(angles.reshape(-1, len(names))).get_matrix()  # (N, 4, 4)
-        return poses[:, :3, 3].reshape(*q.shape[:-1], 3)
+    def __init__(self, robot: Robot, content: bytes, joints: Sequence[str], link: str) -> None:
+        self.link = link
+        # bytes: of text with an encoding declaration the parser would raise
+        chain = pk.build_serial_chain_from_urdf(content, link)
+        self._chain = chain.to(dtype=torch.float64)
+        constraint = mimic_constraint(robot, joints)
+        order = [constraint.names.index(name) for name in chain.get_joint_parameter_names()]
+        self._jacobian = torch.from_numpy(constraint.jacobian[order])  # (joints of the chain, n)
+        self._offset = torch.from_numpy(constraint.offset[order])
+        missing = [name for name, column in zip(joints, self._jacobian.T, strict=True) if not column.any()]
+        if missing:
+            raise ValueError(f"the joints {', '.join(missing)} do not lead to {link}")
 
-    return position
+    def pose(self, q: torch.Tensor) -> torch.Tensor:
+        """The homogeneous transform, (..., 4, 4)."""
+        found: torch.Tensor = self._chain.forward_kinematics(self._rows(q)).get_matrix()
+        return found.reshape(*q.shape[:-1], 4, 4)
+
+    def position(self, q: torch.Tensor) -> torch.Tensor:
+        """The link's origin, (..., 3) [m]."""
+        return self.pose(q)[..., :3, 3]
+
+    def jacobian(self, q: torch.Tensor) -> torch.Tensor:
+        """Velocity of the link's origin [m/s], then angular velocity [rad/s], by qd; (..., 6, n), in root axes."""
+        found: torch.Tensor = self._chain.jacobian(self._rows(q)) @ self._jacobian
+        return found.reshape(*q.shape[:-1], 6, q.shape[-1])
+
+    def _rows(self, q: torch.Tensor) -> torch.Tensor:
+        """Positions of the chain's joints, (states, joints)."""
+        return (q.double() @ self._jacobian.mT + self._offset).reshape(-1, len(self._offset))
+
+
+def tip_kinematics(urdf: Path | str, joints: Sequence[str], link: str | None = None) -> TipKinematics:
+    """The kinematics of ``link``: by default the one after the last joint, or the end of the fixed links behind it.
+
+    Raises ValueError where the joints do not lead there, and what pytorch-kinematics raises where it cannot read
+    the file.
+    """
+    robot = read_urdf(Path(urdf))
+    return TipKinematics(robot, urdf_bytes(Path(urdf)), joints, link or _last_link(robot, joints))
 
 
 def _last_link(robot: Robot, joints: Sequence[str]) -> str:
-    link = next(joint.child for joint in robot.joints if joint.name == joints[-1])
+    link = robot.joint[joints[-1]].child
     while True:
-        fixed = [joint.child for joint in robot.joints if joint.parent == link and joint.type == "fixed"]
+        fixed = [joint.child for joint in robot.joints_below[link] if joint.type == "fixed"]
         if len(fixed) != 1:
             return link
         link = fixed[0]

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
+from spelgen.dynamics.pinocchio_urdf import urdf_dynamics
+from spelgen.dynamics.protocol import integrable
 from spelgen.fitting.rollout import roll_out
 from spelgen.logs.windows import Windows
 
@@ -51,5 +52,5 @@ def urdf_values(urdf: Path, joints: Sequence[str], substeps: int) -> Contender:
 
     Raises what Pinocchio raises where it cannot read the file, and ImportError without Pinocchio.
     """
-    dynamics = PinocchioDynamics(urdf, joints)
-    return Contender("URDF", lambda windows: roll_out(dynamics, windows, substeps), dynamics.inverse_dynamics)
+    dynamics = urdf_dynamics(urdf, joints)
+    return Contender("URDF", lambda windows: roll_out(integrable(dynamics), windows, substeps), dynamics.inverse_dynamics)

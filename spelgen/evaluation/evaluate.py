@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from spelgen.dynamics.tip import tip_position
+from spelgen.dynamics.tip import tip_kinematics
 from spelgen.errors import Diagnostic
 from spelgen.evaluation.baselines import Contender, held_velocity, trained, urdf_values
 from spelgen.evaluation.examples import Example, predict_examples
@@ -171,7 +171,7 @@ def _tip(run: RunFolder, header: Header, notes: list[Diagnostic]) -> Tip | None:
     if not run.urdf.exists():
         return None
     try:
-        return tip_position(run.urdf, header.joints, header.options.tip)
+        return tip_kinematics(run.urdf, header.joints, header.options.tip).position
     except Exception as error:  # as above, of pytorch-kinematics
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         notes.append(Diagnostic("info", "no-tip", "robot.urdf", None, f"no tip errors: {reason}"))

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
+from spelgen.dynamics.pinocchio_urdf import urdf_dynamics
 from spelgen.logs.windows import Windows
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def urdf_prior(urdf: Path, joints: Sequence[str], model: EmittedModel, windows: 
     """The prior of a URDF around the positions of ``windows``. Raises what Pinocchio raises, and ImportError
     without it.
     """
-    dynamics = PinocchioDynamics(urdf, joints)
+    dynamics = urdf_dynamics(urdf, joints)
     seen = windows.q.flatten(0, 1)
     low, high = seen.amin(dim=0), seen.amax(dim=0)
     low, high = low - WIDENED * (high - low), high + WIDENED * (high - low)

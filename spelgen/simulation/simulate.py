@@ -14,7 +14,8 @@ import numpy as np
 from scipy.integrate import DOP853
 
 from spelgen.arm.arm import Arm, Coordinate
-from spelgen.dynamics.pinocchio_engine import Engine, forward_dynamics, make_engine
+from spelgen.dynamics.pinocchio_arm import arm_dynamics
+from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
 from spelgen.errors import RunError, SettingsError, collect
 from spelgen.logs.read import Trajectory
 from spelgen.settings.joint import JointSettings
@@ -95,7 +96,7 @@ def simulate(
     RunError when the motion cannot be integrated.
     """
     protocol = settings.simulation
-    engine, friction = make_engine(arm, settings), make_friction(arm, settings)
+    dynamics, friction = arm_dynamics(arm, settings), make_friction(arm, settings)
     lowest, highest = initial_range(arm, settings)
     torques = [_torques(coordinate, settings) for coordinate in arm.coordinates]
     t = np.arange(round(protocol.duration * protocol.rate) + 1) / protocol.rate
@@ -106,8 +107,8 @@ def simulate(
         start = np.concatenate([random.uniform(lowest, highest), np.zeros(lowest.size)])
         tau = np.stack([random.choice(choices, size=t.size) for choices in torques], axis=1)
         effect = tau if input_matrix is None else tau @ input_matrix.T
-        states = rollout(engine, friction, start, t, effect)
-        errors.append(np.abs(states - rollout(engine, friction, start, t, effect, looser=LOOSER)).max())
+        states = rollout(dynamics, friction, start, t, effect)
+        errors.append(np.abs(states - rollout(dynamics, friction, start, t, effect, looser=LOOSER)).max())
         q, qd = np.split(states, 2, axis=1)
         trajectories.append(Trajectory(f"traj_{number:02d}", t, q, qd, tau))
         if progress is not None:
@@ -121,7 +122,12 @@ def simulate(
 
 
 def rollout(
-    engine: Engine, friction: Friction, start: np.ndarray, t: np.ndarray, tau: np.ndarray, looser: float = 1.0
+    dynamics: PinocchioDynamics,
+    friction: Friction,
+    start: np.ndarray,
+    t: np.ndarray,
+    tau: np.ndarray,
+    looser: float = 1.0,
 ) -> np.ndarray:
     """Return the states (q, qd), (T, 2n), at the times t (T,) [s] from a start (2n,) under tau (T, n).
 
@@ -134,7 +140,7 @@ def rollout(
 
     def derivative(_: float, state: np.ndarray) -> np.ndarray:
         qd = state[n:]
-        return np.concatenate([qd, forward_dynamics(engine, state[:n], qd, held - friction(qd))])
+        return np.concatenate([qd, dynamics.forward_dynamics(state[:n], qd, held - friction(qd))])
 
     for k in range(t.size - 1):
         held = tau[k]

@@ -13,7 +13,8 @@ import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
 from spelgen.arm.arm import Arm
-from spelgen.dynamics.pinocchio_engine import Engine, bias, make_engine, mass_matrix
+from spelgen.dynamics.pinocchio_arm import arm_dynamics
+from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
 from spelgen.errors import SettingsError, SpelgenError, collect
 from spelgen.logs.read import Trajectory
 from spelgen.settings.settings import Settings
@@ -88,18 +89,18 @@ def track(
     recordings under the same torques, as for `simulate`.
     """
     protocol = settings.simulation
-    engine, friction = make_engine(arm, settings), make_friction(arm, settings)
+    dynamics, friction = arm_dynamics(arm, settings), make_friction(arm, settings)
     inputs = np.eye(len(arm.coordinates)) if input_matrix is None else input_matrix
     middle = _middle(arm, settings)
     train, test, errors = [], [], []
     for number, phase in enumerate(_phases(settings, middle.size)):
         sines = Sines(middle, phase, settings.tracking.amplitude, settings.tracking.frequency)
         bandwidth = settings.tracking.bandwidths[number % len(settings.tracking.bandwidths)]
-        felt = 1 / np.diag(np.linalg.inv(mass_matrix(engine, middle)))  # by a joint when the others are free
+        felt = 1 / np.diag(np.linalg.inv(dynamics.mass_matrix(middle)))  # by a joint when the others are free
         gains = tuned(felt, bandwidth)
-        recording = record(engine, friction, inputs, sines, gains, settings)
+        recording = record(dynamics, friction, inputs, sines, gains, settings)
         effect = recording.tau @ inputs.T
-        again = rollout(engine, friction, recording.states[0], recording.t, effect, looser=LOOSER)
+        again = rollout(dynamics, friction, recording.states[0], recording.t, effect, looser=LOOSER)
         errors.append(np.abs(recording.states - again).max())
         log = measured(recording, settings.tracking, f"traj_{number:02d}")
         kept = len(log.t) - round(protocol.test_fraction * len(log.t))
@@ -120,7 +121,7 @@ def tuned(inertia: np.ndarray, bandwidth: float) -> Gains:
 
 
 def record(
-    engine: Engine,
+    dynamics: PinocchioDynamics,
     friction: Friction,
     inputs: np.ndarray,
     sines: Sines,
@@ -136,7 +137,7 @@ def record(
     ticks = -(-round(settings.simulation.duration * settings.simulation.rate) // held)
     to_motors = np.linalg.pinv(inputs)
     state = np.concatenate([sines.position(0.0), np.zeros(n)])
-    integral = bias(engine, *np.split(state, 2))
+    integral = dynamics.nonlinear_effects(*np.split(state, 2))
     before = seen = _seen(state[:n], tracking)
     states, torques = [], []
     for k in range(ticks):
@@ -146,7 +147,7 @@ def record(
         integral = integral + tick * gains.integral * error
         tau = to_motors @ (gains.proportional * error + gains.derivative * lag + integral)
         t = k * tick + np.arange(held + 1) / settings.simulation.rate
-        passed = rollout(engine, friction, state, t, np.tile(inputs @ tau, (held + 1, 1)))
+        passed = rollout(dynamics, friction, state, t, np.tile(inputs @ tau, (held + 1, 1)))
         states.append(passed[:-1])
         torques.append(np.tile(tau, (held, 1)))
         state = passed[-1]

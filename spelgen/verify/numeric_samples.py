@@ -13,7 +13,8 @@ import numpy as np
 import pinocchio as pin
 
 from spelgen.arm.arm import Arm, Body
-from spelgen.dynamics.pinocchio_engine import Engine, make_engine, mass_matrix
+from spelgen.dynamics.pinocchio_arm import arm_dynamics
+from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
 from spelgen.settings.settings import Settings
 from spelgen.structure.basis import Weights
 from spelgen.structure.recursion import triangle
@@ -52,15 +53,15 @@ def draw(arm: Arm, count: int, rng: np.random.Generator, *, random_inertials: bo
     n = len(arm.coordinates)
     rows, columns = np.tril_indices(n)
     mass, potential = np.zeros((1 + n, count, n, n)), np.zeros((1 + n, count))
-    engine = None if random_inertials else make_engine(arm, Settings())
+    own = None if random_inertials else arm_dynamics(arm, Settings())
     for sample in range(count):
-        drawn = engine or make_engine(with_random_inertias(arm, rng), Settings())
+        drawn = own or arm_dynamics(with_random_inertias(arm, rng), Settings())
         base, other = _positions(arm, rng), _positions(arm, rng)
         for block in range(1 + n):
             q = base.copy()
             if block:
                 q[block - 1] = other[block - 1]
-            mass[block, sample] = mass_matrix(drawn, q)
+            mass[block, sample] = drawn.mass_matrix(q)
             potential[block, sample] = _potential_energy(drawn, q)
     typical = np.sqrt(np.abs(np.diagonal(mass, axis1=2, axis2=3)).mean(axis=(0, 1)))
     scale = np.outer(typical, typical)[rows, columns]
@@ -72,15 +73,15 @@ def draw(arm: Arm, count: int, rng: np.random.Generator, *, random_inertials: bo
 
 def regressor(arm: Arm, rng: np.random.Generator) -> np.ndarray:
     """Rows of the inverse-dynamics regressor at random q, qd, qdd, (rows, 10 bodies)."""
-    engine = make_engine(with_random_inertias(arm, rng), Settings())
+    drawn = arm_dynamics(with_random_inertias(arm, rng), Settings())
     n = len(arm.coordinates)
     rows = []
     for _ in range(10 * len(arm.bodies) // n + 10):
-        q = engine.jacobian @ _positions(arm, rng) + engine.offset
-        v, a = (engine.jacobian @ rng.normal(size=n) for _ in range(2))
-        by_joint = pin.computeJointTorqueRegressor(engine.model, engine.data, q, v, a)
+        q = drawn.configuration(_positions(arm, rng))
+        v, a = (drawn.jacobian @ rng.normal(size=n) for _ in range(2))
+        by_joint = pin.computeJointTorqueRegressor(drawn.model, drawn.data, q, v, a)
         # of a single joint Pinocchio gives a vector
-        rows.append(engine.jacobian.T @ by_joint.reshape(len(arm.bodies), -1))
+        rows.append(drawn.jacobian.T @ by_joint.reshape(len(arm.bodies), -1))
     return np.concatenate(rows)
 
 
@@ -89,9 +90,8 @@ def _positions(arm: Arm, rng: np.random.Generator) -> np.ndarray:
     return rng.uniform(-reach, reach)
 
 
-def _potential_energy(engine: Engine, q: np.ndarray) -> float:
-    positions = engine.jacobian @ q + engine.offset
-    return float(pin.computePotentialEnergy(engine.model, engine.data, positions))
+def _potential_energy(drawn: PinocchioDynamics, q: np.ndarray) -> float:
+    return float(pin.computePotentialEnergy(drawn.model, drawn.data, drawn.configuration(q)))
 
 
 def with_random_inertias(arm: Arm, rng: np.random.Generator) -> Arm:

@@ -1,0 +1,59 @@
+"""Arm + Settings -> its rigid-body dynamics by Pinocchio, reflected rotor inertia included."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pinocchio as pin
+
+from spelgen.arm.arm import Arm
+from spelgen.dynamics.constraint import Constraint
+from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
+from spelgen.errors import ArmError, collect
+from spelgen.settings.settings import Settings
+
+
+def arm_dynamics(
+    arm: Arm, settings: Settings, friction: Callable[[np.ndarray], np.ndarray] | None = None
+) -> PinocchioDynamics:
+    """The arm's dynamics, by its joints' own torques; raises ArmError when a body has no inertial."""
+    jacobian = np.zeros((len(arm.bodies), len(arm.coordinates)))
+    for row, body in enumerate(arm.bodies):
+        jacobian[row, body.coordinate] = float(body.multiplier)
+    offset = np.array([body.offset for body in arm.bodies], dtype=float)
+    names = tuple(body.name for body in arm.bodies)
+    return PinocchioDynamics(pinocchio_model(arm, settings), Constraint(names, jacobian, offset), friction)
+
+
+def pinocchio_model(arm: Arm, settings: Settings) -> pin.Model:
+    """A model with, for each body in its order, a joint about or along its own z.
+
+    Reflected rotor inertia is the model's armature. Raises ArmError when a body has no inertial.
+    """
+    bare = [body.name for body in arm.bodies if body.inertia is None]
+    collect([ArmError("its link has no inertial", element=f"joint {name!r}") for name in bare])
+    model = pin.Model()
+    model.name = arm.name
+    model.gravity.linear = np.array(arm.gravity, dtype=float)
+    for body in arm.bodies:
+        joint = pin.JointModelPZ() if body.kind == "prismatic" else pin.JointModelRZ()
+        placement = pin.SE3(np.array(body.rotation, dtype=float), np.array(body.translation, dtype=float))
+        index = model.addJoint(body.parent + 1, joint, placement, body.name)
+        model.appendBodyToJoint(index, _inertia(np.array(body.inertia, dtype=float)), pin.SE3.Identity())
+    model.armature = np.array([_armature(arm, settings, body.name) for body in arm.bodies])
+    return model
+
+
+def _armature(arm: Arm, settings: Settings, joint_name: str) -> float:
+    if joint_name not in {coordinate.name for coordinate in arm.coordinates}:
+        return 0.0  # a mimic joint has no motor of its own
+    joint = settings.joint(joint_name)
+    return joint.rotor_inertia * joint.gear**2
+
+
+def _inertia(parameters: np.ndarray) -> pin.Inertia:
+    mass, hx, hy, hz, ixx, ixy, ixz, iyy, iyz, izz = parameters
+    if mass == 0.0:  # Pinocchio would divide by it
+        return pin.Inertia(0.0, np.zeros(3), np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]]))
+    return pin.Inertia.FromDynamicParameters(np.array([mass, hx, hy, hz, ixx, ixy, iyy, ixz, iyz, izz]))

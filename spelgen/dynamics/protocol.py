@@ -1,0 +1,91 @@
+"""What everything has that moves like an arm: emitted modules, Pinocchio's models, models of least squares."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Protocol
+
+import torch
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+class RigidDynamics(Protocol):
+    """M(q) qdd + h(q, qd) + friction(q, qd) = G tau of n joints; q, qd, qdd, tau are (..., n).
+
+    Units: rad, m; Nm, N; kg m^2, kg m, kg.
+    """
+
+    @property
+    def n(self) -> int:
+        """How many joints."""
+
+    def mass_matrix(self, q: Tensor) -> Tensor:
+        """M, (..., n, n), armature included."""
+
+    def gravity(self, q: Tensor) -> Tensor:
+        """dV/dq, (..., n)."""
+
+    def nonlinear_effects(self, q: Tensor, qd: Tensor) -> Tensor:
+        """h: Coriolis, centrifugal and gravity torques without friction, (..., n)."""
+
+    def friction_torque(self, q: Tensor, qd: Tensor) -> Tensor:
+        """What friction takes, (..., n)."""
+
+    def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
+        """qdd, (..., n), under the inputs tau."""
+
+    def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
+        """The inputs, (..., n), that make qdd; those of a passive joint are the torques that it lacks."""
+
+
+class PortHamiltonianDynamics(RigidDynamics, Protocol):
+    """Dynamics with momenta p = M(q) qd as their state, as emitted modules have them.
+
+    ``prepared`` is what ``prepare`` gave: all that depends on the weights alone.
+    """
+
+    def prepare(self) -> Any:
+        """What many evaluations with the same weights share."""
+
+    def momentum(self, q: Tensor, qd: Tensor, prepared: Any = None) -> Tensor:
+        """p, (..., n)."""
+
+    def velocity(self, q: Tensor, p: Tensor, prepared: Any = None) -> Tensor:
+        """qd, (..., n)."""
+
+    def port_hamiltonian_rhs(
+        self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Any
+    ) -> tuple[Tensor, Tensor]:
+        """q' and p', (..., n), under the inputs tau; without, of the arm left to itself."""
+
+
+class VelocityState:
+    """Any dynamics where momenta are asked for: velocities take their place."""
+
+    def __init__(self, dynamics: RigidDynamics) -> None:
+        self.dynamics = dynamics
+
+    def prepare(self) -> None:
+        """Nothing."""
+
+    def momentum(self, q: Tensor, qd: Tensor, prepared: None = None) -> Tensor:
+        """qd."""
+        return qd
+
+    def velocity(self, q: Tensor, p: Tensor, prepared: None = None) -> Tensor:
+        """qd."""
+        return p
+
+    def port_hamiltonian_rhs(
+        self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: None
+    ) -> tuple[Tensor, Tensor]:
+        """qd and qdd."""
+        return p, self.dynamics.forward_dynamics(q, p, torch.zeros_like(q) if tau is None else tau)
+
+    rates = port_hamiltonian_rhs
+
+
+def integrable(dynamics: RigidDynamics) -> Any:
+    """What a rollout integrates: the dynamics in momenta where they have these, else in velocities."""
+    return dynamics if hasattr(dynamics, "momentum") else VelocityState(dynamics)

@@ -1,0 +1,92 @@
+"""Rigid bodies by their regressor: the dynamics of inertial parameters that least squares found, possible or not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
+
+import numpy as np
+
+from spelgen.arm.arm import Arm
+from spelgen.dynamics.arrays import like
+from spelgen.dynamics.regressor import regressor
+
+Array = TypeVar("Array")
+"""numpy.ndarray or torch.Tensor: what is returned is of the kind of what is given."""
+
+
+class RegressorDynamics:
+    """An arm of n coordinates with these parameters (see ``RigidDynamics``).
+
+    parameters: (10 B,), as ``regressor`` has them. armature: (n,) [kg m^2, kg]. friction: torques (T, n) by
+    velocities (T, n). inputs: G, (n, n); without, each input is its own joint's torque.
+    """
+
+    def __init__(
+        self,
+        arm: Arm,
+        parameters: np.ndarray,
+        armature: np.ndarray,
+        friction: Callable[[np.ndarray], np.ndarray],
+        inputs: np.ndarray | None = None,
+    ) -> None:
+        self.arm, self.parameters, self.armature, self.friction = arm, parameters, armature, friction
+        self.inputs = np.eye(len(armature)) if inputs is None else inputs
+
+    @property
+    def n(self) -> int:
+        """How many coordinates."""
+        return len(self.armature)
+
+    def mass_matrix(self, q: Array) -> Array:
+        """M, (..., n, n) [kg m^2, kg m, kg]."""
+        return self._by_rows(self._mass, q)
+
+    def gravity(self, q: Array) -> Array:
+        """dV/dq, (..., n) [Nm, N]."""
+        return self._by_rows(lambda each: self._bodies(each, 0 * each, 0 * each), q)
+
+    def nonlinear_effects(self, q: Array, qd: Array) -> Array:
+        """Coriolis, centrifugal and gravity torques, (..., n) [Nm, N]."""
+        return self._by_rows(lambda at, speed: self._bodies(at, speed, 0 * at), q, qd)
+
+    def friction_torque(self, q: Array, qd: Array) -> Array:
+        """What friction takes, and what the measured torque shows without any, (..., n) [Nm, N]."""
+        return self._by_rows(lambda _, speed: self.friction(speed), q, qd)
+
+    def forward_dynamics(self, q: Array, qd: Array, tau: Array) -> Array:
+        """qdd, (..., n), under the inputs tau."""
+        return self._by_rows(self._forward, q, qd, tau)
+
+    def inverse_dynamics(self, q: Array, qd: Array, qdd: Array) -> Array:
+        """The inputs, (..., n), that make qdd; those of a passive joint are the torques that it lacks."""
+        return self._by_rows(self._inverse, q, qd, qdd)
+
+    def _bodies(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
+        """The bodies' torques, (T, n)."""
+        torque: np.ndarray = regressor(self.arm, q, qd, qdd) @ self.parameters
+        return torque
+
+    def _mass(self, q: np.ndarray) -> np.ndarray:
+        """Column by column: what each unit acceleration adds to the torque at rest."""
+        count, n = q.shape
+        accelerations = np.concatenate([np.zeros((1, n)), np.eye(n)]).repeat(count, axis=0)
+        still, *moved = self._bodies(
+            np.tile(q, (n + 1, 1)), np.zeros_like(accelerations), accelerations
+        ).reshape(n + 1, count, n)
+        return np.stack([each - still for each in moved], axis=-1) + np.diag(self.armature)
+
+    def _forward(self, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> np.ndarray:
+        force = tau @ self.inputs.T - self._bodies(q, qd, 0 * q) - self.friction(qd)
+        return np.linalg.solve(self._mass(q), force[..., None])[..., 0]
+
+    def _inverse(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
+        force = self._bodies(q, qd, qdd) + self.armature * qdd + self.friction(qd)
+        moved = self.inputs + np.diag(~self.inputs.any(axis=1)).astype(float)
+        return np.linalg.solve(moved, force.T).T
+
+    def _by_rows(self, function: Callable[..., np.ndarray], *states: Array) -> Array:
+        """``function`` of states (T, n), for states (..., n)."""
+        rows = np.broadcast_arrays(*(np.asarray(x) for x in states))
+        found = function(*(x.reshape(-1, self.n) for x in rows))
+        return like(found.reshape(*rows[0].shape[:-1], *found.shape[1:]), states[0])
