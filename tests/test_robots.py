@@ -9,7 +9,7 @@ from lxml import etree
 
 from spelgen import inspect
 from spelgen.arm.arm import make_arm
-from spelgen.settings.settings import check_joint_names, load_settings
+from spelgen.settings.settings import load_settings
 from spelgen.urdf.read import read_urdf
 
 ROBOTS = Path(__file__).parents[1] / "robots"
@@ -106,9 +106,9 @@ def test_every_inertial_is_one_of_a_real_body(robot):
 
 def test_the_sidecar_fits_and_names_its_sources(robot):
     path = ROBOTS / f"{robot}.urdf"
-    settings = load_settings(path)
     joints = [joint.name for joint in make_arm(read_urdf(path)).coordinates]
-    check_joint_names(settings, joints, path)
+    settings = load_settings(path, joints)
+    assert settings.diagnostics == ()
     assert set(settings.joints) == set(joints)
     sources = ("Sci Rep 15:33179", "robotics toolbox", "RA-L", "Universal Robots")
     assert any(source in " ".join(settings.about.split()) for source in sources)

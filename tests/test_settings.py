@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from spelgen.errors import SettingsError, SpelgenErrors
 from spelgen.settings.joint import JointSettings
-from spelgen.settings.settings import Settings, check_joint_names, load_mapping, load_settings
+from spelgen.settings.settings import OF_A_STEP, Settings, load_mapping, load_settings
 
 
 @pytest.fixture
@@ -25,8 +25,11 @@ def urdf(tmp_path, monkeypatch):
 
 
 def told(path):
+    """What is said of a file whose every group is read."""
     with pytest.raises(SettingsError) as error:
-        load_settings(path)
+        settings = load_settings(path)
+        for group in OF_A_STEP:
+            repr(getattr(settings, group).model_fields_set)
     return str(error.value)
 
 
@@ -182,14 +185,25 @@ def test_the_other_suffix_is_not_passed_over(tmp_path, monkeypatch):
 
 def test_joints_that_do_not_exist_are_told_with_their_lines(urdf):
     path = urdf("joints:\n  elbow: {}\n  elbw: {}\nsimulation:\n  positions:\n    wrist: [0, 1]\n")
-    settings = load_settings(path)
-    check_joint_names(settings, ["elbow", "elbw", "wrist", "shoulder"], path)
+    load_settings(path, ["elbow", "elbw", "wrist", "shoulder"])
     with pytest.raises(SpelgenErrors) as error:
-        check_joint_names(settings, ["shoulder", "elbow"], path)
+        load_settings(path, ["shoulder", "elbow"])
     assert str(error.value).splitlines() == [
         "arm.yaml:3: joints: unknown joint 'elbw'; did you mean 'elbow'?",
         "arm.yaml:6: simulation.positions: unknown joint 'wrist'; known are 'shoulder', 'elbow'",
     ]
+
+
+def test_a_group_of_one_step_refuses_that_step_alone(urdf):
+    settings = load_settings(
+        urdf("gravity: [0, 0, -1.6]\ntraining: {epochs: many}\nlogs: {units: {q: deg}}\n")
+    )
+    message = "arm.yaml:2: training.epochs: got 'many', expected a valid integer, unable to parse string as an integer"
+    assert (settings.gravity[2], settings.logs.units.q) == (-1.6, "deg")
+    assert [(each.severity, each.message) for each in settings.diagnostics] == [("warning", message)]
+    with pytest.raises(SettingsError) as error:
+        assert settings.training.epochs
+    assert str(error.value) == message
 
 
 def test_a_mapping_may_have_a_file_of_its_own(tmp_path, monkeypatch):

@@ -1,14 +1,17 @@
-"""What a URDF does not say about a robot: the sidecar `rpr.yaml` beside `rpr.urdf`, checked key by key."""
+"""What a URDF does not say about a robot: the sidecar `rpr.yaml` beside `rpr.urdf`, checked key by key.
+
+A group of keys that one step alone reads refuses that step alone.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
-from spelgen.errors import SettingsError, collect
+from spelgen.errors import Diagnostic, SettingsError, collect
 from spelgen.logs.mapping import LogMapping
 from spelgen.settings.comparison import ComparisonSettings
 from spelgen.settings.joint import Coupling, JointSettings
@@ -19,6 +22,20 @@ from spelgen.settings.values import Group, Number
 from spelgen.settings.yaml_document import Document, read_document
 
 GroupType = TypeVar("GroupType", bound=BaseModel)
+OF_A_STEP = ("simulation", "tracking", "training", "comparison", "logs")
+"""Groups that one step reads; all others belong to the arm."""
+
+
+class Unusable:
+    """In the place of a group that cannot be read: whoever reads it is told why."""
+
+    def __init__(self, errors: Sequence[SettingsError]) -> None:
+        self.errors = tuple(errors)
+
+    def __getattr__(self, name: str) -> Any:
+        if not name.startswith("__"):
+            collect(self.errors)
+        raise AttributeError(name)
 
 
 class Settings(Group):
@@ -52,15 +69,28 @@ class Settings(Group):
                 raise ValueError(f"the joint {name!r} coupled to motors or 'actuated: false', not both")
         return self
 
+    @property
+    def diagnostics(self) -> tuple[Diagnostic, ...]:
+        """Warnings of groups that cannot be read: the steps that need them will stop."""
+        groups = [getattr(self, name) for name in OF_A_STEP]
+        return tuple(
+            Diagnostic("warning", "unusable-settings", "settings", None, str(error))
+            for group in groups
+            if isinstance(group, Unusable)
+            for error in group.errors
+        )
+
     def joint(self, name: str) -> JointSettings:
         """Return the settings of a joint, the defaults when the file does not list it."""
         return self.joints.get(name, JointSettings())
 
 
-def load_settings(urdf_path: Path | str) -> Settings:
+def load_settings(urdf_path: Path | str, joints: Iterable[str] | None = None) -> Settings:
     """Return the settings beside a URDF (`arm.urdf` -> `arm.yaml`), the defaults when there is no such file.
 
-    Raises SettingsError, told with file, line and key, or SpelgenErrors with all that is wrong in the file.
+    ``joints``: all that the URDF has; then unknown names are wrong too. Raises SettingsError, told with file,
+    line and key, or SpelgenErrors with all that is wrong in the file; a group that one step alone reads
+    (``OF_A_STEP``) raises them when it is read.
     """
     path = Path(urdf_path).with_suffix(".yaml")
     if not path.exists():
@@ -68,7 +98,20 @@ def load_settings(urdf_path: Path | str) -> Settings:
         if misnamed.exists():
             raise SettingsError(repr(misnamed.name), file=misnamed, expected=repr(path.name), do="rename it")
         return Settings()
-    return _validated(read_document(path), Settings)
+    document = read_document(path)
+    content = document.value()
+    known = None if joints is None else list(joints)
+    apart = [name for name in OF_A_STEP if isinstance(content, dict) and name in content]
+    parts = {name: {name: content.pop(name)} for name in apart}
+    settings, errors = _read(document, content, known)
+    groups: dict[str, Any] = {}
+    of_steps: list[SettingsError] = []
+    for name, part in parts.items():
+        read, wrong = _read(document, part, known)
+        groups[name] = Unusable(wrong) if wrong else getattr(read, name)
+        of_steps += wrong
+    collect(errors and [*errors, *of_steps])
+    return settings.model_copy(update=groups)
 
 
 def load_mapping(path: Path | str, joints: Iterable[str]) -> LogMapping:
@@ -77,30 +120,32 @@ def load_mapping(path: Path | str, joints: Iterable[str]) -> LogMapping:
     Raises SettingsError as `load_settings` does, and for joints that are not among `joints`.
     """
     document, known = read_document(Path(path)), list(joints)
-    mapping = _validated(document, LogMapping)
+    mapping, errors = _validated(document, document.value(), LogMapping)
     unknown = [name for name in mapping.joints if name not in known]
-    collect([unknown_name(("joints", name), "joint", name, known, document) for name in unknown])
+    errors += [unknown_name(("joints", name), "joint", name, known, document) for name in unknown]
+    collect(errors)
     return mapping
 
 
-def _validated(document: Document, group: type[GroupType]) -> GroupType:
-    content = document.value()
-    try:
-        return group() if content is None else group.model_validate(content)
-    except ValidationError as error:
-        collect([explain(detail, document, group) for detail in error.errors(include_url=False)])
-        raise
-
-
-def check_joint_names(settings: Settings, names: Iterable[str], urdf_path: Path | str) -> None:
-    """Raise SettingsError when the settings beside this URDF speak of joints that are not among `names`."""
-    known = list(names)
+def _read(document: Document, content: Any, known: list[str] | None) -> tuple[Settings, list[SettingsError]]:
+    """The settings in ``content``, and what is wrong with them; the defaults where they cannot be read."""
+    settings, errors = _validated(document, content, Settings)
+    if known is None:
+        return settings, errors
     spoken: list[tuple[tuple[Any, ...], str]] = [(("joints", name), name) for name in settings.joints]
     spoken += [(("simulation", "positions", name), name) for name in settings.simulation.positions or ()]
     spoken += [(("logs", "joints", name), name) for name in settings.logs.joints]
     for number, coupling in enumerate(settings.couplings):
         spoken += [(("couplings", number, "joints", at), name) for at, name in enumerate(coupling.joints)]
     unknown = [(location, name) for location, name in spoken if name not in known]
-    if unknown:
-        document = read_document(Path(urdf_path).with_suffix(".yaml"))  # once more, for the lines
-        collect([unknown_name(location, "joint", name, known, document) for location, name in unknown])
+    errors += [unknown_name(location, "joint", name, known, document) for location, name in unknown]
+    return settings, errors
+
+
+def _validated(
+    document: Document, content: Any, group: type[GroupType]
+) -> tuple[GroupType, list[SettingsError]]:
+    try:
+        return group.model_validate({} if content is None else content), []
+    except ValidationError as error:
+        return group(), [explain(detail, document, group) for detail in error.errors(include_url=False)]
