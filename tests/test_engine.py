@@ -1,13 +1,19 @@
-"""The rigid-body engine against Pinocchio's own reading of the URDF, and against mechanics done by hand."""
+"""All that has rigid-body dynamics: against Pinocchio's own reading of the URDF, mechanics by hand, one another."""
 
 from fractions import Fraction
 
 import numpy as np
 import pinocchio as pin
 import pytest
+import torch
 
 from spelgen.arm.arm import make_arm
 from spelgen.dynamics.pinocchio_arm import arm_dynamics, pinocchio_model
+from spelgen.dynamics.pinocchio_urdf import urdf_dynamics
+from spelgen.dynamics.protocol import integrable
+from spelgen.dynamics.regressor import urdf_parameters
+from spelgen.dynamics.regressor_dynamics import RegressorDynamics
+from spelgen.dynamics.tip import tip_kinematics
 from spelgen.errors import ArmError, SpelgenErrors
 from spelgen.settings.joint import JointSettings
 from spelgen.settings.settings import Settings, load_settings
@@ -113,3 +119,106 @@ def test_bodies_without_inertials_are_all_named():
         pinocchio_model(bare, Settings())
     assert str(error.value) == "joint 'a': its link has no inertial\njoint 'b': its link has no inertial"
     assert all(isinstance(each, ArmError) for each in error.value.errors)
+
+
+# A lift: a stage that slides twice as far as the one below it, and on it a pendulum whose two rods turn against one
+# another; a finger is locked at its offset, its leader being none of the coordinates.
+LIFT = """<robot name="lift"><link name="base"/>
+  <joint name="low" type="prismatic"><parent link="base"/><child link="stage1"/><axis xyz="0 0 1"/>
+    <limit lower="0" upper="1" effort="10" velocity="1"/><dynamics damping="2" friction="0.5"/></joint>
+  <joint name="high" type="prismatic"><parent link="stage1"/><child link="stage2"/><axis xyz="0 0 1"/>
+    <limit lower="0" upper="2" effort="10" velocity="1"/><mimic joint="low" multiplier="2" offset="0.1"/></joint>
+  <joint name="swing" type="continuous"><parent link="stage2"/><child link="rod1"/><axis xyz="0 1 0"/></joint>
+  <joint name="back" type="continuous"><parent link="rod1"/><child link="rod2"/><origin xyz="0.3 0 0.4"/>
+    <axis xyz="0 1 0"/><mimic joint="swing" multiplier="-1.5" offset="0.2"/></joint>
+  <joint name="grip" type="revolute"><parent link="rod2"/><child link="finger1"/><origin xyz="0.1 0 0"/>
+    <axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+  <joint name="gripped" type="revolute"><parent link="finger1"/><child link="finger2"/><origin xyz="0.2 0 0"/>
+    <axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/><mimic joint="grip" offset="0.7"/></joint>
+"""
+LIFT += "".join(
+    f"""<link name="{name}"><inertial><origin xyz="0.1 0.05 {0.1 * k}"/><mass value="{k}"/>
+    <inertia ixx="0.3" ixy="0.02" ixz="0" iyy="0.2" iyz="0.01" izz="0.25"/></inertial></link>"""
+    for k, name in enumerate(("stage1", "stage2", "rod1", "rod2", "finger1", "finger2"), start=1)
+)
+LIFT += "</robot>"
+
+
+def states(n, count=5):
+    random = torch.Generator().manual_seed(0)
+    return torch.randn(3, 2, count, n, generator=random, dtype=torch.float64)
+
+
+def same_dynamics(one, other, joints, tolerance):
+    q, qd, tau = states(joints)
+    for name, arguments in (
+        ("mass_matrix", (q,)),
+        ("gravity", (q,)),
+        ("nonlinear_effects", (q, qd)),
+        ("friction_torque", (q, qd)),
+        ("forward_dynamics", (q, qd, tau)),
+        ("inverse_dynamics", (q, qd, tau)),
+    ):
+        found, expected = (getattr(each, name)(*arguments) for each in (one, other))
+        assert found.shape == (2, 5, *(joints,) * (1 + (name == "mass_matrix")))
+        torch.testing.assert_close(found, expected, atol=tolerance, rtol=tolerance)
+    assert one.n == other.n == joints
+
+
+def test_mimic_and_locked_joints_are_the_arms(tmp_path):
+    """Pinocchio's reading of the whole file under the constraint is spelgen's arm, which folds them in exactly."""
+    path = tmp_path / "lift.urdf"
+    path.write_text(LIFT)
+    lift = make_arm(read_urdf(path), joints=["low", "swing"])
+    own = arm_dynamics(lift, Settings(), lambda qd: np.array([2.0, 0]) * qd + [0.5, 0] * np.tanh(qd / 0.05))
+    same_dynamics(urdf_dynamics(path, ("low", "swing")), own, 2, 1e-9)
+
+
+@pytest.mark.parametrize("robot", ["rpr", "panda"])
+def test_the_regressors_dynamics_are_pinocchios(robot, robots):
+    path = robots / f"{robot}.urdf"
+    whole = make_arm(read_urdf(path))
+    n = len(whole.coordinates)
+    rotors = Settings(joints={c.name: JointSettings(rotor_inertia=0.3) for c in whole.coordinates})
+    found = RegressorDynamics(whole, urdf_parameters(whole), np.full(n, 0.3), lambda qd: 1.5 * qd)
+    same_dynamics(found, arm_dynamics(whole, rotors, lambda qd: 1.5 * qd), n, 1e-9)
+
+
+def test_dynamics_without_momenta_are_integrated_in_velocities(robots):
+    rpr = arm_dynamics(make_arm(read_urdf(robots / "rpr.urdf")), Settings())
+    q, qd, tau = (x[0] for x in states(3))
+    form = integrable(rpr)
+    assert integrable(form) is form
+    torch.testing.assert_close(form.velocity(q, form.momentum(q, qd)), qd)
+    for found, expected in zip(
+        form.port_hamiltonian_rhs(q, qd, tau, form.prepare()),
+        (qd, rpr.forward_dynamics(q, qd, tau)),
+        strict=True,
+    ):
+        torch.testing.assert_close(found, expected)
+
+
+@pytest.mark.parametrize("robot, link", [("panda", None), ("ur10e", None), ("lift", "finger2")])
+def test_pose_and_jacobian_of_the_tip_are_pinocchios(robot, link, robots, tmp_path):
+    path = tmp_path / "lift.urdf" if robot == "lift" else robots / f"{robot}.urdf"
+    if robot == "lift":
+        path.write_text(LIFT)
+    joints = [
+        c.name
+        for c in make_arm(read_urdf(path), joints=["low", "swing"] if robot == "lift" else None).coordinates
+    ]
+    tip, dynamics = tip_kinematics(path, joints, link), urdf_dynamics(path, joints)
+    q = states(len(joints))[0]
+    pose, jacobian = tip.pose(q), tip.jacobian(q)
+    assert pose.shape == (2, 5, 4, 4)
+    assert jacobian.shape == (2, 5, 6, len(joints))
+    torch.testing.assert_close(tip.position(q), pose[..., :3, 3])
+    frame = dynamics.model.getFrameId(tip.link)
+    for at, found, slope in zip(q.flatten(0, 1), pose.flatten(0, 1), jacobian.flatten(0, 1), strict=True):
+        at_joints = dynamics.configuration(at.numpy())
+        by_joint = pin.computeFrameJacobian(
+            dynamics.model, dynamics.data, at_joints, frame, pin.LOCAL_WORLD_ALIGNED
+        )
+        pin.framesForwardKinematics(dynamics.model, dynamics.data, at_joints)
+        np.testing.assert_allclose(found, dynamics.data.oMf[frame].homogeneous, atol=2e-6)
+        np.testing.assert_allclose(slope, by_joint @ dynamics.jacobian, atol=5e-6)
