@@ -76,3 +76,10 @@ class Listing:
         )  # fmt: skip
         console.print(table, crop=False)
         return [line.rstrip() for line in file.getvalue().splitlines()]
+
+
+def number(value: float | None) -> str:
+    """Three significant digits; a dash for what is not known."""
+    if value is None:
+        return "-"
+    return f"{value:.3g}" if value == 0 or 1e-3 <= abs(value) < 1e4 else f"{value:.2e}"

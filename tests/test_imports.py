@@ -29,7 +29,7 @@ structure: fourier base_parameters pseudo_inertia
 {" ".join(RUNTIME)}
 emission: bodies plan source docstring emit
 dynamics: protocol arrays constraint pinocchio_dynamics pinocchio_arm pinocchio_urdf regressor regressor_dynamics tip
-logs: trajectory bags tables read checks filtering windows chunks epoch_windows
+logs: arm_mapping trajectory bags tables read checks filtering windows chunks epoch_windows
 simulation: simulate tracking protocols
 identification: samples friction base_parameters least_squares prior identify formatting
 excitation: trajectory design formatting
@@ -39,10 +39,10 @@ evaluation: baselines torque examples invariants results evaluate
 verify: agreement axes urdf_cross_check numeric_samples verify
 explain: reasons facts
 formulas: expression notation angles harmonics factoring shortening grouping formulas layout text latex sympy_module
-inspection pipeline
+inspection loaded_arm pipeline
 exporting: rigid_body_projection urdf_file
 render: charts plots tables picture learned report_page inspection_page
-logs: statistics gravity report formatting
+logs: statistics gravity report check_logs
 comparison: paper truth metrics study runs formatting
 render: logs_page comparison_page
 cli: console options formats model_commands run_commands log_commands
@@ -64,7 +64,7 @@ SYMBOLIC = {"sympy", "flint", "spelgen.arm", "spelgen.structure"}
 DERIVES = [
     x for x in LAYERS if x.startswith(("urdf.", "arm.", "structure.", "emission.", "verify.", "explain."))
 ]
-BESIDE_A_ROBOT = {"logs.gravity", "logs.report", "logs.formatting"}  # logs held against an arm's own facts
+BESIDE_A_ROBOT = {"logs.gravity", "logs.report", "logs.check_logs"}  # logs held against an arm's own facts
 OF_A_RUN = {f"render.{name}" for name in ("charts", "plots", "tables", "picture", "learned", "report_page")}
 FITS = [x for x in LAYERS if x.startswith(("logs.", "fitting.", "evaluation.")) and x not in BESIDE_A_ROBOT]
 NEVER = {

@@ -99,7 +99,7 @@ def test_velocities_are_differentiated_only_where_that_is_asked(tmp_path):
 
 
 def test_what_spelgen_wrote_is_not_mapped(tmp_path):
-    write_logs(tmp_path / "x.parquet", [Trajectory("x", T, Q, QD, TAU)], JOINTS)
+    write_logs(tmp_path / "x.parquet", [Trajectory(T, Q, QD, TAU, "x")], JOINTS)
     mapping = LogMapping.model_validate({"units": {"q": "deg"}, "columns": {"t": "clock"}})
     (found,) = read_logs([tmp_path / "x.parquet"], JOINTS, mapping=mapping)
     check(found, "x")

@@ -10,15 +10,15 @@ import pytest
 import torch
 
 from spelgen.errors import LogError, SpelgenErrors
-from spelgen.logs.checks import examine
+from spelgen.logs.checks import check
 from spelgen.logs.filtering import (
     automatic_cutoff,
-    automatic_spacing,
+    automatic_decimation,
     low_pass,
     prepare,
 )
 from spelgen.logs.read import Trajectory, read_logs, write_logs
-from spelgen.logs.trajectory import rate, split_at_gaps
+from spelgen.logs.trajectory import split_at_gaps
 from spelgen.logs.windows import cut_windows, split_validation
 
 JOINTS = ("a", "b")
@@ -30,7 +30,7 @@ def swing(name="swing", samples=200, dt=0.01, jitter=0.0, seed=0) -> Trajectory:
     t = np.concatenate([[0.0], np.cumsum(dt * (1 + jitter * random.uniform(-1, 1, samples - 1)))])
     frequency = 2 * np.pi * np.array([0.5, 0.8])
     phase = t[:, None] * frequency
-    return Trajectory(name, t, np.sin(phase), frequency * np.cos(phase), 3.0 * np.cos(phase))
+    return Trajectory(t, np.sin(phase), frequency * np.cos(phase), 3.0 * np.cos(phase), name)
 
 
 def csv(path: Path, text: str) -> Path:
@@ -133,16 +133,16 @@ def test_a_broken_parquet_file_is_told(tmp_path):
 
 
 def test_two_recordings_in_one_file_need_a_trajectory_column(tmp_path):
-    joined = Trajectory(
-        "joined", *(np.concatenate([getattr(swing(), x)] * 2) for x in ("t", "q", "qd", "tau"))
-    )
-    write_logs(tmp_path / "x.parquet", [joined], JOINTS)
+    arrays = {x: np.concatenate([getattr(swing(), x)] * 2) for x in ("q", "qd", "tau")}
+    columns = {f"{x}_{joint}": values[:, k] for x, values in arrays.items() for k, joint in enumerate(JOINTS)}
+    t = np.concatenate([swing().t] * 2)
+    pa.parquet.write_table(pa.table({"t": t, **columns}), tmp_path / "x.parquet")
     with pytest.raises(LogError, match=r"row 201, column t: got t = 0 s after 1\.99 s"):
         read_logs([tmp_path], JOINTS)
 
 
 def scaled(trajectory: Trajectory, q=1.0, qd=1.0) -> Trajectory:
-    return Trajectory("x", trajectory.t, q * trajectory.q, qd * trajectory.qd, trajectory.tau)
+    return Trajectory(trajectory.t, q * trajectory.q, qd * trajectory.qd, trajectory.tau, "x")
 
 
 DEGREES = {
@@ -167,7 +167,7 @@ DEGREES = {
 def test_degrees_are_refused(case):
     trajectory, message = DEGREES[case]
     with pytest.raises(SpelgenErrors) as caught:
-        examine([trajectory], JOINTS, ("revolute", "revolute"))
+        check([trajectory], JOINTS, ("revolute", "revolute"))
     advice = (
         "; convert degrees, by 'units' under 'logs' in the robot's YAML; if the units are right, say so there, "
         "or in the Parquet schema's metadata 'units'"
@@ -178,15 +178,15 @@ def test_degrees_are_refused(case):
 def test_many_turns_are_believed_where_the_units_are_declared(tmp_path):
     spinning = scaled(swing(), q=180 / np.pi, qd=180 / np.pi)
     write_logs(tmp_path / "declared.parquet", [spinning], JOINTS)
-    assert examine(read_logs([tmp_path], JOINTS), JOINTS, ("revolute", "revolute")) == []
+    assert check(read_logs([tmp_path], JOINTS), JOINTS, ("revolute", "revolute")) == []
     table = pa.parquet.read_table(tmp_path / "declared.parquet").replace_schema_metadata(None)
     pa.parquet.write_table(table, tmp_path / "declared.parquet")
     with pytest.raises(SpelgenErrors, match="more than two turns"):
-        examine(read_logs([tmp_path], JOINTS), JOINTS, ("revolute", "revolute"))
+        check(read_logs([tmp_path], JOINTS), JOINTS, ("revolute", "revolute"))
 
 
 def test_a_velocity_that_is_no_derivative_is_a_warning():
-    (note,) = examine([scaled(swing(), qd=np.array([1.0, -1.0]))], JOINTS, ("revolute", "revolute"))
+    (note,) = check([scaled(swing(), qd=np.array([1.0, -1.0]))], JOINTS, ("revolute", "revolute"))
     assert (note.severity, note.code, note.where) == (
         "warning",
         "velocity-is-no-derivative",
@@ -201,7 +201,7 @@ def changed(q=None, qd=None, tau=None) -> Trajectory:
     for array, values in zip(arrays.values(), (q, qd, tau), strict=True):
         for joint, value in (values or {}).items():
             array[:, joint] = value
-    return Trajectory("x", swing().t, **arrays)
+    return Trajectory(swing().t, **arrays, name="x")
 
 
 @pytest.mark.parametrize(
@@ -213,7 +213,7 @@ def changed(q=None, qd=None, tau=None) -> Trajectory:
 )
 def test_a_frozen_column_is_refused(trajectory, got):
     with pytest.raises(LogError) as caught:
-        examine([trajectory], JOINTS, ("revolute", "revolute"))
+        check([trajectory], JOINTS, ("revolute", "revolute"))
     assert str(caught.value) == (
         f"trajectory x, joint 'a': got {got}, expected columns that belong together; "
         "check the logger, and the names of the columns"
@@ -222,7 +222,7 @@ def test_a_frozen_column_is_refused(trajectory, got):
 
 def test_what_never_changes_in_any_trajectory_is_said():
     resting = changed(q={1: 0.5}, qd={1: 0.0}, tau={1: 0.0})
-    notes = examine([resting], JOINTS, ("revolute", "revolute"))
+    notes = check([resting], JOINTS, ("revolute", "revolute"))
     assert [(x.severity, x.code, x.where, x.message) for x in notes] == [
         (
             "warning", "constant-torque", "trajectory x, joint 'b'",
@@ -233,7 +233,7 @@ def test_what_never_changes_in_any_trajectory_is_said():
             "does not move: the logs say nothing about its own dynamics",
         ),
     ]  # fmt: skip
-    assert examine([resting, swing()], JOINTS, ("revolute", "revolute")) == []
+    assert check([resting, swing()], JOINTS, ("revolute", "revolute")) == []
 
 
 @pytest.mark.parametrize(
@@ -241,14 +241,14 @@ def test_what_never_changes_in_any_trajectory_is_said():
     [
         (scaled(swing(), qd=-1.0), "its sign is the opposite of that of q"),
         (scaled(swing(), qd=1e3), "are the times in ms?"),
-        (Trajectory("x", swing().t, swing().q, swing().qd[:, ::-1], swing().tau), "it fits q of joint 'b'"),
+        (Trajectory(swing().t, swing().q, swing().qd[:, ::-1], swing().tau, "x"), "it fits q of joint 'b'"),
         (scaled(swing(), qd=1.3), "check units, signs and the order of the joints"),
     ],
 )
 def test_what_may_be_wrong_with_a_velocity_is_said(trajectory, advice):
-    first, second = examine([trajectory], JOINTS, ("revolute", "revolute"))
+    first, second = check([trajectory], JOINTS, ("revolute", "revolute"))
     assert first.message.endswith(f"; {advice}")
-    several = examine([trajectory] * 3, JOINTS, ("revolute", "revolute"))
+    several = check([trajectory] * 3, JOINTS, ("revolute", "revolute"))
     assert [x.message for x in several] == [
         f"{x.message} (and in 2 more trajectories)" for x in (first, second)
     ]
@@ -257,13 +257,13 @@ def test_what_may_be_wrong_with_a_velocity_is_said(trajectory, advice):
 def with_gap() -> Trajectory:
     whole = swing(jitter=0.4)
     t = whole.t + np.where(np.arange(200) >= 120, 0.5, 0.0)
-    return Trajectory("gap", t, whole.q, whole.qd, whole.tau)
+    return Trajectory(t, whole.q, whole.qd, whole.tau, "gap")
 
 
 def test_gaps_split_and_are_said():
     pieces = split_at_gaps(with_gap())
     assert [len(x.t) for x in pieces] == [120, 80]
-    notes = examine([with_gap()], JOINTS, ("revolute", "revolute"))
+    notes = check([with_gap()], JOINTS, ("revolute", "revolute"))
     assert [(x.code, x.message[:14]) for x in notes] == [("gap", "1 gaps in time")]
 
 
@@ -286,9 +286,8 @@ def test_a_trajectory_without_a_whole_window_is_refused():
 def test_the_filter_has_no_delay_and_takes_out_noise():
     clean = swing(samples=1000, jitter=0.3)
     random = np.random.default_rng(1)
-    noisy = Trajectory(
-        "noisy", clean.t, *(x + 0.1 * random.standard_normal(x.shape) for x in (clean.q, clean.qd, clean.tau))
-    )
+    noise = (0.1 * random.standard_normal(clean.q.shape) for _ in range(3))
+    noisy = Trajectory(clean.t, *(x + e for x, e in zip((clean.q, clean.qd, clean.tau), noise, strict=True)))
     smooth = low_pass(noisy, 5.0)
     np.testing.assert_array_equal(smooth.t, clean.t)
     middle = slice(50, -50)  # the ends have neighbours on one side only
@@ -312,12 +311,12 @@ def test_the_filter_needs_more_than_two_samples_per_period():
 def test_only_dense_logs_are_filtered_unasked():
     assert automatic_cutoff([100.0]) == 8.0
     assert automatic_cutoff([100.0, 20.0]) is None
-    assert automatic_spacing([100.1], 8.0) == 4
-    assert automatic_spacing([1000.0], None) == 1
+    assert automatic_decimation([100.1], 8.0) == 4
+    assert automatic_decimation([1000.0], None) == 1
 
 
 def test_the_rate_ignores_gaps():
-    assert rate(with_gap()) == pytest.approx(100, rel=0.05)
+    assert with_gap().sample_rate == pytest.approx(100, rel=0.05)
 
 
 @pytest.mark.parametrize("every", [1, 3])
@@ -375,6 +374,6 @@ def test_real_logs_are_read(shared):
     joints = [f"panda_joint{k}" for k in range(1, 8)]
     (trajectory,) = read_logs([shared / "logs" / "panda"], joints)
     assert trajectory.q.shape == (20544, 7)
-    notes = examine([trajectory], joints, ("revolute",) * 7)
+    notes = check([trajectory], joints, ("revolute",) * 7)
     assert [x.code for x in notes] == ["gap"]
     assert len(prepare([trajectory], shortest=5, cutoff=8.0)) == 5

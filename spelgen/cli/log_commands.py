@@ -10,7 +10,7 @@ import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import FAILED, counted, note, say
-from spelgen.cli.options import Force, Joints, Mapping, Robot, SnapTolerance, Tip
+from spelgen.cli.options import AngleTolerance, Force, Joints, Mapping, Robot, Tip
 from spelgen.files import write_text
 
 HARMONICS_PER_SECOND = 0.4  # up to 0.4 Hz: what an arm follows well, far below its drives' ripple
@@ -21,7 +21,7 @@ def excite(
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE.csv", help="The motion.")],
     joints: Joints = None,
     tip: Tip = None,
-    snap_tol: SnapTolerance = 2e-3,
+    angle_tolerance: AngleTolerance = 2e-3,
     duration: Annotated[float, typer.Option("--duration", min=2.0, max=600.0, help="In seconds.")] = 30.0,
     rate: Annotated[float, typer.Option("--rate", min=1.0, max=10000.0, help="Samples a second.")] = 100.0,
     harmonics: Annotated[
@@ -41,12 +41,12 @@ def excite(
 
     Collisions are not checked.
     """
-    from spelgen import pipeline
     from spelgen.excitation.design import design
     from spelgen.excitation.formatting import csv_text, text
+    from spelgen.loaded_arm import load_arm
 
     options.require_free(output, force=force)
-    arm = pipeline.load(robot, options.names(joints), tip, snap_tol).arm
+    arm = load_arm(robot, options.names(joints), tip, angle_tolerance).arm
     with counted("searching") as progress:
         found = design(
             arm,
@@ -68,7 +68,7 @@ def logs(
     robot: Annotated[Path, typer.Option("--robot", metavar="ROBOT.urdf", help="The arm that was logged.")],
     joints: Joints = None,
     tip: Tip = None,
-    snap_tol: SnapTolerance = 2e-3,
+    angle_tolerance: AngleTolerance = 2e-3,
     mapping: Mapping = None,
     format: Annotated[Literal["text", "json"], typer.Option("--format", help="Of the result.")] = "text",
     html: Annotated[
@@ -80,32 +80,19 @@ def logs(
 
     Nothing is changed. Exit code 1 where the logs cannot be trained on.
     """
-    from spelgen import pipeline
-    from spelgen.logs.chunks import large_files, scan
-    from spelgen.logs.formatting import text
-    from spelgen.logs.read import read_logs
-    from spelgen.logs.report import survey
+    from spelgen.loaded_arm import load_arm
+    from spelgen.logs.check_logs import check_logs
+    from spelgen.logs.chunks import stream_logs
     from spelgen.render.logs_page import page
 
-    loaded = pipeline.load(robot, options.names(joints), tip, snap_tol)
-    names = [coordinate.name for coordinate in loaded.arm.coordinates]
-    kinds = [coordinate.kind for coordinate in loaded.arm.coordinates]
-    mapped = options.mapping(mapping, robot, names)
-    inputs = loaded.actuation.matrix()
-    large = large_files(paths, names)
-    found = survey(
-        (each for _, each in scan(large, names, mapped, kinds))
-        if large
-        else read_logs(paths, names, mapping=mapped, joint_types=kinds),
-        loaded.arm,
-        inputs,
-    )
-    say(text(found) if format == "text" else json.dumps(found.to_dict(), indent=2))
+    arm = load_arm(robot, options.names(joints), tip, angle_tolerance)
+    found = check_logs(stream_logs(paths, arm, mapping), arm)
+    say(found.text() if format == "text" else json.dumps(found.to_dict(), indent=2))
     if html is not None:
-        note(f"wrote {write_text(html, page(found, loaded.arm, inputs))}")
+        note(f"wrote {write_text(html, page(found, arm.arm, arm.actuation.matrix()))}")
     for error in found.errors:
         note(str(error))
-    warnings = sum(finding.severity == "warning" for finding in found.findings)
+    warnings = len(found.warnings)
     if strict and warnings:
         note(f"{warnings} warning{'s' * (warnings > 1)}, and --strict allows none")
     if found.errors or (strict and warnings):

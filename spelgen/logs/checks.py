@@ -1,6 +1,6 @@
 """What is odd about logs: gaps, columns that never change, velocities that are no derivative, degrees.
 
-Nothing is repaired. Each trajectory is doubted by itself, so that logs need not lie in memory together.
+Nothing is repaired. Each trajectory is checked by itself, so that logs need not lie in memory together.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from spelgen.errors import Diagnostic, LogError, SpelgenError, collect
-from spelgen.logs.trajectory import Trajectory, split_at_gaps
+from spelgen.logs.trajectory import Trajectory, gap_ends, split_at_gaps
 
 SPAN = 10  # steps over which q and the integral of qd are compared: quantisation of q then hides little
 DRIFT = 0.05  # [rad, m] that qd must say a joint moved, before a q that never changes is called frozen
@@ -24,7 +24,7 @@ Code = Literal["degrees", "frozen", "velocity-is-no-derivative", "constant-torqu
 CODES: tuple[Code, ...] = (
     "degrees", "frozen", "velocity-is-no-derivative", "constant-torque", "joint-at-rest",
 )  # fmt: skip
-ERRORS = {  # of these doubts: what is expected, what to do
+ERRORS = {  # findings that are errors: what is expected, what to do
     "degrees": (
         "radians and rad/s",
         "convert degrees, by 'units' under 'logs' in the robot's YAML; if the units are right, say so there, "
@@ -35,8 +35,8 @@ ERRORS = {  # of these doubts: what is expected, what to do
 
 
 @dataclass(frozen=True)
-class Doubt:
-    """One thing that is odd about one trajectory's joint. everywhere: odd only where all trajectories show it."""
+class Finding:
+    """One thing that is odd about one joint of one trajectory. everywhere: odd only where all trajectories show it."""
 
     code: Code
     trajectory: str
@@ -47,7 +47,7 @@ class Doubt:
 
 
 @dataclass(frozen=True, eq=False)
-class Agreement:
+class VelocityAgreement:
     """Sums over increments y of q and of the integral x of qd, over SPAN steps, for n joints.
 
     xx, yy: (n,). xy: (n, n), of qd of the joint of the row with q of that of the column.
@@ -57,8 +57,8 @@ class Agreement:
     yy: np.ndarray
     xy: np.ndarray
 
-    def __add__(self, other: Agreement) -> Agreement:
-        return Agreement(self.xx + other.xx, self.yy + other.yy, self.xy + other.xy)
+    def __add__(self, other: VelocityAgreement) -> VelocityAgreement:
+        return VelocityAgreement(self.xx + other.xx, self.yy + other.yy, self.xy + other.xy)
 
     def factor(self, joint: int) -> float:
         """By what qd must be multiplied to be dq/dt; 1 where qd says nothing."""
@@ -71,7 +71,7 @@ class Agreement:
         return None if size < 1e-12 else float(self.xy[joint, other]) / size
 
 
-def examine(
+def check(
     trajectories: Iterable[Trajectory], joints: Sequence[str], joint_types: Sequence[str]
 ) -> list[Diagnostic]:
     """What is odd about the logs, nothing repaired.
@@ -81,15 +81,15 @@ def examine(
     """
     gaps, found, count = [], [], 0
     for trajectory in trajectories:
-        gaps += told_gaps(trajectory)
-        found += doubts(trajectory, joints, joint_types)
+        gaps += gap_diagnostics(trajectory)
+        found += findings(trajectory, joints, joint_types)
         count += 1
-    return [*gaps, *tell(found, joints, count)]
+    return [*gaps, *summarised(found, joints, count)]
 
 
-def told_gaps(trajectory: Trajectory) -> list[Diagnostic]:
+def gap_diagnostics(trajectory: Trajectory) -> list[Diagnostic]:
     """A note where the recording has holes."""
-    pieces = len(split_at_gaps(trajectory))
+    pieces = len(gap_ends(trajectory.t)) - 1
     if pieces == 1:
         return []
     longest = np.diff(trajectory.t).max()
@@ -97,12 +97,14 @@ def told_gaps(trajectory: Trajectory) -> list[Diagnostic]:
     return [Diagnostic("info", "gap", f"trajectory {trajectory.name}", None, message)]
 
 
-def tell(found: Sequence[Doubt], joints: Sequence[str], trajectories: int) -> list[Diagnostic]:
-    """Doubts about that many trajectories, a sentence for each joint and kind. Raises as `examine` does."""
+def summarised(found: Sequence[Finding], joints: Sequence[str], trajectories: int) -> list[Diagnostic]:
+    """Findings about that many trajectories, a sentence for each joint and kind. Raises as `check` does."""
+    by_kind: dict[tuple[str, Code], list[Finding]] = {(joint, code): [] for joint in joints for code in CODES}
+    for each in found:
+        by_kind[each.joint, each.code].append(each)
     notes: list[Diagnostic] = []
     errors: list[SpelgenError] = []
-    for joint, code in ((joint, code) for joint in joints for code in CODES):
-        same = [each for each in found if (each.joint, each.code) == (joint, code)]
+    for (joint, code), same in by_kind.items():
         if not same or (same[0].everywhere and len(same) < trajectories):
             continue
         others = f" (and in {len(same) - 1} more trajectories)" if len(same) > 1 else ""
@@ -118,32 +120,35 @@ def tell(found: Sequence[Doubt], joints: Sequence[str], trajectories: int) -> li
     return notes
 
 
-def doubts(trajectory: Trajectory, joints: Sequence[str], joint_types: Sequence[str]) -> list[Doubt]:
-    """What is odd about the joints of one trajectory."""
-    agreement, found = agreements(trajectory), []
-    for index, (joint, kind) in enumerate(zip(joints, joint_types, strict=True)):
-        of_joint = [
+def findings(
+    trajectory: Trajectory,
+    joints: Sequence[str],
+    joint_types: Sequence[str],
+    agreement: VelocityAgreement | None = None,
+) -> list[Finding]:
+    """What is odd about the joints of one trajectory. agreement: where it is known already."""
+    agreement = velocity_agreement(trajectory) if agreement is None else agreement
+    return [
+        Finding(code, trajectory.name, trajectory.file, joint, what, everywhere)
+        for index, (joint, kind) in enumerate(zip(joints, joint_types, strict=True))
+        for code, what, everywhere in (
             *_constant(trajectory, index),
             *_velocity(trajectory, index, kind, agreement, joints),
-        ]
-        found += [
-            Doubt(code, trajectory.name, trajectory.file, joint, what, everywhere)
-            for code, what, everywhere in of_joint
-        ]
-    return found
+        )
+    ]
 
 
-def agreements(trajectory: Trajectory) -> Agreement:
+def velocity_agreement(trajectory: Trajectory) -> VelocityAgreement:
     """How far qd is dq/dt, within gap-free pieces."""
     n = trajectory.q.shape[1]
-    total = Agreement(np.zeros(n), np.zeros(n), np.zeros((n, n)))
+    total = VelocityAgreement(np.zeros(n), np.zeros(n), np.zeros((n, n)))
     for piece in split_at_gaps(trajectory):
         span = min(SPAN, len(piece.t) - 1)
         if span:
             steps = (piece.qd[1:] + piece.qd[:-1]) / 2 * np.diff(piece.t)[:, None]
             area = np.concatenate([np.zeros((1, n)), np.cumsum(steps, axis=0)])
             x, y = area[span:] - area[:-span], piece.q[span:] - piece.q[:-span]
-            total += Agreement((x * x).sum(axis=0), (y * y).sum(axis=0), x.T @ y)
+            total += VelocityAgreement((x * x).sum(axis=0), (y * y).sum(axis=0), x.T @ y)
     return total
 
 
@@ -166,15 +171,15 @@ def _constant(trajectory: Trajectory, index: int) -> Iterator[tuple[Code, str, b
 
 
 def _velocity(
-    trajectory: Trajectory, index: int, kind: str, agreement: Agreement, joints: Sequence[str]
+    trajectory: Trajectory, index: int, kind: str, agreement: VelocityAgreement, joints: Sequence[str]
 ) -> Iterator[tuple[Code, str, bool]]:
     """Degrees, and velocities that are not the positions' derivative."""
     factor, correlation = agreement.factor(index), agreement.correlation(index)
-    smell = None
+    degrees = None
     if kind == "revolute" and not trajectory.declares_units:
-        smell = _degrees(trajectory.q[:, index], factor, correlation)
-    if smell:
-        yield "degrees", smell, False
+        degrees = _degrees(trajectory.q[:, index], factor, correlation)
+    if degrees:
+        yield "degrees", degrees, False
     elif correlation is not None and (correlation < AGREEMENT or abs(factor - 1) > DEVIATION):
         yield (
             "velocity-is-no-derivative",
@@ -187,7 +192,7 @@ def _velocity(
 
 
 def _advice(
-    index: int, agreement: Agreement, factor: float, correlation: float, joints: Sequence[str]
+    index: int, agreement: VelocityAgreement, factor: float, correlation: float, joints: Sequence[str]
 ) -> str:
     fits = [
         joint
@@ -205,7 +210,7 @@ def _advice(
 
 
 def _degrees(q: np.ndarray, factor: float, correlation: float | None) -> str | None:
-    """Why a revolute joint seems to be recorded in degrees: in a word, the numbers that say so."""
+    """Why a revolute joint seems to be recorded in degrees: the numbers that say so."""
     agrees = correlation is not None and correlation > AGREEMENT
     if agrees and 0.8 < factor / DEGREES < 1.25:
         return f"q that changes {factor:.3g} times as fast as qd says (180/pi is 57.3)"

@@ -1,11 +1,13 @@
-"""Parquet logs larger than memory: read once from end to end, then by parts, any of them at any time."""
+"""Parquet logs larger than memory: read once from end to end, then chunk by chunk, any of them at any time."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -13,12 +15,15 @@ import pyarrow.compute
 import pyarrow.parquet
 
 from spelgen.errors import LogError, SpelgenError, collect
-from spelgen.logs.mapping import TIMES, LogMapping
+from spelgen.logs.arm_mapping import GivenMapping, log_source
+from spelgen.logs.mapping import LogMapping
 from spelgen.logs.read import (
     ROW_GROUP,
     clock_start,
     in_si,
     log_files,
+    made_trajectory,
+    read_logs,
     require_increasing_times,
     table_values,
 )
@@ -35,7 +40,7 @@ from spelgen.logs.trajectory import Trajectory
 
 IN_MEMORY = 100_000_000  # bytes of numbers up to which logs are held in memory; windows take five times that
 BUFFER = 2**16  # bytes read ahead of each column
-LONGEST = 2**16  # samples of a part: of 7 joints, 12 MB, and 53 MB as windows
+LONGEST = 2**16  # samples of a chunk: of 7 joints, 12 MB, and 53 MB as windows
 
 
 @dataclass(frozen=True)
@@ -52,7 +57,7 @@ class ParquetLog:
 
 
 @dataclass(frozen=True)
-class Part:
+class Chunk:
     """A stretch of one recording, rows first..stop of a file; `load` reads it."""
 
     name: str
@@ -61,7 +66,7 @@ class Part:
     stop: int
 
     def load(self) -> Trajectory:
-        """The part's samples, the same as `scan` gave."""
+        """The chunk's samples, the same as `scan` gave."""
         source = _source(self.log.file)
         groups, row = _row_groups(source, self.first, self.stop)
         found = []
@@ -72,13 +77,14 @@ class Part:
             row += batch.num_rows
             if row >= self.stop:
                 break
-        return _trajectory(self, np.concatenate(found))
+        values = in_si(np.concatenate(found), self.log.joints, self.log.mapping)
+        return _trajectory(self, values)
 
 
 def large_files(paths: Iterable[Path | str], joints: Sequence[str], role: str | None = None) -> list[Path]:
     """The Parquet files among the logs, where they are together larger than IN_MEMORY; else none.
 
-    Raises LogError where logs of another kind lie beside: only Parquet can be read by parts.
+    Raises LogError where logs of another kind lie beside: only Parquet can be read in chunks.
     """
     errors: list[SpelgenError] = []
     files = log_files(paths, role, errors)
@@ -94,32 +100,46 @@ def large_files(paths: Iterable[Path | str], joints: Sequence[str], role: str | 
     return parquet
 
 
+def stream_logs(
+    paths: Sequence[Path | str], arm: Any, mapping: GivenMapping = None, role: str | None = None
+) -> Iterator[Trajectory]:
+    """What `read_logs` gives, one after another; Parquet files larger than memory chunk by chunk."""
+    source = log_source(arm, mapping)
+    large = large_files(paths, source.joints, role)
+    if large:
+        return (
+            trajectory for _, trajectory in scan(large, source.joints, source.mapping, source.joint_types)
+        )
+    return iter(read_logs(paths, arm, mapping, role))
+
+
 def scan(
     files: Sequence[Path],
     joints: Sequence[str],
     mapping: LogMapping | None = None,
     joint_types: Sequence[str] | None = None,
-) -> Iterator[tuple[Part, Trajectory]]:
-    """Every part with its samples, read once in the files' order; the caller keeps what it needs of them.
+) -> Iterator[tuple[Chunk, Trajectory]]:
+    """Every chunk with its samples, read once in the files' order; the caller keeps what it needs of them.
 
-    A recording of more than LONGEST samples is several parts. Raises LogError and SettingsError as `read_logs`
+    A recording of more than LONGEST samples is several chunks. Raises LogError and SettingsError as `read_logs`
     does.
     """
     mapping = mapping or LogMapping()
     collect(mapping.misfits(joints, joint_types))
-    stems = [file.stem for file in files]
+    stems = Counter(file.stem for file in files)
     for file in files:
         log = _opened_log(file, tuple(joints), mapping)
-        place = file.stem if stems.count(file.stem) == 1 else str(file)
+        place = file.stem if stems[file.stem] == 1 else str(file)
         before = ("", -np.inf)
-        for part, recording, values in _stretches(log, place, len(files) > 1):
-            t = values[:, 0] * TIMES[log.mapping.units.t]
+        for chunk, recording, logged in _chunks(log, place, len(files) > 1):
+            values = in_si(logged, log.joints, log.mapping)
+            t = values["t"]
             follows = before[0] == recording
             times = np.concatenate([[before[1]], t]) if follows else t
-            rows = np.arange(part.stop - len(times), part.stop)
+            rows = np.arange(chunk.stop - len(times), chunk.stop)
             require_increasing_times(times, rows, file, log.columns[0])
             before = (recording, t[-1])
-            yield part, _trajectory(part, values)
+            yield chunk, _trajectory(chunk, values)
 
 
 def _opened_log(file: Path, joints: tuple[str, ...], mapping: LogMapping) -> ParquetLog:
@@ -134,22 +154,16 @@ def _opened_log(file: Path, joints: tuple[str, ...], mapping: LogMapping) -> Par
     return ParquetLog(file, joints, mapping, columns, labels_among(schema.names, mapping), declared, start)
 
 
-def _stretches(log: ParquetLog, place: str, several: bool) -> Iterator[tuple[Part, str, np.ndarray]]:
-    """Each part of a file with the name of its recording and its values as logged."""
-    parts = [
-        (Part(name, log, first, stop), recording)
-        for recording, start, end in _recordings(log, place, several)
-        for name, first, stop in _cut(recording, start, end)
-    ]
+def _chunks(log: ParquetLog, place: str, several: bool) -> Iterator[tuple[Chunk, str, np.ndarray]]:
+    """Each chunk of a file with the name of its recording and its values as logged."""
     batches = _source(log.file).iter_batches(ROW_GROUP, columns=list(log.columns))
-    held, row = np.zeros((0, len(log.columns))), 0  # what was read and not yet given, and its first row
-    for part, recording in parts:
-        while row + len(held) < part.stop:
-            batch = next(batches)
-            held = np.concatenate([held, _values(batch, log, row + len(held))])
-        size = part.stop - part.first
-        yield part, recording, held[:size]
-        held, row = held[size:].copy(), part.stop
+    held, first = np.zeros((0, len(log.columns))), 0  # what was read and not yet given, from this row on
+    for recording, start, end in _recordings(log, place, several):
+        for name, begin, stop in _cut(recording, start, end):
+            while first + len(held) < stop:
+                held, first = held[begin - first :], begin
+                held = np.concatenate([held, _values(next(batches), log, first + len(held))])
+            yield Chunk(name, log, begin, stop), recording, held[begin - first : stop - first]
 
 
 def _cut(recording: str, start: int, end: int) -> Iterator[tuple[str, int, int]]:
@@ -164,26 +178,32 @@ def _recordings(log: ParquetLog, place: str, several: bool) -> list[tuple[str, i
     source = _source(log.file)
     if log.labels is None:
         return [(place, 0, source.metadata.num_rows)]
-    runs: list[tuple[str, int]] = []  # a label and where its run ends
+    labels: list[str] = []
+    ends: list[int] = []  # where the run of each label ends
     row = 0
     for batch in source.iter_batches(ROW_GROUP, columns=[log.labels]):
         encoded = pa.compute.run_end_encode(batch.column(0).cast(pa.string()))
-        for label, end in zip(encoded.values.to_pylist(), encoded.run_ends.to_pylist(), strict=True):
-            if runs and runs[-1][0] == str(label):
-                runs.pop()
-            runs.append((str(label), row + end))
+        for label, end in zip(
+            map(str, encoded.values.to_pylist()), encoded.run_ends.to_pylist(), strict=True
+        ):
+            if labels and labels[-1] == label:
+                ends[-1] = row + end
+            else:
+                labels.append(label)
+                ends.append(row + end)
         row += batch.num_rows
-    labels = [label for label, _ in runs]
-    again = next((k for k, label in enumerate(labels) if label in labels[:k]), None)
-    if again is not None:
-        raise LogError(
-            f"trajectory {labels[again]} once more, after others", file=log.file,
-            element=f"row {runs[again - 1][1] + 1}, column {log.labels}",
-            expected="its rows together, in a log too large for memory", do="sort the rows",
-        )  # fmt: skip
-    starts = [0, *(end for _, end in runs)]
+    starts = [0, *ends][:-1]
+    seen: set[str] = set()
+    for label, start in zip(labels, starts, strict=True):
+        if label in seen:
+            raise LogError(
+                f"trajectory {label} once more, after others", file=log.file,
+                element=f"row {start + 1}, column {log.labels}",
+                expected="its rows together, in a log too large for memory", do="sort the rows",
+            )  # fmt: skip
+        seen.add(label)
     names = [f"{place}/{label}" if several else label for label in labels]
-    return [(name, start, end) for name, start, (_, end) in zip(names, starts, runs, strict=False)]
+    return list(zip(names, starts, ends, strict=True))
 
 
 def _source(file: Path) -> pa.parquet.ParquetFile:
@@ -204,8 +224,8 @@ def _values(batch: pa.RecordBatch, log: ParquetLog, row: int) -> np.ndarray:
     return table_values(table, log.file, log.start, row)
 
 
-def _trajectory(part: Part, values: np.ndarray) -> Trajectory:
-    log = part.log
-    t = values[:, 0] * TIMES[log.mapping.units.t]
-    found = in_si(t, values[:, 1:], log.joints, log.mapping)
-    return replace(found, name=part.name, file=log.file, declares_units=log.declares_units)
+def _trajectory(chunk: Chunk, values: dict[str, np.ndarray]) -> Trajectory:
+    log = chunk.log
+    return made_trajectory(
+        values, slice(None), name=chunk.name, file=log.file, declares_units=log.declares_units
+    )

@@ -10,7 +10,7 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import butter, sosfiltfilt
 
 from spelgen.errors import LogError, SpelgenError, collect
-from spelgen.logs.trajectory import QUANTITIES, Trajectory, split_at_gaps
+from spelgen.logs.trajectory import GAP, QUANTITIES, Trajectory, split_at_gaps
 
 FILTER_ORDER = 4
 AUTOMATIC_CUTOFF = 8.0  # [Hz] rigid-body motion of an arm lies below, drive ripple and quantisation above
@@ -27,7 +27,7 @@ def automatic_cutoff(rates: Iterable[float]) -> float | None:
     return AUTOMATIC_CUTOFF if all(each > AUTOMATIC_RATE for each in rates) else None
 
 
-def automatic_spacing(rates: Iterable[float], cutoff: float | None) -> int:
+def automatic_decimation(rates: Iterable[float], cutoff: float | None) -> int:
     """Samples from one sample of a window to the next: every one, unless filtered logs are much denser than
     needed.
 
@@ -73,24 +73,26 @@ def _interpolate(t: np.ndarray, times: np.ndarray, values: np.ndarray) -> np.nda
     return np.stack([np.interp(t, times, column) for column in values.T], axis=1)
 
 
-def prepare(trajectories: Sequence[Trajectory], *, shortest: int, cutoff: float | None) -> list[Trajectory]:
-    """Gap-free pieces of at least `shortest` samples, filtered at cutoff [Hz] if one is given.
+def prepare(
+    trajectories: Sequence[Trajectory], *, shortest: int, cutoff: float | None, gap: float = GAP
+) -> list[Trajectory]:
+    """Gap-free pieces (see `gap_ends`) of at least `shortest` samples, filtered at cutoff [Hz] if one is given.
 
     Raises LogError when a trajectory holds no piece that long.
     """
     prepared: list[Trajectory] = []
     errors: list[SpelgenError] = []
     for trajectory in trajectories:
-        pieces = [x for x in split_at_gaps(trajectory) if len(x.t) >= shortest]
+        pieces = [x for x in split_at_gaps(trajectory, gap) if len(x.t) >= shortest]
         if not pieces:
-            errors.append(_too_short(trajectory, shortest))
+            errors.append(_too_short(trajectory, shortest, gap))
         prepared += pieces if cutoff is None else [low_pass(piece, cutoff) for piece in pieces]
     collect(errors)
     return prepared
 
 
-def _too_short(trajectory: Trajectory, shortest: int) -> LogError:
-    longest = max(len(piece.t) for piece in split_at_gaps(trajectory))
+def _too_short(trajectory: Trajectory, shortest: int, gap: float) -> LogError:
+    longest = max(len(piece.t) for piece in split_at_gaps(trajectory, gap))
     return LogError(
         f"{longest} samples without a gap", file=trajectory.file, element=f"trajectory {trajectory.name}",
         expected=f"at least {shortest}, one window", do="record longer or train with a shorter window",

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -15,6 +15,8 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from spelgen.errors import LogError, SpelgenError, collect
+from spelgen.files import replacing
+from spelgen.logs.arm_mapping import GivenMapping, log_source
 from spelgen.logs.mapping import TIMES, LogMapping
 from spelgen.logs.tables import SUFFIXES, UNITS, UNITS_KEY, LogTable, is_log, read_tables, wanted_quantities
 from spelgen.logs.trajectory import QUANTITIES, Trajectory, gap_ends
@@ -28,29 +30,31 @@ Named = tuple[tuple[str, str, str], Trajectory]
 
 
 def read_logs(
-    paths: Iterable[Path | str],
-    joints: Sequence[str],
-    *,
+    paths: Path | str | Iterable[Path | str],
+    arm: Any,
+    mapping: GivenMapping = None,
     role: str | None = None,
-    mapping: LogMapping | None = None,
+    *,
     joint_types: Sequence[str] | None = None,
 ) -> list[Trajectory]:
     """All trajectories of the given files and folders, in sorted order of their files.
 
-    joints: the URDF's joint names; without a mapping, joint j has the columns `q_<j>`, `qd_<j>`, `tau_<j>`,
-    beside the time `t` [s]. A column `trajectory` splits one file into several. role "train" or "test": of a
-    folder that holds train.* or test.* files, only those with this stem are read. joint_types: what the
-    mapping's units are checked against.
+    arm: one loaded from a URDF, a model, or the names of joints as the URDF has them; without a mapping, joint j
+    has the columns `q_<j>`, `qd_<j>`, `tau_<j>`, beside the time `t` [s]. A column `trajectory` splits one file
+    into several. mapping: how the logs are named and measured, as a LogMapping, its keys in a dict, or a YAML file
+    of them; by default what the settings beside the arm's URDF say under `logs`. role "train" or "test": of a folder
+    that holds train.* or test.* files, only those with this stem are read. joint_types: what the mapping's units are
+    checked against, where `arm` is names alone.
     Raises LogError (or one error that holds several) naming file, row and column, and SettingsError where
     the mapping does not fit the joints.
     """
-    mapping = mapping or LogMapping()
-    collect(mapping.misfits(joints, joint_types))
+    joints, kinds, how = log_source(arm, mapping)
+    collect(how.misfits(joints, kinds or joint_types))
     errors: list[SpelgenError] = []
     labelled: list[Named] = []
-    for file in log_files(paths, role, errors):
+    for file in log_files([paths] if isinstance(paths, str | Path) else paths, role, errors):
         try:
-            for each in read_tables(file, tuple(joints), mapping):
+            for each in read_tables(file, joints, how):
                 labelled += _trajectories(each, file, joints)
         except LogError as error:
             errors.append(error)
@@ -73,10 +77,8 @@ def write_logs(path: Path | str, trajectories: Sequence[Trajectory], joints: Seq
         values = np.concatenate([getattr(x, quantity) for x in trajectories])
         columns |= {f"{quantity}_{joint}": values[:, i] for i, joint in enumerate(joints)}
     table = pa.table(columns).replace_schema_metadata({UNITS_KEY: UNITS})
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(path.name + ".tmp")
-    write(table, unfinished)
-    os.replace(unfinished, path)
+    with replacing(path) as unfinished:
+        write(table, unfinished)
 
 
 def _writer(path: Path) -> Callable[[pa.Table, Path], None]:
@@ -120,34 +122,42 @@ def _trajectories(part: LogTable, file: Path, joints: Sequence[str]) -> list[Nam
     """The trajectories of one table."""
     if not part.table.num_rows:
         raise LogError("no rows", file=file, expected="at least one window of samples")
-    data = table_values(part, file, clock_start(part))
-    labels = None if part.labels is None else np.array(part.table[part.labels].to_pylist(), dtype=str)
+    values = in_si(table_values(part, file, clock_start(part)), joints, part.mapping)
     declared = part.declares_units or all(part.mapping.unit("q", joint) for joint in joints)
-    names = [part.recording or file.stem] if labels is None else list(dict.fromkeys(labels.tolist()))
     found = []
-    for name in names:
-        rows = np.arange(len(data)) if labels is None else np.flatnonzero(labels == name)
-        t = data[rows, 0] * TIMES[part.mapping.units.t]
-        require_increasing_times(t, rows, file, part.wanted[0])
-        trajectory = replace(
-            in_si(t, data[rows, 1:], joints, part.mapping), file=file, declares_units=declared
-        )
+    for name, rows in _recordings(part, file.stem):
+        require_increasing_times(values["t"][rows], rows, file, part.wanted[0])
+        trajectory = made_trajectory(values, rows, name=name, file=file, declares_units=declared)
         found.append(((name, f"{file.stem}/{name}", f"{file}/{name}"), trajectory))
     return found
 
 
-def in_si(t: np.ndarray, data: np.ndarray, joints: Sequence[str], mapping: LogMapping) -> Trajectory:
-    """Times (T,) [s] and columns as logged, q, qd (where it is logged) and tau by joint (T, 3n or 2n) -> a
-    trajectory without a name.
-    """
+def _recordings(part: LogTable, stem: str) -> list[tuple[str, np.ndarray]]:
+    """Name and rows of each recording of a table, in order of their first rows."""
+    if part.labels is None:
+        return [(part.recording or stem, np.arange(part.table.num_rows))]
+    places: dict[str, int] = {}
+    codes = [places.setdefault(str(label), len(places)) for label in part.table[part.labels].to_pylist()]
+    order = np.argsort(codes, kind="stable")
+    return list(zip(places, np.split(order, np.cumsum(np.bincount(codes))[:-1]), strict=True))
+
+
+def in_si(data: np.ndarray, joints: Sequence[str], mapping: LogMapping) -> dict[str, np.ndarray]:
+    """Columns as logged, t, q, qd (where it is logged) and tau by joint (T, 1 + 3n or 2n) -> each in SI units."""
     logged = wanted_quantities(mapping)
-    values = dict(zip(logged, np.split(data, len(logged), axis=1), strict=True))
+    values = dict(zip(logged, np.split(data[:, 1:], len(logged), axis=1), strict=True))
     for quantity, columns in values.items():
         factors = np.array([mapping.scale(quantity, joint) for joint in joints])
         offsets = np.array([mapping.offset(quantity, joint) for joint in joints])
         values[quantity] = columns * factors + offsets
-    qd = values["qd"] if "qd" in values else _differentiated(t, values["q"])
-    return Trajectory("", t, values["q"], qd, values["tau"])
+    return values | {"t": data[:, 0] * TIMES[mapping.units.t]}
+
+
+def made_trajectory(values: dict[str, np.ndarray], rows: np.ndarray | slice, **told: Any) -> Trajectory:
+    """These rows of what `in_si` gave, velocities differentiated where there are none. told: of the trajectory."""
+    t, q, tau = (values[name][rows] for name in ("t", "q", "tau"))
+    qd = values["qd"][rows] if "qd" in values else _differentiated(t, q)
+    return Trajectory(t, q, qd, tau, **told)
 
 
 def _differentiated(t: np.ndarray, q: np.ndarray) -> np.ndarray:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from spelgen.logs.checks import Agreement, agreements
-from spelgen.logs.trajectory import GAP, QUANTITIES, Trajectory, rate
+from spelgen.logs.checks import VelocityAgreement, velocity_agreement
+from spelgen.logs.trajectory import GAP, QUANTITIES, Trajectory
 
 DENSE = 50.0  # [Hz] below this rate motion looks like noise
 SMALLEST = 0.05  # part of the differences between neighbouring levels that may be one step
@@ -21,22 +21,22 @@ MOSTLY = 0.95  # of the differences between neighbouring levels are whole steps 
 class Clock:
     """When the samples of one trajectory were taken.
 
-    duration, longest_gap: [s], the latter 0 without gaps. rate: [Hz], outside gaps. jitter: standard deviation of
-    the steps outside gaps, relative to their mean.
+    duration, longest_gap: [s], the latter 0 without gaps. sample_rate: [Hz], outside gaps. jitter: standard
+    deviation of the steps outside gaps, relative to their mean.
     """
 
     name: str
     file: str | None
     samples: int
     duration: float
-    rate: float
+    sample_rate: float
     jitter: float
     gaps: int
     longest_gap: float
 
 
 @dataclass(frozen=True, eq=False)
-class Measures:
+class Statistics:
     """One trajectory of n joints.
 
     low, high: of q, qd and tau, each (n,). noise: of q, qd and tau (n,), standard deviation of what changes from
@@ -49,22 +49,25 @@ class Measures:
     high: dict[str, np.ndarray]
     noise: dict[str, np.ndarray] | None
     steps: dict[str, np.ndarray]
-    agreement: Agreement
+    agreement: VelocityAgreement
 
 
-def measure(trajectory: Trajectory) -> Measures:
+def statistics(trajectory: Trajectory) -> Statistics:
     """The numbers of one trajectory."""
     signals = {name: getattr(trajectory, name) for name in QUANTITIES}
-    dense = rate(trajectory) >= DENSE and len(trajectory.t) > 8
-    return Measures(
+    dense = trajectory.sample_rate >= DENSE and len(trajectory.t) > 8
+    return Statistics(
         clock=_clock(trajectory),
         low={name: values.min(axis=0) for name, values in signals.items()},
         high={name: values.max(axis=0) for name, values in signals.items()},
-        noise={name: noise(trajectory.t, values) for name, values in signals.items()} if dense else None,
+        noise={name: noise_level(trajectory.t, values) for name, values in signals.items()}
+        if dense
+        else None,
         steps={
-            name: np.array([quantisation(column) for column in values.T]) for name, values in signals.items()
+            name: np.array([quantisation_step(column) for column in values.T])
+            for name, values in signals.items()
         },
-        agreement=agreements(trajectory),
+        agreement=velocity_agreement(trajectory),
     )
 
 
@@ -76,15 +79,15 @@ def _clock(trajectory: Trajectory) -> Clock:
         name=trajectory.name,
         file=None if trajectory.file is None else str(trajectory.file),
         samples=len(trajectory.t),
-        duration=float(trajectory.t[-1] - trajectory.t[0]),
-        rate=rate(trajectory),
+        duration=trajectory.duration,
+        sample_rate=trajectory.sample_rate,
         jitter=float(regular.std() / regular.mean()),
         gaps=len(gaps),
         longest_gap=float(gaps.max(initial=0.0)),
     )
 
 
-def noise(t: np.ndarray, values: np.ndarray) -> np.ndarray:
+def noise_level(t: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Standard deviation (n,) of white noise on smooth signals (T, n) at jittered times (T,).
 
     From third divided differences, scaled so that white noise keeps its size: of smooth motion they are small,
@@ -98,7 +101,7 @@ def noise(t: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.median(np.abs(third), axis=0) / 0.6745
 
 
-def quantisation(values: np.ndarray) -> float:
+def quantisation_step(values: np.ndarray) -> float:
     """The step of a quantised signal (T,); NaN where it is not quantised, or never changes."""
     apart = np.diff(np.unique(values))
     if not apart.size:

@@ -53,16 +53,16 @@ def joined(parts: Sequence[Windows]) -> Windows:
     return Windows(*(torch.cat(each) for each in columns))
 
 
-def window_count(samples: int, window: int, stride: int, every: int) -> int:
+def window_count(samples: int, window: int, stride: int, decimation: int) -> int:
     """How many windows `cut_windows` cuts from a piece of so many samples."""
-    starts = samples - (window - 1) * every
+    starts = samples - (window - 1) * decimation
     return max(0, -(-starts // stride))
 
 
 def cut_windows(
-    pieces: Sequence[Trajectory], window: int, stride: int = 1, every: int = 1, *, measured: bool
+    pieces: Sequence[Trajectory], window: int, stride: int = 1, decimation: int = 1, *, measured: bool
 ) -> Windows:
-    """All windows of `window` samples, `every` apart, that start at every `stride`-th sample of a piece.
+    """All windows of `window` samples, `decimation` apart, that start at every `stride`-th sample of a piece.
 
     Between samples the input is held at its mean over time. measured: False reads tau[k] as held from t[k]
     to t[k+1], as a simulator with zero-order hold applied it. True reads it as measured at t[k] and takes
@@ -70,29 +70,31 @@ def cut_windows(
     there is no window.
     """
     cut = [
-        _cut(piece, window, stride, every, measured)
+        _cut(piece, window, stride, decimation, measured)
         for piece in pieces
-        if len(piece.t) > (window - 1) * every
+        if len(piece.t) > (window - 1) * decimation
     ]
     if not cut:
-        raise LogError(f"no trajectory of {(window - 1) * every + 1} samples", expected="one window")
+        raise LogError(f"no trajectory of {(window - 1) * decimation + 1} samples", expected="one window")
     return Windows(*(torch.from_numpy(np.concatenate(parts)) for parts in zip(*cut, strict=True)))
 
 
-def _cut(piece: Trajectory, window: int, stride: int, every: int, measured: bool) -> tuple[np.ndarray, ...]:
+def _cut(
+    piece: Trajectory, window: int, stride: int, decimation: int, measured: bool
+) -> tuple[np.ndarray, ...]:
     held = (piece.tau[:-1] + piece.tau[1:]) / 2 if measured else piece.tau[:-1]
-    impulse = sliding_window_view(held * np.diff(piece.t)[:, None], every, axis=0).sum(
+    impulse = sliding_window_view(held * np.diff(piece.t)[:, None], decimation, axis=0).sum(
         axis=-1
-    )  # (T - every, n)
-    dt = (piece.t[every:] - piece.t[:-every])[:, None]
-    steps = [_slide(x, window - 1, stride, every) for x in (dt, impulse / dt)]
-    states = [_slide(x, window, stride, every) for x in (piece.q, piece.qd)]
+    )  # (T - decimation, n)
+    dt = (piece.t[decimation:] - piece.t[:-decimation])[:, None]
+    steps = [_slide(x, window - 1, stride, decimation) for x in (dt, impulse / dt)]
+    states = [_slide(x, window, stride, decimation) for x in (piece.q, piece.qd)]
     return steps[0][..., 0], *states, steps[1]
 
 
-def _slide(values: np.ndarray, window: int, stride: int, every: int) -> np.ndarray:
+def _slide(values: np.ndarray, window: int, stride: int, decimation: int) -> np.ndarray:
     """(T, n) -> (W, window, n)."""
-    windows = sliding_window_view(values, (window - 1) * every + 1, axis=0)[::stride, :, ::every]
+    windows = sliding_window_view(values, (window - 1) * decimation + 1, axis=0)[::stride, :, ::decimation]
     return windows.transpose(0, 2, 1)
 
 

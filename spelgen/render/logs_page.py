@@ -1,4 +1,4 @@
-"""A survey as one self-contained HTML page, with what was logged drawn joint by joint."""
+"""A report on logs as one self-contained HTML page, with what was logged drawn joint by joint."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from markupsafe import Markup
 from spelgen import __version__
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.regressor import regressor, urdf_parameters
-from spelgen.logs.formatting import heading, listings
-from spelgen.logs.report import Survey
+from spelgen.logs.report import LogReport
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.render.charts import Line, line_chart
 from spelgen.render.plots import UNITS, JointCharts
@@ -18,7 +17,7 @@ from spelgen.templates import render
 DRAWN = 600  # points of a line: what `line_chart` shows
 
 
-def page(found: Survey, arm: Arm, inputs: np.ndarray) -> str:
+def page(found: LogReport, arm: Arm, inputs: np.ndarray) -> str:
     """The page about ``found``. It has no scripts and needs no other file; names are escaped.
 
     inputs: G (n, n), which takes logged torques to the joints'.
@@ -27,8 +26,8 @@ def page(found: Survey, arm: Arm, inputs: np.ndarray) -> str:
         "logs.html.jinja",
         version=__version__,
         robot=found.robot,
-        heading=heading(found),
-        tables=listings(found),
+        heading=found.heading(),
+        tables=found.listings(),
         findings=found.findings,
         errors=found.errors,
         examples=[(each.name, charts(each, arm, inputs)) for each in found.examples],

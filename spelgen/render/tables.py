@@ -7,6 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from spelgen.listing import number
+
 WIDTH = 80
 WIDEST_LABEL = 30
 MODEL = "model"  # the trained model among the contenders
@@ -88,13 +90,6 @@ def verdict(evaluation: Mapping[str, Any]) -> str:
         return "At no horizon does the model predict better than its rivals."
     lost = [f"; over {name} {each or 'nothing'} is better" for name, each in best.items() if each != MODEL]
     return f"The model predicts best over {_listed(won)}{''.join(lost)}."
-
-
-def number(value: float | None) -> str:
-    """Three significant digits; a dash for what is not known or not finite."""
-    if value is None:
-        return "-"
-    return f"{value:.3g}" if value == 0 or 1e-3 <= abs(value) < 1e4 else f"{value:.2e}"
 
 
 def _ahead(horizon: Mapping[str, Any]) -> str:

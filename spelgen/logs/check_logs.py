@@ -1,0 +1,149 @@
+"""Logs beside a robot: all that is measured, and what is odd about it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from spelgen.arm.arm import Coordinate
+from spelgen.errors import Diagnostic, LogError, SpelgenError, SpelgenErrors
+from spelgen.logs.checks import Finding, findings, gap_diagnostics, summarised
+from spelgen.logs.gravity import GravityFit, StateSamples, fit_gravity, state_samples
+from spelgen.logs.report import SEEN, JointReport, LogReport
+from spelgen.logs.statistics import Statistics, statistics
+from spelgen.logs.trajectory import QUANTITIES, Trajectory, require_joints
+
+if TYPE_CHECKING:
+    from spelgen.loaded_arm import LoadedArm
+
+EXAMPLES = 2  # trajectories that are drawn
+BEYOND = 1e-3  # [rad, m, of a limit] a limit overrun by less is rounding
+LOADED = 0.2  # deviation of the URDF's gravity torque, of the torque's: from here on it must be seen
+UNSEEN = 0.3  # correlation of torque and gravity below which the one is not in the other
+FACTORS = (0.2, 5.0)  # inertials in URDFs are often wrong, but not like this
+
+
+def check_logs(logs: Iterable[Trajectory], arm: LoadedArm) -> LogReport:
+    """All about the logs of an arm, read once, one trajectory after another; nothing is repaired or raised.
+
+    What keeps logs from being trained on is among the report's `errors`. Logged torques go through the arm's
+    input matrix to the joints'. Raises LogError without any trajectory, or with one of another number of joints.
+    """
+    coordinates, inputs = arm.arm.coordinates, arm.actuation.matrix()
+    joints, kinds = [c.name for c in coordinates], [c.kind for c in coordinates]
+    measured: list[Statistics] = []
+    samples: list[StateSamples] = []
+    examples: list[Trajectory] = []
+    notes: list[Diagnostic] = []
+    odd: list[Finding] = []
+    for trajectory in logs:
+        require_joints(trajectory, joints)
+        measured.append(statistics(trajectory))
+        samples.append(state_samples(trajectory, inputs))
+        odd += findings(trajectory, joints, kinds, measured[-1].agreement)
+        notes += gap_diagnostics(trajectory)
+        if len(examples) < EXAMPLES:
+            examples.append(trajectory)
+    if not measured:
+        raise LogError("no trajectory", expected="at least one")
+    errors: tuple[SpelgenError, ...] = ()
+    try:
+        notes += summarised(odd, joints, len(measured))
+    except SpelgenErrors as several:
+        errors = several.errors
+    except SpelgenError as error:
+        errors = (error,)
+    gravity = fit_gravity(arm.arm, samples)
+    reports = [_joint(k, *each, measured) for k, each in enumerate(zip(coordinates, gravity, strict=True))]
+    for coordinate, report in zip(coordinates, reports, strict=True):
+        notes += [*_limits(coordinate, report), *_gravity(report)]
+    return LogReport(
+        robot=arm.arm.name,
+        files=len({each.clock.file for each in measured} - {None}),
+        trajectories=tuple(each.clock for each in measured),
+        joints=tuple(reports),
+        findings=tuple(notes),
+        errors=errors,
+        examples=tuple(examples),
+    )
+
+
+def _joint(
+    index: int, coordinate: Coordinate, gravity: GravityFit, measured: Sequence[Statistics]
+) -> JointReport:
+    low = {name: min(float(each.low[name][index]) for each in measured) for name in QUANTITIES}
+    high = {name: max(float(each.high[name][index]) for each in measured) for name in QUANTITIES}
+    dense = [each.noise for each in measured if each.noise is not None]
+    agreement = measured[0].agreement
+    for each in measured[1:]:
+        agreement = agreement + each.agreement
+    return JointReport(
+        name=coordinate.name,
+        kind=coordinate.kind,
+        low=low,
+        high=high,
+        range_fraction=_range_fraction(coordinate, low["q"], high["q"]),
+        noise={name: float(np.median([each[name][index] for each in dense])) for name in QUANTITIES}
+        if dense
+        else None,
+        steps={name: _common_step([each.steps[name][index] for each in measured]) for name in QUANTITIES},
+        velocity_factor=agreement.factor(index) if agreement.xx[index] > 0 else None,
+        velocity_correlation=agreement.correlation(index),
+        gravity=gravity,
+    )
+
+
+def _range_fraction(coordinate: Coordinate, low: float, high: float) -> float | None:
+    if coordinate.continuous or coordinate.lower is None or coordinate.upper is None:
+        return None
+    width = coordinate.upper - coordinate.lower
+    return (high - low) / width if width > 0 else None
+
+
+def _common_step(steps: Sequence[float]) -> float | None:
+    """The step of most trajectories, where the signal is quantised in most of them."""
+    known = [step for step in steps if np.isfinite(step)]
+    return float(np.median(known)) if 2 * len(known) > len(steps) else None
+
+
+def _limits(coordinate: Coordinate, joint: JointReport) -> list[Diagnostic]:
+    """Where the logs go beyond what the URDF allows."""
+    unit = {"revolute": ("rad", "rad/s", "Nm"), "prismatic": ("m", "m/s", "N")}[joint.kind]
+    speed, torque = (max(abs(joint.low[x]), abs(joint.high[x])) for x in ("qd", "tau"))
+    over = []
+    lower, upper = (None, None) if coordinate.continuous else (coordinate.lower, coordinate.upper)
+    if lower is not None and joint.low["q"] < lower - BEYOND:
+        over.append(("position", f"q down to {joint.low['q']:.4g} {unit[0]}, the limit is {lower:.4g}"))
+    if upper is not None and joint.high["q"] > upper + BEYOND:
+        over.append(("position", f"q up to {joint.high['q']:.4g} {unit[0]}, the limit is {upper:.4g}"))
+    for name, value, limit, told in (
+        ("velocity", speed, coordinate.velocity, unit[1]),
+        ("effort", torque, coordinate.effort, unit[2]),
+    ):
+        if limit and value > limit * (1 + BEYOND):
+            over.append((name, f"{name} up to {value:.4g} {told}, the limit is {limit:.4g}"))
+    where = f"joint {joint.name!r}"
+    return [Diagnostic("warning", f"beyond-{name}-limit", where, None, what) for name, what in over]
+
+
+def _gravity(joint: JointReport) -> list[Diagnostic]:
+    """Where the torque does not move with gravity as the URDF says."""
+    fit = joint.gravity
+    if fit.factor is None or fit.correlation is None or (fit.relative_deviation or 0.0) < LOADED:
+        return []
+    where, (low, high) = f"joint {joint.name!r}", FACTORS
+    if abs(fit.correlation) < UNSEEN:
+        message = (
+            f"tau does not move with gravity: their correlation is {fit.correlation:.2g}, while the URDF's "
+            f"gravity torque spreads {fit.relative_deviation:.2g} times as wide as tau; is it compensated in the log?"
+        )
+        return [Diagnostic("warning", "torque-without-gravity", where, None, message)]
+    if fit.correlation < -SEEN:
+        message = f"tau moves against gravity: {fit.factor:.3g} times the URDF's; a sign of tau or q is wrong"
+        return [Diagnostic("warning", "torque-against-gravity", where, None, message)]
+    if fit.correlation > SEEN and not low < fit.factor < high:
+        message = f"tau moves with {fit.factor:.3g} times the URDF's gravity torque; check its unit and gain"
+        return [Diagnostic("warning", "torque-scale", where, None, message)]
+    return []
