@@ -26,22 +26,26 @@ from characters import TESTS as CHARACTERS
 from characters import read_characters, write_arm
 
 from spelgen.arm.arm import Arm
+from spelgen.emission.loading import load_module
+from spelgen.dynamics.protocol import integrable
 from spelgen.evaluation.baselines import Contender
 from spelgen.evaluation.results import state_errors
 from spelgen.fitting.dataset import WHOLE_DECAY
 from spelgen.fitting.rollout import roll_out
-from spelgen.fitting.run_folder import load_model
 from spelgen.fitting.torque_fit import fit_torque
 from spelgen.fitting.torque_networks import fit_networks
 from spelgen.fitting.torque_start import LOAD, last_body
 from spelgen.identification.friction import FrictionModel
-from spelgen.identification.identify import Identification, Method, identify
+from spelgen.identification.identification import Identification
+from spelgen.identification.identify import least_squares
+from spelgen.identification.method import LeastSquares
 from spelgen.identification.samples import DynamicsSamples, dynamics_samples
+from spelgen.loaded_arm import load_arm
 from spelgen.logs.filtering import prepare
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
-from spelgen.pipeline import build, load
+from spelgen.pipeline import generate
 from spelgen.spec import Preset
 
 Torque = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -71,16 +75,16 @@ def main() -> None:
 
 def ur10e(folder: Path, scratch: Path) -> None:
     urdf = folder / "ur10e.urdf"
-    arm, model = load(urdf).arm, emitted(urdf, scratch)
+    arm, model = load_arm(urdf).arm, emitted(urdf, scratch)
     logs = {name: read(folder / f"{name}.parquet", arm) for name in (*TRAINING, *TESTS, OUTSIDE, *LOADED)}
     training = dynamics_samples([logs[name] for name in TRAINING])
     tests = [
         (dynamics_samples([logs[x] for x in (*TESTS, OUTSIDE)], pauses=pauses)) for pauses in (True, False)
     ]
-    rival = identify(arm, training, Method("range"))
+    rival = least_squares(arm, training, LeastSquares("range"))
     features = FrictionModel(stribeck=True, polynomial=True)
-    more = identify(arm, training, Method("range", friction=features))
-    weighted = identify(arm, training, Method(friction=features))
+    more = least_squares(arm, training, LeastSquares("range", friction=features))
+    weighted = least_squares(arm, training, LeastSquares(friction=features))
     since = time.perf_counter()
     fit_torque(model, training)
     print(
@@ -119,8 +123,8 @@ def few(
     print(f"{'seconds':26}" + "".join(f"{x:>15}" for x in head))
     for seconds in SECONDS:
         samples = dynamics_samples([first(long, seconds)])
-        ridges = [identify(arm, samples, Method("range", ridge=x)).torque for x in RIDGES]
-        prior = identify(arm, samples, Method(prior=0.5)).torque
+        ridges = [least_squares(arm, samples, LeastSquares("range", ridge=x)).torque for x in RIDGES]
+        prior = least_squares(arm, samples, LeastSquares(prior=0.5)).torque
         model = emitted(urdf, scratch)
         fit_torque(model, samples)
         ours = torque_of(model)
@@ -148,38 +152,6 @@ def payload(model: Any, logs: dict[str, Trajectory]) -> None:
     print()
 
 
-class Identified:
-    """What least squares found as a system of equations, with velocities where a module has momenta."""
-
-    def __init__(self, found: Identification, model: Any) -> None:
-        bodies = 10 * len(found.arm.bodies)
-        self.ten = torch.from_numpy(found.parameters[:bodies])
-        drives = torch.from_numpy(found.parameters[bodies:]).view(-1, model.n)
-        self.rotor, self.viscous, self.coulomb, self.offset = drives[:4]
-        self.width, self.model = found.method.friction.dry_velocity, model
-
-    def momentum(self, q: torch.Tensor, qd: torch.Tensor, prepared: None = None) -> torch.Tensor:
-        return qd
-
-    def velocity(self, q: torch.Tensor, p: torch.Tensor, prepared: None = None) -> torch.Tensor:
-        return p
-
-    def prepare(self) -> None:
-        return None
-
-    def rates(
-        self, q: torch.Tensor, p: torch.Tensor, tau: torch.Tensor, prepared: None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        still = torch.zeros_like(q)
-        bias = self.model.regressor(q, p, still) @ self.ten
-        weight = self.model.regressor(q, still, still) @ self.ten
-        unit = torch.eye(q.shape[-1], dtype=q.dtype)
-        columns = [self.model.regressor(q, still, x.expand_as(q)) @ self.ten - weight for x in unit]
-        mass = torch.stack(columns, dim=-1) + torch.diag(self.rotor)
-        friction = self.viscous * p + self.coulomb * (p / self.width).tanh() + self.offset
-        return p, torch.linalg.solve(mass, (tau - bias - friction).unsqueeze(-1)).squeeze(-1)
-
-
 def rollouts(model: Any, found: Identification, logs: Sequence[Trajectory]) -> None:
     print(
         "Predicted states on the nine, error relative to the motion (mean of joints, position and velocity)\n"
@@ -188,7 +160,7 @@ def rollouts(model: Any, found: Identification, logs: Sequence[Trajectory]) -> N
     for name, steps in AHEAD.items():
         windows = tested(logs, steps)
         with torch.no_grad():
-            row = [strayed(x, windows) for x in (Identified(found, model), model)]
+            row = [strayed(x, windows) for x in (integrable(found.dynamics), model)]
         print(f"{name:26}" + "".join(f"{x:15.4f}" for x in row))
     print()
 
@@ -206,12 +178,12 @@ def strayed(dynamics: Any, windows: Windows) -> float:
 
 
 def panda(folder: Path, urdf: Path, scratch: Path) -> None:
-    arm, model = load(urdf).arm, emitted(urdf, scratch)
+    arm, model = load_arm(urdf).arm, emitted(urdf, scratch)
     whole = read(folder / "exciting_traj1.parquet", arm)
     training, test = dynamics_samples([first(whole, 12.0)]), dynamics_samples([after(whole, 12.0)])
     fit_torque(model, training)
     contenders = {
-        f"tanh {width:g}": identify(arm, training, Method("range", friction=FrictionModel(width))).torque
+        f"tanh {width:g}": least_squares(arm, training, LeastSquares("range", friction=FrictionModel(width))).torque
         for width in (0.02, 0.05)
     }
     table("Panda: first 12 s train, last 9 s test", contenders | {"closed-form": torque_of(model)}, test, 1)
@@ -252,8 +224,8 @@ def _torques(
 
 def emitted(urdf: Path, scratch: Path, preset: Preset = "closed-form") -> Any:
     path = scratch / f"{urdf.stem}_{preset}.py"
-    path.write_text(build(urdf, preset=preset), encoding="utf-8")
-    return load_model(path)
+    path.write_text(generate(urdf, preset=preset), encoding="utf-8")
+    return load_module(path)
 
 
 def read(path: Path, arm: Arm) -> Trajectory:

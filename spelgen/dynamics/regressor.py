@@ -11,9 +11,6 @@ import numpy as np
 
 from spelgen.arm.arm import Arm, Body
 
-PARAMETERS = ("m", "mx", "my", "mz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
-"""Of a body, about its joint frame's origin and in its axes: [kg], [kg m], [kg m^2]; as ``Body.inertia``."""
-
 _CROSS = np.zeros((3, 3, 3))  # _CROSS @ b applied to a, summed over the last axes, is a x b
 for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
     _CROSS[_i, _j, _k], _CROSS[_i, _k, _j] = 1.0, -1.0
@@ -33,14 +30,14 @@ class _State:
     rotation: np.ndarray  # (T, 3, 3)
     position: np.ndarray  # (T, 3)
     velocity: np.ndarray  # (T, 3) angular
-    turning: np.ndarray  # (T, 3) angular acceleration
+    angular: np.ndarray  # (T, 3) angular acceleration
     acceleration: np.ndarray  # (T, 3)
 
 
 def regressor(arm: Arm, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
     """Y (T, n, 10 B) at q, qd, qdd, each (T, n), of the arm's B bodies: tau = Y pi [Nm, N].
 
-    Column 10 b + i belongs to parameter ``PARAMETERS[i]`` of ``arm.bodies[b]``.
+    Column 10 b + i belongs to parameter i of ``arm.bodies[b]``, in the order of ``Body.inertia``.
     """
     states: list[_State] = []
     result = np.zeros((*q.shape, 10 * len(arm.bodies)))
@@ -70,7 +67,7 @@ def _moved(
 ) -> _State:
     factor = float(body.multiplier)
     value = factor * q[:, body.coordinate] + body.offset
-    rate, rise = (factor * x[:, body.coordinate, None] for x in (qd, qdd))
+    speed, rise = (factor * x[:, body.coordinate, None] for x in (qd, qdd))
     pose = np.array([[float(x) for x in row] for row in body.rotation])
     position = np.broadcast_to(np.array([float(x) for x in body.translation]), (len(q), 3))
     axis = np.array([0.0, 0.0, 1.0])
@@ -80,22 +77,22 @@ def _moved(
         rotation = np.broadcast_to(pose, (len(q), 3, 3))
         position = position + value[:, None] * pose[:, 2]
     if body.parent < 0:
-        velocity = turning = np.zeros((len(q), 3))
+        velocity = angular = np.zeros((len(q), 3))
         acceleration = np.broadcast_to(-np.array([float(x) for x in arm.gravity]), (len(q), 3))
     else:
         parent = states[body.parent]
-        velocity, turning = parent.velocity, parent.turning
+        velocity, angular = parent.velocity, parent.angular
         swing = np.cross(velocity, np.cross(velocity, position))
-        acceleration = parent.acceleration + np.cross(turning, position) + swing
-    velocity, turning, acceleration = (
-        np.einsum("tij,ti->tj", rotation, x) for x in (velocity, turning, acceleration)
+        acceleration = parent.acceleration + np.cross(angular, position) + swing
+    velocity, angular, acceleration = (
+        np.einsum("tij,ti->tj", rotation, x) for x in (velocity, angular, acceleration)
     )
     if body.kind == "revolute":
-        turning = turning + rise * axis + rate * np.cross(velocity, axis)
-        velocity = velocity + rate * axis
+        angular = angular + rise * axis + speed * np.cross(velocity, axis)
+        velocity = velocity + speed * axis
     else:
-        acceleration = acceleration + rise * axis + 2 * rate * np.cross(velocity, axis)
-    return _State(rotation, position, velocity, turning, acceleration)
+        acceleration = acceleration + rise * axis + 2 * speed * np.cross(velocity, axis)
+    return _State(rotation, position, velocity, angular, acceleration)
 
 
 def _turn(angle: np.ndarray) -> np.ndarray:
@@ -109,11 +106,11 @@ def _wrench(state: _State) -> tuple[np.ndarray, np.ndarray]:
     """Force and moment about the origin by the body's ten parameters, each (T, 3, 10)."""
     samples = len(state.velocity)
     spin = _crossing(state.velocity)
-    inertia = np.einsum("ijc,tj->tic", _TENSOR, state.turning)
+    inertia = np.einsum("ijc,tj->tic", _TENSOR, state.angular)
     inertia = inertia + spin @ np.einsum("ijc,tj->tic", _TENSOR, state.velocity)
     force, moment = np.zeros((2, samples, 3, 10))
     force[:, :, 0] = state.acceleration
-    force[:, :, 1:4] = _crossing(state.turning) + spin @ spin
+    force[:, :, 1:4] = _crossing(state.angular) + spin @ spin
     moment[:, :, 1:4] = -_crossing(state.acceleration)
     moment[:, :, 4:] = inertia
     return force, moment

@@ -62,6 +62,10 @@ class RegressorDynamics:
         """The inputs, (..., n), that make qdd; those of a passive joint are the torques that it lacks."""
         return self._by_rows(self._inverse, q, qd, qdd)
 
+    def joint_torque(self, q: Array, qd: Array, qdd: Array) -> Array:
+        """What all joints, passive ones too, need for qdd, (..., n) [Nm, N]."""
+        return self._by_rows(self._torque, q, qd, qdd)
+
     def _bodies(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
         """The bodies' torques, (T, n)."""
         torque: np.ndarray = regressor(self.arm, q, qd, qdd) @ self.parameters
@@ -80,8 +84,11 @@ class RegressorDynamics:
         force = tau @ self.inputs.T - self._bodies(q, qd, 0 * q) - self.friction(qd)
         return np.linalg.solve(self._mass(q), force[..., None])[..., 0]
 
+    def _torque(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
+        return self._bodies(q, qd, qdd) + self.armature * qdd + self.friction(qd)
+
     def _inverse(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
-        force = self._bodies(q, qd, qdd) + self.armature * qdd + self.friction(qd)
+        force = self._torque(q, qd, qdd)
         moved = self.inputs + np.diag(~self.inputs.any(axis=1)).astype(float)
         return np.linalg.solve(moved, force.T).T
 

@@ -1,7 +1,8 @@
 """Base parameters: which inertial parameters the torque shows, alone or only in fixed combinations.
 
-Found by elimination on the regressor at random states (Gautier and Khalil, IEEE T-RA 6:368, 1990): the columns are
-taken root first, and one that the columns before it already span is regrouped into them.
+Of the bodies they are those of ``structure.base_parameters``, the same in every command: exact combinations with
+their names and order. Friction and drives follow, found by elimination on the regressor at random states: a column
+that the columns before it already span is regrouped into them (Gautier and Khalil, IEEE T-RA 6:368, 1990).
 """
 
 from __future__ import annotations
@@ -11,8 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from spelgen.arm.arm import Arm
-from spelgen.dynamics.regressor import PARAMETERS, regressor
+from spelgen.dynamics.regressor import regressor
 from spelgen.identification.friction import FrictionModel
+from spelgen.structure.base_parameters import base_parameters as body_base_parameters
+from spelgen.structure.base_parameters import parameter_name
+from spelgen.structure.structure import base_parameters as count_base_parameters
 
 _STATES_PER_PARAMETER = 2
 _DEPENDENT = 1e-9  # of its own length: what is left of a column that others span
@@ -23,57 +27,70 @@ _ABSENT = 1e-8  # of the largest coefficient: what is smaller is rounding
 class BaseParameters:
     """r base parameters of K parameters: ten a body, then those of friction and drives.
 
-    columns: (r,) of the regressor, the parameter each is named after. combination: (r, K), base parameters are
-    this times the parameters, with a one in column ``columns[k]`` of row k. names: of all K.
+    names: of the base parameters; those of the bodies are ``inspect``'s. columns: (r,) of the regressor, the
+    parameter each stands for. combination: (r, K), base parameters are this times the parameters, with a one in
+    column ``columns[k]`` of row k. parameters: names of all K. bodies: how many of the r are of bodies.
     """
 
+    names: tuple[str, ...]
     columns: np.ndarray
     combination: np.ndarray
-    names: tuple[str, ...]
+    parameters: tuple[str, ...]
+    bodies: int
 
     def __len__(self) -> int:
         return len(self.columns)
 
     def formulas(self) -> tuple[str, ...]:
-        """What each base parameter is made of, e.g. ``Izz1 + m2 + 0.1 mx2``."""
-        return tuple(
-            _sum(row, column, self.names) for row, column in zip(self.combination, self.columns, strict=True)
-        )
+        """What each base parameter is made of, e.g. ``Izz1 + m2 + 0.1 hx2``."""
+        rows = zip(self.combination, self.columns, strict=True)
+        return tuple(_sum(row, column, self.parameters) for row, column in rows)
 
-    def told(self) -> dict[str, str]:
-        """By parameter, in words, whether motion can show it."""
+    def identifiability(self) -> dict[str, str]:
+        """By parameter whether motion can show it: ``alone``, ``in combination`` or ``never``."""
         alone = (np.abs(self.combination) > 0).sum(axis=1) == 1
         seen = np.abs(self.combination).max(axis=0) > 0
         single = {int(column) for column, one in zip(self.columns, alone, strict=True) if one}
         return {
             name: "alone" if k in single else "in combination" if seen[k] else "never"
-            for k, name in enumerate(self.names)
+            for k, name in enumerate(self.parameters)
         }
 
 
 def base_parameters(arm: Arm, friction: FrictionModel, seed: int = 0) -> BaseParameters:
     """The base parameters of ``arm`` and of this friction."""
-    rng = np.random.default_rng(seed)
-    n = len(arm.coordinates)
-    names = [f"{name}{body + 1}" for body in range(len(arm.bodies)) for name in PARAMETERS]
+    n, inertial = len(arm.coordinates), 10 * len(arm.bodies)
+    exact = body_base_parameters(arm, count_base_parameters(arm))
+    names = [parameter_name(k) for k in range(inertial)]
     names += [f"{effect}{joint + 1}" for effect in friction.effects for joint in range(n)]
-    shape = (_STATES_PER_PARAMETER * len(names) // n + 1, n)
-    q, qd, qdd = rng.uniform(-3.0, 3.0, (3, *shape))
-    rows = np.concatenate([regressor(arm, q, qd, qdd), friction.columns(qd, qdd)], axis=2)
-    columns = rows.reshape(-1, len(names))
-    length = np.linalg.norm(columns, axis=0)
-    chosen: list[int] = []
-    basis = np.zeros((len(columns), 0))  # orthonormal, of the chosen columns
-    for k in range(len(names)):
+    columns = _columns(arm, friction, len(names), seed)
+    chosen = [parameter.index for parameter in exact]
+    basis = np.linalg.qr(columns[:, chosen])[0]
+    for k in range(inertial, len(names)):
         left = columns[:, k]
         for _ in range(2):  # once more takes away what rounding left
             left = left - basis @ (basis.T @ left)
-        if np.linalg.norm(left) > _DEPENDENT * max(float(length[k]), 1.0):
+        if np.linalg.norm(left) > _DEPENDENT * max(float(np.linalg.norm(columns[:, k])), 1.0):
             chosen.append(k)
             basis = np.column_stack([basis, left / np.linalg.norm(left)])
-    combination = np.linalg.lstsq(columns[:, chosen], columns, rcond=None)[0]
-    combination[np.abs(combination) < _ABSENT * np.abs(combination).max(initial=1.0)] = 0.0
-    return BaseParameters(np.array(chosen), combination, tuple(names))
+    combination = np.zeros((len(chosen), len(names)))
+    for row, parameter in enumerate(exact):
+        for k, weight in parameter.weights:
+            combination[row, k] = float(weight)
+    drives = np.linalg.lstsq(columns[:, chosen], columns[:, inertial:], rcond=None)[0]
+    drives[np.abs(drives) < _ABSENT * np.abs(drives).max(initial=1.0)] = 0.0
+    combination[:, inertial:] = drives
+    named = [parameter.name for parameter in exact] + [names[k] for k in chosen[len(exact) :]]
+    return BaseParameters(tuple(named), np.array(chosen), combination, tuple(names), len(exact))
+
+
+def _columns(arm: Arm, friction: FrictionModel, count: int, seed: int) -> np.ndarray:
+    """The whole regressor at random states, (rows, count)."""
+    n = len(arm.coordinates)
+    shape = (_STATES_PER_PARAMETER * count // n + 1, n)
+    q, qd, qdd = np.random.default_rng(seed).uniform(-3.0, 3.0, (3, *shape))
+    rows = np.concatenate([regressor(arm, q, qd, qdd), friction.columns(qd, qdd)], axis=2)
+    return rows.reshape(-1, count)
 
 
 def _sum(row: np.ndarray, first: int, names: tuple[str, ...]) -> str:

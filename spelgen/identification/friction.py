@@ -11,13 +11,13 @@ STRIBECK_VELOCITY = 0.1  # [rad/s, m/s] at which the extra dry friction of slow 
 
 @dataclass(frozen=True)
 class FrictionModel:
-    """Which effects have a column: viscous, Coulomb, offset and rotor inertia always.
+    """Which effects have a column: armature, viscous, Coulomb and offset always.
 
-    dry_velocity [rad/s, m/s]: width of the tanh in place of Coulomb friction's jump. stribeck: dry friction that
-    fades with speed (Gaussian, Armstrong-Helouvry 1991). polynomial: qd |qd| and qd^3.
+    coulomb_smoothing_velocity [rad/s, m/s]: width of the tanh in place of Coulomb friction's jump. stribeck: dry
+    friction of slow motion (Gaussian, Armstrong-Helouvry 1991). polynomial: qd |qd| and qd^3.
     """
 
-    dry_velocity: float = 0.01
+    coulomb_smoothing_velocity: float = 0.01
     stribeck: bool = False
     polynomial: bool = False
 
@@ -25,14 +25,24 @@ class FrictionModel:
     def effects(self) -> tuple[str, ...]:
         """Their names, in the columns' order."""
         more = ("stribeck",) * self.stribeck + ("quadratic", "cubic") * self.polynomial
-        return ("rotor", "viscous", "coulomb", "offset", *more)
+        return ("armature", "viscous", "coulomb", "offset", *more)
 
     def columns(self, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
         """(T, n, effects n): effect e of joint j is column e n + j, which no other joint's torque reads."""
-        dry = np.tanh(qd / self.dry_velocity)
-        parts = [qdd, qd, dry, np.ones_like(qd)]
+        parts = np.stack([qdd, *self._velocity_parts(qd)], axis=-2)  # (T, effects, n)
+        spread: np.ndarray = parts[:, None] * np.eye(qd.shape[1])[:, None]
+        return spread.reshape(*qd.shape, -1)
+
+    def torque(self, constants: np.ndarray, qd: np.ndarray) -> np.ndarray:
+        """All but the armature's part, (T, n), of ``constants`` by effect and joint, (effects, n)."""
+        parts = zip(constants[1:], self._velocity_parts(qd), strict=True)
+        return np.sum([by_joint * part for by_joint, part in parts], axis=0)
+
+    def _velocity_parts(self, qd: np.ndarray) -> list[np.ndarray]:
+        dry = np.tanh(qd / self.coulomb_smoothing_velocity)
+        parts = [qd, dry, np.ones_like(qd)]
         if self.stribeck:
             parts.append(dry * np.exp(-((qd / STRIBECK_VELOCITY) ** 2)))
         if self.polynomial:
             parts += [qd * np.abs(qd), qd**3]
-        return np.concatenate([x[:, :, None] * np.eye(qd.shape[1]) for x in parts], axis=-1)
+        return parts

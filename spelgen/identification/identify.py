@@ -3,78 +3,59 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.regressor import regressor
-from spelgen.errors import LogError
+from spelgen.errors import Diagnostic, LogError
 from spelgen.identification.base_parameters import BaseParameters, base_parameters
 from spelgen.identification.friction import FrictionModel
+from spelgen.identification.identification import Identification
 from spelgen.identification.least_squares import Solution, Triangles, deviations, reduce, solve
+from spelgen.identification.method import LeastSquares
 from spelgen.identification.prior import GaussianPrior, gaussian_prior
-from spelgen.identification.samples import DynamicsSamples
-
-Weights = Literal["equal", "range", "noise"]
+from spelgen.identification.samples import DynamicsSamples, dynamics_samples
+from spelgen.loaded_arm import LoadedArm
+from spelgen.logs.checks import check
+from spelgen.logs.preprocessing import Preprocessing
+from spelgen.logs.trajectory import Trajectory
 
 _BLOCK = 2000  # samples in memory at a time
 _ROUNDS = 4  # of weighing each joint by what is left of its torque
 _LEAST_NOISE = 0.02  # of a joint's torque range: few samples may be fitted better than their model deserves
 
 
-@dataclass(frozen=True)
-class Method:
-    """How parameters are fitted.
+def identify(
+    arm: LoadedArm,
+    logs: Sequence[Trajectory],
+    method: LeastSquares | None = None,
+    *,
+    preprocessing: Preprocessing | None = None,
+) -> Identification:
+    """Fit base parameters, friction and armature of ``arm`` to the torques in ``logs``.
 
-    weights: of the joints' squared errors: ``equal`` (a Nm is a Nm), by the ``range`` of each joint's torque, or
-    by the ``noise`` that is left, found in a few rounds. ridge: times the squared length of each column, as a
-    penalty; 0: none. prior: standard deviation of the bodies around the URDF's (see ``gaussian_prior``); it needs
-    the weights ``noise``; None: none.
+    Torques of motors are taken to the joints' by the arm's input matrix. Raises LogError for logs that cannot be
+    used, ArmError for a prior without inertials.
     """
-
-    weights: Weights = "noise"
-    ridge: float = 0.0
-    prior: float | None = None
-    friction: FrictionModel = field(default_factory=FrictionModel)
-
-
-@dataclass(frozen=True, eq=False)
-class Identification:
-    """What least squares found of an arm with n joints and K parameters, r of them base parameters.
-
-    parameters: (K,), whose torque is the fit's; without prior those outside the base are zero. values, deviations:
-    (r,) of the base parameters. condition: of the regressor (columns of length one, joints weighted). unseen:
-    directions of the base parameters in which these logs say nothing. residual: (n,) root mean square [Nm, N];
-    nmse: (n,) its square by the torque's variance.
-    """
-
-    arm: Arm
-    method: Method
-    base: BaseParameters
-    parameters: np.ndarray
-    values: np.ndarray
-    deviations: np.ndarray
-    condition: float
-    unseen: int
-    residual: np.ndarray
-    nmse: np.ndarray
-    trajectories: tuple[str, ...]
-    samples: int
-
-    def torque(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
-        """Joint torques (T, n) of the identified arm."""
-        return columns(self.arm, self.method.friction, q, qd, qdd) @ self.parameters
+    coordinates, inputs = arm.arm.coordinates, arm.actuation.matrix()
+    notes = check(logs, [c.name for c in coordinates], [c.kind for c in coordinates])
+    samples = dynamics_samples(logs, preprocessing=preprocessing or Preprocessing())
+    left = sorted({x.name for x in logs} - {x.name for x in samples})
+    if left:
+        message = f"sampled too slowly or too short for accelerations: {', '.join(left)}"
+        notes.append(Diagnostic("warning", "no-accelerations", "logs", None, message))
+    at_joints = [replace(x, tau=x.tau @ inputs.T) for x in samples]
+    found = least_squares(arm.arm, at_joints, method or LeastSquares())
+    return replace(found, inputs=inputs, diagnostics=tuple(notes))
 
 
-def columns(arm: Arm, friction: FrictionModel, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
-    """The whole regressor (T, n, 10 B + e n): the bodies', then that of friction and drives."""
-    return np.concatenate([regressor(arm, q, qd, qdd), friction.columns(qd, qdd)], axis=2)
-
-
-def identify(arm: Arm, samples: Sequence[DynamicsSamples], method: Method) -> Identification:
-    """Fit ``arm`` to joint torques. Raises LogError without samples, ArmError for a prior without inertials."""
+def least_squares(
+    arm: Arm, samples: Sequence[DynamicsSamples], method: LeastSquares | None = None
+) -> Identification:
+    """Fit ``arm`` to samples of joint torques; errors as for ``identify``."""
+    method = method or LeastSquares()
     if not any(len(x.q) for x in samples):
         raise LogError(
             "no samples to identify from",
@@ -84,19 +65,23 @@ def identify(arm: Arm, samples: Sequence[DynamicsSamples], method: Method) -> Id
     base = base_parameters(arm, method.friction)
     prior = None
     if method.prior is not None:
-        prior = gaussian_prior(arm, method.friction, triangles.spread, method.prior)
-    return _result(
-        arm, samples, method, base, _fitted(arm, samples, method, _space(base, triangles, prior, method))
-    )
+        prior = gaussian_prior(arm, method.friction, triangles.deviation, method.prior)
+    fit = _fitted(arm, samples, method, _space(base, triangles, prior, method))
+    return _result(arm, samples, method, base, fit)
+
+
+def columns(arm: Arm, friction: FrictionModel, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
+    """The whole regressor (T, n, 10 B + e n): the bodies', then that of friction and drives."""
+    return np.concatenate([regressor(arm, q, qd, qdd), friction.columns(qd, qdd)], axis=2)
 
 
 @dataclass(frozen=True, eq=False)
 class _Space:
-    """The parameters that are fitted: x = start + outlay z. penalty: of z; ridge: of it, times its column."""
+    """The parameters that are fitted: x = start + basis z. penalty: of z; ridge: of it, times its column."""
 
     triangles: Triangles
     start: np.ndarray
-    outlay: np.ndarray
+    basis: np.ndarray
     penalty: np.ndarray | None
     ridge: float
 
@@ -106,7 +91,7 @@ class _Space:
             rows = (self.triangles.factors * weights[:, None, None])[..., :-1]
             length = np.sqrt(np.square(rows).sum(axis=(0, 1)))
             penalty = np.sqrt(self.ridge) * np.where(length > 0, length, 1.0)
-        return solve(self.triangles, weights, self.outlay, self.start, penalty)
+        return solve(self.triangles, weights, self.basis, self.start, penalty)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,18 +105,20 @@ class _Fit:
 
     def covariance(self) -> np.ndarray:
         """Of z, for errors as large as they turned out to be, whatever the weights were."""
-        spread = np.square(self.weights**2 * self.noise)
-        rows = self.space.triangles.factors[..., :-1] @ self.space.outlay
-        inner = np.einsum("j,jka,jkb->ab", spread, rows, rows)
+        variance = np.square(self.weights**2 * self.noise)
+        rows = self.space.triangles.factors[..., :-1] @ self.space.basis
+        inner = np.einsum("j,jka,jkb->ab", variance, rows, rows)
         if self.space.penalty is not None:
             inner = inner + np.diag(self.space.penalty**2)
         return self.solution.covariance @ inner @ self.solution.covariance
 
 
-def _space(base: BaseParameters, triangles: Triangles, prior: GaussianPrior | None, method: Method) -> _Space:
+def _space(
+    base: BaseParameters, triangles: Triangles, prior: GaussianPrior | None, method: LeastSquares
+) -> _Space:
     count = triangles.factors.shape[2] - 1
     if prior is not None:
-        return _Space(triangles, prior.start, prior.outlay, 1.0 / prior.deviation, 0.0)
+        return _Space(triangles, prior.mean, prior.basis, 1.0 / prior.deviation, 0.0)
     if method.ridge:
         return _Space(triangles, np.zeros(count), np.eye(count), None, method.ridge)
     # each base parameter stands for the parameter that it is named after
@@ -147,9 +134,9 @@ def _blocks(
             yield columns(arm, friction, each.q[part], each.qd[part], each.qdd[part]), each.tau[part]
 
 
-def _fitted(arm: Arm, samples: Sequence[DynamicsSamples], method: Method, space: _Space) -> _Fit:
-    spread = space.triangles.spread
-    range_ = np.maximum(spread, 1e-3 * spread.max())
+def _fitted(arm: Arm, samples: Sequence[DynamicsSamples], method: LeastSquares, space: _Space) -> _Fit:
+    deviation = space.triangles.deviation
+    range_ = np.maximum(deviation, 1e-3 * deviation.max())
     weights = np.ones_like(range_) if method.weights == "equal" else 1.0 / range_
     for left in reversed(range(1 + (_ROUNDS if method.weights == "noise" else 0))):
         found = space.solve(weights)
@@ -162,10 +149,10 @@ def _fitted(arm: Arm, samples: Sequence[DynamicsSamples], method: Method, space:
 
 
 def _result(
-    arm: Arm, samples: Sequence[DynamicsSamples], method: Method, base: BaseParameters, fit: _Fit
+    arm: Arm, samples: Sequence[DynamicsSamples], method: LeastSquares, base: BaseParameters, fit: _Fit
 ) -> Identification:
-    triangles, found, outlay = fit.space.triangles, fit.solution, fit.space.outlay
-    covariance = outlay @ fit.covariance() @ outlay.T
+    triangles, found, basis = fit.space.triangles, fit.solution, fit.space.basis
+    covariance = basis @ fit.covariance() @ basis.T
     combined = base.combination @ covariance @ base.combination.T
     squares = triangles.squares(found.parameters) / triangles.count
     shown = fit.space.penalty is not None or method.ridge > 0
@@ -177,9 +164,9 @@ def _result(
         values=base.combination @ found.parameters,
         deviations=np.sqrt(np.diag(combined)),
         condition=found.condition,
-        unseen=0 if shown else outlay.shape[1] - found.rank,
+        unseen=0 if shown else basis.shape[1] - found.rank,
         residual=np.sqrt(squares),
-        nmse=squares / np.where(triangles.spread > 0, triangles.spread, np.nan) ** 2,
+        nmse=squares / np.where(triangles.deviation > 0, triangles.deviation, np.nan) ** 2,
         trajectories=tuple(x.name for x in samples),
         samples=triangles.count,
     )

@@ -18,12 +18,12 @@ Columns = tuple[np.ndarray, np.ndarray]
 class Triangles:
     """The samples' normal equations by joint, as triangular factors (n, K + 1, K + 1) of [regressor, torque].
 
-    count: samples. spread: (n,) standard deviation of each joint's torque [Nm, N].
+    count: samples. deviation: (n,) standard deviation of each joint's torque [Nm, N].
     """
 
     factors: np.ndarray
     count: int
-    spread: np.ndarray
+    deviation: np.ndarray
 
     def squares(self, x: np.ndarray) -> np.ndarray:
         """Sums of squared residuals by joint, (n,), of the parameters x (K,)."""
@@ -45,13 +45,13 @@ def reduce(blocks: Iterable[Columns]) -> Triangles:
         raise ValueError("no samples")
     width = factors[0].shape[1]
     padded = [np.concatenate([x, np.zeros((width - len(x), width))]) for x in factors]
-    spread = np.sqrt(np.maximum(square / count - np.square(total / count), 0.0))
-    return Triangles(np.stack(padded), count, spread)
+    deviation = np.sqrt(np.maximum(square / count - np.square(total / count), 0.0))
+    return Triangles(np.stack(padded), count, deviation)
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Parameters x = start + outlay z of least squares.
+    """Parameters x = start + basis z of least squares.
 
     coordinates: z (r,). covariance: of z (r, r), where the weights are the inverse standard deviations of
     independent errors. condition: of the regressor with columns of length one; rank: directions that it shows.
@@ -67,18 +67,18 @@ class Solution:
 def solve(
     triangles: Triangles,
     weights: np.ndarray,
-    outlay: np.ndarray,
+    basis: np.ndarray,
     start: np.ndarray | None = None,
     penalty: np.ndarray | None = None,
 ) -> Solution:
-    """The x = start + outlay z with the least weighted squares and the least |penalty * z|^2.
+    """The x = start + basis z with the least weighted squares and the least |penalty * z|^2.
 
-    weights (n,) by joint, outlay (K, r), start (K,), penalty (r,): the inverse standard deviations of a Gaussian
+    weights (n,) by joint, basis (K, r), start (K,), penalty (r,): the inverse standard deviations of a Gaussian
     prior on z around zero. Without penalty, directions that the samples do not show stay at zero.
     """
-    x0 = np.zeros(len(outlay)) if start is None else start
-    weighted = (triangles.factors * weights[:, None, None]).reshape(-1, len(outlay) + 1)
-    rows, target = weighted[:, :-1] @ outlay, weighted[:, -1] - weighted[:, :-1] @ x0
+    x0 = np.zeros(len(basis)) if start is None else start
+    weighted = (triangles.factors * weights[:, None, None]).reshape(-1, len(basis) + 1)
+    rows, target = weighted[:, :-1] @ basis, weighted[:, -1] - weighted[:, :-1] @ x0
     if penalty is not None:
         rows = np.concatenate([rows, np.diag(penalty)])
         target = np.concatenate([target, np.zeros(len(penalty))])
@@ -90,7 +90,7 @@ def solve(
     root = (right.T * inverse) / length[:, None]
     z = root @ (left.T @ target)
     condition = float(values[0] / values[-1]) if shown.all() else float("inf")
-    return Solution(x0 + outlay @ z, z, root @ root.T, condition, int(shown.sum()))
+    return Solution(x0 + basis @ z, z, root @ root.T, condition, int(shown.sum()))
 
 
 def deviations(residuals: Iterable[np.ndarray], used: int) -> np.ndarray:

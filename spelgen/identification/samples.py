@@ -8,17 +8,16 @@ from itertools import pairwise
 
 import numpy as np
 
-from spelgen.logs.filtering import low_pass, resample
-from spelgen.logs.read import Trajectory
-from spelgen.logs.trajectory import rate
+from spelgen.logs.filtering import AUTOMATIC_CUTOFF, low_pass, resample
+from spelgen.logs.preprocessing import Preprocessing
+from spelgen.logs.trajectory import Trajectory
 
 FREQUENCY = 100.0  # [Hz] of the common grid
-CUTOFF = 8.0  # [Hz]
 MOVING = 0.02  # [rad/s, m/s] samples at which every joint is slower say nothing of dynamics
 DENSE = 50.0  # [Hz] below this rate accelerations cannot be had from a log
 SHORTEST = 1.0  # [s] pieces below this are all filter transient
-HOLE = 0.25 / CUTOFF  # [s] a shorter one loses nothing that the filter lets through
-JITTER = 4.0  # median steps: a longer one is a hole in the recording, if it is longer than HOLE too
+HOLE = 0.25 / AUTOMATIC_CUTOFF  # [s] a shorter one loses nothing that the filter lets through
+AUTOMATIC = Preprocessing()
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,22 +31,28 @@ class DynamicsSamples:
     tau: np.ndarray
 
 
-def dynamics_samples(trajectories: Sequence[Trajectory], *, pauses: bool = False) -> list[DynamicsSamples]:
+def dynamics_samples(
+    trajectories: Sequence[Trajectory], *, pauses: bool = False, preprocessing: Preprocessing = AUTOMATIC
+) -> list[DynamicsSamples]:
     """The moving samples of each dense enough trajectory.
 
-    At 100 Hz, through a zero-phase 4th-order Butterworth low-pass at 8 Hz on q, qd and tau (before the change of
-    rate where the log is denser, after it where not), qdd by central differences of the filtered qd, only samples
-    with some |qd| > 0.02 rad/s; pieces between gaps separately. ``pauses``: all samples from the first that moves
-    to the last, standstill between them included.
+    At 100 Hz, through the zero-phase low-pass of ``preprocessing``, by default of 8 Hz, on q, qd and tau (before the
+    change of rate where the log is denser, after it where not), qdd by central differences of the filtered qd, only
+    samples with some |qd| > 0.02 rad/s; pieces between gaps separately. ``pauses``: all samples from the first that
+    moves to the last, standstill between them included.
     """
-    return [_samples(x, pauses) for x in trajectories if rate(x) >= DENSE and any(map(_long, _pieces(x)))]
+    return [
+        _samples(x, pauses, preprocessing)
+        for x in trajectories
+        if x.sample_rate >= DENSE and any(map(_long, _pieces(x, preprocessing.gap)))
+    ]
 
 
-def _pieces(trajectory: Trajectory) -> list[Trajectory]:
+def _pieces(trajectory: Trajectory, gap: float) -> list[Trajectory]:
     steps = np.diff(trajectory.t)
     if not steps.size:
         return [trajectory]
-    holes = steps > max(JITTER * np.median(steps), HOLE)
+    holes = steps > max(gap * np.median(steps), HOLE)
     ends = [0, *(np.flatnonzero(holes) + 1), len(trajectory.t)]
     return [trajectory[start:stop] for start, stop in pairwise(ends)]
 
@@ -56,13 +61,10 @@ def _long(piece: Trajectory) -> bool:
     return bool(piece.t[-1] - piece.t[0] >= SHORTEST)
 
 
-def _samples(trajectory: Trajectory, pauses: bool) -> DynamicsSamples:
+def _samples(trajectory: Trajectory, pauses: bool, preprocessing: Preprocessing) -> DynamicsSamples:
     parts = []
-    for piece in filter(_long, _pieces(trajectory)):
-        if rate(piece) > 1.5 * FREQUENCY:
-            smooth = resample(low_pass(piece, CUTOFF), FREQUENCY)
-        else:
-            smooth = low_pass(resample(piece, FREQUENCY), CUTOFF)
+    for piece in filter(_long, _pieces(trajectory, preprocessing.gap)):
+        smooth = _at_common_rate(piece, preprocessing.acceleration_cutoff)
         qdd = np.gradient(smooth.qd, smooth.t, axis=0)
         taken = (np.abs(smooth.qd) > MOVING).any(axis=1)
         if pauses and taken.any():
@@ -72,3 +74,11 @@ def _samples(trajectory: Trajectory, pauses: bool) -> DynamicsSamples:
     return DynamicsSamples(
         trajectory.name, *(np.concatenate(columns) for columns in zip(*parts, strict=True))
     )
+
+
+def _at_common_rate(piece: Trajectory, cutoff: float | None) -> Trajectory:
+    if cutoff is None:
+        return resample(piece, FREQUENCY)
+    if piece.sample_rate > 1.5 * FREQUENCY:
+        return resample(low_pass(piece, cutoff), FREQUENCY)
+    return low_pass(resample(piece, FREQUENCY), cutoff)

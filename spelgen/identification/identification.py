@@ -1,0 +1,189 @@
+"""What an identification found: base parameters with how sure they are, for people, programs and notebooks."""
+
+from __future__ import annotations
+
+import textwrap
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from spelgen.arm.arm import Arm
+from spelgen.dynamics.regressor_dynamics import RegressorDynamics
+from spelgen.errors import Diagnostic
+from spelgen.identification.base_parameters import BaseParameters
+from spelgen.identification.method import LeastSquares
+from spelgen.listing import WIDTH, Listing
+
+SCHEMA = 2
+_CONDITIONS = (
+    (30.0, "well posed"),
+    (300.0, "acceptable"),
+    (np.inf, "poor: some parameters trade against each other; excite the arm more"),
+)
+_UNIT = {"revolute": "Nm", "prismatic": "N"}
+_DETERMINED = ((0.05, "firm"), (0.2, "fair"), (1.0, "weak"), (np.inf, "may be zero"))
+_WEIGHTED = {
+    "equal": "each Nm counting the same",
+    "range": "each joint weighted by its torque's range",
+    "noise": "each joint weighted by the noise left",
+}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Identification:
+    """What least squares found of an arm with n joints and K parameters, r of them base parameters.
+
+    parameters: (K,), whose torque is the fit's; without prior those outside the base are zero. values, deviations:
+    (r,) of the base parameters. condition: of the regressor (columns of length one, joints weighted). unseen:
+    directions of the base parameters in which these logs say nothing. residual: (n,) root mean square [Nm, N];
+    nmse: (n,) its square by the torque's variance. inputs: G, (n, n), of the logs' torques.
+    """
+
+    arm: Arm
+    method: LeastSquares
+    base: BaseParameters
+    parameters: np.ndarray
+    values: np.ndarray
+    deviations: np.ndarray
+    condition: float
+    unseen: int
+    residual: np.ndarray
+    nmse: np.ndarray
+    trajectories: tuple[str, ...]
+    samples: int
+    inputs: np.ndarray | None = None
+    diagnostics: tuple[Diagnostic, ...] = ()
+
+    @cached_property
+    def dynamics(self) -> RegressorDynamics:
+        """The identified arm, e.g. as a baseline of ``evaluate``."""
+        n, inertial = len(self.arm.coordinates), 10 * len(self.arm.bodies)
+        constants = self.parameters[inertial:].reshape(-1, n)
+
+        def friction(qd: np.ndarray) -> np.ndarray:
+            return self.method.friction.torque(constants, qd)
+
+        return RegressorDynamics(self.arm, self.parameters[:inertial], constants[0], friction, self.inputs)
+
+    def torque(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
+        """Joint torques (T, n) of the identified arm."""
+        found: np.ndarray = self.dynamics.joint_torque(q, qd, qdd)
+        return found
+
+    @property
+    def determined(self) -> tuple[str, ...]:
+        """How sure each base parameter is: ``firm``, ``fair``, ``weak`` or ``may be zero``."""
+        pairs = zip(self.values, self.deviations, strict=True)
+        return tuple(
+            next(word for limit, word in _DETERMINED if limit == np.inf or deviation <= limit * abs(value))
+            for value, deviation in pairs
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON form, a public contract."""
+        joints = [coordinate.name for coordinate in self.arm.coordinates]
+        friction = self.method.friction
+        columns = (self.base.names, self.base.formulas(), self.values, self.deviations, self.determined)
+        return {
+            "schema": SCHEMA,
+            "robot": self.arm.name,
+            "joints": joints,
+            "bodies": [body.name for body in self.arm.bodies],
+            "trajectories": list(self.trajectories),
+            "samples": self.samples,
+            "method": {
+                "weights": self.method.weights,
+                "ridge": self.method.ridge,
+                "prior": self.method.prior,
+                "coulomb_smoothing_velocity": friction.coulomb_smoothing_velocity,
+                "effects": list(friction.effects),
+            },
+            "condition": _finite(self.condition),
+            "unseen_directions": self.unseen,
+            "base_parameters": [
+                {
+                    "name": name,
+                    "formula": formula,
+                    "value": float(value),
+                    "deviation": _finite(deviation),
+                    "determined": word,
+                }
+                for name, formula, value, deviation, word in zip(*columns, strict=True)
+            ],
+            "identifiability": self.base.identifiability(),
+            "residual": dict(zip(joints, map(float, self.residual), strict=True)),
+            "nmse": dict(zip(joints, map(_finite, self.nmse), strict=True)),
+            "diagnostics": [each.to_dict() for each in self.diagnostics],
+        }
+
+    def text(self) -> str:
+        """For a terminal, 80 columns."""
+        residuals, parameters = self.listings()
+        parts = [textwrap.fill(self._heading(), WIDTH), self._quality(), residuals.text(), parameters.text()]
+        formulas = zip(self.base.names, self.base.formulas(), strict=True)
+        meant = [
+            textwrap.fill(f"{name} = {formula}", WIDTH, initial_indent="  ", subsequent_indent=" " * 8)
+            for name, formula in formulas
+            if name != formula
+        ]
+        never = [name for name, how in self.base.identifiability().items() if how == "never"]
+        unseen = f"No motion of this arm shows: {', '.join(never) or 'nothing; all have an effect'}."
+        return "\n\n".join([*parts, "\n".join(["where", *meant]), textwrap.fill(unseen, WIDTH)])
+
+    def listings(self) -> tuple[Listing, Listing]:
+        """The torque that is not explained, by joint, and the base parameters."""
+        joints = zip(self.arm.coordinates, self.residual, self.nmse, strict=True)
+        values = zip(self.base.names, self.values, self.deviations, self.determined, strict=True)
+        return (
+            Listing(
+                "Torque not explained: root mean square, and its square by the torque's variance",
+                ("joint", "RMS", "", "nMSE"),
+                tuple((x.name, f"{rms:.4g}", _UNIT[x.kind], f"{nmse:.3g}") for x, rms, nmse in joints),
+                left=(0, 2),
+            ),
+            Listing(
+                "Base parameters [kg, m, s], with standard deviation; numbers after names: joint",
+                ("parameter", "value", "+-", "determined"),
+                tuple((name, f"{value:.5g}", f"{away:.2g}", word) for name, value, away, word in values),
+                left=(0, 3),
+            ),
+        )
+
+    def __repr__(self) -> str:
+        return f"<Identification of {self._heading()}>"
+
+    def _repr_html_(self) -> str:
+        return "".join(listing.html() for listing in self.listings())
+
+    def _heading(self) -> str:
+        count, drives = len(self.trajectories), len(self.base) - self.base.bodies
+        weighted = _WEIGHTED[self.method.weights]
+        if self.method.ridge:
+            weighted += f", ridge {self.method.ridge:g}"
+        if self.method.prior is not None:
+            weighted += f", with the URDF as prior ({self.method.prior:g})"
+        return (
+            f"{self.arm.name}: {self.base.bodies} base parameters of the bodies and {drives} of friction and drives, "
+            f"from {self.samples} samples of {count} trajector{'y' if count == 1 else 'ies'}, {weighted}."
+        )
+
+    def _quality(self) -> str:
+        if self.unseen:
+            directions = f"{self.unseen} direction{'s' * (self.unseen > 1)}"
+            conditioned = (
+                f"The logs say nothing in {directions} of the base parameters: those values are arbitrary; excite "
+                "the arm more, or give --prior."
+            )
+        else:
+            word = next(word for limit, word in _CONDITIONS if self.condition < limit or limit == np.inf)
+            conditioned = f"Condition number {self.condition:.3g} (columns of length one): {word}."
+        words = [word for _, word in _DETERMINED if word in self.determined]
+        counts = ", ".join(f"{self.determined.count(word)} {word}" for word in words)
+        return textwrap.fill(conditioned, WIDTH) + f"\nParameters: {counts}."
+
+
+def _finite(value: float) -> float | None:
+    """A float for JSON, which has no infinity."""
+    return float(value) if np.isfinite(value) else None
