@@ -1,18 +1,94 @@
 """spelgen: a URDF in, a PyTorch model of the arm's dynamics with its exact structure out."""
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from spelgen.pipeline import build, check, inspect, load
+    from spelgen.building import build
+    from spelgen.design import Design
+    from spelgen.emission.loading import load_module
+    from spelgen.errors import SpelgenError
+    from spelgen.evaluation.evaluate import evaluate
+    from spelgen.exporting.export import export
+    from spelgen.fitting.config import MomentumFit, Rollout, TorqueFit
+    from spelgen.fitting.fit import Fit, fit, load_run
+    from spelgen.fitting.rollout import rollout
+    from spelgen.identification.identify import identify
+    from spelgen.inspection import Inspection
+    from spelgen.loaded_arm import LoadedArm, load_arm
+    from spelgen.logs.check_logs import check_logs
+    from spelgen.logs.preprocessing import Preprocessing
+    from spelgen.logs.read import read_logs
+    from spelgen.logs.trajectory import Trajectory
+    from spelgen.pipeline import check, generate, inspect
+    from spelgen.simulation.simulate import simulate
 
 __version__ = "0.1.0"
-__all__ = ["__version__", "build", "check", "inspect", "load"]
+
+_HOME = {
+    "load_arm": "loaded_arm",
+    "LoadedArm": "loaded_arm",
+    "inspect": "pipeline",
+    "Inspection": "inspection",
+    "generate": "pipeline",
+    "Design": "design",
+    "build": "building",
+    "load_module": "emission.loading",
+    "check": "pipeline",
+    "read_logs": "logs.read",
+    "Trajectory": "logs.trajectory",
+    "check_logs": "logs.check_logs",
+    "Preprocessing": "logs.preprocessing",
+    "simulate": "simulation.simulate",
+    "identify": "identification.identify",
+    "fit": "fitting.fit",
+    "Fit": "fitting.fit",
+    "load_run": "fitting.fit",
+    "TorqueFit": "fitting.config",
+    "MomentumFit": "fitting.config",
+    "Rollout": "fitting.config",
+    "rollout": "fitting.rollout",
+    "evaluate": "evaluation.evaluate",
+    "export": "exporting.export",
+    "SpelgenError": "errors",
+}
+"""The file that each name of the API lives in; loaded on first use (PEP 562), so `import spelgen` stays fast."""
+
+__all__ = [
+    "Design",
+    "Fit",
+    "Inspection",
+    "LoadedArm",
+    "MomentumFit",
+    "Preprocessing",
+    "Rollout",
+    "SpelgenError",
+    "TorqueFit",
+    "Trajectory",
+    "__version__",
+    "build",
+    "check",
+    "check_logs",
+    "evaluate",
+    "export",
+    "fit",
+    "generate",
+    "identify",
+    "inspect",
+    "load_arm",
+    "load_module",
+    "load_run",
+    "read_logs",
+    "rollout",
+    "simulate",
+]
 
 
 def __getattr__(name: str) -> Any:
-    """Load the pipeline on first use: `import spelgen` alone stays fast (PEP 562)."""
-    if name in __all__:
-        from spelgen import pipeline
-
-        return getattr(pipeline, name)
+    if name in _HOME:
+        return getattr(import_module(f"spelgen.{_HOME[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -14,13 +14,14 @@ from spelgen.explain.facts import Fact, facts
 from spelgen.formulas.formulas import Entry as PlaceOfEntry
 from spelgen.formulas.formulas import Formulas, formulas
 from spelgen.labels import joint_ranges
+from spelgen.listing import Listing
 from spelgen.structure.structure import Entry, Structure
 from spelgen.urdf.actuation import Actuation
 
 SCHEMA = 1
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Inspection:
     """What ``spelgen inspect`` tells of an arm."""
 
@@ -68,11 +69,32 @@ class Inspection:
 
     def text(self, width: int = 80) -> str:
         """A report for a terminal ``width`` columns wide."""
-        parts = [self._heading(), self._joint_table(), self._matrix(width), self._meaning(width)]
+        parts = [self._heading(), self._joint_table(), self._matrix(width), self._needs(width)]
         parts += [self._in_words(width)] if self.facts else []
         if self.diagnostics:
             parts.append(self._remarks(width))
         return "\n\n".join(parts)
+
+    def __repr__(self) -> str:
+        needs = self.needs()
+        return f"<Inspection of {self.arm.name!r}: {needs['M(q)'].split(' make ')[0]}, {needs['base']}>"
+
+    def _repr_html_(self) -> str:
+        """The matrix, whole, for a notebook."""
+        n = len(self.structure.joints)
+        cells = {(e.row, e.column): _cell(e) for e in self.structure.entries}
+        return Listing(
+            f"{self.arm.name}: mass matrix; joints each entry depends on, C constant, 0 always zero",
+            ("", *(str(column + 1) for column in range(n))),
+            tuple(
+                (
+                    f"{row + 1} {self.structure.joints[row]}",
+                    *(cells[max(row, k), min(row, k)] for k in range(n)),
+                )
+                for row in range(n)
+            ),
+            "; ".join(f"{name}: {need}" for name, need in self.needs().items()),
+        ).html()
 
     def _names(self, joints: tuple[int, ...]) -> list[str]:
         return [self.structure.joints[joint] for joint in joints]
@@ -103,10 +125,10 @@ class Inspection:
         return ", ".join(told + ([f"{_joints(passive)} without a drive"] if passive else []))
 
     def _heading(self) -> str:
-        believed = (
+        trusted = (
             "any inertial values" if self.structure.assume == "kinematics" else "the URDF's inertial values"
         )
-        return f"{_printable(self.arm.name)}: structure for {believed}"
+        return f"{_printable(self.arm.name)}: structure for {trusted}"
 
     def _joint_table(self) -> str:
         lines = []
@@ -151,7 +173,7 @@ class Inspection:
             "base": f"{structure.base_parameters} base inertial parameters",
         }
 
-    def _meaning(self, width: int) -> str:
+    def _needs(self, width: int) -> str:
         lines = []
         for name, fact in self.needs().items():
             lines += textwrap.wrap(fact, width, initial_indent=f"  {name:<5} ", subsequent_indent=" " * 8)

@@ -1,19 +1,16 @@
-r"""A hand-written two-joint planar arm with the interface of an emitted module, small enough to check by eye.
-
-Joints:
-    0  "shoulder"  revolute
-    1  "elbow"  revolute
-
-Record:
-    robot: "stand_in"
-    urdf: "stand_in.urdf"
-    urdf_sha256: "none"
-    spec_sha256: "none"
-    options: {}
-"""
+"""A hand-written two-joint planar arm with the interface of an emitted module, small enough to check by eye."""
 
 import torch
 from torch import nn
+
+FACTS = """{
+  "robot": "stand_in",
+  "urdf": "stand_in.urdf",
+  "urdf_sha256": "none",
+  "spec_sha256": "none",
+  "options": {},
+  "joints": {"shoulder": "revolute", "elbow": "revolute"}
+}"""
 
 
 class Model(nn.Module):
@@ -37,7 +34,7 @@ class Model(nn.Module):
         b, d = self.inertia[0], self.inertia[1].exp()
         return d + b**2 / d + self.inertia[2].exp(), b, d
 
-    def mass_matrix(self, q):
+    def mass_matrix(self, q, prepared=None):
         a, b, d = self._coefficients()
         c = q[..., 1].cos()
         return torch.stack([a + 2 * b * c, d + b * c, d + b * c, d.expand(c.shape)], -1).unflatten(-1, (2, 2))
@@ -73,9 +70,15 @@ class Model(nn.Module):
         rate = -self.inertia[0] * q[..., 1].sin() * qd[..., 1]
         return torch.stack([2 * rate, rate, rate, torch.zeros_like(rate)], -1).unflatten(-1, (2, 2))
 
-    def inverse_dynamics(self, q, qd, qdd):
+    def nonlinear_effects(self, q, qd):
         coriolis = (self._mass_rate(q, qd) @ qd.unsqueeze(-1)).squeeze(-1) - self._kinetic_slope(q, qd)
-        return self.momentum(q, qdd) + coriolis + self.gravity(q) + self.damping.exp() * qd
+        return coriolis + self.gravity(q)
+
+    def friction_torque(self, q, qd):
+        return self.damping.exp() * qd
+
+    def inverse_dynamics(self, q, qd, qdd):
+        return self.momentum(q, qdd) + self.nonlinear_effects(q, qd) + self.friction_torque(q, qd)
 
     def forward_dynamics(self, q, qd, tau):
         return self.velocity(q, tau - self.inverse_dynamics(q, qd, torch.zeros_like(qd)))
@@ -83,12 +86,19 @@ class Model(nn.Module):
     def prepare(self):
         return None
 
-    def rates(self, q, p, tau, prepared):
+    def port_hamiltonian_rhs(self, q, p, tau, prepared):
         qd = self.velocity(q, p)
         pd = self._kinetic_slope(q, qd) - self.gravity(q) - self.damping.exp() * qd
         return qd, pd if tau is None else pd + tau
 
     def forward(self, t, state):
         q, p, *inputs = state.split(2, dim=-1)
-        rates = self.rates(q, p, inputs[0] if inputs else None, None)
+        rates = self.port_hamiltonian_rhs(q, p, inputs[0] if inputs else None, None)
         return torch.cat([*rates, *map(torch.zeros_like, inputs)], -1)
+
+    def to_group(self, q):
+        c, s, o, i = q.cos(), q.sin(), torch.zeros_like(q), torch.ones_like(q)
+        return list(torch.stack([c, -s, o, s, c, o, o, o, i], -1).unflatten(-1, (3, 3)).unbind(-3))
+
+    def from_group(self, parts):
+        return torch.stack([torch.atan2(part[..., 1, 0], part[..., 0, 0]) for part in parts], -1)

@@ -133,8 +133,8 @@ class TestChain:
             ({"tip": "0"}, "FILE: got no joint that moves by itself, expected a serial chain of joints"),
             ({"tip": "1", "joints": ["a"]}, "FILE: got both joints and a tip, expected one of the two"),
             (
-                {"tip": "1", "snap_tolerance": -1},
-                "got a snap tolerance of -1 rad, expected at least 0 and less than pi/4 (0.785)",
+                {"tip": "1", "angle_tolerance": -1},
+                "got an angle tolerance of -1 rad, expected at least 0 and less than pi/4 (0.785)",
             ),
         ],
     )
@@ -241,7 +241,7 @@ class TestSnapping:
             ),
             "snapped-axis": ("info", "joint 'a' axis", "(0.0001, 0, 1) is taken as (0, 0, 1)"),
         }
-        assert codes(make_arm(made, snap_tolerance=0.0)) == []
+        assert codes(make_arm(made, angle_tolerance=0.0)) == []
 
     def test_rounding_errors_in_a_tensor_are_no_products_of_inertia(self, robot):
         made = robot(joint("a", "0", "1"), bare=("0",))
@@ -251,7 +251,7 @@ class TestSnapping:
         arm = make_arm(read_urdf(made.path))
         assert arm.bodies[0].inertia[5:7] == (0, Fraction(1, 10**9))
         assert codes(arm) == ["snapped-inertia"]
-        assert make_arm(read_urdf(made.path), snap_tolerance=0.0).bodies[0].inertia[5] == Fraction(1, 10**20)
+        assert make_arm(read_urdf(made.path), angle_tolerance=0.0).bodies[0].inertia[5] == Fraction(1, 10**20)
 
     def test_full_precision_is_not_worth_a_word(self, robot):
         assert codes(make_arm(robot(joint("a", "0", "1", rpy=f"{pi / 2} 0 1.57079632679")))) == []
@@ -362,7 +362,7 @@ class TestAgainstPinocchio:
         compared = 0
         for name, expected in expectations(shared).items():
             path = shared / "arms" / f"{name}.urdf"
-            arm = arm_of(shared, name, joints=expected["joints"], snap_tolerance=0.0)
+            arm = arm_of(shared, name, joints=expected["joints"], angle_tolerance=0.0)
             try:
                 theirs = Theirs(path, arm)
             except ValueError:

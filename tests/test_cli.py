@@ -238,7 +238,7 @@ def test_unexpected_errors_are_named(spelgen, robots, monkeypatch):
     def broken(*arguments, **options):
         raise ZeroDivisionError("division\nby zero")
 
-    monkeypatch.setattr("spelgen.pipeline.inspect", broken)
+    monkeypatch.setattr("spelgen.loaded_arm.load_arm", broken)
     line = refused(spelgen("inspect", robots / "rpr.urdf"))
     assert line == "spelgen: unexpected ZeroDivisionError: division by zero; --debug shows where"
 
@@ -268,7 +268,7 @@ def test_names_cannot_steer_the_terminal(spelgen, tmp_path):
         ["inspect", "a.urdf", "--jionts", "x"],
         ["inspect", "a.urdf", "--format", "yaml"],
         ["inspect", "a.urdf", "--assume", "everything"],
-        ["inspect", "a.urdf", "--snap-tol", "-1"],
+        ["inspect", "a.urdf", "--angle-tolerance", "-1"],
         ["build", "a.urdf", "--preset", "magic"],
         ["simulate", "a.urdf"],
         ["train", "m.py"],
@@ -308,7 +308,7 @@ def test_interrupt_exits_130(spelgen, robots, monkeypatch):
     def interrupted(*arguments, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("spelgen.pipeline.inspect", interrupted)
+    monkeypatch.setattr("spelgen.loaded_arm.load_arm", interrupted)
     result = spelgen("inspect", robots / "rpr.urdf")
     assert (result.exit_code, result.stderr) == (130, "interrupted\n")
 

@@ -20,7 +20,8 @@ from spelgen.errors import SpelgenError
 from spelgen.formulas.formulas import formulas
 from spelgen.formulas.sympy_module import sympy_source
 from spelgen.formulas.text import text, to_dict
-from spelgen.pipeline import inspect, load
+from spelgen.loaded_arm import load_arm
+from spelgen.pipeline import inspect
 from spelgen.structure.structure import derive
 from spelgen.urdf.read import read_urdf
 
@@ -93,13 +94,13 @@ def test_large_entries_are_counted_and_told_alone(robots, spelgen):
     alone = spelgen("inspect", robots / "ur10e.urdf", "--entry", "1,1").stdout
     assert alone.count("\nM") == 1 and "\nM11 = " in alone
     assert max(map(len, alone.splitlines())) <= 80
-    assert_equal_to_pinocchio(load(robots / "ur10e.urdf").arm, read_back(alone), 36)
+    assert_equal_to_pinocchio(load_arm(robots / "ur10e.urdf").arm, read_back(alone), 36)
 
 
 def test_either_triangle_and_only_the_parameters_in_the_entry(robots, spelgen):
     one, other = (spelgen("inspect", robots / "panda.urdf", "--entry", e).stdout for e in ("2,7", "7,2"))
     assert one == other
-    assert_equal_to_pinocchio(load(robots / "panda.urdf").arm, read_back(one), 43)
+    assert_equal_to_pinocchio(load_arm(robots / "panda.urdf").arm, read_back(one), 43)
     assert re.findall(r"^  (\w+) \[", one, re.MULTILINE) == ["Izz7", "Ixz7", "Iyz7", "hx7", "hy7"]
 
 

@@ -19,7 +19,7 @@ from spelgen.formulas.formulas import WRITABLE, formulas
 from spelgen.formulas.latex import latex
 from spelgen.formulas.sympy_module import sympy_source
 from spelgen.formulas.text import text
-from spelgen.pipeline import load
+from spelgen.loaded_arm import load_arm
 from spelgen.structure.structure import derive
 from spelgen.urdf.read import read_urdf
 from spelgen.verify.numeric_samples import with_random_inertias
@@ -45,7 +45,7 @@ print(json.dumps(found))
 def test_sympy_file_alone_equals_pinocchio(robots, robot, tmp_path):
     """The file is executed where this package cannot be imported; Pinocchio reads the URDF by itself."""
     urdf = robots / f"{robot}.urdf"
-    arm = load(urdf).arm
+    arm = load_arm(urdf).arm
     write_text(tmp_path / "closed_forms.py", sympy_source(formulas(arm, derive(arm), longest=WRITABLE)))
     model = pin.buildModelFromUrdf(str(urdf))
     model.gravity.linear = np.array(arm.gravity, dtype=float)
@@ -66,7 +66,7 @@ def test_sympy_file_alone_equals_pinocchio(robots, robot, tmp_path):
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_text_read_back_equals_pinocchio(robots, robot, assume):
     """By any inertial values under ``kinematics``, by the URDF's under ``inertials``."""
-    arm = load(robots / f"{robot}.urdf").arm
+    arm = load_arm(robots / f"{robot}.urdf").arm
     structure = derive(arm, assume)
     found = formulas(arm, structure, longest=WRITABLE)
     assert not found.unwritten
@@ -77,7 +77,7 @@ def test_text_read_back_equals_pinocchio(robots, robot, assume):
 
 @pytest.mark.parametrize("robot", ["two_link", "rpr", "scara", "six_dof"])
 def test_latex_read_back_equals_pinocchio(robots, robot):
-    arm = load(robots / f"{robot}.urdf").arm
+    arm = load_arm(robots / f"{robot}.urdf").arm
     structure = derive(arm)
     rows = without_latex(latex(formulas(arm, structure, longest=WRITABLE)))
     drawn = with_random_inertias(arm, np.random.default_rng(2))

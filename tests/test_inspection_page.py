@@ -7,7 +7,8 @@ from html_page import Page
 from typer.testing import CliRunner
 
 from spelgen.cli.main import app
-from spelgen.pipeline import inspect, verify
+from spelgen.loaded_arm import load_arm
+from spelgen.pipeline import inspect
 from spelgen.render.inspection_page import page
 
 HOSTILE = "<script>alert(1)</script>{{ 7 * 7 }}&quot;'&amp;"
@@ -35,7 +36,7 @@ def test_formulas_and_proof_only_where_asked(robots, tmp_path, monkeypatch):
     assert run.exit_code == 0, run.stderr
     text = " ".join(Page((tmp_path / "rpr.html").read_text()).text)
     assert "\nM22 = m2R\n" in text
-    assert verify(robots / "rpr.urdf").checks[0].found in text
+    assert load_arm(robots / "rpr.urdf").verify().checks[0].found in text
     plain = page(inspect(robots / "rpr.urdf"))
     assert "Closed forms" not in plain and "Proof" not in plain
 

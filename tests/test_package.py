@@ -38,4 +38,4 @@ def test_wheel_holds_all_that_the_package_needs(installed):
 def test_installed_command_builds_the_same_module(installed, robots, tmp_path):
     command = [sys.executable, "-m", "spelgen", "build", str(robots / "rpr.urdf"), "-o", "module.py"]
     subprocess.run(command, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(installed)}, check=True)
-    assert (tmp_path / "module.py").read_text(encoding="utf-8") == pipeline.build(robots / "rpr.urdf")
+    assert (tmp_path / "module.py").read_text(encoding="utf-8") == pipeline.generate(robots / "rpr.urdf")

@@ -62,7 +62,7 @@ def test_values_are_read(urdf):
     assert settings.simulation.inputs == (-3.0, 3.0)
     assert settings.simulation.positions == {"a": (-1.0, 2.0)}
     assert settings.simulation.seed == 7
-    assert settings.simulation.rate == 20.0
+    assert settings.simulation.sample_rate == 20.0
     assert settings.training.window == 9
 
 
@@ -81,10 +81,9 @@ def test_settings_do_not_change(urdf):
             "arm.yaml:4: joints.a: unknown key 'viscus'; did you mean 'viscous'?",
         ),
         (
-            "training:\n  x: 1",
-            "arm.yaml:2: training: unknown key 'x'; known are 'objective', 'momentum_steps', 'prior', 'window', "
-            "'stride', 'every', 'epochs', "
-            "'batch', 'learning_rate', 'weight_decay' and 5 more",
+            "tracking:\n  x: 1",
+            "arm.yaml:2: tracking: unknown key 'x'; known are 'amplitude', 'frequency', 'paths', 'bandwidths', "
+            "'control_rate', 'resolution', 'cutoff'",
         ),
         (
             "joints:\n  a: {viscous: -1}",
@@ -94,8 +93,11 @@ def test_settings_do_not_change(urdf):
             "gravity:\n  - 0\n  - 0\n  - up",
             "arm.yaml:4: gravity.2: got 'up', expected a valid number, unable to parse string as a number",
         ),
-        ("simulation: {rate: yes}", "arm.yaml:1: simulation.rate: got True, expected a number"),
-        ("simulation: {rate: .nan}", "arm.yaml:1: simulation.rate: got nan, expected a finite number"),
+        ("simulation: {sample_rate: yes}", "arm.yaml:1: simulation.sample_rate: got True, expected a number"),
+        (
+            "simulation: {sample_rate: .nan}",
+            "arm.yaml:1: simulation.sample_rate: got nan, expected a finite number",
+        ),
         (
             "simulation: {trajectories: 0}",
             "arm.yaml:1: simulation.trajectories: got 0, expected greater than or equal to 1",

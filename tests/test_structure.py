@@ -10,7 +10,7 @@ import pytest
 from arms import planar, random_arm
 
 from spelgen.arm.arm import make_arm
-from spelgen.pipeline import load
+from spelgen.loaded_arm import load_arm
 from spelgen.structure.recursion import triangle
 from spelgen.structure.sampling import float_samples
 from spelgen.structure.structure import Structure, derive
@@ -36,7 +36,7 @@ TOLERANCE_CASES = {
 
 @pytest.mark.parametrize("robot", COUNTS)
 def test_counts_of_the_own_robots(robots, robot):
-    structure = derive(load(robots / f"{robot}.urdf").arm)
+    structure = derive(load_arm(robots / f"{robot}.urdf").arm)
     zeros = sum(entry.kind == "zero" for entry in structure.entries)
     assert (len(structure.outputs), len(structure.constants), zeros) == COUNTS[robot]
     assert not structure.passive
@@ -44,7 +44,7 @@ def test_counts_of_the_own_robots(robots, robot):
 
 
 def test_rpr_reads_as_the_paper_says(robots):
-    structure = derive(load(robots / "rpr.urdf").arm)
+    structure = derive(load_arm(robots / "rpr.urdf").arm)
     assert sorted(output.joints for output in structure.outputs) == [(1, 2), (1, 2), (2,)]
     assert {(e.row, e.column): e.kind for e in structure.entries if e.kind != "varying"} == {
         (1, 1): "constant",
@@ -64,7 +64,7 @@ def test_planar_chain_separates_what_joints_share():
 @pytest.mark.parametrize("robot", COUNTS)
 def test_smallest_form_is_exact(robots, robot):
     """sum c A + sum f B gives M back, with c and f read off M as the structure says."""
-    loaded = load(robots / f"{robot}.urdf")
+    loaded = load_arm(robots / f"{robot}.urdf")
     structure = derive(loaded.arm)
     keys = triangle(len(structure.joints))
     mass = float_samples(loaded.arm, "kinematics", 50, seed=9).mass[0]
@@ -78,7 +78,7 @@ def test_smallest_form_is_exact(robots, robot):
 
 def test_factors_are_exact_fractions(robots):
     """two_link is eq. 20 of the paper: M_11 holds twice what M_21 does."""
-    structure = derive(load(robots / "two_link.urdf").arm)
+    structure = derive(load_arm(robots / "two_link.urdf").arm)
     assert structure.outputs[0].basis == ((0, 0, Fraction(2)), (1, 0, Fraction(1)))
 
 

@@ -5,7 +5,7 @@ from fractions import Fraction
 
 import pytest
 
-from spelgen import pipeline
+from spelgen.loaded_arm import load_arm
 from spelgen.structure.structure import Entry, derive
 from spelgen.verify.verify import verify
 
@@ -14,7 +14,7 @@ ROBOTS = ("two_link", "rpr", "six_dof", "scara", "panda", "ur10e")
 
 @pytest.fixture(scope="module")
 def rpr(robots):
-    return pipeline.load(robots / "rpr.urdf")
+    return load_arm(robots / "rpr.urdf")
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def true(rpr):
 @pytest.mark.parametrize("assume", ["kinematics", "inertials"])
 @pytest.mark.parametrize("name", ROBOTS)
 def test_what_is_derived_agrees(robots, name, assume):
-    loaded = pipeline.load(robots / f"{name}.urdf")
+    loaded = load_arm(robots / f"{name}.urdf")
     proof = verify(loaded.robot, loaded.arm, derive(loaded.arm, assume))
     assert proof.agrees, proof.text()
     assert {check.verdict for check in proof.checks} == {"agrees"}

@@ -9,7 +9,7 @@ from random_arms import arms
 
 from spelgen.arm.arm import make_arm
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
-from spelgen.pipeline import load
+from spelgen.loaded_arm import load_arm
 from spelgen.structure.fourier import find_waves
 from spelgen.structure.nominal import nominal_inertias, working_range
 from spelgen.structure.recursion import triangle
@@ -67,7 +67,7 @@ def assert_exact(arm, structure, inertias):
     ],
 )
 def test_they_add_up_to_the_recursion(robot, sums):
-    arm = load(ROBOTS / f"{robot}.urdf").arm
+    arm = load_arm(ROBOTS / f"{robot}.urdf").arm
     structure = derive(arm)
     rng = np.random.default_rng(0)
     assert assert_exact(arm, structure, [list(rng.normal(size=10)) for _ in arm.bodies]) == sums
@@ -86,7 +86,7 @@ def test_random_arms_are_sums_too(tmp_path, drawn):
 
 def test_parallel_axes_turn_as_sums_of_angles():
     """V of two links in a plane is a cos(q1 + b) + c cos(q1 + q2 + d), whatever they weigh."""
-    arm = load(ROBOTS / "two_link.urdf").arm
+    arm = load_arm(ROBOTS / "two_link.urdf").arm
     found = find_waves(arm, derive(arm), nominal_inertias(arm, True))
     turns = [wave.turns for wave in found.waves]
     assert [turns[place] for place, *_ in found.potential.terms] == [(1, 0), (1, 1)]
@@ -95,7 +95,7 @@ def test_parallel_axes_turn_as_sums_of_angles():
 
 def test_the_urdfs_inertials_leave_fewer():
     """A centre of mass on its axis is not to be moved by training under --assume inertials."""
-    arm = load(ROBOTS / "scara.urdf").arm
+    arm = load_arm(ROBOTS / "scara.urdf").arm
     terms = [
         sum(len(x.terms) for x in find_waves(arm, derive(arm, assume), nominal_inertias(arm, True)).outputs)
         for assume in ("kinematics", "inertials")
@@ -122,7 +122,7 @@ def test_followers_have_none(tmp_path):
 def test_an_untrained_module_is_the_urdfs_arm(robot, net, tmp_path):
     """Its numbers are the URDF's to nine digits, where sums are short enough; nothing had to be trained."""
     pytest.importorskip("pinocchio")
-    loaded = load(ROBOTS / f"{robot}.urdf")
+    loaded = load_arm(ROBOTS / f"{robot}.urdf")
     bare = loaded.settings.model_copy(update={"joints": {}})
     engine = arm_dynamics(loaded.arm, bare)
     model = import_source(built(robot, net=net)[0], tmp_path / f"{robot}_spel.py").Model(seed=0)

@@ -8,7 +8,8 @@ import time
 import pytest
 
 from spelgen.errors import SpelgenError
-from spelgen.pipeline import build, check
+from spelgen.loaded_arm import load_arm
+from spelgen.pipeline import check, generate
 from spelgen.urdf import xacro_input
 from spelgen.urdf.document import urdf_bytes
 from spelgen.urdf.read import read_urdf
@@ -86,7 +87,7 @@ class TestExpansion:
         with pytest.raises(
             SpelgenError, match=r"arm\.urdf\.xacro \(expanded\):\d+: joint 'f': got a floating joint"
         ):
-            build(arm, joints=["f"])
+            load_arm(arm, joints=["f"])
 
     def test_warnings_of_xacro_are_passed_on(self, arm):
         arm.write_text(ARM.replace("<link", '<xacro:property name="pi" value="3"/><link'))
@@ -97,11 +98,11 @@ class TestExpansion:
         absolute = urdf_bytes(arm)
         monkeypatch.chdir(arm.parent)
         assert urdf_bytes(arm.relative_to(arm.parent)) == absolute
-        assert read_urdf(arm).digest in build(arm.relative_to(arm.parent))
+        assert read_urdf(arm).digest in generate(arm.relative_to(arm.parent))
 
     def test_a_change_in_an_included_file_makes_a_module_stale(self, arm):
         module = arm.parent / "arm_model.py"
-        module.write_text(build(arm))
+        module.write_text(generate(arm))
         assert check(module).fresh
         (arm.parent / "parts" / "segment.xacro").write_text(SEGMENT.replace("0.02", "0.03"))
         assert f"{arm} has changed since the module was built" in check(module).reasons

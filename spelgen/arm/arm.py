@@ -86,22 +86,22 @@ def make_arm(
     *,
     joints: Sequence[str] | None = None,
     tip: str | None = None,
-    snap_tolerance: float = 2e-3,
+    angle_tolerance: float = 2e-3,
     gravity: Sequence[float] = (0.0, 0.0, -9.81),
 ) -> Arm:
     """Return the arm of the named ``joints``, up to the link ``tip``, or of the longest serial chain.
 
     All other joints are locked at 0.
 
-    ``snap_tolerance`` [rad] is how far an angle may be from a multiple of pi/2 to be taken as one; 0 believes
+    ``angle_tolerance`` [rad] is how far an angle may be from a multiple of pi/2 to be taken as one; 0 believes
     the file in everything. Raises ``ArmError``.
     """
-    if not 0 <= snap_tolerance < pi / 4:
-        got = f"a snap tolerance of {snap_tolerance:g} rad"
+    if not 0 <= angle_tolerance < pi / 4:
+        got = f"an angle tolerance of {angle_tolerance:g} rad"
         raise ArmError(got, expected="at least 0 and less than pi/4 (0.785)")
     chain = choose_chain(robot, joints, tip)
     _require_small(robot, chain)
-    walked = walk(robot, chain, snap_tolerance)
+    walked = walk(robot, chain, angle_tolerance)
     indices = {joint.name: index for index, joint in enumerate(chain.joints)}
     held = {joint.name for joint in walked.held if joint.type != "fixed"}
     x, y, z = (exact(float(value)) for value in gravity)

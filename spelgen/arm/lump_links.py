@@ -38,9 +38,9 @@ class Walk:
     diagnostics: tuple[Diagnostic, ...]
 
 
-def walk(robot: Robot, chain: Chain, snap_tolerance: float) -> Walk:
+def walk(robot: Robot, chain: Chain, angle_tolerance: float) -> Walk:
     """Return the robot with the chain's joints and their followers moving, and all others held."""
-    snapper = Snapper(snap_tolerance)
+    snapper = Snapper(angle_tolerance)
     placement = Placement(robot.root, snapper)
     following = follows(robot)
     leaders = {joint.name for joint in chain.joints}

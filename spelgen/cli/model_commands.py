@@ -11,6 +11,7 @@ from spelgen.cli import options
 from spelgen.cli.console import FAILED, note, say
 from spelgen.cli.formats import Format, chosen, rendered
 from spelgen.cli.options import (
+    AngleTolerance,
     Assumption,
     Entry,
     Force,
@@ -18,7 +19,6 @@ from spelgen.cli.options import (
     Module,
     Robot,
     RobotOption,
-    SnapTolerance,
     Tip,
 )
 from spelgen.files import write_text
@@ -30,7 +30,7 @@ def inspect(
     joints: Joints = None,
     tip: Tip = None,
     assume: Assumption = "kinematics",
-    snap_tol: SnapTolerance = 2e-3,
+    angle_tolerance: AngleTolerance = 2e-3,
     formulas: Annotated[
         bool, typer.Option("--formulas", help="Write M and V as expressions in q and base parameters.")
     ] = False,
@@ -50,13 +50,12 @@ def inspect(
     verify: Annotated[bool, typer.Option("--verify", help="Prove it again by other programs.")] = False,
 ) -> None:
     """Show the exact structure of an arm's dynamics."""
-    from spelgen import pipeline
+    from spelgen.loaded_arm import load_arm
 
     wanted = options.entry(entry)
-    found = pipeline.inspect(robot, options.names(joints), tip, assume, snap_tolerance=snap_tol)
-    proof = None
-    if verify:
-        proof = pipeline.verify(robot, options.names(joints), tip, assume, snap_tolerance=snap_tol)
+    arm = load_arm(robot, options.names(joints), tip, angle_tolerance)
+    found = arm.inspect(assume)
+    proof = arm.verify(assume) if verify else None
     text = rendered(found, chosen(format, output), formulas=formulas, entry=wanted, proof=proof)
     if output is None:
         say(text.removesuffix("\n"))
@@ -76,7 +75,7 @@ def build(
     joints: Joints = None,
     tip: Tip = None,
     assume: Assumption = "kinematics",
-    snap_tol: SnapTolerance = 2e-3,
+    angle_tolerance: AngleTolerance = 2e-3,
     preset: Annotated[Preset, typer.Option("--preset", help="How the model is made.")] = "minimal",
     net: Annotated[
         Net | None, typer.Option("--net", help="The kind of networks; default: the preset's own.")
@@ -92,19 +91,11 @@ def build(
     """Write the PyTorch module tailored to an arm."""
     if net is not None and preset == "closed-form":
         raise typer.BadParameter("closed-form has no networks", param_hint="'--net'")
-    from spelgen import pipeline
+    from spelgen.loaded_arm import load_arm
+    from spelgen.pipeline import generate
 
-    source = pipeline.build(
-        robot,
-        options.names(joints),
-        tip,
-        assume,
-        snap_tolerance=snap_tol,
-        preset=preset,
-        net=net,
-        width=width,
-        depth=depth,
-    )
+    arm = load_arm(robot, options.names(joints), tip, angle_tolerance)
+    source = generate(arm, preset, net=net, width=width, depth=depth, assume=assume)
     path = output or Path(f"{robot.stem}_spel.py")
     if path.is_file() and path.read_bytes() == source.encode():
         say(f"{path} is up to date")

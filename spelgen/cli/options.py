@@ -38,10 +38,14 @@ Assumption = Annotated[
         "--assume", help="Believe the kinematics only, or also the inertials' zeros and symmetries."
     ),
 ]
-SnapTolerance = Annotated[
+AngleTolerance = Annotated[
     float,
     typer.Option(
-        "--snap-tol", metavar="RAD", min=0.0, max=0.1, help="Angles this near to a special one are that one."
+        "--angle-tolerance",
+        metavar="RAD",
+        min=0.0,
+        max=0.1,
+        help="Angles this near to a special one are that one.",
     ),
 ]
 Entry = Annotated[

@@ -1,6 +1,6 @@
 """Closed forms of M(q) and V(q), linear in the base inertial parameters.
 
-Each entry is expanded exactly (``expansion``), its terms are collected by base parameter (``minimal``) and
+Each entry is expanded exactly (``expansion``), its terms are collected by base parameter (``base_parameters``) and
 written the shortest of several ways (``shortening``). What is too long is counted, not written.
 """
 
@@ -17,8 +17,10 @@ from spelgen.arm.arm import Arm
 from spelgen.errors import SpelgenError
 from spelgen.formulas.expression import Sum, Symbol
 from spelgen.formulas.grouping import Collected, grouped
+from spelgen.formulas.notation import Plain
 from spelgen.formulas.shortening import Shortener
 from spelgen.labels import entry_name
+from spelgen.listing import Listing
 from spelgen.structure.base_parameters import BaseParameter, base_parameters
 from spelgen.structure.expansion import Budget, Expansion, TooLarge
 from spelgen.structure.recursion import triangle
@@ -56,7 +58,7 @@ class Formula:
         return "V" if self.place is None else entry_name(*self.place)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Formulas:
     """Closed forms of ``arm``, V up to a constant, in the parameters ``base``.
 
@@ -67,6 +69,17 @@ class Formulas:
     assume: str
     base: tuple[BaseParameter, ...]
     entries: tuple[Formula, ...]
+
+    def __repr__(self) -> str:
+        written = len(self.entries) - len(self.unwritten)
+        return f"<Formulas of {self.arm.name!r}: {written} written, in {len(self.base)} base parameters>"
+
+    def _repr_html_(self) -> str:
+        rows = [
+            (each.name, "too long" if each.expression is None else " ".join(Plain().sum(each.expression)))
+            for each in self.entries
+        ]
+        return Listing(f"{self.arm.name}: closed forms", ("", ""), tuple(rows), left=(0, 1)).html()
 
     @property
     def unwritten(self) -> tuple[Formula, ...]:

@@ -31,7 +31,7 @@ class Entry:
     joints: tuple[int, ...] = ()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Structure:
     """What holds for every value of the inertial parameters (``kinematics``), or for the URDF's
     (``inertials``).
@@ -47,6 +47,10 @@ class Structure:
     passive: tuple[int, ...]
     """Coordinates without an actuator: their row of G is zero."""
     base_parameters: int
+
+    def __repr__(self) -> str:
+        counts = f"{len(self.outputs)} outputs, {len(self.constants)} constants, {self.base_parameters} base parameters"
+        return f"<Structure of {len(self.joints)} joints ({self.assume} trusted): {counts}>"
 
     def outputs_from(self, first: int) -> int:
         """How many outputs read coordinates from ``first`` (0-based) to the tip only."""

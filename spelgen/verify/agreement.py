@@ -6,6 +6,8 @@ import textwrap
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
+from spelgen.listing import Listing
+
 Verdict = Literal["agrees", "differs", "undecided"]
 _MARKS = {"agrees": "ok", "differs": "DIFFERS", "undecided": "open"}
 
@@ -30,7 +32,7 @@ class Check:
         return f"{self.fact}: {self.derived}; {self.found}"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Verification:
     """The checks of one arm, made with ``samples`` random configurations from ``seed``."""
 
@@ -48,6 +50,14 @@ class Verification:
     def differences(self) -> tuple[Check, ...]:
         """The checks that contradict the derivation, or the reading of the file."""
         return tuple(check for check in self.checks if check.verdict == "differs")
+
+    def __repr__(self) -> str:
+        return f"<Verification: {len(self.checks)} checks, {len(self.differences)} of them differ>"
+
+    def _repr_html_(self) -> str:
+        rows = tuple((each.fact, each.derived, each.found, each.verdict) for each in self.checks)
+        head = ("fact", "derived", "found", "")
+        return Listing(f"Verified by {self.means}", head, rows, left=(0, 1, 2, 3)).html()
 
     def to_dict(self) -> dict[str, Any]:
         """A JSON object; ``checks`` in the order they were made."""

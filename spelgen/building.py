@@ -1,0 +1,33 @@
+"""An arm's model at once: its module generated and loaded, all in memory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from spelgen.design import Net
+from spelgen.emission.loading import load_module
+from spelgen.loaded_arm import LoadedArm
+from spelgen.pipeline import generate
+from spelgen.spec import Assume, Preset
+
+if TYPE_CHECKING:
+    from spelgen.emission.loading import EmittedModel
+
+
+def build(
+    arm: LoadedArm | str | Path,
+    preset: Preset = "minimal",
+    *,
+    net: Net | None = None,
+    width: int = 64,
+    depth: int = 2,
+    assume: Assume = "kinematics",
+    seed: int = 0,
+) -> EmittedModel:
+    """An instance of the model tailored to an arm, untrained; arguments and errors as for ``generate``.
+
+    ``seed``: of the weights that it starts with. ``model.source`` is the text of its module, ``model.facts`` what
+    it was made from.
+    """
+    return load_module(generate(arm, preset, net=net, width=width, depth=depth, assume=assume), seed=seed)

@@ -1,0 +1,103 @@
+"""A module's source -> an instance of its ``Model``. Loading runs the source: load what you would run."""
+
+from __future__ import annotations
+
+import hashlib
+import linecache
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, cast
+
+import torch
+
+from spelgen.errors import ModuleError
+from spelgen.spec import Facts, parse_facts
+
+METHODS = (
+    "mass_matrix", "potential_energy", "gravity", "nonlinear_effects", "friction_torque", "dissipation",
+    "input_matrix", "momentum", "velocity", "hamiltonian", "forward_dynamics", "inverse_dynamics", "forward",
+    "prepare", "port_hamiltonian_rhs", "to_group", "from_group",
+)  # fmt: skip
+_EXPECTED = "a module written by this version of `spelgen build`"
+
+if TYPE_CHECKING:
+
+    class EmittedModel(torch.nn.Module):
+        """The class ``Model`` of an emitted module, whose own docstrings hold shapes and units."""
+
+        n: int
+        joint_names: tuple[str, ...]
+        joint_types: tuple[str, ...]
+        dynamics: Any
+        source: str
+        """The module's text, as it was loaded."""
+        facts: Facts
+
+        def mass_matrix(self, q: torch.Tensor, prepared: Any = None) -> torch.Tensor: ...
+        def potential_energy(self, q: torch.Tensor) -> torch.Tensor: ...
+        def gravity(self, q: torch.Tensor) -> torch.Tensor: ...
+        def nonlinear_effects(self, q: torch.Tensor, qd: torch.Tensor) -> torch.Tensor: ...
+        def friction_torque(self, q: torch.Tensor, qd: torch.Tensor) -> torch.Tensor: ...
+        def dissipation(self, q: torch.Tensor, qd: torch.Tensor) -> torch.Tensor: ...
+        def input_matrix(self, q: torch.Tensor) -> torch.Tensor: ...
+        def momentum(self, q: torch.Tensor, qd: torch.Tensor, prepared: Any = None) -> torch.Tensor: ...
+        def velocity(self, q: torch.Tensor, p: torch.Tensor, prepared: Any = None) -> torch.Tensor: ...
+        def hamiltonian(self, q: torch.Tensor, p: torch.Tensor) -> torch.Tensor: ...
+        def forward_dynamics(self, q: torch.Tensor, qd: torch.Tensor, tau: torch.Tensor) -> torch.Tensor: ...
+        def inverse_dynamics(self, q: torch.Tensor, qd: torch.Tensor, qdd: torch.Tensor) -> torch.Tensor: ...
+        def forward(self, t: torch.Tensor, state: torch.Tensor) -> torch.Tensor: ...
+        def prepare(self) -> Any: ...
+        def port_hamiltonian_rhs(
+            self, q: torch.Tensor, p: torch.Tensor, tau: torch.Tensor | None, prepared: Any
+        ) -> tuple[torch.Tensor, torch.Tensor]: ...
+        def to_group(self, q: torch.Tensor) -> list[torch.Tensor]: ...
+        def from_group(self, parts: list[torch.Tensor]) -> torch.Tensor: ...
+
+
+def load_module(module: str | Path, *, seed: int = 0) -> EmittedModel:
+    """An instance of the class ``Model`` of an emitted module, with its ``source`` and ``facts``.
+
+    ``module`` is the file, or the source text itself. ``seed``: of the weights that it starts with. Raises
+    ModuleError for what is no emitted module, or one of another version.
+    """
+    in_memory = isinstance(module, str) and "\n" in module
+    file = None if in_memory else Path(module)
+    source = str(module) if file is None else _text(file)
+    facts = _facts(source, file)
+    # a private name made from the content, so that two modules never meet; torch.compile looks for it there
+    name = f"_spelgen_module_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
+    code = sys.modules[name] = ModuleType(name)
+    path = f"<{name}>" if file is None else str(file)
+    linecache.cache[path] = (len(source), None, source.splitlines(keepends=True), path)  # for tracebacks
+    try:
+        exec(compile(source, path, "exec"), vars(code))
+        model = code.Model(seed=seed)
+    except Exception as error:
+        told = f"import fails ({type(error).__name__}: {error})"
+        raise ModuleError(told, file=file, do="build it again") from error
+    missing = [name for name in ("n", "joint_names", "joint_types", *METHODS) if not hasattr(model, name)]
+    if missing or not isinstance(model, torch.nn.Module):
+        raise ModuleError(f"a class Model without {', '.join(missing)}", file=file, expected=_EXPECTED)
+    emitted = cast("EmittedModel", model)
+    emitted.source, emitted.facts = source, facts
+    return emitted
+
+
+def _text(file: Path) -> str:
+    try:
+        return file.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ModuleError("no such file", file=file, expected="a module made by `spelgen build`") from None
+    except (OSError, ValueError) as problem:
+        raise ModuleError(
+            f"cannot be read ({type(problem).__name__})", file=file, expected=_EXPECTED
+        ) from None
+
+
+def _facts(source: str, file: Path | None) -> Facts:
+    try:
+        return parse_facts(source)
+    except Exception as problem:
+        told = f"no facts of spelgen in it ({type(problem).__name__})"
+        raise ModuleError(told, file=file, expected=_EXPECTED, do="build it again") from None

@@ -1,0 +1,118 @@
+"""An arm as its URDF and its sidecar give it, and what can be asked of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+from spelgen.arm.arm import Arm, make_arm
+from spelgen.errors import Diagnostic
+from spelgen.formulas.formulas import Entry, Formulas, formulas
+from spelgen.inspection import Inspection
+from spelgen.settings.settings import Settings, load_settings
+from spelgen.spec import Assume
+from spelgen.structure.base_parameters import BaseParameter, base_parameters
+from spelgen.structure.structure import Structure, derive
+from spelgen.urdf.actuation import Actuation, derive_actuation
+from spelgen.urdf.read import read_urdf
+from spelgen.urdf.robot import Robot
+from spelgen.verify.agreement import Verification
+
+
+@dataclass(frozen=True, repr=False)
+class LoadedArm:
+    """The robot of a URDF as read, its sidecar's settings, the arm taken from them, and its inputs.
+
+    ``joints``, ``tip`` and ``angle_tolerance`` are those that ``load_arm`` was given. What is derived is worked
+    out when it is first asked for.
+    """
+
+    robot: Robot
+    settings: Settings
+    arm: Arm
+    actuation: Actuation
+    joints: tuple[str, ...] | None
+    tip: str | None
+    angle_tolerance: float
+
+    @cached_property
+    def structure(self) -> Structure:
+        """What holds for any inertial values: the kinematics alone are trusted."""
+        return derive(self.arm)
+
+    @cached_property
+    def base_parameters(self) -> tuple[BaseParameter, ...]:
+        """The combinations of inertial parameters that the motion depends on."""
+        return base_parameters(self.arm, self.structure.base_parameters)
+
+    @property
+    def diagnostics(self) -> tuple[Diagnostic, ...]:
+        """What reading the URDF and the settings, taking the arm and its inputs had to tell."""
+        parts = (self.robot, self.arm, self.actuation, self.settings)
+        return tuple(each for part in parts for each in part.diagnostics)
+
+    def structure_for(self, assume: Assume) -> Structure:
+        """The structure that holds for any inertial values, or (``inertials``) for the URDF's own.
+
+        Raises ArmError where these are asked for and absent.
+        """
+        return self.structure if assume == "kinematics" else derive(self.arm, assume)
+
+    def inspect(self, assume: Assume = "kinematics") -> Inspection:
+        """The structure as people and programs read it. Raises ArmError as ``structure_for`` does."""
+        return Inspection(self.arm, self.structure_for(assume), self.actuation, self.diagnostics)
+
+    def verify(self, assume: Assume = "kinematics") -> Verification:
+        """The structure once more, by numbers and by other programs. Raises SpelgenError without Pinocchio."""
+        from spelgen.verify.verify import verify
+
+        return verify(self.robot, self.arm, self.structure_for(assume))
+
+    def formulas(
+        self, entry: Entry | None = None, assume: Assume = "kinematics", *, longest: int | None = None
+    ) -> Formulas:
+        """M(q) and V(q), or one entry ((row, column) from 1, or "V"), as expressions in the base parameters.
+
+        ``longest``: terms of what is still written out; None: as many as a person reads.
+        """
+        return formulas(self.arm, self.structure_for(assume), entry=entry, longest=longest)
+
+    def __repr__(self) -> str:
+        n = len(self.arm.coordinates)
+        return f"<LoadedArm {self.arm.name!r}: {n} joint{'s' * (n > 1)} of {self.robot.path.name}>"
+
+    def _repr_html_(self) -> str:
+        return self.inspect()._repr_html_()
+
+
+def load_arm(
+    path: str | Path,
+    joints: Sequence[str] | None = None,
+    tip: str | None = None,
+    angle_tolerance: float = 2e-3,
+) -> LoadedArm:
+    """Read the URDF at ``path`` and its sidecar, and take the arm from it.
+
+    ``joints`` names the moving joints, or ``tip`` the last link; else the longest actuated chain is taken.
+    Angles within ``angle_tolerance`` [rad] of a special one are that one; at 0 the file's numbers are taken as
+    they stand. Raises UrdfError, ArmError or SettingsError.
+    """
+    path = Path(path)
+    robot = read_urdf(path)
+    settings = load_settings(path, [joint.name for joint in robot.joints])
+    arm = make_arm(robot, joints=joints, tip=tip, angle_tolerance=angle_tolerance, gravity=settings.gravity)
+    coordinates = tuple(
+        replace(coordinate, passive=not settings.joint(coordinate.name).actuated)
+        for coordinate in arm.coordinates
+    )
+    return LoadedArm(
+        robot=robot,
+        settings=settings,
+        arm=replace(arm, coordinates=coordinates),
+        actuation=derive_actuation(robot, settings, [coordinate.name for coordinate in coordinates]),
+        joints=None if joints is None else tuple(joints),
+        tip=tip,
+        angle_tolerance=angle_tolerance,
+    )
