@@ -1,7 +1,7 @@
 """ModelSpec: everything an emitted module is made from, as plain frozen data. The wall between deriving and
 training.
 
-Also reads back the record that an emitted module carries in its docstring.
+Also writes, and reads back, the facts that an emitted module carries.
 """
 
 from __future__ import annotations
@@ -9,56 +9,24 @@ from __future__ import annotations
 import ast
 import hashlib
 import json
-import re
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import yaml
-
+from spelgen.design import Design, Net
 from spelgen.errors import ModuleError
 
 Assume = Literal["kinematics", "inertials"]
 Kind = Literal["zero", "constant", "varying"]
 Preset = Literal["minimal", "spel", "spel-kan", "phnode", "closed-form"]
-Net = Literal["mlp", "kan"]
 Entries = tuple[tuple[int, int, float], ...]
 """A sparse symmetric matrix by its lower triangle: (row, column, value), 0-based."""
 
 Terms = tuple[tuple[int, float, float], ...]
-"""A sum of waves: (place in ModelSpec.waves, factor of the cosine, factor of the sine), to start from."""
+"""A Fourier series: (place in ModelSpec.fourier, factor of the cosine, factor of the sine), to start from."""
 
-_PRESETS = Path(__file__).parent / "presets"
-
-
-@dataclass(frozen=True)
-class Design:
-    """A point in the space of models: how each quantity of the equations of motion is made.
-
-    derived: by the arm's structure. dense: as if nothing were known of the arm (Wang et al., Sci Rep
-    15:33179, 2025, and Duong et al., IEEE T-RO 40:3695, 2024), over all three axes of each joint where it
-    says 3n. closed-form: that of rigid bodies with trained inertial parameters. constants: friction's laws with
-    trained constants.
-    """
-
-    mass: Literal["derived", "dense-3n", "closed-form"]
-    potential: Literal["derived", "dense", "closed-form"]
-    dissipation: Literal["per-joint", "dense-n", "dense-3n", "constants"]
-    input: Literal["derived", "dense-3n"]
-    waves: Literal["derived", "none"]
-    """Whether networks add to the sums of waves that a rigid arm's functions are, where those are short."""
-    net: Net
-    encoding: Literal["own", "group"]
-    """What a network reads: cos q and sin q or scaled q of the joints it depends on, or the nine or three
-    numbers of every joint's R or r.
-    """
-
-
-def load_design(preset: Preset, net: Net | None = None) -> Design:
-    """The design that ``presets/PRESET.yaml`` names, with ``net`` in place of its own network if given."""
-    data = yaml.safe_load((_PRESETS / f"{preset}.yaml").read_text(encoding="utf-8"))
-    del data["about"]
-    return Design(**(data | ({"net": net} if net else {})))
+_FACTS_WIDTH = 100
 
 
 @dataclass(frozen=True)
@@ -71,7 +39,7 @@ class Options:
     assume: Assume = "kinematics"
     joints: tuple[str, ...] | None = None
     tip: str | None = None
-    snap_tolerance: float = 2e-3
+    angle_tolerance: float = 2e-3
     width: int = 64
     depth: int = 2
 
@@ -91,10 +59,12 @@ class JointSpec:
     speed: float
     friction: float
     """Size of friction torque the model starts from."""
-    rotor: float
+    armature: float
     """What the drive adds to M, to start from [kg m^2, kg]; 0: nothing."""
-    mass_share: float
-    potential_share: float
+    gear: float
+    """Turns of the motor in a turn of the joint."""
+    mass_sensitivity: float
+    potential_sensitivity: float
     """How much M, or V, changes with this joint, relative to the joint it changes with most."""
     actuated: bool
 
@@ -118,15 +88,15 @@ class BodySpec:
 
 @dataclass(frozen=True)
 class OutputSpec:
-    """One learned function of ``joints``: f(q) = center + scale x network, entering M through ``basis``."""
+    """One learned function of ``joints``: f(q) = mean + scale x network, entering M through ``basis``."""
 
     joints: tuple[int, ...]
     basis: Entries
-    center: float
+    mean: float
     scale: float
-    level: float | None = None
-    terms: Terms = ()
-    """With a level: f(q) = level + its terms' waves + a part of the network."""
+    offset: float | None = None
+    series: Terms = ()
+    """With an offset: f(q) = offset + its Fourier series + a part of the network."""
 
 
 @dataclass(frozen=True)
@@ -155,13 +125,13 @@ class ModelSpec:
     constants: tuple[ConstantSpec, ...]
     potential: tuple[int, ...]
     potential_scale: float
-    guard: float
-    """M is lifted where its least eigenvalue, relative to the nominal mean M, falls below this."""
+    margin: float
+    """The least eigenvalue of M, relative to the nominal mean M, that is left as it is."""
     started_from_urdf: bool
-    waves: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...] = ()
-    """(turns, powers), by joint, of x^powers cos(turns q) and x^powers sin(turns q)."""
-    potential_terms: Terms | None = None
-    """What V is the sum of, beside a part of the network; None: of the network alone."""
+    fourier: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...] = ()
+    """(frequencies, powers), by joint, of x^powers cos(frequencies q) and x^powers sin(frequencies q)."""
+    potential_series: Terms | None = None
+    """The Fourier series of V, beside a part of the network; None: of the network alone."""
     bodies: tuple[BodySpec, ...] = ()
     """Of a closed-form model."""
     inputs: tuple[tuple[int, int, float, bool], ...] = ()
@@ -196,7 +166,7 @@ def _tupled(value: Any) -> Any:
 
 
 @dataclass(frozen=True)
-class Header:
+class Facts:
     """What an emitted module says of itself. ``joints`` are the URDF's own names, which logs use."""
 
     robot: str
@@ -208,34 +178,70 @@ class Header:
     joint_types: tuple[str, ...]
 
 
-_JOINT_LINE = re.compile(r'^ {4}\d+ +("(?:[^"\\]|\\.)*") +(revolute|prismatic)\b', re.MULTILINE)
-_RECORD_LINE = re.compile(r"^ {4}(\w+): (.+)$", re.MULTILINE)
-_OPTION_LINE = re.compile(r"^ {4}option (\w+): (.+)$", re.MULTILINE)
+def facts_json(spec: ModelSpec) -> str:
+    """What the module made from ``spec`` says of itself, as JSON for people and programs."""
+    facts = {
+        "robot": spec.robot,
+        "urdf": spec.urdf,
+        "urdf_sha256": spec.urdf_sha256,
+        "spec_sha256": spec.sha256,
+        "options": dict(sorted(asdict(spec.options).items())),
+        "joints": {joint.name: joint.kind for joint in spec.joints},
+    }
+    items = [f"{json.dumps(key)}: {_filled(value)}" for key, value in facts.items()]
+    return "{" + ", ".join(items[:2]) + ",\n " + ",\n ".join(items[2:]) + "}"
 
 
-def read_header(path: str | Path) -> Header:
-    """The record in the docstring of the emitted module at ``path``. Raises ModuleError when there is none."""
+def _filled(value: str | dict[str, Any]) -> str:
+    """JSON of a text, or of a group on as many lines as it takes, with items kept whole."""
+    if isinstance(value, str):
+        return json.dumps(value)
+    lines = [""]
+    for key, item in value.items():
+        text = f"{json.dumps(key)}: {json.dumps(item)}"
+        if lines[-1] and len(lines[-1]) + len(text) > _FACTS_WIDTH:
+            lines.append("")
+        lines[-1] += f", {text}" if lines[-1] else text
+    return "{" + ",\n  ".join(lines) + "}"
+
+
+def read_facts(path: str | Path) -> Facts:
+    """The facts in the emitted module at ``path``; nothing of it is executed. Raises ModuleError without them."""
     path = Path(path)
     try:
-        text = ast.get_docstring(ast.parse(path.read_bytes()), clean=False) or ""
-        record = {key: json.loads(value) for key, value in _RECORD_LINE.findall(text)}
-        options = {key: _tupled(json.loads(value)) for key, value in _OPTION_LINE.findall(text)}
-        rows = [(json.loads(name), kind) for name, kind in _JOINT_LINE.findall(text)]
-        return Header(
-            robot=record["robot"],
-            urdf=record["urdf"],
-            urdf_sha256=record["urdf_sha256"],
-            spec_sha256=record["spec_sha256"],
-            options=Options(**options),
-            joints=tuple(name for name, _ in rows),
-            joint_types=tuple(kind for _, kind in rows),
-        )
+        return parse_facts(path.read_bytes())
     except FileNotFoundError:
         raise ModuleError("no such file", file=path, do="build it with `spelgen build`") from None
-    except (OSError, SyntaxError, ValueError, KeyError, TypeError) as problem:
+    except (OSError, SyntaxError, ValueError, KeyError, TypeError, StopIteration, AttributeError) as problem:
         raise ModuleError(
-            f"no spelgen record in the docstring ({type(problem).__name__})",
+            f"no facts of spelgen in it ({type(problem).__name__})",
             file=path,
-            expected="a module written by `spelgen build`",
+            expected="a module written by this version of `spelgen build`",
             do="build it again, or check the path",
         ) from None
+
+
+def parse_facts(source: str | bytes) -> Facts:
+    """The facts in a module's source text; a KeyError or the like where there are none."""
+    record = json.loads(next(_texts(ast.parse(source), "FACTS")))
+    options = {key: _tupled(value) for key, value in record["options"].items()}
+    return Facts(
+        robot=record["robot"],
+        urdf=record["urdf"],
+        urdf_sha256=record["urdf_sha256"],
+        spec_sha256=record["spec_sha256"],
+        options=Options(**options),
+        joints=tuple(record["joints"]),
+        joint_types=tuple(record["joints"].values()),
+    )
+
+
+def _texts(tree: ast.Module, name: str) -> Iterator[str]:
+    """The strings that a file assigns to ``name``."""
+    for node in tree.body:
+        if (
+            isinstance(node, ast.Assign)
+            and isinstance(node.value, ast.Constant)
+            and [target.id for target in node.targets if isinstance(target, ast.Name)] == [name]
+        ):
+            yield str(node.value.value)

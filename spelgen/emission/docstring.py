@@ -1,9 +1,8 @@
-"""ModelSpec -> the emitted module's docstring: what the model is made of, its joints, and what it was made from."""
+"""ModelSpec -> the emitted module's docstring: what the model is made of, and its joints."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
 
 from spelgen.labels import joint_ranges
 from spelgen.spec import ModelSpec
@@ -47,9 +46,9 @@ def summary(spec: ModelSpec) -> str:
         if spec.started_from_urdf
         else "The URDF's inertials are missing or impossible: sizes and starting values are those of 1 kg links."
     )
-    parts = ["M"] * any(x.level is not None for x in spec.outputs) + ["V"] * bool(spec.potential_terms)
+    parts = ["M"] * any(x.offset is not None for x in spec.outputs) + ["V"] * bool(spec.potential_series)
     sums = (
-        f"\n{' and '.join(parts)}: sums of waves with trained factors, and a part for a network."
+        f"\n{' and '.join(parts)}: Fourier series with trained coefficients, and a part for a network."
         if parts
         else ""
     )
@@ -90,16 +89,3 @@ def joint_table(spec: ModelSpec) -> str:
         )
         lines.append(f"    {index}  {name.ljust(width)}  {joint.kind:9}  {unit:7}  {limits}")
     return "\n".join(lines)
-
-
-def record(spec: ModelSpec) -> str:
-    """What the module was made from, as `read_header` reads it."""
-    facts = {
-        "robot": spec.robot,
-        "urdf": spec.urdf,
-        "urdf_sha256": spec.urdf_sha256,
-        "spec_sha256": spec.sha256,
-    }
-    lines = [f"    {key}: {json.dumps(value)}" for key, value in facts.items()]
-    lines += [f"    option {key}: {json.dumps(value)}" for key, value in sorted(asdict(spec.options).items())]
-    return "Record, by which `spelgen check` tells whether this module is up to date:\n\n" + "\n".join(lines)

@@ -8,15 +8,17 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from spelgen.arm.arm import Arm, Coordinate
+from spelgen.design import load_design
 from spelgen.emission.bodies import body_specs
-from spelgen.spec import ConstantSpec, Entries, JointSpec, ModelSpec, Options, OutputSpec, load_design
+from spelgen.settings.joint import JointSettings
+from spelgen.spec import ConstantSpec, Entries, JointSpec, ModelSpec, Options, OutputSpec
 from spelgen.structure.basis import Weights
 from spelgen.structure.fourier import NO_WAVES, find_waves
 from spelgen.structure.nominal import Nominal, nominal, nominal_inertias, working_range
 from spelgen.structure.structure import Structure
 from spelgen.urdf.actuation import Actuation
 
-_GUARD_SHARE = 0.1
+_MARGIN = 0.1
 _FRICTION_OF_EFFORT = 0.02
 _FRICTION_OF_TORQUE = 0.1
 _LARGEST_EFFORT = 1e4  # Nm, N: what stands above is a placeholder
@@ -33,19 +35,18 @@ def plan_model(
     *,
     urdf: str,
     urdf_sha256: str,
-    rotors: Mapping[str, float] | None = None,
+    drives: Mapping[str, JointSettings] | None = None,
 ) -> ModelSpec:
     """The model of ``arm`` under ``options``; ``urdf`` is the file's name without its folder.
 
-    ``rotors`` [kg m^2, kg] are known rotor inertias as felt at the joint; where there is none, one is
-    guessed.
+    ``drives``: what is known of the joints' motors and gears; where no rotor inertia is, one is guessed.
     """
-    known = rotors or {}
+    known = drives or {}
     design = load_design(options.preset, options.net)
     everything = tuple(range(len(arm.coordinates)))
     sizes = nominal(arm, structure)
     inertias = nominal_inertias(arm, sizes.from_urdf)
-    waves = find_waves(arm, structure, inertias) if design.waves == "derived" else NO_WAVES
+    waves = find_waves(arm, structure, inertias) if design.fourier == "derived" else NO_WAVES
     identifiers = _identifiers([coordinate.name for coordinate in arm.coordinates])
     x, y, z = (float(g) for g in arm.gravity)
     return ModelSpec(
@@ -53,18 +54,16 @@ def plan_model(
         urdf=urdf,
         urdf_sha256=urdf_sha256,
         gravity=(x, y, z),
-        options=replace(options, net=design.net),
+        options=replace(options, net=None if design.net == "none" else design.net),
         design=design,
         joints=tuple(
-            _joint(
-                coordinate, identifiers[k], sizes, k, known.get(coordinate.name) or guessed_rotor(coordinate)
-            )
+            _joint(coordinate, identifiers[k], sizes, k, known.get(coordinate.name, JointSettings()))
             for k, coordinate in enumerate(arm.coordinates)
         ),
         entries=tuple((e.row, e.column, e.kind, e.joints) for e in structure.entries),
         outputs=tuple(
             OutputSpec(
-                everything if design.encoding == "group" else output.joints,
+                everything if design.encoding == "lie-group" else output.joints,
                 _floats(output.basis),
                 center,
                 scale,
@@ -86,10 +85,10 @@ def plan_model(
         ),
         potential=everything if design.potential == "dense" else structure.potential,
         potential_scale=sizes.potential_scale,
-        guard=float(f"{max(_GUARD_SHARE * sizes.least_share, 1e-4):.0e}"),
+        margin=float(f"{max(_MARGIN * sizes.least_share, 1e-4):.0e}"),
         started_from_urdf=sizes.from_urdf,
-        waves=tuple((wave.turns, wave.powers) for wave in waves.waves),
-        potential_terms=waves.potential.terms if waves.potential and structure.potential else None,
+        fourier=tuple((wave.turns, wave.powers) for wave in waves.waves),
+        potential_series=waves.potential.terms if waves.potential and structure.potential else None,
         bodies=body_specs(arm, inertias) if design.mass == "closed-form" else (),
         inputs=()
         if actuation.direct
@@ -97,7 +96,9 @@ def plan_model(
     )
 
 
-def _joint(coordinate: Coordinate, identifier: str, sizes: Nominal, index: int, rotor: float) -> JointSpec:
+def _joint(
+    coordinate: Coordinate, identifier: str, sizes: Nominal, index: int, drive: JointSettings
+) -> JointSpec:
     low, high = working_range(coordinate)
     speed = coordinate.velocity if coordinate.velocity and coordinate.velocity <= _LARGEST_SPEED else None
     return JointSpec(
@@ -110,14 +111,15 @@ def _joint(coordinate: Coordinate, identifier: str, sizes: Nominal, index: int, 
         reach=float(f"{(high - low) / 2:.6g}"),
         speed=speed or _DEFAULT_SPEED[coordinate.kind],
         friction=float(f"{_friction(coordinate, sizes, index):.3g}"),
-        rotor=float(f"{rotor:.3g}"),
-        mass_share=sizes.mass_shares[index],
-        potential_share=sizes.potential_shares[index],
+        armature=float(f"{drive.rotor_inertia * drive.gear**2 or guessed_armature(coordinate):.3g}"),
+        gear=drive.gear,
+        mass_sensitivity=sizes.mass_shares[index],
+        potential_sensitivity=sizes.potential_shares[index],
         actuated=not coordinate.passive,
     )
 
 
-def guessed_rotor(coordinate: Coordinate) -> float:
+def guessed_armature(coordinate: Coordinate) -> float:
     """A geared drive's own inertia: such that its full effort takes ``_RISE`` seconds to reach its full
     speed.
     """

@@ -1,38 +1,67 @@
-"""Values -> source text: tables, calls and literals as a formatter would lay them out."""
+"""Values -> source text: calls, tuples and assignments laid out as a formatter would."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 
-WIDTH = 100
-
-
-def table(start: str, rows: list[str]) -> str:
-    """A tuple with a row a line, or on the line that begins with ``start`` where it fits."""
-    flat = f"({', '.join(rows)}{',' * (len(rows) == 1)})"
-    if len(start) + len(flat) <= WIDTH and "\n" not in flat:
-        return flat
-    return "(\n" + "".join(f"    {row},\n" for row in rows) + ")"
+WIDTH = 110
 
 
-def call(callee: str, **arguments: object) -> str:
-    """A call with its keywords, as a row of a table: on one line, or on one line an argument."""
-    parts = [f"{key}={literal(value, indent=8)}" for key, value in arguments.items()]
-    flat = f"{callee}({', '.join(parts)})"
-    if len(flat) < WIDTH - 4 and "\n" not in flat:
-        return flat
-    return f"{callee}(\n" + "".join(f"        {part},\n" for part in parts) + "    )"
+@dataclass(frozen=True)
+class Code:
+    """An expression that stands as it is: a name, or an expression of names."""
+
+    text: str
 
 
-def literal(value: object, indent: int = 0) -> str:
-    """``value`` as source text; a tuple too long for a line has an item a line."""
-    if isinstance(value, str):
-        return json.dumps(value)
-    if not isinstance(value, tuple):
-        return repr(value)
-    parts = [literal(item, indent + 4) for item in value]
-    flat = f"({parts[0]},)" if len(parts) == 1 else f"({', '.join(parts)})"
-    if indent + len(flat) < WIDTH - 12:
+@dataclass(frozen=True)
+class Call:
+    """A call; an argument without a name stands under None."""
+
+    callee: str
+    arguments: tuple[tuple[str | None, object], ...]
+
+
+def call(callee: str, *positional: object, **named: object) -> Call:
+    """The call of ``callee`` with these arguments."""
+    return Call(callee, (*((None, value) for value in positional), *named.items()))
+
+
+def assignment(target: str, value: object, indent: int = 0) -> str:
+    """``target = value``, over as many lines as it takes."""
+    return " " * indent + laid_out(f"{target} = ", value, indent)
+
+
+def laid_out(start: str, value: object, indent: int = 0, end: str = "") -> str:
+    """``start``, ``value`` and ``end`` on one line, or with an item of the value a line."""
+    flat = start + _flat(value) + end
+    if indent + len(flat) <= WIDTH or not _items(value):
         return flat
     inner = " " * (indent + 4)
-    return "(\n" + "".join(f"{inner}{part},\n" for part in parts) + " " * indent + ")"
+    opening, closing = (f"{value.callee}(", ")") if isinstance(value, Call) else ("(", ")")
+    body = inner + ", ".join(key + _flat(item) for key, item in _items(value))
+    if isinstance(value, Call) and len(body) <= WIDTH:
+        return "\n".join([start + opening, body, " " * indent + closing + end])
+    lines = [inner + laid_out(key, item, indent + 4, ",") for key, item in _items(value)]
+    return "\n".join([start + opening, *lines, " " * indent + closing + end])
+
+
+def _items(value: object) -> list[tuple[str, object]]:
+    """What stands between the parentheses: what precedes each item, and the item."""
+    if isinstance(value, Call):
+        return [(f"{key}=" if key else "", item) for key, item in value.arguments]
+    return [("", item) for item in value] if isinstance(value, tuple) else []
+
+
+def _flat(value: object) -> str:
+    if isinstance(value, Code):
+        return value.text
+    if isinstance(value, str):
+        return json.dumps(value)
+    if not isinstance(value, tuple | Call):
+        return repr(value)
+    inside = ", ".join(key + _flat(item) for key, item in _items(value))
+    if isinstance(value, Call):
+        return f"{value.callee}({inside})"
+    return f"({inside},)" if len(value) == 1 else f"({inside})"

@@ -1,0 +1,295 @@
+"""ModelSpec -> the tailored part of a module: how its model is put together, and where M's functions stand."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable
+from textwrap import wrap
+
+from spelgen.emission.source import WIDTH, Call, Code, assignment, call, laid_out
+from spelgen.labels import entry_name, joint_ranges
+from spelgen.spec import ModelSpec, Terms
+
+_LEAST_UNITS = 4
+_LEAST_KAN_UNITS = 2
+_KAN_FRACTION = 0.25
+_POTENTIAL_FRACTION = 0.5
+_POSITION_SENSITIVITY = 0.1
+_LEAST_ARMATURE = 0.01
+_FRICTION_AXES = {"dense-n": 1, "dense-3n": 3}
+_UNPACKED = 10  # names on a line
+_SEED = Code("generator")
+_INDENT = 8
+
+
+def setup(spec: ModelSpec) -> str:
+    """The statements of the model's ``__init__`` that make its dynamics."""
+    lines = [assignment("joints", _joints(spec), _INDENT)]
+    lines += _rigid_bodies(spec) if spec.bodies else _networks(spec)
+    return "\n".join(lines)
+
+
+def mass_entries(spec: ModelSpec) -> str:
+    """The statements that give M from its functions f and constants c; empty where M is not made of them."""
+    if spec.design.mass != "derived":
+        return ""
+    cells: defaultdict[tuple[int, int], list[tuple[float, str]]] = defaultdict(list)
+    for letter, parts in (("f", spec.outputs), ("c", spec.constants)):
+        for number, part in enumerate(parts, start=1):
+            for row, column, factor in part.basis:
+                cells[row, column].append((factor, f"{letter}{number}"))
+    lines = _told(spec) + _unpacked("f", len(spec.outputs)) + _unpacked("c", len(spec.constants))
+    rows = []
+    for row in range(len(spec.joints)):
+        names = []
+        for column in range(row + 1):
+            text = _sum(cells[row, column])
+            if " " in text or text.startswith("-"):
+                name = entry_name(row, column).lower().replace(",", "_")
+                lines.append(f"{name} = {text}")
+                text = name
+            names.append(text)
+        rows.append(Code(f"[{', '.join(names)}]"))
+    whole = laid_out("return ", Call("symmetric", tuple((None, row) for row in rows)), _INDENT)
+    return "\n".join(" " * _INDENT + line for line in lines) + "\n" + " " * _INDENT + whole
+
+
+def names(target: str, values: Iterable[str]) -> str:
+    """A class attribute of the model that holds these names."""
+    chosen = tuple(values)
+    alike = Code(f'("{chosen[0]}",) * {len(chosen)}')  # names are identifiers
+    return assignment(target, alike if len(set(chosen)) == 1 < len(chosen) else chosen, 4)
+
+
+def units(spec: ModelSpec) -> int:
+    """Units in a hidden layer; those of a Kolmogorov-Arnold network have a grid of numbers on every edge."""
+    width = spec.options.width
+    return width if spec.design.net == "mlp" else max(_LEAST_UNITS, round(_KAN_FRACTION * width))
+
+
+def _told(spec: ModelSpec) -> list[str]:
+    """Comments that say which joints the functions read."""
+    told = ", ".join(
+        f"f{number}(q{joint_ranges(output.joints)})" for number, output in enumerate(spec.outputs, start=1)
+    )
+    return [f"# {line}" for line in wrap(told, WIDTH - _INDENT - 2, break_on_hyphens=False)]
+
+
+def _unpacked(letter: str, count: int) -> list[str]:
+    names = [f"{letter}{number}" for number in range(1, count + 1)]
+    if count <= _UNPACKED:
+        return (
+            [f"{', '.join(names)} = {letter}" if count > 1 else f"({names[0]},) = {letter}"] if names else []
+        )
+    starts = range(0, count, _UNPACKED)
+    return [
+        f"{', '.join(part)}{',' * (len(part) == 1)} = {letter}[{start}:{start + len(part)}]"
+        for start in starts
+        for part in [names[start : start + _UNPACKED]]
+    ]
+
+
+def _sum(terms: Iterable[tuple[float, str]]) -> str:
+    """A linear combination as an expression, what is added before what is subtracted; ``0`` for none."""
+    text = ""
+    for factor, name in sorted(terms, key=lambda term: term[0] < 0):
+        size = name if abs(factor) == 1 else f"{_number(abs(factor))} * {name}"
+        sign = "-" if factor < 0 else "+"
+        text += f" {sign} {size}" if text else f"-{size}" if factor < 0 else size
+    return text or "0"
+
+
+def _number(value: float) -> str:
+    return f"{value:g}" if float(f"{value:g}") == value else repr(value)
+
+
+def _joints(spec: ModelSpec) -> Call:
+    mean = mean_mass(spec) if spec.bodies else ()
+    armature = tuple(
+        # one that nothing is known of still has somewhere to start
+        joint.armature or (float(f"{_LEAST_ARMATURE * mean[k][k]:.3g}") if spec.bodies else 0.0)
+        for k, joint in enumerate(spec.joints)
+    )
+    return call(
+        "Joints",
+        revolute=tuple(joint.kind == "revolute" for joint in spec.joints),
+        center=tuple(joint.center for joint in spec.joints),
+        reach=tuple(joint.reach for joint in spec.joints),
+        speed=tuple(joint.speed for joint in spec.joints),
+        friction=tuple(joint.friction for joint in spec.joints),
+        armature=armature,
+        gear=tuple(joint.gear for joint in spec.joints),
+        actuated=tuple(joint.actuated for joint in spec.joints),
+    )
+
+
+def _rigid_bodies(spec: ModelSpec) -> list[str]:
+    bodies = call(
+        "Bodies",
+        parent=tuple(body.parent for body in spec.bodies),
+        joint=tuple(body.joint for body in spec.bodies),
+        revolute=tuple(body.kind == "revolute" for body in spec.bodies),
+        ratio=tuple(body.ratio for body in spec.bodies),
+        offset=tuple(body.offset for body in spec.bodies),
+        rotation=tuple(body.rotation for body in spec.bodies),
+        position=tuple(body.position for body in spec.bodies),
+        mass=tuple(body.reference[0] for body in spec.bodies),
+        moment=tuple(body.reference[1:4] for body in spec.bodies),
+        inertia=tuple(tuple(body.reference[k] for k in (4, 7, 9)) for body in spec.bodies),
+        products=tuple(tuple(body.reference[k] for k in (5, 6, 8)) for body in spec.bodies),
+    )
+    made = call("RigidBodyDynamics", Code("joints"), Code("bodies"), gravity=spec.gravity, input=_input(spec))
+    return [assignment("bodies", bodies, _INDENT), assignment("self.dynamics", made, _INDENT)]
+
+
+def _networks(spec: ModelSpec) -> list[str]:
+    """Parts in the order in which they draw their random weights: mass, potential, friction, input."""
+    made: list[tuple[str, object]] = [
+        ("generator", Code("torch.Generator().manual_seed(seed)")),
+        ("encoding", Code("JointEncoding(joints)")),
+    ]
+    series = []
+    if _mass_series(spec):
+        made.append(("functions", _functions(spec)))
+        series.append(Code("*(function.series for function in functions)"))
+    if spec.potential_series:
+        made.append(("potential_series", _terms(spec, spec.potential_series)))
+        series.append(Code("potential_series"))
+    if series:
+        items = ", ".join(each.text for each in series)
+        made.append(("fourier", call("FourierFeatures", Code("joints"), Code(f"[{items}]"))))
+    made += [*_mass(spec), *_potential(spec), ("friction", _friction(spec))]
+    parts: list[object] = [Code(name) for name in ("encoding", "mass", "potential", "friction")]
+    if not spec.potential:
+        parts[2] = None
+    parts.append(_input(spec))
+    made.append(("self.dynamics", call("NetworkDynamics", *parts, *([Code("fourier")] if series else []))))
+    return [assignment(name, value, _INDENT) for name, value in made]
+
+
+def _mass_series(spec: ModelSpec) -> bool:
+    return spec.design.mass == "derived" and any(output.offset is not None for output in spec.outputs)
+
+
+def _functions(spec: ModelSpec) -> tuple[Call, ...]:
+    return tuple(
+        call(
+            "MassFunction",
+            each.joints,
+            mean=each.mean,
+            scale=each.scale,
+            **({} if each.offset is None else {"offset": each.offset, "series": _terms(spec, each.series)}),
+        )
+        for each in spec.outputs
+    )
+
+
+def _terms(spec: ModelSpec, series: Terms) -> tuple[Call, ...]:
+    prismatic = any(joint.kind == "prismatic" for joint in spec.joints)
+    return tuple(
+        call("Term", spec.fourier[place][0], spec.fourier[place][1] if prismatic else (), cos, sin)
+        for place, cos, sin in series
+    )
+
+
+def _mass(spec: ModelSpec) -> list[tuple[str, object]]:
+    sensitivity = tuple(joint.mass_sensitivity for joint in spec.joints)
+    group = spec.design.encoding == "lie-group"
+    everything = tuple(range(len(spec.joints)))
+    if spec.design.mass == "dense-3n":
+        rows = 3 * len(spec.joints)
+        outputs = Code(f"[range({len(spec.joints)})] * {rows * (rows + 1) // 2}")
+        network = _network(spec, outputs, everything, sensitivity)
+        made = call("DenseMass", Code("joints"), mean=mean_mass(spec), network=network)
+        return [("mass", made)]
+    constants = tuple((each.start, each.scale) for each in spec.constants)
+    if not spec.outputs:
+        return [("mass", call("ConstantMass", Code("joints"), Code("self.mass_entries"), constants))]
+    series = _mass_series(spec)
+    outputs = Code("[function.joints for function in functions]")
+    least = _LEAST_UNITS if spec.design.net == "mlp" else _LEAST_KAN_UNITS
+    read = everything if group else tuple(sorted({joint for each in spec.outputs for joint in each.joints}))
+    network = _network(spec, outputs, read, Code("sensitivity"), series=series, least=least)
+    parts = [Code(name) for name in ("joints", "self.mass_entries", "functions", "constants", "network")]
+    more = {"fourier": Code("fourier"), "sensitivity": Code("sensitivity")} if series else {}
+    return [
+        *([] if series else [("functions", _functions(spec))]),
+        ("constants", constants),
+        ("sensitivity", sensitivity),
+        ("network", network),
+        ("mass", call("DerivedMass", *parts, spec.margin, **more)),
+    ]
+
+
+def _potential(spec: ModelSpec) -> list[tuple[str, object]]:
+    if not spec.potential:
+        return []
+    sensitivity = tuple(joint.potential_sensitivity for joint in spec.joints)
+    width = max(_LEAST_UNITS, round(_POTENTIAL_FRACTION * units(spec)))
+    series = bool(spec.potential_series)
+    network = _network(
+        spec, (spec.potential,), spec.potential, Code("sensitivity"), series=series, width=width
+    )
+    more = [Code("fourier"), Code("potential_series"), Code("sensitivity")] if series else []
+    made = call("LearnedPotential", spec.potential_scale, Code("network"), *more)
+    return [("sensitivity", sensitivity), ("network", network), ("potential", made)]
+
+
+def _network(
+    spec: ModelSpec,
+    outputs: object,
+    read: tuple[int, ...],
+    sensitivity: object,
+    *,
+    axes: int = 0,
+    series: bool = False,
+    width: int | None = None,
+    least: int | None = None,
+) -> Call:
+    """A network of ``outputs``; ``read``: the joints whose encoding it reads."""
+    if spec.design.encoding == "lie-group":
+        inputs = call("lie_group_input", Code("joints"), sensitivity, **({"axes": axes} if axes else {}))
+    else:
+        inputs = call("joint_input", Code("joints"), read, sensitivity)
+    size = {"width": width or units(spec), "depth": spec.options.depth} | ({"least": least} if least else {})
+    kind = "MaskedMLP" if spec.design.net == "mlp" else "MaskedKAN"
+    fraction = [Code("NETWORK_FRACTION")] if series else []
+    return call(kind, inputs, call("unit_joints", outputs, **size), _SEED, *fraction)
+
+
+def _friction(spec: ModelSpec) -> Call:
+    if spec.design.dissipation == "per-joint":
+        return call("JointFriction", Code("joints"), Code("encoding"), _SEED)
+    n, axes = len(spec.joints), _FRICTION_AXES[spec.design.dissipation]
+    everything, rows = tuple(range(n)), axes * n
+    outputs = Code(f"[range({n})] * {rows * (rows + 1) // 2}")
+    sensitivity = (_POSITION_SENSITIVITY,) * n
+    network = _network(spec, outputs, everything, sensitivity, axes=axes)
+    return call("DenseFriction", Code("joints"), network, axes=axes)
+
+
+def _input(spec: ModelSpec) -> Call:
+    if spec.design.input == "dense-3n":
+        n = len(spec.joints)
+        everything = tuple(range(n))
+        outputs = Code(f"[range({n})] * {3 * n}")
+        network = _network(spec, outputs, everything, (1.0,) * n)
+        return call("DenseInput", Code("joints"), network)
+    if not spec.inputs:
+        return call("DirectInput", Code("joints"))
+    gains = tuple(
+        call("MotorGain", joint, motor, value, trained=trained)
+        for joint, motor, value, trained in spec.inputs
+    )
+    return call("MotorInput", Code("joints"), gains)
+
+
+def mean_mass(spec: ModelSpec) -> tuple[tuple[float, ...], ...]:
+    """The lower triangle of the nominal mean of M, row by row."""
+    terms = [(c.start, c.basis) for c in spec.constants] + [(o.mean, o.basis) for o in spec.outputs]
+    mean: defaultdict[tuple[int, int], float] = defaultdict(float)
+    for size, basis in terms:
+        for row, column, value in basis:
+            mean[row, column] += size * value
+    rows = range(len(spec.joints))
+    return tuple(tuple(float(f"{mean[row, column]:.6g}") for column in range(row + 1)) for row in rows)

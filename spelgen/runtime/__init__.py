@@ -1,0 +1,1 @@
+"""What an emitted module computes with: plain torch, tested here, and copied into each module as it stands."""

@@ -1,0 +1,54 @@
+"""M of an arm whose mass matrix does not depend on q."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from spelgen.runtime.armature import Armature
+from spelgen.runtime.configuration import Configuration
+from spelgen.runtime.joints import Joints, vector
+from spelgen.runtime.symmetric import Entries, entry_basis
+
+
+class ConstantMass(nn.Module):
+    """M, (..., n, n), with ``entries`` saying where the constants stand.
+
+    A constant starts at the first of its two numbers, and is trained in units of the second. They
+    enter by their sizes, so that M stays positive definite.
+    """
+
+    constant_scale: Tensor
+    constant_basis: Tensor
+
+    def __init__(self, joints: Joints, entries: Entries, constants: Sequence[tuple[float, float]]) -> None:
+        super().__init__()
+        self.n = joints.n
+        start = vector(first for first, _ in constants)
+        self.register_buffer("constant_scale", vector(unit for _, unit in constants))
+        self.register_buffer("constant_basis", entry_basis(entries, 0, len(constants))[1])
+        self.raw_constants = nn.Parameter(start / self.constant_scale)
+        self.armature = Armature(joints)
+
+    def constants(self) -> Tensor:
+        """The constants of M, (constants,), in their units."""
+        return self.constant_scale * (self.raw_constants.abs() + 1e-6)
+
+    def prepare(self) -> Tensor:
+        """M, (n, n)."""
+        rows = self.constants() @ self.constant_basis
+        return rows.reshape(self.n, self.n) + torch.diag(self.armature())
+
+    def forward(self, at: Configuration, prepared: Tensor) -> tuple[Tensor, None]:
+        """M, for each state."""
+        return prepared.expand(*at.encoded.shape[:-1], self.n, self.n), None
+
+    def kinetic_vjp(self, at: Configuration, qd: Tensor, residuals: None) -> tuple[Tensor, None]:
+        """The derivative of 1/2 qd^T M qd by the encoding: zero."""
+        return torch.zeros_like(at.encoded), None
+
+    def jvp(self, rate: Configuration, residuals: None) -> Tensor:
+        """dM/dt, (..., n, n): zero."""
+        return rate.encoded.new_zeros(*rate.encoded.shape[:-1], self.n, self.n)

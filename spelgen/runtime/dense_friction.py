@@ -1,0 +1,63 @@
+"""Friction D = L L^T of all q and qd: a network gives L."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from spelgen.runtime.joints import Joints, vector
+from spelgen.runtime.network import Network
+
+FACTOR_START = 0.35  # diagonal of L, relative to the root of the joints' usual friction by speed
+
+
+def lower_entries(rows: int) -> Tensor:
+    """Spreads the numbers of a lower triangle, row by row, over a matrix: (rows, rows, numbers)."""
+    row, column = torch.tril_indices(rows, rows)
+    spread = torch.zeros(rows, rows, len(row), dtype=torch.float64)
+    spread[row, column, torch.arange(len(row))] = 1.0
+    return spread
+
+
+class DenseFriction(nn.Module):
+    """D(q, qd) = L L^T, with ``axes`` rows of L for each joint.
+
+    A joint moves along the last of its axes alone, so only those rows of L are worked out.
+    """
+
+    speed: Tensor
+    nominal: Tensor
+    entries: Tensor
+    start: Tensor
+
+    def __init__(self, joints: Joints, network: Network, axes: int) -> None:
+        super().__init__()
+        rows = axes * joints.n
+        self.register_buffer("speed", vector(joints.speed))
+        self.register_buffer("nominal", vector(joints.friction))
+        moving = slice(axes - 1, None, axes)
+        self.register_buffer("entries", lower_entries(rows)[moving])
+        self.register_buffer("start", FACTOR_START * torch.eye(rows).double()[moving])
+        self.network = network
+
+    def prepare(self) -> Any:
+        """The network's weights made ready for many states."""
+        size = torch.sqrt(self.nominal / self.speed).unsqueeze(-1)
+        output_map = (size.unsqueeze(-1) * self.entries).flatten(0, 1)
+        return self.network.prepare(output_map, (size * self.start).flatten())
+
+    def _factor(self, encoded: Tensor, qd: Tensor, layers: Any) -> Tensor:
+        rows: Tensor = self.network(torch.cat([encoded, qd / self.speed], dim=-1), layers)[0]
+        return rows.reshape(*qd.shape[:-1], *self.start.shape)
+
+    def forward(self, encoded: Tensor, qd: Tensor, layers: Any) -> Tensor:
+        """The friction torque D qd, (..., n) [Nm, N]."""
+        factor = self._factor(encoded, qd, layers)
+        return (factor @ (factor.mT @ qd.unsqueeze(-1))).squeeze(-1)
+
+    def dissipation(self, encoded: Tensor, qd: Tensor, layers: Any) -> Tensor:
+        """D, (..., n, n)."""
+        factor = self._factor(encoded, qd, layers)
+        return factor @ factor.mT

@@ -1,0 +1,138 @@
+"""M(q) by the fewest functions and constants: M = sum_j f_j(q) B_j + sum_k c_k A_k + armature."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from spelgen.runtime.armature import Armature
+from spelgen.runtime.configuration import Configuration
+from spelgen.runtime.fourier import FourierFeatures, FourierSeries, Term
+from spelgen.runtime.joints import Joints, vector
+from spelgen.runtime.network import Network
+from spelgen.runtime.regularisation import PositiveDefiniteShift
+from spelgen.runtime.symmetric import Entries, entry_basis
+
+NETWORK_FRACTION = 0.1  # how much of a function that is a Fourier series is left to its network
+
+
+class MassFunction(NamedTuple):
+    """A learned function f of some joints: mean + scale * network.
+
+    With a ``series``, f = offset + Fourier series + NETWORK_FRACTION * scale * network.
+    """
+
+    joints: tuple[int, ...]
+    mean: float  # over the workspace, with nominal inertias
+    scale: float
+    offset: float = 0.0
+    series: tuple[Term, ...] = ()
+
+
+class MassPrepared(NamedTuple):
+    """What depends on the weights alone."""
+
+    layers: Any  # of the network
+    series: Tensor | None  # takes Fourier features to M
+    least: Tensor  # M above this needs no shift
+
+
+class MassResiduals(NamedTuple):
+    """What M's derivatives need of the work done for M."""
+
+    network: Any
+    series: Tensor | None
+
+
+class DerivedMass(nn.Module):
+    """M(q), (..., n, n), with ``entries`` saying where functions and constants stand.
+
+    A constant starts at the first of its two numbers, and is trained in units of the second. Where
+    M would not exceed armature + margin * its nominal mean, that mean is added (see
+    PositiveDefiniteShift): M is positive definite for all q and all weights.
+    """
+
+    constant_scale: Tensor
+    constant_basis: Tensor  # (constants, n n)
+    function_mean: Tensor
+    function_scale: Tensor
+    function_basis: Tensor  # (functions, n n)
+
+    def __init__(
+        self,
+        joints: Joints,
+        entries: Entries,
+        functions: Sequence[MassFunction],
+        constants: Sequence[tuple[float, float]],
+        network: Network,
+        margin: float,
+        fourier: FourierFeatures | None = None,
+        sensitivity: Sequence[float] = (),
+    ) -> None:
+        super().__init__()
+        self.n, self.margin = joints.n, margin
+        start = vector(first for first, _ in constants)
+        by_function, by_constant = entry_basis(entries, len(functions), len(constants))
+        self.register_buffer("constant_scale", vector(unit for _, unit in constants))
+        self.register_buffer("constant_basis", by_constant)
+        self.register_buffer("function_mean", vector(each.mean for each in functions))
+        self.register_buffer("function_scale", vector(each.scale for each in functions))
+        self.register_buffer("function_basis", by_function)
+        mean = start @ self.constant_basis + self.function_mean @ self.function_basis
+        self.shift = PositiveDefiniteShift(self._square(mean))
+        self.raw_constants = nn.Parameter(start / self.constant_scale)
+        self.network = network
+        self.series: FourierSeries | None = None
+        if fourier is not None:
+            scales = [each.scale for each in functions]
+            self.series = FourierSeries(fourier, [each.series for each in functions], scales, sensitivity)
+            levels = vector((each.offset - each.mean) / each.scale for each in functions)
+            network.set_output_bias(levels)
+        self.armature = Armature(joints)
+
+    def constants(self) -> Tensor:
+        """The constants of M, (constants,), in their units."""
+        return self.constant_scale * self.raw_constants
+
+    def prepare(self) -> MassPrepared:
+        """All that depends on the weights alone."""
+        armature = torch.diag(self.armature())
+        constant = self.constants() @ self.constant_basis
+        constant = constant + self.function_mean @ self.function_basis + armature.flatten()
+        output_map = (self.function_scale.unsqueeze(-1) * self.function_basis).mT
+        return MassPrepared(
+            layers=self.network.prepare(output_map, constant),
+            series=None if self.series is None else self.series.prepare(output_map),
+            least=(armature + self.margin * self.shift.matrix).detach(),
+        )
+
+    def _square(self, rows: Tensor) -> Tensor:
+        """(..., n n) as (..., n, n)."""
+        return rows.reshape(*rows.shape[:-1], self.n, self.n)
+
+    def forward(self, at: Configuration, prepared: MassPrepared) -> tuple[Tensor, MassResiduals]:
+        """M(q), and what its derivatives need."""
+        rows, residuals = self.network(at.encoded, prepared.layers)
+        if at.fourier is not None and prepared.series is not None:
+            rows = rows + F.linear(at.fourier, prepared.series)
+        mass = self.shift(self._square(rows), prepared.least)
+        return mass, MassResiduals(residuals, prepared.series)
+
+    def kinetic_vjp(
+        self, at: Configuration, qd: Tensor, residuals: MassResiduals
+    ) -> tuple[Tensor, Tensor | None]:
+        """The derivative of 1/2 qd^T M(q) qd by the encoding, and by the Fourier features."""
+        weight = ((0.5 * qd).unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2)
+        by_series = None if residuals.series is None else weight @ residuals.series
+        return self.network.vjp(residuals.network, weight), by_series
+
+    def jvp(self, rate: Configuration, residuals: MassResiduals) -> Tensor:
+        """dM/dt, (..., n, n), where the configuration changes at this rate."""
+        rows = self.network.jvp(residuals.network, rate.encoded)
+        if rate.fourier is not None and residuals.series is not None:
+            rows = rows + F.linear(rate.fourier, residuals.series)
+        return self._square(rows)

@@ -1,0 +1,103 @@
+"""Joint positions as the numbers that networks read, with derivatives written out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from spelgen.runtime.joints import Joints, vector
+
+
+class JointEncoding(nn.Module):
+    """cos q, sin q and, where some joint is prismatic, the scaled q: (..., 2 n) or (..., 3 n)."""
+
+    center: Tensor
+    reach: Tensor
+
+    def __init__(self, joints: Joints) -> None:
+        super().__init__()
+        self.prismatic = not all(joints.revolute)
+        self.size = (3 if self.prismatic else 2) * joints.n
+        self.register_buffer("center", vector(joints.center))
+        self.register_buffer("reach", vector(joints.reach))
+
+    def scaled(self, q: Tensor) -> Tensor:
+        """q in units of a joint's reach about its center, (..., n)."""
+        return (q - self.center) / self.reach
+
+    def forward(self, q: Tensor) -> Tensor:
+        """The encoding of q."""
+        parts = [q.cos(), q.sin()]
+        return torch.cat([*parts, self.scaled(q)] if self.prismatic else parts, dim=-1)
+
+    def jvp(self, encoded: Tensor, qd: Tensor) -> Tensor:
+        """How fast the encoding changes along qd."""
+        cos, sin = encoded.chunk(3 if self.prismatic else 2, dim=-1)[:2]
+        parts = [-sin * qd, cos * qd]
+        return torch.cat([*parts, qd / self.reach] if self.prismatic else parts, dim=-1)
+
+    def vjp(self, encoded: Tensor, cotangent: Tensor) -> Tensor:
+        """d/dq, (..., n), of what has the derivative ``cotangent`` by the encoding."""
+        parts = 3 if self.prismatic else 2
+        cos, sin = encoded.chunk(parts, dim=-1)[:2]
+        by_cos, by_sin, *by_scaled = cotangent.chunk(parts, dim=-1)
+        by_joint = by_sin * cos - by_cos * sin
+        return by_joint + by_scaled[0] / self.reach if self.prismatic else by_joint
+
+
+class NetworkInput(NamedTuple):
+    """The inputs of a network: sensitivity * (matrix @ encoded + offset), (..., inputs)."""
+
+    joints: tuple[int, ...]  # of each input
+    sensitivity: Tensor
+    matrix: Tensor  # (inputs, encoded)
+    offset: Tensor
+
+
+def joint_input(joints: Joints, chosen: Iterable[int], sensitivity: Sequence[float]) -> NetworkInput:
+    """cos q and sin q of revolute joints, the scaled q of prismatic ones, times a joint's sensitivity."""
+    n, encoded = joints.n, (2 if all(joints.revolute) else 3) * joints.n
+    chosen = list(chosen)
+    turning = [joint for joint in chosen if joints.revolute[joint]]
+    sliding = [joint for joint in chosen if not joints.revolute[joint]]
+    owners = (*turning, *turning, *sliding)
+    places = [*turning, *(n + joint for joint in turning), *(2 * n + joint for joint in sliding)]
+    matrix = torch.eye(encoded, dtype=torch.float64)[places]
+    return NetworkInput(owners, vector(sensitivity[j] for j in owners), matrix, 0 * matrix.sum(dim=1))
+
+
+def lie_group_input(joints: Joints, sensitivity: Sequence[float], axes: int = 0) -> NetworkInput:
+    """Of each joint the nine numbers of R in SO(3) or the three of r in R^3, times its sensitivity.
+
+    z is the joint's axis, so R = [[cos q, -sin q, 0], [sin q, cos q, 0], [0, 0, 1]]. Then, with
+    ``axes``, each joint's velocity along so many axes, of which the last is z.
+    """
+    n = joints.n
+    encoded = (2 if all(joints.revolute) else 3) * n
+    owners: list[int] = []
+    matrices, offsets = [], []
+    for joint, revolute in enumerate(joints.revolute):
+        size = 9 if revolute else 3
+        matrix, offset = torch.zeros(size, encoded + n * (axes > 0)), torch.zeros(size)
+        if revolute:
+            matrix[[0, 4], joint], offset[8] = 1.0, 1.0
+            matrix[1, n + joint], matrix[3, n + joint] = -1.0, 1.0
+        else:
+            matrix[2, 2 * n + joint] = 1.0
+        owners += [joint] * size
+        matrices.append(matrix)
+        offsets.append(offset)
+    weights = [sensitivity[joint] for joint in owners]
+    for joint in range(n if axes else 0):
+        matrix = torch.zeros(axes, encoded + n)
+        matrix[-1, encoded + joint] = 1.0
+        owners += [joint] * axes
+        weights += [1.0] * axes
+        matrices.append(matrix)
+        offsets.append(torch.zeros(axes))
+    return NetworkInput(
+        tuple(owners), vector(weights), torch.cat(matrices).double(), torch.cat(offsets).double()
+    )

@@ -1,0 +1,97 @@
+"""Friction of each joint by its own q_i and qd_i: viscous, a constant, and dry, a network."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from spelgen.runtime.encoding import JointEncoding
+from spelgen.runtime.joints import Joints, vector
+
+HIDDEN = 8  # units of a joint's network
+POSITION_SENSITIVITY = 0.1  # of friction's networks, relative to velocity
+SMOOTHING = 0.03  # below this fraction of its usual speed dry friction fades to zero, to start from
+LEAST_SMOOTHING = 0.001  # and at the least
+
+
+class FrictionLayers(NamedTuple):
+    """The weights made ready for many states, all joints' networks in one."""
+
+    weight: Tensor
+    bias: Tensor
+    out: Tensor
+    offset: Tensor
+    viscous: Tensor  # [Nm s/rad, N s/m]
+    smoothing: Tensor  # coulomb smoothing velocity squared [rad^2/s^2, m^2/s^2]
+
+
+class JointFriction(nn.Module):
+    """A diagonal D(q, qd), positive for all weights."""
+
+    matrix: Tensor  # where the inputs of a joint's network stand, (joints, inputs, encoded + 2 n)
+    speed: Tensor
+    nominal: Tensor
+
+    def __init__(self, joints: Joints, encoding: JointEncoding, generator: torch.Generator) -> None:
+        super().__init__()
+        n, inputs = joints.n, 4
+        matrix = torch.zeros(n, inputs, encoding.size + 2 * n, dtype=torch.float64)
+        for i, revolute in enumerate(joints.revolute):
+            cos, sin = (i, n + i) if revolute else (2 * n + i, 2 * n + i)
+            matrix[i, 0, cos] = matrix[i, 1, sin] = POSITION_SENSITIVITY
+            matrix[i, 2, i - 2 * n], matrix[i, 3, i - n] = 1 / joints.speed[i], 1.0
+        self.register_buffer("matrix", matrix)
+        self.register_buffer("speed", vector(joints.speed))
+        self.register_buffer("nominal", vector(joints.friction))
+        self.raw_smoothing = nn.Parameter(torch.zeros(n, dtype=torch.float64))
+        self.raw_viscous = nn.Parameter(torch.full((n,), -2.0, dtype=torch.float64))
+        shape = (n, inputs, HIDDEN)
+        weight = torch.randn(shape, dtype=torch.float64, generator=generator)
+        self.weight = nn.Parameter(weight / inputs**0.5)
+        self.bias = nn.Parameter(torch.zeros(n, HIDDEN, dtype=torch.float64))
+        self.out = nn.Parameter(torch.zeros(n, HIDDEN, dtype=torch.float64))
+        self.offset = nn.Parameter(torch.full((n,), -2.0, dtype=torch.float64))
+
+    def viscous(self) -> Tensor:
+        """Torque per velocity, (n,) [Nm s/rad, N s/m]."""
+        return self.nominal * F.softplus(self.raw_viscous) / self.speed
+
+    def coulomb_smoothing_velocity(self) -> Tensor:
+        """Where dry friction has turned around, (n,) [rad/s, m/s]."""
+        return self.speed * (LEAST_SMOOTHING**2 + (SMOOTHING * self.raw_smoothing.exp()) ** 2).sqrt()
+
+    def prepare(self) -> FrictionLayers:
+        """All joints' networks as one: block matrices are faster than a loop over joints.
+
+        Their tanh x is computed as 2 sigmoid(2 x) - 1, which takes a fraction of the time.
+        """
+        own = torch.eye(self.out.shape[0], dtype=self.out.dtype, device=self.out.device)
+        return FrictionLayers(
+            weight=2 * (self.weight.mT @ self.matrix).flatten(0, 1),
+            bias=2 * self.bias.flatten(),
+            out=2 * (own.unsqueeze(-1) * self.out).flatten(1),
+            offset=self.offset - self.out.sum(dim=1),
+            viscous=self.viscous(),
+            smoothing=self.coulomb_smoothing_velocity() ** 2,
+        )
+
+    def _dry(self, encoded: Tensor, qd: Tensor, direction: Tensor, layers: FrictionLayers) -> Tensor:
+        """Dry friction relative to its usual size, (..., n)."""
+        inputs = torch.cat([encoded, qd, direction], dim=-1)
+        hidden = torch.sigmoid(F.linear(inputs, layers.weight, layers.bias))
+        return F.softplus(F.linear(hidden, layers.out, layers.offset))
+
+    def forward(self, encoded: Tensor, qd: Tensor, layers: FrictionLayers) -> Tensor:
+        """The friction torque D qd, (..., n) [Nm, N]."""
+        direction = qd * torch.rsqrt(qd * qd + layers.smoothing)  # -1 or 1, smooth at standstill
+        dry = self._dry(encoded, qd, direction, layers)
+        return layers.viscous * qd + self.nominal * direction * dry
+
+    def dissipation(self, encoded: Tensor, qd: Tensor, layers: FrictionLayers) -> Tensor:
+        """D, (..., n, n) [Nm s/rad, N s/m], diagonal."""
+        smooth_speed = torch.sqrt(qd * qd + layers.smoothing)
+        dry = self._dry(encoded, qd, qd / smooth_speed, layers)
+        return torch.diag_embed(layers.viscous + self.nominal * dry / smooth_speed)

@@ -1,0 +1,129 @@
+"""A Kolmogorov-Arnold network whose outputs read their own joints only, with its derivatives written out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from spelgen.runtime.encoding import NetworkInput
+
+GRID = 4  # bumps on an edge
+SPACING = 2 / (GRID - 1)
+
+
+class KANLayers(NamedTuple):
+    """A network's weights made ready for many states; see ``MaskedKAN.prepare``."""
+
+    weights: tuple[Tensor, ...]
+    biases: tuple[Tensor, ...]
+
+
+class Bumps(NamedTuple):
+    """A layer's inputs as the grid sees them, (..., inputs, GRID)."""
+
+    place: Tensor  # distance from each grid point, in grid spacings
+    height: Tensor
+
+
+KANResiduals = tuple[tuple[Bumps, ...], tuple[Tensor, ...], KANLayers]
+
+
+class MaskedKAN(nn.Module):
+    """A Kolmogorov-Arnold network.
+
+    Each edge from an input to a unit has a learned function of its own: a sum of Gaussian bumps on
+    a grid over [-1, 1] (Li, arXiv 2405.06721, in place of the splines of Liu et al., arXiv
+    2404.19756). It starts nearly straight, with a random slope: few samples do not smooth what
+    starts wavy. tanh keeps what a layer hands on within the grid. ``layers`` names, unit by unit,
+    the joints that each layer's units may read; edges between others are masked, so that a unit
+    has no path to a joint it must not depend on. ``output_fraction`` scales what the last layer
+    gives, but for its biases.
+    """
+
+    matrix: Tensor
+    offset: Tensor
+    grid: Tensor
+
+    def __init__(
+        self,
+        inputs: NetworkInput,
+        layers: Sequence[Sequence[frozenset[int]]],
+        generator: torch.Generator,
+        output_fraction: float = 1.0,
+    ) -> None:
+        super().__init__()
+        grid = torch.linspace(-1, 1, GRID, dtype=torch.float64)
+        self.register_buffer("grid", grid / SPACING)
+        each = torch.eye(GRID, dtype=torch.float64)
+        # the bumps of -x are those of x in reverse
+        forth, back = inputs.matrix.clamp(min=0), (-inputs.matrix).clamp(min=0)
+        self.register_buffer("matrix", torch.kron(forth, each) + torch.kron(back, each.flip(0)))
+        still = 1 - inputs.matrix.abs().sum(dim=1, keepdim=True)
+        self.register_buffer("offset", (still * self._bumps(inputs.offset).height).flatten())
+        self.weights = nn.ParameterList()
+        self.biases = nn.ParameterList()
+        below = [frozenset((joint,)) for joint in inputs.joints]
+        for index, units in enumerate(layers):
+            allowed = [[[float(lower <= upper)] for lower in below] for upper in units]
+            mask = torch.tensor(allowed, dtype=torch.float64)
+            slope = torch.randn(mask.shape, dtype=torch.float64, generator=generator)
+            self.weights.append(nn.Parameter(slope * grid / mask.sum(dim=1, keepdim=True).sqrt()))
+            mask = mask * inputs.sensitivity.unsqueeze(-1) if index == 0 else mask
+            last = index == len(layers) - 1
+            self.register_buffer(f"mask{index}", mask * output_fraction if last else mask)
+            self.biases.append(nn.Parameter(torch.zeros(len(units), dtype=torch.float64)))
+            below = list(units)
+        nn.init.zeros_(self.weights[-1])  # so that the model starts at its nominal values
+
+    def set_output_bias(self, values: Tensor) -> None:
+        """Start the outputs from these values."""
+        self.biases[-1].data = values
+
+    def prepare(self, output_map: Tensor, offset: Tensor) -> KANLayers:
+        """The weights for the encoding as it is, and for offset + output_map y in place of y."""
+        weights = [(w * self.get_buffer(f"mask{i}")).flatten(1) for i, w in enumerate(self.weights)]
+        biases = list(self.biases)
+        biases[0] = biases[0] + weights[0] @ self.offset
+        weights[0] = weights[0] @ self.matrix
+        weights[-1], biases[-1] = output_map @ weights[-1], offset + output_map @ biases[-1]
+        return KANLayers(tuple(weights), tuple(biases))
+
+    def _bumps(self, value: Tensor) -> Bumps:
+        place = (value / SPACING).unsqueeze(-1) - self.grid
+        return Bumps(place, torch.exp(-place * place))
+
+    def forward(self, encoded: Tensor, layers: KANLayers) -> tuple[Tensor, KANResiduals]:
+        """offset + output_map y, (..., rows); and what ``vjp`` and ``jvp`` need."""
+        bumps, hidden = [self._bumps(encoded)], []
+        for weight, bias in zip(layers.weights[:-1], layers.biases, strict=False):
+            hidden.append(torch.tanh(F.linear(bumps[-1].height.flatten(-2), weight, bias)))
+            bumps.append(self._bumps(hidden[-1]))
+        y = F.linear(bumps[-1].height.flatten(-2), layers.weights[-1], layers.biases[-1])
+        return y, (tuple(bumps), tuple(hidden), layers)
+
+    def vjp(self, residuals: KANResiduals, cotangent: Tensor) -> Tensor:
+        """The reverse sweep: cotangent, (..., rows), times d/d encoded; (..., encoded)."""
+        bumps, hidden, layers = residuals
+        layer = self._bumps_vjp(bumps[-1], cotangent @ layers.weights[-1])
+        for index in reversed(range(len(hidden))):
+            layer = layer * (1 - hidden[index] * hidden[index])
+            layer = self._bumps_vjp(bumps[index], layer @ layers.weights[index])
+        return layer
+
+    def _bumps_vjp(self, bumps: Bumps, cotangent: Tensor) -> Tensor:
+        cotangent = cotangent.reshape(*cotangent.shape[:-1], *bumps.place.shape[-2:])
+        return (-2 / SPACING) * (bumps.place * bumps.height * cotangent).sum(dim=-1)
+
+    def jvp(self, residuals: KANResiduals, tangent: Tensor) -> Tensor:
+        """The forward sweep: d/d encoded times the encoding's tangent; (..., rows)."""
+        bumps, hidden, layers = residuals
+        for index, weight in enumerate(layers.weights):
+            slopes = bumps[index].place * bumps[index].height
+            tangent = F.linear((-2 / SPACING) * (slopes * tangent.unsqueeze(-1)).flatten(-2), weight)
+            if index < len(hidden):
+                tangent = tangent * (1 - hidden[index] * hidden[index])
+        return tangent

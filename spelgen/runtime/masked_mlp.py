@@ -1,0 +1,110 @@
+"""A tanh network whose outputs read their own joints only, with its derivatives written out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from spelgen.runtime.encoding import NetworkInput
+
+
+class MLPLayers(NamedTuple):
+    """A network's weights made ready for many states; see ``MaskedMLP.prepare``."""
+
+    weights: tuple[Tensor, ...]
+    biases: tuple[Tensor, ...]
+
+
+MLPResiduals = tuple[tuple[Tensor, ...], MLPLayers]
+
+
+def sigmoid_vjp(cotangent: Tensor, value: Tensor) -> Tensor:
+    """cotangent * value (1 - value), the sigmoid's derivative, in one pass over memory."""
+    changed: Tensor = torch.ops.aten.sigmoid_backward(cotangent, value)
+    return changed
+
+
+class MaskedMLP(nn.Module):
+    """A tanh network.
+
+    ``layers`` names, unit by unit, the joints that each layer's units may read; weights between
+    others are masked, so that a unit has no path to a joint it must not depend on.
+    ``output_fraction`` scales what the last layer gives, but for its biases.
+    """
+
+    matrix: Tensor
+    offset: Tensor
+
+    def __init__(
+        self,
+        inputs: NetworkInput,
+        layers: Sequence[Sequence[frozenset[int]]],
+        generator: torch.Generator,
+        output_fraction: float = 1.0,
+    ) -> None:
+        super().__init__()
+        self.register_buffer("matrix", inputs.matrix)
+        self.register_buffer("offset", inputs.offset)
+        self.weights = nn.ParameterList()
+        self.biases = nn.ParameterList()
+        below = [frozenset((joint,)) for joint in inputs.joints]
+        for index, units in enumerate(layers):
+            allowed = [[float(lower <= upper) for lower in below] for upper in units]
+            mask = torch.tensor(allowed, dtype=torch.float64)
+            weight = torch.randn(mask.shape, dtype=torch.float64, generator=generator)
+            self.weights.append(nn.Parameter(weight / mask.sum(dim=1, keepdim=True).sqrt()))
+            mask = mask * inputs.sensitivity if index == 0 else mask
+            last = index == len(layers) - 1
+            self.register_buffer(f"mask{index}", mask * output_fraction if last else mask)
+            self.biases.append(nn.Parameter(torch.zeros(len(units), dtype=torch.float64)))
+            below = list(units)
+        nn.init.zeros_(self.weights[-1])  # so that the model starts at its nominal values
+
+    def set_output_bias(self, values: Tensor) -> None:
+        """Start the outputs from these values."""
+        self.biases[-1].data = values
+
+    def prepare(self, output_map: Tensor, offset: Tensor) -> MLPLayers:
+        """The weights for the encoding as it is, and for offset + output_map y in place of y.
+
+        tanh x is computed as 2 sigmoid(2 x) - 1, which takes a fraction of the time.
+        """
+        weights, biases = [], []
+        for index, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            weight = weight * self.get_buffer(f"mask{index}")
+            if index == 0:
+                bias, weight = bias + weight @ self.offset, weight @ self.matrix
+            else:
+                bias, weight = bias - weight.sum(dim=1), 2 * weight
+            weights.append(2 * weight)
+            biases.append(2 * bias)
+        weights[-1] = 0.5 * output_map @ weights[-1]
+        biases[-1] = offset + 0.5 * output_map @ biases[-1]
+        return MLPLayers(tuple(weights), tuple(biases))
+
+    def forward(self, encoded: Tensor, layers: MLPLayers) -> tuple[Tensor, MLPResiduals]:
+        """offset + output_map y, (..., rows); and what ``vjp`` and ``jvp`` need."""
+        layer, hidden = encoded, []
+        for weight, bias in zip(layers.weights[:-1], layers.biases, strict=False):
+            layer = torch.sigmoid(F.linear(layer, weight, bias))
+            hidden.append(layer)
+        return F.linear(layer, layers.weights[-1], layers.biases[-1]), (tuple(hidden), layers)
+
+    def vjp(self, residuals: MLPResiduals, cotangent: Tensor) -> Tensor:
+        """The reverse sweep: cotangent, (..., rows), times d/d encoded; (..., encoded)."""
+        hidden, layers = residuals
+        layer = cotangent @ layers.weights[-1]
+        for weight, value in zip(reversed(layers.weights[:-1]), reversed(hidden), strict=True):
+            layer = sigmoid_vjp(layer, value) @ weight
+        return layer
+
+    def jvp(self, residuals: MLPResiduals, tangent: Tensor) -> Tensor:
+        """The forward sweep: d/d encoded times the encoding's tangent; (..., rows)."""
+        hidden, layers = residuals
+        for weight, value in zip(layers.weights[:-1], hidden, strict=True):
+            tangent = sigmoid_vjp(F.linear(tangent, weight), value)
+        return F.linear(tangent, layers.weights[-1])

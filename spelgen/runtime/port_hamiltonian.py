@@ -1,0 +1,158 @@
+"""The equations of motion of an arm, whatever its energies and friction are made of."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+
+def solved(matrix: Tensor, right: Tensor) -> Tensor:
+    """matrix^-1 right, (..., n)."""
+    # its derivative costs one more solution; a Cholesky factor's would cost several times that
+    solution: Tensor = torch.linalg.solve(matrix, right.unsqueeze(-1))
+    return solution.squeeze(-1)
+
+
+def applied(matrix: Tensor, vector: Tensor) -> Tensor:
+    """matrix vector, (..., n)."""
+    return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
+
+
+State = tuple[Tensor, Tensor]  # q and p, or how fast they change
+
+
+class PortHamiltonian(nn.Module):
+    """q' = dH/dp and p' = -dH/dq - D dH/dp + G tau, with H = 1/2 p^T M(q)^-1 p + V(q).
+
+    The port-Hamiltonian form (van der Schaft and Jeltsema, Port-Hamiltonian Systems Theory, 2014).
+    ``prepared`` is what ``prepare`` gave: all that depends on the weights alone. ``at`` is what
+    ``configuration`` gave: all that is computed of q alone. Shapes: q, qd, tau, p are (..., n).
+    """
+
+    n: int
+
+    def prepare(self) -> Any:
+        """All that depends on the weights alone; holds until they change."""
+        raise NotImplementedError
+
+    def configuration(self, q: Tensor, prepared: Any) -> Any:
+        """All that is computed of q alone."""
+        raise NotImplementedError
+
+    def mass_at(self, at: Any, prepared: Any) -> tuple[Tensor, Any]:
+        """M(q), (..., n, n), and what its derivatives need."""
+        raise NotImplementedError
+
+    def energy_at(self, at: Any, prepared: Any) -> Tensor:
+        """V(q), (...) [J]."""
+        raise NotImplementedError
+
+    def gravity_at(self, at: Any, prepared: Any) -> Tensor:
+        """dV/dq, (..., n) [Nm, N]."""
+        raise NotImplementedError
+
+    def lagrangian_gradient(self, at: Any, qd: Tensor, residuals: Any, prepared: Any) -> Tensor:
+        """d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
+        raise NotImplementedError
+
+    def nonlinear_at(self, at: Any, qd: Tensor, residuals: Any, prepared: Any) -> Tensor:
+        """The torque that holds qd steady without friction: Coriolis, centrifugal and gravity."""
+        raise NotImplementedError
+
+    def friction_at(self, at: Any, qd: Tensor, prepared: Any) -> Tensor:
+        """D(q, qd) qd, (..., n) [Nm, N]."""
+        raise NotImplementedError
+
+    def dissipation_at(self, at: Any, qd: Tensor, prepared: Any) -> Tensor:
+        """D(q, qd), (..., n, n)."""
+        raise NotImplementedError
+
+    def input_at(self, at: Any, prepared: Any) -> Tensor:
+        """G, (..., n, n)."""
+        raise NotImplementedError
+
+    def input_force(self, at: Any, tau: Tensor, prepared: Any) -> Tensor:
+        """G tau, (..., n) [Nm, N]."""
+        raise NotImplementedError
+
+    def input_torque(self, at: Any, force: Tensor, prepared: Any) -> Tensor:
+        """The tau, (..., n), that makes this force."""
+        raise NotImplementedError
+
+    def mass_matrix(self, q: Tensor, prepared: Any = None) -> Tensor:
+        """M(q), (..., n, n)."""
+        prepared = self.prepare() if prepared is None else prepared
+        return self.mass_at(self.configuration(q, prepared), prepared)[0]
+
+    def potential_energy(self, q: Tensor) -> Tensor:
+        """V(q), (...) [J]."""
+        prepared = self.prepare()
+        return self.energy_at(self.configuration(q, prepared), prepared)
+
+    def gravity(self, q: Tensor) -> Tensor:
+        """dV/dq, (..., n) [Nm, N]."""
+        prepared = self.prepare()
+        return self.gravity_at(self.configuration(q, prepared), prepared)
+
+    def nonlinear_effects(self, q: Tensor, qd: Tensor) -> Tensor:
+        """Coriolis, centrifugal and gravity torque, (..., n) [Nm, N]."""
+        prepared = self.prepare()
+        at = self.configuration(q, prepared)
+        return self.nonlinear_at(at, qd, self.mass_at(at, prepared)[1], prepared)
+
+    def friction_torque(self, q: Tensor, qd: Tensor) -> Tensor:
+        """D(q, qd) qd, (..., n) [Nm, N]."""
+        prepared = self.prepare()
+        return self.friction_at(self.configuration(q, prepared), qd, prepared)
+
+    def dissipation(self, q: Tensor, qd: Tensor) -> Tensor:
+        """D(q, qd), (..., n, n) [Nm s/rad, N s/m]."""
+        prepared = self.prepare()
+        return self.dissipation_at(self.configuration(q, prepared), qd, prepared)
+
+    def input_matrix(self, q: Tensor) -> Tensor:
+        """G(q), (..., n, n)."""
+        prepared = self.prepare()
+        return self.input_at(self.configuration(q, prepared), prepared)
+
+    def hamiltonian(self, q: Tensor, p: Tensor) -> Tensor:
+        """H, (...) [J]."""
+        prepared = self.prepare()
+        at = self.configuration(q, prepared)
+        qd = solved(self.mass_at(at, prepared)[0], p)
+        return 0.5 * (p * qd).sum(dim=-1) + self.energy_at(at, prepared)
+
+    def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
+        """qdd, (..., n), under the input tau."""
+        prepared = self.prepare()
+        at = self.configuration(q, prepared)
+        mass, residuals = self.mass_at(at, prepared)
+        force = self.input_force(at, tau, prepared)
+        force = force - self.nonlinear_at(at, qd, residuals, prepared)
+        return solved(mass, force - self.friction_at(at, qd, prepared))
+
+    def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
+        """The torque, (..., n), that gives qdd."""
+        prepared = self.prepare()
+        at = self.configuration(q, prepared)
+        mass, residuals = self.mass_at(at, prepared)
+        force = applied(mass, qdd) + self.nonlinear_at(at, qd, residuals, prepared)
+        return self.input_torque(at, force + self.friction_at(at, qd, prepared), prepared)
+
+    def port_hamiltonian_rhs(self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Any) -> State:
+        """q' and p', (..., n), under the input tau; without one, of the arm left to itself."""
+        at = self.configuration(q, prepared)
+        mass, residuals = self.mass_at(at, prepared)
+        qd = solved(mass, p)
+        force = self.lagrangian_gradient(at, qd, residuals, prepared)
+        force = force - self.friction_at(at, qd, prepared)
+        return qd, force if tau is None else force + self.input_force(at, tau, prepared)
+
+    def state_rate(self, state: Tensor) -> Tensor:
+        """The rate of (q, p), (..., 2 n), or of (q, p, tau), (..., 3 n), where tau is held."""
+        n = self.n
+        q, p, tau = state.tensor_split((n, 2 * n), dim=-1)
+        qd, force = self.port_hamiltonian_rhs(q, p, tau if tau.shape[-1] else None, self.prepare())
+        return torch.cat([qd, force, torch.zeros_like(tau)], dim=-1)

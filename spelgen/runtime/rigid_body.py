@@ -1,0 +1,122 @@
+"""Rigid bodies: their geometry, and inertial parameters that some distribution of mass has."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from spelgen.runtime.joints import vector
+
+Row = tuple[float, float, float]
+
+
+class Bodies(NamedTuple):
+    """All that moves rigidly with a joint, an entry for each; a body turns about its frame's z, or
+    slides along it, by ratio * q + offset.
+    """
+
+    parent: tuple[int, ...]  # -1: the base
+    joint: tuple[int, ...]
+    revolute: tuple[bool, ...]
+    ratio: tuple[float, ...]
+    offset: tuple[float, ...]
+    rotation: tuple[tuple[Row, Row, Row], ...]  # of the joint's frame in its parent's
+    position: tuple[Row, ...]  # likewise [m]
+    mass: tuple[float, ...]  # nominal m [kg]
+    moment: tuple[Row, ...]  # nominal m c [kg m]
+    inertia: tuple[Row, ...]  # nominal Ixx, Iyy, Izz about the joint [kg m^2]
+    products: tuple[Row, ...]  # likewise Ixy, Ixz, Iyz
+
+
+def skew(a: Tensor) -> Tensor:
+    """[a]x, (..., 3, 3), with [a]x b = a x b."""
+    x, y, z = a.unbind(dim=-1)
+    zero = torch.zeros_like(x)
+    rows = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1)
+    return rows.reshape(*a.shape[:-1], 3, 3)
+
+
+def twist_map(rotation: Tensor, position: Tensor) -> Tensor:
+    """Takes twists (angular, linear) to a frame at ``position`` turned by ``rotation``^T, (6, 6)."""
+    top = torch.cat([rotation, torch.zeros_like(rotation)], dim=1)
+    return torch.cat([top, torch.cat([-rotation @ skew(position), rotation], dim=1)])
+
+
+def transform_table(bodies: Bodies, index: int) -> Tensor:
+    """A body's twist map from the parent is table[0] + cos table[1] + sin table[2] + slide table[3]."""
+    rotation = torch.stack([vector(row) for row in bodies.rotation[index]]).mT
+    position = vector(bodies.position[index])
+    table = torch.zeros(4, 6, 6, dtype=torch.float64)
+    if bodies.revolute[index]:
+        about = torch.zeros(3, 3, 3, dtype=torch.float64)
+        about[0, 2, 2] = about[1, 0, 0] = about[1, 1, 1] = about[2, 0, 1] = 1
+        about[2, 1, 0] = -1
+        for term in range(3):
+            table[term] = twist_map(about[term] @ rotation, position)
+    else:
+        table[0] = twist_map(rotation, position)
+        table[3] = twist_map(rotation, position + rotation[2]) - table[0]
+    return table
+
+
+def inertia_basis() -> Tensor:
+    """Spatial inertias of bodies with one parameter one and the others zero, (10, 6, 6)."""
+    basis = torch.zeros(10, 6, 6, dtype=torch.float64)
+    basis[0, 3:, 3:] = torch.eye(3)
+    for axis, unit in enumerate(torch.eye(3, dtype=torch.float64)):
+        basis[1 + axis, :3, 3:], basis[1 + axis, 3:, :3] = skew(unit), -skew(unit)
+    for place, (row, column) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))):
+        basis[4 + place, row, column] = basis[4 + place, column, row] = 1
+    return basis
+
+
+def pseudo_inertia(ten: Tensor) -> Tensor:
+    """[[tr(I)/2 - I, m c], [(m c)^T, m]], (..., 4, 4), of (m, m c, I), (..., 10).
+
+    It is positive definite exactly where some distribution of mass has these parameters (Wensing,
+    Kim and Slotine, IEEE RA-L 3:60, 2018).
+    """
+    m, x, y, z, xx, xy, xz, yy, yz, zz = ten.unbind(dim=-1)
+    half = (xx + yy + zz) / 2
+    rows = [half - xx, -xy, -xz, x, -xy, half - yy, -yz, y, -xz, -yz, half - zz, z, x, y, z, m]
+    return torch.stack(rows, dim=-1).reshape(*ten.shape[:-1], 4, 4)
+
+
+class InertialParameters(nn.Module):
+    """Trained inertial parameters of rigid bodies, possible ones for all weights; zero is nominal.
+
+    A body's pseudo-inertia is C T T^T C^T, with C of the nominal body and T lower triangular, its
+    diagonal exponentials (Rucker and Wensing, IEEE RA-L 7:4352, 2022).
+    """
+
+    factors: Tensor
+    triangle: Tensor
+
+    def __init__(self, bodies: Bodies) -> None:
+        super().__init__()
+        columns = zip(bodies.mass, bodies.moment, bodies.inertia, bodies.products, strict=True)
+        nominal = torch.stack(
+            [
+                vector((m, *moment, xx, xy, xz, yy, yz, zz))
+                for m, moment, (xx, yy, zz), (xy, xz, yz) in columns
+            ]
+        )
+        self.register_buffer("factors", torch.linalg.cholesky(pseudo_inertia(nominal)))
+        row, column = torch.tril_indices(4, 4)
+        self.register_buffer("triangle", torch.eye(16, dtype=torch.float64)[4 * row + column])
+        self.raw = nn.Parameter(torch.zeros(len(bodies.mass), 10, dtype=torch.float64))
+
+    def forward(self) -> Tensor:
+        """By body (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) about its joint's frame, (bodies, 10)."""
+        on_diagonal = self.triangle[:, ::5].sum(dim=1) > 0
+        lower = torch.where(on_diagonal, self.raw.exp(), self.raw) @ self.triangle
+        root = self.factors @ lower.reshape(-1, 4, 4)
+        pseudo = root @ root.mT
+        moments, tensor = pseudo[:, 3, :3], -pseudo[:, :3, :3]
+        trace = -tensor.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
+        xx, yy, zz = (trace.unsqueeze(-1) + tensor.diagonal(dim1=-2, dim2=-1)).unbind(dim=-1)
+        xy, xz, yz = tensor[:, 0, 1], tensor[:, 0, 2], tensor[:, 1, 2]
+        six = torch.stack([xx, xy, xz, yy, yz, zz], dim=-1)
+        return torch.cat([pseudo[:, 3, 3:], moments, six], dim=-1)
