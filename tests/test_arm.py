@@ -18,7 +18,7 @@ from spelgen.arm.rational import (
     product,
     rotation_about,
     rotation_from_rpy,
-    snapped_angle,
+    rounded_angle,
     transposed,
 )
 from spelgen.errors import ArmError
@@ -224,8 +224,8 @@ class TestSnapping:
         ],
     )
     def test_angles(self, angle, meant):
-        assert snapped_angle(angle, 2e-3) == meant
-        assert snapped_angle(angle, 0.0) == angle
+        assert rounded_angle(angle, 2e-3) == meant
+        assert rounded_angle(angle, 0.0) == angle
 
     def test_everything_snapped_is_said_once_per_joint(self, robot):
         rounded = joint("a", "0", "1", xyz="1e-12 0 0.3", rpy="1.5708 0 -3.1416", axis="0.0001 0 1")

@@ -1,4 +1,4 @@
-"""The file's origins and axes, snapped where they mean a special value, and what to tell about it."""
+"""The file's origins and axes, rounded where they mean a special value, and what to tell about it."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from math import pi
 
 import numpy as np
 
-from spelgen.arm.rational import Tensor, Vector, exact, rotation_from_rpy, snapped_angle, tamed
+from spelgen.arm.rational import Tensor, Vector, bounded, exact, rotation_from_rpy, rounded_angle
 from spelgen.errors import Diagnostic
 from spelgen.urdf.robot import Inertial, Joint, Link
 
 OFFSET_NOISE = 1e-9
 AXIS_NOISE = 1e-3
-# of a product of inertia, as a share of the largest moment: what rounding in CAD programs leaves
+# of a product of inertia, as a fraction of the largest moment: what rounding in CAD programs leaves
 TENSOR_NOISE = 1e-12
 _TOLD = 1e-9
 
 
 @dataclass(frozen=True)
-class Snapper:
+class AngleRounding:
     """Reads special values out of rounded ones: angles within ``tolerance`` [rad], offsets, axes, tensors.
 
     A tolerance of 0 switches all of it off. What changed is gathered in ``diagnostics``, once per origin or
@@ -67,12 +67,12 @@ class Snapper:
 
     def angle(self, angle: float) -> float:
         """An angle [rad] that no diagnostic is worth: a constant offset of a mimic joint."""
-        return snapped_angle(angle, self.tolerance)
+        return rounded_angle(angle, self.tolerance)
 
     def position(self, vector: Vector) -> Vector:
         """A composed position [m] without the noise that rounded rotations leave in it."""
         noise = OFFSET_NOISE if self.tolerance else 0.0
-        x, y, z = (tamed(value) if abs(value) >= noise else Fraction(0) for value in vector)
+        x, y, z = (bounded(value) if abs(value) >= noise else Fraction(0) for value in vector)
         return x, y, z
 
     def _offset(self, offset: Sequence[float], where: str, line: int) -> Vector:
@@ -86,22 +86,22 @@ class Snapper:
     def _rotation(self, rpy: Sequence[float], where: str, line: int) -> np.ndarray | None:
         if not any(rpy):
             return None
-        snapped = [snapped_angle(angle, self.tolerance) for angle in rpy]
+        rounded = [rounded_angle(angle, self.tolerance) for angle in rpy]
         told = [
             f"{before:.10g} is taken as {_in_pi(after)}"
-            for before, after in zip(rpy, snapped, strict=True)
+            for before, after in zip(rpy, rounded, strict=True)
             if abs(after - before) > _TOLD
         ]
         if told:
             self._tell("snapped-angle", where, line, "; ".join(told))
-        return rotation_from_rpy(snapped) if any(snapped) else None
+        return rotation_from_rpy(rounded) if any(rounded) else None
 
     def _tell(self, code: str, where: str, line: int, message: str) -> None:
         self.diagnostics.append(Diagnostic("info", code, where, line, message))
 
 
 def _in_pi(angle: float) -> str:
-    """An angle as a multiple of pi, which a snapped one is: "-3 pi/4"."""
+    """An angle as a multiple of pi, which a rounded one is: "-3 pi/4"."""
     turns = Fraction(angle / pi).limit_denominator(120)
     if turns == 0:
         return "0"

@@ -9,7 +9,7 @@ from math import pi
 from typing import Literal
 
 from spelgen.arm.chain import Chain, choose_chain, follows
-from spelgen.arm.lump_links import Moved, walk
+from spelgen.arm.lump_links import Moved, lump_links
 from spelgen.arm.placement import TenVector
 from spelgen.arm.rational import Matrix, Vector, exact
 from spelgen.errors import ArmError, Diagnostic
@@ -93,24 +93,24 @@ def make_arm(
 
     All other joints are locked at 0.
 
-    ``angle_tolerance`` [rad] is how far an angle may be from a multiple of pi/2 to be taken as one; 0 believes
-    the file in everything. Raises ``ArmError``.
+    ``angle_tolerance`` [rad] is how far an angle may be from a multiple of pi/2 to be taken as one; 0 takes
+    the file as it stands. Raises ``ArmError``.
     """
     if not 0 <= angle_tolerance < pi / 4:
         got = f"an angle tolerance of {angle_tolerance:g} rad"
         raise ArmError(got, expected="at least 0 and less than pi/4 (0.785)")
     chain = choose_chain(robot, joints, tip)
     _require_small(robot, chain)
-    walked = walk(robot, chain, angle_tolerance)
+    lumped = lump_links(robot, chain, angle_tolerance)
     indices = {joint.name: index for index, joint in enumerate(chain.joints)}
-    held = {joint.name for joint in walked.held if joint.type != "fixed"}
+    held = {joint.name for joint in lumped.held if joint.type != "fixed"}
     x, y, z = (exact(float(value)) for value in gravity)
     return Arm(
         name=robot.name,
         coordinates=tuple(_coordinate(joint) for joint in chain.joints),
-        bodies=tuple(_body(each, indices[each.followed.leader.name]) for each in walked.moved),
+        bodies=tuple(_body(each, indices[each.followed.leader.name]) for each in lumped.moved),
         gravity=(x, y, z),
-        diagnostics=walked.diagnostics,
+        diagnostics=lumped.diagnostics,
         locked=tuple(joint.name for joint in robot.joints if joint.name in held),
     )
 

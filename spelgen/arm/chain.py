@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
-from spelgen.arm.rational import exact, tamed
+from spelgen.arm.rational import bounded, exact
 from spelgen.errors import ArmError, Diagnostic, Severity, suggestion
 from spelgen.urdf.robot import Joint, Robot
 
@@ -66,7 +66,7 @@ def follows(robot: Robot) -> dict[str, Follow]:
         for name, mimic in reversed(waiting):
             multiplier = exact(mimic.multiplier)
             offset = multiplier * followed.offset + exact(mimic.offset)
-            followed = Follow(followed.leader, tamed(multiplier * followed.multiplier), tamed(offset))
+            followed = Follow(followed.leader, bounded(multiplier * followed.multiplier), bounded(offset))
             found[name] = followed
     return found
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spelgen.arm.angle_rounding import Snapper
+from spelgen.arm.angle_rounding import AngleRounding
 from spelgen.arm.chain import Chain, Follow, follows
 from spelgen.arm.placement import Placement, Pose, TenVector
-from spelgen.arm.rational import rotation_from_rpy, tamed
+from spelgen.arm.rational import bounded, rotation_from_rpy
 from spelgen.errors import Diagnostic
 from spelgen.urdf.robot import Joint, Link, Robot
 
@@ -30,7 +30,7 @@ class Moved:
 
 
 @dataclass(frozen=True)
-class Walk:
+class LumpedLinks:
     """All joints: those that move, the chain's first, and those held still, fixed ones included."""
 
     moved: tuple[Moved, ...]
@@ -38,10 +38,10 @@ class Walk:
     diagnostics: tuple[Diagnostic, ...]
 
 
-def walk(robot: Robot, chain: Chain, angle_tolerance: float) -> Walk:
+def lump_links(robot: Robot, chain: Chain, angle_tolerance: float) -> LumpedLinks:
     """Return the robot with the chain's joints and their followers moving, and all others held."""
-    snapper = Snapper(angle_tolerance)
-    placement = Placement(robot.root, snapper)
+    rounding = AngleRounding(angle_tolerance)
+    placement = Placement(robot.root, rounding)
     following = follows(robot)
     leaders = {joint.name for joint in chain.joints}
     poses: list[tuple[Joint, Pose]] = []
@@ -59,13 +59,13 @@ def walk(robot: Robot, chain: Chain, angle_tolerance: float) -> Walk:
     )
     told = [
         *chain.diagnostics,
-        *snapper.diagnostics,
+        *rounding.diagnostics,
         *_tell_folded(moved),
         *_tell_lumped(moved),
         *_tell_locked(following, held),
         *_tell_dependent(placement, moved, held),
     ]
-    return Walk(moved, tuple(held), tuple(sorted(told, key=lambda each: each.line or 0)))
+    return LumpedLinks(moved, tuple(held), tuple(sorted(told, key=lambda each: each.line or 0)))
 
 
 def _chain_first(robot: Robot, chain: Chain) -> list[Joint]:
@@ -91,7 +91,7 @@ def _total(placement: Placement, links: Sequence[Link]) -> TenVector | None:
     for link in links:
         if link.inertial is not None:
             ten = placement.inertia(link, link.inertial)
-            total = ten if total is None else tuple(tamed(a + b) for a, b in zip(total, ten, strict=True))
+            total = ten if total is None else tuple(bounded(a + b) for a, b in zip(total, ten, strict=True))
     return total
 
 

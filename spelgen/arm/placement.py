@@ -13,7 +13,7 @@ from math import inf
 
 import numpy as np
 
-from spelgen.arm.angle_rounding import Snapper
+from spelgen.arm.angle_rounding import AngleRounding
 from spelgen.arm.rational import (
     IDENTITY,
     ZERO,
@@ -70,11 +70,11 @@ class Pose:
 
 
 class Placement:
-    """Walks from the root outwards: every joint is either held, or starts a body of its own."""
+    """From the root outwards: every joint is either held, or starts a body of its own."""
 
-    def __init__(self, root: str, snapper: Snapper) -> None:
+    def __init__(self, root: str, rounding: AngleRounding) -> None:
         self.frames = {root: Frame(-1, np.eye(3), IDENTITY, ZERO)}
-        self._snapper = snapper
+        self._rounding = rounding
         # by body, the frames from the last revolute body above it, or itself, to its own
         self._stretches: list[tuple[_Turned, ...]] = [(_STRAIGHT,)]
 
@@ -82,12 +82,12 @@ class Placement:
         """Place the child of a joint that stays at ``value`` [rad or m]."""
         at = self._joint_origin(joint)
         if value and joint.type == "prismatic":
-            axis = self._snapper.axis(joint)
+            axis = self._rounding.axis(joint)
             x, y, z = (exact(float(component)) * exact(value) for component in axis)
-            shifted = self._snapper.position(summed(at.position, rotated(at.rotation, (x, y, z))))
+            shifted = self._rounding.position(summed(at.position, rotated(at.rotation, (x, y, z))))
             at = Frame(at.body, at.composed, at.rotation, shifted)
         elif value:
-            turn = rotation_about(self._snapper.axis(joint), self._snapper.angle(value))
+            turn = rotation_about(self._rounding.axis(joint), self._rounding.angle(value))
             composed = at.composed @ turn
             at = Frame(at.body, composed, self._in_body(at.body, composed), at.position)
         self.frames[joint.child] = at
@@ -95,7 +95,7 @@ class Placement:
     def move(self, joint: Joint) -> Pose:
         """Place a moving joint and its child, which start a body; bodies are numbered by order of calls."""
         at = self._joint_origin(joint)
-        turned = alignment(self._snapper.axis(joint))
+        turned = alignment(self._rounding.axis(joint))
         along = at.composed @ turned
         rotation = self._in_body(at.body, along)
         slides = joint.type == "prismatic"
@@ -110,11 +110,11 @@ class Placement:
     def inertia(self, link: Link, inertial: Inertial) -> TenVector:
         """The link's (m, m c, I) about its body's origin, in the body's frame (parallel-axis theorem)."""
         frame = self.frames[link.name]
-        offset, turn = self._snapper.inertial_origin(link, inertial)
+        offset, turn = self._rounding.inertial_origin(link, inertial)
         rotation = frame.rotation if turn is None else self._in_body(frame.body, frame.composed @ turn)
-        x, y, z = self._snapper.position(summed(frame.position, rotated(frame.rotation, offset)))
+        x, y, z = self._rounding.position(summed(frame.position, rotated(frame.rotation, offset)))
         mass = exact(inertial.mass)
-        xx, xy, xz, yy, yz, zz = rotated_tensor(rotation, self._snapper.tensor(link, inertial))
+        xx, xy, xz, yy, yz, zz = rotated_tensor(rotation, self._rounding.tensor(link, inertial))
         return (
             mass,
             mass * x,
@@ -130,8 +130,8 @@ class Placement:
 
     def _joint_origin(self, joint: Joint) -> Frame:
         frame = self.frames[joint.parent]
-        offset, turn = self._snapper.joint_origin(joint)
-        position = self._snapper.position(summed(frame.position, rotated(frame.rotation, offset)))
+        offset, turn = self._rounding.joint_origin(joint)
+        position = self._rounding.position(summed(frame.position, rotated(frame.rotation, offset)))
         if turn is None:
             return Frame(frame.body, frame.composed, frame.rotation, position)
         composed = frame.composed @ turn
@@ -142,8 +142,8 @@ class Placement:
 
         An offset of (0.1, 0.1, 0) goes exactly along an axis of 45 degrees, but not along a rational one.
         """
-        own = self._snapper.position(rotated(transposed(rotation), position))
-        moved = self._snapper.position(rotated(rotation, own))
+        own = self._rounding.position(rotated(transposed(rotation), position))
+        moved = self._rounding.position(rotated(rotation, own))
         return moved if rotated(transposed(rotation), moved) == own else position
 
     def _in_body(self, body: int, composed: np.ndarray) -> Matrix:

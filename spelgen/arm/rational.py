@@ -39,7 +39,7 @@ def exact(value: float) -> Fraction:
     return Fraction(repr(value))
 
 
-def tamed(value: Fraction) -> Fraction:
+def bounded(value: Fraction) -> Fraction:
     """The number itself, or the nearest float to one of thousands of digits.
 
     Such a number is no exact value but the trace of dozens of rounded rotations in a row; kept, it would make
@@ -48,10 +48,10 @@ def tamed(value: Fraction) -> Fraction:
     return value if value.denominator.bit_length() <= _MAX_BITS else Fraction(float(value))
 
 
-def snapped_angle(angle: float, tolerance: float) -> float:
+def rounded_angle(angle: float, tolerance: float) -> float:
     """The multiple of pi/2 within ``tolerance`` [rad], else of pi/12, pi/8, pi/5 within 2e-5, else itself.
 
-    A tolerance of 0 believes every angle as it is written.
+    A tolerance of 0 takes every angle as it is written.
     """
     if tolerance == 0.0:
         return angle

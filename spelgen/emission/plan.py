@@ -85,7 +85,7 @@ def plan_model(
         ),
         potential=everything if design.potential == "dense" else structure.potential,
         potential_scale=sizes.potential_scale,
-        margin=float(f"{max(_MARGIN * sizes.least_share, 1e-4):.0e}"),
+        margin=float(f"{max(_MARGIN * sizes.least_eigenvalue, 1e-4):.0e}"),
         started_from_urdf=sizes.from_urdf,
         fourier=tuple((wave.turns, wave.powers) for wave in waves.waves),
         potential_series=waves.potential.terms if waves.potential and structure.potential else None,
@@ -113,8 +113,8 @@ def _joint(
         friction=float(f"{_friction(coordinate, sizes, index):.3g}"),
         armature=float(f"{drive.rotor_inertia * drive.gear**2 or guessed_armature(coordinate):.3g}"),
         gear=drive.gear,
-        mass_sensitivity=sizes.mass_shares[index],
-        potential_sensitivity=sizes.potential_shares[index],
+        mass_sensitivity=sizes.mass_sensitivities[index],
+        potential_sensitivity=sizes.potential_sensitivities[index],
         actuated=not coordinate.passive,
     )
 

@@ -108,14 +108,14 @@ def _by_reason(
 def _equalities(axes: Axes | None, structure: Structure) -> Iterator[Fact]:
     """Entries that are equal, or opposite, at every configuration: the smallest form writes them alike."""
     terms: tuple[Output | Constant, ...] = (*structure.outputs, *structure.constants)
-    shares: dict[tuple[int, int], dict[int, Fraction]] = {}
+    factors: dict[tuple[int, int], dict[int, Fraction]] = {}
     for number, term in enumerate(terms):
         for row, column, factor in term.basis:
-            shares.setdefault((row, column), {})[number] = factor
+            factors.setdefault((row, column), {})[number] = factor
     groups: dict[tuple[tuple[int, Fraction], ...], list[tuple[Fraction, tuple[int, int]]]] = {}
-    for place, share in sorted(shares.items()):
-        sign = Fraction(1 if share[min(share)] > 0 else -1)
-        groups.setdefault(tuple(sorted((k, sign * x) for k, x in share.items())), []).append((sign, place))
+    for place, of_entry in sorted(factors.items()):
+        sign = Fraction(1 if of_entry[min(of_entry)] > 0 else -1)
+        groups.setdefault(tuple(sorted((k, sign * x) for k, x in of_entry.items())), []).append((sign, place))
     for group in groups.values():
         if len(group) > 1:
             first = group[0][0]

@@ -141,7 +141,7 @@ def _formula(work: _Work, shortener: Shortener, place: Place, budget: Budget) ->
     collected: Collected = []
     try:
         for parameter in work.base:
-            # the parameters regrouped into this one have their share in its first one's polynomial
+            # the parameters regrouped into this one have their part in its first one's polynomial
             polynomial = shortener.reduced(expansion.polynomial(element, parameter.index, budget))
             if place is None:
                 polynomial -= polynomial[(0,) * len(expansion.context.gens())]
@@ -149,13 +149,13 @@ def _formula(work: _Work, shortener: Shortener, place: Place, budget: Budget) ->
     except TooLarge:
         return Formula(place, None, None)
     if work.assume == "inertials":
-        collected = _believed(expansion.context, collected)
+        collected = _at_urdf_values(expansion.context, collected)
     collected = [(parameter, polynomial) for parameter, polynomial in collected if polynomial != 0]
     terms = sum(len(polynomial) for _, polynomial in collected)
     return Formula(place, terms, grouped(shortener, collected) if terms <= work.longest else None)
 
 
-def _believed(context: fmpq_mpoly_ctx, collected: Collected) -> Collected:
+def _at_urdf_values(context: fmpq_mpoly_ctx, collected: Collected) -> Collected:
     """Without the monomials whose coefficient is zero for the URDF's values, and without zero parameters."""
     total = context.from_dict({})
     for parameter, polynomial in collected:

@@ -32,16 +32,16 @@ def grouped(shortener: Shortener, collected: Collected) -> Sum:
 
 
 def _group(unit: Sum, members: Sequence[tuple[BaseParameter, Fraction]]) -> list[Term]:
-    """The terms of parameters times shares of one function, given with 1 as its first coefficient."""
+    """The terms of parameters times multiples of one function, given with 1 as its first coefficient."""
     number, factors = Fraction(1), unit.terms[0].factors
     if len(unit.terms) > 1:
         first = abs(members[0][1])
         number, inside = bracketed(unit.times(first))
         factors = ((inside, 1),)
-        members = [(parameter, share / first) for parameter, share in members]
-    each = [Term(share, ((Symbol(parameter.name), 1),)) for parameter, share in members]
+        members = [(parameter, coefficient / first) for parameter, coefficient in members]
+    each = [Term(coefficient, ((Symbol(parameter.name), 1),)) for parameter, coefficient in members]
     if len(members) == 1 or not factors:
         return [Term(number * term.coefficient, (*term.factors, *factors)) for term in each]
-    share, together = bracketed(Sum(tuple(each)))
+    coefficient, together = bracketed(Sum(tuple(each)))
     before: tuple[Factor, int] = (together, 1)
-    return [Term(number * share, (before, *factors))]
+    return [Term(number * coefficient, (before, *factors))]

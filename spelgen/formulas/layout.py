@@ -34,13 +34,16 @@ def broken(parts: list[str], start: str, width: int) -> list[str]:
 def definition(parameter: BaseParameter) -> Sum:
     """What a base parameter is the sum of."""
     return Sum(
-        tuple(Term(share, ((Symbol(parameter_name(index)), 1),)) for index, share in parameter.weights)
+        tuple(
+            Term(coefficient, ((Symbol(parameter_name(index)), 1),))
+            for index, coefficient in parameter.weights
+        )
     )
 
 
 def comments(found: Formulas) -> list[str]:
     """Which robot, joints and bodies the numbers in the names stand for."""
-    lines = [f"Robot {json.dumps(found.arm.name)}, for {believed(found)}."]
+    lines = [f"Robot {json.dumps(found.arm.name)}, for {trusted(found)}."]
     lines += [f"q{k + 1}: {json.dumps(each.name)}" for k, each in enumerate(found.arm.coordinates)]
     if [each.name for each in found.arm.bodies] != [each.name for each in found.arm.coordinates]:
         lines += [f"body {k + 1}: {json.dumps(each.name)}" for k, each in enumerate(found.arm.bodies)]
@@ -48,7 +51,7 @@ def comments(found: Formulas) -> list[str]:
     return lines
 
 
-def believed(found: Formulas) -> str:
+def trusted(found: Formulas) -> str:
     """For which inertial values the formulas hold."""
     if found.assume == "kinematics":
         return "any inertial values"

@@ -180,9 +180,9 @@ class Shortener:
             for run in runs:
                 waves = harmonics({k: (exponents[3 * k], exponents[3 * k + 1]) for k in run}, self._units)
                 products = [
-                    (number * share, (*factors, (trig, 1)) if trig else factors)
+                    (number * coefficient, (*factors, (trig, 1)) if trig else factors)
                     for number, factors in products
-                    for trig, share in waves
+                    for trig, coefficient in waves
                 ]
             for number, factors in products:
                 totals[ordered(factors)] = totals.get(ordered(factors), Fraction(0)) + number

@@ -6,7 +6,7 @@ import textwrap
 from typing import Any
 
 from spelgen.formulas.formulas import WRITABLE, Formulas
-from spelgen.formulas.layout import believed, broken, definition, why_not
+from spelgen.formulas.layout import broken, definition, trusted, why_not
 from spelgen.formulas.notation import Plain
 
 _LONGEST_NAME = 36
@@ -15,7 +15,7 @@ _LONGEST_NAME = 36
 def text(found: Formulas, width: int = 80) -> str:
     """The formulas, what their parameters are, and the parameters' values by the URDF."""
     notation = Plain()
-    lines = [*textwrap.wrap(f"{_printable(found.arm.name)}: closed forms for {believed(found)}", width), ""]
+    lines = [*textwrap.wrap(f"{_printable(found.arm.name)}: closed forms for {trusted(found)}", width), ""]
     for formula in found.entries:
         if formula.expression is None:
             lines.append(f"{formula.name}: {why_not(formula)}")

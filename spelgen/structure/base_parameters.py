@@ -31,7 +31,7 @@ class BaseParameter:
     """A combination of inertial parameters that the motion depends on.
 
     ``name`` is that of its first parameter, with an R where others are regrouped into it; ``weights`` are
-    (parameter, share), parameters counted 10 body + i in the order of ``PARAMETERS``. ``value`` is the
+    (parameter, coefficient), parameters counted 10 body + i in the order of ``PARAMETERS``. ``value`` is the
     URDF's, None where a body has no inertial.
     """
 
@@ -54,14 +54,14 @@ def base_parameters(arm: Arm, count: int) -> tuple[BaseParameter, ...]:
     bound = field.pivots(field.row_basis(residues))
     chosen = field.pivots(field.row_basis(residues[:, bound].T))
     free = [column for column in range(len(order)) if column not in set(bound) and rows[:, column].any()]
-    shares = _solved(rows[np.ix_(chosen, bound)], rows[np.ix_(chosen, free)])
+    coefficients = _solved(rows[np.ix_(chosen, bound)], rows[np.ix_(chosen, free)])
     found = []
     for place, pivot in enumerate(bound):
         weights = [(order[pivot], Fraction(1))]
         weights += [
-            (order[column], Fraction(int(share.p), int(share.q)))
-            for column, share in zip(free, shares[place], strict=True)
-            if share
+            (order[column], Fraction(int(coefficient.p), int(coefficient.q)))
+            for column, coefficient in zip(free, coefficients[place], strict=True)
+            if coefficient
         ]
         name = parameter_name(order[pivot]) + ("R" if len(weights) > 1 else "")
         found.append(BaseParameter(name, order[pivot], tuple(weights), _value(arm, weights)))
@@ -70,11 +70,11 @@ def base_parameters(arm: Arm, count: int) -> tuple[BaseParameter, ...]:
 
 def _value(arm: Arm, weights: list[tuple[int, Fraction]]) -> Fraction | None:
     total = Fraction(0)
-    for index, share in weights:
+    for index, coefficient in weights:
         inertia = arm.bodies[index // 10].inertia
         if inertia is None:
             return None
-        total += share * inertia[index % 10]
+        total += coefficient * inertia[index % 10]
     return total
 
 

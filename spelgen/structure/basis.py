@@ -93,9 +93,9 @@ def _constants(
         # c is the entry at the pivot less what the outputs put there
         reading, reading_values = _single(spans, pivot)
         for j, output in enumerate(readings):
-            share = int(basis[0][j, pivot])
-            if share:
-                scaled = field.product(np.array([[share]], dtype=np.uint64), output.weights[None])[0]
+            coefficient = int(basis[0][j, pivot])
+            if coefficient:
+                scaled = field.product(np.array([[coefficient]], dtype=np.uint64), output.weights[None])[0]
                 reading = field.difference(reading, scaled)
                 reading_values = reading_values - basis[1][j, pivot] * output.values
         constants.append(Constant(_weights(spans, reading, reading_values), _weights(spans, row, values)))
@@ -144,12 +144,12 @@ def _candidates(spans: Spans, joints: frozenset[int]) -> Iterator[tuple[np.ndarr
     kernel[:, order] = reduced
     free = [index for index in range(len(spans.keys)) if index not in set(bound)]
     samples = spans.float_changes(outside)
-    shares = _solved(samples[:, bound], samples[:, free])
+    coefficients = _solved(samples[:, bound], samples[:, free])
     for row in sorted(kernel, key=np.count_nonzero):
         (own,) = {int(index) for index in np.flatnonzero(row)} - set(bound)
         values = np.zeros(len(row))
         values[own] = 1.0
-        values[bound] = -shares[:, free.index(own)]
+        values[bound] = -coefficients[:, free.index(own)]
         yield row, np.where(row != 0, values, 0.0)
 
 

@@ -20,10 +20,10 @@ from spelgen.structure.structure import Structure
 
 _POINTS = 512
 _DIGITS = 6
-_LEAST_SHARE = 0.05
-"""An output that the nominal values hardly move is still allowed this share of the entries it enters."""
+_LEAST_SIZE = 0.05
+"""An output that the nominal values hardly move is still allowed this fraction of the entries it enters."""
 _LEAST_SENSITIVITY = 0.02
-"""A joint that M or V hardly depends on nominally is still seen by the network at this share."""
+"""A joint that M or V hardly depends on nominally is still seen by the network at this sensitivity."""
 
 _DEFAULT_MASS = 1.0  # kg
 _DEFAULT_GYRATION = 0.1  # m
@@ -43,9 +43,9 @@ class Nominal:
     constant_scales: tuple[float, ...]
     potential_scale: float
     joint_torque: tuple[float, ...]
-    mass_shares: tuple[float, ...]
-    potential_shares: tuple[float, ...]
-    least_share: float
+    mass_sensitivities: tuple[float, ...]
+    potential_sensitivities: tuple[float, ...]
+    least_eigenvalue: float
     """Least eigenvalue of M(q) relative to the mean M, over the workspace."""
     from_urdf: bool
     """Whether the URDF's inertials were usable."""
@@ -61,9 +61,9 @@ def nominal(arm: Arm, structure: Structure) -> Nominal:
     means = mass.mean(axis=0)
     typical = np.sqrt([means[keys.index((i, i))] * means[keys.index((j, j))] for i, j in keys])
     outputs = mass @ _matrix(structure, [output.reads for output in structure.outputs]).T
-    output_sizes = [_LEAST_SHARE * _size(typical, keys, output.reads) for output in structure.outputs]
+    output_sizes = [_LEAST_SIZE * _size(typical, keys, output.reads) for output in structure.outputs]
     constants = means @ _matrix(structure, [constant.reads for constant in structure.constants]).T
-    constant_sizes = [_LEAST_SHARE * _size(typical, keys, constant.reads) for constant in structure.constants]
+    constant_sizes = [_LEAST_SIZE * _size(typical, keys, constant.reads) for constant in structure.constants]
     torque = _gravity_torque(arm, q, inertias)
     changes = _mass_changes(arm, q, inertias, typical)
     inertial = np.sqrt((mass[:, [keys.index((i, i)) for i in range(q.shape[1])]] ** 2).mean(axis=0))
@@ -75,9 +75,9 @@ def nominal(arm: Arm, structure: Structure) -> Nominal:
         constant_scales=_rounded(np.maximum(np.abs(constants), constant_sizes)),
         potential_scale=_rounded([max(float(potential.std()), 1e-3)])[0],
         joint_torque=_rounded(np.hypot(torque, inertial)),
-        mass_shares=_shares(changes),
-        potential_shares=_shares(torque),
-        least_share=_rounded([_least_share(mass, means, q.shape[1])])[0],
+        mass_sensitivities=_sensitivities(changes),
+        potential_sensitivities=_sensitivities(torque),
+        least_eigenvalue=_rounded([_least_eigenvalue(mass, means, q.shape[1])])[0],
         from_urdf=from_urdf,
     )
 
@@ -96,7 +96,7 @@ def _mass_samples(arm: Arm, q: np.ndarray) -> tuple[np.ndarray, bool]:
     """Lower triangles of M at ``q``, and whether the URDF's inertials gave them."""
     if arm.has_inertials:
         mass, _ = float_energies(arm, q, nominal_inertias(arm, True))
-        if _least_share(mass, mass.mean(axis=0), q.shape[1]) > 1e-6:
+        if _least_eigenvalue(mass, mass.mean(axis=0), q.shape[1]) > 1e-6:
             return mass, True
     return float_energies(arm, q, nominal_inertias(arm, False))[0], False
 
@@ -118,7 +118,7 @@ def _default_inertia(arm: Arm, index: int) -> list[float]:
     return [_DEFAULT_MASS, *(_DEFAULT_MASS * center), *tensor[np.triu_indices(3)]]
 
 
-def _least_share(mass: np.ndarray, mean: np.ndarray, n: int) -> float:
+def _least_eigenvalue(mass: np.ndarray, mean: np.ndarray, n: int) -> float:
     """Least eigenvalue, over the samples, of M relative to ``mean``; 0 where the mean is not positive
     definite.
     """
@@ -156,7 +156,7 @@ def _mass_changes(arm: Arm, q: np.ndarray, inertias: list[list[float]], typical:
     return np.sqrt(changes)
 
 
-def _shares(sizes: np.ndarray) -> tuple[float, ...]:
+def _sensitivities(sizes: np.ndarray) -> tuple[float, ...]:
     """Sizes relative to the largest, but at least ``_LEAST_SENSITIVITY``."""
     largest = sizes.max()
     return _rounded(

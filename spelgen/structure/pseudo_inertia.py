@@ -14,7 +14,7 @@ import numpy as np
 LOWER = tuple((row, column) for row in range(4) for column in range(row + 1))
 """Where the ten coordinates stand in T."""
 
-_LEAST_SHARE = 1e-4
+_LEAST_RELATIVE = 1e-4
 """Of the largest eigenvalue of J: what an impossible body's negative and zero ones are raised to."""
 
 
@@ -41,8 +41,8 @@ def reference_factor(parameters: np.ndarray) -> tuple[np.ndarray, bool]:
     """
     pseudo = pseudo_inertia(parameters)
     values, vectors = np.linalg.eigh(pseudo)
-    least = _LEAST_SHARE * values[-1]
-    possible = bool(values[0] > least * _LEAST_SHARE)
+    least = _LEAST_RELATIVE * values[-1]
+    possible = bool(values[0] > least * _LEAST_RELATIVE)
     if not possible:
         pseudo = (vectors * np.maximum(values, least)) @ vectors.T
     return np.linalg.cholesky(pseudo), possible

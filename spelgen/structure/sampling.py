@@ -26,7 +26,7 @@ from spelgen.structure.field import (
 from spelgen.structure.recursion import Element, Motion, energies, triangle
 
 Assume = Literal["kinematics", "inertials"]
-"""Which inertial parameters are believed: none of them, or the URDF's."""
+"""Which inertial parameters are trusted: none of them, or the URDF's."""
 
 Ten = Sequence[Element]
 

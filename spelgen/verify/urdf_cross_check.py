@@ -21,11 +21,11 @@ from spelgen.verify.agreement import Check, Verdict, size_told
 
 _ROUNDING = 1e-9
 """What composed rotations (1e-11 each) and dropped offsets (below 1e-9 m) may add up to, per joint."""
-_AXIS_SNAP = 1.5e-3  # two components below 1e-3 of a unit axis
+_AXIS_ROUNDING = 1.5e-3  # two components below 1e-3 of a unit axis
 _STEPS = (pi / 2, pi / 12, pi / 8, pi / 5)
 
-_Snaps = dict[str, str]
-"""What the arm's diagnostics tell as snapped, by place in the file."""
+_Roundings = dict[str, str]
+"""What the arm's diagnostics tell as rounded, by place in the file."""
 
 
 @dataclass(frozen=True)
@@ -51,29 +51,29 @@ class _Reading:
     loads: list[_Load]
 
 
-def second_reading(robot: Robot, arm: Arm, *, samples: int = 6, seed: int = 0) -> tuple[Check, ...]:
+def urdf_cross_check(robot: Robot, arm: Arm, *, samples: int = 6, seed: int = 0) -> tuple[Check, ...]:
     """Compare ``arm`` with yourdfpy's reading of the same bytes at random configurations.
 
-    Where nothing was snapped the two agree to rounding; where something was, within the snaps that the
+    Where nothing was rounded the two agree to rounding; where something was, within the roundings that the
     arm's diagnostics tell.
     """
     try:
-        readings = list(_read_again(robot, arm, samples, seed))
+        readings = list(_yourdfpy_readings(robot, arm, samples, seed))
     except Exception as problem:  # another program's failure proves nothing about ours
         told = " ".join(str(problem).split())[:120]
         found = f"yourdfpy cannot say ({type(problem).__name__}: {told})"
         return (Check("reading of the file", "the moving bodies", found, "undecided"),)
-    snapped: _Snaps = {}
+    rounded: _Roundings = {}
     for each in arm.diagnostics:
         if each.code.startswith("snapped-"):
-            snapped[each.where] = f"{snapped.get(each.where, '')}; {each.message}"
-    checks = [_frames_agree(robot, arm, readings, snapped)]
+            rounded[each.where] = f"{rounded.get(each.where, '')}; {each.message}"
+    checks = [_frames_agree(robot, arm, readings, rounded)]
     if any(body.inertia is not None for body in arm.bodies):
-        checks.append(_loads_agree(robot, arm, readings[0], snapped))
+        checks.append(_loads_agree(robot, arm, readings[0], rounded))
     return tuple(checks)
 
 
-def _read_again(robot: Robot, arm: Arm, samples: int, seed: int) -> Iterator[_Reading]:
+def _yourdfpy_readings(robot: Robot, arm: Arm, samples: int, seed: int) -> Iterator[_Reading]:
     data = robot.path.read_bytes()
     if hashlib.sha256(data).hexdigest() != robot.digest:
         raise ValueError("the file has changed since it was read")
@@ -163,12 +163,12 @@ def _frames(arm: Arm, q: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     return frames
 
 
-def _frames_agree(robot: Robot, arm: Arm, readings: list[_Reading], snapped: _Snaps) -> Check:
+def _frames_agree(robot: Robot, arm: Arm, readings: list[_Reading], rounded: _Roundings) -> Check:
     turned, moved, largest, outside = 0.0, 0.0, 0.0, []
     for index, body in enumerate(arm.bodies):
         joint = robot.joint[body.name]
         path = robot.path_to(joint.child)
-        angle = _snap_angle(path, snapped)
+        angle = _rounding_angle(path, rounded)
         reach = 1.0 + sum(float(np.linalg.norm(each.xyz)) for each in path)
         axis = np.array(joint.axis) / np.linalg.norm(joint.axis)
         for reading in readings:
@@ -184,7 +184,7 @@ def _frames_agree(robot: Robot, arm: Arm, readings: list[_Reading], snapped: _Sn
     return _check("frames in the file", derived, found, outside, "joint")
 
 
-def _loads_agree(robot: Robot, arm: Arm, reading: _Reading, snapped: _Snaps) -> Check:
+def _loads_agree(robot: Robot, arm: Arm, reading: _Reading, rounded: _Roundings) -> Check:
     worst, largest, outside = 0.0, 0.0, []
     frames = _frames(arm, reading.q)
     for index, (body, load) in enumerate(zip(arm.bodies, reading.loads, strict=True)):
@@ -197,13 +197,13 @@ def _loads_agree(robot: Robot, arm: Arm, reading: _Reading, snapped: _Snaps) -> 
             float(np.linalg.norm(moment - load.moment)),
             float(np.linalg.norm(tensor - load.tensor)),
         )
-        share = max(error / (size or 1.0) for error, size in zip(errors, load.sizes, strict=True))
+        error = max(each / (size or 1.0) for each, size in zip(errors, load.sizes, strict=True))
         links = [robot.link[name] for name in _carried(robot, arm, body.name)]
-        angle = max(_snap_angle(robot.path_to(link.name), snapped, link) for link in links)
+        angle = max(_rounding_angle(robot.path_to(link.name), rounded, link) for link in links)
         # turning by a small angle moves a vector by it and a tensor by twice of it
-        if share > 2 * angle + 10 * _ROUNDING * len(robot.joints):
+        if error > 2 * angle + 10 * _ROUNDING * len(robot.joints):
             outside.append(index)
-        worst, largest = max(worst, share), max(largest, angle)
+        worst, largest = max(worst, error), max(largest, angle)
     derived = f"masses, their centres and tensors as yourdfpy finds them{_within(largest)}"
     return _check(
         "inertials in the file", derived, f"at most {size_told(worst)} of their size apart", outside, "body"
@@ -216,24 +216,24 @@ def _check(fact: str, derived: str, found: str, outside: list[int], noun: str) -
 
 
 def _within(angle: float) -> str:
-    return f", within the snaps told ({size_told(angle)} rad in all)" if angle else ""
+    return f", within the roundings told ({size_told(angle)} rad in all)" if angle else ""
 
 
-def _snap_angle(path: Sequence[Joint], snapped: _Snaps, link: Link | None = None) -> float:
-    """How far [rad] what the diagnostics tell as snapped may have turned the end of ``path`` in all."""
+def _rounding_angle(path: Sequence[Joint], rounded: _Roundings, link: Link | None = None) -> float:
+    """How far [rad] what the diagnostics tell as rounded may have turned the end of ``path`` in all."""
     total = 0.0
     for joint in path:
         where = f"joint {joint.name!r}"
-        total += _snapped_share(joint.rpy, snapped.get(f"{where} origin", ""))
-        total += _AXIS_SNAP if f"{where} axis" in snapped else 0.0
+        total += _rounded_by(joint.rpy, rounded.get(f"{where} origin", ""))
+        total += _AXIS_ROUNDING if f"{where} axis" in rounded else 0.0
         if joint.mimic is not None and joint.type != "prismatic":
             total += _to_special(joint.mimic.offset)  # not worth a diagnostic
     if link is not None and link.inertial is not None:
-        total += _snapped_share(link.inertial.rpy, snapped.get(f"link {link.name!r} inertial origin", ""))
+        total += _rounded_by(link.inertial.rpy, rounded.get(f"link {link.name!r} inertial origin", ""))
     return total
 
 
-def _snapped_share(angles: Sequence[float], told: str) -> float:
+def _rounded_by(angles: Sequence[float], told: str) -> float:
     return sum(_to_special(angle) for angle in angles if f"{angle:.10g} is taken as" in told)
 
 

@@ -2,7 +2,7 @@
 
 Under ``kinematics`` every sample has inertial values of its own; under ``inertials`` all have the URDF's.
 Nothing of the derivation is used but the Arm; that the file says what the Arm says is checked by another
-program (``second_reading``).
+program (``urdf_cross_check``).
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from spelgen.structure.recursion import triangle
 from spelgen.structure.structure import Structure
 from spelgen.urdf.robot import Robot
 from spelgen.verify.agreement import Check, Verdict, Verification, size_told
-from spelgen.verify.urdf_cross_check import second_reading
+from spelgen.verify.urdf_cross_check import urdf_cross_check
 
 if TYPE_CHECKING:
     from spelgen.verify.numeric_samples import NumericSamples
 
 ROUNDING = 1e-12
-"""Share of its scale below which a number is taken for rounding; what is found is told beside it."""
+"""Fraction of its scale below which a number is taken for rounding; what is found is told beside it."""
 FORM_ROUNDING = 1e-6
 """The same for the smallest form: its long fractions are kept as doubles, found by least squares."""
 _FINE = 1e-3
@@ -99,7 +99,7 @@ def verify(robot: Robot, arm: Arm, structure: Structure, *, samples: int = 0, se
         *_ranks(case),
         _potential(case),
         case.rank_check("base parameters", numeric_samples.regressor(arm, rng), structure.base_parameters),
-        *second_reading(robot, arm, seed=seed),
+        *urdf_cross_check(robot, arm, seed=seed),
     )
     inertials = "inertial values of its own" if free else "the URDF's inertial values"
     means = f"{numeric_samples.ENGINE} and yourdfpy at {count} random configurations, each with {inertials}"
@@ -215,14 +215,14 @@ def _potential(case: _Case) -> Check:
 
 
 def _rank(rows: np.ndarray) -> tuple[int, np.ndarray]:
-    """The number of singular values above rounding, and all of them as shares of the largest."""
+    """The number of singular values above rounding, and all of them relative to the largest."""
     # the triangular factor has the same singular values, and is small
     factor = np.linalg.qr(rows, mode="r") if len(rows) > rows.shape[1] else rows
     sizes = np.linalg.svd(factor, compute_uv=False)
     if not len(sizes) or sizes[0] == 0:
         return 0, sizes[:0]
-    shares = sizes / sizes[0]
-    return int((shares > ROUNDING).sum()), shares
+    relative = sizes / sizes[0]
+    return int((relative > ROUNDING).sum()), relative
 
 
 def _is_fine(arm: Arm, structure: Structure) -> bool:
