@@ -30,7 +30,7 @@ structure: fourier base_parameters pseudo_inertia
 emission: bodies plan source docstring emit
 dynamics: protocol arrays constraint pinocchio_dynamics pinocchio_arm pinocchio_urdf regressor regressor_dynamics tip
 logs: arm_mapping trajectory bags tables read checks filtering windows chunks epoch_windows
-simulation: simulate tracking protocols
+simulation: friction integration simulated_logs random_inputs tracking
 identification: samples friction base_parameters least_squares prior identify formatting
 excitation: trajectory design formatting
 fitting: run_folder gaussian_prior torque_fit lie_group rollout compiled urdf_regularizer progress
@@ -40,6 +40,7 @@ verify: agreement axes urdf_cross_check numeric_samples verify
 explain: reasons facts
 formulas: expression notation angles harmonics factoring shortening grouping formulas layout text latex sympy_module
 inspection loaded_arm pipeline
+simulation: simulate
 exporting: rigid_body_projection urdf_file
 render: charts plots tables picture learned report_page inspection_page
 logs: statistics gravity report check_logs

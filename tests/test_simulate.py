@@ -9,11 +9,14 @@ from scipy.special import ellipj
 from spelgen.arm.arm import make_arm
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.errors import RunError, SettingsError
+from spelgen.loaded_arm import load_arm
 from spelgen.settings.joint import JointSettings
 from spelgen.settings.settings import Settings, load_settings
-from spelgen.simulation import simulate as simulation
-from spelgen.simulation.protocols import make_logs
-from spelgen.simulation.simulate import make_friction, rollout, simulate
+from spelgen.simulation import integration
+from spelgen.simulation.friction import make_friction
+from spelgen.simulation.integration import rollout
+from spelgen.simulation.random_inputs import random_inputs
+from spelgen.simulation.simulate import PROTOCOLS, simulate
 from spelgen.urdf.read import read_urdf
 from tests.hand_built import arm, body, coordinate, pendulum, point, slider
 
@@ -132,7 +135,7 @@ class TestFriction:
 class TestProtocol:
     def test_logs_are_sampled_at_rest_within_limits_with_inputs_drawn_from_the_list(self, robots, settings):
         two_link, _ = load(robots / "two_link.urdf")
-        logs = simulate(two_link, settings)
+        logs = random_inputs(two_link, settings)
         assert len(logs.train) == len(logs.test) == 3
         assert sorted(each.name for each in logs.train + logs.test) == [f"traj_{k:02d}" for k in range(6)]
         for each in logs.train + logs.test:
@@ -145,7 +148,7 @@ class TestProtocol:
 
     def test_logged_torques_are_held_to_the_next_sample(self, robots, settings):
         two_link, _ = load(robots / "two_link.urdf")
-        log = simulate(two_link, settings).train[0]
+        log = random_inputs(two_link, settings).train[0]
         engine = arm_dynamics(two_link, settings)
 
         def derivative(_, state):
@@ -157,8 +160,10 @@ class TestProtocol:
 
     def test_the_seed_decides_everything(self, robots, settings):
         two_link, _ = load(robots / "two_link.urdf")
-        first, again = simulate(two_link, settings), simulate(two_link, settings)
-        other = simulate(two_link, settings.model_copy(update={"simulation": protocol(settings, seed=1)}))
+        first, again = random_inputs(two_link, settings), random_inputs(two_link, settings)
+        other = random_inputs(
+            two_link, settings.model_copy(update={"simulation": protocol(settings, seed=1)})
+        )
         for one, two in zip(first.train + first.test, again.train + again.test, strict=True):
             assert one.name == two.name
             for quantity in ("q", "qd", "tau"):
@@ -169,7 +174,7 @@ class TestProtocol:
     def test_no_trajectory_depends_on_how_many_there_are(self, settings):
         def start(count):
             changed = settings.model_copy(update={"simulation": protocol(settings, trajectories=count)})
-            logs = simulate(slider(), changed)
+            logs = random_inputs(slider(), changed)
             return next(each.q[0] for each in logs.train + logs.test if each.name == "traj_01")
 
         assert start(2) == start(5)
@@ -179,7 +184,9 @@ class TestProtocol:
     )
     def test_the_split_leaves_something_to_train_on(self, settings, trajectories, fraction, tested):
         changes = {"trajectories": trajectories, "test_fraction": fraction, "duration": 0.05}
-        logs = simulate(slider(), settings.model_copy(update={"simulation": protocol(settings, **changes)}))
+        logs = random_inputs(
+            slider(), settings.model_copy(update={"simulation": protocol(settings, **changes)})
+        )
         assert (len(logs.train), len(logs.test)) == (trajectories - tested, tested)
 
     def test_positions_inputs_and_passive_joints_of_the_sidecar_are_followed(self):
@@ -193,7 +200,7 @@ class TestProtocol:
                 "simulation": {"trajectories": 20, "duration": 0.05, "positions": {"a": [0.5, 0.6]}},
             }
         )
-        logs = simulate(arm(joints, bodies), settings)
+        logs = random_inputs(arm(joints, bodies), settings)
         starts = np.array([each.q[0] for each in logs.train + logs.test])
         assert ((starts[:, 0] >= 0.5) & (starts[:, 0] <= 0.6)).all()
         assert (np.abs(starts[:, 1]) <= 1).all()
@@ -202,22 +209,22 @@ class TestProtocol:
 
     def test_progress_is_told_after_every_trajectory(self, settings):
         told = []
-        simulate(slider(), settings, progress=lambda done, total: told.append((done, total)))
+        random_inputs(slider(), settings, progress=lambda done, total: told.append((done, total)))
         assert told == [(done, 6) for done in range(1, 7)]
 
     def test_a_joint_without_limits_needs_positions(self, settings):
         with pytest.raises(SettingsError) as error:
-            simulate(slider(lower=None, upper=None), settings)
+            random_inputs(slider(lower=None, upper=None), settings)
         assert str(error.value) == (
             "simulation.positions.a: the joint has no limits: give its lowest and highest initial position"
         )
 
     def test_a_motion_without_finite_acceleration_ends_clearly(self, settings):
         with pytest.raises(RunError) as error:
-            simulate(slider(mass=0.0), settings)
+            random_inputs(slider(mass=0.0), settings)
         assert str(error.value) == (
             "the motion cannot be integrated beyond t = 0 s: an acceleration is not finite; check the inertials; "
-            "make simulation.duration smaller or simulation.friction_velocity larger"
+            "make simulation.duration smaller or simulation.coulomb_smoothing_velocity larger"
         )
 
 
@@ -227,17 +234,17 @@ class TestIntegrationError:
         chosen, settings = load(robots / f"{robot}.urdf")
         changes = {"trajectories": 3, "duration": min(1.0, settings.simulation.duration)}
         short = settings.model_copy(update={"simulation": protocol(settings, **changes)})
-        assert 0 < make_logs(chosen, short).integration_error < 1e-8
+        assert 0 < PROTOCOLS[short.simulation.protocol](chosen, short).integration_error < 1e-8
 
     @pytest.mark.parametrize("robot", ["two_link", "rpr", "scara"])
     @pytest.mark.parametrize("rtol", [1e-3, 1e-7])
     def test_it_bounds_the_true_error_of_a_careless_integration(self, robot, rtol, robots, monkeypatch):
         chosen, settings = load(robots / f"{robot}.urdf")
         short = settings.model_copy(update={"simulation": protocol(settings, trajectories=3)})
-        careful = simulate(chosen, short)
-        monkeypatch.setattr(simulation, "RTOL", rtol)
-        monkeypatch.setattr(simulation, "ATOL", rtol)
-        careless = simulate(chosen, short)
+        careful = random_inputs(chosen, short)
+        monkeypatch.setattr(integration, "RTOL", rtol)
+        monkeypatch.setattr(integration, "ATOL", rtol)
+        careless = random_inputs(chosen, short)
         pairs = zip(careful.train + careful.test, careless.train + careless.test, strict=True)
         true = max(max(abs(one.q - two.q).max(), abs(one.qd - two.qd).max()) for one, two in pairs)
         assert careful.integration_error < true < 5 * careless.integration_error
@@ -247,7 +254,7 @@ class TestIntegrationError:
         settings = Settings.model_validate(
             {
                 "joints": {"a": {"coulomb": [1.0, -3.0]}},
-                "simulation": {"friction_velocity": 1e-3},
+                "simulation": {"coulomb_smoothing_velocity": 1e-3},
             }
         )
         t, force = np.array([0.0, 1.0]), np.full((2, 1), -50.0)
@@ -255,3 +262,66 @@ class TestIntegrationError:
         stops = 20.0 / 51.0
         np.testing.assert_allclose(states[1, 1], -47.0 * (1 - stops), atol=1e-3)
         assert states[1, 1] == pytest.approx(-47.0 * (1 - stops), abs=1e-4)
+
+
+LINK = """<link name="{name}"><inertial><mass value="{mass}"/><origin xyz="0.2 0 0"/>
+  <inertia ixx="0.01" iyy="0.02" izz="0.03" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+JOINT = """<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/><origin xyz="{xyz}"/>
+  <axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="10" velocity="2"/>{more}</joint>"""
+
+
+@pytest.fixture
+def coupled(tmp_path):
+    """Two revolute joints, the second of which follows the first: 0.5 q - 0.1."""
+    parts = [
+        '<robot name="coupled"><link name="base"/>',
+        LINK.format(name="upper", mass=2),
+        LINK.format(name="fore", mass=1),
+        JOINT.format(name="a", kind="revolute", parent="base", child="upper", xyz="0 0 0", more=""),
+        JOINT.format(
+            name="b", kind="revolute", parent="upper", child="fore", xyz="0.4 0 0",
+            more='<mimic joint="a" multiplier="0.5" offset="-0.1"/>',
+        ),
+        "</robot>",
+    ]  # fmt: skip
+    path = tmp_path / "coupled.urdf"
+    path.write_text("".join(parts))
+    return path
+
+
+class TestInMemory:
+    def test_an_arm_gives_its_logs(self, robots):
+        logs = simulate(load_arm(robots / "two_link.urdf"), trajectories=4, duration=0.2, seed=3)
+        assert len(logs) == len(logs.train) + len(logs.test) == 4
+        assert [x.name for x in logs] == [x.name for x in (*logs.train, *logs.test)]
+        assert 0 < logs.integration_error < 1e-8
+        assert repr(logs).startswith("<SimulatedLogs: 2 to train, 2 to test, integration error ")
+        assert logs._repr_html_().count("<tr>") == 5
+        again = simulate(load_arm(robots / "two_link.urdf"), trajectories=4, duration=0.2, seed=3)
+        np.testing.assert_array_equal(logs[0].q, again[0].q)
+
+    def test_what_cannot_be_is_told_by_its_name(self, robots):
+        with pytest.raises(SettingsError) as error:
+            simulate(load_arm(robots / "two_link.urdf"), sample_rate=-1)
+        assert str(error.value) == "simulate: sample_rate: got -1, expected greater than 0"
+
+    def test_settings_of_other_steps_are_not_looked_at(self, robots, tmp_path):
+        (tmp_path / "arm.urdf").write_bytes((robots / "two_link.urdf").read_bytes())
+        (tmp_path / "arm.yaml").write_text("training: {nonsense: 1}\nlogs: {units: {q: furlongs}}\n")
+        assert len(simulate(load_arm(tmp_path / "arm.urdf"), trajectories=1, duration=0.1)) == 1
+
+    def test_a_mimic_joint_moves_along(self, coupled):
+        """Both joints by Pinocchio, the second driven along: tau = K^T rnea(K q + offset, K qd, K qdd)."""
+        arm = load_arm(coupled)
+        logs = simulate(arm, trajectories=2, duration=0.2, sample_rate=200.0)
+        assert all(x.q.shape == (41, 1) for x in logs)
+        model = pin.buildModelFromUrdf(str(coupled))
+        data, jacobian = model.createData(), np.array([1.0, 0.5])
+        log = logs[0]
+        states = zip(log.q[:, 0], log.qd[:, 0], np.gradient(log.qd[:, 0], log.t), strict=True)
+        needed = [
+            jacobian @ pin.rnea(model, data, jacobian * q + [0, -0.1], jacobian * qd, jacobian * qdd)
+            for q, qd, qdd in states
+        ]
+        held = (log.tau[1:-2, 0] + log.tau[:-3, 0]) / 2  # the slope at a sample is that of both intervals
+        np.testing.assert_allclose(needed[1:-2], held, atol=0.02)

@@ -4,14 +4,13 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from spelgen import pipeline
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.errors import SettingsError, SpelgenErrors
+from spelgen.loaded_arm import load_arm
 from spelgen.settings.settings import Settings
 from spelgen.simulation import tracking
-from spelgen.simulation.protocols import make_logs
-from spelgen.simulation.simulate import make_friction
-from spelgen.simulation.tracking import Sines, measured, record, track, tuned
+from spelgen.simulation.friction import make_friction
+from spelgen.simulation.tracking import Sines, measured, record, track, tuned_gains
 from tests.hand_built import arm, body, coordinate, point, slider
 
 N = 6
@@ -19,7 +18,7 @@ N = 6
 
 @pytest.fixture(scope="module")
 def loaded(robots):
-    return pipeline.load(robots / "six_dof.urdf")
+    return load_arm(robots / "six_dof.urdf")
 
 
 def changed(settings, tracking=None, **protocol):
@@ -46,10 +45,10 @@ def recordings(loaded):
 def test_the_protocol_is_the_papers(loaded):
     """500 Hz samples, 125 Hz control, sines of 30 deg at 1/8 Hz, 6 PID settings, 24,000 samples, 70/30."""
     protocol, motion = loaded.settings.simulation, loaded.settings.tracking
-    assert (protocol.rate, motion.control, motion.frequency) == (500, 125, 1 / 8)
+    assert (protocol.sample_rate, motion.control_rate, motion.frequency) == (500, 125, 1 / 8)
     assert motion.amplitude == pytest.approx(np.radians(30))
     assert protocol.trajectories == len(motion.bandwidths) == 6
-    assert protocol.trajectories * protocol.duration * protocol.rate == 24_000
+    assert protocol.trajectories * protocol.duration * protocol.sample_rate == 24_000
     assert protocol.test_fraction == 0.3
 
 
@@ -154,7 +153,7 @@ def test_the_integration_error_is_small_and_measured(recordings):
 
 def test_the_seed_decides_everything(loaded):
     def logs(**protocol):
-        return make_logs(loaded.arm, changed(loaded.settings, trajectories=1, duration=0.2, **protocol))
+        return track(loaded.arm, changed(loaded.settings, trajectories=1, duration=0.2, **protocol))
 
     first, again, other = logs(), logs(), logs(seed=1)
     for quantity in ("q", "qd", "tau"):
@@ -167,7 +166,7 @@ def test_motors_behind_gears_get_their_share_and_a_passive_joint_none():
     joints = [coordinate(), coordinate("b", continuous=True, passive=True)]
     bodies = [body(name, parent=k - 1, coordinate=k, inertia=point(1, 0.1)) for k, name in enumerate("ab")]
     two = arm(joints, bodies, gravity=(0, -9.81, 0))
-    settings = changed(Settings(), trajectories=1, duration=0.4, rate=500.0, test_fraction=0.0)
+    settings = changed(Settings(), trajectories=1, duration=0.4, sample_rate=500.0, test_fraction=0.0)
     plain, geared = (track(two, settings, np.diag([gear, 0.0])).train[0] for gear in (1.0, 20.0))
     np.testing.assert_allclose(geared.tau, plain.tau / 20, atol=1e-9)
     np.testing.assert_allclose(geared.q, plain.q, atol=1e-9)
@@ -180,7 +179,7 @@ def test_the_arm_is_held_against_its_weight_from_the_start(loaded):
     engine, friction = arm_dynamics(loaded.arm, loaded.settings), make_friction(loaded.arm, loaded.settings)
     still = Sines(np.full(N, 0.4), np.zeros(N), amplitude=0.0, frequency=0.125)
     settings = changed(loaded.settings, duration=0.4)
-    held = record(engine, friction, np.eye(N), still, tuned(np.zeros(N), 3.0), settings)
+    held = record(engine, friction, np.eye(N), still, tuned_gains(np.zeros(N), 3.0), settings)
     np.testing.assert_allclose(held.states[:, :N], 0.4, atol=1e-12)
     assert np.abs(held.tau).max() > 1
 
@@ -189,9 +188,9 @@ def test_the_arm_is_held_against_its_weight_from_the_start(loaded):
     ("tracking", "message"),
     [
         (
-            {"control": 150.0},
-            "tracking.control: got 150 Hz beside samples at 500 Hz, expected a rate of which "
-            "simulation.rate is a multiple",
+            {"control_rate": 150.0},
+            "tracking.control_rate: got 150 Hz beside samples at 500 Hz, expected a rate of which "
+            "simulation.sample_rate is a multiple",
         ),
         (
             {"amplitude": 1.5},
@@ -202,7 +201,7 @@ def test_the_arm_is_held_against_its_weight_from_the_start(loaded):
 )
 def test_impossible_motions_are_refused(tracking, message):
     with pytest.raises(SettingsError) as error:
-        track(slider(), changed(Settings(), tracking, rate=500.0))
+        track(slider(), changed(Settings(), tracking, sample_rate=500.0))
     assert str(error.value) == message
 
 
@@ -210,4 +209,4 @@ def test_every_joint_whose_range_is_too_small_is_told():
     joints = [coordinate(upper=-0.5), coordinate("b", upper=-0.4)]
     bodies = [body(name, parent=k - 1, coordinate=k, inertia=point(1, 0.1)) for k, name in enumerate("ab")]
     with pytest.raises(SpelgenErrors, match=r"of 'a'.*\n.*of 'b'"):
-        track(arm(joints, bodies), changed(Settings(), rate=500.0))
+        track(arm(joints, bodies), changed(Settings(), sample_rate=500.0))

@@ -19,6 +19,7 @@ from spelgen.cli import (
     log_commands,
     model_commands,
     run_commands,
+    simulate_command,
 )
 from spelgen.cli.console import say, told
 
@@ -32,7 +33,7 @@ app = typer.Typer(
 for command in (
     model_commands.inspect,
     model_commands.build,
-    run_commands.simulate,
+    simulate_command.simulate,
     identify_command.identify,
     log_commands.excite,
     log_commands.logs,

@@ -1,4 +1,4 @@
-"""Commands about logs and runs: `simulate`, `train`, `evaluate`, `report`."""
+"""Commands about runs: `train`, `evaluate`, `report`."""
 
 from __future__ import annotations
 
@@ -10,67 +10,21 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from spelgen.cli import options
-from spelgen.cli.console import INTERRUPTED, counted, note, say
+from spelgen.cli.console import INTERRUPTED, note, say
 from spelgen.cli.options import (
     Data,
     Filter,
     Force,
-    Joints,
     Mapping,
     MoreData,
-    Robot,
     RobotOption,
     Run,
-    SnapTolerance,
-    Tip,
 )
 from spelgen.errors import ModuleError
-from spelgen.spec import read_header
+from spelgen.spec import read_facts
 
 if TYPE_CHECKING:
     from spelgen.fitting.dataset import TrainingConfig
-
-WORST_INTEGRATION = 1e-8  # [rad, rad/s; m, m/s] above this simulated logs are no reference
-
-
-def simulate(
-    robot: Robot,
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="LOGS", help="Folder for train and test logs.")
-    ],
-    joints: Joints = None,
-    tip: Tip = None,
-    snap_tol: SnapTolerance = 2e-3,
-    seed: Annotated[
-        int | None, typer.Option("--seed", min=0, help="Default: that of the robot's settings.")
-    ] = None,
-    force: Force = False,
-) -> None:
-    """Make training and test logs with Pinocchio."""
-    from spelgen import pipeline
-    from spelgen.logs.read import write_logs
-    from spelgen.simulation.protocols import make_logs
-
-    loaded = pipeline.load(robot, options.names(joints), tip, snap_tol)
-    settings = loaded.settings
-    if seed is not None:
-        settings = settings.model_copy(
-            update={"simulation": settings.simulation.model_copy(update={"seed": seed})}
-        )
-    paths = {role: output / f"{role}.parquet" for role in ("train", "test")}
-    for path in paths.values():
-        options.require_free(path, force=force)
-    with counted("simulating") as progress:
-        result = make_logs(loaded.arm, settings, loaded.actuation.matrix(), progress=progress)
-    names = [coordinate.name for coordinate in loaded.arm.coordinates]
-    for path, trajectories in zip(paths.values(), (result.train, result.test), strict=True):
-        if trajectories:
-            write_logs(path, trajectories, names)
-            samples = sum(len(each.t) for each in trajectories)
-            say(f"wrote {path}: {len(trajectories)} trajectories, {samples} samples")
-    say(f"largest integration error: {result.integration_error:.1e} [rad, rad/s; m, m/s]")
-    if result.integration_error > WORST_INTEGRATION:
-        note(f"warning: more than {WORST_INTEGRATION:g}; do not take these logs as a reference")
 
 
 def train(
@@ -180,7 +134,7 @@ def train(
         config,
         urdf=urdf,
         source=source,
-        mapping=options.mapping(mapping, None if resume else urdf, read_header(module).joints),
+        mapping=options.mapping(mapping, None if resume else urdf, read_facts(module).joints),
         resume=resume,
         force=force,
         progress=not quiet,
@@ -205,7 +159,7 @@ def evaluate(
     folder = RunFolder(run)
     named = None
     if mapping is not None:
-        named = options.mapping(mapping, folder.urdf, read_header(folder.module).joints)
+        named = options.mapping(mapping, folder.urdf, read_facts(folder.module).joints)
     result = evaluation.evaluate(run, paths, cutoff=filter, mapping=named)
     for each in result.diagnostics:
         note(f"{each.severity}: {each.where}: {each.message}")
@@ -241,12 +195,12 @@ def _unchanged_urdf(module: Path) -> Path | None:
     """The URDF of the module's name near it, when it is still the one the module was built from."""
     from spelgen.pipeline import find_urdf
 
-    header = read_header(module)
+    facts = read_facts(module)
     try:
-        path = find_urdf(module, header.urdf)
+        path = find_urdf(module, facts.urdf)
     except ModuleError:
         return None
-    return path if hashlib.sha256(path.read_bytes()).hexdigest() == header.urdf_sha256 else None
+    return path if hashlib.sha256(path.read_bytes()).hexdigest() == facts.urdf_sha256 else None
 
 
 def _config(urdf: Path | None, resumed: Path | None, flags: dict[str, Any]) -> TrainingConfig:

@@ -21,13 +21,14 @@ from spelgen.files import write_text
 from spelgen.fitting.dataset import TrainingConfig
 from spelgen.fitting.loop import EPOCH_STEPS
 from spelgen.fitting.run_folder import write_json
+from spelgen.loaded_arm import LoadedArm, load_arm
 from spelgen.logs.read import Trajectory, write_logs
 from spelgen.settings.comparison import ComparisonSettings
 from spelgen.settings.settings import Settings
 from spelgen.spec import Net, Preset
 from spelgen.structure.nominal import working_range
 
-SCHEMA = 2
+SCHEMA = 3
 
 
 @dataclass(frozen=True)
@@ -103,9 +104,9 @@ def prepare_study(
 ) -> Study:
     """Simulate the logs and write the modules, or find them as an earlier call left them.
 
-    Raises RunError where the folder holds another comparison, and what `pipeline.load` and `make_logs` raise.
+    Raises RunError where the folder holds another comparison, and what `load_arm` and `simulate` raise.
     """
-    loaded = pipeline.load(robot)
+    loaded = load_arm(robot)
     chosen = {name: value for name, value in {"seeds": seeds, "steps": steps}.items() if value is not None}
     settings = loaded.settings.comparison.model_copy(update=chosen)
     ranges = [working_range(coordinate) for coordinate in loaded.arm.coordinates]
@@ -127,7 +128,7 @@ def prepare_study(
     gravity = yaml.safe_dump({"gravity": list(loaded.settings.gravity)})
     write_text(study.urdf.with_suffix(".yaml"), gravity)
     for variant in variants:
-        source = pipeline.build(
+        source = pipeline.generate(
             study.urdf, preset=variant.preset, net=variant.net, width=settings.width, depth=settings.depth
         )
         write_text(study.module(variant), source)
@@ -150,7 +151,7 @@ def _training(settings: Settings, comparison: ComparisonSettings) -> TrainingCon
     )
 
 
-def _description(study: Study, loaded: pipeline.Loaded) -> dict[str, Any]:
+def _description(study: Study, loaded: LoadedArm) -> dict[str, Any]:
     """What must be the same for a comparison to go on."""
     return {
         "schema": SCHEMA,
@@ -182,10 +183,10 @@ def _known(folder: Path, description: dict[str, Any], *, force: bool) -> bool:
     return False
 
 
-def _write_logs(study: Study, loaded: pipeline.Loaded, progress: Callable[[int, int], None] | None) -> None:
-    from spelgen.simulation.protocols import make_logs
+def _write_logs(study: Study, loaded: LoadedArm, progress: Callable[[int, int], None] | None) -> None:
+    from spelgen.simulation.simulate import simulate
 
-    result = make_logs(loaded.arm, loaded.settings, loaded.actuation.matrix(), progress=progress)
+    result = simulate(loaded, progress=progress)
     names = [coordinate.name for coordinate in loaded.arm.coordinates]
     first = study.settings.first
     study.logs.mkdir(parents=True, exist_ok=True)

@@ -14,21 +14,21 @@ class SimulationSettings(Group):
 
     protocol: random-inputs, or tracking: controlled motions, see `TrackingSettings`.
     trajectories: number, each from its own initial position, at rest.
-    duration: of each [s]. rate: of samples and of the inputs, which are held in between [Hz].
+    duration: of each [s]. sample_rate: of samples and of the inputs, which are held in between [Hz].
     inputs: the torques each actuated joint draws from, every sample anew [Nm].
     test_fraction: part of the trajectories kept for testing; with tracking, of each trajectory, its end.
     positions: joint -> (lowest, highest) initial position [rad]; not given: its limits, +-pi if continuous.
-    friction_velocity: width of the tanh in place of Coulomb friction's jump [rad/s].
+    coulomb_smoothing_velocity: width of the tanh in place of Coulomb friction's jump [rad/s].
     """
 
     protocol: Literal["random-inputs", "tracking"] = "random-inputs"
     trajectories: Count = 64
     duration: Positive = 1.0
-    rate: Positive = 20.0
+    sample_rate: Positive = 20.0
     inputs: Inputs = (-2.0, -1.0, 0.0, 1.0, 2.0)
     test_fraction: Share = 0.5
     positions: dict[str, tuple[Number, Number]] | None = None
-    friction_velocity: Positive = 0.05
+    coulomb_smoothing_velocity: Positive = 0.05
     seed: Whole = 0
 
     @field_validator("positions")
@@ -47,7 +47,7 @@ class TrackingSettings(Group):
     paths: "same": all trajectories follow one closed path, each beginning further on; "own": each has phases of
     its own, so that its test part lies where no training part was.
     bandwidths: of the PID controllers of the first, second, ... trajectory, then over again [Hz].
-    control: rate of the controllers, which hold their torques; simulation.rate is a multiple of it [Hz].
+    control_rate: of the controllers, which hold their torques; simulation.sample_rate is a multiple of it [Hz].
     resolution: of the encoders [rad; m]. cutoff: of the zero-phase low-pass on their positions [Hz].
     """
 
@@ -55,6 +55,6 @@ class TrackingSettings(Group):
     frequency: Positive = 0.125
     paths: Literal["same", "own"] = "same"
     bandwidths: Annotated[tuple[Positive, ...], Field(min_length=1)] = (2.0, 2.5, 3.0, 3.5, 4.0, 4.5)
-    control: Positive = 125.0
+    control_rate: Positive = 125.0
     resolution: Positive = 4.8e-5
     cutoff: Positive = 30.0

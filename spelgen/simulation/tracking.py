@@ -7,7 +7,7 @@ public. What the paper leaves open is ours: gains, phases, encoders and the filt
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
@@ -16,20 +16,16 @@ from spelgen.arm.arm import Arm
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
 from spelgen.errors import SettingsError, SpelgenError, collect
-from spelgen.logs.read import Trajectory
+from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.settings import Settings
 from spelgen.settings.simulation import TrackingSettings
-from spelgen.simulation.simulate import (
-    LOOSER,
-    Friction,
-    SimulationResult,
-    initial_range,
-    make_friction,
-    rollout,
-)
+from spelgen.simulation.friction import Friction, make_friction
+from spelgen.simulation.integration import LOOSER, rollout
+from spelgen.simulation.random_inputs import initial_range
+from spelgen.simulation.simulated_logs import SimulatedLogs
 
 FILTER_ORDER = 4
-INTEGRAL_SHARE = 0.2  # a tenth of what makes a joint without friction unstable
+INTEGRAL_GAIN = 0.2  # a tenth of what makes a joint without friction unstable
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +43,8 @@ class Sines:
 
     def velocity(self, t: float) -> np.ndarray:
         """(n,) [rad/s; m/s] at t [s]."""
-        rate = 2 * np.pi * self.frequency
-        return self.amplitude * rate * np.cos(rate * t + self.phase)
+        omega = 2 * np.pi * self.frequency
+        return self.amplitude * omega * np.cos(omega * t + self.phase)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,13 +76,13 @@ def track(
     input_matrix: np.ndarray | None = None,
     *,
     progress: Callable[[int, int], None] | None = None,
-) -> SimulationResult:
+) -> SimulatedLogs:
     """Return logs of the arm controlled along sines, by `settings.simulation` and `settings.tracking`.
 
     Every recording has its own gains, and its own phases or place to begin. The last `test_fraction` of each is
     for testing. Logged are positions from the encoders after a zero-phase low-pass, velocities by central
     differences of these, and the motors' torques. Arguments, errors and the integration error, here over whole
-    recordings under the same torques, as for `simulate`.
+    recordings under the same torques, as for `random_inputs`.
     """
     protocol = settings.simulation
     dynamics, friction = arm_dynamics(arm, settings), make_friction(arm, settings)
@@ -96,28 +92,29 @@ def track(
     for number, phase in enumerate(_phases(settings, middle.size)):
         sines = Sines(middle, phase, settings.tracking.amplitude, settings.tracking.frequency)
         bandwidth = settings.tracking.bandwidths[number % len(settings.tracking.bandwidths)]
-        felt = 1 / np.diag(np.linalg.inv(dynamics.mass_matrix(middle)))  # by a joint when the others are free
-        gains = tuned(felt, bandwidth)
+        # what a joint feels when the others are free
+        inertia = 1 / np.diag(np.linalg.inv(dynamics.mass_matrix(middle)))
+        gains = tuned_gains(inertia, bandwidth)
         recording = record(dynamics, friction, inputs, sines, gains, settings)
         effect = recording.tau @ inputs.T
         again = rollout(dynamics, friction, recording.states[0], recording.t, effect, looser=LOOSER)
         errors.append(np.abs(recording.states - again).max())
         log = measured(recording, settings.tracking, f"traj_{number:02d}")
-        kept = len(log.t) - round(protocol.test_fraction * len(log.t))
+        kept = max(1, len(log) - round(protocol.test_fraction * len(log)))
         train.append(log[:kept])
-        if kept < len(log.t):
-            test.append(_renamed(log[kept:], f"{log.name}_end"))
+        if kept < len(log):
+            test.append(replace(log[kept:], name=f"{log.name}_end"))
         if progress is not None:
             progress(number + 1, protocol.trajectories)
-    return SimulationResult(tuple(train), tuple(test), float(max(errors)))
+    return SimulatedLogs(train, test, float(max(errors)))
 
 
-def tuned(inertia: np.ndarray, bandwidth: float) -> Gains:
+def tuned_gains(inertia: np.ndarray, bandwidth: float) -> Gains:
     """Return gains for joints of inertia (n,) [kg m^2; kg] with both poles of the position loop at the bandwidth
     [Hz].
     """
-    rate = 2 * np.pi * bandwidth
-    return Gains(inertia * rate**2, INTEGRAL_SHARE * inertia * rate**3, 2 * inertia * rate)
+    omega = 2 * np.pi * bandwidth
+    return Gains(inertia * omega**2, INTEGRAL_GAIN * inertia * omega**3, 2 * inertia * omega)
 
 
 def record(
@@ -133,8 +130,8 @@ def record(
     inputs: G (n, n). The arm starts at rest where the sines begin, held against its weight.
     """
     tracking, n = settings.tracking, len(sines.middle)
-    tick, held = 1.0 / tracking.control, _samples_of_a_tick(settings)
-    ticks = -(-round(settings.simulation.duration * settings.simulation.rate) // held)
+    tick, held = 1.0 / tracking.control_rate, _samples_of_a_tick(settings)
+    ticks = -(-round(settings.simulation.duration * settings.simulation.sample_rate) // held)
     to_motors = np.linalg.pinv(inputs)
     state = np.concatenate([sines.position(0.0), np.zeros(n)])
     integral = dynamics.nonlinear_effects(*np.split(state, 2))
@@ -146,23 +143,25 @@ def record(
         lag = sines.velocity(k * tick) - (seen - before) / tick
         integral = integral + tick * gains.integral * error
         tau = to_motors @ (gains.proportional * error + gains.derivative * lag + integral)
-        t = k * tick + np.arange(held + 1) / settings.simulation.rate
+        t = k * tick + np.arange(held + 1) / settings.simulation.sample_rate
         passed = rollout(dynamics, friction, state, t, np.tile(inputs @ tau, (held + 1, 1)))
         states.append(passed[:-1])
         torques.append(np.tile(tau, (held, 1)))
         state = passed[-1]
     true = np.concatenate(states)
-    t = np.arange(len(true)) / settings.simulation.rate
+    t = np.arange(len(true)) / settings.simulation.sample_rate
     return Recording(t, true, _seen(true[:, :n], tracking), np.concatenate(torques))
 
 
 def measured(recording: Recording, tracking: TrackingSettings, name: str) -> Trajectory:
     """Return what is logged of a motion: filtered positions, their differences, and the torques."""
-    rate = 1.0 / (recording.t[1] - recording.t[0])
-    low_pass = butter(FILTER_ORDER, tracking.cutoff, fs=rate, output="sos")
-    padding = min(len(recording.t) - 1, int(3 * rate / tracking.cutoff))  # as `low_pass` of logs/filtering.py
+    sample_rate = 1.0 / (recording.t[1] - recording.t[0])
+    low_pass = butter(FILTER_ORDER, tracking.cutoff, fs=sample_rate, output="sos")
+    padding = min(
+        len(recording.t) - 1, int(3 * sample_rate / tracking.cutoff)
+    )  # as `low_pass` of logs/filtering.py
     q = sosfiltfilt(low_pass, recording.encoders, axis=0, padlen=padding)
-    return Trajectory(name, recording.t, q, np.gradient(q, recording.t, axis=0), recording.tau)
+    return Trajectory(recording.t, q, np.gradient(q, recording.t, axis=0), recording.tau, name)
 
 
 def _phases(settings: Settings, n: int) -> list[np.ndarray]:
@@ -180,18 +179,14 @@ def _seen(q: np.ndarray, tracking: TrackingSettings) -> np.ndarray:
     return np.round(q / tracking.resolution) * tracking.resolution
 
 
-def _renamed(trajectory: Trajectory, name: str) -> Trajectory:
-    return Trajectory(name, trajectory.t, trajectory.q, trajectory.qd, trajectory.tau)
-
-
 def _samples_of_a_tick(settings: Settings) -> int:
     """How many samples the controller holds a torque."""
-    rate, control = settings.simulation.rate, settings.tracking.control
-    count = round(rate / control)
-    if count < 1 or abs(count * control - rate) > 1e-9 * rate:
+    sample_rate, control_rate = settings.simulation.sample_rate, settings.tracking.control_rate
+    count = round(sample_rate / control_rate)
+    if count < 1 or abs(count * control_rate - sample_rate) > 1e-9 * sample_rate:
         raise SettingsError(
-            f"{control:g} Hz beside samples at {rate:g} Hz", element="tracking.control",
-            expected="a rate of which simulation.rate is a multiple",
+            f"{control_rate:g} Hz beside samples at {sample_rate:g} Hz", element="tracking.control_rate",
+            expected="a rate of which simulation.sample_rate is a multiple",
         )  # fmt: skip
     return count
 

@@ -1,0 +1,48 @@
+"""`simulate`: training and test logs of an arm."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from spelgen.cli import options
+from spelgen.cli.console import counted, note, say
+from spelgen.cli.options import AngleTolerance, Force, Joints, Robot, Tip
+
+WORST_INTEGRATION = 1e-8  # [rad, rad/s; m, m/s] above this simulated logs are no reference
+
+
+def simulate(
+    robot: Robot,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="LOGS", help="Folder for train and test logs.")
+    ],
+    joints: Joints = None,
+    tip: Tip = None,
+    angle_tolerance: AngleTolerance = 2e-3,
+    seed: Annotated[
+        int | None, typer.Option("--seed", min=0, help="Default: that of the robot's settings.")
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Make training and test logs with Pinocchio."""
+    from spelgen.loaded_arm import load_arm
+    from spelgen.logs.read import write_logs
+    from spelgen.simulation.simulate import simulate as simulated
+
+    arm = load_arm(robot, options.names(joints), tip, angle_tolerance)
+    paths = {role: output / f"{role}.parquet" for role in ("train", "test")}
+    for path in paths.values():
+        options.require_free(path, force=force)
+    with counted("simulating") as progress:
+        logs = simulated(arm, seed=seed, progress=progress)
+    names = [coordinate.name for coordinate in arm.arm.coordinates]
+    for path, trajectories in zip(paths.values(), (logs.train, logs.test), strict=True):
+        if trajectories:
+            write_logs(path, trajectories, names)
+            say(f"wrote {path}: {len(trajectories)} trajectories, {sum(map(len, trajectories))} samples")
+    say(f"largest integration error: {logs.integration_error:.1e} [rad, rad/s; m, m/s]")
+    if logs.integration_error > WORST_INTEGRATION:
+        note(f"warning: more than {WORST_INTEGRATION:g}; do not take these logs as a reference")

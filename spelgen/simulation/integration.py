@@ -1,0 +1,65 @@
+"""Integration of an arm's motion under held torques, as exact as floating-point numbers allow.
+
+    M(q) qdd + nonlinear_effects(q, qd) = tau - friction(qd)        tau held between samples
+
+Joint limits are not enforced: there are no end stops.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.integrate import DOP853
+
+from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
+from spelgen.errors import RunError
+from spelgen.simulation.friction import Friction
+
+RTOL, ATOL = 1e-13, 1e-15
+LOOSER = 100.0  # tolerances of the second integration, which the first is compared with
+
+
+def rollout(
+    dynamics: PinocchioDynamics,
+    friction: Friction,
+    start: np.ndarray,
+    t: np.ndarray,
+    tau: np.ndarray,
+    looser: float = 1.0,
+) -> np.ndarray:
+    """Return the states (q, qd), (T, 2n), at the times t (T,) [s] from a start (2n,) under tau (T, n).
+
+    Dormand-Prince 8(5,3), begun anew at every sample because tau jumps there. looser: factor on the error
+    allowed. Raises RunError where it cannot go on.
+    """
+    n = tau.shape[1]
+    states = np.empty((t.size, 2 * n))
+    states[0] = start
+
+    def derivative(_: float, state: np.ndarray) -> np.ndarray:
+        qd = state[n:]
+        return np.concatenate([qd, dynamics.forward_dynamics(state[:n], qd, held - friction(qd))])
+
+    for k in range(t.size - 1):
+        held = tau[k]
+        solver = DOP853(derivative, t[k], states[k], t[k + 1], rtol=RTOL * looser, atol=ATOL * looser)
+        _finish(solver, friction.widths, stretch=looser**0.125)  # as error control lengthens steps of order 8
+        states[k + 1] = solver.y
+    return states
+
+
+def _finish(solver: DOP853, widths: np.ndarray, stretch: float) -> None:
+    """Carry a solver of (q, qd) to the end of its interval.
+
+    No step may change a velocity by much more than a quarter of it, or of the width (n,) of its joint's
+    friction jump if that is more, times stretch: friction is flat beyond the jump, and the error control
+    would not see a reversal between the stages of a long step.
+    """
+    n, failure = widths.size, None
+    while solver.status == "running" and failure is None:
+        slope = np.max(np.abs(solver.f[n:]) / np.maximum(widths, np.abs(solver.y[n:])))
+        solver.max_step = 0.25 * stretch / slope if slope > 0 else np.inf
+        # the step-size control would never come back from a nan
+        failure = solver.step() if np.isfinite(solver.f).all() else "an acceleration is not finite"
+    if failure is not None:
+        cure = "check the inertials; make simulation.duration smaller or simulation.coulomb_smoothing_velocity larger"
+        raise RunError(f"the motion cannot be integrated beyond t = {solver.t:g} s: {failure}", do=cure)

@@ -1,0 +1,88 @@
+"""Arm + Settings -> logs under random torques, held from sample to sample, and how exact they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from spelgen.arm.arm import Arm, Coordinate
+from spelgen.dynamics.pinocchio_arm import arm_dynamics
+from spelgen.errors import SettingsError, collect
+from spelgen.logs.trajectory import Trajectory
+from spelgen.settings.settings import Settings
+from spelgen.simulation.friction import make_friction
+from spelgen.simulation.integration import LOOSER, rollout
+from spelgen.simulation.simulated_logs import SimulatedLogs
+
+
+def random_inputs(
+    arm: Arm,
+    settings: Settings,
+    input_matrix: np.ndarray | None = None,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+) -> SimulatedLogs:
+    """Return random-input trajectories of the arm by `settings.simulation`; same settings, same logs.
+
+    Each starts at rest at a random position and has round(duration * sample_rate) + 1 samples; tau[k] acts from t[k]
+    to t[k+1]. input_matrix: G (n, n), where the torques drawn and logged are those of motors; the joints get
+    G tau. progress: called with (trajectories done, all) after each one.
+    Raises ArmError without inertials, SettingsError for a joint without a range of initial positions, and
+    RunError when the motion cannot be integrated.
+    """
+    protocol = settings.simulation
+    dynamics, friction = arm_dynamics(arm, settings), make_friction(arm, settings)
+    lowest, highest = initial_range(arm, settings)
+    torques = [_torques(coordinate, settings) for coordinate in arm.coordinates]
+    t = np.arange(round(protocol.duration * protocol.sample_rate) + 1) / protocol.sample_rate
+    split_seed, *seeds = np.random.SeedSequence(protocol.seed).spawn(protocol.trajectories + 1)
+    trajectories, errors = [], []
+    for number, seed in enumerate(seeds):
+        random = np.random.default_rng(seed)
+        start = np.concatenate([random.uniform(lowest, highest), np.zeros(lowest.size)])
+        tau = np.stack([random.choice(choices, size=t.size) for choices in torques], axis=1)
+        effect = tau if input_matrix is None else tau @ input_matrix.T
+        states = rollout(dynamics, friction, start, t, effect)
+        errors.append(np.abs(states - rollout(dynamics, friction, start, t, effect, looser=LOOSER)).max())
+        q, qd = np.split(states, 2, axis=1)
+        trajectories.append(Trajectory(t, q, qd, tau, f"traj_{number:02d}"))
+        if progress is not None:
+            progress(number + 1, protocol.trajectories)
+    tested = _tested(protocol.trajectories, protocol.test_fraction, np.random.default_rng(split_seed))
+    return SimulatedLogs(
+        train=tuple(each for number, each in enumerate(trajectories) if number not in tested),
+        test=tuple(each for number, each in enumerate(trajectories) if number in tested),
+        integration_error=float(max(errors)),
+    )
+
+
+def _torques(coordinate: Coordinate, settings: Settings) -> np.ndarray:
+    joint = settings.joint(coordinate.name)
+    if coordinate.passive or not joint.actuated:
+        return np.zeros(1)
+    return np.array(joint.inputs or settings.simulation.inputs)
+
+
+def initial_range(arm: Arm, settings: Settings) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest and highest positions (n,) [rad; m] to start from; SettingsError where a joint has none."""
+    given = settings.simulation.positions or {}
+    ranges, errors = [], []
+    for joint in arm.coordinates:
+        if joint.name in given:
+            ranges.append(given[joint.name])
+        elif joint.continuous:
+            ranges.append((-np.pi, np.pi))
+        elif joint.lower is not None and joint.upper is not None:
+            ranges.append((joint.lower, joint.upper))
+        else:
+            message = "the joint has no limits: give its lowest and highest initial position"
+            errors.append(SettingsError(message, element=f"simulation.positions.{joint.name}"))
+    collect(errors)
+    lowest, highest = np.array(ranges, dtype=float).T
+    return lowest, highest
+
+
+def _tested(count: int, fraction: float, random: np.random.Generator) -> set[int]:
+    """Numbers of the trajectories kept for testing; at least one is left to train on."""
+    return set(random.permutation(count)[: min(round(fraction * count), count - 1)].tolist())
