@@ -1,4 +1,4 @@
-"""Evaluation: rivals against exact solutions, errors that mean what they say, results that are valid JSON."""
+"""Evaluation: baselines against exact solutions, errors that mean what they say, results that are valid JSON."""
 
 import json
 import math
@@ -7,18 +7,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import typer
+from typer.testing import CliRunner
 
+from spelgen.cli import evaluate_command
 from spelgen.dynamics.pinocchio_urdf import urdf_dynamics
 from spelgen.dynamics.tip import tip_kinematics
+from spelgen.emission.loading import load_module
 from spelgen.errors import LogError, RunError
-from spelgen.evaluation.baselines import held_velocity, urdf_values
+from spelgen.evaluation.baselines import constant_velocity, of_urdf
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.evaluation.invariants import energy_drift
-from spelgen.evaluation.torque import torque_errors, torque_samples
-from spelgen.fitting.dataset import TrainingConfig
-from spelgen.fitting.rollout import roll_out
-from spelgen.fitting.run_folder import load_model
+from spelgen.evaluation.rollout import rollout
+from spelgen.evaluation.subject import read_test_logs
+from spelgen.evaluation.torque import torque_errors
+from spelgen.fitting.config import Rollout
 from spelgen.fitting.train import train
+from spelgen.identification.samples import dynamics_samples
+from spelgen.loaded_arm import load_arm
+from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.windows import Windows, cut_windows
 
@@ -65,7 +72,7 @@ def cart_torque(q, qd, qdd):
     return torch.stack([slide, swing], dim=-1)
 
 
-def test_the_urdf_rival_has_the_dynamics_of_the_urdf(cart):
+def test_the_urdf_baseline_has_the_dynamics_of_the_urdf(cart):
     dynamics = urdf_dynamics(cart, ("slide", "swing"))
     q, qd, qdd = draw(20, 2), draw(20, 2, seed=1), draw(20, 2, seed=2)
     tau = cart_torque(q, qd, qdd)
@@ -73,14 +80,14 @@ def test_the_urdf_rival_has_the_dynamics_of_the_urdf(cart):
     torch.testing.assert_close(dynamics.forward_dynamics(q, qd, tau), qdd, atol=1e-11, rtol=0)
 
 
-def test_the_urdf_rival_follows_the_order_of_joints_asked_for(cart):
+def test_the_urdf_baseline_follows_the_order_of_joints_asked_for(cart):
     q, qd, qdd = draw(20, 2), draw(20, 2, seed=1), draw(20, 2, seed=2)
     turned = urdf_dynamics(cart, ("swing", "slide"))
     tau = turned.inverse_dynamics(q.flip(-1), qd.flip(-1), qdd.flip(-1))
     torch.testing.assert_close(tau.flip(-1), cart_torque(q, qd, qdd), atol=1e-12, rtol=0)
 
 
-def test_the_urdf_rival_locks_other_joints(cart):
+def test_the_urdf_baseline_locks_other_joints(cart):
     dynamics = urdf_dynamics(cart, ("swing",))
     q, qd, qdd = draw(20, 1), draw(20, 1, seed=1), draw(20, 1, seed=2)
     whole = [torch.cat([torch.zeros(20, 1), x], dim=-1) for x in (q, qd, qdd)]
@@ -107,12 +114,12 @@ def test_the_tip_is_the_end_of_the_fixed_links(cart):
         tip_kinematics(cart, ("slide", "swing"), "cart")
 
 
-def test_a_held_velocity_is_exact_where_nothing_accelerates():
+def test_a_constant_velocity_is_exact_where_nothing_accelerates():
     dt = 0.1 + 0.05 * torch.rand(4, 3, dtype=torch.float64)
     qd = draw(4, 1, 2)
     t = torch.cat([torch.zeros(4, 1), dt.cumsum(dim=1)], dim=1)
     windows = Windows(dt, t.unsqueeze(-1) * qd, qd.expand(-1, 4, -1), draw(4, 3, 2))
-    q, velocity = held_velocity().roll_out(windows)
+    q, velocity = constant_velocity().states(windows)
     torch.testing.assert_close(q, windows.q[:, 1:])
     torch.testing.assert_close(velocity, windows.qd[:, 1:])
 
@@ -120,33 +127,32 @@ def test_a_held_velocity_is_exact_where_nothing_accelerates():
 def motions(model, count=4, samples=25, rate=20.0, seed=0) -> list[Trajectory]:
     """Trajectories of a model under random held torques."""
     random = torch.Generator().manual_seed(seed)
-    start = 2 * torch.rand(count, 1, 2, generator=random, dtype=torch.float64) - 1
+    start = 2 * torch.rand(count, 2, generator=random, dtype=torch.float64) - 1
     tau = torch.randint(-2, 3, (count, samples, 2), generator=random).double()
-    still = torch.zeros(count, samples, 2, dtype=torch.float64)
-    dt = torch.full((count, samples - 1), 1 / rate, dtype=torch.float64)
     with torch.no_grad():
-        q, qd = roll_out(model, Windows(dt, start + still, still, tau[:, :-1]), 32)
-    states = [torch.cat([first, rest], dim=1).numpy() for first, rest in ((start, q), (still[:, :1], qd))]
+        q, qd = rollout(model, start, torch.zeros_like(start), tau[:, :-1], 1 / rate, substeps=32)
     t = np.arange(samples) / rate
-    return [
-        Trajectory(f"motion_{seed}{k}", t, states[0][k], states[1][k], tau[k].numpy()) for k in range(count)
-    ]
+    return [Trajectory(t, q[k], qd[k], tau[k], f"motion_{seed}{k}") for k in range(count)]
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:
     """A run whose best model is the one that made the logs."""
     folder = tmp_path_factory.mktemp("run")
-    model = load_model(STAND_IN)
+    model = load_module(STAND_IN)
     for role, seed in (("train", 0), ("test", 1)):
         write_logs(folder / "logs" / f"{role}.parquet", motions(model, seed=seed), JOINTS)
-    config = TrainingConfig(epochs=1, batch=32, learning_rate=1e-12, momentum_steps=0)
+    config = Rollout(epochs=1, optimizer="adamw", batch=32, learning_rate=1e-12, momentum_steps=0)
     train(STAND_IN, [folder / "logs"], folder / "run", config, progress=False)
     return folder / "run"
 
 
-def test_the_true_model_is_perfect_and_its_rival_is_not(run):
-    result = evaluate(run, [run.parent / "logs"])
+def evaluated(run, logs, **options):
+    return evaluate(run, read_test_logs(run, [logs]), **options)
+
+
+def test_the_true_model_is_perfect_and_its_baseline_is_not(run):
+    result = evaluated(run, run.parent / "logs")
     assert [(x.name, x.steps, x.windows) for x in result.horizons] == [
         ("1 step", 1, 4 * 24),
         ("10 steps", 10, 4 * 15),
@@ -154,30 +160,33 @@ def test_the_true_model_is_perfect_and_its_rival_is_not(run):
     ]
     for horizon in result.horizons:
         assert horizon.seconds == pytest.approx(horizon.steps / 20)
-        assert horizon.errors["model"].mean_share < 1e-4
-        assert horizon.errors["velocity stays constant"].mean_share > 0.3
+        assert horizon.errors["model"].mean_relative_rms < 1e-4
+        assert horizon.errors["velocity stays constant"].mean_relative_rms > 0.3
     assert result.energy_drift < 1e-9
     assert result.parameters == 7
     assert result.torque == {}  # 20 Hz is too sparse for accelerations
 
 
 def test_errors_are_those_of_the_last_sample(run):
-    result = evaluate(run, [run.parent / "logs"], steps=(3,), seconds=())
+    result = evaluated(run, run.parent / "logs", steps=(3,), seconds=())
     windows = cut_windows(read_logs([run.parent / "logs"], JOINTS, role="test"), 4, measured=False)
     error = windows.qd[:, 0] - windows.qd[:, 3]
     found = result.horizons[0].errors["velocity stays constant"]
     np.testing.assert_allclose(found.qd, error.square().mean(dim=0).sqrt(), rtol=1e-12)
-    np.testing.assert_allclose(found.qd_share, [1.0, 1.0], rtol=1e-12)
+    np.testing.assert_allclose(found.qd_relative_rms, [1.0, 1.0], rtol=1e-12)
 
 
 def test_the_same_run_and_logs_give_the_same_file(run):
-    files = []
+    app, files = typer.Typer(), []
+    app.command()(evaluate_command.evaluate)
     for _ in range(2):
-        evaluate(run, [run.parent / "logs"])
+        shown = CliRunner().invoke(app, [str(run), "--data", str(run.parent / "logs")])
+        assert shown.exit_code == 0, shown.output
         files.append((run / "evaluation.json").read_bytes())
     assert files[0] == files[1]
+    assert "stand_in on 4 test trajectories; * marks the best of a row" in shown.stdout
     found = json.loads(files[0], parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
-    assert found["schema"] == 1
+    assert found["schema"] == 2
     assert [x["trajectory"] for x in found["examples"]] == ["motion_10", "motion_12"]
     joint = found["examples"][0]["joints"][1]
     assert joint["name"] == "elbow"
@@ -186,12 +195,12 @@ def test_the_same_run_and_logs_give_the_same_file(run):
 
 
 def test_what_could_not_be_done_is_said(run):
-    result = evaluate(run, [run.parent / "logs" / "train.parquet"], seconds=(5.0,))
+    result = evaluated(run, run.parent / "logs" / "train.parquet", seconds=(5.0,))
     assert {x.code: x.message for x in result.diagnostics} == {
         "tested-on-training-data": "names also used in training: motion_00, motion_01, motion_02, motion_03; "
         "errors on training data prove nothing",
         "horizon-too-long": "no prediction over 5 s: the longest trajectory has 24 steps",
-        "no-urdf-rival": "no comparison with the URDF: the run has no robot.urdf",
+        "no-urdf-baseline": "no comparison with the URDF: no arm is known",
     }
 
 
@@ -202,23 +211,23 @@ def test_a_model_that_runs_away_has_no_error_but_null(run, tmp_path):
     for path in run.iterdir():
         (copy / path.name).write_bytes(path.read_bytes())
     torch.save(weights | {"damping": torch.tensor([12.0, 12.0], dtype=torch.float64)}, copy / "model.pt")
-    result = evaluate(copy, [run.parent / "logs"])
-    assert result.horizons[-1].errors["model"].mean_share is None
-    assert "NaN" not in (copy / "evaluation.json").read_text()
+    result = evaluated(copy, run.parent / "logs")
+    assert result.horizons[-1].errors["model"].mean_relative_rms is None
+    assert "NaN" not in json.dumps(result.to_dict())
 
 
 def test_what_is_no_run_is_refused(run, tmp_path):
     with pytest.raises(RunError) as caught:
-        evaluate(tmp_path / "none", [run.parent / "logs"])
+        evaluate(tmp_path / "none", [])
     assert str(caught.value) == (
         f"{tmp_path}/none: got no such run, expected a folder with config.json; spelgen train"
     )
     with pytest.raises(LogError, match="got no such file or folder, expected a log; check the path"):
-        evaluate(run, [tmp_path / "none.parquet"])
+        read_test_logs(run, [tmp_path / "none.parquet"])
 
 
 def test_energy_drift_is_seen():
-    model = load_model(STAND_IN)
+    model = load_module(STAND_IN)
     with torch.no_grad():
         model.weight.fill_(1.0)
     windows = cut_windows(motions(model), 2, measured=False)
@@ -229,24 +238,57 @@ def test_energy_drift_is_seen():
 
 
 def test_a_urdf_run_is_compared_in_torque_and_at_the_tip(cart):
-    """End to end on a URDF: its own dynamics made the logs, so the URDF rival is perfect."""
+    """End to end on a URDF: its own dynamics made the logs, so the URDF baseline is perfect."""
     from spelgen import pipeline
 
     module = cart.with_name("cart_model.py")
-    module.write_text(pipeline.build(cart))
-    names = load_model(module).joint_names
+    module.write_text(pipeline.generate(cart))
+    names = load_module(module).joint_names
     dynamics = urdf_dynamics(cart, names)
     for role, seed in (("train", 0), ("test", 1)):
         logs = motions(dynamics, count=2, samples=200, rate=100.0, seed=seed)
         write_logs(cart.parent / "logs" / f"{role}.parquet", logs, names)
-    config = TrainingConfig(epochs=1, filter=0.0, momentum_steps=0)
-    train(module, [cart.parent / "logs"], cart.parent / "run", config, progress=False)
-    result = evaluate(cart.parent / "run", [cart.parent / "logs"])
+    config, unfiltered = Rollout(epochs=1, momentum_steps=0), Preprocessing(cutoff=0.0)
+    logs = [cart.parent / "logs"]
+    train(module, logs, cart.parent / "run", config, preprocessing=unfiltered, progress=False)
+    result = evaluated(cart.parent / "run", logs[0])
     for horizon in result.horizons:
-        assert horizon.errors["URDF"].mean_share < 1e-4
+        assert horizon.errors["URDF"].mean_relative_rms < 1e-4
         assert horizon.errors["URDF"].tip_mm < min(1e-3, horizon.errors["model"].tip_mm)
     assert result.torque["URDF"].mean_nmse < result.torque["model"].mean_nmse
     assert not [x for x in result.diagnostics if x.code.startswith("no-")]
+
+
+def test_a_model_in_memory_is_judged_beside_any_dynamics(cart):
+    """No run, no file of logs: an arm, arrays, and whatever else predicts; the filter reaches torques too."""
+    from spelgen.building import build
+
+    arm = load_arm(cart)
+    model, dynamics = build(arm, preset="closed-form"), urdf_dynamics(cart, ["slide", "swing"])
+    logs = motions(dynamics, count=2, samples=200, rate=100.0)
+    result = evaluate(
+        model, logs, arm=arm, baselines={"truth": dynamics}, preprocessing=Preprocessing(cutoff=0.0)
+    )
+    for horizon in result.horizons:
+        assert set(horizon.errors) == {"model", "velocity stays constant", "URDF", "truth"}
+        assert horizon.errors["truth"] == horizon.errors["URDF"]
+    assert repr(result).startswith("<Results of cart on 2 test trajectories, relative RMS ")
+    assert "velocity stays constant" in result._repr_html_()
+    filtered = evaluate(model, logs, arm=arm, preprocessing=Preprocessing(cutoff=3.0))
+    assert filtered.cutoff == 3.0
+    assert filtered.torque["model"] != result.torque["model"]
+    assert "no-urdf-baseline" in {x.code for x in evaluate(model, logs).diagnostics}
+
+
+def test_rollouts_have_any_batch_shape_and_solver(cart):
+    dynamics = urdf_dynamics(cart, ("slide", "swing"))
+    q, qd, tau = draw(3, 2), draw(3, 2, seed=1), draw(4, 3, 5, 2, seed=2)
+    positions, velocities = rollout(dynamics, q, qd, tau, 0.01)
+    assert positions.shape == velocities.shape == (4, 3, 6, 2)
+    alone = rollout(dynamics, q[1], qd[1], tau[2, 1], torch.full((5,), 0.01, dtype=torch.float64))
+    torch.testing.assert_close((positions[2, 1], velocities[2, 1]), alone)
+    adaptive = rollout(dynamics, q, qd, tau, 0.01, solver="dopri5")
+    torch.testing.assert_close(adaptive, (positions, velocities), atol=1e-6, rtol=0)
 
 
 def moving(samples=600, rate=100.0, still=0) -> Trajectory:
@@ -254,23 +296,25 @@ def moving(samples=600, rate=100.0, still=0) -> Trajectory:
     phase = 2 * np.pi * np.maximum(t - still / rate, 0.0)
     q, qd = np.stack([1 - np.cos(phase)] * 2, 1), 2 * np.pi * np.stack([np.sin(phase)] * 2, 1)
     tau = (2 * np.pi) ** 2 * np.stack([np.cos(phase), 0 * phase], 1)
-    return Trajectory("moving", t, q, qd, tau)
+    return Trajectory(t, q, qd, tau, "moving")
 
 
 def test_torque_errors_by_the_protocol():
-    (samples,) = torque_samples([moving()])
+    (samples,) = dynamics_samples([moving()])
     exact = torque_errors(lambda q, qd, qdd: torch.stack([qdd[:, 0], 0 * qdd[:, 1]], -1), [samples])
     assert exact.nmse[0, 0] < 1e-3  # the ends of the filter remain
     assert math.isnan(exact.nmse[0, 1])  # a torque that never varies has nothing to explain
-    offset = torque_errors(lambda q, qd, qdd: samples.tau + torch.tensor([1.0, 2.0]), [samples])
+    offset = torque_errors(
+        lambda q, qd, qdd: torch.from_numpy(samples.tau) + torch.tensor([1.0, 2.0]), [samples]
+    )
     np.testing.assert_allclose(offset.rmse, [[1.0, 2.0]], rtol=1e-12)
-    np.testing.assert_allclose(offset.nmse[0, 0], 1 / samples.tau[:, 0].numpy().var(), rtol=1e-12)
+    np.testing.assert_allclose(offset.nmse[0, 0], 1 / samples.tau[:, 0].var(), rtol=1e-12)
 
 
 def test_only_moving_samples_of_dense_logs_count():
-    (samples,) = torque_samples([moving(still=200)])
+    (samples,) = dynamics_samples([moving(still=200)])
     assert len(samples.q) == pytest.approx(400, abs=15)
-    assert torque_samples([moving(rate=20.0)]) == []
+    assert dynamics_samples([moving(rate=20.0)]) == []
 
 
 def test_the_ur10e_urdf_has_its_known_torque_error(shared):
@@ -284,7 +328,7 @@ def test_the_ur10e_urdf_has_its_known_torque_error(shared):
         for x in folder.glob("*.parquet")
         if x.stem not in trained and not any(map(x.stem.__contains__, others))
     ]
-    samples = torque_samples(read_logs(sorted(paths), UR10E))
+    samples = dynamics_samples(read_logs(sorted(paths), UR10E))
     assert len(samples) == 9
-    torque = urdf_values(folder / "ur10e.urdf", UR10E, 1).torque
+    torque = of_urdf(folder / "ur10e.urdf", UR10E, 1).torque
     assert torque_errors(torque, samples).nmse.mean() == pytest.approx(0.67, abs=0.005)

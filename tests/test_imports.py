@@ -20,6 +20,7 @@ ROWS = f"""
 errors files labels listing templates
 settings: values yaml_document
 logs: mapping
+fitting: config
 settings: joint simulation training comparison messages settings
 design spec
 urdf: robot xacro_child xacro_input document values elements lint read actuation
@@ -29,25 +30,26 @@ structure: fourier base_parameters pseudo_inertia
 {" ".join(RUNTIME)}
 emission: bodies plan source docstring emit
 dynamics: protocol arrays constraint pinocchio_dynamics pinocchio_arm pinocchio_urdf regressor regressor_dynamics tip
-logs: arm_mapping trajectory bags tables read checks filtering windows chunks epoch_windows
+logs: arm_mapping trajectory bags tables read checks filtering preprocessing windows chunks epoch_windows
 simulation: friction integration simulated_logs random_inputs tracking
-identification: samples friction base_parameters least_squares prior identify formatting
+identification: samples friction base_parameters least_squares method prior identification
 excitation: trajectory design formatting
-fitting: run_folder gaussian_prior torque_fit lie_group rollout compiled urdf_regularizer progress
-fitting: dataset streaming optimizers torque_networks torque_start loop train
-evaluation: baselines torque examples invariants results evaluate
+fitting: run_folder gaussian_prior adaptive rollout dataset streaming torque_samples torque_jacobian torque_fit
+fitting: optimizers torque_networks urdf_regularizer stages compiled progress validation loop run_record fitted fit train
+evaluation: baselines torque rollout examples invariants tables results subject evaluate
 verify: agreement axes urdf_cross_check numeric_samples verify
 explain: reasons facts
 formulas: expression notation angles harmonics factoring shortening grouping formulas layout text latex sympy_module
 inspection loaded_arm pipeline
 simulation: simulate
+identification: identify
 exporting: rigid_body_projection urdf_file
-render: charts plots tables picture learned report_page inspection_page
+render: charts plots picture learned report_page inspection_page
 logs: statistics gravity report check_logs
 comparison: paper truth metrics study runs formatting
 render: logs_page comparison_page
-cli: console options formats model_commands run_commands log_commands
-cli: identify_command compare_command export_command main
+cli: console options formats model_commands train_command log_commands
+cli: identify_command evaluate_command compare_command export_command main
 __init__ __main__
 """
 
@@ -66,7 +68,7 @@ DERIVES = [
     x for x in LAYERS if x.startswith(("urdf.", "arm.", "structure.", "emission.", "verify.", "explain."))
 ]
 BESIDE_A_ROBOT = {"logs.gravity", "logs.report", "logs.check_logs"}  # logs held against an arm's own facts
-OF_A_RUN = {f"render.{name}" for name in ("charts", "plots", "tables", "picture", "learned", "report_page")}
+OF_A_RUN = {f"render.{name}" for name in ("charts", "plots", "picture", "learned", "report_page")}
 FITS = [x for x in LAYERS if x.startswith(("logs.", "fitting.", "evaluation.")) and x not in BESIDE_A_ROBOT]
 NEVER = {
     "spec": {"sympy", "flint", "torch"},

@@ -55,7 +55,7 @@ def compare(
             force=force,
             progress=progress,
         )
-    run_study(study, jobs=jobs, told=note)
+    run_study(study, jobs=jobs, note=note)
     tables = comparison_tables(study.robot, list(study.results()), time_steps(study))
     for table in tables:
         say(table.text() + "\n")

@@ -7,7 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from spelgen.comparison.paper import PAPER, Published
-from spelgen.render.tables import Cell, Row, Table, number
+from spelgen.evaluation.tables import Cell, Row, Table
+from spelgen.listing import number
 
 BASELINE = "phnode"
 Result = Mapping[str, Any]
@@ -16,7 +17,7 @@ Result = Mapping[str, Any]
 def comparison_tables(
     robot: str, results: Sequence[Result], step_seconds: Mapping[str, float]
 ) -> list[Table]:
-    """The tables of a comparison: sizes and speed (Tables 3 and 4 of the paper), losses (5, 6), laws."""
+    """The tables of a comparison: sizes and speed (Tables 3 and 4 of the paper), losses (5, 6), invariants."""
     by_variant: dict[str, list[Result]] = {}
     for result in results:
         by_variant.setdefault(result["variant"], []).append(result)
@@ -24,8 +25,8 @@ def comparison_tables(
     return [
         _sizes(by_variant, step_seconds, paper),
         _losses(by_variant, paper),
-        _spread(by_variant),
-        _laws(by_variant),
+        _by_seed(by_variant),
+        _invariants(by_variant),
     ]
 
 
@@ -78,7 +79,7 @@ def _losses(found: Mapping[str, Sequence[Result]], paper: Mapping[str, Published
     return Table(title, names, tuple(rows))
 
 
-def _spread(found: Mapping[str, Sequence[Result]]) -> Table:
+def _by_seed(found: Mapping[str, Sequence[Result]]) -> Table:
     names = tuple(found)
     seeds = sorted({run["seed"] for runs in found.values() for run in runs})
     rows = []
@@ -91,19 +92,19 @@ def _spread(found: Mapping[str, Sequence[Result]]) -> Table:
     return Table("Prediction loss over 1 s of every run", names, tuple(rows))
 
 
-def _laws(found: Mapping[str, Sequence[Result]]) -> Table:
+def _invariants(found: Mapping[str, Sequence[Result]]) -> Table:
     names = tuple(found)
     worst: dict[str, tuple[str, Callable[[list[float]], float]]] = {
         "least eigenvalue of M / mean": ("least_eigenvalue", min),
         "|R R^T - I|, 10,000 steps": ("orthogonality", max),
         "rise of energy, no input": ("energy_rise", max),
-        "energy drift, no friction": ("drift", max),
+        "energy drift, no friction": ("energy_drift", max),
     }
     rows = []
     for label, (key, pick) in worst.items():
-        values = {name: _worst([run["laws"][key] for run in found[name]], pick) for name in names}
+        values = {name: _worst([run["invariants"][key] for run in found[name]], pick) for name in names}
         rows.append(Row(label, tuple(Cell(number(values[name])) for name in names)))
-    return Table("Laws, worst over seeds; a negative rise is a fall", names, tuple(rows))
+    return Table("Invariants, worst over seeds; a negative rise is a fall", names, tuple(rows))
 
 
 def _worst(values: Sequence[float | None], pick: Callable[[list[float]], float]) -> float | None:

@@ -4,31 +4,35 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from multiprocessing import get_context
 from typing import TYPE_CHECKING, Any
 
 import torch
 
-from spelgen.comparison.metrics import laws, predict, sizes, step_seconds, thinned
+from spelgen.comparison.metrics import predict, sizes, step_seconds, thinned
 from spelgen.comparison.study import Study, Variant
 from spelgen.comparison.truth import example_positions, mass_error, true_mass
-from spelgen.evaluation.baselines import trained
+from spelgen.emission.loading import load_module
+from spelgen.evaluation.baselines import MODEL, of_dynamics
 from spelgen.evaluation.examples import predict_examples
+from spelgen.evaluation.invariants import invariants
+from spelgen.files import write_json
+from spelgen.fitting.config import BATCH
 from spelgen.fitting.rollout import LossScales, loss_scales
-from spelgen.fitting.run_folder import RunFolder, load_model, trained_model, write_json
+from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.fitting.train import train
 from spelgen.logs.read import read_logs
-from spelgen.spec import read_header
+from spelgen.spec import read_facts
 
 if TYPE_CHECKING:
-    from spelgen.fitting.run_folder import EmittedModel
+    from spelgen.emission.loading import EmittedModel
 
 HORIZON = 1.0  # s, over which trajectories are predicted
 
 
-def run_study(study: Study, *, jobs: int, told: Callable[[str], None]) -> None:
-    """Train and measure what is not yet done, `jobs` runs at a time; `told` hears of each that ends."""
+def run_study(study: Study, *, jobs: int, note: Callable[[str], None]) -> None:
+    """Train and measure what is not yet done, `jobs` runs at a time; `note` hears of each that ends."""
     waiting = [
         (variant, seed)
         for seed in range(study.settings.seeds)
@@ -38,13 +42,13 @@ def run_study(study: Study, *, jobs: int, told: Callable[[str], None]) -> None:
     count = len(study.variants) * study.settings.seeds
     done = count - len(waiting)
     if done:
-        told(f"{done} of {count} runs are done already")
+        note(f"{done} of {count} runs are done already")
     for variant, seed, result in _finished(study, waiting, jobs):
         done += 1
         loss = result["prediction"]["loss"]
         shown = "not finite" if loss is None else f"{loss:.3g}"
         took = f"{result['seconds']:.0f} s"
-        told(f"{done}/{count} {variant.name}, seed {seed}: prediction loss {shown}, {took}")
+        note(f"{done}/{count} {variant.name}, seed {seed}: prediction loss {shown}, {took}")
 
 
 def _finished(
@@ -70,12 +74,13 @@ def _run(study: Study, variant: Variant, seed: int) -> dict[str, Any]:
     folder = study.run(variant, seed)
     run = RunFolder(folder)
     ended = train(
-        study.module(variant), [study.logs], folder, replace(study.training, seed=seed),
-        urdf=study.urdf, resume=run.checkpoint.exists(), force=not run.checkpoint.exists(), progress=False,
+        study.module(variant), [study.logs], folder, study.training, preprocessing=study.preprocessing,
+        validation=study.validation_fraction, seed=seed, urdf=study.urdf,
+        resume=run.checkpoint.exists(), force=not run.checkpoint.exists(), progress=False,
     )  # fmt: skip
     if ended.status == "interrupted":
         raise KeyboardInterrupt
-    found = _measured(study, trained_model(run), read_header(run.module).joints, ended.substeps)
+    found = _measured(study, trained_model(run), read_facts(run.module).joints, ended.substeps)
     result = {
         "variant": variant.name,
         "seed": seed,
@@ -89,13 +94,15 @@ def _run(study: Study, variant: Variant, seed: int) -> dict[str, Any]:
 
 def _measured(study: Study, model: EmittedModel, joints: Sequence[str], substeps: int) -> dict[str, Any]:
     """What result.json holds of a trained model."""
-    every = study.training.every or 1
+    every = study.preprocessing.decimation or 1
     training, testing = (read_logs([study.logs], joints, role=role) for role in ("train", "test"))
     steps = round(HORIZON / (every * float(testing[0].t[1] - testing[0].t[0])))
     far = thinned(testing, steps + 1, every)
     near_train, near_test = (thinned(x, study.training.window, every) for x in (training, testing))
     low, high = (torch.tensor(x, dtype=torch.float64) for x in (study.low, study.high))
-    examples = predict_examples(trained(model, substeps), testing, steps, joints, every=every, measured=False)
+    examples = predict_examples(
+        of_dynamics(MODEL, model, substeps), testing, steps, joints, decimation=every, measured=False
+    )
     along = example_positions(asdict(examples[0])) if examples else torch.zeros(0, len(joints))
     seen = far.q[:, 0]
     return {
@@ -103,7 +110,7 @@ def _measured(study: Study, model: EmittedModel, joints: Sequence[str], substeps
         "train": asdict(predict(model, near_train, substeps)),
         "test": asdict(predict(model, near_test, substeps)),
         "prediction": asdict(predict(model, far, substeps)),
-        "laws": asdict(laws(model, far, low, high)),
+        "invariants": asdict(invariants(model, far, low, high)),
         "mass": {
             "error": mass_error(model.mass_matrix(seen), true_mass(study.source, seen)),
             "along": model.mass_matrix(along).tolist(),
@@ -114,13 +121,14 @@ def _measured(study: Study, model: EmittedModel, joints: Sequence[str], substeps
 
 def time_steps(study: Study) -> dict[str, float]:
     """Seconds of a training step of each variant, one after the other in this process."""
-    joints = read_header(study.module(study.variants[0])).joints
+    joints = read_facts(study.module(study.variants[0])).joints
     training = read_logs([study.logs], joints, role="train")
-    windows = thinned(training, study.training.window, study.training.every or 1)[: study.training.batch]
+    windows = thinned(training, study.training.window, study.preprocessing.decimation or 1)
+    windows = windows[: study.training.batch or BATCH]
     times = {}
-    torch.set_num_threads(study.training.threads)
+    torch.set_num_threads(1)
     for variant in study.variants:
-        model = load_model(study.module(variant))
+        model = load_module(study.module(variant))
         scales: LossScales = loss_scales(windows, model.joint_types)
         times[variant.name] = step_seconds(model, windows, scales, 1)
     return times

@@ -8,24 +8,24 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import yaml
 from lxml import etree
 
 from spelgen import pipeline
+from spelgen.design import Net, Preset
 from spelgen.errors import RunError
-from spelgen.files import write_text
-from spelgen.fitting.dataset import TrainingConfig
+from spelgen.files import write_json, write_text
+from spelgen.fitting.config import Rollout, fit_config
 from spelgen.fitting.loop import EPOCH_STEPS
-from spelgen.fitting.run_folder import write_json
 from spelgen.loaded_arm import LoadedArm, load_arm
+from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import Trajectory, write_logs
 from spelgen.settings.comparison import ComparisonSettings
 from spelgen.settings.settings import Settings
-from spelgen.spec import Net, Preset
 from spelgen.structure.nominal import working_range
 
 SCHEMA = 3
@@ -62,7 +62,9 @@ class Study:
     source: Path
     robot: str
     settings: ComparisonSettings
-    training: TrainingConfig
+    training: Rollout
+    preprocessing: Preprocessing
+    validation_fraction: float
     variants: tuple[Variant, ...]
     low: tuple[float, ...]
     high: tuple[float, ...]
@@ -116,6 +118,8 @@ def prepare_study(
         robot=loaded.arm.name,
         settings=settings,
         training=_training(loaded.settings, settings),
+        preprocessing=Preprocessing(**{**loaded.settings.training.preprocessing, "cutoff": 0.0}),
+        validation_fraction=loaded.settings.training.validation_fraction,
         variants=tuple(variants),
         low=tuple(low for low, _ in ranges),
         high=tuple(high for _, high in ranges),
@@ -136,19 +140,15 @@ def prepare_study(
     return study
 
 
-def _training(settings: Settings, comparison: ComparisonSettings) -> TrainingConfig:
-    """How every variant is trained: without the URDF's pull, which would tell the answer."""
-    config = TrainingConfig.from_settings(settings.training)
+def _training(settings: Settings, comparison: ComparisonSettings) -> Rollout:
+    """How every variant is trained: without the URDF's regularizer, which would tell the answer."""
     epochs = -(-comparison.steps // EPOCH_STEPS)
-    return replace(
-        config,
-        prior=0.0,
-        filter=0.0,
-        epochs=epochs,
-        patience=epochs,
-        momentum_steps=comparison.momentum_steps,
-        weight_decay=config.weight_decay if comparison.weight_decay is None else comparison.weight_decay,
-    )
+    options: dict[str, Any] = {"urdf_weight": 0.0, "epochs": epochs, "patience": epochs}
+    options["momentum_steps"] = comparison.momentum_steps
+    if comparison.weight_decay is not None:
+        options["weight_decay"] = comparison.weight_decay
+    defaults = settings.training.options
+    return cast("Rollout", fit_config("rollout", closed_form=False, options=options, defaults=defaults))
 
 
 def _description(study: Study, loaded: LoadedArm) -> dict[str, Any]:
@@ -160,7 +160,8 @@ def _description(study: Study, loaded: LoadedArm) -> dict[str, Any]:
         "simulation": loaded.settings.simulation.model_dump(mode="json"),
         "tracking": loaded.settings.tracking.model_dump(mode="json"),
         "comparison": study.settings.model_dump(mode="json"),
-        "training": asdict(study.training),
+        "training": study.training.model_dump(mode="json"),
+        "preprocessing": asdict(study.preprocessing),
         "variants": [variant.name for variant in study.variants],
     }
 

@@ -8,14 +8,14 @@ from typing import Any
 
 import torch
 
-from spelgen import pipeline
+from spelgen.loaded_arm import load_arm
 
 
 def true_mass(robot: Path, q: torch.Tensor) -> torch.Tensor:
     """M (T, n, n) [kg m^2, kg m, kg] of a URDF and its sidecar, by Pinocchio, at q (T, n); rotors included."""
     from spelgen.dynamics.pinocchio_arm import arm_dynamics
 
-    loaded = pipeline.load(robot)
+    loaded = load_arm(robot)
     return arm_dynamics(loaded.arm, loaded.settings).mass_matrix(q)
 
 

@@ -83,8 +83,6 @@ class VelocityState:
         """qd and qdd."""
         return p, self.dynamics.forward_dynamics(q, p, torch.zeros_like(q) if tau is None else tau)
 
-    rates = port_hamiltonian_rhs
-
 
 def integrable(dynamics: RigidDynamics) -> Any:
     """What a rollout integrates: the dynamics in momenta where they have these, else in velocities."""

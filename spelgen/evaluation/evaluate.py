@@ -1,100 +1,98 @@
-"""Judge a trained run on test logs, beside its rivals, on the same windows and with the same integrator."""
+"""Judge a model on test logs, beside its baselines, on the same windows and with the same integrator."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import torch
-
-from spelgen.dynamics.tip import tip_kinematics
+from spelgen.dynamics.protocol import RigidDynamics
 from spelgen.errors import Diagnostic
-from spelgen.evaluation.baselines import Contender, held_velocity, trained, urdf_values
+from spelgen.evaluation.baselines import MODEL, Predictor, constant_velocity, of_dynamics, of_urdf
 from spelgen.evaluation.examples import Example, predict_examples
 from spelgen.evaluation.invariants import energy_drift
-from spelgen.evaluation.results import Evaluation, Horizon, Tip, state_errors, torque_figures
-from spelgen.evaluation.torque import torque_errors, torque_samples
-from spelgen.fitting.dataset import filter_cutoff
+from spelgen.evaluation.results import Horizon, Results, state_errors, torque_summary
+from spelgen.evaluation.subject import Subject, subject
+from spelgen.evaluation.torque import torque_errors
 from spelgen.fitting.rollout import choose_substeps, loss_scales
-from spelgen.fitting.run_folder import RunFolder, trained_model, write_json
-from spelgen.logs.checks import examine
-from spelgen.logs.filtering import prepare
-from spelgen.logs.mapping import LogMapping
-from spelgen.logs.read import Trajectory, read_logs
-from spelgen.logs.trajectory import rate
+from spelgen.identification.samples import dynamics_samples
+from spelgen.logs.checks import check
+from spelgen.logs.preprocessing import Preprocessing
+from spelgen.logs.trajectory import Trajectory, require_joints
 from spelgen.logs.windows import Windows, cut_windows
-from spelgen.spec import Header, read_header
 
 if TYPE_CHECKING:
-    from spelgen.fitting.run_folder import EmittedModel
+    from spelgen.dynamics.tip import TipKinematics
 
-PREDICTED_STEPS = 40_000  # per horizon and contender: windows are thinned evenly to about this many
+PREDICTED_STEPS = 40_000  # per horizon and predictor: windows are thinned evenly to about this many
 MOST_WINDOWS = 2000
+PROBED = 64  # windows that say how many steps the integrator needs
 
 
 def evaluate(
-    folder: Path | str,
-    data: Iterable[Path | str],
+    model: Any,
+    logs: Sequence[Trajectory],
     *,
+    arm: Any = None,
+    baselines: Mapping[str, RigidDynamics] | None = None,
+    preprocessing: Preprocessing | None = None,
     steps: Sequence[int] = (1, 10),
     seconds: Sequence[float] = (1.0,),
-    cutoff: float | None = None,
-    mapping: LogMapping | None = None,
-    threads: int = 1,
-) -> Evaluation:
-    """Evaluate the best model of a run on logs (a folder's test.* where there are such) and write
-    evaluation.json.
+) -> Results:
+    """Predict the states and torques of test logs and measure the errors.
 
-    steps, seconds: horizons in samples and in time; those longer than every trajectory are left out, and
-    said. cutoff: of the filter on the logs [Hz], 0: none; by default the one the run was trained with.
-    mapping: how the logs are named and measured; by default as those that were trained on. The
-    result depends on nothing else: no random numbers. Raises RunError, ModuleError, LogError.
+    model: an emitted one, a fit, or the folder of a run. arm: of ``load_arm``, or the path of a URDF; by default
+    the fit's: it gives the URDF as a baseline, and errors of the tip. baselines: any dynamics to be judged beside
+    it, by name, e.g. ``{"least squares": identify(...).dynamics}``. preprocessing: of states and torques; by
+    default as the model was fitted. steps, seconds: horizons in samples and in time; those longer than every
+    trajectory are left out, and said. The result depends on nothing else: no random numbers. Raises LogError.
     """
-    torch.set_num_threads(threads)
-    run = RunFolder(Path(folder))
-    config = run.read_json(run.config)
-    model, header = trained_model(run), read_header(run.module)
-    mapping = mapping or LogMapping(**config.get("mapping", {}))
-    trajectories = read_logs(data, header.joints, role="test", mapping=mapping, joint_types=model.joint_types)
-    notes = examine(trajectories, header.joints, model.joint_types)
-    notes += _seen(trajectories, config)
-    used = config["cutoff"] if cutoff is None else filter_cutoff(cutoff, map(rate, trajectories))
-    pieces = prepare(trajectories, shortest=2, cutoff=used)
+    judged = subject(model, arm)
+    joint_types, logs = judged.model.joint_types, list(logs)
+    for trajectory in logs:
+        require_joints(trajectory, judged.joints)
+    notes = check(logs, judged.joints, joint_types)
+    notes += _seen(logs, judged)
+    used = _preprocessing(preprocessing, judged, logs)
+    pieces = used.pieces(logs, shortest=2)
     lengths = _lengths(pieces, steps, seconds, notes)
-    probe = _windows(pieces, config["config"]["window"], 64, measured=used is not None)
-    start = run.load_state(run.checkpoint)["substeps"]
-    substeps = choose_substeps(model, probe, loss_scales(probe, model.joint_types), start=start)
-    contenders = [trained(model, substeps), held_velocity(), *_urdf(run, header, substeps, notes)]
-    tip = _tip(run, header, notes)
-    samples = torque_samples(trajectories)
-    result = Evaluation(
-        robot=header.robot,
-        joints=header.joints,
-        trajectories=tuple(x.name for x in trajectories),
-        cutoff=used,
+    probe = _windows(pieces, judged.window, PROBED, measured=used.filtered)
+    substeps = choose_substeps(judged.model, probe, loss_scales(probe, joint_types), start=judged.substeps)
+    predictors = [of_dynamics(MODEL, judged.model, substeps), constant_velocity()]
+    predictors += _urdf_baseline(judged, substeps, notes)
+    predictors += [of_dynamics(name, each, substeps) for name, each in (baselines or {}).items()]
+    tip = _tip(judged, notes)
+    samples = dynamics_samples(logs, preprocessing=used)
+    return Results(
+        robot=judged.robot,
+        joints=tuple(judged.joints),
+        trajectories=tuple(x.name for x in logs),
+        cutoff=used.cutoff or None,
         substeps=substeps,
-        parameters=sum(parameter.numel() for parameter in model.parameters()),
+        parameters=sum(parameter.numel() for parameter in judged.model.parameters()),
         horizons=tuple(
-            _horizon(name, k, pieces, contenders, model, tip, used) for name, k in lengths.items()
+            _horizon(name, k, pieces, predictors, joint_types, tip, used) for name, k in lengths.items()
         ),
         torque={
-            x.name: torque_figures(torque_errors(x.torque, samples))
-            for x in contenders
+            x.name: torque_summary(torque_errors(x.torque, samples))
+            for x in predictors
             if x.torque and samples
         },
-        energy_drift=energy_drift(model, probe),
-        examples=_examples(contenders[0], pieces, lengths, header.joints, used),
+        energy_drift=energy_drift(judged.model, probe),
+        examples=_examples(predictors[0], pieces, lengths, judged.joints, used),
         diagnostics=tuple(notes),
     )
-    write_json(run.evaluation, result.to_dict())
-    return result
 
 
-def _seen(trajectories: Sequence[Trajectory], config: dict[str, Any]) -> list[Diagnostic]:
+def _preprocessing(asked: Preprocessing | None, judged: Subject, logs: Sequence[Trajectory]) -> Preprocessing:
+    if asked is None and judged.preprocessing is not None:
+        return judged.preprocessing
+    return (asked or Preprocessing()).resolved([x.sample_rate for x in logs])
+
+
+def _seen(logs: Sequence[Trajectory], judged: Subject) -> list[Diagnostic]:
     """A warning when a trajectory of this name was trained on."""
-    known = set(config["training"]) | set(config["validation"])
-    seen = [x.name for x in trajectories if x.name in known]
+    seen = [x.name for x in logs if x.name in judged.trained_on]
     if not seen:
         return []
     message = f"names also used in training: {', '.join(seen)}; errors on training data prove nothing"
@@ -105,10 +103,10 @@ def _lengths(
     pieces: Sequence[Trajectory], steps: Sequence[int], seconds: Sequence[float], notes: list[Diagnostic]
 ) -> dict[str, int]:
     """Horizon name -> number of samples ahead."""
-    frequency = sum(rate(x) for x in pieces) / len(pieces)
+    frequency = sum(x.sample_rate for x in pieces) / len(pieces)
     wanted = {f"{k} step{'s' if k > 1 else ''}": k for k in steps}
     wanted |= {f"{duration:g} s": round(duration * frequency) for duration in seconds}
-    longest = max(len(x.t) for x in pieces) - 1
+    longest = max(map(len, pieces)) - 1
     for name, k in wanted.items():
         if not 0 < k <= longest:
             message = f"no prediction over {name}: the longest trajectory has {longest} steps"
@@ -118,8 +116,8 @@ def _lengths(
 
 def _windows(pieces: Sequence[Trajectory], samples: int, most: int, *, measured: bool) -> Windows:
     """About `most` windows, or all, evenly spread."""
-    samples = min(samples, max(len(x.t) for x in pieces))
-    starts = sum(max(0, len(x.t) - samples + 1) for x in pieces)
+    samples = min(samples, max(map(len, pieces)))
+    starts = sum(max(0, len(x) - samples + 1) for x in pieces)
     return cut_windows(pieces, samples, -(-starts // most), measured=measured)
 
 
@@ -127,52 +125,60 @@ def _horizon(
     name: str,
     steps: int,
     pieces: Sequence[Trajectory],
-    contenders: Sequence[Contender],
-    model: EmittedModel,
-    tip: Tip | None,
-    cutoff: float | None,
+    predictors: Sequence[Predictor],
+    joint_types: Sequence[str],
+    tip: TipKinematics | None,
+    used: Preprocessing,
 ) -> Horizon:
     most = min(MOST_WINDOWS, PREDICTED_STEPS // steps)
-    windows = _windows(pieces, steps + 1, max(most, 1), measured=cutoff is not None)
-    errors = {x.name: state_errors(x, windows, model.joint_types, tip) for x in contenders}
+    windows = _windows(pieces, steps + 1, max(most, 1), measured=used.filtered)
+    position = None if tip is None else tip.position
+    errors = {x.name: state_errors(x, windows, joint_types, position) for x in predictors}
     return Horizon(name, steps, windows.dt.sum(dim=1).mean().item(), len(windows), errors)
 
 
 def _examples(
-    contender: Contender,
+    predictor: Predictor,
     pieces: Sequence[Trajectory],
     lengths: dict[str, int],
     joints: Sequence[str],
-    cutoff: float | None,
+    used: Preprocessing,
 ) -> tuple[Example, ...]:
     if not lengths:
         return ()
-    return predict_examples(contender, pieces, max(lengths.values()), joints, measured=cutoff is not None)
+    return predict_examples(predictor, pieces, max(lengths.values()), joints, measured=used.filtered)
 
 
-def _urdf(run: RunFolder, header: Header, substeps: int, notes: list[Diagnostic]) -> list[Contender]:
-    """The URDF's own values as a rival, where they can be had."""
-    if not run.urdf.exists():
-        reason = "the run has no robot.urdf"
+def _urdf_baseline(judged: Subject, substeps: int, notes: list[Diagnostic]) -> list[Predictor]:
+    """The URDF's own values as a baseline, where they can be had."""
+    if judged.urdf is None:
+        reason = "no arm is known"
     else:
         try:
-            return [urdf_values(run.urdf, header.joints, substeps)]
-        except (
-            Exception
-        ) as error:  # Pinocchio and its parser raise many kinds; the evaluation stands without it
-            reason = " ".join(f"{type(error).__name__}: {error}".split())
-    notes.append(
-        Diagnostic("info", "no-urdf-rival", "robot.urdf", None, f"no comparison with the URDF: {reason}")
-    )
+            return [of_urdf(judged.urdf, judged.joints, substeps)]
+        except Exception as error:  # Pinocchio and its parser raise many kinds; the evaluation stands without
+            reason = _told(error)
+    message = f"no comparison with the URDF: {reason}"
+    notes.append(Diagnostic("info", "no-urdf-baseline", _where(judged.urdf), None, message))
     return []
 
 
-def _tip(run: RunFolder, header: Header, notes: list[Diagnostic]) -> Tip | None:
-    if not run.urdf.exists():
+def _tip(judged: Subject, notes: list[Diagnostic]) -> TipKinematics | None:
+    if judged.urdf is None:
         return None
+    from spelgen.dynamics.tip import tip_kinematics  # slow to import
+
     try:
-        return tip_kinematics(run.urdf, header.joints, header.options.tip).position
+        return tip_kinematics(judged.urdf, judged.joints, judged.tip)
     except Exception as error:  # as above, of pytorch-kinematics
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
-        notes.append(Diagnostic("info", "no-tip", "robot.urdf", None, f"no tip errors: {reason}"))
+        message = f"no tip errors: {_told(error)}"
+        notes.append(Diagnostic("info", "no-tip", _where(judged.urdf), None, message))
         return None
+
+
+def _where(urdf: Path | None) -> str:
+    return "robot.urdf" if urdf is None else urdf.name
+
+
+def _told(error: Exception) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import torch
 
-from spelgen.evaluation.baselines import Contender
-from spelgen.logs.read import Trajectory
+from spelgen.evaluation.baselines import Predictor
+from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import cut_windows
 
 MOST = 3
@@ -36,36 +36,36 @@ class Example:
 
 
 def predict_examples(
-    contender: Contender,
+    predictor: Predictor,
     pieces: Sequence[Trajectory],
     steps: int,
     joints: Sequence[str],
     *,
-    every: int = 1,
+    decimation: int = 1,
     measured: bool,
 ) -> tuple[Example, ...]:
-    """Up to three examples of `steps` steps of `every` samples, each from the middle of another trajectory,
+    """Up to three examples of `steps` steps of `decimation` samples, each from the middle of another trajectory,
     evenly chosen.
     """
-    long_enough = list({x.name: x for x in pieces if len(x.t) > steps * every}.values())
+    long_enough = list({x.name: x for x in pieces if len(x.t) > steps * decimation}.values())
     chosen = long_enough[:: -(-len(long_enough) // MOST)]
-    return tuple(_example(contender, piece, steps, joints, every, measured) for piece in chosen)
+    return tuple(_example(predictor, piece, steps, joints, decimation, measured) for piece in chosen)
 
 
 def _example(
-    contender: Contender,
+    predictor: Predictor,
     piece: Trajectory,
     steps: int,
     joints: Sequence[str],
-    every: int,
+    decimation: int,
     measured: bool,
 ) -> Example:
-    start = (len(piece.t) - 1 - steps * every) // (2 * every) * every
-    part = piece[start : start + steps * every + 1]
-    window = cut_windows([part], steps + 1, every=every, measured=measured)
-    part = part[::every]
+    start = (len(piece.t) - 1 - steps * decimation) // (2 * decimation) * decimation
+    part = piece[start : start + steps * decimation + 1]
+    window = cut_windows([part], steps + 1, decimation=decimation, measured=measured)
+    part = part[::decimation]
     with torch.no_grad():
-        predicted = contender.roll_out(window)  # each (1, steps, n)
+        predicted = predictor.states(window)  # each (1, steps, n)
     q, qd = (
         torch.cat([first[:, :1], rest], dim=1)[0]
         for first, rest in zip((window.q, window.qd), predicted, strict=True)

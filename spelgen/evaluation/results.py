@@ -1,4 +1,4 @@
-"""What an evaluation finds, in the form that evaluation.json has, and how errors come into it."""
+"""What an evaluation finds: for people, notebooks, and as evaluation.json."""
 
 from __future__ import annotations
 
@@ -10,46 +10,50 @@ from typing import Any
 import torch
 
 from spelgen.errors import Diagnostic
-from spelgen.evaluation.baselines import Contender
+from spelgen.evaluation.baselines import MODEL, Predictor
 from spelgen.evaluation.examples import Example
+from spelgen.evaluation.tables import result_tables, verdict
 from spelgen.evaluation.torque import TorqueErrors
 from spelgen.fitting.rollout import position_difference
 from spelgen.logs.windows import Windows
 
-Tip = Callable[[torch.Tensor], torch.Tensor]
+SCHEMA = 2
 
 
 @dataclass(frozen=True)
-class Errors:
-    """Errors at the end of a horizon, root mean square over windows, per joint where a tuple.
+class StateErrors:
+    """Errors at the end of a horizon, root mean square (RMS) over windows, per joint where a tuple.
 
-    q, qd: [rad, rad/s; m, m/s], revolute positions as angles on the circle. q_share, qd_share: the same
-    relative to how much q and qd change over the horizon. mean_share: mean of all q_share and qd_share.
-    tip_mm: distance of the tip [mm]. None: not finite, or not known.
+    q, qd: [rad, rad/s; m, m/s], revolute positions as angles on the circle. q_relative_rms, qd_relative_rms:
+    relative to how much q and qd change over the horizon. mean_relative_rms: mean of all of these. tip_mm: distance
+    of the tip [mm]. None: not finite, or not known.
     """
 
     q: tuple[float | None, ...]
     qd: tuple[float | None, ...]
-    q_share: tuple[float | None, ...]
-    qd_share: tuple[float | None, ...]
-    mean_share: float | None
+    q_relative_rms: tuple[float | None, ...]
+    qd_relative_rms: tuple[float | None, ...]
+    mean_relative_rms: float | None
     tip_mm: float | None
 
 
 @dataclass(frozen=True)
 class Horizon:
-    """How far ahead: a number of samples, in the mean `seconds`; from `windows` starting points."""
+    """How far ahead: a number of samples, in the mean `seconds`; from `windows` starting points.
+
+    errors: by predictor.
+    """
 
     name: str
     steps: int
     seconds: float
     windows: int
-    errors: dict[str, Errors]
+    errors: dict[str, StateErrors]
 
 
 @dataclass(frozen=True)
-class Torque:
-    """Errors of the inverse dynamics of one contender by the protocol of `torque_samples`.
+class TorqueSummary:
+    """Errors of the inverse dynamics of one predictor by the protocol of `dynamics_samples`.
 
     nmse: per trajectory, mean over joints. mean_nmse: mean over trajectories. rmse: per joint [Nm, N], mean
     over trajectories.
@@ -60,13 +64,14 @@ class Torque:
     rmse: tuple[float | None, ...]
 
 
-@dataclass(frozen=True)
-class Evaluation:
+@dataclass(frozen=True, repr=False)
+class Results:
     """What `evaluate` found; `to_dict` is evaluation.json.
 
-    cutoff: of the filter on the test logs [Hz], None without. torque: by contender, empty where the logs are
-    too sparse. energy_drift: of the model without input and dissipation over 1 s, integrated to thirteen digits,
-    relative to its kinetic energy; None where the logs never move. examples: over the longest horizon.
+    cutoff: of the filter on the test logs [Hz], None without. substeps: of rk4 between samples. parameters: trained
+    numbers of the model. torque: by predictor, empty where the logs are too sparse. energy_drift: of the model
+    without input and dissipation over 1 s, integrated to thirteen digits, relative to its kinetic energy; None where
+    the logs never move. examples: over the longest horizon.
     """
 
     robot: str
@@ -76,35 +81,58 @@ class Evaluation:
     substeps: int
     parameters: int
     horizons: tuple[Horizon, ...]
-    torque: dict[str, Torque]
+    torque: dict[str, TorqueSummary]
     energy_drift: float | None
     examples: tuple[Example, ...]
     diagnostics: tuple[Diagnostic, ...]
 
     def to_dict(self) -> dict[str, Any]:
         """JSON form, versioned by `schema`."""
-        return {"schema": 1} | asdict(self)
+        return {"schema": SCHEMA} | asdict(self)
+
+    def text(self) -> str:
+        """For a terminal: every table, the best of each row starred."""
+        tables = (table.text() for table in result_tables(self.to_dict()))
+        return "\n\n".join([f"{self._heading()}; * marks the best of a row", *tables])
+
+    def __repr__(self) -> str:
+        last = self.horizons[-1] if self.horizons else None
+        error = last and last.errors[MODEL].mean_relative_rms
+        told = f", relative RMS {error:.3g} after {last.name}" if last and error is not None else ""
+        return f"<Results of {self._heading()}{told}>"
+
+    def _repr_html_(self) -> str:
+        tables = (table.listing().html() for table in result_tables(self.to_dict()))
+        return "".join([f"<p>{verdict(self.to_dict())}</p>", *tables])
+
+    def _heading(self) -> str:
+        count = len(self.trajectories)
+        return f"{self.robot} on {count} test trajector{'ies' if count != 1 else 'y'}"
 
 
 def state_errors(
-    contender: Contender, windows: Windows, joint_types: Sequence[str], tip: Tip | None
-) -> Errors:
+    predictor: Predictor,
+    windows: Windows,
+    joint_types: Sequence[str],
+    tip: Callable[[torch.Tensor], torch.Tensor] | None,
+) -> StateErrors:
+    """Errors at the ends of these windows. tip: its position (..., 3) [m] by q."""
     with torch.no_grad():
-        q, qd = (x[:, -1] for x in contender.roll_out(windows))  # (W, n)
+        q, qd = (x[:, -1] for x in predictor.states(windows))  # (W, n)
         measured_q, measured_qd = windows.q[:, -1], windows.qd[:, -1]
         error = position_difference(q, measured_q, joint_types), qd - measured_qd
         change = position_difference(measured_q, windows.q[:, 0], joint_types), measured_qd - windows.qd[:, 0]
-        shares = [_rms(e) / _rms(c) for e, c in zip(error, change, strict=True)]
-        away = (
-            None if tip is None else 1000 * _rms((tip(q) - tip(measured_q)).norm(dim=-1, keepdim=True)).item()
-        )
-    return Errors(
+        relative = [_rms(e) / _rms(c) for e, c in zip(error, change, strict=True)]
+        away = math.nan
+        if tip is not None:
+            away = 1000 * _rms((tip(q) - tip(measured_q)).norm(dim=-1, keepdim=True)).item()
+    return StateErrors(
         q=_finite(_rms(error[0])),
         qd=_finite(_rms(error[1])),
-        q_share=_finite(shares[0]),
-        qd_share=_finite(shares[1]),
-        mean_share=_finite(torch.cat(shares).mean().unsqueeze(0))[0],
-        tip_mm=away if away is not None and math.isfinite(away) else None,
+        q_relative_rms=_finite(relative[0]),
+        qd_relative_rms=_finite(relative[1]),
+        mean_relative_rms=_finite(torch.cat(relative).mean().unsqueeze(0))[0],
+        tip_mm=away if math.isfinite(away) else None,
     )
 
 
@@ -118,10 +146,11 @@ def _finite(values: torch.Tensor) -> tuple[float | None, ...]:
     return tuple(x if math.isfinite(x) else None for x in values.tolist())
 
 
-def torque_figures(errors: TorqueErrors) -> Torque:
+def torque_summary(errors: TorqueErrors) -> TorqueSummary:
+    """Means over joints and trajectories."""
     nmse = torch.from_numpy(errors.nmse)
     by_trajectory = nmse.nanmean(dim=1)
-    return Torque(
+    return TorqueSummary(
         nmse=dict(zip(errors.trajectories, _finite(by_trajectory), strict=True)),
         mean_nmse=_finite(by_trajectory.mean().unsqueeze(0))[0],
         rmse=_finite(torch.from_numpy(errors.rmse).mean(dim=0)),

@@ -13,12 +13,13 @@ from markupsafe import Markup
 from spelgen import __version__
 from spelgen.comparison.study import Study
 from spelgen.comparison.truth import example_positions, true_mass
+from spelgen.emission.loading import load_module
+from spelgen.evaluation.tables import Table
 from spelgen.files import write_text
-from spelgen.fitting.run_folder import RunFolder, load_model
+from spelgen.fitting.run_folder import RunFolder
 from spelgen.render.charts import Line, line_chart
 from spelgen.render.learned import INERTIA_UNITS, entry_index
 from spelgen.render.plots import QUANTITIES, UNITS
-from spelgen.render.tables import Table
 from spelgen.templates import render
 
 STYLES = ("c1", "c2", "c3", "c4", "c5")
@@ -37,7 +38,7 @@ def write_comparison(study: Study, tables: Sequence[Table]) -> Path:
     results = [result for result in study.results() if result["seed"] == 0]
     names = [result["variant"] for result in results]
     styles = dict(zip(names, STYLES, strict=False))
-    joint_types = load_model(study.module(study.variants[0])).joint_types
+    joint_types = load_module(study.module(study.variants[0])).joint_types
     text = render(
         "comparison.html.jinja",
         version=__version__,

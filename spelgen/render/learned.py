@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import torch
 
-from spelgen.fitting.run_folder import RunFolder, load_model
+from spelgen.emission.loading import load_module
+from spelgen.fitting.run_folder import RunFolder, trained_model
 
-CONSTANTS = ("constants", "constant_scale", "constant_basis")
-ROTORS = ("rotor", "rotor_size")
+if TYPE_CHECKING:
+    from spelgen.emission.loading import EmittedModel
+
 INERTIA_UNITS = {"revolute revolute": "kg m²", "prismatic prismatic": "kg"}
 
 
@@ -38,29 +40,22 @@ class Learned:
 
 def read_learned(run: RunFolder) -> Learned:
     """What the best model of a run has learned. Raises ModuleError or RunError when it cannot be read."""
-    model = load_model(run.module)
-    parameters = sum(parameter.numel() for parameter in model.parameters())
-    before, after = model.state_dict(), run.load_state(run.weights)
-    found: list[Constant] = []
-    if all(key in state for key in CONSTANTS for state in (before, after)):
-        basis = after["constant_basis"].reshape(-1, model.n, model.n)
+    before, after = load_module(run.module), trained_model(run)
+    found = []
+    mass = getattr(after.dynamics, "mass", None)
+    if hasattr(mass, "constants"):
+        basis = mass.constant_basis.reshape(-1, after.n, after.n)
         values = zip(basis, _constants(before), _constants(after), strict=True)
-        found += [_constant(*each, model.joint_types) for each in values]
-    if all(key in state for key in ROTORS for state in (before, after)):
-        drives = zip(_rotors(before), _rotors(after), model.joint_types, strict=True)
-        found += [_rotor(index, *each) for index, each in enumerate(drives)]
-    return Learned(parameters, tuple(found))
+        found += [_constant(*each, after.joint_types) for each in values]
+    if hasattr(after, "armature"):
+        drives = zip(before.armature.tolist(), after.armature.tolist(), after.joint_types, strict=True)
+        found += [_armature(index, *each) for index, each in enumerate(drives)]
+    return Learned(sum(parameter.numel() for parameter in after.parameters()), tuple(found))
 
 
-def _constants(state: Mapping[str, Any]) -> list[float]:
-    constants = state["constants"]
-    # where the mass matrix is all constants, the module takes their sizes so that it stays positive definite
-    sizes = constants if "output_basis" in state else constants.abs()
-    return (sizes * state["constant_scale"]).tolist()
-
-
-def _rotors(state: Mapping[str, Any]) -> list[float]:
-    return (state["rotor_size"] * state["rotor"].exp()).tolist()
+def _constants(model: EmittedModel) -> list[float]:
+    values: list[float] = model.dynamics.mass.constants().tolist()
+    return values
 
 
 def _constant(basis: torch.Tensor, start: float, learned: float, joint_types: Sequence[str]) -> Constant:
@@ -72,9 +67,9 @@ def _constant(basis: torch.Tensor, start: float, learned: float, joint_types: Se
     return Constant("links", where, start, learned, unit)
 
 
-def _rotor(index: int, start: float, learned: float, kind: str) -> Constant:
+def _armature(index: int, start: float, learned: float, kind: str) -> Constant:
     unit = INERTIA_UNITS[f"{kind} {kind}"]
-    return Constant(f"drive of joint {index + 1}", f"M{entry_index(index, index)}", start, learned, unit)
+    return Constant(f"armature of joint {index + 1}", f"M{entry_index(index, index)}", start, learned, unit)
 
 
 def entry_index(row: int, column: int) -> str:

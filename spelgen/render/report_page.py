@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
-import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +12,17 @@ from markupsafe import Markup
 
 from spelgen import __version__
 from spelgen.errors import RunError
+from spelgen.evaluation.baselines import MODEL
+from spelgen.evaluation.tables import result_tables, verdict
 from spelgen.files import write_text
-from spelgen.fitting.dataset import TrainingConfig
 from spelgen.fitting.run_folder import RunFolder
+from spelgen.listing import number
+from spelgen.logs.preprocessing import Preprocessing
 from spelgen.render.learned import Learned, read_learned
 from spelgen.render.picture import Picture, read_picture
 from spelgen.render.plots import UNITS, joint_charts, loss_chart
-from spelgen.render.tables import MODEL, number, result_tables, verdict
-from spelgen.spec import Header, Options, read_header
+from spelgen.render.reproduction import commands, files
+from spelgen.spec import read_facts
 from spelgen.templates import render
 
 EXAMPLES = 2  # predicted trajectories that are drawn
@@ -33,15 +34,6 @@ class Number:
 
     value: str
     label: str
-
-
-@dataclass(frozen=True)
-class File:
-    """A file of the run folder."""
-
-    name: str
-    size: str
-    sha256: str
 
 
 @dataclass(frozen=True)
@@ -69,7 +61,7 @@ def render_report(folder: Path | str) -> str:
         raise RunError(
             "no run", file=run.path, expected="a folder with module.py", do="make one with `spelgen train`"
         )
-    header, picture = read_header(run.module), read_picture(run.module)
+    facts, picture = read_facts(run.module), read_picture(run.module)
     config = run.read_json(run.config) if run.config.is_file() else None
     metrics = _metrics(run.metrics)
     evaluation = run.read_json(run.evaluation) if run.evaluation.is_file() else None
@@ -77,7 +69,7 @@ def render_report(folder: Path | str) -> str:
     return render(
         "report.html.jinja",
         version=__version__,
-        header=header,
+        facts=facts,
         picture=picture,
         units=UNITS,
         numbers=_numbers(picture, learned, metrics, evaluation),
@@ -89,13 +81,13 @@ def render_report(folder: Path | str) -> str:
         examples=[
             (
                 each["trajectory"],
-                joint_charts(each, dict(zip(header.joints, header.joint_types, strict=True))),
+                joint_charts(each, dict(zip(facts.joints, facts.joint_types, strict=True))),
             )
             for each in (evaluation or {}).get("examples", [])[:EXAMPLES]
         ],
         learned=learned,
-        files=_files(run.path),
-        commands=_commands(header, config),
+        files=files(run.path),
+        commands=commands(facts, config),
     )
 
 
@@ -122,11 +114,11 @@ def _numbers(
     found = []
     if evaluation and evaluation["horizons"]:
         last = evaluation["horizons"][-1]
-        errors = {name: each["mean_share"] for name, each in last["errors"].items()}
-        rivals = ", ".join(f"{name} {number(value)}" for name, value in errors.items() if name != MODEL)
+        errors = {name: each["mean_relative_rms"] for name, each in last["errors"].items()}
+        others = ", ".join(f"{name} {number(value)}" for name, value in errors.items() if name != MODEL)
         found.append(
             Number(
-                number(errors.get(MODEL)), f"error after {last['name']}, relative to the motion ({rivals})"
+                number(errors.get(MODEL)), f"error after {last['name']}, relative to the motion ({others})"
             )
         )
         if last["errors"][MODEL]["tip_mm"] is not None:
@@ -149,50 +141,22 @@ def _training(config: Mapping[str, Any], metrics: Sequence[Mapping[str, Any]]) -
     last, best = metrics[-1], metrics[-1]["best"]
     best_epoch = next((each["epoch"] for each in metrics if each["validation"] == best), 0)
     kept = f"epoch {best_epoch}" if best_epoch else "the start: no epoch was better"
+    used, chosen = Preprocessing(**config["preprocessing"]), config["config"]
     facts = {
+        "objective": config["objective"],
         "data": f"{config['training_windows']:,} windows from {_many(config['training'])}",
         "validation": f"{config['validation_windows']:,} windows from {_many(config['validation'])} held out",
-        "start": f"{config['config']['momentum_steps']:,} steps on the momentum along the logs",
-        "filter": f"{config['cutoff']:g} Hz, zero phase" if config["cutoff"] else "none",
+        "filter": f"{used.cutoff:g} Hz, zero phase" if used.filtered else "none",
         "length": f"{last['epoch']} epochs, {last['step']:,} steps, {_duration(last['seconds'])}",
         "kept": f"the model of {kept}, validation loss {number(best)}",
-        "integrator": f"rk4, {last['substeps']} steps between samples",
         "setbacks": f"{last['rollbacks']} epochs undone" if last["rollbacks"] else "none",
     }
-    settings = {key.replace("_", " "): str(x) for key, x in config["config"].items() if x is not None}
+    if chosen.get("momentum_steps"):
+        facts["start"] = f"{chosen['momentum_steps']:,} steps on the momentum along the logs"
+    if chosen.get("solver", "rk4") == "rk4":
+        facts["integrator"] = f"rk4, {last['substeps']} steps between samples"
+    settings = {key.replace("_", " "): str(x) for key, x in chosen.items() if x is not None}
     return Training(loss_chart(metrics, best_epoch), facts, settings)
-
-
-def _files(folder: Path) -> list[File]:
-    """Every file of the folder but the page itself and what is being written."""
-    paths = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
-    return [
-        File(path.name, _size(path.stat().st_size), hashlib.sha256(path.read_bytes()).hexdigest())
-        for path in paths
-        if path.suffix != ".html"
-    ]
-
-
-def _commands(header: Header, config: Mapping[str, Any] | None) -> list[str]:
-    """What makes this run again; the logs' place is not known to the run."""
-    options = _flags(asdict(header.options), asdict(Options()))
-    commands = [f"spelgen build {shlex.quote(header.urdf)}{options} -o module.py"]
-    if config:
-        commands.append(
-            f"spelgen train module.py --data LOGS -o RUN{_flags(config['config'], asdict(TrainingConfig()))}"
-        )
-    return [*commands, "spelgen evaluate RUN --data LOGS", "spelgen report RUN"]
-
-
-def _flags(chosen: Mapping[str, Any], usual: Mapping[str, Any]) -> str:
-    """The command-line flags of what differs from the default."""
-    names = {"snap_tolerance": "snap-tol"}
-    text = ""
-    for key, value in chosen.items():
-        if value is not None and value != usual.get(key):
-            told = ",".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
-            text += f" --{names.get(key, key.replace('_', '-'))} {shlex.quote(told)}"
-    return text
 
 
 def _many(trajectories: Sequence[str]) -> str:
@@ -204,9 +168,3 @@ def _duration(seconds: float) -> str:
         return f"{seconds:.0f} s"
     minutes = seconds / 60
     return f"{minutes:.1f} min" if minutes < 100 else f"{minutes / 60:.1f} h"
-
-
-def _size(count: int) -> str:
-    return (
-        f"{count} B" if count < 1000 else f"{count / 1000:.1f} kB" if count < 1e6 else f"{count / 1e6:.1f} MB"
-    )

@@ -1,17 +1,13 @@
-"""Tables of a run's results against its rivals, laid out once for the terminal and for the report."""
+"""Tables of results, a column for each predictor or model: for the terminal, notebooks and pages."""
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from spelgen.listing import number
-
-WIDTH = 80
-WIDEST_LABEL = 30
-MODEL = "model"  # the trained model among the contenders
+from spelgen.evaluation.baselines import MODEL
+from spelgen.listing import Listing, number
 
 
 @dataclass(frozen=True)
@@ -24,7 +20,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Row:
-    """One quantity, as every contender has it."""
+    """One quantity, in every column."""
 
     label: str
     cells: tuple[Cell, ...]
@@ -32,26 +28,24 @@ class Row:
 
 @dataclass(frozen=True)
 class Table:
-    """Quantities down, contenders across; `title` says what the numbers are."""
+    """Quantities down, predictors or models across; `title` says what the numbers are."""
 
     title: str
-    contenders: tuple[str, ...]
+    columns: tuple[str, ...]
     rows: tuple[Row, ...]
 
     def text(self) -> str:
-        """The table for a terminal; the best of each row is starred."""
-        head = ["", *(f"{name}  " for name in self.contenders)]
-        lines = [head]
-        for row in self.rows:
-            label = textwrap.shorten(row.label, WIDEST_LABEL, placeholder="...")
-            lines.append([label, *(cell.text + (" *" if cell.best else "  ") for cell in row.cells)])
-        widths = [max(len(line[k]) for line in lines) for k in range(len(head))]
-        laid = [
-            f"  {line[0]:<{widths[0]}}"
-            + "".join(f"  {x:>{w}}" for x, w in zip(line[1:], widths[1:], strict=True))
-            for line in lines
-        ]
-        return "\n".join([*textwrap.wrap(self.title, WIDTH), *(line.rstrip() for line in laid)])
+        """For a terminal; the best of each row is starred."""
+        return self.listing().text()
+
+    def listing(self) -> Listing:
+        """The same as text."""
+        head = ("", *(f"{name}  " for name in self.columns))
+        rows = tuple(
+            (row.label, *(cell.text + (" *" if cell.best else "  ") for cell in row.cells))
+            for row in self.rows
+        )
+        return Listing(self.title, head, rows)
 
 
 def result_tables(evaluation: Mapping[str, Any]) -> list[Table]:
@@ -60,7 +54,7 @@ def result_tables(evaluation: Mapping[str, Any]) -> list[Table]:
     if horizons:
         heads = [_ahead(horizon) for horizon in horizons]
         title = "Error relative to the motion (0: none, 1: as if the arm had stood still)"
-        tables.append(_table(title, heads, [_of(horizon, "mean_share") for horizon in horizons]))
+        tables.append(_table(title, heads, [_of(horizon, "mean_relative_rms") for horizon in horizons]))
         tips = [_of(horizon, "tip_mm") for horizon in horizons]
         if any(value is not None for tip in tips for value in tip.values()):
             tables.append(_table("Error of the tip's position [mm]", heads, tips))
@@ -81,13 +75,13 @@ def verdict(evaluation: Mapping[str, Any]) -> str:
     """One sentence: at which horizons the model's relative error is the least."""
     best: dict[str, str | None] = {}
     for horizon in evaluation["horizons"]:
-        errors = {name: value for name, value in _of(horizon, "mean_share").items() if value is not None}
+        errors = {name: x for name, x in _of(horizon, "mean_relative_rms").items() if x is not None}
         best[horizon["name"]] = min(errors, key=errors.__getitem__, default=None)
-    won = [name for name, contender in best.items() if contender == MODEL]
+    won = [name for name, predictor in best.items() if predictor == MODEL]
     if not best:
         return "No horizon was evaluated."
     if not won:
-        return "At no horizon does the model predict better than its rivals."
+        return "At no horizon does the model predict better than its baselines."
     lost = [f"; over {name} {each or 'nothing'} is better" for name, each in best.items() if each != MODEL]
     return f"The model predicts best over {_listed(won)}{''.join(lost)}."
 
@@ -99,7 +93,7 @@ def _ahead(horizon: Mapping[str, Any]) -> str:
 
 
 def _of(horizon: Mapping[str, Any], what: str) -> dict[str, Any]:
-    return {contender: errors[what] for contender, errors in horizon["errors"].items()}
+    return {predictor: errors[what] for predictor, errors in horizon["errors"].items()}
 
 
 def _by_joint(title: str, joints: Sequence[str], values: Mapping[str, Sequence[float | None]]) -> Table:

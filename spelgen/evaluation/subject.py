@@ -1,0 +1,81 @@
+"""What is judged, and what is known of how it came about."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from spelgen.fitting.fitted import Fit, load_run
+from spelgen.fitting.run_folder import RunFolder
+from spelgen.logs.arm_mapping import GivenMapping
+from spelgen.logs.mapping import LogMapping
+from spelgen.logs.preprocessing import Preprocessing
+from spelgen.logs.read import read_logs
+from spelgen.logs.trajectory import Trajectory
+from spelgen.settings.settings import load_mapping
+from spelgen.spec import read_facts
+from spelgen.urdf.read import read_urdf
+
+if TYPE_CHECKING:
+    from spelgen.emission.loading import EmittedModel
+    from spelgen.fitting.config import WindowConfig
+
+WINDOW = 5  # samples of the windows that say how many steps the integrator needs
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A model with its joints as the URDF and logs name them.
+
+    urdf: its robot's, where known; tip: the link there, None for the last. preprocessing, window, substeps: those
+    of its fit. trained_on: names of the trajectories that it has seen.
+    """
+
+    model: EmittedModel
+    robot: str
+    joints: Sequence[str]
+    urdf: Path | None = None
+    tip: str | None = None
+    preprocessing: Preprocessing | None = None
+    window: int = WINDOW
+    substeps: int = 1
+    trained_on: frozenset[str] = frozenset()
+
+
+def subject(judged: Any, arm: Any = None) -> Subject:
+    """A model, a fit or the folder of a run, on an arm of ``load_arm`` or the URDF of this path."""
+    if isinstance(judged, str | Path):
+        judged = load_run(judged)
+    urdf = arm if arm is None or isinstance(arm, str | Path) else arm.robot.path
+    if not isinstance(judged, Fit):
+        return _of_model(judged, urdf)
+    seen = frozenset(judged.record["training"]) | frozenset(judged.record["validation"])
+    return replace(
+        _of_model(judged.model, urdf or judged.urdf),
+        preprocessing=judged.preprocessing,
+        window=cast("WindowConfig", judged.config).window,
+        substeps=judged.substeps,
+        trained_on=seen,
+    )
+
+
+def _of_model(model: EmittedModel, urdf: Path | str | None) -> Subject:
+    facts = getattr(model, "facts", None)
+    if facts is None:  # no emitted module: what else has an arm's dynamics
+        return Subject(model, type(model).__name__, model.joint_names, None if urdf is None else Path(urdf))
+    return Subject(model, facts.robot, facts.joints, None if urdf is None else Path(urdf), facts.options.tip)
+
+
+def read_test_logs(
+    folder: Path | str, paths: Iterable[Path | str], mapping: GivenMapping = None
+) -> list[Trajectory]:
+    """Logs of a run's arm (a folder's test.* where there are such), mapped as those that it was trained on."""
+    run = RunFolder(Path(folder))
+    record, facts = run.read_json(run.config), read_facts(run.module)
+    if mapping is None:
+        mapping = LogMapping(**record["mapping"])
+    elif isinstance(mapping, str | Path) and run.urdf.exists():  # it may speak of all joints of the URDF
+        mapping = load_mapping(mapping, [joint.name for joint in read_urdf(run.urdf).joints])
+    return read_logs(paths, facts.joints, mapping, "test", joint_types=facts.joint_types)

@@ -1,0 +1,67 @@
+"""What a run lies in and how it is made again."""
+
+from __future__ import annotations
+
+import hashlib
+import shlex
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from spelgen.fitting.config import CONFIGS
+from spelgen.logs.preprocessing import Preprocessing
+from spelgen.spec import Facts, Options
+
+FLAGS = {"cutoff": "filter"}  # options whose flag has another name
+
+
+@dataclass(frozen=True)
+class File:
+    """A file of the run folder."""
+
+    name: str
+    size: str
+    sha256: str
+
+
+def files(folder: Path) -> list[File]:
+    """Every file of the folder but pages and what is being written."""
+    paths = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
+    return [
+        File(path.name, _size(path.stat().st_size), hashlib.sha256(path.read_bytes()).hexdigest())
+        for path in paths
+        if path.suffix != ".html"
+    ]
+
+
+def commands(facts: Facts, record: Mapping[str, Any] | None) -> list[str]:
+    """What makes a run again, from its config.json; the logs' place is not known to the run."""
+    built = _flags(asdict(facts.options), asdict(Options()))
+    found = [f"spelgen build {shlex.quote(facts.urdf)}{built} -o module.py"]
+    if record:
+        usual = CONFIGS[record["objective"]]().model_dump(mode="json") | asdict(Preprocessing())
+        usual |= {"validation_fraction": 0.25, "seed": 0, "objective": None}
+        chosen = {name: record[name] for name in ("objective", "validation_fraction", "seed")}
+        chosen |= record["config"] | record["preprocessing"]
+        found.append(f"spelgen train module.py --data LOGS -o RUN{_flags(chosen, usual)}")
+    return [*found, "spelgen evaluate RUN --data LOGS", "spelgen report RUN"]
+
+
+def _flags(chosen: Mapping[str, Any], usual: Mapping[str, Any]) -> str:
+    """The command-line flags of what differs from the default."""
+    text = ""
+    for key, value in chosen.items():
+        if value is None or value == usual.get(key) or isinstance(value, Mapping):
+            continue
+        text += f" --{'no-' if value is False else ''}{FLAGS.get(key, key).replace('_', '-')}"
+        if not isinstance(value, bool):
+            told = ",".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
+            text += f" {shlex.quote(told)}"
+    return text
+
+
+def _size(count: int) -> str:
+    return (
+        f"{count} B" if count < 1000 else f"{count / 1000:.1f} kB" if count < 1e6 else f"{count / 1e6:.1f} MB"
+    )
