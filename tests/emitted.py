@@ -4,7 +4,9 @@ weights.
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
+import sys
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -15,8 +17,8 @@ from flint import fmpq_mpoly
 from torch import nn
 
 from spelgen.emission.emit import emit
-from spelgen.emission.plan import plan_model
-from spelgen.pipeline import load
+from spelgen.loaded_arm import load_arm
+from spelgen.pipeline import make_spec
 from spelgen.spec import Options
 from spelgen.structure.structure import Structure, derive
 from spelgen.structure.symbolic import polynomials
@@ -34,10 +36,11 @@ SIX = ("two_link", "rpr", "six_dof", "scara", "panda", "ur10e")
 def import_source(source: str, path: Path) -> ModuleType:
     """Write ``source`` to ``path`` and import it from there."""
     path.write_text(source, encoding="utf-8")
-    spec = importlib.util.spec_from_file_location(path.stem, path)
+    name = f"{path.stem}_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
+    spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None
     assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)  # where torch.compile looks for it
     spec.loader.exec_module(module)
     return module
 
@@ -47,18 +50,9 @@ def built(
     robot: str, assume: str = "kinematics", preset: str = "minimal", net: str | None = None
 ) -> tuple[str, Structure]:
     """Source and structure of one of the robots that come with spelgen."""
-    loaded = load(ROBOTS / f"{robot}.urdf")
-    structure = derive(loaded.arm, assume)
+    loaded = load_arm(ROBOTS / f"{robot}.urdf")
     options = Options(preset=preset, net=net, assume=assume)
-    spec = plan_model(
-        loaded.arm,
-        structure,
-        loaded.actuation,
-        options,
-        urdf=f"{robot}.urdf",
-        urdf_sha256=loaded.robot.digest,
-    )
-    return emit(spec), structure
+    return emit(make_spec(loaded, options)), derive(loaded.arm, assume)
 
 
 def random_model(
@@ -82,7 +76,7 @@ def randomise(model: nn.Module, seed: int, deviation: float | None = None) -> No
     generator = torch.Generator().manual_seed(seed)
     for name, parameter in model.named_parameters():
         draw = torch.randn(parameter.shape, dtype=parameter.dtype, generator=generator)
-        if name == "rotor":
+        if name.endswith("armature.raw"):
             parameter.data = draw
         elif deviation is not None:
             parameter.data = deviation * draw
@@ -93,41 +87,58 @@ def randomise(model: nn.Module, seed: int, deviation: float | None = None) -> No
 
 
 def network_inputs(model: nn.Module, q: torch.Tensor) -> torch.Tensor:
-    """What the networks of a model with or without waves read of q, (..., features)."""
-    features = model._features(q)
-    inputs: torch.Tensor = getattr(features, "own", features)
-    return inputs
+    """What the networks of a model read of q, (..., encoded)."""
+    encoded: torch.Tensor = model.dynamics.encoding(q)
+    return encoded
+
+
+def outputs_alone(network: nn.Module, encoded: torch.Tensor) -> torch.Tensor:
+    """A network's outputs y, (..., outputs), without what a model makes of them."""
+    count = len(network.biases[-1])
+    layers = network.prepare(torch.eye(count, dtype=encoded.dtype), encoded.new_zeros(count))
+    y: torch.Tensor = network(encoded, layers)[0]
+    return y
+
+
+def shifted(model: nn.Module, q: torch.Tensor) -> torch.Tensor:
+    """Where, (...), M would not be positive definite by itself."""
+    unit = model.dynamics.mass.shift.unit
+    whole, kept = model.mass_matrix(q), unit.clone()
+    unit.zero_()
+    plain = model.mass_matrix(q)
+    unit.copy_(kept)
+    return (whole != plain).flatten(-2).any(dim=-1)
 
 
 def frictionless(model: nn.Module) -> nn.Module:
     """The model without dissipation."""
-    model.friction.size.zero_()
+    model.dynamics.friction.nominal.zero_()
     return model
 
 
 class ExactFunctions(nn.Module):
     """Stands in for a network: y = (polynomial - mean) / scale, with exact derivatives."""
 
-    def __init__(self, functions: list[fmpq_mpoly], mean: torch.Tensor, scale: torch.Tensor, joints: tuple):
+    def __init__(
+        self, functions: list[fmpq_mpoly], mean: torch.Tensor, scale: torch.Tensor, encoding: nn.Module
+    ):
         super().__init__()
-        self.mean, self.scale, self.n = mean, scale, len(joints)
-        self.revolute = [joint.revolute for joint in joints]
-        self.center = torch.tensor([joint.center for joint in joints], dtype=torch.float64)
-        self.reach = torch.tensor([joint.reach for joint in joints], dtype=torch.float64)
+        self.mean, self.scale, self.n = mean, scale, len(encoding.center)
+        self.center, self.reach = encoding.center, encoding.reach
         self.values = [_compiled(f) for f in functions]
         self.slopes = [
             [_compiled(f.derivative(3 * k + letter)) for k in range(self.n) for letter in range(3)]
             for f in functions
         ]
 
-    def prepared(self, outlay: torch.Tensor, offset: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        return outlay, offset
+    def prepare(self, output_map: torch.Tensor, offset: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return output_map, offset
 
     def forward(
-        self, features: torch.Tensor, laid_out: tuple[torch.Tensor, torch.Tensor]
+        self, encoded: torch.Tensor, layers: tuple[torch.Tensor, torch.Tensor]
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        outlay, offset = laid_out
-        cos, sin, *rest = features.split(self.n, dim=-1)
+        output_map, offset = layers
+        cos, sin, *rest = encoded.split(self.n, dim=-1)
         q = rest[0] * self.reach + self.center if rest else torch.zeros_like(cos)
         variables = torch.stack([cos, sin, q], dim=-1).flatten(-2)  # (..., 3 n): c1, s1, q1, c2, ...
         y = torch.stack([_evaluated(f, variables) for f in self.values], dim=-1)
@@ -137,13 +148,13 @@ class ExactFunctions(nn.Module):
         by_c, by_s, by_q = slopes.unflatten(-1, (self.n, 3)).unbind(dim=-1)
         jacobian = torch.cat([by_c, by_s, by_q * self.reach] if rest else [by_c, by_s], dim=-1)
         y = (y - self.mean) / self.scale
-        return y @ outlay.mT + offset, outlay @ (jacobian / self.scale.unsqueeze(-1))
+        return y @ output_map.mT + offset, output_map @ (jacobian / self.scale.unsqueeze(-1))
 
-    def pull(self, jacobian: torch.Tensor, cotangent: torch.Tensor) -> torch.Tensor:
+    def vjp(self, jacobian: torch.Tensor, cotangent: torch.Tensor) -> torch.Tensor:
         return (cotangent.unsqueeze(-2) @ jacobian).squeeze(-2)
 
-    def push(self, jacobian: torch.Tensor, rate: torch.Tensor) -> torch.Tensor:
-        return (jacobian @ rate.unsqueeze(-1)).squeeze(-1)
+    def jvp(self, jacobian: torch.Tensor, tangent: torch.Tensor) -> torch.Tensor:
+        return (jacobian @ tangent.unsqueeze(-1)).squeeze(-1)
 
 
 def exact_model(robot: str, folder: Path) -> nn.Module:
@@ -153,23 +164,25 @@ def exact_model(robot: str, folder: Path) -> nn.Module:
     source, structure = built(robot)
     module = import_source(source, folder / f"{robot}_exact.py")
     model = frictionless(module.Model())
-    model.rotor_size.zero_()
-    true = polynomials(load(ROBOTS / f"{robot}.urdf").arm, inertials=True)
+    mass, potential = model.dynamics.mass, model.dynamics.potential
+    mass.armature.nominal.zero_()
+    true = polynomials(load_arm(ROBOTS / f"{robot}.urdf").arm, inertials=True)
     if structure.outputs:
         functions = [true.combination(output.reads) for output in structure.outputs]
-        model.mass_network = ExactFunctions(functions, model.output_mean, model.output_scale, module.JOINTS)
+        encoding = model.dynamics.encoding
+        mass.network = ExactFunctions(functions, mass.function_mean, mass.function_scale, encoding)
     if structure.potential:
-        scale = torch.tensor([module.POTENTIAL_SCALE], dtype=torch.float64)
-        model.potential_network = ExactFunctions(
-            [true.potential], torch.zeros_like(scale), scale, module.JOINTS
+        scale = potential.scale[0]
+        potential.network = ExactFunctions(
+            [true.potential], torch.zeros_like(scale), scale, model.dynamics.encoding
         )
-    for series in ("mass_series", "potential_series"):  # the functions are whole without them
-        if hasattr(model, series):
-            getattr(model, series).size.zero_()
+    for part in (mass, potential):  # the functions are whole without them
+        if getattr(part, "series", None) is not None:
+            part.series.units.zero_()
     constants = [true.combination(constant.reads) for constant in structure.constants]
     assert all(sum(c.degrees()) == 0 for c in constants), "a constant depends on q"
     values = torch.tensor([_float(c.leading_coefficient()) for c in constants], dtype=torch.float64)
-    model.constants.data = values / model.constant_scale
+    mass.raw_constants.data = values / mass.constant_scale
     return model
 
 

@@ -15,8 +15,10 @@ from emitted import (
     frictionless,
     import_source,
     network_inputs,
+    outputs_alone,
     random_model,
     randomise,
+    shifted,
 )
 
 from spelgen.settings.settings import load_settings
@@ -68,10 +70,10 @@ def test_forward_and_inverse_dynamics_undo_each_other(robot, tmp_path):
     assert (back - tau).abs().max() < 1e-10 * tau.abs().max() * 100
 
 
-@pytest.mark.parametrize("deviation", [None, 1.0], ids=["asleep", "awake"])
+@pytest.mark.parametrize("deviation", [None, 1.0], ids=["plain", "shifted"])
 @pytest.mark.parametrize("robot", SIX)
 def test_written_out_derivatives_equal_autograd(robot, deviation, tmp_path):
-    """dV/dq, dH/dq and dM/dt, with the guard of M asleep and awake."""
+    """dV/dq, dH/dq and dM/dt, where M is positive definite by itself and where it is shifted."""
     model = frictionless(random_model(robot, tmp_path, seed=4, deviation=deviation))
     n = model.n
     q, qd, _, _ = states(n, STATES)
@@ -84,9 +86,10 @@ def test_written_out_derivatives_equal_autograd(robot, deviation, tmp_path):
     _near(rate[..., n:], -slope)
     _near(rate[..., :n], qd)
     _, mass_rate = torch.func.jvp(model.mass_matrix, (q.detach(),), (qd,))
-    features = model._features(q)
-    _, memory = model._mass(features, model.prepare())
-    _near(model._mass_rate(model._features_rate(features, qd), memory), mass_rate)
+    dynamics, prepared = model.dynamics, model.prepare()
+    at = dynamics.configuration(q, prepared)
+    residuals = dynamics.mass_at(at, prepared)[1]
+    _near(dynamics.mass.jvp(dynamics._rate(at, qd), residuals), mass_rate)
 
 
 def _near(ours: torch.Tensor, reference: torch.Tensor) -> None:
@@ -98,37 +101,33 @@ def test_mass_matrix_is_positive_definite_for_any_weights(robot, tmp_path):
     """10,000 random q for each of 100 draws of all weights, constants included, with standard deviation 30."""
     model = random_model(robot, tmp_path, seed=0)
     generator = torch.Generator().manual_seed(0)
-    lifted = 0
+    needed = 0
     with torch.no_grad():
         for draw in range(100):
             randomise(model, seed=draw, deviation=30.0)
             q = 8 * torch.rand(10_000, model.n, dtype=torch.float64, generator=generator) - 4
             mass = model.mass_matrix(q)
             assert torch.linalg.eigvalsh(mass)[:, 0].min() > 0
-            lifted += _awake(model, q)
-    assert lifted > 50, "the draws were to need the guard"
+            needed += shifted(model, q).any().item()
+    assert needed > 50, "the draws were to need the shift"
 
 
 @pytest.mark.parametrize("robot", SIX)
-def test_guard_keeps_zeros_and_relations_and_sleeps_at_nominal_values(robot, tmp_path):
+def test_shift_keeps_zeros_and_relations_and_is_nothing_at_nominal_values(robot, tmp_path):
     model = random_model(robot, tmp_path, seed=1, deviation=3.0)
     structure = built(robot)[1]
     q = states(model.n, 200)[0]
-    model.rotor_size.zero_()
+    part = model.dynamics.mass
+    part.armature.nominal.zero_()
     mass = model.mass_matrix(q).detach()
     for entry in structure.entries:
         if entry.kind == "zero":
             assert (mass[:, entry.row, entry.column] == 0).all()
-    basis = torch.cat([model.constant_basis, model.output_basis])
+    basis = torch.cat([part.constant_basis, part.function_basis])
     residual = mass.flatten(1) - mass.flatten(1) @ torch.linalg.pinv(basis) @ basis
     assert residual.abs().max() < 1e-9 * mass.abs().max()
     nominal = exact_model(robot, tmp_path)
-    assert not _awake(nominal, q)
-
-
-def _awake(model: torch.nn.Module, q: torch.Tensor) -> bool:
-    """Whether the guard of M acts somewhere in ``q``."""
-    return model._mass(model._features(q), model.prepare())[1][1] is not None
+    assert not shifted(nominal, q).any()
 
 
 @pytest.mark.parametrize("robot", SIX)
@@ -136,13 +135,12 @@ def test_outputs_read_their_own_joints_only(robot, tmp_path):
     """Moving any other joint leaves an output's bits unchanged, and its own joints move it."""
     model = random_model(robot, tmp_path, seed=2)
     q = states(model.n, 50)[0]
-    outputs = len(built(robot)[1].outputs)
-    layers = model.mass_network.prepared(torch.eye(outputs, dtype=torch.float64), torch.zeros(outputs))
-    before = model.mass_network(network_inputs(model, q), layers)[0]
+    network = model.dynamics.mass.network
+    before = outputs_alone(network, network_inputs(model, q))
     for joint in range(model.n):
         moved = q.clone()
         moved[:, joint] += 0.7
-        changed = (model.mass_network(network_inputs(model, moved), layers)[0] != before).any(dim=0)
+        changed = (outputs_alone(network, network_inputs(model, moved)) != before).any(dim=0)
         expected = [joint in output.joints for output in built(robot)[1].outputs]
         assert changed.tolist() == expected
 
@@ -259,9 +257,9 @@ def test_arm_with_a_constant_mass_matrix(tmp_path):
         + joint.format("slide", "prismatic", "b", "c")
         + "</robot>"
     )
-    from spelgen.pipeline import build
+    from spelgen.pipeline import generate
 
-    model = import_source(build(urdf), tmp_path / "rp_spel.py").Model()
+    model = import_source(generate(urdf), tmp_path / "rp_spel.py").Model()
     q, qd, _, tau = states(2, 20)
     mass = model.mass_matrix(q)
     assert torch.allclose(

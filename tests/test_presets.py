@@ -6,13 +6,24 @@ from typing import get_args
 
 import pytest
 import torch
-from emitted import GANTRY, built, frictionless, import_source, network_inputs, random_model
+from emitted import (
+    GANTRY,
+    built,
+    frictionless,
+    import_source,
+    network_inputs,
+    outputs_alone,
+    random_model,
+    shifted,
+)
+from lie_group import geodesic_distance, group_rates
 from published_phnode import Published
 
-from spelgen.fitting.lie_group import geodesic_distance, group_rates
+from spelgen.design import Preset, load_design
 from spelgen.fitting.rollout import position_difference
-from spelgen.pipeline import build, make_spec
-from spelgen.spec import Options, Preset, load_design
+from spelgen.loaded_arm import load_arm
+from spelgen.pipeline import generate, make_spec
+from spelgen.spec import Options
 
 ROOT = Path(__file__).parents[1]
 PRESETS = [("phnode", "mlp"), ("phnode", "kan"), ("spel", "mlp"), ("spel-kan", "kan"), ("minimal", "kan")]
@@ -36,8 +47,10 @@ def test_presets_are_the_files():
     assert {name for name in get_args(Preset) if name in files} == files
     for name in files:
         design = load_design(name)
-        assert load_design(name, "kan").net == "kan"
-        assert make_spec(ROOT / "robots" / "rpr.urdf", Options(preset=name)).options.net == design.net
+        assert design.net == "none" or load_design(name, "kan").net == "kan"
+        assert (
+            make_spec(load_arm(ROOT / "robots" / "rpr.urdf"), Options(preset=name)).options.net == design.net
+        )
 
 
 @each_robot
@@ -55,9 +68,9 @@ def test_written_out_derivatives_equal_autograd(robot, preset, net, tmp_path):
     near(rate[..., n:], -slope)
     near(rate[..., :n], qd)
     _, mass_rate = torch.func.jvp(model.mass_matrix, (q.detach(),), (qd,))
-    features = model._features(q)
-    _, memory = model._mass(features, model.prepare())
-    near(model._mass_rate(model._features_rate(features, qd), memory), mass_rate)
+    dynamics, prepared = model.dynamics, model.prepare()
+    at = dynamics.configuration(q, prepared)
+    near(dynamics.mass.jvp(dynamics._rate(at, qd), dynamics.mass_at(at, prepared)[1]), mass_rate)
 
 
 @each_robot
@@ -65,7 +78,7 @@ def test_written_out_derivatives_equal_autograd(robot, preset, net, tmp_path):
 def test_forward_and_inverse_dynamics_undo_each_other(robot, preset, net, tmp_path):
     model = random_model(robot, tmp_path, seed=3, preset=preset, net=net)
     if preset == "phnode":  # random gains may be next to zero
-        torch.nn.init.zeros_(model.input_network.weights[-1])
+        torch.nn.init.zeros_(model.dynamics.input.network.weights[-1])
     q, qd, _, tau = states(model.n)
     near(model.inverse_dynamics(q, qd, model.forward_dynamics(q, qd, tau)), tau, 1e-8)
 
@@ -82,7 +95,7 @@ def test_mass_matrix_and_dissipation_are_positive(robot, preset, net, tmp_path):
             assert torch.linalg.eigvalsh(model.mass_matrix(q))[:, 0].min() > 0
             damping = model.dissipation(q, qd)
             assert torch.linalg.eigvalsh(damping)[:, 0].min() > -1e-12 * damping.abs().max()
-            torque = model.friction(network_inputs(model, q), qd, model.prepare().friction)
+            torque = model.friction_torque(q, qd)
             near(torque, (damping @ qd.unsqueeze(-1)).squeeze(-1))
 
 
@@ -106,7 +119,7 @@ def test_backpropagation_reaches_every_weight(preset, net, tmp_path):
     model.forward_dynamics(q, qd, tau).square().sum().backward()
     for name, parameter in model.named_parameters():
         # V's own level moves nothing
-        assert name.startswith("potential_network.biases") or parameter.grad.abs().max() > 0, name
+        assert name.startswith("dynamics.potential.network.biases") or parameter.grad.abs().max() > 0, name
 
 
 @pytest.mark.parametrize("preset", get_args(Preset))
@@ -114,7 +127,7 @@ def test_arm_whose_mass_matrix_is_constant(preset, tmp_path):
     """A gantry: M is a diagonal of trained numbers, and gravity does no work."""
     urdf = tmp_path / "gantry.urdf"
     urdf.write_text(GANTRY, encoding="utf-8")
-    model = import_source(build(urdf, preset=preset), tmp_path / "gantry.py").Model()
+    model = import_source(generate(urdf, preset=preset), tmp_path / "gantry.py").Model()
     q, qd, _, tau = states(2)
     near(model.mass_matrix(q), model.mass_matrix(q[:1]).expand(len(q), 2, 2))
     near(model.inverse_dynamics(q, qd, model.forward_dynamics(q, qd, tau)), tau)
@@ -127,12 +140,12 @@ def test_kan_outputs_read_their_own_joints_only(robot, tmp_path):
     model = random_model(robot, tmp_path, seed=2, net="kan")
     outputs = built(robot, net="kan")[1].outputs
     q = states(model.n)[0]
-    layers = model.mass_network.prepared(torch.eye(len(outputs), dtype=q.dtype), q.new_zeros(len(outputs)))
-    before = model.mass_network(network_inputs(model, q), layers)[0]
+    network = model.dynamics.mass.network
+    before = outputs_alone(network, network_inputs(model, q))
     for joint in range(model.n):
         moved = q.clone()
         moved[:, joint] += 0.7
-        changed = (model.mass_network(network_inputs(model, moved), layers)[0] != before).any(dim=0)
+        changed = (outputs_alone(network, network_inputs(model, moved)) != before).any(dim=0)
         assert changed.tolist() == [joint in output.joints for output in outputs]
 
 
@@ -141,8 +154,10 @@ def test_kan_outputs_read_their_own_joints_only(robot, tmp_path):
 def test_spel_keeps_zeros_constants_and_relations(robot, preset, tmp_path):
     """Its networks see all joints, as the paper's do; what the structure fixes stays fixed."""
     model = random_model(robot, tmp_path, seed=1, preset=preset)
+    for weight in model.dynamics.mass.network.parameters():
+        weight.data *= 0.5
     q = states(model.n, 100)[0] / 5
-    assert model._mass(model._features(q), model.prepare())[1][1] is None, "the guard was to sleep"
+    assert not shifted(model, q).any(), "M was to be positive definite by itself"
     mass = model.mass_matrix(q).detach()
     for entry in built(robot)[1].entries:
         values = mass[:, entry.row, entry.column]
@@ -151,15 +166,15 @@ def test_spel_keeps_zeros_constants_and_relations(robot, preset, tmp_path):
         assert entry.kind != "varying" or values.std() > 0
 
 
-@pytest.mark.parametrize("network", ["mass_network", "potential_network", "input_network"])
+@pytest.mark.parametrize("part", ["mass", "potential", "input"])
 @pytest.mark.parametrize("net", ["mlp", "kan"])
-def test_networks_read_rotation_matrices(net, network, tmp_path):
+def test_networks_read_rotation_matrices(net, part, tmp_path):
     """Layer by layer as the papers write them, on the 9 numbers of R and the 3 of r."""
-    model = getattr(frictionless(random_model("rpr", tmp_path, seed=5, preset="phnode", net=net)), network)
     owner = random_model("rpr", tmp_path, seed=5, preset="phnode", net=net)
+    model, encoding = getattr(owner.dynamics, part).network, owner.dynamics.encoding
     q = states(3)[0]
     parts = owner.to_group(q)
-    parts[1] = (parts[1] - owner.center[1] * torch.tensor([0, 0, 1.0], dtype=q.dtype)) / owner.reach[1]
+    parts[1] = (parts[1] - encoding.center[1] * torch.tensor([0, 0, 1.0], dtype=q.dtype)) / encoding.reach[1]
     layer = torch.cat([part.reshape(len(q), -1) for part in parts], dim=-1)
     count = len(model.weights)
     for index, (weight, bias) in enumerate(zip(model.weights, model.biases, strict=True)):
@@ -171,9 +186,7 @@ def test_networks_read_rotation_matrices(net, network, tmp_path):
             bumps = torch.exp(-(((layer.unsqueeze(-1) - grid) / (grid[1] - grid[0])) ** 2))
             layer = torch.einsum("big,oig->bo", bumps, weight) + bias
         layer = torch.tanh(layer) if index < count - 1 else layer
-    outputs = len(model.biases[-1])
-    ready = model.prepared(torch.eye(outputs, dtype=q.dtype), q.new_zeros(outputs))
-    near(model(network_inputs(owner, q), ready)[0], layer)
+    near(outputs_alone(model, network_inputs(owner, q)), layer)
 
 
 @pytest.mark.parametrize(("preset", "net"), [*PRESETS, ("minimal", "mlp")])
@@ -203,13 +216,18 @@ def test_phnode_is_its_three_axis_model_held_by_bearings(net, tmp_path):
     model = frictionless(random_model("six_dof", tmp_path, seed=7, preset="phnode", net=net))
     n = model.n
     q, qd, _, _ = states(n)
-    inverse = model.axes_inverse_mass(q).detach()
+
+    def inverse_mass(at: torch.Tensor) -> torch.Tensor:
+        prepared = model.prepare()
+        return model.dynamics.mass.inverse(model.dynamics.configuration(at, prepared), prepared.mass)
+
+    inverse = inverse_mass(q).detach()
     assert torch.linalg.eigvalsh(inverse)[:, 0].min() > 0
     axes = torch.zeros(len(q), n, 3, dtype=torch.float64)
     axes[..., 2] = qd
     momenta = torch.linalg.solve(inverse, axes.flatten(-2).unsqueeze(-1))
     q.requires_grad_()
-    kinetic = 0.5 * (momenta.mT @ model.axes_inverse_mass(q) @ momenta).sum()
+    kinetic = 0.5 * (momenta.mT @ inverse_mass(q) @ momenta).sum()
     (slope,) = torch.autograd.grad(kinetic + model.potential_energy(q).sum(), q)
     p = momenta.squeeze(-1)[:, 2::3]
     rate = model(torch.zeros(()), torch.cat([q, p], dim=-1))

@@ -15,131 +15,513 @@ Joints, in the order of q, qd and tau:
     1  "joint1"  revolute   rad, Nm  -2.96706 .. 2.96706
     2  "joint2"  prismatic  m, N     0.305 .. 1.27
     3  "joint3"  revolute   rad, Nm  -2.96706 .. 2.96706
-
-Record, by which `spelgen check` tells whether this module is up to date:
-
-    robot: "rpr"
-    urdf: "rpr.urdf"
-    urdf_sha256: "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d"
-    spec_sha256: "d30d581a4dd143d8a10386bee233d1676ad54855f3d679f8cf2ef81981f5bc95"
-    option assume: "kinematics"
-    option depth: 2
-    option joints: null
-    option net: "mlp"
-    option preset: "closed-form"
-    option snap_tolerance: 0.002
-    option tip: null
-    option width: 64
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import ClassVar, NamedTuple
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor, nn
 
-Row = tuple[float, float, float]
+FACTS = r"""{"robot": "rpr", "urdf": "rpr.urdf",
+ "urdf_sha256": "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d",
+ "spec_sha256": "4ec62acc227daebcf4ecb6477284670d398a2f6ff9e62d22cd354a7529a442c7",
+ "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,
+  "net": null, "preset": "closed-form", "tip": null, "width": 64},
+ "joints": {"joint1": "revolute", "joint2": "prismatic", "joint3": "revolute"}}"""
 
 
-class Joint(NamedTuple):
-    """A joint; angles are in rad, lengths in m."""
+class Model(nn.Module):
+    """The arm's dynamics: 3 rigid bodies with trained inertial parameters.
 
-    name: str
-    revolute: bool
-    speed: float  # usual speed
-    friction: float  # usual size of the friction torque
-    rotor: float  # what its drive adds to M at the start: rotor inertia times gear squared
-    actuated: bool
+    Shapes: q, qd, qdd, tau and p are (..., n), with any leading dimensions. Units: rad and Nm for
+    revolute joints, m and N for prismatic ones. M is positive definite and D positive semi-definite
+    for all weights. What ``prepare`` gives as ``prepared`` saves work while the weights stay.
+    """
+
+    n = 3
+    joint_names = ("joint1", "joint2", "joint3")
+    joint_types = ("revolute", "prismatic", "revolute")
+
+    def __init__(self, seed: int = 0, dtype: torch.dtype = torch.float64) -> None:
+        super().__init__()
+        joints = Joints(
+            revolute=(True, False, True),
+            center=(0.0, 0.7875, 0.0),
+            reach=(2.96706, 0.4825, 2.96706),
+            speed=(3.0, 1.0, 6.0),
+            friction=(0.4, 0.4, 0.4),
+            armature=(2.19, 0.782, 0.106),
+            gear=(1.0, 1.0, 1.0),
+            actuated=(True, True, True),
+        )
+        bodies = Bodies(
+            parent=(-1, 0, 1),
+            joint=(0, 1, 2),
+            revolute=(True, False, True),
+            ratio=(1.0, 1.0, 1.0),
+            offset=(0.0, 0.0, 0.0),
+            rotation=(
+                ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+                ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
+                ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+            ),
+            position=((0.0, 0.0, 0.0), (0.0, 0.0, 0.154), (0.0, -0.0203, 0.0)),
+            mass=(5.01, 4.25, 1.08),
+            moment=((0.0, 0.0, -4.48896), (0.0, -0.086275, -27.4125), (0.0, 0.09936, -0.05832)),
+            inertia=(
+                (4.13010816, 4.12210816, 0.018),
+                (179.3223763825, 179.320625, 0.0077513825),
+                (0.0142904, 0.00425851, 0.0102504),
+            ),
+            products=((0.0, 0.0, 0.0), (0.0, 0.0, -0.55647375), (0.0, 0.0, 0.00536544)),
+        )
+        self.dynamics = RigidBodyDynamics(
+            joints, bodies, gravity=(0.0, 0.0, -9.81), input=DirectInput(joints)
+        )
+        self.to(dtype)
+
+    @property
+    def inertial_parameters(self) -> Tensor:
+        """By body (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) about its joint's frame, (bodies, 10)."""
+        value: Tensor = self.dynamics.inertial_parameters()
+        return value
+
+    @property
+    def armature(self) -> Tensor:
+        """What the drives add to M's diagonal, (n,) [kg m^2, kg]."""
+        value: Tensor = self.dynamics.armature()
+        return value
+
+    @property
+    def rotor_inertia(self) -> Tensor:
+        """The drives' inertia before the gear, (n,) [kg m^2, kg]."""
+        value: Tensor = self.dynamics.armature.rotor_inertia()
+        return value
+
+    @property
+    def viscous(self) -> Tensor:
+        """Friction torque by velocity, (n,) [Nm s/rad, N s/m]."""
+        value: Tensor = self.dynamics.friction.prepare().viscous
+        return value
+
+    @property
+    def coulomb(self) -> Tensor:
+        """Dry friction, (n,) [Nm, N]."""
+        value: Tensor = self.dynamics.friction.prepare().coulomb
+        return value
+
+    @property
+    def stribeck(self) -> Tensor:
+        """Dry friction that only slow motion has, (n,) [Nm, N]."""
+        value: Tensor = self.dynamics.friction.prepare().stribeck
+        return value
+
+    @property
+    def torque_offset(self) -> Tensor:
+        """What the measured torque shows without any, (n,) [Nm, N]."""
+        value: Tensor = self.dynamics.torque_offset()
+        return value
+
+    def prepare(self) -> Any:
+        """All that depends on the weights alone; holds until they change."""
+        return self.dynamics.prepare()
+
+    def mass_matrix(self, q: Tensor, prepared: Any = None) -> Tensor:
+        """M(q), (..., n, n) [kg m^2, kg m, kg]."""
+        return self.dynamics.mass_matrix(q, prepared)
+
+    def potential_energy(self, q: Tensor) -> Tensor:
+        """V(q), (...) [J]."""
+        return self.dynamics.potential_energy(q)
+
+    def gravity(self, q: Tensor) -> Tensor:
+        """dV/dq, (..., n) [Nm, N]."""
+        return self.dynamics.gravity(q)
+
+    def nonlinear_effects(self, q: Tensor, qd: Tensor) -> Tensor:
+        """Coriolis, centrifugal and gravity torque, (..., n) [Nm, N]."""
+        return self.dynamics.nonlinear_effects(q, qd)
+
+    def friction_torque(self, q: Tensor, qd: Tensor) -> Tensor:
+        """D(q, qd) qd, (..., n) [Nm, N]."""
+        return self.dynamics.friction_torque(q, qd)
+
+    def dissipation(self, q: Tensor, qd: Tensor) -> Tensor:
+        """D(q, qd), (..., n, n) [Nm s/rad, N s/m]."""
+        return self.dynamics.dissipation(q, qd)
+
+    def input_matrix(self, q: Tensor) -> Tensor:
+        """G(q), (..., n, n): joint torques by inputs."""
+        return self.dynamics.input_matrix(q)
+
+    def momentum(self, q: Tensor, qd: Tensor, prepared: Any = None) -> Tensor:
+        """p = M(q) qd, (..., n)."""
+        return applied(self.mass_matrix(q, prepared), qd)
+
+    def velocity(self, q: Tensor, p: Tensor, prepared: Any = None) -> Tensor:
+        """qd = M(q)^-1 p, (..., n)."""
+        return solved(self.mass_matrix(q, prepared), p)
+
+    def hamiltonian(self, q: Tensor, p: Tensor) -> Tensor:
+        """H = 1/2 p^T M(q)^-1 p + V(q), (...) [J]."""
+        return self.dynamics.hamiltonian(q, p)
+
+    def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
+        """qdd, (..., n), under the input tau."""
+        return self.dynamics.forward_dynamics(q, qd, tau)
+
+    def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
+        """The input, (..., n), that gives qdd."""
+        return self.dynamics.inverse_dynamics(q, qd, qdd)
+
+    def forward(self, t: Tensor, state: Tensor) -> Tensor:
+        """The rate of (q, p), (..., 2 n), or of (q, p, tau), (..., 3 n), where tau is held."""
+        return self.dynamics.state_rate(state)
+
+    def port_hamiltonian_rhs(self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Any) -> State:
+        """q' = dH/dp and p' = -dH/dq - D dH/dp + G tau, (..., n)."""
+        return self.dynamics.port_hamiltonian_rhs(q, p, tau, prepared)
+
+    def to_group(self, q: Tensor) -> list[Tensor]:
+        """By joint, R in SO(3), (..., 3, 3), or r in R^3, (..., 3), if prismatic; z is its axis."""
+        return to_group(q, self.joint_types)
+
+    def from_group(self, parts: list[Tensor]) -> Tensor:
+        """q, (..., n), with angles in [-pi, pi]; the inverse of ``to_group``."""
+        return from_group(parts, self.joint_types)
 
 
-class Body(NamedTuple):
-    """All that moves rigidly with a joint, whose frame's z it turns about, or slides along."""
-
-    parent: int  # -1: the base
-    joint: int
-    revolute: bool
-    ratio: float  # it moves by ratio * q + offset
-    offset: float
-    rotation: tuple[Row, Row, Row]  # of the joint's frame in its parent's
-    position: Row  # likewise [m]
-    # where training starts: m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz about the joint
-    reference: tuple[float, ...]
+# ---- spelgen's runtime, as it stands in the package: the same for every arm ----
 
 
-JOINTS = (
-    Joint(name="joint1", revolute=True, speed=3.0, friction=0.4, rotor=0.133, actuated=True),
-    Joint(name="joint2", revolute=False, speed=1.0, friction=0.4, rotor=0.4, actuated=True),
-    Joint(name="joint3", revolute=True, speed=6.0, friction=0.4, rotor=0.0667, actuated=True),
-)
-BODIES = (
-    Body(
-        parent=-1,
-        joint=0,
-        revolute=True,
-        ratio=1.0,
-        offset=0.0,
-        rotation=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
-        position=(0.0, 0.0, 0.0),
-        reference=(5.01, 0.0, 0.0, -4.48896, 4.13010816, 0.0, 0.0, 4.12210816, 0.0, 0.018),
-    ),
-    Body(
-        parent=0,
-        joint=1,
-        revolute=False,
-        ratio=1.0,
-        offset=0.0,
-        rotation=((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
-        position=(0.0, 0.0, 0.154),
-        reference=(
-            4.25,
-            0.0,
-            -0.086275,
-            -27.4125,
-            179.3223763825,
-            0.0,
-            0.0,
-            179.320625,
-            -0.55647375,
-            0.0077513825,
-        ),
-    ),
-    Body(
-        parent=1,
-        joint=2,
-        revolute=True,
-        ratio=1.0,
-        offset=0.0,
-        rotation=((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
-        position=(0.0, -0.0203, 0.0),
-        reference=(
-            1.08,
-            0.0,
-            0.09936,
-            -0.05832,
-            0.0142904,
-            0.0,
-            0.0,
-            0.00425851,
-            0.00536544,
-            0.0102504,
-        ),
-    ),
-)
-GRAVITY = (0.0, 0.0, -9.81)  # [m/s^2]
+class Joints(NamedTuple):
+    """The joints, an entry for each; angles in rad and torques in Nm, lengths in m and forces in N."""
 
-# where friction's trained constants start, relative to a joint's usual friction and speed
-STRIBECK = 0.3  # dry friction that only slow motion has
-FADING = 0.03  # speed at which that has faded
-JUMP = 0.006  # speed over which dry friction turns around
-BEND = 0.2  # speed at which viscous friction begins to grow more slowly
-LOAD = 0.03  # dry friction by gravity torque
+    revolute: tuple[bool, ...]
+    center: tuple[float, ...]  # a prismatic joint is encoded as (q - center) / reach
+    reach: tuple[float, ...]
+    speed: tuple[float, ...]  # usual velocity
+    friction: tuple[float, ...]  # usual size of the friction torque
+    armature: tuple[float, ...]  # nominal rotor inertia times gear squared [kg m^2, kg]
+    gear: tuple[float, ...]  # turns of the motor in a turn of the joint
+    actuated: tuple[bool, ...]
+
+    @property
+    def n(self) -> int:
+        """The number of joints."""
+        return len(self.revolute)
 
 
 def vector(values: Iterable[float]) -> Tensor:
     """The values as a float64 tensor."""
     return torch.tensor(list(values), dtype=torch.float64)
+
+
+def to_group(q: Tensor, joint_types: Sequence[str]) -> list[Tensor]:
+    """By joint, R in SO(3), (..., 3, 3), or r in R^3, (..., 3), if prismatic; z is its axis."""
+    parts = []
+    for kind, value in zip(joint_types, q.unbind(dim=-1), strict=True):
+        zero, one = torch.zeros_like(value), torch.ones_like(value)
+        if kind == "revolute":
+            c, s = value.cos(), value.sin()
+            rows = ((c, -s, zero), (s, c, zero), (zero, zero, one))
+            parts.append(torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2))
+        else:
+            parts.append(torch.stack((zero, zero, value), dim=-1))
+    return parts
+
+
+def from_group(parts: Sequence[Tensor], joint_types: Sequence[str]) -> Tensor:
+    """q, (..., n), with angles in [-pi, pi]; the inverse of ``to_group``."""
+    values = [
+        torch.atan2(part[..., 1, 0], part[..., 0, 0]) if kind == "revolute" else part[..., 2]
+        for kind, part in zip(joint_types, parts, strict=True)
+    ]
+    return torch.stack(values, dim=-1)
+
+
+def solved(matrix: Tensor, right: Tensor) -> Tensor:
+    """matrix^-1 right, (..., n)."""
+    # its derivative costs one more solution; a Cholesky factor's would cost several times that
+    solution: Tensor = torch.linalg.solve(matrix, right.unsqueeze(-1))
+    return solution.squeeze(-1)
+
+
+def applied(matrix: Tensor, vector: Tensor) -> Tensor:
+    """matrix vector, (..., n)."""
+    return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
+
+
+State = tuple[Tensor, Tensor]  # q and p, or how fast they change
+
+
+class PortHamiltonian(nn.Module):
+    """q' = dH/dp and p' = -dH/dq - D dH/dp + G tau, with H = 1/2 p^T M(q)^-1 p + V(q).
+
+    The port-Hamiltonian form (van der Schaft and Jeltsema, Port-Hamiltonian Systems Theory, 2014).
+    ``prepared`` is what ``prepare`` gave: all that depends on the weights alone. ``at`` is what
+    ``configuration`` gave: all that is computed of q alone. Shapes: q, qd, tau, p are (..., n).
+    """
+
+    n: int
+
+    def prepare(self) -> Any:
+        """All that depends on the weights alone; holds until they change."""
+        raise NotImplementedError
+
+    def configuration(self, q: Tensor, prepared: Any) -> Any:
+        """All that is computed of q alone."""
+        raise NotImplementedError
+
+    def mass_at(self, at: Any, prepared: Any) -> tuple[Tensor, Any]:
+        """M(q), (..., n, n), and what its derivatives need."""
+        raise NotImplementedError
+
+    def energy_at(self, at: Any, prepared: Any) -> Tensor:
+        """V(q), (...) [J]."""
+        raise NotImplementedError
+
+    def gravity_at(self, at: Any, prepared: Any) -> Tensor:
+        """dV/dq, (..., n) [Nm, N]."""
+        raise NotImplementedError
+
+    def lagrangian_gradient(self, at: Any, qd: Tensor, residuals: Any, prepared: Any) -> Tensor:
+        """d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
+        raise NotImplementedError
+
+    def nonlinear_at(self, at: Any, qd: Tensor, residuals: Any, prepared: Any) -> Tensor:
+        """The torque that holds qd steady without friction: Coriolis, centrifugal and gravity."""
+        raise NotImplementedError
+
+    def friction_at(self, at: Any, qd: Tensor, prepared: Any) -> Tensor:
+        """D(q, qd) qd, (..., n) [Nm, N]."""
+        raise NotImplementedError
+
+    def dissipation_at(self, at: Any, qd: Tensor, prepared: Any) -> Tensor:
+        """D(q, qd), (..., n, n)."""
+        raise NotImplementedError
+
+    def input_at(self, at: Any, prepared: Any) -> Tensor:
+        """G, (..., n, n)."""
+        raise NotImplementedError
+
+    def input_force(self, at: Any, tau: Tensor, prepared: Any) -> Tensor:
+        """G tau, (..., n) [Nm, N]."""
+        raise NotImplementedError
+
+    def input_torque(self, at: Any, force: Tensor, prepared: Any) -> Tensor:
+        """The tau, (..., n), that makes this force."""
+        raise NotImplementedError
+
+    def mass_matrix(self, q: Tensor, prepared: Any = None) -> Tensor:
+        """M(q), (..., n, n)."""
+        prepared = self.prepare() if prepared is None else prepared
+        return self.mass_at(self.configuration(q, prepared), prepared)[0]
+
+    def potential_energy(self, q: Tensor) -> Tensor:
+        """V(q), (...) [J]."""
+        prepared = self.prepare()
+        return self.energy_at(self.configuration(q, prepared), prepared)
+
+    def gravity(self, q: Tensor) -> Tensor:
+        """dV/dq, (..., n) [Nm, N]."""
+        prepared = self.prepare()
+        return self.gravity_at(self.configuration(q, prepared), prepared)
+
+    def nonlinear_effects(self, q: Tensor, qd: Tensor) -> Tensor:
+        """Coriolis, centrifugal and gravity torque, (..., n) [Nm, N]."""
+        prepared = self.prepare()
+        at = self.configuration(q, prepared)
+        return self.nonlinear_at(at, qd, self.mass_at(at, prepared)[1], prepared)
+
+    def friction_torque(self, q: Tensor, qd: Tensor) -> Tensor:
+        """D(q, qd) qd, (..., n) [Nm, N]."""
+        prepared = self.prepare()
+        return self.friction_at(self.configuration(q, prepared), qd, prepared)
+
+    def dissipation(self, q: Tensor, qd: Tensor) -> Tensor:
+        """D(q, qd), (..., n, n) [Nm s/rad, N s/m]."""
+        prepared = self.prepare()
+        return self.dissipation_at(self.configuration(q, prepared), qd, prepared)
+
+    def input_matrix(self, q: Tensor) -> Tensor:
+        """G(q), (..., n, n)."""
+        prepared = self.prepare()
+        return self.input_at(self.configuration(q, prepared), prepared)
+
+    def hamiltonian(self, q: Tensor, p: Tensor) -> Tensor:
+        """H, (...) [J]."""
+        prepared = self.prepare()
+        at = self.configuration(q, prepared)
+        qd = solved(self.mass_at(at, prepared)[0], p)
+        return 0.5 * (p * qd).sum(dim=-1) + self.energy_at(at, prepared)
+
+    def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
+        """qdd, (..., n), under the input tau."""
+        prepared = self.prepare()
+        at = self.configuration(q, prepared)
+        mass, residuals = self.mass_at(at, prepared)
+        force = self.input_force(at, tau, prepared)
+        force = force - self.nonlinear_at(at, qd, residuals, prepared)
+        return solved(mass, force - self.friction_at(at, qd, prepared))
+
+    def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
+        """The torque, (..., n), that gives qdd."""
+        prepared = self.prepare()
+        at = self.configuration(q, prepared)
+        mass, residuals = self.mass_at(at, prepared)
+        force = applied(mass, qdd) + self.nonlinear_at(at, qd, residuals, prepared)
+        return self.input_torque(at, force + self.friction_at(at, qd, prepared), prepared)
+
+    def port_hamiltonian_rhs(self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Any) -> State:
+        """q' and p', (..., n), under the input tau; without one, of the arm left to itself."""
+        at = self.configuration(q, prepared)
+        mass, residuals = self.mass_at(at, prepared)
+        qd = solved(mass, p)
+        force = self.lagrangian_gradient(at, qd, residuals, prepared)
+        force = force - self.friction_at(at, qd, prepared)
+        return qd, force if tau is None else force + self.input_force(at, tau, prepared)
+
+    def state_rate(self, state: Tensor) -> Tensor:
+        """The rate of (q, p), (..., 2 n), or of (q, p, tau), (..., 3 n), where tau is held."""
+        n = self.n
+        q, p, tau = state.tensor_split((n, 2 * n), dim=-1)
+        qd, force = self.port_hamiltonian_rhs(q, p, tau if tau.shape[-1] else None, self.prepare())
+        return torch.cat([qd, force, torch.zeros_like(tau)], dim=-1)
+
+
+class Armature(nn.Module):
+    """Rotor inertia times gear squared of each joint, never negative; the weights are logarithms."""
+
+    nominal: Tensor
+    gear: Tensor
+
+    def __init__(self, joints: Joints) -> None:
+        super().__init__()
+        self.register_buffer("nominal", vector(joints.armature))
+        self.register_buffer("gear", vector(joints.gear))
+        self.raw = nn.Parameter(torch.zeros(joints.n, dtype=torch.float64))
+
+    def forward(self) -> Tensor:
+        """The diagonal of the drives' part of M, (n,) [kg m^2, kg]."""
+        return self.nominal * self.raw.exp()
+
+    def rotor_inertia(self) -> Tensor:
+        """As the motors feel it, before the gear, (n,) [kg m^2, kg]."""
+        return self.nominal * self.raw.exp() / self.gear**2
+
+
+# where the constants start, relative to a joint's usual friction and speed
+STRIBECK = 0.3  # dry friction that only slow motion has
+
+
+STRIBECK_VELOCITY = 0.03  # where that has faded
+
+
+SMOOTHING_VELOCITY = 0.006  # over which dry friction turns around
+
+
+SATURATION_VELOCITY = 0.2  # where viscous friction begins to grow more slowly
+
+
+LOAD_DEPENDENCE = 0.03  # dry friction by gravity torque
+
+
+class FrictionConstants(NamedTuple):
+    """By joint, (n,), all positive."""
+
+    viscous: Tensor  # [Nm s/rad, N s/m]
+    saturation: Tensor  # viscous friction that stops growing [Nm, N]
+    saturation_velocity: Tensor  # [rad/s, m/s]
+    coulomb: Tensor  # [Nm, N]
+    stribeck: Tensor  # [Nm, N]
+    stribeck_velocity: Tensor  # [rad/s, m/s]
+    coulomb_smoothing_velocity: Tensor  # [rad/s, m/s]
+    load_dependence: Tensor  # dry friction by gravity torque
+
+
+class FrictionLaws(nn.Module):
+    """Friction which resists whatever the weights are: they are logarithms.
+
+    viscous qd + saturation tanh(qd / saturation_velocity)
+    + (coulomb + stribeck exp(-(qd / stribeck_velocity)^2) + load_dependence |gravity torque|)
+    tanh(qd / coulomb_smoothing_velocity).
+    """
+
+    nominal: Tensor
+    speed: Tensor
+
+    def __init__(self, joints: Joints) -> None:
+        super().__init__()
+        self.register_buffer("nominal", vector(joints.friction))
+        self.register_buffer("speed", vector(joints.speed))
+        start = torch.zeros(joints.n, dtype=torch.float64)
+        self.raw_viscous = nn.Parameter(start.clone())
+        self.raw_saturation = nn.Parameter(start.clone())
+        self.raw_saturation_velocity = nn.Parameter(start.clone())
+        self.raw_coulomb = nn.Parameter(start.clone())
+        self.raw_stribeck = nn.Parameter(start.clone())
+        self.raw_stribeck_velocity = nn.Parameter(start.clone())
+        self.raw_coulomb_smoothing_velocity = nn.Parameter(start.clone())
+        self.raw_load_dependence = nn.Parameter(start.clone())
+
+    def prepare(self) -> FrictionConstants:
+        """The constants, in their units."""
+        size, speed = self.nominal, self.speed
+        return FrictionConstants(
+            viscous=size / speed * self.raw_viscous.exp(),
+            saturation=size * self.raw_saturation.exp(),
+            saturation_velocity=SATURATION_VELOCITY * speed * self.raw_saturation_velocity.exp(),
+            coulomb=size * self.raw_coulomb.exp(),
+            stribeck=STRIBECK * size * self.raw_stribeck.exp(),
+            stribeck_velocity=STRIBECK_VELOCITY * speed * self.raw_stribeck_velocity.exp(),
+            coulomb_smoothing_velocity=SMOOTHING_VELOCITY * speed * self.raw_coulomb_smoothing_velocity.exp(),
+            load_dependence=LOAD_DEPENDENCE * size.sign() * self.raw_load_dependence.exp(),
+        )
+
+    def resistance(self, qd: Tensor, gravity: Tensor, constants: FrictionConstants) -> Tensor:
+        """The diagonal of D, (..., n): friction torque by velocity, under this gravity torque."""
+        c = constants
+        slow = (-((qd / c.stribeck_velocity) ** 2)).exp()
+        dry = c.coulomb + c.stribeck * slow + c.load_dependence * gravity.abs()
+        dry = dry / c.coulomb_smoothing_velocity * tanh_ratio(qd / c.coulomb_smoothing_velocity)
+        saturating = c.saturation / c.saturation_velocity * tanh_ratio(qd / c.saturation_velocity)
+        return c.viscous + saturating + dry
+
+    def forward(self, qd: Tensor, gravity: Tensor, constants: FrictionConstants) -> Tensor:
+        """The friction torque D qd, (..., n) [Nm, N], under this gravity torque."""
+        return self.resistance(qd, gravity, constants) * qd
+
+
+def tanh_ratio(x: Tensor) -> Tensor:
+    """tanh(x) / x."""
+    near = x.abs() < 1e-4
+    safe = torch.where(near, torch.ones_like(x), x)
+    return torch.where(near, 1 - x**2 / 3, safe.tanh() / safe)
+
+
+Row = tuple[float, float, float]
+
+
+class Bodies(NamedTuple):
+    """All that moves rigidly with a joint, an entry for each; a body turns about its frame's z, or
+    slides along it, by ratio * q + offset.
+    """
+
+    parent: tuple[int, ...]  # -1: the base
+    joint: tuple[int, ...]
+    revolute: tuple[bool, ...]
+    ratio: tuple[float, ...]
+    offset: tuple[float, ...]
+    rotation: tuple[tuple[Row, Row, Row], ...]  # of the joint's frame in its parent's
+    position: tuple[Row, ...]  # likewise [m]
+    mass: tuple[float, ...]  # nominal m [kg]
+    moment: tuple[Row, ...]  # nominal m c [kg m]
+    inertia: tuple[Row, ...]  # nominal Ixx, Iyy, Izz about the joint [kg m^2]
+    products: tuple[Row, ...]  # likewise Ixy, Ixz, Iyz
 
 
 def skew(a: Tensor) -> Tensor:
@@ -150,25 +532,26 @@ def skew(a: Tensor) -> Tensor:
     return rows.reshape(*a.shape[:-1], 3, 3)
 
 
-def twist_map(turn: Tensor, position: Tensor) -> Tensor:
-    """Takes twists (angular, linear) to a frame at ``position`` turned by ``turn``^T, (6, 6)."""
-    top = torch.cat([turn, torch.zeros_like(turn)], dim=1)
-    return torch.cat([top, torch.cat([-turn @ skew(position), turn], dim=1)])
+def twist_map(rotation: Tensor, position: Tensor) -> Tensor:
+    """Takes twists (angular, linear) to a frame at ``position`` turned by ``rotation``^T, (6, 6)."""
+    top = torch.cat([rotation, torch.zeros_like(rotation)], dim=1)
+    return torch.cat([top, torch.cat([-rotation @ skew(position), rotation], dim=1)])
 
 
-def transform_table(body: Body) -> Tensor:
-    """Its twist map from the parent is table[0] + cos table[1] + sin table[2] + slide table[3]."""
-    turn, position = torch.stack([vector(row) for row in body.rotation]).mT, vector(body.position)
+def transform_table(bodies: Bodies, index: int) -> Tensor:
+    """A body's twist map from the parent is table[0] + cos table[1] + sin table[2] + slide table[3]."""
+    rotation = torch.stack([vector(row) for row in bodies.rotation[index]]).mT
+    position = vector(bodies.position[index])
     table = torch.zeros(4, 6, 6, dtype=torch.float64)
-    if body.revolute:
+    if bodies.revolute[index]:
         about = torch.zeros(3, 3, 3, dtype=torch.float64)
         about[0, 2, 2] = about[1, 0, 0] = about[1, 1, 1] = about[2, 0, 1] = 1
         about[2, 1, 0] = -1
         for term in range(3):
-            table[term] = twist_map(about[term] @ turn, position)
+            table[term] = twist_map(about[term] @ rotation, position)
     else:
-        table[0] = twist_map(turn, position)
-        table[3] = twist_map(turn, position + turn[2]) - table[0]
+        table[0] = twist_map(rotation, position)
+        table[3] = twist_map(rotation, position + rotation[2]) - table[0]
     return table
 
 
@@ -195,160 +578,34 @@ def pseudo_inertia(ten: Tensor) -> Tensor:
     return torch.stack(rows, dim=-1).reshape(*ten.shape[:-1], 4, 4)
 
 
-class FrictionConstants(NamedTuple):
-    """By joint, (n,), all positive."""
+class InertialParameters(nn.Module):
+    """Trained inertial parameters of rigid bodies, possible ones for all weights; zero is nominal.
 
-    viscous: Tensor  # [Nm s/rad, N s/m]
-    bend: Tensor  # [Nm, N]
-    bend_speed: Tensor  # [rad/s, m/s]
-    coulomb: Tensor  # [Nm, N]
-    stribeck: Tensor  # [Nm, N]
-    fading: Tensor  # [rad/s, m/s]
-    jump: Tensor  # [rad/s, m/s]
-    load: Tensor  # dry friction by gravity torque
-
-
-class Friction(nn.Module):
-    """Friction of each joint, which resists whatever the weights are: the weights are logarithms.
-
-    viscous qd + bend tanh(qd / bend_speed)
-    + (coulomb + stribeck exp(-(qd / fading)^2) + load |gravity torque|) tanh(qd / jump).
+    A body's pseudo-inertia is C T T^T C^T, with C of the nominal body and T lower triangular, its
+    diagonal exponentials (Rucker and Wensing, IEEE RA-L 7:4352, 2022).
     """
 
-    size: Tensor
-    speed: Tensor
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.register_buffer("size", vector(joint.friction for joint in JOINTS))
-        self.register_buffer("speed", vector(joint.speed for joint in JOINTS))
-        start = torch.zeros(len(JOINTS), dtype=torch.float64)
-        self.viscous = nn.Parameter(start.clone())
-        self.bend = nn.Parameter(start.clone())
-        self.bend_speed = nn.Parameter(start.clone())
-        self.coulomb = nn.Parameter(start.clone())
-        self.stribeck = nn.Parameter(start.clone())
-        self.fading = nn.Parameter(start.clone())
-        self.jump = nn.Parameter(start.clone())
-        self.load = nn.Parameter(start.clone())
-
-    def prepared(self) -> FrictionConstants:
-        """The constants of the present weights."""
-        size, speed = self.size, self.speed
-        return FrictionConstants(
-            viscous=size / speed * self.viscous.exp(),
-            bend=size * self.bend.exp(),
-            bend_speed=BEND * speed * self.bend_speed.exp(),
-            coulomb=size * self.coulomb.exp(),
-            stribeck=STRIBECK * size * self.stribeck.exp(),
-            fading=FADING * speed * self.fading.exp(),
-            jump=JUMP * speed * self.jump.exp(),
-            load=LOAD * size.sign() * self.load.exp(),
-        )
-
-    def resistance(self, qd: Tensor, gravity: Tensor, constants: FrictionConstants) -> Tensor:
-        """The diagonal of D, (..., n): friction torque by velocity."""
-        slow = (-((qd / constants.fading) ** 2)).exp()
-        dry = constants.coulomb + constants.stribeck * slow + constants.load * gravity.abs()
-        dry = dry / constants.jump * self._flattening(qd / constants.jump)
-        bend = constants.bend / constants.bend_speed * self._flattening(qd / constants.bend_speed)
-        return constants.viscous + bend + dry
-
-    def forward(self, qd: Tensor, gravity: Tensor, constants: FrictionConstants) -> Tensor:
-        """The friction torque D qd, (..., n) [Nm, N], under this gravity torque."""
-        return self.resistance(qd, gravity, constants) * qd
-
-    @staticmethod
-    def _flattening(x: Tensor) -> Tensor:
-        """tanh(x) / x."""
-        near = x.abs() < 1e-4
-        safe = torch.where(near, torch.ones_like(x), x)
-        return torch.where(near, 1 - x**2 / 3, safe.tanh() / safe)
-
-
-class Prepared(NamedTuple):
-    """What depends on the weights alone, worked out once for many states."""
-
-    inertia: Tensor  # spatial inertias, (bodies, 6, 6)
-    rotors: Tensor  # (n,)
-    friction: FrictionConstants
-    input: Tensor  # (n, n)
-
-
-class Motion(NamedTuple):
-    """How the bodies may move at a position, each in its own frame."""
-
-    maps: Tensor  # twists from the parent's frame, (..., bodies, 6, 6)
-    twists: Tensor  # by joint velocity, (..., bodies, 6, n)
-    weight: Tensor  # acceleration that stands for gravity, (..., bodies, 6)
-
-
-class Model(nn.Module):
-    """The arm's dynamics: 3 rigid bodies with trained inertial parameters.
-
-    Shapes: q, qd, qdd, tau and p are (..., n), with any leading dimensions. Units: rad and Nm for
-    turning joints, m and N for sliding ones. M is positive definite and D positive semi-definite
-    for all weights. Spatial vectors are (angular, linear), as in Featherstone, Rigid Body Dynamics
-    Algorithms, 2008.
-    """
-
-    n: ClassVar[int] = 3
-    joint_names: ClassVar[tuple[str, ...]] = tuple(joint.name for joint in JOINTS)
-    joint_types: ClassVar[tuple[str, ...]] = tuple(
-        "revolute" if joint.revolute else "prismatic" for joint in JOINTS
-    )
-
-    tables: Tensor
-    axes: Tensor  # twist of a body by the velocity of its joint, (bodies, 6, n)
-    ratios: Tensor
-    offsets: Tensor
     factors: Tensor
     triangle: Tensor
-    basis: Tensor
-    crossing: Tensor
-    base: Tensor
-    rotor_size: Tensor
-    actuated: Tensor
 
-    def __init__(self, seed: int = 0) -> None:
+    def __init__(self, bodies: Bodies) -> None:
         super().__init__()
-        kind = torch.float64
-        self.register_buffer("tables", torch.stack([transform_table(body) for body in BODIES]))
-        axes = torch.zeros(len(BODIES), 6, self.n, dtype=kind)
-        for index, body in enumerate(BODIES):
-            axes[index, 2 if body.revolute else 5, body.joint] = body.ratio
-        self.register_buffer("axes", axes)
-        self.register_buffer("ratios", axes.sum(dim=1))
-        self.register_buffer("offsets", vector(body.offset for body in BODIES))
-        reference = torch.stack([vector(body.reference) for body in BODIES])
-        self.register_buffer("factors", torch.linalg.cholesky(pseudo_inertia(reference)))
+        columns = zip(bodies.mass, bodies.moment, bodies.inertia, bodies.products, strict=True)
+        nominal = torch.stack(
+            [
+                vector((m, *moment, xx, xy, xz, yy, yz, zz))
+                for m, moment, (xx, yy, zz), (xy, xz, yz) in columns
+            ]
+        )
+        self.register_buffer("factors", torch.linalg.cholesky(pseudo_inertia(nominal)))
         row, column = torch.tril_indices(4, 4)
-        self.register_buffer("triangle", torch.eye(16, dtype=kind)[4 * row + column])
-        self.register_buffer("basis", inertia_basis())
-        crossing = torch.zeros(6, 6, 6, dtype=kind)
-        for axis, unit in enumerate(torch.eye(3, dtype=kind)):
-            crossing[axis, :3, :3] = crossing[axis, 3:, 3:] = skew(unit)
-            crossing[3 + axis, 3:, :3] = skew(unit)
-        self.register_buffer("crossing", crossing)
-        self.register_buffer("base", vector((0, 0, 0, *(-g for g in GRAVITY))))
-        self.register_buffer("rotor_size", vector(joint.rotor for joint in JOINTS))
-        self.register_buffer("actuated", vector(float(joint.actuated) for joint in JOINTS))
-        # by body, ten coordinates of its pseudo-inertia; zero is the reference
-        self.bodies = nn.Parameter(torch.zeros(len(BODIES), 10, dtype=kind))
-        self.rotor = nn.Parameter(torch.zeros(self.n, dtype=kind))
-        self.friction = Friction()
-        # of the measured torque, in units of the joints' usual friction
-        self.offset = nn.Parameter(torch.zeros(self.n, dtype=kind))
+        self.register_buffer("triangle", torch.eye(16, dtype=torch.float64)[4 * row + column])
+        self.raw = nn.Parameter(torch.zeros(len(bodies.mass), 10, dtype=torch.float64))
 
-    def inertial_parameters(self) -> Tensor:
-        """By body (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) about its joint's frame, (bodies, 10).
-
-        Its pseudo-inertia is C T T^T C^T, with C of the reference and T lower triangular, the
-        diagonal exponentials: a possible body for all weights (Rucker and Wensing, IEEE RA-L
-        7:4352, 2022).
-        """
+    def forward(self) -> Tensor:
+        """By body (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) about its joint's frame, (bodies, 10)."""
         on_diagonal = self.triangle[:, ::5].sum(dim=1) > 0
-        lower = torch.where(on_diagonal, self.bodies.exp(), self.bodies) @ self.triangle
+        lower = torch.where(on_diagonal, self.raw.exp(), self.raw) @ self.triangle
         root = self.factors @ lower.reshape(-1, 4, 4)
         pseudo = root @ root.mT
         moments, tensor = pseudo[:, 3, :3], -pseudo[:, :3, :3]
@@ -358,14 +615,133 @@ class Model(nn.Module):
         six = torch.stack([xx, xy, xz, yy, yz, zz], dim=-1)
         return torch.cat([pseudo[:, 3, 3:], moments, six], dim=-1)
 
-    def prepare(self) -> Prepared:
-        """All that depends on the weights alone; holds until they change."""
-        return Prepared(
-            inertia=torch.tensordot(self.inertial_parameters(), self.basis, dims=1),
-            rotors=self.rotor_size * self.rotor.exp(),
-            friction=self.friction.prepared(),
-            input=self._inputs(),
+
+class DirectInput(nn.Module):
+    """G is the identity: each input is the torque of its own joint, and none that of a passive one."""
+
+    actuated: Tensor
+
+    def __init__(self, joints: Joints) -> None:
+        super().__init__()
+        self.register_buffer("actuated", vector(float(x) for x in joints.actuated))
+
+    def prepare(self) -> Tensor:
+        """The diagonal of G, (n,)."""
+        return self.actuated
+
+    def forward(self, encoded: Tensor, prepared: Tensor) -> Tensor:
+        """G, (..., n, n)."""
+        return torch.diag(prepared).expand(*encoded.shape[:-1], len(prepared), len(prepared))
+
+    def force(self, encoded: Tensor, tau: Tensor, prepared: Tensor) -> Tensor:
+        """G tau, (..., n)."""
+        return prepared * tau
+
+    def solve(self, encoded: Tensor, force: Tensor, prepared: Tensor) -> Tensor:
+        """The inputs, (..., n), that make this force; a passive joint shows the torque it lacks."""
+        return force
+
+
+class Input(Protocol):
+    """What gives G."""
+
+    def prepare(self) -> Any:
+        """All that depends on the weights alone."""
+
+    def __call__(self, encoded: Tensor, prepared: Any) -> Tensor:
+        """G, (..., n, n)."""
+
+    def force(self, encoded: Tensor, tau: Tensor, prepared: Any) -> Tensor:
+        """G tau, (..., n)."""
+
+    def solve(self, encoded: Tensor, force: Tensor, prepared: Any) -> Tensor:
+        """The inputs, (..., n), that make this force."""
+
+
+class RigidPrepared(NamedTuple):
+    """What depends on the weights alone, worked out once for many states."""
+
+    inertia: Tensor  # spatial inertias, (bodies, 6, 6)
+    armature: Tensor  # (n,)
+    friction: FrictionConstants
+    input: Tensor
+
+
+class Motion(NamedTuple):
+    """How the bodies may move at a position, each in its own frame."""
+
+    maps: Tensor  # twists from the parent's frame, (..., bodies, 6, 6)
+    twists: Tensor  # by joint velocity, (..., bodies, 6, n)
+    weight: Tensor  # acceleration that stands for gravity, (..., bodies, 6)
+    gravity: Tensor  # dV/dq, (..., n)
+
+
+class RigidBodyDynamics(PortHamiltonian):
+    """Rigid bodies with trained inertial parameters, friction by laws, a trained torque offset.
+
+    Spatial vectors are (angular, linear), as in Featherstone, Rigid Body Dynamics Algorithms, 2008.
+    """
+
+    tables: Tensor
+    axes: Tensor  # twist of a body by the velocity of its joint, (bodies, 6, n)
+    ratios: Tensor
+    offsets: Tensor
+    basis: Tensor
+    crossing: Tensor
+    base: Tensor
+    actuated: Tensor
+
+    def __init__(
+        self,
+        joints: Joints,
+        bodies: Bodies,
+        gravity: tuple[float, float, float],
+        input: Input,
+    ) -> None:
+        super().__init__()
+        self.n, self.parents = joints.n, bodies.parent
+        self.register_buffer(
+            "tables", torch.stack([transform_table(bodies, k) for k in range(len(bodies.mass))])
         )
+        axes = torch.zeros(len(bodies.mass), 6, self.n, dtype=torch.float64)
+        for index, revolute in enumerate(bodies.revolute):
+            axes[index, 2 if revolute else 5, bodies.joint[index]] = bodies.ratio[index]
+        self.register_buffer("axes", axes)
+        self.register_buffer("ratios", axes.sum(dim=1))
+        self.register_buffer("offsets", vector(bodies.offset))
+        self.register_buffer("basis", inertia_basis())
+        crossing = torch.zeros(6, 6, 6, dtype=torch.float64)
+        for axis, unit in enumerate(torch.eye(3, dtype=torch.float64)):
+            crossing[axis, :3, :3] = crossing[axis, 3:, 3:] = skew(unit)
+            crossing[3 + axis, 3:, :3] = skew(unit)
+        self.register_buffer("crossing", crossing)
+        self.register_buffer("base", vector((0, 0, 0, *(-g for g in gravity))))
+        self.register_buffer("actuated", vector(float(x) for x in joints.actuated))
+        self.inertial_parameters = InertialParameters(bodies)
+        self.armature = Armature(joints)
+        self.friction = FrictionLaws(joints)
+        self.input: Any = input
+        # of the measured torque, in units of the joints' usual friction
+        self.raw_offset = nn.Parameter(torch.zeros(self.n, dtype=torch.float64))
+
+    def torque_offset(self) -> Tensor:
+        """What the measured torque shows without any, (n,) [Nm, N]."""
+        return self.raw_offset * self.friction.nominal * self.actuated
+
+    def prepare(self) -> RigidPrepared:
+        """All that depends on the weights alone; holds until they change."""
+        return RigidPrepared(
+            inertia=torch.tensordot(self.inertial_parameters(), self.basis, dims=1),
+            armature=self.armature(),
+            friction=self.friction.prepare(),
+            input=self.input.prepare(),
+        )
+
+    def configuration(self, q: Tensor, prepared: RigidPrepared) -> Motion:
+        """How the bodies may move at q, and what they weigh there."""
+        motion = self._motion(q)
+        wrenches = applied(prepared.inertia, motion.weight)
+        return motion._replace(gravity=self._by_joint(motion, wrenches))
 
     def _motion(self, q: Tensor) -> Motion:
         value = q @ self.ratios.mT + self.offsets
@@ -374,196 +750,113 @@ class Model(nn.Module):
         still = torch.cat([torch.zeros_like(self.axes[0]), self.base.unsqueeze(-1)], dim=-1)
         own = torch.cat([self.axes, torch.zeros_like(self.axes[..., :1])], dim=-1)
         moved: list[Tensor] = []
-        for index, body in enumerate(BODIES):
-            parent = still if body.parent < 0 else moved[body.parent]
-            moved.append(maps[..., index, :, :] @ parent + own[index])
+        for index, parent in enumerate(self.parents):
+            below = still if parent < 0 else moved[parent]
+            moved.append(maps[..., index, :, :] @ below + own[index])
         columns = torch.stack(moved, dim=-3)
-        return Motion(maps, columns[..., :-1], columns[..., -1])
+        return Motion(maps, columns[..., :-1], columns[..., -1], torch.zeros_like(q))
 
     def _cross(self, twist: Tensor) -> Tensor:
         """What a frame with this twist makes of a constant twist in it, (..., 6, 6)."""
         rows = twist @ self.crossing.flatten(1)
         return rows.reshape(*twist.shape[:-1], 6, 6)
 
-    def mass_matrix(self, q: Tensor, prepared: Prepared | None = None) -> Tensor:
-        """M(q), (..., n, n) [kg m^2, kg m, kg]; with what ``prepare`` gave, where it is at hand."""
-        return self._mass(self._motion(q), prepared or self.prepare())
+    @staticmethod
+    def _by_joint(motion: Motion, wrenches: Tensor) -> Tensor:
+        """Joint torques, (..., n), that wrenches on the bodies, (..., bodies, 6), stand for."""
+        return (wrenches.unsqueeze(-2) @ motion.twists).squeeze(-2).sum(dim=-2)
 
-    def _mass(self, motion: Motion, prepared: Prepared) -> Tensor:
-        inertia = (motion.twists.mT @ (prepared.inertia @ motion.twists)).sum(dim=-3)
-        return inertia + torch.diag(prepared.rotors)
+    def mass_at(self, at: Motion, prepared: RigidPrepared) -> tuple[Tensor, None]:
+        """M(q), (..., n, n)."""
+        inertia = (at.twists.mT @ (prepared.inertia @ at.twists)).sum(dim=-3)
+        return inertia + torch.diag(prepared.armature), None
 
-    def potential_energy(self, q: Tensor) -> Tensor:
+    def energy_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
         """V(q), (...) [J]; zero for a mass at the base's origin."""
-        maps = self._motion(q).maps
-        inertia, height = self.prepare().inertia, q.new_zeros(q.shape[:-1])
+        inertia, height = prepared.inertia, at.maps.new_zeros(at.maps.shape[:-3])
         placed: list[Tensor] = []
-        for index, body in enumerate(BODIES):
-            own = maps[..., index, :, :]
-            placed.append(own if body.parent < 0 else own @ placed[body.parent])
+        for index, parent in enumerate(self.parents):
+            own = at.maps[..., index, :, :]
+            placed.append(own if parent < 0 else own @ placed[parent])
             # in the base's frame the moment of mass stands in the inertia's upper right block
             seen = placed[index].mT @ (inertia[index] @ placed[index])
             moment = torch.stack([seen[..., 2, 4], seen[..., 0, 5], seen[..., 1, 3]], dim=-1)
             height = height + moment @ self.base[3:]
         return height
 
-    def gravity(self, q: Tensor) -> Tensor:
+    def gravity_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
         """dV/dq, (..., n) [Nm, N]."""
-        return self._weight(self._motion(q), self.prepare())
-
-    def _weight(self, motion: Motion, prepared: Prepared) -> Tensor:
-        return self._by_joint(motion, self._applied(prepared.inertia, motion.weight))
-
-    @staticmethod
-    def _applied(matrices: Tensor, vectors: Tensor) -> Tensor:
-        return (matrices @ vectors.unsqueeze(-1)).squeeze(-1)
-
-    @staticmethod
-    def _by_joint(motion: Motion, wrenches: Tensor) -> Tensor:
-        """Joint torques, (..., n), that wrenches on the bodies, (..., bodies, 6), stand for."""
-        return (wrenches.unsqueeze(-2) @ motion.twists).squeeze(-2).sum(dim=-2)
-
-    def _twists(self, motion: Motion, qd: Tensor) -> Tensor:
-        """The bodies' velocities, (..., bodies, 6)."""
-        return self._applied(motion.twists, qd.unsqueeze(-2))
+        return at.gravity
 
     def _accelerations(self, motion: Motion, qd: Tensor, twists: Tensor) -> Tensor:
         """The bodies' accelerations at steady qd, gravity taken as one, (..., bodies, 6)."""
-        turned = self._applied(self._cross(twists) @ self.axes, qd.unsqueeze(-2))
+        turned = applied(self._cross(twists) @ self.axes, qd.unsqueeze(-2))
         found: list[Tensor] = []
-        for index, body in enumerate(BODIES):
+        for index, parent in enumerate(self.parents):
             own = turned[..., index, :]
-            if body.parent >= 0:
-                own = own + self._applied(motion.maps[..., index, :, :], found[body.parent])
+            if parent >= 0:
+                own = own + applied(motion.maps[..., index, :, :], found[parent])
             found.append(own)
         return torch.stack(found, dim=-2) + motion.weight
 
-    def _kinetic_slope(self, motion: Motion, qd: Tensor, prepared: Prepared) -> Tensor:
-        """d/dq of 1/2 qd^T M(q) qd, (..., n): the momentum of all that a joint carries, by what its
-        displacement adds to their twist.
-        """
-        twists = self._twists(motion, qd)
-        turned = self._cross(twists) @ self.axes
-        carried = list(self._applied(prepared.inertia, twists).unbind(dim=-2))
-        for index in reversed(range(len(BODIES))):
-            parent = BODIES[index].parent
-            if parent >= 0:
-                back = motion.maps[..., index, :, :].mT
-                carried[parent] = carried[parent] + self._applied(back, carried[index])
-        momenta = torch.stack(carried, dim=-2)
-        return (momenta.unsqueeze(-2) @ turned).squeeze(-2).sum(dim=-2)
+    def lagrangian_gradient(self, at: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
+        """d/dq of 1/2 qd^T M(q) qd - V(q), (..., n).
 
-    def _bias(self, motion: Motion, qd: Tensor, prepared: Prepared) -> Tensor:
-        """The torque that holds qd steady, (..., n), friction included."""
-        twists = self._twists(motion, qd)
-        accelerations = self._accelerations(motion, qd, twists)
-        momenta = self._applied(prepared.inertia, twists)
-        wrenches = self._applied(prepared.inertia, accelerations)
-        wrenches = wrenches - self._applied(self._cross(twists).mT, momenta)
-        friction: Tensor = self.friction(qd, self._weight(motion, prepared), prepared.friction)
-        return self._by_joint(motion, wrenches) + friction
+        The kinetic part: the momentum of all that a joint carries, by what its displacement adds to
+        their twist.
+        """
+        twists = applied(at.twists, qd.unsqueeze(-2))
+        turned = self._cross(twists) @ self.axes
+        carried = list(applied(prepared.inertia, twists).unbind(dim=-2))
+        for index in reversed(range(len(self.parents))):
+            parent = self.parents[index]
+            if parent >= 0:
+                back = at.maps[..., index, :, :].mT
+                carried[parent] = carried[parent] + applied(back, carried[index])
+        momenta = torch.stack(carried, dim=-2)
+        return (momenta.unsqueeze(-2) @ turned).squeeze(-2).sum(dim=-2) - at.gravity
+
+    def nonlinear_at(self, at: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
+        """The torque that holds qd steady without friction, (..., n)."""
+        twists = applied(at.twists, qd.unsqueeze(-2))
+        accelerations = self._accelerations(at, qd, twists)
+        momenta = applied(prepared.inertia, twists)
+        wrenches = applied(prepared.inertia, accelerations)
+        return self._by_joint(at, wrenches - applied(self._cross(twists).mT, momenta))
 
     def regressor(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
-        """Y, (..., n, 10 bodies): Y @ ``inertial_parameters().flatten()`` is the bodies' torque."""
+        """Y, (..., n, 10 bodies): Y @ inertial parameters is the bodies' torque."""
         motion = self._motion(q)
-        twists = self._twists(motion, qd)
-        accelerations = self._accelerations(motion, qd, twists) + self._twists(motion, qdd)
+        twists = applied(motion.twists, qd.unsqueeze(-2))
+        accelerations = self._accelerations(motion, qd, twists)
+        accelerations = accelerations + applied(motion.twists, qdd.unsqueeze(-2))
         # by body and parameter: (..., bodies, 6, 10)
         rises = torch.tensordot(accelerations, self.basis, dims=([-1], [2])).mT
         momenta = torch.tensordot(twists, self.basis, dims=([-1], [2])).mT
         wrenches = rises - self._cross(twists).mT @ momenta
         rows: Tensor = (motion.twists.mT @ wrenches).transpose(-3, -2)
-        return rows.reshape(*q.shape, 10 * len(BODIES))
+        return rows.reshape(*q.shape, 10 * len(self.parents))
 
-    def dissipation(self, q: Tensor, qd: Tensor) -> Tensor:
-        """D(q, qd), (..., n, n), diagonal: D qd is the friction torque."""
-        prepared = self.prepare()
-        weight = self._weight(self._motion(q), prepared)
-        return torch.diag_embed(self.friction.resistance(qd, weight, prepared.friction))
+    def friction_at(self, at: Motion, qd: Tensor, prepared: RigidPrepared) -> Tensor:
+        """D(q, qd) qd, (..., n) [Nm, N]."""
+        torque: Tensor = self.friction(qd, at.gravity, prepared.friction)
+        return torque
 
-    def input_matrix(self, q: Tensor) -> Tensor:
-        """G, (..., n, n): joint torques by inputs, one for each actuated joint."""
-        return self._inputs().expand(*q.shape[:-1], self.n, self.n)
+    def dissipation_at(self, at: Motion, qd: Tensor, prepared: RigidPrepared) -> Tensor:
+        """D(q, qd), (..., n, n), diagonal."""
+        return torch.diag_embed(self.friction.resistance(qd, at.gravity, prepared.friction))
 
-    def _inputs(self) -> Tensor:
-        return torch.diag(self.actuated)
+    def input_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
+        """G, (..., n, n)."""
+        matrix: Tensor = self.input(at.gravity, prepared.input)
+        return matrix
 
-    def torque_offset(self) -> Tensor:
-        """What the measured torque shows without any, (n,) [Nm, N]."""
-        return self.offset * self.friction.size * self.actuated
+    def input_force(self, at: Motion, tau: Tensor, prepared: RigidPrepared) -> Tensor:
+        """G (tau - torque offset), (..., n) [Nm, N]."""
+        force: Tensor = self.input.force(at.gravity, tau - self.torque_offset(), prepared.input)
+        return force
 
-    def momentum(self, q: Tensor, qd: Tensor, prepared: Prepared | None = None) -> Tensor:
-        """p = M(q) qd, (..., n)."""
-        return self._applied(self.mass_matrix(q, prepared), qd)
-
-    def velocity(self, q: Tensor, p: Tensor, prepared: Prepared | None = None) -> Tensor:
-        """qd = M(q)^-1 p, (..., n)."""
-        return self._solved(self.mass_matrix(q, prepared), p)
-
-    @staticmethod
-    def _solved(mass: Tensor, force: Tensor) -> Tensor:
-        # its derivative costs one more solution; a Cholesky factor's would cost several times that
-        solution: Tensor = torch.linalg.solve(mass, force.unsqueeze(-1))
-        return solution.squeeze(-1)
-
-    def hamiltonian(self, q: Tensor, p: Tensor) -> Tensor:
-        """H = 1/2 p^T M(q)^-1 p + V(q), (...) [J]."""
-        return 0.5 * (p * self.velocity(q, p)).sum(dim=-1) + self.potential_energy(q)
-
-    def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
-        """qdd, (..., n), under the input tau."""
-        prepared, motion = self.prepare(), self._motion(q)
-        force = (tau - self.torque_offset()) @ prepared.input.mT
-        return self._solved(self._mass(motion, prepared), force - self._bias(motion, qd, prepared))
-
-    def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
-        """The torque, (..., n), that gives qdd."""
-        prepared, motion = self.prepare(), self._motion(q)
-        force = self._applied(self._mass(motion, prepared), qdd) + self._bias(motion, qd, prepared)
-        # a joint without a motor shows the torque that it lacks
-        moved = prepared.input + torch.diag(1 - self.actuated)
-        return self._solved(moved, force) + self.torque_offset()
-
-    def forward(self, t: Tensor, state: Tensor) -> Tensor:
-        """The rate of (q, p), (..., 2 n), or of (q, p, tau), (..., 3 n), where tau is held."""
-        q, p, tau = state.tensor_split((self.n, 2 * self.n), dim=-1)
-        qd, force = self.rates(q, p, tau if tau.shape[-1] else None, self.prepare())
-        return torch.cat([qd, force, torch.zeros_like(tau)], dim=-1)
-
-    def rates(
-        self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Prepared
-    ) -> tuple[Tensor, Tensor]:
-        """q' and p', (..., n), under the input tau, with what ``prepare`` gave.
-
-        q' = dH/dp and p' = -dH/dq - D dH/dp + G tau: the port-Hamiltonian form (van der Schaft and
-        Jeltsema, Port-Hamiltonian Systems Theory, 2014).
-        """
-        motion = self._motion(q)
-        qd = self._solved(self._mass(motion, prepared), p)
-        weight = self._weight(motion, prepared)
-        force = self._kinetic_slope(motion, qd, prepared) - weight
-        force = force - self.friction(qd, weight, prepared.friction)
-        if tau is not None:
-            force = force + (tau - self.torque_offset()) @ prepared.input.mT
-        return qd, force
-
-    def to_group(self, q: Tensor) -> list[Tensor]:
-        """By joint, R in SO(3), (..., 3, 3), or r in R^3, (..., 3), if it slides; z is its axis."""
-        parts = []
-        for joint, value in zip(JOINTS, q.unbind(dim=-1), strict=True):
-            zero, one = torch.zeros_like(value), torch.ones_like(value)
-            if joint.revolute:
-                c, s = value.cos(), value.sin()
-                rows = ((c, -s, zero), (s, c, zero), (zero, zero, one))
-                parts.append(torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2))
-            else:
-                parts.append(torch.stack((zero, zero, value), dim=-1))
-        return parts
-
-    def from_group(self, parts: list[Tensor]) -> Tensor:
-        """q, (..., n), with angles in [-pi, pi]; the inverse of ``to_group``."""
-        values = [
-            torch.atan2(part[..., 1, 0], part[..., 0, 0]) if joint.revolute else part[..., 2]
-            for joint, part in zip(JOINTS, parts, strict=True)
-        ]
-        return torch.stack(values, dim=-1)
+    def input_torque(self, at: Motion, force: Tensor, prepared: RigidPrepared) -> Tensor:
+        """The tau, (..., n), that makes this force."""
+        tau: Tensor = self.input.solve(at.gravity, force, prepared.input)
+        return tau + self.torque_offset()

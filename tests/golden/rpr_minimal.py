@@ -2,7 +2,7 @@ r"""Port-Hamiltonian model of an arm with 3 joints, written by `spelgen build`.
 
 3 learned functions of q and 2 constants make the mass matrix.
 The potential energy depends on joint 3.
-M and V: sums of waves with trained factors, and a part for a network.
+M and V: Fourier series with trained coefficients, and a part for a network.
 Sizes and starting values are the URDF's inertials.
 
 Mass matrix: the joints each entry depends on, C where it is constant, . where it is always zero.
@@ -16,176 +16,228 @@ Joints, in the order of q, qd and tau:
     1  "joint1"  revolute   rad, Nm  -2.96706 .. 2.96706
     2  "joint2"  prismatic  m, N     0.305 .. 1.27
     3  "joint3"  revolute   rad, Nm  -2.96706 .. 2.96706
-
-Record, by which `spelgen check` tells whether this module is up to date:
-
-    robot: "rpr"
-    urdf: "rpr.urdf"
-    urdf_sha256: "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d"
-    spec_sha256: "926929801f301015a755b90fedf3bbc15485d9b782dfd1387e706348975d73e2"
-    option assume: "kinematics"
-    option depth: 2
-    option joints: null
-    option net: "mlp"
-    option preset: "minimal"
-    option snap_tolerance: 0.002
-    option tip: null
-    option width: 64
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import ClassVar, NamedTuple
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple, Protocol
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-# the lower triangle of a symmetric matrix: row, column, factor
-Entries = tuple[tuple[int, int, float], ...]
-# a sum of waves: number of the wave, factor of its cosine, factor of its sine, to start from
-Terms = tuple[tuple[int, float, float], ...]
+FACTS = r"""{"robot": "rpr", "urdf": "rpr.urdf",
+ "urdf_sha256": "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d",
+ "spec_sha256": "8eb4fc07da8e4341c31cdf78e9936e14d6003f74c56c679a48c922be10e58b81",
+ "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,
+  "net": "mlp", "preset": "minimal", "tip": null, "width": 64},
+ "joints": {"joint1": "revolute", "joint2": "prismatic", "joint3": "revolute"}}"""
 
 
-class Joint(NamedTuple):
-    """A joint; angles are in rad, lengths in m."""
+class Model(nn.Module):
+    """The arm's dynamics: 3 learned functions of q and 2 constants make the mass matrix.
 
-    name: str
-    revolute: bool
-    center: float  # a sliding joint is read as (q - center) / reach
-    reach: float
-    speed: float  # usual speed
-    friction: float  # usual size of the friction torque
-    rotor: float  # what its drive adds to M at the start: rotor inertia times gear squared
-    mass_share: float  # how much M changes with it, relative to the joint that moves M most
-    potential_share: float  # the same of V
-    actuated: bool
-
-
-class Constant(NamedTuple):
-    """A trained number c that enters M as c A; it starts at ``start``, in units of ``scale``."""
-
-    start: float
-    scale: float
-    entries: Entries  # of A
-
-
-class Output(NamedTuple):
-    """A learned function f of some joints, which enters M as f B: a sum of waves and a network.
-
-    f = level + sum of terms + NETWORK_SHARE * scale * network; mean is f's over the workspace.
+    Shapes: q, qd, qdd, tau and p are (..., n), with any leading dimensions. Units: rad and Nm for
+    revolute joints, m and N for prismatic ones. M is positive definite and D positive semi-definite
+    for all weights. What ``prepare`` gives as ``prepared`` saves work while the weights stay.
     """
 
-    joints: tuple[int, ...]
-    mean: float
-    scale: float
-    level: float
-    terms: Terms
-    entries: Entries  # of B
+    n = 3
+    joint_names = ("joint1", "joint2", "joint3")
+    joint_types = ("revolute", "prismatic", "revolute")
+
+    def __init__(self, seed: int = 0, dtype: torch.dtype = torch.float64) -> None:
+        super().__init__()
+        joints = Joints(
+            revolute=(True, False, True),
+            center=(0.0, 0.7875, 0.0),
+            reach=(2.96706, 0.4825, 2.96706),
+            speed=(3.0, 1.0, 6.0),
+            friction=(0.4, 0.4, 0.4),
+            armature=(2.19, 0.782, 0.106),
+            gear=(1.0, 1.0, 1.0),
+            actuated=(True, True, True),
+        )
+        generator = torch.Generator().manual_seed(seed)
+        encoding = JointEncoding(joints)
+        functions = (
+            MassFunction(
+                (2,),
+                mean=-0.00167665,
+                scale=1.36528,
+                offset=0.0,
+                series=(Term((0, 0, 1), (0, 0, 0), -0.09936, 0.0),),
+            ),
+            MassFunction(
+                (1, 2),
+                mean=-0.00154309,
+                scale=0.0595527,
+                offset=0.0,
+                series=(
+                    Term((0, 0, 1), (0, 0, 0), 0.0, -0.07288056),
+                    Term((0, 0, 1), (0, 1, 0), 0.0, -0.0479412),
+                ),
+            ),
+            MassFunction(
+                (1, 2),
+                mean=139.887,
+                scale=12.6351,
+                offset=139.386736,
+                series=(
+                    Term((0, 0, 2), (0, 0, 0), 0.00507056, 0.0),
+                    Term((0, 0, 0), (0, 1, 0), -22.4588744, 0.0),
+                    Term((0, 0, 0), (0, 2, 0), 1.24085731, 0.0),
+                ),
+            ),
+        )
+        potential_series = (Term((0, 0, 1), (0, 0, 0), 0.0, 0.9747216),)
+        fourier = FourierFeatures(joints, [*(function.series for function in functions), potential_series])
+        constants = ((0.0101411, 0.0101411), (5.33, 5.33))
+        sensitivity = (0.02, 1.0, 0.518)
+        network = MaskedMLP(
+            joint_input(joints, (1, 2), sensitivity),
+            unit_joints([function.joints for function in functions], width=64, depth=2, least=4),
+            generator,
+            NETWORK_FRACTION,
+        )
+        mass = DerivedMass(
+            joints,
+            self.mass_entries,
+            functions,
+            constants,
+            network,
+            0.08,
+            fourier=fourier,
+            sensitivity=sensitivity,
+        )
+        sensitivity = (0.02, 0.02, 1.0)
+        network = MaskedMLP(
+            joint_input(joints, (2,), sensitivity),
+            unit_joints(((2,),), width=32, depth=2),
+            generator,
+            NETWORK_FRACTION,
+        )
+        potential = LearnedPotential(0.703291, network, fourier, potential_series, sensitivity)
+        friction = JointFriction(joints, encoding, generator)
+        self.dynamics = NetworkDynamics(encoding, mass, potential, friction, DirectInput(joints), fourier)
+        self.to(dtype)
+
+    @staticmethod
+    def mass_entries(f: Sequence[Tensor], c: Sequence[Tensor]) -> Tensor:
+        """M, (..., n, n), without armature, by its functions f(q) and its constants c."""
+        # f1(q3), f2(q2,3), f3(q2,3)
+        f1, f2, f3 = f
+        c1, c2 = c
+        return symmetric([f3], [f1, c2], [f2, 0, c1])
+
+    @property
+    def armature(self) -> Tensor:
+        """What the drives add to M's diagonal, (n,) [kg m^2, kg]."""
+        value: Tensor = self.dynamics.mass.armature()
+        return value
+
+    @property
+    def rotor_inertia(self) -> Tensor:
+        """The drives' inertia before the gear, (n,) [kg m^2, kg]."""
+        value: Tensor = self.dynamics.mass.armature.rotor_inertia()
+        return value
+
+    @property
+    def viscous(self) -> Tensor:
+        """Friction torque by velocity, (n,) [Nm s/rad, N s/m]."""
+        value: Tensor = self.dynamics.friction.viscous()
+        return value
+
+    def prepare(self) -> Any:
+        """All that depends on the weights alone; holds until they change."""
+        return self.dynamics.prepare()
+
+    def mass_matrix(self, q: Tensor, prepared: Any = None) -> Tensor:
+        """M(q), (..., n, n) [kg m^2, kg m, kg]."""
+        return self.dynamics.mass_matrix(q, prepared)
+
+    def potential_energy(self, q: Tensor) -> Tensor:
+        """V(q), (...) [J]."""
+        return self.dynamics.potential_energy(q)
+
+    def gravity(self, q: Tensor) -> Tensor:
+        """dV/dq, (..., n) [Nm, N]."""
+        return self.dynamics.gravity(q)
+
+    def nonlinear_effects(self, q: Tensor, qd: Tensor) -> Tensor:
+        """Coriolis, centrifugal and gravity torque, (..., n) [Nm, N]."""
+        return self.dynamics.nonlinear_effects(q, qd)
+
+    def friction_torque(self, q: Tensor, qd: Tensor) -> Tensor:
+        """D(q, qd) qd, (..., n) [Nm, N]."""
+        return self.dynamics.friction_torque(q, qd)
+
+    def dissipation(self, q: Tensor, qd: Tensor) -> Tensor:
+        """D(q, qd), (..., n, n) [Nm s/rad, N s/m]."""
+        return self.dynamics.dissipation(q, qd)
+
+    def input_matrix(self, q: Tensor) -> Tensor:
+        """G(q), (..., n, n): joint torques by inputs."""
+        return self.dynamics.input_matrix(q)
+
+    def momentum(self, q: Tensor, qd: Tensor, prepared: Any = None) -> Tensor:
+        """p = M(q) qd, (..., n)."""
+        return applied(self.mass_matrix(q, prepared), qd)
+
+    def velocity(self, q: Tensor, p: Tensor, prepared: Any = None) -> Tensor:
+        """qd = M(q)^-1 p, (..., n)."""
+        return solved(self.mass_matrix(q, prepared), p)
+
+    def hamiltonian(self, q: Tensor, p: Tensor) -> Tensor:
+        """H = 1/2 p^T M(q)^-1 p + V(q), (...) [J]."""
+        return self.dynamics.hamiltonian(q, p)
+
+    def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
+        """qdd, (..., n), under the input tau."""
+        return self.dynamics.forward_dynamics(q, qd, tau)
+
+    def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
+        """The input, (..., n), that gives qdd."""
+        return self.dynamics.inverse_dynamics(q, qd, qdd)
+
+    def forward(self, t: Tensor, state: Tensor) -> Tensor:
+        """The rate of (q, p), (..., 2 n), or of (q, p, tau), (..., 3 n), where tau is held."""
+        return self.dynamics.state_rate(state)
+
+    def port_hamiltonian_rhs(self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Any) -> State:
+        """q' = dH/dp and p' = -dH/dq - D dH/dp + G tau, (..., n)."""
+        return self.dynamics.port_hamiltonian_rhs(q, p, tau, prepared)
+
+    def to_group(self, q: Tensor) -> list[Tensor]:
+        """By joint, R in SO(3), (..., 3, 3), or r in R^3, (..., 3), if prismatic; z is its axis."""
+        return to_group(q, self.joint_types)
+
+    def from_group(self, parts: list[Tensor]) -> Tensor:
+        """q, (..., n), with angles in [-pi, pi]; the inverse of ``to_group``."""
+        return from_group(parts, self.joint_types)
 
 
-class Wave(NamedTuple):
-    """x^powers cos(turns q) and x^powers sin(turns q), with the scaled q of sliding joints as x."""
-
-    turns: tuple[int, ...]
-    powers: tuple[int, ...]
+# ---- spelgen's runtime, as it stands in the package: the same for every arm ----
 
 
-JOINTS = (
-    Joint(
-        name="joint1",
-        revolute=True,
-        center=0.0,
-        reach=2.96706,
-        speed=3.0,
-        friction=0.4,
-        rotor=0.133,
-        mass_share=0.02,
-        potential_share=0.02,
-        actuated=True,
-    ),
-    Joint(
-        name="joint2",
-        revolute=False,
-        center=0.7875,
-        reach=0.4825,
-        speed=1.0,
-        friction=0.4,
-        rotor=0.4,
-        mass_share=1.0,
-        potential_share=0.02,
-        actuated=True,
-    ),
-    Joint(
-        name="joint3",
-        revolute=True,
-        center=0.0,
-        reach=2.96706,
-        speed=6.0,
-        friction=0.4,
-        rotor=0.0667,
-        mass_share=0.518,
-        potential_share=1.0,
-        actuated=True,
-    ),
-)
+class Joints(NamedTuple):
+    """The joints, an entry for each; angles in rad and torques in Nm, lengths in m and forces in N."""
 
-# what M and V of a rigid arm are made of, whatever its masses are
-WAVES = (
-    Wave(turns=(0, 0, 0), powers=(0, 0, 0)),
-    Wave(turns=(0, 0, 1), powers=(0, 0, 0)),
-    Wave(turns=(0, 0, 2), powers=(0, 0, 0)),
-    Wave(turns=(0, 0, 0), powers=(0, 1, 0)),
-    Wave(turns=(0, 0, 1), powers=(0, 1, 0)),
-    Wave(turns=(0, 0, 0), powers=(0, 2, 0)),
-)
-NETWORK_SHARE = 0.1  # how much of a function that is a sum of waves is left to its network
+    revolute: tuple[bool, ...]
+    center: tuple[float, ...]  # a prismatic joint is encoded as (q - center) / reach
+    reach: tuple[float, ...]
+    speed: tuple[float, ...]  # usual velocity
+    friction: tuple[float, ...]  # usual size of the friction torque
+    armature: tuple[float, ...]  # nominal rotor inertia times gear squared [kg m^2, kg]
+    gear: tuple[float, ...]  # turns of the motor in a turn of the joint
+    actuated: tuple[bool, ...]
 
-# M(q) = sum_k c_k A_k + sum_j f_j(q) B_j
-CONSTANTS: tuple[Constant, ...] = (
-    Constant(start=0.0101411, scale=0.0101411, entries=((2, 2, 1.0),)),
-    Constant(start=5.33, scale=5.33, entries=((1, 1, 1.0),)),
-)
-OUTPUTS = (
-    Output(
-        joints=(2,),
-        mean=-0.00167665,
-        scale=1.36528,
-        level=0.0,
-        terms=((1, -0.09936, 0.0),),
-        entries=((1, 0, 1.0),),
-    ),
-    Output(
-        joints=(1, 2),
-        mean=-0.00154309,
-        scale=0.0595527,
-        level=0.0,
-        terms=((1, 0.0, -0.07288056), (4, 0.0, -0.0479412)),
-        entries=((2, 0, 1.0),),
-    ),
-    Output(
-        joints=(1, 2),
-        mean=139.887,
-        scale=12.6351,
-        level=139.386736,
-        terms=((2, 0.00507056, 0.0), (3, -22.4588744, 0.0), (5, 1.24085731, 0.0)),
-        entries=((0, 0, 1.0),),
-    ),
-)
-# in each hidden layer: the joints that some units read, and how many units do
-MASS_HIDDEN = (((2,), 21), ((1, 2), 43))
-GUARD = 0.08  # least eigenvalue of M, relative to its nominal mean, that is left as it is
-POTENTIAL_JOINTS = (2,)  # the joints that V depends on
-POTENTIAL_WIDTH = 32
-POTENTIAL_SCALE = 0.703291  # [J]
-POTENTIAL_TERMS: Terms = ((1, 0.0, 0.9747216),)
-DEPTH = 2  # hidden layers of a network
-FRICTION_HIDDEN = 8
-SLOW = 0.03  # below this share of its usual speed dry friction fades to zero, to start from
-SLOWEST = 0.001  # and at the least
-FEATURES = 3 * len(JOINTS)  # numbers made of q, which networks read
-PLACE_SHARE = 0.1  # how much friction's networks see of where a joint is, relative to its speed
+    @property
+    def n(self) -> int:
+        """The number of joints."""
+        return len(self.revolute)
 
 
 def vector(values: Iterable[float]) -> Tensor:
@@ -193,83 +245,718 @@ def vector(values: Iterable[float]) -> Tensor:
     return torch.tensor(list(values), dtype=torch.float64)
 
 
-def stacked(matrices: list[Entries]) -> Tensor:
-    """The symmetric n x n matrices with these entries as rows, (matrices, n n)."""
-    n = len(JOINTS)
-    rows = torch.zeros(len(matrices), n, n, dtype=torch.float64)
-    for matrix, entries in zip(rows, matrices, strict=True):
-        for row, column, factor in entries:
-            matrix[row, column] = matrix[column, row] = factor
-    return rows.reshape(len(matrices), n * n)
+class Network(Protocol):
+    """Learned functions y of an encoding, each of its own joints, with derivatives written out."""
+
+    def prepare(self, output_map: Tensor, offset: Tensor) -> Any:
+        """The weights made ready for many states, for offset + output_map y in place of y."""
+
+    def __call__(self, encoded: Tensor, layers: Any) -> tuple[Tensor, Any]:
+        """offset + output_map y, (..., rows); and residuals, which ``vjp`` and ``jvp`` need."""
+
+    def vjp(self, residuals: Any, cotangent: Tensor) -> Tensor:
+        """cotangent, (..., rows), times d/d encoded."""
+
+    def jvp(self, residuals: Any, tangent: Tensor) -> Tensor:
+        """d/d encoded times the encoding's tangent, (..., rows)."""
+
+    def set_output_bias(self, values: Tensor) -> None:
+        """Start the outputs from these values."""
 
 
-class Reading(NamedTuple):
-    """The inputs of a network: share * (spread features), (inputs, ...)."""
+def unit_joints(
+    outputs: Sequence[Sequence[int]], width: int, depth: int, least: int = 1
+) -> tuple[tuple[frozenset[int], ...], ...]:
+    """The joints that each unit may read, layer by layer: ``depth`` hidden layers, then the outputs.
 
-    joints: tuple[int, ...]  # whose each input is
-    share: Tensor
-    spread: Tensor  # (inputs, features)
+    A hidden layer has ``width`` units, shared out in proportion to how many outputs read the same
+    joints, ``least`` or more for each such group.
+    """
+    counts = Counter(tuple(joints) for joints in outputs)
+    groups = sorted(counts, key=lambda each: (len(each), each))
+    ideal = [width * counts[joints] / len(outputs) for joints in groups]
+    units = [max(least, round(size)) for size in ideal]
+    # rounding may have taken or left a unit or two: those who gained most give, who lost most take
+    while sum(units) > width and max(units) > least:
+        gained = [
+            number - size if number > least else -width for number, size in zip(units, ideal, strict=True)
+        ]
+        units[gained.index(max(gained))] -= 1
+    while sum(units) < width:
+        lost = [size - number for number, size in zip(units, ideal, strict=True)]
+        units[lost.index(max(lost))] += 1
+    hidden = tuple(frozenset(g) for g, number in zip(groups, units, strict=True) for _ in range(number))
+    return (*((hidden,) * depth), tuple(frozenset(joints) for joints in outputs))
 
 
-def reading(joints: Iterable[int], shares: list[float]) -> Reading:
-    """cos q and sin q of turning joints, the scaled q of sliding ones, times each joint's share."""
-    n = len(JOINTS)
-    turning = [joint for joint in joints if JOINTS[joint].revolute]
-    sliding = [joint for joint in joints if not JOINTS[joint].revolute]
-    whose = turning + turning + sliding
-    places = turning + [n + joint for joint in turning] + [2 * n + joint for joint in sliding]
-    spread = torch.eye(FEATURES, dtype=torch.float64)[places]
-    return Reading(tuple(whose), vector(shares[joint] for joint in whose), spread)
+class Configuration(NamedTuple):
+    """A position as networks and Fourier series read it; or how fast that changes."""
+
+    encoded: Tensor  # (..., 2 n) or (..., 3 n), see JointEncoding
+    fourier: Tensor | None  # (..., 2 K), see FourierFeatures
 
 
-class Layers(NamedTuple):
-    """A network's weights made ready for many states; see ``Network.prepared``."""
+Entries = Callable[[Sequence[Tensor], Sequence[Tensor]], Tensor]
+
+
+def symmetric(*rows: Sequence[Tensor | float]) -> Tensor:
+    """The matrix, (..., n, n), with these rows as its lower triangle; entries are (...) or numbers."""
+    some = next(entry for row in rows for entry in row if isinstance(entry, Tensor))
+    lower = [[entry if isinstance(entry, Tensor) else some * 0 + entry for entry in row] for row in rows]
+    n = len(lower)
+    whole = [[lower[max(i, j)][min(i, j)] for j in range(n)] for i in range(n)]
+    return torch.stack([torch.stack(row, dim=-1) for row in whole], dim=-2)
+
+
+def entry_basis(entries: Entries, functions: int, constants: int) -> tuple[Tensor, Tensor]:
+    """What each function and each constant adds to a matrix that is linear in them, as rows.
+
+    (functions, n n) and (constants, n n); found by asking ``entries`` for one at a time.
+    """
+    f, c = torch.eye(functions).double(), torch.eye(constants).double()
+    by_function = entries(f.unbind(), f.new_zeros(constants, functions).unbind())
+    by_constant = entries(c.new_zeros(functions, constants).unbind(), c.unbind())
+    return by_function.flatten(1), by_constant.flatten(1)
+
+
+class PositiveDefiniteShift(nn.Module):
+    """Adds a multiple s >= 0 of a positive definite matrix C that makes S + s C positive definite.
+
+    s = 0 wherever S is positive definite already. Elsewhere s = 2^k, the first power of two above
+    2 |S| / (least eigenvalue of C), both with C's diagonal scaled to one: s is constant in pieces, so
+    that derivatives of S are derivatives of S + s C. C has S's own zeros and linear relations,
+    which therefore hold in the sum.
+    """
+
+    matrix: Tensor  # C
+    unit: Tensor  # what scales C's diagonal to one, times 2 / least eigenvalue
+
+    def __init__(self, matrix: Tensor) -> None:
+        super().__init__()
+        scale = matrix.diagonal().rsqrt()
+        scaled = scale.unsqueeze(-1) * matrix * scale
+        least = torch.linalg.eigvalsh(scaled)[0]
+        self.register_buffer("matrix", matrix)
+        self.register_buffer("unit", 2 / least * scale.unsqueeze(-1) * scale)
+
+    def forward(self, mass: Tensor, least: Tensor) -> Tensor:
+        """mass + s C, (..., n, n), for S = mass - least."""
+        excess = mass.detach() - least
+        indefinite = torch.linalg.cholesky_ex(excess).info != 0
+        size = torch.linalg.vector_norm(self.unit * excess, dim=(-2, -1))
+        shift = torch.where(indefinite, torch.exp2(torch.ceil(torch.log2(size))), 0.0)
+        return torch.addcmul(mass, shift[..., None, None], self.matrix)
+
+
+def to_group(q: Tensor, joint_types: Sequence[str]) -> list[Tensor]:
+    """By joint, R in SO(3), (..., 3, 3), or r in R^3, (..., 3), if prismatic; z is its axis."""
+    parts = []
+    for kind, value in zip(joint_types, q.unbind(dim=-1), strict=True):
+        zero, one = torch.zeros_like(value), torch.ones_like(value)
+        if kind == "revolute":
+            c, s = value.cos(), value.sin()
+            rows = ((c, -s, zero), (s, c, zero), (zero, zero, one))
+            parts.append(torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2))
+        else:
+            parts.append(torch.stack((zero, zero, value), dim=-1))
+    return parts
+
+
+def from_group(parts: Sequence[Tensor], joint_types: Sequence[str]) -> Tensor:
+    """q, (..., n), with angles in [-pi, pi]; the inverse of ``to_group``."""
+    values = [
+        torch.atan2(part[..., 1, 0], part[..., 0, 0]) if kind == "revolute" else part[..., 2]
+        for kind, part in zip(joint_types, parts, strict=True)
+    ]
+    return torch.stack(values, dim=-1)
+
+
+def solved(matrix: Tensor, right: Tensor) -> Tensor:
+    """matrix^-1 right, (..., n)."""
+    # its derivative costs one more solution; a Cholesky factor's would cost several times that
+    solution: Tensor = torch.linalg.solve(matrix, right.unsqueeze(-1))
+    return solution.squeeze(-1)
+
+
+def applied(matrix: Tensor, vector: Tensor) -> Tensor:
+    """matrix vector, (..., n)."""
+    return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
+
+
+State = tuple[Tensor, Tensor]  # q and p, or how fast they change
+
+
+class PortHamiltonian(nn.Module):
+    """q' = dH/dp and p' = -dH/dq - D dH/dp + G tau, with H = 1/2 p^T M(q)^-1 p + V(q).
+
+    The port-Hamiltonian form (van der Schaft and Jeltsema, Port-Hamiltonian Systems Theory, 2014).
+    ``prepared`` is what ``prepare`` gave: all that depends on the weights alone. ``at`` is what
+    ``configuration`` gave: all that is computed of q alone. Shapes: q, qd, tau, p are (..., n).
+    """
+
+    n: int
+
+    def prepare(self) -> Any:
+        """All that depends on the weights alone; holds until they change."""
+        raise NotImplementedError
+
+    def configuration(self, q: Tensor, prepared: Any) -> Any:
+        """All that is computed of q alone."""
+        raise NotImplementedError
+
+    def mass_at(self, at: Any, prepared: Any) -> tuple[Tensor, Any]:
+        """M(q), (..., n, n), and what its derivatives need."""
+        raise NotImplementedError
+
+    def energy_at(self, at: Any, prepared: Any) -> Tensor:
+        """V(q), (...) [J]."""
+        raise NotImplementedError
+
+    def gravity_at(self, at: Any, prepared: Any) -> Tensor:
+        """dV/dq, (..., n) [Nm, N]."""
+        raise NotImplementedError
+
+    def lagrangian_gradient(self, at: Any, qd: Tensor, residuals: Any, prepared: Any) -> Tensor:
+        """d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
+        raise NotImplementedError
+
+    def nonlinear_at(self, at: Any, qd: Tensor, residuals: Any, prepared: Any) -> Tensor:
+        """The torque that holds qd steady without friction: Coriolis, centrifugal and gravity."""
+        raise NotImplementedError
+
+    def friction_at(self, at: Any, qd: Tensor, prepared: Any) -> Tensor:
+        """D(q, qd) qd, (..., n) [Nm, N]."""
+        raise NotImplementedError
+
+    def dissipation_at(self, at: Any, qd: Tensor, prepared: Any) -> Tensor:
+        """D(q, qd), (..., n, n)."""
+        raise NotImplementedError
+
+    def input_at(self, at: Any, prepared: Any) -> Tensor:
+        """G, (..., n, n)."""
+        raise NotImplementedError
+
+    def input_force(self, at: Any, tau: Tensor, prepared: Any) -> Tensor:
+        """G tau, (..., n) [Nm, N]."""
+        raise NotImplementedError
+
+    def input_torque(self, at: Any, force: Tensor, prepared: Any) -> Tensor:
+        """The tau, (..., n), that makes this force."""
+        raise NotImplementedError
+
+    def mass_matrix(self, q: Tensor, prepared: Any = None) -> Tensor:
+        """M(q), (..., n, n)."""
+        prepared = self.prepare() if prepared is None else prepared
+        return self.mass_at(self.configuration(q, prepared), prepared)[0]
+
+    def potential_energy(self, q: Tensor) -> Tensor:
+        """V(q), (...) [J]."""
+        prepared = self.prepare()
+        return self.energy_at(self.configuration(q, prepared), prepared)
+
+    def gravity(self, q: Tensor) -> Tensor:
+        """dV/dq, (..., n) [Nm, N]."""
+        prepared = self.prepare()
+        return self.gravity_at(self.configuration(q, prepared), prepared)
+
+    def nonlinear_effects(self, q: Tensor, qd: Tensor) -> Tensor:
+        """Coriolis, centrifugal and gravity torque, (..., n) [Nm, N]."""
+        prepared = self.prepare()
+        at = self.configuration(q, prepared)
+        return self.nonlinear_at(at, qd, self.mass_at(at, prepared)[1], prepared)
+
+    def friction_torque(self, q: Tensor, qd: Tensor) -> Tensor:
+        """D(q, qd) qd, (..., n) [Nm, N]."""
+        prepared = self.prepare()
+        return self.friction_at(self.configuration(q, prepared), qd, prepared)
+
+    def dissipation(self, q: Tensor, qd: Tensor) -> Tensor:
+        """D(q, qd), (..., n, n) [Nm s/rad, N s/m]."""
+        prepared = self.prepare()
+        return self.dissipation_at(self.configuration(q, prepared), qd, prepared)
+
+    def input_matrix(self, q: Tensor) -> Tensor:
+        """G(q), (..., n, n)."""
+        prepared = self.prepare()
+        return self.input_at(self.configuration(q, prepared), prepared)
+
+    def hamiltonian(self, q: Tensor, p: Tensor) -> Tensor:
+        """H, (...) [J]."""
+        prepared = self.prepare()
+        at = self.configuration(q, prepared)
+        qd = solved(self.mass_at(at, prepared)[0], p)
+        return 0.5 * (p * qd).sum(dim=-1) + self.energy_at(at, prepared)
+
+    def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
+        """qdd, (..., n), under the input tau."""
+        prepared = self.prepare()
+        at = self.configuration(q, prepared)
+        mass, residuals = self.mass_at(at, prepared)
+        force = self.input_force(at, tau, prepared)
+        force = force - self.nonlinear_at(at, qd, residuals, prepared)
+        return solved(mass, force - self.friction_at(at, qd, prepared))
+
+    def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
+        """The torque, (..., n), that gives qdd."""
+        prepared = self.prepare()
+        at = self.configuration(q, prepared)
+        mass, residuals = self.mass_at(at, prepared)
+        force = applied(mass, qdd) + self.nonlinear_at(at, qd, residuals, prepared)
+        return self.input_torque(at, force + self.friction_at(at, qd, prepared), prepared)
+
+    def port_hamiltonian_rhs(self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Any) -> State:
+        """q' and p', (..., n), under the input tau; without one, of the arm left to itself."""
+        at = self.configuration(q, prepared)
+        mass, residuals = self.mass_at(at, prepared)
+        qd = solved(mass, p)
+        force = self.lagrangian_gradient(at, qd, residuals, prepared)
+        force = force - self.friction_at(at, qd, prepared)
+        return qd, force if tau is None else force + self.input_force(at, tau, prepared)
+
+    def state_rate(self, state: Tensor) -> Tensor:
+        """The rate of (q, p), (..., 2 n), or of (q, p, tau), (..., 3 n), where tau is held."""
+        n = self.n
+        q, p, tau = state.tensor_split((n, 2 * n), dim=-1)
+        qd, force = self.port_hamiltonian_rhs(q, p, tau if tau.shape[-1] else None, self.prepare())
+        return torch.cat([qd, force, torch.zeros_like(tau)], dim=-1)
+
+
+class Armature(nn.Module):
+    """Rotor inertia times gear squared of each joint, never negative; the weights are logarithms."""
+
+    nominal: Tensor
+    gear: Tensor
+
+    def __init__(self, joints: Joints) -> None:
+        super().__init__()
+        self.register_buffer("nominal", vector(joints.armature))
+        self.register_buffer("gear", vector(joints.gear))
+        self.raw = nn.Parameter(torch.zeros(joints.n, dtype=torch.float64))
+
+    def forward(self) -> Tensor:
+        """The diagonal of the drives' part of M, (n,) [kg m^2, kg]."""
+        return self.nominal * self.raw.exp()
+
+    def rotor_inertia(self) -> Tensor:
+        """As the motors feel it, before the gear, (n,) [kg m^2, kg]."""
+        return self.nominal * self.raw.exp() / self.gear**2
+
+
+class JointEncoding(nn.Module):
+    """cos q, sin q and, where some joint is prismatic, the scaled q: (..., 2 n) or (..., 3 n)."""
+
+    center: Tensor
+    reach: Tensor
+
+    def __init__(self, joints: Joints) -> None:
+        super().__init__()
+        self.prismatic = not all(joints.revolute)
+        self.size = (3 if self.prismatic else 2) * joints.n
+        self.register_buffer("center", vector(joints.center))
+        self.register_buffer("reach", vector(joints.reach))
+
+    def scaled(self, q: Tensor) -> Tensor:
+        """q in units of a joint's reach about its center, (..., n)."""
+        return (q - self.center) / self.reach
+
+    def forward(self, q: Tensor) -> Tensor:
+        """The encoding of q."""
+        parts = [q.cos(), q.sin()]
+        return torch.cat([*parts, self.scaled(q)] if self.prismatic else parts, dim=-1)
+
+    def jvp(self, encoded: Tensor, qd: Tensor) -> Tensor:
+        """How fast the encoding changes along qd."""
+        cos, sin = encoded.chunk(3 if self.prismatic else 2, dim=-1)[:2]
+        parts = [-sin * qd, cos * qd]
+        return torch.cat([*parts, qd / self.reach] if self.prismatic else parts, dim=-1)
+
+    def vjp(self, encoded: Tensor, cotangent: Tensor) -> Tensor:
+        """d/dq, (..., n), of what has the derivative ``cotangent`` by the encoding."""
+        parts = 3 if self.prismatic else 2
+        cos, sin = encoded.chunk(parts, dim=-1)[:2]
+        by_cos, by_sin, *by_scaled = cotangent.chunk(parts, dim=-1)
+        by_joint = by_sin * cos - by_cos * sin
+        return by_joint + by_scaled[0] / self.reach if self.prismatic else by_joint
+
+
+class NetworkInput(NamedTuple):
+    """The inputs of a network: sensitivity * (matrix @ encoded + offset), (..., inputs)."""
+
+    joints: tuple[int, ...]  # of each input
+    sensitivity: Tensor
+    matrix: Tensor  # (inputs, encoded)
+    offset: Tensor
+
+
+def joint_input(joints: Joints, chosen: Iterable[int], sensitivity: Sequence[float]) -> NetworkInput:
+    """cos q and sin q of revolute joints, the scaled q of prismatic ones, times a joint's sensitivity."""
+    n, encoded = joints.n, (2 if all(joints.revolute) else 3) * joints.n
+    chosen = list(chosen)
+    turning = [joint for joint in chosen if joints.revolute[joint]]
+    sliding = [joint for joint in chosen if not joints.revolute[joint]]
+    owners = (*turning, *turning, *sliding)
+    places = [*turning, *(n + joint for joint in turning), *(2 * n + joint for joint in sliding)]
+    matrix = torch.eye(encoded, dtype=torch.float64)[places]
+    return NetworkInput(owners, vector(sensitivity[j] for j in owners), matrix, 0 * matrix.sum(dim=1))
+
+
+class Term(NamedTuple):
+    """x^powers (cos_factor cos(frequencies q) + sin_factor sin(frequencies q)), x the scaled q."""
+
+    frequencies: tuple[int, ...]  # by joint
+    powers: tuple[int, ...]  # by joint; none where no joint is prismatic
+    cos_factor: float
+    sin_factor: float
+
+
+class FourierFeatures(nn.Module):
+    """x^powers cos(frequencies q), then x^powers sin(frequencies q), (..., 2 K), of all terms of ``series``.
+
+    With every power its lower powers are there too, for the derivatives.
+    """
+
+    frequencies: Tensor  # (n, K)
+    powers: Tensor  # (K, n)
+    lower: Tensor  # takes K features to their derivatives by each joint that slides, (K, n K)
+
+    def __init__(self, joints: Joints, series: Iterable[Sequence[Term]]) -> None:
+        super().__init__()
+        still = (0,) * joints.n
+        keys = {(term.frequencies, term.powers or still) for terms in series for term in terms}
+        waiting = list(keys)
+        while waiting:
+            frequencies, powers = waiting.pop()
+            below = {(frequencies, _less(powers, joint)) for joint, power in enumerate(powers) if power}
+            waiting += below - keys
+            keys |= below
+        self.keys = sorted(keys)
+        self.count, self.joints = len(keys), joints.n
+        self.prismatic = any(any(powers) for _, powers in keys)
+        self.register_buffer("frequencies", torch.stack([vector(each) for each, _ in self.keys]).mT)
+        self.register_buffer("powers", torch.stack([vector(each) for _, each in self.keys]))
+        lower = torch.zeros(self.count, joints.n, self.count, dtype=torch.float64)
+        for place, (frequencies, powers) in enumerate(self.keys):
+            for joint, power in enumerate(powers):
+                if power:
+                    below_place = self.keys.index((frequencies, _less(powers, joint)))
+                    lower[below_place, joint, place] = power / joints.reach[joint]
+        self.register_buffer("lower", lower.flatten(1))
+
+    def place(self, term: Term) -> int:
+        """Where a term's cosine stands among the features."""
+        return self.keys.index((term.frequencies, term.powers or (0,) * self.joints))
+
+    def forward(self, q: Tensor, scaled: Tensor) -> Tensor:
+        """The features of q, with the scaled q at hand."""
+        angle = q @ self.frequencies
+        cos, sin = angle.cos(), angle.sin()
+        if self.prismatic:
+            size = (scaled.unsqueeze(-2) ** self.powers).prod(dim=-1)
+            cos, sin = size * cos, size * sin
+        return torch.cat([cos, sin], dim=-1)
+
+    def _by_sliding(self, feature: Tensor) -> Tensor:
+        """d/dq of K features by prismatic joints, (..., n, K)."""
+        return (feature @ self.lower).reshape(*feature.shape[:-1], self.joints, self.count)
+
+    def jvp(self, features: Tensor, qd: Tensor) -> Tensor:
+        """How fast the features change along qd."""
+        cos, sin = features.chunk(2, dim=-1)
+        turned = qd @ self.frequencies
+        by_cos, by_sin = -sin * turned, cos * turned
+        if self.prismatic:
+            slid = [(qd.unsqueeze(-2) @ self._by_sliding(x)).squeeze(-2) for x in (cos, sin)]
+            by_cos, by_sin = slid[0] + by_cos, slid[1] + by_sin
+        return torch.cat([by_cos, by_sin], dim=-1)
+
+    def vjp(self, features: Tensor, cotangent: Tensor) -> Tensor:
+        """d/dq, (..., n), of what has the derivative ``cotangent`` by the features."""
+        cos, sin = features.chunk(2, dim=-1)
+        by_cos, by_sin = cotangent.chunk(2, dim=-1)
+        by_joint = (by_sin * cos - by_cos * sin) @ self.frequencies.mT
+        if self.prismatic:
+            for feature, by_feature in ((cos, by_cos), (sin, by_sin)):
+                slid = self._by_sliding(feature) @ by_feature.unsqueeze(-1)
+                by_joint = by_joint + slid.squeeze(-1)
+        return by_joint
+
+    def gradient_map(self, coefficients: Tensor) -> Tensor:
+        """What takes the features to d/dq of features @ coefficients, (2 K, n)."""
+        by_cos, by_sin = coefficients.unsqueeze(-1).chunk(2)
+        turned = torch.cat([by_sin * self.frequencies.mT, -by_cos * self.frequencies.mT])
+        if not self.prismatic:
+            return turned
+        lower = self.lower.reshape(self.count, self.joints, self.count)
+        return turned + torch.cat([lower @ by_cos, lower @ by_sin]).squeeze(-1)
+
+
+class FourierSeries(nn.Module):
+    """Fourier series with trained coefficients, one for each output of a network beside it.
+
+    ``series`` has, for each output, the terms that coefficients start from. They are trained in
+    units of the output's scale times the least sensitivity of the joints that the term depends on.
+    """
+
+    outputs: Tensor  # of each coefficient
+    places: Tensor
+    units: Tensor
+
+    def __init__(
+        self,
+        features: FourierFeatures,
+        series: Sequence[Sequence[Term]],
+        scales: Sequence[float],
+        sensitivity: Sequence[float],
+    ) -> None:
+        super().__init__()
+        self.count = features.count
+        moving = (features.frequencies.mT != 0) | (features.powers != 0)  # (K, n)
+        rows = []
+        for output, (terms, scale) in enumerate(zip(series, scales, strict=True)):
+            for term in terms:
+                place = features.place(term)
+                unit = min(s for s, moves in zip(sensitivity, moving[place], strict=True) if moves)
+                rows.append((output, place, term.cos_factor / scale / unit, unit))
+                rows.append((output, features.count + place, term.sin_factor / scale / unit, unit))
+        outputs, places, starts, units = zip(*rows, strict=True)
+        self.register_buffer("outputs", torch.tensor(outputs))
+        self.register_buffer("places", torch.tensor(places))
+        self.register_buffer("units", vector(units))
+        self.raw_coefficients = nn.Parameter(vector(starts))
+
+    def prepare(self, output_map: Tensor) -> Tensor:
+        """What takes features to output_map y, (rows, 2 K), where y are the series."""
+        known = output_map.new_zeros(output_map.shape[1], 2 * self.count)
+        coefficients = self.units * self.raw_coefficients
+        return output_map @ known.index_put((self.outputs, self.places), coefficients)
+
+
+def _less(powers: tuple[int, ...], joint: int) -> tuple[int, ...]:
+    """The powers with one less of a joint."""
+    return tuple(power - (k == joint) for k, power in enumerate(powers))
+
+
+class DirectInput(nn.Module):
+    """G is the identity: each input is the torque of its own joint, and none that of a passive one."""
+
+    actuated: Tensor
+
+    def __init__(self, joints: Joints) -> None:
+        super().__init__()
+        self.register_buffer("actuated", vector(float(x) for x in joints.actuated))
+
+    def prepare(self) -> Tensor:
+        """The diagonal of G, (n,)."""
+        return self.actuated
+
+    def forward(self, encoded: Tensor, prepared: Tensor) -> Tensor:
+        """G, (..., n, n)."""
+        return torch.diag(prepared).expand(*encoded.shape[:-1], len(prepared), len(prepared))
+
+    def force(self, encoded: Tensor, tau: Tensor, prepared: Tensor) -> Tensor:
+        """G tau, (..., n)."""
+        return prepared * tau
+
+    def solve(self, encoded: Tensor, force: Tensor, prepared: Tensor) -> Tensor:
+        """The inputs, (..., n), that make this force; a passive joint shows the torque it lacks."""
+        return force
+
+
+class Mass(Protocol):
+    """What gives M(q) and its derivatives."""
+
+    def prepare(self) -> Any:
+        """All that depends on the weights alone."""
+
+    def __call__(self, at: Configuration, prepared: Any) -> tuple[Tensor, Any]:
+        """M(q), (..., n, n), and what its derivatives need."""
+
+    def kinetic_vjp(self, at: Configuration, qd: Tensor, residuals: Any) -> tuple[Tensor, Tensor | None]:
+        """The derivative of 1/2 qd^T M(q) qd by the encoding, and by the Fourier features."""
+
+    def jvp(self, rate: Configuration, residuals: Any) -> Tensor:
+        """dM/dt, (..., n, n), where the configuration changes at this rate."""
+
+
+class Friction(Protocol):
+    """What gives D(q, qd)."""
+
+    def prepare(self) -> Any:
+        """All that depends on the weights alone."""
+
+    def __call__(self, encoded: Tensor, qd: Tensor, prepared: Any) -> Tensor:
+        """D qd, (..., n) [Nm, N]."""
+
+    def dissipation(self, encoded: Tensor, qd: Tensor, prepared: Any) -> Tensor:
+        """D, (..., n, n)."""
+
+
+class Input(Protocol):
+    """What gives G."""
+
+    def prepare(self) -> Any:
+        """All that depends on the weights alone."""
+
+    def __call__(self, encoded: Tensor, prepared: Any) -> Tensor:
+        """G, (..., n, n)."""
+
+    def force(self, encoded: Tensor, tau: Tensor, prepared: Any) -> Tensor:
+        """G tau, (..., n)."""
+
+    def solve(self, encoded: Tensor, force: Tensor, prepared: Any) -> Tensor:
+        """The inputs, (..., n), that make this force."""
+
+
+HIDDEN = 8  # units of a joint's network
+
+
+POSITION_SENSITIVITY = 0.1  # of friction's networks, relative to velocity
+
+
+SMOOTHING = 0.03  # below this fraction of its usual speed dry friction fades to zero, to start from
+
+
+LEAST_SMOOTHING = 0.001  # and at the least
+
+
+class FrictionLayers(NamedTuple):
+    """The weights made ready for many states, all joints' networks in one."""
+
+    weight: Tensor
+    bias: Tensor
+    out: Tensor
+    offset: Tensor
+    viscous: Tensor  # [Nm s/rad, N s/m]
+    smoothing: Tensor  # coulomb smoothing velocity squared [rad^2/s^2, m^2/s^2]
+
+
+class JointFriction(nn.Module):
+    """A diagonal D(q, qd), positive for all weights."""
+
+    matrix: Tensor  # where the inputs of a joint's network stand, (joints, inputs, encoded + 2 n)
+    speed: Tensor
+    nominal: Tensor
+
+    def __init__(self, joints: Joints, encoding: JointEncoding, generator: torch.Generator) -> None:
+        super().__init__()
+        n, inputs = joints.n, 4
+        matrix = torch.zeros(n, inputs, encoding.size + 2 * n, dtype=torch.float64)
+        for i, revolute in enumerate(joints.revolute):
+            cos, sin = (i, n + i) if revolute else (2 * n + i, 2 * n + i)
+            matrix[i, 0, cos] = matrix[i, 1, sin] = POSITION_SENSITIVITY
+            matrix[i, 2, i - 2 * n], matrix[i, 3, i - n] = 1 / joints.speed[i], 1.0
+        self.register_buffer("matrix", matrix)
+        self.register_buffer("speed", vector(joints.speed))
+        self.register_buffer("nominal", vector(joints.friction))
+        self.raw_smoothing = nn.Parameter(torch.zeros(n, dtype=torch.float64))
+        self.raw_viscous = nn.Parameter(torch.full((n,), -2.0, dtype=torch.float64))
+        shape = (n, inputs, HIDDEN)
+        weight = torch.randn(shape, dtype=torch.float64, generator=generator)
+        self.weight = nn.Parameter(weight / inputs**0.5)
+        self.bias = nn.Parameter(torch.zeros(n, HIDDEN, dtype=torch.float64))
+        self.out = nn.Parameter(torch.zeros(n, HIDDEN, dtype=torch.float64))
+        self.offset = nn.Parameter(torch.full((n,), -2.0, dtype=torch.float64))
+
+    def viscous(self) -> Tensor:
+        """Torque per velocity, (n,) [Nm s/rad, N s/m]."""
+        return self.nominal * F.softplus(self.raw_viscous) / self.speed
+
+    def coulomb_smoothing_velocity(self) -> Tensor:
+        """Where dry friction has turned around, (n,) [rad/s, m/s]."""
+        return self.speed * (LEAST_SMOOTHING**2 + (SMOOTHING * self.raw_smoothing.exp()) ** 2).sqrt()
+
+    def prepare(self) -> FrictionLayers:
+        """All joints' networks as one: block matrices are faster than a loop over joints.
+
+        Their tanh x is computed as 2 sigmoid(2 x) - 1, which takes a fraction of the time.
+        """
+        own = torch.eye(self.out.shape[0], dtype=self.out.dtype, device=self.out.device)
+        return FrictionLayers(
+            weight=2 * (self.weight.mT @ self.matrix).flatten(0, 1),
+            bias=2 * self.bias.flatten(),
+            out=2 * (own.unsqueeze(-1) * self.out).flatten(1),
+            offset=self.offset - self.out.sum(dim=1),
+            viscous=self.viscous(),
+            smoothing=self.coulomb_smoothing_velocity() ** 2,
+        )
+
+    def _dry(self, encoded: Tensor, qd: Tensor, direction: Tensor, layers: FrictionLayers) -> Tensor:
+        """Dry friction relative to its usual size, (..., n)."""
+        inputs = torch.cat([encoded, qd, direction], dim=-1)
+        hidden = torch.sigmoid(F.linear(inputs, layers.weight, layers.bias))
+        return F.softplus(F.linear(hidden, layers.out, layers.offset))
+
+    def forward(self, encoded: Tensor, qd: Tensor, layers: FrictionLayers) -> Tensor:
+        """The friction torque D qd, (..., n) [Nm, N]."""
+        direction = qd * torch.rsqrt(qd * qd + layers.smoothing)  # -1 or 1, smooth at standstill
+        dry = self._dry(encoded, qd, direction, layers)
+        return layers.viscous * qd + self.nominal * direction * dry
+
+    def dissipation(self, encoded: Tensor, qd: Tensor, layers: FrictionLayers) -> Tensor:
+        """D, (..., n, n) [Nm s/rad, N s/m], diagonal."""
+        smooth_speed = torch.sqrt(qd * qd + layers.smoothing)
+        dry = self._dry(encoded, qd, qd / smooth_speed, layers)
+        return torch.diag_embed(layers.viscous + self.nominal * dry / smooth_speed)
+
+
+class MLPLayers(NamedTuple):
+    """A network's weights made ready for many states; see ``MaskedMLP.prepare``."""
 
     weights: tuple[Tensor, ...]
     biases: tuple[Tensor, ...]
 
 
-Trace = tuple[tuple[Tensor, ...], Layers]
+MLPResiduals = tuple[tuple[Tensor, ...], MLPLayers]
 
 
-def by_sigmoid(rate: Tensor, value: Tensor) -> Tensor:
-    """rate * value (1 - value), the sigmoid's slope, in one pass: memory is what takes the time."""
-    changed: Tensor = torch.ops.aten.sigmoid_backward(rate, value)
+def sigmoid_vjp(cotangent: Tensor, value: Tensor) -> Tensor:
+    """cotangent * value (1 - value), the sigmoid's derivative, in one pass over memory."""
+    changed: Tensor = torch.ops.aten.sigmoid_backward(cotangent, value)
     return changed
 
 
-class Network(nn.Module):
-    """A tanh network, with its derivatives written out.
+class MaskedMLP(nn.Module):
+    """A tanh network.
 
     ``layers`` names, unit by unit, the joints that each layer's units may read; weights between
     others are masked, so that a unit has no path to a joint it must not depend on.
+    ``output_fraction`` scales what the last layer gives, but for its biases.
     """
 
-    spread: Tensor
+    matrix: Tensor
+    offset: Tensor
 
     def __init__(
         self,
-        reading: Reading,
-        layers: tuple[tuple[frozenset[int], ...], ...],
+        inputs: NetworkInput,
+        layers: Sequence[Sequence[frozenset[int]]],
         generator: torch.Generator,
+        output_fraction: float = 1.0,
     ) -> None:
         super().__init__()
-        self.register_buffer("spread", reading.spread)
+        self.register_buffer("matrix", inputs.matrix)
+        self.register_buffer("offset", inputs.offset)
         self.weights = nn.ParameterList()
         self.biases = nn.ParameterList()
-        below = tuple(frozenset((joint,)) for joint in reading.joints)
+        below = [frozenset((joint,)) for joint in inputs.joints]
         for index, units in enumerate(layers):
             allowed = [[float(lower <= upper) for lower in below] for upper in units]
             mask = torch.tensor(allowed, dtype=torch.float64)
             weight = torch.randn(mask.shape, dtype=torch.float64, generator=generator)
             self.weights.append(nn.Parameter(weight / mask.sum(dim=1, keepdim=True).sqrt()))
-            self.register_buffer(f"mask{index}", mask * reading.share if index == 0 else mask)
+            mask = mask * inputs.sensitivity if index == 0 else mask
+            last = index == len(layers) - 1
+            self.register_buffer(f"mask{index}", mask * output_fraction if last else mask)
             self.biases.append(nn.Parameter(torch.zeros(len(units), dtype=torch.float64)))
-            below = units
+            below = list(units)
         nn.init.zeros_(self.weights[-1])  # so that the model starts at its nominal values
 
-    def prepared(self, outlay: Tensor, offset: Tensor) -> Layers:
-        """The weights for the features as they are, and for offset + outlay y in place of y.
+    def set_output_bias(self, values: Tensor) -> None:
+        """Start the outputs from these values."""
+        self.biases[-1].data = values
+
+    def prepare(self, output_map: Tensor, offset: Tensor) -> MLPLayers:
+        """The weights for the encoding as it is, and for offset + output_map y in place of y.
 
         tanh x is computed as 2 sigmoid(2 x) - 1, which takes a fraction of the time.
         """
@@ -277,488 +964,330 @@ class Network(nn.Module):
         for index, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             weight = weight * self.get_buffer(f"mask{index}")
             if index == 0:
-                weight = weight @ self.spread
+                bias, weight = bias + weight @ self.offset, weight @ self.matrix
             else:
                 bias, weight = bias - weight.sum(dim=1), 2 * weight
             weights.append(2 * weight)
             biases.append(2 * bias)
-        weights[-1] = 0.5 * outlay @ weights[-1]
-        biases[-1] = offset + 0.5 * outlay @ biases[-1]
-        return Layers(tuple(weights), tuple(biases))
+        weights[-1] = 0.5 * output_map @ weights[-1]
+        biases[-1] = offset + 0.5 * output_map @ biases[-1]
+        return MLPLayers(tuple(weights), tuple(biases))
 
-    def forward(self, features: Tensor, layers: Layers) -> tuple[Tensor, Trace]:
-        """y laid out, (..., rows); and what ``pull`` and ``push`` need."""
-        layer, hidden = features, []
+    def forward(self, encoded: Tensor, layers: MLPLayers) -> tuple[Tensor, MLPResiduals]:
+        """offset + output_map y, (..., rows); and what ``vjp`` and ``jvp`` need."""
+        layer, hidden = encoded, []
         for weight, bias in zip(layers.weights[:-1], layers.biases, strict=False):
             layer = torch.sigmoid(F.linear(layer, weight, bias))
             hidden.append(layer)
         return F.linear(layer, layers.weights[-1], layers.biases[-1]), (tuple(hidden), layers)
 
-    def pull(self, trace: Trace, cotangent: Tensor) -> Tensor:
-        """The reverse sweep: cotangent, (..., rows), times dy/dfeatures; (..., features)."""
-        hidden, layers = trace
+    def vjp(self, residuals: MLPResiduals, cotangent: Tensor) -> Tensor:
+        """The reverse sweep: cotangent, (..., rows), times d/d encoded; (..., encoded)."""
+        hidden, layers = residuals
         layer = cotangent @ layers.weights[-1]
         for weight, value in zip(reversed(layers.weights[:-1]), reversed(hidden), strict=True):
-            layer = by_sigmoid(layer, value) @ weight
+            layer = sigmoid_vjp(layer, value) @ weight
         return layer
 
-    def push(self, trace: Trace, rate: Tensor) -> Tensor:
-        """The forward sweep: dy/dfeatures times the features' rate; (..., rows)."""
-        hidden, layers = trace
+    def jvp(self, residuals: MLPResiduals, tangent: Tensor) -> Tensor:
+        """The forward sweep: d/d encoded times the encoding's tangent; (..., rows)."""
+        hidden, layers = residuals
         for weight, value in zip(layers.weights[:-1], hidden, strict=True):
-            rate = by_sigmoid(F.linear(rate, weight), value)
-        return F.linear(rate, layers.weights[-1])
+            tangent = sigmoid_vjp(F.linear(tangent, weight), value)
+        return F.linear(tangent, layers.weights[-1])
 
 
-class Series(nn.Module):
-    """Sums of waves with trained factors, one for each output of a network beside it."""
-
-    outputs: Tensor  # for each term, to which output it goes
-    places: Tensor  # and where its wave stands
-    size: Tensor  # in which its factor is counted
-
-    def __init__(self, sums: list[Terms], scales: list[float], shares: list[float]) -> None:
-        """Of terms in units of their output's scale; a wave counts as its joints' least share."""
-        super().__init__()
-        rows = []
-        for output, (terms, scale) in enumerate(zip(sums, scales, strict=True)):
-            for number, cos, sin in terms:
-                turns = WAVES[number].turns
-                powers = WAVES[number].powers
-                moved = [turn or power for turn, power in zip(turns, powers, strict=True)]
-                size = min(share for share, moves in zip(shares, moved, strict=True) if moves)
-                rows.append((output, number, cos / scale / size, size))
-                rows.append((output, len(WAVES) + number, sin / scale / size, size))
-        outputs, places, starts, sizes = zip(*rows, strict=True)
-        self.register_buffer("outputs", torch.tensor(outputs))
-        self.register_buffer("places", torch.tensor(places))
-        self.register_buffer("size", vector(sizes))
-        self.factors = nn.Parameter(vector(starts))
-
-    def prepared(self, outlay: Tensor) -> Tensor:
-        """What takes waves to outlay y, (rows, 2 waves), where y are the sums."""
-        known = outlay.new_zeros(outlay.shape[1], 2 * len(WAVES))
-        return outlay @ known.index_put((self.outputs, self.places), self.size * self.factors)
+NETWORK_FRACTION = 0.1  # how much of a function that is a Fourier series is left to its network
 
 
-def leave_to_sums(network: Network, levels: Tensor) -> None:
-    """Leave a network a small share of functions that are sums of waves, and the sums' levels."""
-    network.biases[-1].data = levels
-    network.get_buffer(f"mask{DEPTH}").mul_(NETWORK_SHARE)
+class MassFunction(NamedTuple):
+    """A learned function f of some joints: mean + scale * network.
 
-
-def lower_powers() -> Tensor:
-    """What takes all waves to their slopes by each joint that slides, (waves, n waves)."""
-    lower = torch.zeros(len(WAVES), len(JOINTS), len(WAVES), dtype=torch.float64)
-    for place, wave in enumerate(WAVES):
-        for joint, power in enumerate(wave.powers):
-            if power:
-                less = tuple(p - (j == joint) for j, p in enumerate(wave.powers))
-                below = WAVES.index(Wave(wave.turns, less))
-                lower[below, joint, place] = power / JOINTS[joint].reach
-    return lower.flatten(1)
-
-
-class FrictionLayers(NamedTuple):
-    """The friction networks' weights made ready for many states, all joints in one."""
-
-    weight: Tensor
-    bias: Tensor
-    out: Tensor
-    offset: Tensor
-    viscous: Tensor  # [Nm s/rad, N s/m]
-    slow: Tensor  # [rad^2/s^2, m^2/s^2]
-
-
-class Friction(nn.Module):
-    """Damping of each joint by its own q_i and qd_i: viscous, a constant, and dry, a network."""
-
-    spread: Tensor  # where the inputs of a joint's network stand, (joints, inputs, features + 2 n)
-    speed: Tensor
-    size: Tensor
-
-    def __init__(self, generator: torch.Generator) -> None:
-        super().__init__()
-        joints, inputs = len(JOINTS), 4
-        spread = torch.zeros(joints, inputs, FEATURES + 2 * joints, dtype=torch.float64)
-        for i, joint in enumerate(JOINTS):
-            cos, sin = (i, joints + i) if joint.revolute else (2 * joints + i, 2 * joints + i)
-            spread[i, 0, cos] = spread[i, 1, sin] = PLACE_SHARE
-            spread[i, 2, i - 2 * joints], spread[i, 3, i - joints] = 1 / joint.speed, 1.0
-        self.register_buffer("spread", spread)
-        self.register_buffer("speed", vector(joint.speed for joint in JOINTS))
-        self.register_buffer("size", vector(joint.friction for joint in JOINTS))
-        self.slow = nn.Parameter(torch.zeros(joints, dtype=torch.float64))
-        self.viscous = nn.Parameter(torch.full((joints,), -2.0, dtype=torch.float64))
-        shape = (joints, inputs, FRICTION_HIDDEN)
-        weight = torch.randn(shape, dtype=torch.float64, generator=generator)
-        self.weight = nn.Parameter(weight / inputs**0.5)
-        self.bias = nn.Parameter(torch.zeros(joints, FRICTION_HIDDEN, dtype=torch.float64))
-        self.out = nn.Parameter(torch.zeros(joints, FRICTION_HIDDEN, dtype=torch.float64))
-        self.offset = nn.Parameter(torch.full((joints,), -2.0, dtype=torch.float64))
-
-    def prepared(self) -> FrictionLayers:
-        """All joints' networks as one: block matrices are faster than a loop over joints.
-
-        Their tanh x is computed as 2 sigmoid(2 x) - 1, which takes a fraction of the time.
-        """
-        own = torch.eye(len(JOINTS), dtype=self.out.dtype, device=self.out.device)
-        return FrictionLayers(
-            weight=2 * (self.weight.mT @ self.spread).flatten(0, 1),
-            bias=2 * self.bias.flatten(),
-            out=2 * (own.unsqueeze(-1) * self.out).flatten(1),
-            offset=self.offset - self.out.sum(dim=1),
-            viscous=self.size * F.softplus(self.viscous) / self.speed,
-            slow=self.speed**2 * (SLOWEST**2 + (SLOW * self.slow.exp()) ** 2),
-        )
-
-    def _dry(
-        self, features: Tensor, qd: Tensor, direction: Tensor, layers: FrictionLayers
-    ) -> Tensor:
-        """Dry friction relative to its usual size, (..., n)."""
-        inputs = torch.cat([features, qd, direction], dim=-1)
-        hidden = torch.sigmoid(F.linear(inputs, layers.weight, layers.bias))
-        return F.softplus(F.linear(hidden, layers.out, layers.offset))
-
-    def forward(self, features: Tensor, qd: Tensor, layers: FrictionLayers) -> Tensor:
-        """The friction torque D qd, (..., n) [Nm, N]."""
-        direction = qd * torch.rsqrt(qd * qd + layers.slow)  # -1 or 1, smooth where it stands still
-        dry = self._dry(features, qd, direction, layers)
-        return layers.viscous * qd + self.size * direction * dry
-
-    def matrix(self, features: Tensor, qd: Tensor, layers: FrictionLayers) -> Tensor:
-        """D, (..., n, n) [Nm s/rad, N s/m], diagonal."""
-        smooth_speed = torch.sqrt(qd * qd + layers.slow)
-        dry = self._dry(features, qd, qd / smooth_speed, layers)
-        return torch.diag_embed(layers.viscous + self.size * dry / smooth_speed)
-
-
-class Features(NamedTuple):
-    """Numbers made of q, which all else is made of."""
-
-    own: Tensor  # cos q, sin q, the scaled q, (..., FEATURES)
-    waves: Tensor  # cosines of all waves, then sines, (..., 2 waves)
-
-
-class Prepared(NamedTuple):
-    """What depends on the weights alone, worked out once for many states."""
-
-    mass: Layers
-    mass_waves: Tensor  # takes the waves to M
-    rotors: Tensor
-    least: Tensor  # M above this needs no guard
-    potential: Layers
-    potential_waves: Tensor  # takes the waves to V
-    gravity_waves: Tensor  # and to dV/dq
-    friction: FrictionLayers
-
-
-# what M's derivatives need of the work done for M
-Memory = tuple[Trace, Tensor | None, Tensor]
-
-
-class Model(nn.Module):
-    """The arm's dynamics: 3 learned functions of q and 2 constants make the mass matrix.
-
-    Shapes: q, qd, qdd, tau and p are (..., n), with any leading dimensions. Units: rad and Nm for
-    turning joints, m and N for sliding ones. M is positive definite and D positive semi-definite
-    for all weights.
+    With a ``series``, f = offset + Fourier series + NETWORK_FRACTION * scale * network.
     """
 
-    n: ClassVar[int] = 3
-    joint_names: ClassVar[tuple[str, ...]] = tuple(joint.name for joint in JOINTS)
-    joint_types: ClassVar[tuple[str, ...]] = tuple(
-        "revolute" if joint.revolute else "prismatic" for joint in JOINTS
-    )
+    joints: tuple[int, ...]
+    mean: float  # over the workspace, with nominal inertias
+    scale: float
+    offset: float = 0.0
+    series: tuple[Term, ...] = ()
 
-    center: Tensor
-    reach: Tensor
-    turns: Tensor  # of joints by wave, (n, waves)
-    powers: Tensor
-    lower: Tensor  # takes waves to what the slopes by each joint are
+
+class MassPrepared(NamedTuple):
+    """What depends on the weights alone."""
+
+    layers: Any  # of the network
+    series: Tensor | None  # takes Fourier features to M
+    least: Tensor  # M above this needs no shift
+
+
+class MassResiduals(NamedTuple):
+    """What M's derivatives need of the work done for M."""
+
+    network: Any
+    series: Tensor | None
+
+
+class DerivedMass(nn.Module):
+    """M(q), (..., n, n), with ``entries`` saying where functions and constants stand.
+
+    A constant starts at the first of its two numbers, and is trained in units of the second. Where
+    M would not exceed armature + margin * its nominal mean, that mean is added (see
+    PositiveDefiniteShift): M is positive definite for all q and all weights.
+    """
+
     constant_scale: Tensor
-    constant_basis: Tensor
-    output_mean: Tensor
-    output_scale: Tensor
-    output_basis: Tensor
-    mean_mass: Tensor
-    whitening: Tensor  # takes M to its eigenproblem relative to its mean
-    rotor_size: Tensor
-    actuated: Tensor
+    constant_basis: Tensor  # (constants, n n)
+    function_mean: Tensor
+    function_scale: Tensor
+    function_basis: Tensor  # (functions, n n)
 
-    def __init__(self, seed: int = 0) -> None:
+    def __init__(
+        self,
+        joints: Joints,
+        entries: Entries,
+        functions: Sequence[MassFunction],
+        constants: Sequence[tuple[float, float]],
+        network: Network,
+        margin: float,
+        fourier: FourierFeatures | None = None,
+        sensitivity: Sequence[float] = (),
+    ) -> None:
         super().__init__()
-        generator = torch.Generator().manual_seed(seed)
-        self.register_buffer("center", vector(joint.center for joint in JOINTS))
-        self.register_buffer("reach", vector(joint.reach for joint in JOINTS))
-        turns = torch.tensor([wave.turns for wave in WAVES], dtype=torch.float64)
-        self.register_buffer("turns", turns.mT)
-        powers = torch.tensor([wave.powers for wave in WAVES], dtype=torch.float64)
-        self.register_buffer("powers", powers)
-        self.register_buffer("lower", lower_powers())
-        start = vector(constant.start for constant in CONSTANTS)
-        self.register_buffer("constant_scale", vector(constant.scale for constant in CONSTANTS))
-        self.register_buffer("constant_basis", stacked([c.entries for c in CONSTANTS]))
-        self.constants = nn.Parameter(start / self.constant_scale)
-        self.register_buffer("output_mean", vector(output.mean for output in OUTPUTS))
-        self.register_buffer("output_scale", vector(output.scale for output in OUTPUTS))
-        self.register_buffer("output_basis", stacked([output.entries for output in OUTPUTS]))
-        mean = start @ self.constant_basis + self.output_mean @ self.output_basis
-        self.register_buffer("mean_mass", self._square(mean))
-        self.register_buffer("whitening", torch.linalg.inv(torch.linalg.cholesky(self.mean_mass)))
-        hidden = tuple(frozenset(joints) for joints, units in MASS_HIDDEN for _ in range(units))
-        outputs = tuple(frozenset(output.joints) for output in OUTPUTS)
-        shares = [joint.mass_share for joint in JOINTS]
-        read = reading(sorted(frozenset().union(*outputs)), shares)
-        self.mass_network = Network(read, (*((hidden,) * DEPTH), outputs), generator)
-        scales = [output.scale for output in OUTPUTS]
-        self.mass_series = Series([output.terms for output in OUTPUTS], scales, shares)
-        levels = vector((output.level - output.mean) / output.scale for output in OUTPUTS)
-        leave_to_sums(self.mass_network, levels)
-        everything = frozenset(POTENTIAL_JOINTS)
-        layers = (*(((everything,) * POTENTIAL_WIDTH,) * DEPTH), (everything,))
-        shares = [joint.potential_share for joint in JOINTS]
-        self.potential_network = Network(reading(POTENTIAL_JOINTS, shares), layers, generator)
-        self.potential_series = Series([POTENTIAL_TERMS], [POTENTIAL_SCALE], shares)
-        leave_to_sums(self.potential_network, vector([0.0]))
-        self.friction = Friction(generator)
-        self.register_buffer("rotor_size", vector(joint.rotor for joint in JOINTS))
-        self.rotor = nn.Parameter(torch.zeros(self.n, dtype=torch.float64))
-        self.register_buffer("actuated", vector(float(joint.actuated) for joint in JOINTS))
+        self.n, self.margin = joints.n, margin
+        start = vector(first for first, _ in constants)
+        by_function, by_constant = entry_basis(entries, len(functions), len(constants))
+        self.register_buffer("constant_scale", vector(unit for _, unit in constants))
+        self.register_buffer("constant_basis", by_constant)
+        self.register_buffer("function_mean", vector(each.mean for each in functions))
+        self.register_buffer("function_scale", vector(each.scale for each in functions))
+        self.register_buffer("function_basis", by_function)
+        mean = start @ self.constant_basis + self.function_mean @ self.function_basis
+        self.shift = PositiveDefiniteShift(self._square(mean))
+        self.raw_constants = nn.Parameter(start / self.constant_scale)
+        self.network = network
+        self.series: FourierSeries | None = None
+        if fourier is not None:
+            scales = [each.scale for each in functions]
+            self.series = FourierSeries(fourier, [each.series for each in functions], scales, sensitivity)
+            levels = vector((each.offset - each.mean) / each.scale for each in functions)
+            network.set_output_bias(levels)
+        self.armature = Armature(joints)
 
-    def prepare(self) -> Prepared:
-        """All that depends on the weights alone; holds until they change."""
-        rotors = torch.diag(self.rotor_size * self.rotor.exp())  # diagonal and never negative
-        constant = (self.constant_scale * self.constants) @ self.constant_basis
-        constant = constant + self.output_mean @ self.output_basis + rotors.flatten()
-        outlay = (self.output_scale.unsqueeze(-1) * self.output_basis).mT
-        scale = self.friction.size.new_full((1, 1), POTENTIAL_SCALE)
-        heights = self.potential_series.prepared(scale)[0]
-        return Prepared(
-            mass=self.mass_network.prepared(outlay, constant),
-            mass_waves=self.mass_series.prepared(outlay),
-            rotors=rotors,
-            least=(rotors + GUARD * self.mean_mass).detach(),
-            potential=self.potential_network.prepared(scale, 0 * scale[0]),
-            potential_waves=heights,
-            gravity_waves=self._gravity_waves(heights),
-            friction=self.friction.prepared(),
+    def constants(self) -> Tensor:
+        """The constants of M, (constants,), in their units."""
+        return self.constant_scale * self.raw_constants
+
+    def prepare(self) -> MassPrepared:
+        """All that depends on the weights alone."""
+        armature = torch.diag(self.armature())
+        constant = self.constants() @ self.constant_basis
+        constant = constant + self.function_mean @ self.function_basis + armature.flatten()
+        output_map = (self.function_scale.unsqueeze(-1) * self.function_basis).mT
+        return MassPrepared(
+            layers=self.network.prepare(output_map, constant),
+            series=None if self.series is None else self.series.prepare(output_map),
+            least=(armature + self.margin * self.shift.matrix).detach(),
         )
 
     def _square(self, rows: Tensor) -> Tensor:
         """(..., n n) as (..., n, n)."""
         return rows.reshape(*rows.shape[:-1], self.n, self.n)
 
-    def _features(self, q: Tensor) -> Features:
-        """cos q, sin q, the scaled q; the waves: all that is read of q."""
-        place = (q - self.center) / self.reach
-        own = torch.cat([q.cos(), q.sin(), place], dim=-1)
-        angle = q @ self.turns
-        size = (place.unsqueeze(-2) ** self.powers).prod(dim=-1)
-        return Features(own, torch.cat([size * angle.cos(), size * angle.sin()], dim=-1))
+    def forward(self, at: Configuration, prepared: MassPrepared) -> tuple[Tensor, MassResiduals]:
+        """M(q), and what its derivatives need."""
+        rows, residuals = self.network(at.encoded, prepared.layers)
+        if at.fourier is not None and prepared.series is not None:
+            rows = rows + F.linear(at.fourier, prepared.series)
+        mass = self.shift(self._square(rows), prepared.least)
+        return mass, MassResiduals(residuals, prepared.series)
 
-    def _slide_slopes(self, wave: Tensor) -> Tensor:
-        """d/dq of waves by sliding joints, (..., n, waves): lower powers of the same waves."""
-        return (wave @ self.lower).reshape(*wave.shape[:-1], self.n, len(WAVES))
+    def kinetic_vjp(
+        self, at: Configuration, qd: Tensor, residuals: MassResiduals
+    ) -> tuple[Tensor, Tensor | None]:
+        """The derivative of 1/2 qd^T M(q) qd by the encoding, and by the Fourier features."""
+        weight = ((0.5 * qd).unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2)
+        by_series = None if residuals.series is None else weight @ residuals.series
+        return self.network.vjp(residuals.network, weight), by_series
 
-    def _features_rate(self, features: Features, qd: Tensor) -> Features:
-        """How fast the features change along qd."""
-        cos, sin, _ = features.own.chunk(3, dim=-1)
-        own = torch.cat([-sin * qd, cos * qd, qd / self.reach], dim=-1)
-        cos, sin = features.waves.chunk(2, dim=-1)
-        turn = qd @ self.turns
-        slid = [(qd.unsqueeze(-2) @ self._slide_slopes(wave)).squeeze(-2) for wave in (cos, sin)]
-        return Features(own, torch.cat([slid[0] - sin * turn, slid[1] + cos * turn], dim=-1))
+    def jvp(self, rate: Configuration, residuals: MassResiduals) -> Tensor:
+        """dM/dt, (..., n, n), where the configuration changes at this rate."""
+        rows = self.network.jvp(residuals.network, rate.encoded)
+        if rate.fourier is not None and residuals.series is not None:
+            rows = rows + F.linear(rate.fourier, residuals.series)
+        return self._square(rows)
 
-    def _by_joint(self, own: Tensor, slope: Tensor) -> Tensor:
-        """d/dq, (..., n), of what has this slope by cos q, sin q and the scaled q."""
-        cos, sin, _ = own.chunk(3, dim=-1)
-        by_cos, by_sin, by_place = slope.chunk(3, dim=-1)
-        return by_sin * cos - by_cos * sin + by_place / self.reach
 
-    def _waves_by_joint(self, waves: Tensor, slope: Tensor) -> Tensor:
-        """d/dq, (..., n), of what has this slope by waves."""
-        cos, sin = waves.chunk(2, dim=-1)
-        by_cos, by_sin = slope.chunk(2, dim=-1)
-        by_joint = (by_sin * cos - by_cos * sin) @ self.turns.mT
-        for wave, by_wave in ((cos, by_cos), (sin, by_sin)):
-            by_joint = by_joint + (self._slide_slopes(wave) @ by_wave.unsqueeze(-1)).squeeze(-1)
-        return by_joint
+class PotentialPrepared(NamedTuple):
+    """What depends on the weights alone."""
 
-    def _gravity_waves(self, heights: Tensor) -> Tensor:
-        """What takes the waves to d/dq of waves @ heights, (2 waves, n)."""
-        by_cos, by_sin = heights.unsqueeze(-1).chunk(2)
-        turned = torch.cat([by_sin * self.turns.mT, -by_cos * self.turns.mT])
-        lower = self.lower.reshape(len(WAVES), self.n, len(WAVES))
-        slid = torch.cat([lower @ by_cos, lower @ by_sin]).squeeze(-1)
-        return turned + slid
+    layers: Any  # of the network
+    energy: Tensor | None  # takes Fourier features to V, (2 K,)
+    gradient: Tensor | None  # and to dV/dq, (2 K, n)
 
-    def mass_matrix(self, q: Tensor, prepared: Prepared | None = None) -> Tensor:
-        """M(q), (..., n, n) [kg m^2, kg m, kg]; with what ``prepare`` gave, where it is at hand."""
-        return self._mass(self._features(q), prepared or self.prepare())[0]
 
-    def _mass(self, features: Features, prepared: Prepared) -> tuple[Tensor, Memory]:
-        """M(q), the network's trace and, where the guard is awake, its slope dl/dM, (..., n, n)."""
-        rows, trace = self.mass_network(features.own, prepared.mass)
-        rows = rows + F.linear(features.waves, prepared.mass_waves)
-        mass = self._square(rows)
-        if self._sound(mass, prepared):
-            return mass, (trace, None, prepared.mass_waves)
-        lift, slope = self._lift(mass - prepared.rotors)
-        return mass + lift[..., None, None] * self.mean_mass, (trace, slope, prepared.mass_waves)
+class LearnedPotential(nn.Module):
+    """V(q) [J], of one network and, with ``series``, one Fourier series, both in units of ``scale``."""
 
-    def _sound(self, mass: Tensor, prepared: Prepared) -> bool:
-        """Whether no eigenvalue of M less rotors, relative to its mean, is below GUARD."""
-        return not torch.linalg.cholesky_ex(mass.detach() - prepared.least).info.any()
+    scale: Tensor
 
-    def _lift(self, mass: Tensor) -> tuple[Tensor, Tensor]:
-        """l >= 0 that makes M + l M_mean positive definite, (...), and dl/dM, (..., n, n).
+    def __init__(
+        self,
+        scale: float,
+        network: Network,
+        fourier: FourierFeatures | None = None,
+        series: Sequence[Term] = (),
+        sensitivity: Sequence[float] = (),
+    ) -> None:
+        super().__init__()
+        self.register_buffer("scale", torch.full((1, 1), scale, dtype=torch.float64))
+        self.network, self.fourier = network, fourier
+        self.series: FourierSeries | None = None
+        if fourier is not None:
+            self.series = FourierSeries(fourier, [series], [scale], sensitivity)
 
-        With e_i the eigenvalues of M relative to M_mean, and u_i = max(0, 1 - e_i / GUARD),
-        l = GUARD sum_i u_i^5 / (1 + u_i^4). So every e_i + l stays above 0.43 GUARD, l is four
-        times differentiable, and l = 0 where all e_i exceed GUARD. M_mean has M's own zeros and
-        relations, which therefore hold in the sum.
-        """
-        values, vectors = torch.linalg.eigh(self.whitening @ mass @ self.whitening.mT)
-        u = F.relu(1 - values / GUARD)
-        u4 = u**4
-        slopes = -u4 * (5 + u4) / (1 + u4) ** 2
-        slope = self.whitening.mT @ (vectors * slopes.unsqueeze(-2)) @ vectors.mT @ self.whitening
-        return GUARD * (u * (u4 / (1 + u4))).sum(dim=-1), slope
+    def prepare(self) -> PotentialPrepared:
+        """All that depends on the weights alone."""
+        layers = self.network.prepare(self.scale, 0 * self.scale[0])
+        if self.series is None or self.fourier is None:
+            return PotentialPrepared(layers, None, None)
+        energy = self.series.prepare(self.scale)[0]
+        return PotentialPrepared(layers, energy, self.fourier.gradient_map(energy))
 
-    def _kinetic_slope(self, qd: Tensor, memory: Memory) -> Features:
-        """d/dfeatures of 1/2 qd^T M(q) qd."""
-        trace, slope, waves = memory
-        weight = (0.5 * qd).unsqueeze(-1) * qd.unsqueeze(-2)
-        if slope is not None:
-            weight = weight + (weight * self.mean_mass).sum(dim=(-2, -1))[..., None, None] * slope
-        weight = weight.flatten(-2)
-        return Features(self.mass_network.pull(trace, weight), weight @ waves)
-
-    def _mass_rate(self, rate: Features, memory: Memory) -> Tensor:
-        """dM/dt where the features change at this rate, (..., n, n)."""
-        trace, slope, waves = memory
-        pushed = self.mass_network.push(trace, rate.own) + F.linear(rate.waves, waves)
-        mass_rate = self._square(pushed)
-        if slope is not None:
-            along = (slope * mass_rate).sum(dim=(-2, -1))[..., None, None]
-            mass_rate = mass_rate + along * self.mean_mass
-        return mass_rate
-
-    def potential_energy(self, q: Tensor) -> Tensor:
+    def forward(self, at: Configuration, prepared: PotentialPrepared) -> Tensor:
         """V(q), (...) [J]."""
-        features, prepared = self._features(q), self.prepare()
-        y: Tensor = self.potential_network(features.own, prepared.potential)[0]
-        return y.squeeze(-1) + features.waves @ prepared.potential_waves
+        energy: Tensor = self.network(at.encoded, prepared.layers)[0].squeeze(-1)
+        if at.fourier is None or prepared.energy is None:
+            return energy
+        return energy + at.fourier @ prepared.energy
 
-    def gravity(self, q: Tensor) -> Tensor:
+    def network_vjp(self, at: Configuration, prepared: PotentialPrepared) -> Tensor:
+        """The derivative of the network's part of V by the encoding."""
+        _, residuals = self.network(at.encoded, prepared.layers)
+        return self.network.vjp(residuals, at.encoded.new_ones(1))
+
+
+class NetworkPrepared(NamedTuple):
+    """What depends on the weights alone, by part."""
+
+    mass: Any
+    potential: Any
+    friction: Any
+    input: Any
+
+
+class NetworkDynamics(PortHamiltonian):
+    """The dynamics made of these parts; without a ``potential`` gravity does no work."""
+
+    def __init__(
+        self,
+        encoding: JointEncoding,
+        mass: Mass,
+        potential: LearnedPotential | None,
+        friction: Friction,
+        input: Input,
+        fourier: FourierFeatures | None = None,
+    ) -> None:
+        super().__init__()
+        self.n = len(encoding.center)
+        self.encoding, self.fourier = encoding, fourier
+        # Any: what a part has beside its protocol is there to be asked for
+        self.mass: Any = mass
+        self.friction: Any = friction
+        self.input: Any = input
+        self.potential = potential
+
+    def prepare(self) -> NetworkPrepared:
+        """All that depends on the weights alone; holds until they change."""
+        return NetworkPrepared(
+            mass=self.mass.prepare(),
+            potential=None if self.potential is None else self.potential.prepare(),
+            friction=self.friction.prepare(),
+            input=self.input.prepare(),
+        )
+
+    def configuration(self, q: Tensor, prepared: NetworkPrepared) -> Configuration:
+        """What networks and Fourier series read of q."""
+        encoded = self.encoding(q)
+        if self.fourier is None:
+            return Configuration(encoded, None)
+        return Configuration(encoded, self.fourier(q, encoded[..., 2 * self.n :]))
+
+    def mass_at(self, at: Configuration, prepared: NetworkPrepared) -> tuple[Tensor, Any]:
+        """M(q), (..., n, n), and what its derivatives need."""
+        found: tuple[Tensor, Any] = self.mass(at, prepared.mass)
+        return found
+
+    def energy_at(self, at: Configuration, prepared: NetworkPrepared) -> Tensor:
+        """V(q), (...) [J]."""
+        if self.potential is None:
+            return at.encoded.new_zeros(at.encoded.shape[:-1])
+        energy: Tensor = self.potential(at, prepared.potential)
+        return energy
+
+    def gravity_at(self, at: Configuration, prepared: NetworkPrepared) -> Tensor:
         """dV/dq, (..., n) [Nm, N]."""
-        features, prepared = self._features(q), self.prepare()
-        by_network = self._by_joint(features.own, self._potential_slope(features.own, prepared))
-        return by_network + features.waves @ prepared.gravity_waves
+        if self.potential is None:
+            return torch.zeros_like(at.encoded[..., : self.n])
+        by_network = self.potential.network_vjp(at, prepared.potential)
+        gradient: Tensor = self.encoding.vjp(at.encoded, by_network)
+        if at.fourier is None or prepared.potential.gradient is None:
+            return gradient
+        by_series: Tensor = at.fourier @ prepared.potential.gradient
+        return gradient + by_series
 
-    def _potential_slope(self, own: Tensor, prepared: Prepared) -> Tensor:
-        """d/dfeatures of the network's part of V, (..., FEATURES)."""
-        _, trace = self.potential_network(own, prepared.potential)
-        return self.potential_network.pull(trace, own.new_ones(1))
-
-    def dissipation(self, q: Tensor, qd: Tensor) -> Tensor:
-        """D(q, qd), (..., n, n), diagonal: D qd is the friction torque."""
-        return self.friction.matrix(self._features(q).own, qd, self.prepare().friction)
-
-    def input_matrix(self, q: Tensor) -> Tensor:
-        """G, (..., n, n): one for each actuated joint."""
-        return torch.diag(self.actuated).expand(*q.shape[:-1], self.n, self.n)
-
-    def momentum(self, q: Tensor, qd: Tensor, prepared: Prepared | None = None) -> Tensor:
-        """p = M(q) qd, (..., n)."""
-        return (self.mass_matrix(q, prepared) @ qd.unsqueeze(-1)).squeeze(-1)
-
-    def velocity(self, q: Tensor, p: Tensor, prepared: Prepared | None = None) -> Tensor:
-        """qd = M(q)^-1 p, (..., n)."""
-        return self._solved(self.mass_matrix(q, prepared), p)
-
-    @staticmethod
-    def _solved(mass: Tensor, force: Tensor) -> Tensor:
-        # its derivative costs one more solution; a Cholesky factor's would cost several times that
-        solution: Tensor = torch.linalg.solve(mass, force.unsqueeze(-1))
-        return solution.squeeze(-1)
-
-    def hamiltonian(self, q: Tensor, p: Tensor) -> Tensor:
-        """H = 1/2 p^T M(q)^-1 p + V(q), (...) [J]."""
-        return 0.5 * (p * self.velocity(q, p)).sum(dim=-1) + self.potential_energy(q)
-
-    def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
-        """qdd, (..., n), under the input tau."""
-        prepared, features = self.prepare(), self._features(q)
-        mass, bias = self._mass_and_bias(features, qd, prepared)
-        return self._solved(mass, self.actuated * tau - bias)
-
-    def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
-        """The torque, (..., n), that gives qdd."""
-        mass, bias = self._mass_and_bias(self._features(q), qd, self.prepare())
-        return (mass @ qdd.unsqueeze(-1)).squeeze(-1) + bias
-
-    def _mass_and_bias(
-        self, features: Features, qd: Tensor, prepared: Prepared
-    ) -> tuple[Tensor, Tensor]:
-        """M and the torque that holds qd steady: dM/dt qd - d/dq (1/2 qd^T M qd) + dV/dq + D qd."""
-        mass, memory = self._mass(features, prepared)
-        mass_rate = self._mass_rate(self._features_rate(features, qd), memory)
-        bias = (mass_rate @ qd.unsqueeze(-1)).squeeze(-1)
-        bias = bias - self._lagrangian_slope(features, qd, memory, prepared)
-        return mass, bias + self.friction(features.own, qd, prepared.friction)
-
-    def _lagrangian_slope(
-        self, features: Features, qd: Tensor, memory: Memory, prepared: Prepared
+    def lagrangian_gradient(
+        self, at: Configuration, qd: Tensor, residuals: Any, prepared: NetworkPrepared
     ) -> Tensor:
         """d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
-        kinetic = self._kinetic_slope(qd, memory)
-        slope = kinetic.own - self._potential_slope(features.own, prepared)
-        by_joint = self._by_joint(features.own, slope)
-        by_joint = by_joint + self._waves_by_joint(features.waves, kinetic.waves)
-        return by_joint - features.waves @ prepared.gravity_waves
+        by_encoded, by_fourier = self.mass.kinetic_vjp(at, qd, residuals)
+        if self.potential is not None:
+            by_encoded = by_encoded - self.potential.network_vjp(at, prepared.potential)
+        gradient: Tensor = self.encoding.vjp(at.encoded, by_encoded)
+        if self.fourier is None or at.fourier is None:
+            return gradient
+        if by_fourier is not None:
+            gradient = gradient + self.fourier.vjp(at.fourier, by_fourier)
+        if self.potential is not None and prepared.potential.gradient is not None:
+            gradient = gradient - at.fourier @ prepared.potential.gradient
+        return gradient
 
-    def forward(self, t: Tensor, state: Tensor) -> Tensor:
-        """The rate of (q, p), (..., 2 n), or of (q, p, tau), (..., 3 n), where tau is held."""
-        q, p, tau = state.tensor_split((self.n, 2 * self.n), dim=-1)
-        qd, force = self.rates(q, p, tau if tau.shape[-1] else None, self.prepare())
-        return torch.cat([qd, force, torch.zeros_like(tau)], dim=-1)
+    def nonlinear_at(
+        self, at: Configuration, qd: Tensor, residuals: Any, prepared: NetworkPrepared
+    ) -> Tensor:
+        """dM/dt qd - d/dq (1/2 qd^T M qd) + dV/dq, (..., n)."""
+        gradient = self.lagrangian_gradient(at, qd, residuals, prepared)
+        mass_rate: Tensor = self.mass.jvp(self._rate(at, qd), residuals)
+        return applied(mass_rate, qd) - gradient
 
-    def rates(
-        self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Prepared
-    ) -> tuple[Tensor, Tensor]:
-        """q' and p', (..., n), under the input tau, with what ``prepare`` gave.
+    def _rate(self, at: Configuration, qd: Tensor) -> Configuration:
+        """How fast the configuration changes along qd."""
+        by_fourier = None
+        if self.fourier is not None and at.fourier is not None:
+            by_fourier = self.fourier.jvp(at.fourier, qd)
+        return Configuration(self.encoding.jvp(at.encoded, qd), by_fourier)
 
-        q' = dH/dp and p' = -dH/dq - D dH/dp + G tau: the port-Hamiltonian form (van der Schaft and
-        Jeltsema, Port-Hamiltonian Systems Theory, 2014).
-        """
-        features = self._features(q)
-        mass, memory = self._mass(features, prepared)
-        qd = self._solved(mass, p)
-        force = self._lagrangian_slope(features, qd, memory, prepared)
-        force = force - self.friction(features.own, qd, prepared.friction)
-        if tau is not None:
-            force = force + self.actuated * tau
-        return qd, force
+    def friction_at(self, at: Configuration, qd: Tensor, prepared: NetworkPrepared) -> Tensor:
+        """D(q, qd) qd, (..., n) [Nm, N]."""
+        torque: Tensor = self.friction(at.encoded, qd, prepared.friction)
+        return torque
 
-    def to_group(self, q: Tensor) -> list[Tensor]:
-        """By joint, R in SO(3), (..., 3, 3), or r in R^3, (..., 3), if it slides; z is its axis."""
-        parts = []
-        for joint, value in zip(JOINTS, q.unbind(dim=-1), strict=True):
-            zero, one = torch.zeros_like(value), torch.ones_like(value)
-            if joint.revolute:
-                c, s = value.cos(), value.sin()
-                rows = ((c, -s, zero), (s, c, zero), (zero, zero, one))
-                parts.append(torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2))
-            else:
-                parts.append(torch.stack((zero, zero, value), dim=-1))
-        return parts
+    def dissipation_at(self, at: Configuration, qd: Tensor, prepared: NetworkPrepared) -> Tensor:
+        """D(q, qd), (..., n, n)."""
+        matrix: Tensor = self.friction.dissipation(at.encoded, qd, prepared.friction)
+        return matrix
 
-    def from_group(self, parts: list[Tensor]) -> Tensor:
-        """q, (..., n), with angles in [-pi, pi]; the inverse of ``to_group``."""
-        values = [
-            torch.atan2(part[..., 1, 0], part[..., 0, 0]) if joint.revolute else part[..., 2]
-            for joint, part in zip(JOINTS, parts, strict=True)
-        ]
-        return torch.stack(values, dim=-1)
+    def input_at(self, at: Configuration, prepared: NetworkPrepared) -> Tensor:
+        """G(q), (..., n, n)."""
+        matrix: Tensor = self.input(at.encoded, prepared.input)
+        return matrix
+
+    def input_force(self, at: Configuration, tau: Tensor, prepared: NetworkPrepared) -> Tensor:
+        """G tau, (..., n) [Nm, N]."""
+        force: Tensor = self.input.force(at.encoded, tau, prepared.input)
+        return force
+
+    def input_torque(self, at: Configuration, force: Tensor, prepared: NetworkPrepared) -> Tensor:
+        """The tau, (..., n), that makes this force."""
+        tau: Tensor = self.input.solve(at.encoded, force, prepared.input)
+        return tau

@@ -15,101 +15,180 @@ Joints, in the order of q, qd and tau:
     1  "joint1"  revolute   rad, Nm  -2.96706 .. 2.96706
     2  "joint2"  prismatic  m, N     0.305 .. 1.27
     3  "joint3"  revolute   rad, Nm  -2.96706 .. 2.96706
-
-Record, by which `spelgen check` tells whether this module is up to date:
-
-    robot: "rpr"
-    urdf: "rpr.urdf"
-    urdf_sha256: "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d"
-    spec_sha256: "433ae0e5dc62c042be455e649dd800c2947fd4eed322498f890111bbb4f8ae0e"
-    option assume: "kinematics"
-    option depth: 2
-    option joints: null
-    option net: "mlp"
-    option preset: "phnode"
-    option snap_tolerance: 0.002
-    option tip: null
-    option width: 64
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from functools import partial
-from typing import ClassVar, NamedTuple
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple, Protocol
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-
-class Joint(NamedTuple):
-    """A joint; angles are in rad, lengths in m."""
-
-    name: str
-    revolute: bool
-    center: float  # a sliding joint is read as (q - center) / reach
-    reach: float
-    speed: float  # usual speed
-    friction: float  # usual size of the friction torque
-    rotor: float  # what its drive adds to M at the start: rotor inertia times gear squared
-    mass_share: float  # how much M changes with it, relative to the joint that moves M most
-    potential_share: float  # the same of V
-    actuated: bool
+FACTS = r"""{"robot": "rpr", "urdf": "rpr.urdf",
+ "urdf_sha256": "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d",
+ "spec_sha256": "93f90b8c3559884e3028df001a3a3dbc485c5bdee843236bb497e894a6aa0193",
+ "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,
+  "net": "mlp", "preset": "phnode", "tip": null, "width": 64},
+ "joints": {"joint1": "revolute", "joint2": "prismatic", "joint3": "revolute"}}"""
 
 
-JOINTS = (
-    Joint(
-        name="joint1",
-        revolute=True,
-        center=0.0,
-        reach=2.96706,
-        speed=3.0,
-        friction=0.4,
-        rotor=0.133,
-        mass_share=0.02,
-        potential_share=0.02,
-        actuated=True,
-    ),
-    Joint(
-        name="joint2",
-        revolute=False,
-        center=0.7875,
-        reach=0.4825,
-        speed=1.0,
-        friction=0.4,
-        rotor=0.4,
-        mass_share=1.0,
-        potential_share=0.02,
-        actuated=True,
-    ),
-    Joint(
-        name="joint3",
-        revolute=True,
-        center=0.0,
-        reach=2.96706,
-        speed=6.0,
-        friction=0.4,
-        rotor=0.0667,
-        mass_share=0.518,
-        potential_share=1.0,
-        actuated=True,
-    ),
-)
+class Model(nn.Module):
+    """The arm's dynamics: 45 learned functions of q make M^-1 over all axes.
 
-# nominal mean of M without rotors, its lower triangle row by row
-MEAN_MASS = ((139.887,), (-0.00167665, 5.33), (-0.00154309, 0.0, 0.0101411))
-MASS_WIDTH = 64  # units in a hidden layer
-POTENTIAL_JOINTS = (0, 1, 2)  # the joints that V depends on
-POTENTIAL_WIDTH = 32
-POTENTIAL_SCALE = 0.703291  # [J]
-DEPTH = 2  # hidden layers of a network
-FRICTION_AXES = 3  # of each joint, z the last
-FRICTION_WIDTH = 64
-FRICTION_START = 0.35  # diagonal of D's factor, relative to the joints' usual friction
-PLACE_SHARE = 0.1  # how much friction's networks see of where a joint is, relative to its speed
-INPUT_WIDTH = 64
+    Shapes: q, qd, qdd, tau and p are (..., n), with any leading dimensions. Units: rad and Nm for
+    revolute joints, m and N for prismatic ones. M is positive definite and D positive semi-definite
+    for all weights. What ``prepare`` gives as ``prepared`` saves work while the weights stay.
+    """
+
+    n = 3
+    joint_names = ("joint1", "joint2", "joint3")
+    joint_types = ("revolute", "prismatic", "revolute")
+
+    def __init__(self, seed: int = 0, dtype: torch.dtype = torch.float64) -> None:
+        super().__init__()
+        joints = Joints(
+            revolute=(True, False, True),
+            center=(0.0, 0.7875, 0.0),
+            reach=(2.96706, 0.4825, 2.96706),
+            speed=(3.0, 1.0, 6.0),
+            friction=(0.4, 0.4, 0.4),
+            armature=(2.19, 0.782, 0.106),
+            gear=(1.0, 1.0, 1.0),
+            actuated=(True, True, True),
+        )
+        generator = torch.Generator().manual_seed(seed)
+        encoding = JointEncoding(joints)
+        mass = DenseMass(
+            joints,
+            mean=((139.887,), (-0.00167665, 5.33), (-0.00154309, 0.0, 0.0101411)),
+            network=MaskedMLP(
+                lie_group_input(joints, (0.02, 1.0, 0.518)),
+                unit_joints([range(3)] * 45, width=64, depth=2),
+                generator,
+            ),
+        )
+        sensitivity = (0.02, 0.02, 1.0)
+        network = MaskedMLP(
+            lie_group_input(joints, sensitivity), unit_joints(((0, 1, 2),), width=32, depth=2), generator
+        )
+        potential = LearnedPotential(0.703291, network)
+        friction = DenseFriction(
+            joints,
+            MaskedMLP(
+                lie_group_input(joints, (0.1, 0.1, 0.1), axes=3),
+                unit_joints([range(3)] * 45, width=64, depth=2),
+                generator,
+            ),
+            axes=3,
+        )
+        self.dynamics = NetworkDynamics(
+            encoding,
+            mass,
+            potential,
+            friction,
+            DenseInput(
+                joints,
+                MaskedMLP(
+                    lie_group_input(joints, (1.0, 1.0, 1.0)),
+                    unit_joints([range(3)] * 9, width=64, depth=2),
+                    generator,
+                ),
+            ),
+        )
+        self.to(dtype)
+
+    def prepare(self) -> Any:
+        """All that depends on the weights alone; holds until they change."""
+        return self.dynamics.prepare()
+
+    def mass_matrix(self, q: Tensor, prepared: Any = None) -> Tensor:
+        """M(q), (..., n, n) [kg m^2, kg m, kg]."""
+        return self.dynamics.mass_matrix(q, prepared)
+
+    def potential_energy(self, q: Tensor) -> Tensor:
+        """V(q), (...) [J]."""
+        return self.dynamics.potential_energy(q)
+
+    def gravity(self, q: Tensor) -> Tensor:
+        """dV/dq, (..., n) [Nm, N]."""
+        return self.dynamics.gravity(q)
+
+    def nonlinear_effects(self, q: Tensor, qd: Tensor) -> Tensor:
+        """Coriolis, centrifugal and gravity torque, (..., n) [Nm, N]."""
+        return self.dynamics.nonlinear_effects(q, qd)
+
+    def friction_torque(self, q: Tensor, qd: Tensor) -> Tensor:
+        """D(q, qd) qd, (..., n) [Nm, N]."""
+        return self.dynamics.friction_torque(q, qd)
+
+    def dissipation(self, q: Tensor, qd: Tensor) -> Tensor:
+        """D(q, qd), (..., n, n) [Nm s/rad, N s/m]."""
+        return self.dynamics.dissipation(q, qd)
+
+    def input_matrix(self, q: Tensor) -> Tensor:
+        """G(q), (..., n, n): joint torques by inputs."""
+        return self.dynamics.input_matrix(q)
+
+    def momentum(self, q: Tensor, qd: Tensor, prepared: Any = None) -> Tensor:
+        """p = M(q) qd, (..., n)."""
+        return applied(self.mass_matrix(q, prepared), qd)
+
+    def velocity(self, q: Tensor, p: Tensor, prepared: Any = None) -> Tensor:
+        """qd = M(q)^-1 p, (..., n)."""
+        return solved(self.mass_matrix(q, prepared), p)
+
+    def hamiltonian(self, q: Tensor, p: Tensor) -> Tensor:
+        """H = 1/2 p^T M(q)^-1 p + V(q), (...) [J]."""
+        return self.dynamics.hamiltonian(q, p)
+
+    def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
+        """qdd, (..., n), under the input tau."""
+        return self.dynamics.forward_dynamics(q, qd, tau)
+
+    def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
+        """The input, (..., n), that gives qdd."""
+        return self.dynamics.inverse_dynamics(q, qd, qdd)
+
+    def forward(self, t: Tensor, state: Tensor) -> Tensor:
+        """The rate of (q, p), (..., 2 n), or of (q, p, tau), (..., 3 n), where tau is held."""
+        return self.dynamics.state_rate(state)
+
+    def port_hamiltonian_rhs(self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Any) -> State:
+        """q' = dH/dp and p' = -dH/dq - D dH/dp + G tau, (..., n)."""
+        return self.dynamics.port_hamiltonian_rhs(q, p, tau, prepared)
+
+    def to_group(self, q: Tensor) -> list[Tensor]:
+        """By joint, R in SO(3), (..., 3, 3), or r in R^3, (..., 3), if prismatic; z is its axis."""
+        return to_group(q, self.joint_types)
+
+    def from_group(self, parts: list[Tensor]) -> Tensor:
+        """q, (..., n), with angles in [-pi, pi]; the inverse of ``to_group``."""
+        return from_group(parts, self.joint_types)
+
+
+# ---- spelgen's runtime, as it stands in the package: the same for every arm ----
+
+
+class Joints(NamedTuple):
+    """The joints, an entry for each; angles in rad and torques in Nm, lengths in m and forces in N."""
+
+    revolute: tuple[bool, ...]
+    center: tuple[float, ...]  # a prismatic joint is encoded as (q - center) / reach
+    reach: tuple[float, ...]
+    speed: tuple[float, ...]  # usual velocity
+    friction: tuple[float, ...]  # usual size of the friction torque
+    armature: tuple[float, ...]  # nominal rotor inertia times gear squared [kg m^2, kg]
+    gear: tuple[float, ...]  # turns of the motor in a turn of the joint
+    actuated: tuple[bool, ...]
+
+    @property
+    def n(self) -> int:
+        """The number of joints."""
+        return len(self.revolute)
 
 
 def vector(values: Iterable[float]) -> Tensor:
@@ -117,20 +196,477 @@ def vector(values: Iterable[float]) -> Tensor:
     return torch.tensor(list(values), dtype=torch.float64)
 
 
-def mean_factor() -> Tensor:
-    """C, lower triangular: C C^T is the nominal mean of M^-1 over all axes, (3 n, 3 n).
+class Network(Protocol):
+    """Learned functions y of an encoding, each of its own joints, with derivatives written out."""
 
-    z of each joint moves; about its other axes a joint is taken to be as heavy as about z.
+    def prepare(self, output_map: Tensor, offset: Tensor) -> Any:
+        """The weights made ready for many states, for offset + output_map y in place of y."""
+
+    def __call__(self, encoded: Tensor, layers: Any) -> tuple[Tensor, Any]:
+        """offset + output_map y, (..., rows); and residuals, which ``vjp`` and ``jvp`` need."""
+
+    def vjp(self, residuals: Any, cotangent: Tensor) -> Tensor:
+        """cotangent, (..., rows), times d/d encoded."""
+
+    def jvp(self, residuals: Any, tangent: Tensor) -> Tensor:
+        """d/d encoded times the encoding's tangent, (..., rows)."""
+
+    def set_output_bias(self, values: Tensor) -> None:
+        """Start the outputs from these values."""
+
+
+def unit_joints(
+    outputs: Sequence[Sequence[int]], width: int, depth: int, least: int = 1
+) -> tuple[tuple[frozenset[int], ...], ...]:
+    """The joints that each unit may read, layer by layer: ``depth`` hidden layers, then the outputs.
+
+    A hidden layer has ``width`` units, shared out in proportion to how many outputs read the same
+    joints, ``least`` or more for each such group.
     """
-    n = len(JOINTS)
-    mean = torch.zeros(n, n, dtype=torch.float64)
-    row, column = torch.tril_indices(n, n)
-    mean[row, column] = mean[column, row] = vector(x for entries in MEAN_MASS for x in entries)
-    mean += torch.diag(vector(joint.rotor for joint in JOINTS))
-    everywhere = torch.diag(mean.diagonal().repeat_interleave(3))
-    everywhere[2::3, 2::3] = mean
-    factor: Tensor = torch.linalg.cholesky(torch.linalg.inv(everywhere))
-    return factor
+    counts = Counter(tuple(joints) for joints in outputs)
+    groups = sorted(counts, key=lambda each: (len(each), each))
+    ideal = [width * counts[joints] / len(outputs) for joints in groups]
+    units = [max(least, round(size)) for size in ideal]
+    # rounding may have taken or left a unit or two: those who gained most give, who lost most take
+    while sum(units) > width and max(units) > least:
+        gained = [
+            number - size if number > least else -width for number, size in zip(units, ideal, strict=True)
+        ]
+        units[gained.index(max(gained))] -= 1
+    while sum(units) < width:
+        lost = [size - number for number, size in zip(units, ideal, strict=True)]
+        units[lost.index(max(lost))] += 1
+    hidden = tuple(frozenset(g) for g, number in zip(groups, units, strict=True) for _ in range(number))
+    return (*((hidden,) * depth), tuple(frozenset(joints) for joints in outputs))
+
+
+class Configuration(NamedTuple):
+    """A position as networks and Fourier series read it; or how fast that changes."""
+
+    encoded: Tensor  # (..., 2 n) or (..., 3 n), see JointEncoding
+    fourier: Tensor | None  # (..., 2 K), see FourierFeatures
+
+
+def to_group(q: Tensor, joint_types: Sequence[str]) -> list[Tensor]:
+    """By joint, R in SO(3), (..., 3, 3), or r in R^3, (..., 3), if prismatic; z is its axis."""
+    parts = []
+    for kind, value in zip(joint_types, q.unbind(dim=-1), strict=True):
+        zero, one = torch.zeros_like(value), torch.ones_like(value)
+        if kind == "revolute":
+            c, s = value.cos(), value.sin()
+            rows = ((c, -s, zero), (s, c, zero), (zero, zero, one))
+            parts.append(torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2))
+        else:
+            parts.append(torch.stack((zero, zero, value), dim=-1))
+    return parts
+
+
+def from_group(parts: Sequence[Tensor], joint_types: Sequence[str]) -> Tensor:
+    """q, (..., n), with angles in [-pi, pi]; the inverse of ``to_group``."""
+    values = [
+        torch.atan2(part[..., 1, 0], part[..., 0, 0]) if kind == "revolute" else part[..., 2]
+        for kind, part in zip(joint_types, parts, strict=True)
+    ]
+    return torch.stack(values, dim=-1)
+
+
+def solved(matrix: Tensor, right: Tensor) -> Tensor:
+    """matrix^-1 right, (..., n)."""
+    # its derivative costs one more solution; a Cholesky factor's would cost several times that
+    solution: Tensor = torch.linalg.solve(matrix, right.unsqueeze(-1))
+    return solution.squeeze(-1)
+
+
+def applied(matrix: Tensor, vector: Tensor) -> Tensor:
+    """matrix vector, (..., n)."""
+    return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
+
+
+State = tuple[Tensor, Tensor]  # q and p, or how fast they change
+
+
+class PortHamiltonian(nn.Module):
+    """q' = dH/dp and p' = -dH/dq - D dH/dp + G tau, with H = 1/2 p^T M(q)^-1 p + V(q).
+
+    The port-Hamiltonian form (van der Schaft and Jeltsema, Port-Hamiltonian Systems Theory, 2014).
+    ``prepared`` is what ``prepare`` gave: all that depends on the weights alone. ``at`` is what
+    ``configuration`` gave: all that is computed of q alone. Shapes: q, qd, tau, p are (..., n).
+    """
+
+    n: int
+
+    def prepare(self) -> Any:
+        """All that depends on the weights alone; holds until they change."""
+        raise NotImplementedError
+
+    def configuration(self, q: Tensor, prepared: Any) -> Any:
+        """All that is computed of q alone."""
+        raise NotImplementedError
+
+    def mass_at(self, at: Any, prepared: Any) -> tuple[Tensor, Any]:
+        """M(q), (..., n, n), and what its derivatives need."""
+        raise NotImplementedError
+
+    def energy_at(self, at: Any, prepared: Any) -> Tensor:
+        """V(q), (...) [J]."""
+        raise NotImplementedError
+
+    def gravity_at(self, at: Any, prepared: Any) -> Tensor:
+        """dV/dq, (..., n) [Nm, N]."""
+        raise NotImplementedError
+
+    def lagrangian_gradient(self, at: Any, qd: Tensor, residuals: Any, prepared: Any) -> Tensor:
+        """d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
+        raise NotImplementedError
+
+    def nonlinear_at(self, at: Any, qd: Tensor, residuals: Any, prepared: Any) -> Tensor:
+        """The torque that holds qd steady without friction: Coriolis, centrifugal and gravity."""
+        raise NotImplementedError
+
+    def friction_at(self, at: Any, qd: Tensor, prepared: Any) -> Tensor:
+        """D(q, qd) qd, (..., n) [Nm, N]."""
+        raise NotImplementedError
+
+    def dissipation_at(self, at: Any, qd: Tensor, prepared: Any) -> Tensor:
+        """D(q, qd), (..., n, n)."""
+        raise NotImplementedError
+
+    def input_at(self, at: Any, prepared: Any) -> Tensor:
+        """G, (..., n, n)."""
+        raise NotImplementedError
+
+    def input_force(self, at: Any, tau: Tensor, prepared: Any) -> Tensor:
+        """G tau, (..., n) [Nm, N]."""
+        raise NotImplementedError
+
+    def input_torque(self, at: Any, force: Tensor, prepared: Any) -> Tensor:
+        """The tau, (..., n), that makes this force."""
+        raise NotImplementedError
+
+    def mass_matrix(self, q: Tensor, prepared: Any = None) -> Tensor:
+        """M(q), (..., n, n)."""
+        prepared = self.prepare() if prepared is None else prepared
+        return self.mass_at(self.configuration(q, prepared), prepared)[0]
+
+    def potential_energy(self, q: Tensor) -> Tensor:
+        """V(q), (...) [J]."""
+        prepared = self.prepare()
+        return self.energy_at(self.configuration(q, prepared), prepared)
+
+    def gravity(self, q: Tensor) -> Tensor:
+        """dV/dq, (..., n) [Nm, N]."""
+        prepared = self.prepare()
+        return self.gravity_at(self.configuration(q, prepared), prepared)
+
+    def nonlinear_effects(self, q: Tensor, qd: Tensor) -> Tensor:
+        """Coriolis, centrifugal and gravity torque, (..., n) [Nm, N]."""
+        prepared = self.prepare()
+        at = self.configuration(q, prepared)
+        return self.nonlinear_at(at, qd, self.mass_at(at, prepared)[1], prepared)
+
+    def friction_torque(self, q: Tensor, qd: Tensor) -> Tensor:
+        """D(q, qd) qd, (..., n) [Nm, N]."""
+        prepared = self.prepare()
+        return self.friction_at(self.configuration(q, prepared), qd, prepared)
+
+    def dissipation(self, q: Tensor, qd: Tensor) -> Tensor:
+        """D(q, qd), (..., n, n) [Nm s/rad, N s/m]."""
+        prepared = self.prepare()
+        return self.dissipation_at(self.configuration(q, prepared), qd, prepared)
+
+    def input_matrix(self, q: Tensor) -> Tensor:
+        """G(q), (..., n, n)."""
+        prepared = self.prepare()
+        return self.input_at(self.configuration(q, prepared), prepared)
+
+    def hamiltonian(self, q: Tensor, p: Tensor) -> Tensor:
+        """H, (...) [J]."""
+        prepared = self.prepare()
+        at = self.configuration(q, prepared)
+        qd = solved(self.mass_at(at, prepared)[0], p)
+        return 0.5 * (p * qd).sum(dim=-1) + self.energy_at(at, prepared)
+
+    def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
+        """qdd, (..., n), under the input tau."""
+        prepared = self.prepare()
+        at = self.configuration(q, prepared)
+        mass, residuals = self.mass_at(at, prepared)
+        force = self.input_force(at, tau, prepared)
+        force = force - self.nonlinear_at(at, qd, residuals, prepared)
+        return solved(mass, force - self.friction_at(at, qd, prepared))
+
+    def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
+        """The torque, (..., n), that gives qdd."""
+        prepared = self.prepare()
+        at = self.configuration(q, prepared)
+        mass, residuals = self.mass_at(at, prepared)
+        force = applied(mass, qdd) + self.nonlinear_at(at, qd, residuals, prepared)
+        return self.input_torque(at, force + self.friction_at(at, qd, prepared), prepared)
+
+    def port_hamiltonian_rhs(self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Any) -> State:
+        """q' and p', (..., n), under the input tau; without one, of the arm left to itself."""
+        at = self.configuration(q, prepared)
+        mass, residuals = self.mass_at(at, prepared)
+        qd = solved(mass, p)
+        force = self.lagrangian_gradient(at, qd, residuals, prepared)
+        force = force - self.friction_at(at, qd, prepared)
+        return qd, force if tau is None else force + self.input_force(at, tau, prepared)
+
+    def state_rate(self, state: Tensor) -> Tensor:
+        """The rate of (q, p), (..., 2 n), or of (q, p, tau), (..., 3 n), where tau is held."""
+        n = self.n
+        q, p, tau = state.tensor_split((n, 2 * n), dim=-1)
+        qd, force = self.port_hamiltonian_rhs(q, p, tau if tau.shape[-1] else None, self.prepare())
+        return torch.cat([qd, force, torch.zeros_like(tau)], dim=-1)
+
+
+class JointEncoding(nn.Module):
+    """cos q, sin q and, where some joint is prismatic, the scaled q: (..., 2 n) or (..., 3 n)."""
+
+    center: Tensor
+    reach: Tensor
+
+    def __init__(self, joints: Joints) -> None:
+        super().__init__()
+        self.prismatic = not all(joints.revolute)
+        self.size = (3 if self.prismatic else 2) * joints.n
+        self.register_buffer("center", vector(joints.center))
+        self.register_buffer("reach", vector(joints.reach))
+
+    def scaled(self, q: Tensor) -> Tensor:
+        """q in units of a joint's reach about its center, (..., n)."""
+        return (q - self.center) / self.reach
+
+    def forward(self, q: Tensor) -> Tensor:
+        """The encoding of q."""
+        parts = [q.cos(), q.sin()]
+        return torch.cat([*parts, self.scaled(q)] if self.prismatic else parts, dim=-1)
+
+    def jvp(self, encoded: Tensor, qd: Tensor) -> Tensor:
+        """How fast the encoding changes along qd."""
+        cos, sin = encoded.chunk(3 if self.prismatic else 2, dim=-1)[:2]
+        parts = [-sin * qd, cos * qd]
+        return torch.cat([*parts, qd / self.reach] if self.prismatic else parts, dim=-1)
+
+    def vjp(self, encoded: Tensor, cotangent: Tensor) -> Tensor:
+        """d/dq, (..., n), of what has the derivative ``cotangent`` by the encoding."""
+        parts = 3 if self.prismatic else 2
+        cos, sin = encoded.chunk(parts, dim=-1)[:2]
+        by_cos, by_sin, *by_scaled = cotangent.chunk(parts, dim=-1)
+        by_joint = by_sin * cos - by_cos * sin
+        return by_joint + by_scaled[0] / self.reach if self.prismatic else by_joint
+
+
+class NetworkInput(NamedTuple):
+    """The inputs of a network: sensitivity * (matrix @ encoded + offset), (..., inputs)."""
+
+    joints: tuple[int, ...]  # of each input
+    sensitivity: Tensor
+    matrix: Tensor  # (inputs, encoded)
+    offset: Tensor
+
+
+def lie_group_input(joints: Joints, sensitivity: Sequence[float], axes: int = 0) -> NetworkInput:
+    """Of each joint the nine numbers of R in SO(3) or the three of r in R^3, times its sensitivity.
+
+    z is the joint's axis, so R = [[cos q, -sin q, 0], [sin q, cos q, 0], [0, 0, 1]]. Then, with
+    ``axes``, each joint's velocity along so many axes, of which the last is z.
+    """
+    n = joints.n
+    encoded = (2 if all(joints.revolute) else 3) * n
+    owners: list[int] = []
+    matrices, offsets = [], []
+    for joint, revolute in enumerate(joints.revolute):
+        size = 9 if revolute else 3
+        matrix, offset = torch.zeros(size, encoded + n * (axes > 0)), torch.zeros(size)
+        if revolute:
+            matrix[[0, 4], joint], offset[8] = 1.0, 1.0
+            matrix[1, n + joint], matrix[3, n + joint] = -1.0, 1.0
+        else:
+            matrix[2, 2 * n + joint] = 1.0
+        owners += [joint] * size
+        matrices.append(matrix)
+        offsets.append(offset)
+    weights = [sensitivity[joint] for joint in owners]
+    for joint in range(n if axes else 0):
+        matrix = torch.zeros(axes, encoded + n)
+        matrix[-1, encoded + joint] = 1.0
+        owners += [joint] * axes
+        weights += [1.0] * axes
+        matrices.append(matrix)
+        offsets.append(torch.zeros(axes))
+    return NetworkInput(
+        tuple(owners), vector(weights), torch.cat(matrices).double(), torch.cat(offsets).double()
+    )
+
+
+class Term(NamedTuple):
+    """x^powers (cos_factor cos(frequencies q) + sin_factor sin(frequencies q)), x the scaled q."""
+
+    frequencies: tuple[int, ...]  # by joint
+    powers: tuple[int, ...]  # by joint; none where no joint is prismatic
+    cos_factor: float
+    sin_factor: float
+
+
+class FourierFeatures(nn.Module):
+    """x^powers cos(frequencies q), then x^powers sin(frequencies q), (..., 2 K), of all terms of ``series``.
+
+    With every power its lower powers are there too, for the derivatives.
+    """
+
+    frequencies: Tensor  # (n, K)
+    powers: Tensor  # (K, n)
+    lower: Tensor  # takes K features to their derivatives by each joint that slides, (K, n K)
+
+    def __init__(self, joints: Joints, series: Iterable[Sequence[Term]]) -> None:
+        super().__init__()
+        still = (0,) * joints.n
+        keys = {(term.frequencies, term.powers or still) for terms in series for term in terms}
+        waiting = list(keys)
+        while waiting:
+            frequencies, powers = waiting.pop()
+            below = {(frequencies, _less(powers, joint)) for joint, power in enumerate(powers) if power}
+            waiting += below - keys
+            keys |= below
+        self.keys = sorted(keys)
+        self.count, self.joints = len(keys), joints.n
+        self.prismatic = any(any(powers) for _, powers in keys)
+        self.register_buffer("frequencies", torch.stack([vector(each) for each, _ in self.keys]).mT)
+        self.register_buffer("powers", torch.stack([vector(each) for _, each in self.keys]))
+        lower = torch.zeros(self.count, joints.n, self.count, dtype=torch.float64)
+        for place, (frequencies, powers) in enumerate(self.keys):
+            for joint, power in enumerate(powers):
+                if power:
+                    below_place = self.keys.index((frequencies, _less(powers, joint)))
+                    lower[below_place, joint, place] = power / joints.reach[joint]
+        self.register_buffer("lower", lower.flatten(1))
+
+    def place(self, term: Term) -> int:
+        """Where a term's cosine stands among the features."""
+        return self.keys.index((term.frequencies, term.powers or (0,) * self.joints))
+
+    def forward(self, q: Tensor, scaled: Tensor) -> Tensor:
+        """The features of q, with the scaled q at hand."""
+        angle = q @ self.frequencies
+        cos, sin = angle.cos(), angle.sin()
+        if self.prismatic:
+            size = (scaled.unsqueeze(-2) ** self.powers).prod(dim=-1)
+            cos, sin = size * cos, size * sin
+        return torch.cat([cos, sin], dim=-1)
+
+    def _by_sliding(self, feature: Tensor) -> Tensor:
+        """d/dq of K features by prismatic joints, (..., n, K)."""
+        return (feature @ self.lower).reshape(*feature.shape[:-1], self.joints, self.count)
+
+    def jvp(self, features: Tensor, qd: Tensor) -> Tensor:
+        """How fast the features change along qd."""
+        cos, sin = features.chunk(2, dim=-1)
+        turned = qd @ self.frequencies
+        by_cos, by_sin = -sin * turned, cos * turned
+        if self.prismatic:
+            slid = [(qd.unsqueeze(-2) @ self._by_sliding(x)).squeeze(-2) for x in (cos, sin)]
+            by_cos, by_sin = slid[0] + by_cos, slid[1] + by_sin
+        return torch.cat([by_cos, by_sin], dim=-1)
+
+    def vjp(self, features: Tensor, cotangent: Tensor) -> Tensor:
+        """d/dq, (..., n), of what has the derivative ``cotangent`` by the features."""
+        cos, sin = features.chunk(2, dim=-1)
+        by_cos, by_sin = cotangent.chunk(2, dim=-1)
+        by_joint = (by_sin * cos - by_cos * sin) @ self.frequencies.mT
+        if self.prismatic:
+            for feature, by_feature in ((cos, by_cos), (sin, by_sin)):
+                slid = self._by_sliding(feature) @ by_feature.unsqueeze(-1)
+                by_joint = by_joint + slid.squeeze(-1)
+        return by_joint
+
+    def gradient_map(self, coefficients: Tensor) -> Tensor:
+        """What takes the features to d/dq of features @ coefficients, (2 K, n)."""
+        by_cos, by_sin = coefficients.unsqueeze(-1).chunk(2)
+        turned = torch.cat([by_sin * self.frequencies.mT, -by_cos * self.frequencies.mT])
+        if not self.prismatic:
+            return turned
+        lower = self.lower.reshape(self.count, self.joints, self.count)
+        return turned + torch.cat([lower @ by_cos, lower @ by_sin]).squeeze(-1)
+
+
+class FourierSeries(nn.Module):
+    """Fourier series with trained coefficients, one for each output of a network beside it.
+
+    ``series`` has, for each output, the terms that coefficients start from. They are trained in
+    units of the output's scale times the least sensitivity of the joints that the term depends on.
+    """
+
+    outputs: Tensor  # of each coefficient
+    places: Tensor
+    units: Tensor
+
+    def __init__(
+        self,
+        features: FourierFeatures,
+        series: Sequence[Sequence[Term]],
+        scales: Sequence[float],
+        sensitivity: Sequence[float],
+    ) -> None:
+        super().__init__()
+        self.count = features.count
+        moving = (features.frequencies.mT != 0) | (features.powers != 0)  # (K, n)
+        rows = []
+        for output, (terms, scale) in enumerate(zip(series, scales, strict=True)):
+            for term in terms:
+                place = features.place(term)
+                unit = min(s for s, moves in zip(sensitivity, moving[place], strict=True) if moves)
+                rows.append((output, place, term.cos_factor / scale / unit, unit))
+                rows.append((output, features.count + place, term.sin_factor / scale / unit, unit))
+        outputs, places, starts, units = zip(*rows, strict=True)
+        self.register_buffer("outputs", torch.tensor(outputs))
+        self.register_buffer("places", torch.tensor(places))
+        self.register_buffer("units", vector(units))
+        self.raw_coefficients = nn.Parameter(vector(starts))
+
+    def prepare(self, output_map: Tensor) -> Tensor:
+        """What takes features to output_map y, (rows, 2 K), where y are the series."""
+        known = output_map.new_zeros(output_map.shape[1], 2 * self.count)
+        coefficients = self.units * self.raw_coefficients
+        return output_map @ known.index_put((self.outputs, self.places), coefficients)
+
+
+def _less(powers: tuple[int, ...], joint: int) -> tuple[int, ...]:
+    """The powers with one less of a joint."""
+    return tuple(power - (k == joint) for k, power in enumerate(powers))
+
+
+class DenseInput(nn.Module):
+    """G(q) of a network, over all three axes of every joint, of which z moves."""
+
+    moving: Tensor
+
+    def __init__(self, joints: Joints, network: Network) -> None:
+        super().__init__()
+        self.register_buffer("moving", torch.eye(3 * joints.n).double()[2::3])
+        self.network = network
+
+    def prepare(self) -> Any:
+        """The network's weights made ready for many states."""
+        return self.network.prepare(self.moving, self.moving.sum(dim=1))
+
+    def _gains(self, encoded: Tensor, prepared: Any) -> Tensor:
+        return self.network(encoded, prepared)[0]
+
+    def forward(self, encoded: Tensor, prepared: Any) -> Tensor:
+        """G(q), (..., n, n), diagonal."""
+        return torch.diag_embed(self._gains(encoded, prepared))
+
+    def force(self, encoded: Tensor, tau: Tensor, prepared: Any) -> Tensor:
+        """G(q) tau, (..., n)."""
+        return self._gains(encoded, prepared) * tau
+
+    def solve(self, encoded: Tensor, force: Tensor, prepared: Any) -> Tensor:
+        """The inputs, (..., n), that make this force."""
+        return force / self._gains(encoded, prepared)
+
+
+FACTOR_START = 0.35  # diagonal of L, relative to the root of the joints' usual friction by speed
 
 
 def lower_entries(rows: int) -> Tensor:
@@ -141,282 +677,109 @@ def lower_entries(rows: int) -> Tensor:
     return spread
 
 
-class Reading(NamedTuple):
-    """The inputs of a network: share * (spread features + fixed), (inputs, ...)."""
+class DenseFriction(nn.Module):
+    """D(q, qd) = L L^T, with ``axes`` rows of L for each joint.
 
-    joints: tuple[int, ...]  # whose each input is
-    share: Tensor
-    spread: Tensor  # (inputs, features)
-    fixed: Tensor
-
-
-def reading(shares: list[float], axes: int = 0) -> Reading:
-    """Of each joint the nine numbers of R in SO(3) or the three of r in R^3, times its share.
-
-    z is the joint's axis, so R = [[cos q, -sin q, 0], [sin q, cos q, 0], [0, 0, 1]]. Then, with
-    ``axes``, each joint's velocity along so many axes, of which the last is z.
-    """
-    n, zeros = len(JOINTS), partial(torch.zeros, dtype=torch.float64)
-    width = 3 * n + n * (axes > 0)
-    joints, share, spread, fixed = [], [], [], []
-    for i, joint in enumerate(JOINTS):
-        size = 9 if joint.revolute else 3
-        block, rest = zeros(size, width), zeros(size)
-        if joint.revolute:
-            block[[0, 4], i], rest[8] = 1.0, 1.0
-            block[[1, 3], n + i] = vector((-1.0, 1.0))
-        else:
-            block[2, 2 * n + i] = 1.0
-        joints += [i] * size
-        share += [shares[i]] * size
-        spread.append(block)
-        fixed.append(rest)
-    for i in range(n if axes else 0):
-        block = zeros(axes, width)
-        block[-1, 3 * n + i] = 1.0
-        joints += [i] * axes
-        share += [1.0] * axes
-        spread.append(block)
-        fixed.append(zeros(axes))
-    return Reading(tuple(joints), vector(share), torch.cat(spread), torch.cat(fixed))
-
-
-class Layers(NamedTuple):
-    """A network's weights made ready for many states; see ``Network.prepared``."""
-
-    weights: tuple[Tensor, ...]
-    biases: tuple[Tensor, ...]
-
-
-Trace = tuple[tuple[Tensor, ...], Layers]
-
-
-def by_sigmoid(rate: Tensor, value: Tensor) -> Tensor:
-    """rate * value (1 - value), the sigmoid's slope, in one pass: memory is what takes the time."""
-    changed: Tensor = torch.ops.aten.sigmoid_backward(rate, value)
-    return changed
-
-
-class Network(nn.Module):
-    """A tanh network, with its derivatives written out.
-
-    ``layers`` names, unit by unit, the joints that each layer's units may read; weights between
-    others are masked, so that a unit has no path to a joint it must not depend on.
-    """
-
-    spread: Tensor
-    fixed: Tensor
-
-    def __init__(
-        self,
-        reading: Reading,
-        layers: tuple[tuple[frozenset[int], ...], ...],
-        generator: torch.Generator,
-    ) -> None:
-        super().__init__()
-        self.register_buffer("spread", reading.spread)
-        self.register_buffer("fixed", reading.fixed)
-        self.weights = nn.ParameterList()
-        self.biases = nn.ParameterList()
-        below = tuple(frozenset((joint,)) for joint in reading.joints)
-        for index, units in enumerate(layers):
-            allowed = [[float(lower <= upper) for lower in below] for upper in units]
-            mask = torch.tensor(allowed, dtype=torch.float64)
-            weight = torch.randn(mask.shape, dtype=torch.float64, generator=generator)
-            self.weights.append(nn.Parameter(weight / mask.sum(dim=1, keepdim=True).sqrt()))
-            self.register_buffer(f"mask{index}", mask * reading.share if index == 0 else mask)
-            self.biases.append(nn.Parameter(torch.zeros(len(units), dtype=torch.float64)))
-            below = units
-        nn.init.zeros_(self.weights[-1])  # so that the model starts at its nominal means
-
-    def prepared(self, outlay: Tensor, offset: Tensor) -> Layers:
-        """The weights for the features as they are, and for offset + outlay y in place of y.
-
-        tanh x is computed as 2 sigmoid(2 x) - 1, which takes a fraction of the time.
-        """
-        weights, biases = [], []
-        for index, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            weight = weight * self.get_buffer(f"mask{index}")
-            if index == 0:
-                bias = bias + weight @ self.fixed
-                weight = weight @ self.spread
-            else:
-                bias, weight = bias - weight.sum(dim=1), 2 * weight
-            weights.append(2 * weight)
-            biases.append(2 * bias)
-        weights[-1] = 0.5 * outlay @ weights[-1]
-        biases[-1] = offset + 0.5 * outlay @ biases[-1]
-        return Layers(tuple(weights), tuple(biases))
-
-    def forward(self, features: Tensor, layers: Layers) -> tuple[Tensor, Trace]:
-        """y laid out, (..., rows); and what ``pull`` and ``push`` need."""
-        layer, hidden = features, []
-        for weight, bias in zip(layers.weights[:-1], layers.biases, strict=False):
-            layer = torch.sigmoid(F.linear(layer, weight, bias))
-            hidden.append(layer)
-        return F.linear(layer, layers.weights[-1], layers.biases[-1]), (tuple(hidden), layers)
-
-    def pull(self, trace: Trace, cotangent: Tensor) -> Tensor:
-        """The reverse sweep: cotangent, (..., rows), times dy/dfeatures; (..., features)."""
-        hidden, layers = trace
-        layer = cotangent @ layers.weights[-1]
-        for weight, value in zip(reversed(layers.weights[:-1]), reversed(hidden), strict=True):
-            layer = by_sigmoid(layer, value) @ weight
-        return layer
-
-    def push(self, trace: Trace, rate: Tensor) -> Tensor:
-        """The forward sweep: dy/dfeatures times the features' rate; (..., rows)."""
-        hidden, layers = trace
-        for weight, value in zip(layers.weights[:-1], hidden, strict=True):
-            rate = by_sigmoid(F.linear(rate, weight), value)
-        return F.linear(rate, layers.weights[-1])
-
-
-class Friction(nn.Module):
-    """D = L L^T, of all q and qd: a network gives L, over all three axes of every joint.
-
-    A joint moves along z alone, so only the rows of L that are z axes are worked out.
+    A joint moves along the last of its axes alone, so only those rows of L are worked out.
     """
 
     speed: Tensor
-    size: Tensor
-    outlay: Tensor
+    nominal: Tensor
+    entries: Tensor
     start: Tensor
 
-    def __init__(self, generator: torch.Generator) -> None:
+    def __init__(self, joints: Joints, network: Network, axes: int) -> None:
         super().__init__()
-        n, rows = len(JOINTS), FRICTION_AXES * len(JOINTS)
-        self.register_buffer("speed", vector(joint.speed for joint in JOINTS))
-        self.register_buffer("size", vector(joint.friction for joint in JOINTS))
-        moving = slice(FRICTION_AXES - 1, None, FRICTION_AXES)
-        entries = lower_entries(rows)
-        self.register_buffer("outlay", entries[moving])
-        self.register_buffer("start", FRICTION_START * torch.eye(rows, dtype=torch.float64)[moving])
-        everything = frozenset(range(n))
-        layers = (*(((everything,) * FRICTION_WIDTH,) * DEPTH), (everything,) * entries.shape[-1])
-        self.network = Network(reading([PLACE_SHARE] * n, FRICTION_AXES), layers, generator)
+        rows = axes * joints.n
+        self.register_buffer("speed", vector(joints.speed))
+        self.register_buffer("nominal", vector(joints.friction))
+        moving = slice(axes - 1, None, axes)
+        self.register_buffer("entries", lower_entries(rows)[moving])
+        self.register_buffer("start", FACTOR_START * torch.eye(rows).double()[moving])
+        self.network = network
 
-    def prepared(self) -> Layers:
+    def prepare(self) -> Any:
         """The network's weights made ready for many states."""
-        size = torch.sqrt(self.size / self.speed).unsqueeze(-1)
-        outlay = (size.unsqueeze(-1) * self.outlay).flatten(0, 1)
-        return self.network.prepared(outlay, (size * self.start).flatten())
+        size = torch.sqrt(self.nominal / self.speed).unsqueeze(-1)
+        output_map = (size.unsqueeze(-1) * self.entries).flatten(0, 1)
+        return self.network.prepare(output_map, (size * self.start).flatten())
 
-    def _factor(self, features: Tensor, qd: Tensor, layers: Layers) -> Tensor:
-        rows: Tensor = self.network(torch.cat([features, qd / self.speed], dim=-1), layers)[0]
+    def _factor(self, encoded: Tensor, qd: Tensor, layers: Any) -> Tensor:
+        rows: Tensor = self.network(torch.cat([encoded, qd / self.speed], dim=-1), layers)[0]
         return rows.reshape(*qd.shape[:-1], *self.start.shape)
 
-    def forward(self, features: Tensor, qd: Tensor, layers: Layers) -> Tensor:
+    def forward(self, encoded: Tensor, qd: Tensor, layers: Any) -> Tensor:
         """The friction torque D qd, (..., n) [Nm, N]."""
-        factor = self._factor(features, qd, layers)
+        factor = self._factor(encoded, qd, layers)
         return (factor @ (factor.mT @ qd.unsqueeze(-1))).squeeze(-1)
 
-    def matrix(self, features: Tensor, qd: Tensor, layers: Layers) -> Tensor:
+    def dissipation(self, encoded: Tensor, qd: Tensor, layers: Any) -> Tensor:
         """D, (..., n, n)."""
-        factor = self._factor(features, qd, layers)
+        factor = self._factor(encoded, qd, layers)
         return factor @ factor.mT
 
 
-class Prepared(NamedTuple):
-    """What depends on the weights alone, worked out once for many states."""
+class DenseResiduals(NamedTuple):
+    """What M's derivatives need of the work done for M."""
 
-    mass: Layers
-    potential: Layers
-    friction: Layers
-    input: Layers
-
-
-# what M's derivatives need of the work done for M
-Memory = tuple[Trace, Tensor, Tensor, Tensor]
+    network: Any
+    factor: Tensor  # U
+    moved: Tensor  # U^-1 A, with A the moving columns of C^-1
+    scale: Tensor  # e
 
 
-class Model(nn.Module):
-    """The arm's dynamics: 45 learned functions of q make M^-1 over all axes.
+def nominal_factor(joints: Joints, mean: Sequence[Sequence[float]]) -> Tensor:
+    """C, lower triangular: C C^T is the nominal mean of M^-1 over all axes, (3 n, 3 n).
 
-    Shapes: q, qd, qdd, tau and p are (..., n), with any leading dimensions. Units: rad and Nm for
-    turning joints, m and N for sliding ones. M is positive definite and D positive semi-definite
-    for all weights.
+    ``mean`` is the lower triangle of the nominal mean of M without armature. z of each joint
+    moves; about its other axes a joint is taken to be as heavy as about z.
+    """
+    n = joints.n
+    mass = torch.zeros(n, n, dtype=torch.float64)
+    row, column = torch.tril_indices(n, n)
+    mass[row, column] = mass[column, row] = vector(x for entries in mean for x in entries)
+    mass += torch.diag(vector(joints.armature))
+    everywhere = torch.diag(mass.diagonal().repeat_interleave(3))
+    everywhere[2::3, 2::3] = mass
+    factor: Tensor = torch.linalg.cholesky(torch.linalg.inv(everywhere))
+    return factor
+
+
+class DenseMass(nn.Module):
+    """M(q), (..., n, n), from M^-1 = C U diag(e) U^T C^T over all axes, (3 n, 3 n).
+
+    C is the Cholesky factor of the nominal mean, U lower triangular with ones on its diagonal and
+    e > 0, both given by a network: the Cholesky factorisation without square roots. The bearings
+    hold all axes but z still, so M is the moving block of the inverse:
+    (U^-1 A)^T diag(1 / e) U^-1 A, where A is the moving columns of C^-1.
     """
 
-    n: ClassVar[int] = 3
-    joint_names: ClassVar[tuple[str, ...]] = tuple(joint.name for joint in JOINTS)
-    joint_types: ClassVar[tuple[str, ...]] = tuple(
-        "revolute" if joint.revolute else "prismatic" for joint in JOINTS
-    )
-
-    center: Tensor
-    reach: Tensor
-    mean_factor: Tensor
+    nominal: Tensor
     moving: Tensor
     below: Tensor  # where the entries below U's diagonal stand in U, row by row
-    mass_start: Tensor
-    input_outlay: Tensor
+    start: Tensor
 
-    def __init__(self, seed: int = 0) -> None:
+    def __init__(self, joints: Joints, mean: Sequence[Sequence[float]], network: Network) -> None:
         super().__init__()
-        generator = torch.Generator().manual_seed(seed)
-        self.register_buffer("center", vector(joint.center for joint in JOINTS))
-        self.register_buffer("reach", vector(joint.reach for joint in JOINTS))
-        everything = frozenset(range(self.n))
-        factor, size = mean_factor(), 3 * self.n
-        self.register_buffer("mean_factor", factor)
+        self.size = 3 * joints.n
+        factor = nominal_factor(joints, mean)
+        self.register_buffer("nominal", factor)
         self.register_buffer("moving", torch.linalg.inv(factor)[:, 2::3])
-        row, column = torch.tril_indices(size, size, -1)
-        self.register_buffer("below", row * size + column)
+        row, column = torch.tril_indices(self.size, self.size, -1)
+        self.register_buffer("below", row * self.size + column)
         # so that U starts without entries below its diagonal, and e at one
-        start = vector([0.0] * len(row) + [math.log(math.e - 1)] * size)
-        self.register_buffer("mass_start", start)
-        layers = (*(((everything,) * MASS_WIDTH,) * DEPTH), (everything,) * len(start))
-        shares = [joint.mass_share for joint in JOINTS]
-        self.mass_network = Network(reading(shares), layers, generator)
-        layers = (*(((everything,) * POTENTIAL_WIDTH,) * DEPTH), (everything,))
-        shares = [joint.potential_share for joint in JOINTS]
-        self.potential_network = Network(reading(shares), layers, generator)
-        self.friction = Friction(generator)
-        self.register_buffer("input_outlay", torch.eye(3 * self.n, dtype=torch.float64)[2::3])
-        layers = (*(((everything,) * INPUT_WIDTH,) * DEPTH), (everything,) * (3 * self.n))
-        self.input_network = Network(reading([1.0] * self.n), layers, generator)
+        start = vector([0.0] * len(row) + [math.log(math.e - 1)] * self.size)
+        self.register_buffer("start", start)
+        self.network = network
 
-    def prepare(self) -> Prepared:
-        """All that depends on the weights alone; holds until they change."""
-        scale = self.friction.size.new_full((1, 1), POTENTIAL_SCALE)
-        return Prepared(
-            mass=self.mass_network.prepared(torch.diag(0 * self.mass_start + 1), self.mass_start),
-            potential=self.potential_network.prepared(scale, 0 * scale[0]),
-            friction=self.friction.prepared(),
-            input=self.input_network.prepared(self.input_outlay, self.input_outlay.sum(dim=1)),
-        )
+    def prepare(self) -> Any:
+        """The network's weights made ready for many states."""
+        return self.network.prepare(torch.diag(0 * self.start + 1), self.start)
 
-    def _features(self, q: Tensor) -> Tensor:
-        """cos q, sin q, the scaled q: all that is read of q, (..., 3 n)."""
-        place = (q - self.center) / self.reach
-        return torch.cat([q.cos(), q.sin(), place], dim=-1)
-
-    def _features_rate(self, features: Tensor, qd: Tensor) -> Tensor:
-        """How fast the features change along qd."""
-        cos, sin, _ = features.chunk(3, dim=-1)
-        return torch.cat([-sin * qd, cos * qd, qd / self.reach], dim=-1)
-
-    def _by_joint(self, features: Tensor, slope: Tensor) -> Tensor:
-        """d/dq, (..., n), of what has this slope by features."""
-        cos, sin, _ = features.chunk(3, dim=-1)
-        by_cos, by_sin, by_place = slope.chunk(3, dim=-1)
-        return by_sin * cos - by_cos * sin + by_place / self.reach
-
-    def mass_matrix(self, q: Tensor, prepared: Prepared | None = None) -> Tensor:
-        """M(q), (..., n, n) [kg m^2, kg m, kg]; with what ``prepare`` gave, where it is at hand."""
-        return self._mass(self._features(q), prepared or self.prepare())[0]
-
-    def axes_inverse_mass(self, q: Tensor) -> Tensor:
-        """M(q)^-1 over all three axes of every joint, of which z moves; (..., 3 n, 3 n).
-
-        M^-1 = C U diag(e) U^T C^T, with C the Cholesky factor of the nominal mean, U lower
-        triangular with ones on its diagonal and e > 0: the Cholesky factorisation in its form
-        without square roots.
-        """
-        raw, _ = self.mass_network(self._features(q), self.prepare().mass)
-        factor, scale = self._factor(raw)
-        lower = self.mean_factor @ (factor + torch.eye(3 * self.n).to(q))
+    def inverse(self, at: Configuration, prepared: Any) -> Tensor:
+        """M^-1 over all three axes of every joint, of which z moves; (..., 3 n, 3 n)."""
+        factor, scale = self._factor(self.network(at.encoded, prepared)[0])
+        lower = self.nominal @ (factor + torch.eye(self.size).to(factor))
         return (lower * scale.unsqueeze(-2)) @ lower.mT
 
     def _factor(self, raw: Tensor) -> tuple[Tensor, Tensor]:
@@ -426,163 +789,358 @@ class Model(nn.Module):
 
     def _lower(self, entries: Tensor) -> Tensor:
         """The matrix, (..., 3 n, 3 n), with these entries below its diagonal, row by row."""
-        size = 3 * self.n
-        rows = entries.new_zeros(*entries.shape[:-1], size * size)
-        return rows.index_copy(-1, self.below, entries).reshape(*entries.shape[:-1], size, size)
+        rows = entries.new_zeros(*entries.shape[:-1], self.size * self.size)
+        rows = rows.index_copy(-1, self.below, entries)
+        return rows.reshape(*entries.shape[:-1], self.size, self.size)
 
     @staticmethod
     def _unit_solved(factor: Tensor, right: Tensor, upper: bool = False) -> Tensor:
-        solution: Tensor = torch.linalg.solve_triangular(
-            factor, right, upper=upper, unitriangular=True
-        )
+        solution: Tensor = torch.linalg.solve_triangular(factor, right, upper=upper, unitriangular=True)
         return solution
 
-    def _mass(self, features: Tensor, prepared: Prepared) -> tuple[Tensor, Memory]:
-        """M(q) of the moving axes, (..., n, n); the network's trace, U, U^-1 A and e.
-
-        The bearings hold the other axes still, so M is the moving block of M over all axes:
-        (U^-1 A)^T diag(1 / e) U^-1 A, where A is the moving columns of C^-1.
-        """
-        raw, trace = self.mass_network(features, prepared.mass)
+    def forward(self, at: Configuration, prepared: Any) -> tuple[Tensor, DenseResiduals]:
+        """M(q), and what its derivatives need."""
+        raw, residuals = self.network(at.encoded, prepared)
         factor, scale = self._factor(raw)
         moved = self._unit_solved(factor, self.moving)
-        return moved.mT @ (moved / scale.unsqueeze(-1)), (trace, factor, moved, scale)
+        mass = moved.mT @ (moved / scale.unsqueeze(-1))
+        return mass, DenseResiduals(residuals, factor, moved, scale)
 
-    def _kinetic_slope(self, qd: Tensor, memory: Memory) -> Tensor:
-        """d/dfeatures of 1/2 qd^T M(q) qd, (..., features)."""
-        trace, factor, moved, scale = memory
+    def kinetic_vjp(self, at: Configuration, qd: Tensor, residuals: DenseResiduals) -> tuple[Tensor, None]:
+        """The derivative of 1/2 qd^T M(q) qd by the encoding."""
+        _, factor, moved, scale = residuals
         speed = moved @ qd.unsqueeze(-1)
         momentum = speed / scale.unsqueeze(-1)
         by_factor = -self._unit_solved(factor.mT, momentum, upper=True) @ speed.mT
         by_entry = by_factor.flatten(-2).index_select(-1, self.below)
         by_scale = 0.5 * momentum.squeeze(-1) ** 2 * torch.expm1(-scale)
-        return self.mass_network.pull(trace, torch.cat([by_entry, by_scale], dim=-1))
+        cotangent = torch.cat([by_entry, by_scale], dim=-1)
+        return self.network.vjp(residuals.network, cotangent), None
 
-    def _mass_rate(self, rate: Tensor, memory: Memory) -> Tensor:
-        """dM/dt where the features change at this rate, (..., n, n)."""
-        trace, factor, moved, scale = memory
-        pushed = self.mass_network.push(trace, rate)
+    def jvp(self, rate: Configuration, residuals: DenseResiduals) -> Tensor:
+        """dM/dt, (..., n, n), where the configuration changes at this rate."""
+        _, factor, moved, scale = residuals
+        pushed = self.network.jvp(residuals.network, rate.encoded)
         entries, raw_rate = pushed.tensor_split((len(self.below),), dim=-1)
         turned = self._unit_solved(factor, self._lower(entries) @ moved)
         by_factor = moved.mT @ (turned / scale.unsqueeze(-1))
         by_scale = raw_rate * torch.expm1(-scale) / scale**2
         return moved.mT @ (moved * by_scale.unsqueeze(-1)) - by_factor - by_factor.mT
 
-    def potential_energy(self, q: Tensor) -> Tensor:
+
+class Mass(Protocol):
+    """What gives M(q) and its derivatives."""
+
+    def prepare(self) -> Any:
+        """All that depends on the weights alone."""
+
+    def __call__(self, at: Configuration, prepared: Any) -> tuple[Tensor, Any]:
+        """M(q), (..., n, n), and what its derivatives need."""
+
+    def kinetic_vjp(self, at: Configuration, qd: Tensor, residuals: Any) -> tuple[Tensor, Tensor | None]:
+        """The derivative of 1/2 qd^T M(q) qd by the encoding, and by the Fourier features."""
+
+    def jvp(self, rate: Configuration, residuals: Any) -> Tensor:
+        """dM/dt, (..., n, n), where the configuration changes at this rate."""
+
+
+class Friction(Protocol):
+    """What gives D(q, qd)."""
+
+    def prepare(self) -> Any:
+        """All that depends on the weights alone."""
+
+    def __call__(self, encoded: Tensor, qd: Tensor, prepared: Any) -> Tensor:
+        """D qd, (..., n) [Nm, N]."""
+
+    def dissipation(self, encoded: Tensor, qd: Tensor, prepared: Any) -> Tensor:
+        """D, (..., n, n)."""
+
+
+class Input(Protocol):
+    """What gives G."""
+
+    def prepare(self) -> Any:
+        """All that depends on the weights alone."""
+
+    def __call__(self, encoded: Tensor, prepared: Any) -> Tensor:
+        """G, (..., n, n)."""
+
+    def force(self, encoded: Tensor, tau: Tensor, prepared: Any) -> Tensor:
+        """G tau, (..., n)."""
+
+    def solve(self, encoded: Tensor, force: Tensor, prepared: Any) -> Tensor:
+        """The inputs, (..., n), that make this force."""
+
+
+class MLPLayers(NamedTuple):
+    """A network's weights made ready for many states; see ``MaskedMLP.prepare``."""
+
+    weights: tuple[Tensor, ...]
+    biases: tuple[Tensor, ...]
+
+
+MLPResiduals = tuple[tuple[Tensor, ...], MLPLayers]
+
+
+def sigmoid_vjp(cotangent: Tensor, value: Tensor) -> Tensor:
+    """cotangent * value (1 - value), the sigmoid's derivative, in one pass over memory."""
+    changed: Tensor = torch.ops.aten.sigmoid_backward(cotangent, value)
+    return changed
+
+
+class MaskedMLP(nn.Module):
+    """A tanh network.
+
+    ``layers`` names, unit by unit, the joints that each layer's units may read; weights between
+    others are masked, so that a unit has no path to a joint it must not depend on.
+    ``output_fraction`` scales what the last layer gives, but for its biases.
+    """
+
+    matrix: Tensor
+    offset: Tensor
+
+    def __init__(
+        self,
+        inputs: NetworkInput,
+        layers: Sequence[Sequence[frozenset[int]]],
+        generator: torch.Generator,
+        output_fraction: float = 1.0,
+    ) -> None:
+        super().__init__()
+        self.register_buffer("matrix", inputs.matrix)
+        self.register_buffer("offset", inputs.offset)
+        self.weights = nn.ParameterList()
+        self.biases = nn.ParameterList()
+        below = [frozenset((joint,)) for joint in inputs.joints]
+        for index, units in enumerate(layers):
+            allowed = [[float(lower <= upper) for lower in below] for upper in units]
+            mask = torch.tensor(allowed, dtype=torch.float64)
+            weight = torch.randn(mask.shape, dtype=torch.float64, generator=generator)
+            self.weights.append(nn.Parameter(weight / mask.sum(dim=1, keepdim=True).sqrt()))
+            mask = mask * inputs.sensitivity if index == 0 else mask
+            last = index == len(layers) - 1
+            self.register_buffer(f"mask{index}", mask * output_fraction if last else mask)
+            self.biases.append(nn.Parameter(torch.zeros(len(units), dtype=torch.float64)))
+            below = list(units)
+        nn.init.zeros_(self.weights[-1])  # so that the model starts at its nominal values
+
+    def set_output_bias(self, values: Tensor) -> None:
+        """Start the outputs from these values."""
+        self.biases[-1].data = values
+
+    def prepare(self, output_map: Tensor, offset: Tensor) -> MLPLayers:
+        """The weights for the encoding as it is, and for offset + output_map y in place of y.
+
+        tanh x is computed as 2 sigmoid(2 x) - 1, which takes a fraction of the time.
+        """
+        weights, biases = [], []
+        for index, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            weight = weight * self.get_buffer(f"mask{index}")
+            if index == 0:
+                bias, weight = bias + weight @ self.offset, weight @ self.matrix
+            else:
+                bias, weight = bias - weight.sum(dim=1), 2 * weight
+            weights.append(2 * weight)
+            biases.append(2 * bias)
+        weights[-1] = 0.5 * output_map @ weights[-1]
+        biases[-1] = offset + 0.5 * output_map @ biases[-1]
+        return MLPLayers(tuple(weights), tuple(biases))
+
+    def forward(self, encoded: Tensor, layers: MLPLayers) -> tuple[Tensor, MLPResiduals]:
+        """offset + output_map y, (..., rows); and what ``vjp`` and ``jvp`` need."""
+        layer, hidden = encoded, []
+        for weight, bias in zip(layers.weights[:-1], layers.biases, strict=False):
+            layer = torch.sigmoid(F.linear(layer, weight, bias))
+            hidden.append(layer)
+        return F.linear(layer, layers.weights[-1], layers.biases[-1]), (tuple(hidden), layers)
+
+    def vjp(self, residuals: MLPResiduals, cotangent: Tensor) -> Tensor:
+        """The reverse sweep: cotangent, (..., rows), times d/d encoded; (..., encoded)."""
+        hidden, layers = residuals
+        layer = cotangent @ layers.weights[-1]
+        for weight, value in zip(reversed(layers.weights[:-1]), reversed(hidden), strict=True):
+            layer = sigmoid_vjp(layer, value) @ weight
+        return layer
+
+    def jvp(self, residuals: MLPResiduals, tangent: Tensor) -> Tensor:
+        """The forward sweep: d/d encoded times the encoding's tangent; (..., rows)."""
+        hidden, layers = residuals
+        for weight, value in zip(layers.weights[:-1], hidden, strict=True):
+            tangent = sigmoid_vjp(F.linear(tangent, weight), value)
+        return F.linear(tangent, layers.weights[-1])
+
+
+class PotentialPrepared(NamedTuple):
+    """What depends on the weights alone."""
+
+    layers: Any  # of the network
+    energy: Tensor | None  # takes Fourier features to V, (2 K,)
+    gradient: Tensor | None  # and to dV/dq, (2 K, n)
+
+
+class LearnedPotential(nn.Module):
+    """V(q) [J], of one network and, with ``series``, one Fourier series, both in units of ``scale``."""
+
+    scale: Tensor
+
+    def __init__(
+        self,
+        scale: float,
+        network: Network,
+        fourier: FourierFeatures | None = None,
+        series: Sequence[Term] = (),
+        sensitivity: Sequence[float] = (),
+    ) -> None:
+        super().__init__()
+        self.register_buffer("scale", torch.full((1, 1), scale, dtype=torch.float64))
+        self.network, self.fourier = network, fourier
+        self.series: FourierSeries | None = None
+        if fourier is not None:
+            self.series = FourierSeries(fourier, [series], [scale], sensitivity)
+
+    def prepare(self) -> PotentialPrepared:
+        """All that depends on the weights alone."""
+        layers = self.network.prepare(self.scale, 0 * self.scale[0])
+        if self.series is None or self.fourier is None:
+            return PotentialPrepared(layers, None, None)
+        energy = self.series.prepare(self.scale)[0]
+        return PotentialPrepared(layers, energy, self.fourier.gradient_map(energy))
+
+    def forward(self, at: Configuration, prepared: PotentialPrepared) -> Tensor:
         """V(q), (...) [J]."""
-        y: Tensor = self.potential_network(self._features(q), self.prepare().potential)[0]
-        return y.squeeze(-1)
+        energy: Tensor = self.network(at.encoded, prepared.layers)[0].squeeze(-1)
+        if at.fourier is None or prepared.energy is None:
+            return energy
+        return energy + at.fourier @ prepared.energy
 
-    def gravity(self, q: Tensor) -> Tensor:
+    def network_vjp(self, at: Configuration, prepared: PotentialPrepared) -> Tensor:
+        """The derivative of the network's part of V by the encoding."""
+        _, residuals = self.network(at.encoded, prepared.layers)
+        return self.network.vjp(residuals, at.encoded.new_ones(1))
+
+
+class NetworkPrepared(NamedTuple):
+    """What depends on the weights alone, by part."""
+
+    mass: Any
+    potential: Any
+    friction: Any
+    input: Any
+
+
+class NetworkDynamics(PortHamiltonian):
+    """The dynamics made of these parts; without a ``potential`` gravity does no work."""
+
+    def __init__(
+        self,
+        encoding: JointEncoding,
+        mass: Mass,
+        potential: LearnedPotential | None,
+        friction: Friction,
+        input: Input,
+        fourier: FourierFeatures | None = None,
+    ) -> None:
+        super().__init__()
+        self.n = len(encoding.center)
+        self.encoding, self.fourier = encoding, fourier
+        # Any: what a part has beside its protocol is there to be asked for
+        self.mass: Any = mass
+        self.friction: Any = friction
+        self.input: Any = input
+        self.potential = potential
+
+    def prepare(self) -> NetworkPrepared:
+        """All that depends on the weights alone; holds until they change."""
+        return NetworkPrepared(
+            mass=self.mass.prepare(),
+            potential=None if self.potential is None else self.potential.prepare(),
+            friction=self.friction.prepare(),
+            input=self.input.prepare(),
+        )
+
+    def configuration(self, q: Tensor, prepared: NetworkPrepared) -> Configuration:
+        """What networks and Fourier series read of q."""
+        encoded = self.encoding(q)
+        if self.fourier is None:
+            return Configuration(encoded, None)
+        return Configuration(encoded, self.fourier(q, encoded[..., 2 * self.n :]))
+
+    def mass_at(self, at: Configuration, prepared: NetworkPrepared) -> tuple[Tensor, Any]:
+        """M(q), (..., n, n), and what its derivatives need."""
+        found: tuple[Tensor, Any] = self.mass(at, prepared.mass)
+        return found
+
+    def energy_at(self, at: Configuration, prepared: NetworkPrepared) -> Tensor:
+        """V(q), (...) [J]."""
+        if self.potential is None:
+            return at.encoded.new_zeros(at.encoded.shape[:-1])
+        energy: Tensor = self.potential(at, prepared.potential)
+        return energy
+
+    def gravity_at(self, at: Configuration, prepared: NetworkPrepared) -> Tensor:
         """dV/dq, (..., n) [Nm, N]."""
-        features = self._features(q)
-        return self._by_joint(features, self._potential_slope(features, self.prepare()))
+        if self.potential is None:
+            return torch.zeros_like(at.encoded[..., : self.n])
+        by_network = self.potential.network_vjp(at, prepared.potential)
+        gradient: Tensor = self.encoding.vjp(at.encoded, by_network)
+        if at.fourier is None or prepared.potential.gradient is None:
+            return gradient
+        by_series: Tensor = at.fourier @ prepared.potential.gradient
+        return gradient + by_series
 
-    def _potential_slope(self, features: Tensor, prepared: Prepared) -> Tensor:
-        """d/dfeatures of V, (..., features)."""
-        _, trace = self.potential_network(features, prepared.potential)
-        return self.potential_network.pull(trace, features.new_ones(1))
-
-    def dissipation(self, q: Tensor, qd: Tensor) -> Tensor:
-        """D(q, qd), (..., n, n): D qd is the friction torque."""
-        return self.friction.matrix(self._features(q), qd, self.prepare().friction)
-
-    def input_matrix(self, q: Tensor) -> Tensor:
-        """G(q), (..., n, n), diagonal: the moving axis of each joint's column of three."""
-        return torch.diag_embed(self._gains(self._features(q), self.prepare()))
-
-    def _gains(self, features: Tensor, prepared: Prepared) -> Tensor:
-        gains: Tensor = self.input_network(features, prepared.input)[0]
-        return gains
-
-    def momentum(self, q: Tensor, qd: Tensor, prepared: Prepared | None = None) -> Tensor:
-        """p = M(q) qd, (..., n)."""
-        return (self.mass_matrix(q, prepared) @ qd.unsqueeze(-1)).squeeze(-1)
-
-    def velocity(self, q: Tensor, p: Tensor, prepared: Prepared | None = None) -> Tensor:
-        """qd = M(q)^-1 p, (..., n)."""
-        return self._solved(self.mass_matrix(q, prepared), p)
-
-    @staticmethod
-    def _solved(mass: Tensor, force: Tensor) -> Tensor:
-        # its derivative costs one more solution; a Cholesky factor's would cost several times that
-        solution: Tensor = torch.linalg.solve(mass, force.unsqueeze(-1))
-        return solution.squeeze(-1)
-
-    def hamiltonian(self, q: Tensor, p: Tensor) -> Tensor:
-        """H = 1/2 p^T M(q)^-1 p + V(q), (...) [J]."""
-        return 0.5 * (p * self.velocity(q, p)).sum(dim=-1) + self.potential_energy(q)
-
-    def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
-        """qdd, (..., n), under the input tau."""
-        prepared, features = self.prepare(), self._features(q)
-        mass, bias = self._mass_and_bias(features, qd, prepared)
-        return self._solved(mass, self._gains(features, prepared) * tau - bias)
-
-    def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
-        """The torque, (..., n), that gives qdd."""
-        prepared, features = self.prepare(), self._features(q)
-        mass, bias = self._mass_and_bias(features, qd, prepared)
-        force = (mass @ qdd.unsqueeze(-1)).squeeze(-1) + bias
-        return force / self._gains(features, prepared)
-
-    def _mass_and_bias(
-        self, features: Tensor, qd: Tensor, prepared: Prepared
-    ) -> tuple[Tensor, Tensor]:
-        """M and the torque that holds qd steady: dM/dt qd - d/dq (1/2 qd^T M qd) + dV/dq + D qd."""
-        mass, memory = self._mass(features, prepared)
-        mass_rate = self._mass_rate(self._features_rate(features, qd), memory)
-        bias = (mass_rate @ qd.unsqueeze(-1)).squeeze(-1)
-        bias = bias - self._lagrangian_slope(features, qd, memory, prepared)
-        return mass, bias + self.friction(features, qd, prepared.friction)
-
-    def _lagrangian_slope(
-        self, features: Tensor, qd: Tensor, memory: Memory, prepared: Prepared
+    def lagrangian_gradient(
+        self, at: Configuration, qd: Tensor, residuals: Any, prepared: NetworkPrepared
     ) -> Tensor:
         """d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
-        slope = self._kinetic_slope(qd, memory) - self._potential_slope(features, prepared)
-        return self._by_joint(features, slope)
+        by_encoded, by_fourier = self.mass.kinetic_vjp(at, qd, residuals)
+        if self.potential is not None:
+            by_encoded = by_encoded - self.potential.network_vjp(at, prepared.potential)
+        gradient: Tensor = self.encoding.vjp(at.encoded, by_encoded)
+        if self.fourier is None or at.fourier is None:
+            return gradient
+        if by_fourier is not None:
+            gradient = gradient + self.fourier.vjp(at.fourier, by_fourier)
+        if self.potential is not None and prepared.potential.gradient is not None:
+            gradient = gradient - at.fourier @ prepared.potential.gradient
+        return gradient
 
-    def forward(self, t: Tensor, state: Tensor) -> Tensor:
-        """The rate of (q, p), (..., 2 n), or of (q, p, tau), (..., 3 n), where tau is held."""
-        q, p, tau = state.tensor_split((self.n, 2 * self.n), dim=-1)
-        qd, force = self.rates(q, p, tau if tau.shape[-1] else None, self.prepare())
-        return torch.cat([qd, force, torch.zeros_like(tau)], dim=-1)
+    def nonlinear_at(
+        self, at: Configuration, qd: Tensor, residuals: Any, prepared: NetworkPrepared
+    ) -> Tensor:
+        """dM/dt qd - d/dq (1/2 qd^T M qd) + dV/dq, (..., n)."""
+        gradient = self.lagrangian_gradient(at, qd, residuals, prepared)
+        mass_rate: Tensor = self.mass.jvp(self._rate(at, qd), residuals)
+        return applied(mass_rate, qd) - gradient
 
-    def rates(
-        self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Prepared
-    ) -> tuple[Tensor, Tensor]:
-        """q' and p', (..., n), under the input tau, with what ``prepare`` gave.
+    def _rate(self, at: Configuration, qd: Tensor) -> Configuration:
+        """How fast the configuration changes along qd."""
+        by_fourier = None
+        if self.fourier is not None and at.fourier is not None:
+            by_fourier = self.fourier.jvp(at.fourier, qd)
+        return Configuration(self.encoding.jvp(at.encoded, qd), by_fourier)
 
-        q' = dH/dp and p' = -dH/dq - D dH/dp + G tau: the port-Hamiltonian form (van der Schaft and
-        Jeltsema, Port-Hamiltonian Systems Theory, 2014).
-        """
-        features = self._features(q)
-        mass, memory = self._mass(features, prepared)
-        qd = self._solved(mass, p)
-        force = self._lagrangian_slope(features, qd, memory, prepared)
-        force = force - self.friction(features, qd, prepared.friction)
-        if tau is not None:
-            force = force + self._gains(features, prepared) * tau
-        return qd, force
+    def friction_at(self, at: Configuration, qd: Tensor, prepared: NetworkPrepared) -> Tensor:
+        """D(q, qd) qd, (..., n) [Nm, N]."""
+        torque: Tensor = self.friction(at.encoded, qd, prepared.friction)
+        return torque
 
-    def to_group(self, q: Tensor) -> list[Tensor]:
-        """By joint, R in SO(3), (..., 3, 3), or r in R^3, (..., 3), if it slides; z is its axis."""
-        parts = []
-        for joint, value in zip(JOINTS, q.unbind(dim=-1), strict=True):
-            zero, one = torch.zeros_like(value), torch.ones_like(value)
-            if joint.revolute:
-                c, s = value.cos(), value.sin()
-                rows = ((c, -s, zero), (s, c, zero), (zero, zero, one))
-                parts.append(torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2))
-            else:
-                parts.append(torch.stack((zero, zero, value), dim=-1))
-        return parts
+    def dissipation_at(self, at: Configuration, qd: Tensor, prepared: NetworkPrepared) -> Tensor:
+        """D(q, qd), (..., n, n)."""
+        matrix: Tensor = self.friction.dissipation(at.encoded, qd, prepared.friction)
+        return matrix
 
-    def from_group(self, parts: list[Tensor]) -> Tensor:
-        """q, (..., n), with angles in [-pi, pi]; the inverse of ``to_group``."""
-        values = [
-            torch.atan2(part[..., 1, 0], part[..., 0, 0]) if joint.revolute else part[..., 2]
-            for joint, part in zip(JOINTS, parts, strict=True)
-        ]
-        return torch.stack(values, dim=-1)
+    def input_at(self, at: Configuration, prepared: NetworkPrepared) -> Tensor:
+        """G(q), (..., n, n)."""
+        matrix: Tensor = self.input(at.encoded, prepared.input)
+        return matrix
+
+    def input_force(self, at: Configuration, tau: Tensor, prepared: NetworkPrepared) -> Tensor:
+        """G tau, (..., n) [Nm, N]."""
+        force: Tensor = self.input.force(at.encoded, tau, prepared.input)
+        return force
+
+    def input_torque(self, at: Configuration, force: Tensor, prepared: NetworkPrepared) -> Tensor:
+        """The tau, (..., n), that makes this force."""
+        tau: Tensor = self.input.solve(at.encoded, force, prepared.input)
+        return tau

@@ -1,4 +1,4 @@
-"""The waves that M and V are made of: against the recursion at random points, in the module against Pinocchio."""
+"""The Fourier series that M and V are: against the recursion at random points, in the module against Pinocchio."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from random_arms import arms
 from spelgen.arm.arm import make_arm
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.loaded_arm import load_arm
-from spelgen.structure.fourier import find_waves
+from spelgen.structure.fourier import fourier_expansion
 from spelgen.structure.nominal import nominal_inertias, working_range
 from spelgen.structure.recursion import triangle
 from spelgen.structure.sampling import float_energies
@@ -18,25 +18,25 @@ from spelgen.structure.structure import derive
 from spelgen.urdf.read import read_urdf
 
 
-def values(arm, waves, sums, q):
-    """Sums of waves at q (points, n), (points, sums)."""
+def values(arm, terms, functions, q):
+    """Fourier series at q (points, n), (points, functions)."""
     ranges = np.array([working_range(coordinate) for coordinate in arm.coordinates])
     x = (q - ranges.mean(axis=1)) / (ranges[:, 1] - ranges[:, 0]) * 2
     columns = []
-    for each in sums:
-        total = np.full(len(q), each.level)
+    for each in functions:
+        total = np.full(len(q), each.offset)
         for place, a, b in each.terms:
-            wave = waves[place]
-            angle = q @ np.array(wave.turns)
-            size = np.prod(x ** np.array(wave.powers), axis=1)
+            term = terms[place]
+            angle = q @ np.array(term.frequencies)
+            size = np.prod(x ** np.array(term.powers), axis=1)
             total = total + size * (a * np.cos(angle) + b * np.sin(angle))
         columns.append(total)
     return np.stack(columns, axis=-1)
 
 
 def assert_exact(arm, structure, inertias):
-    """The sums are M's outputs and V, but for nine digits; returns which of the two are sums at all."""
-    found = find_waves(arm, structure, inertias)
+    """The series are M's outputs and V, but for nine digits; returns which of the two are series at all."""
+    found = fourier_expansion(arm, structure, inertias)
     rng = np.random.default_rng(1)
     q = rng.uniform(-3, 3, (40, len(arm.coordinates)))
     mass, potential = float_energies(arm, q, inertias)
@@ -47,9 +47,9 @@ def assert_exact(arm, structure, inertias):
             for output in structure.outputs
         ]
         size = max(1.0, np.abs(true).max())
-        assert np.abs(values(arm, found.waves, found.outputs, q).T - true).max() < 1e-7 * size
+        assert np.abs(values(arm, found.terms, found.outputs, q).T - true).max() < 1e-7 * size
     if found.potential:
-        rise = values(arm, found.waves, [found.potential], q)[:, 0]
+        rise = values(arm, found.terms, [found.potential], q)[:, 0]
         true = potential - potential[0]
         assert np.abs(rise - rise[0] - true).max() < 1e-7 * max(1.0, np.abs(true).max())
     return found.outputs is not None, found.potential is not None
@@ -87,17 +87,20 @@ def test_random_arms_are_sums_too(tmp_path, drawn):
 def test_parallel_axes_turn_as_sums_of_angles():
     """V of two links in a plane is a cos(q1 + b) + c cos(q1 + q2 + d), whatever they weigh."""
     arm = load_arm(ROBOTS / "two_link.urdf").arm
-    found = find_waves(arm, derive(arm), nominal_inertias(arm, True))
-    turns = [wave.turns for wave in found.waves]
-    assert [turns[place] for place, *_ in found.potential.terms] == [(1, 0), (1, 1)]
-    assert [turns[place] for place, *_ in found.outputs[0].terms] == [(0, 1)]
+    found = fourier_expansion(arm, derive(arm), nominal_inertias(arm, True))
+    frequencies = [term.frequencies for term in found.terms]
+    assert [frequencies[place] for place, *_ in found.potential.terms] == [(1, 0), (1, 1)]
+    assert [frequencies[place] for place, *_ in found.outputs[0].terms] == [(0, 1)]
 
 
 def test_the_urdfs_inertials_leave_fewer():
     """A centre of mass on its axis is not to be moved by training under --assume inertials."""
     arm = load_arm(ROBOTS / "scara.urdf").arm
     terms = [
-        sum(len(x.terms) for x in find_waves(arm, derive(arm, assume), nominal_inertias(arm, True)).outputs)
+        sum(
+            len(x.terms)
+            for x in fourier_expansion(arm, derive(arm, assume), nominal_inertias(arm, True)).outputs
+        )
         for assume in ("kinematics", "inertials")
     ]
     assert terms[1] <= terms[0]
@@ -113,8 +116,8 @@ def test_followers_have_none(tmp_path):
         )
     )
     arm = make_arm(read_urdf(path))
-    found = find_waves(arm, derive(arm), nominal_inertias(arm, True))
-    assert (found.waves, found.outputs, found.potential) == ((), None, None)
+    found = fourier_expansion(arm, derive(arm), nominal_inertias(arm, True))
+    assert (found.terms, found.outputs, found.potential) == ((), None, None)
 
 
 @pytest.mark.parametrize("robot", ["two_link", "rpr", "scara"])
@@ -128,7 +131,7 @@ def test_an_untrained_module_is_the_urdfs_arm(robot, net, tmp_path):
     model = import_source(built(robot, net=net)[0], tmp_path / f"{robot}_spel.py").Model(seed=0)
     q = torch.randn(20, model.n, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
-        model.rotor.fill_(-100.0)  # drives are no part of a URDF
+        model.dynamics.mass.armature.raw.fill_(-100.0)  # drives are no part of a URDF
         mass, load_torque = model.mass_matrix(q).numpy(), model.gravity(q).numpy()
     still = np.zeros(model.n)
     for at, found, torque in zip(q.numpy(), mass, load_torque, strict=True):

@@ -1,0 +1,280 @@
+"""The runtime where it stands: derivatives against autograd, shapes and types, and what a module takes of it."""
+
+import ast
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from emitted import SIX, built, import_source, random_model
+from torch import Tensor
+from torch.func import hessian, jacfwd, jacrev, jvp, vjp, vmap
+
+from spelgen.emission.bundle import bundle, load_runtime, names_in
+from spelgen.runtime.encoding import JointEncoding, joint_input, lie_group_input
+from spelgen.runtime.fourier import FourierFeatures, FourierSeries, Term
+from spelgen.runtime.friction_laws import FrictionLaws, tanh_ratio
+from spelgen.runtime.joints import Joints
+from spelgen.runtime.masked_kan import MaskedKAN
+from spelgen.runtime.masked_mlp import MaskedMLP
+from spelgen.runtime.network import unit_joints
+from spelgen.runtime.regularisation import PositiveDefiniteShift
+from spelgen.runtime.rigid_body import Bodies, InertialParameters, pseudo_inertia
+from spelgen.runtime.symmetric import entry_basis, symmetric
+
+NUMBERS = Path(__file__).parent / "golden" / "numbers.json"
+PRESETS = (
+    ("minimal", "mlp"),
+    ("minimal", "kan"),
+    ("spel", "mlp"),
+    ("spel-kan", "kan"),
+    ("phnode", "mlp"),
+    ("closed-form", None),
+)
+JOINTS = Joints(
+    revolute=(True, False, True),
+    center=(0.0, 0.5, 0.0),
+    reach=(3.0, 0.25, 2.0),
+    speed=(1.0, 0.5, 2.0),
+    friction=(1.0, 2.0, 0.0),
+    armature=(0.1, 0.2, 0.3),
+    gear=(1.0, 10.0, 50.0),
+    actuated=(True, True, True),
+)
+SERIES = (Term((0, 0, 2), (0, 0, 0), 0.5, -0.2), Term((1, 0, 0), (0, 2, 0), 0.3, 0.7))
+
+
+def draw(*shape: int, seed: int = 0) -> Tensor:
+    """Normal numbers."""
+    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+def near(ours: Tensor, reference: Tensor, bound: float = 1e-12) -> None:
+    assert ours.shape == reference.shape
+    assert (ours - reference).abs().max() <= bound * max(1.0, reference.abs().max().item())
+
+
+@pytest.mark.parametrize("joints", [JOINTS, JOINTS._replace(revolute=(True, True, True))])
+def test_encoding_is_cos_sin_and_scaled_distance_with_its_derivatives(joints):
+    encoding, q, qd = JointEncoding(joints), draw(4, 3), draw(4, 3, seed=1)
+    encoded, rate = jvp(encoding, (q,), (qd,))
+    near(encoded[:, 0], q[:, 0].cos())
+    near(encoded[:, 5], q[:, 2].sin())
+    if encoding.prismatic:
+        near(encoded[:, 7], (q[:, 1] - 0.5) / 0.25)
+    near(encoding.jvp(encoded, qd), rate)
+    cotangent = draw(*encoded.shape, seed=2)
+    near(encoding.vjp(encoded, cotangent), vjp(encoding, q)[1](cotangent)[0])
+
+
+@pytest.mark.parametrize("kind", [MaskedMLP, MaskedKAN])
+@pytest.mark.parametrize("group", [False, True])
+def test_networks_equal_autograd_and_read_their_own_joints(kind, group):
+    encoding = JointEncoding(JOINTS)
+    inputs = (
+        lie_group_input(JOINTS, (1.0, 0.5, 2.0)) if group else joint_input(JOINTS, (0, 1, 2), (1.0, 0.5, 2.0))
+    )
+    outputs = [(0,), (1, 2), (2,)]
+    generator = torch.Generator().manual_seed(0)
+    network = kind(inputs, unit_joints(outputs, width=9, depth=2, least=2), generator)
+    for weight in network.parameters():
+        weight.data = draw(*weight.shape, seed=weight.numel())
+    layers = network.prepare(draw(5, 3), draw(5, seed=1))
+    encoded, tangent = encoding(draw(4, 3)), draw(4, 9, seed=3)
+    (rows, rate) = jvp(lambda x: network(x, layers)[0], (encoded,), (tangent,))
+    residuals = network(encoded, layers)[1]
+    near(network.jvp(residuals, tangent), rate, 1e-10)
+    cotangent = draw(*rows.shape, seed=4)
+    pulled = vjp(lambda x: network(x, layers)[0], encoded)[1](cotangent)[0]
+    near(network.vjp(residuals, cotangent), pulled, 1e-10)
+    plain = network.prepare(torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+    slopes = jacrev(lambda q: network(encoding(q), plain)[0])(draw(3))
+    assert (slopes != 0).tolist() == [[joint in read for joint in range(3)] for read in outputs]
+
+
+def test_units_are_shared_out_by_how_many_outputs_read_the_same_joints():
+    layers = unit_joints([(2,), (1, 2), (1, 2)], width=64, depth=2, least=4)
+    assert [len(layer) for layer in layers] == [64, 64, 3]
+    assert layers[0].count(frozenset((2,))) == 21
+    crowded = unit_joints([(k,) for k in range(9)], width=8, depth=1, least=2)
+    assert len(crowded[0]) == 18, "each group keeps its least"
+
+
+def test_fourier_series_and_its_derivatives():
+    encoding = JointEncoding(JOINTS)
+    features = FourierFeatures(JOINTS, [SERIES])
+    assert features.count == 4, "x^2 cos q1 brings x cos q1 and cos q1"
+    q, qd = draw(5, 3), draw(5, 3, seed=1)
+    series = FourierSeries(features, [SERIES], [2.0], (0.5, 0.25, 1.0))
+    heights = series.prepare(torch.ones(1, 1, dtype=torch.float64) * 2.0)[0]
+
+    def value(at: Tensor) -> Tensor:
+        return features(at, encoding.scaled(at)) @ heights
+
+    x = encoding.scaled(q)[:, 1]
+    expected = 0.5 * (2 * q[:, 2]).cos() - 0.2 * (2 * q[:, 2]).sin()
+    near(value(q), expected + x**2 * (0.3 * q[:, 0].cos() + 0.7 * q[:, 0].sin()))
+    found = features(q, encoding.scaled(q))
+    near(features.jvp(found, qd) @ heights, jvp(value, (q,), (qd,))[1])
+    gradient = vjp(lambda at: value(at).sum(), q)[1](torch.ones((), dtype=torch.float64))[0]
+    near(features.vjp(found, heights.expand(5, -1)), gradient)
+    near(found @ features.gradient_map(heights), gradient)
+
+
+def test_entries_of_a_symmetric_matrix_and_their_basis():
+    def entries(f, c):
+        return symmetric([f[0]], [f[0] - 2 * f[1], c[0]], [0, f[1], 0])
+
+    f, c = draw(7, 2), draw(7, 1)
+    matrix = entries(f.unbind(-1), c.unbind(-1))
+    near(matrix, matrix.mT)
+    assert (matrix[:, 2, 2] == 0).all()
+    by_function, by_constant = entry_basis(entries, 2, 1)
+    near(matrix.flatten(1), f @ by_function + c @ by_constant)
+
+
+def test_shift_leaves_what_is_positive_definite_and_mends_what_is_not():
+    center = torch.diag(torch.tensor([5.0, 1.0, 1e-3], dtype=torch.float64))
+    shift, zero = PositiveDefiniteShift(center), torch.zeros(3, 3, dtype=torch.float64)
+    root = draw(500, 3, 3)
+    definite = root @ root.mT + 1e-9 * torch.eye(3)
+    assert torch.equal(shift(definite, zero), definite)
+    for size in (1e-12, 1.0, 1e12):
+        broken = size * (root + root.mT)
+        broken = broken[torch.linalg.eigvalsh(broken)[:, 0] < 0]
+        mended = shift(broken, zero)
+        assert len(broken) > 400
+        assert (torch.linalg.eigvalsh(mended)[:, 0] > 0).all()
+        away = mended - broken
+        share = away[:, 0, 0] / center[0, 0]
+        near(away / share[:, None, None], center.expand_as(away), 1e-6)
+
+
+def test_bodies_are_possible_for_all_weights():
+    eye = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    bodies = Bodies(
+        parent=(-1,), joint=(0,), revolute=(True,), ratio=(1.0,), offset=(0.0,), rotation=(eye,),
+        position=((0.0, 0.0, 0.0),), mass=(2.0,), moment=((0.1, 0.2, 0.3),), inertia=((0.5, 0.6, 0.4),),
+        products=((0.01, 0.02, 0.03),),
+    )  # fmt: skip
+    parameters = InertialParameters(bodies)
+    nominal = torch.tensor([[2.0, 0.1, 0.2, 0.3, 0.5, 0.01, 0.02, 0.6, 0.03, 0.4]], dtype=torch.float64)
+    near(parameters(), nominal)
+    for seed in range(100):
+        parameters.raw.data = 2 * draw(1, 10, seed=seed)
+        assert torch.linalg.eigvalsh(pseudo_inertia(parameters()))[0, 0] > 0
+
+
+def test_friction_laws_resist_and_read_as_what_they_are():
+    laws = FrictionLaws(JOINTS)
+    constants = laws.prepare()
+    near(constants.coulomb, torch.tensor([1.0, 2.0, 0.0], dtype=torch.float64))
+    gravity = torch.tensor([3.0, -4.0, 5.0], dtype=torch.float64)
+    fast = 1e3 * torch.ones(3, dtype=torch.float64)
+    expected = constants.viscous * 1e3 + constants.saturation + constants.coulomb
+    near(laws(fast, gravity, constants), expected + constants.load_dependence * gravity.abs())
+    qd = draw(100, 3)
+    assert (laws(qd, gravity, constants) * qd >= 0).all()
+    near(laws(-qd, gravity, constants), -laws(qd, gravity, constants))
+    x = torch.tensor([0.0, 1e-9, 1e-4, 0.3, -2.0], dtype=torch.float64)
+    near(tanh_ratio(x)[1:], x[1:].tanh() / x[1:])
+    assert tanh_ratio(x)[0] == 1
+
+
+def test_a_module_takes_what_it_uses_as_it_stands():
+    runtime = load_runtime()
+    for preset, net in PRESETS:
+        source = built("rpr", preset=preset, net=net)[0]
+        tree = ast.parse(source)
+        own = {node.name for node in tree.body if isinstance(node, ast.ClassDef | ast.FunctionDef)} - {
+            "Model"
+        }
+        assert own <= set(runtime.definitions)
+        for name in own:
+            assert runtime.definitions[name].text in source
+            users = [
+                node for node in tree.body if name in names_in(node) and getattr(node, "name", "") != name
+            ]
+            assert users, f"{name} is used by nothing in {preset}"
+    assert bundle("x = 1") == ("", "")
+
+
+def test_tailored_part_is_short_and_shows_the_entries():
+    for robot in SIX:
+        for preset, net in PRESETS:
+            lines = built(robot, preset=preset, net=net)[0].splitlines()
+            end = next(number for number, line in enumerate(lines) if line.startswith("# ---- spelgen's"))
+            assert end < 250, f"{robot}, {preset}, {net}: {end} lines"
+    assert "return symmetric([f3], [f1, c2], [f2, 0, c1])" in built("rpr")[0]
+    assert "m22 = f9 + 2 * f12 - f5" in built("six_dof")[0]
+
+
+@pytest.mark.parametrize(
+    ("robot", "preset", "net"),
+    [*(("rpr", *each) for each in PRESETS), ("six_dof", "minimal", "mlp"), ("six_dof", "closed-form", None)],
+)
+def test_transforms_work_for_every_preset(robot, preset, net, tmp_path):
+    """Without a branch on data: torch.func, strict export with a batch of any size, a whole graph to compile."""
+    model = random_model(robot, tmp_path, seed=1, preset=preset, net=net)
+    n = model.n
+    q, qd, tau = draw(5, n), draw(5, n, seed=1), draw(5, n, seed=2)
+    qdd = model.forward_dynamics(q, qd, tau)
+    near(vmap(model.forward_dynamics)(q, qd, tau), qdd, 1e-9)
+    one = q[0], qd[0], tau[0]
+    forward, reverse = jacfwd(model.forward_dynamics)(*one), jacrev(model.forward_dynamics)(*one)
+    near(forward, reverse, 1e-8)
+    curvature = hessian(model.hamiltonian, argnums=1)(q[0], model.momentum(q[0], qd[0]))
+    near(curvature, torch.linalg.inv(model.mass_matrix(q[0])), 1e-8)
+    state = torch.cat([q, qd, tau], dim=-1)
+    batch = {"t": None, "state": {0: torch.export.Dim("batch")}}
+    program = torch.export.export(model, (torch.zeros(()), state), dynamic_shapes=batch, strict=True)
+    more = torch.cat([state, state])
+    near(program.module()(torch.zeros(()), more), model(torch.zeros(()), more), 1e-9)
+    compiled = torch.compile(model.forward_dynamics, fullgraph=True, backend="aot_eager")
+    near(compiled(q, qd, tau), qdd, 1e-9)
+
+
+@pytest.mark.parametrize(("preset", "net"), PRESETS)
+def test_single_precision_and_batches_of_any_shape(preset, net, tmp_path):
+    module = import_source(built("rpr", preset=preset, net=net)[0], tmp_path / "rpr_single.py")
+    double, single = module.Model(seed=1), module.Model(seed=1, dtype=torch.float32)
+    assert {x.dtype for x in single.state_dict().values() if x.is_floating_point()} == {torch.float32}
+    for shape in ((), (3,), (2, 3)):
+        q, qd, tau = (draw(*shape, 3, seed=seed) for seed in range(3))
+        exact = double.inverse_dynamics(q, qd, tau)
+        for model in (single, module.Model(seed=1).float()):
+            found = model.inverse_dynamics(q.float(), qd.float(), tau.float())
+            assert found.dtype == torch.float32
+            near(found.double(), exact, 1e-4)
+        assert single.hamiltonian(q.float(), qd.float()).shape == shape
+
+
+def test_values_are_in_units(tmp_path):
+    model = import_source(built("six_dof")[0], tmp_path / "six.py").Model()
+    near(model.armature, torch.tensor([0.306, 0.306, 0.204, 0.0816, 0.0816, 0.0816], dtype=torch.float64))
+    closed = import_source(built("rpr", preset="closed-form")[0], tmp_path / "closed.py").Model()
+    closed.dynamics.friction.raw_coulomb.data[:] = math.log(2)
+    near(closed.coulomb, 2 * closed.dynamics.friction.nominal)
+    assert closed.inertial_parameters.shape == (3, 10)
+    near(model.rotor_inertia, model.armature / 101.0**2)
+
+
+@pytest.mark.parametrize("case", json.loads(NUMBERS.read_text()))
+def test_numbers_are_those_of_the_first_stage(case, tmp_path):
+    """Modules of the first stage, made by templates, gave these with the same seed and the same change of weights."""
+    robot, preset, net = case.split()
+    source = built(robot, preset=preset, net=None if net == "default" else net)[0]
+    model = import_source(source, tmp_path / f"{robot}_numbers.py").Model(seed=3)
+    generator = torch.Generator().manual_seed(1)
+    q, qd, tau = (torch.randn(model.n, generator=generator, dtype=torch.float64) for _ in range(3))
+    with torch.no_grad():
+        for weight in model.parameters():
+            weight += 0.01
+        found = {
+            "mass_matrix": model.mass_matrix(q).diagonal(),
+            "inverse_dynamics": model.inverse_dynamics(q, qd, tau),
+            "forward_dynamics": model.forward_dynamics(q, qd, tau),
+        }
+    for name, expected in json.loads(NUMBERS.read_text())[case].items():
+        near(found[name], torch.tensor(expected, dtype=torch.float64), 1e-12)
