@@ -9,10 +9,10 @@ if TYPE_CHECKING:
     from spelgen.emission.loading import load_module
     from spelgen.errors import SpelgenError
     from spelgen.evaluation.evaluate import evaluate
+    from spelgen.evaluation.rollout import rollout
     from spelgen.exporting.export import export
     from spelgen.fitting.config import MomentumFit, Rollout, TorqueFit
     from spelgen.fitting.fit import Fit, fit, load_run
-    from spelgen.fitting.rollout import rollout
     from spelgen.identification.identify import identify
     from spelgen.inspection import Inspection
     from spelgen.loaded_arm import LoadedArm, load_arm
@@ -47,7 +47,7 @@ _HOME = {
     "TorqueFit": "fitting.config",
     "MomentumFit": "fitting.config",
     "Rollout": "fitting.config",
-    "rollout": "fitting.rollout",
+    "rollout": "evaluation.rollout",
     "evaluate": "evaluation.evaluate",
     "export": "exporting.export",
     "SpelgenError": "errors",

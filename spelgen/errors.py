@@ -55,6 +55,14 @@ class SettingsError(SpelgenError):
     """A sidecar file or an option holds something unknown or impossible."""
 
 
+class OptionError(SettingsError):
+    """An option that does not apply to what is asked for; the text names what it belongs to."""
+
+    def __init__(self, option: str, belongs: str) -> None:
+        super().__init__(belongs, element=option)
+        self.option = option
+
+
 class LogError(SpelgenError):
     """Measured data is missing, malformed or not what it claims to be."""
 

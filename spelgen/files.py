@@ -2,22 +2,45 @@
 
 from __future__ import annotations
 
+import json
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 
-def write_text(path: Path | str, text: str) -> Path:
-    """Write `text` to `path` as UTF-8, all or nothing, making its folder; return the path.
+@contextmanager
+def replacing(path: Path | str) -> Iterator[Path]:
+    """A hidden neighbour to write to, which in the end takes the place of `path`, also through a power cut.
 
-    The text goes to a hidden neighbour first, which then takes the file's place: an interrupted or failed
-    write leaves what was there before. Raises OSError when the place cannot be written.
+    Makes the folder. An interrupted or failed write leaves what was there before. Raises OSError when the place
+    cannot be written.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        unfinished.write_text(text, encoding="utf-8", newline="\n")
+        yield unfinished
+        with unfinished.open("rb+") as file:
+            os.fsync(file.fileno())
         os.replace(unfinished, path)
     finally:
         unfinished.unlink(missing_ok=True)
-    return path
+
+
+def write_bytes(path: Path | str, content: bytes) -> Path:
+    """Write `content` to `path`, all or nothing (see `replacing`); return the path."""
+    with replacing(path) as unfinished:
+        unfinished.write_bytes(content)
+    return Path(path)
+
+
+def write_text(path: Path | str, text: str) -> Path:
+    """Write `text` to `path` as UTF-8, all or nothing; return the path."""
+    return write_bytes(path, text.encode())
+
+
+def write_json(path: Path | str, content: dict[str, Any]) -> Path:
+    """Write indented JSON, all or nothing; return the path."""
+    return write_text(path, json.dumps(content, indent=2) + "\n")

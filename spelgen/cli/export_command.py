@@ -25,9 +25,9 @@ def export(
     from spelgen.errors import RunError
     from spelgen.exporting.rigid_body_projection import make_twin
     from spelgen.exporting.urdf_file import settings_text, urdf_text
-    from spelgen.files import write_text
-    from spelgen.fitting.run_folder import RunFolder, write_bytes
-    from spelgen.spec import read_header
+    from spelgen.files import write_bytes, write_text
+    from spelgen.fitting.run_folder import RunFolder
+    from spelgen.spec import read_facts
 
     if output.suffix == ".yaml":
         raise RunError(f"the name {output.name!r}", expected="FILE.urdf, beside which FILE.yaml is written")
@@ -38,7 +38,7 @@ def export(
     if not folder.urdf.exists():
         raise RunError("no robot.urdf", file=run, expected="a run of `spelgen train --robot FILE.urdf`")
     twin = make_twin(folder)
-    robot = urdf_text(twin, folder.urdf, read_header(folder.module).options.snap_tolerance)
+    robot = urdf_text(twin, folder.urdf, read_facts(folder.module).options.angle_tolerance)
     settings = settings_text(twin, folder.urdf)
     write_bytes(output, robot)
     write_text(beside, settings)

@@ -14,12 +14,13 @@ import typer
 from spelgen import __version__
 from spelgen.cli import (
     compare_command,
+    evaluate_command,
     export_command,
     identify_command,
     log_commands,
     model_commands,
-    run_commands,
     simulate_command,
+    train_command,
 )
 from spelgen.cli.console import say, told
 
@@ -37,9 +38,9 @@ for command in (
     identify_command.identify,
     log_commands.excite,
     log_commands.logs,
-    run_commands.train,
-    run_commands.evaluate,
-    run_commands.report,
+    train_command.train,
+    evaluate_command.evaluate,
+    evaluate_command.report,
     export_command.export,
     compare_command.compare,
     model_commands.check,

@@ -1,7 +1,7 @@
 """A model's right-hand side compiled by torch, for training steps: fewer and larger operations on small matrices,
 on a GPU as CUDA graphs.
 
-Only `rates` is compiled: it is nearly all of a step, and it stays the same whatever the window's length and the
+Only `port_hamiltonian_rhs` is compiled: it is nearly all of a step, the same whatever the window's length and the
 number of substeps, so that it is compiled once.
 """
 
@@ -15,8 +15,8 @@ from spelgen.errors import RunError
 from spelgen.fitting.rollout import rollout_loss
 
 if TYPE_CHECKING:
+    from spelgen.emission.loading import EmittedModel
     from spelgen.fitting.rollout import LossScales
-    from spelgen.fitting.run_folder import EmittedModel
     from spelgen.logs.windows import Windows
 
 OPTIONS: dict[str, dict[str, Any]] = {
@@ -34,7 +34,7 @@ class Compiled:
     def __init__(self, model: EmittedModel) -> None:
         self._model = model
         device = next(model.parameters()).device.type
-        self._rates = torch.compile(model.rates, dynamic=False, options=OPTIONS.get(device))
+        self._rhs = torch.compile(model.port_hamiltonian_rhs, dynamic=False, options=OPTIONS.get(device))
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._model, name)
@@ -44,7 +44,7 @@ class Compiled:
         torch.compiler.cudagraph_mark_step_begin()
         return self._model.prepare()
 
-    def rates(
+    def port_hamiltonian_rhs(
         self, q: torch.Tensor, p: torch.Tensor, tau: torch.Tensor | None, prepared: Any
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """As the model's. A window's first q, a measured one, is made like all later ones: else it would be compiled
@@ -53,7 +53,7 @@ class Compiled:
         q = q.contiguous()
         if torch.is_grad_enabled() and not q.requires_grad:
             q = q.detach().requires_grad_()
-        return self._rates(q, p, tau, prepared)
+        return self._rhs(q, p, tau, prepared)
 
 
 def compiled(model: EmittedModel, windows: Windows, scales: LossScales) -> EmittedModel:

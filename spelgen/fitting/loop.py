@@ -1,4 +1,4 @@
-"""The loop of a training run: epochs, validation, checkpoints, and what happens when numbers blow up."""
+"""The loop of a fit to windows: epochs, validation, checkpoints, and what happens when numbers blow up."""
 
 from __future__ import annotations
 
@@ -11,83 +11,89 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 
 from spelgen.errors import RunError
-from spelgen.fitting.dataset import TrainingConfig, TrainingData
-from spelgen.fitting.optimizers import Batches, Descent, WholeSet
+from spelgen.fitting.config import BATCH, LEARNING_RATE, WindowConfig
+from spelgen.fitting.dataset import TrainingData
+from spelgen.fitting.optimizers import LBFGS, MiniBatchAdamW, WindowOptimizer
 from spelgen.fitting.progress import TrainingProgress
-from spelgen.fitting.rollout import (
-    INTEGRATION_SHARE,
-    choose_substeps,
-    integration_error,
-    momentum_loss,
-    rollout_loss,
-)
+from spelgen.fitting.rollout import momentum_loss, rollout_loss
 from spelgen.fitting.run_folder import RunFolder, write_state
-from spelgen.fitting.urdf_regularizer import Prior
+from spelgen.fitting.urdf_regularizer import UrdfRegularizer
+from spelgen.fitting.validation import Validation
 from spelgen.logs.windows import Windows
 
 if TYPE_CHECKING:
-    from spelgen.fitting.run_folder import EmittedModel
+    from spelgen.emission.loading import EmittedModel
 
-MOMENTUM_SHARE = 0.5  # of the allowed time, what the momentum steps may take
+MOMENTUM_FRACTION = 0.5  # of the allowed time, what the momentum steps may take
 MOMENTUM_FACTOR = 10.0  # on the learning rate of the momentum steps, which are cheap and noisy
 WARM_UP = 0.02  # part of all steps over which the learning rate rises
 FINAL_RATE = 0.01  # the cosine ends at this part of the learning rate
 EPOCH_STEPS = 20  # at least; few windows are passed over several times between validations
-PROBE = 64  # windows on which the integration error is watched
-PROBE_EVERY = 5  # epochs
+PROBE_EVERY = 5  # epochs: friction that is learned may be too stiff for the substeps so far
 MAX_ROLLBACKS = 8
 
 PLAIN = (
-    "epoch", "step", "best_epoch", "best_loss", "best_weights",
-    "rollbacks", "rate_factor", "seconds", "substeps", "warm",
+    "epoch", "step", "best_epoch", "best_loss", "best_weights", "rollbacks", "learning_rate_factor", "seconds",
+    "substeps", "momentum_done",
 )  # fmt: skip
 
 Status = Literal["finished", "stopped early", "out of time", "interrupted"]
 
 
 class TrainingLoop:
-    """The changing state of one run; `save` writes all of it, so a resumed run repeats the same numbers."""
+    """The changing state of one fit; `save` writes all of it, so a resumed run repeats the same numbers.
+
+    config: a resolved one. stepped: what steps are taken with, the same weights, compiled maybe. folder: where
+    checkpoints go; None: nothing is written.
+    """
 
     def __init__(
         self,
-        folder: RunFolder,
         model: EmittedModel,
         data: TrainingData,
-        config: TrainingConfig,
-        prior: Prior | None = None,
+        config: WindowConfig,
+        *,
+        seed: int = 0,
+        device: str = "cpu",
+        regularizer: UrdfRegularizer | None = None,
         stepped: EmittedModel | None = None,
+        folder: RunFolder | None = None,
     ) -> None:
-        self.folder, self.config = folder, config
-        self.model = model.to(config.device)
-        self.stepped = stepped or self.model  # the same weights, compiled maybe
-        self.training, self.validation = data.training.to(config.device), data.validation.to(config.device)
-        self.scales = data.scales.to(config.device)
-        self.prior = prior
-        self.generator = torch.Generator().manual_seed(config.seed)
-        self.batch = min(config.batch, len(self.training))
-        self.stream, self.size = data.stream, data.size
-        windows = len(self.training) if self.stream is None else len(self.stream) // self.stream.shares
-        self.descent = self._descent(self.generator)
-        self.epoch_steps = (
-            EPOCH_STEPS if config.whole(self.size) else max(EPOCH_STEPS, -(-windows // self.batch))
-        )
-        self.probe = self.training[:: -(-len(self.training) // PROBE)]
+        self.folder, self.config, self.seed, self.device = folder, config, seed, device
+        self.model = model.to(device)
+        self.stepped = stepped or self.model
+        self.training = data.training.to(device)
+        self.scales = data.scales.to(device)
+        self.regularizer = None if regularizer is None else regularizer.to(device)
+        self.generator = torch.Generator().manual_seed(seed)
+        self.stream = data.stream
+        self.batch = min(getattr(config, "batch", None) or BATCH, len(self.training))
+        self.whole = getattr(config, "optimizer", "lbfgs") == "lbfgs"  # all windows at once
+        self.optimizer = self._optimizer(self.generator)
+        windows = len(self.training)
+        if self.stream is not None:
+            windows = len(self.stream) // self.stream.epochs_per_pass
+        self.epoch_steps = EPOCH_STEPS if self.whole else max(EPOCH_STEPS, -(-windows // self.batch))
+        self.validation = Validation(self.model, data, config, self.batch, device)
         self.epoch = self.step = self.best_epoch = self.rollbacks = 0
-        self.rate_factor, self.seconds = 1.0, 0.0
-        self.warm = not config.momentum_steps
+        self.learning_rate_factor, self.seconds = 1.0, 0.0
+        self.momentum_done = not config.momentum_steps
+        self.history: list[dict[str, Any]] = []
         self._measure()
 
     def run(self, progress: TrainingProgress) -> Status:
-        """Train until an end is reached; Ctrl-C is one and leaves the checkpoint of the last whole epoch."""
+        """Go on until an end is reached; Ctrl-C is one and leaves the checkpoint of the last whole epoch."""
         since = time.monotonic() - self.seconds
         try:
             self.save()
-            if not self.warm:
-                self._warm_up(progress)
+            if not self.momentum_done:
+                self._momentum_stage(progress)
             while (end := self._end()) is None:
                 record = self._run_epoch()
                 self.seconds = record["seconds"] = time.monotonic() - since
-                self.folder.append_metrics(record)
+                self.history.append(record)
+                if self.folder is not None:
+                    self.folder.append_metrics(record)
                 self.save()
                 progress.epoch(record)
         except KeyboardInterrupt:
@@ -96,56 +102,55 @@ class TrainingLoop:
 
     def _measure(self) -> None:
         """Begin anew from the present weights: substeps, validation loss and best so far."""
-        self.substeps = self.config.substeps or choose_substeps(self.model, self.probe, self.scales)
-        self.best_loss = self._validate()
+        self.substeps = self.validation.substeps()
+        self.best_loss = self.validation.loss(self.substeps)
         self.best_weights = copy.deepcopy(self.model.state_dict())
 
-    def _descent(self, generator: torch.Generator) -> Descent:
+    def _optimizer(self, generator: torch.Generator) -> WindowOptimizer:
         """From the present weights; ``generator`` orders batches."""
-        decay = self.config.decay(self.size)
-        if self.config.whole(self.size):
-            return WholeSet(self.model, decay)
-        return Batches(self.model, self.batch, decay, generator)
+        if self.whole:
+            return LBFGS(self.model, self.config.weight_decay or 0.0)
+        return MiniBatchAdamW(self.model, self.batch, self.config.weight_decay or 0.0, generator)
 
-    def _warm_up(self, progress: TrainingProgress) -> None:
-        """Momentum first: the weak form needs no ODE solve and brings the model near before windows are
-        predicted.
+    def _momentum_stage(self, progress: TrainingProgress) -> None:
+        """The weak form needs no ODE solve and brings the model near before windows are predicted.
 
         Kept only if it predicts the validation windows better. An interruption here starts it again on
         resumption.
         """
         before = copy.deepcopy(self.model.state_dict()), self.best_loss
-        descent = self._descent(torch.Generator().manual_seed(self.config.seed))
+        optimizer = self._optimizer(torch.Generator().manual_seed(self.seed))
         since, steps = time.monotonic(), self.config.momentum_steps
         for done in range(0, steps, EPOCH_STEPS):
-            spent = self._spent(time.monotonic() - since) / MOMENTUM_SHARE
+            spent = self._spent(time.monotonic() - since) / MOMENTUM_FRACTION
             if spent >= 1.0:
                 break
-            rate = functools.partial(self._warm_rate, done, spent)
-            loss = descent.descend(self._momentum_loss, self.training, min(EPOCH_STEPS, steps - done), rate)
-            if descent.stalled or not math.isfinite(loss):
+            rate = functools.partial(self._momentum_rate, done, spent)
+            loss = optimizer.run(self._momentum_loss, self.training, min(EPOCH_STEPS, steps - done), rate)
+            if optimizer.stalled or not math.isfinite(loss):
                 break
-            progress.warm_up(min(done + EPOCH_STEPS, steps), steps, loss)
+            progress.momentum(min(done + EPOCH_STEPS, steps), steps, loss)
         self._measure()
         if not self.best_loss < before[1]:
             self.model.load_state_dict(before[0])
             self._measure()
-        self.warm = True
+        self.momentum_done = True
         self.seconds += time.monotonic() - since
         self.save()
 
-    def _warm_rate(self, done: int, spent: float, step: int) -> float:
+    def _momentum_rate(self, done: int, spent: float, step: int) -> float:
         part = max((done + step) / self.config.momentum_steps, spent)
-        return MOMENTUM_FACTOR * self.config.learning_rate * _schedule(part)
+        return MOMENTUM_FACTOR * self._largest_rate * _schedule(part)
 
     def _momentum_loss(self, windows: Windows) -> torch.Tensor:
-        return momentum_loss(self.model, windows, self.scales) + self._pull()
+        return momentum_loss(self.model, windows, self.scales) + self._penalty()
 
     def _rollout_loss(self, windows: Windows) -> torch.Tensor:
-        return rollout_loss(self.stepped, windows, self.scales, self.substeps) + self._pull()
+        solver = self.config.solver
+        return rollout_loss(self.stepped, windows, self.scales, self.substeps, solver) + self._penalty()
 
     def _end(self) -> Status | None:
-        if self.epoch >= self.config.epochs or self.descent.stalled:
+        if self.epoch >= self.config.epochs or self.optimizer.stalled:
             return "finished"
         if self.epoch - self.best_epoch >= self.config.patience:
             return "stopped early"
@@ -158,9 +163,9 @@ class TrainingLoop:
     def _run_epoch(self) -> dict[str, Any]:
         """One epoch with finite losses, after as many attempts at a lower learning rate as that takes."""
         while True:
-            before = copy.deepcopy((self.model.state_dict(), self.descent.state_dict(), self.step))
+            before = copy.deepcopy((self.model.state_dict(), self.optimizer.state_dict(), self.step))
             loss = self._train_epoch()
-            validation = self._validate() if math.isfinite(loss) else math.nan
+            validation = self.validation.loss(self.substeps) if math.isfinite(loss) else math.nan
             if math.isfinite(validation):
                 break
             self._roll_back(*before)
@@ -175,83 +180,82 @@ class TrainingLoop:
             "validation": validation,
             "best": self.best_loss,
         }
-        record |= {"rate": self._rate(), "substeps": self.substeps, "rollbacks": self.rollbacks}
-        self._watch_integration()
+        record |= {
+            "learning_rate": self._rate(),
+            "substeps": self.substeps,
+            "rollbacks": self.rollbacks,
+        }
+        if self.epoch % PROBE_EVERY == 0:
+            self.substeps = self.validation.substeps(self.substeps)
         return record
 
     def _train_epoch(self) -> float:
         """Mean loss over the epoch's steps; NaN as soon as a step has no finite loss or gradient."""
         windows = self.training
         if self.stream is not None:
-            windows = self.stream.share(self.epoch).to(self.config.device)
-        loss = self.descent.descend(self._rollout_loss, windows, self.epoch_steps, self._rate)
+            windows = self.stream.epoch(self.epoch).to(self.device)
+        loss = self.optimizer.run(self._rollout_loss, windows, self.epoch_steps, self._rate)
         self.step += self.epoch_steps
         return loss
 
-    def _pull(self) -> torch.Tensor | float:
+    def _penalty(self) -> torch.Tensor | float:
         """What straying from the URDF costs."""
-        return 0.0 if self.prior is None else self.config.prior * self.prior.loss(self.model)
+        return (
+            0.0 if self.regularizer is None else self.config.urdf_weight * self.regularizer.loss(self.model)
+        )
+
+    @property
+    def _largest_rate(self) -> float:
+        return getattr(self.config, "learning_rate", None) or LEARNING_RATE
 
     def _rate(self, ahead: int = 0) -> float:
         """Learning rate so many steps ahead, over all steps or minutes, whichever end sooner."""
         steps = self.config.epochs * self.epoch_steps
         part = max((self.step + ahead) / steps, self._spent(self.seconds))
-        return self.config.learning_rate * self.rate_factor * _schedule(part)
+        return self._largest_rate * self.learning_rate_factor * _schedule(part)
 
-    def _validate(self) -> float:
-        """Loss on the validation windows."""
-        parts = self.validation.split(4 * self.batch)
-        try:
-            with torch.no_grad():
-                losses = [
-                    rollout_loss(self.model, x, self.scales, self.substeps).item() * len(x) for x in parts
-                ]
-        except torch.linalg.LinAlgError:
-            return math.inf
-        return sum(losses) / len(self.validation)
-
-    def _roll_back(self, weights: dict[str, Any], optimiser: dict[str, Any], step: int) -> None:
+    def _roll_back(self, weights: dict[str, Any], optimizer: dict[str, Any], step: int) -> None:
         """Undo an epoch whose numbers were not finite, and halve the learning rate from here on."""
         self.rollbacks += 1
+        self.model.load_state_dict(weights)
         if self.rollbacks > MAX_ROLLBACKS:
             raise RunError(
                 f"losses that are not finite, after {MAX_ROLLBACKS} attempts at half the learning rate each",
-                file=self.folder.path,
-                do="check units and signs of the logs; the best model so far is kept in model.pt",
+                file=None if self.folder is None else self.folder.path,
+                do="check units and signs of the logs"
+                + ("" if self.folder is None else "; the best model so far is kept in model.pt"),
             )
-        self.model.load_state_dict(weights)
-        self.descent.load_state_dict(optimiser)
+        self.optimizer.load_state_dict(optimizer)
         self.step = step
-        self.rate_factor /= 2
+        self.learning_rate_factor /= 2
 
-    def _watch_integration(self) -> None:
-        """Take more substeps when what was learned (friction, mostly) is too stiff for the present ones."""
-        if self.config.substeps is not None or self.epoch % PROBE_EVERY:
-            return
-        if integration_error(self.model, self.probe, self.scales, self.substeps) > INTEGRATION_SHARE:
-            self.substeps = choose_substeps(self.model, self.probe, self.scales, start=2 * self.substeps)
+    def state(self) -> dict[str, Any]:
+        """All that a resumed run needs: what checkpoint.pt holds."""
+        state = {name: getattr(self, name) for name in PLAIN}
+        state["model"], state["optimizer"] = self.model.state_dict(), self.optimizer.state_dict()
+        return state | {"generator": self.generator.get_state()}
 
     def save(self) -> None:
         """Write model.pt and checkpoint.pt."""
-        write_state(self.folder.weights, self.best_weights)
-        state = {name: getattr(self, name) for name in PLAIN}
-        state["model"], state["optimiser"] = self.model.state_dict(), self.descent.state_dict()
-        write_state(self.folder.checkpoint, state | {"generator": self.generator.get_state()})
+        if self.folder is not None:
+            write_state(self.folder.weights, self.best_weights)
+            write_state(self.folder.checkpoint, self.state())
 
-    def restore(self) -> None:
+    def restore(self, folder: RunFolder) -> None:
         """Continue from checkpoint.pt."""
-        state = self.folder.load_state(self.folder.checkpoint)
+        state = folder.load_state(folder.checkpoint)
         try:
             for name in PLAIN:
                 setattr(self, name, state[name])
             self.model.load_state_dict(state["model"])
-            self.descent.load_state_dict(state["optimiser"])
+            self.optimizer.load_state_dict(state["optimizer"])
             self.generator.set_state(state["generator"])
         except (KeyError, RuntimeError, ValueError) as error:
             raise RunError(
-                "a checkpoint of another model", file=self.folder.checkpoint, do="start a new run"
+                "a checkpoint of another model", file=folder.checkpoint, do="start a new run"
             ) from error
-        self.folder.keep_metrics(self.epoch)
+        folder.keep_metrics(self.epoch)
+        self.history = folder.read_metrics()
 
 
 def _schedule(part: float) -> float:

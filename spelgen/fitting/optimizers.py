@@ -1,4 +1,4 @@
-"""How weights move downhill: AdamW on batches, or L-BFGS on all windows at once where these are few.
+"""Optimizers: AdamW on batches, or L-BFGS on all windows at once where these are few.
 
 The gradient of a few hundred windows costs no more than that of a batch and is exact, so curvature pays: simulated
 logs have many digits to find, and an engineer's first log has few windows.
@@ -7,7 +7,7 @@ logs have many digits to find, and an engineer's first log has few windows.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, Protocol
 
 import torch
@@ -21,18 +21,20 @@ CALL = 20  # evaluations between looks at whether more would help
 STALLED = 1 - 1e-3  # of the loss before a call: what ends above it has found next to nothing
 TOO_LARGE = 1e12  # told to the line search where a loss is not finite, so that it turns back
 
-Loss = Callable[[Windows], torch.Tensor]
+Loss = Callable[[Any], torch.Tensor]  # of windows, or of what else is given to the optimizer
+LearningRate = Callable[[int], float]
+Blocks = Callable[[], Iterable[Any]]  # the same ones whenever it is called
 
 
-class Descent(Protocol):
+class WindowOptimizer(Protocol):
     """Moves the weights of one model. stalled: whether there is no way down from here."""
 
     @property
     def stalled(self) -> bool: ...
 
-    def descend(self, loss: Loss, windows: Windows, steps: int, rate: Callable[[int], float]) -> float:
-        """Take ``steps`` steps on ``loss`` with the learning rates rate(0), rate(1) ... Return the mean loss,
-        NaN as soon as one is not finite.
+    def run(self, loss: Loss, windows: Windows, steps: int, learning_rate: LearningRate) -> float:
+        """Take ``steps`` steps on ``loss`` with the learning rates learning_rate(0), learning_rate(1) ... Return the
+        mean loss, NaN as soon as one is not finite.
         """
         ...
 
@@ -41,7 +43,7 @@ class Descent(Protocol):
     def load_state_dict(self, state: dict[str, Any]) -> None: ...
 
 
-class Batches:
+class MiniBatchAdamW:
     """AdamW on batches in random order; single numbers (constants, viscous friction) learn faster than weights
     and do not decay.
     """
@@ -53,7 +55,7 @@ class Batches:
         self._batch, self._generator = batch, generator
         weights = [parameter for parameter in self._parameters if parameter.dim() > 1]
         numbers = [parameter for parameter in self._parameters if parameter.dim() <= 1]
-        self._optimiser = torch.optim.AdamW(
+        self._optimizer = torch.optim.AdamW(
             [
                 {"params": weights, "weight_decay": weight_decay, "factor": 1.0},
                 {"params": numbers, "weight_decay": 0.0, "factor": VECTOR_FACTOR},
@@ -62,14 +64,14 @@ class Batches:
 
     stalled = False
 
-    def descend(self, loss: Loss, windows: Windows, steps: int, rate: Callable[[int], float]) -> float:
-        """See ``Descent``."""
+    def run(self, loss: Loss, windows: Windows, steps: int, learning_rate: LearningRate) -> float:
+        """See ``WindowOptimizer``."""
         rows, size = steps * self._batch, len(windows)
         passes = [torch.randperm(size, generator=self._generator) for _ in range(-(-rows // size))]
         total = 0.0
         for step, batch in enumerate(torch.cat(passes)[:rows].split(self._batch)):
-            for group in self._optimiser.param_groups:
-                group["lr"] = rate(step) * group["factor"]
+            for group in self._optimizer.param_groups:
+                group["lr"] = learning_rate(step) * group["factor"]
             value = self._step(loss, windows[batch.to(windows.q.device)])
             if not math.isfinite(value):
                 return math.nan
@@ -77,7 +79,7 @@ class Batches:
         return total / steps
 
     def _step(self, loss: Loss, windows: Windows) -> float:
-        self._optimiser.zero_grad()
+        self._optimizer.zero_grad()
         try:
             value = loss(windows)
         except torch.linalg.LinAlgError:  # numbers blew up within the rollout
@@ -86,31 +88,31 @@ class Batches:
         norm = torch.nn.utils.clip_grad_norm_(self._parameters, GRADIENT_NORM)
         if not torch.isfinite(norm):
             return math.nan
-        self._optimiser.step()
+        self._optimizer.step()
         return value.item()
 
     def state_dict(self) -> dict[str, Any]:
         """All that a resumed run needs."""
-        return self._optimiser.state_dict()
+        return self._optimizer.state_dict()
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from a ``state_dict``."""
-        self._optimiser.load_state_dict(state)
+        self._optimizer.load_state_dict(state)
 
 
-class WholeSet:
+class LBFGS:
     """L-BFGS (Liu and Nocedal, Math. Programming 45, 1989) with a strong-Wolfe line search on all windows.
 
-    A step is an evaluation. decay: factor of half the sum of squares of all weights, which is added to the loss;
+    A step is an evaluation. weight_decay: factor of half the sum of squares of all weights, which is added to the loss;
     the learning rate is not used.
     """
 
-    def __init__(self, model: torch.nn.Module, decay: float) -> None:
+    def __init__(self, model: torch.nn.Module, weight_decay: float) -> None:
         self._parameters = list(model.parameters())
         self._weights = [parameter for parameter in self._parameters if parameter.dim() > 1]
-        self._decay, self._sound = decay, True
+        self._decay, self._finite = weight_decay, True
         self._waits, self._reached = 0, (math.inf, math.inf)  # loss, and with the penalty
-        self._optimiser = torch.optim.LBFGS(
+        self._optimizer = torch.optim.LBFGS(
             self._parameters,
             history_size=HISTORY,
             line_search_fn="strong_wolfe",
@@ -118,19 +120,21 @@ class WholeSet:
             tolerance_change=1e-15,
         )
 
-    def descend(
-        self, loss: Callable[[Any], torch.Tensor], windows: Any, steps: int, rate: Callable[[int], float]
-    ) -> float:
-        """See ``Descent``; the loss where it ends, NaN where no evaluation was finite."""
-        group = self._optimiser.param_groups[0]
+    def run(self, loss: Loss, windows: Any, steps: int, learning_rate: LearningRate) -> float:
+        """See ``WindowOptimizer``; the loss where it ends, NaN where no evaluation was finite."""
+        return self.run_on_blocks(loss, lambda: [windows], steps)
+
+    def run_on_blocks(self, loss: Loss, blocks: Blocks, steps: int) -> float:
+        """As ``run``, of a loss that is the sum over blocks, of which one at a time is in memory."""
+        group = self._optimizer.param_groups[0]
         group["max_iter"], group["max_eval"] = steps, steps
-        self._sound = False
-        self._optimiser.step(lambda: self._evaluated(loss, windows))
-        if not self._sound:
+        self._finite = False
+        self._optimizer.step(lambda: self._evaluated(loss, blocks))
+        if not self._finite:
             return math.nan
         try:
             with torch.no_grad():
-                found = loss(windows)
+                found = torch.stack([loss(block) for block in blocks()]).sum()
                 reached = (found + self._penalty()).item()
         except torch.linalg.LinAlgError:
             return math.nan
@@ -145,18 +149,21 @@ class WholeSet:
         """Whether two calls in a row found next to nothing."""
         return self._waits > 1
 
-    def _evaluated(self, loss: Callable[[Any], torch.Tensor], windows: Any) -> torch.Tensor:
-        self._optimiser.zero_grad()
+    def _evaluated(self, loss: Loss, blocks: Blocks) -> torch.Tensor:
+        self._optimizer.zero_grad()
         try:
-            value = loss(windows) + self._penalty()
-            value.backward()
+            value = torch.zeros((), dtype=torch.float64)
+            for number, block in enumerate(blocks()):
+                part = loss(block) if number else loss(block) + self._penalty()
+                part.backward()
+                value = value + part.detach()
             slopes = torch.cat([x.grad.flatten() for x in self._parameters if x.grad is not None])
             if value.isfinite() and slopes.isfinite().all():
-                self._sound = True
-                return value.detach()
+                self._finite = True
+                return value
         except torch.linalg.LinAlgError:
             pass
-        self._optimiser.zero_grad()
+        self._optimizer.zero_grad()
         return torch.tensor(TOO_LARGE, dtype=torch.float64)
 
     def _penalty(self) -> torch.Tensor | float:
@@ -165,23 +172,35 @@ class WholeSet:
     def state_dict(self) -> dict[str, Any]:
         """All that a resumed run needs."""
         return {
-            "optimiser": self._optimiser.state_dict(),
+            "optimizer": self._optimizer.state_dict(),
             "reached": self._reached,
             "waits": self._waits,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from a ``state_dict``."""
-        self._optimiser.load_state_dict(state["optimiser"])
+        self._optimizer.load_state_dict(state["optimizer"])
         self._reached, self._waits = state["reached"], state["waits"]
 
 
-def minimise(model: torch.nn.Module, loss: Callable[[], torch.Tensor], most: int, decay: float = 0.0) -> int:
-    """Move the model's weights down ``loss`` by ``WholeSet`` until that stalls or about ``most`` evaluations are
-    made; return how many were.
+def minimise(
+    model: torch.nn.Module,
+    loss: Callable[[], torch.Tensor],
+    evaluations: int,
+    weight_decay: float = 0.0,
+) -> int:
+    """Move the model's weights down ``loss`` by ``LBFGS`` until that stalls or about so many evaluations are made;
+    return how many were.
     """
-    descent, done = WholeSet(model, decay), 0
-    while done < most and not descent.stalled:
-        descent.descend(lambda _: loss(), None, CALL, lambda _: 1.0)
+    return minimise_sum(model, lambda _: loss(), lambda: [None], evaluations, weight_decay)
+
+
+def minimise_sum(
+    model: torch.nn.Module, loss: Loss, blocks: Blocks, evaluations: int, weight_decay: float = 0.0
+) -> int:
+    """As ``minimise``, of the sum of ``loss`` over ``blocks``, of which one at a time is in memory."""
+    optimizer, done = LBFGS(model, weight_decay), 0
+    while done < evaluations and not optimizer.stalled:
+        optimizer.run_on_blocks(loss, blocks, CALL)
         done += CALL
     return done

@@ -44,7 +44,7 @@ class TrainingProgress:
             text = f"{diagnostic.severity}: {diagnostic.where}: {diagnostic.message}"
             self._console.print("".join(c if c.isprintable() else "?" for c in text), markup=False)
 
-    def warm_up(self, step: int, steps: int, loss: float) -> None:
+    def momentum(self, step: int, steps: int, loss: float) -> None:
         """Show how far the momentum steps are."""
         if not self._show or step % 100:
             return

@@ -5,43 +5,36 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import torch
 
+from spelgen.dynamics.protocol import PortHamiltonianDynamics
+from spelgen.fitting.adaptive import roll_out_adaptive
+from spelgen.fitting.config import Solver
 from spelgen.logs.windows import Windows
 
 if TYPE_CHECKING:
-    from spelgen.fitting.run_folder import EmittedModel
+    from spelgen.emission.loading import EmittedModel
 
-SUBSTEPS = (1, 2, 4, 8, 16, 32)
-INTEGRATION_SHARE = 0.03  # of the model's own error, what the integrator may add
+SUBSTEPS = (1, 2, 4, 8, 16, 32)  # rk4 steps between samples
+INTEGRATION_FRACTION = 0.03  # of the model's own error, what the integrator may add
 LEAST_ERROR = 1e-2  # no model is expected to be better, in units of the scales
 
 
-class Dynamics(Protocol):
-    """What a rollout needs of an emitted module; see its docstrings for shapes."""
-
-    def momentum(self, q: torch.Tensor, qd: torch.Tensor, prepared: Any = None) -> torch.Tensor: ...
-
-    def velocity(self, q: torch.Tensor, p: torch.Tensor, prepared: Any = None) -> torch.Tensor: ...
-
-    def prepare(self) -> Any: ...
-
-    def rates(
-        self, q: torch.Tensor, p: torch.Tensor, tau: torch.Tensor | None, prepared: Any
-    ) -> tuple[torch.Tensor, torch.Tensor]: ...
-
-
-def roll_out(model: Dynamics, windows: Windows, substeps: int) -> tuple[torch.Tensor, torch.Tensor]:
+def roll_out(
+    model: PortHamiltonianDynamics, windows: Windows, substeps: int = 1, solver: Solver = "rk4"
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Positions and velocities (W, K-1, n) predicted for samples 1..K-1 of each window from its sample 0.
 
-    The state is (q, p), p = M(q) qd, so that no derivative of M in time is needed. Between samples stand
-    `substeps` steps of the classical Runge-Kutta method, each window's as long as its own sample times say:
-    windows make one batch, and the input's jumps fall on the ends of steps. Written out here and not left to
-    torchdiffeq, which cannot know that the weights stay the same over the whole window: `prepare` readies
-    them once.
+    The state is (q, p), p = M(q) qd, so that no derivative of M in time is needed. Windows make one batch, each with
+    its own sample times, and every interval between samples is solved by itself: the input jumps at its ends.
+    solver: "rk4" takes `substeps` steps of the classical Runge-Kutta method in each. Written out here and not left
+    to torchdiffeq, which cannot know that the weights stay the same over the whole window: `prepare` readies them
+    once. "dopri5": see `adaptive.roll_out_adaptive`.
     """
+    if solver == "dopri5":
+        return roll_out_adaptive(model, windows)
     prepared = model.prepare()
     q = windows.q[:, 0]
     p = model.momentum(q, windows.qd[:, 0], prepared)
@@ -58,14 +51,19 @@ def roll_out(model: Dynamics, windows: Windows, substeps: int) -> tuple[torch.Te
 
 
 def _runge_kutta(
-    model: Dynamics, q: torch.Tensor, p: torch.Tensor, tau: torch.Tensor, prepared: Any, step: torch.Tensor
+    model: PortHamiltonianDynamics,
+    q: torch.Tensor,
+    p: torch.Tensor,
+    tau: torch.Tensor,
+    prepared: Any,
+    step: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """q and p (W, n) one `step` (W, 1) [s] later, and q' at its start (Hairer et al., Solving ODEs I, II.1)."""
-    qd1, pd1 = model.rates(q, p, tau, prepared)
+    qd1, pd1 = model.port_hamiltonian_rhs(q, p, tau, prepared)
     half = step / 2
-    qd2, pd2 = model.rates(q + half * qd1, p + half * pd1, tau, prepared)
-    qd3, pd3 = model.rates(q + half * qd2, p + half * pd2, tau, prepared)
-    qd4, pd4 = model.rates(q + step * qd3, p + step * pd3, tau, prepared)
+    qd2, pd2 = model.port_hamiltonian_rhs(q + half * qd1, p + half * pd1, tau, prepared)
+    qd3, pd3 = model.port_hamiltonian_rhs(q + half * qd2, p + half * pd2, tau, prepared)
+    qd4, pd4 = model.port_hamiltonian_rhs(q + step * qd3, p + step * pd3, tau, prepared)
     sixth = step / 6
     q = q + sixth * (qd1 + 2 * (qd2 + qd3) + qd4)
     p = p + sixth * (pd1 + 2 * (pd2 + pd3) + pd4)
@@ -116,20 +114,24 @@ def loss_scales(windows: Windows, joint_types: Sequence[str]) -> LossScales:
     )
 
 
-def rollout_errors(model: EmittedModel, windows: Windows, scales: LossScales, substeps: int) -> torch.Tensor:
+def rollout_errors(
+    model: EmittedModel, windows: Windows, scales: LossScales, substeps: int, solver: Solver = "rk4"
+) -> torch.Tensor:
     """Scaled errors (W, K-1, 2n) of the rollout: of the positions, then of the velocities."""
-    q, qd = roll_out(model, windows, substeps)
+    q, qd = roll_out(model, windows, substeps, solver)
     position = position_difference(q, windows.q[:, 1:], model.joint_types) / scales.q
     return torch.cat([position, (qd - windows.qd[:, 1:]) / scales.qd], dim=-1)
 
 
-def rollout_loss(model: EmittedModel, windows: Windows, scales: LossScales, substeps: int) -> torch.Tensor:
+def rollout_loss(
+    model: EmittedModel, windows: Windows, scales: LossScales, substeps: int, solver: Solver = "rk4"
+) -> torch.Tensor:
     """SPEL eq. 8: squared geodesic distance plus squared velocity error, here scaled per joint and averaged.
 
     The paper sums over joints and samples in rad and rad/s; scaled, a wrist counts as much as a shoulder and
     the next sample as much as the last, and 1 is the loss of predicting that nothing changes.
     """
-    return rollout_errors(model, windows, scales, substeps).square().mean()
+    return rollout_errors(model, windows, scales, substeps, solver).square().mean()
 
 
 def momentum_loss(model: EmittedModel, windows: Windows, scales: LossScales) -> torch.Tensor:
@@ -144,11 +146,11 @@ def momentum_loss(model: EmittedModel, windows: Windows, scales: LossScales) -> 
     q, qd = windows.q, windows.qd  # (W, K, n)
     prepared = model.prepare()
     p = model.momentum(q, qd, prepared)
-    force = model.rates(q, p, None, prepared)[1]
+    force = model.port_hamiltonian_rhs(q, p, None, prepared)[1]
     dt = windows.dt.unsqueeze(-1)
     inputs = model.input_matrix(q[:, :-1])
-    push = (inputs @ windows.tau.unsqueeze(-1)).squeeze(-1)
-    impulse = (dt * (push + (force[:, :-1] + force[:, 1:]) / 2)).cumsum(dim=1)  # (W, K-1, n)
+    driven = (inputs @ windows.tau.unsqueeze(-1)).squeeze(-1)
+    impulse = (dt * (driven + (force[:, :-1] + force[:, 1:]) / 2)).cumsum(dim=1)  # (W, K-1, n)
     missing = (p[:, 1:] - p[:, :1] - impulse) / dt.cumsum(dim=1)
     unit = (inputs.detach().abs() @ scales.tau).mean(dim=(0, 1))  # gears may stand between motor and joint
     return (missing / torch.maximum(unit, 1e-2 * unit.amax())).square().mean()
@@ -175,6 +177,6 @@ def choose_substeps(model: EmittedModel, windows: Windows, scales: LossScales, s
     error.
     """
     for substeps in SUBSTEPS:
-        if substeps >= start and integration_error(model, windows, scales, substeps) < INTEGRATION_SHARE:
+        if substeps >= start and integration_error(model, windows, scales, substeps) < INTEGRATION_FRACTION:
             return substeps
     return max(start, SUBSTEPS[-1])

@@ -5,37 +5,41 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 
-from spelgen.fitting.optimizers import minimise
+from spelgen.fitting.config import LBFGS_DECAY
+from spelgen.fitting.optimizers import minimise_sum
+from spelgen.fitting.torque_samples import Block, TorqueSamples
 from spelgen.identification.samples import DynamicsSamples
 
 if TYPE_CHECKING:
-    from spelgen.fitting.run_folder import EmittedModel
+    from spelgen.emission.loading import EmittedModel
 
-MOST = 2000  # evaluations
+BLOCK = 2**16  # samples in memory with all that their gradient needs
 
 
 def fit_networks(
     model: EmittedModel,
-    samples: Sequence[DynamicsSamples],
-    decay: float,
-    pull: Callable[[], torch.Tensor | float] = lambda: 0.0,
+    samples: TorqueSamples | Sequence[DynamicsSamples],
+    weight_decay: float = LBFGS_DECAY,
+    penalty: Callable[[], torch.Tensor | float] = lambda: 0.0,
+    evaluations: int = 2000,
 ) -> int:
     """Set the weights of ``model`` to what meets the samples' torques best; return the evaluations it took.
 
-    The error of each joint is told in standard deviations of its torque. decay: see ``WholeSet``; pull: what else
-    is to be small, the distance from a URDF for one.
+    The error of each joint is told in standard deviations of its torque. weight_decay: see ``LBFGS``; penalty: what
+    else is to be small, the distance from a URDF for one.
     """
-    q, qd, qdd, tau = (
-        torch.from_numpy(np.concatenate([getattr(x, name) for x in samples]))
-        for name in ("q", "qd", "qdd", "tau")
-    )  # each (T, n)
-    scale = tau.std(dim=0)
+    if not isinstance(samples, TorqueSamples):
+        samples = TorqueSamples.held(samples)
+    count, joints = samples.count, samples.joints
+    scale = samples.torque_deviation(torch.eye(joints).double(), BLOCK)
     scale = torch.maximum(scale, 1e-2 * scale.amax())
 
-    def missed() -> torch.Tensor:
-        return ((model.inverse_dynamics(q, qd, qdd) - tau) / scale).square().mean() + pull()
+    def missed(block: tuple[int, Block]) -> torch.Tensor:
+        number, (q, qd, qdd, tau) = block
+        error = ((model.inverse_dynamics(q, qd, qdd) - tau) / scale).square()
+        part = error.mean() if count <= BLOCK else error.sum() / (count * joints)
+        return part if number else part + penalty()
 
-    return minimise(model, missed, MOST, decay)
+    return minimise_sum(model, missed, lambda: enumerate(samples.blocks(BLOCK)), evaluations, weight_decay)

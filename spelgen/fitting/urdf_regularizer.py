@@ -1,4 +1,4 @@
-"""What the URDF believes of M and gravity, as a pull on training where the logs say little.
+"""A regularizer towards the URDF's own M and gravity, for where the logs say little.
 
 How M varies with q is compared, not its mean: rotors and loads that the URDF leaves out add constants.
 """
@@ -16,7 +16,7 @@ from spelgen.dynamics.pinocchio_urdf import urdf_dynamics
 from spelgen.logs.windows import Windows
 
 if TYPE_CHECKING:
-    from spelgen.fitting.run_folder import EmittedModel
+    from spelgen.emission.loading import EmittedModel
 
 POINTS = 200
 WIDENED = 0.5  # of the logs' range, to both sides: a model is used a little beyond its logs
@@ -24,7 +24,7 @@ LEAST_SCALE = 0.05  # of the largest gravity torque, for joints that gravity har
 
 
 @dataclass(frozen=True, eq=False)
-class Prior:
+class UrdfRegularizer:
     """The URDF's variation of M, relative to the model's mean M at the start, and its gravity torque, at
     points q (S, n).
     """
@@ -41,9 +41,16 @@ class Prior:
         load = (model.gravity(self.q) - self.gravity) / self.gravity_scale
         return variation.square().sum(dim=(-2, -1)).mean() / load.shape[-1] + load.square().mean()
 
+    def to(self, device: str | torch.device) -> UrdfRegularizer:
+        """The same on another device."""
+        parts = (self.q, self.whitening, self.variation, self.gravity, self.gravity_scale)
+        return UrdfRegularizer(*(x.to(device) for x in parts))
 
-def urdf_prior(urdf: Path, joints: Sequence[str], model: EmittedModel, windows: Windows) -> Prior:
-    """The prior of a URDF around the positions of ``windows``. Raises what Pinocchio raises, and ImportError
+
+def urdf_regularizer(
+    urdf: Path, joints: Sequence[str], model: EmittedModel, windows: Windows
+) -> UrdfRegularizer:
+    """The regularizer of a URDF around the positions of ``windows``. Raises what Pinocchio raises, and ImportError
     without it.
     """
     dynamics = urdf_dynamics(urdf, joints)
@@ -58,7 +65,7 @@ def urdf_prior(urdf: Path, joints: Sequence[str], model: EmittedModel, windows: 
     scale = gravity.square().mean(dim=0).sqrt()
     largest = scale.max().item()
     scale = scale.clamp(min=LEAST_SCALE * largest) if largest > 0 else torch.ones_like(scale)
-    return Prior(q, whitening, _variation(dynamics.mass_matrix(q), whitening), gravity, scale)
+    return UrdfRegularizer(q, whitening, _variation(dynamics.mass_matrix(q), whitening), gravity, scale)
 
 
 def _variation(mass: torch.Tensor, whitening: torch.Tensor) -> torch.Tensor:

@@ -2,41 +2,62 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import Field, ValidationInfo, field_validator
 
+from spelgen.fitting.config import OWNERS, GaussianPrior, Objective, Optimizer, Solver, Window
 from spelgen.settings.values import Count, Group, NonNegative, Number, Positive, Whole
 
 
 class TrainingSettings(Group):
-    """Defaults of `spelgen train`; command-line flags override them.
+    """Defaults of `spelgen train`; command-line flags override them. None: not said here.
 
-    objective: what is fitted: the torque (the default of closed-form models) or predicted windows.
-    window: samples predicted together. stride: samples from the start of one window to the next.
-    every: samples from one sample of a window to the next; None: as many as filtered logs can spare.
-    batch: windows per step. epochs: passes over all windows, at most.
-    patience: epochs without a better validation loss before stopping.
-    momentum_steps: steps on the weak form (see `momentum_loss`) before windows are predicted.
-    prior: weight of staying near the URDF's own M and gravity (see `Prior`); 0: none.
-    optimiser: AdamW on batches or L-BFGS on all windows at once; None: L-BFGS where these are few.
-    weight_decay: of AdamW, or the weight of L-BFGS's penalty; None: what suits the optimiser.
-    substeps: integrator steps per sample interval; None: as many as the robot needs.
+    objective: what is fitted; an option that belongs to others only is an error beside it. The options are those of
+    `TorqueFit`, `MomentumFit` and `Rollout`; those of `Preprocessing` stand beside them.
     validation_fraction: part of the training trajectories held out to watch the validation loss.
     """
 
-    objective: Literal["torque", "momentum", "rollout"] | None = None
-    momentum_steps: Whole = 2000
-    prior: NonNegative = 1.0
-    window: Annotated[Count, Field(ge=2)] = 5
-    stride: Count = 1
-    every: Count | None = None
-    epochs: Count = 400
-    batch: Count = 256
-    learning_rate: Positive = 1e-3
+    objective: Objective | None = None
+    prior: GaussianPrior | None = None
+    evaluations: Count | None = None
+    torque_first: bool | None = None
+    momentum_steps: Whole | None = None
+    urdf_weight: NonNegative | None = None
+    window: Window | None = None
+    stride: Count | None = None
+    epochs: Count | None = None
+    patience: Count | None = None
+    optimizer: Optimizer | None = None
+    batch: Count | None = None
+    learning_rate: Positive | None = None
     weight_decay: NonNegative | None = None
-    optimiser: Literal["adamw", "lbfgs"] | None = None
+    solver: Solver | None = None
     substeps: Count | None = None
+    max_minutes: NonNegative | None = None
+    cutoff: NonNegative | None = None
+    decimation: Count | None = None
+    gap: Annotated[Number, Field(gt=1)] | None = None
     validation_fraction: Annotated[Number, Field(gt=0, lt=1)] = 0.25
-    patience: Count = 60
     seed: Whole = 0
+
+    @field_validator("*")
+    @classmethod
+    def _belongs(cls, value: Any, info: ValidationInfo) -> Any:
+        objective, owners = info.data.get("objective"), OWNERS.get(str(info.field_name))
+        if objective and owners and objective not in owners:
+            raise ValueError(
+                f"nothing beside 'objective: {objective}': this belongs to {' and '.join(owners)}"
+            )
+        return value
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """What is said of the options of any objective."""
+        return {name: getattr(self, name) for name in OWNERS if getattr(self, name, None) is not None}
+
+    @property
+    def preprocessing(self) -> dict[str, Any]:
+        """What is said of the options of `Preprocessing`."""
+        said = {name: getattr(self, name) for name in ("cutoff", "decimation", "gap")}
+        return {name: value for name, value in said.items() if value is not None}

@@ -1,0 +1,311 @@
+"""The command `train`: a module and log files in, a run folder out."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from spelgen.cli import options
+from spelgen.cli.console import INTERRUPTED, note, say
+from spelgen.cli.options import Data, Filter, Force, Mapping, MoreData, RobotOption
+from spelgen.errors import ModuleError, OptionError, RunError
+from spelgen.fitting.config import Objective, Optimizer, Solver
+from spelgen.spec import read_facts
+
+if TYPE_CHECKING:
+    from spelgen.emission.loading import EmittedModel
+    from spelgen.fitting.config import FitConfig
+    from spelgen.fitting.fitted import Fit
+    from spelgen.logs.mapping import LogMapping
+    from spelgen.logs.preprocessing import Preprocessing
+
+
+def train(
+    module: Annotated[
+        Path | None,
+        typer.Argument(metavar="MODULE.py", help="A module written by `spelgen build`.", show_default=False),
+    ] = None,
+    more: MoreData = None,
+    data: Data = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="RUN", help="Run folder; default: runs/<module>.")
+    ] = None,
+    robot: RobotOption = None,
+    mapping: Mapping = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in the run folder.")] = False,
+    force: Force = False,
+    source: Annotated[
+        Path | None,
+        typer.Option(
+            "--from", metavar="RUN", help="Adapt a closed-form run to a load at the tip; no MODULE."
+        ),
+    ] = None,
+    objective: Annotated[
+        Objective | None,
+        typer.Option(
+            "--objective", help="Default: of closed-form models torque, else rollout, after momentum steps."
+        ),
+    ] = None,
+    window: Annotated[
+        int | None, typer.Option("--window", min=2, help="[momentum, rollout] Samples in a window.")
+    ] = None,
+    stride: Annotated[
+        int | None,
+        typer.Option("--stride", min=1, help="[momentum, rollout] Samples from window to window."),
+    ] = None,
+    momentum_steps: Annotated[
+        int | None,
+        typer.Option(
+            "--momentum-steps",
+            min=0,
+            help="[momentum, rollout] On the weak form, before windows are predicted.",
+        ),
+    ] = None,
+    torque_first: Annotated[
+        bool | None,
+        typer.Option(
+            "--torque-first/--no-torque-first", help="[rollout] Fit torques first; of closed-form models."
+        ),
+    ] = None,
+    epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="[rollout] At most so many.")] = None,
+    patience: Annotated[
+        int | None, typer.Option("--patience", min=1, help="[rollout] Epochs without gain before the end.")
+    ] = None,
+    solver: Annotated[
+        Solver | None, typer.Option("--solver", help="[rollout] rk4 of fixed steps, or torchdiffeq's dopri5.")
+    ] = None,
+    substeps: Annotated[
+        int | None, typer.Option("--substeps", min=1, help="[rollout] Steps of rk4 between samples.")
+    ] = None,
+    compile: Annotated[
+        bool | None,
+        typer.Option(
+            "--compile/--no-compile", help="[rollout] The right-hand side by torch; needs a C++ compiler."
+        ),
+    ] = None,
+    optimizer: Annotated[
+        Optimizer | None,
+        typer.Option(
+            "--optimizer",
+            help="[momentum, rollout] On batches, or on all windows at once: default where few.",
+        ),
+    ] = None,
+    batch: Annotated[int | None, typer.Option("--batch", min=1, help="[adamw] Windows in a step.")] = None,
+    learning_rate: Annotated[
+        float | None, typer.Option("--learning-rate", min=0.0, help="[adamw] At its largest.")
+    ] = None,
+    max_minutes: Annotated[
+        float | None, typer.Option("--max-minutes", min=0.0, help="[momentum, rollout] At most so long.")
+    ] = None,
+    evaluations: Annotated[
+        int | None, typer.Option("--evaluations", min=1, help="[torque] Of the loss of networks, at most.")
+    ] = None,
+    weight_decay: Annotated[
+        float | None,
+        typer.Option("--weight-decay", min=0.0, help="Of AdamW; or of the penalty of L-BFGS."),
+    ] = None,
+    urdf_weight: Annotated[
+        float | None,
+        typer.Option("--urdf-weight", min=0.0, help="Of staying near the URDF's own M and gravity; 0: none."),
+    ] = None,
+    validation_fraction: Annotated[
+        float | None,
+        typer.Option("--validation-fraction", min=0.01, max=0.9, help="Part of the trajectories."),
+    ] = None,
+    filter: Filter = None,
+    decimation: Annotated[
+        int | None, typer.Option("--decimation", min=1, help="In windows, take one sample of so many.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option("--seed", min=0, help="Of split, order and batches.")] = None,
+    device: Annotated[str, typer.Option("--device", help="cpu, cuda, ...")] = "cpu",
+    threads: Annotated[int, typer.Option("--threads", min=1, help="Of torch.")] = 1,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Show no progress.")] = False,
+) -> None:
+    """Fit a module to logs.
+
+    What is not given here comes from the settings beside the robot. [torque], [momentum], [rollout]: the objectives
+    that an option belongs to; it is an error beside another one.
+    """
+    flags = {
+        "window": window, "stride": stride, "momentum_steps": momentum_steps, "torque_first": torque_first,
+        "epochs": epochs, "patience": patience, "solver": solver, "substeps": substeps, "compile": compile,
+        "optimizer": optimizer, "batch": batch, "learning_rate": learning_rate, "max_minutes": max_minutes,
+        "evaluations": evaluations, "weight_decay": weight_decay, "urdf_weight": urdf_weight,
+    }  # fmt: skip
+    flags = {name: value for name, value in flags.items() if value is not None}
+    if source is not None:
+        more = [*([module] if module else []), *(more or [])]  # all that stands there is logs
+        module, robot = _of_run(source, robot)
+        if objective not in (None, "torque"):
+            raise NotApplicable(f"--from: belongs to the objective torque, this fits {objective}")
+        objective, flags["payload"] = "torque", True
+    if module is None:
+        raise typer.BadParameter("name a module, or a run with --from", param_hint="'MODULE.py'")
+    paths = options.logs(data, more)
+    folder = output or Path("runs") / module.stem
+    urdf = None if resume else robot or _unchanged_urdf(module)
+    chosen = _Chosen(
+        objective, flags, {"cutoff": filter, "decimation": decimation}, validation_fraction, seed
+    )
+    start = _resumed(folder, chosen) if resume else _begun(module, urdf, chosen)
+    given = options.mapping(mapping, urdf, read_facts(start.module).joints)
+    found = _fit(start, paths, folder, given, urdf=urdf, source=None if resume else source, resume=resume,
+                 force=force, device=device, threads=threads, progress=not quiet)  # fmt: skip
+    say(f"{found.status} after {found.epochs} epochs, {found.steps} steps, {found.seconds:.0f} s")
+    say(f"best validation loss {found.best_validation:.3g}, at epoch {found.best_epoch}")
+    say(f"run folder: {folder}")
+    if found.status == "interrupted":
+        note("the best model so far is in the run folder; --resume goes on")
+        raise typer.Exit(INTERRUPTED)
+
+
+class NotApplicable(typer.BadParameter):
+    """An option that belongs to something else than what is fitted."""
+
+    def format_message(self) -> str:
+        """The message as it is."""
+        return self.message
+
+
+@dataclass(frozen=True)
+class _Chosen:
+    """What the command line says."""
+
+    objective: str | None
+    flags: dict[str, Any]
+    preprocessing: dict[str, Any]
+    validation: float | None
+    seed: int | None
+
+
+@dataclass(frozen=True)
+class _Start:
+    """What is fitted, and how: `config` makes it where the logs' sample rates are known."""
+
+    module: Path
+    config: Callable[[EmittedModel, Sequence[float] | None], FitConfig | None]
+    preprocessing: Preprocessing
+    validation: float
+    seed: int
+    mapping: LogMapping | None
+
+
+def _begun(module: Path, urdf: Path | None, chosen: _Chosen) -> _Start:
+    """A new run: what the command line does not say, the robot's settings do."""
+    from spelgen.fitting.config import fit_config
+    from spelgen.fitting.stages import default_config, is_closed_form
+    from spelgen.logs.preprocessing import Preprocessing
+    from spelgen.settings.settings import load_settings
+    from spelgen.settings.training import TrainingSettings
+
+    settings = TrainingSettings() if urdf is None else load_settings(urdf).training
+    said = {name: value for name, value in chosen.preprocessing.items() if value is not None}
+    objective = chosen.objective or settings.objective
+
+    def config(model: EmittedModel, rates: Sequence[float] | None) -> FitConfig | None:
+        if objective is not None:
+            return fit_config(
+                objective, closed_form=is_closed_form(model), options=chosen.flags, defaults=settings.options
+            )
+        if rates is None and is_closed_form(model):
+            return None  # the logs decide
+        return default_config(model, rates or [], chosen.flags, settings.options)
+
+    return _Start(
+        module,
+        config,
+        Preprocessing(**(settings.preprocessing | said)),
+        settings.validation_fraction if chosen.validation is None else chosen.validation,
+        settings.seed if chosen.seed is None else chosen.seed,
+        None,
+    )
+
+
+def _resumed(folder: Path, chosen: _Chosen) -> _Start:
+    """A run that goes on: what the command line does not say, the run does."""
+    from spelgen.fitting.config import fit_config
+    from spelgen.fitting.run_folder import RunFolder
+    from spelgen.fitting.run_record import recorded_config
+    from spelgen.fitting.stages import is_closed_form
+    from spelgen.logs.mapping import LogMapping
+    from spelgen.logs.preprocessing import Preprocessing
+
+    run = RunFolder(folder)
+    before = run.read_json(run.config)
+    said = {name: value for name, value in chosen.preprocessing.items() if value is not None}
+
+    def config(model: EmittedModel, rates: Sequence[float] | None) -> FitConfig:
+        if chosen.objective not in (None, before["objective"]):
+            return fit_config(chosen.objective, closed_form=is_closed_form(model), options=chosen.flags)
+        return recorded_config(before, **chosen.flags)
+
+    return _Start(
+        run.module,
+        config,
+        Preprocessing(**(before["preprocessing"] | said)),
+        before["validation_fraction"] if chosen.validation is None else chosen.validation,
+        before["seed"] if chosen.seed is None else chosen.seed,
+        LogMapping(**before["mapping"]),
+    )
+
+
+def _fit(
+    start: _Start,
+    paths: Sequence[Path],
+    folder: Path,
+    mapping: LogMapping | None,
+    *,
+    urdf: Path | None,
+    source: Path | None,
+    resume: bool,
+    **rest: Any,
+) -> Fit:
+    from spelgen.emission.loading import load_module
+    from spelgen.fitting.fit import fit
+    from spelgen.fitting.stages import is_closed_form
+    from spelgen.fitting.train import open_logs, robot_of, sample_rates, start_from
+
+    model = load_module(start.module)
+    if source is not None:
+        if not is_closed_form(model):
+            raise RunError("a load for a model of networks", expected="a module of the preset closed-form")
+        start_from(model, source)
+    mapping = mapping or start.mapping
+    try:
+        config = start.config(model, None)  # before the logs, which may take long to read
+        logs = open_logs(model, paths, mapping, start.preprocessing)
+        config = config or start.config(model, sample_rates(logs))
+    except OptionError as error:
+        flag = "from" if error.option == "payload" else error.option.replace("_", "-")
+        raise NotApplicable(f"--{flag}: {error.got}") from error
+    robot, notes = (None, []) if resume else robot_of(start.module, urdf, model.facts)
+    return fit(
+        model, logs, config, preprocessing=start.preprocessing, validation=start.validation, seed=start.seed,
+        arm=robot, folder=folder, resume=resume, mapping=mapping, notes=notes, **rest,
+    )  # fmt: skip
+
+
+def _of_run(source: Path, robot: Path | None) -> tuple[Path, Path | None]:
+    """The module and the URDF of a run."""
+    from spelgen.fitting.run_folder import RunFolder
+
+    run = RunFolder(source)
+    run.read_json(run.config)  # where there is no run, this says so
+    return run.module, robot or (run.urdf if run.urdf.exists() else None)
+
+
+def _unchanged_urdf(module: Path) -> Path | None:
+    """The URDF of the module's name near it, when it is still the one the module was built from."""
+    from spelgen.pipeline import find_urdf
+
+    facts = read_facts(module)
+    try:
+        path = find_urdf(module, facts.urdf)
+    except ModuleError:
+        return None
+    return path if hashlib.sha256(path.read_bytes()).hexdigest() == facts.urdf_sha256 else None

@@ -1,0 +1,57 @@
+"""Predict windows with torchdiffeq's adaptive dopri5, where a fixed step is not trusted or horizons are long."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torchdiffeq import odeint, odeint_adjoint
+
+from spelgen.logs.windows import Windows
+
+RELATIVE, ABSOLUTE = 1e-7, 1e-9  # tolerances of a step
+LONG = 20  # samples from which gradients come from the adjoint equation: memory does not grow with the steps
+
+
+def roll_out_adaptive(model: Any, windows: Windows) -> tuple[torch.Tensor, torch.Tensor]:
+    """As `roll_out` gives them: positions and velocities (W, K-1, n).
+
+    Intervals between samples are solved one after the other, each over [0, 1] in units of the window's own step.
+    Gradients go through the solver (Dormand and Prince, J. Comput. Appl. Math. 6, 1980), over long horizons by the
+    adjoint equation (Chen et al., Neural Ordinary Differential Equations, NeurIPS 2018).
+    """
+    adjoint = windows.dt.shape[1] >= LONG and isinstance(model, torch.nn.Module) and torch.is_grad_enabled()
+    # the adjoint equation sees weights alone, so what is made of them cannot be prepared once for it
+    prepared = None if adjoint else model.prepare()
+    q = windows.q[:, 0]
+    state = torch.cat([q, model.momentum(q, windows.qd[:, 0])], dim=-1)  # (W, 2n)
+    unit = torch.tensor([0.0, 1.0], dtype=q.dtype, device=q.device)
+    states = []
+    for dt, tau in zip(windows.dt.unbind(1), windows.tau.unbind(1), strict=True):
+        interval = _Interval(model, dt.unsqueeze(-1), tau, prepared)
+        if adjoint:
+            weights = tuple(x for x in model.parameters() if x.requires_grad)
+            solved = odeint_adjoint(
+                interval, state, unit, rtol=RELATIVE, atol=ABSOLUTE, method="dopri5", adjoint_params=weights
+            )
+        else:
+            solved = odeint(interval, state, unit, rtol=RELATIVE, atol=ABSOLUTE, method="dopri5")
+        state = solved[-1]
+        states.append(state)
+    positions, momenta = torch.stack(states, dim=1).chunk(2, dim=-1)
+    return positions, model.velocity(positions, momenta)
+
+
+class _Interval(torch.nn.Module):
+    """The equations of motion under a held input (W, n), in time relative to the step (W, 1)."""
+
+    def __init__(self, model: Any, step: torch.Tensor, tau: torch.Tensor, prepared: Any) -> None:
+        super().__init__()
+        # functions, not parts of this module: the weights are the model's own
+        self.rhs, self.prepare, self.prepared = model.port_hamiltonian_rhs, model.prepare, prepared
+        self.step, self.tau = step, tau
+
+    def forward(self, t: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
+        q, p = state.chunk(2, dim=-1)
+        prepared = self.prepare() if self.prepared is None else self.prepared
+        return self.step * torch.cat(self.rhs(q, p, self.tau, prepared), dim=-1)

@@ -1,0 +1,232 @@
+"""What a model is fitted to, and how: one class for each objective, with the options that apply to it and no others.
+
+`OWNERS` says of every option which objectives it belongs to; an option of another one is an `OptionError`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+from pydantic import Field, model_validator
+
+from spelgen.errors import OptionError, SettingsError, suggestion
+from spelgen.settings.values import Count, Group, NonNegative, Positive, Whole
+
+Objective = Literal["torque", "momentum", "rollout"]
+Optimizer = Literal["adamw", "lbfgs"]
+Solver = Literal["rk4", "dopri5"]
+Window = Annotated[Count, Field(ge=2)]
+
+FEW_WINDOWS = 1024  # of which L-BFGS takes all at once
+LBFGS_DECAY, ADAMW_DECAY = 2e-5, 0.2
+BATCH, LEARNING_RATE = 256, 1e-3
+UNLESS = {  # options that belong to one value of another option
+    "batch": ("optimizer", "adamw", "lbfgs"),
+    "learning_rate": ("optimizer", "adamw", "lbfgs"),
+    "substeps": ("solver", "rk4", "dopri5"),
+}
+
+
+class GaussianPrior(Group):
+    """How far the weights of a closed-form model may be from where they start: standard deviations.
+
+    The weights are logarithms or fractions and so have no unit. bodies: in the affine-invariant metric, 0.1 is about
+    20 % in mass. offset: in usual sizes of friction. armature, sizes and velocities of friction: of each joint by
+    itself; shared_*: of all joints together, of one effect (`shared_sizes`) or of all friction (`shared_friction`).
+    """
+
+    bodies: Positive = 0.5
+    offset: Positive = 0.1
+    gains: Positive = 0.3
+    armature: Positive = 0.4
+    sizes: Positive = 1.0
+    velocities: Positive = 0.7
+    shared_armature: NonNegative = 3.0
+    shared_sizes: NonNegative = 1.0
+    shared_velocities: NonNegative = 1.0
+    shared_friction: NonNegative = 3.0
+
+
+class FitConfig(Group):
+    """What the objectives have in common: to know which options are theirs."""
+
+    objective: ClassVar[Objective]
+    of_closed_form: ClassVar[tuple[str, ...]] = ()
+    of_networks: ClassVar[tuple[str, ...]] = ()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _only_own(cls, options: Any) -> Any:
+        for name in options if isinstance(options, Mapping) else ():
+            if name not in cls.model_fields:
+                raise _not_of(name, cls)
+        return options
+
+    @model_validator(mode="after")
+    def _agree(self) -> Self:
+        for name, (other, needed, against) in UNLESS.items():
+            if getattr(self, name, None) is not None and getattr(self, other, None) == against:
+                raise OptionError(name, f"belongs to the {other} {needed}, this is {against}")
+        return self
+
+    def require(self, *, closed_form: bool) -> None:
+        """Raise OptionError for an option that was given and does not apply to this kind of model."""
+        if closed_form and self.objective == "momentum":
+            raise OptionError(
+                "objective", "momentum belongs to models of networks, this is a closed-form one"
+            )
+        kind = "models of networks" if closed_form else "closed-form models"
+        for name in self.of_networks if closed_form else self.of_closed_form:
+            if name in self.model_fields_set:
+                raise OptionError(name, f"with the objective {self.objective} belongs to {kind}")
+
+    def record(self, *, closed_form: bool) -> dict[str, Any]:
+        """The options that apply, for config.json."""
+        unused = self.of_networks if closed_form else self.of_closed_form
+        return self.model_dump(mode="json", exclude_none=True, exclude=set(unused))
+
+    def resolved(self, windows: int) -> Self:
+        """The same with all that depends on the number of windows decided."""
+        return self
+
+
+class TorqueFit(FitConfig):
+    """Fit the torque of the model's inverse dynamics to the measured one, on samples at 100 Hz that move.
+
+    A closed-form model by Gauss-Newton steps to its most probable weights after `prior`; with `payload` its last
+    body alone moves: a load at the tip of an arm that was fitted without one. A model of networks by L-BFGS, with
+    at most `evaluations` of the loss, to which are added `weight_decay` times half the sum of squares of all
+    weights, and `urdf_weight` times the distance from the URDF (see `UrdfRegularizer`).
+    """
+
+    objective: ClassVar[Objective] = "torque"
+    of_closed_form: ClassVar[tuple[str, ...]] = ("prior", "payload")
+    of_networks: ClassVar[tuple[str, ...]] = ("evaluations", "weight_decay", "urdf_weight")
+    # windows are not fitted, only judged by
+    window: ClassVar[int] = 5
+    stride: ClassVar[int] = 1
+    momentum_steps: ClassVar[int] = 0
+    epochs: ClassVar[int] = 0
+    patience: ClassVar[int] = 1
+    substeps: ClassVar[int | None] = None
+    solver: ClassVar[Solver] = "rk4"
+    max_minutes: ClassVar[float | None] = None
+    compile: ClassVar[bool] = False
+
+    prior: GaussianPrior | None = None
+    payload: bool = False
+    evaluations: Count = 2000
+    weight_decay: NonNegative = LBFGS_DECAY
+    urdf_weight: NonNegative = 1.0
+
+
+class OnWindows(FitConfig):
+    """Options of the objectives that step down a loss of windows.
+
+    window: samples predicted together. stride: samples from the start of one window to the next.
+    optimizer: AdamW on batches or L-BFGS on all windows at once; None: L-BFGS where these are few.
+    batch: windows in a step of AdamW. learning_rate: of AdamW, at its largest. weight_decay: of AdamW, or the weight
+    of L-BFGS's penalty; None: what suits the optimizer.
+    momentum_steps: on the weak form of the equations (see `momentum_loss`).
+    urdf_weight: of staying near the URDF's own M and gravity (see `UrdfRegularizer`); 0: none.
+    max_minutes: the learning rate is annealed within this time too.
+    """
+
+    window: Window = 5
+    stride: Count = 1
+    momentum_steps: Whole = 2000
+    optimizer: Optimizer | None = None
+    batch: Count | None = None
+    learning_rate: Positive | None = None
+    weight_decay: NonNegative | None = None
+    urdf_weight: NonNegative = 1.0
+    max_minutes: NonNegative | None = None
+
+    def resolved(self, windows: int) -> Self:
+        """With optimizer, batch, learning rate and weight decay decided for so many windows."""
+        optimizer = self.optimizer or ("lbfgs" if windows <= FEW_WINDOWS else "adamw")
+        update: dict[str, Any] = {"optimizer": optimizer}
+        if optimizer == "adamw":
+            update |= {"batch": self.batch or BATCH, "learning_rate": self.learning_rate or LEARNING_RATE}
+        else:
+            update |= {"batch": None, "learning_rate": None}
+        decay = LBFGS_DECAY if optimizer == "lbfgs" else ADAMW_DECAY
+        update["weight_decay"] = decay if self.weight_decay is None else self.weight_decay
+        return self.model_copy(update=update)
+
+
+class MomentumFit(OnWindows):
+    """Fit the weak form of the equations alone: change of momentum against impulse along measured windows.
+
+    Neither accelerations nor an ODE solver are needed. Kept only if it predicts the validation windows better than
+    the model did before.
+    """
+
+    objective: ClassVar[Objective] = "momentum"
+    epochs: ClassVar[int] = 0
+    patience: ClassVar[int] = 1
+    substeps: ClassVar[int | None] = None
+    solver: ClassVar[Solver] = "rk4"
+    compile: ClassVar[bool] = False
+
+
+class Rollout(OnWindows):
+    """Fit predicted windows, in up to three stages: torque, momentum, windows (SPEL, Algorithm 1, no PD penalty).
+
+    First, with `torque_first`, a closed-form model is fitted to torques as `TorqueFit` does. Then come
+    `momentum_steps` as of `MomentumFit`, kept where they help. Then windows are predicted by `solver`: rk4 with
+    `substeps` per sample interval (None: as many as the robot needs) or dopri5 of torchdiffeq.
+    epochs: passes over all windows, at most. patience: epochs without a better validation loss before the end.
+    compile: the right-hand side, by torch; needs a C++ compiler.
+    """
+
+    objective: ClassVar[Objective] = "rollout"
+    of_closed_form: ClassVar[tuple[str, ...]] = ("torque_first",)
+
+    torque_first: bool = True
+    epochs: Count = 400
+    patience: Count = 60
+    solver: Solver = "rk4"
+    substeps: Count | None = None
+    compile: bool = False
+
+
+WindowConfig = TorqueFit | MomentumFit | Rollout
+CONFIGS: dict[str, type[FitConfig]] = {x.objective: x for x in (TorqueFit, MomentumFit, Rollout)}
+OWNERS: dict[str, list[str]] = {
+    name: [objective for objective, config in CONFIGS.items() if name in config.model_fields]
+    for name in dict.fromkeys(name for config in CONFIGS.values() for name in config.model_fields)
+}
+
+
+def fit_config(
+    objective: str,
+    *,
+    closed_form: bool,
+    options: Mapping[str, Any] | None = None,
+    defaults: Mapping[str, Any] | None = None,
+) -> FitConfig:
+    """The configuration of an objective; raises OptionError for an option that does not apply to what is fitted.
+
+    Of ``defaults``, a robot's settings for whatever is fitted, those that do not apply are left out.
+    """
+    kind, options = CONFIGS[objective], dict(options or {})
+    unused = kind.of_networks if closed_form else kind.of_closed_form
+    usual = {k: x for k, x in (defaults or {}).items() if k in kind.model_fields and k not in unused}
+    for name, (other, _, against) in UNLESS.items():
+        if options.get(other, usual.get(other)) == against:
+            usual.pop(name, None)
+        elif name in options and other not in options and usual.get(other) == against:
+            usual.pop(other)
+    found = kind(**(usual | options))
+    found.require(closed_form=closed_form)
+    return found
+
+
+def _not_of(name: str, config: type[FitConfig]) -> SettingsError:
+    owners = OWNERS.get(name)
+    if owners is None:
+        return SettingsError(f"unknown option {name!r}", do=suggestion(name, config.model_fields))
+    several = f"objective{'s' if len(owners) > 1 else ''} {' and '.join(owners)}"
+    return OptionError(name, f"belongs to the {several}, this fits {config.objective}")

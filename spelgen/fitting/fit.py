@@ -1,0 +1,233 @@
+"""Fit a model to logs, in memory; the command `spelgen train` is this with files."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import torch
+
+from spelgen.errors import Diagnostic, RunError
+from spelgen.files import write_json
+from spelgen.fitting.compiled import compiled
+from spelgen.fitting.config import FitConfig, Rollout, WindowConfig
+from spelgen.fitting.dataset import TrainingData, prepare_data
+from spelgen.fitting.fitted import Fit, load_run
+from spelgen.fitting.loop import TrainingLoop
+from spelgen.fitting.progress import TrainingProgress
+from spelgen.fitting.run_folder import RunFolder
+from spelgen.fitting.run_record import describe, require_same
+from spelgen.fitting.stages import default_config, fit_torque_stage, is_closed_form
+from spelgen.fitting.streaming import LargeLogs, prepare_streamed
+from spelgen.fitting.urdf_regularizer import UrdfRegularizer, urdf_regularizer
+from spelgen.logs.mapping import LogMapping
+from spelgen.logs.preprocessing import Preprocessing
+from spelgen.logs.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from spelgen.emission.loading import EmittedModel
+
+__all__ = ["Fit", "fit", "load_run"]
+
+Logs = Sequence[Trajectory] | LargeLogs
+AUTOMATIC = Preprocessing()
+
+
+def fit(
+    model: EmittedModel,
+    logs: Trajectory | Logs,
+    config: FitConfig | None = None,
+    *,
+    preprocessing: Preprocessing = AUTOMATIC,
+    validation: float | Sequence[Trajectory] = 0.25,
+    seed: int = 0,
+    arm: Any = None,
+    device: str = "cpu",
+    threads: int = 1,
+    folder: Path | str | None = None,
+    resume: bool = False,
+    force: bool = False,
+    mapping: LogMapping | None = None,
+    progress: bool = False,
+    notes: Sequence[Diagnostic] = (),
+) -> Fit:
+    """Fit ``model`` to ``logs``; it then has the best weights that were found.
+
+    config: a `TorqueFit`, `MomentumFit` or `Rollout`; by default torque for a closed-form model, where logs are
+    dense enough for accelerations, and rollout for networks. validation: the fraction of the logs that is set aside,
+    whole trajectories drawn by ``seed``, or trajectories. arm: the arm or the URDF that the model was made from,
+    for the regularizer towards it and for the run folder.
+    folder: where checkpoints go after every epoch (see `RunFolder`); without one, `Fit.save` writes all that.
+    resume: go on from the folder's checkpoint, exactly as if there had been no interruption. force: replace a run.
+    mapping: how the logs were read, kept with the run. notes: what was found before, to be told with the rest.
+    Ctrl-C or SIGTERM end the fit with status "interrupted".
+    Raises OptionError for an option that does not apply to this model, LogError, and RunError when the folder holds a
+    run or cannot be resumed with this.
+    """
+    logs = [logs] if isinstance(logs, Trajectory) else logs
+    closed_form = is_closed_form(model)
+    if config is None:
+        config = default_config(model, _rates(logs))
+    config.require(closed_form=closed_form)
+    run = None if folder is None else RunFolder(Path(folder))
+    if run is not None and not resume:
+        run.require_free(force=force)
+    with _threads(threads):
+        _require_device(device)
+        data = _prepared(model, logs, cast("WindowConfig", config), preprocessing, validation, seed)
+        chosen = cast("WindowConfig", config.resolved(data.size))
+        found = [*data.diagnostics, *notes]
+        stepped = _compiled(model, data, chosen, device, found)
+        record = describe(model, chosen, data, seed=seed, validation=validation, mapping=mapping) | {
+            "device": device,
+            "threads": threads,
+        }
+        urdf = run.urdf if resume and run is not None else _urdf(arm)
+        if resume and run is not None:
+            require_same(run, record)
+        regularizer = _regularizer(urdf, model, chosen, data, found)
+        if not resume:
+            found += fit_torque_stage(model, data, chosen, regularizer)
+            if run is not None:
+                run.start(model.source, urdf, force=force)
+                write_json(run.config, record)
+        loop = TrainingLoop(
+            model,
+            data,
+            chosen,
+            seed=seed,
+            device=device,
+            regularizer=regularizer,
+            stepped=stepped,
+            folder=run,
+        )
+        if resume and run is not None:
+            loop.restore(run)
+        with TrainingProgress(chosen.epochs, show=progress) as shown, _termination_as_interrupt():
+            for note in found:
+                shown.note(note)
+            status = loop.run(shown)
+    model.load_state_dict(loop.best_weights)
+    return Fit(
+        model=model,
+        config=chosen,
+        preprocessing=data.preprocessing,
+        history=loop.history,
+        diagnostics=tuple(found),
+        status=status,
+        record=record,
+        checkpoint=loop.state(),
+        urdf=urdf,
+        folder=None if run is None else run.path,
+    )
+
+
+def _rates(logs: Logs) -> list[float]:
+    return logs.rates if isinstance(logs, LargeLogs) else [x.sample_rate for x in logs]
+
+
+def _prepared(
+    model: EmittedModel,
+    logs: Logs,
+    config: WindowConfig,
+    preprocessing: Preprocessing,
+    validation: float | Sequence[Trajectory],
+    seed: int,
+) -> TrainingData:
+    if not isinstance(logs, LargeLogs):
+        joints, kinds = _joints(model), model.joint_types
+        return prepare_data(logs, joints, kinds, config, preprocessing, validation, seed)
+    if not isinstance(validation, float):
+        raise RunError(
+            "trajectories to validate logs larger than memory on", expected="a fraction of these logs"
+        )
+    return prepare_streamed(logs, config, preprocessing, validation, seed)
+
+
+def _urdf(arm: Any) -> Path | None:
+    """The file of an arm that was loaded, or of a path; None: neither."""
+    if arm is None or isinstance(arm, str | Path):
+        return None if arm is None else Path(arm)
+    return Path(arm.robot.path)
+
+
+def _regularizer(
+    urdf: Path | None,
+    model: EmittedModel,
+    config: WindowConfig,
+    data: TrainingData,
+    notes: list[Diagnostic],
+) -> UrdfRegularizer | None:
+    """Where it is wanted and can be had; the torques of a closed-form model have a prior of their own."""
+    wanted = isinstance(config, Rollout) or not is_closed_form(model)
+    if not wanted or not config.urdf_weight or urdf is None or not urdf.exists():
+        return None
+    try:
+        return urdf_regularizer(urdf, _joints(model), model, data.training)
+    except Exception as error:  # Pinocchio and its parser raise many kinds; the fit goes on without
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        message = f"fitted without the URDF's regularizer: {reason}"
+        notes.append(Diagnostic("info", "no-regularizer", urdf.name, None, message))
+        return None
+
+
+def _joints(model: EmittedModel) -> Sequence[str]:
+    return model.facts.joints if hasattr(model, "facts") else model.joint_names
+
+
+def _compiled(
+    model: EmittedModel, data: TrainingData, config: WindowConfig, device: str, notes: list[Diagnostic]
+) -> EmittedModel:
+    """The model as steps on windows use it, compiled where that is asked for."""
+    if not config.compile:
+        return model
+    since = time.monotonic()
+    batch = getattr(config, "batch", None)
+    windows = data.training if batch is None else data.training[:batch]  # as steps take them
+    ready = compiled(model.to(device), windows.to(device), data.scales.to(device))
+    message = f"right-hand side compiled in {time.monotonic() - since:.0f} s"
+    notes.append(Diagnostic("info", "compiled", "training", None, message))
+    return ready
+
+
+def _require_device(device: str) -> None:
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise RunError(
+            f"a device {device!r} that torch cannot use ({reason})", do="use --device cpu"
+        ) from error
+
+
+@contextmanager
+def _threads(count: int) -> Iterator[None]:
+    """The matrices are tiny: more than two threads rarely help, and one makes runs repeatable."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@contextmanager
+def _termination_as_interrupt() -> Iterator[None]:
+    """SIGTERM ends training as Ctrl-C does. Only the main thread may set handlers; others change nothing."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def interrupt(signum: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

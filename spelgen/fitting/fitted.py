@@ -1,0 +1,187 @@
+"""A fitted model with all that a fit found, in memory or from a run folder."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from spelgen.errors import Diagnostic, LogError, RunError
+from spelgen.files import write_json
+from spelgen.fitting.config import FitConfig
+from spelgen.fitting.loop import Status
+from spelgen.fitting.run_folder import RunFolder, trained_model, write_state
+from spelgen.fitting.run_record import recorded_config
+from spelgen.identification.samples import DENSE, dynamics_samples
+from spelgen.listing import Listing
+from spelgen.logs.filtering import low_pass
+from spelgen.logs.preprocessing import Preprocessing
+from spelgen.logs.trajectory import Trajectory, gap_ends
+
+if TYPE_CHECKING:
+    from spelgen.emission.loading import EmittedModel
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Fit:
+    """A fitted model and how it was found.
+
+    config, preprocessing: as they were resolved. history: a record for each epoch. status: how the fit ended; None:
+    not known, of a run that was loaded. record: what config.json holds. checkpoint: what checkpoint.pt holds.
+    urdf: of the robot, where it is known. folder: of the run, where there is one.
+    """
+
+    model: EmittedModel
+    config: FitConfig
+    preprocessing: Preprocessing
+    history: Sequence[dict[str, Any]]
+    diagnostics: tuple[Diagnostic, ...]
+    status: Status | None
+    record: dict[str, Any]
+    checkpoint: dict[str, Any]
+    urdf: Path | None = None
+    folder: Path | None = None
+
+    @property
+    def epochs(self) -> int:
+        """Epochs that were run."""
+        return int(self.checkpoint["epoch"])
+
+    @property
+    def steps(self) -> int:
+        """Steps on windows that were taken."""
+        return int(self.checkpoint["step"])
+
+    @property
+    def best_epoch(self) -> int:
+        """After which the model was best; 0: before the first."""
+        return int(self.checkpoint["best_epoch"])
+
+    @property
+    def best_validation(self) -> float:
+        """`rollout_loss` of the validation windows, without unit."""
+        return float(self.checkpoint["best_loss"])
+
+    @property
+    def seconds(self) -> float:
+        """Time of the steps on windows [s]."""
+        return float(self.checkpoint["seconds"])
+
+    @property
+    def substeps(self) -> int:
+        """Steps of rk4 between samples that the model needs."""
+        return int(self.checkpoint["substeps"])
+
+    @property
+    def parameters(self) -> int:
+        """Numbers that were fitted."""
+        return sum(parameter.numel() for parameter in self.model.parameters())
+
+    def predict(self, trajectory: Trajectory) -> np.ndarray:
+        """Joint torques (T, n) [Nm, N] of the model's inverse dynamics along a trajectory, at its own times.
+
+        Velocity is filtered as in the fit and differentiated. NaN where a piece between gaps is too short for that.
+        """
+        tau = np.full_like(trajectory.q, np.nan)
+        for start, stop in pairwise(gap_ends(trajectory.t, self.preprocessing.gap)):
+            if stop - start < 2:
+                continue
+            piece = self._filtered(trajectory[start:stop])
+            qdd = np.gradient(piece.qd, piece.t, axis=0)
+            tau[start:stop] = self._torque(piece.q, piece.qd, qdd)
+        return tau
+
+    def score(self, logs: Trajectory | Sequence[Trajectory]) -> float:
+        """1 - nMSE of the torque on the samples of ``logs`` that move: 1 is perfect, 0 as good as a constant.
+
+        The mean over trajectories of the mean over joints, by the protocol of `dynamics_samples`. Raises LogError
+        where no log is sampled densely enough for accelerations.
+        """
+        logs = [logs] if isinstance(logs, Trajectory) else logs
+        samples = [x for x in dynamics_samples(logs, preprocessing=self.preprocessing) if len(x.q)]
+        if not samples:
+            raise LogError(
+                "no motion to judge torques on", expected=f"samples at {DENSE:g} Hz or more that move"
+            )
+        scores = []
+        for x in samples:
+            squares = np.square(self._torque(x.q, x.qd, x.qdd) - x.tau).mean(axis=0)
+            variance = x.tau.var(axis=0)
+            varies = variance > 0  # a joint without torque says nothing
+            scores.append(1 - (squares[varies] / variance[varies]).mean())
+        return float(np.mean(scores))
+
+    def evaluate(self, logs: Any, **options: Any) -> Any:
+        """What `spelgen.evaluate` finds of this fit on test logs."""
+        import spelgen
+
+        return spelgen.evaluate(self, logs, **options)
+
+    def export(self, to: str, path: Path | str | None = None, **options: Any) -> Any:
+        """What `spelgen.export` makes of this fit."""
+        import spelgen
+
+        return spelgen.export(self, to=to, path=path, **options)
+
+    def save(self, folder: Path | str, *, force: bool = False) -> Path:
+        """Write the run folder that `spelgen train` writes; return its path. Raises RunError where a run lies, unless
+        forced.
+        """
+        if not hasattr(self.model, "source"):
+            raise RunError("a model without a module", expected="one of spelgen.build or spelgen.load_module")
+        run = RunFolder(Path(folder))
+        run.start(self.model.source, self.urdf, force=force)
+        write_json(run.config, self.record)
+        run.write_metrics(self.history)
+        write_state(run.weights, self.model.state_dict())
+        write_state(run.checkpoint, self.checkpoint)
+        return run.path
+
+    def _filtered(self, piece: Trajectory) -> Trajectory:
+        cutoff = self.preprocessing.cutoff
+        return low_pass(piece, cutoff) if cutoff and len(piece.t) > 3 else piece
+
+    def _torque(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
+        some = next(self.model.parameters())
+        inputs = (torch.as_tensor(np.ascontiguousarray(x)).to(some) for x in (q, qd, qdd))
+        with torch.no_grad():
+            return self.model.inverse_dynamics(*inputs).cpu().double().numpy()
+
+    def __repr__(self) -> str:
+        ended = f"{self.status} after " if self.status else ""
+        told = f"{ended}{self.epochs} epochs, validation loss {self.best_validation:.3g}"
+        return f"<Fit of {self.record['robot']!r} to {self.config.objective}: {told}>"
+
+    def _repr_html_(self) -> str:
+        rows = [
+            ("robot", str(self.record["robot"])),
+            ("objective", self.config.objective),
+            ("parameters", f"{self.parameters}"),
+            ("epochs", f"{self.epochs}"),
+            ("validation loss", f"{self.best_validation:.3g}"),
+            *((name.replace("_", " "), f"{value}") for name, value in self.record["config"].items()),
+        ]
+        return Listing("Fit", ("", ""), tuple(rows), left=(0, 1)).html()
+
+
+def load_run(folder: Path | str) -> Fit:
+    """A run folder of `spelgen train` or `Fit.save`, with its best weights. Raises RunError and ModuleError."""
+    run = RunFolder(Path(folder))
+    record = run.read_json(run.config)
+    return Fit(
+        model=trained_model(run),
+        config=recorded_config(record),
+        preprocessing=Preprocessing(**record["preprocessing"]),
+        history=run.read_metrics(),
+        diagnostics=(),
+        status=None,
+        record=record,
+        checkpoint=run.load_state(run.checkpoint),
+        urdf=run.urdf if run.urdf.exists() else None,
+        folder=run.path,
+    )

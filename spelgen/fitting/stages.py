@@ -1,0 +1,106 @@
+"""The stage before windows: the fit to all logs' torques, after which a closed-form model is mostly done."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from spelgen.errors import Diagnostic, LogError
+from spelgen.fitting.config import FitConfig, GaussianPrior, Rollout, TorqueFit, fit_config
+from spelgen.fitting.dataset import TrainingData
+from spelgen.fitting.torque_fit import EVERY, PAYLOAD, fit_torque, last_body
+from spelgen.fitting.torque_networks import fit_networks
+from spelgen.fitting.torque_samples import TorqueSamples
+from spelgen.fitting.urdf_regularizer import UrdfRegularizer
+from spelgen.identification.samples import DENSE, dynamics_samples
+
+if TYPE_CHECKING:
+    from spelgen.emission.loading import EmittedModel
+
+
+def is_closed_form(model: Any) -> bool:
+    """Whether the model is one of rigid bodies and friction laws, without networks."""
+    return hasattr(model, "inertial_parameters")
+
+
+def default_objective(model: EmittedModel, rates: Sequence[float]) -> str:
+    """What is fitted where nobody says: torque to a closed-form model, where logs are sampled densely enough for
+    accelerations (rates [Hz]); else windows.
+    """
+    return "torque" if is_closed_form(model) and any(rate >= DENSE for rate in rates) else "rollout"
+
+
+def default_config(
+    model: EmittedModel,
+    rates: Sequence[float],
+    options: Mapping[str, Any] | None = None,
+    defaults: Mapping[str, Any] | None = None,
+) -> FitConfig:
+    """The configuration of `default_objective`; options and defaults as for `fit_config`."""
+    objective, closed_form = default_objective(model, rates), is_closed_form(model)
+    if closed_form and objective == "rollout":  # bodies need no regularizer where nobody asks for one
+        defaults = {"urdf_weight": 0.0, **(defaults or {})}
+    return fit_config(objective, closed_form=closed_form, options=options, defaults=defaults)
+
+
+def fit_torque_stage(
+    model: EmittedModel,
+    data: TrainingData,
+    config: FitConfig,
+    regularizer: UrdfRegularizer | None = None,
+) -> list[Diagnostic]:
+    """Fit the model to the torques of all logs, validation included, where its config has that stage; notes.
+
+    Of logs larger than memory the samples lie in a temporary file. Raises LogError where torques are the objective
+    and no log is sampled densely enough for accelerations.
+    """
+    first = isinstance(config, Rollout) and config.torque_first and is_closed_form(model)
+    if not isinstance(config, TorqueFit) and not first:
+        return []
+    samples = _samples(model, data)
+    if samples is None:
+        if isinstance(config, TorqueFit):
+            what = "to fit a load to" if config.payload else "to fit torques to"
+            raise LogError(
+                f"no motion {what}", expected=f"samples at {DENSE:g} Hz or more that move",
+                do="fit windows: the objective rollout",
+            )  # fmt: skip
+        message = f"no torque fit: these logs are sampled below {DENSE:g} Hz"
+        return [Diagnostic("warning", "no-torque-fit", "logs", None, message)]
+    steps = _fit(model, samples, config, regularizer)
+    what = "the last body alone fitted" if isinstance(config, TorqueFit) and config.payload else "fitted"
+    message = (
+        f"{what} to the torques of {samples.seen} samples, those of validation included, in {steps} steps"
+    )
+    return [Diagnostic("info", "torque-fit", "logs", None, message)]
+
+
+def _fit(
+    model: EmittedModel, samples: TorqueSamples, config: FitConfig, regularizer: UrdfRegularizer | None
+) -> int:
+    """Fit the model; the steps it took."""
+    if not isinstance(config, TorqueFit):
+        return fit_torque(model, samples).steps
+    if is_closed_form(model):
+        prior = config.prior or (PAYLOAD if config.payload else GaussianPrior())
+        return fit_torque(model, samples, prior, [last_body(model)] if config.payload else None).steps
+    weight = config.urdf_weight
+    if regularizer is None:
+        return fit_networks(model, samples, config.weight_decay, evaluations=config.evaluations)
+    penalty = lambda: weight * regularizer.loss(model)  # noqa: E731
+    return fit_networks(model, samples, config.weight_decay, penalty, config.evaluations)
+
+
+def _samples(model: EmittedModel, data: TrainingData) -> TorqueSamples | None:
+    """None: there are none."""
+    every = EVERY if is_closed_form(model) else 1
+    if not data.chunks:
+        found = dynamics_samples(data.recordings, preprocessing=data.preprocessing)
+        return TorqueSamples.held(found, every) if any(len(x.q) for x in found) else None
+    each = (
+        samples
+        for chunk in data.chunks
+        for samples in dynamics_samples([chunk.load()], preprocessing=data.preprocessing)
+    )
+    spooled = TorqueSamples.spooled(each, model.n, every)
+    return spooled if spooled.count else None
