@@ -1,0 +1,67 @@
+"""What is done to logs before anything is computed from them: the same in training, identification and evaluation."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+from spelgen.errors import Diagnostic, SettingsError
+from spelgen.logs.filtering import AUTOMATIC_CUTOFF, automatic_cutoff, automatic_decimation, prepare
+from spelgen.logs.trajectory import GAP, Trajectory
+
+
+@dataclass(frozen=True)
+class Preprocessing:
+    """How logs are cut, filtered and thinned. Raises SettingsError for values that cannot be.
+
+    cutoff: of the zero-phase low-pass on q, qd and tau [Hz]; 0: none; None: 8 Hz, and none for windows of logs of
+    which one is sampled at 50 Hz or less (see `automatic_cutoff`).
+    decimation: samples from one sample of a window to the next; None: as many as filtered logs can spare (see
+    `automatic_decimation`).
+    gap: a step longer than so many median steps is a hole in the recording, at which it is cut.
+    """
+
+    cutoff: float | None = None
+    decimation: int | None = None
+    gap: float = GAP
+
+    def __post_init__(self) -> None:
+        if self.cutoff is not None and not 0 <= self.cutoff < float("inf"):
+            raise SettingsError(
+                f"{self.cutoff!r}", element="cutoff", expected="a frequency [Hz], or 0 for none"
+            )
+        if self.decimation is not None and self.decimation < 1:
+            raise SettingsError(f"{self.decimation!r}", element="decimation", expected="1 or more samples")
+        if not self.gap > 1:
+            raise SettingsError(f"{self.gap!r}", element="gap", expected="more than 1 median step")
+
+    def resolved(self, rates: Iterable[float]) -> Preprocessing:
+        """The same with all decided for windows of logs with these sample rates [Hz], as it is kept with a run.
+
+        A cutoff that stays None is that of logs too slow to be filtered unasked.
+        """
+        rates = list(rates)
+        cutoff = automatic_cutoff(rates) if self.cutoff is None else self.cutoff
+        return replace(
+            self, cutoff=cutoff, decimation=self.decimation or automatic_decimation(rates, cutoff or None)
+        )
+
+    @property
+    def acceleration_cutoff(self) -> float | None:
+        """The filter [Hz] before accelerations are taken; None: no filter."""
+        return AUTOMATIC_CUTOFF if self.cutoff is None else self.cutoff or None
+
+    @property
+    def filtered(self) -> bool:
+        """Whether windows are cut from filtered logs; of a ``resolved`` one."""
+        return bool(self.cutoff)
+
+    @property
+    def diagnostics(self) -> list[Diagnostic]:
+        """That the logs are filtered, if they are; of a ``resolved`` one."""
+        message = f"q, qd and tau filtered at {self.cutoff:g} Hz, zero phase" if self.cutoff else ""
+        return [Diagnostic("info", "filter", "logs", None, message)] if message else []
+
+    def pieces(self, trajectories: Sequence[Trajectory], *, shortest: int) -> list[Trajectory]:
+        """Gap-free pieces of at least so many samples, filtered; of a ``resolved`` one. Raises LogError."""
+        return prepare(trajectories, shortest=shortest, cutoff=self.cutoff or None, gap=self.gap)
