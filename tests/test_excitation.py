@@ -8,28 +8,34 @@ from typer.testing import CliRunner
 
 from spelgen.cli.main import app
 from spelgen.errors import SpelgenErrors
-from spelgen.excitation.design import design
-from spelgen.excitation.trajectory import Series, bounds
-from spelgen.pipeline import load
+from spelgen.excitation.criterion import Criterion
+from spelgen.excitation.design import excite
+from spelgen.excitation.trajectory import ExcitationTrajectory, motion_bounds
+from spelgen.loaded_arm import load_arm
 
-CHOICE = {"duration": 10.0, "rate": 100.0, "harmonics": 5, "reach": 0.8, "speed": 0.6}
-
-
-@pytest.fixture(scope="module")
-def arm(robots):
-    return load(robots / "ur10e.urdf").arm
+CHOICE = {"duration": 10.0, "sample_rate": 100.0, "harmonics": 5, "reach": 0.8, "speed": 0.6}
 
 
 @pytest.fixture(scope="module")
-def found(arm):
-    return design(arm, **CHOICE, trials=300)
+def loaded(robots):
+    return load_arm(robots / "ur10e.urdf")
+
+
+@pytest.fixture(scope="module")
+def arm(loaded):
+    return loaded.arm
+
+
+@pytest.fixture(scope="module")
+def found(loaded):
+    return excite(loaded, **CHOICE, trials=40)
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_every_series_keeps_limits_and_is_at_rest_at_both_ends(arm, seed):
-    series = Series(7.0, 6, bounds(arm, 0.9, 0.5))
-    numbers = 3 * np.random.default_rng(seed).standard_normal(series.size)
-    motion = series.motion(numbers, np.linspace(0, 7, 5001))
+def test_every_trajectory_keeps_limits_and_is_at_rest_at_both_ends(arm, seed):
+    trajectory = ExcitationTrajectory(7.0, 6, motion_bounds(arm, 0.9, 0.5))
+    parameters = 3 * np.random.default_rng(seed).standard_normal(trajectory.size)
+    motion = trajectory.motion(parameters, np.linspace(0, 7, 5001))
     for k, coordinate in enumerate(arm.coordinates):
         assert 0.9 * coordinate.lower <= motion.q[:, k].min()
         assert motion.q[:, k].max() <= 0.9 * coordinate.upper
@@ -39,11 +45,11 @@ def test_every_series_keeps_limits_and_is_at_rest_at_both_ends(arm, seed):
 
 
 def test_the_amplitude_is_the_largest_that_fits(arm):
-    limits = bounds(arm, 0.9, 0.5)
-    series = Series(7.0, 6, limits)
-    numbers = np.random.default_rng(0).standard_normal((6, 14))
-    numbers[:, -1] = 0
-    motion = series.motion(numbers.ravel(), np.linspace(0, 7, 5001))
+    limits = motion_bounds(arm, 0.9, 0.5)
+    trajectory = ExcitationTrajectory(7.0, 6, limits)
+    parameters = np.random.default_rng(0).standard_normal((6, 14))
+    parameters[:, -1] = 0
+    motion = trajectory.motion(parameters.ravel(), np.linspace(0, 7, 5001))
     used = np.ptp(motion.q, axis=0) / (limits.high - limits.low)
     np.testing.assert_allclose(np.maximum(used, np.abs(motion.qd).max(axis=0) / limits.speed), 1, atol=4e-3)
 
@@ -57,13 +63,13 @@ def test_velocities_and_accelerations_are_derivatives(found):
     )
 
 
-def test_the_motion_is_worth_the_search(arm, found):
+def test_the_motion_is_worth_the_search(loaded, found):
     assert found.condition < found.first / 3
     assert (
         found.parameters == 36 + 6 * 4 - 2
     )  # rigid bodies, friction and rotors; what these share counts once
     assert (found.efforts < 1).all()
-    assert design(arm, **CHOICE, trials=1).first == found.first
+    assert excite(loaded, **CHOICE, trials=1).first == found.first
 
 
 def test_the_condition_number_is_that_of_the_regressor(arm, found):
@@ -83,18 +89,34 @@ def test_the_condition_number_is_that_of_the_regressor(arm, found):
     assert values[35] / values[0] > 1e-3 > 1e-9 > values[36] / values[0]  # all 36 base parameters show
 
 
-def test_the_same_arguments_give_the_same_motion(arm, found):
-    again = design(arm, **CHOICE, trials=300)
+@pytest.mark.parametrize("robot", ["rpr", "scara"])
+def test_the_gradient_is_that_of_the_criterion(robots, robot):
+    """rpr's start overruns efforts, scara has prismatic and gravity-free joints; central differences tell."""
+    arm = load_arm(robots / f"{robot}.urdf").arm
+    trajectory = ExcitationTrajectory(10.0, 3, motion_bounds(arm, 0.9, 0.7))
+    criterion = Criterion(arm, trajectory)
+    parameters = np.random.default_rng(4).standard_normal(trajectory.size)
+    overran = np.nanmax(np.abs(criterion.efforts(criterion.motion(parameters)))) > 1
+    assert overran == (robot == "rpr")
+    value, gradient = criterion.value_and_gradient(parameters)
+    assert value == pytest.approx(criterion.value(parameters), rel=1e-12)
+    steps = 1e-5 * np.eye(trajectory.size)
+    slopes = [(criterion.value(parameters + e) - criterion.value(parameters - e)) / 2e-5 for e in steps]
+    np.testing.assert_allclose(gradient, slopes, rtol=1e-3, atol=1e-4 * np.abs(gradient).max())
+
+
+def test_the_same_arguments_give_the_same_motion(loaded, found):
+    again = excite(loaded, **CHOICE, trials=40)
     np.testing.assert_array_equal(again.motion.q, found.motion.q)
-    other = design(arm, **CHOICE, trials=300, seed=1)
+    other = excite(loaded, **CHOICE, trials=40, seed=1)
     assert not np.allclose(other.motion.q, found.motion.q)
 
 
 def test_effort_limits_are_kept_where_they_can_be(robots):
-    weak = load(robots / "rpr.urdf").arm
-    choice = CHOICE | {"harmonics": 3}
-    assert (design(weak, **choice, trials=1).efforts > 1).any()
-    assert (design(weak, **choice, trials=1500).efforts < 1).all()
+    found = excite(load_arm(robots / "rpr.urdf"), **CHOICE | {"harmonics": 3}, trials=60)
+    assert (found.first_efforts > 1).any()
+    assert (found.efforts < 1).all()
+    assert "(which overran effort limits)" in found.text()
 
 
 def test_an_arm_without_limits_gets_modest_ones(tmp_path):
@@ -102,7 +124,7 @@ def test_an_arm_without_limits_gets_modest_ones(tmp_path):
       <origin xyz="0.1 0 0"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
       <joint name="turn" type="continuous"><parent link="a"/><child link="b"/><axis xyz="0 1 0"/></joint></robot>"""
     (tmp_path / "one.urdf").write_text(text)
-    one = design(load(tmp_path / "one.urdf").arm, **CHOICE, trials=50)
+    one = excite(load_arm(tmp_path / "one.urdf"), **CHOICE, trials=50)
     assert 0.3 < np.abs(one.motion.qd).max() <= 0.6
     assert np.abs(one.motion.q).max() <= 0.8 * np.pi
     assert np.isnan(one.efforts).all()
@@ -114,11 +136,16 @@ def test_a_joint_without_room_is_refused(robots, tmp_path):
         text.replace("-3.141592653589793", "0").replace("3.141592653589793", "0")
     )
     with pytest.raises(SpelgenErrors) as caught:
-        design(load(tmp_path / "stuck.urdf").arm, **CHOICE, trials=1)
+        excite(load_arm(tmp_path / "stuck.urdf"), **CHOICE, trials=1)
     assert str(caught.value).splitlines()[0] == (
         "joint 'joint1': got the limits 0 .. 0, expected room to move; "
         "correct them, or leave the joint out by --joints"
     )
+
+
+def test_it_is_told_in_a_notebook(found):
+    assert repr(found).startswith("<Excitation of 'ur10e': 10 s, condition number ")
+    assert found._repr_html_().count("<tr>") == 7
 
 
 def test_the_command(robots, tmp_path, monkeypatch):

@@ -1,4 +1,4 @@
-"""Commands about logs alone: `excite`, which motion to log, and `logs`, what was logged."""
+"""Commands about logs: `excite`, which motion to log, and `logs`, what was logged."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ from spelgen.cli.console import FAILED, counted, note, say
 from spelgen.cli.options import AngleTolerance, Force, Joints, Mapping, Robot, Tip
 from spelgen.files import write_text
 
-HARMONICS_PER_SECOND = 0.4  # up to 0.4 Hz: what an arm follows well, far below its drives' ripple
-
 
 def excite(
     robot: Robot,
@@ -23,7 +21,9 @@ def excite(
     tip: Tip = None,
     angle_tolerance: AngleTolerance = 2e-3,
     duration: Annotated[float, typer.Option("--duration", min=2.0, max=600.0, help="In seconds.")] = 30.0,
-    rate: Annotated[float, typer.Option("--rate", min=1.0, max=10000.0, help="Samples a second.")] = 100.0,
+    sample_rate: Annotated[
+        float, typer.Option("--sample-rate", min=1.0, max=10000.0, help="Samples a second.")
+    ] = 100.0,
     harmonics: Annotated[
         int | None, typer.Option("--harmonics", min=2, max=100, help="Default: 0.4 a second, at least 5.")
     ] = None,
@@ -33,7 +33,9 @@ def excite(
     speed: Annotated[
         float, typer.Option("--speed", min=0.05, max=1.0, help="Part of the velocity limits that is used.")
     ] = 0.7,
-    trials: Annotated[int, typer.Option("--trials", min=1, help="Motions looked at.")] = 1000,
+    trials: Annotated[
+        int, typer.Option("--trials", min=1, help="Motions that the search looks at, beside random ones.")
+    ] = 100,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Of the search.")] = 0,
     force: Force = False,
 ) -> None:
@@ -41,26 +43,25 @@ def excite(
 
     Collisions are not checked.
     """
-    from spelgen.excitation.design import design
-    from spelgen.excitation.formatting import csv_text, text
+    from spelgen.excitation.design import excite as excited
     from spelgen.loaded_arm import load_arm
 
     options.require_free(output, force=force)
-    arm = load_arm(robot, options.names(joints), tip, angle_tolerance).arm
+    arm = load_arm(robot, options.names(joints), tip, angle_tolerance)
     with counted("searching") as progress:
-        found = design(
+        found = excited(
             arm,
             duration=duration,
-            rate=rate,
-            harmonics=harmonics or max(5, round(HARMONICS_PER_SECOND * duration)),
+            sample_rate=sample_rate,
+            harmonics=harmonics,
             reach=reach,
             speed=speed,
             trials=trials,
             seed=seed,
             progress=progress,
         )
-    say(text(found, arm))
-    say(f"wrote {write_text(output, csv_text(found.motion, arm))}")
+    say(found.text())
+    say(f"wrote {write_text(output, found.csv())}")
 
 
 def logs(

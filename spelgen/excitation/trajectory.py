@@ -1,4 +1,4 @@
-"""Periodic motions as Fourier series that begin and end at rest and keep an arm's limits by construction.
+"""Excitation trajectories: Fourier series that begin and end at rest and keep an arm's limits by construction.
 
 Swevers et al., Optimal robot excitation and identification, IEEE T-RA 13:730 (1997).
 """
@@ -14,13 +14,13 @@ from spelgen.arm.arm import Arm, Coordinate
 from spelgen.errors import ArmError, collect
 
 DENSITY = 40  # points of a grid for each harmonic
-BETWEEN = cos(pi / DENSITY)
+BETWEEN = cos(pi / DENSITY)  # of a series' largest value, what a grid shows at least
 SPEEDS = {"revolute": 1.0, "prismatic": 0.25}  # [rad/s, m/s] where the URDF names no limit
 REACHES = {"revolute": pi, "prismatic": 0.5}  # [rad, m] to both sides of 0, likewise, and for endless joints
 
 
 @dataclass(frozen=True, eq=False)
-class Bounds:
+class MotionBounds:
     """What a motion must keep, each (n,): lowest and highest position, speed [rad, m, per second]."""
 
     low: np.ndarray
@@ -28,7 +28,7 @@ class Bounds:
     speed: np.ndarray
 
 
-def bounds(arm: Arm, reach: float, speed: float) -> Bounds:
+def motion_bounds(arm: Arm, reach: float, speed: float) -> MotionBounds:
     """The arm's limits, of the range the middle part `reach`, of the velocity limits the part `speed`.
 
     Raises ArmError where a joint has no room between its limits.
@@ -44,7 +44,7 @@ def bounds(arm: Arm, reach: float, speed: float) -> Bounds:
     ranges = np.array([_range(coordinate) for coordinate in arm.coordinates])
     middle, half = ranges.mean(axis=1), np.diff(ranges, axis=1)[:, 0] / 2
     limits = np.array([c.velocity or SPEEDS[c.kind] for c in arm.coordinates])
-    return Bounds(middle - reach * half, middle + reach * half, speed * limits)
+    return MotionBounds(middle - reach * half, middle + reach * half, speed * limits)
 
 
 def _range(coordinate: Coordinate) -> tuple[float, float]:
@@ -65,66 +65,69 @@ class Motion:
 
 
 @dataclass(frozen=True, eq=False)
-class Series:
-    """The motions with H harmonics of one period: a vector of `size` numbers gives one that keeps the bounds.
+class ExcitationTrajectory:
+    """The motions of n joints with H harmonics of one period; parameters (`size`,) choose one that keeps the bounds.
 
-    For each joint: H sine and H cosine coefficients, where in its range it lies, and how much of the largest
-    amplitude that range and speed allow it gives away. Velocity and acceleration
-    are zero at both ends: the sine coefficients are made orthogonal to (1, 2 .. H), the cosine ones to
-    (1, 4 .. H^2).
+    The parameters of each joint: H sine and H cosine coefficients, whose common size is free, the offset (where in
+    its range the joint moves), and how much of the largest amplitude that range and speed allow it gives away.
+    Velocity and acceleration are zero at both ends: the sine coefficients are made orthogonal to (1, 2 .. H), the
+    cosine ones to (1, 4 .. H^2).
     """
 
     duration: float
     harmonics: int
-    bounds: Bounds
+    bounds: MotionBounds
 
     @property
     def joints(self) -> int:
+        """n."""
         return len(self.bounds.low)
 
     @property
     def size(self) -> int:
+        """How many parameters."""
         return self.joints * (2 * self.harmonics + 2)
 
-    def motion(self, numbers: np.ndarray, t: np.ndarray) -> Motion:
-        """The motion of these numbers at these times (T,). The bounds hold at every time, not at these alone:
+    def motion(self, parameters: np.ndarray, t: np.ndarray) -> Motion:
+        """The motion of these parameters at these times (T,). The bounds hold at every time, not at these alone:
         between the points of a grid a series of H harmonics exceeds them by less than 1 / cos(pi / density)
         (Ehlich and Zeller, Math. Z. 86:41, 1964).
         """
-        shape, places = self._shapes(numbers)
-        grid = self._signals(shape, np.linspace(0.0, self.duration, DENSITY * self.harmonics + 1))
+        coefficients, offsets = self._coefficients(parameters)
+        grid = self._signals(coefficients, np.linspace(0.0, self.duration, DENSITY * self.harmonics + 1))
         middle, half = (grid[0].max(axis=0) + grid[0].min(axis=0)) / 2, np.ptp(grid[0], axis=0) / 2 / BETWEEN
         low, high, fastest = middle - half, middle + half, np.abs(grid[1]).max(axis=0) / BETWEEN
         room = self.bounds.high - self.bounds.low
-        size = np.minimum(room / (high - low), self.bounds.speed / fastest) * self.parts(numbers)
+        largest = np.minimum(room / (high - low), self.bounds.speed / fastest)
+        size = largest * self.amplitude_fractions(parameters)
         free = room - size * (high - low)  # how far the whole motion can be moved
-        start = self.bounds.low - size * low + free * (1 + np.tanh(places)) / 2
-        q, qd, qdd = (size * x for x in self._signals(shape, t))
+        start = self.bounds.low - size * low + free * (1 + np.tanh(offsets)) / 2
+        q, qd, qdd = (size * x for x in self._signals(coefficients, t))
         return Motion(t, start + q, qd, qdd)
 
-    def parts(self, numbers: np.ndarray) -> np.ndarray:
+    def amplitude_fractions(self, parameters: np.ndarray) -> np.ndarray:
         """Which part of its largest amplitude each joint has, (n,)."""
-        return np.exp(-(numbers.reshape(self.joints, -1)[:, -1] ** 2) / 4)
+        return np.exp(-(parameters.reshape(self.joints, -1)[:, -1] ** 2) / 4)
 
-    def _shapes(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Coefficients (2, H, n) of sines and cosines, and places (n,)."""
-        rows = numbers.reshape(self.joints, 2 * self.harmonics + 2)
-        waves = rows[:, :-2].reshape(self.joints, 2, self.harmonics).transpose(1, 2, 0)
+    def _coefficients(self, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Coefficients (2, H, n) of sines and cosines, and offsets (n,)."""
+        rows = parameters.reshape(self.joints, 2 * self.harmonics + 2)
+        sines_cosines = rows[:, :-2].reshape(self.joints, 2, self.harmonics).transpose(1, 2, 0)
         k = np.arange(1, self.harmonics + 1, dtype=float)
         found = []
-        for coefficients, power in zip(waves, (k, k**2), strict=True):
+        for coefficients, power in zip(sines_cosines, (k, k**2), strict=True):
             along = power / np.linalg.norm(power)
             found.append(coefficients - np.outer(along, along @ coefficients))
         return np.stack(found), rows[:, -2]
 
-    def _signals(self, shape: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _signals(self, coefficients: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Position, velocity and acceleration (T, n) of amplitude one."""
-        k = np.arange(1, self.harmonics + 1) * 2 * pi / self.duration
-        sine, cosine = np.sin(t[:, None] * k), np.cos(t[:, None] * k)  # (T, H)
-        a, b = shape
-        rates, rises = k[:, None], (k**2)[:, None]
+        frequencies = np.arange(1, self.harmonics + 1) * 2 * pi / self.duration  # angular
+        sine, cosine = np.sin(t[:, None] * frequencies), np.cos(t[:, None] * frequencies)  # (T, H)
+        a, b = coefficients
+        first, second = frequencies[:, None], (frequencies**2)[:, None]
         return (
             sine @ a + cosine @ b,
-            cosine @ (rates * a) - sine @ (rates * b),
-            -sine @ (rises * a) - cosine @ (rises * b),
+            cosine @ (first * a) - sine @ (first * b),
+            -sine @ (second * a) - cosine @ (second * b),
         )

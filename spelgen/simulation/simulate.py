@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -50,9 +50,9 @@ def simulate(
     return run(arm.arm, settings, arm.actuation.matrix(), progress=progress)
 
 
-def _changed(settings: SimulationSettings, changes: dict[str, object]) -> SimulationSettings:
+def _changed(settings: SimulationSettings, changes: Mapping[str, object]) -> SimulationSettings:
     try:
-        return SimulationSettings.model_validate(settings.model_dump() | changes)
+        return SimulationSettings.model_validate({**settings.model_dump(), **changes})
     except ValidationError as error:
         keys = Document(Path("simulate"), None)
         collect([explain(each, keys, SimulationSettings) for each in error.errors(include_url=False)])
