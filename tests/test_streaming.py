@@ -1,7 +1,6 @@
 """Logs larger than memory: the same samples and windows as in memory, drawn part by part, the same when resumed."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,20 +10,23 @@ import pytest
 import torch
 
 from spelgen.errors import LogError
-from spelgen.fitting.dataset import TrainingConfig, prepare_data
-from spelgen.fitting.streaming import prepare_streamed
+from spelgen.fitting.config import Rollout
+from spelgen.fitting.dataset import prepare_data
+from spelgen.fitting.streaming import LargeLogs, prepare_streamed
 from spelgen.fitting.train import train
 from spelgen.logs import chunks, epoch_windows
 from spelgen.logs.chunks import large_files, scan
-from spelgen.logs.epoch_windows import Cutting, WindowStream
+from spelgen.logs.epoch_windows import EpochWindows, WindowCutting
 from spelgen.logs.mapping import LogMapping
+from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import QUANTITIES, Trajectory
 
 STAND_IN = Path(__file__).with_name("stand_in.py")
 JOINTS = ("shoulder", "elbow")
 KINDS = ("revolute", "revolute")
-CONFIG = TrainingConfig(epochs=4, batch=32, momentum_steps=5, every=2, optimiser="adamw")
+CONFIG = Rollout(epochs=4, batch=32, momentum_steps=5, optimizer="adamw")
+EVERY_OTHER, AUTOMATIC = Preprocessing(decimation=2), Preprocessing()
 
 
 def recordings(count=8, samples=400, rate=100.0) -> list[Trajectory]:
@@ -36,7 +38,7 @@ def recordings(count=8, samples=400, rate=100.0) -> list[Trajectory]:
         t[samples // 2 :] += 0.5 * (number == 3)
         speed = random.uniform(2, 5, 2)
         phase = t[:, None] * speed + random.uniform(0, 6, 2)
-        found.append(Trajectory(f"r{number}", t, np.sin(phase), speed * np.cos(phase), 3 * np.cos(phase)))
+        found.append(Trajectory(t, np.sin(phase), speed * np.cos(phase), 3 * np.cos(phase), f"r{number}"))
     return found
 
 
@@ -92,36 +94,35 @@ def test_a_mapping_holds_for_parts_too(tmp_path):
     np.testing.assert_allclose(expected.q[:, 0], -np.sin(phase), rtol=1e-12)
 
 
-def streamed(log, cutting, **changed) -> WindowStream:
+def streamed(log, cutting, **changed) -> EpochWindows:
     found = [part for part, _ in scan([log], JOINTS, LogMapping())]
     counts = tuple(len(cutting.windows([part.load()])) for part in found)
-    return WindowStream(tuple(found), counts, cutting, seed=0)
+    return EpochWindows(tuple(found), counts, cutting, seed=0)
 
 
 @pytest.mark.parametrize("cutoff", [None, 8.0])
 def test_a_pass_over_all_shares_gives_every_window_once(log, monkeypatch, cutoff):
-    monkeypatch.setattr(epoch_windows, "SHARE", 900)
-    cutting = Cutting(window=5, stride=3, every=2, cutoff=cutoff)
+    monkeypatch.setattr(epoch_windows, "EPOCH", 900)
+    cutting = WindowCutting(5, 3, Preprocessing(cutoff, 2))
     expected = cutting.windows(read_logs([log], JOINTS))
     found = streamed(log, cutting)
-    assert (len(found), found.shares) == (len(expected), -(-len(expected) // 900))
+    assert (len(found), found.epochs_per_pass) == (len(expected), -(-len(expected) // 900))
     for turn in range(2):
-        shares = [found.share(turn * found.shares + k) for k in range(found.shares)]
+        shares = [found.epoch(turn * found.epochs_per_pass + k) for k in range(found.epochs_per_pass)]
         drawn = torch.cat([share.q for share in shares])
         order, expected_order = drawn[:, 0, 0].argsort(), expected.q[:, 0, 0].argsort()
         for name in ("dt", "q", "qd", "tau"):
             values = torch.cat([getattr(share, name) for share in shares])
             assert torch.equal(values[order], getattr(expected, name)[expected_order])
-    first = [found.share(k).q[0, 0, 0].item() for k in range(2 * found.shares)]
-    assert first[: found.shares] != first[found.shares :]
-    assert torch.equal(found.share(3).q, streamed(log, cutting).share(3).q)
+    first = [found.epoch(k).q[0, 0, 0].item() for k in range(2 * found.epochs_per_pass)]
+    assert first[: found.epochs_per_pass] != first[found.epochs_per_pass :]
+    assert torch.equal(found.epoch(3).q, streamed(log, cutting).epoch(3).q)
 
 
 def test_preparation_finds_what_it_finds_in_memory(log):
-    config = replace(CONFIG, every=None)
-    plain = prepare_data([log], JOINTS, KINDS, config)
-    found = prepare_streamed([log], JOINTS, KINDS, config)
-    assert (found.cutoff, found.digest) == (plain.cutoff, plain.digest)
+    plain = prepare_data(read_logs([log], JOINTS), JOINTS, KINDS, CONFIG, AUTOMATIC)
+    found = prepare_streamed(LargeLogs((log,), JOINTS, KINDS), CONFIG, AUTOMATIC)
+    assert (found.preprocessing, found.digest) == (plain.preprocessing, plain.digest)
     assert len(found.validation_names) == len(plain.validation_names)
     assert found.training.dt.mean().item() == pytest.approx(plain.training.dt.mean().item(), rel=0.01)
     assert set(found.training_names) | set(found.validation_names) == {f"r{k}" for k in range(8)}
@@ -129,17 +130,17 @@ def test_preparation_finds_what_it_finds_in_memory(log):
     codes = {each.code for each in found.diagnostics}
     assert codes == {"gap", "filter", "streamed"}
     starts = {round(x, 12) for x in found.validation.q[:, 0, 0].tolist()}
-    for number in range(found.stream.shares):
-        assert starts.isdisjoint(round(x, 12) for x in found.stream.share(number).q[:, 0, 0].tolist())
+    for number in range(found.stream.epochs_per_pass):
+        assert starts.isdisjoint(round(x, 12) for x in found.stream.epoch(number).q[:, 0, 0].tolist())
 
 
 def test_a_last_sample_alone_changes_nothing(log, monkeypatch):
     monkeypatch.setattr(chunks, "LONGEST", 399)
-    config = replace(CONFIG, every=None)
-    found, plain = prepare_streamed([log], JOINTS, KINDS, config), prepare_data([log], JOINTS, KINDS, config)
-    assert found.cutoff == plain.cutoff == 8.0
+    found = prepare_streamed(LargeLogs((log,), JOINTS, KINDS), CONFIG, AUTOMATIC)
+    plain = prepare_data(read_logs([log], JOINTS), JOINTS, KINDS, CONFIG, AUTOMATIC)
+    assert found.preprocessing.cutoff == plain.preprocessing.cutoff == 8.0
     assert found.training.dt.mean().item() == pytest.approx(plain.training.dt.mean().item(), rel=0.01)
-    assert "validation on 2 parts, 8 hold no window" in found.diagnostics[-1].message
+    assert "validation on 2 chunks, 8 hold no window" in found.diagnostics[-1].message
 
 
 def lines(run: Path) -> list[dict]:
@@ -149,8 +150,8 @@ def lines(run: Path) -> list[dict]:
 
 @pytest.mark.parametrize("log", [1000], indirect=True)
 def test_training_streams_and_resumes_with_the_same_numbers(log, tmp_path, monkeypatch):
-    monkeypatch.setattr(epoch_windows, "SHARE", 400)
-    drawn, share = [], WindowStream.share
+    monkeypatch.setattr(epoch_windows, "EPOCH", 400)
+    drawn, share = [], EpochWindows.epoch
 
     def drawing(self, number):
         drawn.append(number)
@@ -158,11 +159,11 @@ def test_training_streams_and_resumes_with_the_same_numbers(log, tmp_path, monke
             raise KeyboardInterrupt
         return share(self, number)
 
-    monkeypatch.setattr(WindowStream, "share", drawing)
-    whole = train(STAND_IN, [log], tmp_path / "whole", CONFIG, progress=False)
-    half = train(STAND_IN, [log], tmp_path / "half", CONFIG, progress=False)
+    monkeypatch.setattr(EpochWindows, "epoch", drawing)
+    whole = train(STAND_IN, [log], tmp_path / "whole", CONFIG, preprocessing=EVERY_OTHER, progress=False)
+    half = train(STAND_IN, [log], tmp_path / "half", CONFIG, preprocessing=EVERY_OTHER, progress=False)
     assert (whole.status, half.status, half.epochs) == ("finished", "interrupted", 2)
-    train(STAND_IN, [log], tmp_path / "half", CONFIG, resume=True, progress=False)
+    train(STAND_IN, [log], tmp_path / "half", CONFIG, preprocessing=EVERY_OTHER, resume=True, progress=False)
     assert drawn == [0, 1, 2, 3, 0, 1, 2, 2, 3]
     assert lines(tmp_path / "half") == lines(tmp_path / "whole")
     assert json.loads((tmp_path / "whole" / "config.json").read_text())["training_windows"] > 4 * 400
@@ -237,5 +238,5 @@ def test_the_rows_of_a_recording_must_lie_together(log):
 
 
 def test_two_parts_are_needed(log):
-    with pytest.raises(LogError, match="no two parts with 799 samples without a gap"):
-        prepare_streamed([log], JOINTS, KINDS, replace(CONFIG, window=400))
+    with pytest.raises(LogError, match="no two chunks with 799 samples without a gap"):
+        prepare_streamed(LargeLogs((log,), JOINTS, KINDS), Rollout(window=400), EVERY_OTHER)

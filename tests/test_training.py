@@ -8,18 +8,20 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from spelgen.emission.loading import load_module
 from spelgen.errors import LogError, ModuleError, RunError
 from spelgen.evaluation.evaluate import evaluate
-from spelgen.fitting.dataset import TrainingConfig, prepare_data
+from spelgen.evaluation.subject import read_test_logs
+from spelgen.fitting.config import MomentumFit, Rollout
+from spelgen.fitting.dataset import prepare_data
 from spelgen.fitting.loop import TrainingLoop
-from spelgen.fitting.optimizers import WholeSet
+from spelgen.fitting.optimizers import LBFGS
 from spelgen.fitting.progress import TrainingProgress
 from spelgen.fitting.rollout import (
     choose_substeps,
@@ -30,20 +32,29 @@ from spelgen.fitting.rollout import (
     roll_out,
     rollout_loss,
 )
-from spelgen.fitting.run_folder import load_model
 from spelgen.fitting.train import train
 from spelgen.logs.mapping import LogMapping
-from spelgen.logs.read import Trajectory, write_logs
+from spelgen.logs.preprocessing import Preprocessing
+from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.windows import Windows, cut_windows
 
 STAND_IN = Path(__file__).with_name("stand_in.py")
 JOINTS = ("shoulder", "elbow")
-QUICK = TrainingConfig(epochs=6, batch=32, learning_rate=1e-2, momentum_steps=20, optimiser="adamw")
+ADAMW = {"optimizer": "adamw", "batch": 32, "learning_rate": 1e-2}
+QUICK = Rollout(epochs=6, momentum_steps=20, **ADAMW)
+
+
+def quick(**changed) -> Rollout:
+    """`QUICK` with other options; an option of AdamW goes with it."""
+    options = QUICK.model_dump(exclude_unset=True) | changed
+    if options["optimizer"] != "adamw":
+        options = {name: x for name, x in options.items() if name not in ("batch", "learning_rate")}
+    return Rollout(**options)
 
 
 def truth():
     """A stand-in with other parameters than the one that is trained."""
-    model = load_model(STAND_IN)
+    model = load_module(STAND_IN)
     with torch.no_grad():
         model.inertia.copy_(torch.tensor([0.4, -0.5, -1.0]))
         model.weight.copy_(torch.tensor([3.0, 1.0]))
@@ -63,7 +74,7 @@ def motions(count=6, samples=21, seed=0, rate=20.0) -> list[Trajectory]:
     positions = torch.cat([q, predicted_q], dim=1)
     velocities = torch.cat([torch.zeros(count, 1, 2), predicted_qd], dim=1)
     rows = zip(t.numpy(), positions.numpy(), velocities.numpy(), tau.numpy(), strict=True)
-    return [Trajectory(f"motion_{k}", *row) for k, row in enumerate(rows)]
+    return [Trajectory(*row, name=f"motion_{k}") for k, row in enumerate(rows)]
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +105,7 @@ class Oscillator:
     def prepare(self):
         return None
 
-    def rates(self, q, p, tau, prepared):
+    def port_hamiltonian_rhs(self, q, p, tau, prepared):
         return p, tau - self.frequency**2 * q
 
     def solve(self, windows: Windows):
@@ -139,7 +150,7 @@ def test_the_true_model_has_no_loss():
     windows = cut_windows(motions(), 5, measured=False)
     scales = loss_scales(windows, ("revolute", "revolute"))
     assert rollout_loss(truth(), windows, scales, 4) < 1e-12
-    assert rollout_loss(load_model(STAND_IN), windows, scales, 4) > 0.1
+    assert rollout_loss(load_module(STAND_IN), windows, scales, 4) > 0.1
 
 
 def test_the_weak_form_tends_to_zero_with_the_step():
@@ -154,11 +165,11 @@ def test_the_weak_form_tends_to_zero_with_the_step():
 
 
 def test_standing_still_has_loss_one(monkeypatch):
-    def still(model, windows, substeps):
+    def still(model, windows, substeps, solver):
         return tuple(x[:, :1].expand_as(x[:, 1:]) for x in (windows.q, windows.qd))
 
     monkeypatch.setattr("spelgen.fitting.rollout.roll_out", still)
-    model, windows = load_model(STAND_IN), cut_windows(motions(), 5, measured=False)
+    model, windows = load_module(STAND_IN), cut_windows(motions(), 5, measured=False)
     assert rollout_loss(model, windows, loss_scales(windows, model.joint_types), 1) == pytest.approx(1.0)
 
 
@@ -178,9 +189,9 @@ def test_stiff_friction_gets_more_substeps():
 
 
 def test_training_finds_the_true_parameters(logs, tmp_path):
-    config = replace(QUICK, epochs=15, momentum_steps=200)
+    config = quick(epochs=15, momentum_steps=200)
     result = train(STAND_IN, [logs], tmp_path / "run", config, progress=False)
-    model = load_model(tmp_path / "run" / "module.py")
+    model = load_module(tmp_path / "run" / "module.py")
     model.load_state_dict(torch.load(tmp_path / "run" / "model.pt", weights_only=True))
     assert result.status == "finished"
     assert result.best_validation < 1e-4
@@ -189,7 +200,7 @@ def test_training_finds_the_true_parameters(logs, tmp_path):
 
 
 def test_the_run_folder_tells_what_was_done(logs, tmp_path):
-    result = train(STAND_IN, [logs], tmp_path / "run", replace(QUICK, epochs=2), progress=False)
+    result = train(STAND_IN, [logs], tmp_path / "run", quick(epochs=2), progress=False)
     names = {path.name for path in (tmp_path / "run").iterdir()}
     assert names == {"module.py", "config.json", "metrics.jsonl", "checkpoint.pt", "model.pt"}
     config = json.loads((tmp_path / "run" / "config.json").read_text())
@@ -210,14 +221,14 @@ class Interrupted(TrainingProgress):
             raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize(("optimiser", "steps"), [("adamw", 20), ("lbfgs", 3)])
-def test_resuming_repeats_what_would_have_been(logs, tmp_path, monkeypatch, optimiser, steps):
+@pytest.mark.parametrize(("optimizer", "steps"), [("adamw", 20), ("lbfgs", 3)])
+def test_resuming_repeats_what_would_have_been(logs, tmp_path, monkeypatch, optimizer, steps):
     monkeypatch.setattr("spelgen.fitting.loop.EPOCH_STEPS", steps)
-    config = replace(QUICK, optimiser=optimiser, momentum_steps=20 if optimiser == "adamw" else 0)
+    config = quick(optimizer=optimizer, momentum_steps=20 if optimizer == "adamw" else 0)
     straight, broken = tmp_path / "straight", tmp_path / "broken"
     train(STAND_IN, [logs], straight, config, progress=False)
     with monkeypatch.context() as patch:
-        patch.setattr("spelgen.fitting.train.TrainingProgress", Interrupted)
+        patch.setattr("spelgen.fitting.fit.TrainingProgress", Interrupted)
         assert train(STAND_IN, [logs], broken, config, progress=False).status == "interrupted"
     assert len(lines(broken)) == 3
     result = train(STAND_IN, [logs], broken, config, resume=True, progress=False)
@@ -252,7 +263,7 @@ def test_resuming_drops_epochs_after_the_checkpoint(logs, tmp_path):
 def test_numbers_that_blow_up_are_rolled_back_at_half_the_rate(logs, tmp_path, monkeypatch):
     calls = []
 
-    def blown_up_once(model, windows, scales, substeps):
+    def blown_up_once(model, windows, scales, substeps, solver):
         loss = rollout_loss(model, windows, scales, substeps)
         calls.append(torch.is_grad_enabled())
         return loss * math.nan if sum(calls) == 25 and calls[-1] else loss
@@ -266,15 +277,15 @@ def test_numbers_that_blow_up_are_rolled_back_at_half_the_rate(logs, tmp_path, m
     assert all(math.isfinite(record["loss"]) for record in records)
 
 
-@pytest.mark.parametrize("optimiser", ["adamw", "lbfgs"])
-def test_numbers_that_never_recover_end_the_run(logs, tmp_path, monkeypatch, optimiser):
-    def blown_up(model, windows, scales, substeps):
+@pytest.mark.parametrize("optimizer", ["adamw", "lbfgs"])
+def test_numbers_that_never_recover_end_the_run(logs, tmp_path, monkeypatch, optimizer):
+    def blown_up(model, windows, scales, substeps, solver):
         loss = rollout_loss(model, windows, scales, substeps)
         return loss * math.nan if torch.is_grad_enabled() else loss
 
     monkeypatch.setattr("spelgen.fitting.loop.rollout_loss", blown_up)
     with pytest.raises(RunError) as caught:
-        train(STAND_IN, [logs], tmp_path / "run", replace(QUICK, optimiser=optimiser), progress=False)
+        train(STAND_IN, [logs], tmp_path / "run", quick(optimizer=optimizer), progress=False)
     assert str(caught.value) == (
         f"{tmp_path}/run: losses that are not finite, after 8 attempts at half the learning rate each; "
         "check units and signs of the logs; the best model so far is kept in model.pt"
@@ -305,20 +316,23 @@ def test_mapped_logs_train_as_plain_ones_do(logs, tmp_path):
         STAND_IN,
         [tmp_path / "train.npz"],
         tmp_path / "run",
-        replace(QUICK, epochs=7),
+        quick(epochs=7),
         resume=True,
         progress=False,
     )
     assert again.epochs == 7
-    assert evaluate(tmp_path / "run", [tmp_path / "train.npz"]).trajectories[0] == "motion_0"
+    assert (
+        evaluate(tmp_path / "run", read_test_logs(tmp_path / "run", [tmp_path / "train.npz"])).trajectories[0]
+        == "motion_0"
+    )
 
 
 def test_early_stop_and_time_limit(logs, tmp_path):
-    stuck = replace(QUICK, learning_rate=1e-30, patience=2, momentum_steps=0)
+    stuck = quick(learning_rate=1e-30, patience=2, momentum_steps=0)
     result = train(STAND_IN, [logs], tmp_path / "stuck", stuck, progress=False)
     assert (result.status, result.epochs) == ("stopped early", 2)
     for momentum_steps, epochs in ((0, 1), (1000, 0)):
-        hurried = replace(QUICK, max_minutes=1e-6, momentum_steps=momentum_steps)
+        hurried = quick(max_minutes=1e-6, momentum_steps=momentum_steps)
         result = train(STAND_IN, [logs], tmp_path / f"late{epochs}", hurried, progress=False)
         assert (result.status, result.epochs) == ("out of time", epochs)
 
@@ -326,9 +340,9 @@ def test_early_stop_and_time_limit(logs, tmp_path):
 CHILD = """
 import signal, sys
 from spelgen.fitting.train import train
-from spelgen.fitting.dataset import TrainingConfig
+from spelgen.fitting.config import Rollout
 signal.signal(signal.SIGINT, signal.default_int_handler)  # whoever runs the tests may ignore it
-config = TrainingConfig(epochs=100000, batch=32, patience=100000, momentum_steps=0, optimiser="adamw")
+config = Rollout(epochs=100000, batch=32, patience=100000, momentum_steps=0, optimizer="adamw")
 result = train(sys.argv[1], [sys.argv[2]], sys.argv[3], config)
 print(result.status)
 """
@@ -349,15 +363,15 @@ def test_a_signal_leaves_a_usable_run(logs, tmp_path, number):
     output, errors = child.communicate(timeout=30)
     assert (child.returncode, output) == (0, "interrupted\n"), errors
     assert "Traceback" not in errors
-    load_model(folder / "module.py").load_state_dict(torch.load(folder / "model.pt", weights_only=True))
+    load_module(folder / "module.py").load_state_dict(torch.load(folder / "model.pt", weights_only=True))
     epoch = torch.load(folder / "checkpoint.pt", weights_only=True)["epoch"]
-    config = TrainingConfig(epochs=epoch + 1, batch=32, patience=100000, momentum_steps=0, optimiser="adamw")
+    config = Rollout(epochs=epoch + 1, batch=32, patience=100000, momentum_steps=0, optimizer="adamw")
     assert train(STAND_IN, [logs], folder, config, resume=True, progress=False).epochs == epoch + 1
     assert not list(folder.glob(".*"))  # no half-written file is left
 
 
 def test_a_run_is_not_overwritten_unasked(logs, tmp_path):
-    config = replace(QUICK, epochs=1)
+    config = quick(epochs=1)
     train(STAND_IN, [logs], tmp_path / "run", config, progress=False)
     before = (tmp_path / "run" / "model.pt").read_bytes()
     with pytest.raises(RunError) as caught:
@@ -366,16 +380,14 @@ def test_a_run_is_not_overwritten_unasked(logs, tmp_path):
         f"{tmp_path}/run: there is a run in this folder; --resume it, --force to replace it, or -o another"
     )
     assert (tmp_path / "run" / "model.pt").read_bytes() == before
-    train(STAND_IN, [logs], tmp_path / "run", replace(config, seed=5), force=True, progress=False)
-    assert json.loads((tmp_path / "run" / "config.json").read_text())["config"]["seed"] == 5
+    train(STAND_IN, [logs], tmp_path / "run", config, seed=5, force=True, progress=False)
+    assert json.loads((tmp_path / "run" / "config.json").read_text())["seed"] == 5
 
 
 def test_a_run_is_resumed_only_as_it_was_started(logs, tmp_path):
-    train(STAND_IN, [logs], tmp_path / "run", replace(QUICK, epochs=1), progress=False)
+    train(STAND_IN, [logs], tmp_path / "run", quick(epochs=1), progress=False)
     with pytest.raises(RunError) as caught:
-        train(
-            STAND_IN, [logs], tmp_path / "run", replace(QUICK, seed=1, batch=16), resume=True, progress=False
-        )
+        train(STAND_IN, [logs], tmp_path / "run", quick(batch=16), seed=1, resume=True, progress=False)
     assert str(caught.value) == (
         f"{tmp_path}/run: got batch 16 instead of 32, seed 1 instead of 0, "
         "expected the settings the run was started with; or start a new run"
@@ -400,41 +412,10 @@ def test_nothing_is_written_when_the_logs_are_bad(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_what_is_no_module_is_refused(tmp_path):
-    path = tmp_path / "module.py"
-    with pytest.raises(ModuleError) as caught:
-        load_model(path)
-    assert str(caught.value) == f"{path}: got no such file, expected a module made by `spelgen build`"
-    path.write_text("x = 1\n")
-    with pytest.raises(ModuleError, match="got no class Model"):
-        load_model(path)
-    path.write_text("import torch\nclass Model(torch.nn.Module):\n    n = 1\n")
-    with pytest.raises(ModuleError, match="got a class Model without joint_names, joint_types, mass_matrix"):
-        load_model(path)
-    path.write_text(STAND_IN.read_text().replace(", prepared=None", ""))
-    with pytest.raises(ModuleError, match="a module of an older spelgen; build it again"):
-        load_model(path)
-    path.write_text("1 / 0\n")
-    with pytest.raises(
-        ModuleError, match=r"import fails \(ZeroDivisionError: division by zero\); build it again"
-    ):
-        load_model(path)
-
-
-def test_two_modules_of_the_same_name_do_not_meet(tmp_path):
-    for folder, n in (("a", 3), ("b", 4)):
-        (tmp_path / folder).mkdir()
-        text = STAND_IN.read_text().replace("    n = 2\n", f"    n = {n}\n")
-        (tmp_path / folder / "module.py").write_text(text)
-    models = [load_model(tmp_path / folder / "module.py") for folder in ("a", "b")]
-    assert [model.n for model in models] == [3, 4]
-    assert not list(tmp_path.rglob("__pycache__"))
-
-
 def test_a_changed_urdf_stays_out_of_the_run(logs, tmp_path):
     module = Path(shutil.copy(STAND_IN, tmp_path / "module.py"))
     (tmp_path / "stand_in.urdf").write_text("<robot/>")
-    result = train(module, [logs], tmp_path / "run", replace(QUICK, epochs=1), progress=False)
+    result = train(module, [logs], tmp_path / "run", quick(epochs=1), progress=False)
     assert "changed-urdf" in [note.code for note in result.diagnostics]
     assert not (tmp_path / "run" / "robot.urdf").exists()
     with pytest.raises(
@@ -445,15 +426,15 @@ def test_a_changed_urdf_stays_out_of_the_run(logs, tmp_path):
 
 
 def test_validation_windows_come_from_other_trajectories(logs):
-    data = prepare_data([logs], JOINTS, ("revolute", "revolute"), QUICK)
+    data = prepare_data(read_logs([logs], JOINTS), JOINTS, ("revolute", "revolute"), QUICK, Preprocessing())
     seen = {tuple(row) for row in data.training.q.flatten(0, 1).tolist()}
     assert not any(tuple(row) in seen for row in data.validation.q.flatten(0, 1).tolist())
     assert len(data.training) + len(data.validation) == 6 * 17
 
 
 def test_the_learning_rate_rises_and_falls(logs, tmp_path):
-    data = prepare_data([logs], JOINTS, ("revolute", "revolute"), QUICK)
-    loop = TrainingLoop(None, load_model(STAND_IN), data, QUICK)
+    data = prepare_data(read_logs([logs], JOINTS), JOINTS, ("revolute", "revolute"), QUICK, Preprocessing())
+    loop = TrainingLoop(load_module(STAND_IN), data, QUICK)
     rates = []
     for step in range(QUICK.epochs * loop.epoch_steps):
         loop.step = step
@@ -466,15 +447,23 @@ def test_the_learning_rate_rises_and_falls(logs, tmp_path):
 
 def test_few_windows_are_taken_all_at_once(logs, tmp_path):
     """L-BFGS comes nearer in as many steps, and a weight decay of its own is what it gets."""
-    config = replace(QUICK, momentum_steps=0, optimiser=None)
-    assert config.whole(100)
-    assert not config.whole(5000)
-    assert config.decay(100) != config.decay(5000)
-    assert replace(config, weight_decay=0.5).decay(100) == 0.5
+    config = Rollout(momentum_steps=0, epochs=6)
+    assert config.resolved(100).record(closed_form=False).keys() & {"batch", "learning_rate"} == set()
+    assert (config.resolved(100).optimizer, config.resolved(100).weight_decay) == ("lbfgs", 2e-5)
+    resolved = config.resolved(5000)
+    assert (resolved.optimizer, resolved.batch, resolved.learning_rate) == ("adamw", 256, 1e-3)
+    assert resolved.weight_decay == 0.2
+    assert Rollout(weight_decay=0.5).resolved(100).weight_decay == 0.5
     losses = {}
-    for optimiser in ("adamw", "lbfgs"):
-        train(STAND_IN, [logs], tmp_path / optimiser, replace(config, optimiser=optimiser), progress=False)
-        losses[optimiser] = lines(tmp_path / optimiser)[-1]["best"]
+    for optimizer in ("adamw", "lbfgs"):
+        train(
+            STAND_IN,
+            [logs],
+            tmp_path / optimizer,
+            quick(momentum_steps=0, optimizer=optimizer),
+            progress=False,
+        )
+        losses[optimizer] = lines(tmp_path / optimizer)[-1]["best"]
     assert losses["lbfgs"] < 0.5 * losses["adamw"]
 
 
@@ -489,17 +478,18 @@ def test_the_line_search_turns_back_from_numbers_that_blow_up():
         value = (model.x - 1.9).square().sum()
         return value if model.x.item() < 2 else value * math.nan
 
-    whole = WholeSet(model, 0.0)
-    group = whole._optimiser.param_groups[0]
+    whole = LBFGS(model, 0.0)
+    group = whole._optimizer.param_groups[0]
     group["lr"] = 4.0
-    assert whole.descend(loss, None, 30, lambda _: 1.0) < 1e-12
+    assert whole.run(loss, None, 30, lambda _: 1.0) < 1e-12
     assert max(tried) >= 2
 
 
 def test_the_objective_momentum_predicts_no_windows(logs, tmp_path):
-    config = replace(QUICK, objective="momentum", momentum_steps=200)
-    result = train(STAND_IN, [logs], tmp_path / "run", config, progress=False)
-    start = train(STAND_IN, [logs], tmp_path / "start", replace(config, momentum_steps=1), progress=False)
+    result, start = (
+        train(STAND_IN, [logs], tmp_path / f"{k}", MomentumFit(momentum_steps=k, **ADAMW), progress=False)
+        for k in (200, 1)
+    )
     assert (result.status, result.epochs, result.steps) == ("finished", 0, 0)
     assert result.best_validation < 0.5 * start.best_validation
 
