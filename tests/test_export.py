@@ -1,46 +1,47 @@
 """What was learned, as a URDF and settings again: exactly for closed-form models, nearest for others."""
 
-import json
-
 import numpy as np
 import pytest
 import torch
 from emitted import ROBOTS
 from typer.testing import CliRunner
 
+from spelgen.building import build
 from spelgen.cli.main import app
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
-from spelgen.fitting.run_folder import RunFolder, load_model, write_state
-from spelgen.pipeline import build, load
+from spelgen.errors import RunError
+from spelgen.exporting.export import export
+from spelgen.fitting.config import TorqueFit
+from spelgen.fitting.fitted import Fit
+from spelgen.fitting.run_folder import RunFolder
+from spelgen.loaded_arm import load_arm
+from spelgen.logs.preprocessing import Preprocessing
 
 pytest.importorskip("pinocchio")
 
 
 def run_of(robot, folder, preset, change=lambda model: None):
     """A run folder as `spelgen train` leaves it, of a model whose weights ``change`` has moved."""
-    module = folder / f"{robot}_spel.py"
-    module.write_text(build(ROBOTS / f"{robot}.urdf", preset=preset))
-    run = RunFolder(folder / "run")
-    run.start(module, ROBOTS / f"{robot}.urdf", force=False)
-    run.config.write_text(json.dumps({}))
-    model = load_model(run.module)
+    urdf = ROBOTS / f"{robot}.urdf"
+    model = build(urdf, preset)
     with torch.no_grad():
         change(model)
-    write_state(run.weights, model.state_dict())
-    return run, model
+    record = {"robot": robot, "objective": "torque", "config": {}, "preprocessing": {}}
+    fit = Fit(model, TorqueFit(), Preprocessing(), (), (), None, record, {}, urdf)
+    return RunFolder(fit.save(folder / "run")), model
 
 
 def exported(run, path):
     told = CliRunner().invoke(app, ["export", str(run.path), "--to", "urdf", "-o", str(path)])
     assert told.exit_code == 0, told.output
-    return load(path), told.output
+    return load_arm(path), told.output
 
 
 def heavier(model):
     random = torch.Generator().manual_seed(0)
-    for parameter in (model.bodies, model.rotor):
+    for parameter in (model.dynamics.inertial_parameters.raw, model.dynamics.armature.raw):
         parameter += 0.2 * torch.randn(parameter.shape, dtype=torch.float64, generator=random)
-    model.friction.coulomb += 0.5
+    model.dynamics.friction.raw_coulomb += 0.5
 
 
 def differences(model, loaded):
@@ -79,7 +80,7 @@ def test_friction_goes_back_as_the_urdf_can_say_it(tmp_path):
 
 
 def test_other_models_go_back_as_the_nearest_bodies(tmp_path):
-    """An untrained minimal model is the URDF's arm: its twin must be that arm again."""
+    """An untrained minimal model is the URDF's arm: its projection must be that arm again."""
     run, model = run_of("two_link", tmp_path, "minimal")
     loaded, told = exported(run, tmp_path / "learned.urdf")
     mass, load_torque = differences(model, loaded)
@@ -105,3 +106,30 @@ def test_a_run_without_its_robot_is_refused(tmp_path):
     assert told.exit_code == 1
     assert "no robot.urdf" in told.output
     assert not (tmp_path / "x.urdf").exists()
+
+
+@pytest.mark.parametrize("robot", ["rpr", "panda"])
+def test_exported_bodies_have_the_models_base_parameters(robot, tmp_path):
+    """By the names and combinations of `inspect`, whatever the single parameters are."""
+    run, _ = run_of(robot, tmp_path, "closed-form", heavier)
+    found = export(run.path, "urdf", tmp_path / "learned.urdf")
+    learned = found.projection.base_parameters
+    exact = {each.name: float(each.value) for each in load_arm(tmp_path / "learned.urdf").base_parameters}
+    before = {each.name: float(each.value) for each in found.projection.arm.base_parameters}
+    assert list(exact) == list(learned)
+    np.testing.assert_allclose(list(exact.values()), list(learned.values()), rtol=1e-8, atol=1e-9)
+    assert max(abs(exact[name] - before[name]) for name in exact) > 0.01
+
+
+def test_a_model_in_memory_is_exported_with_its_arm(tmp_path):
+    arm = load_arm(ROBOTS / "two_link.urdf")
+    model = build(arm, "closed-form")
+    found = export(model, arm=arm)
+    assert found.urdf.startswith(b"<?xml")
+    assert "bodies: the model's own" in repr(found)
+    assert "Izz2" in found._repr_html_()
+    assert [x.name for x in found.write(tmp_path / "arm.urdf")] == ["arm.urdf", "arm.yaml"]
+    with pytest.raises(RunError, match="this output exists already"):
+        found.write(tmp_path / "arm.urdf")
+    with pytest.raises(RunError, match=r"no robot\.urdf"):
+        export(model)

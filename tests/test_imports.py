@@ -44,8 +44,8 @@ inspection loaded_arm pipeline building
 simulation: simulate
 excitation: design
 identification: identify
-exporting: rigid_body_projection urdf_file
-render: charts plots picture learned report_page inspection_page
+exporting: rigid_body_projection urdf_file export
+render: charts plots picture learned reproduction report_page inspection_page
 logs: statistics gravity report check_logs
 comparison: paper truth metrics study runs formatting
 render: logs_page comparison_page

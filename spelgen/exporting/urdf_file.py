@@ -1,65 +1,60 @@
-"""Twin -> a URDF and the settings beside it: the run's own files with other numbers in them."""
+"""Rigid bodies -> a URDF and the settings beside it: the arm's own files with other numbers in them."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import numpy as np
 import yaml
 from lxml import etree
 
-from spelgen.arm.angle_rounding import Snapper
+from spelgen.arm.angle_rounding import AngleRounding
 from spelgen.arm.rational import alignment
-from spelgen.exporting.rigid_body_projection import Twin
-from spelgen.settings.settings import load_settings
+from spelgen.exporting.rigid_body_projection import RigidBodyProjection
 from spelgen.urdf.document import urdf_bytes
-from spelgen.urdf.read import read_urdf
 from spelgen.urdf.robot import Robot
 
 TEN = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
-def urdf_text(twin: Twin, urdf: Path, snap_tolerance: float) -> bytes:
-    """The URDF at ``urdf`` with the twin's inertials and friction.
+def urdf_text(projection: RigidBodyProjection) -> bytes:
+    """The arm's URDF with these inertials and friction.
 
     A link that a joint moves gets all that moves with it; the links it carries by fixed or locked joints lose
     their inertials to it.
     """
-    robot = read_urdf(urdf)
+    robot, arm = projection.arm.robot, projection.arm.arm
     parser = etree.XMLParser(resolve_entities=False, no_network=True)
-    root = etree.fromstring(urdf_bytes(urdf), parser)
+    root = etree.fromstring(urdf_bytes(robot.path), parser)
     links = {element.get("name"): element for element in root.findall("link")}
     joints = {element.get("name"): element for element in root.findall("joint")}
-    moved = {robot.joint[body.name].child for body in twin.arm.bodies}
+    moved = {robot.joint[body.name].child for body in arm.bodies}
     for name in _carried(robot, moved):
         for element in links[name].findall("inertial"):
             links[name].remove(element)
-    snapper = Snapper(snap_tolerance)
-    for body, ten in zip(twin.arm.bodies, twin.inertias, strict=True):
+    rounding = AngleRounding(projection.arm.angle_tolerance)
+    for body, ten in zip(arm.bodies, projection.inertias, strict=True):
         joint = robot.joint[body.name]
-        _set_inertial(links[joint.child], _in_link(ten, alignment(snapper.axis(joint))))
-    for index, coordinate in enumerate(twin.arm.coordinates):
-        mean = (twin.forward[index] - twin.backward[index]) / 2
+        _set_inertial(links[joint.child], _in_link(ten, alignment(rounding.axis(joint))))
+    for index, coordinate in enumerate(arm.coordinates):
+        mean = (projection.forward[index] - projection.backward[index]) / 2
         element = joints[coordinate.name]
         for old in element.findall("dynamics"):
             element.remove(old)
-        values = {"damping": _number(twin.viscous[index]), "friction": _number(mean)}
+        values = {"damping": _number(projection.viscous[index]), "friction": _number(mean)}
         etree.SubElement(element, "dynamics", values)
     return etree.tostring(root, xml_declaration=True, encoding="utf-8") + b"\n"
 
 
-def settings_text(twin: Twin, urdf: Path) -> str:
-    """The settings beside ``urdf`` with the twin's drives and friction, in both directions."""
-    beside = urdf.with_suffix(".yaml")
+def settings_text(projection: RigidBodyProjection) -> str:
+    """The settings beside the arm's URDF with these drives and friction, in both directions."""
+    beside = projection.arm.robot.path.with_suffix(".yaml")
     content = (yaml.safe_load(beside.read_text(encoding="utf-8")) if beside.exists() else None) or {}
-    settings = load_settings(urdf)
     joints = content.setdefault("joints", {})
-    for index, coordinate in enumerate(twin.arm.coordinates):
+    for index, coordinate in enumerate(projection.arm.arm.coordinates):
         joint = joints.setdefault(coordinate.name, {})
-        gear = settings.joint(coordinate.name).gear
-        joint["rotor_inertia"] = _rounded(twin.rotors[index] / gear**2)
-        joint["viscous"] = _rounded(twin.viscous[index])
-        joint["coulomb"] = [_rounded(twin.forward[index]), _rounded(twin.backward[index])]
+        gear = projection.arm.settings.joint(coordinate.name).gear
+        joint["rotor_inertia"] = _rounded(projection.armature[index] / gear**2)
+        joint["viscous"] = _rounded(projection.viscous[index])
+        joint["coulomb"] = [_rounded(projection.forward[index]), _rounded(projection.backward[index])]
     return yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
 
 
