@@ -24,17 +24,18 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from characters import TESTS as CHARACTERS
 from characters import read_characters, write_arm
+from spelgen.fitting.torque_start import LOAD, last_body
 
 from spelgen.arm.arm import Arm
-from spelgen.emission.loading import load_module
+from spelgen.design import Preset
 from spelgen.dynamics.protocol import integrable
+from spelgen.emission.loading import load_module
 from spelgen.evaluation.baselines import Contender
 from spelgen.evaluation.results import state_errors
 from spelgen.fitting.dataset import WHOLE_DECAY
 from spelgen.fitting.rollout import roll_out
 from spelgen.fitting.torque_fit import fit_torque
 from spelgen.fitting.torque_networks import fit_networks
-from spelgen.fitting.torque_start import LOAD, last_body
 from spelgen.identification.friction import FrictionModel
 from spelgen.identification.identification import Identification
 from spelgen.identification.identify import least_squares
@@ -46,7 +47,6 @@ from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
 from spelgen.pipeline import generate
-from spelgen.spec import Preset
 
 Torque = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from spelgen.errors import SpelgenError
     from spelgen.evaluation.evaluate import evaluate
     from spelgen.evaluation.rollout import rollout
+    from spelgen.excitation.design import excite
     from spelgen.exporting.export import export
     from spelgen.fitting.config import MomentumFit, Rollout, TorqueFit
     from spelgen.fitting.fit import Fit, fit, load_run
@@ -40,10 +41,11 @@ _HOME = {
     "check_logs": "logs.check_logs",
     "Preprocessing": "logs.preprocessing",
     "simulate": "simulation.simulate",
+    "excite": "excitation.design",
     "identify": "identification.identify",
     "fit": "fitting.fit",
-    "Fit": "fitting.fit",
-    "load_run": "fitting.fit",
+    "Fit": "fitting.fitted",
+    "load_run": "fitting.fitted",
     "TorqueFit": "fitting.config",
     "MomentumFit": "fitting.config",
     "Rollout": "fitting.config",
@@ -70,6 +72,7 @@ __all__ = [
     "check",
     "check_logs",
     "evaluate",
+    "excite",
     "export",
     "fit",
     "generate",

@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from spelgen.design import Net
+from spelgen.design import Design, Net
 from spelgen.emission.loading import load_module
 from spelgen.loaded_arm import LoadedArm
 from spelgen.pipeline import generate
-from spelgen.spec import Assume, Preset
+from spelgen.spec import Assume
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def build(
     arm: LoadedArm | str | Path,
-    preset: Preset = "minimal",
+    preset: str | Path | Design = "minimal",
     *,
     net: Net | None = None,
     width: int = 64,

@@ -10,10 +10,14 @@ from typing import Any, Literal, get_args, get_type_hints
 from spelgen.errors import SettingsError, collect, suggestion
 from spelgen.settings.yaml_document import Document, read_document
 
+Preset = Literal["minimal", "spel", "spel-kan", "phnode", "closed-form"]
+"""Those that come with spelgen."""
+
+PRESET_NAMES: tuple[str, ...] = get_args(Preset)
+
 Net = Literal["mlp", "kan"]
 
 PRESETS = Path(__file__).parent / "presets"
-PRESET_NAMES = ("minimal", "spel", "spel-kan", "phnode", "closed-form")
 
 
 @dataclass(frozen=True)

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from spelgen.design import Net
+from spelgen.design import PRESET_NAMES, Design, Net, load_design
 from spelgen.emission.emit import emit
 from spelgen.emission.plan import plan_model
 from spelgen.errors import ModuleError
 from spelgen.inspection import Inspection
 from spelgen.loaded_arm import LoadedArm, load_arm
-from spelgen.spec import Assume, ModelSpec, Options, Preset, read_facts
+from spelgen.spec import Assume, ModelSpec, Options, read_facts
 from spelgen.verify.agreement import Verification
 
 
@@ -30,7 +30,7 @@ def inspect(
 
 def generate(
     arm: LoadedArm | str | Path,
-    preset: Preset = "minimal",
+    preset: str | Path | Design = "minimal",
     *,
     net: Net | None = None,
     width: int = 64,
@@ -39,13 +39,16 @@ def generate(
 ) -> str:
     """The source of the module tailored to an arm, or to that of a URDF.
 
-    ``net`` takes the place of the preset's own networks, which have ``depth`` hidden layers of ``width``.
+    ``preset``: one that comes with spelgen by its name, one of yours by its YAML file, or a ``Design``. ``net``
+    takes the place of its own networks, which have ``depth`` hidden layers of ``width``.
     ``assume`` as for ``inspect``. Raises what ``load_arm`` raises, SettingsError for a design that stands for
     no model.
     """
     loaded = arm if isinstance(arm, LoadedArm) else load_arm(arm)
+    shipped = preset in PRESET_NAMES
     options = Options(
-        preset=preset,
+        preset=str(preset) if shipped else "own" if isinstance(preset, Design) else Path(preset).stem,
+        design=None if shipped else load_design(preset),
         net=net,
         assume=assume,
         joints=loaded.joints,

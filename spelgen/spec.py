@@ -19,7 +19,6 @@ from spelgen.errors import ModuleError
 
 Assume = Literal["kinematics", "inertials"]
 Kind = Literal["zero", "constant", "varying"]
-Preset = Literal["minimal", "spel", "spel-kan", "phnode", "closed-form"]
 Entries = tuple[tuple[int, int, float], ...]
 """A sparse symmetric matrix by its lower triangle: (row, column, value), 0-based."""
 
@@ -33,9 +32,11 @@ _FACTS_WIDTH = 100
 class Options:
     """What the user chose when building; enough to build the same module again from the same URDF."""
 
-    preset: Preset = "minimal"
+    preset: str = "minimal"
+    design: Design | None = None
+    """None: that of the preset of this name, which comes with spelgen."""
     net: Net | None = None
-    """None: the preset's own."""
+    """None: the design's own."""
     assume: Assume = "kinematics"
     joints: tuple[str, ...] | None = None
     tip: str | None = None
@@ -145,7 +146,7 @@ class ModelSpec:
     def from_json(cls, text: str) -> ModelSpec:
         """The spec that ``to_json`` wrote."""
         data = _tupled(json.loads(text))
-        data["options"] = Options(**data["options"])
+        data["options"] = _options(data["options"])
         data["design"] = Design(**data["design"])
         data["joints"] = tuple(JointSpec(**joint) for joint in data["joints"])
         data["outputs"] = tuple(OutputSpec(**output) for output in data["outputs"])
@@ -224,16 +225,20 @@ def read_facts(path: str | Path) -> Facts:
 def parse_facts(source: str | bytes) -> Facts:
     """The facts in a module's source text; a KeyError or the like where there are none."""
     record = json.loads(next(_texts(ast.parse(source), "FACTS")))
-    options = {key: _tupled(value) for key, value in record["options"].items()}
     return Facts(
         robot=record["robot"],
         urdf=record["urdf"],
         urdf_sha256=record["urdf_sha256"],
         spec_sha256=record["spec_sha256"],
-        options=Options(**options),
+        options=_options(_tupled(record["options"])),
         joints=tuple(record["joints"]),
         joint_types=tuple(record["joints"].values()),
     )
+
+
+def _options(record: dict[str, Any]) -> Options:
+    design = record.get("design")
+    return Options(**(record | {"design": design and Design(**design)}))
 
 
 def _texts(tree: ast.Module, name: str) -> Iterator[str]:

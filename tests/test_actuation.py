@@ -11,13 +11,15 @@ from emitted import import_source, randomise
 from typer.testing import CliRunner
 
 from spelgen.cli.main import app
-from spelgen.dynamics.pinocchio_urdf import urdf_dynamics
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
+from spelgen.dynamics.pinocchio_urdf import urdf_dynamics
 from spelgen.errors import SettingsError, SpelgenError
 from spelgen.fitting.rollout import loss_scales, momentum_loss, roll_out
+from spelgen.loaded_arm import load_arm
 from spelgen.logs.windows import Windows
-from spelgen.pipeline import build, inspect, load
-from spelgen.simulation.simulate import make_friction, simulate
+from spelgen.pipeline import generate, inspect
+from spelgen.simulation.friction import make_friction
+from spelgen.simulation.random_inputs import random_inputs
 
 pytest.importorskip("pinocchio")
 
@@ -146,20 +148,20 @@ def test_wrong_couplings_are_refused(tmp_path, monkeypatch, sidecar):
     monkeypatch.chdir(tmp_path)
     urdf(tmp_path, sidecar=sidecar)
     with pytest.raises(SpelgenError) as error:
-        load("arm.urdf")
+        load_arm("arm.urdf")
     assert str(error.value) == WRONG[sidecar]
 
 
 def test_a_coupling_of_a_locked_joint_is_refused(tmp_path):
     with pytest.raises(SettingsError, match="got the joint 'roll', which is locked, expected joints of"):
-        load(urdf(tmp_path, sidecar=COUPLED), joints=["j1", "pitch"])
+        load_arm(urdf(tmp_path, sidecar=COUPLED), joints=["j1", "pitch"])
 
 
 @pytest.fixture
 def coupled(tmp_path):
     """A built module of the arm with a known gear, a trained one among couplings, and its URDF."""
     path = urdf(tmp_path, sidecar=COUPLED + "joints: {j1: {gear: 80, gain: trained}}")
-    model = import_source(build(path), tmp_path / "arm_spel.py").Model(seed=1)
+    model = import_source(generate(path), tmp_path / "arm_spel.py").Model(seed=1)
     randomise(model, 1)
     return path, model
 
@@ -175,7 +177,7 @@ def states(count=40):
 class TestModule:
     def test_dynamics_both_ways(self, coupled):
         model = coupled[1]
-        model.gains.data.fill_(np.log(1.25))
+        model.dynamics.input.raw_gains.data.fill_(np.log(1.25))
         q, qd, _, tau = states()
         expected = G.clone()
         expected[0, 0] = 100
@@ -184,17 +186,17 @@ class TestModule:
         assert torch.allclose(model.inverse_dynamics(q, qd, qdd), tau, rtol=0, atol=1e-10)
         p, none = model.momentum(q, qd), torch.zeros_like(tau)
         prepared = model.prepare()
-        pushed = model.rates(q, p, tau, prepared)[1] - model.rates(q, p, none, prepared)[1]
+        pushed = model.port_hamiltonian_rhs(q, p, tau, prepared)[1] - model.port_hamiltonian_rhs(q, p, none, prepared)[1]
         assert torch.allclose(pushed, tau @ expected.T, rtol=0, atol=1e-9)
 
     def test_the_gain_has_a_gradient(self, coupled):
         q, qd, _, tau = states()
         coupled[1].forward_dynamics(q, qd, tau).square().sum().backward()
-        assert coupled[1].gains.grad.abs().min() > 0
+        assert coupled[1].dynamics.input.raw_gains.grad.abs().min() > 0
 
     def test_a_passive_joint_gets_nothing(self, tmp_path):
         path = urdf(tmp_path, sidecar=MOTOR + "joints: {j1: {gear: 9}, roll: {actuated: false}}")
-        model = import_source(build(path), tmp_path / "passive_spel.py").Model(seed=1)
+        model = import_source(generate(path), tmp_path / "passive_spel.py").Model(seed=1)
         q, qd, _, tau = states()
         qdd = model.forward_dynamics(q, qd, tau)
         assert torch.equal(qdd, model.forward_dynamics(q, qd, tau * torch.tensor([1.0, 1, 0])))
@@ -205,13 +207,13 @@ class TestModule:
 
 def test_the_simulation_moves_joints_by_motors(coupled):
     """The logged torques, times G, are what the rigid bodies feel."""
-    loaded = load(coupled[0])
+    loaded = load_arm(coupled[0])
     short = {"trajectories": 2, "duration": 0.5, "rate": 20.0}
     settings = loaded.settings.model_copy(
         update={"simulation": loaded.settings.simulation.model_copy(update=short)}
     )
     assert np.array_equal(loaded.actuation.matrix(), G.numpy())
-    log = simulate(loaded.arm, settings, loaded.actuation.matrix()).train[0]
+    log = random_inputs(loaded.arm, settings, loaded.actuation.matrix()).train[0]
     engine, friction = arm_dynamics(loaded.arm, settings), make_friction(loaded.arm, settings)
     q, qd = log.q[0], log.qd[0]
     for _ in range(5000):  # explicit Euler over the first interval, 10 us a step
@@ -224,9 +226,9 @@ def test_the_simulation_moves_joints_by_motors(coupled):
 def test_the_urdf_rival_has_the_same_motors(coupled):
     rival = urdf_dynamics(coupled[0], ["j1", "pitch", "roll"])
     q, qd, _, tau = states()
-    qdd = rival.rates(q, qd, tau, None)[1]
+    qdd = rival.port_hamiltonian_rhs(q, qd, tau, None)[1]
     assert torch.allclose(rival.inverse_dynamics(q, qd, qdd), tau, rtol=0, atol=1e-9)
-    loaded = load(coupled[0])
+    loaded = load_arm(coupled[0])
     engine = arm_dynamics(loaded.arm, loaded.settings)  # the URDF gives no friction
     wanted = [
         engine.forward_dynamics(q[i].numpy(), qd[i].numpy(), G.numpy() @ tau[i].numpy())
@@ -238,7 +240,7 @@ def test_the_urdf_rival_has_the_same_motors(coupled):
 def test_a_gain_is_recovered(coupled):
     """From motion under a gear of 100 that is thought to be 80, all else known."""
     model = coupled[1]
-    model.gains.data.fill_(np.log(1.25))
+    model.dynamics.input.raw_gains.data.fill_(np.log(1.25))
     start, speed, tau, _ = states(200)
     still = Windows(
         q=start[:, None].expand(-1, 5, -1),
@@ -251,9 +253,9 @@ def test_a_gain_is_recovered(coupled):
     moved = replace(
         still, q=torch.cat([still.q[:, :1], q], dim=1), qd=torch.cat([still.qd[:, :1], qd], dim=1)
     )
-    model.gains.data.zero_()
+    model.dynamics.input.raw_gains.data.zero_()
     scales = loss_scales(moved, model.joint_types)
-    optimiser = torch.optim.LBFGS([model.gains], line_search_fn="strong_wolfe")
+    optimiser = torch.optim.LBFGS([model.dynamics.input.raw_gains], line_search_fn="strong_wolfe")
 
     def closure():
         optimiser.zero_grad()
@@ -262,4 +264,4 @@ def test_a_gain_is_recovered(coupled):
         return loss
 
     optimiser.step(closure)
-    assert model.gains.exp().item() == pytest.approx(1.25, rel=1e-3)
+    assert model.dynamics.input.raw_gains.exp().item() == pytest.approx(1.25, rel=1e-3)

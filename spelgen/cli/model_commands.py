@@ -21,8 +21,8 @@ from spelgen.cli.options import (
     RobotOption,
     Tip,
 )
+from spelgen.design import PRESET_NAMES, Net
 from spelgen.files import write_text
-from spelgen.spec import Net, Preset
 
 
 def inspect(
@@ -76,7 +76,14 @@ def build(
     tip: Tip = None,
     assume: Assumption = "kinematics",
     angle_tolerance: AngleTolerance = 2e-3,
-    preset: Annotated[Preset, typer.Option("--preset", help="How the model is made.")] = "minimal",
+    preset: Annotated[
+        str,
+        typer.Option(
+            "--preset",
+            metavar="NAME|FILE.yaml",
+            help=f"How the model is made: {', '.join(PRESET_NAMES)}, or yours.",
+        ),
+    ] = "minimal",
     net: Annotated[
         Net | None, typer.Option("--net", help="The kind of networks; default: the preset's own.")
     ] = None,
@@ -89,6 +96,9 @@ def build(
     force: Force = False,
 ) -> None:
     """Write the PyTorch module tailored to an arm."""
+    if preset not in PRESET_NAMES and Path(preset).suffix not in (".yaml", ".yml"):
+        told = f"{preset!r} is none of {', '.join(PRESET_NAMES)}, nor a YAML file"
+        raise typer.BadParameter(told, param_hint="'--preset'")
     if net is not None and preset == "closed-form":
         raise typer.BadParameter("closed-form has no networks", param_hint="'--net'")
     from spelgen.loaded_arm import load_arm

@@ -13,7 +13,7 @@ from spelgen.emission.bodies import body_specs
 from spelgen.settings.joint import JointSettings
 from spelgen.spec import ConstantSpec, Entries, JointSpec, ModelSpec, Options, OutputSpec
 from spelgen.structure.basis import Weights
-from spelgen.structure.fourier import NO_WAVES, find_waves
+from spelgen.structure.fourier import NO_SERIES, fourier_expansion
 from spelgen.structure.nominal import Nominal, nominal, nominal_inertias, working_range
 from spelgen.structure.structure import Structure
 from spelgen.urdf.actuation import Actuation
@@ -42,11 +42,11 @@ def plan_model(
     ``drives``: what is known of the joints' motors and gears; where no rotor inertia is, one is guessed.
     """
     known = drives or {}
-    design = load_design(options.preset, options.net)
+    design = load_design(options.design or options.preset, options.net)
     everything = tuple(range(len(arm.coordinates)))
     sizes = nominal(arm, structure)
     inertias = nominal_inertias(arm, sizes.from_urdf)
-    waves = find_waves(arm, structure, inertias) if design.fourier == "derived" else NO_WAVES
+    series = fourier_expansion(arm, structure, inertias) if design.fourier == "derived" else NO_SERIES
     identifiers = _identifiers([coordinate.name for coordinate in arm.coordinates])
     x, y, z = (float(g) for g in arm.gravity)
     return ModelSpec(
@@ -67,13 +67,13 @@ def plan_model(
                 _floats(output.basis),
                 center,
                 scale,
-                *((sums.level, sums.terms) if sums else ()),
+                *((function.offset, function.terms) if function else ()),
             )
-            for output, center, scale, sums in zip(
+            for output, center, scale, function in zip(
                 structure.outputs,
                 sizes.output_means,
                 sizes.output_scales,
-                waves.outputs or [None] * len(structure.outputs),
+                series.outputs or [None] * len(structure.outputs),
                 strict=True,
             )
         ),
@@ -87,8 +87,8 @@ def plan_model(
         potential_scale=sizes.potential_scale,
         margin=float(f"{max(_MARGIN * sizes.least_eigenvalue, 1e-4):.0e}"),
         started_from_urdf=sizes.from_urdf,
-        fourier=tuple((wave.turns, wave.powers) for wave in waves.waves),
-        potential_series=waves.potential.terms if waves.potential and structure.potential else None,
+        fourier=tuple((term.frequencies, term.powers) for term in series.terms),
+        potential_series=series.potential.terms if series.potential and structure.potential else None,
         bodies=body_specs(arm, inertias) if design.mass == "closed-form" else (),
         inputs=()
         if actuation.direct

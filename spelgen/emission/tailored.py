@@ -248,9 +248,11 @@ def _network(
 ) -> Call:
     """A network of ``outputs``; ``read``: the joints whose encoding it reads."""
     if spec.design.encoding == "lie-group":
-        inputs = call("lie_group_input", Code("joints"), sensitivity, **({"axes": axes} if axes else {}))
+        inputs = call("lie_group_input", Code("joints"), sensitivity)
     else:
         inputs = call("joint_input", Code("joints"), read, sensitivity)
+    if axes:
+        inputs = call("with_velocities", inputs, Code("joints"), axes)
     size = {"width": width or units(spec), "depth": spec.options.depth} | ({"least": least} if least else {})
     kind = "MaskedMLP" if spec.design.net == "mlp" else "MaskedKAN"
     fraction = [Code("NETWORK_FRACTION")] if series else []

@@ -152,7 +152,7 @@ class Shortener:
                 single += [(factor, own * power) for factor, own in inner.terms[0].factors]
             else:
                 # the factor's coefficients are integers: leave it what keeps the number before it near 1
-                scale = Fraction(10) ** round(-log10(abs(number)) / power)
+                scale = Fraction(10) ** round(-_magnitude(number) / power)
                 number *= scale**power
                 sums.append((inner.times(1 / scale), power))
         yield Sum((Term(number, ordered((*single, *sums))),))
@@ -178,15 +178,20 @@ class Shortener:
                 (_fraction(coefficient), self._monomial(rest, plain.angles))
             ]
             for run in runs:
-                waves = harmonics({k: (exponents[3 * k], exponents[3 * k + 1]) for k in run}, self._units)
+                terms = harmonics({k: (exponents[3 * k], exponents[3 * k + 1]) for k in run}, self._units)
                 products = [
                     (number * coefficient, (*factors, (trig, 1)) if trig else factors)
                     for number, factors in products
-                    for trig, coefficient in waves
+                    for trig, coefficient in terms
                 ]
             for number, factors in products:
                 totals[ordered(factors)] = totals.get(ordered(factors), Fraction(0)) + number
         return Sum(tuple(Term(number, key) for key, number in totals.items() if number))
+
+
+def _magnitude(number: Fraction) -> float:
+    """log10 of its size; its digits may be more than a float holds."""
+    return log10(abs(number.numerator)) - log10(number.denominator)
 
 
 def _fraction(number: fmpq) -> Fraction:

@@ -1,11 +1,11 @@
-"""Every function that M and V are made of, as a finite sum of waves: what a rigid arm leaves of a function is numbers.
+"""Every function that M and V are made of as a finite Fourier series: what a rigid arm leaves of it is numbers.
 
 A revolute joint's angle enters M as cosine and sine to the second degree at most, a prismatic joint's distance
 as a polynomial of the second degree. So a function of few joints is
 
-    f(q) = sum over waves of  x^powers (a cos(turns q) + b sin(turns q))
+    f(q) = offset + sum over terms of  x^powers (a cos(frequencies q) + b sin(frequencies q))
 
-with whole numbers ``turns`` between -2 and 2 and x the scaled distances. Which waves occur follows from the
+with whole numbers ``frequencies`` between -2 and 2 and x the scaled distances. Which terms occur follows from the
 kinematics: they are those that a discrete Fourier transform finds for random inertial parameters.
 """
 
@@ -25,7 +25,7 @@ from spelgen.structure.recursion import triangle
 from spelgen.structure.sampling import Ten, float_energies
 from spelgen.structure.structure import Structure
 
-MOST_WAVES = 48
+MOST_TERMS = 48
 """M or V is left to networks alone where it takes more."""
 _MOST_POINTS = 5**5
 _GRIDS = {"revolute": 2 * np.pi / 5 * np.arange(5), "prismatic": np.array([-1.0, 0.0, 1.0])}
@@ -33,78 +33,80 @@ _DRAWS = 2
 _NOTHING = 1e-9  # relative to a function's largest coefficient
 _DIGITS = 9
 
-Sums = dict["Wave", tuple[float, float]]
+Coefficients = dict["FourierTerm", tuple[float, float]]
 
 
 @dataclass(frozen=True)
-class Wave:
-    """x^powers cos(turns q) and x^powers sin(turns q); both by coordinate."""
+class FourierTerm:
+    """x^powers cos(frequencies q) and x^powers sin(frequencies q); both by coordinate."""
 
-    turns: tuple[int, ...]
+    frequencies: tuple[int, ...]
     powers: tuple[int, ...]
 
 
 @dataclass(frozen=True)
-class WaveSum:
-    """level + sum over terms of wave x (a cos + b sin); a term is (place in Waves.waves, a, b)."""
+class FourierSeries:
+    """offset + sum over ``terms`` of x^powers (a cos + b sin), each (place in FourierExpansion.terms, a, b)."""
 
-    level: float
+    offset: float
     terms: tuple[tuple[int, float, float], ...]
 
 
 @dataclass(frozen=True)
-class Waves:
-    """The ``waves`` of an arm, with every power's lower powers. outputs, potential: the structure's outputs
-    and V as sums with nominal coefficients; None for what takes too many waves. V has no level: only its
+class FourierExpansion:
+    """The ``terms`` of an arm, with every power's lower powers. outputs, potential: the structure's outputs
+    and V as series with nominal coefficients; None for what takes too many terms. V has no offset: only its
     changes matter.
     """
 
-    waves: tuple[Wave, ...]
-    outputs: tuple[WaveSum, ...] | None
-    potential: WaveSum | None
+    terms: tuple[FourierTerm, ...]
+    outputs: tuple[FourierSeries, ...] | None
+    potential: FourierSeries | None
 
 
-NO_WAVES = Waves((), None, None)
+NO_SERIES = FourierExpansion((), None, None)
 
 
-def find_waves(arm: Arm, structure: Structure, inertias: Sequence[Ten]) -> Waves:
-    """Which waves the structure's functions consist of; coefficients are those that ``inertias`` give.
+def fourier_expansion(arm: Arm, structure: Structure, inertias: Sequence[Ten]) -> FourierExpansion:
+    """The Fourier series of the structure's functions; coefficients are those that ``inertias`` give.
 
     None are found for arms with mimic joints, which turn by fractions of an angle.
     """
-    outputs = _sums(arm, structure, inertias, [(each.joints, each.reads) for each in structure.outputs])
+    outputs = _coefficients(
+        arm, structure, inertias, [(each.joints, each.reads) for each in structure.outputs]
+    )
     v = [(structure.potential, None)] if structure.potential else []
-    potential = _sums(arm, structure, inertias, v) or None
+    potential = _coefficients(arm, structure, inertias, v) or None
     constant = _constant(len(arm.coordinates))
-    chosen = {wave for each in (*(outputs or ()), *(potential or ())) for wave in each} - {constant}
-    if any(any(wave.powers) for wave in chosen):
+    chosen = {term for each in (*(outputs or ()), *(potential or ())) for term in each} - {constant}
+    if any(any(term.powers) for term in chosen):
         chosen.add(constant)
-    waves = sorted(chosen, key=lambda wave: (wave.powers, wave.turns))
-    numbered = {wave: place for place, wave in enumerate(waves)}
+    terms = sorted(chosen, key=lambda term: (term.powers, term.frequencies))
+    places = {term: place for place, term in enumerate(terms)}
 
-    def told(found: Sums) -> WaveSum:
-        terms = sorted((numbered[wave], *found[wave]) for wave in found if wave != constant)
-        return WaveSum(found.get(constant, (0.0, 0.0))[0], tuple(terms))
+    def series(found: Coefficients) -> FourierSeries:
+        rows = sorted((places[term], *found[term]) for term in found if term != constant)
+        return FourierSeries(found.get(constant, (0.0, 0.0))[0], tuple(rows))
 
-    return Waves(
-        tuple(waves),
-        None if outputs is None else tuple(told(each) for each in outputs),
-        None if potential is None else replace(told(potential[0]), level=0.0),
+    return FourierExpansion(
+        tuple(terms),
+        None if outputs is None else tuple(series(each) for each in outputs),
+        None if potential is None else replace(series(potential[0]), offset=0.0),
     )
 
 
-def _constant(n: int) -> Wave:
-    return Wave((0,) * n, (0,) * n)
+def _constant(n: int) -> FourierTerm:
+    return FourierTerm((0,) * n, (0,) * n)
 
 
-def _sums(
+def _coefficients(
     arm: Arm,
     structure: Structure,
     inertias: Sequence[Ten],
     functions: Sequence[tuple[tuple[int, ...], Weights | None]],
-) -> list[Sums] | None:
-    """The waves of functions of (joints, weights of M's entries, or None for V); None where there are too
-    many.
+) -> list[Coefficients] | None:
+    """The terms of functions of (joints, weights of M's entries, or None for V), with their coefficients;
+    None where there are too many.
     """
     plain = [body.coordinate for body in arm.bodies] == list(range(len(arm.coordinates)))
     if not plain or any(body.multiplier != 1 or body.offset for body in arm.bodies):
@@ -112,16 +114,16 @@ def _sums(
     if any(_points(arm, joints) > _MOST_POINTS for joints, _ in functions):
         return None
     rng = np.random.default_rng(0)
-    believed: list[Sequence[Ten]] = [inertias]
+    drawn: list[Sequence[Ten]] = [inertias]
     if structure.assume == "kinematics":
-        believed = [[list(rng.normal(size=10)) for _ in arm.bodies] for _ in range(_DRAWS)]
-    found: list[Sums] = []
+        drawn = [[list(rng.normal(size=10)) for _ in arm.bodies] for _ in range(_DRAWS)]
+    found: list[Coefficients] = []
     for joints, reads in functions:
-        occurring = np.any([_occurring(_spectrum(arm, joints, reads, each)) for each in believed], axis=0)
+        occurring = np.any([_occurring(_spectrum(arm, joints, reads, each)) for each in drawn], axis=0)
         nominal = _spectrum(arm, joints, reads, inertias)
         found.append(_folded(arm, joints, nominal, occurring))
     constant = _constant(len(arm.coordinates))
-    return found if len({wave for each in found for wave in each} - {constant}) <= MOST_WAVES else None
+    return found if len({term for each in found for term in each} - {constant}) <= MOST_TERMS else None
 
 
 def _points(arm: Arm, joints: Sequence[int]) -> int:
@@ -129,8 +131,8 @@ def _points(arm: Arm, joints: Sequence[int]) -> int:
 
 
 def _spectrum(arm: Arm, joints: Sequence[int], reads: Weights | None, inertias: Sequence[Ten]) -> np.ndarray:
-    """Complex coefficients of a function, an axis for each of its joints: by turns 0, 1, 2, -2, -1, or by
-    power.
+    """Complex coefficients of a function, an axis for each of its joints: by frequencies 0, 1, 2, -2,
+    -1, or by power.
     """
     kinds = [arm.coordinates[joint].kind for joint in joints]
     grids = [_GRIDS[kind] for kind in kinds]
@@ -160,26 +162,26 @@ def _occurring(spectrum: np.ndarray) -> np.ndarray:
     return size > _NOTHING * size.max(initial=0.0)
 
 
-def _folded(arm: Arm, joints: Sequence[int], spectrum: np.ndarray, occurring: np.ndarray) -> Sums:
-    """Wave -> (a, b). Turns and their opposites are one wave; with a power come the lower ones, which another
-    origin of the distance would bring in.
+def _folded(arm: Arm, joints: Sequence[int], spectrum: np.ndarray, occurring: np.ndarray) -> Coefficients:
+    """Term -> (a, b). Frequencies and their opposites are one term; with a power come the lower ones, which
+    another origin of the distance would bring in.
     """
     n = len(arm.coordinates)
-    found: Sums = {}
+    found: Coefficients = {}
     for place in zip(*np.nonzero(occurring), strict=True):
-        turns, powers = [0] * n, [0] * n
+        frequencies, powers = [0] * n, [0] * n
         for joint, index in zip(joints, place, strict=True):
             if arm.coordinates[joint].kind == "revolute":
-                turns[joint] = int(index) if index <= 2 else int(index) - 5
+                frequencies[joint] = int(index) if index <= 2 else int(index) - 5
             else:
                 powers[joint] = int(index)
-        if next((turn for turn in turns if turn), 0) < 0:
+        if next((each for each in frequencies if each), 0) < 0:
             continue  # its opposite is there too
-        share = spectrum[place] * (2 if any(turns) else 1)
-        found[Wave(tuple(turns), tuple(powers))] = (_rounded(share.real), _rounded(-share.imag))
-    for wave in list(found):
-        for lower in product(*(range(power + 1) for power in wave.powers)):
-            found.setdefault(Wave(wave.turns, lower), (0.0, 0.0))
+        value = spectrum[place] * (2 if any(frequencies) else 1)
+        found[FourierTerm(tuple(frequencies), tuple(powers))] = (_rounded(value.real), _rounded(-value.imag))
+    for term in list(found):
+        for lower in product(*(range(power + 1) for power in term.powers)):
+            found.setdefault(FourierTerm(term.frequencies, lower), (0.0, 0.0))
     return found
 
 

@@ -82,7 +82,7 @@ class Model(nn.Module):
         friction = DenseFriction(
             joints,
             MaskedKAN(
-                lie_group_input(joints, (0.1, 0.1, 0.1), axes=1),
+                with_velocities(lie_group_input(joints, (0.1, 0.1, 0.1)), joints, 1),
                 unit_joints([range(3)] * 6, width=16, depth=2),
                 generator,
             ),
@@ -549,11 +549,10 @@ class NetworkInput(NamedTuple):
     offset: Tensor
 
 
-def lie_group_input(joints: Joints, sensitivity: Sequence[float], axes: int = 0) -> NetworkInput:
+def lie_group_input(joints: Joints, sensitivity: Sequence[float]) -> NetworkInput:
     """Of each joint the nine numbers of R in SO(3) or the three of r in R^3, times its sensitivity.
 
-    z is the joint's axis, so R = [[cos q, -sin q, 0], [sin q, cos q, 0], [0, 0, 1]]. Then, with
-    ``axes``, each joint's velocity along so many axes, of which the last is z.
+    z is the joint's axis, so R = [[cos q, -sin q, 0], [sin q, cos q, 0], [0, 0, 1]].
     """
     n = joints.n
     encoded = (2 if all(joints.revolute) else 3) * n
@@ -561,7 +560,7 @@ def lie_group_input(joints: Joints, sensitivity: Sequence[float], axes: int = 0)
     matrices, offsets = [], []
     for joint, revolute in enumerate(joints.revolute):
         size = 9 if revolute else 3
-        matrix, offset = torch.zeros(size, encoded + n * (axes > 0)), torch.zeros(size)
+        matrix, offset = torch.zeros(size, encoded), torch.zeros(size)
         if revolute:
             matrix[[0, 4], joint], offset[8] = 1.0, 1.0
             matrix[1, n + joint], matrix[3, n + joint] = -1.0, 1.0
@@ -571,15 +570,26 @@ def lie_group_input(joints: Joints, sensitivity: Sequence[float], axes: int = 0)
         matrices.append(matrix)
         offsets.append(offset)
     weights = [sensitivity[joint] for joint in owners]
-    for joint in range(n if axes else 0):
-        matrix = torch.zeros(axes, encoded + n)
-        matrix[-1, encoded + joint] = 1.0
-        owners += [joint] * axes
-        weights += [1.0] * axes
-        matrices.append(matrix)
-        offsets.append(torch.zeros(axes))
     return NetworkInput(
         tuple(owners), vector(weights), torch.cat(matrices).double(), torch.cat(offsets).double()
+    )
+
+
+def with_velocities(inputs: NetworkInput, joints: Joints, axes: int) -> NetworkInput:
+    """These inputs, then each joint's velocity along so many axes, of which the last is the joint's own.
+
+    The network then reads the encoding and, behind it, the velocities, (..., encoded + n).
+    """
+    n, (rows, encoded) = joints.n, inputs.matrix.shape
+    matrix = torch.zeros(rows + axes * n, encoded + n, dtype=torch.float64)
+    matrix[:rows, :encoded] = inputs.matrix
+    matrix[rows + axes - 1 :: axes, encoded:] = torch.eye(n, dtype=torch.float64)
+    velocities = torch.ones(axes * n, dtype=torch.float64)
+    return NetworkInput(
+        joints=(*inputs.joints, *(joint for joint in range(n) for _ in range(axes))),
+        sensitivity=torch.cat([inputs.sensitivity, velocities]),
+        matrix=matrix,
+        offset=torch.cat([inputs.offset, 0 * velocities]),
     )
 
 

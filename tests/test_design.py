@@ -1,0 +1,114 @@
+"""The design space: every combination is a model that works, or is refused with the two options that clash."""
+
+import itertools
+from dataclasses import asdict
+from typing import get_args
+
+import pytest
+import torch
+
+from spelgen.building import build
+from spelgen.design import CHOICES, PRESETS, Design, Preset, load_design
+from spelgen.emission.loading import load_module
+from spelgen.errors import SettingsError, SpelgenError
+from spelgen.loaded_arm import load_arm
+from spelgen.pipeline import check, generate
+
+COMBINATIONS = [dict(zip(CHOICES, values, strict=True)) for values in itertools.product(*CHOICES.values())]
+
+
+@pytest.fixture(scope="module")
+def rpr(robots):
+    return load_arm(robots / "rpr.urdf")
+
+
+def made(values):
+    try:
+        return Design(**values)
+    except SpelgenError:
+        return None
+
+
+def test_what_is_refused_names_the_two_options():
+    refused = [values for values in COMBINATIONS if made(values) is None]
+    for values in refused:
+        with pytest.raises(SpelgenError) as error:
+            Design(**values)
+        for line in str(error.value).splitlines():
+            first, _, rest = line.partition(" with ")
+            second = rest.partition(";")[0]
+            named = dict(part.split(": ") for part in (first, second))
+            assert len(named) == 2 and named.items() <= values.items()
+    assert len(COMBINATIONS) - len(refused) == 169  # 168 with networks, and closed-form
+
+
+@pytest.mark.parametrize("mass", CHOICES["mass"])
+@pytest.mark.parametrize("dissipation", CHOICES["dissipation"])
+def test_every_other_combination_is_a_model(rpr, mass, dissipation):
+    generator = torch.Generator().manual_seed(0)
+    q, qd, tau = torch.rand(3, 5, 3, dtype=torch.float64, generator=generator)
+    for values in COMBINATIONS:
+        design = made(values) if (values["mass"], values["dissipation"]) == (mass, dissipation) else None
+        if design is None:
+            continue
+        model = build(rpr, design, width=8)
+        qdd = model.forward_dynamics(q, qd, tau)
+        assert (model.inverse_dynamics(q, qd, qdd) - tau).abs().max() < 1e-8, values
+        assert torch.linalg.eigvalsh(model.mass_matrix(q)).min() > 0, values
+        assert torch.linalg.eigvalsh(model.dissipation(q, qd)).min() > -1e-12, values
+        model(torch.zeros(()), torch.cat([q, qd, tau], dim=-1)).square().sum().backward()
+        assert all(each.grad is None or each.grad.isfinite().all() for each in model.parameters()), values
+
+
+@pytest.mark.parametrize("preset", get_args(Preset))
+def test_presets_are_the_files(preset):
+    assert {path.stem for path in PRESETS.glob("*.yaml")} == set(get_args(Preset))
+    design = load_design(preset)
+    assert load_design(PRESETS / f"{preset}.yaml") == design == load_design(design)
+    if preset != "closed-form":
+        assert load_design(preset, "kan").net == "kan"
+
+
+def test_a_preset_of_your_own(rpr, robots, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    own = asdict(load_design("minimal")) | {"dissipation": "dense-n", "about": "Friction of all joints."}
+    (tmp_path / "mine.yaml").write_text("".join(f"{key}: {value}\n" for key, value in own.items()))
+    source = generate(rpr, "mine.yaml")
+    options = load_module(source).facts.options
+    assert (options.preset, options.design.dissipation) == ("mine", "dense-n")
+    (tmp_path / "module.py").write_text(source, encoding="utf-8")
+    (tmp_path / "mine.yaml").unlink()  # the module knows how it was made
+    assert check(tmp_path / "module.py", robots / "rpr.urdf").reasons == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"fourier": "all"}, "mine.yaml:5: fourier: got 'all', expected one of derived, none"),
+        ({"fourier": ["derived"]}, "mine.yaml:5: fourier: got ['derived'], expected one of derived, none"),
+        ({"masss": "none"}, "mine.yaml:8: unknown key 'masss'; did you mean 'mass'?"),
+        ({"net": None}, "mine.yaml:6: net: got None, expected one of mlp, kan, none"),
+        (
+            {"mass": "closed-form"},
+            "mine.yaml:1: mass: closed-form with potential: derived; rigid bodies give both: name closed-form for "
+            "both or for neither",
+        ),
+    ],
+)
+def test_a_wrong_preset_is_told_with_its_place(tmp_path, monkeypatch, change, message):
+    monkeypatch.chdir(tmp_path)
+    values = asdict(load_design("minimal")) | change
+    text = "".join(f"{key}: {'null' if value is None else value}\n" for key, value in values.items())
+    (tmp_path / "mine.yaml").write_text(text)
+    with pytest.raises(SpelgenError) as error:
+        load_design("mine.yaml")
+    assert str(error.value).splitlines()[0] == message
+
+
+def test_no_preset_at_all():
+    with pytest.raises(SettingsError) as error:
+        load_design("minmal")
+    expected = "minimal, spel, spel-kan, phnode, closed-form, or a YAML file"
+    assert str(error.value) == f"got the preset 'minmal', expected one of {expected}"
+    with pytest.raises(SettingsError, match="mass: closed-form with net: kan"):
+        load_design("closed-form", "kan")
