@@ -17,10 +17,11 @@ from spelgen.comparison.paper import PAPER
 from spelgen.comparison.runs import run_study, time_steps
 from spelgen.comparison.study import VARIANTS, prepare_study
 from spelgen.comparison.truth import example_positions, mass_error, true_mass
+from spelgen.emission.loading import load_module
 from spelgen.errors import RunError
-from spelgen.evaluation.baselines import held_velocity
+from spelgen.evaluation import invariants
+from spelgen.evaluation.baselines import constant_velocity
 from spelgen.evaluation.examples import predict_examples
-from spelgen.fitting.run_folder import load_model
 from spelgen.logs.read import Trajectory, read_logs
 from spelgen.render.comparison_page import write_comparison
 from spelgen.urdf.read import read_urdf
@@ -32,8 +33,8 @@ JOINTS = ("joint1", "joint2")
 @pytest.fixture(scope="module")
 def quick():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(metrics, "POSITIONS", 100)
-        patch.setattr(metrics, "FREE_STEPS", 50)
+        patch.setattr(invariants, "POSITIONS", 100)
+        patch.setattr(invariants, "FREE_STEPS", 50)
         yield
 
 
@@ -51,14 +52,14 @@ def robot(tmp_path_factory, robots):
 
 
 @pytest.fixture(scope="module")
-def told():
+def notes():
     return []
 
 
 @pytest.fixture(scope="module")
-def study(robot, quick, told, tmp_path_factory):
+def study(robot, quick, notes, tmp_path_factory):
     found = prepare_study(robot, tmp_path_factory.mktemp("study"), variants=CHOSEN)
-    run_study(found, jobs=1, told=told.append)
+    run_study(found, jobs=1, note=notes.append)
     return found
 
 
@@ -70,22 +71,22 @@ def test_models_know_the_kinematics_alone(study):
 
 
 def test_training_sees_the_beginning_only(study):
-    names = load_model(study.module(CHOSEN[0])).joint_names
+    names = load_module(study.module(CHOSEN[0])).joint_names
     training, testing = (read_logs([study.logs], names, role=role) for role in ("train", "test"))
     assert {len(x.t) for x in training} == {5}
     assert {len(x.t) for x in testing} == {21}
     assert not {x.name for x in training} & {x.name for x in testing}
 
 
-def test_every_run_is_told_and_measured(study, told):
-    assert len(told) == 2
+def test_every_run_is_noted_and_measured(study, notes):
+    assert len(notes) == 2
     results = {result["variant"]: result for result in study.results()}
     assert set(results) == {"phnode", "minimal"}
     for result in results.values():
         parts = result["prediction"]
         assert parts["loss"] == pytest.approx(parts["position"] + parts["velocity"])
-        assert result["laws"]["least_eigenvalue"] > 0
-        assert result["laws"]["orthogonality"] < 1e-14
+        assert result["invariants"]["least_eigenvalue"] > 0
+        assert result["invariants"]["orthogonality"] < 1e-14
     assert results["minimal"]["sizes"]["outputs"] == [1, 2, 0, 1]
     assert results["phnode"]["sizes"]["outputs"] == list(PAPER["two_link"]["phnode"].outputs)
     assert results["phnode"]["sizes"]["inputs"] == PAPER["two_link"]["phnode"].inputs
@@ -95,10 +96,10 @@ def test_a_comparison_goes_on_where_it_stopped(study, robot, quick):
     lost, kept = study.result(CHOSEN[0], 0), study.result(CHOSEN[1], 0)
     before = lost.read_text(), kept.stat().st_mtime_ns
     lost.unlink()
-    told = []
+    notes = []
     again = prepare_study(robot, study.folder, variants=CHOSEN)
-    run_study(again, jobs=1, told=told.append)
-    assert told[0] == "1 of 2 runs are done already"
+    run_study(again, jobs=1, note=notes.append)
+    assert notes[0] == "1 of 2 runs are done already"
     assert kept.stat().st_mtime_ns == before[1]
     first, second = (json.loads(x) for x in (before[0], lost.read_text()))
     assert first["prediction"] == second["prediction"]
@@ -157,7 +158,7 @@ def test_the_page_shows_predictions_and_m_beside_the_truth(study):
     assert learned.count("<title>true</title>") == 3
     (result,) = (x for x in study.results() if x["variant"] == "minimal")
     q = example_positions(result["examples"][0])
-    model = load_model(study.module(CHOSEN[1]))
+    model = load_module(study.module(CHOSEN[1]))
     model.load_state_dict(torch.load(study.run(CHOSEN[1], 0) / "model.pt"))
     np.testing.assert_allclose(result["mass"]["along"], model.mass_matrix(q).detach(), rtol=1e-12)
 
@@ -173,26 +174,26 @@ def test_windows_and_examples_of_every_fourth_sample_begin_with_a_fourth_one():
     """Where a controller holds its torque for four samples, a window's input is then exactly what acted."""
     count = 200
     q = torch.arange(count, dtype=torch.float64).unsqueeze(-1).numpy()  # a sample's number
-    log = Trajectory("a", 0.002 * q[:, 0], q, q, np.floor(q / 4))
+    log = Trajectory(0.002 * q[:, 0], q, q, np.floor(q / 4), "a")
     windows = metrics.thinned([log], 5, 4)
     assert not (windows.q % 4).any()
     assert torch.equal(windows.tau, windows.q[:, :-1] / 4)
-    (example,) = predict_examples(held_velocity(), [log], 10, ["joint1"], every=4, measured=False)
+    (example,) = predict_examples(constant_velocity(), [log], 10, ["joint1"], decimation=4, measured=False)
     assert [x % 4 for x in example.joints[0].q_true] == [0] * 11
     np.testing.assert_allclose(example.t, 0.008 * np.arange(11), atol=1e-12)
 
 
-def test_laws_notice_what_breaks_them(study, quick):
-    model = load_model(study.module(CHOSEN[1]))
+def test_invariants_notice_what_breaks_them(study, quick):
+    model = load_module(study.module(CHOSEN[1]))
     testing = read_logs([study.logs], model.joint_names, role="test")
     still = metrics.thinned(testing, 21, 1)
     windows = replace(still, qd=0.5 + still.qd)
     low, high = (torch.full((2,), bound, dtype=torch.float64) for bound in (-math.pi, math.pi))
-    kept = metrics.laws(model, windows, low, high)
+    kept = invariants.invariants(model, windows, low, high)
     assert kept.energy_rise <= 1e-12 < kept.least_eigenvalue
-    model.friction.forward = lambda features, qd, prepared: -5.0 * qd  # drives instead of braking
-    assert metrics.laws(model, windows, low, high).energy_rise > 1e-3
+    model.dynamics.friction.forward = lambda encoded, qd, prepared: -5.0 * qd  # drives instead of braking
+    assert invariants.invariants(model, windows, low, high).energy_rise > 1e-3
     model.mass_matrix = lambda q, prepared=None: torch.diag_embed(
         torch.cat([q.cos()[..., :1], 1 + 0 * q[..., :1]], dim=-1)
     )
-    assert metrics.laws(model, windows, low, high).least_eigenvalue < -1
+    assert invariants.invariants(model, windows, low, high).least_eigenvalue < -1

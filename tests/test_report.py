@@ -10,15 +10,15 @@ import torch
 from html_page import Page
 
 from spelgen import pipeline
+from spelgen.emission.loading import load_module
 from spelgen.errors import RunError
-from spelgen.fitting.dataset import TrainingConfig
-from spelgen.fitting.run_folder import load_model
+from spelgen.fitting.config import Rollout
 from spelgen.render.report_page import render_report, write_report
 
 
 def errors(share, tip=None):
-    return {"q": [share, 0.02, None], "qd": [0.1, 0.2, 0.3], "q_share": [share] * 3, "qd_share": [share] * 3,
-            "mean_share": share, "tip_mm": tip}  # fmt: skip
+    return {"q": [share, 0.02, None], "qd": [0.1, 0.2, 0.3], "q_relative_rms": [share] * 3,
+            "qd_relative_rms": [share] * 3, "mean_relative_rms": share, "tip_mm": tip}  # fmt: skip
 
 
 def example(name):
@@ -37,7 +37,7 @@ def validation(epoch):
 
 
 EVALUATION = {
-    "schema": 1,
+    "schema": 2,
     "robot": "rpr",
     "joints": ["joint1", "joint2", "joint3"],
     "trajectories": ["traj_00", "traj_02"],
@@ -64,19 +64,20 @@ def run(robots, tmp_path) -> Path:
     """A complete run folder, but for the training."""
     folder = tmp_path / "run"
     folder.mkdir()
-    (folder / "module.py").write_text(pipeline.build(robots / "rpr.urdf"), encoding="utf-8")
-    torch.save(load_model(folder / "module.py").state_dict(), folder / "model.pt")
+    (folder / "module.py").write_text(pipeline.generate(robots / "rpr.urdf"), encoding="utf-8")
+    torch.save(load_module(folder / "module.py").state_dict(), folder / "model.pt")
     config = {
-        "schema": 1, "robot": "rpr", "preset": "minimal", "joints": ["joint1", "joint2", "joint3"],
-        "config": vars(TrainingConfig(epochs=30, seed=7)), "data_digest": "d" * 64,
+        "schema": 2, "robot": "rpr", "preset": "minimal", "joints": ["joint1", "joint2", "joint3"],
+        "objective": "rollout", "config": Rollout(epochs=30).record(closed_form=False), "data_digest": "d" * 64,
+        "preprocessing": {"cutoff": 8.0, "decimation": 1}, "validation_fraction": 0.25, "seed": 7,
         "training": ["traj_01", "traj_03"],
-        "validation": ["traj_05"], "training_windows": 34, "validation_windows": 17, "cutoff": None,
+        "validation": ["traj_05"], "training_windows": 34, "validation_windows": 17,
         "scales": {"q": [1, 1, 1], "qd": [1, 1, 1]},
     }  # fmt: skip
     (folder / "config.json").write_text(json.dumps(config))
     lines = [
         {"epoch": k, "step": 20 * k, "loss": 2.0 * 0.8**k, "validation": validation(k),
-         "best": min(map(validation, range(1, k + 1))), "rate": 1e-3, "substeps": 4, "rollbacks": 0,
+         "best": min(map(validation, range(1, k + 1))), "learning_rate": 1e-3, "substeps": 4, "rollbacks": 0,
          "seconds": 2.5 * k}
         for k in range(1, 31)
     ]  # fmt: skip
@@ -106,7 +107,8 @@ def test_numbers_are_those_of_the_run(run):
     assert "The model predicts best over 1 s; over 1 step URDF is better." in text
     assert "34 windows from 2 trajectories" in text
     assert "8.0e-10" in text
-    assert "--epochs 30 --seed 7" in text
+    assert "--objective rollout --seed 7 --epochs 30 --filter 8.0 --decimation 1" in text
+    assert "2,000 steps on the momentum" in text
 
 
 def test_a_run_that_never_got_better_says_so(run):
@@ -128,13 +130,12 @@ def test_structure_picture_is_the_modules(run):
 
 def test_learned_constants_are_those_of_the_weights(run):
     state = torch.load(run / "model.pt", weights_only=True)
-    state["constants"] += 1.0
+    state["dynamics.mass.raw_constants"] += 1.0
     torch.save(state, run / "model.pt")
     page = render_report(run)
-    for start, scale in zip(
-        load_model(run / "module.py").constants.tolist(), state["constant_scale"].tolist(), strict=True
-    ):
-        assert f'<td class="n">{start * scale:.4g}</td>\n<td class="n">{(start + 1) * scale:.4g}</td>' in page
+    mass = load_module(run / "module.py").dynamics.mass
+    for start, scale in zip(mass.constants().tolist(), mass.constant_scale.tolist(), strict=True):
+        assert f'<td class="n">{start:.4g}</td>\n<td class="n">{start + scale:.4g}</td>' in page
 
 
 @pytest.mark.parametrize("lacking, said", [

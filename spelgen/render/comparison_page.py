@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,10 +55,9 @@ def _losses(study: Study, styles: Mapping[str, str]) -> Markup:
     """Validation loss of the first seed's runs by training step."""
     lines = []
     for variant in study.variants:
-        metrics = RunFolder(study.run(variant, 0)).metrics
-        if variant.name not in styles or not metrics.is_file():
+        records = RunFolder(study.run(variant, 0)).read_metrics()
+        if variant.name not in styles or not records:
             continue
-        records = [json.loads(line) for line in metrics.read_text(encoding="utf-8").splitlines()]
         steps = [record["step"] for record in records]
         lines.append(Line(variant.name, steps, [record["best"] for record in records], styles[variant.name]))
     return line_chart(lines, "Best validation loss by step", "training step", "loss", log=True, width=860)

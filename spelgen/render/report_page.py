@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -63,7 +62,7 @@ def render_report(folder: Path | str) -> str:
         )
     facts, picture = read_facts(run.module), read_picture(run.module)
     config = run.read_json(run.config) if run.config.is_file() else None
-    metrics = _metrics(run.metrics)
+    metrics = run.read_metrics()
     evaluation = run.read_json(run.evaluation) if run.evaluation.is_file() else None
     learned = read_learned(run) if run.weights.is_file() else None
     return render(
@@ -89,19 +88,6 @@ def render_report(folder: Path | str) -> str:
         files=files(run.path),
         commands=commands(facts, config),
     )
-
-
-def _metrics(path: Path) -> list[dict[str, Any]]:
-    """The lines of metrics.jsonl; the last may be torn where a run was killed, and is then left out."""
-    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-    records = []
-    for count, line in enumerate(lines, start=1):
-        try:
-            records.append(json.loads(line))
-        except ValueError as error:
-            if count < len(lines):
-                raise RunError(f"broken JSON ({error})", file=path, line=count) from error
-    return records
 
 
 def _numbers(
