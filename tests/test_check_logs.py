@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 from spelgen.cli.main import app
 from spelgen.dynamics.regressor import regressor, urdf_parameters
+from spelgen.errors import LogError
 from spelgen.loaded_arm import load_arm
 from spelgen.logs.check_logs import check_logs
 from spelgen.logs.read import write_logs
@@ -187,6 +188,32 @@ def test_logs_larger_than_memory_are_told_by_parts(spelgen, robots, arm, log, tm
     told = json.loads(spelgen(*command).stdout)
     assert [x["name"] for x in told["trajectories"]] == [f"motion [{k}]" for k in range(1, 5)]
     assert [x["low"] for x in told["joints"]] == [x["low"] for x in whole["joints"]]
+
+
+@pytest.mark.parametrize("constant", [0.0, 0.1, 5.0])
+def test_a_torque_that_never_changes_is_told(loaded, log, constant):
+    """0.1 is no binary number: what is left of it is rounding, not 0."""
+    report = check_logs([replace(log, tau=np.full_like(log.tau, constant))], loaded)
+    assert {x.code for x in report.findings} == {"constant-torque"}
+    assert [x.gravity.explained for x in report.joints] == [None] * 3
+
+
+def test_arrays_of_another_arm_are_refused(loaded, log):
+    other = Trajectory(log.t, log.q[:, :2], log.qd[:, :2], log.tau[:, :2])
+    with pytest.raises(LogError) as caught:
+        check_logs([other], loaded)
+    assert str(caught.value) == "trajectory trajectory: got 2 joints, expected 3: joint1, joint2, joint3"
+    with pytest.raises(LogError, match="got no trajectory, expected at least one"):
+        check_logs([], loaded)
+
+
+def test_a_report_is_told_in_a_line_and_in_a_notebook(loaded, log):
+    report = check_logs([replace(log, name="<b>", qd=-log.qd)], loaded)
+    assert repr(report) == "<LogReport rpr: 1 trajectory, 19.99 s, 2000 samples; 3 warnings, 0 errors>"
+    shown = report._repr_html_()
+    assert "&lt;b&gt;" in shown and "<b>: " not in shown
+    assert shown.count("<table>") == 5
+    assert json.loads(json.dumps(report.to_dict()))["files"] == 0
 
 
 def test_a_few_samples_are_told_without_judgement(loaded, arm, log):

@@ -1,6 +1,10 @@
 """Every kind of log file and every way to name and measure: the same trajectory, or one clear sentence."""
 
+import os
 import sys
+import textwrap
+import tracemalloc
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +13,7 @@ import pyarrow.parquet
 import pytest
 
 from spelgen.errors import LogError, SettingsError, SpelgenErrors
+from spelgen.loaded_arm import load_arm
 from spelgen.logs.mapping import LogMapping
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory
@@ -132,6 +137,36 @@ def test_measured_currents_times_gains_are_the_recorded_torques(shared):
     np.testing.assert_allclose(mapped.tau, plain.tau, atol=1e-6)
 
 
+def test_a_mapping_may_be_a_dict_a_file_or_that_of_the_arm(robots, tmp_path):
+    joints = ("joint1", "joint2")
+    turned = {f"{what}_{joint}": -x[:, k] for what, x in (("q", Q), ("qd", QD), ("tau", TAU))
+              for k, joint in enumerate(joints)}  # fmt: skip
+    path = parquet(tmp_path / "x.parquet", {"clock": T} | turned)
+    text = "columns: {t: clock}\njoints:\n  joint1: {sign: -1}\n  joint2: {sign: -1}\n"
+    (tmp_path / "names.yaml").write_text(text)
+    (tmp_path / "arm.urdf").write_bytes((robots / "two_link.urdf").read_bytes())
+    (tmp_path / "arm.yaml").write_text("logs:\n" + textwrap.indent(text, "  "))
+    arm = load_arm(tmp_path / "arm.urdf")
+    keys = {"columns": {"t": "clock"}, "joints": {joint: {"sign": -1} for joint in joints}}
+    for given, mapping in ((joints, keys), (joints, tmp_path / "names.yaml"), (arm, None), (arm, keys)):
+        check(read_logs(path, given, mapping)[0], "x")
+    with pytest.raises(SettingsError) as caught:
+        read_logs(path, joints, {"columns": {"time": "clock"}})
+    assert (
+        str(caught.value)
+        == "mapping: columns: unknown key 'time'; known are 't', 'trajectory', 'q', 'qd', 'tau'"
+    )
+
+
+@pytest.mark.parametrize("arm", ["arm.urdf", ["a", 2], 3])
+def test_what_is_no_arm_is_refused(tmp_path, arm):
+    with pytest.raises(LogError) as caught:
+        read_logs(tmp_path, arm)
+    assert str(caught.value) == (
+        f"read_logs: got {arm!r}, expected an arm of load_arm, a model, or joint names in a list"
+    )
+
+
 MISFITS = {
     "current": (
         {"units": {"tau": "A"}, "joints": {"elbow": {"gain": 2.0}}},
@@ -247,12 +282,57 @@ def test_bad_npz_is_refused_in_one_sentence(tmp_path, case):
 
 
 def test_npz_never_unpickles(tmp_path):
-    np.savez(tmp_path / "x.npz", **columns(extra=np.array([print], dtype=object)))
+    np.savez(tmp_path / "x.npz", **columns(q_elbow=np.array([print] * 4, dtype=object)))
     with pytest.raises(LogError, match=r"x\.npz: an unreadable npz file \(.*pickle"):
         read_logs([tmp_path], JOINTS)
     (tmp_path / "x.npz").write_bytes(b"not an archive")
     with pytest.raises(LogError, match=r"x\.npz: an unreadable npz file"):
         read_logs([tmp_path], JOINTS)
+
+
+def test_arrays_that_are_not_asked_for_are_not_looked_at(tmp_path):
+    """A member that inflates to 2 GB of zeros, one that is no array, and one that is pickled."""
+    np.savez_compressed(tmp_path / "x.npz", **columns(pickled=np.array([print], dtype=object)))
+    with zipfile.ZipFile(tmp_path / "x.npz", "a", compression=zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("README.txt", "how this was recorded")
+        with archive.open("image.npy", "w", force_zip64=True) as member:
+            member.write(
+                b"\x93NUMPY\x01\x00v\x00{'descr': '<f8', 'fortran_order': False, 'shape': (250000000,), }"
+            )
+            for _ in range(64):
+                member.write(bytes(2**20))
+    tracemalloc.start()
+    check(read_logs([tmp_path / "x.npz"], JOINTS)[0], "x")
+    assert tracemalloc.get_traced_memory()[1] < 5e6
+    tracemalloc.stop()
+
+
+def test_a_trajectory_named_twice_in_a_column_is_one_text(tmp_path):
+    arrays = {f"{k}/t_{k}": T for k in ("a", "b")} | {"a/t_b": T, "/t_": T}
+    for k in ("a", "b"):
+        arrays |= {f"{k}/q_{k}": Q, f"{k}/qd_{k}": QD, f"{k}/tau_{k}": TAU}
+    np.savez(tmp_path / "x.npz", **arrays)
+    names = {quantity: f"{{trajectory}}/{quantity}_{{trajectory}}" for quantity in ("t", "q", "qd", "tau")}
+    found = read_logs(tmp_path / "x.npz", JOINTS, {"columns": names})
+    assert [x.name for x in found] == ["a", "b"]
+
+
+def test_repeated_patterns_do_not_backtrack(tmp_path):
+    """Six open ends on a name of 5000 letters: by a regular expression, centuries."""
+    np.savez(tmp_path / "x.npz", **{"a" * 5000: T})
+    with pytest.raises(LogError, match="missing column"):
+        read_logs(tmp_path / "x.npz", JOINTS, {"columns": {"t": "{trajectory}" * 6 + "t"}})
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet", ".npz", ".mcap"])
+def test_pipes_among_logs_are_not_waited_for(tmp_path, suffix):
+    os.mkfifo(tmp_path / f"live{suffix}")
+    with pytest.raises(LogError) as caught:
+        read_logs(tmp_path / f"live{suffix}", JOINTS)
+    kinds = ".parquet, .csv, .npz, .mcap, .db3, or the folder of a ROS 2 bag"
+    assert str(caught.value) == f"{tmp_path}/live{suffix}: got a pipe or a device, expected a file: {kinds}"
+    parquet(tmp_path / "x.parquet", columns())
+    check(read_logs(tmp_path, JOINTS)[0], "x")
 
 
 # ---- ROS 2 bags

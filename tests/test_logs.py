@@ -2,6 +2,7 @@
 
 from itertools import pairwise
 from pathlib import Path
+from time import process_time
 
 import numpy as np
 import pyarrow as pa
@@ -11,6 +12,7 @@ import torch
 
 from spelgen.errors import LogError, SpelgenErrors
 from spelgen.logs.checks import check
+from spelgen.logs.chunks import scan
 from spelgen.logs.filtering import (
     automatic_cutoff,
     automatic_decimation,
@@ -31,6 +33,85 @@ def swing(name="swing", samples=200, dt=0.01, jitter=0.0, seed=0) -> Trajectory:
     frequency = 2 * np.pi * np.array([0.5, 0.8])
     phase = t[:, None] * frequency
     return Trajectory(t, np.sin(phase), frequency * np.cos(phase), 3.0 * np.cos(phase), name)
+
+
+class TestTrajectory:
+    @pytest.mark.parametrize(
+        "kind", [np.ndarray.tolist, np.float32, torch.tensor, lambda x: torch.tensor(x).requires_grad_()]
+    )
+    def test_lists_arrays_and_tensors_are_taken(self, kind):
+        whole = swing(samples=4)
+        found = Trajectory(*(kind(x) for x in (whole.t, whole.q, whole.qd, whole.tau)))
+        assert found.name == "trajectory"
+        for quantity in ("t", "q", "qd", "tau"):
+            assert getattr(found, quantity).dtype == np.float64
+            np.testing.assert_allclose(getattr(found, quantity), getattr(whole, quantity), rtol=1e-6)
+
+    @pytest.mark.parametrize(
+        ("changes", "message"),
+        [
+            ({"t": [[0.0], [1.0]]}, "t: got an array of shape (2, 1), expected (T,), a time for each sample"),
+            ({"t": []}, "t: got an array of shape (0,), expected (T,), a time for each sample"),
+            (
+                {"qd": np.zeros((3, 2))},
+                "qd: got an array of shape (3, 2), expected (2, 2), a row for each time and a column for each joint",
+            ),
+            (
+                {"q": [1.0, 2.0]},
+                "q: got an array of shape (2,), expected (2, n), a row for each time and a column for each joint",
+            ),
+            (
+                {"tau": [[0, 1], [2, float("nan")]]},
+                "tau: got [2.0, nan] at sample 1, expected finite numbers",
+            ),
+            ({"t": [0.1, 0.1]}, "t: got 0.1 s after 0.1 s, expected increasing times"),
+        ],
+    )
+    def test_what_does_not_fit_is_told(self, changes, message):
+        arrays = {"t": [0.0, 0.1], "q": np.zeros((2, 2)), "qd": np.zeros((2, 2)), "tau": np.zeros((2, 2))}
+        with pytest.raises(LogError) as caught:
+            Trajectory(**arrays | changes, name="x")
+        assert str(caught.value) == f"trajectory x: {message}"
+
+    def test_words_are_no_numbers(self):
+        with pytest.raises(
+            LogError, match=r"trajectory trajectory: t: got str \(.*\), expected an array of numbers"
+        ):
+            Trajectory("name", [0.0], [[0.0]], [[0.0]])
+
+    def test_it_is_told_in_a_line_and_in_a_notebook(self):
+        assert repr(swing()) == "<Trajectory 'swing': 200 samples, 1.99 s at 100 Hz, 2 joints>"
+        hostile = swing(name="<script>")
+        assert "&lt;script&gt;" in hostile._repr_html_() and "<script>" not in hostile._repr_html_()
+
+
+def test_recordings_are_told_apart_wherever_their_rows_lie(tmp_path):
+    """Rows of 3000 recordings in turn; time and memory grow with the rows, not with rows times recordings."""
+    names = [f"r{k % 3000}" for k in range(12_000)]
+    t, values = np.arange(12_000) // 3000 * 0.1, np.arange(12_000.0)
+    columns = {"trajectory": names, "t": t, "q_a": values, "qd_a": values, "tau_a": values}
+    pa.parquet.write_table(pa.table(columns), tmp_path / "x.parquet")
+    found = read_logs(tmp_path, ["a"])
+    assert [x.name for x in found] == [f"r{k}" for k in range(3000)]
+    np.testing.assert_array_equal(found[17].q[:, 0], [17, 3017, 6017, 9017])
+
+
+@pytest.mark.parametrize("step", ["read", "scan", "check"])
+def test_many_short_recordings_take_time_by_their_number(tmp_path, step):
+    """Two samples each: sixteen times as many took 256 times as long."""
+    random, seconds = np.random.default_rng(0), []
+    for count in (500, 8000):
+        logs = [Trajectory([0, 0.01], *random.standard_normal((3, 2, 2)), name=f"r{k}") for k in range(count)]
+        write_logs(tmp_path / "x.parquet", logs, JOINTS)
+        run = {
+            "read": lambda: read_logs(tmp_path / "x.parquet", JOINTS),
+            "scan": lambda: list(scan([tmp_path / "x.parquet"], JOINTS)),
+            "check": lambda logs=logs: check(logs, JOINTS, ("prismatic",) * 2),
+        }[step]
+        start = process_time()
+        run()
+        seconds.append(process_time() - start)
+    assert seconds[1] < 60 * max(seconds[0], 0.01)
 
 
 def csv(path: Path, text: str) -> Path:

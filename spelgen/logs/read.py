@@ -18,7 +18,8 @@ from spelgen.errors import LogError, SpelgenError, collect
 from spelgen.files import replacing
 from spelgen.logs.arm_mapping import GivenMapping, log_source
 from spelgen.logs.mapping import TIMES, LogMapping
-from spelgen.logs.tables import SUFFIXES, UNITS, UNITS_KEY, LogTable, is_log, read_tables, wanted_quantities
+from spelgen.logs.readers import read_tables
+from spelgen.logs.tables import SUFFIXES, UNITS, UNITS_KEY, LogTable, is_log, wanted_quantities
 from spelgen.logs.trajectory import QUANTITIES, Trajectory, gap_ends
 
 KINDS = f"{', '.join(SUFFIXES)}, or the folder of a ROS 2 bag"
@@ -95,7 +96,7 @@ def log_files(paths: Iterable[Path | str], role: str | None, errors: list[Spelge
     """The files and bags that these paths name, each once; what cannot be one is added to the errors."""
     files: dict[Path, None] = {}
     for path in map(Path, paths):
-        if is_log(path) and path.exists():
+        if is_log(path):
             files[path] = None
         elif path.is_dir():
             found = _folder_files(path, role)
@@ -106,6 +107,8 @@ def log_files(paths: Iterable[Path | str], role: str | None, errors: list[Spelge
             errors.append(
                 LogError("no such file or folder", file=path, expected="a log", do="check the path")
             )
+        elif not path.is_file():
+            errors.append(LogError("a pipe or a device", file=path, expected=f"a file: {KINDS}"))
         else:
             errors.append(LogError(f"a file of kind {path.suffix!r}", file=path, expected=KINDS))
     return list(files)

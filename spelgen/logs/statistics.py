@@ -14,6 +14,7 @@ DENSE = 50.0  # [Hz] below this rate motion looks like noise
 SMALLEST = 0.05  # part of the differences between neighbouring levels that may be one step
 NEAR = 100.0  # steps
 WHOLE = 0.05  # a difference this near to a whole number of steps is that number
+FEWEST = 3  # differences between neighbouring levels that tell of steps
 MOSTLY = 0.95  # of the differences between neighbouring levels are whole steps where a signal is quantised
 
 
@@ -104,9 +105,9 @@ def noise_level(t: np.ndarray, values: np.ndarray) -> np.ndarray:
 def quantisation_step(values: np.ndarray) -> float:
     """The step of a quantised signal (T,); NaN where it is not quantised, or never changes."""
     apart = np.diff(np.unique(values))
-    if not apart.size:
+    if len(apart) < FEWEST:
         return float("nan")
     step = float(np.median(apart[apart <= 1.5 * np.quantile(apart, SMALLEST)]))
     near = apart[apart < NEAR * step] / step  # far apart, whole steps cannot be told from rounding
     whole = np.abs(near - np.round(near)) < WHOLE
-    return step if len(near) >= 3 and whole.mean() > MOSTLY else float("nan")
+    return step if len(near) >= FEWEST and whole.mean() > MOSTLY else float("nan")
