@@ -56,7 +56,7 @@ def test_every_option_has_a_help_text(spelgen, command):
     options = re.split(r"^  (?=-)", spelgen(command, "--help").stdout, flags=re.MULTILINE)[1:]
     assert len(options) >= 2
     for option in options:
-        assert re.search(r"(\s{2,}|\n\s+)[A-Za-z]\S*[ ,.]", option.split("\n\n")[0]), option
+        assert re.search(r"(\s{2,}|\n\s+)(\[[a-z, ]+\] )?[A-Za-z]\S*[ ,.]", option.split("\n\n")[0]), option
 
 
 def test_help_and_inspect_load_no_torch(robots):
@@ -375,7 +375,7 @@ def test_interrupted_training_leaves_a_run(trained, tmp_path):
     folder, _ = trained
     run = tmp_path / "run"
     command = [sys.executable, "-m", "spelgen", "train", "arm_spel.py", "--data", "logs", "-o", str(run)]
-    command += ["--optimiser", "adamw"]  # L-BFGS would have ended by itself
+    command += ["--optimizer", "adamw"]  # L-BFGS would have ended by itself
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     with subprocess.Popen(
         command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
