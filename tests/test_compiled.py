@@ -5,7 +5,6 @@ import os
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -18,7 +17,7 @@ from spelgen.fitting.rollout import loss_scales, rollout_loss
 from spelgen.fitting.train import train
 from spelgen.logs.read import write_logs
 from spelgen.logs.windows import Windows
-from tests.test_training import JOINTS, QUICK, STAND_IN, motions
+from tests.test_training import JOINTS, STAND_IN, motions, quick
 
 has_compiler = pytest.mark.skipif(shutil.which("g++") is None, reason="no g++ to compile with")
 
@@ -29,7 +28,7 @@ def test_a_compiled_run_says_so_and_repeats_the_plain_one(tmp_path, monkeypatch)
     write_logs(tmp_path / "train.parquet", motions(), JOINTS)
     losses = {}
     for compile in (False, True):
-        config = replace(QUICK, epochs=2, momentum_steps=0, compile=compile)
+        config = quick(epochs=2, momentum_steps=0, compile=compile)
         result = train(
             STAND_IN, [tmp_path / "train.parquet"], tmp_path / f"{compile}", config, progress=False
         )

@@ -1,13 +1,13 @@
 """Networks fitted to torques: the torques of an arm that they can be, met to many digits."""
 
-from types import SimpleNamespace
-
 import torch
 from emitted import built, import_source
 
-from spelgen.fitting.dataset import TrainingConfig
+from spelgen.fitting import torque_networks
+from spelgen.fitting.config import MomentumFit, Rollout
+from spelgen.fitting.stages import default_objective, fit_torque_stage
 from spelgen.fitting.torque_networks import fit_networks
-from spelgen.fitting.torque_start import start_from_torque
+from spelgen.fitting.torque_samples import TorqueSamples
 from spelgen.identification.samples import DynamicsSamples
 
 
@@ -30,11 +30,11 @@ def test_another_arms_torques_are_met(tmp_path):
     module = import_source(built("two_link")[0], tmp_path / "two_link_spel.py")
     true, model = module.Model(seed=0), module.Model(seed=1)
     with torch.no_grad():
-        true.mass_series.factors *= 1.3
-        true.potential_series.factors *= 0.8
-        true.constants *= 1.5
-        true.rotor += 0.5
-        true.friction.viscous += 1.0
+        true.dynamics.mass.series.raw_coefficients *= 1.3
+        true.dynamics.potential.series.raw_coefficients *= 0.8
+        true.dynamics.mass.raw_constants *= 1.5
+        true.dynamics.mass.armature.raw += 0.5
+        true.dynamics.friction.raw_viscous += 1.0
     start = missed(model, recorded(true, 7))
     steps = fit_networks(model, [recorded(true, 5), recorded(true, 6)], 1e-6)
     assert steps % 20 == 0
@@ -42,38 +42,36 @@ def test_another_arms_torques_are_met(tmp_path):
     assert missed(model, recorded(true, 7)) < 1e-6
 
 
-def test_the_objective_torque_fits_and_leaves_no_windows(tmp_path, monkeypatch):
+def test_what_is_penalised_stays(tmp_path):
+    """A penalty against the torques leaves an error that nothing else would."""
     module = import_source(built("two_link")[0], tmp_path / "two_link_spel.py")
     true, model = module.Model(seed=0), module.Model(seed=0)
+    constants = model.dynamics.mass.raw_constants
     with torch.no_grad():
-        true.constants *= 1.5
-    monkeypatch.setattr(
-        "spelgen.fitting.torque_start.dynamics_samples", lambda recordings: [recorded(true, 5)]
-    )
-    config = TrainingConfig(objective="torque")
-    left, notes = start_from_torque(model, SimpleNamespace(recordings=()), config, fit=True)
-    assert (left.epochs, left.momentum_steps) == (0, 0)
-    assert [note.code for note in notes] == ["torque-fit"]
-    assert missed(model, recorded(true, 7)) < 1e-6
+        true.dynamics.mass.raw_constants *= 1.5
+    fit_networks(model, [recorded(true, 5)], 1e-6, lambda: 1e3 * (constants - 1).square().sum())
+    assert (constants - 1).abs().max() < 0.01
 
 
-def test_what_pulls_is_weighed(tmp_path):
-    """A pull away from the torques leaves an error that nothing else would."""
+def test_blocks_give_what_all_at_once_gives(tmp_path, monkeypatch):
+    """The loss and its gradient; what many steps make of the last digits is another thing."""
     module = import_source(built("two_link")[0], tmp_path / "two_link_spel.py")
-    true, model = module.Model(seed=0), module.Model(seed=0)
-    with torch.no_grad():
-        true.constants *= 1.5
-    fit_networks(model, [recorded(true, 5)], 1e-6, lambda: 1e3 * (model.constants - 1).square().sum())
-    assert (model.constants - 1).abs().max() < 0.01
+    true = module.Model(seed=0)
+    samples = [recorded(true, 5), recorded(true, 6)]
+    whole, parts = module.Model(seed=1), module.Model(seed=1)
+    penalty = lambda model: lambda: 1e-3 * model.dynamics.mass.raw_constants.square().sum()  # noqa: E731
+    fit_networks(whole, samples, 1e-6, penalty(whole), evaluations=20)
+    monkeypatch.setattr(torque_networks, "BLOCK", 128)
+    fit_networks(parts, TorqueSamples.spooled(samples, 2), 1e-6, penalty(parts), evaluations=20)
+    for name, value in whole.state_dict().items():
+        torch.testing.assert_close(parts.state_dict()[name], value, rtol=1e-5, atol=1e-7)
 
 
 def test_networks_are_fitted_to_torques_only_where_that_is_asked_for(tmp_path):
     """Without a word on it windows are predicted; the objective momentum leaves its own steps alone."""
     model = import_source(built("two_link")[0], tmp_path / "two_link_spel.py").Model()
+    assert default_objective(model, [1000.0]) == "rollout"
     weights = {name: value.clone() for name, value in model.state_dict().items()}
-    samples = SimpleNamespace(recordings=())
-    for objective, epochs in ((None, 200), ("rollout", 200), ("momentum", 0)):
-        config = TrainingConfig(epochs=200, objective=objective)
-        left, notes = start_from_torque(model, samples, config, fit=True)
-        assert (left.epochs, left.momentum_steps, notes) == (epochs, config.momentum_steps, [])
+    for config in (Rollout(), MomentumFit()):
+        assert fit_torque_stage(model, None, config) == []
     assert all(torch.equal(value, weights[name]) for name, value in model.state_dict().items())

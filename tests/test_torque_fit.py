@@ -1,0 +1,290 @@
+"""Closed-form models fitted to torques: known arms found again, in blocks as at once, adapted to a load, real ones."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from characters import TESTS, read_characters, write_arm
+from emitted import import_source
+from typer.testing import CliRunner
+
+from spelgen.cli import train_command
+from spelgen.cli.main import app
+from spelgen.emission.loading import load_module
+from spelgen.errors import LogError, RunError
+from spelgen.fitting import torque_jacobian
+from spelgen.fitting.config import GaussianPrior, Rollout, TorqueFit
+from spelgen.fitting.fit import fit
+from spelgen.fitting.gaussian_prior import SIZES, covariance, kind_of
+from spelgen.fitting.stages import default_objective
+from spelgen.fitting.torque_fit import fit_torque
+from spelgen.fitting.torque_samples import TorqueSamples
+from spelgen.identification.samples import DynamicsSamples, dynamics_samples
+from spelgen.loaded_arm import load_arm
+from spelgen.logs.read import read_logs, write_logs
+from spelgen.logs.trajectory import Trajectory
+from spelgen.pipeline import generate
+from tests.test_closed_form import FOLLOWED, drawn
+
+ROBOTS = ("two_link", "rpr", "six_dof")
+BODIES = "dynamics.inertial_parameters.raw"
+
+
+@pytest.fixture(scope="module")
+def emitted(robots, tmp_path_factory):
+    """Robot name -> (module, arm)."""
+    folder = tmp_path_factory.mktemp("closed_form")
+    (folder / "followed.urdf").write_text(FOLLOWED, encoding="utf-8")
+    made = {}
+    for name in (*ROBOTS, "followed"):
+        urdf = (folder if name == "followed" else robots) / f"{name}.urdf"
+        source = generate(urdf, preset="closed-form")
+        made[name] = import_source(source, folder / f"{name}_closed_form.py"), load_arm(urdf).arm
+    return made
+
+
+def recorded(model, seconds, noise, seed=0):
+    """Samples of a smooth random motion with the model's own torque."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, seconds, 0.01)[:, None, None]
+    n = model.n
+    speed, phase = 2 * np.pi * rng.uniform(0.1, 0.7, (5, n)), rng.uniform(0, 2 * np.pi, (5, n))
+    size = rng.uniform(0.2, 0.5, (5, n))
+    angle = speed * t + phase
+    q, qd = (size * np.sin(angle)).sum(1), (size * speed * np.cos(angle)).sum(1)
+    qdd = -(size * speed**2 * np.sin(angle)).sum(1)
+    with torch.no_grad():
+        tau = model.inverse_dynamics(*(torch.from_numpy(x) for x in (q, qd, qdd))).numpy()
+    tau = tau + noise * tau.std(0) * rng.normal(size=tau.shape)
+    return DynamicsSamples("known", q, qd, qdd, tau)
+
+
+def nmse(model, sample):
+    with torch.no_grad():
+        inputs = (torch.from_numpy(x) for x in (sample.q, sample.qd, sample.qdd))
+        error = model.inverse_dynamics(*inputs).numpy() - sample.tau
+    return float((np.square(error).mean(0) / sample.tau.var(0)).mean())
+
+
+@pytest.mark.parametrize("robot", ["rpr", "six_dof"])
+def test_a_known_arm_is_fitted_from_seconds_of_noisy_torque(emitted, robot):
+    module = emitted[robot][0]
+    true = drawn(module, seed=2, deviation=0.3)
+    found = module.Model()
+    start = nmse(found, recorded(true, 10.0, 0.0, seed=9))
+    fit = fit_torque(found, [recorded(true, 6.0, 0.05, seed=1)])
+    assert fit.steps > 2
+    assert nmse(found, recorded(true, 10.0, 0.0, seed=9)) < min(2e-3, 0.02 * start)
+
+
+def test_without_noise_the_torque_is_met_to_many_digits(emitted):
+    module = emitted["two_link"][0]
+    true = drawn(module, seed=3, deviation=0.3)
+    found = module.Model()
+    fit_torque(found, [recorded(true, 20.0, 0.0)])
+    assert nmse(found, recorded(true, 10.0, 0.0, seed=5)) < 1e-6
+
+
+def test_only_the_named_bodies_move(emitted):
+    module = emitted["six_dof"][0]
+    true, found = module.Model(), module.Model()
+    true.get_parameter(BODIES).data[5] = torch.tensor([0.3, 0.5, -0.2, 0.1, 0.4, 0.2, 0.6, -0.3, 0.2, 0.9])
+    fit_torque(found, [recorded(true, 5.0, 0.01)], GaussianPrior(bodies=10.0), only_bodies=[5])
+    assert nmse(found, recorded(true, 5.0, 0.0, seed=4)) < 1e-4
+    before = module.Model().state_dict()
+    for name, value in found.state_dict().items():
+        change = (value - before[name]).abs()
+        if name == BODIES:
+            assert change[5].max() > 0.1
+            change[5] = 0
+        assert change.max() == 0, name
+
+
+def test_the_prior_shares_what_joints_share():
+    weights = {"armature.raw": torch.zeros(2), **{f"friction.{name}": torch.zeros(2) for name in SIZES}}
+    prior = GaussianPrior(armature=0.5, shared_armature=2.0, sizes=0.3, shared_sizes=1.0, shared_friction=3.0)
+    found = covariance(prior, weights)
+    assert found[0, 0] == 0.25 + 4.0
+    assert found[0, 1] == 4.0
+    assert found[2, 2] == pytest.approx(0.09 + 1.0 + 9.0)
+    assert found[2, 3] == 1.0 + 9.0  # the same effect at another joint
+    assert found[2, 4] == 9.0  # another effect
+    assert found[0, 2] == 0.0
+    assert torch.linalg.eigvalsh(found)[0] > 0
+
+
+def test_the_prior_knows_every_weight(emitted):
+    """What it knows nothing of would be taken for something else in silence."""
+    module = emitted["six_dof"][0]
+    kinds = {kind_of(name) for name, _ in module.Model().named_parameters()}
+    assert kinds == {"bodies", "offset", "armature", "sizes", "velocities"}
+    with pytest.raises(StopIteration):
+        kind_of("dynamics.unheard_of")
+
+
+@pytest.mark.parametrize("held", [True, False])
+@pytest.mark.parametrize("on_disk", [True, False])
+def test_blocks_give_what_all_at_once_gives(emitted, monkeypatch, held, on_disk):
+    """Of blocks that leave a rest, with regressors kept or computed anew, in memory or in a temporary file."""
+    module = emitted["six_dof"][0]
+    samples = [recorded(drawn(module, seed=2, deviation=0.3), 3.0, 0.05, seed=seed) for seed in range(3)]
+    whole, parts = module.Model(), module.Model()
+    expected = fit_torque(whole, samples)
+    monkeypatch.setattr(torque_jacobian, "BLOCK", 64)
+    monkeypatch.setattr(torque_jacobian, "HELD", 1e12 if held else 0)
+    table = TorqueSamples.spooled(iter(samples), 6, 2) if on_disk else TorqueSamples.held(samples, 2)
+    assert (table.count, table.seen, len(list(table.blocks(64)))) == (450, 900, 8)
+    found = fit_torque(parts, table)
+    assert found.steps == expected.steps
+    assert found.cost == pytest.approx(expected.cost, rel=1e-9)
+    np.testing.assert_allclose(found.residual, expected.residual, rtol=1e-9)
+    for name, value in whole.state_dict().items():
+        torch.testing.assert_close(parts.state_dict()[name], value, rtol=1e-6, atol=1e-8)
+
+
+def test_joints_that_follow_others_are_fitted(emitted):
+    module = emitted["followed"][0]
+    true, found = drawn(module, seed=2, deviation=0.3), module.Model()
+    start = nmse(found, recorded(true, 10.0, 0.0, seed=9))
+    fit_torque(found, [recorded(true, 6.0, 0.02, seed=1)])
+    assert nmse(found, recorded(true, 10.0, 0.0, seed=9)) < min(2e-3, 0.02 * start)
+
+
+def write(path, samples, arm):
+    """Samples at 100 Hz as a log."""
+    names = [coordinate.name for coordinate in arm.coordinates]
+    written = [
+        Trajectory(0.01 * np.arange(len(x.q)), x.q, x.qd, x.tau, f"known {k}") for k, x in enumerate(samples)
+    ]
+    write_logs(path, written, names)
+
+
+@pytest.fixture(scope="module")
+def run(emitted, robots, tmp_path_factory):
+    """A run of `spelgen train` on a closed-form module, and the model whose torques its logs hold."""
+    folder = tmp_path_factory.mktemp("closed_form_run")
+    module, arm = emitted["six_dof"]
+    true = drawn(module, seed=4, deviation=0.2)
+    logs = [recorded(true, 5.0, 0.01, seed=seed) for seed in range(2)]
+    write(folder / "logs.parquet", logs, arm)
+    robot = str(robots / "six_dof.urdf")
+    build_ = ["build", robot, "--preset", "closed-form", "-o", str(folder / "arm.py")]
+    train = ["train", str(folder / "arm.py"), "--robot", robot, "--data", str(folder / "logs.parquet")]
+    train += ["-o", str(folder / "run"), "--quiet"]
+    for command in (build_, train):
+        done = CliRunner().invoke(app, command)
+        assert done.exit_code == 0, done.output
+    return folder, true, train
+
+
+def test_train_fits_torques_and_leaves_a_run(run, emitted):
+    folder, true, _ = run
+    model = emitted["six_dof"][0].Model()
+    model.load_state_dict(torch.load(folder / "run" / "model.pt", weights_only=True))
+    fresh = recorded(true, 5.0, 0.0, seed=8)
+    assert nmse(model, fresh) < 0.2 * nmse(
+        emitted["six_dof"][0].Model(), fresh
+    )  # friction, filtered at 8 Hz, differs
+    write(folder / "test.parquet", [recorded(true, 1.2, 0.01, seed=8)], emitted["six_dof"][1])
+    done = CliRunner().invoke(app, ["evaluate", str(folder / "run"), "--data", str(folder / "test.parquet")])
+    assert done.exit_code == 0, done.output
+    result = json.loads((folder / "run" / "evaluation.json").read_text(encoding="utf-8"))
+    assert result["torque"]["model"]["mean_nmse"] < 5e-3
+    assert CliRunner().invoke(app, ["report", str(folder / "run")]).exit_code == 0
+
+
+def test_a_run_is_adapted_to_a_load(run, emitted, tmp_path):
+    folder, true, _ = run
+    module, arm = emitted["six_dof"]
+    loaded = module.Model()
+    loaded.load_state_dict(true.state_dict())
+    loaded.get_parameter(BODIES).data[5, 9] += 1.0  # heavier
+    loaded.get_parameter(BODIES).data[5, 6] += 0.5
+    seen = recorded(loaded, 5.0, 0.01, seed=3)
+    write(tmp_path / "loaded.parquet", [seen], arm)
+    command = ["train", "--from", str(folder / "run"), "--data", str(tmp_path / "loaded.parquet")]
+    done = CliRunner().invoke(app, [*command, "-o", str(tmp_path / "adapted"), "--quiet"])
+    assert done.exit_code == 0, done.output
+    before, after = (
+        torch.load(x / "model.pt", weights_only=True) for x in (folder / "run", tmp_path / "adapted")
+    )
+    assert {name for name in before if not torch.equal(before[name], after[name])} == {BODIES}
+    assert torch.equal(before[BODIES][:5], after[BODIES][:5])
+    errors = []
+    for state in (before, after):
+        model = module.Model()
+        model.load_state_dict(state)
+        errors.append(nmse(model, recorded(loaded, 5.0, 0.0, seed=6)))
+    assert errors[1] < 0.3 * errors[0]
+
+
+def sparse(model):
+    """Logs of a moving arm at 20 Hz, too slow for accelerations."""
+    samples = (recorded(model, 5.0, 0.0, seed=seed) for seed in range(2))
+    return [
+        Trajectory(0.05 * np.arange(100), *(getattr(x, k)[:500:5] for k in ("q", "qd", "tau")))
+        for x in samples
+    ]
+
+
+def test_logs_too_slow_for_accelerations_are_fitted_by_windows(emitted, robots):
+    model = load_module(generate(robots / "rpr.urdf", preset="closed-form"))
+    logs = sparse(drawn(emitted["rpr"][0], seed=0))
+    found = fit(model, logs, Rollout(epochs=1, momentum_steps=0, urdf_weight=0.0))
+    assert [note.code for note in found.diagnostics].count("no-torque-fit") == 1
+    assert default_objective(model, [20.0]) == "rollout"
+    assert default_objective(model, [20.0, 100.0]) == "torque"
+    for payload, what in ((False, "to fit torques to"), (True, "to fit a load to")):
+        with pytest.raises(LogError, match=f"no motion {what}, expected samples at 50 Hz or more that move"):
+            fit(model, logs, TorqueFit(payload=payload))
+
+
+def test_a_model_of_networks_is_not_adapted_to_a_load(robots, run, tmp_path):
+    folder, _, train = run
+    build_ = ["build", str(robots / "six_dof.urdf"), "-o", str(folder / "networks.py"), "--force"]
+    assert CliRunner().invoke(app, build_).exit_code == 0
+    command = ["train", str(folder / "networks.py"), *train[2:6], "--quiet", "--objective", "torque"]
+    done = CliRunner().invoke(app, [*command, "--evaluations", "20", "-o", str(tmp_path / "networks")])
+    assert done.exit_code == 0, done.output
+    with pytest.raises(
+        RunError, match="got a load for a model of networks, expected a module of the preset closed"
+    ):
+        train_command.train(
+            source=tmp_path / "networks", data=[folder / "logs.parquet"], output=tmp_path / "x"
+        )
+
+
+def test_the_same_logs_give_the_same_weights(run, tmp_path):
+    folder, _, train = run
+    again = [*train[:-3], "-o", str(tmp_path / "again"), "--quiet"]
+    assert CliRunner().invoke(app, again).exit_code == 0
+    first, second = (
+        torch.load(x / "model.pt", weights_only=True) for x in (folder / "run", tmp_path / "again")
+    )
+    assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+def test_characters(shared, tmp_path):
+    source = generate(write_arm(tmp_path), preset="closed-form")
+    model = import_source(source, tmp_path / "planar_closed_form.py").Model()
+    samples, _ = read_characters(shared / "logs" / "delan_characters")
+    fit_torque(model, [x for x in samples if x.name not in TESTS])
+    test = [x for x in samples if x.name in TESTS]
+    with torch.no_grad():
+        inputs = [torch.from_numpy(np.concatenate([getattr(x, k) for x in test])) for k in ("q", "qd", "qdd")]
+        error = model.inverse_dynamics(*inputs).numpy() - np.concatenate([x.tau for x in test])
+    tau = np.concatenate([x.tau for x in test])
+    assert np.square(error).sum() / np.square(tau - tau.mean(0)).sum() < 1e-8
+
+
+def test_two_seconds_of_a_real_arm_beat_least_squares(shared, tmp_path):
+    folder = shared / "logs" / "ur10e"
+    source = generate(folder / "ur10e.urdf", preset="closed-form")
+    model = import_source(source, tmp_path / "ur10e_closed_form.py").Model()
+    names = [coordinate.name for coordinate in load_arm(folder / "ur10e.urdf").arm.coordinates]
+    (long,) = read_logs([folder / "20_02_10_30sec_12harm.parquet"], names)
+    fit_torque(model, dynamics_samples([long[: int(np.searchsorted(long.t, long.t[0] + 2.0))]]))
+    tests = ("19_12_23_free", "20_02_06_20sec_5harm")
+    samples = dynamics_samples([read_logs([folder / f"{x}.parquet"], names)[0] for x in tests], pauses=True)
+    assert np.mean([nmse(model, sample) for sample in samples]) < 0.03  # the best quick prior: 0.057 of nine
