@@ -1,15 +1,14 @@
-"""Real logs, real rivals: every figure of docs/real_logs.md, from the folder of reference logs, in one command.
+"""Real logs beside published baselines: every figure of docs/real_logs.md in one command.
 
     python benchmarks/real_logs.py [LOGS]
 
 LOGS is ../shared/logs beside the checkout by default. Torque errors are nMSE (mean squared error by the torque's
 variance, mean of the joints), once over the samples that move and once with the pauses between motions; the second is
-how the rivals' published figures were made. Nothing is chosen here: the settings are the defaults of spelgen.
+how the baselines' published figures were made. Nothing is chosen here: the settings are the defaults of spelgen.
 """
 
 from __future__ import annotations
 
-import functools
 import sys
 import tempfile
 import time
@@ -24,17 +23,12 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from characters import TESTS as CHARACTERS
 from characters import read_characters, write_arm
-from spelgen.fitting.torque_start import LOAD, last_body
 
 from spelgen.arm.arm import Arm
-from spelgen.design import Preset
-from spelgen.dynamics.protocol import integrable
-from spelgen.emission.loading import load_module
-from spelgen.evaluation.baselines import Contender
+from spelgen.building import build
+from spelgen.evaluation.baselines import of_dynamics
 from spelgen.evaluation.results import state_errors
-from spelgen.fitting.dataset import WHOLE_DECAY
-from spelgen.fitting.rollout import roll_out
-from spelgen.fitting.torque_fit import fit_torque
+from spelgen.fitting.torque_fit import PAYLOAD, fit_torque, last_body
 from spelgen.fitting.torque_networks import fit_networks
 from spelgen.identification.friction import FrictionModel
 from spelgen.identification.identification import Identification
@@ -42,11 +36,10 @@ from spelgen.identification.identify import least_squares
 from spelgen.identification.method import LeastSquares
 from spelgen.identification.samples import DynamicsSamples, dynamics_samples
 from spelgen.loaded_arm import load_arm
-from spelgen.logs.filtering import prepare
+from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
-from spelgen.pipeline import generate
 
 Torque = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
@@ -68,20 +61,20 @@ def main() -> None:
     torch.set_num_threads(1)
     logs = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parents[2] / "shared" / "logs"
     with tempfile.TemporaryDirectory() as scratch:
-        ur10e(logs / "ur10e", Path(scratch))
-        panda(logs / "panda", logs.parent / "arms" / "panda_erd.urdf", Path(scratch))
+        ur10e(logs / "ur10e")
+        panda(logs / "panda", logs.parent / "arms" / "panda_erd.urdf")
         characters(logs / "delan_characters", Path(scratch))
 
 
-def ur10e(folder: Path, scratch: Path) -> None:
+def ur10e(folder: Path) -> None:
     urdf = folder / "ur10e.urdf"
-    arm, model = load_arm(urdf).arm, emitted(urdf, scratch)
+    arm, model = load_arm(urdf).arm, build(urdf, "closed-form")
     logs = {name: read(folder / f"{name}.parquet", arm) for name in (*TRAINING, *TESTS, OUTSIDE, *LOADED)}
     training = dynamics_samples([logs[name] for name in TRAINING])
     tests = [
         (dynamics_samples([logs[x] for x in (*TESTS, OUTSIDE)], pauses=pauses)) for pauses in (True, False)
     ]
-    rival = least_squares(arm, training, LeastSquares("range"))
+    baseline = least_squares(arm, training, LeastSquares("range"))
     features = FrictionModel(stribeck=True, polynomial=True)
     more = least_squares(arm, training, LeastSquares("range", friction=features))
     weighted = least_squares(arm, training, LeastSquares(friction=features))
@@ -90,24 +83,24 @@ def ur10e(folder: Path, scratch: Path) -> None:
     print(
         f"UR10e: the closed-form model is fitted to 100 s of three logs in {time.perf_counter() - since:.0f} s\n"
     )
-    contenders = {
-        "least squares": rival.torque,
+    predictors = {
+        "least squares": baseline.torque,
         "with features": more.torque,
         "by noise": weighted.torque,
         "closed-form": torque_of(model),
     }
     for samples, said in zip(tests, ("pauses included", "moving samples alone"), strict=True):
-        table(f"Torque nMSE, {said}", contenders, samples, len(TESTS))
-    rollouts(model, rival, [logs[name] for name in TESTS])
+        table(f"Torque nMSE, {said}", predictors, samples, len(TESTS))
+    rollouts(model, baseline, [logs[name] for name in TESTS])
     payload(model, logs)
-    few(urdf, scratch, arm, logs[TRAINING[0]], [each[: len(TESTS)] for each in tests])
+    few(urdf, arm, logs[TRAINING[0]], [each[: len(TESTS)] for each in tests])
 
 
 def table(
-    title: str, contenders: dict[str, Torque], samples: Sequence[DynamicsSamples], counted: int
+    title: str, predictors: dict[str, Torque], samples: Sequence[DynamicsSamples], counted: int
 ) -> None:
-    print(title + "\n\n" + " " * 26 + "".join(f"{name:>15}" for name in contenders))
-    errors = np.array([[nmse(torque, sample) for torque in contenders.values()] for sample in samples])
+    print(title + "\n\n" + " " * 26 + "".join(f"{name:>15}" for name in predictors))
+    errors = np.array([[nmse(torque, sample) for torque in predictors.values()] for sample in samples])
     rows = [*zip((x.name for x in samples), errors, strict=True)]
     rows.insert(counted, (f"mean of the {counted}", errors[:counted].mean(axis=0)))
     for name, row in rows:
@@ -115,9 +108,7 @@ def table(
     print()
 
 
-def few(
-    urdf: Path, scratch: Path, arm: Arm, long: Trajectory, tests: Sequence[Sequence[DynamicsSamples]]
-) -> None:
+def few(urdf: Path, arm: Arm, long: Trajectory, tests: Sequence[Sequence[DynamicsSamples]]) -> None:
     print(f"Trained on the first seconds of {long.name}: mean nMSE of the nine, pauses included\n")
     head = ("best ridge", "URDF as prior", "closed-form", "(moving)")
     print(f"{'seconds':26}" + "".join(f"{x:>15}" for x in head))
@@ -125,7 +116,7 @@ def few(
         samples = dynamics_samples([first(long, seconds)])
         ridges = [least_squares(arm, samples, LeastSquares("range", ridge=x)).torque for x in RIDGES]
         prior = least_squares(arm, samples, LeastSquares(prior=0.5)).torque
-        model = emitted(urdf, scratch)
+        model = build(urdf, "closed-form")
         fit_torque(model, samples)
         ours = torque_of(model)
         best = min(mean(x, tests[0]) for x in ridges)  # by the tests themselves: in its favour
@@ -144,7 +135,7 @@ def payload(model: Any, logs: dict[str, Trajectory]) -> None:
             model.load_state_dict(trained)
             seen = dynamics_samples([first(logs[name], seconds)]) if seconds else []
             if sum(len(x.q) for x in seen):
-                fit_torque(model, seen, LOAD, only_bodies=[last_body(model)])
+                fit_torque(model, seen, PAYLOAD, only_bodies=[last_body(model)])
             rest = dynamics_samples([after(logs[name], seconds or 10.0)], pauses=True)
             row.append(mean(torque_of(model), rest))
         print(f"{name:26}" + "".join(f"{x:15.5f}" for x in row))
@@ -160,42 +151,46 @@ def rollouts(model: Any, found: Identification, logs: Sequence[Trajectory]) -> N
     for name, steps in AHEAD.items():
         windows = tested(logs, steps)
         with torch.no_grad():
-            row = [strayed(x, windows) for x in (integrable(found.dynamics), model)]
+            row = [relative_error(x, windows) for x in (found.dynamics, model)]
         print(f"{name:26}" + "".join(f"{x:15.4f}" for x in row))
     print()
 
 
 def tested(logs: Sequence[Trajectory], steps: int) -> Windows:
     """Evenly spread windows of each trajectory."""
-    pieces = [piece for x in logs for piece in prepare([x], shortest=steps + 1, cutoff=8.0)]
-    cut = [cut_windows([x], steps + 1, max(1, (len(x.t) - steps) // WINDOWS), measured=True) for x in pieces]
+    filtered = Preprocessing(cutoff=8.0)
+    pieces = [piece for x in logs for piece in filtered.pieces([x], shortest=steps + 1)]
+    cut = [cut_windows([x], steps + 1, max(1, (len(x) - steps) // WINDOWS), measured=True) for x in pieces]
     return Windows(*(torch.cat([getattr(x, k) for x in cut]) for k in ("dt", "q", "qd", "tau")))
 
 
-def strayed(dynamics: Any, windows: Windows) -> float:
-    contender = Contender("", functools.partial(roll_out, dynamics, substeps=SUBSTEPS), None)
-    return state_errors(contender, windows, ("revolute",) * windows.q.shape[-1], None).mean_share or np.nan
+def relative_error(dynamics: Any, windows: Windows) -> float:
+    predictor = of_dynamics("", dynamics, SUBSTEPS)
+    found = state_errors(predictor, windows, ("revolute",) * windows.q.shape[-1], None)
+    return found.mean_relative_rms or np.nan
 
 
-def panda(folder: Path, urdf: Path, scratch: Path) -> None:
-    arm, model = load_arm(urdf).arm, emitted(urdf, scratch)
+def panda(folder: Path, urdf: Path) -> None:
+    arm, model = load_arm(urdf).arm, build(urdf, "closed-form")
     whole = read(folder / "exciting_traj1.parquet", arm)
     training, test = dynamics_samples([first(whole, 12.0)]), dynamics_samples([after(whole, 12.0)])
     fit_torque(model, training)
-    contenders = {
-        f"tanh {width:g}": least_squares(arm, training, LeastSquares("range", friction=FrictionModel(width))).torque
+    predictors = {
+        f"tanh {width:g}": least_squares(
+            arm, training, LeastSquares("range", friction=FrictionModel(width))
+        ).torque
         for width in (0.02, 0.05)
     }
-    table("Panda: first 12 s train, last 9 s test", contenders | {"closed-form": torque_of(model)}, test, 1)
+    table("Panda: first 12 s train, last 9 s test", predictors | {"closed-form": torque_of(model)}, test, 1)
 
 
 def characters(folder: Path, scratch: Path) -> None:
     urdf = write_arm(scratch)
-    model, networks = emitted(urdf, scratch), emitted(urdf, scratch, "minimal")
+    model, networks = build(urdf, "closed-form"), build(urdf, "minimal")
     samples, forces = read_characters(folder)
     training = [x for x in samples if x.name not in CHARACTERS]
     fit_torque(model, training)
-    fit_networks(networks, training, WHOLE_DECAY)
+    fit_networks(networks, training)
     tests = [i for i, x in enumerate(samples) if x.name in CHARACTERS]
     q, qd, qdd = (
         torch.from_numpy(np.concatenate([getattr(samples[i], k) for i in tests])) for k in ("q", "qd", "qdd")
@@ -218,14 +213,8 @@ def _torques(
     """The torque, and what of it is Coriolis and centrifugal."""
     with torch.no_grad():
         steady, still = (model.inverse_dynamics(q, x, torch.zeros_like(q)) for x in (qd, torch.zeros_like(q)))
-        friction = (model.dissipation(q, qd) @ qd.unsqueeze(-1)).squeeze(-1)
+        friction = model.friction_torque(q, qd)
         return model.inverse_dynamics(q, qd, qdd).numpy(), (steady - still - friction).numpy()
-
-
-def emitted(urdf: Path, scratch: Path, preset: Preset = "closed-form") -> Any:
-    path = scratch / f"{urdf.stem}_{preset}.py"
-    path.write_text(generate(urdf, preset=preset), encoding="utf-8")
-    return load_module(path)
 
 
 def read(path: Path, arm: Arm) -> Trajectory:

@@ -108,10 +108,10 @@ def test_the_tip_is_the_end_of_the_fixed_links(cart):
     x, z = q[..., 0] + q[..., 1].sin(), -q[..., 1].cos()
     expected = torch.stack([x, torch.zeros_like(x), z], dim=-1)
     for tip in (None, "weight"):
-        position = tip_kinematics(cart, ("slide", "swing"), tip).position
+        position = tip_kinematics(cart, tip, joints=("slide", "swing")).position
         torch.testing.assert_close(position(q), expected, atol=1e-6, rtol=0)
     with pytest.raises(ValueError, match="the joints swing do not lead to cart"):
-        tip_kinematics(cart, ("slide", "swing"), "cart")
+        tip_kinematics(cart, "cart", joints=("slide", "swing"))
 
 
 def test_a_constant_velocity_is_exact_where_nothing_accelerates():

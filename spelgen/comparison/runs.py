@@ -94,14 +94,14 @@ def _run(study: Study, variant: Variant, seed: int) -> dict[str, Any]:
 
 def _measured(study: Study, model: EmittedModel, joints: Sequence[str], substeps: int) -> dict[str, Any]:
     """What result.json holds of a trained model."""
-    every = study.preprocessing.decimation or 1
+    decimation = study.preprocessing.decimation or 1
     training, testing = (read_logs([study.logs], joints, role=role) for role in ("train", "test"))
-    steps = round(HORIZON / (every * float(testing[0].t[1] - testing[0].t[0])))
-    far = thinned(testing, steps + 1, every)
-    near_train, near_test = (thinned(x, study.training.window, every) for x in (training, testing))
+    steps = round(HORIZON / (decimation * float(testing[0].t[1] - testing[0].t[0])))
+    far = thinned(testing, steps + 1, decimation)
+    near_train, near_test = (thinned(x, study.training.window, decimation) for x in (training, testing))
     low, high = (torch.tensor(x, dtype=torch.float64) for x in (study.low, study.high))
     examples = predict_examples(
-        of_dynamics(MODEL, model, substeps), testing, steps, joints, decimation=every, measured=False
+        of_dynamics(MODEL, model, substeps), testing, steps, joints, decimation=decimation, measured=False
     )
     along = example_positions(asdict(examples[0])) if examples else torch.zeros(0, len(joints))
     seen = far.q[:, 0]

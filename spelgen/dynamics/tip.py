@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytorch_kinematics as pk
 import torch
@@ -54,14 +55,23 @@ class TipKinematics:
         return (q.double() @ self._jacobian.mT + self._offset).reshape(-1, len(self._offset))
 
 
-def tip_kinematics(urdf: Path | str, joints: Sequence[str], link: str | None = None) -> TipKinematics:
-    """The kinematics of ``link``: by default the one after the last joint, or the end of the fixed links behind it.
+def tip_kinematics(
+    arm: Any, link: str | None = None, *, joints: Sequence[str] | None = None
+) -> TipKinematics:
+    """The kinematics of ``link``: by default the tip that the arm was loaded with, else the link after the last joint
+    or the end of the fixed links behind it.
 
-    Raises ValueError where the joints do not lead there, and what pytorch-kinematics raises where it cannot read
-    the file.
+    arm: of ``load_arm``, or the path of a URDF, with the names of its ``joints``. Raises ValueError where the joints
+    do not lead to the link, and what pytorch-kinematics raises where it cannot read the file.
     """
-    robot = read_urdf(Path(urdf))
-    return TipKinematics(robot, urdf_bytes(Path(urdf)), joints, link or _last_link(robot, joints))
+    if isinstance(arm, str | Path):
+        robot, names = read_urdf(Path(arm)), list(joints or ())
+    else:
+        robot, names = arm.robot, [coordinate.name for coordinate in arm.arm.coordinates]
+        link = link or arm.tip
+    if not names:
+        raise ValueError("no joints are named")
+    return TipKinematics(robot, urdf_bytes(robot.path), names, link or _last_link(robot, names))
 
 
 def _last_link(robot: Robot, joints: Sequence[str]) -> str:

@@ -169,7 +169,7 @@ def _tip(judged: Subject, notes: list[Diagnostic]) -> TipKinematics | None:
     from spelgen.dynamics.tip import tip_kinematics  # slow to import
 
     try:
-        return tip_kinematics(judged.urdf, judged.joints, judged.tip)
+        return tip_kinematics(judged.urdf, judged.tip, joints=judged.joints)
     except Exception as error:  # as above, of pytorch-kinematics
         message = f"no tip errors: {_told(error)}"
         notes.append(Diagnostic("info", "no-tip", _where(judged.urdf), None, message))

@@ -98,8 +98,8 @@ class Results:
     def __repr__(self) -> str:
         last = self.horizons[-1] if self.horizons else None
         error = last and last.errors[MODEL].mean_relative_rms
-        told = f", relative RMS {error:.3g} after {last.name}" if last and error is not None else ""
-        return f"<Results of {self._heading()}{told}>"
+        shown = f", relative RMS {error:.3g} after {last.name}" if last and error is not None else ""
+        return f"<Results of {self._heading()}{shown}>"
 
     def _repr_html_(self) -> str:
         tables = (table.listing().html() for table in result_tables(self.to_dict()))

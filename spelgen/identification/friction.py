@@ -30,8 +30,8 @@ class FrictionModel:
     def columns(self, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
         """(T, n, effects n): effect e of joint j is column e n + j, which no other joint's torque reads."""
         parts = np.stack([qdd, *self._velocity_parts(qd)], axis=-2)  # (T, effects, n)
-        spread: np.ndarray = parts[:, None] * np.eye(qd.shape[1])[:, None]
-        return spread.reshape(*qd.shape, -1)
+        columns: np.ndarray = parts[:, None] * np.eye(qd.shape[1])[:, None]
+        return columns.reshape(*qd.shape, -1)
 
     def torque(self, constants: np.ndarray, qd: np.ndarray) -> np.ndarray:
         """All but the armature's part, (T, n), of ``constants`` by effect and joint, (effects, n)."""
@@ -39,10 +39,10 @@ class FrictionModel:
         return np.sum([by_joint * part for by_joint, part in parts], axis=0)
 
     def _velocity_parts(self, qd: np.ndarray) -> list[np.ndarray]:
-        dry = np.tanh(qd / self.coulomb_smoothing_velocity)
-        parts = [qd, dry, np.ones_like(qd)]
+        sign = np.tanh(qd / self.coulomb_smoothing_velocity)
+        parts = [qd, sign, np.ones_like(qd)]
         if self.stribeck:
-            parts.append(dry * np.exp(-((qd / STRIBECK_VELOCITY) ** 2)))
+            parts.append(sign * np.exp(-((qd / STRIBECK_VELOCITY) ** 2)))
         if self.polynomial:
             parts += [qd * np.abs(qd), qd**3]
         return parts

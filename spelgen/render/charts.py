@@ -38,8 +38,8 @@ class Axis:
     def pixel(self, value: float) -> float:
         """Where a value lies; a value below the axis lies on its edge."""
         low, high = self._scale(self.low), self._scale(self.high)
-        share = (self._scale(max(value, self.low)) - low) / (high - low)
-        return self.start + share * (self.end - self.start)
+        fraction = (self._scale(max(value, self.low)) - low) / (high - low)
+        return self.start + fraction * (self.end - self.start)
 
     def ticks(self) -> list[float]:
         """Round values within the axis, about five."""

@@ -36,20 +36,20 @@ def page(found: LogReport, arm: Arm, inputs: np.ndarray) -> str:
 
 def charts(trajectory: Trajectory, arm: Arm, inputs: np.ndarray) -> list[JointCharts]:
     """By joint: q; qd beside dq/dt; the joint's torque beside the URDF's gravity torque."""
-    every = -(-len(trajectory.t) // DRAWN)
-    pieces = [piece[::every] for piece in split_at_gaps(trajectory)]
+    stride = -(-len(trajectory.t) // DRAWN)
+    pieces = [piece[::stride] for piece in split_at_gaps(trajectory)]
     t, q, qd, tau = (
         np.concatenate([getattr(piece, name) for piece in pieces]) for name in ("t", "q", "qd", "tau")
     )
     slope, tau = np.concatenate([_slope(piece) for piece in pieces]), tau @ inputs.T
     still = np.zeros_like(q)
     gravity = regressor(arm, q, still, still) @ urdf_parameters(arm)  # (T, n)
-    believed = any(body.inertia for body in arm.bodies)
+    known = any(body.inertia for body in arm.bodies)
     drawn = []
     for k, coordinate in enumerate(arm.coordinates):
         units, force = UNITS[coordinate.kind], "Nm" if coordinate.kind == "revolute" else "N"
         torque = [Line("logged", t, tau[:, k], "truth")]
-        torque += [Line("gravity of the URDF", t, gravity[:, k], "predicted")] if believed else []
+        torque += [Line("gravity of the URDF", t, gravity[:, k], "predicted")] if known else []
         lines = (
             ("position", units[0], [Line("logged", t, q[:, k], "truth")]),
             (

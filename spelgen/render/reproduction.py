@@ -56,8 +56,8 @@ def _flags(chosen: Mapping[str, Any], usual: Mapping[str, Any]) -> str:
             continue
         text += f" --{'no-' if value is False else ''}{FLAGS.get(key, key).replace('_', '-')}"
         if not isinstance(value, bool):
-            told = ",".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
-            text += f" {shlex.quote(told)}"
+            words = ",".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
+            text += f" {shlex.quote(words)}"
     return text
 
 
