@@ -45,10 +45,13 @@ def twist_map(rotation: Tensor, position: Tensor) -> Tensor:
 
 
 def transform_table(bodies: Bodies, index: int) -> Tensor:
-    """A body's twist map from the parent is table[0] + cos table[1] + sin table[2] + slide table[3]."""
+    """A body's twist map from its parent's frame is table[0] + table[1] cos + table[2] sin, (3, 6, 6).
+
+    A prismatic one's is table[0] + displacement table[1].
+    """
     rotation = torch.stack([vector(row) for row in bodies.rotation[index]]).mT
     position = vector(bodies.position[index])
-    table = torch.zeros(4, 6, 6, dtype=torch.float64)
+    table = torch.zeros(3, 6, 6, dtype=torch.float64)
     if bodies.revolute[index]:
         about = torch.zeros(3, 3, 3, dtype=torch.float64)
         about[0, 2, 2] = about[1, 0, 0] = about[1, 1, 1] = about[2, 0, 1] = 1
@@ -57,7 +60,7 @@ def transform_table(bodies: Bodies, index: int) -> Tensor:
             table[term] = twist_map(about[term] @ rotation, position)
     else:
         table[0] = twist_map(rotation, position)
-        table[3] = twist_map(rotation, position + rotation[2]) - table[0]
+        table[1] = twist_map(rotation, position + rotation[2]) - table[0]
     return table
 
 

@@ -539,10 +539,13 @@ def twist_map(rotation: Tensor, position: Tensor) -> Tensor:
 
 
 def transform_table(bodies: Bodies, index: int) -> Tensor:
-    """A body's twist map from the parent is table[0] + cos table[1] + sin table[2] + slide table[3]."""
+    """A body's twist map from its parent's frame is table[0] + table[1] cos + table[2] sin, (3, 6, 6).
+
+    A prismatic one's is table[0] + displacement table[1].
+    """
     rotation = torch.stack([vector(row) for row in bodies.rotation[index]]).mT
     position = vector(bodies.position[index])
-    table = torch.zeros(4, 6, 6, dtype=torch.float64)
+    table = torch.zeros(3, 6, 6, dtype=torch.float64)
     if bodies.revolute[index]:
         about = torch.zeros(3, 3, 3, dtype=torch.float64)
         about[0, 2, 2] = about[1, 0, 0] = about[1, 1, 1] = about[2, 0, 1] = 1
@@ -551,7 +554,7 @@ def transform_table(bodies: Bodies, index: int) -> Tensor:
             table[term] = twist_map(about[term] @ rotation, position)
     else:
         table[0] = twist_map(rotation, position)
-        table[3] = twist_map(rotation, position + rotation[2]) - table[0]
+        table[1] = twist_map(rotation, position + rotation[2]) - table[0]
     return table
 
 
@@ -661,18 +664,18 @@ class Input(Protocol):
 class RigidPrepared(NamedTuple):
     """What depends on the weights alone, worked out once for many states."""
 
-    inertia: Tensor  # spatial inertias, (bodies, 6, 6)
+    inertia: Tensor  # spatial inertias on the diagonal, (6 bodies, 6 bodies)
     armature: Tensor  # (n,)
     friction: FrictionConstants
     input: Tensor
 
 
 class Motion(NamedTuple):
-    """How the bodies may move at a position, each in its own frame."""
+    """How the bodies may move at a position, each in its own frame; 6 numbers a body, side by side."""
 
-    maps: Tensor  # twists from the parent's frame, (..., bodies, 6, 6)
-    twists: Tensor  # by joint velocity, (..., bodies, 6, n)
-    weight: Tensor  # acceleration that stands for gravity, (..., bodies, 6)
+    terms: Tensor  # cos and sin of a body's angle, or its displacement and 0, (..., bodies, 2)
+    twists: Tensor  # by joint velocity, (..., n, 6 bodies)
+    weight: Tensor  # acceleration that stands for gravity, (..., 6 bodies)
     gravity: Tensor  # dV/dq, (..., n)
 
 
@@ -680,11 +683,16 @@ class RigidBodyDynamics(PortHamiltonian):
     """Rigid bodies with trained inertial parameters, friction by laws, a trained torque offset.
 
     Spatial vectors are (angular, linear), as in Featherstone, Rigid Body Dynamics Algorithms, 2008.
+    They are rows here, and all bodies' stand side by side: so most products are of one large matrix.
     """
 
-    tables: Tensor
-    axes: Tensor  # twist of a body by the velocity of its joint, (bodies, 6, n)
-    ratios: Tensor
+    forth: Tensor  # takes twists from the parent's frame: constant part, that of each term, (bodies, 6, 18)
+    back: Tensor  # takes wrenches to the parent's frame, likewise
+    axes: Tensor  # twists of the bodies by joint velocity alone, (n, 6 bodies)
+    turning: Tensor  # takes a body's twist to how its joint's axis turns, (6 bodies, 6 bodies)
+    owner: Tensor  # sums six numbers of a body to its joint, (6 bodies, n)
+    revolute: Tensor
+    ratios: Tensor  # (bodies, n)
     offsets: Tensor
     basis: Tensor
     crossing: Tensor
@@ -692,28 +700,31 @@ class RigidBodyDynamics(PortHamiltonian):
     actuated: Tensor
 
     def __init__(
-        self,
-        joints: Joints,
-        bodies: Bodies,
-        gravity: tuple[float, float, float],
-        input: Input,
+        self, joints: Joints, bodies: Bodies, gravity: tuple[float, float, float], input: Input
     ) -> None:
         super().__init__()
         self.n, self.parents = joints.n, bodies.parent
-        self.register_buffer(
-            "tables", torch.stack([transform_table(bodies, k) for k in range(len(bodies.mass))])
-        )
-        axes = torch.zeros(len(bodies.mass), 6, self.n, dtype=torch.float64)
-        for index, revolute in enumerate(bodies.revolute):
-            axes[index, 2 if revolute else 5, bodies.joint[index]] = bodies.ratio[index]
-        self.register_buffer("axes", axes)
-        self.register_buffer("ratios", axes.sum(dim=1))
-        self.register_buffer("offsets", vector(bodies.offset))
-        self.register_buffer("basis", inertia_basis())
+        count = len(bodies.parent)
+        tables = torch.stack([transform_table(bodies, index) for index in range(count)])
+        self.register_buffer("forth", tables.mT.transpose(1, 2).flatten(2))
+        self.register_buffer("back", tables.transpose(1, 2).flatten(2))
         crossing = torch.zeros(6, 6, 6, dtype=torch.float64)
         for axis, unit in enumerate(torch.eye(3, dtype=torch.float64)):
             crossing[axis, :3, :3] = crossing[axis, 3:, 3:] = skew(unit)
             crossing[3 + axis, 3:, :3] = skew(unit)
+        axes = torch.zeros(count, 6, dtype=torch.float64)
+        ratios = torch.zeros(count, self.n, dtype=torch.float64)
+        for index, revolute in enumerate(bodies.revolute):
+            axes[index, 2 if revolute else 5] = bodies.ratio[index]
+            ratios[index, bodies.joint[index]] = bodies.ratio[index]
+        owner = (ratios != 0).double().repeat_interleave(6, dim=0)
+        self.register_buffer("axes", owner.mT * axes.flatten())
+        self.register_buffer("turning", torch.block_diag(*((crossing @ axis) for axis in axes)))
+        self.register_buffer("owner", owner)
+        self.register_buffer("revolute", vector(float(each) for each in bodies.revolute))
+        self.register_buffer("ratios", ratios)
+        self.register_buffer("offsets", vector(bodies.offset))
+        self.register_buffer("basis", inertia_basis())
         self.register_buffer("crossing", crossing)
         self.register_buffer("base", vector((0, 0, 0, *(-g for g in gravity))))
         self.register_buffer("actuated", vector(float(x) for x in joints.actuated))
@@ -730,8 +741,9 @@ class RigidBodyDynamics(PortHamiltonian):
 
     def prepare(self) -> RigidPrepared:
         """All that depends on the weights alone; holds until they change."""
+        inertia = torch.tensordot(self.inertial_parameters(), self.basis, dims=1)
         return RigidPrepared(
-            inertia=torch.tensordot(self.inertial_parameters(), self.basis, dims=1),
+            inertia=torch.block_diag(*inertia.unbind()),
             armature=self.armature(),
             friction=self.friction.prepare(),
             input=self.input.prepare(),
@@ -740,46 +752,45 @@ class RigidBodyDynamics(PortHamiltonian):
     def configuration(self, q: Tensor, prepared: RigidPrepared) -> Motion:
         """How the bodies may move at q, and what they weigh there."""
         motion = self._motion(q)
-        wrenches = applied(prepared.inertia, motion.weight)
-        return motion._replace(gravity=self._by_joint(motion, wrenches))
+        return motion._replace(gravity=applied(motion.twists, motion.weight @ prepared.inertia))
 
     def _motion(self, q: Tensor) -> Motion:
         value = q @ self.ratios.mT + self.offsets
-        terms = torch.stack([torch.ones_like(value), value.cos(), value.sin(), value], dim=-1)
-        maps = (terms.unsqueeze(-2) @ self.tables.flatten(2)).reshape(*value.shape, 6, 6)
-        still = torch.cat([torch.zeros_like(self.axes[0]), self.base.unsqueeze(-1)], dim=-1)
-        own = torch.cat([self.axes, torch.zeros_like(self.axes[..., :1])], dim=-1)
+        sliding = 1 - self.revolute
+        terms = torch.stack(
+            [self.revolute * value.cos() + sliding * value, self.revolute * value.sin()], dim=-1
+        )
+        rows = torch.cat([torch.zeros_like(self.axes[:, :6]), self.base.unsqueeze(0)])
+        own = torch.cat([self.axes, torch.zeros_like(self.axes[:1])]).reshape(self.n + 1, -1, 6)
         moved: list[Tensor] = []
         for index, parent in enumerate(self.parents):
-            below = still if parent < 0 else moved[parent]
-            moved.append(maps[..., index, :, :] @ below + own[index])
-        columns = torch.stack(moved, dim=-3)
-        return Motion(maps, columns[..., :-1], columns[..., -1], torch.zeros_like(q))
-
-    def _cross(self, twist: Tensor) -> Tensor:
-        """What a frame with this twist makes of a constant twist in it, (..., 6, 6)."""
-        rows = twist @ self.crossing.flatten(1)
-        return rows.reshape(*twist.shape[:-1], 6, 6)
+            below = rows.expand(*q.shape[:-1], -1, -1) if parent < 0 else moved[parent]
+            moved.append(self._carried(self.forth[index], below, terms[..., index, :]) + own[:, index])
+        columns = torch.cat(moved, dim=-1)
+        return Motion(terms, columns[..., :-1, :], columns[..., -1, :], torch.zeros_like(q))
 
     @staticmethod
-    def _by_joint(motion: Motion, wrenches: Tensor) -> Tensor:
-        """Joint torques, (..., n), that wrenches on the bodies, (..., bodies, 6), stand for."""
-        return (wrenches.unsqueeze(-2) @ motion.twists).squeeze(-2).sum(dim=-2)
+    def _carried(table: Tensor, rows: Tensor, terms: Tensor) -> Tensor:
+        """Rows, (..., k, 6), taken to a neighbour's frame."""
+        constant, by_cos, by_sin = (rows @ table).chunk(3, dim=-1)
+        cos, sin = terms.unsqueeze(-2).chunk(2, dim=-1)
+        return constant + cos * by_cos + sin * by_sin
 
     def mass_at(self, at: Motion, prepared: RigidPrepared) -> tuple[Tensor, None]:
         """M(q), (..., n, n)."""
-        inertia = (at.twists.mT @ (prepared.inertia @ at.twists)).sum(dim=-3)
-        return inertia + torch.diag(prepared.armature), None
+        return (at.twists @ prepared.inertia) @ at.twists.mT + torch.diag(prepared.armature), None
 
     def energy_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
         """V(q), (...) [J]; zero for a mass at the base's origin."""
-        inertia, height = prepared.inertia, at.maps.new_zeros(at.maps.shape[:-3])
+        height = at.terms.new_zeros(at.terms.shape[:-2])
+        still = torch.eye(6, dtype=height.dtype, device=height.device).expand(*height.shape, 6, 6)
         placed: list[Tensor] = []
         for index, parent in enumerate(self.parents):
-            own = at.maps[..., index, :, :]
-            placed.append(own if parent < 0 else own @ placed[parent])
+            below = still if parent < 0 else placed[parent]
+            placed.append(self._carried(self.forth[index], below, at.terms[..., index, :]))
+            own = slice(6 * index, 6 * index + 6)
             # in the base's frame the moment of mass stands in the inertia's upper right block
-            seen = placed[index].mT @ (inertia[index] @ placed[index])
+            seen = placed[index] @ prepared.inertia[own, own] @ placed[index].mT
             moment = torch.stack([seen[..., 2, 4], seen[..., 0, 5], seen[..., 1, 3]], dim=-1)
             height = height + moment @ self.base[3:]
         return height
@@ -788,16 +799,22 @@ class RigidBodyDynamics(PortHamiltonian):
         """dV/dq, (..., n) [Nm, N]."""
         return at.gravity
 
+    def _velocities(self, motion: Motion, qd: Tensor) -> Tensor:
+        """The bodies' twists, (..., 6 bodies)."""
+        return (qd.unsqueeze(-2) @ motion.twists).squeeze(-2)
+
     def _accelerations(self, motion: Motion, qd: Tensor, twists: Tensor) -> Tensor:
-        """The bodies' accelerations at steady qd, gravity taken as one, (..., bodies, 6)."""
-        turned = applied(self._cross(twists) @ self.axes, qd.unsqueeze(-2))
+        """The bodies' accelerations at steady qd, gravity taken as one, (..., 6 bodies)."""
+        turned = (twists @ self.turning) * (qd @ self.owner.mT)
         found: list[Tensor] = []
-        for index, parent in enumerate(self.parents):
-            own = turned[..., index, :]
+        for index, (parent, own) in enumerate(
+            zip(self.parents, turned.chunk(len(self.parents), dim=-1), strict=True)
+        ):
             if parent >= 0:
-                own = own + applied(motion.maps[..., index, :, :], found[parent])
+                below = found[parent].unsqueeze(-2)
+                own = own + self._carried(self.forth[index], below, motion.terms[..., index, :]).squeeze(-2)
             found.append(own)
-        return torch.stack(found, dim=-2) + motion.weight
+        return torch.cat(found, dim=-1) + motion.weight
 
     def lagrangian_gradient(self, at: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
         """d/dq of 1/2 qd^T M(q) qd - V(q), (..., n).
@@ -805,36 +822,46 @@ class RigidBodyDynamics(PortHamiltonian):
         The kinetic part: the momentum of all that a joint carries, by what its displacement adds to
         their twist.
         """
-        twists = applied(at.twists, qd.unsqueeze(-2))
-        turned = self._cross(twists) @ self.axes
-        carried = list(applied(prepared.inertia, twists).unbind(dim=-2))
+        twists = self._velocities(at, qd)
+        carried = list((twists @ prepared.inertia).chunk(len(self.parents), dim=-1))
         for index in reversed(range(len(self.parents))):
             parent = self.parents[index]
             if parent >= 0:
-                back = at.maps[..., index, :, :].mT
-                carried[parent] = carried[parent] + applied(back, carried[index])
-        momenta = torch.stack(carried, dim=-2)
-        return (momenta.unsqueeze(-2) @ turned).squeeze(-2).sum(dim=-2) - at.gravity
+                below = self._carried(self.back[index], carried[index].unsqueeze(-2), at.terms[..., index, :])
+                carried[parent] = carried[parent] + below.squeeze(-2)
+        turned = twists @ self.turning
+        return (torch.cat(carried, dim=-1) * turned) @ self.owner - at.gravity
 
     def nonlinear_at(self, at: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
         """The torque that holds qd steady without friction, (..., n)."""
-        twists = applied(at.twists, qd.unsqueeze(-2))
-        accelerations = self._accelerations(at, qd, twists)
-        momenta = applied(prepared.inertia, twists)
-        wrenches = applied(prepared.inertia, accelerations)
-        return self._by_joint(at, wrenches - applied(self._cross(twists).mT, momenta))
+        twists = self._velocities(at, qd)
+        wrenches = self._accelerations(at, qd, twists) @ prepared.inertia
+        momenta = self._by_body(twists @ prepared.inertia)
+        turned = applied(self._cross(self._by_body(twists)).mT, momenta)
+        return applied(at.twists, wrenches - turned.flatten(-2))
+
+    @staticmethod
+    def _by_body(rows: Tensor) -> Tensor:
+        """(..., 6 bodies) as (..., bodies, 6)."""
+        return rows.reshape(*rows.shape[:-1], -1, 6)
+
+    def _cross(self, twist: Tensor) -> Tensor:
+        """What a frame with this twist makes of a constant twist in it, (..., 6, 6)."""
+        rows = twist @ self.crossing.flatten(1)
+        return rows.reshape(*twist.shape[:-1], 6, 6)
 
     def regressor(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
         """Y, (..., n, 10 bodies): Y @ inertial parameters is the bodies' torque."""
         motion = self._motion(q)
-        twists = applied(motion.twists, qd.unsqueeze(-2))
-        accelerations = self._accelerations(motion, qd, twists)
-        accelerations = accelerations + applied(motion.twists, qdd.unsqueeze(-2))
+        twists = self._velocities(motion, qd)
+        accelerations = self._accelerations(motion, qd, twists) + self._velocities(motion, qdd)
+        twists = self._by_body(twists)
         # by body and parameter: (..., bodies, 6, 10)
-        rises = torch.tensordot(accelerations, self.basis, dims=([-1], [2])).mT
+        rises = torch.tensordot(self._by_body(accelerations), self.basis, dims=([-1], [2])).mT
         momenta = torch.tensordot(twists, self.basis, dims=([-1], [2])).mT
         wrenches = rises - self._cross(twists).mT @ momenta
-        rows: Tensor = (motion.twists.mT @ wrenches).transpose(-3, -2)
+        columns = self._by_body(motion.twists).transpose(-3, -2)  # (..., bodies, n, 6)
+        rows: Tensor = (columns @ wrenches).transpose(-3, -2)
         return rows.reshape(*q.shape, 10 * len(self.parents))
 
     def friction_at(self, at: Motion, qd: Tensor, prepared: RigidPrepared) -> Tensor:
