@@ -6,15 +6,20 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from spelgen.building import build
     from spelgen.design import Design
+    from spelgen.dynamics.tip import tip_kinematics
     from spelgen.emission.loading import load_module
     from spelgen.errors import SpelgenError
     from spelgen.evaluation.evaluate import evaluate
+    from spelgen.evaluation.results import Results
     from spelgen.evaluation.rollout import rollout
     from spelgen.excitation.design import excite
     from spelgen.exporting.export import export
     from spelgen.fitting.config import MomentumFit, Rollout, TorqueFit
     from spelgen.fitting.fit import Fit, fit, load_run
+    from spelgen.identification.friction import FrictionModel
+    from spelgen.identification.identification import Identification
     from spelgen.identification.identify import identify
+    from spelgen.identification.method import LeastSquares
     from spelgen.inspection import Inspection
     from spelgen.loaded_arm import LoadedArm, load_arm
     from spelgen.logs.check_logs import check_logs
@@ -43,6 +48,9 @@ _HOME = {
     "simulate": "simulation.simulate",
     "excite": "excitation.design",
     "identify": "identification.identify",
+    "LeastSquares": "identification.method",
+    "FrictionModel": "identification.friction",
+    "Identification": "identification.identification",
     "fit": "fitting.fit",
     "Fit": "fitting.fitted",
     "load_run": "fitting.fitted",
@@ -51,6 +59,8 @@ _HOME = {
     "Rollout": "fitting.config",
     "rollout": "evaluation.rollout",
     "evaluate": "evaluation.evaluate",
+    "Results": "evaluation.results",
+    "tip_kinematics": "dynamics.tip",
     "export": "exporting.export",
     "SpelgenError": "errors",
 }
@@ -59,10 +69,14 @@ _HOME = {
 __all__ = [
     "Design",
     "Fit",
+    "FrictionModel",
+    "Identification",
     "Inspection",
+    "LeastSquares",
     "LoadedArm",
     "MomentumFit",
     "Preprocessing",
+    "Results",
     "Rollout",
     "SpelgenError",
     "TorqueFit",
@@ -84,6 +98,7 @@ __all__ = [
     "read_logs",
     "rollout",
     "simulate",
+    "tip_kinematics",
 ]
 
 

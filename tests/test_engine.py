@@ -15,6 +15,7 @@ from spelgen.dynamics.regressor import urdf_parameters
 from spelgen.dynamics.regressor_dynamics import RegressorDynamics
 from spelgen.dynamics.tip import tip_kinematics
 from spelgen.errors import ArmError, SpelgenErrors
+from spelgen.loaded_arm import load_arm
 from spelgen.settings.joint import JointSettings
 from spelgen.settings.settings import Settings, load_settings
 from spelgen.urdf.read import read_urdf
@@ -203,11 +204,9 @@ def test_pose_and_jacobian_of_the_tip_are_pinocchios(robot, link, robots, tmp_pa
     path = tmp_path / "lift.urdf" if robot == "lift" else robots / f"{robot}.urdf"
     if robot == "lift":
         path.write_text(LIFT)
-    joints = [
-        c.name
-        for c in make_arm(read_urdf(path), joints=["low", "swing"] if robot == "lift" else None).coordinates
-    ]
-    tip, dynamics = tip_kinematics(path, joints, link), urdf_dynamics(path, joints)
+    loaded = load_arm(path, ["low", "swing"] if robot == "lift" else None)
+    joints = [c.name for c in loaded.arm.coordinates]
+    tip, dynamics = tip_kinematics(loaded, link), urdf_dynamics(path, joints)
     q = states(len(joints))[0]
     pose, jacobian = tip.pose(q), tip.jacobian(q)
     assert pose.shape == (2, 5, 4, 4)
