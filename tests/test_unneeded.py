@@ -63,13 +63,14 @@ def test_couplings_of_locked_joints_are_not_needed(odd):
         (
             TRANSMISSION.format(2),
             "torque: motor",
-            "rpr.urdf:56: transmission 'drive' mechanicalReduction: got 'fifty', expected one number in decimal notation",
+            "rpr.urdf:56: transmission 'drive' mechanicalReduction: got 'fifty', "
+            "expected one number in decimal notation",
         ),
         ("", "gravity: [0, 0]", "rpr.yaml:1: gravity.2: got [0, 0], expected Field required"),
         (
             FIXED.replace("fixed", "revolute"),
             "",
-            "rpr.urdf:55: joint 'mount' axis: got 1 numbers ('up'), expected three numbers",
+            "rpr.urdf:55: joint 'mount' dynamics damping: got '?', expected one number in decimal notation",
         ),
     ],
 )
