@@ -15,6 +15,13 @@ from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied
 from spelgen.runtime.rigid_body import Bodies, InertialParameters, inertia_basis, skew, transform_table
 
 
+def block_diagonal(blocks: Tensor) -> Tensor:
+    """The matrix, (k m, k m), with these blocks, (k, m, m), on its diagonal."""
+    k, m, _ = blocks.shape
+    own = torch.eye(k, dtype=blocks.dtype, device=blocks.device)
+    return (own[:, None, :, None] * blocks[:, :, None, :]).reshape(k * m, k * m)
+
+
 class RigidPrepared(NamedTuple):
     """What depends on the weights alone, worked out once for many states."""
 
@@ -73,7 +80,7 @@ class RigidBodyDynamics(PortHamiltonian):
             ratios[index, bodies.joint[index]] = bodies.ratio[index]
         owner = (ratios != 0).double().repeat_interleave(6, dim=0)
         self.register_buffer("axes", owner.mT * axes.flatten())
-        self.register_buffer("turning", torch.block_diag(*((crossing @ axis) for axis in axes)))
+        self.register_buffer("turning", block_diagonal(torch.stack([crossing @ axis for axis in axes])))
         self.register_buffer("owner", owner)
         self.register_buffer("revolute", vector(float(each) for each in bodies.revolute))
         self.register_buffer("ratios", ratios)
@@ -97,7 +104,7 @@ class RigidBodyDynamics(PortHamiltonian):
         """All that depends on the weights alone; holds until they change."""
         inertia = torch.tensordot(self.inertial_parameters(), self.basis, dims=1)
         return RigidPrepared(
-            inertia=torch.block_diag(*inertia.unbind()),
+            inertia=block_diagonal(inertia),
             armature=self.armature(),
             friction=self.friction.prepare(),
             input=self.input.prepare(),
