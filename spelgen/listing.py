@@ -48,11 +48,11 @@ class Listing:
 
     def _row(self, cells: tuple[str, ...], tag: str) -> str:
         sides = ["left" if k in self.left else "right" for k in range(len(cells))]
-        told = "".join(
+        text = "".join(
             f'<{tag} style="text-align: {side}">{escape(cell)}</{tag}>'
             for side, cell in zip(sides, cells, strict=True)
         )
-        return f"<tr>{told}</tr>"
+        return f"<tr>{text}</tr>"
 
     def _lines(self) -> list[str]:
         from rich.cells import cell_len  # here: `--help` and `import spelgen` stay fast

@@ -1,6 +1,7 @@
 """Arms of one or two bodies, small enough to do their mechanics by hand."""
 
 from fractions import Fraction
+from pathlib import Path
 
 from spelgen.arm.arm import Arm, Body, Coordinate
 
@@ -46,3 +47,26 @@ def slider(mass=2.0, **changes):
 def pendulum(mass=1.5, length=0.7):
     """A point mass on a rod, at angle q from the horizontal."""
     return arm([coordinate(continuous=True)], [body(inertia=point(mass, length))], gravity=(0, -9.81, 0))
+
+
+LINK = """<link name="{name}"><inertial><mass value="{mass}"/><origin xyz="0.2 0 0"/>
+  <inertia ixx="0.01" iyy="0.02" izz="0.03" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+JOINT = """<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/><origin xyz="{xyz}"/>
+  <axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="10" velocity="2"/>{more}</joint>"""
+
+
+def coupled_urdf(path: Path) -> Path:
+    """Two revolute joints, the second of which follows the first: 0.5 q - 0.1."""
+    parts = [
+        '<robot name="coupled"><link name="base"/>',
+        LINK.format(name="upper", mass=2),
+        LINK.format(name="fore", mass=1),
+        JOINT.format(name="a", kind="revolute", parent="base", child="upper", xyz="0 0 0", more=""),
+        JOINT.format(
+            name="b", kind="revolute", parent="upper", child="fore", xyz="0.4 0 0",
+            more='<mimic joint="a" multiplier="0.5" offset="-0.1"/>',
+        ),
+        "</robot>",
+    ]  # fmt: skip
+    path.write_text("".join(parts))
+    return path

@@ -12,6 +12,7 @@ from spelgen.excitation.criterion import Criterion
 from spelgen.excitation.design import excite
 from spelgen.excitation.trajectory import ExcitationTrajectory, motion_bounds
 from spelgen.loaded_arm import load_arm
+from tests.hand_built import coupled_urdf
 
 CHOICE = {"duration": 10.0, "sample_rate": 100.0, "harmonics": 5, "reach": 0.8, "speed": 0.6}
 
@@ -128,6 +129,19 @@ def test_an_arm_without_limits_gets_modest_ones(tmp_path):
     assert 0.3 < np.abs(one.motion.qd).max() <= 0.6
     assert np.abs(one.motion.q).max() <= 0.8 * np.pi
     assert np.isnan(one.efforts).all()
+
+
+def test_joints_that_follow_keep_their_limits_too(tmp_path):
+    """b = 0.5 a - 0.1 within -0.3 .. 0.2 and 0.1 rad/s: a within -0.4 .. 0.6 and 0.2 rad/s, for limits of 1 and 2."""
+    path = coupled_urdf(tmp_path / "coupled.urdf")
+    limits = 'lower="-1" upper="1" effort="10" velocity="2"/><mimic'
+    path.write_text(
+        path.read_text().replace(limits, 'lower="-0.3" upper="0.2" effort="10" velocity="0.1"/><mimic')
+    )
+    found = excite(load_arm(path), **CHOICE | {"reach": 1.0, "speed": 1.0}, trials=1)
+    assert found.motion.q.shape == (1001, 1)
+    assert -0.4 <= found.motion.q.min() < found.motion.q.max() <= 0.6
+    assert 0.1 < np.abs(found.motion.qd).max() <= 0.2
 
 
 def test_a_joint_without_room_is_refused(robots, tmp_path):

@@ -18,7 +18,7 @@ from spelgen.simulation.integration import rollout
 from spelgen.simulation.random_inputs import random_inputs
 from spelgen.simulation.simulate import PROTOCOLS, simulate
 from spelgen.urdf.read import read_urdf
-from tests.hand_built import arm, body, coordinate, pendulum, point, slider
+from tests.hand_built import arm, body, coordinate, coupled_urdf, pendulum, point, slider
 
 SIX = ("two_link", "rpr", "six_dof", "scara", "panda", "ur10e")
 
@@ -264,31 +264,6 @@ class TestIntegrationError:
         assert states[1, 1] == pytest.approx(-47.0 * (1 - stops), abs=1e-4)
 
 
-LINK = """<link name="{name}"><inertial><mass value="{mass}"/><origin xyz="0.2 0 0"/>
-  <inertia ixx="0.01" iyy="0.02" izz="0.03" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
-JOINT = """<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/><origin xyz="{xyz}"/>
-  <axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="10" velocity="2"/>{more}</joint>"""
-
-
-@pytest.fixture
-def coupled(tmp_path):
-    """Two revolute joints, the second of which follows the first: 0.5 q - 0.1."""
-    parts = [
-        '<robot name="coupled"><link name="base"/>',
-        LINK.format(name="upper", mass=2),
-        LINK.format(name="fore", mass=1),
-        JOINT.format(name="a", kind="revolute", parent="base", child="upper", xyz="0 0 0", more=""),
-        JOINT.format(
-            name="b", kind="revolute", parent="upper", child="fore", xyz="0.4 0 0",
-            more='<mimic joint="a" multiplier="0.5" offset="-0.1"/>',
-        ),
-        "</robot>",
-    ]  # fmt: skip
-    path = tmp_path / "coupled.urdf"
-    path.write_text("".join(parts))
-    return path
-
-
 class TestInMemory:
     def test_an_arm_gives_its_logs(self, robots):
         logs = simulate(load_arm(robots / "two_link.urdf"), trajectories=4, duration=0.2, seed=3)
@@ -310,10 +285,10 @@ class TestInMemory:
         (tmp_path / "arm.yaml").write_text("training: {nonsense: 1}\nlogs: {units: {q: furlongs}}\n")
         assert len(simulate(load_arm(tmp_path / "arm.urdf"), trajectories=1, duration=0.1)) == 1
 
-    def test_a_mimic_joint_moves_along(self, coupled):
+    def test_a_mimic_joint_moves_along(self, tmp_path):
         """Both joints by Pinocchio, the second driven along: tau = K^T rnea(K q + offset, K qd, K qdd)."""
-        arm = load_arm(coupled)
-        logs = simulate(arm, trajectories=2, duration=0.2, sample_rate=200.0)
+        coupled = coupled_urdf(tmp_path / "coupled.urdf")
+        logs = simulate(load_arm(coupled), trajectories=2, duration=0.2, sample_rate=200.0)
         assert all(x.q.shape == (41, 1) for x in logs)
         model = pin.buildModelFromUrdf(str(coupled))
         data, jacobian = model.createData(), np.array([1.0, 0.5])

@@ -77,7 +77,7 @@ def logs(
     ] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 if there is any warning.")] = False,
 ) -> None:
-    """Tell what logs hold, and what to doubt before training on them.
+    """Check logs: what they hold, and what is odd about them.
 
     Nothing is changed. Exit code 1 where the logs cannot be trained on.
     """

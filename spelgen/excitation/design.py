@@ -37,12 +37,14 @@ def excite(
     """An exciting motion of this duration [s], sampled at about `sample_rate` [Hz]; the same for the same arguments.
 
     It starts and ends at rest and keeps the part `reach` of the joints' ranges and `speed` of their velocity
-    limits; effort limits too, where the URDF has them and inertials, and where any motion can. harmonics: of the
+    limits; effort limits too, where the URDF has them and inertials, and where any motion can. Joints that follow
+    others by <mimic> keep their limits as well. harmonics: of the
     period `duration`; by default 0.4 a second, at least 5. trials: motions that the search looks at, beside 40 at
     random that it starts from. progress: called with the trials done and all. Collisions are not checked.
     """
     harmonics = harmonics or max(FEWEST_HARMONICS, round(HARMONICS_PER_SECOND * duration))
-    trajectory = ExcitationTrajectory(duration, harmonics, motion_bounds(arm.arm, reach, speed))
+    bounds = motion_bounds(arm.arm, reach, speed, arm.robot.joint)
+    trajectory = ExcitationTrajectory(duration, harmonics, bounds)
     criterion = Criterion(arm.arm, trajectory)
     starts = np.random.default_rng(seed).standard_normal((STARTS, trajectory.size))
     best = _improved(criterion, min(starts, key=criterion.value), trials, progress)

@@ -50,8 +50,8 @@ class Excitation:
             parts.append("warning: effort limits are overrun: no motion was found that keeps them")
         lacking = [c.name for c in self.arm.coordinates if not c.velocity]
         if lacking:
-            told = f"no velocity limit, 1 rad/s or 0.25 m/s taken: {', '.join(lacking)}"
-            parts.append(textwrap.fill(told, WIDTH, subsequent_indent="  "))
+            summary = f"no velocity limit, 1 rad/s or 0.25 m/s taken: {', '.join(lacking)}"
+            parts.append(textwrap.fill(summary, WIDTH, subsequent_indent="  "))
         return "\n\n".join(parts)
 
     def listing(self) -> Listing:
@@ -83,8 +83,8 @@ class Excitation:
         return file.getvalue()
 
     def __repr__(self) -> str:
-        told = f"{self.motion.t[-1]:g} s, condition number {self.condition:.3g}"
-        return f"<Excitation of {self.arm.name!r}: {told} of {self.parameters} base parameters>"
+        summary = f"{self.motion.t[-1]:g} s, condition number {self.condition:.3g}"
+        return f"<Excitation of {self.arm.name!r}: {summary} of {self.parameters} base parameters>"
 
     def _repr_html_(self) -> str:
         return self.listing().html()

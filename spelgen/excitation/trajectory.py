@@ -5,6 +5,7 @@ Swevers et al., Optimal robot excitation and identification, IEEE T-RA 13:730 (1
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import cos, pi
 
@@ -12,6 +13,7 @@ import numpy as np
 
 from spelgen.arm.arm import Arm, Coordinate
 from spelgen.errors import ArmError, collect
+from spelgen.urdf.robot import Joint
 
 DENSITY = 40  # points of a grid for each harmonic
 BETWEEN = cos(pi / DENSITY)  # of a series' largest value, what a grid shows at least
@@ -28,23 +30,44 @@ class MotionBounds:
     speed: np.ndarray
 
 
-def motion_bounds(arm: Arm, reach: float, speed: float) -> MotionBounds:
+def motion_bounds(
+    arm: Arm, reach: float, speed: float, joints: Mapping[str, Joint] | None = None
+) -> MotionBounds:
     """The arm's limits, of the range the middle part `reach`, of the velocity limits the part `speed`.
 
+    joints: of the URDF, by name; then joints that follow others by <mimic> keep their limits too.
     Raises ArmError where a joint has no room between its limits.
     """
-    stuck = [c for c in arm.coordinates if _range(c)[0] == _range(c)[1]]
+    limits = [_limits(index, arm, joints or {}) for index in range(len(arm.coordinates))]
     collect([
         ArmError(
-            f"the limits {c.lower:g} .. {c.upper:g}", element=f"joint {c.name!r}", expected="room to move",
+            f"the limits {low:g} .. {high:g}", element=f"joint {c.name!r}", expected="room to move",
             do="correct them, or leave the joint out by --joints",
         )
-        for c in stuck
+        for c, (low, high, _) in zip(arm.coordinates, limits, strict=True) if not low < high
     ])  # fmt: skip
-    ranges = np.array([_range(coordinate) for coordinate in arm.coordinates])
-    middle, half = ranges.mean(axis=1), np.diff(ranges, axis=1)[:, 0] / 2
-    limits = np.array([c.velocity or SPEEDS[c.kind] for c in arm.coordinates])
-    return MotionBounds(middle - reach * half, middle + reach * half, speed * limits)
+    low, high, fastest = np.array(limits).T
+    middle, half = (low + high) / 2, (high - low) / 2
+    return MotionBounds(middle - reach * half, middle + reach * half, speed * fastest)
+
+
+def _limits(index: int, arm: Arm, joints: Mapping[str, Joint]) -> tuple[float, float, float]:
+    """Lowest and highest position and largest speed of a coordinate."""
+    coordinate = arm.coordinates[index]
+    low, high = _range(coordinate)
+    speed = coordinate.velocity or SPEEDS[coordinate.kind]
+    for body in arm.bodies:
+        if body.coordinate != index or body.name == coordinate.name or body.name not in joints:
+            continue
+        follower, factor = joints[body.name], float(body.multiplier)
+        if not factor:
+            continue
+        if follower.type != "continuous" and follower.lower is not None and follower.upper is not None:
+            ends = sorted((end - body.offset) / factor for end in (follower.lower, follower.upper))
+            low, high = max(low, ends[0]), min(high, ends[1])
+        if follower.velocity:
+            speed = min(speed, follower.velocity / abs(factor))
+    return low, high, speed
 
 
 def _range(coordinate: Coordinate) -> tuple[float, float]:

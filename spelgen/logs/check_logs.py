@@ -118,12 +118,12 @@ def _limits(coordinate: Coordinate, joint: JointReport) -> list[Diagnostic]:
         over.append(("position", f"q down to {joint.low['q']:.4g} {unit[0]}, the limit is {lower:.4g}"))
     if upper is not None and joint.high["q"] > upper + BEYOND:
         over.append(("position", f"q up to {joint.high['q']:.4g} {unit[0]}, the limit is {upper:.4g}"))
-    for name, value, limit, told in (
+    for name, value, limit, unit_name in (
         ("velocity", speed, coordinate.velocity, unit[1]),
         ("effort", torque, coordinate.effort, unit[2]),
     ):
         if limit and value > limit * (1 + BEYOND):
-            over.append((name, f"{name} up to {value:.4g} {told}, the limit is {limit:.4g}"))
+            over.append((name, f"{name} up to {value:.4g} {unit_name}, the limit is {limit:.4g}"))
     where = f"joint {joint.name!r}"
     return [Diagnostic("warning", f"beyond-{name}-limit", where, None, what) for name, what in over]
 
@@ -137,7 +137,7 @@ def _gravity(joint: JointReport) -> list[Diagnostic]:
     if abs(fit.correlation) < UNSEEN:
         message = (
             f"tau does not move with gravity: their correlation is {fit.correlation:.2g}, while the URDF's "
-            f"gravity torque spreads {fit.relative_deviation:.2g} times as wide as tau; is it compensated in the log?"
+            f"gravity torque varies {fit.relative_deviation:.2g} times as much as tau; is it compensated in the log?"
         )
         return [Diagnostic("warning", "torque-without-gravity", where, None, message)]
     if fit.correlation < -SEEN:

@@ -62,7 +62,7 @@ class JointUnits(Group):
 
 
 class LogUnits(JointUnits):
-    """Units of all columns; None: SI units, and degrees are still smelt."""
+    """Units of all columns; None: SI units, and degrees are still detected."""
 
     t: Time = "s"
 

@@ -156,11 +156,11 @@ def in_si(data: np.ndarray, joints: Sequence[str], mapping: LogMapping) -> dict[
     return values | {"t": data[:, 0] * TIMES[mapping.units.t]}
 
 
-def made_trajectory(values: dict[str, np.ndarray], rows: np.ndarray | slice, **told: Any) -> Trajectory:
-    """These rows of what `in_si` gave, velocities differentiated where there are none. told: of the trajectory."""
+def made_trajectory(values: dict[str, np.ndarray], rows: np.ndarray | slice, **about: Any) -> Trajectory:
+    """These rows of what `in_si` gave, velocities differentiated where there are none. about: the trajectory."""
     t, q, tau = (values[name][rows] for name in ("t", "q", "tau"))
     qd = values["qd"][rows] if "qd" in values else _differentiated(t, q)
-    return Trajectory(t, q, qd, tau, **told)
+    return Trajectory(t, q, qd, tau, **about)
 
 
 def _differentiated(t: np.ndarray, q: np.ndarray) -> np.ndarray:

@@ -101,8 +101,8 @@ class LogReport:
 
     def __repr__(self) -> str:
         warnings, errors = len(self.warnings), len(self.errors)
-        told = f"{_counted(warnings, 'warning', 'warnings')}, {_counted(errors, 'error', 'errors')}"
-        return f"<LogReport {self.heading()}; {told}>"
+        summary = f"{_counted(warnings, 'warning', 'warnings')}, {_counted(errors, 'error', 'errors')}"
+        return f"<LogReport {self.heading()}; {summary}>"
 
     def _repr_html_(self) -> str:
         lines: list[tuple[str, ...]] = [(each.severity, each.where, each.message) for each in self.findings]
@@ -177,8 +177,8 @@ def _physics(found: LogReport) -> Listing:
 
 
 def _wrapped(finding: Diagnostic) -> str:
-    told = f"{finding.severity}: {finding.where}: {finding.message}"
-    return textwrap.fill(told, WIDTH, initial_indent="  ", subsequent_indent="    ")
+    summary = f"{finding.severity}: {finding.where}: {finding.message}"
+    return textwrap.fill(summary, WIDTH, initial_indent="  ", subsequent_indent="    ")
 
 
 def _counted(count: int, one: str, many: str) -> str:

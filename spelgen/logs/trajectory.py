@@ -82,8 +82,8 @@ class Trajectory:
 
     def __repr__(self) -> str:
         joints = self.q.shape[1]
-        told = f"{len(self)} samples, {self.duration:.4g} s at {self.sample_rate:.4g} Hz"
-        return f"<Trajectory {self.name!r}: {told}, {joints} joint{'s' * (joints != 1)}>"
+        summary = f"{len(self)} samples, {self.duration:.4g} s at {self.sample_rate:.4g} Hz"
+        return f"<Trajectory {self.name!r}: {summary}, {joints} joint{'s' * (joints != 1)}>"
 
     def _repr_html_(self) -> str:
         return trajectory_listing([self]).html()

@@ -22,8 +22,8 @@ class SimulatedLogs(list[Trajectory]):
         self.integration_error = integration_error
 
     def __repr__(self) -> str:
-        told = f"{len(self.train)} to train, {len(self.test)} to test"
-        return f"<SimulatedLogs: {told}, integration error {self.integration_error:.1e}>"
+        summary = f"{len(self.train)} to train, {len(self.test)} to test"
+        return f"<SimulatedLogs: {summary}, integration error {self.integration_error:.1e}>"
 
     def _repr_html_(self) -> str:
         return trajectory_listing(self).html()
