@@ -21,8 +21,9 @@ import pyarrow as pa
 import pyarrow.parquet
 
 from spelgen.dynamics.regressor import regressor, urdf_parameters
+from spelgen.loaded_arm import load_arm
 from spelgen.logs.read import ROW_GROUP
-from spelgen.pipeline import build, load
+from spelgen.pipeline import generate
 
 ROOT = Path(__file__).parents[1]
 URDF = ROOT / "robots" / "panda.urdf"
@@ -42,10 +43,10 @@ def main() -> None:
         since = time.monotonic()
         size = write_log(folder / "train.parquet", chosen.gigabytes * 1e9)
         print(f"log: {size / 1e9:.2f} GB of numbers, written in {time.monotonic() - since:.0f} s")
-        (folder / "module.py").write_text(build(URDF, width=32), encoding="utf-8")
+        (folder / "module.py").write_text(generate(URDF, width=32), encoding="utf-8")
         command = [
             "train", "module.py", "--data", "train.parquet", "-o", "run", "--epochs", str(chosen.epochs),
-            "--momentum-steps", "200", "--quiet", "--robot", str(URDF), "--prior", "0",
+            "--momentum-steps", "200", "--quiet", "--robot", str(URDF), "--urdf-weight", "0",
         ]  # fmt: skip
         since = time.monotonic()
         subprocess.run([sys.executable, "-m", "spelgen", *command], cwd=folder, check=True)
@@ -57,7 +58,7 @@ def main() -> None:
 
 def write_log(path: Path, least: float) -> int:
     """Recordings of a swinging arm until there are `least` bytes of numbers; returns how many there are."""
-    arm = load(URDF).arm
+    arm = load_arm(URDF).arm
     names = [coordinate.name for coordinate in arm.coordinates]
     t, q, qd, tau = motion(arm, np.random.default_rng(0))
     width = 8 * (1 + 3 * len(names))

@@ -1,0 +1,209 @@
+"""Fits in memory: the same as those of files, saved and loaded again; torques predicted and scored; both solvers."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from emitted import random_model
+
+import spelgen
+from spelgen.errors import LogError, RunError
+from spelgen.fitting.adaptive import LONG
+from spelgen.fitting.config import MomentumFit, Rollout, TorqueFit
+from spelgen.fitting.rollout import loss_scales, roll_out, rollout_loss
+from spelgen.fitting.train import train
+from spelgen.logs.preprocessing import Preprocessing
+from spelgen.logs.read import write_logs
+from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.windows import Windows, cut_windows
+from tests.test_training import (
+    JOINTS,
+    QUICK,
+    STAND_IN,
+    Oscillator,
+    lines,
+    motions,
+    quick,
+    random_windows,
+    truth,
+)
+
+
+def same(first: torch.nn.Module, second: torch.nn.Module) -> bool:
+    pairs = zip(first.state_dict().items(), second.state_dict().items(), strict=True)
+    return all(a == b and torch.equal(x, y) for (a, x), (b, y) in pairs)
+
+
+def test_a_fit_in_memory_is_that_of_files(tmp_path):
+    write_logs(tmp_path / "train.parquet", motions(), JOINTS)
+    filed = train(STAND_IN, [tmp_path / "train.parquet"], tmp_path / "filed", QUICK, progress=False)
+    model = spelgen.load_module(STAND_IN)
+    found = spelgen.fit(model, motions(), QUICK)
+    assert found.model is model
+    assert (found.status, found.epochs, found.best_validation) == ("finished", 6, filed.best_validation)
+    assert same(model, filed.model)
+    found.save(tmp_path / "saved")
+    names = {path.name for path in (tmp_path / "saved").iterdir()}
+    assert names == {path.name for path in (tmp_path / "filed").iterdir()}
+    assert lines(tmp_path / "saved") == lines(tmp_path / "filed")
+    for name in ("config.json", "module.py"):
+        assert (tmp_path / "saved" / name).read_bytes() == (tmp_path / "filed" / name).read_bytes()
+    again = train(
+        STAND_IN,
+        [tmp_path / "train.parquet"],
+        tmp_path / "saved",
+        quick(epochs=7),
+        resume=True,
+        progress=False,
+    )
+    assert again.epochs == 7
+
+
+def test_a_saved_fit_is_loaded_as_it_was(tmp_path):
+    found = spelgen.fit(spelgen.load_module(STAND_IN), motions(), quick(epochs=2), seed=3)
+    folder = found.save(tmp_path / "run")
+    loaded = spelgen.load_run(folder)
+    assert same(loaded.model, found.model)
+    assert (loaded.config, loaded.preprocessing, loaded.record) == (
+        found.config,
+        found.preprocessing,
+        found.record,
+    )
+    assert (loaded.history, loaded.best_epoch, loaded.substeps) == (
+        found.history,
+        found.best_epoch,
+        found.substeps,
+    )
+    assert (loaded.status, loaded.folder, found.folder) == (None, folder, None)
+    with pytest.raises(RunError, match="there is a run in this folder"):
+        found.save(folder)
+    again = loaded.save(tmp_path / "again")
+    assert (again / "config.json").read_bytes() == (folder / "config.json").read_bytes()
+    loaded.save(folder, force=True)
+    assert same(spelgen.load_run(folder).model, found.model)
+
+
+def test_what_was_used_is_recorded_and_nothing_else(tmp_path):
+    found = spelgen.fit(spelgen.load_module(STAND_IN), motions(), Rollout(epochs=1, momentum_steps=0))
+    assert found.record["objective"] == "rollout"
+    assert found.record["config"] == {
+        "window": 5, "stride": 1, "momentum_steps": 0, "optimizer": "lbfgs", "weight_decay": 2e-5,
+        "urdf_weight": 1.0, "epochs": 1, "patience": 60, "solver": "rk4", "compile": False,
+    }  # fmt: skip
+    assert found.record["preprocessing"] == {"cutoff": None, "decimation": 1, "gap": 4.0}
+    json.dumps(found.record)
+
+
+def test_validation_may_be_given():
+    logs = motions()
+    found = spelgen.fit(spelgen.load_module(STAND_IN), logs[:4], quick(epochs=1), validation=logs[4:])
+    assert found.record["training"] == [x.name for x in logs[:4]]
+    assert found.record["validation"] == [x.name for x in logs[4:]]
+    assert found.record["validation_fraction"] is None
+
+
+def test_one_trajectory_alone_is_enough():
+    (log,) = motions(count=1, samples=60)
+    found = spelgen.fit(spelgen.load_module(STAND_IN), log, quick(epochs=1))
+    assert found.record["training"] == ["motion_0"]
+
+
+def swings(seed: int, rate=200.0) -> Trajectory:
+    """A smooth motion of the true arm with its own torques."""
+    random = np.random.default_rng(seed)
+    t = np.arange(0, 6, 1 / rate)[:, None]
+    speed, phase = random.uniform(2, 5, 2), random.uniform(0, 6, 2)
+    q, qd, qdd = (
+        np.sin(speed * t + phase),
+        speed * np.cos(speed * t + phase),
+        -(speed**2) * np.sin(speed * t + phase),
+    )
+    with torch.no_grad():
+        tau = truth().inverse_dynamics(*(torch.from_numpy(x) for x in (q, qd, qdd))).numpy()
+    return Trajectory(t[:, 0], q, qd, tau, f"swing_{seed}")
+
+
+def test_torques_are_fitted_predicted_and_scored():
+    model, test = spelgen.load_module(STAND_IN), swings(9)
+    found = spelgen.fit(model, [swings(seed) for seed in range(3)], TorqueFit(weight_decay=0.0))
+    assert (found.epochs, found.history, found.config.objective) == (0, [], "torque")
+    assert [note.code for note in found.diagnostics].count("torque-fit") == 1
+    assert found.score(test) > 0.9999
+    tau = found.predict(test)
+    assert tau.shape == test.tau.shape
+    inner = slice(100, -100)  # away from the ends, where the filter settles
+    assert np.abs(tau - test.tau)[inner].max() < 0.02 * test.tau.std()
+    result = found.evaluate([test])
+    assert result.torque["model"].mean_nmse == pytest.approx(1 - found.score([test]), rel=1e-6)
+    constant = Trajectory(test.t, test.q, test.qd, np.ones_like(test.tau), "constant")
+    assert found.predict(constant).shape == test.tau.shape
+    with pytest.raises(LogError, match="no motion to judge torques on"):
+        found.score(motions())
+
+
+def test_the_filter_reaches_torques():
+    logs = [swings(seed) for seed in range(2)]
+    fits = [
+        spelgen.fit(spelgen.load_module(STAND_IN), logs, TorqueFit(evaluations=20), preprocessing=each)
+        for each in (Preprocessing(), Preprocessing(cutoff=3.0), Preprocessing(cutoff=0.0))
+    ]
+    assert [x.preprocessing.cutoff for x in fits] == [8.0, 3.0, 0.0]
+    scores = [x.score(logs) for x in fits]
+    assert len({round(x, 9) for x in scores}) == 3
+
+
+def test_predictions_at_gaps_are_not_numbers():
+    log = swings(0)
+    t = log.t.copy()
+    t[1:] += 1.0  # the first sample stands alone
+    found = spelgen.fit(spelgen.load_module(STAND_IN), [swings(1), swings(2)], TorqueFit(evaluations=20))
+    tau = found.predict(Trajectory(t, log.q, log.qd, log.tau, "gap"))
+    assert np.isnan(tau[0]).all() and np.isfinite(tau[1:]).all()
+
+
+def test_a_fit_tells_what_it_is():
+    found = spelgen.fit(spelgen.load_module(STAND_IN), motions(), MomentumFit(momentum_steps=20))
+    told = f"<Fit of 'stand_in' to momentum: finished after 0 epochs, validation loss {found.best_validation:.3g}>"
+    assert repr(found) == told
+    assert "momentum steps" in found._repr_html_()
+
+
+@pytest.mark.parametrize("samples", [4, LONG + 2])
+def test_both_solvers_agree(tmp_path, samples):
+    """In what they predict and in its gradient, which over long horizons comes from the adjoint equation."""
+    model = random_model("two_link", tmp_path, seed=0)
+    torch.manual_seed(0)
+    q, qd, tau = torch.rand(3, 5, samples, model.n, dtype=torch.float64)
+    windows = Windows(0.01 + 0.01 * torch.rand(5, samples - 1).double(), q, qd, tau[:, 1:])
+    scales, losses, gradients = loss_scales(windows, model.joint_types), [], []
+    for solver, substeps in (("rk4", 16), ("dopri5", 1)):
+        model.zero_grad()
+        loss = rollout_loss(model, windows, scales, substeps, solver)
+        loss.backward()
+        losses.append(loss.item())
+        found = [torch.zeros_like(x) if x.grad is None else x.grad for x in model.parameters()]
+        gradients.append(torch.cat([x.flatten() for x in found]))
+    assert losses[1] == pytest.approx(losses[0], rel=1e-5)
+    torch.testing.assert_close(
+        gradients[1], gradients[0], rtol=1e-3, atol=1e-5 * gradients[0].abs().max().item()
+    )
+
+
+def test_dopri5_is_the_exact_solution():
+    windows = random_windows()
+    pairs = zip(roll_out(Oscillator(), windows, solver="dopri5"), Oscillator().solve(windows), strict=True)
+    assert max((got - exact).abs().max().item() for got, exact in pairs) < 1e-6
+
+
+def test_windows_are_fitted_by_dopri5():
+    config = Rollout(epochs=2, momentum_steps=0, solver="dopri5", optimizer="lbfgs")
+    found = spelgen.fit(spelgen.load_module(STAND_IN), motions(), config)
+    plain = spelgen.fit(
+        spelgen.load_module(STAND_IN), motions(), Rollout(epochs=2, momentum_steps=0, substeps=8)
+    )
+    assert found.record["config"]["solver"] == "dopri5"
+    assert found.best_validation == pytest.approx(plain.best_validation, rel=0.05)
+    windows = cut_windows(motions(), 5, measured=False)
+    scales = loss_scales(windows, ("revolute", "revolute"))
+    assert rollout_loss(truth(), windows, scales, 1, "dopri5") < 1e-12

@@ -1,0 +1,161 @@
+"""Options of a fit: each objective has its own, and one that does not apply is told with what it belongs to."""
+
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+from typer.testing import CliRunner
+
+from spelgen.cli.main import app
+from spelgen.errors import OptionError, SettingsError
+from spelgen.fitting.config import CONFIGS, OWNERS, MomentumFit, Rollout, TorqueFit, fit_config
+from spelgen.logs.preprocessing import Preprocessing
+from spelgen.logs.read import write_logs
+from spelgen.pipeline import generate
+from spelgen.settings.settings import load_settings
+from spelgen.settings.training import TrainingSettings
+from tests.test_training import JOINTS, STAND_IN, motions
+
+VALUES = {
+    "prior": {"bodies": 1.0}, "payload": True, "evaluations": 40, "weight_decay": 0.1, "urdf_weight": 0.5,
+    "window": 7, "stride": 2, "momentum_steps": 10, "optimizer": "adamw", "batch": 16, "learning_rate": 0.01,
+    "max_minutes": 2.0, "torque_first": True, "epochs": 3, "patience": 2, "solver": "rk4", "substeps": 2,
+    "compile": True,
+}  # fmt: skip
+OF_CLOSED_FORM = {"torque": {"prior", "payload"}, "rollout": {"torque_first"}}
+OF_NETWORKS = {"torque": {"evaluations", "weight_decay", "urdf_weight"}}
+
+
+def test_every_option_has_a_value_here_and_a_place_in_the_settings():
+    assert OWNERS.keys() == VALUES.keys()
+    in_a_file = OWNERS.keys() - {"payload", "compile"}  # of one run, not of a robot
+    assert in_a_file <= TrainingSettings.model_fields.keys()
+    beside = {"objective", "cutoff", "decimation", "gap", "validation_fraction", "seed"}
+    assert TrainingSettings.model_fields.keys() == in_a_file | beside
+
+
+@pytest.mark.parametrize("closed_form", [False, True])
+@pytest.mark.parametrize("objective", ["torque", "momentum", "rollout"])
+@pytest.mark.parametrize("option", VALUES)
+def test_an_option_applies_or_is_told_where_it_belongs(option, objective, closed_form):
+    make = lambda: fit_config(objective, closed_form=closed_form, options={option: VALUES[option]})  # noqa: E731
+    owners = [x for x in ("torque", "momentum", "rollout") if option in CONFIGS[x].model_fields]
+    if objective not in owners:
+        several = "objectives" if len(owners) > 1 else "objective"
+        told = f"{option}: belongs to the {several} {' and '.join(owners)}, this fits {objective}"
+    elif closed_form and objective == "momentum":
+        told = "objective: momentum belongs to models of networks, this is a closed-form one"
+    elif option in (OF_NETWORKS if closed_form else OF_CLOSED_FORM).get(objective, ()):
+        kind = "models of networks" if closed_form else "closed-form models"
+        told = f"{option}: with the objective {objective} belongs to {kind}"
+    else:
+        config = make()
+        assert config.record(closed_form=closed_form)[option]
+        return
+    with pytest.raises(OptionError) as caught:
+        make()
+    assert str(caught.value) == told
+
+
+def test_options_of_another_option():
+    for option in ("batch", "learning_rate"):
+        with pytest.raises(OptionError, match=f"{option}: belongs to the optimizer adamw, this is lbfgs"):
+            MomentumFit(optimizer="lbfgs", **{option: VALUES[option]})
+    with pytest.raises(OptionError, match="substeps: belongs to the solver rk4, this is dopri5"):
+        Rollout(solver="dopri5", substeps=2)
+
+
+def test_from_python_too():
+    with pytest.raises(
+        OptionError, match="window: belongs to the objectives momentum and rollout, this fits torq"
+    ):
+        TorqueFit(window=7)
+    with pytest.raises(SettingsError, match=r"unknown option 'windw'; did you mean 'window'\?"):
+        Rollout(windw=7)
+    with pytest.raises(ValidationError, match="greater than or equal to 2"):
+        Rollout(window=1)
+    with pytest.raises(ValidationError, match="frozen"):
+        Rollout().window = 3
+    for wrong in ({"cutoff": -1.0}, {"decimation": 0}, {"gap": 1.0}):
+        with pytest.raises(SettingsError, match=next(iter(wrong))):
+            Preprocessing(**wrong)
+
+
+def test_what_a_robot_settles_for_another_objective_is_left_out():
+    settled = {"window": 9, "batch": 8, "substeps": 4, "weight_decay": 0.3, "prior": {"bodies": 1.0}}
+    make = lambda objective, **chosen: fit_config(  # noqa: E731
+        objective, closed_form=False, options=chosen, defaults=settled
+    ).record(closed_form=False)
+    assert make("torque") == {"evaluations": 2000, "weight_decay": 0.3, "urdf_weight": 1.0}
+    found = make("rollout", solver="dopri5", optimizer="lbfgs")
+    assert (found["window"], "batch" in found, "substeps" in found) == (9, False, False)
+    assert make("momentum", batch=4)["batch"] == 4
+
+
+@pytest.fixture
+def sidecar(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    def write(text: str) -> Path:
+        Path("arm.yaml").write_text(text)
+        return Path("arm.urdf")
+
+    return write
+
+
+def test_a_sidecar_names_its_line(sidecar):
+    path = sidecar("training:\n  objective: torque\n  weight_decay: 0.1\n  window: 7\n")
+    with pytest.raises(SettingsError) as caught:
+        assert load_settings(path).training.options
+    assert str(caught.value) == (
+        "arm.yaml:4: training.window: got 7, expected nothing beside 'objective: torque': "
+        "this belongs to momentum and rollout"
+    )
+    path = sidecar("training:\n  window: 7\n  weight_decay: 0.1\n  cutoff: 5\n  decimation: 2\n")
+    settings = load_settings(path).training
+    assert settings.options == {"window": 7, "weight_decay": 0.1}
+    assert Preprocessing(**settings.preprocessing) == Preprocessing(5.0, 2)
+
+
+def refused(*command: object) -> str:
+    done = CliRunner().invoke(app, ["train", *map(str, command)])
+    assert done.exit_code == 2, done.output
+    return done.output.strip().splitlines()[-1]
+
+
+def test_the_command_line_names_the_flag(robots, tmp_path):
+    logs, module = tmp_path / "train.parquet", tmp_path / "rpr.py"
+    write_logs(logs, motions(), JOINTS)
+    module.write_text(generate(robots / "rpr.urdf", preset="closed-form"))
+    data = ("--data", logs, "-o", tmp_path / "run", "--quiet")
+    told = refused(module, *data, "--objective", "torque", "--learning-rate", "0.1")
+    assert told == "Error: --learning-rate: belongs to the objectives momentum and rollout, this fits torque"
+    told = refused(module, *data, "--objective", "torque", "--urdf-weight", "0")
+    assert told == "Error: --urdf-weight: with the objective torque belongs to models of networks"
+    told = refused(module, *data, "--objective", "momentum")
+    assert told == "Error: --objective: momentum belongs to models of networks, this is a closed-form one"
+    told = refused(STAND_IN, *data, "--evaluations", "40")
+    assert told == "Error: --evaluations: belongs to the objective torque, this fits rollout"
+    told = refused(STAND_IN, *data, "--no-torque-first")
+    assert told == "Error: --torque-first: with the objective rollout belongs to closed-form models"
+    told = refused(STAND_IN, *data, "--optimizer", "lbfgs", "--batch", "4")
+    assert told == "Error: --batch: belongs to the optimizer adamw, this is lbfgs"
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_goes_on_with_its_own_options(tmp_path):
+    logs, run = tmp_path / "train.parquet", tmp_path / "run"
+    write_logs(logs, motions(), JOINTS)
+    begin = ["train", str(STAND_IN), "--data", str(logs), "-o", str(run), "--quiet", "--momentum-steps", "20"]
+    assert CliRunner().invoke(app, [*begin, "--epochs", "1", "--window", "6"]).exit_code == 0
+    again = ["train", str(STAND_IN), "--data", str(logs), "-o", str(run), "--quiet", "--resume"]
+    assert CliRunner().invoke(app, [*again, "--epochs", "2"]).output.startswith("finished after 2 epochs")
+    assert refused(*again[1:], "--evaluations", "40").startswith(
+        "Error: --evaluations: belongs to the objective t"
+    )
+    done = CliRunner().invoke(app, [*again, "--window", "7"])
+    assert done.exit_code == 1
+    assert "got window 7 instead of 6, expected the settings the run was started with" in done.stderr
+    done = CliRunner().invoke(app, [*again, "--objective", "momentum"])
+    assert done.exit_code == 1
+    assert "objective momentum instead of rollout" in done.stderr
