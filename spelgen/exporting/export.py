@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from spelgen.errors import RunError
 from spelgen.exporting.rigid_body_projection import RigidBodyProjection, rigid_body_projection
@@ -13,8 +13,6 @@ from spelgen.files import write_bytes, write_text
 from spelgen.fitting.fitted import Fit, load_run
 from spelgen.listing import Listing, number
 from spelgen.loaded_arm import LoadedArm, load_arm
-
-Format = Literal["urdf"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -60,7 +58,7 @@ class Exported:
 
 
 def export(
-    trained: Any, to: Format = "urdf", path: Path | str | None = None, *, arm: Any = None, force: bool = False
+    trained: Any, to: str = "urdf", path: Path | str | None = None, *, arm: Any = None, force: bool = False
 ) -> Exported:
     """What a fit, the folder of a run or a model has learned, for other tools; written where a path is given.
 

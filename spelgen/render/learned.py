@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -42,7 +42,7 @@ def read_learned(run: RunFolder) -> Learned:
     """What the best model of a run has learned. Raises ModuleError or RunError when it cannot be read."""
     before, after = load_module(run.module), trained_model(run)
     found = []
-    mass = getattr(after.dynamics, "mass", None)
+    mass: Any = getattr(after.dynamics, "mass", None)
     if hasattr(mass, "constants"):
         basis = mass.constant_basis.reshape(-1, after.n, after.n)
         values = zip(basis, _constants(before), _constants(after), strict=True)
@@ -54,8 +54,8 @@ def read_learned(run: RunFolder) -> Learned:
 
 
 def _constants(model: EmittedModel) -> list[float]:
-    values: list[float] = model.dynamics.mass.constants().tolist()
-    return values
+    dynamics: Any = model.dynamics
+    return list(dynamics.mass.constants().tolist())
 
 
 def _constant(basis: torch.Tensor, start: float, learned: float, joint_types: Sequence[str]) -> Constant:
