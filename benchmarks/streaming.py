@@ -1,6 +1,8 @@
-"""Trains on a log larger than memory: how much memory that takes, and how long.
+"""Fits a log larger than memory: how much memory that takes, and how long.
 
-    python benchmarks/streaming.py [--gigabytes 5] [--epochs 2]
+    python benchmarks/streaming.py [--gigabytes 5] [--epochs 2] [--preset closed-form]
+
+A model of networks is fitted to windows, a closed-form one to torques.
 
 The log is synthetic: the Panda of robots/ under the torques of its own URDF, friction and noise, at 1 kHz. It is
 written to a temporary folder (TMPDIR) and removed in the end. `make bench` takes 0.2 GB.
@@ -37,17 +39,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--gigabytes", type=float, default=0.2)
     parser.add_argument("--epochs", type=int, default=2)
+    parser.add_argument("--preset", default="minimal")
     chosen = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         since = time.monotonic()
         size = write_log(folder / "train.parquet", chosen.gigabytes * 1e9)
         print(f"log: {size / 1e9:.2f} GB of numbers, written in {time.monotonic() - since:.0f} s")
-        (folder / "module.py").write_text(generate(URDF, width=32), encoding="utf-8")
-        command = [
-            "train", "module.py", "--data", "train.parquet", "-o", "run", "--epochs", str(chosen.epochs),
-            "--momentum-steps", "200", "--quiet", "--robot", str(URDF), "--urdf-weight", "0",
-        ]  # fmt: skip
+        source = generate(URDF, preset=chosen.preset, width=32)
+        (folder / "module.py").write_text(source, encoding="utf-8")
+        command = ["train", "module.py", "--data", "train.parquet", "-o", "run", "--quiet", "--robot", str(URDF)]
+        if chosen.preset != "closed-form":
+            command += ["--epochs", str(chosen.epochs), "--momentum-steps", "200", "--urdf-weight", "0"]
         since = time.monotonic()
         subprocess.run([sys.executable, "-m", "spelgen", *command], cwd=folder, check=True)
         peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024 / 1e9

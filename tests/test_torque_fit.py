@@ -20,8 +20,10 @@ from spelgen.fitting.gaussian_prior import SIZES, covariance, kind_of
 from spelgen.fitting.stages import default_objective
 from spelgen.fitting.torque_fit import fit_torque
 from spelgen.fitting.torque_samples import TorqueSamples
+from spelgen.fitting.train import train
 from spelgen.identification.samples import DynamicsSamples, dynamics_samples
 from spelgen.loaded_arm import load_arm
+from spelgen.logs import chunks
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.pipeline import generate
@@ -170,12 +172,12 @@ def run(emitted, robots, tmp_path_factory):
     write(folder / "logs.parquet", logs, arm)
     robot = str(robots / "six_dof.urdf")
     build_ = ["build", robot, "--preset", "closed-form", "-o", str(folder / "arm.py")]
-    train = ["train", str(folder / "arm.py"), "--robot", robot, "--data", str(folder / "logs.parquet")]
-    train += ["-o", str(folder / "run"), "--quiet"]
-    for command in (build_, train):
+    fitting = ["train", str(folder / "arm.py"), "--robot", robot, "--data", str(folder / "logs.parquet")]
+    fitting += ["-o", str(folder / "run"), "--quiet"]
+    for command in (build_, fitting):
         done = CliRunner().invoke(app, command)
         assert done.exit_code == 0, done.output
-    return folder, true, train
+    return folder, true, fitting
 
 
 def test_train_fits_torques_and_leaves_a_run(run, emitted):
@@ -241,10 +243,10 @@ def test_logs_too_slow_for_accelerations_are_fitted_by_windows(emitted, robots):
 
 
 def test_a_model_of_networks_is_not_adapted_to_a_load(robots, run, tmp_path):
-    folder, _, train = run
+    folder, _, fitting = run
     build_ = ["build", str(robots / "six_dof.urdf"), "-o", str(folder / "networks.py"), "--force"]
     assert CliRunner().invoke(app, build_).exit_code == 0
-    command = ["train", str(folder / "networks.py"), *train[2:6], "--quiet", "--objective", "torque"]
+    command = ["train", str(folder / "networks.py"), *fitting[2:6], "--quiet", "--objective", "torque"]
     done = CliRunner().invoke(app, [*command, "--evaluations", "20", "-o", str(tmp_path / "networks")])
     assert done.exit_code == 0, done.output
     with pytest.raises(
@@ -256,8 +258,8 @@ def test_a_model_of_networks_is_not_adapted_to_a_load(robots, run, tmp_path):
 
 
 def test_the_same_logs_give_the_same_weights(run, tmp_path):
-    folder, _, train = run
-    again = [*train[:-3], "-o", str(tmp_path / "again"), "--quiet"]
+    folder, _, fitting = run
+    again = [*fitting[:-3], "-o", str(tmp_path / "again"), "--quiet"]
     assert CliRunner().invoke(app, again).exit_code == 0
     first, second = (
         torch.load(x / "model.pt", weights_only=True) for x in (folder / "run", tmp_path / "again")
@@ -288,3 +290,19 @@ def test_two_seconds_of_a_real_arm_beat_least_squares(shared, tmp_path):
     tests = ("19_12_23_free", "20_02_06_20sec_5harm")
     samples = dynamics_samples([read_logs([folder / f"{x}.parquet"], names)[0] for x in tests], pauses=True)
     assert np.mean([nmse(model, sample) for sample in samples]) < 0.03  # the best quick prior: 0.057 of nine
+
+
+def test_a_log_larger_than_memory_is_fitted_to_torques(emitted, robots, tmp_path, monkeypatch):
+    """To the very weights that the same recordings give in memory."""
+    module, arm = emitted["two_link"]
+    logs = [recorded(drawn(module, seed=3, deviation=0.3), 4.0, 0.01, seed=seed) for seed in range(4)]
+    write(tmp_path / "train.parquet", logs, arm)
+    (tmp_path / "arm.py").write_text(generate(robots / "two_link.urdf", preset="closed-form"))
+    plain = train(tmp_path / "arm.py", [tmp_path / "train.parquet"], tmp_path / "plain", progress=False)
+    monkeypatch.setattr(chunks, "IN_MEMORY", 1000)
+    monkeypatch.setattr(torque_jacobian, "BLOCK", 100)
+    large = train(tmp_path / "arm.py", [tmp_path / "train.parquet"], tmp_path / "large", progress=False)
+    assert {"streamed", "torque-fit"} <= {note.code for note in large.diagnostics}
+    assert plain.config.objective == large.config.objective == "torque"
+    for name, value in plain.model.state_dict().items():
+        torch.testing.assert_close(large.model.state_dict()[name], value, rtol=1e-6, atol=1e-8)
