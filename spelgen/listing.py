@@ -7,6 +7,7 @@ colours, notebook), so that the same rows give the same text wherever they go.
 from __future__ import annotations
 
 import io
+import re
 import textwrap
 from dataclasses import dataclass
 from html import escape
@@ -39,12 +40,10 @@ class Listing:
 
     def html(self) -> str:
         """For a notebook."""
+        title = f"<p><b>{escape(self.title)}</b></p>" if self.title else ""
         note = f"<p>{escape(self.note)}</p>" if self.note else ""
         rows = "".join(self._row(row, "td") for row in self.rows)
-        return (
-            f"<p><b>{escape(self.title)}</b></p><table><thead>{self._row(self.head, 'th')}</thead>"
-            f"<tbody>{rows}</tbody></table>{note}"
-        )
+        return f"{title}<table><thead>{self._row(self.head, 'th')}</thead><tbody>{rows}</tbody></table>{note}"
 
     def _row(self, cells: tuple[str, ...], tag: str) -> str:
         sides = ["left" if k in self.left else "right" for k in range(len(cells))]
@@ -67,15 +66,26 @@ class Listing:
         for k, width in enumerate(widths):
             side: Literal["left", "right"] = "left" if k in self.left else "right"
             table.add_column(justify=side, overflow="fold", min_width=width, no_wrap=k > 0)
+        room = max(SHORTEST, WIDTH - sum(2 + width for width in widths[1:]) - 2)
         for line in lines:
-            table.add_row(*map(Text, line))
+            table.add_row(*map(Text, (_folded(line[0], room), *line[1:])))
         file = io.StringIO()
         console = Console(
             file=file, width=max(WIDTH, sum(widths) + 2 * len(widths)), color_system=None, force_terminal=False,
             force_jupyter=False, legacy_windows=False, _environ={},
         )  # fmt: skip
         console.print(table, crop=False)
-        return [line.rstrip() for line in file.getvalue().splitlines()]
+        return [line.rstrip() for line in file.getvalue().rstrip("\n").split("\n")]
+
+
+def _folded(name: str, width: int) -> str:
+    """The name with line breaks after its separators where it is longer than the width."""
+    lines = [""]
+    for part in re.split(r"(?<=[_\-/. ])", name):
+        if lines[-1] and len(lines[-1]) + len(part) > width:
+            lines.append("")
+        lines[-1] += part
+    return "\n".join(lines)
 
 
 def number(value: float | None) -> str:

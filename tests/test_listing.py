@@ -1,0 +1,67 @@
+"""Tables of text: the same everywhere, nothing lost, nothing interpreted."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from spelgen.listing import WIDTH, Listing, number
+
+NAMES = ("[bold]x[/bold]", "shoulder_pan_joint_of_the_left_arm", "関節1", "a")
+TABLE = Listing(
+    "Ranges", ("joint", *"abcdef"), tuple((x, *["-0.1 .. 0.3"] * 5, "1") for x in NAMES), "n " * 60
+)
+
+
+def test_columns_are_aligned_and_names_folded_at_their_separators():
+    lines = TABLE.text().splitlines()
+    cells = "-0.1 .. 0.3  " * 5 + "1"
+    assert lines == [
+        "Ranges",
+        "  joint                 a            b            c            d            e  f",
+        f"  [bold]x[/   {cells}",
+        "  bold]",
+        f"  shoulder_   {cells}",
+        "  pan_joint_",
+        "  of_the_",
+        "  left_arm",
+        f"  関節1       {cells}",
+        f"  a           {cells}",
+        "  " + ("n " * 38).strip(),
+        "  " + ("n " * 22).strip(),
+    ]
+    assert max(map(len, lines)) <= WIDTH
+
+
+def test_numbers_are_never_shortened():
+    wide = Listing("", ("joint", *"abcdefghij"), (("x", *["123456789.012"] * 10),))
+    assert wide.text().count("123456789.012") == 10
+
+
+def test_columns_may_be_aligned_to_the_left():
+    text = Listing("", ("name", "what"), (("a", "x"), ("b", "yyyyyy")), left=(0, 1)).text()
+    assert text.splitlines() == ["  name  what", "  a     x", "  b     yyyyyy"]
+
+
+@pytest.mark.parametrize("environment", [{"COLUMNS": "20"}, {"FORCE_COLOR": "1", "TERM": "xterm-256color"}])
+def test_no_terminal_and_no_environment_changes_it(environment):
+    code = "from tests.test_listing import TABLE; import sys; sys.stdout.buffer.write(TABLE.text().encode())"
+    found = subprocess.run([sys.executable, "-c", code], env=os.environ | environment, capture_output=True)
+    assert found.stdout.decode() == TABLE.text(), found.stderr
+
+
+def test_html_holds_the_same_and_escapes_it():
+    shown = Listing("<t>", ("joint", "q"), (("<script>", "1"),), "a & b").html()
+    assert "<script>" not in shown and "&lt;script&gt;" in shown and "a &amp; b" in shown
+    assert shown.count("<tr>") == 2 and shown.count('text-align: right">') == 2
+
+
+def test_three_digits():
+    assert [number(x) for x in (None, 0.0, 0.12345, 1e-4, 12345.0)] == [
+        "-",
+        "0",
+        "0.123",
+        "1.00e-04",
+        "1.23e+04",
+    ]
