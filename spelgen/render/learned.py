@@ -40,11 +40,11 @@ class Learned:
 
 def read_learned(run: RunFolder) -> Learned:
     """What the best model of a run has learned. Raises ModuleError or RunError when it cannot be read."""
-    before, after = load_module(run.module), trained_model(run)
+    before: Any = load_module(run.module)
+    after: Any = trained_model(run)
     found = []
-    mass: Any = getattr(after.dynamics, "mass", None)
-    if hasattr(mass, "constants"):
-        basis = mass.constant_basis.reshape(-1, after.n, after.n)
+    if hasattr(after.dynamics, "mass") and hasattr(after.dynamics.mass, "constants"):
+        basis = after.dynamics.mass.constant_basis.reshape(-1, after.n, after.n)
         values = zip(basis, _constants(before), _constants(after), strict=True)
         found += [_constant(*each, after.joint_types) for each in values]
     if hasattr(after, "armature"):
