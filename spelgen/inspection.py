@@ -8,15 +8,15 @@ import textwrap
 from dataclasses import dataclass
 from typing import Any
 
+from spelgen.arm.actuation import Actuation
 from spelgen.arm.arm import Arm, Coordinate
 from spelgen.errors import Diagnostic
 from spelgen.explain.facts import Fact, facts
 from spelgen.formulas.formulas import Entry as PlaceOfEntry
 from spelgen.formulas.formulas import Formulas, formulas
-from spelgen.labels import joint_ranges
+from spelgen.labels import joint_ranges, joints_in_ranges, printable
 from spelgen.listing import Listing
 from spelgen.structure.structure import Entry, Structure
-from spelgen.urdf.actuation import Actuation
 
 SCHEMA = 1
 
@@ -62,7 +62,7 @@ class Inspection:
             "input_matrix": {
                 "entries": [self._input(row, column) for row in range(n) for column in range(n)]
             },
-            "base_parameters": structure.base_parameters,
+            "base_parameters": structure.base_parameter_count,
             "facts": [fact.to_dict() for fact in self.facts],
             "diagnostics": [diagnostic.to_dict() for diagnostic in self.diagnostics],
         }
@@ -120,22 +120,22 @@ class Inspection:
             told = ["motor torques"]
             for kind, what in (("fixed", "gear known"), ("gain", "gain trained"), ("coupled", "coupled")):
                 joints = tuple(sorted({entry.row for entry in entries if entry.kind == kind}))
-                told += [f"{what} at {_joints(joints)}"] if joints else []
+                told += [f"{what} at {joints_in_ranges(joints)}"] if joints else []
         passive = self.structure.passive
-        return ", ".join(told + ([f"{_joints(passive)} without a drive"] if passive else []))
+        return ", ".join(told + ([f"{joints_in_ranges(passive)} without a drive"] if passive else []))
 
     def _heading(self) -> str:
         trusted = (
             "any inertial values" if self.structure.assume == "kinematics" else "the URDF's inertial values"
         )
-        return f"{_printable(self.arm.name)}: structure for {trusted}"
+        return f"{printable(self.arm.name)}: structure for {trusted}"
 
     def _joint_table(self) -> str:
         lines = []
         for index, coordinate in enumerate(self.arm.coordinates, start=1):
             limits = reach(coordinate)
             passive = ", passive" if index - 1 in self.structure.passive else ""
-            name = textwrap.shorten(_printable(coordinate.name), 36, placeholder="...") or '""'
+            name = textwrap.shorten(printable(coordinate.name), 36, placeholder="...") or '""'
             lines.append(f"  {index:>2}  {name:<36}  {coordinate.kind:<9}  {limits}{passive}")
         return "Joints\n" + "\n".join(lines)
 
@@ -161,16 +161,16 @@ class Inspection:
         counts: dict[tuple[int, ...], int] = {}
         for output in structure.outputs:
             counts[output.joints] = counts.get(output.joints, 0) + 1
-        told = "; ".join(f"{count} of {_joints(joints)}" for joints, count in counts.items())
+        told = "; ".join(f"{count} of {joints_in_ranges(joints)}" for joints, count in counts.items())
         entries, constants = len(structure.entries), len(structure.constants)
         return {
             "M(q)": f"{_many(len(structure.outputs), 'output')} and {_many(constants, 'constant')} "
             f"make all {entries} entries" + (f": {told}" if told else ""),
-            "V(q)": f"depends on {_joints(structure.potential)}"
+            "V(q)": f"depends on {joints_in_ranges(structure.potential)}"
             if structure.potential
             else "zero: gravity does no work",
             "G": self._inputs(),
-            "base": f"{structure.base_parameters} base inertial parameters",
+            "base": f"{structure.base_parameter_count} base inertial parameters",
         }
 
     def _needs(self, width: int) -> str:
@@ -189,7 +189,7 @@ class Inspection:
         lines = []
         for each in self.diagnostics:
             line = "" if each.line is None else f"line {each.line}: "
-            text = _printable(f"{each.severity}: {line}{each.where}: {each.message}")
+            text = printable(f"{each.severity}: {line}{each.where}: {each.message}")
             lines += textwrap.wrap(text, width, initial_indent="  ", subsequent_indent="    ")
         return "Remarks\n" + "\n".join(lines)
 
@@ -210,14 +210,5 @@ def _cell(entry: Entry) -> str:
     return "C" if entry.kind == "constant" else "0"
 
 
-def _joints(joints: tuple[int, ...]) -> str:
-    return f"joint{'s' * (len(joints) > 1)} {joint_ranges(joints)}"
-
-
 def _many(count: int, noun: str) -> str:
     return f"{count} {noun}{'s' * (count != 1)}"
-
-
-def _printable(text: str) -> str:
-    """Text from a file, with what could steer a terminal made visible."""
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

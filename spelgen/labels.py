@@ -19,6 +19,11 @@ def joint_ranges(joints: tuple[int, ...]) -> str:
     )
 
 
+def joints_in_ranges(joints: tuple[int, ...]) -> str:
+    """``joint 2``, or ``joints 2-4,6``."""
+    return f"joint{'s' * (len(joints) > 1)} {joint_ranges(joints)}"
+
+
 def entry_name(row: int, column: int) -> str:
     """How an entry of M is called, from its 0-based place: M21, or M12,1 from ten joints on."""
     separator = "," if max(row, column) >= 9 else ""
@@ -38,3 +43,8 @@ def axes_told(joints: Sequence[int]) -> str:
 def listed(parts: Sequence[str]) -> str:
     """``a``, or ``a, b and c``."""
     return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
+
+
+def printable(text: str, kept: str = "") -> str:
+    """Text from a file, with what could steer a terminal made visible, but for the characters ``kept``."""
+    return "".join(c if c.isprintable() or c in kept else c.encode("unicode_escape").decode() for c in text)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
+from spelgen.arm.actuation import Actuation, derive_actuation
 from spelgen.arm.arm import Arm, make_arm
 from spelgen.errors import Diagnostic
 from spelgen.formulas.formulas import Entry, Formulas, formulas
@@ -15,7 +16,6 @@ from spelgen.settings.settings import Settings, load_settings
 from spelgen.spec import Assume
 from spelgen.structure.base_parameters import BaseParameter, base_parameters
 from spelgen.structure.structure import Structure, derive
-from spelgen.urdf.actuation import Actuation, derive_actuation
 from spelgen.urdf.read import read_urdf
 from spelgen.urdf.robot import Robot
 from spelgen.verify.agreement import Verification
@@ -45,7 +45,7 @@ class LoadedArm:
     @cached_property
     def base_parameters(self) -> tuple[BaseParameter, ...]:
         """The combinations of inertial parameters that the motion depends on."""
-        return base_parameters(self.arm, self.structure.base_parameters)
+        return base_parameters(self.arm, self.structure.base_parameter_count)
 
     @property
     def diagnostics(self) -> tuple[Diagnostic, ...]:

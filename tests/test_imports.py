@@ -23,21 +23,21 @@ logs: mapping
 fitting: config
 settings: joint simulation training comparison messages settings
 design spec
-urdf: robot xacro_child xacro_input document values elements lint read actuation
-arm: rational angle_rounding placement chain lump_links arm
+urdf: robot xacro_child xacro_input document values elements lint read
+arm: rational angle_rounding placement chain lump_links arm actuation axes
 structure: recursion field sampling spans basis expansion symbolic structure nominal
 structure: fourier base_parameters pseudo_inertia
 {" ".join(RUNTIME)}
 emission: bodies plan source docstring tailored bundle emit loading
 dynamics: protocol arrays constraint pinocchio_dynamics pinocchio_arm pinocchio_urdf regressor regressor_dynamics tip
-logs: arm_mapping trajectory bags tables npz readers read checks filtering preprocessing windows chunks epoch_windows
+logs: arm_mapping trajectory bags tables npz readers log_files read checks filtering preprocessing windows chunks epoch_windows
 simulation: friction integration simulated_logs random_inputs tracking
 identification: samples friction base_parameters least_squares method prior identification
 excitation: trajectory criterion excitation
 fitting: run_folder gaussian_prior adaptive rollout dataset streaming torque_samples torque_jacobian torque_fit
 fitting: optimizers torque_networks urdf_regularizer stages compiled progress validation loop run_record fitted fit train
 evaluation: baselines torque rollout examples invariants tables results subject evaluate
-verify: agreement axes urdf_cross_check numeric_samples verify
+verify: agreement urdf_cross_check numeric_samples verify
 explain: reasons facts
 formulas: expression notation angles harmonics factoring shortening grouping formulas layout text latex sympy_module
 inspection loaded_arm pipeline building
@@ -47,7 +47,7 @@ identification: identify
 exporting: rigid_body_projection urdf_file export
 render: charts plots picture learned reproduction report_page inspection_page
 logs: statistics gravity report check_logs
-comparison: paper truth metrics study runs formatting
+comparison: truth metrics study runs formatting
 render: logs_page comparison_page
 cli: console options formats model_commands train_command log_commands simulate_command
 cli: identify_command evaluate_command compare_command export_command main

@@ -13,12 +13,12 @@ from arms import STRAIGHT, chain
 from seen_arm import NOTHING, Seen
 
 from spelgen.arm.arm import Arm, make_arm
+from spelgen.arm.axes import is_plain
 from spelgen.explain.facts import Fact, facts
 from spelgen.pipeline import inspect
 from spelgen.structure.recursion import triangle
 from spelgen.structure.structure import Structure, derive
 from spelgen.urdf.read import read_urdf
-from spelgen.verify.axes import is_plain
 from spelgen.verify.numeric_samples import draw
 
 LAST = (

@@ -151,6 +151,6 @@ def test_what_is_read_is_right(nasty, name):
     arm = make_arm(robot)
     found = derive(arm)
     sizes = (found.joints, found.outputs, found.constants, found.potential)
-    assert (*map(len, sizes), found.base_parameters) == FACTS[name]
+    assert (*map(len, sizes), found.base_parameter_count) == FACTS[name]
     proof = verify(robot, arm, found)
     assert proof.agrees, proof.text()

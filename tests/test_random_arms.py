@@ -147,7 +147,7 @@ def told(structure: Structure) -> Facts:
         potential=structure.potential,
         outputs_from=tuple(structure.outputs_from(k) for k in range(n)),
         constants=len(structure.constants),
-        base_parameters=structure.base_parameters,
+        base_parameters=structure.base_parameter_count,
     )
 
 

@@ -108,7 +108,7 @@ def test_generic_arms_follow_the_formula(joints, seed):
     assert (len(structure.outputs), len(structure.constants)) == (joints * (joints + 1) // 2 - 1, 1)
     # Khalil and Dombre, Modeling, Identification and Control of Robots, 2002, section 9.4: 7 n - 4, axis 1
     # not along gravity
-    assert structure.base_parameters == 7 * joints - 4
+    assert structure.base_parameter_count == 7 * joints - 4
 
 
 def test_edo_by_singular_values(shared):
@@ -145,5 +145,5 @@ def _facts(structure: Structure) -> dict:
         "outputs": len(structure.outputs),
         "constants": len(structure.constants),
         "outputs_only_from_joint": [structure.outputs_from(k) for k in range(n)],
-        "base_parameters": structure.base_parameters,
+        "base_parameters": structure.base_parameter_count,
     }

@@ -14,6 +14,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from spelgen.errors import SpelgenError
+from spelgen.labels import printable
 
 FAILED = 1
 INTERRUPTED = 130  # 128 + SIGINT, as shells count
@@ -89,14 +90,9 @@ def counted(what: str) -> Iterator[Callable[[int, int], None]]:
 
 def say(text: str) -> None:
     """Print a result to stdout."""
-    print(printable(text))
+    print(printable(text, "\n"))
 
 
 def note(text: str) -> None:
     """Print progress, a remark or an error to stderr."""
-    print(printable(text), file=sys.stderr, flush=True)
-
-
-def printable(text: str) -> str:
-    """The text with control characters escaped: names come from files and must not steer a terminal."""
-    return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)
+    print(printable(text, "\n"), file=sys.stderr, flush=True)

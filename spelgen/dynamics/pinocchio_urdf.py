@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
+from spelgen.arm.actuation import derive_actuation
 from spelgen.dynamics.constraint import mimic_constraint
 from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
 from spelgen.settings.settings import load_settings
-from spelgen.urdf.actuation import derive_actuation
 from spelgen.urdf.read import read_urdf
 
 COULOMB_SMOOTHING_VELOCITY = (

@@ -7,6 +7,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import replace
 
+from spelgen.arm.actuation import Actuation
 from spelgen.arm.arm import Arm, Coordinate
 from spelgen.design import load_design
 from spelgen.emission.bodies import body_specs
@@ -16,7 +17,6 @@ from spelgen.structure.basis import Weights
 from spelgen.structure.fourier import NO_SERIES, fourier_expansion
 from spelgen.structure.nominal import Nominal, nominal, nominal_inertias, working_range
 from spelgen.structure.structure import Structure
-from spelgen.urdf.actuation import Actuation
 
 _MARGIN = 0.1
 _FRICTION_OF_EFFORT = 0.02

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from spelgen.arm.axes import Axes
 from spelgen.arm.rational import ZERO
 from spelgen.labels import axes_told, entry_name, joints_told
 from spelgen.structure.structure import Entry, Structure
-from spelgen.verify.axes import Axes
 
 
 def constant_reason(axes: Axes, structure: Structure, entry: Entry) -> str | None:

@@ -16,7 +16,7 @@ from spelgen.dynamics.regressor import regressor
 from spelgen.identification.friction import FrictionModel
 from spelgen.structure.base_parameters import base_parameters as body_base_parameters
 from spelgen.structure.base_parameters import parameter_name
-from spelgen.structure.structure import base_parameters as count_base_parameters
+from spelgen.structure.structure import base_parameter_count
 
 _STATES_PER_PARAMETER = 2
 _DEPENDENT = 1e-9  # of its own length: what is left of a column that others span
@@ -60,7 +60,7 @@ class BaseParameters:
 def base_parameters(arm: Arm, friction: FrictionModel, seed: int = 0) -> BaseParameters:
     """The base parameters of ``arm`` and of this friction."""
     n, inertial = len(arm.coordinates), 10 * len(arm.bodies)
-    exact = body_base_parameters(arm, count_base_parameters(arm))
+    exact = body_base_parameters(arm, base_parameter_count(arm))
     names = [parameter_name(k) for k in range(inertial)]
     names += [f"{effect}{joint + 1}" for effect in friction.effects for joint in range(n)]
     columns = _columns(arm, friction, len(names), seed)

@@ -46,11 +46,12 @@ class Structure:
     """Coordinates the potential energy depends on; none when gravity does no work."""
     passive: tuple[int, ...]
     """Coordinates without an actuator: their row of G is zero."""
-    base_parameters: int
+    base_parameter_count: int
 
     def __repr__(self) -> str:
-        counts = f"{len(self.outputs)} outputs, {len(self.constants)} constants, {self.base_parameters} base parameters"
-        return f"<Structure of {len(self.joints)} joints ({self.assume} trusted): {counts}>"
+        made = f"{len(self.outputs)} outputs, {len(self.constants)} constants"
+        base = f"{self.base_parameter_count} base parameters"
+        return f"<Structure of {len(self.joints)} joints ({self.assume} trusted): {made}, {base}>"
 
     def outputs_from(self, first: int) -> int:
         """How many outputs read coordinates from ``first`` (0-based) to the tip only."""
@@ -75,11 +76,11 @@ def derive(arm: Arm, assume: Assume = "kinematics") -> Structure:
         constants=constants,
         potential=tuple(k for k in range(spans.n) if spans.potential_changes[k]),
         passive=tuple(k for k, coordinate in enumerate(arm.coordinates) if coordinate.passive),
-        base_parameters=base_parameters(arm),
+        base_parameter_count=base_parameter_count(arm),
     )
 
 
-def base_parameters(arm: Arm) -> int:
+def base_parameter_count(arm: Arm) -> int:
     """Rank of the inverse-dynamics regressor: how many combinations of inertial parameters move the arm
     differently.
     """

@@ -15,7 +15,7 @@ import numpy as np
 
 from spelgen.arm.arm import Arm
 from spelgen.errors import SpelgenError
-from spelgen.labels import entry_name, joint_ranges
+from spelgen.labels import entry_name, joints_in_ranges
 from spelgen.structure.basis import Weights
 from spelgen.structure.recursion import triangle
 from spelgen.structure.structure import Structure
@@ -98,7 +98,9 @@ def verify(robot: Robot, arm: Arm, structure: Structure, *, samples: int = 0, se
         *_smallest_form(case),
         *_ranks(case),
         _potential(case),
-        case.rank_check("base parameters", numeric_samples.regressor(arm, rng), structure.base_parameters),
+        case.rank_check(
+            "base parameters", numeric_samples.regressor(arm, rng), structure.base_parameter_count
+        ),
         *urdf_cross_check(robot, arm, seed=seed),
     )
     inertials = "inertial values of its own" if free else "the URDF's inertial values"
@@ -160,7 +162,7 @@ def _smallest_form(case: _Case) -> Iterator[Check]:
         moved = max((float(moves[joint]) for joint in range(n) if joint not in joints), default=0.0)
         largest = max(largest, moved)
         if moved > FORM_ROUNDING:
-            what = f"an output of {_joints(joints)}" if joints else "a constant"
+            what = f"an output of {joints_in_ranges(joints)}" if joints else "a constant"
             wrong[what] = f"moves by {size_told(moved)} with another joint"
     residual = float(np.abs(rebuilt - samples.mass).max(initial=0.0))
     found = f"off by {size_told(residual)} of an entry's scale at most"
@@ -210,7 +212,7 @@ def _potential(case: _Case) -> Check:
     found = f"any other joint moves it by {size_told(largest)} of its size at most"
     joints = case.structure.potential
     return case.check(
-        "potential energy", _joints(joints) if joints else "no joint", found, unexpected, unseen
+        "potential energy", joints_in_ranges(joints) if joints else "no joint", found, unexpected, unseen
     )
 
 
@@ -232,7 +234,3 @@ def _is_fine(arm: Arm, structure: Structure) -> bool:
             tensor = [abs(float(x)) for x in (body.inertia or ())[4:]]
             numbers += [x / max(tensor) for x in tensor if x]
     return min(x for x in numbers if x) < _FINE
-
-
-def _joints(joints: tuple[int, ...]) -> str:
-    return f"joint{'s' * (len(joints) > 1)} {joint_ranges(joints)}"
