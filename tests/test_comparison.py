@@ -1,4 +1,4 @@
-"""A comparison in small: same data for every preset, measures that can fail, resumption, tables beside the paper."""
+"""A comparison in small: same data for every preset, measures that can fail, resumption, tables beside published figures."""
 
 import json
 import math
@@ -13,7 +13,6 @@ import yaml
 
 from spelgen.comparison import metrics
 from spelgen.comparison.formatting import comparison_tables
-from spelgen.comparison.paper import PAPER
 from spelgen.comparison.runs import run_study, time_steps
 from spelgen.comparison.study import VARIANTS, prepare_study
 from spelgen.comparison.truth import example_positions, mass_error, true_mass
@@ -46,7 +45,7 @@ def robot(tmp_path_factory, robots):
     urdf.write_bytes((robots / "two_link.urdf").read_bytes())
     settings = yaml.safe_load((robots / "two_link.yaml").read_text())
     settings["simulation"]["trajectories"] = 8
-    settings["comparison"] = {"first": 0.25, "steps": 20, "momentum_steps": 5, "seeds": 1, "width": 8}
+    settings["comparison"] |= {"first": 0.25, "steps": 20, "momentum_steps": 5, "seeds": 1, "width": 8}
     urdf.with_suffix(".yaml").write_text(yaml.safe_dump(settings))
     return urdf
 
@@ -88,8 +87,8 @@ def test_every_run_is_noted_and_measured(study, notes):
         assert result["invariants"]["least_eigenvalue"] > 0
         assert result["invariants"]["orthogonality"] < 1e-14
     assert results["minimal"]["sizes"]["outputs"] == [1, 2, 0, 1]
-    assert results["phnode"]["sizes"]["outputs"] == list(PAPER["two_link"]["phnode"].outputs)
-    assert results["phnode"]["sizes"]["inputs"] == PAPER["two_link"]["phnode"].inputs
+    assert results["phnode"]["sizes"]["outputs"] == [21, 21, 6, 1]  # as in the paper
+    assert results["phnode"]["sizes"]["inputs"] == 18
 
 
 def test_a_comparison_goes_on_where_it_stopped(study, robot, quick):
@@ -118,12 +117,12 @@ def test_begun_anew_nothing_of_the_old_runs_goes_on(study, robot, tmp_path):
     assert not list(folder.rglob("checkpoint.pt"))
 
 
-def test_tables_stand_beside_the_paper(study):
+def test_tables_stand_beside_published_figures(study):
     results = list(study.results())
-    tables = comparison_tables("two_link", results, time_steps(study))
+    tables = comparison_tables(results, time_steps(study), study.settings.published)
     rows = {row.label: [cell.text for cell in row.cells] for table in tables for row in table.rows}
     assert rows["outputs of M"] == ["21", "1"]
-    assert rows["paper: prediction loss"] == ["0.194", ""]
+    assert rows["published: prediction loss"] == ["0.194", ""]
     base, ours = (result["prediction"]["loss"] for result in results)
     assert rows["phnode's prediction loss / this"] == ["1", f"{base / ours:.3g}"]
     assert all(line == line.rstrip() and len(line) <= 80 for x in tables for line in x.text().splitlines())
@@ -166,7 +165,7 @@ def test_the_page_shows_predictions_and_m_beside_the_truth(study):
 def test_a_run_that_is_not_finite_counts_as_worst(study):
     (result,) = (x for x in study.results() if x["variant"] == "minimal")
     broken = result | {"seed": 1, "prediction": {"loss": None, "position": None, "velocity": None}}
-    table = comparison_tables("other", [result, broken, broken], {"minimal": 1.0})[1]
+    table = comparison_tables([result, broken, broken], {"minimal": 1.0}, {})[1]
     assert {row.label: row.cells[0].text for row in table.rows}["prediction loss, 1 s"] == "-"
 
 

@@ -26,7 +26,7 @@ def compare(
     jobs: Annotated[int, typer.Option("--jobs", min=1, help="Runs at a time, one core each.")] = 2,
     force: Force = False,
 ) -> None:
-    """Train every preset on the same simulated logs, and set them beside one another and the paper.
+    """Train every preset on the same simulated logs, and set them beside one another.
 
     Started again with the same settings, it goes on where it stopped.
     """
@@ -56,7 +56,7 @@ def compare(
             progress=progress,
         )
     run_study(study, jobs=jobs, note=note)
-    tables = comparison_tables(study.robot, list(study.results()), time_steps(study))
+    tables = comparison_tables(list(study.results()), time_steps(study), study.settings.published)
     for table in tables:
         say(table.text() + "\n")
     say(f"wrote {write_comparison(study, tables)}")

@@ -1,4 +1,4 @@
-"""What a comparison found, as tables: median over seeds, next to the paper's figures."""
+"""What a comparison found, as tables: median over seeds, next to published figures."""
 
 from __future__ import annotations
 
@@ -6,32 +6,35 @@ import statistics
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from spelgen.comparison.paper import PAPER, Published
 from spelgen.evaluation.tables import Cell, Row, Table
 from spelgen.listing import number
+from spelgen.settings.comparison import PublishedFigures
 
 BASELINE = "phnode"
 Result = Mapping[str, Any]
 
 
 def comparison_tables(
-    robot: str, results: Sequence[Result], step_seconds: Mapping[str, float]
+    results: Sequence[Result],
+    step_seconds: Mapping[str, float],
+    published: Mapping[str, PublishedFigures],
 ) -> list[Table]:
-    """The tables of a comparison: sizes and speed (Tables 3 and 4 of the paper), losses (5, 6), invariants."""
+    """The tables of a comparison: sizes and speed, losses, those of each seed, invariants."""
     by_variant: dict[str, list[Result]] = {}
     for result in results:
         by_variant.setdefault(result["variant"], []).append(result)
-    paper = PAPER.get(robot, {})
     return [
-        _sizes(by_variant, step_seconds, paper),
-        _losses(by_variant, paper),
+        _sizes(by_variant, step_seconds, published),
+        _losses(by_variant, published),
         _by_seed(by_variant),
         _invariants(by_variant),
     ]
 
 
 def _sizes(
-    found: Mapping[str, Sequence[Result]], step_seconds: Mapping[str, float], paper: Mapping[str, Published]
+    found: Mapping[str, Sequence[Result]],
+    step_seconds: Mapping[str, float],
+    published: Mapping[str, PublishedFigures],
 ) -> Table:
     names = tuple(found)
     first = {name: runs[0]["sizes"] for name, runs in found.items()}
@@ -43,14 +46,12 @@ def _sizes(
     rows.append(_row("parameters", {name: first[name]["parameters"] for name in names}, "{:,.0f}"))
     milliseconds = {name: 1e3 * step_seconds[name] for name in names}
     rows.append(_row("training step [ms]", milliseconds, "{:.1f}"))
-    rows += _published(names, paper, "parameters", lambda each: each.parameters, "{:,.0f}")
-    rows += _published(names, paper, "step [s, RTX 4090]", lambda each: each.step_seconds, "{:.2f}")
-    return Table(
-        "Sizes, and the time of a training step here; below, what the paper reports", names, tuple(rows)
-    )
+    rows += _published(names, published, "parameters", lambda each: each.parameters, "{:,.0f}")
+    rows += _published(names, published, "training step [s]", lambda each: each.step_seconds, "{:.2f}")
+    return Table("Sizes, and the time of a training step here; below, what is published", names, tuple(rows))
 
 
-def _losses(found: Mapping[str, Sequence[Result]], paper: Mapping[str, Published]) -> Table:
+def _losses(found: Mapping[str, Sequence[Result]], published: Mapping[str, PublishedFigures]) -> Table:
     names = tuple(found)
     quantities: dict[str, tuple[str, str]] = {
         "training loss": ("train", "loss"),
@@ -67,14 +68,14 @@ def _losses(found: Mapping[str, Sequence[Result]], paper: Mapping[str, Published
         rows.insert(3, Row(f"{BASELINE}'s prediction loss / this", _ratios(found, names, "loss")))
         rows.insert(5, Row(f"{BASELINE}'s velocity / this", _ratios(found, names, "velocity")))
     rows.append(_row("M, relative error", {name: _median(found[name], "mass", "error") for name in names}))
-    rows += _published(names, paper, "training loss", lambda each: each.train_loss)
-    rows += _published(names, paper, "test loss", lambda each: each.test_loss)
-    rows += _published(names, paper, "prediction loss", lambda each: each.prediction_loss)
-    rows += _published(names, paper, "velocity", lambda each: each.velocity)
-    rows += _published(names, paper, "position", lambda each: each.position)
+    rows += _published(names, published, "training loss", lambda each: each.train_loss)
+    rows += _published(names, published, "test loss", lambda each: each.test_loss)
+    rows += _published(names, published, "prediction loss", lambda each: each.prediction_loss)
+    rows += _published(names, published, "velocity", lambda each: each.velocity)
+    rows += _published(names, published, "position", lambda each: each.position)
     title = (
         "Squared errors summed over joints [rad, m, s], mean over samples and windows, and the error of M, "
-        "relative to M; median over seeds; below, what the paper reports"
+        "relative to M; median over seeds; below, what is published"
     )
     return Table(title, names, tuple(rows))
 
@@ -141,17 +142,17 @@ def _row(label: str, values: Mapping[str, float | None], form: str | None = None
 
 def _published(
     names: Sequence[str],
-    paper: Mapping[str, Published],
+    published: Mapping[str, PublishedFigures],
     label: str,
-    of: Callable[[Published], float | None],
+    of: Callable[[PublishedFigures], float | None],
     form: str | None = None,
 ) -> list[Row]:
-    """A row of the paper's figures, or none where it has none for this robot."""
-    values = {name: of(paper[name]) if name in paper else None for name in names}
+    """A row of published figures, or none where there are none for this robot."""
+    values = {name: of(published[name]) if name in published else None for name in names}
     if all(value is None for value in values.values()):
         return []
     cells = tuple(
         Cell("" if value is None else number(value) if form is None else form.format(value))
         for value in values.values()
     )
-    return [Row(f"paper: {label}", cells)]
+    return [Row(f"published: {label}", cells)]
