@@ -72,7 +72,7 @@ def test_text_read_back_equals_pinocchio(robots, robot, assume):
     assert not found.unwritten
     if assume == "kinematics":
         arm = with_random_inertias(arm, np.random.default_rng(1))
-    assert_equal_to_pinocchio(arm, read_back(text(found)), structure.base_parameters)
+    assert_equal_to_pinocchio(arm, read_back(text(found)), structure.base_parameter_count)
 
 
 @pytest.mark.parametrize("robot", ["two_link", "rpr", "scara", "six_dof"])
@@ -81,7 +81,7 @@ def test_latex_read_back_equals_pinocchio(robots, robot):
     structure = derive(arm)
     rows = without_latex(latex(formulas(arm, structure, longest=WRITABLE)))
     drawn = with_random_inertias(arm, np.random.default_rng(2))
-    assert_equal_to_pinocchio(drawn, rows, structure.base_parameters)
+    assert_equal_to_pinocchio(drawn, rows, structure.base_parameter_count)
 
 
 @settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck))
@@ -94,4 +94,4 @@ def test_random_arms_equal_pinocchio(drawn, tmp_path_factory):
     structure = derive(arm)
     rows = read_back(text(formulas(arm, structure)))
     if rows:
-        assert_equal_to_pinocchio(arm, rows, structure.base_parameters, tolerance=1e-8)
+        assert_equal_to_pinocchio(arm, rows, structure.base_parameter_count, tolerance=1e-8)

@@ -100,7 +100,7 @@ def formulas(
     n = len(arm.coordinates)
     # from the tip on, so that what is cheap is not left out for what is dear
     wanted: list[Place] = [None, *reversed(triangle(n))] if entry is None else [_place(n, entry)]
-    base = base_parameters(arm, structure.base_parameters)
+    base = base_parameters(arm, structure.base_parameter_count)
     work = _Work(Expansion(arm), base, structure.assume, longest)
     shortener = Shortener(arm, work.expansion.context)
     left, found = _WHOLE_BUDGET, {}

@@ -8,6 +8,7 @@ from typing import Any
 from spelgen.formulas.formulas import WRITABLE, Formulas
 from spelgen.formulas.layout import broken, definition, trusted, why_not
 from spelgen.formulas.notation import Plain
+from spelgen.labels import printable
 
 _LONGEST_NAME = 36
 
@@ -15,7 +16,7 @@ _LONGEST_NAME = 36
 def text(found: Formulas, width: int = 80) -> str:
     """The formulas, what their parameters are, and the parameters' values by the URDF."""
     notation = Plain()
-    lines = [*textwrap.wrap(f"{_printable(found.arm.name)}: closed forms for {trusted(found)}", width), ""]
+    lines = [*textwrap.wrap(f"{printable(found.arm.name)}: closed forms for {trusted(found)}", width), ""]
     for formula in found.entries:
         if formula.expression is None:
             lines.append(f"{formula.name}: {why_not(formula)}")
@@ -87,9 +88,4 @@ def _legend(found: Formulas, width: int) -> list[str]:
 
 
 def _short(name: str) -> str:
-    return textwrap.shorten(_printable(name), _LONGEST_NAME, placeholder="...") or '""'
-
-
-def _printable(name: str) -> str:
-    """Text from a file, with what could steer a terminal made visible."""
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in name)
+    return textwrap.shorten(printable(name), _LONGEST_NAME, placeholder="...") or '""'
