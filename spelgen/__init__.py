@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from spelgen.loaded_arm import LoadedArm, load_arm
     from spelgen.logs.check_logs import check_logs
     from spelgen.logs.preprocessing import Preprocessing
-    from spelgen.logs.read import read_logs
+    from spelgen.logs.read import read_logs, write_logs
     from spelgen.logs.trajectory import Trajectory
     from spelgen.pipeline import check, generate, inspect
     from spelgen.simulation.simulate import simulate
@@ -42,6 +42,7 @@ _HOME = {
     "load_module": "emission.loading",
     "check": "pipeline",
     "read_logs": "logs.read",
+    "write_logs": "logs.read",
     "Trajectory": "logs.trajectory",
     "check_logs": "logs.check_logs",
     "Preprocessing": "logs.preprocessing",
@@ -99,6 +100,7 @@ __all__ = [
     "rollout",
     "simulate",
     "tip_kinematics",
+    "write_logs",
 ]
 
 

@@ -1,6 +1,7 @@
 """`spelgen logs`: what it measures is what was put in, and what is wrong is found."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -176,6 +177,22 @@ def test_the_command_fails_where_logs_cannot_be_trained_on(spelgen, robots, arm,
     assert spelgen("logs", "logs.csv", "--robot", robots / "rpr.urdf").exit_code == 0
     strict = spelgen("logs", "logs.csv", "--robot", robots / "rpr.urdf", "--strict")
     assert (strict.exit_code, strict.stderr) == (1, "3 warnings, and --strict allows none\n")
+
+
+def test_what_logs_do_not_need_does_not_refuse_them(spelgen, robots, arm, log, tmp_path):
+    """Neither settings of other steps, nor inertials, nor a transmission that says nothing."""
+    text = (robots / "rpr.urdf").read_text()
+    text = re.sub(r"<inertial>.*?</inertial>", "", text, flags=re.DOTALL)
+    odd = '<transmission name="t"><type>x/SimpleTransmission</type><joint name="joint1"/>'
+    odd += (
+        '<actuator name="m"><mechanicalReduction>fast</mechanicalReduction></actuator></transmission></robot>'
+    )
+    (tmp_path / "arm.urdf").write_text(text.replace("</robot>", odd))
+    (tmp_path / "arm.yaml").write_text("training: {nonsense: 1}\nsimulation: {sample_rate: never}\n")
+    write_logs(tmp_path / "logs.csv", [log], [c.name for c in arm.coordinates])
+    shown = spelgen("logs", "logs.csv", "--robot", "arm.urdf")
+    assert shown.exit_code == 0, shown.stderr
+    assert "Nothing is odd." in shown.stdout
 
 
 def test_logs_larger_than_memory_are_told_by_parts(spelgen, robots, arm, log, tmp_path, monkeypatch):

@@ -35,7 +35,7 @@ simulation: friction integration simulated_logs random_inputs tracking
 identification: samples friction base_parameters least_squares method prior identification
 excitation: trajectory criterion excitation
 fitting: run_folder gaussian_prior adaptive rollout dataset streaming torque_samples torque_jacobian torque_fit
-fitting: optimizers torque_networks urdf_regularizer stages compiled progress validation loop run_record fitted fit train
+fitting: optimizers torque_networks urdf_regularizer stages compiled process progress validation loop run_record fitted fit train
 evaluation: baselines torque rollout examples invariants tables results subject evaluate
 verify: agreement urdf_cross_check numeric_samples verify
 explain: reasons facts
@@ -49,7 +49,7 @@ render: charts plots picture learned reproduction report_page inspection_page
 logs: statistics gravity report check_logs
 comparison: truth metrics study runs formatting
 render: logs_page comparison_page
-cli: console options formats model_commands train_command log_commands simulate_command
+cli: console options formats model_commands train_start train_command log_commands simulate_command
 cli: identify_command evaluate_command compare_command export_command main
 __init__ __main__
 """

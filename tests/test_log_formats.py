@@ -421,6 +421,16 @@ def test_empty_fields_of_a_bag_are_missing_columns(bag):
         read_logs([folder], JOINTS)
 
 
+def test_a_pipe_in_a_bag_is_not_waited_for(bag):
+    folder = bag(STATES)
+    os.mkfifo(folder / "live")
+    with pytest.raises(LogError) as caught:
+        read_logs([folder], JOINTS)
+    assert str(caught.value) == (
+        f"{folder}/live: got a pipe or a device, expected files in the folder of a ROS 2 bag"
+    )
+
+
 BAD_BAGS = {
     "part": (
         [("/a", JOINTS[:1], [0.0], [0.0], [0.0])],

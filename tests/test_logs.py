@@ -155,6 +155,18 @@ def test_names_are_unique_across_files(tmp_path):
     assert names == ["monday/0", "monday/1", "tuesday/0", "tuesday/1"]
 
 
+def test_what_cannot_be_written_is_told(tmp_path):
+    for path, logs, message in (
+        ("x.txt", [swing()], "got a log named 'x.txt', expected .parquet or .csv"),
+        ("x.csv", [], f"{tmp_path}/x.csv: got no trajectory, expected at least one"),
+        ("x.csv", [swing()], "trajectory swing: got 2 joints, expected 3: a, b, c"),
+    ):
+        with pytest.raises(LogError) as caught:
+            write_logs(tmp_path / path, logs, ["a", "b", "c"])
+        assert str(caught.value) == message
+    assert not list(tmp_path.iterdir())
+
+
 BAD = {
     "empty": ("", "{}: an unreadable csv file (Empty CSV file)"),
     "header-only": (HEADER, "{}: got no rows, expected at least one window of samples"),

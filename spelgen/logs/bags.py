@@ -94,6 +94,9 @@ def _messages(path: Path, topic: str | None) -> Iterator[tuple[int, Any]]:
             expected="the package rosbags to read it",
             do="pip install 'spelgen[ros]'",
         ) from error
+    endless = next((each for each in path.rglob("*") if not (each.is_file() or each.is_dir())), None)
+    if endless is not None:
+        raise LogError("a pipe or a device", file=endless, expected="files in the folder of a ROS 2 bag")
     store = get_typestore(Stores.ROS2_HUMBLE)
     with ExitStack() as stack:
         try:

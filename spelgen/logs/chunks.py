@@ -16,12 +16,12 @@ import pyarrow.parquet
 
 from spelgen.errors import LogError, SpelgenError, collect
 from spelgen.logs.arm_mapping import GivenMapping, log_source
+from spelgen.logs.log_files import log_files
 from spelgen.logs.mapping import LogMapping
 from spelgen.logs.read import (
     ROW_GROUP,
     clock_start,
     in_si,
-    log_files,
     made_trajectory,
     read_logs,
     require_increasing_times,

@@ -17,12 +17,12 @@ import pyarrow.parquet
 from spelgen.errors import LogError, SpelgenError, collect
 from spelgen.files import replacing
 from spelgen.logs.arm_mapping import GivenMapping, log_source
+from spelgen.logs.log_files import log_files
 from spelgen.logs.mapping import TIMES, LogMapping
 from spelgen.logs.readers import read_tables
-from spelgen.logs.tables import SUFFIXES, UNITS, UNITS_KEY, LogTable, is_log, wanted_quantities
-from spelgen.logs.trajectory import QUANTITIES, Trajectory, gap_ends
+from spelgen.logs.tables import UNITS, UNITS_KEY, LogTable, wanted_quantities
+from spelgen.logs.trajectory import QUANTITIES, Trajectory, gap_ends, require_joints
 
-KINDS = f"{', '.join(SUFFIXES)}, or the folder of a ROS 2 bag"
 ROW_GROUP = 2**16  # rows that are written together: a log too large for memory is read by them
 EXACT = 2**53  # whole numbers up to here are exact as floating-point numbers
 
@@ -63,13 +63,18 @@ def read_logs(
     return _with_unique_names(labelled)
 
 
-def write_logs(path: Path | str, trajectories: Sequence[Trajectory], joints: Sequence[str]) -> None:
-    """Write one Parquet or CSV file (by suffix) with a `trajectory` column, all or nothing.
+def write_logs(path: Path | str, trajectories: Sequence[Trajectory], arm: Any) -> Path:
+    """Write one Parquet or CSV file (by suffix) with a `trajectory` column, all or nothing; return the path.
 
-    `read_logs` gives the same numbers back from either. Parquet files declare their units.
+    arm: as for `read_logs`, which gives the same numbers back from either. Parquet files declare their units.
+    Raises LogError for another suffix, without trajectories, and for those of another number of joints.
     """
-    path = Path(path)
+    path, joints = Path(path), log_source(arm).joints
     write = _writer(path)
+    if not trajectories:
+        raise LogError("no trajectory", file=path, expected="at least one")
+    for trajectory in trajectories:
+        require_joints(trajectory, joints)
     columns: dict[str, np.ndarray | list[str]] = {
         "trajectory": [x.name for x in trajectories for _ in x.t],
         "t": np.concatenate([x.t for x in trajectories]),
@@ -80,6 +85,7 @@ def write_logs(path: Path | str, trajectories: Sequence[Trajectory], joints: Seq
     table = pa.table(columns).replace_schema_metadata({UNITS_KEY: UNITS})
     with replacing(path) as unfinished:
         write(table, unfinished)
+    return path
 
 
 def _writer(path: Path) -> Callable[[pa.Table, Path], None]:
@@ -90,35 +96,6 @@ def _writer(path: Path) -> Callable[[pa.Table, Path], None]:
     if path.suffix not in writers:
         raise LogError(f"a log named {path.name!r}", expected=" or ".join(writers))
     return writers[path.suffix]
-
-
-def log_files(paths: Iterable[Path | str], role: str | None, errors: list[SpelgenError]) -> list[Path]:
-    """The files and bags that these paths name, each once; what cannot be one is added to the errors."""
-    files: dict[Path, None] = {}
-    for path in map(Path, paths):
-        if is_log(path):
-            files[path] = None
-        elif path.is_dir():
-            found = _folder_files(path, role)
-            if not found:
-                errors.append(LogError("a folder without logs", file=path, expected=KINDS))
-            files |= dict.fromkeys(found)
-        elif not path.exists():
-            errors.append(
-                LogError("no such file or folder", file=path, expected="a log", do="check the path")
-            )
-        elif not path.is_file():
-            errors.append(LogError("a pipe or a device", file=path, expected=f"a file: {KINDS}"))
-        else:
-            errors.append(LogError(f"a file of kind {path.suffix!r}", file=path, expected=KINDS))
-    return list(files)
-
-
-def _folder_files(folder: Path, role: str | None) -> list[Path]:
-    found = sorted(filter(is_log, folder.iterdir()))
-    if role and any(path.stem in ("train", "test") for path in found):
-        return [path for path in found if path.stem == role]
-    return found
 
 
 def _trajectories(part: LogTable, file: Path, joints: Sequence[str]) -> list[Named]:
