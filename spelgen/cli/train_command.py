@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,16 +12,14 @@ import typer
 from spelgen.cli import options
 from spelgen.cli.console import INTERRUPTED, note, say
 from spelgen.cli.options import Data, Filter, Force, Mapping, MoreData, RobotOption
+from spelgen.cli.train_start import Chosen, NotApplicable, Start, begun, resumed
 from spelgen.errors import ModuleError, OptionError, RunError
 from spelgen.fitting.config import Objective, Optimizer, Solver
 from spelgen.spec import read_facts
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
-    from spelgen.fitting.config import FitConfig
     from spelgen.fitting.fitted import Fit
     from spelgen.logs.mapping import LogMapping
-    from spelgen.logs.preprocessing import Preprocessing
 
 
 def train(
@@ -149,10 +146,8 @@ def train(
     paths = options.logs(data, more)
     folder = output or Path("runs") / module.stem
     urdf = None if resume else robot or _unchanged_urdf(module)
-    chosen = _Chosen(
-        objective, flags, {"cutoff": filter, "decimation": decimation}, validation_fraction, seed
-    )
-    start = _resumed(folder, chosen) if resume else _begun(module, urdf, chosen)
+    chosen = Chosen(objective, flags, {"cutoff": filter, "decimation": decimation}, validation_fraction, seed)
+    start = resumed(folder, chosen) if resume else begun(module, urdf, chosen)
     given = options.mapping(mapping, urdf, read_facts(start.module).joints)
     found = _fit(start, paths, folder, given, urdf=urdf, source=None if resume else source, resume=resume,
                  force=force, device=device, threads=threads, progress=not quiet)  # fmt: skip
@@ -164,98 +159,8 @@ def train(
         raise typer.Exit(INTERRUPTED)
 
 
-class NotApplicable(typer.BadParameter):
-    """An option that belongs to something else than what is fitted."""
-
-    def format_message(self) -> str:
-        """The message as it is."""
-        return self.message
-
-
-@dataclass(frozen=True)
-class _Chosen:
-    """What the command line says."""
-
-    objective: str | None
-    flags: dict[str, Any]
-    preprocessing: dict[str, Any]
-    validation: float | None
-    seed: int | None
-
-
-@dataclass(frozen=True)
-class _Start:
-    """What is fitted, and how: `config` makes it where the logs' sample rates are known."""
-
-    module: Path
-    config: Callable[[EmittedModel, Sequence[float] | None], FitConfig | None]
-    preprocessing: Preprocessing
-    validation: float
-    seed: int
-    mapping: LogMapping | None
-
-
-def _begun(module: Path, urdf: Path | None, chosen: _Chosen) -> _Start:
-    """A new run: what the command line does not say, the robot's settings do."""
-    from spelgen.fitting.config import fit_config
-    from spelgen.fitting.stages import default_config, is_closed_form
-    from spelgen.logs.preprocessing import Preprocessing
-    from spelgen.settings.settings import load_settings
-    from spelgen.settings.training import TrainingSettings
-
-    settings = TrainingSettings() if urdf is None else load_settings(urdf).training
-    said = {name: value for name, value in chosen.preprocessing.items() if value is not None}
-    objective = chosen.objective or settings.objective
-
-    def config(model: EmittedModel, rates: Sequence[float] | None) -> FitConfig | None:
-        if objective is not None:
-            return fit_config(
-                objective, closed_form=is_closed_form(model), options=chosen.flags, defaults=settings.options
-            )
-        if rates is None and is_closed_form(model):
-            return None  # the logs decide
-        return default_config(model, rates or [], chosen.flags, settings.options)
-
-    return _Start(
-        module,
-        config,
-        Preprocessing(**(settings.preprocessing | said)),
-        settings.validation_fraction if chosen.validation is None else chosen.validation,
-        settings.seed if chosen.seed is None else chosen.seed,
-        None,
-    )
-
-
-def _resumed(folder: Path, chosen: _Chosen) -> _Start:
-    """A run that goes on: what the command line does not say, the run does."""
-    from spelgen.fitting.config import fit_config
-    from spelgen.fitting.run_folder import RunFolder
-    from spelgen.fitting.run_record import recorded_config
-    from spelgen.fitting.stages import is_closed_form
-    from spelgen.logs.mapping import LogMapping
-    from spelgen.logs.preprocessing import Preprocessing
-
-    run = RunFolder(folder)
-    before = run.read_json(run.config)
-    said = {name: value for name, value in chosen.preprocessing.items() if value is not None}
-
-    def config(model: EmittedModel, rates: Sequence[float] | None) -> FitConfig:
-        if chosen.objective not in (None, before["objective"]):
-            return fit_config(chosen.objective, closed_form=is_closed_form(model), options=chosen.flags)
-        return recorded_config(before, **chosen.flags)
-
-    return _Start(
-        run.module,
-        config,
-        Preprocessing(**(before["preprocessing"] | said)),
-        before["validation_fraction"] if chosen.validation is None else chosen.validation,
-        before["seed"] if chosen.seed is None else chosen.seed,
-        LogMapping(**before["mapping"]),
-    )
-
-
 def _fit(
-    start: _Start,
+    start: Start,
     paths: Sequence[Path],
     folder: Path,
     mapping: LogMapping | None,
@@ -266,9 +171,9 @@ def _fit(
     **rest: Any,
 ) -> Fit:
     from spelgen.emission.loading import load_module
-    from spelgen.fitting.fit import fit
+    from spelgen.fitting.fit import fit, sample_rates
     from spelgen.fitting.stages import is_closed_form
-    from spelgen.fitting.train import open_logs, robot_of, sample_rates, start_from
+    from spelgen.fitting.train import open_logs, robot_of, start_from
 
     model = load_module(start.module)
     if source is not None:

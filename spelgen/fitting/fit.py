@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import signal
-import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
-
-import torch
 
 from spelgen.errors import Diagnostic, RunError
 from spelgen.files import write_json
@@ -19,6 +14,7 @@ from spelgen.fitting.config import FitConfig, Rollout, WindowConfig
 from spelgen.fitting.dataset import TrainingData, prepare_data
 from spelgen.fitting.fitted import Fit, load_run
 from spelgen.fitting.loop import TrainingLoop
+from spelgen.fitting.process import require_device, termination_as_interrupt, threads_of_torch
 from spelgen.fitting.progress import TrainingProgress
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.run_record import describe, require_same
@@ -72,13 +68,13 @@ def fit(
     logs = [logs] if isinstance(logs, Trajectory) else logs
     closed_form = is_closed_form(model)
     if config is None:
-        config = default_config(model, _rates(logs))
+        config = default_config(model, sample_rates(logs))
     config.require(closed_form=closed_form)
     run = None if folder is None else RunFolder(Path(folder))
     if run is not None and not resume:
         run.require_free(force=force)
-    with _threads(threads):
-        _require_device(device)
+    with threads_of_torch(threads):
+        require_device(device)
         data = _prepared(model, logs, cast("WindowConfig", config), preprocessing, validation, seed)
         chosen = cast("WindowConfig", config.resolved(data.size))
         found = [*data.diagnostics, *notes]
@@ -108,7 +104,7 @@ def fit(
         )
         if resume and run is not None:
             loop.restore(run)
-        with TrainingProgress(chosen.epochs, show=progress) as shown, _termination_as_interrupt():
+        with TrainingProgress(chosen.epochs, show=progress) as shown, termination_as_interrupt():
             for note in found:
                 shown.note(note)
             status = loop.run(shown)
@@ -127,7 +123,8 @@ def fit(
     )
 
 
-def _rates(logs: Logs) -> list[float]:
+def sample_rates(logs: Logs) -> list[float]:
+    """Of all logs [Hz]."""
     return logs.rates if isinstance(logs, LargeLogs) else [x.sample_rate for x in logs]
 
 
@@ -193,41 +190,3 @@ def _compiled(
     message = f"right-hand side compiled in {time.monotonic() - since:.0f} s"
     notes.append(Diagnostic("info", "compiled", "training", None, message))
     return ready
-
-
-def _require_device(device: str) -> None:
-    try:
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:
-        reason = str(error).splitlines()[0]
-        raise RunError(
-            f"a device {device!r} that torch cannot use ({reason})", do="use --device cpu"
-        ) from error
-
-
-@contextmanager
-def _threads(count: int) -> Iterator[None]:
-    """The matrices are tiny: more than two threads rarely help, and one makes runs repeatable."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
-@contextmanager
-def _termination_as_interrupt() -> Iterator[None]:
-    """SIGTERM ends training as Ctrl-C does. Only the main thread may set handlers; others change nothing."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def interrupt(signum: int, frame: object) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)

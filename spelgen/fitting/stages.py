@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.config import FitConfig, GaussianPrior, Rollout, TorqueFit, fit_config
 from spelgen.fitting.dataset import TrainingData
-from spelgen.fitting.torque_fit import EVERY, PAYLOAD, fit_torque, last_body
+from spelgen.fitting.torque_fit import DECIMATION, PAYLOAD, fit_torque, last_body
 from spelgen.fitting.torque_networks import fit_networks
 from spelgen.fitting.torque_samples import TorqueSamples
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer
@@ -93,14 +93,14 @@ def _fit(
 
 def _samples(model: EmittedModel, data: TrainingData) -> TorqueSamples | None:
     """None: there are none."""
-    every = EVERY if is_closed_form(model) else 1
+    decimation = DECIMATION if is_closed_form(model) else 1
     if not data.chunks:
         found = dynamics_samples(data.recordings, preprocessing=data.preprocessing)
-        return TorqueSamples.held(found, every) if any(len(x.q) for x in found) else None
+        return TorqueSamples.held(found, decimation) if any(len(x.q) for x in found) else None
     each = (
         samples
         for chunk in data.chunks
         for samples in dynamics_samples([chunk.load()], preprocessing=data.preprocessing)
     )
-    spooled = TorqueSamples.spooled(each, model.n, every)
+    spooled = TorqueSamples.spooled(each, model.n, decimation)
     return spooled if spooled.count else None

@@ -27,7 +27,9 @@ from spelgen.identification.samples import DynamicsSamples
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
-EVERY = 2  # samples taken of so many: filtered at 8 Hz and sampled at 100 Hz they say all that is to be said
+DECIMATION = (
+    2  # samples taken of so many: filtered at 8 Hz and sampled at 100 Hz they say all that is to be said
+)
 ALIKE = 20.0  # of those: so many in a row, 0.4 s, err alike and count once
 ROUNDS = 6  # of weighing joints by what is left of their torque
 STEPS = 8  # at most in a round
@@ -74,7 +76,7 @@ def fit_torque(
     The prior is centred on the weights as they are. ``only_bodies``: nothing moves but these bodies' parameters.
     """
     if not isinstance(samples, TorqueSamples):
-        samples = TorqueSamples.held(samples, EVERY)
+        samples = TorqueSamples.held(samples, DECIMATION)
     problem = _Problem(TorqueJacobian(model, samples), prior or GaussianPrior(), only_bodies)
     at = _Step(problem.start, problem.jacobian.squares(problem.start), float("inf"), DAMPING[1])
     noise, steps = ALIKE**0.5 * FIRST_NOISE * problem.range, 0

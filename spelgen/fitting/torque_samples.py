@@ -30,21 +30,21 @@ class TorqueSamples:
         self._file: IO[bytes] | None = None
 
     @classmethod
-    def held(cls, samples: Sequence[DynamicsSamples], every: int = 1) -> TorqueSamples:
+    def held(cls, samples: Sequence[DynamicsSamples], decimation: int = 1) -> TorqueSamples:
         """Of these samples, of each trajectory one of so many, in memory."""
         found = cls(samples[0].q.shape[1])
-        columns = [np.concatenate([getattr(x, name)[::every] for x in samples]) for name in COLUMNS]
+        columns = [np.concatenate([getattr(x, name)[::decimation] for x in samples]) for name in COLUMNS]
         found._held, found.count = [torch.from_numpy(x) for x in columns], len(columns[0])
         found.seen = sum(len(x.q) for x in samples)
         return found
 
     @classmethod
-    def spooled(cls, samples: Iterable[DynamicsSamples], joints: int, every: int = 1) -> TorqueSamples:
+    def spooled(cls, samples: Iterable[DynamicsSamples], joints: int, decimation: int = 1) -> TorqueSamples:
         """Of samples that are too many for memory, of each trajectory one of so many, in a temporary file."""
         found = cls(joints)
         found._file = tempfile.TemporaryFile(prefix="spelgen-")  # noqa: SIM115
         for each in samples:
-            rows = np.concatenate([getattr(each, name)[::every] for name in COLUMNS], axis=1)
+            rows = np.concatenate([getattr(each, name)[::decimation] for name in COLUMNS], axis=1)
             found._file.write(np.ascontiguousarray(rows).data)
             found.count += len(rows)
             found.seen += len(each.q)

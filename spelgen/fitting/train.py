@@ -26,6 +26,9 @@ if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
 
+RECORDED = {"seed": "seed", "validation": "validation_fraction"}
+
+
 def train(
     module: Path | str,
     data: Iterable[Path | str],
@@ -44,8 +47,8 @@ def train(
 
     urdf: the robot the module was built from, for the regularizer and the baselines of `evaluate`; by default the file
     of that name beside the module. source: a run of this module, whose weights are where the fit starts. mapping:
-    how the logs are named and measured; by default as spelgen writes them, and when resumed as before. config: when
-    resumed, by default as before.
+    how the logs are named and measured; by default as spelgen writes them. What is not said of a run that is resumed
+    is as before.
     Raises ModuleError, LogError, and RunError when the folder holds a run or cannot be resumed with this.
     """
     run = RunFolder(Path(folder))
@@ -54,6 +57,10 @@ def train(
         before = run.read_json(run.config)  # a missing run is told before anything is read
         mapping = mapping or LogMapping(**before["mapping"])
         config = config or recorded_config(before)
+        options = {name: before[x] for name, x in RECORDED.items()} | options
+        preprocessing = (
+            Preprocessing(**before["preprocessing"]) if preprocessing is AUTOMATIC else preprocessing
+        )
         module = run.module
     model = load_module(module)
     if source is not None and not resume:
@@ -87,11 +94,6 @@ def open_logs(
         return LargeLogs(tuple(large), joints, tuple(model.joint_types), mapping, preprocessing.gap)
     mapping = mapping or LogMapping()
     return read_logs(paths, joints, mapping, role="train", joint_types=model.joint_types)
-
-
-def sample_rates(logs: Sequence[Trajectory] | LargeLogs) -> list[float]:
-    """Of all logs [Hz]."""
-    return logs.rates if isinstance(logs, LargeLogs) else [x.sample_rate for x in logs]
 
 
 def robot_of(module: Path, urdf: Path | str | None, facts: Facts) -> tuple[Path | None, list[Diagnostic]]:

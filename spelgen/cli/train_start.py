@@ -1,0 +1,115 @@
+"""What the command `train` fits, from its flags and the robot's settings, or the run that goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from spelgen.errors import RunError
+
+if TYPE_CHECKING:
+    from spelgen.emission.loading import EmittedModel
+    from spelgen.fitting.config import FitConfig
+    from spelgen.logs.mapping import LogMapping
+    from spelgen.logs.preprocessing import Preprocessing
+
+
+class NotApplicable(typer.BadParameter):
+    """An option that belongs to something else than what is fitted."""
+
+    def format_message(self) -> str:
+        """The message as it is."""
+        return self.message
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """What the command line says."""
+
+    objective: str | None
+    flags: dict[str, Any]
+    preprocessing: dict[str, Any]
+    validation: float | None
+    seed: int | None
+
+
+@dataclass(frozen=True)
+class Start:
+    """What is fitted, and how: `config` makes it where the logs' sample rates are known."""
+
+    module: Path
+    config: Callable[[EmittedModel, Sequence[float] | None], FitConfig | None]
+    preprocessing: Preprocessing
+    validation: float
+    seed: int
+    mapping: LogMapping | None
+
+
+def begun(module: Path, urdf: Path | None, chosen: Chosen) -> Start:
+    """A new run: what the command line does not say, the robot's settings do."""
+    from spelgen.fitting.config import fit_config
+    from spelgen.fitting.stages import default_config, is_closed_form
+    from spelgen.logs.preprocessing import Preprocessing
+    from spelgen.settings.settings import load_settings
+    from spelgen.settings.training import TrainingSettings
+
+    settings = TrainingSettings() if urdf is None else load_settings(urdf).training
+    said = {name: value for name, value in chosen.preprocessing.items() if value is not None}
+    objective = chosen.objective or settings.objective
+
+    def config(model: EmittedModel, rates: Sequence[float] | None) -> FitConfig | None:
+        if objective is not None:
+            return fit_config(
+                objective, closed_form=is_closed_form(model), options=chosen.flags, defaults=settings.options
+            )
+        if rates is None and is_closed_form(model):
+            return None  # the logs decide
+        return default_config(model, rates or [], chosen.flags, settings.options)
+
+    return Start(
+        module,
+        config,
+        Preprocessing(**(settings.preprocessing | said)),
+        settings.validation_fraction if chosen.validation is None else chosen.validation,
+        settings.seed if chosen.seed is None else chosen.seed,
+        None,
+    )
+
+
+def resumed(folder: Path, chosen: Chosen) -> Start:
+    """A run that goes on: what the command line does not say, the run does."""
+    from spelgen.fitting.config import fit_config
+    from spelgen.fitting.run_folder import RunFolder
+    from spelgen.fitting.run_record import recorded_config
+    from spelgen.fitting.stages import is_closed_form
+    from spelgen.logs.mapping import LogMapping
+    from spelgen.logs.preprocessing import Preprocessing
+
+    run = RunFolder(folder)
+    before = run.read_json(run.config)
+    said = {name: value for name, value in chosen.preprocessing.items() if value is not None}
+    if before["validation_fraction"] is None:
+        raise RunError(
+            "a run with validation logs that were given in memory", file=folder,
+            do="go on with spelgen.fit(..., folder=..., resume=True)",
+        )  # fmt: skip
+
+    def config(model: EmittedModel, rates: Sequence[float] | None) -> FitConfig:
+        if chosen.objective not in (None, before["objective"]):
+            return fit_config(chosen.objective, closed_form=is_closed_form(model), options=chosen.flags)
+        found = recorded_config(before, **chosen.flags)
+        found.require(closed_form=is_closed_form(model))
+        return found
+
+    return Start(
+        run.module,
+        config,
+        Preprocessing(**(before["preprocessing"] | said)),
+        before["validation_fraction"] if chosen.validation is None else chosen.validation,
+        before["seed"] if chosen.seed is None else chosen.seed,
+        LogMapping(**before["mapping"]),
+    )
