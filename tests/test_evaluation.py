@@ -127,8 +127,8 @@ def test_a_constant_velocity_is_exact_where_nothing_accelerates():
 def motions(model, count=4, samples=25, rate=20.0, seed=0) -> list[Trajectory]:
     """Trajectories of a model under random held torques."""
     random = torch.Generator().manual_seed(seed)
-    start = 2 * torch.rand(count, 2, generator=random, dtype=torch.float64) - 1
-    tau = torch.randint(-2, 3, (count, samples, 2), generator=random).double()
+    start = 2 * torch.rand(count, model.n, generator=random, dtype=torch.float64) - 1
+    tau = torch.randint(-2, 3, (count, samples, model.n), generator=random).double()
     with torch.no_grad():
         q, qd = rollout(model, start, torch.zeros_like(start), tau[:, :-1], 1 / rate, substeps=32)
     t = np.arange(samples) / rate
@@ -278,6 +278,28 @@ def test_a_model_in_memory_is_judged_beside_any_dynamics(cart):
     assert filtered.cutoff == 3.0
     assert filtered.torque["model"] != result.torque["model"]
     assert "no-urdf-baseline" in {x.code for x in evaluate(model, logs).diagnostics}
+
+
+def test_mimic_joints_have_baselines_tips_and_predictions(cart):
+    """The pendulum follows the slider: its own dynamics made the logs, in single precision the model is judged too."""
+    from spelgen.building import build
+
+    mimic = '<axis xyz="0 -1 0"/><mimic joint="slide" multiplier="2" offset="0.1"/>'
+    cart.write_text(CART.replace('<axis xyz="0 -1 0"/>', mimic))
+    arm = load_arm(cart)
+    (log,) = motions(urdf_dynamics(cart, ["slide"]), count=1, samples=200, rate=100.0)
+    model = build(arm, preset="closed-form")
+    result = evaluate(model, log, arm=arm, preprocessing=Preprocessing(cutoff=0.0))
+    assert result.joints == ("slide",)
+    assert not [x for x in result.diagnostics if x.code.startswith("no-")]
+    for horizon in result.horizons:
+        assert horizon.errors["URDF"].mean_relative_rms < 1e-3
+        assert 0 <= horizon.errors["URDF"].tip_mm < horizon.errors["model"].tip_mm
+    single = evaluate(model.float(), log, arm=arm, preprocessing=Preprocessing(cutoff=0.0))
+    assert single.horizons[0].errors["model"].mean_relative_rms == pytest.approx(
+        result.horizons[0].errors["model"].mean_relative_rms, rel=1e-3
+    )
+    assert next(model.parameters()).dtype == torch.float32
 
 
 def test_rollouts_have_any_batch_shape_and_solver(cart):

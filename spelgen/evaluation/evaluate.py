@@ -31,7 +31,7 @@ PROBED = 64  # windows that say how many steps the integrator needs
 
 def evaluate(
     model: Any,
-    logs: Sequence[Trajectory],
+    logs: Trajectory | Sequence[Trajectory],
     *,
     arm: Any = None,
     baselines: Mapping[str, RigidDynamics] | None = None,
@@ -48,7 +48,7 @@ def evaluate(
     trajectory are left out, and said. The result depends on nothing else: no random numbers. Raises LogError.
     """
     judged = subject(model, arm)
-    joint_types, logs = judged.model.joint_types, list(logs)
+    joint_types, logs = judged.model.joint_types, [logs] if isinstance(logs, Trajectory) else list(logs)
     for trajectory in logs:
         require_joints(trajectory, judged.joints)
     notes = check(logs, judged.joints, joint_types)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
+
+import torch
 
 from spelgen.fitting.fitted import Fit, load_run
 from spelgen.fitting.run_folder import RunFolder
@@ -62,6 +65,9 @@ def subject(judged: Any, arm: Any = None) -> Subject:
 
 
 def _of_model(model: EmittedModel, urdf: Path | str | None) -> Subject:
+    weights = next(model.parameters(), None)
+    if weights is not None and (weights.dtype != torch.float64 or not weights.is_cpu):  # as logs are
+        model = copy.deepcopy(model).double().cpu()
     facts = getattr(model, "facts", None)
     if facts is None:  # no emitted module: what else has an arm's dynamics
         return Subject(model, type(model).__name__, model.joint_names, None if urdf is None else Path(urdf))

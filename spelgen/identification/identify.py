@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -17,10 +18,10 @@ from spelgen.identification.least_squares import Solution, Triangles, deviations
 from spelgen.identification.method import LeastSquares
 from spelgen.identification.prior import GaussianPrior, gaussian_prior
 from spelgen.identification.samples import DynamicsSamples, dynamics_samples
-from spelgen.loaded_arm import LoadedArm
+from spelgen.loaded_arm import LoadedArm, load_arm
 from spelgen.logs.checks import check
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.trajectory import Trajectory, require_joints
 
 _BLOCK = 2000  # samples in memory at a time
 _ROUNDS = 4  # of weighing each joint by what is left of its torque
@@ -28,18 +29,23 @@ _LEAST_NOISE = 0.02  # of a joint's torque range: few samples may be fitted bett
 
 
 def identify(
-    arm: LoadedArm,
-    logs: Sequence[Trajectory],
+    arm: LoadedArm | Path | str,
+    logs: Trajectory | Sequence[Trajectory],
     method: LeastSquares | None = None,
     *,
     preprocessing: Preprocessing | None = None,
 ) -> Identification:
     """Fit base parameters, friction and armature of ``arm`` to the torques in ``logs``.
 
-    Torques of motors are taken to the joints' by the arm's input matrix. Raises LogError for logs that cannot be
-    used, ArmError for a prior without inertials.
+    arm: of ``load_arm``, or the path of a URDF. Torques of motors are taken to the joints' by its input matrix.
+    preprocessing: its filter and gap. Raises LogError for logs that cannot be used, ArmError for a prior without
+    inertials.
     """
+    arm = arm if isinstance(arm, LoadedArm) else load_arm(arm)
+    logs = [logs] if isinstance(logs, Trajectory) else logs
     coordinates, inputs = arm.arm.coordinates, arm.actuation.matrix()
+    for trajectory in logs:
+        require_joints(trajectory, [c.name for c in coordinates])
     notes = check(logs, [c.name for c in coordinates], [c.kind for c in coordinates])
     samples = dynamics_samples(logs, preprocessing=preprocessing or Preprocessing())
     left = sorted({x.name for x in logs} - {x.name for x in samples})
