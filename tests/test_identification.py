@@ -226,7 +226,7 @@ def test_command(robots, tmp_path):
     assert "Condition number" in shown.stdout
     again = CliRunner().invoke(app, [*base, "--format", "json"])
     data = json.loads(again.stdout)
-    assert data["schema"] == 1
+    assert data["schema"] == 2
     viscous = [x for x in data["base_parameters"] if x["name"].startswith("viscous")]
     assert [x["value"] for x in viscous] == pytest.approx([3.0] * 6, rel=0.1)
     assert all(x["determined"] == "firm" for x in viscous)

@@ -11,6 +11,7 @@ import typer
 from spelgen.cli import options
 from spelgen.cli.console import note, say
 from spelgen.cli.options import AngleTolerance, Data, Filter, Joints, Mapping, MoreData, Robot, Tip
+from spelgen.errors import OptionError
 from spelgen.files import write_text
 
 
@@ -58,9 +59,11 @@ def identify(
     from spelgen.logs.preprocessing import Preprocessing
     from spelgen.logs.read import read_logs
 
-    method = LeastSquares(
-        weights, ridge, prior, FrictionModel(coulomb_smoothing_velocity, stribeck, polynomial)
-    )
+    friction = FrictionModel(coulomb_smoothing_velocity, stribeck, polynomial)
+    try:
+        method = LeastSquares(weights, ridge, prior, friction)
+    except OptionError as error:
+        raise typer.BadParameter(error.got, param_hint=f"'--{error.element}'") from None
     arm = load_arm(robot, options.names(joints), tip, angle_tolerance)
     logs = read_logs(paths, arm, mapping, role="train")
     found = identified(arm, logs, method, preprocessing=Preprocessing(cutoff=filter))
