@@ -18,6 +18,8 @@ from spelgen.design import Design, Net
 from spelgen.errors import ModuleError
 
 Assume = Literal["kinematics", "inertials"]
+"""Which values of the URDF are trusted: the kinematics alone, or the inertials' zeros and symmetries too."""
+
 Kind = Literal["zero", "constant", "varying"]
 Entries = tuple[tuple[int, int, float], ...]
 """A sparse symmetric matrix by its lower triangle: (row, column, value), 0-based."""

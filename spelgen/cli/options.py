@@ -35,7 +35,7 @@ Tip = Annotated[
 Assumption = Annotated[
     Assume,
     typer.Option(
-        "--assume", help="Believe the kinematics only, or also the inertials' zeros and symmetries."
+        "--assume", help="What is trusted: the kinematics, or also the inertials' zeros and symmetries."
     ),
 ]
 AngleTolerance = Annotated[

@@ -10,11 +10,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from math import cos, lcm, sin, tan
-from typing import Literal
 
 import numpy as np
 
 from spelgen.arm.arm import Arm
+from spelgen.spec import Assume
 from spelgen.structure.field import (
     PRIME,
     Residues,
@@ -24,9 +24,6 @@ from spelgen.structure.field import (
     residue,
 )
 from spelgen.structure.recursion import Element, Motion, energies, triangle
-
-Assume = Literal["kinematics", "inertials"]
-"""Which inertial parameters are trusted: none of them, or the URDF's."""
 
 Ten = Sequence[Element]
 
@@ -116,7 +113,7 @@ def float_samples(arm: Arm, assume: Assume, samples: int, seed: int = 2) -> Samp
 
 def float_energies(arm: Arm, q: np.ndarray, inertias: Sequence[Ten]) -> tuple[np.ndarray, np.ndarray]:
     """Lower triangles of M, (points, n(n+1)/2), and V [J], (points,), at ``q`` (points, n) [rad, m]."""
-    bases = _base_denominators(arm)
+    bases = base_denominators(arm)
     positions = [
         Position(np.cos(value / base), np.sin(value / base), value)
         for value, base in zip(q.T, bases, strict=True)
@@ -129,7 +126,7 @@ def float_energies(arm: Arm, q: np.ndarray, inertias: Sequence[Ten]) -> tuple[np
 
 def motions(arm: Arm, positions: Sequence[Position], number: Callable[[Fraction], Element]) -> list[Motion]:
     """How every body's joint has moved when the coordinates stand at ``positions``."""
-    bases = _base_denominators(arm)
+    bases = base_denominators(arm)
     moved = []
     for body in arm.bodies:
         position = positions[body.coordinate]
@@ -158,7 +155,7 @@ def circle_point(angle: float) -> tuple[Fraction, Fraction]:
     return (1 - t * t) / (1 + t * t), 2 * t / (1 + t * t)
 
 
-def _base_denominators(arm: Arm) -> list[int]:
+def base_denominators(arm: Arm) -> list[int]:
     """By coordinate, the d for which every body's angle is a whole multiple of q / d."""
     return [
         lcm(

@@ -7,9 +7,10 @@ from functools import cached_property
 import numpy as np
 
 from spelgen.arm.arm import Arm
+from spelgen.spec import Assume
 from spelgen.structure import field
 from spelgen.structure.recursion import triangle
-from spelgen.structure.sampling import Assume, Samples, field_samples, float_samples
+from spelgen.structure.sampling import Samples, field_samples, float_samples
 
 _SPARE_SAMPLES = 4
 

@@ -15,9 +15,10 @@ from typing import Literal
 
 from spelgen.arm.arm import Arm
 from spelgen.errors import ArmError
+from spelgen.spec import Assume
 from spelgen.structure import field
 from spelgen.structure.basis import Constant, Output, smallest_form
-from spelgen.structure.sampling import Assume, regressor_rows
+from spelgen.structure.sampling import regressor_rows
 from spelgen.structure.spans import Spans
 
 
