@@ -81,7 +81,9 @@ class Chunk:
         return _trajectory(self, values)
 
 
-def large_files(paths: Iterable[Path | str], joints: Sequence[str], role: str | None = None) -> list[Path]:
+def large_files(
+    paths: Path | str | Iterable[Path | str], joints: Sequence[str], role: str | None = None
+) -> list[Path]:
     """The Parquet files among the logs, where they are together larger than IN_MEMORY; else none.
 
     Raises LogError where logs of another kind lie beside: only Parquet can be read in chunks.
@@ -101,7 +103,7 @@ def large_files(paths: Iterable[Path | str], joints: Sequence[str], role: str | 
 
 
 def stream_logs(
-    paths: Sequence[Path | str], arm: Any, mapping: GivenMapping = None, role: str | None = None
+    paths: Path | str | Sequence[Path | str], arm: Any, mapping: GivenMapping = None, role: str | None = None
 ) -> Iterator[Trajectory]:
     """What `read_logs` gives, one after another; Parquet files larger than memory chunk by chunk."""
     source = log_source(arm, mapping)

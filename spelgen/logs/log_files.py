@@ -11,10 +11,12 @@ from spelgen.logs.tables import SUFFIXES, is_log
 KINDS = f"{', '.join(SUFFIXES)}, or the folder of a ROS 2 bag"
 
 
-def log_files(paths: Iterable[Path | str], role: str | None, errors: list[SpelgenError]) -> list[Path]:
+def log_files(
+    paths: Path | str | Iterable[Path | str], role: str | None, errors: list[SpelgenError]
+) -> list[Path]:
     """The files and bags that these paths name, each once; what cannot be one is added to the errors."""
     files: dict[Path, None] = {}
-    for path in map(Path, paths):
+    for path in map(Path, [paths] if isinstance(paths, str | Path) else paths):
         if is_log(path):
             files[path] = None
         elif path.is_dir():

@@ -53,7 +53,7 @@ def read_logs(
     collect(how.misfits(joints, kinds or joint_types))
     errors: list[SpelgenError] = []
     labelled: list[Named] = []
-    for file in log_files([paths] if isinstance(paths, str | Path) else paths, role, errors):
+    for file in log_files(paths, role, errors):
         try:
             for each in read_tables(file, joints, how):
                 labelled += _trajectories(each, file, joints)
