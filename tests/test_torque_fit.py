@@ -13,7 +13,7 @@ from spelgen.cli import train_command
 from spelgen.cli.main import app
 from spelgen.emission.loading import load_module
 from spelgen.errors import LogError, RunError
-from spelgen.fitting import torque_jacobian
+from spelgen.fitting import torque_fit, torque_jacobian
 from spelgen.fitting.config import GaussianPrior, Rollout, TorqueFit
 from spelgen.fitting.fit import fit
 from spelgen.fitting.gaussian_prior import SIZES, covariance, kind_of
@@ -306,3 +306,19 @@ def test_a_log_larger_than_memory_is_fitted_to_torques(emitted, robots, tmp_path
     assert plain.config.objective == large.config.objective == "torque"
     for name, value in plain.model.state_dict().items():
         torch.testing.assert_close(large.model.state_dict()[name], value, rtol=1e-6, atol=1e-8)
+
+
+def test_few_of_very_many_samples_come_near_first(emitted, monkeypatch):
+    """And all of them end where they end without."""
+    module = emitted["six_dof"][0]
+    samples = [recorded(drawn(module, seed=2, deviation=0.3), 6.0, 0.05, seed=seed) for seed in range(3)]
+    plain, quick = module.Model(), module.Model()
+    expected = fit_torque(plain, samples)
+    monkeypatch.setattr(torque_fit, "LARGE", 500)
+    monkeypatch.setattr(torque_fit, "FEW", 300)
+    found = fit_torque(quick, samples)
+    assert found.steps != expected.steps
+    assert found.cost == pytest.approx(expected.cost, rel=1e-3)
+    np.testing.assert_allclose(found.residual, expected.residual, rtol=1e-3)
+    few = TorqueSamples.held(samples, 2).thinned(300)
+    assert (few.count, len(next(few.blocks(1000))[0])) == (300, 300)

@@ -33,6 +33,8 @@ DECIMATION = (
 ALIKE = 20.0  # of those: so many in a row, 0.4 s, err alike and count once
 ROUNDS = 6  # of weighing joints by what is left of their torque
 STEPS = 8  # at most in a round
+LARGE = 2**17  # samples; of more, FEW of them are fitted first
+FEW, LAST_ROUNDS = 2**14, 2
 GAIN = 1e-4  # relative: a step that gains less ends a round
 FIRST_NOISE = 0.1  # of a joint's torque range
 LEAST_NOISE = 1e-4  # likewise: noise-free samples are fitted to four digits of their torque's range
@@ -77,19 +79,15 @@ def fit_torque(
     """
     if not isinstance(samples, TorqueSamples):
         samples = TorqueSamples.held(samples, DECIMATION)
-    problem = _Problem(TorqueJacobian(model, samples), prior or GaussianPrior(), only_bodies)
-    at = _Step(problem.start, problem.jacobian.squares(problem.start), float("inf"), DAMPING[1])
-    noise, steps = ALIKE**0.5 * FIRST_NOISE * problem.range, 0
-    for _ in range(ROUNDS):
-        at = _Step(at.x, at.squares, problem.cost(at.x, at.squares, noise), at.damping)
-        for _ in range(STEPS):
-            after = problem.step(at, noise)
-            if after is None:
-                break
-            gained, at, steps = at.cost - after.cost, after, steps + 1
-            if gained < GAIN * at.cost:
-                break
-        noise = problem.noise(at.squares)
+    prior = prior or GaussianPrior()
+    problem = _Problem(TorqueJacobian(model, samples), prior, only_bodies)
+    if samples.count <= LARGE:
+        at, steps = problem.solve(problem.start, ALIKE**0.5 * FIRST_NOISE * problem.range, ROUNDS)
+    else:  # few of many samples come near, all of them finish
+        few = _Problem(TorqueJacobian(model, samples.thinned(FEW)), prior, only_bodies)
+        near, first = few.solve(few.start, ALIKE**0.5 * FIRST_NOISE * few.range, ROUNDS)
+        at, steps = problem.solve(near.x, few.noise(near.squares), LAST_ROUNDS)
+        steps += first
     problem.jacobian.write(at.x)
     return TorqueSolution((at.squares / samples.count).sqrt().numpy(), steps, at.cost)
 
@@ -104,6 +102,21 @@ class _Problem:
         self.free = jacobian.free(only_bodies)
         deviation = jacobian.torque_deviation()
         self.range = torch.maximum(deviation, 1e-3 * deviation.max())
+
+    def solve(self, x: torch.Tensor, noise: torch.Tensor, rounds: int) -> tuple[_Step, int]:
+        """Steps down from x, and how many; the noise (n,) is found anew after each round."""
+        at, steps = _Step(x, self.jacobian.squares(x), float("inf"), DAMPING[1]), 0
+        for _ in range(rounds):
+            at = _Step(at.x, at.squares, self.cost(at.x, at.squares, noise), at.damping)
+            for _ in range(STEPS):
+                after = self.step(at, noise)
+                if after is None:
+                    break
+                gained, at, steps = at.cost - after.cost, after, steps + 1
+                if gained < GAIN * at.cost:
+                    break
+            noise = self.noise(at.squares)
+        return at, steps
 
     def noise(self, squares: torch.Tensor) -> torch.Tensor:
         """Standard deviations (n,) of errors as if they were independent from sample to sample."""

@@ -50,6 +50,16 @@ class TorqueSamples:
             found.seen += len(each.q)
         return found
 
+    def thinned(self, most: int) -> TorqueSamples:
+        """At most that many of them, evenly spread, in memory."""
+        every = -(-self.count // most)
+        found = TorqueSamples(self.joints)
+        size = every * max(1, most // 8)
+        rows = zip(*((x[::every] for x in block) for block in self.blocks(size)), strict=True)
+        found._held = [torch.cat(column) for column in rows]
+        found.count = found.seen = len(found._held[0])
+        return found
+
     def blocks(self, size: int) -> Iterator[Block]:
         """All samples in order, at most ``size`` at a time."""
         if self._file is None:
