@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from spelgen.cli.main import app
-from spelgen.errors import SpelgenErrors
+from spelgen.errors import SettingsError, SpelgenErrors
 from spelgen.excitation.criterion import Criterion
 from spelgen.excitation.design import excite
 from spelgen.excitation.trajectory import ExcitationTrajectory, motion_bounds
@@ -155,6 +155,20 @@ def test_a_joint_without_room_is_refused(robots, tmp_path):
         "joint 'joint1': got the limits 0 .. 0, expected room to move; "
         "correct them, or leave the joint out by --joints"
     )
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"duration": -1}, "duration: got -1, expected a positive number"),
+        ({"reach": 1.5}, "reach: got 1.5, expected more than 0, at most 1"),
+        ({"harmonics": 1}, "harmonics: got 1, expected 2 or more"),
+    ],
+)
+def test_values_that_cannot_be_are_refused(loaded, changes, message):
+    with pytest.raises(SettingsError) as caught:
+        excite(loaded, **CHOICE | changes)
+    assert str(caught.value) == f"excite: {message}"
 
 
 def test_it_is_told_in_a_notebook(found):

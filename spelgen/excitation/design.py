@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import isfinite
+from math import inf, isfinite
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.optimize import minimize
 
+from spelgen.errors import SettingsError
 from spelgen.excitation.criterion import Criterion
 from spelgen.excitation.excitation import Excitation
 from spelgen.excitation.trajectory import ExcitationTrajectory, motion_bounds
@@ -38,11 +39,16 @@ def excite(
 
     It starts and ends at rest and keeps the part `reach` of the joints' ranges and `speed` of their velocity
     limits; effort limits too, where the URDF has them and inertials, and where any motion can. Joints that follow
-    others by <mimic> keep their limits as well. harmonics: of the
-    period `duration`; by default 0.4 a second, at least 5. trials: motions that the search looks at, beside 40 at
-    random that it starts from. progress: called with the trials done and all. Collisions are not checked.
+    others by <mimic> keep their limits as well. Collisions are not checked.
+    harmonics: of the period `duration`; by default 0.4 a second, at least 5. trials: motions that the search looks
+    at, beside 40 at random that it starts from. progress: called with the trials done and all.
+    Raises SettingsError for a value that cannot be, ArmError for a joint without room between its limits.
     """
-    harmonics = harmonics or max(FEWEST_HARMONICS, round(HARMONICS_PER_SECOND * duration))
+    _require(duration=duration, sample_rate=sample_rate, reach=reach, speed=speed)
+    if harmonics is None:
+        harmonics = max(FEWEST_HARMONICS, round(HARMONICS_PER_SECOND * duration))
+    elif harmonics < 2:
+        raise SettingsError(repr(harmonics), element="excite: harmonics", expected="2 or more")
     bounds = motion_bounds(arm.arm, reach, speed, arm.robot.joint)
     trajectory = ExcitationTrajectory(duration, harmonics, bounds)
     criterion = Criterion(arm.arm, trajectory)
@@ -59,6 +65,15 @@ def excite(
         efforts=np.abs(criterion.efforts(motion)).max(axis=0),
         first_efforts=np.abs(criterion.efforts(first)).max(axis=0),
     )
+
+
+def _require(**values: float) -> None:
+    """Raise SettingsError for values that are not positive, and parts that are more than the whole."""
+    for name, value in values.items():
+        most = 1.0 if name in ("reach", "speed") else inf
+        if not 0 < value <= most or value == inf:
+            expected = "more than 0, at most 1" if most == 1.0 else "a positive number"
+            raise SettingsError(repr(value), element=f"excite: {name}", expected=expected)
 
 
 def _improved(
