@@ -17,6 +17,7 @@ from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import write_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
+from tests.test_closed_form import FOLLOWED
 from tests.test_training import (
     JOINTS,
     QUICK,
@@ -207,3 +208,22 @@ def test_windows_are_fitted_by_dopri5():
     windows = cut_windows(motions(), 5, measured=False)
     scales = loss_scales(windows, ("revolute", "revolute"))
     assert rollout_loss(truth(), windows, scales, 1, "dopri5") < 1e-12
+
+
+def test_the_tour_on_an_arm_with_a_joint_that_follows(tmp_path):
+    """From a URDF to a saved run, networks and rigid bodies, with the regularizer towards the URDF."""
+    (tmp_path / "followed.urdf").write_text(FOLLOWED)
+    arm = spelgen.load_arm(tmp_path / "followed.urdf")
+    logs = spelgen.simulate(arm, seed=0)[:8]
+    for preset, config in (
+        ("minimal", Rollout(epochs=1, momentum_steps=20)),
+        ("closed-form", Rollout(epochs=1, momentum_steps=0)),
+    ):
+        model = spelgen.build(arm, preset, width=8)
+        found = spelgen.fit(model, logs, config, arm=arm)
+        assert "no-regularizer" not in {note.code for note in found.diagnostics}
+        folder = found.save(tmp_path / preset)
+        assert (folder / "robot.urdf").read_text() == FOLLOWED
+        loaded = spelgen.load_run(folder)
+        assert loaded.urdf == folder / "robot.urdf"
+        assert same(loaded.model, model)
