@@ -183,7 +183,7 @@ class Facts:
 
 def facts_json(spec: ModelSpec) -> str:
     """What the module made from ``spec`` says of itself, as JSON for people and programs."""
-    facts = {
+    facts: dict[str, str | dict[str, Any]] = {
         "robot": spec.robot,
         "urdf": spec.urdf,
         "urdf_sha256": spec.urdf_sha256,
@@ -210,31 +210,43 @@ def _filled(value: str | dict[str, Any]) -> str:
 
 def read_facts(path: str | Path) -> Facts:
     """The facts in the emitted module at ``path``; nothing of it is executed. Raises ModuleError without them."""
+    return parse_facts(read_source(path), Path(path))
+
+
+def read_source(path: str | Path) -> str:
+    """The text of the module at ``path``. Raises ModuleError."""
     path = Path(path)
     try:
-        return parse_facts(path.read_bytes())
+        return path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise ModuleError("no such file", file=path, do="build it with `spelgen build`") from None
-    except (OSError, SyntaxError, ValueError, KeyError, TypeError, StopIteration, AttributeError) as problem:
-        raise ModuleError(
-            f"no facts of spelgen in it ({type(problem).__name__})",
-            file=path,
-            expected="a module written by this version of `spelgen build`",
-            do="build it again, or check the path",
-        ) from None
+    except (OSError, ValueError) as problem:
+        raise _no_facts(problem, path) from None
 
 
-def parse_facts(source: str | bytes) -> Facts:
-    """The facts in a module's source text; a KeyError or the like where there are none."""
-    record = json.loads(next(_texts(ast.parse(source), "FACTS")))
-    return Facts(
-        robot=record["robot"],
-        urdf=record["urdf"],
-        urdf_sha256=record["urdf_sha256"],
-        spec_sha256=record["spec_sha256"],
-        options=_options(_tupled(record["options"])),
-        joints=tuple(record["joints"]),
-        joint_types=tuple(record["joints"].values()),
+def parse_facts(source: str, file: Path | None = None) -> Facts:
+    """The facts in a module's source text; nothing of it is executed. Raises ModuleError without them."""
+    try:
+        record = json.loads(next(_texts(ast.parse(source), "FACTS")))
+        return Facts(
+            robot=record["robot"],
+            urdf=record["urdf"],
+            urdf_sha256=record["urdf_sha256"],
+            spec_sha256=record["spec_sha256"],
+            options=_options(_tupled(record["options"])),
+            joints=tuple(record["joints"]),
+            joint_types=tuple(record["joints"].values()),
+        )
+    except (SyntaxError, ValueError, KeyError, TypeError, StopIteration, AttributeError) as problem:
+        raise _no_facts(problem, file) from None
+
+
+def _no_facts(problem: Exception, file: Path | None) -> ModuleError:
+    return ModuleError(
+        f"no facts of spelgen in it ({type(problem).__name__})",
+        file=file,
+        expected="a module written by this version of `spelgen build`",
+        do="build it again, or check the path",
     )
 
 

@@ -32,7 +32,7 @@ def test_what_is_no_module_is_refused(tmp_path):
     path = tmp_path / "module.py"
     with pytest.raises(ModuleError) as caught:
         load_module(path)
-    assert str(caught.value) == f"{path}: got no such file, expected a module made by `spelgen build`"
+    assert str(caught.value) == f"{path}: no such file; build it with `spelgen build`"
     path.write_text("x = 1\n")
     with pytest.raises(ModuleError, match=r"got no facts of spelgen in it \(StopIteration\)"):
         load_module(path)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, cast
 import torch
 
 from spelgen.errors import ModuleError
-from spelgen.spec import Facts, parse_facts
+from spelgen.spec import Facts, parse_facts, read_source
 
 METHODS = (
     "mass_matrix", "potential_energy", "gravity", "nonlinear_effects", "friction_torque", "dissipation",
@@ -63,8 +63,8 @@ def load_module(module: str | Path, *, seed: int = 0) -> EmittedModel:
     """
     in_memory = isinstance(module, str) and "\n" in module
     file = None if in_memory else Path(module)
-    source = str(module) if file is None else _text(file)
-    facts = _facts(source, file)
+    source = str(module) if file is None else read_source(file)
+    facts = parse_facts(source, file)
     # a private name made from the content, so that two modules never meet; torch.compile looks for it there
     name = f"_spelgen_module_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
     code = sys.modules[name] = ModuleType(name)
@@ -82,22 +82,3 @@ def load_module(module: str | Path, *, seed: int = 0) -> EmittedModel:
     emitted = cast("EmittedModel", model)
     emitted.source, emitted.facts = source, facts
     return emitted
-
-
-def _text(file: Path) -> str:
-    try:
-        return file.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise ModuleError("no such file", file=file, expected="a module made by `spelgen build`") from None
-    except (OSError, ValueError) as problem:
-        raise ModuleError(
-            f"cannot be read ({type(problem).__name__})", file=file, expected=_EXPECTED
-        ) from None
-
-
-def _facts(source: str, file: Path | None) -> Facts:
-    try:
-        return parse_facts(source)
-    except Exception as problem:
-        told = f"no facts of spelgen in it ({type(problem).__name__})"
-        raise ModuleError(told, file=file, expected=_EXPECTED, do="build it again") from None

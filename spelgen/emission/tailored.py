@@ -34,9 +34,10 @@ def mass_entries(spec: ModelSpec) -> str:
     if spec.design.mass != "derived":
         return ""
     cells: defaultdict[tuple[int, int], list[tuple[float, str]]] = defaultdict(list)
-    for letter, parts in (("f", spec.outputs), ("c", spec.constants)):
-        for number, part in enumerate(parts, start=1):
-            for row, column, factor in part.basis:
+    functions, constants = [each.basis for each in spec.outputs], [each.basis for each in spec.constants]
+    for letter, bases in (("f", functions), ("c", constants)):
+        for number, basis in enumerate(bases, start=1):
+            for row, column, factor in basis:
                 cells[row, column].append((factor, f"{letter}{number}"))
     lines = _told(spec) + _unpacked("f", len(spec.outputs)) + _unpacked("c", len(spec.constants))
     rows = []
