@@ -8,7 +8,7 @@ from math import lcm
 
 from spelgen.arm.arm import Arm
 from spelgen.arm.rational import IDENTITY, product
-from spelgen.verify.axes import is_plain
+from spelgen.arm.axes import is_plain
 
 
 @dataclass(frozen=True)
