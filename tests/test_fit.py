@@ -110,6 +110,15 @@ def test_one_trajectory_alone_is_enough():
     assert found.record["training"] == ["motion_0"]
 
 
+def test_logs_that_cannot_be_fitted_are_told():
+    model = spelgen.load_module(STAND_IN)
+    with pytest.raises(LogError, match="got no logs, expected a trajectory or more"):
+        spelgen.fit(model, [])
+    (log,) = motions(count=1)
+    with pytest.raises(LogError, match="motion_0"):
+        spelgen.fit(model, Trajectory(log.t, log.q[:, :1], log.qd[:, :1], log.tau[:, :1], log.name))
+
+
 def swings(seed: int, rate=200.0) -> Trajectory:
     """A smooth motion of the true arm with its own torques."""
     random = np.random.default_rng(seed)

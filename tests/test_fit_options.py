@@ -76,6 +76,9 @@ def test_from_python_too():
         Rollout(window=1)
     with pytest.raises(ValidationError, match="frozen"):
         Rollout().window = 3
+    with pytest.raises(SettingsError) as caught:
+        fit_config("rollout", closed_form=False, options={"learning_rate": 0.0})
+    assert str(caught.value) == "learning_rate: got 0.0, expected greater than 0"
     for wrong in ({"cutoff": -1.0}, {"decimation": 0}, {"gap": 1.0}):
         with pytest.raises(SettingsError, match=next(iter(wrong))):
             Preprocessing(**wrong)

@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationError, model_validator
 
-from spelgen.errors import OptionError, SettingsError, suggestion
+from spelgen.errors import OptionError, SettingsError, collect, suggestion
 from spelgen.settings.values import Count, Group, NonNegative, Positive, Whole
 
 Objective = Literal["torque", "momentum", "rollout"]
@@ -219,9 +219,24 @@ def fit_config(
             usual.pop(name, None)
         elif name in options and other not in options and usual.get(other) == against:
             usual.pop(other)
-    found = kind(**(usual | options))
+    found = made(kind, usual | options)
     found.require(closed_form=closed_form)
     return found
+
+
+def made(kind: type[FitConfig], options: Mapping[str, Any]) -> FitConfig:
+    """The configuration with these options. Raises SettingsError for values that cannot be."""
+    try:
+        return kind(**options)
+    except ValidationError as error:
+        collect([
+            SettingsError(
+                repr(each["input"]), element=".".join(map(str, each["loc"])),
+                expected=each["msg"].removeprefix("Input should be "),
+            )
+            for each in error.errors(include_url=False)
+        ])  # fmt: skip
+        raise
 
 
 def _not_of(name: str, config: type[FitConfig]) -> SettingsError:

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from spelgen.errors import Diagnostic
+from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.rollout import LossScales, loss_scales
 from spelgen.logs.checks import check
 from spelgen.logs.epoch_windows import EpochWindows, WindowCutting
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.trajectory import Trajectory, require_joints
 from spelgen.logs.windows import Split, Windows, split_validation, thinned
 
 if TYPE_CHECKING:
@@ -65,8 +65,12 @@ def prepare_data(
     validation: trajectories, or the fraction of the logs that is set aside, whole trajectories drawn by the seed
     before anything is cut, so that no sample is in both parts. Raises LogError.
     """
+    if not trajectories:
+        raise LogError("no logs", expected="a trajectory or more")
     split = _split(trajectories, validation, seed)
     everything = [*trajectories] if isinstance(validation, float) else [*trajectories, *validation]
+    for trajectory in everything:
+        require_joints(trajectory, joints)
     notes = check(everything, joints, joint_types)
     resolved = preprocessing.resolved([x.sample_rate for x in everything])
     cutting = WindowCutting(config.window, config.stride, resolved)

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from spelgen.errors import RunError
-from spelgen.fitting.config import CONFIGS, FitConfig, WindowConfig
+from spelgen.fitting.config import CONFIGS, FitConfig, WindowConfig, made
 from spelgen.fitting.dataset import TrainingData
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.stages import is_closed_form
@@ -53,7 +53,7 @@ def describe(
 
 def recorded_config(record: dict[str, Any], **changed: Any) -> FitConfig:
     """The configuration in config.json, with some options changed. Raises OptionError where these do not apply."""
-    return CONFIGS[record["objective"]](**(record["config"] | changed))
+    return made(CONFIGS[record["objective"]], record["config"] | changed)
 
 
 def require_same(run: RunFolder, now: dict[str, Any]) -> None:
