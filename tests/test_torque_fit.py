@@ -9,10 +9,9 @@ from characters import TESTS, read_characters, write_arm
 from emitted import import_source
 from typer.testing import CliRunner
 
-from spelgen.cli import train_command
 from spelgen.cli.main import app
 from spelgen.emission.loading import load_module
-from spelgen.errors import LogError, RunError
+from spelgen.errors import LogError
 from spelgen.fitting import torque_fit, torque_jacobian
 from spelgen.fitting.config import GaussianPrior, Rollout, TorqueFit
 from spelgen.fitting.fit import fit
@@ -249,12 +248,10 @@ def test_a_model_of_networks_is_not_adapted_to_a_load(robots, run, tmp_path):
     command = ["train", str(folder / "networks.py"), *fitting[2:6], "--quiet", "--objective", "torque"]
     done = CliRunner().invoke(app, [*command, "--evaluations", "20", "-o", str(tmp_path / "networks")])
     assert done.exit_code == 0, done.output
-    with pytest.raises(
-        RunError, match="got a load for a model of networks, expected a module of the preset closed"
-    ):
-        train_command.train(
-            source=tmp_path / "networks", data=[folder / "logs.parquet"], output=tmp_path / "x"
-        )
+    command = ["train", "--from", str(tmp_path / "networks"), "--data", str(folder / "logs.parquet")]
+    done = CliRunner().invoke(app, [*command, "-o", str(tmp_path / "x")])
+    assert done.exit_code == 2
+    assert "--from: with the objective torque belongs to closed-form models" in done.output
 
 
 def test_the_same_logs_give_the_same_weights(run, tmp_path):

@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import INTERRUPTED, note, say
 from spelgen.cli.options import Data, Filter, Force, Mapping, MoreData, RobotOption
-from spelgen.cli.train_start import Chosen, NotApplicable, Start, begun, resumed
-from spelgen.errors import ModuleError, OptionError, RunError
+from spelgen.cli.train_start import Chosen, NotApplicable, begun, resumed
+from spelgen.errors import ModuleError, OptionError
 from spelgen.fitting.config import Objective, Optimizer, Solver
 from spelgen.spec import read_facts
-
-if TYPE_CHECKING:
-    from spelgen.fitting.fitted import Fit
-    from spelgen.logs.mapping import LogMapping
 
 
 def train(
@@ -149,50 +144,23 @@ def train(
     chosen = Chosen(objective, flags, {"cutoff": filter, "decimation": decimation}, validation_fraction, seed)
     start = resumed(folder, chosen) if resume else begun(module, urdf, chosen)
     given = options.mapping(mapping, urdf, read_facts(start.module).joints)
-    found = _fit(start, paths, folder, given, urdf=urdf, source=None if resume else source, resume=resume,
-                 force=force, device=device, threads=threads, progress=not quiet)  # fmt: skip
+    from spelgen.fitting.train import train as train_files
+
+    try:
+        found = train_files(
+            start.module, paths, folder, start.config, urdf=urdf, source=source, mapping=given or start.mapping,
+            preprocessing=start.preprocessing, validation=start.validation, seed=start.seed, resume=resume,
+            force=force, device=device, threads=threads, progress=not quiet,
+        )  # fmt: skip
+    except OptionError as error:
+        flag = "from" if error.option == "payload" else error.option.replace("_", "-")
+        raise NotApplicable(f"--{flag}: {error.got}") from error
     say(f"{found.status} after {found.epochs} epochs, {found.steps} steps, {found.seconds:.0f} s")
     say(f"best validation loss {found.best_validation:.3g}, at epoch {found.best_epoch}")
     say(f"run folder: {folder}")
     if found.status == "interrupted":
         note("the best model so far is in the run folder; --resume goes on")
         raise typer.Exit(INTERRUPTED)
-
-
-def _fit(
-    start: Start,
-    paths: Sequence[Path],
-    folder: Path,
-    mapping: LogMapping | None,
-    *,
-    urdf: Path | None,
-    source: Path | None,
-    resume: bool,
-    **rest: Any,
-) -> Fit:
-    from spelgen.emission.loading import load_module
-    from spelgen.fitting.fit import fit, sample_rates
-    from spelgen.fitting.stages import is_closed_form
-    from spelgen.fitting.train import open_logs, robot_of, start_from
-
-    model = load_module(start.module)
-    if source is not None:
-        if not is_closed_form(model):
-            raise RunError("a load for a model of networks", expected="a module of the preset closed-form")
-        start_from(model, source)
-    mapping = mapping or start.mapping
-    try:
-        config = start.config(model, None)  # before the logs, which may take long to read
-        logs = open_logs(model, paths, mapping, start.preprocessing)
-        config = config or start.config(model, sample_rates(logs))
-    except OptionError as error:
-        flag = "from" if error.option == "payload" else error.option.replace("_", "-")
-        raise NotApplicable(f"--{flag}: {error.got}") from error
-    robot, notes = (None, []) if resume else robot_of(start.module, urdf, model.facts)
-    return fit(
-        model, logs, config, preprocessing=start.preprocessing, validation=start.validation, seed=start.seed,
-        arm=robot, folder=folder, resume=resume, mapping=mapping, notes=notes, **rest,
-    )  # fmt: skip
 
 
 def _of_run(source: Path, robot: Path | None) -> tuple[Path, Path | None]:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from spelgen.emission.loading import load_module
 from spelgen.errors import Diagnostic, ModuleError, RunError
 from spelgen.fitting.config import FitConfig
-from spelgen.fitting.fit import AUTOMATIC, fit
+from spelgen.fitting.fit import AUTOMATIC, fit, sample_rates
 from spelgen.fitting.fitted import Fit
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.run_record import recorded_config
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
 
+Choice = Callable[[Any, Sequence[float] | None], FitConfig | None]
+"""From the model and, where it asks for these by None, the logs' sample rates [Hz]."""
 RECORDED = {"seed": "seed", "validation": "validation_fraction"}
 
 
@@ -33,7 +35,7 @@ def train(
     module: Path | str,
     data: Iterable[Path | str],
     folder: Path | str,
-    config: FitConfig | None = None,
+    config: FitConfig | Choice | None = None,
     *,
     urdf: Path | str | None = None,
     source: Path | str | None = None,
@@ -47,8 +49,8 @@ def train(
 
     urdf: the robot the module was built from, for the regularizer and the baselines of `evaluate`; by default the file
     of that name beside the module. source: a run of this module, whose weights are where the fit starts. mapping:
-    how the logs are named and measured; by default as spelgen writes them. What is not said of a run that is resumed
-    is as before.
+    how the logs are named and measured; by default as spelgen writes them. config: may also be a function that
+    chooses. What is not said of a run that is resumed is as before.
     Raises ModuleError, LogError, and RunError when the folder holds a run or cannot be resumed with this.
     """
     run = RunFolder(Path(folder))
@@ -65,10 +67,13 @@ def train(
     model = load_module(module)
     if source is not None and not resume:
         start_from(model, source)
+    chosen = config(model, None) if callable(config) else config  # before logs, which may take long to read
     logs = open_logs(model, data, mapping, preprocessing)
+    if chosen is None and callable(config):
+        chosen = config(model, sample_rates(logs))
     robot, notes = (None, []) if resume else robot_of(module, urdf, model.facts)
     return fit(
-        model, logs, config, preprocessing=preprocessing, arm=robot, folder=folder, resume=resume, mapping=mapping,
+        model, logs, chosen, preprocessing=preprocessing, arm=robot, folder=folder, resume=resume, mapping=mapping,
         progress=progress, notes=notes, **options,
     )  # fmt: skip
 
