@@ -6,17 +6,19 @@ from __future__ import annotations
 
 import textwrap
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from spelgen.arm.actuation import Actuation
 from spelgen.arm.arm import Arm, Coordinate
 from spelgen.errors import Diagnostic
 from spelgen.explain.facts import Fact, facts
-from spelgen.formulas.formulas import Entry as PlaceOfEntry
-from spelgen.formulas.formulas import Formulas, formulas
 from spelgen.labels import joint_ranges, joints_in_ranges, printable
 from spelgen.listing import Listing
 from spelgen.structure.structure import Entry, Structure
+
+if TYPE_CHECKING:  # SymPy is read in only for formulas
+    from spelgen.formulas.formulas import Entry as PlaceOfEntry
+    from spelgen.formulas.formulas import Formulas
 
 SCHEMA = 1
 
@@ -37,6 +39,8 @@ class Inspection:
 
     def closed_forms(self, entry: PlaceOfEntry | None = None, *, longest: int | None = None) -> Formulas:
         """M and V, or one entry, as expressions; arguments and errors as for ``formulas.formulas.formulas``."""
+        from spelgen.formulas.formulas import formulas
+
         return formulas(self.arm, self.structure, entry=entry, longest=longest)
 
     def to_dict(self) -> dict[str, Any]:

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from spelgen.arm.actuation import Actuation, derive_actuation
 from spelgen.arm.arm import Arm, make_arm
 from spelgen.errors import Diagnostic
-from spelgen.formulas.formulas import Entry, Formulas, formulas
 from spelgen.inspection import Inspection
 from spelgen.settings.settings import Settings, load_settings
 from spelgen.spec import Assume
@@ -19,6 +19,9 @@ from spelgen.structure.structure import Structure, derive
 from spelgen.urdf.read import read_urdf
 from spelgen.urdf.robot import Robot
 from spelgen.verify.agreement import Verification
+
+if TYPE_CHECKING:  # SymPy is read in only for formulas
+    from spelgen.formulas.formulas import Entry, Formulas
 
 
 @dataclass(frozen=True, repr=False)
@@ -73,10 +76,13 @@ class LoadedArm:
     def formulas(
         self, entry: Entry | None = None, assume: Assume = "kinematics", *, longest: int | None = None
     ) -> Formulas:
-        """M(q) and V(q), or one entry ((row, column) from 1, or "V"), as expressions in the base parameters.
+        """M(q) and V(q), or one entry ((row, column) from 1, or "V"), as SymPy expressions: ``.entries``,
+        ``.mass_matrix`` and ``.potential`` in ``.q`` and ``.base_parameters``.
 
         ``longest``: terms of what is still written out; None: as many as a person reads.
         """
+        from spelgen.formulas.formulas import formulas
+
         return formulas(self.arm, self.structure_for(assume), entry=entry, longest=longest)
 
     def __repr__(self) -> str:

@@ -69,8 +69,7 @@ def without_latex(told: str) -> dict[str, str]:
         (r"\\(?:bigl|bigr)", ""),
         (r"([mhI])_\{(?:([xyz]+),)?(\w+)\}", r"\1\2\3"),
         (r"([Mq])_\{(\d+)\}", r"\1\2"),
-        (r"\\(cos|sin)(?:\^\{(\d)\})? (q\d+)", lambda m: f"{m[1]}({m[3]})**{m[2] or 1}"),
-        (r"\\(cos|sin)(?:\^\{(\d)\})?(\([^()]*\))", lambda m: f"{m[1]}{m[3]}**{m[2] or 1}"),
+        (r"\\(cos|sin)(?:\^\{(\d)\})?\{\\left(\([^()]*)\\right\)\}", lambda m: f"{m[1]}{m[3]})**{m[2] or 1}"),
         (r"\^\{(\d)\}", r"**\1"),
     ):
         body = re.sub(pattern, plain, body)

@@ -17,8 +17,8 @@ from typer.testing import CliRunner
 from spelgen.arm.arm import make_arm
 from spelgen.cli.main import app
 from spelgen.errors import SpelgenError
+from spelgen.formulas.files import sympy_source
 from spelgen.formulas.formulas import formulas
-from spelgen.formulas.sympy_module import sympy_source
 from spelgen.formulas.text import text, to_dict
 from spelgen.loaded_arm import load_arm
 from spelgen.pipeline import inspect
@@ -188,7 +188,7 @@ def test_what_is_too_large_is_not_expanded():
     """The first entries of eight generic joints have more than 10^5 terms."""
     arm = random_arm(8, 0)
     found = formulas(arm, derive(arm))
-    terms = {formula.name: formula.terms for formula in found.entries}
+    terms = {formula.name: formula.terms for formula in found.rows}
     assert (terms["M11"], terms["M55"], terms["M88"]) == (None, 466, 1)
     assert "M11: too many terms to be expanded\n" in text(found)
 

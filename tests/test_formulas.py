@@ -9,17 +9,18 @@ import sys
 import numpy as np
 import pinocchio as pin
 import pytest
+import sympy
 from formulas_read import assert_close, assert_equal_to_pinocchio, read_back, without_latex
 from hypothesis import HealthCheck, given, settings
 from random_arms import arms
 
 from spelgen.arm.arm import make_arm
 from spelgen.files import write_text
+from spelgen.formulas.files import latex, sympy_source
 from spelgen.formulas.formulas import WRITABLE, formulas
-from spelgen.formulas.latex import latex
-from spelgen.formulas.sympy_module import sympy_source
 from spelgen.formulas.text import text
 from spelgen.loaded_arm import load_arm
+from spelgen.structure.expansion import Budget, Expansion
 from spelgen.structure.structure import derive
 from spelgen.urdf.read import read_urdf
 from spelgen.verify.numeric_samples import with_random_inertias
@@ -82,6 +83,50 @@ def test_latex_read_back_equals_pinocchio(robots, robot):
     rows = without_latex(latex(formulas(arm, structure, longest=WRITABLE)))
     drawn = with_random_inertias(arm, np.random.default_rng(2))
     assert_equal_to_pinocchio(drawn, rows, structure.base_parameter_count)
+
+
+@pytest.mark.parametrize("robot", ["two_link", "rpr", "scara"])
+def test_sympy_proves_each_expression(robots, robot):
+    """Exactly, and not by numbers: by sines and cosines of single angles each is its unshortened expansion."""
+    arm = load_arm(robots / f"{robot}.urdf").arm
+    found = formulas(arm, derive(arm))
+    expansion = Expansion(arm)
+    generators = [function for q in found.q for function in (sympy.cos(q), sympy.sin(q), q)]
+    circles = [sympy.cos(q) ** 2 + sympy.sin(q) ** 2 - 1 for q in found.q]
+    for row in found.rows:
+        element = expansion.written.potential if row.place is None else expansion.written.mass[row.place]
+        expanded = sympy.Integer(0)
+        for each in found.base:
+            polynomial = expansion.polynomial(element, each.index, Budget(10**6))
+            for powers, share in polynomial.terms():
+                if row.place is not None or any(powers):  # V is known up to a constant
+                    monomial = sympy.prod(x**power for x, power in zip(generators, powers, strict=True))
+                    expanded += (
+                        sympy.Rational(int(share.p), int(share.q))
+                        * sympy.Symbol(each.name, real=True)
+                        * monomial
+                    )
+        difference = sympy.expand(sympy.expand_trig(row.expression.doit()) - expanded)
+        assert sympy.reduced(difference, circles, *generators)[1] == 0, row.name
+
+
+def test_python_users_get_sympy(robots):
+    """Names and shapes of what `load_arm(path).formulas()` gives, and that SymPy goes on from there."""
+    found = load_arm(robots / "rpr.urdf").formulas()
+    q1, q2, q3 = found.q
+    names = {symbol.name: symbol for symbol in found.base_parameters}
+    m2r, hz2r, ixx3r, ixy3 = (names[name] for name in ("m2R", "hz2R", "Ixx3R", "Ixy3"))
+    m11 = found.entries[1, 1]
+    assert set(found.entries) == {(1, 1), (2, 1), (2, 2), (3, 1), (3, 2), (3, 3)}
+    assert sympy.diff(m11, q2) == 2 * m2r * q2 + 2 * hz2r
+    assert sympy.simplify(sympy.diff(m11, q3) + ixx3r * sympy.sin(2 * q3) + 2 * ixy3 * sympy.cos(2 * q3)) == 0
+    assert sympy.diff(found.potential, q1) == 0
+    assert str(found.base_parameters[m2r]) == "m2 + m3" and found.values[m2r] == sympy.Rational("5.33")
+    assert found.mass_matrix.shape == (3, 3) and found.mass_matrix[0, 0] == m11
+    assert repr(found) == "<Formulas of 'rpr': 7 written, in 11 base parameters>"
+    assert "M32</td>" in found._repr_html_() and "$m_{2R}$" in found._repr_html_()
+    one = load_arm(robots / "rpr.urdf").formulas((2, 2))
+    assert (one.entries, one.potential, one.mass_matrix) == ({(2, 2): m2r}, None, None)
 
 
 @settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck))

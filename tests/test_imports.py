@@ -39,7 +39,7 @@ fitting: optimizers torque_networks urdf_regularizer stages compiled process pro
 evaluation: baselines torque rollout examples invariants tables results subject evaluate
 verify: agreement urdf_cross_check numeric_samples verify
 explain: reasons facts
-formulas: expression notation angles harmonics factoring shortening grouping formulas layout text latex sympy_module
+formulas: terms printing angles shortening formulas text files
 inspection loaded_arm pipeline building
 simulation: simulate
 excitation: design

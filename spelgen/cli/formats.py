@@ -29,17 +29,18 @@ def rendered(
 
     Raises SpelgenError for an entry that M does not have.
     """
-    from spelgen.formulas import latex, sympy_module, text
-    from spelgen.formulas.formulas import WRITABLE
     from spelgen.render import inspection_page
 
-    longest = WRITABLE if format in ("json", "sympy") else None
     closed = None
     if formulas or entry is not None or format in ("latex", "sympy"):
+        from spelgen.formulas import files, text
+        from spelgen.formulas.formulas import WRITABLE
+
+        longest = WRITABLE if format in ("json", "sympy") else None
         closed = found.closed_forms(entry, longest=longest)
     if closed and format in ("latex", "sympy"):
         _tell(closed, proof)
-        return latex.latex(closed) if format == "latex" else sympy_module.sympy_source(closed)
+        return files.latex(closed) if format == "latex" else files.sympy_source(closed)
     if format == "html":
         return inspection_page.page(found, closed, proof)
     if format == "text":

@@ -1,4 +1,4 @@
-"""Closed forms of M(q) and V(q), linear in the base inertial parameters.
+"""Closed forms of M(q) and V(q), linear in the base inertial parameters, as SymPy expressions.
 
 Each entry is expanded exactly (``expansion``), its terms are collected by base parameter (``base_parameters``) and
 written the shortest of several ways (``shortening``). What is too long is counted, not written.
@@ -9,19 +9,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cached_property
 from typing import Literal
 
-from flint import fmpq, fmpq_mpoly_ctx
+from flint import fmpq, fmpq_mpoly, fmpq_mpoly_ctx
+from sympy import Expr, Matrix, Rational, Symbol
 
 from spelgen.arm.arm import Arm
 from spelgen.errors import SpelgenError
-from spelgen.formulas.expression import Sum, Symbol
-from spelgen.formulas.grouping import Collected, grouped
-from spelgen.formulas.notation import Plain
+from spelgen.formulas.printing import Latex
 from spelgen.formulas.shortening import Shortener
+from spelgen.formulas.terms import coordinate, expression, grouped, parameter
 from spelgen.labels import entry_name
 from spelgen.listing import Listing
-from spelgen.structure.base_parameters import BaseParameter, base_parameters
+from spelgen.structure.base_parameters import BaseParameter, base_parameters, parameter_name
 from spelgen.structure.expansion import Budget, Expansion, TooLarge
 from spelgen.structure.recursion import triangle
 from spelgen.structure.structure import Structure
@@ -37,6 +38,7 @@ Place = tuple[int, int] | None
 """An entry of M, 0-based with row >= column; None stands for V."""
 Entry = tuple[int, int] | Literal["V"]
 """An entry as users name it: (row, column) from 1, or V."""
+_Polynomials = list[tuple[BaseParameter, fmpq_mpoly]]
 
 
 @dataclass(frozen=True)
@@ -50,41 +52,98 @@ class Formula:
 
     place: Place
     terms: int | None
-    expression: Sum | None
+    expression: Expr | None
 
     @property
     def name(self) -> str:
         """``M21`` or ``V``."""
         return "V" if self.place is None else entry_name(*self.place)
 
+    @property
+    def omission(self) -> str:
+        """Why it is not written out."""
+        return (
+            "too many terms to be expanded" if self.terms is None else f"{self.terms} terms, not written out"
+        )
+
 
 @dataclass(frozen=True, repr=False)
 class Formulas:
-    """Closed forms of ``arm``, V up to a constant, in the parameters ``base``.
+    """Closed forms of ``arm`` in the base parameters ``base``; V up to a constant.
 
-    Under ``inertials`` terms that vanish for the URDF's values are left out.
+    Sums and products stand as they were chosen: SymPy did not evaluate them, and what it makes of them (a
+    derivative, a substitution) it does. Under ``inertials`` terms that vanish for the URDF's values are left out.
     """
 
     arm: Arm
     assume: str
     base: tuple[BaseParameter, ...]
-    entries: tuple[Formula, ...]
+    rows: tuple[Formula, ...]
 
-    def __repr__(self) -> str:
-        written = len(self.entries) - len(self.unwritten)
-        return f"<Formulas of {self.arm.name!r}: {written} written, in {len(self.base)} base parameters>"
+    @property
+    def q(self) -> tuple[Symbol, ...]:
+        """The joints' positions [rad, m]."""
+        return tuple(coordinate(joint) for joint in range(len(self.arm.coordinates)))
 
-    def _repr_html_(self) -> str:
-        rows = [
-            (each.name, "too long" if each.expression is None else " ".join(Plain().sum(each.expression)))
-            for each in self.entries
+    @cached_property
+    def entries(self) -> dict[tuple[int, int], Expr]:
+        """(row, column) -> entry of M that is not too long; the lower triangle, counted from 1."""
+        return {
+            (each.place[0] + 1, each.place[1] + 1): each.expression
+            for each in self.rows
+            if each.place and each.expression is not None
+        }
+
+    @property
+    def mass_matrix(self) -> Matrix | None:
+        """M(q), None where entries are missing."""
+        n = len(self.arm.coordinates)
+        if len(self.entries) < n * (n + 1) // 2:
+            return None
+        return Matrix(n, n, lambda i, j: self.entries[max(i, j) + 1, min(i, j) + 1])
+
+    @property
+    def potential(self) -> Expr | None:
+        """V(q) [J], None where it is missing."""
+        return next((each.expression for each in self.rows if each.place is None), None)
+
+    @property
+    def base_parameters(self) -> dict[Symbol, Expr]:
+        """What each parameter in the expressions is the sum of, by body: m a mass [kg], h = m c a first moment
+        [kg m] and I a tensor [kg m2] about the joint's origin, in a frame whose z is the joint's axis.
+        """
+        sums = [
+            {(parameter(parameter_name(i)),): _rational(x) for i, x in each.weights} for each in self.base
         ]
-        return Listing(f"{self.arm.name}: closed forms", ("", ""), tuple(rows), left=(0, 1)).html()
+        return {parameter(each.name): expression(terms) for each, terms in zip(self.base, sums, strict=True)}
+
+    @property
+    def values(self) -> dict[Symbol, Rational]:
+        """The base parameters' exact values by the URDF, where it has inertials."""
+        return {parameter(each.name): Rational(each.value) for each in self.base if each.value is not None}
+
+    @property
+    def trusted(self) -> str:
+        """For which inertial values the formulas hold."""
+        own = self.assume == "inertials"
+        return "the URDF's inertial zeros and symmetries" if own else "any inertial values"
 
     @property
     def unwritten(self) -> tuple[Formula, ...]:
         """The entries that were too long."""
-        return tuple(formula for formula in self.entries if formula.expression is None)
+        return tuple(each for each in self.rows if each.expression is None)
+
+    def __repr__(self) -> str:
+        written = len(self.rows) - len(self.unwritten)
+        return f"<Formulas of {self.arm.name!r}: {written} written, in {len(self.base)} base parameters>"
+
+    def _repr_html_(self) -> str:
+        """A table of LaTeX, for a notebook."""
+        rows = [
+            (each.name, each.omission if each.expression is None else f"${Latex().whole(each.expression)}$")
+            for each in self.rows
+        ]
+        return Listing(f"{self.arm.name}: closed forms", ("", ""), tuple(rows), left=(0, 1)).html()
 
 
 def formulas(
@@ -95,33 +154,31 @@ def formulas(
     Entries of more than ``longest`` terms (``READABLE``, of one entry ``WRITABLE``) are counted and not
     written. Raises SpelgenError for an entry that M does not have.
     """
-    if longest is None:
-        longest = READABLE if entry is None else WRITABLE
     n = len(arm.coordinates)
-    # from the tip on, so that what is cheap is not left out for what is dear
-    wanted: list[Place] = [None, *reversed(triangle(n))] if entry is None else [_place(n, entry)]
+    order: list[Place] = [*triangle(n), None] if entry is None else [_place(n, entry)]
     base = base_parameters(arm, structure.base_parameter_count)
-    work = _Work(Expansion(arm), base, structure.assume, longest)
-    shortener = Shortener(arm, work.expansion.context)
-    left, found = _WHOLE_BUDGET, {}
-    for place in wanted:
+    if structure.assume == "inertials":
+        base = tuple(each for each in base if each.value)
+    expansion = Expansion(arm)
+    shortener = Shortener(arm, expansion.context)
+    left, found = _WHOLE_BUDGET, dict[Place, Formula]()
+    for place in reversed(order):  # from the tip on, so that what is cheap is not left out for what is dear
         budget = Budget(left if entry else min(left, _BUDGET))
         before = budget.left
-        found[place] = _formula(work, shortener, place, budget)
+        try:
+            polynomials = _polynomials(expansion, shortener, base, place, budget)
+        except TooLarge:
+            found[place] = Formula(place, None, None)
+        else:
+            if structure.assume == "inertials":
+                polynomials = _at_urdf_values(expansion.context, polynomials)
+            found[place] = _formula(
+                shortener, place, polynomials, longest or (WRITABLE if entry else READABLE)
+            )
         left -= before - budget.left
-    order: list[Place] = [*triangle(n), None]
-    entries = tuple(found[place] for place in order if place in found)
-    return Formulas(arm, structure.assume, _used(work, entries, entry is None), entries)
-
-
-@dataclass(frozen=True)
-class _Work:
-    """What every entry is made from."""
-
-    expansion: Expansion
-    base: tuple[BaseParameter, ...]
-    assume: str
-    longest: int
+    if entry and (told := found[order[0]].expression) is not None:
+        base = tuple(each for each in base if parameter(each.name) in told.free_symbols)
+    return Formulas(arm, structure.assume, base, tuple(found[place] for place in order))
 
 
 def _place(n: int, entry: Entry) -> Place:
@@ -135,56 +192,39 @@ def _place(n: int, entry: Entry) -> Place:
     return row - 1, column - 1
 
 
-def _formula(work: _Work, shortener: Shortener, place: Place, budget: Budget) -> Formula:
-    expansion = work.expansion
+def _polynomials(
+    expansion: Expansion, shortener: Shortener, base: Sequence[BaseParameter], place: Place, budget: Budget
+) -> _Polynomials:
+    """What each base parameter is multiplied by, without the constant part of V. Raises TooLarge."""
     element = expansion.written.potential if place is None else expansion.written.mass[place]
-    collected: Collected = []
-    try:
-        for parameter in work.base:
-            # the parameters regrouped into this one have their part in its first one's polynomial
-            polynomial = shortener.reduced(expansion.polynomial(element, parameter.index, budget))
-            if place is None:
-                polynomial -= polynomial[(0,) * len(expansion.context.gens())]
-            collected.append((parameter, polynomial))
-    except TooLarge:
-        return Formula(place, None, None)
-    if work.assume == "inertials":
-        collected = _at_urdf_values(expansion.context, collected)
-    collected = [(parameter, polynomial) for parameter, polynomial in collected if polynomial != 0]
-    terms = sum(len(polynomial) for _, polynomial in collected)
-    return Formula(place, terms, grouped(shortener, collected) if terms <= work.longest else None)
+    found = []
+    for each in base:
+        # the parameters regrouped into this one have their part in its first one's polynomial
+        polynomial = shortener.reduced(expansion.polynomial(element, each.index, budget))
+        constant = polynomial[(0,) * len(expansion.context.gens())]
+        found.append((each, polynomial if place else polynomial - constant))
+    return found
 
 
-def _at_urdf_values(context: fmpq_mpoly_ctx, collected: Collected) -> Collected:
-    """Without the monomials whose coefficient is zero for the URDF's values, and without zero parameters."""
-    total = context.from_dict({})
-    for parameter, polynomial in collected:
-        total += _rational(parameter.value or Fraction(0)) * polynomial
+def _at_urdf_values(context: fmpq_mpoly_ctx, polynomials: _Polynomials) -> _Polynomials:
+    """Without the monomials whose coefficient is zero for the URDF's values."""
+    scaled = (_rational(each.value or Fraction(0)) * polynomial for each, polynomial in polynomials)
+    total = sum(scaled, context.from_dict({}))
     kept = []
-    for parameter, polynomial in collected:
-        if parameter.value:
-            left = {monomial: share for monomial, share in polynomial.terms() if total[monomial] != 0}
-            kept.append((parameter, context.from_dict(left)))
+    for each, polynomial in polynomials:
+        left = {monomial: share for monomial, share in polynomial.terms() if total[monomial] != 0}
+        kept.append((each, context.from_dict(left)))
     return kept
 
 
-def _used(work: _Work, entries: Sequence[Formula], everything: bool) -> tuple[BaseParameter, ...]:
-    """All base parameters or, of one entry, those in it; under ``inertials`` without those that are 0."""
-    if everything:
-        return tuple(each for each in work.base if work.assume == "kinematics" or each.value)
-    names = {name for formula in entries if formula.expression for name in _symbols(formula.expression)}
-    return tuple(each for each in work.base if each.name in names)
-
-
-def _symbols(expression: Sum) -> set[str]:
-    found: set[str] = set()
-    for term in expression.terms:
-        for factor, _ in term.factors:
-            if isinstance(factor, Symbol):
-                found.add(factor.name)
-            elif isinstance(factor, Sum):
-                found |= _symbols(factor)
-    return found
+def _formula(shortener: Shortener, place: Place, polynomials: _Polynomials, longest: int) -> Formula:
+    terms = sum(len(polynomial) for _, polynomial in polynomials)
+    if terms > longest:
+        return Formula(place, terms, None)
+    functions = [
+        (parameter(x.name), shortener.shortest(function)) for x, function in polynomials if function != 0
+    ]
+    return Formula(place, terms, grouped(functions))
 
 
 def _rational(number: Fraction) -> fmpq:

@@ -6,8 +6,7 @@ import textwrap
 from typing import Any
 
 from spelgen.formulas.formulas import WRITABLE, Formulas
-from spelgen.formulas.layout import broken, definition, trusted, why_not
-from spelgen.formulas.notation import Plain
+from spelgen.formulas.printing import Text
 from spelgen.labels import printable
 
 _LONGEST_NAME = 36
@@ -15,13 +14,12 @@ _LONGEST_NAME = 36
 
 def text(found: Formulas, width: int = 80) -> str:
     """The formulas, what their parameters are, and the parameters' values by the URDF."""
-    notation = Plain()
-    lines = [*textwrap.wrap(f"{printable(found.arm.name)}: closed forms for {trusted(found)}", width), ""]
-    for formula in found.entries:
-        if formula.expression is None:
-            lines.append(f"{formula.name}: {why_not(formula)}")
+    lines = [*textwrap.wrap(f"{printable(found.arm.name)}: closed forms for {found.trusted}", width), ""]
+    for each in found.rows:
+        if each.expression is None:
+            lines.append(f"{each.name}: {each.omission}")
         else:
-            lines += broken(notation.sum(formula.expression), f"{formula.name} = ", width)
+            lines += Text().lines(each.expression, f"{each.name} = ", width)
     lines += _notes(found, width)
     if found.base:
         lines += ["", *_parameters(found, width), "", *_legend(found, width)]
@@ -30,34 +28,35 @@ def text(found: Formulas, width: int = 80) -> str:
 
 def to_dict(found: Formulas) -> dict[str, Any]:
     """Every expression as one line of text, null where it is too long; rows and columns count from 1."""
-    notation = Plain()
-    entries = []
-    for formula in found.entries:
-        place = (
-            {"row": None, "col": None}
-            if formula.place is None
-            else dict(zip(("row", "col"), (k + 1 for k in formula.place), strict=True))
-        )
-        expression = None if formula.expression is None else " ".join(notation.sum(formula.expression))
-        entries.append({"name": formula.name, **place, "terms": formula.terms, "expression": expression})
-    base = [
+    printer = Text()
+    entries = [
         {
             "name": each.name,
-            "definition": " ".join(notation.sum(definition(each))),
-            "value": None if each.value is None else float(each.value),
+            "row": each.place and each.place[0] + 1,
+            "col": each.place and each.place[1] + 1,
+            "terms": each.terms,
+            "expression": None if each.expression is None else printer.whole(each.expression),
         }
-        for each in found.base
+        for each in found.rows
+    ]
+    base = [
+        {
+            "name": symbol.name,
+            "definition": printer.whole(definition),
+            "value": float(found.values[symbol]) if symbol in found.values else None,
+        }
+        for symbol, definition in found.base_parameters.items()
     ]
     return {"entries": entries, "base_parameters": base}
 
 
 def _notes(found: Formulas, width: int) -> list[str]:
     notes = []
-    if any(formula.place is None for formula in found.entries):
+    if any(each.place is None for each in found.rows):
         notes.append("V is given up to a constant.")
-    long = [formula for formula in found.unwritten if formula.terms is not None and formula.terms <= WRITABLE]
+    long = [each for each in found.unwritten if each.terms is not None and each.terms <= WRITABLE]
     if long:
-        place = "V" if long[0].place is None else ",".join(str(k + 1) for k in long[0].place)
+        place = ",".join(str(k + 1) for k in long[0].place) if long[0].place else "V"
         notes.append(
             f"What is not written out: --entry {place} shows {long[0].name} alone, and -o FILE.py writes a file "
             "for SymPy with all of them."
@@ -66,13 +65,14 @@ def _notes(found: Formulas, width: int) -> list[str]:
 
 
 def _parameters(found: Formulas, width: int) -> list[str]:
-    notation = Plain()
-    known = any(each.value is not None for each in found.base)
-    lines = ["Base parameters" + (", and the URDF's values" if known else "")]
-    for each in found.base:
-        value = [] if each.value is None else [f"[{float(each.value):.6g}]"]
-        parts = [] if len(each.weights) == 1 else ["=", *notation.sum(definition(each))]
-        lines += broken([*parts, *value], f"  {each.name} ", width)
+    values = found.values
+    lines = ["Base parameters" + (", and the URDF's values" if values else "")]
+    for symbol, definition in found.base_parameters.items():
+        value = f" [{float(values[symbol]):.6g}]" if symbol in values else ""
+        if definition.is_Symbol:
+            lines.append(f"  {symbol.name}{value}")
+        else:
+            lines += Text().lines(definition, f"  {symbol.name} = ", width, end=value)
     return lines
 
 

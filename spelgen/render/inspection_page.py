@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from spelgen import __version__
-from spelgen.formulas.formulas import Formulas
-from spelgen.formulas.text import text
 from spelgen.inspection import Inspection, reach
 from spelgen.labels import joint_ranges
 from spelgen.templates import render
 from spelgen.verify.agreement import Verification
+
+if TYPE_CHECKING:
+    from spelgen.formulas.formulas import Formulas
 
 _WIDTH = 100  # of the closed forms
 
@@ -18,13 +21,18 @@ def page(found: Inspection, closed: Formulas | None = None, proof: Verification 
 
     It has no scripts and needs no other file; all that comes from the URDF is escaped.
     """
+    text = None
+    if closed:  # SymPy is read in only for formulas
+        from spelgen.formulas.text import text as written
+
+        text = written(closed, _WIDTH)
     return render(
         "inspection.html.jinja",
         version=__version__,
         found=found,
         rows=_rows(found),
         joints=[(each.name, each.kind, reach(each)) for each in found.arm.coordinates],
-        closed=None if closed is None else text(closed, _WIDTH),
+        closed=text,
         proof=proof,
     )
 

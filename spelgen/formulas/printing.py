@@ -1,0 +1,121 @@
+"""SymPy's printers, kept from rearranging what was chosen, and lines of one width.
+
+Blanks that must not end a line are no-break spaces until the lines are made.
+"""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from functools import cache
+
+from sympy import Add, Expr, Function, Integer, Mul, Rational, Symbol
+from sympy.printing.latex import LatexPrinter
+from sympy.printing.precedence import PRECEDENCE
+from sympy.printing.printer import Printer
+from sympy.printing.str import StrPrinter
+
+_FIXED = "\N{NO-BREAK SPACE}"
+_LONG_SUM = 20
+_DOUBLE = 10**17
+
+
+class _AsBuilt(Printer):
+    """Sums and products in the order they were put together, numbers as decimals."""
+
+    times = "*"
+
+    def whole(self, expression: Expr) -> str:
+        """The expression in one line."""
+        return str(self.doprint(expression)).replace(_FIXED, " ")
+
+    def lines(self, expression: Expr, start: str, width: int, end: str = "") -> list[str]:
+        """The expression between ``start`` and ``end``, broken where lines get longer than ``width``: before
+        terms, and inside of those that are longer than a line.
+        """
+        indent = " " * (len(start) - len(start.lstrip()) + 4)
+        pieces: list[str] = []
+        for term in Add.make_args(expression):
+            text = self._signed(self.doprint(term)) if pieces else self.doprint(term)
+            room = width - len(indent if pieces else start)
+            pieces.append(text if len(text) > room else text.replace(" ", _FIXED))
+        lines = textwrap.wrap(
+            " ".join(pieces) + end,
+            width,
+            initial_indent=start,
+            subsequent_indent=indent,
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
+        return [line.replace(_FIXED, " ") for line in lines]
+
+    def _signed(self, text: str) -> str:
+        return f"-{_FIXED}{text[1:]}" if text.startswith("-") else f"+{_FIXED}{text}"
+
+    def _print_Add(self, expression: Add, order: str | None = None) -> str:
+        first, *others = [self._print(term) for term in expression.args]
+        return " ".join([first, *map(self._signed, others)])
+
+    def _print_Mul(self, expression: Mul) -> str:
+        number, factors = expression.as_coeff_mul()
+        written = [self.parenthesize(factor, PRECEDENCE["Mul"]) for factor in factors]
+        if abs(number) != 1:
+            written.insert(0, self._print(abs(number)))
+        return ("-" if number < 0 else "") + self.times.join(written)
+
+    def _print_Function(self, expression: Function, **power: str) -> str:
+        return super()._print_Function(expression, **power).replace(" ", _FIXED)
+
+    def _print_Rational(self, number: Rational) -> str:
+        return ("-" if number < 0 else "") + decimal(abs(number))
+
+    _print_Integer = _print_Rational
+
+
+class Text(_AsBuilt, StrPrinter):
+    """As one types it: numbers as short decimals, else with twelve digits."""
+
+
+class Latex(_AsBuilt, LatexPrinter):
+    r"""For a formula of LaTeX's, with brackets that unlike \left( may stand on different lines."""
+
+    times = rf"{_FIXED}\,{_FIXED}"
+
+    def _add_parens(self, text: str) -> str:
+        return rf"\bigl({text}\bigr)"
+
+    def _print_Symbol(self, symbol: Symbol, style: str = "plain") -> str:
+        """``Izz1R`` as I with the index zz,1R."""
+        letter, axes, place = re.findall(r"(.)([a-z]*)(.*)", symbol.name)[0]
+        return f"{letter}_{{{axes}{',' if axes else ''}{place}}}" if place else letter
+
+    def _print_Rational(self, number: Rational) -> str:
+        mantissa, _, exponent = super()._print_Rational(number).partition("e")
+        mantissa = re.sub(r"(\d+)/(\d+)", r"\\tfrac{\1}{\2}", mantissa)
+        return rf"{mantissa} \cdot 10^{{{int(exponent)}}}" if exponent else mantissa
+
+    _print_Integer = _print_Rational
+
+
+class Python(_AsBuilt, StrPrinter):
+    """Python that SymPy evaluates exactly: fractions as they are, unless they have more digits than a double."""
+
+    def _print_Add(self, expression: Add, order: str | None = None) -> str:
+        """A long sum in one call, since Python cannot nest thousands of additions."""
+        if len(expression.args) <= _LONG_SUM:
+            return super()._print_Add(expression)
+        return f"Add({', '.join(map(self._print, expression.args))})"
+
+    def _print_Rational(self, number: Rational) -> str:
+        short = max(abs(number.p), number.q) < _DOUBLE
+        return f"Rational({number.p}, {number.q})" if short else f"Float({float(number)!r})"
+
+    def _print_Integer(self, number: Integer) -> str:
+        return str(number.p)
+
+
+@cache
+def decimal(value: Rational) -> str:
+    """A positive number: an exact decimal or a small fraction where it is one, else twelve digits."""
+    short = f"{float(value):.12g}"
+    return short if Rational(short) == value or value.q > 16 else f"{value.p}/{value.q}"
