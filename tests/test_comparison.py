@@ -1,4 +1,4 @@
-"""A comparison in small: same data for every preset, measures that can fail, resumption, tables beside published figures."""
+"""A comparison in small: same data for every preset, measures that can fail, tables beside published figures."""
 
 import json
 import math
