@@ -5,9 +5,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from spelgen.building import build
 from spelgen.emission.loading import load_module
 from spelgen.errors import ModuleError
 
+ROBOTS = Path(__file__).parents[1] / "robots"
 STAND_IN = Path(__file__).parent / "stand_in.py"
 
 
@@ -58,3 +60,13 @@ def test_two_modules_of_the_same_name_do_not_meet(tmp_path):
     models = [load_module(tmp_path / folder / "module.py") for folder in ("a", "b")]
     assert [model.n for model in models] == [3, 4]
     assert not list(tmp_path.rglob("__pycache__"))
+
+
+def test_a_model_is_shown_in_a_line_and_as_its_structure():
+    model = build(ROBOTS / "rpr.urdf")
+    count = sum(parameter.numel() for parameter in model.parameters())
+    assert repr(model) == f"<Model of 'rpr' (minimal, mlp): 3 joints, {count} parameters>"
+    assert "2,3\n    3    C\n    2,3  .    C" in model._repr_html_()
+    assert repr(build(ROBOTS / "rpr.urdf", preset="closed-form")).startswith(
+        "<Model of 'rpr' (closed-form): "
+    )

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import linecache
 import sys
+from html import escape
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, cast
@@ -12,6 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 import torch
 
 from spelgen.errors import ModuleError
+from spelgen.labels import printable
 from spelgen.spec import Facts, parse_facts, read_source
 
 METHODS = (
@@ -79,6 +82,20 @@ def load_module(module: str | Path, *, seed: int = 0) -> EmittedModel:
     missing = [name for name in ("n", "joint_names", "joint_types", *METHODS) if not hasattr(model, name)]
     if missing or not isinstance(model, torch.nn.Module):
         raise ModuleError(f"a class Model without {', '.join(missing)}", file=file, expected=_EXPECTED)
+    # how a notebook shows it is no matter of the module, which stands alone
+    code.Model.__repr__, code.Model._repr_html_ = _summary, _page
     emitted = cast("EmittedModel", model)
     emitted.source, emitted.facts = source, facts
     return emitted
+
+
+def _summary(model: EmittedModel) -> str:
+    count = sum(parameter.numel() for parameter in model.parameters())
+    options = model.facts.options
+    made = options.preset + (f", {options.net}" if options.net in ("mlp", "kan") else "")
+    return f"<Model of {printable(model.facts.robot)!r} ({made}): {model.n} joints, {count} parameters>"
+
+
+def _page(model: EmittedModel) -> str:
+    """The module's docstring: what M is made of, and the joints."""
+    return f"<pre>{escape(ast.get_docstring(ast.parse(model.source)) or '')}</pre>"
