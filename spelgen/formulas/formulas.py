@@ -62,9 +62,7 @@ class Formula:
     @property
     def omission(self) -> str:
         """Why it is not written out."""
-        return (
-            "too many terms to be expanded" if self.terms is None else f"{self.terms} terms, not written out"
-        )
+        return f"{self.terms} terms, not written out" if self.terms else "too many terms to be expanded"
 
 
 @dataclass(frozen=True, repr=False)
@@ -112,10 +110,12 @@ class Formulas:
         """What each parameter in the expressions is the sum of, by body: m a mass [kg], h = m c a first moment
         [kg m] and I a tensor [kg m2] about the joint's origin, in a frame whose z is the joint's axis.
         """
-        sums = [
-            {(parameter(parameter_name(i)),): _rational(x) for i, x in each.weights} for each in self.base
-        ]
-        return {parameter(each.name): expression(terms) for each, terms in zip(self.base, sums, strict=True)}
+        return {
+            parameter(each.name): expression(
+                {(parameter(parameter_name(index)),): _rational(share) for index, share in each.weights}
+            )
+            for each in self.base
+        }
 
     @property
     def values(self) -> dict[Symbol, Rational]:
@@ -134,7 +134,7 @@ class Formulas:
         return tuple(each for each in self.rows if each.expression is None)
 
     def __repr__(self) -> str:
-        written = len(self.rows) - len(self.unwritten)
+        written = sum(each.expression is not None for each in self.rows)
         return f"<Formulas of {self.arm.name!r}: {written} written, in {len(self.base)} base parameters>"
 
     def _repr_html_(self) -> str:
@@ -156,6 +156,8 @@ def formulas(
     """
     n = len(arm.coordinates)
     order: list[Place] = [*triangle(n), None] if entry is None else [_place(n, entry)]
+    if longest is None:
+        longest = READABLE if entry is None else WRITABLE
     base = base_parameters(arm, structure.base_parameter_count)
     if structure.assume == "inertials":
         base = tuple(each for each in base if each.value)
@@ -172,13 +174,18 @@ def formulas(
         else:
             if structure.assume == "inertials":
                 polynomials = _at_urdf_values(expansion.context, polynomials)
-            found[place] = _formula(
-                shortener, place, polynomials, longest or (WRITABLE if entry else READABLE)
-            )
+            found[place] = _formula(shortener, place, polynomials, longest)
         left -= before - budget.left
-    if entry and (told := found[order[0]].expression) is not None:
-        base = tuple(each for each in base if parameter(each.name) in told.free_symbols)
-    return Formulas(arm, structure.assume, base, tuple(found[place] for place in order))
+    rows = tuple(found[place] for place in order)
+    if entry:
+        told = {
+            symbol.name
+            for each in rows
+            if each.expression is not None
+            for symbol in each.expression.free_symbols
+        }
+        base = tuple(each for each in base if each.name in told)
+    return Formulas(arm, structure.assume, base, rows)
 
 
 def _place(n: int, entry: Entry) -> Place:
