@@ -38,7 +38,6 @@ class MassPrepared(NamedTuple):
 
     layers: Any  # of the network
     series: Tensor | None  # takes Fourier features to M
-    least: Tensor  # M above this needs no shift
 
 
 class MassResiduals(NamedTuple):
@@ -52,7 +51,7 @@ class DerivedMass(nn.Module):
     """M(q), (..., n, n), with ``entries`` saying where functions and constants stand.
 
     A constant starts at the first of its two numbers, and is trained in units of the second. Where
-    M would not exceed armature + margin * its nominal mean, that mean is added (see
+    M would not exceed margin * its nominal mean, that mean is added (see
     PositiveDefiniteShift): M is positive definite for all q and all weights.
     """
 
@@ -74,7 +73,7 @@ class DerivedMass(nn.Module):
         sensitivity: Sequence[float] = (),
     ) -> None:
         super().__init__()
-        self.n, self.margin = joints.n, margin
+        self.n = joints.n
         start = vector(first for first, _ in constants)
         by_function, by_constant = entry_basis(entries, len(functions), len(constants))
         self.register_buffer("constant_scale", vector(unit for _, unit in constants))
@@ -83,7 +82,7 @@ class DerivedMass(nn.Module):
         self.register_buffer("function_scale", vector(each.scale for each in functions))
         self.register_buffer("function_basis", by_function)
         mean = start @ self.constant_basis + self.function_mean @ self.function_basis
-        self.shift = PositiveDefiniteShift(self._square(mean))
+        self.shift = PositiveDefiniteShift(self._square(mean), margin)
         self.raw_constants = nn.Parameter(start / self.constant_scale)
         self.network = network
         self.series: FourierSeries | None = None
@@ -107,7 +106,6 @@ class DerivedMass(nn.Module):
         return MassPrepared(
             layers=self.network.prepare(output_map, constant),
             series=None if self.series is None else self.series.prepare(output_map),
-            least=(armature + self.margin * self.shift.matrix).detach(),
         )
 
     def _square(self, rows: Tensor) -> Tensor:
@@ -119,7 +117,7 @@ class DerivedMass(nn.Module):
         rows, residuals = self.network(at.encoded, prepared.layers)
         if at.fourier is not None and prepared.series is not None:
             rows = rows + F.linear(at.fourier, prepared.series)
-        mass = self.shift(self._square(rows), prepared.least)
+        mass = self.shift(self._square(rows))
         return mass, MassResiduals(residuals, prepared.series)
 
     def kinetic_vjp(

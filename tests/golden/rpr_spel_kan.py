@@ -281,28 +281,30 @@ def entry_basis(entries: Entries, functions: int, constants: int) -> tuple[Tenso
 
 
 class PositiveDefiniteShift(nn.Module):
-    """Adds a multiple s >= 0 of a positive definite matrix C that makes S + s C positive definite.
+    """Adds a multiple s >= 0 of a positive definite matrix C that makes M positive definite.
 
-    s = 0 wherever S is positive definite already. Elsewhere s = 2^k, the first power of two above
-    2 |S| / (least eigenvalue of C), both with C's diagonal scaled to one: s is constant in pieces, so
-    that derivatives of S are derivatives of S + s C. C has S's own zeros and linear relations,
-    which therefore hold in the sum.
+    s = 0 wherever S = M - margin C is positive definite. Elsewhere s = 2^k, the first power of two
+    above 2 |S| / (least eigenvalue of C), both with C's diagonal scaled to one: s is constant in
+    pieces, so that derivatives of M are derivatives of M + s C. C has M's own zeros and linear
+    relations, which therefore hold in the sum.
     """
 
     matrix: Tensor  # C
+    least: Tensor  # margin C
     unit: Tensor  # what scales C's diagonal to one, times 2 / least eigenvalue
 
-    def __init__(self, matrix: Tensor) -> None:
+    def __init__(self, matrix: Tensor, margin: float) -> None:
         super().__init__()
         scale = matrix.diagonal().rsqrt()
         scaled = scale.unsqueeze(-1) * matrix * scale
         least = torch.linalg.eigvalsh(scaled)[0]
         self.register_buffer("matrix", matrix)
+        self.register_buffer("least", margin * matrix)
         self.register_buffer("unit", 2 / least * scale.unsqueeze(-1) * scale)
 
-    def forward(self, mass: Tensor, least: Tensor) -> Tensor:
-        """mass + s C, (..., n, n), for S = mass - least."""
-        excess = mass.detach() - least
+    def forward(self, mass: Tensor) -> Tensor:
+        """M + s C, (..., n, n)."""
+        excess = mass.detach() - self.least
         indefinite = torch.linalg.cholesky_ex(excess).info != 0
         size = torch.linalg.vector_norm(self.unit * excess, dim=(-2, -1))
         shift = torch.where(indefinite, torch.exp2(torch.ceil(torch.log2(size))), 0.0)
@@ -991,7 +993,6 @@ class MassPrepared(NamedTuple):
 
     layers: Any  # of the network
     series: Tensor | None  # takes Fourier features to M
-    least: Tensor  # M above this needs no shift
 
 
 class MassResiduals(NamedTuple):
@@ -1005,7 +1006,7 @@ class DerivedMass(nn.Module):
     """M(q), (..., n, n), with ``entries`` saying where functions and constants stand.
 
     A constant starts at the first of its two numbers, and is trained in units of the second. Where
-    M would not exceed armature + margin * its nominal mean, that mean is added (see
+    M would not exceed margin * its nominal mean, that mean is added (see
     PositiveDefiniteShift): M is positive definite for all q and all weights.
     """
 
@@ -1027,7 +1028,7 @@ class DerivedMass(nn.Module):
         sensitivity: Sequence[float] = (),
     ) -> None:
         super().__init__()
-        self.n, self.margin = joints.n, margin
+        self.n = joints.n
         start = vector(first for first, _ in constants)
         by_function, by_constant = entry_basis(entries, len(functions), len(constants))
         self.register_buffer("constant_scale", vector(unit for _, unit in constants))
@@ -1036,7 +1037,7 @@ class DerivedMass(nn.Module):
         self.register_buffer("function_scale", vector(each.scale for each in functions))
         self.register_buffer("function_basis", by_function)
         mean = start @ self.constant_basis + self.function_mean @ self.function_basis
-        self.shift = PositiveDefiniteShift(self._square(mean))
+        self.shift = PositiveDefiniteShift(self._square(mean), margin)
         self.raw_constants = nn.Parameter(start / self.constant_scale)
         self.network = network
         self.series: FourierSeries | None = None
@@ -1060,7 +1061,6 @@ class DerivedMass(nn.Module):
         return MassPrepared(
             layers=self.network.prepare(output_map, constant),
             series=None if self.series is None else self.series.prepare(output_map),
-            least=(armature + self.margin * self.shift.matrix).detach(),
         )
 
     def _square(self, rows: Tensor) -> Tensor:
@@ -1072,7 +1072,7 @@ class DerivedMass(nn.Module):
         rows, residuals = self.network(at.encoded, prepared.layers)
         if at.fourier is not None and prepared.series is not None:
             rows = rows + F.linear(at.fourier, prepared.series)
-        mass = self.shift(self._square(rows), prepared.least)
+        mass = self.shift(self._square(rows))
         return mass, MassResiduals(residuals, prepared.series)
 
     def kinetic_vjp(
