@@ -33,9 +33,10 @@ DECIMATION = (
 ALIKE = 20.0  # of those: so many in a row, 0.4 s, err alike and count once
 ROUNDS = 6  # of weighing joints by what is left of their torque
 STEPS = 8  # at most in a round
-LARGE = 2**17  # samples; of more, FEW of them are fitted first
+LARGE = 2**15  # samples; of more, FEW of them are fitted first
 FEW, LAST_ROUNDS = 2**14, 2
 GAIN = 1e-4  # relative: a step that gains less ends a round
+NO_GAIN = 1e-10  # likewise: a step that promises less is not tried
 FIRST_NOISE = 0.1  # of a joint's torque range
 LEAST_NOISE = 1e-4  # likewise: noise-free samples are fitted to four digits of their torque's range
 DAMPING = (1e-9, 1e-3, 1e6)  # of the steps, relative to the curvature: least, first, most
@@ -86,7 +87,7 @@ def fit_torque(
     else:  # few of many samples come near, all of them finish
         few = _Problem(TorqueJacobian(model, samples.thinned(FEW)), prior, only_bodies)
         near, first = few.solve(few.start, ALIKE**0.5 * FIRST_NOISE * few.range, ROUNDS)
-        at, steps = problem.solve(near.x, few.noise(near.squares), LAST_ROUNDS)
+        at, steps = problem.solve(near.x, few.noise(near.squares), LAST_ROUNDS, near.damping)
         steps += first
     problem.jacobian.write(at.x)
     return TorqueSolution((at.squares / samples.count).sqrt().numpy(), steps, at.cost)
@@ -103,9 +104,11 @@ class _Problem:
         deviation = jacobian.torque_deviation()
         self.range = torch.maximum(deviation, 1e-3 * deviation.max())
 
-    def solve(self, x: torch.Tensor, noise: torch.Tensor, rounds: int) -> tuple[_Step, int]:
+    def solve(
+        self, x: torch.Tensor, noise: torch.Tensor, rounds: int, damping: float = DAMPING[1]
+    ) -> tuple[_Step, int]:
         """Steps down from x, and how many; the noise (n,) is found anew after each round."""
-        at, steps = _Step(x, self.jacobian.squares(x), float("inf"), DAMPING[1]), 0
+        at, steps = _Step(x, self.jacobian.squares(x), float("inf"), damping), 0
         for _ in range(rounds):
             at = _Step(at.x, at.squares, self.cost(at.x, at.squares, noise), at.damping)
             for _ in range(STEPS):
@@ -135,7 +138,10 @@ class _Problem:
         while damping < DAMPING[2]:
             damped = curvature + damping * torch.diag(curvature.diagonal())
             moved = at.x.clone()
-            moved[self.free] += torch.linalg.solve(damped, target)
+            step = torch.linalg.solve(damped, target)
+            if step @ (target - curvature @ step / 2) < NO_GAIN * at.cost:
+                return None
+            moved[self.free] += step
             squares = self.jacobian.squares(moved)
             lower = self.cost(moved, squares, noise)
             if lower < at.cost:
