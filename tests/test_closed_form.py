@@ -56,10 +56,10 @@ def drawn(module, seed, deviation=0.5):
 
 
 def rigid(module):
-    """The untrained model without friction and rotors."""
+    """The untrained model without friction and armature."""
     model = module.Model()
-    model.rotor_size.zero_()
-    model.friction.size.zero_()
+    model.dynamics.armature.nominal.zero_()
+    model.dynamics.friction.nominal.zero_()
     return model.requires_grad_(False)
 
 
@@ -92,7 +92,7 @@ def test_untrained_it_is_the_urdfs_rigid_arm(emitted, robots, robot):
     each = list(zip(q.numpy(), qd.numpy(), qdd.numpy(), strict=True))
     tau = torch.from_numpy(np.array([pin.rnea(other, data, *x) for x in each]))
     near(model.inverse_dynamics(q, qd, qdd), tau, 1e-8)
-    near(model.regressor(q, qd, qdd) @ model.inertial_parameters().flatten(), tau, 1e-8)
+    near(model.dynamics.regressor(q, qd, qdd) @ model.inertial_parameters.flatten(), tau, 1e-8)
     height = torch.from_numpy(np.array([pin.computePotentialEnergy(other, data, x) for x in q.numpy()]))
     near(model.potential_energy(q) - model.potential_energy(q[:1]), height - height[0], 1e-8)
 
@@ -110,7 +110,7 @@ def test_joints_that_follow_and_joints_that_slide(emitted):
 
 def test_impossible_bodies_start_from_possible_ones(emitted):
     module, _ = emitted["rpr"]
-    ten = module.Model().inertial_parameters().detach().numpy()
+    ten = module.Model().inertial_parameters.detach().numpy()
     assert (np.linalg.eigvalsh(pseudo_inertia(ten))[:, 0] > 0).all()
 
 
@@ -124,9 +124,9 @@ def test_the_equations_are_those_of_its_hamiltonian(emitted, robot):
     (gravity,) = torch.autograd.grad(model.potential_energy(q).sum(), q)
     q = q.detach()
     near(model.gravity(q), gravity)
-    rate, force = model.rates(q, p, tau, model.prepare())
+    rate, force = model.port_hamiltonian_rhs(q, p, tau, model.prepare())
     near(rate, qd)
-    given = (model.input_matrix(q) @ (tau - model.torque_offset()).unsqueeze(-1)).squeeze(-1)
+    given = (model.input_matrix(q) @ (tau - model.torque_offset).unsqueeze(-1)).squeeze(-1)
     near(force, given - slope - (model.dissipation(q, qd) @ qd.unsqueeze(-1)).squeeze(-1))
     qdd = model.forward_dynamics(q, qd, tau)
     near(model.inverse_dynamics(q, qd, qdd), tau, 1e-8)
@@ -139,7 +139,7 @@ def test_possible_bodies_and_resisting_friction_for_all_weights(emitted, robot):
     for seed in range(3):
         model = drawn(emitted[robot][0], seed=seed, deviation=1.5).requires_grad_(False)
         q, qd, _, _ = states(model.n, 300, seed)
-        pseudo = pseudo_inertia(model.inertial_parameters().numpy())
+        pseudo = pseudo_inertia(model.inertial_parameters.numpy())
         assert (np.linalg.eigvalsh(pseudo)[:, 0] > 0).all()
         assert torch.linalg.eigvalsh(model.mass_matrix(q))[:, 0].min() > 0
         assert model.dissipation(q, 1e-3 * qd).diagonal(dim1=-2, dim2=-1).min() > 0
@@ -153,7 +153,7 @@ def test_any_batch_shape(emitted, batch):
         assert value.shape == (*batch, 3)
     for value in (model.mass_matrix(q), model.dissipation(q, qd), model.input_matrix(q)):
         assert value.shape == (*batch, 3, 3)
-    assert model.regressor(q, qd, tau).shape == (*batch, 3, 30)
+    assert model.dynamics.regressor(q, qd, tau).shape == (*batch, 3, 30)
     assert model.potential_energy(q).shape == batch
     assert model(torch.zeros(()), torch.cat([q, qd, tau], dim=-1)).shape == (*batch, 9)
 
@@ -169,16 +169,17 @@ def test_backpropagation_reaches_every_weight(emitted):
 def test_friction_at_a_standstill_has_its_slope(emitted):
     model = drawn(emitted["ur10e"][0], seed=0)
     q = states(6)[0]
-    constants = model.friction.prepared()
+    constants = model.dynamics.friction.prepare()
     still = torch.zeros_like(q).requires_grad_()
-    (slope,) = torch.autograd.grad(model.friction(still, model.gravity(q), constants).sum(), still)
+    (slope,) = torch.autograd.grad(model.dynamics.friction(still, model.gravity(q), constants).sum(), still)
     near(slope, model.dissipation(q, still).diagonal(dim1=-2, dim2=-1))
     away = torch.full_like(q, 1e-3)  # where the formula is another branch
-    torque = model.friction(away, model.gravity(q), constants)
-    dry = constants.coulomb + constants.load * model.gravity(q).abs()
-    dry = dry + constants.stribeck * (-((away / constants.fading) ** 2)).exp()
-    bend = constants.bend * (away / constants.bend_speed).tanh()
-    near(torque, constants.viscous * away + bend + dry * (away / constants.jump).tanh())
+    torque = model.dynamics.friction(away, model.gravity(q), constants)
+    dry = constants.coulomb + constants.load_dependence * model.gravity(q).abs()
+    dry = dry + constants.stribeck * (-((away / constants.stribeck_velocity) ** 2)).exp()
+    saturating = constants.saturation * (away / constants.saturation_velocity).tanh()
+    dry = dry * (away / constants.coulomb_smoothing_velocity).tanh()
+    near(torque, constants.viscous * away + saturating + dry)
 
 
 def test_it_has_no_network_to_choose(robots, tmp_path):

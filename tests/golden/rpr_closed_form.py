@@ -847,10 +847,9 @@ class RigidBodyDynamics(PortHamiltonian):
         turned = applied(self._cross(self._by_body(twists)).mT, momenta)
         return applied(at.twists, wrenches - turned.flatten(-2))
 
-    @staticmethod
-    def _by_body(rows: Tensor) -> Tensor:
+    def _by_body(self, rows: Tensor) -> Tensor:
         """(..., 6 bodies) as (..., bodies, 6)."""
-        return rows.reshape(*rows.shape[:-1], -1, 6)
+        return rows.reshape(*rows.shape[:-1], len(self.parents), 6)
 
     def _cross(self, twist: Tensor) -> Tensor:
         """What a frame with this twist makes of a constant twist in it, (..., 6, 6)."""
