@@ -9,7 +9,7 @@ import re
 import textwrap
 from functools import cache
 
-from sympy import Add, Expr, Function, Integer, Mul, Rational, Symbol
+from sympy import Add, Expr, Function, Mul, Rational, Symbol
 from sympy.printing.latex import LatexPrinter
 from sympy.printing.precedence import PRECEDENCE
 from sympy.printing.printer import Printer
@@ -40,13 +40,9 @@ class _AsBuilt(Printer):
             room = width - len(indent if pieces else start)
             pieces.append(text if len(text) > room else text.replace(" ", _FIXED))
         lines = textwrap.wrap(
-            " ".join(pieces) + end,
-            width,
-            initial_indent=start,
-            subsequent_indent=indent,
-            break_long_words=False,
-            break_on_hyphens=False,
-        )
+            " ".join(pieces) + end, width, initial_indent=start, subsequent_indent=indent,
+            break_long_words=False, break_on_hyphens=False,
+        )  # fmt: skip
         return [line.replace(_FIXED, " ") for line in lines]
 
     def _signed(self, text: str) -> str:
@@ -107,11 +103,12 @@ class Python(_AsBuilt, StrPrinter):
         return f"Add({', '.join(map(self._print, expression.args))})"
 
     def _print_Rational(self, number: Rational) -> str:
+        if number.q == 1:
+            return str(number.p)
         short = max(abs(number.p), number.q) < _DOUBLE
         return f"Rational({number.p}, {number.q})" if short else f"Float({float(number)!r})"
 
-    def _print_Integer(self, number: Integer) -> str:
-        return str(number.p)
+    _print_Integer = _print_Rational
 
 
 @cache

@@ -28,17 +28,12 @@ def parameter(name: str) -> Symbol:
     return Symbol(name, real=True)
 
 
-def number(value: fmpq) -> Rational:
-    """The number in SymPy."""
-    return Rational(int(value.p), int(value.q))
-
-
 def expression(terms: Terms) -> Expr:
     """The sum as it stands."""
-    products = [
-        Mul(*([] if value == 1 and factors else [number(value)]), *factors, evaluate=False)
-        for factors, value in terms.items()
-    ]
+    products = []
+    for factors, value in terms.items():
+        before = [] if value == 1 and factors else [Rational(int(value.p), int(value.q))]
+        products.append(Mul(*before, *factors, evaluate=False))
     return Add(*products, evaluate=False)
 
 
@@ -52,19 +47,18 @@ def length(terms: Terms) -> float:
 
 @lru_cache(4096)
 def _length(part: Expr) -> float:
-    if part.is_Number:
-        return 0.7
-    if part.is_Symbol:
-        return 1.0
+    if part.is_Number or part.is_Symbol:
+        return 0.7 if part.is_Number else 1.0
     if part.is_Pow:
         return 0.3 + _length(part.base)
     if part.is_Add:
         return 0.3 + sum(0.3 + _length(term) for term in part.args)
     if part.is_Mul:
         return sum(_length(factor) for factor in part.args if factor != -1)
-    return 0.5 + sum(
-        0.5 if term.is_Symbol or (-term).is_Symbol else 0.75 for term in Add.make_args(part.args[0])
-    )
+    multiples = [
+        term.as_coeff_Mul()[0] for term in Add.make_args(part.args[0])
+    ]  # of a cosine's or sine's angle
+    return 0.5 + sum(0.5 if abs(multiple) == 1 else 0.75 for multiple in multiples)
 
 
 @lru_cache(4096)
