@@ -48,7 +48,8 @@ def main() -> None:
         print(f"log: {size / 1e9:.2f} GB of numbers, written in {time.monotonic() - since:.0f} s")
         source = generate(URDF, preset=chosen.preset, width=32)
         (folder / "module.py").write_text(source, encoding="utf-8")
-        command = ["train", "module.py", "--data", "train.parquet", "-o", "run", "--quiet", "--robot", str(URDF)]
+        command = ["train", "module.py", "--data", "train.parquet", "-o", "run", "--quiet"]
+        command += ["--robot", str(URDF)]
         if chosen.preset != "closed-form":
             command += ["--epochs", str(chosen.epochs), "--momentum-steps", "200", "--urdf-weight", "0"]
         since = time.monotonic()
