@@ -2,12 +2,15 @@
 
 Six joints, 256 windows of 5 samples, hidden layers of 64 units, rk4 with one step from sample to sample, forward
 and backward (the update of the weights is left out). Medians of repeats, taken in turns in one run, on one thread.
+"bound" is the part of a step that keeps M positive definite: what the step gains where M is taken as it comes.
 PHNODE as published gets its windows in four parts: in one its graph needs 9 GB and takes as long. Then the same
 presets with their right-hand side compiled, each with a cold cache; what compiling costs, in s.
 """
 
 from __future__ import annotations
 
+import copy
+import math
 import os
 import shutil
 import statistics
@@ -16,7 +19,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from torch import Tensor, nn
@@ -26,21 +29,21 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from emitted import network_inputs
 from published_phnode import Published
 
+from spelgen.building import build
 from spelgen.fitting.compiled import Compiled
 from spelgen.fitting.rollout import position_difference
-from spelgen.fitting.run_folder import load_model
-from spelgen.pipeline import build
 
 if TYPE_CHECKING:
-    from spelgen.fitting.run_folder import EmittedModel
+    from spelgen.emission.loading import EmittedModel
 
 ROBOT = Path(__file__).parents[1] / "robots" / "six_dof.urdf"
-PRESETS = {
+PRESETS: dict[str, tuple[str, Literal["mlp", "kan"] | None]] = {
     "phnode": ("phnode", "mlp"),
     "spel": ("spel", "mlp"),
     "spel-kan": ("spel-kan", "kan"),
     "minimal": ("minimal", "mlp"),
     "minimal-kan": ("minimal", "kan"),
+    "closed-form": ("closed-form", None),
 }
 WIDTH, WINDOWS, SAMPLES, JOINTS, STEP = 64, 256, 5, 6, 0.02
 PARTS, REPEATS, SLOW_REPEATS = 4, 15, 3
@@ -69,14 +72,31 @@ def rk4(rate: Callable[..., tuple[Tensor, Tensor]], q: Tensor, p: Tensor) -> tup
     return q, p, k1[0]
 
 
-def training_step(model: nn.Module, data: Data) -> None:
+class Unbounded(nn.Module):
+    """Stands in for what keeps M positive definite: all of M as it comes."""
+
+    def forward(self, mass: Tensor) -> tuple[Tensor, Tensor]:
+        """M, and the part of it that is taken: one."""
+        return mass, mass.new_ones(mass.shape[:-2])
+
+
+def unbounded(model: EmittedModel) -> EmittedModel | None:
+    """The model with M as it comes; None where nothing is done to it."""
+    if not hasattr(getattr(model.dynamics, "mass", None), "bound"):
+        return None
+    plain = copy.deepcopy(model)
+    plain.dynamics.mass.bound = Unbounded()
+    return plain
+
+
+def training_step(model: EmittedModel, data: Data) -> None:
     """Loss of the windows, and its gradient: geodesic distance and velocity, as in eq. 8 of the paper."""
     model.zero_grad()
     prepared = model.prepare()
     q, p = data.q[:, 0], model.momentum(data.q[:, 0], data.qd[:, 0], prepared)
     positions, velocities = [], []
     for tau in data.tau.unbind(dim=1):
-        q, p, qd = rk4(lambda q, p, tau=tau: model.rates(q, p, tau, prepared), q, p)
+        q, p, qd = rk4(lambda q, p, tau=tau: model.port_hamiltonian_rhs(q, p, tau, prepared), q, p)
         positions.append(q)
         velocities.append(qd)
     velocities = [*velocities[1:], model.velocity(q, p, prepared)]
@@ -85,18 +105,21 @@ def training_step(model: nn.Module, data: Data) -> None:
     (distance.square().mean() + velocity.square().mean()).backward()
 
 
-def networks_alone(model: nn.Module, data: Data) -> None:
+def networks_alone(model: EmittedModel, data: Data) -> None:
     """The floor: each network forward and backward once for every evaluation in the step, and nothing else."""
     model.zero_grad()
-    prepared, q, qd = model.prepare(), data.q[:, 0], data.qd[:, 0]
+    dynamics, q, qd = model.dynamics, data.q[:, 0], data.qd[:, 0]
+    prepared = dynamics.prepare()
     total = torch.zeros((), dtype=torch.float64)
     for _ in range(4 * (SAMPLES - 1)):
         features = network_inputs(model, q).requires_grad_()
-        total = total + model.mass_network(features, prepared.mass)[0].sum()
-        total = total + model.potential_network(features, prepared.potential)[0].sum()
-        total = total + model.friction(features, qd, prepared.friction).sum()
-        if hasattr(model, "input_network"):
-            total = total + model.input_network(features, prepared.input)[0].sum()
+        total = (
+            total + dynamics.mass.network(features, getattr(prepared.mass, "layers", prepared.mass))[0].sum()
+        )
+        total = total + dynamics.potential.network(features, prepared.potential.layers)[0].sum()
+        total = total + dynamics.friction(features, qd, prepared.friction).sum()
+        if hasattr(dynamics.input, "network"):
+            total = total + dynamics.input.network(features, prepared.input)[0].sum()
     total.backward()
 
 
@@ -128,56 +151,62 @@ def seconds(work: Callable[[], None]) -> float:
     return time.perf_counter() - start
 
 
-def emitted_models() -> dict[str, EmittedModel]:
-    """The presets' models of the robot."""
-    with tempfile.TemporaryDirectory() as folder:
-        module, models = Path(folder) / "model.py", {}
-        for name, (preset, net) in PRESETS.items():
-            module.write_text(build(ROBOT, preset=preset, net=net, width=WIDTH), encoding="utf-8")
-            models[name] = load_model(module)
-        return models
-
-
-def sizes(model: nn.Module) -> str:
+def sizes(model: EmittedModel) -> str:
     """Outputs of the networks of M, D, G and V, and inputs of that of M."""
-    friction = getattr(model.friction, "network", None)
+    if not hasattr(model.dynamics, "mass"):
+        return ""
+    parts = (model.dynamics.mass, model.dynamics.friction, model.dynamics.input, model.dynamics.potential)
+    mass, friction, given, potential = (getattr(part, "network", None) for part in parts)
     outputs = (
-        len(model.mass_network.biases[-1]),
+        len(mass.biases[-1]),
         len(friction.biases[-1]) if friction else model.n,
-        len(model.input_network.biases[-1]) if hasattr(model, "input_network") else 0,
-        len(model.potential_network.biases[-1]),
+        len(given.biases[-1]) if given else 0,
+        len(potential.biases[-1]),
     )
-    return f"{' '.join(f'{count:4}' for count in outputs)} {model.mass_network.weights[0].shape[1]:7}"
+    return f"{' '.join(f'{count:4}' for count in outputs)} {mass.weights[0].shape[1]:7}"
+
+
+def median(times: list[float]) -> float:
+    """In seconds; nan where nothing was measured."""
+    return statistics.median(times or [math.nan])
 
 
 def main() -> None:
     """Print the table."""
     torch.set_num_threads(1)
     torch.manual_seed(0)
-    data, models = Data(WINDOWS), emitted_models()
-    steps: dict[str, list[float]] = {name: [] for name in models}
-    floors: dict[str, list[float]] = {name: [] for name in models}
+    data = Data(WINDOWS)
+    models = {name: build(ROBOT, preset, net=net, width=WIDTH) for name, (preset, net) in PRESETS.items()}
+    plain = {name: unbounded(model) for name, model in models.items()}
+    steps, floors, bare = ({name: list[float]() for name in models} for _ in range(3))
     for _ in range(REPEATS):
         for name, model in models.items():
             steps[name].append(seconds(lambda model=model: training_step(model, data)))
-            floors[name].append(seconds(lambda model=model: networks_alone(model, data)))
+            if (free := plain[name]) is not None:
+                bare[name].append(seconds(lambda model=free: training_step(model, data)))
+            if PRESETS[name][1] is not None:
+                floors[name].append(seconds(lambda model=model: networks_alone(model, data)))
     published = Published(JOINTS, WIDTH, WIDTH // 2)
-    slow = statistics.median(seconds(lambda: published_step(published, data)) for _ in range(SLOW_REPEATS))
+    slow = median([seconds(lambda: published_step(published, data)) for _ in range(SLOW_REPEATS)])
     count = sum(parameter.numel() for parameter in published.parameters())
     print(
-        f"{'':12}      step  networks alone  published /  phnode /  parameters  outputs: M    D    G    V  inputs"
+        f"{'':12}      step   bound  networks alone  published /  phnode /  parameters"
+        "  outputs: M    D    G    V  inputs"
     )
-    print(f"{'published':12} {1e3 * slow:6.0f} ms {1:29} {'':10} {count:11}")
-    fast = statistics.median(steps["phnode"])
+    print(f"{'published':12} {1e3 * slow:6.0f} ms {'':7} {1:29} {'':10} {count:11}")
+    fast = median(steps["phnode"])
     for name, model in models.items():
-        step, floor = statistics.median(steps[name]), statistics.median(floors[name])
+        step, floor = median(steps[name]), median(floors[name])
+        share = 1 - median([without / whole for without, whole in zip(bare[name], steps[name], strict=False)])
         count = sum(parameter.numel() for parameter in model.parameters())
+        bound = "" if math.isnan(share) else f"{share:.1%}"
+        alone = "" if math.isnan(floor) else f"{1e3 * floor:7.1f} ms {step / floor:4.1f}x"
         print(
-            f"{name:12} {1e3 * step:6.1f} ms {1e3 * floor:7.1f} ms {step / floor:4.1f}x {slow / step:11.0f}"
+            f"{name:12} {1e3 * step:6.1f} ms {bound:>7} {alone:16} {slow / step:12.0f}"
             f" {fast / step:10.1f} {count:11}       {sizes(model)}"
         )
     if shutil.which("g++"):
-        print_compiled(models, data, {name: statistics.median(times) for name, times in steps.items()})
+        print_compiled(models, data, {name: median(times) for name, times in steps.items()})
 
 
 def print_compiled(models: dict[str, EmittedModel], data: Data, plain: dict[str, float]) -> None:

@@ -100,14 +100,12 @@ def outputs_alone(network: nn.Module, encoded: torch.Tensor) -> torch.Tensor:
     return y
 
 
-def shifted(model: nn.Module, q: torch.Tensor) -> torch.Tensor:
+def bounded(model: nn.Module, q: torch.Tensor) -> torch.Tensor:
     """Where, (...), M would not be positive definite by itself."""
-    unit = model.dynamics.mass.shift.unit
-    whole, kept = model.mass_matrix(q), unit.clone()
-    unit.zero_()
-    plain = model.mass_matrix(q)
-    unit.copy_(kept)
-    return (whole != plain).flatten(-2).any(dim=-1)
+    prepared = model.prepare()
+    residuals = model.dynamics.mass_at(model.dynamics.configuration(q, prepared), prepared)[1]
+    part: torch.Tensor = residuals.part
+    return part < 1
 
 
 def frictionless(model: nn.Module) -> nn.Module:

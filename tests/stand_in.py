@@ -83,7 +83,7 @@ class Model(nn.Module):
     def forward_dynamics(self, q, qd, tau):
         return self.velocity(q, tau - self.inverse_dynamics(q, qd, torch.zeros_like(qd)))
 
-    def prepare(self):
+    def prepare(self, definite=True):
         return None
 
     def port_hamiltonian_rhs(self, q, p, tau, prepared):

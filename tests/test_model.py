@@ -10,6 +10,7 @@ import torch
 from emitted import (
     ROBOTS,
     SIX,
+    bounded,
     built,
     exact_model,
     frictionless,
@@ -18,7 +19,6 @@ from emitted import (
     outputs_alone,
     random_model,
     randomise,
-    shifted,
 )
 
 from spelgen.settings.settings import load_settings
@@ -70,10 +70,10 @@ def test_forward_and_inverse_dynamics_undo_each_other(robot, tmp_path):
     assert (back - tau).abs().max() < 1e-10 * tau.abs().max() * 100
 
 
-@pytest.mark.parametrize("deviation", [None, 1.0], ids=["plain", "shifted"])
+@pytest.mark.parametrize("deviation", [None, 1.0], ids=["plain", "bounded"])
 @pytest.mark.parametrize("robot", SIX)
 def test_written_out_derivatives_equal_autograd(robot, deviation, tmp_path):
-    """dV/dq, dH/dq and dM/dt, where M is positive definite by itself and where it is shifted."""
+    """dV/dq, dH/dq and dM/dt, where M is positive definite by itself and where it is bounded."""
     model = frictionless(random_model(robot, tmp_path, seed=4, deviation=deviation))
     n = model.n
     q, qd, _, _ = states(n, STATES)
@@ -108,12 +108,12 @@ def test_mass_matrix_is_positive_definite_for_any_weights(robot, tmp_path):
             q = 8 * torch.rand(10_000, model.n, dtype=torch.float64, generator=generator) - 4
             mass = model.mass_matrix(q)
             assert torch.linalg.eigvalsh(mass)[:, 0].min() > 0
-            needed += shifted(model, q).any().item()
-    assert needed > 50, "the draws were to need the shift"
+            needed += bounded(model, q).any().item()
+    assert needed > 50, "the draws were to need the bound"
 
 
 @pytest.mark.parametrize("robot", SIX)
-def test_shift_keeps_zeros_and_relations_and_is_nothing_at_nominal_values(robot, tmp_path):
+def test_bound_keeps_zeros_and_relations_and_is_nothing_at_nominal_values(robot, tmp_path):
     model = random_model(robot, tmp_path, seed=1, deviation=3.0)
     structure = built(robot)[1]
     q = states(model.n, 200)[0]
@@ -127,7 +127,7 @@ def test_shift_keeps_zeros_and_relations_and_is_nothing_at_nominal_values(robot,
     residual = mass.flatten(1) - mass.flatten(1) @ torch.linalg.pinv(basis) @ basis
     assert residual.abs().max() < 1e-9 * mass.abs().max()
     nominal = exact_model(robot, tmp_path)
-    assert not shifted(nominal, q).any()
+    assert not bounded(nominal, q).any()
 
 
 @pytest.mark.parametrize("robot", SIX)

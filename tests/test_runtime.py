@@ -19,7 +19,7 @@ from spelgen.runtime.joints import Joints
 from spelgen.runtime.masked_kan import MaskedKAN
 from spelgen.runtime.masked_mlp import MaskedMLP
 from spelgen.runtime.network import unit_joints
-from spelgen.runtime.regularisation import PositiveDefiniteShift
+from spelgen.runtime.regularisation import PositiveDefiniteBound
 from spelgen.runtime.rigid_body import Bodies, InertialParameters, pseudo_inertia
 from spelgen.runtime.symmetric import entry_basis, symmetric
 
@@ -134,21 +134,24 @@ def test_entries_of_a_symmetric_matrix_and_their_basis():
     near(matrix.flatten(1), f @ by_function + c @ by_constant)
 
 
-def test_shift_leaves_what_is_positive_definite_and_mends_what_is_not():
+def test_bound_leaves_what_is_positive_definite_and_mends_what_is_not():
     center = torch.diag(torch.tensor([5.0, 1.0, 1e-3], dtype=torch.float64))
-    shift = PositiveDefiniteShift(center, 1e-6)
+    bound = PositiveDefiniteBound(center, 1e-3)
     root = draw(500, 3, 3)
-    definite = root @ root.mT + 1e-5 * torch.eye(3)
-    assert torch.equal(shift(definite), definite)
-    for size in (1e-12, 1.0, 1e12):
+    definite = root @ root.mT + 2e-3 * center
+    kept, part = bound(definite)
+    assert torch.equal(kept, definite)
+    assert (part == 1).all()
+    for size in (1e-6, 1.0, 1e12):
         broken = size * (root + root.mT)
         broken = broken[torch.linalg.eigvalsh(broken)[:, 0] < 0]
-        mended = shift(broken)
+        mended, part = bound(broken)
         assert len(broken) > 400
-        assert (torch.linalg.eigvalsh(mended)[:, 0] > 0).all()
-        away = mended - broken
-        share = away[:, 0, 0] / center[0, 0]
-        near(away / share[:, None, None], center.expand_as(away), 1e-6)
+        assert (part <= 0.5).all()
+        near(mended, center + part[:, None, None] * (broken - center), 1e-12)
+        root_center = center.diagonal().rsqrt()
+        relative = root_center[:, None] * mended * root_center
+        assert torch.linalg.eigvalsh(relative)[:, 0].min() >= 1e-3
 
 
 def test_bodies_are_possible_for_all_weights():

@@ -102,7 +102,7 @@ class Oscillator:
     def velocity(self, q, p, prepared=None):
         return p
 
-    def prepare(self):
+    def prepare(self, definite=True):
         return None
 
     def port_hamiltonian_rhs(self, q, p, tau, prepared):

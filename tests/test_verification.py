@@ -67,8 +67,14 @@ LIES = {
     ),
     "no gravity": (lambda s: replace(s, potential=()), "V|potential"),
     "gravity on a level joint": (lambda s: replace(s, potential=(0, *s.potential)), "V|potential"),
-    "a base parameter too few": (lambda s: replace(s, base_parameter_count=s.base_parameter_count - 1), "base"),
-    "a base parameter too many": (lambda s: replace(s, base_parameter_count=s.base_parameter_count + 1), "base"),
+    "a base parameter too few": (
+        lambda s: replace(s, base_parameter_count=s.base_parameter_count - 1),
+        "base",
+    ),
+    "a base parameter too many": (
+        lambda s: replace(s, base_parameter_count=s.base_parameter_count + 1),
+        "base",
+    ),
 }
 
 

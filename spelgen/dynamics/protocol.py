@@ -45,7 +45,7 @@ class PortHamiltonianDynamics(RigidDynamics, Protocol):
     ``prepared`` is what ``prepare`` gave: all that depends on the weights alone.
     """
 
-    def prepare(self) -> Any:
+    def prepare(self, definite: bool = True) -> Any:
         """What many evaluations with the same weights share."""
 
     def momentum(self, q: Tensor, qd: Tensor, prepared: Any = None) -> Tensor:
@@ -66,7 +66,7 @@ class VelocityState:
     def __init__(self, dynamics: RigidDynamics) -> None:
         self.dynamics = dynamics
 
-    def prepare(self) -> None:
+    def prepare(self, definite: bool = True) -> None:
         """Nothing."""
 
     def momentum(self, q: Tensor, qd: Tensor, prepared: None = None) -> Tensor:

@@ -39,10 +39,10 @@ class Compiled:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._model, name)
 
-    def prepare(self) -> Any:
+    def prepare(self, definite: bool = True) -> Any:
         """As the model's. Called once a step, so that CUDA graphs know when the last one's memory is free."""
         torch.compiler.cudagraph_mark_step_begin()
-        return self._model.prepare()
+        return self._model.prepare(definite)
 
     def port_hamiltonian_rhs(
         self, q: torch.Tensor, p: torch.Tensor, tau: torch.Tensor | None, prepared: Any

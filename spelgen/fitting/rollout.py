@@ -144,7 +144,8 @@ def momentum_loss(model: EmittedModel, windows: Windows, scales: LossScales) -> 
     torque would count less.)
     """
     q, qd = windows.q, windows.qd  # (W, K, n)
-    prepared = model.prepare()
+    # velocities are measured, so M need not be positive definite on the way; kept so, descent stops where it is not
+    prepared = model.prepare(definite=False)
     p = model.momentum(q, qd, prepared)
     force = model.port_hamiltonian_rhs(q, p, None, prepared)[1]
     dt = windows.dt.unsqueeze(-1)

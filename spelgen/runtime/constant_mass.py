@@ -36,7 +36,7 @@ class ConstantMass(nn.Module):
         """The constants of M, (constants,), in their units."""
         return self.constant_scale * (self.raw_constants.abs() + 1e-6)
 
-    def prepare(self) -> Tensor:
+    def prepare(self, definite: bool = True) -> Tensor:
         """M, (n, n)."""
         rows = self.constants() @ self.constant_basis
         return rows.reshape(self.n, self.n) + torch.diag(self.armature())

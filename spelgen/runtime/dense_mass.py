@@ -68,7 +68,7 @@ class DenseMass(nn.Module):
         self.register_buffer("start", start)
         self.network = network
 
-    def prepare(self) -> Any:
+    def prepare(self, definite: bool = True) -> Any:
         """The network's weights made ready for many states."""
         return self.network.prepare(torch.diag(0 * self.start + 1), self.start)
 

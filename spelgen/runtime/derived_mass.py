@@ -14,7 +14,7 @@ from spelgen.runtime.configuration import Configuration
 from spelgen.runtime.fourier import FourierFeatures, FourierSeries, Term
 from spelgen.runtime.joints import Joints, vector
 from spelgen.runtime.network import Network
-from spelgen.runtime.regularisation import PositiveDefiniteShift
+from spelgen.runtime.regularisation import PositiveDefiniteBound
 from spelgen.runtime.symmetric import Entries, entry_basis
 
 NETWORK_FRACTION = 0.1  # how much of a function that is a Fourier series is left to its network
@@ -38,6 +38,7 @@ class MassPrepared(NamedTuple):
 
     layers: Any  # of the network
     series: Tensor | None  # takes Fourier features to M
+    definite: bool  # whether M is kept positive definite
 
 
 class MassResiduals(NamedTuple):
@@ -45,14 +46,15 @@ class MassResiduals(NamedTuple):
 
     network: Any
     series: Tensor | None
+    part: Tensor  # of the functions' changes that M takes, see PositiveDefiniteBound
 
 
 class DerivedMass(nn.Module):
     """M(q), (..., n, n), with ``entries`` saying where functions and constants stand.
 
     A constant starts at the first of its two numbers, and is trained in units of the second. Where
-    M would not exceed margin * its nominal mean, that mean is added (see
-    PositiveDefiniteShift): M is positive definite for all q and all weights.
+    M would not exceed margin * its nominal mean, it is drawn towards that mean (see
+    PositiveDefiniteBound): M is positive definite for all q and all weights.
     """
 
     constant_scale: Tensor
@@ -82,7 +84,7 @@ class DerivedMass(nn.Module):
         self.register_buffer("function_scale", vector(each.scale for each in functions))
         self.register_buffer("function_basis", by_function)
         mean = start @ self.constant_basis + self.function_mean @ self.function_basis
-        self.shift = PositiveDefiniteShift(self._square(mean), margin)
+        self.bound = PositiveDefiniteBound(self._square(mean), margin)
         self.raw_constants = nn.Parameter(start / self.constant_scale)
         self.network = network
         self.series: FourierSeries | None = None
@@ -97,8 +99,8 @@ class DerivedMass(nn.Module):
         """The constants of M, (constants,), in their units."""
         return self.constant_scale * self.raw_constants
 
-    def prepare(self) -> MassPrepared:
-        """All that depends on the weights alone."""
+    def prepare(self, definite: bool = True) -> MassPrepared:
+        """All that depends on the weights alone; ``definite``: keep M positive definite."""
         armature = torch.diag(self.armature())
         constant = self.constants() @ self.constant_basis
         constant = constant + self.function_mean @ self.function_basis + armature.flatten()
@@ -106,6 +108,7 @@ class DerivedMass(nn.Module):
         return MassPrepared(
             layers=self.network.prepare(output_map, constant),
             series=None if self.series is None else self.series.prepare(output_map),
+            definite=definite,
         )
 
     def _square(self, rows: Tensor) -> Tensor:
@@ -117,14 +120,18 @@ class DerivedMass(nn.Module):
         rows, residuals = self.network(at.encoded, prepared.layers)
         if at.fourier is not None and prepared.series is not None:
             rows = rows + F.linear(at.fourier, prepared.series)
-        mass = self.shift(self._square(rows))
-        return mass, MassResiduals(residuals, prepared.series)
+        mass = self._square(rows)
+        part = torch.ones_like(mass[..., 0, 0])
+        if prepared.definite:
+            mass, part = self.bound(mass)
+        return mass, MassResiduals(residuals, prepared.series, part)
 
     def kinetic_vjp(
         self, at: Configuration, qd: Tensor, residuals: MassResiduals
     ) -> tuple[Tensor, Tensor | None]:
         """The derivative of 1/2 qd^T M(q) qd by the encoding, and by the Fourier features."""
-        weight = ((0.5 * qd).unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2)
+        half = 0.5 * residuals.part.unsqueeze(-1) * qd
+        weight = (half.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2)
         by_series = None if residuals.series is None else weight @ residuals.series
         return self.network.vjp(residuals.network, weight), by_series
 
@@ -133,4 +140,4 @@ class DerivedMass(nn.Module):
         rows = self.network.jvp(residuals.network, rate.encoded)
         if rate.fourier is not None and residuals.series is not None:
             rows = rows + F.linear(rate.fourier, residuals.series)
-        return self._square(rows)
+        return residuals.part[..., None, None] * self._square(rows)

@@ -45,10 +45,10 @@ class NetworkDynamics(PortHamiltonian):
         self.input: Any = input
         self.potential = potential
 
-    def prepare(self) -> NetworkPrepared:
+    def prepare(self, definite: bool = True) -> NetworkPrepared:
         """All that depends on the weights alone; holds until they change."""
         return NetworkPrepared(
-            mass=self.mass.prepare(),
+            mass=self.mass.prepare(definite),
             potential=None if self.potential is None else self.potential.prepare(),
             friction=self.friction.prepare(),
             input=self.input.prepare(),

@@ -12,8 +12,8 @@ from spelgen.runtime.configuration import Configuration
 class Mass(Protocol):
     """What gives M(q) and its derivatives."""
 
-    def prepare(self) -> Any:
-        """All that depends on the weights alone."""
+    def prepare(self, definite: bool = True) -> Any:
+        """All that depends on the weights alone; ``definite``: keep M positive definite."""
 
     def __call__(self, at: Configuration, prepared: Any) -> tuple[Tensor, Any]:
         """M(q), (..., n, n), and what its derivatives need."""

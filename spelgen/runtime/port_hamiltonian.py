@@ -33,8 +33,11 @@ class PortHamiltonian(nn.Module):
 
     n: int
 
-    def prepare(self) -> Any:
-        """All that depends on the weights alone; holds until they change."""
+    def prepare(self, definite: bool = True) -> Any:
+        """All that depends on the weights alone; holds until they change.
+
+        Without ``definite`` M is left as learned: for the weak form, whose velocities are measured.
+        """
         raise NotImplementedError
 
     def configuration(self, q: Tensor, prepared: Any) -> Any:

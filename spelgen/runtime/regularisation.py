@@ -6,32 +6,32 @@ import torch
 from torch import Tensor, nn
 
 
-class PositiveDefiniteShift(nn.Module):
-    """Adds a multiple s >= 0 of a positive definite matrix C that makes M positive definite.
+class PositiveDefiniteBound(nn.Module):
+    """Draws M towards a positive definite matrix C, as far as M needs it to be positive definite.
 
-    s = 0 wherever S = M - margin C is positive definite. Elsewhere s = 2^k, the first power of two
-    above 2 |S| / (least eigenvalue of C), both with C's diagonal scaled to one: s is constant in
-    pieces, so that derivatives of M are derivatives of M + s C. C has M's own zeros and linear
-    relations, which therefore hold in the sum.
+    M' = C + t (M - C), with t = 1 wherever M - margin C is positive definite. Elsewhere t = 2^-k is
+    the first such power with t |M - C| <= 1 - margin, |.| being at least the norm relative to C:
+    then M' - margin C is positive definite. t is constant in pieces, so that derivatives of M' are
+    t times those of M. C has M's own zeros and linear relations, which therefore hold in M'.
     """
 
-    matrix: Tensor  # C
+    center: Tensor  # C
     least: Tensor  # margin C
-    unit: Tensor  # what scales C's diagonal to one, times 2 / least eigenvalue
+    unit: Tensor  # an entry's largest part in the norm relative to C, divided by 1 - margin
 
-    def __init__(self, matrix: Tensor, margin: float) -> None:
+    def __init__(self, center: Tensor, margin: float) -> None:
         super().__init__()
-        scale = matrix.diagonal().rsqrt()
-        scaled = scale.unsqueeze(-1) * matrix * scale
+        scale = center.diagonal().rsqrt()
+        scaled = scale.unsqueeze(-1) * center * scale
         least = torch.linalg.eigvalsh(scaled)[0]
-        self.register_buffer("matrix", matrix)
-        self.register_buffer("least", margin * matrix)
-        self.register_buffer("unit", 2 / least * scale.unsqueeze(-1) * scale)
+        self.register_buffer("center", center)
+        self.register_buffer("least", margin * center)
+        self.register_buffer("unit", scale.unsqueeze(-1) * scale / least / (1 - margin))
 
-    def forward(self, mass: Tensor) -> Tensor:
-        """M + s C, (..., n, n)."""
-        excess = mass.detach() - self.least
-        indefinite = torch.linalg.cholesky_ex(excess).info != 0
-        size = torch.linalg.vector_norm(self.unit * excess, dim=(-2, -1))
-        shift = torch.where(indefinite, torch.exp2(torch.ceil(torch.log2(size))), 0.0)
-        return torch.addcmul(mass, shift[..., None, None], self.matrix)
+    def forward(self, mass: Tensor) -> tuple[Tensor, Tensor]:
+        """M', (..., n, n), and t, (...)."""
+        fixed = mass.detach()
+        indefinite = torch.linalg.cholesky_ex(fixed - self.least).info != 0
+        size = torch.linalg.vector_norm(self.unit * (fixed - self.center), dim=(-2, -1))
+        part = torch.where(indefinite, torch.exp2(-torch.ceil(torch.log2(size)).clamp(min=1.0)), 1.0)
+        return torch.lerp(self.center, mass, part[..., None, None]), part

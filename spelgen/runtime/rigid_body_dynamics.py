@@ -100,7 +100,7 @@ class RigidBodyDynamics(PortHamiltonian):
         """What the measured torque shows without any, (n,) [Nm, N]."""
         return self.raw_offset * self.friction.nominal * self.actuated
 
-    def prepare(self) -> RigidPrepared:
+    def prepare(self, definite: bool = True) -> RigidPrepared:
         """All that depends on the weights alone; holds until they change."""
         inertia = torch.tensordot(self.inertial_parameters(), self.basis, dims=1)
         return RigidPrepared(

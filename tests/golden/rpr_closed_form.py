@@ -125,9 +125,9 @@ class Model(nn.Module):
         value: Tensor = self.dynamics.torque_offset()
         return value
 
-    def prepare(self) -> Any:
-        """All that depends on the weights alone; holds until they change."""
-        return self.dynamics.prepare()
+    def prepare(self, definite: bool = True) -> Any:
+        """All that depends on the weights alone, until they change; M made ``definite``, or as learned."""
+        return self.dynamics.prepare(definite)
 
     def mass_matrix(self, q: Tensor, prepared: Any = None) -> Tensor:
         """M(q), (..., n, n) [kg m^2, kg m, kg]."""
@@ -268,8 +268,11 @@ class PortHamiltonian(nn.Module):
 
     n: int
 
-    def prepare(self) -> Any:
-        """All that depends on the weights alone; holds until they change."""
+    def prepare(self, definite: bool = True) -> Any:
+        """All that depends on the weights alone; holds until they change.
+
+        Without ``definite`` M is left as learned: for the weak form, whose velocities are measured.
+        """
         raise NotImplementedError
 
     def configuration(self, q: Tensor, prepared: Any) -> Any:
@@ -746,7 +749,7 @@ class RigidBodyDynamics(PortHamiltonian):
         """What the measured torque shows without any, (n,) [Nm, N]."""
         return self.raw_offset * self.friction.nominal * self.actuated
 
-    def prepare(self) -> RigidPrepared:
+    def prepare(self, definite: bool = True) -> RigidPrepared:
         """All that depends on the weights alone; holds until they change."""
         inertia = torch.tensordot(self.inertial_parameters(), self.basis, dims=1)
         return RigidPrepared(

@@ -150,9 +150,9 @@ class Model(nn.Module):
         value: Tensor = self.dynamics.friction.viscous()
         return value
 
-    def prepare(self) -> Any:
-        """All that depends on the weights alone; holds until they change."""
-        return self.dynamics.prepare()
+    def prepare(self, definite: bool = True) -> Any:
+        """All that depends on the weights alone, until they change; M made ``definite``, or as learned."""
+        return self.dynamics.prepare(definite)
 
     def mass_matrix(self, q: Tensor, prepared: Any = None) -> Tensor:
         """M(q), (..., n, n) [kg m^2, kg m, kg]."""
@@ -319,35 +319,35 @@ def entry_basis(entries: Entries, functions: int, constants: int) -> tuple[Tenso
     return by_function.flatten(1), by_constant.flatten(1)
 
 
-class PositiveDefiniteShift(nn.Module):
-    """Adds a multiple s >= 0 of a positive definite matrix C that makes M positive definite.
+class PositiveDefiniteBound(nn.Module):
+    """Draws M towards a positive definite matrix C, as far as M needs it to be positive definite.
 
-    s = 0 wherever S = M - margin C is positive definite. Elsewhere s = 2^k, the first power of two
-    above 2 |S| / (least eigenvalue of C), both with C's diagonal scaled to one: s is constant in
-    pieces, so that derivatives of M are derivatives of M + s C. C has M's own zeros and linear
-    relations, which therefore hold in the sum.
+    M' = C + t (M - C), with t = 1 wherever M - margin C is positive definite. Elsewhere t = 2^-k is
+    the first such power with t |M - C| <= 1 - margin, |.| being at least the norm relative to C:
+    then M' - margin C is positive definite. t is constant in pieces, so that derivatives of M' are
+    t times those of M. C has M's own zeros and linear relations, which therefore hold in M'.
     """
 
-    matrix: Tensor  # C
+    center: Tensor  # C
     least: Tensor  # margin C
-    unit: Tensor  # what scales C's diagonal to one, times 2 / least eigenvalue
+    unit: Tensor  # an entry's largest part in the norm relative to C, divided by 1 - margin
 
-    def __init__(self, matrix: Tensor, margin: float) -> None:
+    def __init__(self, center: Tensor, margin: float) -> None:
         super().__init__()
-        scale = matrix.diagonal().rsqrt()
-        scaled = scale.unsqueeze(-1) * matrix * scale
+        scale = center.diagonal().rsqrt()
+        scaled = scale.unsqueeze(-1) * center * scale
         least = torch.linalg.eigvalsh(scaled)[0]
-        self.register_buffer("matrix", matrix)
-        self.register_buffer("least", margin * matrix)
-        self.register_buffer("unit", 2 / least * scale.unsqueeze(-1) * scale)
+        self.register_buffer("center", center)
+        self.register_buffer("least", margin * center)
+        self.register_buffer("unit", scale.unsqueeze(-1) * scale / least / (1 - margin))
 
-    def forward(self, mass: Tensor) -> Tensor:
-        """M + s C, (..., n, n)."""
-        excess = mass.detach() - self.least
-        indefinite = torch.linalg.cholesky_ex(excess).info != 0
-        size = torch.linalg.vector_norm(self.unit * excess, dim=(-2, -1))
-        shift = torch.where(indefinite, torch.exp2(torch.ceil(torch.log2(size))), 0.0)
-        return torch.addcmul(mass, shift[..., None, None], self.matrix)
+    def forward(self, mass: Tensor) -> tuple[Tensor, Tensor]:
+        """M', (..., n, n), and t, (...)."""
+        fixed = mass.detach()
+        indefinite = torch.linalg.cholesky_ex(fixed - self.least).info != 0
+        size = torch.linalg.vector_norm(self.unit * (fixed - self.center), dim=(-2, -1))
+        part = torch.where(indefinite, torch.exp2(-torch.ceil(torch.log2(size)).clamp(min=1.0)), 1.0)
+        return torch.lerp(self.center, mass, part[..., None, None]), part
 
 
 def to_group(q: Tensor, joint_types: Sequence[str]) -> list[Tensor]:
@@ -398,8 +398,11 @@ class PortHamiltonian(nn.Module):
 
     n: int
 
-    def prepare(self) -> Any:
-        """All that depends on the weights alone; holds until they change."""
+    def prepare(self, definite: bool = True) -> Any:
+        """All that depends on the weights alone; holds until they change.
+
+        Without ``definite`` M is left as learned: for the weak form, whose velocities are measured.
+        """
         raise NotImplementedError
 
     def configuration(self, q: Tensor, prepared: Any) -> Any:
@@ -767,8 +770,8 @@ class DirectInput(nn.Module):
 class Mass(Protocol):
     """What gives M(q) and its derivatives."""
 
-    def prepare(self) -> Any:
-        """All that depends on the weights alone."""
+    def prepare(self, definite: bool = True) -> Any:
+        """All that depends on the weights alone; ``definite``: keep M positive definite."""
 
     def __call__(self, at: Configuration, prepared: Any) -> tuple[Tensor, Any]:
         """M(q), (..., n, n), and what its derivatives need."""
@@ -1020,6 +1023,7 @@ class MassPrepared(NamedTuple):
 
     layers: Any  # of the network
     series: Tensor | None  # takes Fourier features to M
+    definite: bool  # whether M is kept positive definite
 
 
 class MassResiduals(NamedTuple):
@@ -1027,14 +1031,15 @@ class MassResiduals(NamedTuple):
 
     network: Any
     series: Tensor | None
+    part: Tensor  # of the functions' changes that M takes, see PositiveDefiniteBound
 
 
 class DerivedMass(nn.Module):
     """M(q), (..., n, n), with ``entries`` saying where functions and constants stand.
 
     A constant starts at the first of its two numbers, and is trained in units of the second. Where
-    M would not exceed margin * its nominal mean, that mean is added (see
-    PositiveDefiniteShift): M is positive definite for all q and all weights.
+    M would not exceed margin * its nominal mean, it is drawn towards that mean (see
+    PositiveDefiniteBound): M is positive definite for all q and all weights.
     """
 
     constant_scale: Tensor
@@ -1064,7 +1069,7 @@ class DerivedMass(nn.Module):
         self.register_buffer("function_scale", vector(each.scale for each in functions))
         self.register_buffer("function_basis", by_function)
         mean = start @ self.constant_basis + self.function_mean @ self.function_basis
-        self.shift = PositiveDefiniteShift(self._square(mean), margin)
+        self.bound = PositiveDefiniteBound(self._square(mean), margin)
         self.raw_constants = nn.Parameter(start / self.constant_scale)
         self.network = network
         self.series: FourierSeries | None = None
@@ -1079,8 +1084,8 @@ class DerivedMass(nn.Module):
         """The constants of M, (constants,), in their units."""
         return self.constant_scale * self.raw_constants
 
-    def prepare(self) -> MassPrepared:
-        """All that depends on the weights alone."""
+    def prepare(self, definite: bool = True) -> MassPrepared:
+        """All that depends on the weights alone; ``definite``: keep M positive definite."""
         armature = torch.diag(self.armature())
         constant = self.constants() @ self.constant_basis
         constant = constant + self.function_mean @ self.function_basis + armature.flatten()
@@ -1088,6 +1093,7 @@ class DerivedMass(nn.Module):
         return MassPrepared(
             layers=self.network.prepare(output_map, constant),
             series=None if self.series is None else self.series.prepare(output_map),
+            definite=definite,
         )
 
     def _square(self, rows: Tensor) -> Tensor:
@@ -1099,14 +1105,18 @@ class DerivedMass(nn.Module):
         rows, residuals = self.network(at.encoded, prepared.layers)
         if at.fourier is not None and prepared.series is not None:
             rows = rows + F.linear(at.fourier, prepared.series)
-        mass = self.shift(self._square(rows))
-        return mass, MassResiduals(residuals, prepared.series)
+        mass = self._square(rows)
+        part = torch.ones_like(mass[..., 0, 0])
+        if prepared.definite:
+            mass, part = self.bound(mass)
+        return mass, MassResiduals(residuals, prepared.series, part)
 
     def kinetic_vjp(
         self, at: Configuration, qd: Tensor, residuals: MassResiduals
     ) -> tuple[Tensor, Tensor | None]:
         """The derivative of 1/2 qd^T M(q) qd by the encoding, and by the Fourier features."""
-        weight = ((0.5 * qd).unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2)
+        half = 0.5 * residuals.part.unsqueeze(-1) * qd
+        weight = (half.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2)
         by_series = None if residuals.series is None else weight @ residuals.series
         return self.network.vjp(residuals.network, weight), by_series
 
@@ -1115,7 +1125,7 @@ class DerivedMass(nn.Module):
         rows = self.network.jvp(residuals.network, rate.encoded)
         if rate.fourier is not None and residuals.series is not None:
             rows = rows + F.linear(rate.fourier, residuals.series)
-        return self._square(rows)
+        return residuals.part[..., None, None] * self._square(rows)
 
 
 class PotentialPrepared(NamedTuple):
@@ -1197,10 +1207,10 @@ class NetworkDynamics(PortHamiltonian):
         self.input: Any = input
         self.potential = potential
 
-    def prepare(self) -> NetworkPrepared:
+    def prepare(self, definite: bool = True) -> NetworkPrepared:
         """All that depends on the weights alone; holds until they change."""
         return NetworkPrepared(
-            mass=self.mass.prepare(),
+            mass=self.mass.prepare(definite),
             potential=None if self.potential is None else self.potential.prepare(),
             friction=self.friction.prepare(),
             input=self.input.prepare(),

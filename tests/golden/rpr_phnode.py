@@ -101,9 +101,9 @@ class Model(nn.Module):
         )
         self.to(dtype)
 
-    def prepare(self) -> Any:
-        """All that depends on the weights alone; holds until they change."""
-        return self.dynamics.prepare()
+    def prepare(self, definite: bool = True) -> Any:
+        """All that depends on the weights alone, until they change; M made ``definite``, or as learned."""
+        return self.dynamics.prepare(definite)
 
     def mass_matrix(self, q: Tensor, prepared: Any = None) -> Tensor:
         """M(q), (..., n, n) [kg m^2, kg m, kg]."""
@@ -295,8 +295,11 @@ class PortHamiltonian(nn.Module):
 
     n: int
 
-    def prepare(self) -> Any:
-        """All that depends on the weights alone; holds until they change."""
+    def prepare(self, definite: bool = True) -> Any:
+        """All that depends on the weights alone; holds until they change.
+
+        Without ``definite`` M is left as learned: for the weak form, whose velocities are measured.
+        """
         raise NotImplementedError
 
     def configuration(self, q: Tensor, prepared: Any) -> Any:
@@ -782,7 +785,7 @@ class DenseMass(nn.Module):
         self.register_buffer("start", start)
         self.network = network
 
-    def prepare(self) -> Any:
+    def prepare(self, definite: bool = True) -> Any:
         """The network's weights made ready for many states."""
         return self.network.prepare(torch.diag(0 * self.start + 1), self.start)
 
@@ -841,8 +844,8 @@ class DenseMass(nn.Module):
 class Mass(Protocol):
     """What gives M(q) and its derivatives."""
 
-    def prepare(self) -> Any:
-        """All that depends on the weights alone."""
+    def prepare(self, definite: bool = True) -> Any:
+        """All that depends on the weights alone; ``definite``: keep M positive definite."""
 
     def __call__(self, at: Configuration, prepared: Any) -> tuple[Tensor, Any]:
         """M(q), (..., n, n), and what its derivatives need."""
@@ -1060,10 +1063,10 @@ class NetworkDynamics(PortHamiltonian):
         self.input: Any = input
         self.potential = potential
 
-    def prepare(self) -> NetworkPrepared:
+    def prepare(self, definite: bool = True) -> NetworkPrepared:
         """All that depends on the weights alone; holds until they change."""
         return NetworkPrepared(
-            mass=self.mass.prepare(),
+            mass=self.mass.prepare(definite),
             potential=None if self.potential is None else self.potential.prepare(),
             friction=self.friction.prepare(),
             input=self.input.prepare(),
