@@ -30,12 +30,14 @@ structure: fourier base_parameters pseudo_inertia
 {" ".join(RUNTIME)}
 emission: bodies plan source docstring tailored bundle emit loading
 dynamics: protocol arrays constraint pinocchio_dynamics pinocchio_arm pinocchio_urdf regressor regressor_dynamics tip
-logs: arm_mapping trajectory bags tables npz readers log_files read checks filtering preprocessing windows chunks epoch_windows
+logs: arm_mapping trajectory bags tables npz readers log_files read checks filtering
+logs: preprocessing windows chunks epoch_windows
 simulation: friction integration simulated_logs random_inputs tracking
 identification: samples friction base_parameters least_squares method prior identification
 excitation: trajectory criterion excitation
 fitting: run_folder gaussian_prior adaptive rollout dataset streaming torque_samples torque_jacobian torque_fit
-fitting: optimizers torque_networks urdf_regularizer stages compiled process progress validation loop run_record fitted fit train
+fitting: optimizers torque_networks urdf_regularizer stages compiled process progress validation loop
+fitting: run_record fitted fit train
 evaluation: baselines torque rollout examples invariants tables results subject evaluate
 verify: agreement urdf_cross_check numeric_samples verify
 explain: reasons facts
