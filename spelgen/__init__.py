@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from spelgen.evaluation.rollout import rollout
     from spelgen.excitation.design import excite
     from spelgen.exporting.export import export
-    from spelgen.fitting.config import MomentumFit, Rollout, TorqueFit
+    from spelgen.fitting.config import GaussianPrior, MomentumFit, Rollout, TorqueFit
     from spelgen.fitting.fit import Fit, fit, load_run
     from spelgen.identification.friction import FrictionModel
     from spelgen.identification.identification import Identification
@@ -55,6 +55,7 @@ _HOME = {
     "fit": "fitting.fit",
     "Fit": "fitting.fitted",
     "load_run": "fitting.fitted",
+    "GaussianPrior": "fitting.config",
     "TorqueFit": "fitting.config",
     "MomentumFit": "fitting.config",
     "Rollout": "fitting.config",
@@ -71,6 +72,7 @@ __all__ = [
     "Design",
     "Fit",
     "FrictionModel",
+    "GaussianPrior",
     "Identification",
     "Inspection",
     "LeastSquares",
