@@ -255,13 +255,13 @@ def test_a_gain_is_recovered(coupled):
     )
     model.dynamics.input.raw_gains.data.zero_()
     scales = loss_scales(moved, model.joint_types)
-    optimiser = torch.optim.LBFGS([model.dynamics.input.raw_gains], line_search_fn="strong_wolfe")
+    optimizer = torch.optim.LBFGS([model.dynamics.input.raw_gains], line_search_fn="strong_wolfe")
 
     def closure():
-        optimiser.zero_grad()
+        optimizer.zero_grad()
         loss = momentum_loss(model, moved, scales)
         loss.backward()
         return loss
 
-    optimiser.step(closure)
+    optimizer.step(closure)
     assert model.dynamics.input.raw_gains.exp().item() == pytest.approx(1.25, rel=1e-3)

@@ -41,7 +41,7 @@ def test_a_compiled_run_says_so_and_repeats_the_plain_one(tmp_path, monkeypatch)
 
 @has_compiler
 def test_all_states_of_a_window_share_what_was_compiled(tmp_path, monkeypatch):
-    """phnode, which has no guard to branch on: one graph, for the first state, a measured one, as for all."""
+    """phnode: one graph, for the first state, a measured one, as for all."""
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path / "cache"))
     torch._dynamo.reset()
     counters.clear()

@@ -263,7 +263,7 @@ def test_an_impossible_body_is_replaced_by_the_nearest_possible_one():
 
 
 TRAINING = ("20_02_10_30sec_12harm", "20_02_12_50sec_12harm", "20_02_05_20sec_8harm")
-RIVAL = {  # ../shared/logs/README.md
+BASELINE = {  # ../shared/logs/README.md
     "19_12_23_free": 0.0056, "20_01_31_unload": 0.0138, "20_02_05_20sec_12harm": 0.0092,
     "20_02_06_20sec_10harm": 0.0118, "20_02_06_20sec_5harm": 0.0080, "20_02_10_20sec_7harm": 0.0138,
     "20_02_12_40sec_12harm": 0.0039, "20_02_19_14harm50sec": 0.0092, "20_02_19_15harm50sec": 0.0079,
@@ -285,10 +285,10 @@ def test_ur10e_gives_the_published_figures(shared):
     arm = load_arm(folder / "ur10e.urdf").arm
     training = dynamics_samples(read(folder, TRAINING, arm))
     found = least_squares(arm, training, LeastSquares("range"))
-    tests = dynamics_samples(read(folder, RIVAL, arm), pauses=True)
+    tests = dynamics_samples(read(folder, BASELINE, arm), pauses=True)
     measured = {sample.name: nmse(found, sample) for sample in tests}
     assert np.mean(list(measured.values())) == pytest.approx(0.0092, rel=0.05)
-    assert measured == pytest.approx(RIVAL, rel=0.05)
+    assert measured == pytest.approx(BASELINE, rel=0.05)
     more = least_squares(
         arm, training, LeastSquares("range", friction=FrictionModel(stribeck=True, polynomial=True))
     )

@@ -251,7 +251,7 @@ def test_geodesic_distance_is_the_angle_between():
 
 
 def test_published_formulation_keeps_its_energy():
-    """The benchmark's rival is the equations it stands for: without friction and input dH/dt = 0."""
+    """The benchmark's baseline is the equations it stands for: without friction and input dH/dt = 0."""
     torch.manual_seed(0)
     model = Published(2, 8, 8)
     for network in (model.dissipation.network, model.gains):
