@@ -264,3 +264,9 @@ def _texts(tree: ast.Module, name: str) -> Iterator[str]:
             and [target.id for target in node.targets if isinstance(target, ast.Name)] == [name]
         ):
             yield str(node.value.value)
+
+
+def logged_joints(model: Any) -> tuple[str, ...]:
+    """The joints of a model by the names that logs use: the URDF's, or its own where it comes from none."""
+    facts = getattr(model, "facts", None)
+    return tuple(model.joint_names) if facts is None else facts.joints

@@ -10,7 +10,9 @@ import pyarrow.parquet
 import pytest
 import torch
 
+from spelgen.building import build
 from spelgen.errors import LogError, SpelgenErrors
+from spelgen.loaded_arm import load_arm
 from spelgen.logs.checks import check
 from spelgen.logs.chunks import scan
 from spelgen.logs.filtering import (
@@ -470,3 +472,18 @@ def test_real_logs_are_read(shared):
     notes = check([trajectory], joints, ("revolute",) * 7)
     assert [x.code for x in notes] == ["gap"]
     assert len(prepare([trajectory], shortest=5, cutoff=8.0)) == 5
+
+
+def test_a_models_logs_have_the_urdfs_names(tmp_path):
+    """Its own are made fit for code: logs know nothing of that."""
+    text = (Path(__file__).parents[1] / "robots" / "two_link.urdf").read_text()
+    urdf = tmp_path / "named.urdf"
+    urdf.write_text(text.replace('"joint1"', '"Arm/1 (left)"').replace('"joint2"', '"class"'))
+    arm = load_arm(urdf)
+    model = build(arm)
+    assert model.joint_names != ("Arm/1 (left)", "class")
+    t = np.arange(5) / 100
+    log = Trajectory(t, *(np.full((5, 2), k) for k in (1.0, 2.0, 3.0)), name="one")
+    path = write_logs(tmp_path / "log.csv", [log], arm)
+    for owner in (arm, model):
+        assert np.array_equal(read_logs(path, owner)[0].tau, log.tau)

@@ -18,7 +18,7 @@ from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.settings import load_mapping
-from spelgen.spec import read_facts
+from spelgen.spec import logged_joints, read_facts
 from spelgen.urdf.read import read_urdf
 
 if TYPE_CHECKING:
@@ -68,10 +68,14 @@ def _of_model(model: EmittedModel, urdf: Path | str | None) -> Subject:
     weights = next(model.parameters(), None)
     if weights is not None and (weights.dtype != torch.float64 or not weights.is_cpu):  # as logs are
         model = copy.deepcopy(model).double().cpu()
-    facts = getattr(model, "facts", None)
-    if facts is None:  # no emitted module: what else has an arm's dynamics
-        return Subject(model, type(model).__name__, model.joint_names, None if urdf is None else Path(urdf))
-    return Subject(model, facts.robot, facts.joints, None if urdf is None else Path(urdf), facts.options.tip)
+    facts = getattr(model, "facts", None)  # none where it is what else has an arm's dynamics
+    return Subject(
+        model,
+        facts.robot if facts else type(model).__name__,
+        logged_joints(model),
+        None if urdf is None else Path(urdf),
+        facts.options.tip if facts else None,
+    )
 
 
 def read_test_logs(

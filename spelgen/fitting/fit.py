@@ -24,6 +24,7 @@ from spelgen.fitting.urdf_regularizer import UrdfRegularizer, urdf_regularizer
 from spelgen.logs.mapping import LogMapping
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
+from spelgen.spec import logged_joints
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
@@ -137,7 +138,7 @@ def _prepared(
     seed: int,
 ) -> TrainingData:
     if not isinstance(logs, LargeLogs):
-        joints, kinds = _joints(model), model.joint_types
+        joints, kinds = logged_joints(model), model.joint_types
         return prepare_data(logs, joints, kinds, config, preprocessing, validation, seed)
     if not isinstance(validation, float):
         raise RunError(
@@ -165,16 +166,12 @@ def _regularizer(
     if not wanted or not config.urdf_weight or urdf is None or not urdf.exists():
         return None
     try:
-        return urdf_regularizer(urdf, _joints(model), model, data.training)
+        return urdf_regularizer(urdf, logged_joints(model), model, data.training)
     except Exception as error:  # Pinocchio and its parser raise many kinds; the fit goes on without
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         message = f"fitted without the URDF's regularizer: {reason}"
         notes.append(Diagnostic("info", "no-regularizer", urdf.name, None, message))
         return None
-
-
-def _joints(model: EmittedModel) -> Sequence[str]:
-    return model.facts.joints if hasattr(model, "facts") else model.joint_names
 
 
 def _compiled(

@@ -13,6 +13,7 @@ from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.stages import is_closed_form
 from spelgen.logs.mapping import LogMapping
 from spelgen.logs.trajectory import Trajectory
+from spelgen.spec import logged_joints
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
@@ -35,7 +36,7 @@ def describe(
         "schema": 2,
         "robot": facts.robot if facts else type(model).__name__,
         "preset": facts.options.preset if facts else None,
-        "joints": list(facts.joints if facts else model.joint_names),
+        "joints": list(logged_joints(model)),
         "objective": config.objective,
         "config": config.record(closed_form=is_closed_form(model)),
         "preprocessing": asdict(data.preprocessing),

@@ -13,6 +13,7 @@ from spelgen.logs.mapping import LogMapping
 from spelgen.settings.messages import explain
 from spelgen.settings.settings import load_mapping
 from spelgen.settings.yaml_document import Document
+from spelgen.spec import logged_joints
 
 GivenMapping = LogMapping | Mapping[str, Any] | Path | str | None
 
@@ -34,7 +35,7 @@ def log_source(arm: Any, mapping: GivenMapping = None) -> LogSource:
         names, kinds = tuple(c.name for c in coordinates), tuple(c.kind for c in coordinates)
         return LogSource(names, kinds, _mapping(given, known))
     if hasattr(arm, "joint_names"):
-        names = tuple(arm.joint_names)
+        names = logged_joints(arm)
         return LogSource(names, tuple(arm.joint_types), _mapping(mapping, names))
     if isinstance(arm, Sequence) and not isinstance(arm, str) and all(isinstance(x, str) for x in arm):
         return LogSource(tuple(arm), None, _mapping(mapping, arm))
