@@ -15,15 +15,14 @@ from spelgen.errors import SpelgenError, suggestion
 def compare(
     robot: Robot,
     output: Annotated[
-        Path | None,
-        typer.Option("-o", "--output", metavar="FOLDER", help="Default: comparisons/<robot>."),
+        Path | None, typer.Option("-o", "--output", metavar="FOLDER", help="Default: comparisons/<robot>.")
     ] = None,
     presets: Annotated[
-        str | None, typer.Option("--presets", metavar="A,B,C", help="Only these, of phnode, spel, ...")
+        str | None, typer.Option(metavar="A,B,C", help="Only these, of phnode, spel, ...")
     ] = None,
-    seeds: Annotated[int | None, typer.Option("--seeds", min=1, help="Runs of each preset.")] = None,
-    steps: Annotated[int | None, typer.Option("--steps", min=1, help="Training steps of each run.")] = None,
-    jobs: Annotated[int, typer.Option("--jobs", min=1, help="Runs at a time, one core each.")] = 2,
+    seeds: Annotated[int | None, typer.Option(min=1, help="Runs of each preset.")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Training steps of each run.")] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Runs at a time, one core each.")] = 2,
     force: Force = False,
 ) -> None:
     """Train every preset on the same simulated logs, and set them beside one another.
@@ -40,9 +39,7 @@ def compare(
     for name in chosen:
         if name not in known:
             raise SpelgenError(
-                f"unknown preset {name!r}",
-                expected=", ".join(known),
-                do=suggestion(name, known),
+                f"unknown preset {name!r}", expected=", ".join(known), do=suggestion(name, known)
             )
     folder = output or Path("comparisons") / robot.stem
     with counted("simulating") as progress:

@@ -15,7 +15,7 @@ from spelgen.cli.options import Force
 def export(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="A folder that `spelgen train` wrote.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE.urdf", help="Where to.")],
-    to: Annotated[Literal["urdf"], typer.Option("--to", help="What to write.")] = "urdf",
+    to: Annotated[Literal["urdf"], typer.Option(help="What to write.")] = "urdf",
     force: Force = False,
 ) -> None:
     """Write what was learned as a URDF and the settings beside it.

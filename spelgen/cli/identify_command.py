@@ -26,26 +26,20 @@ def identify(
     filter: Filter = None,
     weights: Annotated[
         Literal["equal", "range", "noise"],
-        typer.Option("--weights", help="Of the joints: equal, or by their torque's range or noise."),
+        typer.Option(help="Of the joints: equal, or by their torque's range or noise."),
     ] = "noise",
     ridge: Annotated[
-        float, typer.Option("--ridge", min=0.0, help="Penalty on every parameter, relative to its column.")
+        float, typer.Option(min=0.0, help="Penalty on every parameter, relative to its column.")
     ] = 0.0,
     prior: Annotated[
-        float | None,
-        typer.Option("--prior", min=1e-6, help="Stay near the URDF's inertials; 0.5 suits few data."),
+        float | None, typer.Option(min=1e-6, help="Stay near the URDF's inertials; 0.5 suits few data.")
     ] = None,
     stribeck: Annotated[bool, typer.Option("--stribeck", help="Dry friction of slow motion.")] = False,
     polynomial: Annotated[bool, typer.Option("--polynomial", help="Friction in qd |qd| and qd^3.")] = False,
     coulomb_smoothing_velocity: Annotated[
-        float,
-        typer.Option(
-            "--coulomb-smoothing-velocity",
-            min=1e-6,
-            help="Width of Coulomb friction's jump [rad/s, m/s].",
-        ),
+        float, typer.Option(min=1e-6, help="Width of Coulomb friction's jump [rad/s, m/s].")
     ] = 0.01,
-    format: Annotated[Literal["text", "json"], typer.Option("--format", help="Of the result.")] = "text",
+    format: Annotated[Literal["text", "json"], typer.Option(help="Of the result.")] = "text",
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write to a file.")
     ] = None,

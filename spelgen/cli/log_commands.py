@@ -20,23 +20,21 @@ def excite(
     joints: Joints = None,
     tip: Tip = None,
     angle_tolerance: AngleTolerance = 2e-3,
-    duration: Annotated[float, typer.Option("--duration", min=2.0, max=600.0, help="In seconds.")] = 30.0,
-    sample_rate: Annotated[
-        float, typer.Option("--sample-rate", min=1.0, max=10000.0, help="Samples a second.")
-    ] = 100.0,
+    duration: Annotated[float, typer.Option(min=2.0, max=600.0, help="In seconds.")] = 30.0,
+    sample_rate: Annotated[float, typer.Option(min=1.0, max=10000.0, help="Samples a second.")] = 100.0,
     harmonics: Annotated[
-        int | None, typer.Option("--harmonics", min=2, max=100, help="Default: 0.4 a second, at least 5.")
+        int | None, typer.Option(min=2, max=100, help="Default: 0.4 a second, at least 5.")
     ] = None,
     reach: Annotated[
-        float, typer.Option("--reach", min=0.05, max=1.0, help="Part of the joints' ranges that is used.")
+        float, typer.Option(min=0.05, max=1.0, help="Part of the joints' ranges that is used.")
     ] = 0.9,
     speed: Annotated[
-        float, typer.Option("--speed", min=0.05, max=1.0, help="Part of the velocity limits that is used.")
+        float, typer.Option(min=0.05, max=1.0, help="Part of the velocity limits that is used.")
     ] = 0.7,
     trials: Annotated[
-        int, typer.Option("--trials", min=1, help="Motions that the search looks at, beside random ones.")
+        int, typer.Option(min=1, help="Motions that the search looks at, beside random ones.")
     ] = 100,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the search.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of the search.")] = 0,
     force: Force = False,
 ) -> None:
     """Propose a motion that shows an arm's inertial parameters and friction.
@@ -66,15 +64,13 @@ def excite(
 
 def logs(
     paths: Annotated[list[Path], typer.Argument(metavar="LOGS...", help="Log files, or folders of them.")],
-    robot: Annotated[Path, typer.Option("--robot", metavar="ROBOT.urdf", help="The arm that was logged.")],
+    robot: Annotated[Path, typer.Option(metavar="ROBOT.urdf", help="The arm that was logged.")],
     joints: Joints = None,
     tip: Tip = None,
     angle_tolerance: AngleTolerance = 2e-3,
     mapping: Mapping = None,
-    format: Annotated[Literal["text", "json"], typer.Option("--format", help="Of the result.")] = "text",
-    html: Annotated[
-        Path | None, typer.Option("--html", metavar="FILE", help="Write a page with plots too.")
-    ] = None,
+    format: Annotated[Literal["text", "json"], typer.Option(help="Of the result.")] = "text",
+    html: Annotated[Path | None, typer.Option(metavar="FILE", help="Write a page with plots too.")] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 if there is any warning.")] = False,
 ) -> None:
     """Check logs: what they hold, and what is odd about them.

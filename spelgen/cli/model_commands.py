@@ -38,7 +38,6 @@ def inspect(
     format: Annotated[
         Format | None,
         typer.Option(
-            "--format",
             help="Of the result; without it, by the suffix of -o: .json, .html, .tex, .py, else text.",
             show_default=False,
         ),
@@ -79,16 +78,12 @@ def build(
     preset: Annotated[
         str,
         typer.Option(
-            "--preset",
-            metavar="NAME|FILE.yaml",
-            help=f"How the model is made: {', '.join(PRESET_NAMES)}, or yours.",
+            metavar="NAME|FILE.yaml", help=f"How the model is made: {', '.join(PRESET_NAMES)}, or yours."
         ),
     ] = "minimal",
-    net: Annotated[
-        Net | None, typer.Option("--net", help="The kind of networks; default: the preset's own.")
-    ] = None,
-    width: Annotated[int, typer.Option("--width", min=1, max=4096, help="Units in a hidden layer.")] = 64,
-    depth: Annotated[int, typer.Option("--depth", min=1, max=16, help="Hidden layers.")] = 2,
+    net: Annotated[Net | None, typer.Option(help="The kind of networks; default: the preset's own.")] = None,
+    width: Annotated[int, typer.Option(min=1, max=4096, help="Units in a hidden layer.")] = 64,
+    depth: Annotated[int, typer.Option(min=1, max=16, help="Hidden layers.")] = 2,
     output: Annotated[
         Path | None,
         typer.Option("-o", "--output", metavar="MODULE.py", help="Default: <robot>_spel.py here."),

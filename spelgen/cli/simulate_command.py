@@ -22,9 +22,7 @@ def simulate(
     joints: Joints = None,
     tip: Tip = None,
     angle_tolerance: AngleTolerance = 2e-3,
-    seed: Annotated[
-        int | None, typer.Option("--seed", min=0, help="Default: that of the robot's settings.")
-    ] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Default: that of the robot's settings.")] = None,
     force: Force = False,
 ) -> None:
     """Make training and test logs with Pinocchio."""

@@ -39,83 +39,62 @@ def train(
     ] = None,
     objective: Annotated[
         Objective | None,
-        typer.Option(
-            "--objective", help="Default: of closed-form models torque, else rollout, after momentum steps."
-        ),
+        typer.Option(help="Default: of closed-form models torque, else rollout, after momentum steps."),
     ] = None,
     window: Annotated[
-        int | None, typer.Option("--window", min=2, help="[momentum, rollout] Samples in a window.")
+        int | None, typer.Option(min=2, help="[momentum, rollout] Samples in a window.")
     ] = None,
     stride: Annotated[
-        int | None,
-        typer.Option("--stride", min=1, help="[momentum, rollout] Samples from window to window."),
+        int | None, typer.Option(min=1, help="[momentum, rollout] Samples from window to window.")
     ] = None,
     momentum_steps: Annotated[
         int | None,
-        typer.Option(
-            "--momentum-steps",
-            min=0,
-            help="[momentum, rollout] On the weak form, before windows are predicted.",
-        ),
+        typer.Option(min=0, help="[momentum, rollout] On the weak form, before windows are predicted."),
     ] = None,
     torque_first: Annotated[
-        bool | None,
-        typer.Option(
-            "--torque-first/--no-torque-first", help="[rollout] Fit torques first; of closed-form models."
-        ),
+        bool | None, typer.Option(help="[rollout] Fit torques first; of closed-form models.")
     ] = None,
-    epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="[rollout] At most so many.")] = None,
+    epochs: Annotated[int | None, typer.Option(min=1, help="[rollout] At most so many.")] = None,
     patience: Annotated[
-        int | None, typer.Option("--patience", min=1, help="[rollout] Epochs without gain before the end.")
+        int | None, typer.Option(min=1, help="[rollout] Epochs without gain before the end.")
     ] = None,
     solver: Annotated[
-        Solver | None, typer.Option("--solver", help="[rollout] rk4 of fixed steps, or torchdiffeq's dopri5.")
+        Solver | None, typer.Option(help="[rollout] rk4 of fixed steps, or torchdiffeq's dopri5.")
     ] = None,
     substeps: Annotated[
-        int | None, typer.Option("--substeps", min=1, help="[rollout] Steps of rk4 between samples.")
+        int | None, typer.Option(min=1, help="[rollout] Steps of rk4 between samples.")
     ] = None,
     compile: Annotated[
-        bool | None,
-        typer.Option(
-            "--compile/--no-compile", help="[rollout] The right-hand side by torch; needs a C++ compiler."
-        ),
+        bool | None, typer.Option(help="[rollout] The right-hand side by torch; needs a C++ compiler.")
     ] = None,
     optimizer: Annotated[
         Optimizer | None,
-        typer.Option(
-            "--optimizer",
-            help="[momentum, rollout] On batches, or on all windows at once: default where few.",
-        ),
+        typer.Option(help="[momentum, rollout] On batches, or on all windows at once: default where few."),
     ] = None,
-    batch: Annotated[int | None, typer.Option("--batch", min=1, help="[adamw] Windows in a step.")] = None,
-    learning_rate: Annotated[
-        float | None, typer.Option("--learning-rate", min=0.0, help="[adamw] At its largest.")
-    ] = None,
+    batch: Annotated[int | None, typer.Option(min=1, help="[adamw] Windows in a step.")] = None,
+    learning_rate: Annotated[float | None, typer.Option(min=0.0, help="[adamw] At its largest.")] = None,
     max_minutes: Annotated[
-        float | None, typer.Option("--max-minutes", min=0.0, help="[momentum, rollout] At most so long.")
+        float | None, typer.Option(min=0.0, help="[momentum, rollout] At most so long.")
     ] = None,
     evaluations: Annotated[
-        int | None, typer.Option("--evaluations", min=1, help="[torque] Of the loss of networks, at most.")
+        int | None, typer.Option(min=1, help="[torque] Of the loss of networks, at most.")
     ] = None,
     weight_decay: Annotated[
-        float | None,
-        typer.Option("--weight-decay", min=0.0, help="Of AdamW; or of the penalty of L-BFGS."),
+        float | None, typer.Option(min=0.0, help="Of AdamW; or of the penalty of L-BFGS.")
     ] = None,
     urdf_weight: Annotated[
-        float | None,
-        typer.Option("--urdf-weight", min=0.0, help="Of staying near the URDF's own M and gravity; 0: none."),
+        float | None, typer.Option(min=0.0, help="Of staying near the URDF's own M and gravity; 0: none.")
     ] = None,
     validation_fraction: Annotated[
-        float | None,
-        typer.Option("--validation-fraction", min=0.01, max=0.9, help="Part of the trajectories."),
+        float | None, typer.Option(min=0.01, max=0.9, help="Part of the trajectories.")
     ] = None,
     filter: Filter = None,
     decimation: Annotated[
-        int | None, typer.Option("--decimation", min=1, help="In windows, take one sample of so many.")
+        int | None, typer.Option(min=1, help="In windows, take one sample of so many.")
     ] = None,
-    seed: Annotated[int | None, typer.Option("--seed", min=0, help="Of split, order and batches.")] = None,
-    device: Annotated[str, typer.Option("--device", help="cpu, cuda, ...")] = "cpu",
-    threads: Annotated[int, typer.Option("--threads", min=1, help="Of torch.")] = 1,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of split, order and batches.")] = None,
+    device: Annotated[str, typer.Option(help="cpu, cuda, ...")] = "cpu",
+    threads: Annotated[int, typer.Option(min=1, help="Of torch.")] = 1,
     quiet: Annotated[bool, typer.Option("--quiet", help="Show no progress.")] = False,
 ) -> None:
     """Fit a module to logs.

@@ -15,9 +15,7 @@ Result = Mapping[str, Any]
 
 
 def comparison_tables(
-    results: Sequence[Result],
-    step_seconds: Mapping[str, float],
-    published: Mapping[str, PublishedFigures],
+    results: Sequence[Result], step_seconds: Mapping[str, float], published: Mapping[str, PublishedFigures]
 ) -> list[Table]:
     """The tables of a comparison: sizes and speed, losses, those of each seed, invariants."""
     by_variant: dict[str, list[Result]] = {}

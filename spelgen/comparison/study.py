@@ -173,9 +173,7 @@ def _known(folder: Path, description: dict[str, Any], *, force: bool) -> bool:
         if json.loads(path.read_text(encoding="utf-8")) == json.loads(json.dumps(description)):
             return True
         raise RunError(
-            "a comparison with other settings",
-            file=path,
-            do="--force begins anew, -o names another folder",
+            "a comparison with other settings", file=path, do="--force begins anew, -o names another folder"
         )
     for name in ("result.json", "checkpoint.pt"):  # else another comparison's runs would go on
         for old in sorted(folder.glob(f"runs/*/{name}")):
