@@ -30,7 +30,7 @@ structure: fourier base_parameters pseudo_inertia
 {" ".join(RUNTIME)}
 emission: bodies plan source docstring tailored bundle emit loading
 dynamics: protocol arrays constraint pinocchio_dynamics pinocchio_arm pinocchio_urdf regressor regressor_dynamics tip
-logs: arm_mapping trajectory bags tables npz readers log_files read checks filtering
+logs: arm_mapping trajectory bags tables npz readers values log_files read checks filtering
 logs: preprocessing windows chunks epoch_windows
 simulation: friction integration simulated_logs random_inputs tracking
 identification: samples friction base_parameters least_squares method prior identification

@@ -1,5 +1,6 @@
 """Every kind of log file and every way to name and measure: the same trajectory, or one clear sentence."""
 
+import csv
 import os
 import sys
 import textwrap
@@ -14,6 +15,7 @@ import pytest
 
 from spelgen.errors import LogError, SettingsError, SpelgenErrors
 from spelgen.loaded_arm import load_arm
+from spelgen.logs.chunks import scan
 from spelgen.logs.mapping import LogMapping
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory
@@ -254,7 +256,7 @@ NPZ = {
         {"t": T, "q": Q, "tau": TAU},
         "{}: missing columns qd_shoulder, qd_elbow: got only the columns t, q, tau, "
         "expected t, q_<joint>, qd_<joint>, tau_<joint>; "
-        "rename the columns, or say their names under 'logs' in the robot's YAML",
+        "say 'velocity: differentiated' under 'logs' in the robot's YAML where none were logged",
     ),
     "short": (
         {"t": T, "q": Q[:3], "qd": QD, "tau": TAU},
@@ -481,3 +483,122 @@ def test_without_rosbags_the_extra_is_named(tmp_path, monkeypatch):
         f"{tmp_path}/x.mcap: got a ROS 2 bag, expected the package rosbags to read it; "
         "pip install 'spelgen[ros]'"
     )
+
+
+# ---- odd files: read, or refused with file, row and column
+
+
+def text_log(separator: str = ",", decimal: str = ".", names: str = "{}") -> str:
+    rows = [[t, *q, *qd, *tau] for t, q, qd, tau in zip(T, Q, QD, TAU, strict=True)]
+    head = ["t", *(f"{x}_{joint}" for x in ("q", "qd", "tau") for joint in JOINTS)]
+    lines = [separator.join(map(names.format, head))]
+    return (
+        "\n".join(lines + [separator.join(str(x).replace(".", decimal) for x in row) for row in rows]) + "\n"
+    )
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "latin-1"])
+@pytest.mark.parametrize(("separator", "decimal"), [(",", "."), (";", ","), (";", "."), ("\t", ",")])
+def test_csv_as_spreadsheets_write_it(tmp_path, separator, decimal, encoding):
+    joints = tuple(f"{joint}°" for joint in JOINTS)
+    (tmp_path / "x.csv").write_bytes(text_log(separator, decimal, "{}").encode(encoding))
+    check(read_logs(tmp_path / "x.csv", JOINTS)[0], "x")
+    named = text_log(separator, decimal).replace("shoulder", "shoulder°").replace("elbow", "elbow°")
+    (tmp_path / "x.csv").write_bytes(named.encode(encoding))
+    check(read_logs(tmp_path / "x.csv", joints)[0], "x")
+
+
+def test_a_cell_that_is_no_number_is_told_with_its_row(tmp_path):
+    (tmp_path / "x.csv").write_text(text_log().replace("-0.23", "o.23"))
+    with pytest.raises(LogError) as caught:
+        read_logs(tmp_path / "x.csv", JOINTS)
+    assert (
+        str(caught.value) == f"{tmp_path / 'x.csv'}:4: row 3, column q_elbow: got 'o.23', expected a number"
+    )
+
+
+def test_finiteness_counts_after_units(tmp_path):
+    path = parquet(tmp_path / "x.parquet", columns(tau_elbow=TAU[:, 1] * 1e200))
+    mapping = {"joints": {"elbow": {"gain": 1e200}}}
+    with pytest.raises(LogError, match=r"row 1, column tau_elbow: got no finite number \(4 of 4 rows"):
+        read_logs(path, JOINTS, mapping)
+    with pytest.raises(
+        LogError, match=r"row 1, column tau_elbow: got 6e\+200 in SI units .* below 1e\+09; check"
+    ):
+        read_logs(path, JOINTS)
+    small = {"joints": {"elbow": {"gain": 1e-200}}}
+    check(read_logs(path, JOINTS, small)[0], "x", rtol=1e-12)
+
+
+ODD_ARRAYS = {
+    "complex": (Q[:, 0].astype(complex), "unreadable npz file"),
+    "records": (np.zeros(4, dtype=[("a", "f8")]), "unreadable npz file"),
+    "bytes": (np.zeros(4, "V3"), "unreadable npz file"),
+    "text": (np.array(["a"] * 4), "row 1, column q_shoulder: got 'a', expected a number"),
+}
+
+
+@pytest.mark.parametrize("case", ODD_ARRAYS)
+def test_odd_arrays_are_refused(tmp_path, case):
+    array, message = ODD_ARRAYS[case]
+    np.savez(tmp_path / "x.npz", **columns(q_shoulder=array))
+    with pytest.raises(LogError, match=message):
+        read_logs(tmp_path / "x.npz", JOINTS)
+
+
+@pytest.mark.parametrize("kind", [">f8", np.longdouble, np.float32])
+def test_numbers_of_any_machine_are_read(tmp_path, kind):
+    np.savez(tmp_path / "x.npz", **columns(q_shoulder=Q[:, 0].astype(kind)))
+    check(read_logs(tmp_path / "x.npz", JOINTS)[0], "x", rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", [pa.duration("ns"), pa.time64("ns"), pa.timestamp("ns", "UTC")])
+def test_clocks_of_any_type_are_read(tmp_path, kind):
+    path = parquet(tmp_path / "x.parquet", columns(t=pa.array((T * 1e9).round().astype(np.int64), kind)))
+    check(read_logs(path, JOINTS)[0], "x", rtol=1e-9)
+
+
+def test_lists_do_not_name_recordings(tmp_path):
+    path = parquet(tmp_path / "x.parquet", columns(trajectory=pa.array([[1, 2]] * 4)))
+    for read in (lambda: read_logs(path, JOINTS), lambda: list(scan([path], JOINTS))):
+        with pytest.raises(LogError, match=r"column trajectory: got values of type list<.*>, expected names"):
+            read()
+
+
+@pytest.mark.parametrize("form", ["[{}, {}]", "({} {})", "array('d', [{}, {}])"])
+def test_places_of_lists_are_columns(tmp_path, form):
+    """As of sensor_msgs/JointState: a list in a cell for all joints, in the message's order."""
+    mapping = {
+        "columns": {"t": "time"},
+        "joints": {
+            "shoulder": {"columns": {"q": "position[1]", "qd": "velocity[1]", "tau": "effort[1]"}},
+            "elbow": {"columns": {"q": "position[0]", "qd": "velocity[0]", "tau": "effort[0]"}},
+        },
+    }
+    lists = {"position": Q, "velocity": QD, "effort": TAU}
+    texts = {name: [form.format(*row[::-1]) for row in values] for name, values in lists.items()}
+    nested = {name: pa.array(values[:, ::-1].tolist()) for name, values in lists.items()}
+    with (tmp_path / "x.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([["time", *texts], *zip(T, *texts.values(), strict=True)])
+    parquet(tmp_path / "y.parquet", {"time": T} | nested)
+    for name in ("x.csv", "y.parquet"):
+        check(read_logs(tmp_path / name, JOINTS, mapping)[0], name[0])
+    ((_, scanned),) = scan([tmp_path / "y.parquet"], JOINTS, LogMapping.model_validate(mapping))
+    check(scanned, "y")
+    texts["effort"][2] = "[]"
+    with (tmp_path / "x.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([["time", *texts], *zip(T, *texts.values(), strict=True)])
+    with pytest.raises(LogError, match=r"x\.csv:4: row 3, column effort\[1\]: got no finite number"):
+        read_logs(tmp_path / "x.csv", JOINTS, mapping)
+
+
+def test_no_column_of_another_joint_is_offered(tmp_path):
+    joints = tuple(str(k) for k in range(6))
+    names = {"q": "position_{joint}", "qd": "velocity_{joint}", "tau": "effort_{joint}"}
+    log = {"t": T} | {pattern.replace("{joint}", k): T for pattern in names.values() for k in joints}
+    del log["effort_3"]
+    path = parquet(tmp_path / "x.parquet", log)
+    for asked in (joints, ("3",)):
+        with pytest.raises(LogError, match="missing column effort_3") as caught:
+            read_logs(path, asked, {"columns": names})
+        assert "rename the column '" not in str(caught.value)

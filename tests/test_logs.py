@@ -183,7 +183,7 @@ BAD = {
     ),
     "text": (
         HEADER + "0,zero,0,0\n",
-        "{}: column q_a: got values of type string, expected numbers",
+        "{}:2: row 1, column q_a: got 'zero', expected a number",
     ),
     "hole": (
         HEADER + "0,0,0,0\n0.1,0,,0\n0.2,0,0,nan\n",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,25 +18,10 @@ from spelgen.errors import LogError, SpelgenError, collect
 from spelgen.logs.arm_mapping import GivenMapping, log_source
 from spelgen.logs.log_files import log_files
 from spelgen.logs.mapping import LogMapping
-from spelgen.logs.read import (
-    ROW_GROUP,
-    clock_start,
-    in_si,
-    made_trajectory,
-    read_logs,
-    require_increasing_times,
-    table_values,
-)
-from spelgen.logs.tables import (
-    UNITS_KEY,
-    LogTable,
-    labels_among,
-    opened,
-    read_schema,
-    require_columns,
-    wanted_names,
-)
+from spelgen.logs.read import ROW_GROUP, read_logs
+from spelgen.logs.tables import Layout, opened, stored_columns, table_layout
 from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.values import clock_start, made_trajectory, require_increasing_times, values_in_si
 
 IN_MEMORY = 100_000_000  # bytes of numbers up to which logs are held in memory; windows take five times that
 BUFFER = 2**16  # bytes read ahead of each column
@@ -45,15 +30,16 @@ LONGEST = 2**16  # samples of a chunk: of 7 joints, 12 MB, and 53 MB as windows
 
 @dataclass(frozen=True)
 class ParquetLog:
-    """A file and how it is read. labels: the column of its recordings' names. start: of its clock."""
+    """A file and how it is read. stored: its columns that are needed. start: of its clock."""
 
     file: Path
-    joints: tuple[str, ...]
-    mapping: LogMapping
-    columns: tuple[str, ...]
-    labels: str | None
-    declares_units: bool
+    layout: Layout
+    stored: tuple[str, ...]
     start: int
+
+    def values(self, batch: pa.RecordBatch, row: int) -> np.ndarray:
+        """What a batch from this row on holds (T, C), in SI units."""
+        return values_in_si(batch, self.layout, self.file, self.start, row)
 
 
 @dataclass(frozen=True)
@@ -70,15 +56,18 @@ class Chunk:
         source = _source(self.log.file)
         groups, row = _row_groups(source, self.first, self.stop)
         found = []
-        for batch in source.iter_batches(ROW_GROUP, row_groups=groups, columns=list(self.log.columns)):
+        for batch in source.iter_batches(ROW_GROUP, row_groups=groups, columns=list(self.log.stored)):
             low, high = max(self.first - row, 0), min(self.stop - row, batch.num_rows)
             if low < high:
-                found.append(_values(batch.slice(low, high - low), self.log, row + low))
+                found.append(self.log.values(batch.slice(low, high - low), row + low))
             row += batch.num_rows
             if row >= self.stop:
                 break
-        values = in_si(np.concatenate(found), self.log.joints, self.log.mapping)
-        return _trajectory(self, values)
+        return self.trajectory(np.concatenate(found))
+
+    def trajectory(self, data: np.ndarray) -> Trajectory:
+        """Its samples, from their values (T, C) in SI units."""
+        return made_trajectory(data, self.log.layout, name=self.name, file=self.log.file)
 
 
 def large_files(
@@ -133,38 +122,39 @@ def scan(
         log = _opened_log(file, tuple(joints), mapping)
         place = file.stem if stems[file.stem] == 1 else str(file)
         before = ("", -np.inf)
-        for chunk, recording, logged in _chunks(log, place, len(files) > 1):
-            values = in_si(logged, log.joints, log.mapping)
-            t = values["t"]
+        for chunk, recording, data in _chunks(log, place, len(files) > 1):
+            t = data[:, 0]
             follows = before[0] == recording
             times = np.concatenate([[before[1]], t]) if follows else t
             rows = np.arange(chunk.stop - len(times), chunk.stop)
-            require_increasing_times(times, rows, file, log.columns[0])
+            require_increasing_times(times, rows, file, log.layout.columns[0])
             before = (recording, t[-1])
-            yield chunk, _trajectory(chunk, values)
+            yield chunk, chunk.trajectory(data)
 
 
 def _opened_log(file: Path, joints: tuple[str, ...], mapping: LogMapping) -> ParquetLog:
-    schema, mapping = read_schema(file, mapping)
-    columns = wanted_names(joints, mapping)
-    require_columns(schema.names, columns, file, mapping)
-    head = next(_source(file).iter_batches(1, columns=[columns[0]]), None)
+    source = opened(file, lambda: _source(file))
+    schema = source.schema_arrow
+    layout = table_layout(schema, joints, mapping, file)
+    stored = stored_columns(replace(layout, labels=None), schema.names)
+    head = next(source.iter_batches(1, columns=[layout.columns[0]]), None)
     if head is None:
         raise LogError("no rows", file=file, expected="at least one window of samples")
-    declared = UNITS_KEY in (schema.metadata or {}) or all(mapping.unit("q", joint) for joint in joints)
-    start = clock_start(LogTable(None, pa.Table.from_batches([head]), columns, mapping))
-    return ParquetLog(file, joints, mapping, columns, labels_among(schema.names, mapping), declared, start)
+    return ParquetLog(file, layout, tuple(stored), clock_start(head.column(0)))
 
 
 def _chunks(log: ParquetLog, place: str, several: bool) -> Iterator[tuple[Chunk, str, np.ndarray]]:
-    """Each chunk of a file with the name of its recording and its values as logged."""
-    batches = _source(log.file).iter_batches(ROW_GROUP, columns=list(log.columns))
-    held, first = np.zeros((0, len(log.columns))), 0  # what was read and not yet given, from this row on
+    """Each chunk of a file with the name of its recording and its values."""
+    batches = _source(log.file).iter_batches(ROW_GROUP, columns=list(log.stored))
+    held, first = (
+        np.zeros((0, len(log.layout.columns))),
+        0,
+    )  # what was read and not yet given, from this row on
     for recording, start, end in _recordings(log, place, several):
         for name, begin, stop in _cut(recording, start, end):
             while first + len(held) < stop:
                 held, first = held[begin - first :], begin
-                held = np.concatenate([held, _values(next(batches), log, first + len(held))])
+                held = np.concatenate([held, log.values(next(batches), first + len(held))])
             yield Chunk(name, log, begin, stop), recording, held[begin - first : stop - first]
 
 
@@ -178,12 +168,12 @@ def _cut(recording: str, start: int, end: int) -> Iterator[tuple[str, int, int]]
 def _recordings(log: ParquetLog, place: str, several: bool) -> list[tuple[str, int, int]]:
     """Name, first row and end of each recording of a file; the rows of one must lie together."""
     source = _source(log.file)
-    if log.labels is None:
+    if log.layout.labels is None:
         return [(place, 0, source.metadata.num_rows)]
     labels: list[str] = []
     ends: list[int] = []  # where the run of each label ends
     row = 0
-    for batch in source.iter_batches(ROW_GROUP, columns=[log.labels]):
+    for batch in source.iter_batches(ROW_GROUP, columns=[log.layout.labels]):
         encoded = pa.compute.run_end_encode(batch.column(0).cast(pa.string()))
         for label, end in zip(
             map(str, encoded.values.to_pylist()), encoded.run_ends.to_pylist(), strict=True
@@ -200,7 +190,7 @@ def _recordings(log: ParquetLog, place: str, several: bool) -> list[tuple[str, i
         if label in seen:
             raise LogError(
                 f"trajectory {label} once more, after others", file=log.file,
-                element=f"row {start + 1}, column {log.labels}",
+                element=f"row {start + 1}, column {log.layout.labels}",
                 expected="its rows together, in a log too large for memory", do="sort the rows",
             )  # fmt: skip
         seen.add(label)
@@ -219,15 +209,3 @@ def _row_groups(source: pa.parquet.ParquetFile, first: int, stop: int) -> tuple[
     ends = np.cumsum(sizes)
     groups = [k for k, end in enumerate(ends) if end > first and end - sizes[k] < stop]
     return groups, int(ends[groups[0]] - sizes[groups[0]])
-
-
-def _values(batch: pa.RecordBatch, log: ParquetLog, row: int) -> np.ndarray:
-    table = LogTable(None, pa.Table.from_batches([batch]), log.columns, log.mapping)
-    return table_values(table, log.file, log.start, row)
-
-
-def _trajectory(chunk: Chunk, values: dict[str, np.ndarray]) -> Trajectory:
-    log = chunk.log
-    return made_trajectory(
-        values, slice(None), name=chunk.name, file=log.file, declares_units=log.declares_units
-    )

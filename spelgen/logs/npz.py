@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from spelgen.errors import LogError
 from spelgen.logs.mapping import LogMapping
-from spelgen.logs.tables import LogTable, missing_columns, opened, wanted_quantities
+from spelgen.logs.tables import LogTable, made_layout, missing_columns, opened, wanted_quantities
 
 NAMES = "joints"  # the array of joint names, by the columns of the matrices
 ENDING = ".npy"
@@ -56,7 +56,7 @@ def read_npz(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
             return [_npz_table(None, arrays, file, joints, mapping)]
         texts = [text for name in arrays if (text := _trajectory_text(mapping.columns.t, name))]
         if not texts:
-            raise missing_columns([mapping.columns.t], list(arrays), file, mapping)
+            raise missing_columns([mapping.columns.t], list(arrays), file, mapping, joints)
         return [_npz_table(text, arrays, file, joints, mapping.of_trajectory(text)) for text in texts]
 
 
@@ -87,12 +87,21 @@ def _npz_table(
                 found[name] = arrays[name]
             names.append(name)
     if missing := [name for name in names if name not in found]:
-        raise missing_columns(missing, list(arrays), file, mapping)
+        raise missing_columns(missing, list(arrays), file, mapping, joints)
     _require_samples(found, file)
     labels = mapping.columns.trajectory
     if text is None and labels in arrays:
         found[labels] = arrays[labels]
-    return LogTable(text, pa.table(found), tuple(names), mapping, labels if labels in found else None)
+    table = opened(file, lambda: pa.table({name: _plain(array) for name, array in found.items()}))
+    layout = made_layout(names, labels if labels in found else None, joints, mapping)
+    return LogTable(text, table, layout)
+
+
+def _plain(array: np.ndarray) -> np.ndarray:
+    """The array with a type that Arrow knows: this machine's byte order, no more than double precision."""
+    if array.dtype.kind == "f":
+        return array.astype(float)
+    return array.astype(array.dtype.newbyteorder("="))
 
 
 def _place(arrays: NpzArrays, index: int, name: str, matrix: str, joints: int, file: Path) -> int:

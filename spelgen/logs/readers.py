@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,15 +13,9 @@ import pyarrow.parquet
 from spelgen.logs.bags import is_bag, read_bag
 from spelgen.logs.mapping import PLAIN, LogMapping
 from spelgen.logs.npz import read_npz
-from spelgen.logs.tables import (
-    LogTable,
-    labels_among,
-    opened,
-    read_schema,
-    require_columns,
-    wanted_names,
-    wanted_quantities,
-)
+from spelgen.logs.tables import LogTable, made_layout, opened, stored_columns, table_layout, wanted_quantities
+
+HEAD = 2**16  # bytes of a CSV file that tell how it is written
 
 
 def read_tables(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
@@ -33,26 +28,41 @@ def read_tables(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[
     if file.suffix == ".npz":
         return read_npz(file, joints, mapping)
     if file.suffix == ".parquet":
-        return [_parquet(file, joints, mapping)]
-    table = opened(file, lambda: pa.csv.read_csv(file))
-    names = wanted_names(joints, mapping)
-    require_columns(table.column_names, names, file, mapping)
-    return [LogTable(None, table, names, mapping, labels_among(table.column_names, mapping))]
+        schema = opened(file, lambda: pa.parquet.read_schema(file))
+        layout = table_layout(schema, joints, mapping, file)
+        stored = stored_columns(layout, schema.names)
+        return [LogTable(None, opened(file, lambda: pa.parquet.read_table(file, columns=stored)), layout)]
+    table = opened(file, lambda: read_csv(file))
+    return [LogTable(None, table, table_layout(table.schema, joints, mapping, file))]
 
 
-def _parquet(file: Path, joints: Sequence[str], mapping: LogMapping) -> LogTable:
-    schema, mapping = read_schema(file, mapping)
-    names, labels = wanted_names(joints, mapping), labels_among(schema.names, mapping)
-    require_columns(schema.names, names, file, mapping)
-    read = [*names, *filter(None, [labels])]
-    return LogTable(
-        None, opened(file, lambda: pa.parquet.read_table(file, columns=read)), names, mapping, labels
+def read_csv(file: Path) -> pa.Table:
+    """A table of commas, semicolons or tabs, with decimal commas beside the latter two, in UTF-8, -16 or Latin-1."""
+    with file.open("rb") as source:
+        head = source.read(HEAD)
+    encoding = "utf-16" if head[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8"
+    try:
+        names, _, rows = head.decode(encoding, "strict" if len(head) < HEAD else "ignore").partition("\n")
+    except UnicodeDecodeError:
+        encoding = "latin-1"
+        names, _, rows = head.decode(encoding).partition("\n")
+    delimiter = max(",;\t", key=names.count)
+    decimal = (
+        "," if delimiter != "," and re.search(rf"(^|{delimiter}) *-?\d+,\d", rows, re.MULTILINE) else "."
     )
+    table = pa.csv.read_csv(
+        file,
+        pa.csv.ReadOptions(encoding=encoding),
+        pa.csv.ParseOptions(delimiter=delimiter),
+        pa.csv.ConvertOptions(decimal_point=decimal),
+    )
+    return table.rename_columns([name.strip() for name in table.column_names])
 
 
 def _bag(file: Path, joints: Sequence[str], mapping: LogMapping) -> LogTable:
-    table = read_bag(file, [mapping.log_name(joint) for joint in joints], mapping.topic)
-    plain = {x: PLAIN[x].replace("{joint}", "{}") for x in wanted_quantities(mapping)}
-    names = [form.format(mapping.log_name(joint)) for form in plain.values() for joint in joints]
-    require_columns(table.column_names, ["t", *names], file, LogMapping())
-    return LogTable(None, table, ("t", *names), mapping)
+    names = [mapping.log_name(joint) for joint in joints]
+    table = read_bag(file, names, mapping.topic)
+    plain = LogMapping(velocity=mapping.velocity)
+    table_layout(table.schema, names, plain, file)
+    columns = [PLAIN[x].replace("{joint}", name) for x in wanted_quantities(mapping) for name in names]
+    return LogTable(None, table, made_layout(["t", *columns], None, joints, mapping))

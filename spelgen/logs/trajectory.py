@@ -14,6 +14,7 @@ from spelgen.errors import LogError
 from spelgen.listing import Listing
 
 QUANTITIES = ("q", "qd", "tau")
+LARGEST = 1e9  # [rad, rad/s, Nm; m, m/s, N] no arm has more
 GAP = 4.0  # a step longer than this many median steps is a hole in the recording, not jitter
 
 
@@ -28,7 +29,8 @@ class Trajectory:
     name: unique among the trajectories that are used together.
     file: where it was read from, None if it was not.
     declares_units: the file itself, or the mapping it was read by, says in what units its columns are.
-    Raises LogError where shapes do not fit, a number is not finite, or times do not increase.
+    Raises LogError where shapes do not fit, a number is not finite or beyond any arm (LARGEST), or times do not
+    increase.
     """
 
     t: np.ndarray
@@ -51,11 +53,14 @@ class Trajectory:
                 wanted = f"({samples}, {joints}), a row for each time and a column for each joint"
                 raise self._error(column, f"an array of shape {shape}", wanted)
         for column in ("t", *QUANTITIES):
-            bad = ~np.isfinite(getattr(self, column))
+            values = getattr(self, column)
+            bad = ~np.isfinite(values) if column == "t" else ~(np.abs(values) < LARGEST)
             if bad.any():
                 row = int(np.argwhere(bad)[0, 0])
-                got = f"{getattr(self, column)[row].tolist()} at sample {row}"
-                raise self._error(column, got, "finite numbers")
+                possible = (
+                    f"numbers below {LARGEST:g}" if np.isfinite(values[row]).all() else "finite numbers"
+                )
+                raise self._error(column, f"{values[row].tolist()} at sample {row}", possible)
         back = np.flatnonzero(np.diff(self.t) <= 0)
         if back.size:
             before, after = self.t[back[0]], self.t[back[0] + 1]
