@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+import yaml
 from emitted import ROBOTS
 from typer.testing import CliRunner
 
@@ -89,6 +90,15 @@ def test_other_models_go_back_as_the_nearest_bodies(tmp_path):
     assert "M differs by 0.0%, gravity by 0.0%" in told
 
 
+def test_the_models_own_friction_law_lies_beside(tmp_path):
+    run, model = run_of("rpr", tmp_path, "closed-form", heavier)
+    exported(run, tmp_path / "learned.urdf")
+    told = yaml.safe_load((tmp_path / "learned.friction.yaml").read_text())
+    law = [told["joints"][name]["law"]["coulomb"] for name in model.facts.joints]
+    np.testing.assert_allclose(law, model.coulomb.detach().numpy(), rtol=1e-10)
+    assert len((tmp_path / "learned.README.md").read_text().splitlines()) == 5
+
+
 def test_what_lies_there_stays_unless_forced(tmp_path):
     run, _ = run_of("two_link", tmp_path, "closed-form")
     path = tmp_path / "learned.urdf"
@@ -128,7 +138,8 @@ def test_a_model_in_memory_is_exported_with_its_arm(tmp_path):
     assert found.urdf.startswith(b"<?xml")
     assert "bodies: the model's own" in repr(found)
     assert "Izz2" in found._repr_html_()
-    assert [x.name for x in found.write(tmp_path / "arm.urdf")] == ["arm.urdf", "arm.yaml"]
+    written = [x.name for x in found.write(tmp_path / "arm.urdf")]
+    assert written == ["arm.urdf", "arm.yaml", "arm.friction.yaml", "arm.README.md"]
     with pytest.raises(RunError, match="this output exists already"):
         found.write(tmp_path / "arm.urdf")
     with pytest.raises(RunError, match=r"no robot\.urdf"):

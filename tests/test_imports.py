@@ -46,7 +46,9 @@ inspection loaded_arm pipeline building
 simulation: simulate
 excitation: design
 identification: identify
-exporting: rigid_body_projection urdf_file export
+exporting: description describe trained parity exported readme rigid_body_projection urdf_file urdf_export
+exporting: rigid_expressions friction_expressions learned_expressions model_expressions tip_expressions entry_points
+exporting: c_statements c_networks c_code c_library c_export casadi_export export
 render: charts plots picture learned reproduction report_page inspection_page
 logs: statistics gravity report check_logs
 comparison: truth metrics study runs formatting

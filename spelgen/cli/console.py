@@ -20,7 +20,10 @@ FAILED = 1
 INTERRUPTED = 130  # 128 + SIGINT, as shells count
 BROKEN_PIPE = 141  # 128 + SIGPIPE
 
-EXTRAS = {"pinocchio": "simulate"}  # top-level module that only an extra brings -> the extra
+EXTRAS = {
+    "pinocchio": "simulate",
+    "casadi": "deploy",
+}  # top-level module that only an extra brings -> the extra
 
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
 

@@ -14,22 +14,24 @@ from spelgen.cli.options import Force
 
 def export(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="A folder that `spelgen train` wrote.")],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE.urdf", help="Where to.")],
-    to: Annotated[Literal["urdf"], typer.Option(help="What to write.")] = "urdf",
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="FILE.urdf|FOLDER", help="Where to: a file for urdf.")
+    ],
+    to: Annotated[Literal["urdf", "c", "casadi"], typer.Option(help="What to write.")] = "urdf",
     force: Force = False,
 ) -> None:
-    """Write what was learned as a URDF and the settings beside it.
+    """Write what was learned for other tools, compared with the model before anything is written.
 
-    Bodies of a closed-form model are written as they are; of other models, the rigid bodies nearest to them.
+    urdf: bodies of a closed-form model as they are; of other models, the rigid bodies nearest to them.
+    c: a C99 header and source without dependencies. casadi: CasADi functions.
     """
     from spelgen.exporting.export import export as exported
+    from spelgen.exporting.exported import require_fitting
 
-    for path in (output, output.with_suffix(".yaml")):
-        options.require_free(path, force=force)
+    require_fitting(to, output)
+    options.require_free(output, force=force)
     found = exported(run, to)
-    robot, settings = found.write(output, force=force)
-    count = len(found.projection.arm.arm.bodies)
-    say(f"wrote {robot}: inertials of {count} {'body' if count == 1 else 'bodies'}, friction")
-    say(f"wrote {settings}: rotor inertia, friction in both directions")
+    for path in found.write(output, force=force):
+        say(f"wrote {path}")
     for line in found.summary:
         say(line)

@@ -71,10 +71,11 @@ def tip_kinematics(
         link = link or arm.tip
     if not names:
         raise ValueError("no joints are named")
-    return TipKinematics(robot, urdf_bytes(robot.path), names, link or _last_link(robot, names))
+    return TipKinematics(robot, urdf_bytes(robot.path), names, link or last_link(robot, names))
 
 
-def _last_link(robot: Robot, joints: Sequence[str]) -> str:
+def last_link(robot: Robot, joints: Sequence[str]) -> str:
+    """The link after the last of these joints, or the end of the fixed links behind it."""
     link = robot.joint[joints[-1]].child
     while True:
         fixed = [joint.child for joint in robot.joints_below[link] if joint.type == "fixed"]

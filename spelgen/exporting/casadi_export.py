@@ -1,0 +1,127 @@
+"""--to casadi: each entry point as a file of a CasADi function, with derivatives by CasADi's own."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+
+from spelgen.exporting.description import Functions, TrainedModel
+from spelgen.exporting.entry_points import (
+    ENTRY_POINTS,
+    EntryPoint,
+    expression_function,
+    networks_needed,
+)
+from spelgen.exporting.exported import Exported
+from spelgen.exporting.learned_expressions import encoded, entry_places
+from spelgen.exporting.parity import Values, check_parity
+from spelgen.exporting.readme import UNITS, readme
+from spelgen.exporting.trained import Trained
+
+TOLERANCE = 1e-12
+
+
+def export_casadi(trained: Trained) -> Exported:
+    """A file for each entry point. Raises RunError where they do not give what the model gives."""
+    model = trained.described
+    functions = casadi_functions(model)
+    names = list(functions)
+    parity = check_parity(_Called(functions), trained.model, trained.arm, model, names, TOLERANCE)
+    checked = f"Checked when exported, by CasADi {ca.CasadiMeta.version()}: {parity.summary}."
+    use = (
+        "qdd = casadi.Function.load('forward_dynamics.casadi')(q, qd, tau, z) takes numbers or symbols: "
+        "its derivatives, of any order, are CasADi's; *_derivatives.casadi hold the first ones ready."
+    )
+    about = f"{UNITS}; z is friction's memory, {model.memory} numbers: casadi.DM(0, 1) where there are none."
+    files = {f"{name}.casadi": _saved(function) for name, function in functions.items()}
+    text = readme(f"Dynamics of {model.robot} in CasADi", use, trained.joint_names, about, checked)
+    return Exported("casadi", model.robot, {**files, "README.md": text}, (checked,))
+
+
+def casadi_functions(model: TrainedModel) -> dict[str, ca.Function]:
+    """Every entry point: of scalar expressions, or where there are networks, of matrices."""
+    found: dict[str, ca.Function] = {}
+    for entry in ENTRY_POINTS:
+        if entry.level == "jets" and model.learned is not None:
+            found[entry.name] = _derivatives(entry, found[entry.name.removesuffix("_derivatives")])
+        else:
+            found[entry.name] = _with_networks(entry, model)
+    return found
+
+
+def _with_networks(entry: EntryPoint, model: TrainedModel) -> ca.Function:
+    expressions = expression_function(entry, model)
+    needed = networks_needed(expressions)
+    if not needed:
+        return expressions
+    given = [ca.MX.sym(name, expressions.size1_in(name)) for name in entry.inputs]
+    states = dict(zip(entry.inputs, given, strict=True))
+    networks = _network_values(model, states["q"], states.get("qd"))
+    arguments = [*given, *(networks[name] for name in needed)]
+    names = [name for name, _ in entry.outputs]
+    return ca.Function(entry.name, given, expressions.call(arguments), list(entry.inputs), names)
+
+
+def _network_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[str, ca.MX]:
+    """What networks give at q, by its name in ``NetworkSymbols``."""
+    learned, n, found = model.learned, model.n, {}
+    assert learned is not None
+    read, places = encoded(learned.encoding, q), entry_places(model)
+    if places:
+        rows = [row * n + column for row, column in places]
+        mass = found["mass"] = _network(learned.mass, rows, read)
+        if qd is not None:
+            found["rate"] = ca.jtimes(mass, q, qd)
+            squares = [(0.5 if row == column else 1.0) * qd[row] * qd[column] for row, column in places]
+            found["kinetic"] = ca.jtimes(mass, q, ca.vertcat(*squares), True)
+    if learned.potential is not None and learned.potential.reached.any():
+        found["energy"] = _network(learned.potential, [0], read)
+        found["gravity"] = ca.gradient(found["energy"], q)
+    return found
+
+
+def _network(functions: Functions, rows: list[int], read: ca.MX) -> ca.MX:
+    layer = read
+    for weight, bias in zip(functions.weights[:-1], functions.biases, strict=False):
+        layer = 1 / (1 + ca.exp(-(ca.sparsify(ca.DM(weight)) @ layer + bias)))
+    return ca.sparsify(ca.DM(functions.weights[-1][rows])) @ layer + functions.biases[-1][rows]
+
+
+def _derivatives(entry: EntryPoint, function: ca.Function) -> ca.Function:
+    given = function.mx_in()
+    (output,) = function.call(given)
+    places = [name for name in entry.inputs if name in ("q", "qd", "tau")]
+    by_input = [ca.densify(ca.jacobian(output, given[entry.inputs.index(name)])) for name in places]
+    names = [name for name, _ in entry.outputs]
+    return ca.Function(entry.name, given, by_input, list(entry.inputs), names)
+
+
+def _saved(function: ca.Function) -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "function.casadi")
+        function.save(str(path))
+        return path.read_bytes()
+
+
+class _Called:
+    """CasADi's functions for arrays of states."""
+
+    def __init__(self, functions: Mapping[str, ca.Function]) -> None:
+        self._functions = functions
+
+    def __call__(self, name: str, inputs: Values) -> dict[str, np.ndarray]:
+        function = self._functions[name]
+        rows = [inputs[key] for key in function.name_in()]
+        found = [function.call([ca.DM(x) for x in state]) for state in zip(*rows, strict=True)]
+        return {
+            key: np.array([_array(each[k]) for each in found]) for k, key in enumerate(function.name_out())
+        }
+
+
+def _array(value: ca.DM) -> np.ndarray:
+    full: np.ndarray = value.full()
+    return full[:, 0] if full.shape[1] == 1 else full

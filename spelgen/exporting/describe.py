@@ -1,0 +1,152 @@
+"""A torch model and its arm -> its description: facts of the arm, values of the model; no text of the module."""
+
+from __future__ import annotations
+
+import copy
+import keyword
+import re
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from spelgen.arm.rational import rotation_from_rpy
+from spelgen.dynamics.constraint import mimic_constraint
+from spelgen.dynamics.tip import last_link
+from spelgen.errors import RunError
+from spelgen.exporting.description import (
+    Bound,
+    Encoding,
+    FrictionLaw,
+    FrictionNetwork,
+    Functions,
+    Learned,
+    TipJoint,
+    TrainedModel,
+)
+from spelgen.loaded_arm import LoadedArm
+
+if TYPE_CHECKING:
+    from spelgen.emission.loading import EmittedModel
+
+
+def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
+    """The numbers of a trained model of this arm. Raises RunError for a preset that has no such description."""
+    exact: Any = copy.deepcopy(model).double().cpu().requires_grad_(False)
+    dynamics, preset, n = exact.dynamics, model.facts.options.preset, model.n
+    rigid = hasattr(exact, "inertial_parameters")
+    with torch.no_grad():
+        prepared = dynamics.prepare()
+        learned = None if rigid else _learned(dynamics, prepared, preset)
+        tip_link = loaded.tip or last_link(loaded.robot, [c.name for c in loaded.arm.coordinates])
+        tip, end = _tip(loaded, tip_link)
+        gains = _array(prepared.input)
+        return TrainedModel(
+            name=identifier(loaded.arm.name),
+            robot=loaded.arm.name,
+            preset=preset,
+            coordinates=loaded.arm.coordinates,
+            identifiers=tuple(model.joint_names),
+            gravity=np.array(loaded.arm.gravity, dtype=float),
+            bodies=loaded.arm.bodies,
+            inertias=_array(exact.inertial_parameters) if rigid else None,
+            armature=_array(exact.armature) if rigid else np.zeros(n),
+            learned=learned,
+            friction=_friction(dynamics, prepared, preset),
+            bristles=None,
+            inputs=np.diag(gains) if gains.ndim == 1 else gains,
+            actuated=_array(dynamics.input.actuated),
+            torque_offset=_array(exact.torque_offset) if rigid else np.zeros(n),
+            tip_link=tip_link,
+            tip=tip,
+            tip_end=end,
+        )
+
+
+def identifier(text: str) -> str:
+    """ASCII letters, digits and underscores of a text: a name that any language takes."""
+    plain = re.sub(r"[^0-9a-z]+", "_", text.lower()).strip("_")[:40]
+    bad = not plain or plain[0].isdigit() or keyword.iskeyword(plain)
+    return f"arm_{plain}".rstrip("_") if bad else plain
+
+
+def _array(value: torch.Tensor) -> np.ndarray:
+    found: np.ndarray = value.detach().double().numpy().copy()
+    return found
+
+
+def _friction(dynamics: Any, prepared: Any, preset: str) -> FrictionLaw | FrictionNetwork:
+    constants = prepared.friction
+    if hasattr(constants, "coulomb"):
+        return FrictionLaw(**{name: _array(getattr(constants, name)) for name in FrictionLaw.__annotations__})
+    if hasattr(constants, "smoothing"):
+        names = [name for name in FrictionNetwork.__annotations__ if name != "nominal"]
+        values = {name: _array(getattr(constants, name)) for name in names}
+        return FrictionNetwork(**values, nominal=_array(dynamics.friction.nominal))
+    raise _foreign(preset, "a full friction matrix")
+
+
+def _learned(dynamics: Any, prepared: Any, preset: str) -> Learned:
+    n, mass = dynamics.n, prepared.mass
+    if isinstance(mass, torch.Tensor):  # M does not depend on q
+        functions, bound = Functions((), (_array(mass).ravel(),), None), None
+    elif hasattr(dynamics.mass, "bound") and hasattr(mass, "series"):
+        functions = _functions(mass.layers, mass.series, preset)
+        bound = Bound(*(_array(getattr(dynamics.mass.bound, name)) for name in Bound.__annotations__))
+    else:
+        raise _foreign(preset, "a dense mass matrix")
+    potential = None
+    if prepared.potential is not None:
+        energy = prepared.potential.energy
+        series = None if energy is None else energy.unsqueeze(0)
+        potential = _functions(prepared.potential.layers, series, preset)
+    features = dynamics.fourier
+    encoding = Encoding(
+        prismatic=dynamics.encoding.prismatic,
+        center=_array(dynamics.encoding.center),
+        reach=_array(dynamics.encoding.reach),
+        frequencies=np.zeros((0, n)) if features is None else _array(features.frequencies).T,
+        powers=np.zeros((0, n)) if features is None else _array(features.powers),
+    )
+    return Learned(encoding, functions, potential, bound)
+
+
+def _functions(layers: Any, series: torch.Tensor | None, preset: str) -> Functions:
+    if type(layers).__name__ != "MLPLayers":
+        raise _foreign(preset, "Kolmogorov-Arnold networks")
+    weights, biases = (tuple(map(_array, each)) for each in (layers.weights, layers.biases))
+    return Functions(weights, biases, None if series is None else _array(series))
+
+
+def _foreign(preset: str, what: str) -> RunError:
+    return RunError(
+        f"the preset {preset}, which has {what}",
+        expected="closed-form, or minimal with tanh networks",
+        do="--to onnx, torch and urdf take every preset",
+    )
+
+
+def _tip(loaded: LoadedArm, link: str) -> tuple[tuple[TipJoint, ...], np.ndarray]:
+    """The joints on the way to a link as the URDF has them, and the fixed transform behind the last."""
+    robot = loaded.robot
+    constraint = mimic_constraint(robot, [c.name for c in loaded.arm.coordinates])
+    found: list[TipJoint] = []
+    at = np.eye(4)
+    for joint in robot.path_to(link):
+        origin = np.eye(4)
+        origin[:3, :3], origin[:3, 3] = rotation_from_rpy(joint.rpy), joint.xyz
+        at = at @ origin
+        if not joint.moves:
+            continue
+        index = constraint.names.index(joint.name)
+        kind = "prismatic" if joint.type == "prismatic" else "revolute"
+        axis = np.array(joint.axis, dtype=float)
+        unit = axis / np.linalg.norm(axis)
+        found.append(TipJoint(_clean(at), kind, unit, constraint.jacobian[index], constraint.offset[index]))
+        at = np.eye(4)
+    return tuple(found), _clean(at)
+
+
+def _clean(transform: np.ndarray) -> np.ndarray:
+    """Without the rounding that cos(pi / 2) leaves."""
+    return np.where(np.abs(transform) < 1e-15, 0.0, transform)

@@ -1,0 +1,47 @@
+"""What friction takes, as CasADi expressions, and what its memory does along a displacement."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+
+from spelgen.exporting.description import Bristles, FrictionLaw, FrictionNetwork
+
+
+def law_torque(law: FrictionLaw, qd: ca.SX, gravity: ca.SX) -> ca.SX:
+    """``runtime.friction_laws``: (n, 1) [Nm, N], under this gravity torque."""
+    dry = ca.SX(law.coulomb) + law.load_dependence * ca.fabs(gravity)
+    if law.stribeck.any():
+        dry = dry + law.stribeck * ca.exp(-((qd / law.stribeck_velocity) ** 2))
+    turned = ca.tanh(qd / law.coulomb_smoothing_velocity)
+    return law.viscous * qd + law.saturation * ca.tanh(qd / law.saturation_velocity) + dry * turned
+
+
+def network_torque(network: FrictionNetwork, encoded: ca.SX, qd: ca.SX) -> ca.SX:
+    """``runtime.joint_friction``: (n, 1) [Nm, N]."""
+    direction = qd / ca.sqrt(qd * qd + network.smoothing)
+    inputs = ca.vertcat(encoded, qd, direction)
+    hidden = 1 / (1 + ca.exp(-(_sparse(network.weight) @ inputs + network.bias)))
+    dry = _sparse(network.out) @ hidden + network.offset
+    # log(1 + exp x) without overflow
+    size = ca.fmax(dry, 0) + ca.log1p(ca.exp(-ca.fabs(dry)))
+    return network.viscous * qd + network.nominal * direction * size
+
+
+def bristle_torque(bristles: Bristles, z: ca.SX) -> ca.SX:
+    """strength z / reach, summed over a joint's elements; (n, 1) [Nm, N]. z: joint by joint, (n count, 1)."""
+    n, count = bristles.reach.shape
+    force = z * (bristles.strength / bristles.reach).ravel()
+    return ca.sum2(ca.reshape(force, count, n).T)
+
+
+def bristle_step(bristles: Bristles, z: ca.SX, dq: ca.SX) -> ca.SX:
+    """z after a displacement dq: z' = qd - |qd| z / reach, solved along it."""
+    moved = ca.SX(np.kron(np.eye(len(bristles.reach)), np.ones((bristles.count, 1)))) @ dq
+    reach = bristles.reach.ravel()
+    end = ca.sign(moved) * reach
+    return end + (z - end) * ca.exp(-ca.fabs(moved) / reach)
+
+
+def _sparse(matrix: np.ndarray) -> ca.DM:
+    return ca.sparsify(ca.DM(matrix))

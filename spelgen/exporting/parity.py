@@ -1,0 +1,148 @@
+"""Whether what was exported gives what the torch model gives: the largest difference at random states."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from spelgen.dynamics.tip import TipKinematics
+from spelgen.errors import RunError
+from spelgen.exporting.description import TrainedModel
+from spelgen.structure.nominal import working_range
+from spelgen.urdf.document import urdf_bytes
+
+if TYPE_CHECKING:
+    from spelgen.emission.loading import EmittedModel
+    from spelgen.loaded_arm import LoadedArm
+
+STATES = 200
+DIFFERENTIATED = 10  # of these, where derivatives are compared: torch takes long for them
+_TIP_TOLERANCE = 3e-6  # pytorch-kinematics rounds offsets to float32
+_USUAL_SPEED = {"revolute": 1.0, "prismatic": 0.3}  # rad/s, m/s where the URDF names none
+
+Values = dict[str, np.ndarray]
+Called = Callable[[str, Values], Mapping[str, np.ndarray]]
+"""What was exported: an entry point's name and its inputs, (states, n) each, to its outputs, (states, ...)."""
+
+
+@dataclass(frozen=True)
+class Parity:
+    """The largest difference to the torch model by entry point, relative to the largest value, and what is allowed."""
+
+    differences: dict[str, float]
+    tolerance: float
+    states: int
+
+    @property
+    def summary(self) -> str:
+        """One sentence."""
+        of_model = [name for name in self.differences if not name.startswith("tip_")]
+        worst = max(of_model, key=lambda name: self.differences[name])
+        return (
+            f"{self.states} random states: at most {self.differences[worst]:.1e} ({worst}) from the torch module, "
+            f"relative to the largest value; {self.tolerance:.0e} is allowed"
+        )
+
+    def require(self) -> Parity:
+        """Itself. Raises RunError where a difference is larger than allowed."""
+        for name, difference in self.differences.items():
+            if not difference <= self._allowed(name):
+                raise RunError(
+                    f"{name} differs from the model by {difference:.1e}",
+                    element="parity check",
+                    expected=f"at most {self._allowed(name):.0e} of the largest value",
+                    do="nothing was written; please report this with the run folder",
+                )
+        return self
+
+    def _allowed(self, name: str) -> float:
+        return max(self.tolerance, _TIP_TOLERANCE) if name.startswith("tip_") else self.tolerance
+
+
+def check_parity(
+    called: Called,
+    model: EmittedModel,
+    loaded: LoadedArm,
+    described: TrainedModel,
+    names: list[str],
+    tolerance: float,
+    states: int = STATES,
+) -> Parity:
+    """``called`` held against the torch model at random states, at each of these entry points. Raises RunError."""
+    inputs = random_inputs(described, states)
+    exact = copy.deepcopy(model).double().cpu().requires_grad_(False)
+    differences: dict[str, float] = {}
+    for name in names:
+        few = name.endswith("derivatives")
+        given = {key: value[:DIFFERENTIATED] if few else value for key, value in inputs.items()}
+        expected, found = reference(name, exact, loaded, described, given), called(name, given)
+        differences[name] = max(relative(found[key], value) for key, value in expected.items())
+    return Parity(differences, tolerance, states).require()
+
+
+def random_inputs(model: TrainedModel, states: int, seed: int = 0) -> Values:
+    """States over the joints' ranges at their usual speeds, with torques of the size of friction and gravity."""
+    random = np.random.default_rng(seed)
+    speed = np.array([c.velocity or _USUAL_SPEED[c.kind] for c in model.coordinates])
+    q = np.stack([random.uniform(*working_range(c), states) for c in model.coordinates], axis=-1)
+    qd, qdd, dq = (size * speed * random.standard_normal((states, model.n)) for size in (0.5, 2.0, 0.05))
+    z = 1e-3 * random.standard_normal((states, model.memory))
+    tau = 10.0 * random.standard_normal((states, model.n))
+    return {"q": q, "qd": qd, "qdd": qdd, "tau": tau, "z": z, "dq": dq}
+
+
+def relative(found: np.ndarray, expected: np.ndarray) -> float:
+    """The largest difference, relative to the largest value; NaN where one is NaN."""
+    if not expected.size:
+        return 0.0
+    size = np.abs(expected).max()
+    return float(np.abs(found - expected).max() / (size if size > 0 else 1.0))
+
+
+def reference(
+    name: str, model: Any, loaded: LoadedArm, described: TrainedModel, inputs: Values
+) -> dict[str, np.ndarray]:
+    """What the torch model says of an entry point, by output."""
+    q, qd, qdd, tau = (torch.from_numpy(inputs[key]) for key in ("q", "qd", "qdd", "tau"))
+    with torch.no_grad():
+        if name.startswith("tip_"):
+            names = [coordinate.name for coordinate in described.coordinates]
+            tip = TipKinematics(loaded.robot, urdf_bytes(loaded.robot.path), names, described.tip_link)
+            found = {"pose": tip.pose(q)} if name == "tip_pose" else {"jacobian": tip.jacobian(q)}
+        elif name == "energy":
+            kinetic = 0.5 * (model.momentum(q, qd) * qd).sum(dim=-1)
+            found = {"energy": torch.stack([kinetic, model.potential_energy(q)], dim=-1)}
+        elif name == "friction_step":
+            return {"z_next": inputs["z"]}
+        elif name.endswith("derivatives"):
+            found = _derivatives(name, model, q, qd, qdd if name.startswith("inverse") else tau)
+        else:
+            found = {key: value(model, q, qd, qdd, tau) for key, value in [_VALUES[name]]}
+    return {key: value.numpy() for key, value in found.items()}
+
+
+_VALUES: dict[str, tuple[str, Callable[..., torch.Tensor]]] = {
+    "inverse_dynamics": ("tau", lambda m, q, qd, qdd, tau: m.inverse_dynamics(q, qd, qdd)),
+    "forward_dynamics": ("qdd", lambda m, q, qd, qdd, tau: m.forward_dynamics(q, qd, tau)),
+    "mass_matrix": ("mass", lambda m, q, qd, qdd, tau: m.mass_matrix(q)),
+    "bias": ("bias", lambda m, q, qd, qdd, tau: m.nonlinear_effects(q, qd)),
+    "gravity": ("gravity", lambda m, q, qd, qdd, tau: m.gravity(q)),
+    "friction": ("friction", lambda m, q, qd, qdd, tau: m.friction_torque(q, qd)),
+    "momentum": ("momentum", lambda m, q, qd, qdd, tau: m.momentum(q, qd)),
+}
+
+
+def _derivatives(name: str, model: Any, *states: torch.Tensor) -> dict[str, torch.Tensor]:
+    function = getattr(model, name.removesuffix("_derivatives"))
+    inverse = name.startswith("inverse")
+    places = (0, 1) if inverse else (0, 1, 2)
+    jacobian = torch.func.jacfwd(function, argnums=places)
+    # one state at a time: torch.func.vmap of a forward derivative of linalg.solve gives wrong numbers (torch 2.13)
+    found = zip(*(jacobian(*each) for each in zip(*states, strict=True)), strict=True)
+    keys = ("dtau_dq", "dtau_dqd") if inverse else ("dqdd_dq", "dqdd_dqd", "dqdd_dtau")
+    return {key: torch.stack(columns) for key, columns in zip(keys, found, strict=True)}

@@ -1,0 +1,59 @@
+"""Run folders to export: models whose weights were moved at random, so that no part of them is idle."""
+
+from pathlib import Path
+
+import torch
+from emitted import ROBOTS
+
+from spelgen.building import build
+from spelgen.fitting.config import TorqueFit
+from spelgen.fitting.fitted import Fit
+from spelgen.fitting.run_folder import RunFolder
+from spelgen.loaded_arm import load_arm
+from spelgen.logs.preprocessing import Preprocessing
+
+COUPLED = """<robot name="2 fast; } int main( /* */"><link name="base"/>
+<link name="a"><inertial><origin xyz="0.1 0 0.2"/><mass value="2"/>
+<inertia ixx="0.1" iyy="0.2" izz="0.15" ixy="0.01" ixz="0" iyz="0"/></inertial></link>
+<link name="b"><inertial><origin xyz="0 0.1 0.1"/><mass value="1"/>
+<inertia ixx="0.02" iyy="0.03" izz="0.02" ixy="0" ixz="0" iyz="0.001"/></inertial></link>
+<link name="c"><inertial><origin xyz="0.1 0 0"/><mass value="0.5"/>
+<inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<link name="d"><inertial><origin xyz="0 0 0.1"/><mass value="0.5"/>
+<inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="shoulder" type="revolute"><parent link="base"/><child link="a"/><origin rpy="0.3 0 0"/><axis xyz="0 1 0"/>
+<limit lower="-2" upper="2" effort="50" velocity="2"/></joint>
+<joint name="slide" type="prismatic"><parent link="a"/><child link="b"/><origin xyz="0.2 0 0" rpy="0 0.7 0"/>
+<axis xyz="1 0 0"/><limit lower="0" upper="0.5" effort="50" velocity="1"/></joint>
+<joint name="wrist" type="continuous"><parent link="b"/><child link="c"/><axis xyz="0 0 1"/></joint>
+<joint name="follower" type="revolute"><parent link="c"/><child link="d"/><origin xyz="0.1 0 0"/><axis xyz="1 0 0"/>
+<limit lower="-3" upper="3" effort="1" velocity="9"/><mimic joint="slide" multiplier="-2" offset="0.4"/></joint>
+</robot>"""
+"""A follower, motors and a passive joint, and a name that would be code."""
+MOTORS = """torque: motor
+gravity: [1, 2, -9]
+joints: {shoulder: {gear: 50}, slide: {gear: 20, gain: trained}, wrist: {actuated: false}}
+"""
+
+
+def moved_model(robot, preset, size=0.2):
+    """A model of one of the project's robots with all weights moved by normal numbers of this size."""
+    model = build(ROBOTS / f"{robot}.urdf", preset)
+    random = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter += size * torch.randn(parameter.shape, dtype=torch.float64, generator=random)
+    return model.requires_grad_(False)
+
+
+def arm_of(robot):
+    """The arm of one of the project's robots."""
+    return load_arm(ROBOTS / f"{robot}.urdf")
+
+
+def run_folder(robot, preset, folder: Path) -> RunFolder:
+    """A run folder as `spelgen train` leaves it, of a moved model."""
+    urdf = ROBOTS / f"{robot}.urdf"
+    record = {"robot": robot, "objective": "torque", "config": {}, "preprocessing": {}}
+    fit = Fit(moved_model(robot, preset), TorqueFit(), Preprocessing(), (), (), None, record, {}, urdf)
+    return RunFolder(fit.save(folder / "run"))

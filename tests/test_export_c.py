@@ -1,0 +1,253 @@
+"""C and CasADi of a trained model give what the torch model gives, and the C is sound."""
+
+import shutil
+import subprocess
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+import torch
+from exported_runs import COUPLED, MOTORS, arm_of, moved_model, run_folder
+from typer.testing import CliRunner
+
+from spelgen.building import build
+from spelgen.cli.main import app
+from spelgen.errors import RunError
+from spelgen.exporting import friction_expressions
+from spelgen.exporting.c_export import c_files
+from spelgen.exporting.c_library import CLibrary, compile_object, link_library
+from spelgen.exporting.casadi_export import export_casadi
+from spelgen.exporting.describe import identifier
+from spelgen.exporting.description import Bristles
+from spelgen.exporting.entry_points import ENTRY_POINTS
+from spelgen.exporting.export import export
+from spelgen.exporting.parity import check_parity, random_inputs
+from spelgen.exporting.trained import Trained
+from spelgen.loaded_arm import load_arm
+
+needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc on this machine")
+NAMES = [entry.name for entry in ENTRY_POINTS]
+BOTH = [("two_link", "closed-form"), ("rpr", "minimal")]
+
+
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory):
+    """By robot and preset: what is exported, the C's folder, and its library."""
+    found = {}
+    for robot, preset in BOTH:
+        trained = Trained(moved_model(robot, preset), arm_of(robot))
+        folder = tmp_path_factory.mktemp(f"{robot}_{preset}")
+        files, told = c_files(trained)
+        for name, content in files.items():
+            (folder / name).write_bytes(content)
+        found[robot, preset] = trained, folder, told
+    return found
+
+
+@needs_gcc
+@pytest.mark.parametrize("flags", [(), ("float",)], ids=["double", "float"])
+@pytest.mark.parametrize("program", ["gcc", "clang"])
+@pytest.mark.parametrize("case", BOTH, ids=lambda each: "-".join(each))
+def test_c_gives_what_the_model_gives(case, program, flags, compiled):
+    if shutil.which(program) is None:
+        pytest.skip(f"no {program} on this machine")
+    trained, folder, _ = compiled[case]
+    model = trained.described
+    options = [f"-D{model.name.upper()}_FLOAT"] if flags else []
+    source = folder / f"{model.name}.c"
+    library = link_library(compile_object(source, program, *options), program)
+    library = library.rename(folder / f"{program}{len(flags)}.so")  # ctypes keeps what it has loaded by name
+    called = CLibrary(library, model, np.float32 if flags else np.float64)
+    parity = check_parity(called, trained.model, trained.arm, model, NAMES, 1e-5 if flags else 1e-12)
+    assert set(parity.differences) == set(NAMES)
+
+
+@needs_gcc
+def test_the_header_tells_sizes_and_the_readme_the_check(compiled):
+    _, folder, told = compiled["rpr", "minimal"]
+    header = (folder / "rpr.h").read_text()
+    assert "bytes of code and constants, at most" in header
+    assert "bytes of stack" in header
+    assert "from the torch module" in told
+    assert max(map(len, header.splitlines())) < 130
+
+
+@pytest.mark.parametrize("preset", ["closed-form", "minimal"])
+@pytest.mark.parametrize("robot", ["rpr", "scara"])
+def test_casadi_gives_what_the_model_gives(robot, preset):
+    found = export_casadi(Trained(moved_model(robot, preset), arm_of(robot)))
+    assert len(found.files) == len(NAMES) + 1
+    assert len(found.files["README.md"].decode().splitlines()) == 5
+
+
+@pytest.mark.parametrize("preset", ["closed-form", "minimal"])
+def test_followers_motors_and_passive_joints_go_along(preset, tmp_path):
+    """And text of the URDF becomes no code: the robot's name would."""
+    urdf = tmp_path / "coupled.urdf"
+    urdf.write_text(COUPLED)
+    urdf.with_suffix(".yaml").write_text(MOTORS)
+    arm = load_arm(urdf)
+    model = build(arm, preset)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter += 0.1
+    trained = Trained(model, arm)
+    assert export_casadi(trained).summary
+    assert trained.described.name == "arm_2_fast_int_main"
+    if shutil.which("gcc"):
+        files, told = c_files(trained)
+        assert "from the torch module" in told
+        assert b"fast;" not in files["arm_2_fast_int_main.c"]
+
+
+def test_names_for_code():
+    assert identifier("UR10e") == "ur10e"
+    assert identifier("7 axes") == "arm_7_axes"
+    assert identifier("für */") == "f_r"
+    assert identifier("*/") == "arm"
+    assert identifier("while") == "arm_while"
+
+
+def test_a_wrong_export_is_refused():
+    trained = Trained(moved_model("two_link", "closed-form"), arm_of("two_link"))
+    still = lambda name, inputs: {"tau": np.zeros_like(inputs["q"])}  # noqa: E731
+    with pytest.raises(RunError, match=r"inverse_dynamics differs from the model by 1\.0e"):
+        check_parity(still, trained.model, trained.arm, trained.described, ["inverse_dynamics"], 1e-12)
+    nothing = lambda name, inputs: {"tau": np.full_like(inputs["q"], np.nan)}  # noqa: E731
+    with pytest.raises(RunError, match="differs from the model by nan"):
+        check_parity(nothing, trained.model, trained.arm, trained.described, ["inverse_dynamics"], 1e-12)
+
+
+DRIVER = r"""
+#include "{name}.h"
+#include <math.h>
+#include <stdio.h>
+#define R {name}_real
+int main(void)
+{{
+    static const R size[] = {{0, 1, 1e3, 1e30, 1e300, -1e300, INFINITY, NAN}};
+    int k, i;
+    for (k = 0; k < 8; k++) {{
+        R q[{n}], qd[{n}], x[{n}], z[1] = {{0}}, out[16], more[{square}], most[{square}], last[{square}];
+        for (i = 0; i < {n}; i++) q[i] = size[k] * (i + 1), qd[i] = size[7 - k], x[i] = -size[k];
+        for (i = 0; i < {square}; i++) last[i] = 0;
+{calls}
+        if (k == 7) printf("%d %d\n", isnan(out[0]), isnan(last[0]));
+    }}
+    return 0;
+}}
+"""
+
+
+@needs_gcc
+@pytest.mark.parametrize("case", BOTH, ids=lambda each: "-".join(each))
+def test_c_is_sound_whatever_it_is_given(case, compiled):
+    """Zero, large, overflowing and infinite states, under address and undefined-behaviour sanitizers; NaN stays."""
+    trained, folder, _ = compiled[case]
+    name, n = trained.described.name, trained.described.n
+    calls = []
+    for entry in ENTRY_POINTS:
+        given = [{"q": "q", "qd": "qd", "z": "z"}.get(each, "x") for each in entry.inputs]
+        outputs = ["more", "most", "last"][: len(entry.outputs)] if len(entry.outputs) > 1 else ["out"]
+        outputs = ["more"] if entry.name in ("tip_jacobian", "mass_matrix", "tip_pose") else outputs
+        calls.append(f"        {name}_{entry.name}({', '.join([*given, *outputs])});")
+    calls.append(f"        {name}_forward_dynamics(q, qd, x, z, out);")
+    text = DRIVER.format(name=name, n=n, square=max(n * n, 6 * n, 16), calls="\n".join(calls))
+    driver = folder / "driver.c"
+    driver.write_text(text)
+    program = folder / "driver"
+    flags = ["-std=c99", "-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    built = subprocess.run(
+        ["gcc", *flags, str(driver), str(folder / f"{name}.c"), "-o", str(program), "-lm"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    if "cannot find -lasan" in built.stderr:
+        pytest.skip("no address sanitizer on this machine")
+    assert not built.returncode, built.stderr
+    done = subprocess.run([program], capture_output=True, text=True, check=False)
+    assert not done.returncode, done.stderr
+    assert done.stdout == "1 1\n"
+
+
+def test_bristles_follow_their_law_along_a_displacement():
+    """z' = qd - |qd| z / reach, integrated in small steps, there and back."""
+    bristles = Bristles(np.array([[0.01, 0.1], [0.02, 0.3]]), np.array([[1.0, 2.0], [3.0, 4.0]]))
+    z, dq = ca.SX.sym("z", 4), ca.SX.sym("dq", 2)
+    step = ca.Function("step", [z, dq], [friction_expressions.bristle_step(bristles, z, dq)])
+    torque = ca.Function("torque", [z], [friction_expressions.bristle_torque(bristles, z)])
+    found, small, steps = np.zeros(4), np.zeros(4), 4000
+    for moved in (np.array([0.05, -0.02]), np.array([-0.01, 0.03]), np.zeros(2)):
+        found = step(found, moved).full()[:, 0]
+        d = np.repeat(moved / steps, 2)
+        for _ in range(steps):
+            small = small + d - np.abs(d) * small / bristles.reach.ravel()
+    np.testing.assert_allclose(found, small, rtol=1e-3)
+    assert (np.abs(found) <= bristles.reach.ravel()).all()
+    force = (bristles.strength / bristles.reach * found.reshape(2, 2)).sum(axis=1)
+    np.testing.assert_allclose(torque(found).full()[:, 0], force)
+
+
+@needs_gcc
+def test_c_carries_frictions_memory(tmp_path):
+    """Memory of two elements a joint: z in the forces, and its step; NZ says how many numbers."""
+    from spelgen.exporting.c_code import c_entries, c_header, c_source
+
+    model = Trained(moved_model("two_link", "closed-form"), arm_of("two_link")).described
+    bristles = Bristles(np.array([[0.01, 0.1], [0.02, 0.3]]), np.array([[1.0, 2.0], [3.0, 4.0]]))
+    with_memory = replace(model, bristles=bristles)
+    entries = c_entries(with_memory)
+    source = tmp_path / f"{model.name}.c"
+    source.write_text(c_source(with_memory, entries))
+    source.with_suffix(".h").write_text(c_header(with_memory, entries, ""))
+    assert "#define TWO_LINK_NZ 4" in source.with_suffix(".h").read_text()
+    called = CLibrary(link_library(compile_object(source, "gcc"), "gcc"), with_memory)
+    given = random_inputs(with_memory, 5)
+    without = called("friction", given | {"z": np.zeros((5, 4))})["friction"]
+    force = (bristles.strength / bristles.reach * given["z"].reshape(5, 2, 2)).sum(axis=-1)
+    np.testing.assert_allclose(called("friction", given)["friction"], without + force)
+    moved = called("friction_step", given)["z_next"]
+    assert np.abs(moved - given["z"]).max() > 1e-3
+
+
+def test_export_needs_the_run_folder_alone(tmp_path):
+    run = run_folder("two_link", "closed-form", tmp_path)
+    told = CliRunner().invoke(app, ["export", str(run.path), "--to", "casadi", "-o", str(tmp_path / "out")])
+    assert told.exit_code == 0, told.output
+    forward = ca.Function.load(str(tmp_path / "out" / "forward_dynamics.casadi"))
+    assert forward.size1_out(0) == 2
+    assert "from the torch module" in told.output
+    again = CliRunner().invoke(app, ["export", str(run.path), "--to", "casadi", "-o", str(tmp_path / "out")])
+    assert again.exit_code == 1
+    assert "this output exists already" in again.output
+
+
+@pytest.mark.parametrize(
+    ("to", "name", "told"),
+    [
+        (
+            "c",
+            "arm.urdf",
+            "got the name 'arm.urdf' for --to c, expected a folder, named without an extension; --to urdf",
+        ),
+        ("urdf", "arm.xml", "got the name 'arm.xml' for --to urdf, expected FILE.urdf"),
+        ("urdf", "arm", "got the name 'arm' for --to urdf, expected FILE.urdf"),
+    ],
+)
+def test_a_name_that_contradicts_the_format_is_refused(to, name, told, tmp_path):
+    run = run_folder("two_link", "closed-form", tmp_path)
+    found = CliRunner().invoke(app, ["export", str(run.path), "--to", to, "-o", str(tmp_path / name)])
+    assert found.exit_code == 1
+    assert told in found.output
+    assert not (tmp_path / name).exists()
+
+
+def test_presets_without_such_a_form_are_refused():
+    with pytest.raises(
+        RunError, match="the preset spel, which has a full friction matrix, expected closed-form"
+    ):
+        export(moved_model("two_link", "spel"), "casadi", arm=arm_of("two_link"))
+    with pytest.raises(RunError, match="the preset phnode, which has a dense mass matrix"):
+        export(moved_model("two_link", "phnode"), "c", arm=arm_of("two_link"))
+    with pytest.raises(RunError, match=r"the format 'matlab', expected one of urdf, c, casadi"):
+        export(moved_model("two_link", "closed-form"), "matlab", arm=arm_of("two_link"))
