@@ -13,10 +13,14 @@ _IN_THE_REPOSITORY = Path(__file__).parent.parent / "templates"
 
 
 @cache
+def _folder() -> Path:
+    return _BESIDE_THE_CODE if _BESIDE_THE_CODE.is_dir() else _IN_THE_REPOSITORY
+
+
+@cache
 def _environment(autoescape: bool) -> Environment:
-    folder = _BESIDE_THE_CODE if _BESIDE_THE_CODE.is_dir() else _IN_THE_REPOSITORY
     return Environment(
-        loader=FileSystemLoader(folder),
+        loader=FileSystemLoader(_folder()),
         undefined=StrictUndefined,
         autoescape=autoescape,
         trim_blocks=True,
@@ -30,3 +34,8 @@ def render(template: str, **context: Any) -> str:
     what they show.
     """
     return _environment(".html" in template).get_template(template).render(**context)
+
+
+def read(name: str) -> str:
+    """A file beside the templates that goes into pages as it is."""
+    return (_folder() / name).read_text(encoding="utf-8")

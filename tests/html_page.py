@@ -2,7 +2,11 @@
 
 from html.parser import HTMLParser
 
-VOID = {"meta", "br"}
+from spelgen.render.page import SCRIPTS
+from spelgen.templates import read
+
+OWN = {read(name).strip() for name in SCRIPTS}
+VOID = {"meta", "br", "link", "input"}
 
 
 class Page(HTMLParser):
@@ -10,16 +14,19 @@ class Page(HTMLParser):
 
     def __init__(self, text: str) -> None:
         super().__init__()
+        self.data = False
         self.open, self.tags, self.text = [], [], []
-        self.links = []
+        self.links, self.scripts = [], []
         self.feed(text)
         assert not self.open
+        assert set(self.scripts) <= OWN  # nothing else can run; data cannot
 
     def handle_starttag(self, tag, attrs):
         self.tags.append(tag)
         self.links += [value for name, value in attrs if name in ("src", "href", "action", "xlink:href")]
         if tag not in VOID:
             self.open.append(tag)
+        self.data = tag == "script" and dict(attrs).get("type") == "application/json"
 
     def handle_startendtag(self, tag, attrs):
         self.tags.append(tag)
@@ -28,4 +35,7 @@ class Page(HTMLParser):
         assert self.open.pop() == tag
 
     def handle_data(self, data):
-        self.text.append(data)
+        if self.open and self.open[-1] == "script" and not self.data:
+            self.scripts.append(data)
+        elif self.open and self.open[-1] not in ("script", "style"):
+            self.text.append(data)

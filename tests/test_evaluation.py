@@ -15,7 +15,7 @@ from spelgen.dynamics.pinocchio_urdf import urdf_dynamics
 from spelgen.dynamics.tip import tip_kinematics
 from spelgen.emission.loading import load_module
 from spelgen.errors import LogError, RunError
-from spelgen.evaluation.baselines import constant_velocity, of_urdf
+from spelgen.evaluation.baselines import constant_velocity
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.evaluation.invariants import energy_drift
 from spelgen.evaluation.rollout import rollout
@@ -352,5 +352,5 @@ def test_the_ur10e_urdf_has_its_known_torque_error(shared):
     ]
     samples = dynamics_samples(read_logs(sorted(paths), UR10E))
     assert len(samples) == 9
-    torque = of_urdf(folder / "ur10e.urdf", UR10E, 1).torque
+    torque = urdf_dynamics(folder / "ur10e.urdf", UR10E).inverse_dynamics
     assert torque_errors(torque, samples).nmse.mean() == pytest.approx(0.67, abs=0.005)

@@ -38,18 +38,19 @@ excitation: trajectory criterion excitation
 fitting: run_folder gaussian_prior adaptive rollout dataset streaming torque_samples torque_jacobian torque_fit
 fitting: optimizers torque_networks urdf_regularizer stages compiled process progress validation loop
 fitting: run_record fitted fit train
-evaluation: baselines torque rollout examples invariants tables results subject evaluate
+evaluation: stiff baselines torque rollout torque_traces traces examples invariants tables results subject evaluate
 verify: agreement urdf_cross_check numeric_samples verify
 explain: reasons facts
 formulas: terms printing angles shortening formulas text files
 inspection loaded_arm pipeline building
 simulation: simulate
 excitation: design
-identification: identify
+identification: identify baseline
 exporting: description describe trained parity exported readme rigid_body_projection urdf_file urdf_export
 exporting: rigid_expressions friction_expressions learned_expressions model_expressions tip_expressions entry_points
 exporting: c_statements c_networks c_code c_library c_export casadi_export export
-render: charts plots picture learned reproduction report_page inspection_page
+render: charts plots picture page learned parameters reproduction verdict shapes scene still arm_section
+render: report_page inspection_page
 logs: statistics gravity report check_logs
 comparison: truth metrics study runs formatting
 render: logs_page comparison_page
@@ -73,7 +74,9 @@ PLAIN = {"spelgen.arm.actuation"}  # G by the files, without the exact arithmeti
 ROOMS_THAT_DERIVE = ("urdf.", "arm.", "structure.", "emission.", "verify.", "explain.", "formulas.")
 DERIVES = [x for x in LAYERS if x.startswith(ROOMS_THAT_DERIVE) and x != "emission.loading"]
 BESIDE_A_ROBOT = {"logs.gravity", "logs.report", "logs.check_logs"}  # logs held against an arm's own facts
-OF_A_RUN = {f"render.{name}" for name in ("charts", "plots", "picture", "learned", "report_page")}
+OF_A_RUN = {
+    f"render.{name}" for name in ("charts", "plots", "picture", "page", "learned", "verdict", "scene")
+}
 FITS = [x for x in LAYERS if x.startswith(("logs.", "fitting.", "evaluation.")) and x not in BESIDE_A_ROBOT]
 NEVER = {
     "spec": {"sympy", "flint", "torch"},

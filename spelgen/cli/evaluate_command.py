@@ -23,11 +23,13 @@ def evaluate(
     from spelgen.evaluation.subject import read_test_logs
     from spelgen.files import write_json
     from spelgen.fitting.run_folder import RunFolder
+    from spelgen.identification.baseline import read_baseline
     from spelgen.logs.preprocessing import Preprocessing
 
     torch.set_num_threads(1)
     used = None if filter is None else Preprocessing(cutoff=filter)
-    found = evaluated(run, read_test_logs(run, paths, mapping), preprocessing=used)
+    logs, baselines = read_test_logs(run, paths, mapping), read_baseline(RunFolder(run))
+    found = evaluated(run, logs, baselines=baselines, preprocessing=used)
     write_json(RunFolder(run).evaluation, found.to_dict())
     for each in found.diagnostics:
         note(f"{each.severity}: {each.where}: {each.message}")

@@ -23,7 +23,13 @@ def chosen(format: Format | None, output: Path | None) -> Format:
 
 
 def rendered(
-    found: Inspection, format: Format, *, formulas: bool, entry: Entry | None, proof: Verification | None
+    found: Inspection,
+    format: Format,
+    *,
+    formulas: bool,
+    entry: Entry | None,
+    proof: Verification | None,
+    urdf: Path,
 ) -> str:
     """The text of the result, with a line end; with ``formulas``, or an ``entry``, the closed forms.
 
@@ -42,7 +48,7 @@ def rendered(
         _tell(closed, proof)
         return files.latex(closed) if format == "latex" else files.sympy_source(closed)
     if format == "html":
-        return inspection_page.page(found, closed, proof)
+        return inspection_page.page(found, closed, proof, urdf)
     if format == "text":
         told = found.text() if closed is None else text.text(closed)
         return told + (f"\n\n{proof.text()}" if proof else "") + "\n"

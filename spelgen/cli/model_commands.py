@@ -55,7 +55,9 @@ def inspect(
     arm = load_arm(robot, options.names(joints), tip, angle_tolerance)
     found = arm.inspect(assume)
     proof = arm.verify(assume) if verify else None
-    text = rendered(found, chosen(format, output), formulas=formulas, entry=wanted, proof=proof)
+    text = rendered(
+        found, chosen(format, output), formulas=formulas, entry=wanted, proof=proof, urdf=arm.robot.path
+    )
     if output is None:
         say(text.removesuffix("\n"))
     else:

@@ -134,6 +134,11 @@ def train(
     except OptionError as error:
         flag = "from" if error.option == "payload" else error.option.replace("_", "-")
         raise NotApplicable(f"--{flag}: {error.got}") from error
+    if not resume and found.status != "interrupted":
+        from spelgen.fitting.run_folder import RunFolder
+        from spelgen.identification.baseline import keep_baseline
+
+        keep_baseline(RunFolder(folder), paths)
     say(f"{found.status} after {found.epochs} epochs, {found.steps} steps, {found.seconds:.0f} s")
     say(f"best validation loss {found.best_validation:.3g}, at epoch {found.best_epoch}")
     say(f"run folder: {folder}")

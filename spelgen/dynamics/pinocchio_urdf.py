@@ -19,11 +19,12 @@ COULOMB_SMOOTHING_VELOCITY = (
 )
 
 
-def urdf_dynamics(urdf: Path, joints: Sequence[str]) -> PinocchioDynamics:
+def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) -> PinocchioDynamics:
     """The dynamics of these joints of a URDF and what follows them, all others locked at zero.
 
-    Inertials, damping and friction are the URDF's; gravity and inputs the settings' beside it. Raises what
-    Pinocchio raises where it cannot read the file.
+    Inertials, damping and friction are the URDF's; gravity and inputs the settings' beside it. drives: with the
+    settings' rotors, and their friction in place of the URDF's where a joint has any. Raises what Pinocchio raises
+    where it cannot read the file.
     """
     robot, settings = read_urdf(urdf), load_settings(urdf)
     model = pin.buildModelFromUrdf(str(urdf))
@@ -32,13 +33,27 @@ def urdf_dynamics(urdf: Path, joints: Sequence[str]) -> PinocchioDynamics:
     missing = [name for name in constraint.names if not model.existJointName(name)]
     if missing:
         raise ValueError(f"Pinocchio sees no joint {', '.join(missing)}")
+    known = settings.joints if drives else {}
     damping, coulomb = (
         np.array([getattr(robot.joint[name], what) for name in joints]) for what in ("damping", "friction")
     )
+    forward, backward = coulomb, -coulomb
+    for k, name in enumerate(joints):
+        if name in known:
+            damping[k], (forward[k], backward[k]) = known[name].viscous, known[name].coulomb
+            place = model.joints[model.getJointId(name)].idx_v
+            model.armature[place] = known[name].rotor_inertia * known[name].gear ** 2
 
     def friction(qd: np.ndarray) -> np.ndarray:
-        lost: np.ndarray = damping * qd + coulomb * np.tanh(qd / COULOMB_SMOOTHING_VELOCITY)
+        s = np.tanh(qd / COULOMB_SMOOTHING_VELOCITY)
+        lost: np.ndarray = damping * qd + s * ((forward - backward) + s * (forward + backward)) / 2
         return lost
 
     inputs = derive_actuation(robot, settings, joints).matrix()
     return PinocchioDynamics(model, constraint, friction, inputs)
+
+
+def has_drives(urdf: Path, joints: Sequence[str]) -> bool:
+    """Whether the settings beside a URDF tell of rotors or friction of these joints."""
+    known = load_settings(urdf).joints
+    return any(x.rotor_inertia or x.viscous or any(x.coulomb) for k, x in known.items() if k in joints)

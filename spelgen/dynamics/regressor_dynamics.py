@@ -9,7 +9,7 @@ import numpy as np
 
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.arrays import like
-from spelgen.dynamics.regressor import regressor
+from spelgen.dynamics.regressor import body_torque
 
 Array = TypeVar("Array")
 """numpy.ndarray or torch.Tensor: what is returned is of the kind of what is given."""
@@ -68,8 +68,7 @@ class RegressorDynamics:
 
     def _bodies(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
         """The bodies' torques, (T, n)."""
-        torque: np.ndarray = regressor(self.arm, q, qd, qdd) @ self.parameters
-        return torque
+        return body_torque(self.arm, self.parameters, q, qd, qdd)
 
     def _mass(self, q: np.ndarray) -> np.ndarray:
         """Column by column: what each unit acceleration adds to the torque at rest."""

@@ -9,10 +9,12 @@ from pathlib import Path
 import torch
 
 from spelgen.dynamics.protocol import RigidDynamics, integrable
+from spelgen.evaluation.stiff import accurate_solver
 from spelgen.fitting.rollout import roll_out
 from spelgen.logs.windows import Windows
 
 MODEL = "model"  # the trained model among the predictors
+URDF, URDF_WITH_DRIVES = "URDF", "URDF and drives"
 
 
 @dataclass(frozen=True)
@@ -20,18 +22,26 @@ class Predictor:
     """Something that predicts.
 
     states: windows of K samples -> predicted q, qd, both (W, K-1, n), from the first sample and the inputs.
-    torque: q, qd, qdd, each (T, n) -> tau (T, n); None for what has no dynamics.
+    torque: q, qd, qdd, each (T, n) -> tau (T, n); None for what has no dynamics. dynamics: these.
     """
 
     name: str
     states: Callable[[Windows], tuple[torch.Tensor, torch.Tensor]]
     torque: Callable[[torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor] | None
+    dynamics: RigidDynamics | None = None
 
 
 def of_dynamics(name: str, dynamics: RigidDynamics, substeps: int) -> Predictor:
-    """Dynamics as a predictor, all by the same integrator."""
+    """Dynamics as a predictor, by the classical Runge-Kutta method."""
     form = integrable(dynamics)
-    return Predictor(name, lambda windows: roll_out(form, windows, substeps), dynamics.inverse_dynamics)
+    return Predictor(
+        name, lambda windows: roll_out(form, windows, substeps), dynamics.inverse_dynamics, dynamics
+    )
+
+
+def of_baseline(name: str, dynamics: RigidDynamics, probe: Windows) -> Predictor:
+    """Dynamics that are not the model's as a predictor: by steps of their own, as many as they need on the probe."""
+    return Predictor(name, accurate_solver(dynamics, probe), dynamics.inverse_dynamics, dynamics)
 
 
 def constant_velocity() -> Predictor:
@@ -45,11 +55,18 @@ def constant_velocity() -> Predictor:
     return Predictor("velocity stays constant", hold, None)
 
 
-def of_urdf(urdf: Path, joints: Sequence[str], substeps: int) -> Predictor:
-    """Rigid bodies with the URDF's own inertials, damping and friction, by Pinocchio.
+def of_urdf(urdf: Path, joints: Sequence[str], probe: Windows) -> list[Predictor]:
+    """Rigid bodies as the URDF has them, with its damping and friction, by Pinocchio; and, where the settings beside
+    it tell of drives, with their friction and rotors.
 
     Raises what Pinocchio raises where it cannot read the file, and ImportError without Pinocchio.
     """
-    from spelgen.dynamics.pinocchio_urdf import urdf_dynamics  # an extra: everything else here works without
+    from spelgen.dynamics.pinocchio_urdf import (
+        has_drives,
+        urdf_dynamics,
+    )  # an extra: all else here works without
 
-    return of_dynamics("URDF", urdf_dynamics(urdf, joints), substeps)
+    found = [of_baseline(URDF, urdf_dynamics(urdf, joints), probe)]
+    if has_drives(urdf, joints):
+        found.append(of_baseline(URDF_WITH_DRIVES, urdf_dynamics(urdf, joints, drives=True), probe))
+    return found

@@ -8,12 +8,20 @@ from typing import TYPE_CHECKING, Any
 
 from spelgen.dynamics.protocol import RigidDynamics
 from spelgen.errors import Diagnostic
-from spelgen.evaluation.baselines import MODEL, Predictor, constant_velocity, of_dynamics, of_urdf
+from spelgen.evaluation.baselines import (
+    MODEL,
+    Predictor,
+    constant_velocity,
+    of_baseline,
+    of_dynamics,
+    of_urdf,
+)
 from spelgen.evaluation.examples import Example, predict_examples
 from spelgen.evaluation.invariants import energy_drift
 from spelgen.evaluation.results import Horizon, Results, state_errors, torque_summary
 from spelgen.evaluation.subject import Subject, subject
 from spelgen.evaluation.torque import torque_errors
+from spelgen.evaluation.traces import traces
 from spelgen.fitting.rollout import choose_substeps, loss_scales
 from spelgen.identification.samples import dynamics_samples
 from spelgen.logs.checks import check
@@ -59,8 +67,8 @@ def evaluate(
     probe = _windows(pieces, judged.window, PROBED, measured=used.filtered)
     substeps = choose_substeps(judged.model, probe, loss_scales(probe, joint_types), start=judged.substeps)
     predictors = [of_dynamics(MODEL, judged.model, substeps), constant_velocity()]
-    predictors += _urdf_baseline(judged, substeps, notes)
-    predictors += [of_dynamics(name, each, substeps) for name, each in (baselines or {}).items()]
+    predictors += _urdf_baseline(judged, probe, notes)
+    predictors += [of_baseline(name, each, probe) for name, each in (baselines or {}).items()]
     tip = _tip(judged, notes)
     samples = dynamics_samples(logs, preprocessing=used)
     return Results(
@@ -80,8 +88,13 @@ def evaluate(
         },
         energy_drift=energy_drift(judged.model, probe),
         examples=_examples(predictors[0], pieces, lengths, judged.joints, used),
+        traces=traces(
+            predictors, pieces, max(lengths.values(), default=0), joint_types,
+            used=used, tip=None if tip is None else tip.position,
+        ),
         diagnostics=tuple(notes),
-    )
+        joint_types=tuple(joint_types),
+    )  # fmt: skip
 
 
 def _preprocessing(asked: Preprocessing | None, judged: Subject, logs: Sequence[Trajectory]) -> Preprocessing:
@@ -149,13 +162,13 @@ def _examples(
     return predict_examples(predictor, pieces, max(lengths.values()), joints, measured=used.filtered)
 
 
-def _urdf_baseline(judged: Subject, substeps: int, notes: list[Diagnostic]) -> list[Predictor]:
+def _urdf_baseline(judged: Subject, probe: Windows, notes: list[Diagnostic]) -> list[Predictor]:
     """The URDF's own values as a baseline, where they can be had."""
     if judged.urdf is None:
         reason = "no arm is known"
     else:
         try:
-            return [of_urdf(judged.urdf, judged.joints, substeps)]
+            return of_urdf(judged.urdf, judged.joints, probe)
         except Exception as error:  # Pinocchio and its parser raise many kinds; the evaluation stands without
             reason = _told(error)
     message = f"no comparison with the URDF: {reason}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import torch
@@ -71,7 +71,7 @@ class Results:
     cutoff: of the filter on the test logs [Hz], None without. substeps: of rk4 between samples. parameters: trained
     numbers of the model. torque: by predictor, empty where the logs are too sparse. energy_drift: of the model
     without input and dissipation over 1 s, integrated to thirteen digits, relative to its kinetic energy; None where
-    the logs never move. examples: over the longest horizon.
+    the logs never move. examples: over the longest horizon. traces: the curves behind the figures, see `traces.py`.
     """
 
     robot: str
@@ -85,6 +85,8 @@ class Results:
     energy_drift: float | None
     examples: tuple[Example, ...]
     diagnostics: tuple[Diagnostic, ...]
+    traces: dict[str, Any] = field(default_factory=dict)
+    joint_types: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """JSON form, versioned by `schema`."""

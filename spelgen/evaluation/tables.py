@@ -48,9 +48,16 @@ class Table:
         return Listing(self.title, head, rows)
 
 
-def result_tables(evaluation: Mapping[str, Any]) -> list[Table]:
-    """The tables of evaluation.json: errors by horizon, by joint at the longest one, torque errors."""
+UNITS = {"revolute": ("rad", "rad/s", "Nm"), "prismatic": ("m", "m/s", "N")}
+
+
+def result_tables(evaluation: Mapping[str, Any], joint_types: Sequence[str] = ()) -> list[Table]:
+    """The tables of evaluation.json: errors by horizon, by joint at the longest one, torque errors.
+
+    joint_types: those of the evaluation by default; units are only those of joints that there are.
+    """
     tables, horizons = [], evaluation["horizons"]
+    types = joint_types or evaluation.get("joint_types") or ()
     if horizons:
         heads = [_ahead(horizon) for horizon in horizons]
         title = "Error relative to the motion (0: none, 1: as if the arm had stood still)"
@@ -58,17 +65,27 @@ def result_tables(evaluation: Mapping[str, Any]) -> list[Table]:
         tips = [_of(horizon, "tip_mm") for horizon in horizons]
         if any(value is not None for tip in tips for value in tip.values()):
             tables.append(_table("Error of the tip's position [mm]", heads, tips))
-        for what, title in (("q", "Position error [rad, m]"), ("qd", "Velocity error [rad/s, m/s]")):
-            tables.append(
-                _by_joint(f"{title} after {heads[-1]}", evaluation["joints"], _of(horizons[-1], what))
-            )
+        for k, (what, title) in enumerate((("q", "Position error"), ("qd", "Velocity error"))):
+            unit, labels = _units(evaluation["joints"], types, k)
+            tables.append(_by_joint(f"{title}{unit} after {heads[-1]}", labels, _of(horizons[-1], what)))
     torque = evaluation["torque"]
     if torque:
         mean = {name: errors["mean_nmse"] for name, errors in torque.items()}
         tables.append(_table("Torque error of the inverse dynamics", ["nMSE, mean of all"], [mean]))
         rmse = {name: errors["rmse"] for name, errors in torque.items()}
-        tables.append(_by_joint("Torque error by joint, RMSE [Nm, N]", evaluation["joints"], rmse))
+        unit, labels = _units(evaluation["joints"], types, 2)
+        tables.append(_by_joint(f"Torque error by joint, RMSE{unit}", labels, rmse))
     return tables
+
+
+def _units(joints: Sequence[str], types: Sequence[str], quantity: int) -> tuple[str, list[str]]:
+    """The unit for a title where all joints have the same, else each beside its joint."""
+    if not types:
+        return f" [{', '.join(each[quantity] for each in UNITS.values())}]", list(joints)
+    units = [UNITS[kind][quantity] for kind in types]
+    if len(set(units)) == 1:
+        return f" [{units[0]}]", list(joints)
+    return "", [f"{joint} [{unit}]" for joint, unit in zip(joints, units, strict=True)]
 
 
 def verdict(evaluation: Mapping[str, Any]) -> str:

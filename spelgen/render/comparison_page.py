@@ -3,33 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from markupsafe import Markup
 
-from spelgen import __version__
 from spelgen.comparison.study import Study
 from spelgen.comparison.truth import example_positions, true_mass
 from spelgen.emission.loading import load_module
 from spelgen.evaluation.tables import Table
 from spelgen.files import write_text
 from spelgen.fitting.run_folder import RunFolder
+from spelgen.labels import entry_name
 from spelgen.render.charts import Line, line_chart
-from spelgen.render.learned import INERTIA_UNITS, entry_index
-from spelgen.render.plots import QUANTITIES, UNITS
-from spelgen.templates import render
+from spelgen.render.page import render_page
+from spelgen.render.plots import QUANTITIES, UNITS, Panel, inertia_unit
 
 STYLES = ("c1", "c2", "c3", "c4", "c5")
-
-
-@dataclass(frozen=True)
-class Panel:
-    """Charts that belong together: a joint's, or that of an entry of M."""
-
-    name: str
-    charts: tuple[Markup, ...]
 
 
 def write_comparison(study: Study, tables: Sequence[Table]) -> Path:
@@ -38,17 +28,33 @@ def write_comparison(study: Study, tables: Sequence[Table]) -> Path:
     names = [result["variant"] for result in results]
     styles = dict(zip(names, STYLES, strict=False))
     joint_types = load_module(study.module(study.variants[0])).joint_types
-    text = render(
+    text = render_page(
         "comparison.html.jinja",
-        version=__version__,
         study=study,
         tables=tables,
-        styles=styles,
+        key=[(style, name) for name, style in styles.items()],
+        verdict=_verdict(tables),
         losses=_losses(study, styles),
         panels=_panels(results, styles, joint_types),
         entries=_entries(study, results, styles, joint_types),
     )
     return write_text(study.folder / "comparison.html", text)
+
+
+def _verdict(tables: Sequence[Table]) -> str:
+    """Which model is best in most rows of the tables."""
+    wins: dict[str, int] = {}
+    rows = 0
+    for table in tables:
+        for row in table.rows:
+            best = [name for name, cell in zip(table.columns, row.cells, strict=True) if cell.best]
+            rows += bool(best)
+            for name in best:
+                wins[name] = wins.get(name, 0) + 1
+    if not wins:
+        return "Nothing was compared."
+    most = max(wins, key=wins.__getitem__)
+    return f"{most} is the best in {wins[most]} of {rows} rows."
 
 
 def _losses(study: Study, styles: Mapping[str, str]) -> Markup:
@@ -60,7 +66,9 @@ def _losses(study: Study, styles: Mapping[str, str]) -> Markup:
             continue
         steps = [record["step"] for record in records]
         lines.append(Line(variant.name, steps, [record["best"] for record in records], styles[variant.name]))
-    return line_chart(lines, "Best validation loss by step", "training step", "loss", log=True, width=860)
+    return line_chart(
+        lines, "Best validation loss by step", "training step", "loss", log=True, width=560, height=250
+    )
 
 
 def _entries(
@@ -81,9 +89,9 @@ def _entries(
         for result in shown:
             learned = [each[i][j] for each in result["mass"]["along"]]
             lines.append(Line(result["variant"], example["t"], learned, styles[result["variant"]]))
-        name = f"M{entry_index(i, j)}"
-        unit = INERTIA_UNITS.get(f"{joint_types[i]} {joint_types[j]}", "kg m")
-        chart = line_chart(lines, name, "t [s]", f"{name} [{unit}]", width=330, height=190)
+        name = entry_name(i, j)
+        unit = inertia_unit(joint_types[i], joint_types[j])
+        chart = line_chart(lines, name, "t [s]", f"{name} [{unit}]", height=170)
         panels.append(Panel(name, (chart,)))
     return panels
 
@@ -108,6 +116,6 @@ def _panels(
             ]
             name = QUANTITIES[what]
             title = f"{name} of {joint['name']}"
-            charts.append(line_chart(lines, title, "t [s]", f"{name} [{unit}]", width=330, height=190))
+            charts.append(line_chart(lines, title, "t [s]", f"{name} [{unit}]", height=170))
         panels.append(Panel(joint["name"], tuple(charts)))
     return panels

@@ -10,11 +10,10 @@ import torch
 
 from spelgen.emission.loading import load_module
 from spelgen.fitting.run_folder import RunFolder, trained_model
+from spelgen.render.plots import INERTIA_UNITS
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
-
-INERTIA_UNITS = {"revolute revolute": "kg m²", "prismatic prismatic": "kg"}
 
 
 @dataclass(frozen=True)
@@ -47,9 +46,6 @@ def read_learned(run: RunFolder) -> Learned:
         basis = after.dynamics.mass.constant_basis.reshape(-1, after.n, after.n)
         values = zip(basis, _constants(before), _constants(after), strict=True)
         found += [_constant(*each, after.joint_types) for each in values]
-    if hasattr(after, "armature"):
-        drives = zip(before.armature.tolist(), after.armature.tolist(), after.joint_types, strict=True)
-        found += [_armature(index, *each) for index, each in enumerate(drives)]
     return Learned(sum(parameter.numel() for parameter in after.parameters()), tuple(found))
 
 
@@ -65,11 +61,6 @@ def _constant(basis: torch.Tensor, start: float, learned: float, joint_types: Se
     )
     unit = INERTIA_UNITS.get(" ".join(joint_types[k] for k in entries[0]), "kg m")
     return Constant("links", where, start, learned, unit)
-
-
-def _armature(index: int, start: float, learned: float, kind: str) -> Constant:
-    unit = INERTIA_UNITS[f"{kind} {kind}"]
-    return Constant(f"armature of joint {index + 1}", f"M{entry_index(index, index)}", start, learned, unit)
 
 
 def entry_index(row: int, column: int) -> str:

@@ -5,26 +5,24 @@ from __future__ import annotations
 import numpy as np
 from markupsafe import Markup
 
-from spelgen import __version__
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.regressor import regressor, urdf_parameters
 from spelgen.logs.report import LogReport
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.render.charts import Line, line_chart
-from spelgen.render.plots import UNITS, JointCharts
-from spelgen.templates import render
+from spelgen.render.page import render_page
+from spelgen.render.plots import FORCE, UNITS, Panel
 
-DRAWN = 600  # points of a line: what `line_chart` shows
+DRAWN = 300  # points of a line: what `line_chart` shows
 
 
 def page(found: LogReport, arm: Arm, inputs: np.ndarray) -> str:
-    """The page about ``found``. It has no scripts and needs no other file; names are escaped.
+    """The page about ``found``. It needs no other file, and names are escaped.
 
     inputs: G (n, n), which takes logged torques to the joints'.
     """
-    return render(
+    return render_page(
         "logs.html.jinja",
-        version=__version__,
         robot=found.robot,
         heading=found.heading(),
         tables=found.listings(),
@@ -34,7 +32,7 @@ def page(found: LogReport, arm: Arm, inputs: np.ndarray) -> str:
     )
 
 
-def charts(trajectory: Trajectory, arm: Arm, inputs: np.ndarray) -> list[JointCharts]:
+def charts(trajectory: Trajectory, arm: Arm, inputs: np.ndarray) -> list[Panel]:
     """By joint: q; qd beside dq/dt; the joint's torque beside the URDF's gravity torque."""
     stride = -(-len(trajectory.t) // DRAWN)
     pieces = [piece[::stride] for piece in split_at_gaps(trajectory)]
@@ -47,7 +45,7 @@ def charts(trajectory: Trajectory, arm: Arm, inputs: np.ndarray) -> list[JointCh
     known = any(body.inertia for body in arm.bodies)
     drawn = []
     for k, coordinate in enumerate(arm.coordinates):
-        units, force = UNITS[coordinate.kind], "Nm" if coordinate.kind == "revolute" else "N"
+        units, force = UNITS[coordinate.kind], FORCE[coordinate.kind]
         torque = [Line("logged", t, tau[:, k], "truth")]
         torque += [Line("gravity of the URDF", t, gravity[:, k], "predicted")] if known else []
         lines = (
@@ -60,12 +58,14 @@ def charts(trajectory: Trajectory, arm: Arm, inputs: np.ndarray) -> list[JointCh
             ("torque", force, torque),
         )
         name = coordinate.name
-        drawn.append(JointCharts(name, tuple(_chart(what, unit, name, each) for what, unit, each in lines)))
+        charts = [_chart(what, unit, name, each, last=what == "torque") for what, unit, each in lines]
+        drawn.append(Panel(name, tuple(charts)))
     return drawn
 
 
-def _chart(what: str, unit: str, joint: str, lines: list[Line]) -> Markup:
-    return line_chart(lines, f"{what} of {joint}", "t [s]", f"{what} [{unit}]", width=330, height=190)
+def _chart(what: str, unit: str, joint: str, lines: list[Line], *, last: bool) -> Markup:
+    t, height = ("t [s]", 158) if last else ("", 130)
+    return line_chart(lines, f"{what} of {joint}", t, f"{what} [{unit}]", height=height)
 
 
 def _slope(piece: Trajectory) -> np.ndarray:

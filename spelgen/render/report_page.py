@@ -9,22 +9,40 @@ from typing import Any
 
 from markupsafe import Markup
 
-from spelgen import __version__
-from spelgen.errors import RunError
+from spelgen.errors import RunError, SpelgenError
 from spelgen.evaluation.baselines import MODEL
-from spelgen.evaluation.tables import result_tables, verdict
+from spelgen.evaluation.tables import result_tables
 from spelgen.files import write_text
-from spelgen.fitting.run_folder import RunFolder
+from spelgen.fitting.run_folder import RunFolder, trained_model
+from spelgen.identification.baseline import FILE, run_arm
 from spelgen.listing import number
+from spelgen.loaded_arm import LoadedArm
 from spelgen.logs.preprocessing import Preprocessing
+from spelgen.render.arm_section import LETTERS, ArmSection, Cell, arm_section, matrix
 from spelgen.render.learned import Learned, read_learned
+from spelgen.render.page import render_page
+from spelgen.render.parameters import ParameterTable, parameter_tables
 from spelgen.render.picture import Picture, read_picture
-from spelgen.render.plots import UNITS, joint_charts, loss_chart
+from spelgen.render.plots import (
+    FORCE,
+    UNITS,
+    Panel,
+    coverage_panels,
+    eigenvalue_chart,
+    energy_chart,
+    friction_panels,
+    growth_charts,
+    loss_chart,
+    mass_panels,
+    style,
+    torque_panels,
+    trajectory_panels,
+)
 from spelgen.render.reproduction import commands, files
-from spelgen.spec import read_facts
-from spelgen.templates import render
+from spelgen.render.verdict import verdict
+from spelgen.spec import Facts, read_facts
 
-EXAMPLES = 2  # predicted trajectories that are drawn
+Limits = list[tuple[float, float] | None]
 
 
 @dataclass(frozen=True)
@@ -37,11 +55,34 @@ class Number:
 
 @dataclass(frozen=True)
 class Training:
-    """How the run went: its loss curves and what it was set to."""
+    """How the run went: its loss curves where it took epochs, what it was fitted to, and what it was set to."""
 
-    chart: Markup
+    chart: Markup | None
     facts: dict[str, str]
     settings: dict[str, str]
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A part of the page: a heading, its legend (style, label) and panels."""
+
+    title: str
+    key: tuple[tuple[str, str], ...]
+    panels: tuple[Panel, ...]
+
+
+@dataclass(frozen=True)
+class Curves:
+    """All that is drawn of an evaluation's traces; None or empty where there is nothing."""
+
+    growth: tuple[Panel, ...] = ()
+    torques: tuple[Drawn, ...] = ()
+    trajectories: tuple[Drawn, ...] = ()
+    mass: tuple[Panel, ...] = ()
+    eigenvalues: Markup | None = None
+    along: str = ""
+    friction: tuple[Panel, ...] = ()
+    energy: Markup | None = None
 
 
 def write_report(folder: Path | str, output: Path | str | None = None) -> Path:
@@ -61,92 +102,203 @@ def render_report(folder: Path | str) -> str:
             "no run", file=run.path, expected="a folder with module.py", do="make one with `spelgen train`"
         )
     facts, picture = read_facts(run.module), read_picture(run.module)
-    config = run.read_json(run.config) if run.config.is_file() else None
+    config, evaluation, identified = (
+        run.read_json(path) if path.is_file() else None
+        for path in (run.config, run.evaluation, run.path / FILE)
+    )
     metrics = run.read_metrics()
-    evaluation = run.read_json(run.evaluation) if run.evaluation.is_file() else None
-    learned = read_learned(run) if run.weights.is_file() else None
-    return render(
+    arm = _arm(run)
+    trained = trained_model(run) if run.weights.is_file() else None
+    traces = (evaluation or {}).get("traces") or {}
+    limits = _limits(arm, len(facts.joints))
+    learned = read_learned(run) if trained is not None else None
+    return render_page(
         "report.html.jinja",
-        version=__version__,
         facts=facts,
         picture=picture,
+        cells=_cells(arm, facts, picture),
+        arm=_section(arm, traces, identified),
         units=UNITS,
-        numbers=_numbers(picture, learned, metrics, evaluation),
-        verdict=verdict(evaluation) if evaluation else None,
+        force=FORCE,
+        numbers=_numbers(learned, config, metrics, evaluation),
+        verdict=verdict(evaluation, identified, limits) if evaluation else None,
         config=config,
-        training=_training(config, metrics) if config and metrics else None,
+        training=_training(config, metrics, identified) if config else None,
         evaluation=evaluation,
-        tables=result_tables(evaluation) if evaluation else [],
-        examples=[
-            (
-                each["trajectory"],
-                joint_charts(each, dict(zip(facts.joints, facts.joint_types, strict=True))),
-            )
-            for each in (evaluation or {}).get("examples", [])[:EXAMPLES]
-        ],
+        predictors=_predictors(evaluation),
+        tables=result_tables(evaluation, facts.joint_types) if evaluation else [],
+        curves=_curves(traces, facts, picture),
+        coverage=_coverage(traces, identified, facts, limits),
         learned=learned,
+        parameters=_parameters(trained, arm, identified),
         files=files(run.path),
-        commands=commands(facts, config),
+        commands=commands(run, facts, config),
     )
 
 
+def _arm(run: RunFolder) -> LoadedArm | None:
+    """The run's arm, where its folder has the URDF and that can still be read."""
+    try:
+        return run_arm(run)
+    except SpelgenError:
+        return None
+
+
+def _section(
+    arm: LoadedArm | None, traces: Mapping[str, Any], identified: Mapping[str, Any] | None
+) -> ArmSection | None:
+    return None if arm is None else arm_section(arm.arm, arm.robot.path, traces, identified)
+
+
+def _parameters(
+    model: Any | None, arm: LoadedArm | None, identified: Mapping[str, Any] | None
+) -> list[ParameterTable]:
+    return parameter_tables(model, arm, identified)
+
+
+def _cells(arm: LoadedArm | None, facts: Facts, picture: Picture) -> list[list[Cell]]:
+    """M with reasons where the arm is at hand, else as the module's docstring pictures it."""
+    if arm is not None and facts.options.preset not in ("dense", "phnode"):
+        return matrix(arm.arm, arm.structure_for(facts.options.assume))
+    return [
+        [
+            Cell(x.kind, LETTERS.get(x.kind, x.joints), (), f"M{i + 1}{j + 1}: {x.kind}")
+            for j, x in enumerate(row)
+        ]
+        for i, row in enumerate(picture.rows)
+    ]
+
+
+def _limits(arm: LoadedArm | None, count: int) -> Limits:
+    if arm is None:
+        return [None] * count
+    return [
+        None if x.continuous or x.lower is None or x.upper is None else (x.lower, x.upper)
+        for x in arm.arm.coordinates
+    ]
+
+
+def _predictors(evaluation: Mapping[str, Any] | None) -> list[tuple[str, str]]:
+    """Legend of all that predicts: style and name."""
+    horizons = (evaluation or {}).get("horizons") or []
+    names = list(horizons[0]["errors"]) if horizons else list((evaluation or {}).get("torque") or {})
+    return [(style(name), name) for name in names]
+
+
+def _curves(traces: Mapping[str, Any], facts: Facts, picture: Picture) -> Curves:
+    joints, types = facts.joints, facts.joint_types
+    mass = traces.get("mass") or {}
+    torques = traces.get("torques") or []
+    both = (("truth", "measured"), ("predicted", "predicted"))
+    parts = (
+        ("inertia", "inertia"),
+        ("coriolis", "Coriolis"),
+        ("gravity", "gravity"),
+        ("friction", "friction"),
+    )
+    return Curves(
+        growth=tuple(growth_charts(traces["growth"])) if traces.get("growth") else (),
+        torques=tuple(
+            Drawn(
+                f"{x['which'].capitalize()} trajectory: {x['trajectory']}",
+                (*both, *parts),
+                tuple(torque_panels(x, joints, types)),
+            )
+            for x in torques
+        ),
+        trajectories=tuple(
+            Drawn(
+                f"{x['which'].capitalize()} prediction: {x['trajectory']} from {x['start']:g} s, "
+                f"relative error {number(x['error'])}",
+                both,
+                tuple(trajectory_panels(x, joints, types)),
+            )
+            for x in traces.get("trajectories", [])
+        ),
+        mass=tuple(mass_panels(mass, types, picture.rows)) if mass.get("by") else (),
+        eigenvalues=eigenvalue_chart(mass) if mass.get("by") else None,
+        along=str(mass.get("trajectory", "")),
+        friction=tuple(friction_panels(traces["friction"], joints, types)) if traces.get("friction") else (),
+        energy=energy_chart(torques[0]) if torques else None,
+    )
+
+
+def _coverage(
+    traces: Mapping[str, Any], identified: Mapping[str, Any] | None, facts: Facts, limits: Limits
+) -> list[Panel]:
+    known = {"training": (identified or {}).get("coverage"), "test": traces.get("coverage")}
+    logs = {name: x for name, x in known.items() if x}
+    return coverage_panels(logs, facts.joints, facts.joint_types, limits) if logs else []
+
+
 def _numbers(
-    picture: Picture,
     learned: Learned | None,
+    config: Mapping[str, Any] | None,
     metrics: Sequence[Mapping[str, Any]],
     evaluation: Mapping[str, Any] | None,
 ) -> list[Number]:
     """The figures a reader wants first, as far as the run has come."""
     found = []
+    torque = evaluation["torque"].get(MODEL) if evaluation else None
+    if torque and torque["mean_nmse"] is not None:
+        found.append(
+            Number(f"{100 * torque['mean_nmse']:.3g} %", "of the torque's variance is not explained")
+        )
     if evaluation and evaluation["horizons"]:
         last = evaluation["horizons"][-1]
-        errors = {name: each["mean_relative_rms"] for name, each in last["errors"].items()}
-        others = ", ".join(f"{name} {number(value)}" for name, value in errors.items() if name != MODEL)
-        found.append(
-            Number(
-                number(errors.get(MODEL)), f"error after {last['name']}, relative to the motion ({others})"
-            )
-        )
-        if last["errors"][MODEL]["tip_mm"] is not None:
+        error = last["errors"][MODEL]
+        if error["mean_relative_rms"] is not None:
             found.append(
                 Number(
-                    f"{number(last['errors'][MODEL]['tip_mm'])} mm", f"error of the tip after {last['name']}"
+                    f"{100 * error['mean_relative_rms']:.3g} %",
+                    f"of the motion is missed after {last['name']}",
                 )
             )
+        if error["tip_mm"] is not None:
+            found.append(Number(f"{number(error['tip_mm'])} mm", f"error of the tip after {last['name']}"))
     if learned:
         found.append(Number(f"{learned.parameters:,}", "trained parameters"))
     if metrics:
         found.append(Number(_duration(metrics[-1]["seconds"]), f"of training, {metrics[-1]['step']:,} steps"))
-    varying = sum(cell.kind == "varying" for i, row in enumerate(picture.rows) for cell in row[: i + 1])
-    entries = len(picture.rows) * (len(picture.rows) + 1) // 2
-    found.append(Number(f"{varying} of {entries}", "entries of the mass matrix vary"))
     return found
 
 
-def _training(config: Mapping[str, Any], metrics: Sequence[Mapping[str, Any]]) -> Training:
-    last, best = metrics[-1], metrics[-1]["best"]
-    best_epoch = next((each["epoch"] for each in metrics if each["validation"] == best), 0)
-    kept = f"epoch {best_epoch}" if best_epoch else "the start: no epoch was better"
+def _training(
+    config: Mapping[str, Any], metrics: Sequence[Mapping[str, Any]], identified: Mapping[str, Any] | None
+) -> Training:
     used, chosen = Preprocessing(**config["preprocessing"]), config["config"]
     facts = {
         "objective": config["objective"],
-        "data": f"{config['training_windows']:,} windows from {_many(config['training'])}",
-        "validation": f"{config['validation_windows']:,} windows from {_many(config['validation'])} held out",
+        "training logs": _named(config["training"]),
+        "validation logs": _named(config["validation"]),
+        "windows": f"{config['training_windows']:,} to train, {config['validation_windows']:,} held out",
         "filter": f"{used.cutoff:g} Hz, zero phase" if used.filtered else "none",
-        "length": f"{last['epoch']} epochs, {last['step']:,} steps, {_duration(last['seconds'])}",
-        "kept": f"the model of {kept}, validation loss {number(best)}",
-        "setbacks": f"{last['rollbacks']} epochs undone" if last["rollbacks"] else "none",
     }
+    if identified and "samples" in identified:
+        facts["dense samples"] = (
+            f"{identified['samples']:,} that move, from which least squares is fitted as well"
+        )
+    chart = None
+    if metrics:
+        last, best = metrics[-1], metrics[-1]["best"]
+        best_epoch = next((each["epoch"] for each in metrics if each["validation"] == best), 0)
+        kept = f"epoch {best_epoch}" if best_epoch else "the start: no epoch was better"
+        facts["length"] = f"{last['epoch']} epochs, {last['step']:,} steps, {_duration(last['seconds'])}"
+        facts["kept"] = f"the model of {kept}, validation loss {number(best)}"
+        facts["setbacks"] = f"{last['rollbacks']} epochs undone" if last["rollbacks"] else "none"
+        if chosen.get("solver", "rk4") == "rk4":
+            facts["integrator"] = f"rk4, {last['substeps']} steps between samples"
+        chart = loss_chart(metrics, best_epoch)
     if chosen.get("momentum_steps"):
         facts["start"] = f"{chosen['momentum_steps']:,} steps on the momentum along the logs"
-    if chosen.get("solver", "rk4") == "rk4":
-        facts["integrator"] = f"rk4, {last['substeps']} steps between samples"
     settings = {key.replace("_", " "): str(x) for key, x in chosen.items() if x is not None}
-    return Training(loss_chart(metrics, best_epoch), facts, settings)
+    return Training(chart, facts, settings)
 
 
-def _many(trajectories: Sequence[str]) -> str:
-    return f"{len(trajectories)} trajector{'ies' if len(trajectories) != 1 else 'y'}"
+def _named(trajectories: Sequence[str]) -> str:
+    count = len(trajectories)
+    names = ", ".join(trajectories) if count <= 6 else f"{', '.join(trajectories[:5])} and {count - 5} more"
+    return f"{count} trajector{'ies' if count != 1 else 'y'}: {names}" if count else "none"
 
 
 def _duration(seconds: float) -> str:

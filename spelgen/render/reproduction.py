@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from spelgen.fitting.config import CONFIGS
+from spelgen.fitting.run_folder import RunFolder
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.spec import Facts, Options
 
@@ -35,17 +36,23 @@ def files(folder: Path) -> list[File]:
     ]
 
 
-def commands(facts: Facts, record: Mapping[str, Any] | None) -> list[str]:
+def commands(run: RunFolder, facts: Facts, record: Mapping[str, Any] | None) -> list[str]:
     """What makes a run again, from its config.json; the logs' place is not known to the run."""
     built = _flags(asdict(facts.options), asdict(Options()))
-    found = [f"spelgen build {shlex.quote(facts.urdf)}{built} -o module.py"]
+    urdf, found = shlex.quote(facts.urdf), []
+    if run.urdf.exists():  # under the name that the module knows it by
+        copies = [(run.urdf.name, facts.urdf)]
+        if run.settings.exists():
+            copies.append((run.settings.name, str(Path(facts.urdf).with_suffix(".yaml"))))
+        found += [f"cp RUN/{before} {shlex.quote(after)}" for before, after in copies]
+    found.append(f"spelgen build {urdf}{built} -o module.py")
     if record:
         usual = CONFIGS[record["objective"]]().model_dump(mode="json") | asdict(Preprocessing())
         usual |= {"validation_fraction": 0.25, "seed": 0, "objective": None}
         chosen = {name: record[name] for name in ("objective", "validation_fraction", "seed")}
         chosen |= record["config"] | record["preprocessing"]
-        found.append(f"spelgen train module.py --data LOGS -o RUN{_flags(chosen, usual)}")
-    return [*found, "spelgen evaluate RUN --data LOGS", "spelgen report RUN"]
+        found.append(f"spelgen train module.py --robot {urdf} --data LOGS -o RUN2{_flags(chosen, usual)}")
+    return [*found, "spelgen evaluate RUN2 --data LOGS", "spelgen report RUN2"]
 
 
 def _flags(chosen: Mapping[str, Any], usual: Mapping[str, Any]) -> str:

@@ -1,0 +1,199 @@
+"""The curves behind the figures of an evaluation: for pages, and for programs as `traces` of evaluation.json.
+
+Everything is plain lists and numbers [rad, m, s, Nm, N, kg m^2, J], rounded to five digits; None where not finite.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from spelgen.dynamics.protocol import RigidDynamics
+from spelgen.evaluation.baselines import MODEL, Predictor
+from spelgen.evaluation.torque_traces import plain, torque_trace
+from spelgen.fitting.rollout import loss_scales, position_difference
+from spelgen.logs.preprocessing import Preprocessing
+from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.windows import Windows, cut_windows, joined
+
+WINDOWS = 96  # that the growth of errors is told from
+TIMES = 24  # at which it is told
+QUANTILES = (0.1, 0.5, 0.9)
+SHOWN = 240  # samples of a predicted trajectory
+BINS = 24
+
+
+def traces(
+    predictors: Sequence[Predictor],
+    pieces: Sequence[Trajectory],
+    steps: int,
+    joint_types: Sequence[str],
+    *,
+    used: Preprocessing,
+    tip: Any = None,
+) -> dict[str, Any]:
+    """All curves. pieces: gap-free and filtered. steps: of the longest horizon, 0: none. tip: its position [m] by q."""
+    dynamics = {x.name: x.dynamics for x in predictors if x.dynamics is not None}
+    found: dict[str, Any] = {"coverage": _coverage(pieces)}
+    if steps:
+        found |= _predictions(predictors, pieces, steps, joint_types, used, tip)
+    model = next((x for x in predictors if x.name == MODEL and x.dynamics is not None), None)
+    if model is not None and model.dynamics is not None:
+        found["torques"] = torque_trace(model.dynamics, dynamics, pieces, used)
+        found["mass"] = _masses(dynamics, found)
+        found["friction"] = _friction(dynamics, pieces, found["torques"])
+    return found
+
+
+def _predictions(
+    predictors: Sequence[Predictor],
+    pieces: Sequence[Trajectory],
+    steps: int,
+    joint_types: Sequence[str],
+    used: Preprocessing,
+    tip: Any,
+) -> dict[str, Any]:
+    """How errors grow with the horizon, and the predictions of the middle and the largest error."""
+    starts = [(piece, start) for piece in pieces for start in range(0, len(piece) - steps)]
+    starts = starts[:: -(-len(starts) // WINDOWS)]
+    windows = joined(
+        [
+            cut_windows([piece[start : start + steps + 1]], steps + 1, measured=used.filtered)
+            for piece, start in starts
+        ]
+    )
+    times = np.unique(np.geomspace(1, steps, TIMES).round().astype(int)) - 1
+    scales = loss_scales(windows, joint_types)
+    grown: dict[str, Any] = {}
+    tips: dict[str, Any] = {}
+    examples: list[dict[str, Any]] = []
+    for predictor in predictors:
+        with torch.no_grad():
+            q, qd = predictor.states(windows)
+        away = position_difference(q, windows.q[:, 1:], joint_types)
+        error = torch.cat([away / scales.q, (qd - windows.qd[:, 1:]) / scales.qd], dim=-1)
+        size = error.square().mean(dim=-1).sqrt()  # (W, steps)
+        grown[predictor.name] = _quantiles(size[:, times])
+        if tip is not None:
+            distance = 1000 * (tip(q[:, times]) - tip(windows.q[:, 1:][:, times])).norm(dim=-1)
+            tips[predictor.name] = _quantiles(distance)
+        if predictor.name == MODEL:
+            order = size[:, -1].nan_to_num(nan=torch.inf).argsort()
+            chosen = {"typical": int(order[len(order) // 2]), "worst": int(order[-1])}
+            examples = [
+                _example(which, starts[k], windows[k : k + 1], q[k], qd[k], size[k, -1].item())
+                for which, k in chosen.items()
+            ]
+    seconds = windows.dt.cumsum(dim=1).mean(dim=0)[times]
+    return {
+        "growth": {"seconds": plain(seconds), "windows": len(windows), "relative": grown, "tip_mm": tips},
+        "trajectories": examples,
+    }
+
+
+def _quantiles(values: torch.Tensor) -> dict[str, Any]:
+    """Over windows (W, times): not finite counts as infinite."""
+    ordered = values.nan_to_num(nan=torch.inf).sort(dim=0).values
+    rows = [ordered[round(part * (len(ordered) - 1))] for part in QUANTILES]
+    return dict(zip(("low", "median", "high"), map(plain, rows), strict=True))
+
+
+def _example(
+    which: str,
+    start: tuple[Trajectory, int],
+    window: Windows,
+    q: torch.Tensor,
+    qd: torch.Tensor,
+    error: float,
+) -> dict[str, Any]:
+    piece, first = start
+    stride = -(-len(q) // SHOWN)
+    t = torch.cat([window.dt.new_zeros(1), window.dt[0].cumsum(dim=0)])
+    predicted = (torch.cat([x[0, :1], y]) for x, y in ((window.q, q), (window.qd, qd)))
+    columns = dict(
+        zip(
+            ("t", "q", "qd", "predicted_q", "predicted_qd"),
+            (t, window.q[0], window.qd[0], *predicted),
+            strict=True,
+        )
+    )
+    told = {name: plain(x[::stride]) for name, x in columns.items()}
+    return {
+        "which": which,
+        "trajectory": piece.name,
+        "start": plain(piece.t[first]),
+        "error": plain(error),
+    } | told
+
+
+def _masses(dynamics: Mapping[str, RigidDynamics], found: Mapping[str, Any]) -> dict[str, Any]:
+    """M along the first trajectory that is drawn: its lower triangle, row by row, and its eigenvalues."""
+    along = [*found["torques"], *found.get("trajectories", [])]
+    if not along:
+        return {}
+    stride = -(-len(along[0]["t"]) // SHOWN)
+    q = torch.tensor(along[0]["q"], dtype=torch.float64)[::stride]
+    shown: dict[str, Any] = {}
+    for name, each in dynamics.items():
+        with torch.no_grad():
+            mass = torch.as_tensor(each.mass_matrix(q))
+        if mass.isfinite().all():
+            rows, columns = torch.tril_indices(mass.shape[-1], mass.shape[-1])
+            shown[name] = {
+                "entries": plain(mass[:, rows, columns].mT),
+                "eigenvalues": plain(torch.linalg.eigvalsh(mass).mT),
+            }
+    return {"trajectory": along[0]["trajectory"], "t": along[0]["t"][::stride], "by": shown}
+
+
+def _friction(
+    dynamics: Mapping[str, RigidDynamics], pieces: Sequence[Trajectory], torques: Sequence[Mapping[str, Any]]
+) -> dict[str, Any]:
+    """Friction by velocity, each joint alone at the mean position; and what the rigid bodies leave of the torque."""
+    q = np.concatenate([piece.q for piece in pieces])
+    fast = np.quantile(np.abs(np.concatenate([piece.qd for piece in pieces])), 0.995, axis=0)
+    middle = torch.from_numpy(q.mean(axis=0))
+    n = len(middle)
+    grid = np.sinh(np.linspace(-4, 4, 81)) / np.sinh(4)  # dense where friction turns around
+    speeds = torch.from_numpy(grid[:, None] * fast)  # (81, n)
+    curves: dict[str, Any] = {}
+    for name, each in dynamics.items():
+        with torch.no_grad():
+            moved = torch.diag_embed(speeds)  # one joint at a time
+            torque = each.friction_torque(middle.expand(len(speeds), n, n), moved)
+        curves[name] = plain(torch.diagonal(torch.as_tensor(torque), dim1=-2, dim2=-1).mT)
+    left = [
+        {
+            "qd": [row[k] for trace in torques for row in trace["qd"]],
+            "torque": [
+                None if a is None or b is None else a - b
+                for trace in torques
+                for a, b in zip(
+                    (row[k] for row in trace["measured"]),
+                    (row[k] for row in trace["without_friction"]),
+                    strict=True,
+                )
+            ],
+        }
+        for k in range(n)
+    ]
+    return {"qd": plain(speeds.mT), "by": curves, "measured": left}
+
+
+def _coverage(pieces: Sequence[Trajectory]) -> dict[str, Any]:
+    """Of each joint: its range, and how many samples fall into equal bins of it; of q and of qd."""
+    found: dict[str, Any] = {"seconds": plain(sum(piece.duration for piece in pieces))}
+    for name in ("q", "qd"):
+        values = np.concatenate([getattr(piece, name) for piece in pieces])
+        found[name] = [
+            {
+                "low": plain(x.min()),
+                "high": plain(x.max()),
+                "counts": np.histogram(x, BINS)[0].tolist(),
+            }
+            for x in values.T
+        ]
+    return found

@@ -1,0 +1,91 @@
+"""Least squares on a run's own training logs, kept in its folder: what any model of the arm has to beat."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spelgen.dynamics.regressor_dynamics import RegressorDynamics
+from spelgen.emission.loading import load_module
+from spelgen.errors import LogError, RunError
+from spelgen.files import write_json
+from spelgen.fitting.run_folder import RunFolder
+from spelgen.fitting.streaming import LargeLogs
+from spelgen.fitting.train import open_logs
+from spelgen.identification.friction import FrictionModel
+from spelgen.identification.identify import identify
+from spelgen.loaded_arm import LoadedArm, load_arm
+from spelgen.logs.mapping import LogMapping
+from spelgen.logs.preprocessing import Preprocessing
+from spelgen.logs.trajectory import Trajectory
+from spelgen.spec import read_facts
+
+NAME = "least squares"
+FILE = "least_squares.json"
+BINS = 24
+
+
+def run_arm(run: RunFolder) -> LoadedArm:
+    """The arm that a run's module was built from. Raises RunError where the run has no URDF."""
+    if not run.urdf.exists():
+        raise RunError("no robot.urdf", file=run.path, do="train with --robot")
+    options = read_facts(run.module).options
+    return load_arm(run.urdf, read_facts(run.module).joints, options.tip, options.angle_tolerance)
+
+
+def keep_baseline(run: RunFolder, paths: Iterable[Path | str]) -> None:
+    """Identify the run's arm from the log files that it was trained on, those of validation included.
+
+    What the logs cover is kept beside it. A run without URDF and logs larger than memory are left as they are; logs
+    that are too sparse for accelerations give no parameters.
+    """
+    record = run.read_json(run.config)
+    model = load_module(run.module)
+    logs = open_logs(model, paths, LogMapping(**record["mapping"]))
+    if isinstance(logs, LargeLogs) or not run.urdf.exists():
+        return
+    found: dict[str, Any] = {"coverage": _coverage(logs)}
+    try:
+        fit = identify(run_arm(run), logs, preprocessing=Preprocessing(**record["preprocessing"]))
+    except (LogError, np.linalg.LinAlgError):
+        pass
+    else:
+        found |= fit.to_dict() | {"parameters": fit.parameters.tolist()}
+    write_json(run.path / FILE, found)
+
+
+def read_baseline(run: RunFolder) -> dict[str, RegressorDynamics]:
+    """The dynamics that ``write_baseline`` found, by name; none where it found none."""
+    path = run.path / FILE
+    found = run.read_json(path) if path.exists() else {}
+    if "parameters" not in found:
+        return {}
+    arm, method = run_arm(run), found["method"]
+    n, inertial = len(arm.arm.coordinates), 10 * len(arm.arm.bodies)
+    friction = FrictionModel(coulomb_smoothing_velocity=method["coulomb_smoothing_velocity"])
+    parameters = np.array(found["parameters"])
+    constants = parameters[inertial:].reshape(-1, n)
+    return {
+        NAME: RegressorDynamics(
+            arm.arm,
+            parameters[:inertial],
+            constants[0],
+            lambda qd: friction.torque(constants, qd),
+            arm.actuation.matrix(),
+        )
+    }
+
+
+def _coverage(logs: Sequence[Trajectory]) -> dict[str, list[dict[str, Any]]]:
+    """By joint: the range of q and of qd, and how many samples fall into equal bins of it."""
+    columns = {name: np.concatenate([getattr(log, name) for log in logs]).T for name in ("q", "qd")}
+    return {
+        name: [
+            {"low": float(x.min()), "high": float(x.max()), "counts": np.histogram(x, BINS)[0].tolist()}
+            for x in rows
+        ]
+        for name, rows in columns.items()
+    }

@@ -1,0 +1,181 @@
+"""What a model has learned that is a number: inertial parameters, drives and friction, beside the URDF's."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from spelgen.dynamics.regressor import urdf_parameters
+from spelgen.identification.base_parameters import base_parameters
+from spelgen.identification.friction import FrictionModel
+from spelgen.loaded_arm import LoadedArm
+from spelgen.render.plots import FORCE, INERTIA_UNITS, UNITS
+
+SURE_WORDS = ("firm", "fair")
+SURE = 2.0  # standard deviations of an interval: 95 %
+FRICTION_UNITS = {
+    "viscous": "{force} s/{length}",
+    "saturation_velocity": "{speed}",
+    "stribeck_velocity": "{speed}",
+    "coulomb_smoothing_velocity": "{speed}",
+    "load_dependence": "1",
+}  # all others are a torque
+
+
+@dataclass(frozen=True)
+class ParameterTable:
+    """title, heads and rows of text; the first column is a name. more: rows that are folded away. note: below it."""
+
+    title: str
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    note: str = ""
+    more: tuple[tuple[str, ...], ...] = ()
+    more_title: str = ""
+
+
+def parameter_tables(
+    model: Any | None, arm: LoadedArm | None, identified: Mapping[str, Any] | None
+) -> list[ParameterTable]:
+    """All that is known of a run's parameters; `identified`: what least squares found of the same logs."""
+    found = [] if model is None else [*_bodies(model, arm), *_joints(model, arm)]
+    if arm is not None and identified and "base_parameters" in identified:
+        found.insert(0, _base(model, arm, identified))
+    return found
+
+
+def body_parameters(model: Any) -> np.ndarray | None:
+    """(bodies, 10) of a closed-form model, as ``Body.inertia`` has them; None of another."""
+    own = getattr(getattr(model, "dynamics", None), "inertial_parameters", None)
+    if own is None:
+        return None
+    with torch.no_grad():
+        values: np.ndarray = own().numpy()
+    return values
+
+
+def _base(model: Any | None, arm: LoadedArm, identified: Mapping[str, Any]) -> ParameterTable:
+    base = base_parameters(arm.arm, FrictionModel())
+    drives = len(base.parameters) - 10 * len(arm.arm.bodies)
+    nominal = base.combination @ np.concatenate([urdf_parameters(arm.arm), np.zeros(drives)])
+    learned = _learned(model, base.combination)
+    known = arm.arm.has_inertials
+    rows: dict[bool, list[tuple[str, ...]]] = {True: [], False: []}
+    for k, each in enumerate(identified["base_parameters"]):
+        of_bodies = k < base.bodies
+        away = each["deviation"]
+        rows[each["determined"] in SURE_WORDS].append(
+            (
+                each["name"],
+                f"{nominal[k]:.4g}" if of_bodies and known else "",
+                f"{learned[k]:.4g}"
+                if learned is not None and (of_bodies or each["name"].startswith("armature"))
+                else "",
+                f"{each['value']:.4g}" + ("" if away is None else f" ± {SURE * away:.2g}"),
+                each["determined"],
+                "" if each["formula"] == each["name"] else each["formula"],
+            )
+        )
+    return ParameterTable(
+        "Base parameters: the only combinations that motion shows",
+        ("parameter", "URDF", "model", "least squares, 95 %", "determined", "made of"),
+        tuple(rows[True]),
+        "The intervals are those of least squares on the training logs [kg, m, s]; a value of the model outside "
+        "its interval is either drawn there by the URDF, or tells of an effect that least squares has no column for.",
+        tuple(rows[False]),
+        f"{len(rows[False])} more that these logs hardly tell from zero",
+    )
+
+
+def _learned(model: Any, combination: np.ndarray) -> np.ndarray | None:
+    """Base parameters of a closed-form model; those of friction are of other laws, and stay zero."""
+    own = body_parameters(model)
+    if own is None:
+        return None
+    parameters = np.zeros(combination.shape[1])
+    parameters[: own.size] = own.ravel()
+    if hasattr(model, "armature"):
+        parameters[own.size : own.size + model.n] = model.armature.detach().numpy()
+    found: np.ndarray = combination @ parameters
+    return found
+
+
+def _bodies(model: Any, arm: LoadedArm | None) -> Iterator[ParameterTable]:
+    values = body_parameters(model)
+    if values is None:
+        return
+    nominal = urdf_parameters(arm.arm).reshape(-1, 10) if arm and arm.arm.has_inertials else None
+    names = [body.name for body in arm.arm.bodies] if arm else [f"body {k + 1}" for k in range(len(values))]
+    rows = []
+    for k, name in enumerate(names):
+        rows.append((name, "model", *_about_centre(values[k])))
+        if nominal is not None:
+            rows.append(("", "URDF", *_about_centre(nominal[k])))
+    yield ParameterTable(
+        "Masses, centres of mass and inertias",
+        ("moves with", "by", "m [kg]", "centre of mass x, y, z [m]", "principal moments about it [kg m²]"),
+        tuple(rows),
+        "In the frame of the joint, z its axis. One of many sets that move alike: what motion shows are the base "
+        "parameters above; all sets shown belong to some real distribution of mass.",
+    )
+
+
+def _about_centre(ten: np.ndarray) -> tuple[str, str, str]:
+    mass = ten[0]
+    if mass <= 0:
+        return f"{mass:.4g}", "", ""
+    c = ten[1:4] / mass
+    xx, xy, xz, yy, yz, zz = ten[4:]
+    tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    moments = np.linalg.eigvalsh(tensor - mass * (c @ c * np.eye(3) - np.outer(c, c)))
+    place, about = (", ".join(f"{x:.3g}" for x in values) for values in (c, moments))
+    return f"{mass:.4g}", place, about
+
+
+def _joints(model: Any, arm: LoadedArm | None) -> Iterator[ParameterTable]:
+    """Armature and friction of each joint: whatever constants with one number a joint the model has."""
+    types = tuple(model.joint_types)
+    columns: dict[str, tuple[list[float], str]] = {}
+    if hasattr(model, "armature"):
+        columns["armature"] = ([float(x) for x in model.armature.tolist()], "armature")
+    friction: Any = getattr(getattr(model, "dynamics", None), "friction", None)
+    with torch.no_grad():
+        prepared: Any = friction.prepare() if hasattr(friction, "prepare") else None
+        named = prepared._asdict() if hasattr(prepared, "_asdict") else {}
+        for name, values in named.items():
+            if (
+                torch.is_tensor(values)
+                and values.shape == (len(types),)
+                and name != "offset"
+                and name != "smoothing"
+            ):
+                columns[name] = (values.tolist(), name)
+        offset = getattr(getattr(model, "dynamics", None), "torque_offset", None)
+        if offset is not None:
+            columns["torque offset"] = (offset().tolist(), "offset")
+    if not columns:
+        return
+    head = ["joint", *(name.replace("_", " ") for name in columns)]
+    known = arm is not None
+    if known:
+        head += ["URDF: viscous, Coulomb"]
+    rows = []
+    for k, kind in enumerate(types):
+        name = arm.arm.coordinates[k].name if arm else f"joint {k + 1}"
+        row = [name, *(f"{values[k]:.3g} {_unit(what, kind)}" for values, what in columns.values())]
+        if arm is not None:
+            each = arm.arm.coordinates[k]
+            row.append(f"{each.damping:.3g}, {each.friction:.3g}")
+        rows.append(tuple(row))
+    yield ParameterTable("Drives and friction", tuple(head), tuple(rows))
+
+
+def _unit(what: str, kind: str) -> str:
+    if what == "armature":
+        return INERTIA_UNITS[f"{kind} {kind}"]
+    length, speed = UNITS[kind]
+    return FRICTION_UNITS.get(what, "{force}").format(force=FORCE[kind], length=length, speed=speed)

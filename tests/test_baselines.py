@@ -1,0 +1,100 @@
+"""Baselines: integrated as accurately as they need, whatever the model needs, and identified from the same logs."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from spelgen.dynamics.regressor import body_torque, regressor
+from spelgen.evaluation.baselines import URDF, URDF_WITH_DRIVES, of_urdf
+from spelgen.evaluation.stiff import accurate_solver, roll_out_stiff
+from spelgen.loaded_arm import load_arm
+from spelgen.logs.windows import Windows
+
+
+class Slider:
+    """A mass with damping, pushed: qdd = (tau - d qd) / m."""
+
+    n = 1
+
+    def __init__(self, mass, damping):
+        self.mass, self.damping = mass, damping
+
+    def mass_matrix(self, q):
+        return torch.full((*q.shape, 1), self.mass, dtype=q.dtype)
+
+    def friction_torque(self, q, qd):
+        return self.damping * qd
+
+    def forward_dynamics(self, q, qd, tau):
+        return (tau - self.damping * qd) / self.mass
+
+
+def pushed(steps=20, dt=0.05, push=2.0):
+    shape = (3, steps + 1, 1)
+    qd = torch.zeros(shape, dtype=torch.float64)
+    qd[:, 0, 0] = torch.tensor([0.0, 1.0, -1.0])
+    tau = torch.full((3, steps, 1), push, dtype=torch.float64)
+    return Windows(torch.full((3, steps), dt, dtype=torch.float64), torch.zeros_like(qd), qd, tau)
+
+
+def exact(slider, windows):
+    t = windows.dt.cumsum(dim=1).unsqueeze(-1)
+    rate, end = slider.damping / slider.mass, windows.tau[:, :1] / slider.damping
+    return end + (windows.qd[:, :1] - end) * torch.exp(-rate * t)
+
+
+def test_damping_far_beyond_an_explicit_step_is_integrated():
+    stiff, windows = Slider(1e-3, 5.0), pushed()  # rate 5000 1/s: RK4 at 0.05 s multiplies by 1e7 a step
+    qd = roll_out_stiff(stiff, windows, 1)[1]
+    assert (qd[:, 2:] - exact(stiff, windows)[:, 2:]).abs().max() < 1e-2
+
+
+def test_the_method_has_order_two():
+    slider, windows = Slider(1.0, 1.5), pushed()
+    errors = [
+        (roll_out_stiff(slider, windows, steps)[1] - exact(slider, windows)).abs().max() for steps in (2, 4)
+    ]
+    assert 3.4 < errors[0] / errors[1] < 4.6
+
+
+@pytest.mark.parametrize("damping, tolerance", [(0.01, 1e-6), (30.0, 1e-2), (3000.0, 1e-2)])
+def test_method_and_steps_are_those_that_the_dynamics_need(damping, tolerance):
+    slider, windows = Slider(1.0, damping), pushed()
+    windows.qd[:, 1:] = exact(slider, windows)
+    qd = accurate_solver(slider, windows)(windows)[1]
+    assert (qd - windows.qd[:, 1:]).abs().max() < tolerance
+
+
+@pytest.mark.parametrize("robot", ["rpr", "panda"])
+def test_torques_by_recursion_are_the_regressors(robots, robot):
+    arm = load_arm(robots / f"{robot}.urdf").arm
+    generator = np.random.default_rng(0)
+    q, qd, qdd = generator.normal(size=(3, 20, len(arm.coordinates)))
+    parameters = generator.normal(size=10 * len(arm.bodies))
+    torque = body_torque(arm, parameters, q, qd, qdd)
+    np.testing.assert_allclose(torque, regressor(arm, q, qd, qdd) @ parameters, rtol=1e-10, atol=1e-10)
+
+
+def test_the_urdf_stands_once_as_it_is_and_once_with_its_drives(robots):
+    pytest.importorskip("pinocchio")
+    arm = load_arm(robots / "rpr.urdf")
+    names = [coordinate.name for coordinate in arm.arm.coordinates]
+    q = torch.zeros(1, 4, 3, dtype=torch.float64)
+    probe = Windows(torch.full((1, 3), 0.05, dtype=torch.float64), q, q, q[:, :3])
+    plain, driven = of_urdf(arm.robot.path, names, probe)
+    assert (plain.name, driven.name) == (URDF, URDF_WITH_DRIVES)
+    at = torch.full((1, 3), 0.3, dtype=torch.float64)
+    rotors = [arm.settings.joint(name) for name in names]
+    expected = [x.rotor_inertia * x.gear**2 for x in rotors]
+    added = driven.dynamics.mass_matrix(at) - plain.dynamics.mass_matrix(at)
+    np.testing.assert_allclose(added[0], np.diag(expected), atol=1e-12)
+    fast = torch.full((1, 3), 5.0, dtype=torch.float64)
+    lost = driven.dynamics.friction_torque(at, fast)[0].tolist()
+    for found, joint in zip(lost, rotors, strict=True):
+        assert found == pytest.approx(5 * joint.viscous + joint.coulomb[0])
+    back = driven.dynamics.friction_torque(at, -fast)[0].tolist()
+    for found, joint in zip(back, rotors, strict=True):
+        assert found == pytest.approx(-5 * joint.viscous + joint.coulomb[1])
+    assert not math.isnan(sum(lost))

@@ -1,0 +1,76 @@
+"""The arm of a page: it stands where other programs say, and what is drawn of it is whole."""
+
+import json
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from spelgen.dynamics.tip import tip_kinematics
+from spelgen.loaded_arm import load_arm
+from spelgen.render.arm_section import arm_section, matrix
+from spelgen.render.page import json_data
+from spelgen.render.scene import scene
+from spelgen.render.shapes import tube
+from spelgen.render.still import camera
+
+
+@pytest.mark.parametrize("robot", ["rpr", "scara", "panda", "ur10e"])
+def test_links_stand_where_pytorch_kinematics_has_them(robots, robot):
+    import torch
+
+    arm = load_arm(robots / f"{robot}.urdf")
+    names = [coordinate.name for coordinate in arm.arm.coordinates]
+    drawn, tip = scene(arm.robot.path, names), tip_kinematics(arm)
+    at = [link.name for link in drawn.links].index(tip.link)
+    q = np.random.default_rng(1).uniform(-1, 1, (5, len(names)))
+    for row in q:
+        rotation, position = drawn.frames(row)[at]
+        pose = tip.pose(torch.from_numpy(row)).numpy()
+        np.testing.assert_allclose(position, pose[:3, 3], atol=1e-6)
+        np.testing.assert_allclose(rotation, pose[:3, :3], atol=1e-6)
+
+
+def test_the_shapes_of_the_file_are_drawn_where_all_are_there(tmp_path):
+    box = "<visual><geometry><box size='0.1 0.2 0.3'/></geometry></visual>"
+    mesh = "<visual><geometry><mesh filename='not_there.stl'/></geometry></visual>"
+    text = f"""<robot name="r"><link name="a">{box}</link><link name="b">BOX</link>
+      <joint name="j" type="revolute"><parent link="a"/><child link="b"/><origin xyz="0 0 1"/><axis xyz="0 1 0"/>
+      <limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>"""
+    path = tmp_path / "r.urdf"
+    path.write_text(text.replace("BOX", box))
+    found = scene(path, ["j"])
+    assert found.found and [len(link.shape.faces) for link in found.links] == [12, 12]
+    np.testing.assert_allclose(np.ptp(found.links[1].shape.vertices, axis=0), [0.1, 0.2, 0.3], atol=1e-3)
+    path.write_text(text.replace("BOX", mesh))
+    assert not scene(path, ["j"]).found  # tubes: an arm with holes is worse
+
+
+def test_tubes_are_closed_and_look_outward():
+    shape = tube(np.zeros(3), np.array([0.0, 0.0, 2.0]), 0.5)
+    volume = 0.0
+    for face in shape.faces:
+        first, *rest = shape.vertices[list(face)]
+        volume += sum(first @ np.cross(a, b) / 6 for a, b in pairwise(rest))
+    assert volume == pytest.approx(2 * 0.5**2 * np.pi, rel=0.1)  # negative were it inside out
+
+
+def test_the_camera_is_no_mirror():
+    assert np.linalg.det(camera()) == pytest.approx(1.0)
+
+
+def test_every_cell_tells_what_it_is_and_why(robots):
+    arm = load_arm(robots / "rpr.urdf")
+    cells = matrix(arm.arm, arm.structure)
+    assert cells[1][1].told.startswith("M22 is constant.") and "the mass that it carries" in cells[1][1].told
+    assert cells[1][2].told.startswith("M32 is always zero.") and cells[1][2] == cells[2][1]
+    assert "M22 = m2R" in cells[1][1].told
+    assert cells[0][0].joints == (1, 2)
+
+
+def test_data_cannot_end_its_element_and_is_the_same_every_time(robots):
+    assert "<" not in json_data({"x": "</script><script>alert(1)</script>"})
+    assert json.loads(json_data({"x": "</script>&"})) == {"x": "</script>&"}
+    arm = load_arm(robots / "panda.urdf")
+    first, again = (arm_section(arm.arm, arm.robot.path) for _ in range(2))
+    assert first == again and len(first.data) < 200_000

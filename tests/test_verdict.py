@@ -1,0 +1,76 @@
+"""The verdict of a report: computed from the figures, each word of it."""
+
+import pytest
+
+from spelgen.render.verdict import verdict
+
+JOINTS = ["a", "b"]
+
+
+def errors(relative, tip=None):
+    return {"q_relative_rms": [relative, relative], "mean_relative_rms": relative, "tip_mm": tip}
+
+
+def evaluation(relative=0.05, nmse=0.004, **others):
+    horizons = [
+        {"name": name, "errors": {"model": errors(relative * factor)} | {k: errors(v) for k, v in others.items()}}
+        for name, factor in (("1 step", 0.5), ("1 s", 1.0))
+    ]  # fmt: skip
+    return {"joints": JOINTS, "horizons": horizons, "torque": {"model": {"mean_nmse": nmse}}}
+
+
+def torques(slow, fast):
+    """Traces whose residual at the second joint has one size below and another above a tenth of its speed."""
+    qd = [[1.0, 0.001 * k] for k in range(-100, 101)]
+    residual = [[0.0, slow if abs(x) < 0.01 else fast] for _, x in qd]
+    measured = [[float(k % 7), 10 * x[1] + r[1]] for k, (x, r) in enumerate(zip(qd, residual, strict=True))]
+    predicted = [[m[0], m[1] - r[1]] for m, r in zip(measured, residual, strict=True)]
+    return {"torques": [{"measured": measured, "predicted": {"model": predicted}, "qd": qd}]}
+
+
+@pytest.mark.parametrize("relative, nmse, said", [
+    (0.05, 0.004, "Good enough for feed-forward control, telling contacts from its own error and simulation 1 s ahead"),
+    (0.2, 0.03, "Good enough for feed-forward control and rough simulation 1 s ahead, not for telling contacts"),
+    (0.09, 0.03, "and simulation 1 s ahead"),
+    (0.7, 0.1, "Good enough for gravity compensation, not for feed-forward control and simulation 1 s ahead"),
+    (0.7, 0.5, "Not good enough yet to rely on"),
+    (0.7, None, "Not good enough yet to rely on"),
+])  # fmt: skip
+def test_what_it_is_good_for_follows_the_figures(relative, nmse, said):
+    assert said in verdict(evaluation(relative, nmse)).sentence
+
+
+def test_figures_and_better_baselines_are_told():
+    told = verdict(evaluation(0.05, 0.004, squares=0.03)).because
+    assert "explains 99.6 % of the variance" in told and "misses 5 % of the motion after 1 s" in told
+    assert "But squares is better after 1 s." in told
+
+
+@pytest.mark.parametrize("slow, fast, place", [
+    (0.5, 0.1, "worst at b near standstill; next, record slow reversals of b."),
+    (0.1, 0.5, "worst at b at speed."),
+    (0.2, 0.2, "worst at b."),
+])  # fmt: skip
+def test_where_it_fails_follows_the_residuals(slow, fast, place):
+    assert verdict(evaluation() | {"traces": torques(slow, fast)}).sentence.endswith(place)
+
+
+def test_what_to_record_follows_what_the_logs_cover():
+    def ranges(high):
+        return {"q": [{"low": 0.0, "high": x} for x in (1.0, high)], "qd": [{"low": -1.0, "high": 1.0}] * 2}
+
+    tested = evaluation() | {"traces": {"coverage": ranges(2.0)}}
+    assert (
+        "next, record motion with the positions of b" in verdict(tested, {"coverage": ranges(1.0)}).sentence
+    )
+    inside = evaluation() | {"traces": {"coverage": ranges(1.0)}}
+    narrow = verdict(inside, {"coverage": ranges(1.0)}, [(0.0, 1.2), (0.0, 4.0)])
+    assert (
+        narrow.sentence.endswith("next, record wider motion of b.") and "25 % of its range" in narrow.because
+    )
+    assert "record" not in verdict(inside, {"coverage": ranges(1.0)}, [None, None]).sentence
+
+
+def test_nothing_to_judge_by_is_said():
+    empty = {"joints": JOINTS, "horizons": [], "torque": {}}
+    assert verdict(empty).sentence == "Nothing to judge by: no horizon and no torque was evaluated."
