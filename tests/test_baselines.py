@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from spelgen.dynamics.regressor import body_torque, regressor
-from spelgen.evaluation.baselines import URDF, URDF_WITH_DRIVES, of_urdf
+from spelgen.evaluation.baselines import of_urdf
+from spelgen.evaluation.names import URDF, URDF_WITH_DRIVES
 from spelgen.evaluation.stiff import accurate_solver, roll_out_stiff
 from spelgen.loaded_arm import load_arm
 from spelgen.logs.windows import Windows

@@ -38,7 +38,8 @@ excitation: trajectory criterion excitation
 fitting: run_folder gaussian_prior adaptive rollout dataset streaming torque_samples torque_jacobian torque_fit
 fitting: optimizers torque_networks urdf_regularizer stages compiled process progress validation loop
 fitting: run_record fitted fit train
-evaluation: stiff baselines torque rollout torque_traces traces examples invariants tables results subject evaluate
+evaluation: names stiff baselines torque rollout torque_traces traces examples invariants tables results
+evaluation: subject evaluate
 verify: agreement urdf_cross_check numeric_samples verify
 explain: reasons facts
 formulas: terms printing angles shortening formulas text files

@@ -35,8 +35,6 @@ def rendered(
 
     Raises SpelgenError for an entry that M does not have.
     """
-    from spelgen.render import inspection_page
-
     closed = None
     if formulas or entry is not None or format in ("latex", "sympy"):
         from spelgen.formulas import files, text
@@ -48,7 +46,9 @@ def rendered(
         _tell(closed, proof)
         return files.latex(closed) if format == "latex" else files.sympy_source(closed)
     if format == "html":
-        return inspection_page.page(found, closed, proof, urdf)
+        from spelgen.render.inspection_page import page
+
+        return page(found, closed, proof, urdf)
     if format == "text":
         told = found.text() if closed is None else text.text(closed)
         return told + (f"\n\n{proof.text()}" if proof else "") + "\n"

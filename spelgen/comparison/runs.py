@@ -14,9 +14,10 @@ from spelgen.comparison.metrics import predict, sizes, step_seconds, thinned
 from spelgen.comparison.study import Study, Variant
 from spelgen.comparison.truth import example_positions, mass_error, true_mass
 from spelgen.emission.loading import load_module
-from spelgen.evaluation.baselines import MODEL, of_dynamics
+from spelgen.evaluation.baselines import of_dynamics
 from spelgen.evaluation.examples import predict_examples
 from spelgen.evaluation.invariants import invariants
+from spelgen.evaluation.names import MODEL
 from spelgen.files import write_json
 from spelgen.fitting.config import BATCH
 from spelgen.fitting.rollout import LossScales, loss_scales

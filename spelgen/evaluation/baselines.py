@@ -9,12 +9,10 @@ from pathlib import Path
 import torch
 
 from spelgen.dynamics.protocol import RigidDynamics, integrable
+from spelgen.evaluation.names import CONSTANT_VELOCITY, URDF, URDF_WITH_DRIVES
 from spelgen.evaluation.stiff import accurate_solver
 from spelgen.fitting.rollout import roll_out
 from spelgen.logs.windows import Windows
-
-MODEL = "model"  # the trained model among the predictors
-URDF, URDF_WITH_DRIVES = "URDF", "URDF and drives"
 
 
 @dataclass(frozen=True)
@@ -52,7 +50,7 @@ def constant_velocity() -> Predictor:
         qd = windows.qd[:, :1]
         return windows.q[:, :1] + qd * elapsed, qd.expand(-1, elapsed.shape[1], -1)
 
-    return Predictor("velocity stays constant", hold, None)
+    return Predictor(CONSTANT_VELOCITY, hold, None)
 
 
 def of_urdf(urdf: Path, joints: Sequence[str], probe: Windows) -> list[Predictor]:

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 from spelgen.dynamics.protocol import RigidDynamics
 from spelgen.errors import Diagnostic
 from spelgen.evaluation.baselines import (
-    MODEL,
     Predictor,
     constant_velocity,
     of_baseline,
@@ -18,6 +17,7 @@ from spelgen.evaluation.baselines import (
 )
 from spelgen.evaluation.examples import Example, predict_examples
 from spelgen.evaluation.invariants import energy_drift
+from spelgen.evaluation.names import MODEL
 from spelgen.evaluation.results import Horizon, Results, state_errors, torque_summary
 from spelgen.evaluation.subject import Subject, subject
 from spelgen.evaluation.torque import torque_errors

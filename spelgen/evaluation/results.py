@@ -10,8 +10,9 @@ from typing import Any
 import torch
 
 from spelgen.errors import Diagnostic
-from spelgen.evaluation.baselines import MODEL, Predictor
+from spelgen.evaluation.baselines import Predictor
 from spelgen.evaluation.examples import Example
+from spelgen.evaluation.names import MODEL
 from spelgen.evaluation.tables import result_tables, verdict
 from spelgen.evaluation.torque import TorqueErrors
 from spelgen.fitting.rollout import position_difference

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from spelgen.evaluation.baselines import MODEL
+from spelgen.evaluation.names import MODEL
 from spelgen.listing import Listing, number
 
 

@@ -12,7 +12,8 @@ import numpy as np
 import torch
 
 from spelgen.dynamics.protocol import RigidDynamics
-from spelgen.evaluation.baselines import MODEL, Predictor
+from spelgen.evaluation.baselines import Predictor
+from spelgen.evaluation.names import MODEL
 from spelgen.evaluation.torque_traces import plain, torque_trace
 from spelgen.fitting.rollout import loss_scales, position_difference
 from spelgen.logs.preprocessing import Preprocessing

@@ -11,6 +11,7 @@ import numpy as np
 from spelgen.dynamics.regressor_dynamics import RegressorDynamics
 from spelgen.emission.loading import load_module
 from spelgen.errors import LogError, RunError
+from spelgen.evaluation.names import LEAST_SQUARES
 from spelgen.files import write_json
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.streaming import LargeLogs
@@ -23,7 +24,6 @@ from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 from spelgen.spec import read_facts
 
-NAME = "least squares"
 FILE = "least_squares.json"
 BINS = 24
 
@@ -69,7 +69,7 @@ def read_baseline(run: RunFolder) -> dict[str, RegressorDynamics]:
     parameters = np.array(found["parameters"])
     constants = parameters[inertial:].reshape(-1, n)
     return {
-        NAME: RegressorDynamics(
+        LEAST_SQUARES: RegressorDynamics(
             arm.arm,
             parameters[:inertial],
             constants[0],

@@ -12,7 +12,7 @@ import numpy as np
 from markupsafe import Markup
 
 from spelgen.arm.arm import Arm
-from spelgen.evaluation.baselines import MODEL
+from spelgen.evaluation.names import MODEL
 from spelgen.explain.facts import facts
 from spelgen.formulas.formulas import Formulas, formulas
 from spelgen.formulas.text import to_dict

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from spelgen.evaluation.baselines import MODEL, URDF, URDF_WITH_DRIVES
+from spelgen.evaluation.names import CONSTANT_VELOCITY, LEAST_SQUARES, MODEL, URDF, URDF_WITH_DRIVES
 from spelgen.labels import entry_name
 from spelgen.render.charts import Band, Dots, Line, line_chart
 
@@ -21,8 +21,8 @@ STYLES = {
     MODEL: "model",
     URDF: "urdf",
     URDF_WITH_DRIVES: "drives",
-    "least squares": "squares",
-    "velocity stays constant": "hold",
+    LEAST_SQUARES: "squares",
+    CONSTANT_VELOCITY: "hold",
 }
 PARTS = {"inertia": "inertia", "Coriolis": "coriolis", "gravity": "gravity", "friction": "friction"}
 BARE = 84  # height of a chart that stands above another with the same times
@@ -66,7 +66,7 @@ def growth_charts(growth: Mapping[str, Any]) -> list[Panel]:
         shown: list[Line | Band] = []
         for name, x in growth[what].items():
             shown.append(Line(f"{name}, median", seconds, _numbers(x["median"]), style(name)))
-            if name in (MODEL, "least squares"):
+            if name in (MODEL, LEAST_SQUARES):
                 shown.append(
                     Band(f"{name}, 10 to 90 %", seconds, _numbers(x["low"]), _numbers(x["high"]), style(name))
                 )

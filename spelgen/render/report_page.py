@@ -10,7 +10,7 @@ from typing import Any
 from markupsafe import Markup
 
 from spelgen.errors import RunError, SpelgenError
-from spelgen.evaluation.baselines import MODEL
+from spelgen.evaluation.names import MODEL
 from spelgen.evaluation.tables import result_tables
 from spelgen.files import write_text
 from spelgen.fitting.run_folder import RunFolder, trained_model

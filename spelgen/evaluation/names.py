@@ -1,0 +1,6 @@
+"""How predictors are called, in results and wherever these are shown."""
+
+MODEL = "model"  # the trained model
+URDF, URDF_WITH_DRIVES = "URDF", "URDF and drives"
+LEAST_SQUARES = "least squares"
+CONSTANT_VELOCITY = "velocity stays constant"
