@@ -59,7 +59,7 @@ def test_c_gives_what_the_model_gives(case, program, flags, compiled):
     library = link_library(compile_object(source, program, *options), program)
     library = library.rename(folder / f"{program}{len(flags)}.so")  # ctypes keeps what it has loaded by name
     called = CLibrary(library, model, np.float32 if flags else np.float64)
-    parity = check_parity(called, trained.model, trained.arm, model, NAMES, 1e-5 if flags else 1e-12)
+    parity = check_parity(called, trained, NAMES, 1e-5 if flags else 1e-12)
     assert set(parity.differences) == set(NAMES)
 
 
@@ -113,10 +113,10 @@ def test_a_wrong_export_is_refused():
     trained = Trained(moved_model("two_link", "closed-form"), arm_of("two_link"))
     still = lambda name, inputs: {"tau": np.zeros_like(inputs["q"])}  # noqa: E731
     with pytest.raises(RunError, match=r"inverse_dynamics differs from the model by 1\.0e"):
-        check_parity(still, trained.model, trained.arm, trained.described, ["inverse_dynamics"], 1e-12)
+        check_parity(still, trained, ["inverse_dynamics"], 1e-12)
     nothing = lambda name, inputs: {"tau": np.full_like(inputs["q"], np.nan)}  # noqa: E731
     with pytest.raises(RunError, match="differs from the model by nan"):
-        check_parity(nothing, trained.model, trained.arm, trained.described, ["inverse_dynamics"], 1e-12)
+        check_parity(nothing, trained, ["inverse_dynamics"], 1e-12)
 
 
 DRIVER = r"""
@@ -202,7 +202,7 @@ def test_c_carries_frictions_memory(tmp_path):
     source.with_suffix(".h").write_text(c_header(with_memory, entries, ""))
     assert "#define TWO_LINK_NZ 4" in source.with_suffix(".h").read_text()
     called = CLibrary(link_library(compile_object(source, "gcc"), "gcc"), with_memory)
-    given = random_inputs(with_memory, 5)
+    given = random_inputs(with_memory.coordinates, 5, 4)
     without = called("friction", given | {"z": np.zeros((5, 4))})["friction"]
     force = (bristles.strength / bristles.reach * given["z"].reshape(5, 2, 2)).sum(axis=-1)
     np.testing.assert_allclose(called("friction", given)["friction"], without + force)
@@ -249,5 +249,7 @@ def test_presets_without_such_a_form_are_refused():
         export(moved_model("two_link", "spel"), "casadi", arm=arm_of("two_link"))
     with pytest.raises(RunError, match="the preset phnode, which has a dense mass matrix"):
         export(moved_model("two_link", "phnode"), "c", arm=arm_of("two_link"))
-    with pytest.raises(RunError, match=r"the format 'matlab', expected one of urdf, c, casadi"):
+    with pytest.raises(
+        RunError, match=r"the format 'matlab', expected one of urdf, mjcf, c, casadi, onnx, torch"
+    ):
         export(moved_model("two_link", "closed-form"), "matlab", arm=arm_of("two_link"))

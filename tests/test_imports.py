@@ -28,8 +28,9 @@ arm: rational angle_rounding placement chain lump_links arm actuation axes
 structure: recursion field sampling spans basis expansion symbolic structure nominal
 structure: fourier base_parameters pseudo_inertia
 {" ".join(RUNTIME)}
+dynamics: protocol prepared
 emission: bodies plan source docstring tailored bundle emit loading
-dynamics: protocol arrays constraint pinocchio_dynamics pinocchio_arm pinocchio_urdf regressor regressor_dynamics tip
+dynamics: arrays constraint pinocchio_dynamics pinocchio_arm pinocchio_urdf regressor regressor_dynamics tip
 logs: arm_mapping trajectory bags tables npz readers values log_files read checks filtering
 logs: preprocessing windows chunks epoch_windows
 simulation: friction integration simulated_logs random_inputs tracking
@@ -47,7 +48,8 @@ inspection loaded_arm pipeline building
 simulation: simulate
 excitation: design
 identification: identify baseline
-exporting: description describe trained parity exported readme rigid_body_projection urdf_file urdf_export
+exporting: description tip_chain describe trained parity exported readme rigid_body_projection urdf_file urdf_export
+exporting: mjcf_file mjcf_export torch_programs torch_export onnx_export
 exporting: rigid_expressions friction_expressions learned_expressions model_expressions tip_expressions entry_points
 exporting: c_statements c_networks c_code c_library c_export casadi_export export
 render: charts plots picture page learned parameters reproduction verdict shapes scene still arm_section

@@ -3,27 +3,29 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import say
 from spelgen.cli.options import Force
+from spelgen.exporting.exported import Format
 
 
 def export(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="A folder that `spelgen train` wrote.")],
     output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="FILE.urdf|FOLDER", help="Where to: a file for urdf.")
+        Path, typer.Option("-o", "--output", metavar="FILE|FOLDER", help="A file for urdf and mjcf.")
     ],
-    to: Annotated[Literal["urdf", "c", "casadi"], typer.Option(help="What to write.")] = "urdf",
+    to: Annotated[Format, typer.Option(help="What to write.")] = "urdf",
     force: Force = False,
 ) -> None:
     """Write what was learned for other tools, compared with the model before anything is written.
 
     urdf: bodies of a closed-form model as they are; of other models, the rigid bodies nearest to them.
-    c: a C99 header and source without dependencies. casadi: CasADi functions.
+    mjcf: such bodies, drives and friction for MuJoCo. c: a C99 header and source without dependencies. casadi,
+    onnx, torch: a file for each function.
     """
     from spelgen.exporting.export import export as exported
     from spelgen.exporting.exported import require_fitting

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import torch
 
+from spelgen.dynamics.prepared import PreparedModel
 from spelgen.errors import ModuleError
 from spelgen.labels import printable
 from spelgen.spec import Facts, parse_facts, read_source
@@ -54,6 +55,7 @@ if TYPE_CHECKING:
         def port_hamiltonian_rhs(
             self, q: torch.Tensor, p: torch.Tensor, tau: torch.Tensor | None, prepared: Any
         ) -> tuple[torch.Tensor, torch.Tensor]: ...
+        def prepared(self, tip: Any = None, *, dtype: torch.dtype = torch.float64) -> PreparedModel: ...
         def to_group(self, q: torch.Tensor) -> list[torch.Tensor]: ...
         def from_group(self, parts: list[torch.Tensor]) -> torch.Tensor: ...
 
@@ -82,8 +84,8 @@ def load_module(module: str | Path, *, seed: int = 0) -> EmittedModel:
     missing = [name for name in ("n", "joint_names", "joint_types", *METHODS) if not hasattr(model, name)]
     if missing or not isinstance(model, torch.nn.Module):
         raise ModuleError(f"a class Model without {', '.join(missing)}", file=file, expected=_EXPECTED)
-    # how a notebook shows it is no matter of the module, which stands alone
-    code.Model.__repr__, code.Model._repr_html_ = _summary, _page
+    # neither how a notebook shows it nor its deployment is a matter of the module, which stands alone
+    code.Model.__repr__, code.Model._repr_html_, code.Model.prepared = _summary, _page, _prepared
     emitted = cast("EmittedModel", model)
     emitted.source, emitted.facts = source, facts
     return emitted
@@ -99,3 +101,8 @@ def _summary(model: EmittedModel) -> str:
 def _page(model: EmittedModel) -> str:
     """The module's docstring: what M is made of, and the joints."""
     return f"<pre>{escape(ast.get_docstring(ast.parse(model.source)) or '')}</pre>"
+
+
+def _prepared(model: EmittedModel, tip: Any = None, *, dtype: torch.dtype = torch.float64) -> PreparedModel:
+    """The model as it is now, ready for many calls; see ``PreparedModel``."""
+    return PreparedModel(model, tip, dtype=dtype)

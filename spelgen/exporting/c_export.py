@@ -47,7 +47,7 @@ def c_files(trained: Trained) -> tuple[dict[str, bytes], str]:
             sizes = measured(compiled, program)
             library = CLibrary(link_library(compiled, program), model)
             names = [entry.name for entry in ENTRY_POINTS]
-            parity = check_parity(library, trained.model, trained.arm, model, names, TOLERANCE)
+            parity = check_parity(library, trained, names, TOLERANCE, memory=model.memory)
         checked = f"Checked when exported, compiled by {Path(program).name}: {parity.summary}."
     files = {header: c_header(model, entries, sizes), f"{model.name}.c": source}
     return {name: text.encode() for name, text in files.items()}, checked

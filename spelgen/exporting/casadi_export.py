@@ -30,7 +30,7 @@ def export_casadi(trained: Trained) -> Exported:
     model = trained.described
     functions = casadi_functions(model)
     names = list(functions)
-    parity = check_parity(_Called(functions), trained.model, trained.arm, model, names, TOLERANCE)
+    parity = check_parity(_Called(functions), trained, names, TOLERANCE, memory=model.memory)
     checked = f"Checked when exported, by CasADi {ca.CasadiMeta.version()}: {parity.summary}."
     use = (
         "qdd = casadi.Function.load('forward_dynamics.casadi')(q, qd, tau, z) takes numbers or symbols: "

@@ -10,9 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from spelgen.arm.rational import rotation_from_rpy
-from spelgen.dynamics.constraint import mimic_constraint
-from spelgen.dynamics.tip import last_link
 from spelgen.errors import RunError
 from spelgen.exporting.description import (
     Bound,
@@ -21,9 +18,9 @@ from spelgen.exporting.description import (
     FrictionNetwork,
     Functions,
     Learned,
-    TipJoint,
     TrainedModel,
 )
+from spelgen.exporting.tip_chain import tip_chain
 from spelgen.loaded_arm import LoadedArm
 
 if TYPE_CHECKING:
@@ -38,8 +35,7 @@ def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
     with torch.no_grad():
         prepared = dynamics.prepare()
         learned = None if rigid else _learned(dynamics, prepared, preset)
-        tip_link = loaded.tip or last_link(loaded.robot, [c.name for c in loaded.arm.coordinates])
-        tip, end = _tip(loaded, tip_link)
+        tip_link, tip, end = tip_chain(loaded)
         gains = _array(prepared.input)
         return TrainedModel(
             name=identifier(loaded.arm.name),
@@ -124,29 +120,3 @@ def _foreign(preset: str, what: str) -> RunError:
         expected="closed-form, or minimal with tanh networks",
         do="--to onnx, torch and urdf take every preset",
     )
-
-
-def _tip(loaded: LoadedArm, link: str) -> tuple[tuple[TipJoint, ...], np.ndarray]:
-    """The joints on the way to a link as the URDF has them, and the fixed transform behind the last."""
-    robot = loaded.robot
-    constraint = mimic_constraint(robot, [c.name for c in loaded.arm.coordinates])
-    found: list[TipJoint] = []
-    at = np.eye(4)
-    for joint in robot.path_to(link):
-        origin = np.eye(4)
-        origin[:3, :3], origin[:3, 3] = rotation_from_rpy(joint.rpy), joint.xyz
-        at = at @ origin
-        if not joint.moves:
-            continue
-        index = constraint.names.index(joint.name)
-        kind = "prismatic" if joint.type == "prismatic" else "revolute"
-        axis = np.array(joint.axis, dtype=float)
-        unit = axis / np.linalg.norm(axis)
-        found.append(TipJoint(_clean(at), kind, unit, constraint.jacobian[index], constraint.offset[index]))
-        at = np.eye(4)
-    return tuple(found), _clean(at)
-
-
-def _clean(transform: np.ndarray) -> np.ndarray:
-    """Without the rounding that cos(pi / 2) leaves."""
-    return np.where(np.abs(transform) < 1e-15, 0.0, transform)

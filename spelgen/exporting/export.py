@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 from spelgen.errors import RunError, suggestion
-from spelgen.exporting.exported import Exported, require_fitting
+from spelgen.exporting.exported import FORMATS, Exported, require_fitting
 from spelgen.exporting.trained import Trained
 from spelgen.fitting.fitted import Fit, load_run
 from spelgen.loaded_arm import LoadedArm, load_arm
-
-Format = Literal["urdf", "c", "casadi"]
-FORMATS: tuple[str, ...] = get_args(Format)
 
 
 def export(
@@ -20,10 +17,11 @@ def export(
 ) -> Exported:
     """What a fit, the folder of a run or a model has learned, for other tools; written where a path is given.
 
-    to: ``urdf``, FILE.urdf with its settings and friction beside it; ``c``, a folder with a C99 header and source;
-    ``casadi``, a folder of CasADi functions. What is written was compared with the model first. arm: of ``load_arm``
-    or the path of a URDF; by default the fit's. Raises RunError where no arm is known, for a preset or a path that
-    does not go with the format, where the comparison fails, and where a file exists and ``force`` is not given.
+    to: ``urdf``, FILE.urdf with its settings and friction beside it; ``mjcf``, FILE.xml for MuJoCo; ``c``, a folder
+    with a C99 header and source; ``casadi``, ``onnx`` and ``torch``, a folder with a file for each function. What is
+    written was compared with the model first. arm: of ``load_arm`` or the path of a URDF; by default the fit's. Raises
+    RunError where no arm is known, for a preset or a path that does not go with the format, where the comparison fails,
+    and where a file exists and ``force`` is not given.
     """
     if to not in FORMATS:
         raise RunError(
@@ -45,6 +43,18 @@ def _exported(to: str, trained: Trained) -> Exported:
         from spelgen.exporting.c_export import export_c
 
         return export_c(trained)
+    if to == "onnx":
+        from spelgen.exporting.onnx_export import export_onnx
+
+        return export_onnx(trained)
+    if to == "torch":
+        from spelgen.exporting.torch_export import export_torch
+
+        return export_torch(trained)
+    if to == "mjcf":
+        from spelgen.exporting.mjcf_export import export_mjcf
+
+        return export_mjcf(trained)
     if to == "casadi":
         from spelgen.exporting.casadi_export import export_casadi
 

@@ -5,9 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal, get_args
 
 from spelgen.errors import RunError
 from spelgen.files import write_bytes
+
+Format = Literal["urdf", "mjcf", "c", "casadi", "onnx", "torch"]
+FORMATS: tuple[str, ...] = get_args(Format)
 
 SUFFIXES = {"urdf": ".urdf", "mjcf": ".xml"}
 """Formats of one file, by its extension; what belongs to it lies beside it. All others are folders."""

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
-from spelgen.dynamics.tip import TipKinematics
+from spelgen.arm.arm import Coordinate
+from spelgen.dynamics.tip import tip_kinematics
 from spelgen.errors import RunError
-from spelgen.exporting.description import TrainedModel
+from spelgen.exporting.trained import Trained
 from spelgen.structure.nominal import working_range
-from spelgen.urdf.document import urdf_bytes
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
     from spelgen.loaded_arm import LoadedArm
 
 STATES = 200
@@ -66,33 +65,36 @@ class Parity:
 
 def check_parity(
     called: Called,
-    model: EmittedModel,
-    loaded: LoadedArm,
-    described: TrainedModel,
-    names: list[str],
+    trained: Trained,
+    names: Sequence[str],
     tolerance: float,
+    *,
+    memory: int = 0,
     states: int = STATES,
 ) -> Parity:
-    """``called`` held against the torch model at random states, at each of these entry points. Raises RunError."""
-    inputs = random_inputs(described, states)
-    exact = copy.deepcopy(model).double().cpu().requires_grad_(False)
+    """``called`` held against the torch model at random states, at each of these entry points. Raises RunError.
+
+    memory: numbers of friction's.
+    """
+    inputs = random_inputs(trained.arm.arm.coordinates, states, memory)
+    exact = copy.deepcopy(trained.model).double().cpu().requires_grad_(False)
     differences: dict[str, float] = {}
     for name in names:
         few = name.endswith("derivatives")
         given = {key: value[:DIFFERENTIATED] if few else value for key, value in inputs.items()}
-        expected, found = reference(name, exact, loaded, described, given), called(name, given)
+        expected, found = reference(name, exact, trained.arm, given), called(name, given)
         differences[name] = max(relative(found[key], value) for key, value in expected.items())
     return Parity(differences, tolerance, states).require()
 
 
-def random_inputs(model: TrainedModel, states: int, seed: int = 0) -> Values:
+def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 0, seed: int = 0) -> Values:
     """States over the joints' ranges at their usual speeds, with torques of the size of friction and gravity."""
     random = np.random.default_rng(seed)
-    speed = np.array([c.velocity or _USUAL_SPEED[c.kind] for c in model.coordinates])
-    q = np.stack([random.uniform(*working_range(c), states) for c in model.coordinates], axis=-1)
-    qd, qdd, dq = (size * speed * random.standard_normal((states, model.n)) for size in (0.5, 2.0, 0.05))
-    z = 1e-3 * random.standard_normal((states, model.memory))
-    tau = 10.0 * random.standard_normal((states, model.n))
+    speed = np.array([c.velocity or _USUAL_SPEED[c.kind] for c in coordinates])
+    q = np.stack([random.uniform(*working_range(c), states) for c in coordinates], axis=-1)
+    qd, qdd, dq = (size * speed * random.standard_normal(q.shape) for size in (0.5, 2.0, 0.05))
+    z = 1e-3 * random.standard_normal((states, memory))
+    tau = 10.0 * random.standard_normal(q.shape)
     return {"q": q, "qd": qd, "qdd": qdd, "tau": tau, "z": z, "dq": dq}
 
 
@@ -104,15 +106,12 @@ def relative(found: np.ndarray, expected: np.ndarray) -> float:
     return float(np.abs(found - expected).max() / (size if size > 0 else 1.0))
 
 
-def reference(
-    name: str, model: Any, loaded: LoadedArm, described: TrainedModel, inputs: Values
-) -> dict[str, np.ndarray]:
+def reference(name: str, model: Any, arm: LoadedArm, inputs: Values) -> dict[str, np.ndarray]:
     """What the torch model says of an entry point, by output."""
     q, qd, qdd, tau = (torch.from_numpy(inputs[key]) for key in ("q", "qd", "qdd", "tau"))
     with torch.no_grad():
         if name.startswith("tip_"):
-            names = [coordinate.name for coordinate in described.coordinates]
-            tip = TipKinematics(loaded.robot, urdf_bytes(loaded.robot.path), names, described.tip_link)
+            tip = tip_kinematics(arm)
             found = {"pose": tip.pose(q)} if name == "tip_pose" else {"jacobian": tip.jacobian(q)}
         elif name == "energy":
             kinetic = 0.5 * (model.momentum(q, qd) * qd).sum(dim=-1)

@@ -36,6 +36,7 @@ class RigidBodyProjection:
     drives add to M, (n,) [kg m^2, kg]. viscous, forward, backward: friction, (n,); backward is not positive.
     mass_error, gravity_error: root mean square of what M and gravity torque of bodies and model differ by,
     relative to the model's; None where the bodies are the model's own. friction_error: (n,) likewise, of friction.
+    bodies: a closed-form model of these bodies, float64.
     """
 
     arm: LoadedArm
@@ -47,6 +48,7 @@ class RigidBodyProjection:
     friction_error: np.ndarray
     mass_error: float | None
     gravity_error: float | None
+    bodies: Any
 
     @property
     def base_parameters(self) -> Mapping[str, float]:
@@ -76,6 +78,7 @@ def rigid_body_projection(model: EmittedModel, arm: LoadedArm) -> RigidBodyProje
         friction_error=missed,
         mass_error=mass,
         gravity_error=gravity,
+        bodies=bodies,
     )
 
 

@@ -6,8 +6,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from spelgen.exporting.describe import describe
 from spelgen.exporting.description import TrainedModel
+from spelgen.exporting.tip_chain import tip_in_body
 from spelgen.loaded_arm import LoadedArm
 
 if TYPE_CHECKING:
@@ -25,6 +28,11 @@ class Trained:
     def described(self) -> TrainedModel:
         """The model as plain numbers. Raises RunError for a preset that has no such description."""
         return describe(self.model, self.arm)
+
+    @property
+    def tip_in_body(self) -> tuple[str, int, np.ndarray]:
+        """The tip's link, the body that it moves with, and its pose in that body's frame, (4, 4)."""
+        return tip_in_body(self.arm)
 
     @property
     def joint_names(self) -> tuple[str, ...]:

@@ -68,13 +68,18 @@ def _carried(robot: Robot, moved: set[str]) -> list[str]:
     return found
 
 
-def _in_link(ten: np.ndarray, turned: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Mass, centre of mass and tensor about it in the link's frame; ``turned`` takes +z to the joint's axis."""
+def about_center(ten: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Mass, centre of mass and the tensor about it, (3, 3), of ten parameters about the joint, in its frame."""
     mass, center = ten[0], ten[1:4] / ten[0]
     xx, xy, xz, yy, yz, zz = ten[4:]
     about_joint = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    about_center = about_joint - mass * (center @ center * np.eye(3) - np.outer(center, center))
-    return mass, turned @ center, turned @ about_center @ turned.T
+    return mass, center, about_joint - mass * (center @ center * np.eye(3) - np.outer(center, center))
+
+
+def _in_link(ten: np.ndarray, turned: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Mass, centre of mass and tensor about it in the link's frame; ``turned`` takes +z to the joint's axis."""
+    mass, center, tensor = about_center(ten)
+    return mass, turned @ center, turned @ tensor @ turned.T
 
 
 def _set_inertial(link: etree._Element, values: tuple[float, np.ndarray, np.ndarray]) -> None:
