@@ -15,6 +15,7 @@ from spelgen.building import build
 from spelgen.cli.main import app
 from spelgen.errors import RunError
 from spelgen.exporting import friction_expressions
+from spelgen.exporting.c_code import c_entries, c_header, c_source
 from spelgen.exporting.c_export import c_files
 from spelgen.exporting.c_library import CLibrary, compile_object, link_library
 from spelgen.exporting.casadi_export import export_casadi
@@ -170,44 +171,44 @@ def test_c_is_sound_whatever_it_is_given(case, compiled):
     assert done.stdout == "1 1\n"
 
 
+BRISTLES = Bristles(np.array([[0.01, 0.1], [0.02, 0.3]]), np.array([[0.3, 0.7], [0.4, 0.6]]))
+
+
 def test_bristles_follow_their_law_along_a_displacement():
     """z' = qd - |qd| z / reach, integrated in small steps, there and back."""
-    bristles = Bristles(np.array([[0.01, 0.1], [0.02, 0.3]]), np.array([[1.0, 2.0], [3.0, 4.0]]))
     z, dq = ca.SX.sym("z", 4), ca.SX.sym("dq", 2)
-    step = ca.Function("step", [z, dq], [friction_expressions.bristle_step(bristles, z, dq)])
-    torque = ca.Function("torque", [z], [friction_expressions.bristle_torque(bristles, z)])
-    found, small, steps = np.zeros(4), np.zeros(4), 4000
+    step = ca.Function("step", [z, dq], [friction_expressions.bristle_step(BRISTLES, z, dq)])
+    found, small, steps, reach = np.zeros(4), np.zeros(4), 4000, BRISTLES.reach.ravel()
     for moved in (np.array([0.05, -0.02]), np.array([-0.01, 0.03]), np.zeros(2)):
         found = step(found, moved).full()[:, 0]
         d = np.repeat(moved / steps, 2)
         for _ in range(steps):
-            small = small + d - np.abs(d) * small / bristles.reach.ravel()
+            small = small + d - np.abs(d) * small / reach
     np.testing.assert_allclose(found, small, rtol=1e-3)
-    assert (np.abs(found) <= bristles.reach.ravel()).all()
-    force = (bristles.strength / bristles.reach * found.reshape(2, 2)).sum(axis=1)
-    np.testing.assert_allclose(torque(found).full()[:, 0], force)
+    assert (np.abs(found) <= reach).all()
 
 
 @needs_gcc
 def test_c_carries_frictions_memory(tmp_path):
-    """Memory of two elements a joint: z in the forces, and its step; NZ says how many numbers."""
-    from spelgen.exporting.c_code import c_entries, c_header, c_source
-
+    """Two elements a joint: z turns dry friction, and long sliding bends it fully. NZ says how many numbers."""
     model = Trained(moved_model("two_link", "closed-form"), arm_of("two_link")).described
-    bristles = Bristles(np.array([[0.01, 0.1], [0.02, 0.3]]), np.array([[1.0, 2.0], [3.0, 4.0]]))
-    with_memory = replace(model, bristles=bristles)
-    entries = c_entries(with_memory)
+    model = replace(model, bristles=BRISTLES)
+    entries = c_entries(model)
     source = tmp_path / f"{model.name}.c"
-    source.write_text(c_source(with_memory, entries))
-    source.with_suffix(".h").write_text(c_header(with_memory, entries, ""))
+    source.write_text(c_source(model, entries))
+    source.with_suffix(".h").write_text(c_header(model, entries, ""))
     assert "#define TWO_LINK_NZ 4" in source.with_suffix(".h").read_text()
-    called = CLibrary(link_library(compile_object(source, "gcc"), "gcc"), with_memory)
-    given = random_inputs(with_memory.coordinates, 5, 4)
-    without = called("friction", given | {"z": np.zeros((5, 4))})["friction"]
-    force = (bristles.strength / bristles.reach * given["z"].reshape(5, 2, 2)).sum(axis=-1)
-    np.testing.assert_allclose(called("friction", given)["friction"], without + force)
-    moved = called("friction_step", given)["z_next"]
-    assert np.abs(moved - given["z"]).max() > 1e-3
+    called = CLibrary(link_library(compile_object(source, "gcc"), "gcc"), model)
+    given = random_inputs(model.coordinates, 5, 4)
+    law, qd = model.friction, given["qd"]
+    dry = law.coulomb + law.stribeck * np.exp(-((qd / law.stribeck_velocity) ** 2))
+    dry += law.load_dependence * np.abs(called("gravity", given)["gravity"])
+    straight = called("friction", given | {"z": np.zeros((5, 4))})["friction"]
+    bent = (BRISTLES.fractions / BRISTLES.reach * given["z"].reshape(5, 2, 2)).sum(axis=-1)
+    np.testing.assert_allclose(called("friction", given)["friction"], straight + dry * bent)
+    slid = called("friction_memory", given)["z_start"].reshape(5, 2, 2)
+    direction = np.tanh(qd / law.coulomb_smoothing_velocity)
+    np.testing.assert_allclose(slid, BRISTLES.reach * direction[..., None])
 
 
 def test_export_needs_the_run_folder_alone(tmp_path):

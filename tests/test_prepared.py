@@ -56,7 +56,7 @@ def test_linearize_is_the_slope_of_rate_and_step(pair):
         return torch.cat([qd, prepared.forward_dynamics(q, qd, tau)], dim=-1)
 
     def step(x):
-        return torch.cat(prepared.step(*x.chunk(3, dim=-1), 0.01), dim=-1)
+        return torch.cat(prepared.step(*x.chunk(3, dim=-1), 0.01)[:2], dim=-1)
 
     for function, dt in ((rate, None), (step, 0.01)):
         found = torch.cat(prepared.linearize(*given.chunk(3, dim=-1), dt), dim=-1)
@@ -73,10 +73,12 @@ def test_rollout_is_steps_and_converges_to_the_fourth_order():
         torch.tensor([2.0, 1.5]).double(),
     )  # friction is smooth at speed
     tau = torch.zeros(4, 2, dtype=torch.float64)
-    positions, velocities = prepared.rollout(q, qd, tau, 0.01)
-    assert positions.shape == velocities.shape == (5, 2)
-    fine = prepared.rollout(q, qd, tau, 0.01, substeps=64)[0][-1]
-    errors = [float((prepared.rollout(q, qd, tau, 0.01, k)[0][-1] - fine).abs().max()) for k in (1, 2)]
+    found = prepared.rollout(q, qd, tau, 0.01)
+    assert found.q.shape == found.qd.shape == (5, 2)
+    fine = prepared.rollout(q, qd, tau, 0.01, substeps=64).q[-1]
+    errors = [
+        float((prepared.rollout(q, qd, tau, 0.01, substeps=k).q[-1] - fine).abs().max()) for k in (1, 2)
+    ]
     assert errors[1] < errors[0] / 8
 
 

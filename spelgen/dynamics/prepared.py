@@ -4,17 +4,25 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 
+class State(NamedTuple):
+    """q and qd, (..., n), and friction's memory z, (..., n, K)."""
+
+    q: Tensor
+    qd: Tensor
+    z: Tensor
+
+
 class PreparedModel:
     """An emitted model with its weights as they were, without gradients by them.
 
-    q, qd, qdd and tau are (..., n); units are rad and Nm, or m and N. Calls keep to ``torch.inference_mode`` rules of
-    their caller, and take derivatives by q, qd and tau. tip: what gives ``pose(q)`` and ``jacobian(q)``, as
+    q, qd, qdd and tau are (..., n); units are rad and Nm, or m and N. z, (..., n, K), is friction's memory; without it
+    friction is that of joints which have long gone the way of qd. tip: what gives ``pose(q)`` and ``jacobian(q)``, as
     ``tip_kinematics`` does.
     """
 
@@ -22,6 +30,7 @@ class PreparedModel:
         model = copy.deepcopy(model).to(dtype=dtype).requires_grad_(False)
         self.n: int = model.n
         self._dynamics, self._weights, self._tip = model.dynamics, model.prepare(), tip
+        self._remembers = bool(getattr(model.dynamics, "elements", 0))
 
     def mass_matrix(self, q: Tensor) -> Tensor:
         """M(q), (..., n, n) [kg m^2, kg m, kg]."""
@@ -37,62 +46,80 @@ class PreparedModel:
         """Coriolis, centrifugal and gravity torque, (..., n) [Nm, N]."""
         return self._mass_and_bias(self._at(q), qd)[1]
 
-    def friction_torque(self, q: Tensor, qd: Tensor) -> Tensor:
+    def friction_torque(self, q: Tensor, qd: Tensor, z: Tensor | None = None) -> Tensor:
         """What friction takes, (..., n) [Nm, N]."""
-        torque: Tensor = self._dynamics.friction_at(self._at(q), qd, self._weights)
-        return torque
+        return self._friction(self._at(q), qd, z)
 
-    def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
+    def memory(self, qd: Tensor) -> Tensor:
+        """Friction's memory z, (..., n, K), of joints that have long gone the way of qd: zero at rest."""
+        z: Tensor = self._dynamics.memory(qd) if self._remembers else qd.unsqueeze(-1)[..., :0]
+        return z
+
+    def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
         """qdd, (..., n), under the input tau."""
-        mass, force = self._mass_and_force(q, qd, tau)
+        mass, force = self._mass_and_force(q, qd, tau, z)
         found: Tensor = torch.linalg.solve(mass, force.unsqueeze(-1))
         return found.squeeze(-1)
 
-    def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
+    def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None = None) -> Tensor:
         """The input, (..., n), that gives qdd."""
         at = self._at(q)
         mass, bias = self._mass_and_bias(at, qd)
         force = (mass @ qdd.unsqueeze(-1)).squeeze(-1) + bias
-        force = force + self._dynamics.friction_at(at, qd, self._weights)
+        force = force + self._friction(at, qd, z)
         tau: Tensor = self._dynamics.input_torque(at, force, self._weights)
         return tau
 
-    def step(self, q: Tensor, qd: Tensor, tau: Tensor, dt: float, substeps: int = 1) -> tuple[Tensor, Tensor]:
-        """q and qd after dt [s] under a tau that is held, by so many steps of the classical Runge-Kutta method."""
-        return _stepped(self.forward_dynamics, q, qd, tau, dt, substeps)
+    def step(
+        self, q: Tensor, qd: Tensor, tau: Tensor, dt: float, z: Tensor | None = None, *, substeps: int = 1
+    ) -> State:
+        """q, qd and z after dt [s] under a tau that is held, by so many steps of the classical Runge-Kutta method.
+
+        z follows the displacements exactly; by default it starts as ``memory`` says.
+        """
+        z = self.memory(qd) if z is None else z
+        return self._stepped(self.forward_dynamics, State(q, qd, z), tau, dt, substeps)
 
     def rollout(
-        self, q: Tensor, qd: Tensor, tau: Tensor, dt: float, substeps: int = 1
-    ) -> tuple[Tensor, Tensor]:
-        """q and qd, (steps + 1, ..., n), from a state on; tau, (steps, ..., n), is held for dt [s] each."""
-        states = [(q, qd)]
+        self, q: Tensor, qd: Tensor, tau: Tensor, dt: float, z: Tensor | None = None, *, substeps: int = 1
+    ) -> State:
+        """q and qd, (steps + 1, ..., n), and z from a state on; tau, (steps, ..., n), is held for dt [s] each."""
+        states = [State(q, qd, self.memory(qd) if z is None else z)]
         for held in tau:
-            states.append(self.step(*states[-1], held, dt, substeps))
-        positions, velocities = zip(*states, strict=True)
-        return torch.stack(positions), torch.stack(velocities)
+            at = states[-1]
+            states.append(self.step(at.q, at.qd, held, dt, at.z, substeps=substeps))
+        return State(*(torch.stack(each) for each in zip(*states, strict=True)))
 
     def linearize(
-        self, q: Tensor, qd: Tensor, tau: Tensor, dt: float | None = None, substeps: int = 1
+        self,
+        q: Tensor,
+        qd: Tensor,
+        tau: Tensor,
+        dt: float | None = None,
+        z: Tensor | None = None,
+        *,
+        substeps: int = 1,
     ) -> tuple[Tensor, Tensor]:
         """A, (..., 2 n, 2 n), and B, (..., 2 n, n), of the state (q, qd) and the input tau.
 
-        Of its rate, (qd, qdd); with dt [s], of what ``step`` makes of it.
+        Of its rate, (qd, qdd), with z held; with dt [s], of what ``step`` makes of it.
         """
+        n = self.n
+        z = self.memory(qd) if z is None else z
 
-        def function(state: Tensor, held: Tensor) -> Tensor:
-            place, speed = state.split(self.n)
+        def function(state: Tensor, held: Tensor, kept: Tensor) -> Tensor:
+            place, speed = state.split(n)
             if dt is None:
-                return torch.cat([speed, self._differentiable(place, speed, held)])
-            return torch.cat(_stepped(self._differentiable, place, speed, held, dt, substeps))
+                return torch.cat([speed, self._differentiable(place, speed, held, kept)])
+            after = self._stepped(self._differentiable, State(place, speed, kept), held, dt, substeps)
+            return torch.cat([after.q, after.qd])
 
-        states = torch.cat([q, qd], dim=-1)
-        rows = (states.reshape(-1, 2 * self.n), tau.reshape(-1, self.n))
+        batch, elements = q.shape[:-1], z.shape[-1]
+        states = torch.cat([q, qd], dim=-1).reshape(-1, 2 * n)
+        rows = states, tau.reshape(-1, n), z.reshape(len(states), n, elements)
         jacobian = torch.func.vmap(torch.func.jacfwd(function, argnums=(0, 1)))
         by_state, by_input = jacobian(*rows)
-        return (
-            by_state.reshape(*q.shape[:-1], 2 * self.n, 2 * self.n),
-            by_input.reshape(*q.shape[:-1], 2 * self.n, self.n),
-        )
+        return by_state.reshape(*batch, 2 * n, 2 * n), by_input.reshape(*batch, 2 * n, n)
 
     def pose(self, q: Tensor) -> Tensor:
         """The tip's homogeneous transform in the root link's frame, (..., 4, 4). Raises ValueError without a tip."""
@@ -123,36 +150,39 @@ class PreparedModel:
         mass, residuals = self._dynamics.mass_at(at, self._weights)
         return mass, self._dynamics.nonlinear_at(at, qd, residuals, self._weights)
 
-    def _mass_and_force(self, q: Tensor, qd: Tensor, tau: Tensor) -> tuple[Tensor, Tensor]:
+    def _friction(self, at: Any, qd: Tensor, z: Tensor | None) -> Tensor:
+        memory = (z,) if self._remembers else ()
+        torque: Tensor = self._dynamics.friction_at(at, qd, self._weights, *memory)
+        return torque
+
+    def _mass_and_force(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None) -> tuple[Tensor, Tensor]:
         at = self._at(q)
         mass, bias = self._mass_and_bias(at, qd)
         force = self._dynamics.input_force(at, tau, self._weights) - bias
-        return mass, force - self._dynamics.friction_at(at, qd, self._weights)
+        return mass, force - self._friction(at, qd, z)
 
-    def _differentiable(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
+    def _differentiable(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
         """``forward_dynamics`` by the inverse: vmap of a forward derivative of linalg.solve is wrong in torch 2.13."""
-        mass, force = self._mass_and_force(q, qd, tau)
+        mass, force = self._mass_and_force(q, qd, tau, z)
         found: Tensor = torch.linalg.inv(mass) @ force
         return found
 
+    def _stepped(
+        self, accelerations: Callable[..., Tensor], start: State, tau: Tensor, dt: float, substeps: int
+    ) -> State:
+        h, (q, qd, z) = dt / substeps, start
+        for _ in range(substeps):
+            a1 = accelerations(q, qd, tau, z)
+            q2, v2 = q + 0.5 * h * qd, qd + 0.5 * h * a1
+            a2 = accelerations(q2, v2, tau, self._memory_after(z, q2 - q))
+            q3, v3 = q + 0.5 * h * v2, qd + 0.5 * h * a2
+            a3 = accelerations(q3, v3, tau, self._memory_after(z, q3 - q))
+            q4, v4 = q + h * v3, qd + h * a3
+            a4 = accelerations(q4, v4, tau, self._memory_after(z, q4 - q))
+            moved = h / 6 * (qd + 2 * v2 + 2 * v3 + v4)
+            q, qd, z = q + moved, qd + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4), self._memory_after(z, moved)
+        return State(q, qd, z)
 
-def _stepped(
-    accelerations: Callable[[Tensor, Tensor, Tensor], Tensor],
-    q: Tensor,
-    qd: Tensor,
-    tau: Tensor,
-    dt: float,
-    substeps: int,
-) -> tuple[Tensor, Tensor]:
-    h = dt / substeps
-    for _ in range(substeps):
-        a1 = accelerations(q, qd, tau)
-        v2 = qd + 0.5 * h * a1
-        a2 = accelerations(q + 0.5 * h * qd, v2, tau)
-        v3 = qd + 0.5 * h * a2
-        a3 = accelerations(q + 0.5 * h * v2, v3, tau)
-        v4 = qd + h * a3
-        a4 = accelerations(q + h * v3, v4, tau)
-        q = q + h / 6 * (qd + 2 * v2 + 2 * v3 + v4)
-        qd = qd + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
-    return q, qd
+    def _memory_after(self, z: Tensor, moved: Tensor) -> Tensor:
+        found: Tensor = self._dynamics.memory_after(z, moved) if self._remembers else z
+        return found

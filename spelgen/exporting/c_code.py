@@ -81,7 +81,7 @@ def _entry(model: TrainedModel, entry: EntryPoint) -> CEntry:
     ]
     for k, (name, _) in enumerate(entry.outputs):
         size = function.size1_out(k) * function.size2_out(k)
-        parameters.append(f"{real} *{name}" if name == "z_next" else f"{real} {name}[{size}]")
+        parameters.append(f"{real} *{name}" if name.startswith("z_") else f"{real} {name}[{size}]")
     signature = f"void {prefix}{entry.name}({', '.join(parameters)})"
     shapes = ", ".join(
         f"{name} {_shape(function, k)} [{unit}]" for k, (name, unit) in enumerate(entry.outputs)

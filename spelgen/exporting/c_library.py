@@ -89,4 +89,10 @@ class CLibrary:
 def _shape(entry: str, output: str, n: int, memory: int) -> tuple[int, ...]:
     if entry in ("mass_matrix", "inverse_dynamics_derivatives", "forward_dynamics_derivatives"):
         return n, n
-    return {"pose": (4, 4), "jacobian": (6, n), "energy": (2,), "z_next": (memory,)}.get(output, (n,))
+    return {
+        "pose": (4, 4),
+        "jacobian": (6, n),
+        "energy": (2,),
+        "z_next": (memory,),
+        "z_start": (memory,),
+    }.get(output, (n,))

@@ -13,6 +13,7 @@ import torch
 from spelgen.errors import RunError
 from spelgen.exporting.description import (
     Bound,
+    Bristles,
     Encoding,
     FrictionLaw,
     FrictionNetwork,
@@ -49,7 +50,7 @@ def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
             armature=_array(exact.armature) if rigid else np.zeros(n),
             learned=learned,
             friction=_friction(dynamics, prepared, preset),
-            bristles=None,
+            bristles=_bristles(dynamics, prepared),
             inputs=np.diag(gains) if gains.ndim == 1 else gains,
             actuated=_array(dynamics.input.actuated),
             torque_offset=_array(exact.torque_offset) if rigid else np.zeros(n),
@@ -80,6 +81,13 @@ def _friction(dynamics: Any, prepared: Any, preset: str) -> FrictionLaw | Fricti
         values = {name: _array(getattr(constants, name)) for name in names}
         return FrictionNetwork(**values, nominal=_array(dynamics.friction.nominal))
     raise _foreign(preset, "a full friction matrix")
+
+
+def _bristles(dynamics: Any, prepared: Any) -> Bristles | None:
+    fractions = getattr(prepared.friction, "bristle_fractions", None)
+    if fractions is None or not fractions.shape[-1]:
+        return None
+    return Bristles(_array(dynamics.friction.bristles.reach), _array(fractions))
 
 
 def _learned(dynamics: Any, prepared: Any, preset: str) -> Learned:

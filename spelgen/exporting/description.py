@@ -36,10 +36,12 @@ class FrictionLaw:
 
 @dataclass(frozen=True, eq=False)
 class Bristles:
-    """Friction's memory: ``count`` elements a joint, each with a reach [rad, m] and a strength [Nm, N], (n, count)."""
+    """Friction's memory: ``count`` elements a joint, each with a reach [rad, m] and its fraction of dry friction;
+    (n, count).
+    """
 
     reach: np.ndarray
-    strength: np.ndarray
+    fractions: np.ndarray
 
     @property
     def count(self) -> int:

@@ -57,8 +57,12 @@ ENTRY_POINTS = (
         (("friction", _TORQUE),), "rates", lambda m: (m.friction,),
     ),
     EntryPoint(
-        "friction_step", "friction's memory after a displacement dq", ("z", "dq"),
+        "friction_step", "friction's memory after each joint went one way by dq", ("z", "dq"),
         (("z_next", "rad, m"),), "values", lambda m: (m.friction_step,),
+    ),
+    EntryPoint(
+        "friction_memory", "friction's memory of joints that have long gone the way of qd: to start from", ("qd",),
+        (("z_start", "rad, m"),), "values", lambda m: (m.friction_memory,),
     ),
     EntryPoint(
         "momentum", "M qd", ("q", "qd"),

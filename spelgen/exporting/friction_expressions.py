@@ -8,13 +8,17 @@ import numpy as np
 from spelgen.exporting.description import Bristles, FrictionLaw, FrictionNetwork
 
 
-def law_torque(law: FrictionLaw, qd: ca.SX, gravity: ca.SX) -> ca.SX:
-    """``runtime.friction_laws``: (n, 1) [Nm, N], under this gravity torque."""
+def law_torque(law: FrictionLaw, qd: ca.SX, gravity: ca.SX, direction: ca.SX) -> ca.SX:
+    """``runtime.friction_laws``: (n, 1) [Nm, N], under this gravity torque; direction: of dry friction, -1 to 1."""
     dry = ca.SX(law.coulomb) + law.load_dependence * ca.fabs(gravity)
     if law.stribeck.any():
         dry = dry + law.stribeck * ca.exp(-((qd / law.stribeck_velocity) ** 2))
-    turned = ca.tanh(qd / law.coulomb_smoothing_velocity)
-    return law.viscous * qd + law.saturation * ca.tanh(qd / law.saturation_velocity) + dry * turned
+    return law.viscous * qd + law.saturation * ca.tanh(qd / law.saturation_velocity) + dry * direction
+
+
+def sliding_direction(law: FrictionLaw, qd: ca.SX) -> ca.SX:
+    """The direction of dry friction of joints that have long gone this way, (n, 1)."""
+    return ca.tanh(qd / law.coulomb_smoothing_velocity)
 
 
 def network_torque(network: FrictionNetwork, encoded: ca.SX, qd: ca.SX) -> ca.SX:
@@ -28,19 +32,30 @@ def network_torque(network: FrictionNetwork, encoded: ca.SX, qd: ca.SX) -> ca.SX
     return network.viscous * qd + network.nominal * direction * size
 
 
-def bristle_torque(bristles: Bristles, z: ca.SX) -> ca.SX:
-    """strength z / reach, summed over a joint's elements; (n, 1) [Nm, N]. z: joint by joint, (n count, 1)."""
+def bristle_direction(bristles: Bristles, z: ca.SX) -> ca.SX:
+    """fraction z / reach, summed over a joint's elements; (n, 1). z: joint by joint, (n count, 1)."""
     n, count = bristles.reach.shape
-    force = z * (bristles.strength / bristles.reach).ravel()
-    return ca.sum2(ca.reshape(force, count, n).T)
+    bent = z * (bristles.fractions / bristles.reach).ravel()
+    return ca.sum2(ca.reshape(bent, count, n).T)
+
+
+def sliding_bristles(bristles: Bristles, law: FrictionLaw, qd: ca.SX) -> ca.SX:
+    """z of joints that have long gone this way, (n count, 1)."""
+    direction = _by_element(bristles, sliding_direction(law, qd))
+    return direction * bristles.reach.ravel()
 
 
 def bristle_step(bristles: Bristles, z: ca.SX, dq: ca.SX) -> ca.SX:
     """z after a displacement dq: z' = qd - |qd| z / reach, solved along it."""
-    moved = ca.SX(np.kron(np.eye(len(bristles.reach)), np.ones((bristles.count, 1)))) @ dq
+    moved = _by_element(bristles, dq)
     reach = bristles.reach.ravel()
     end = ca.sign(moved) * reach
     return end + (z - end) * ca.exp(-ca.fabs(moved) / reach)
+
+
+def _by_element(bristles: Bristles, values: ca.SX) -> ca.SX:
+    """A joint's value for each of its elements, (n count, 1)."""
+    return ca.vec(ca.repmat(values.T, bristles.count, 1))
 
 
 def _sparse(matrix: np.ndarray) -> ca.DM:

@@ -141,21 +141,33 @@ class ModelExpressions:
         law = self.model.friction
         if isinstance(law, FrictionLaw):
             gravity = self.gravity if law.load_dependence.any() else ca.SX(self.n, 1)
-            found = friction_expressions.law_torque(law, self.qd, gravity)
+            bristles = self.model.bristles
+            direction = (
+                friction_expressions.sliding_direction(law, self.qd)
+                if bristles is None
+                else friction_expressions.bristle_direction(bristles, self.z)
+            )
+            found = friction_expressions.law_torque(law, self.qd, gravity, direction)
         else:
             assert self.model.learned is not None
             read = learned_expressions.encoded(self.model.learned.encoding, self.q)
             found = friction_expressions.network_torque(law, read, self.qd)
-        if self.model.bristles is not None:
-            found = found + friction_expressions.bristle_torque(self.model.bristles, self.z)
         return found
 
     @cached_property
     def friction_step(self) -> ca.SX:
-        """Friction's memory after a displacement dq, (memory, 1)."""
+        """Friction's memory after each joint went one way by dq, (memory, 1)."""
         if self.model.bristles is None:
             return self.z
         return friction_expressions.bristle_step(self.model.bristles, self.z, self.dq)
+
+    @cached_property
+    def friction_memory(self) -> ca.SX:
+        """Friction's memory of joints that have long gone the way of qd, (memory, 1)."""
+        law, bristles = self.model.friction, self.model.bristles
+        if bristles is None or not isinstance(law, FrictionLaw):
+            return self.z
+        return friction_expressions.sliding_bristles(bristles, law, self.qd)
 
     @cached_property
     def force(self) -> ca.SX:

@@ -93,7 +93,7 @@ def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 
     speed = np.array([c.velocity or _USUAL_SPEED[c.kind] for c in coordinates])
     q = np.stack([random.uniform(*working_range(c), states) for c in coordinates], axis=-1)
     qd, qdd, dq = (size * speed * random.standard_normal(q.shape) for size in (0.5, 2.0, 0.05))
-    z = 1e-3 * random.standard_normal((states, memory))
+    z = 1e-4 * random.standard_normal((states, memory))
     tau = 10.0 * random.standard_normal(q.shape)
     return {"q": q, "qd": qd, "qdd": qdd, "tau": tau, "z": z, "dq": dq}
 
@@ -108,7 +108,9 @@ def relative(found: np.ndarray, expected: np.ndarray) -> float:
 
 def reference(name: str, model: Any, arm: LoadedArm, inputs: Values) -> dict[str, np.ndarray]:
     """What the torch model says of an entry point, by output."""
-    q, qd, qdd, tau = (torch.from_numpy(inputs[key]) for key in ("q", "qd", "qdd", "tau"))
+    q, qd, qdd, tau, dq = (torch.from_numpy(inputs[key]) for key in ("q", "qd", "qdd", "tau", "dq"))
+    z = torch.from_numpy(inputs["z"]).unflatten(-1, (model.n, -1)) if inputs["z"].size else None
+    kept = () if z is None else (z,)
     with torch.no_grad():
         if name.startswith("tip_"):
             tip = tip_kinematics(arm)
@@ -117,22 +119,24 @@ def reference(name: str, model: Any, arm: LoadedArm, inputs: Values) -> dict[str
             kinetic = 0.5 * (model.momentum(q, qd) * qd).sum(dim=-1)
             found = {"energy": torch.stack([kinetic, model.potential_energy(q)], dim=-1)}
         elif name == "friction_step":
-            return {"z_next": inputs["z"]}
+            found = {"z_next": q[:, :0] if z is None else model.memory_after(z, dq).flatten(-2)}
+        elif name == "friction_memory":
+            found = {"z_start": q[:, :0] if z is None else model.memory(qd).flatten(-2)}
         elif name.endswith("derivatives"):
-            found = _derivatives(name, model, q, qd, qdd if name.startswith("inverse") else tau)
+            found = _derivatives(name, model, q, qd, qdd if name.startswith("inverse") else tau, *kept)
         else:
-            found = {key: value(model, q, qd, qdd, tau) for key, value in [_VALUES[name]]}
+            found = {key: value(model, q, qd, qdd, tau, kept) for key, value in [_VALUES[name]]}
     return {key: value.numpy() for key, value in found.items()}
 
 
 _VALUES: dict[str, tuple[str, Callable[..., torch.Tensor]]] = {
-    "inverse_dynamics": ("tau", lambda m, q, qd, qdd, tau: m.inverse_dynamics(q, qd, qdd)),
-    "forward_dynamics": ("qdd", lambda m, q, qd, qdd, tau: m.forward_dynamics(q, qd, tau)),
-    "mass_matrix": ("mass", lambda m, q, qd, qdd, tau: m.mass_matrix(q)),
-    "bias": ("bias", lambda m, q, qd, qdd, tau: m.nonlinear_effects(q, qd)),
-    "gravity": ("gravity", lambda m, q, qd, qdd, tau: m.gravity(q)),
-    "friction": ("friction", lambda m, q, qd, qdd, tau: m.friction_torque(q, qd)),
-    "momentum": ("momentum", lambda m, q, qd, qdd, tau: m.momentum(q, qd)),
+    "inverse_dynamics": ("tau", lambda m, q, qd, qdd, tau, z: m.inverse_dynamics(q, qd, qdd, *z)),
+    "forward_dynamics": ("qdd", lambda m, q, qd, qdd, tau, z: m.forward_dynamics(q, qd, tau, *z)),
+    "mass_matrix": ("mass", lambda m, q, qd, qdd, tau, z: m.mass_matrix(q)),
+    "bias": ("bias", lambda m, q, qd, qdd, tau, z: m.nonlinear_effects(q, qd)),
+    "gravity": ("gravity", lambda m, q, qd, qdd, tau, z: m.gravity(q)),
+    "friction": ("friction", lambda m, q, qd, qdd, tau, z: m.friction_torque(q, qd, *z)),
+    "momentum": ("momentum", lambda m, q, qd, qdd, tau, z: m.momentum(q, qd)),
 }
 
 
