@@ -251,6 +251,6 @@ def test_presets_without_such_a_form_are_refused():
     with pytest.raises(RunError, match="the preset phnode, which has a dense mass matrix"):
         export(moved_model("two_link", "phnode"), "c", arm=arm_of("two_link"))
     with pytest.raises(
-        RunError, match=r"the format 'matlab', expected one of urdf, mjcf, c, casadi, onnx, torch"
+        RunError, match=r"the format 'matlab', expected one of urdf, mjcf, c, casadi, onnx, torch, ros2"
     ):
         export(moved_model("two_link", "closed-form"), "matlab", arm=arm_of("two_link"))

@@ -51,7 +51,7 @@ identification: identify baseline
 exporting: description tip_chain describe trained parity exported readme rigid_body_projection urdf_file urdf_export
 exporting: mjcf_file mjcf_export torch_programs torch_export onnx_export
 exporting: rigid_expressions friction_expressions learned_expressions model_expressions tip_expressions entry_points
-exporting: c_statements c_networks c_code c_library c_export casadi_export export
+exporting: c_statements c_networks c_code c_library c_export ros2_export casadi_export export
 render: charts plots picture page learned parameters reproduction verdict shapes scene still arm_section
 render: report_page inspection_page
 logs: statistics gravity report check_logs

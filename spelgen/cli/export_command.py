@@ -24,8 +24,8 @@ def export(
     """Write what was learned for other tools, compared with the model before anything is written.
 
     urdf: bodies of a closed-form model as they are; of other models, the rigid bodies nearest to them.
-    mjcf: such bodies, drives and friction for MuJoCo. c: a C99 header and source without dependencies. casadi,
-    onnx, torch: a file for each function.
+    mjcf: such bodies, drives and friction for MuJoCo. c: a C99 header and source without dependencies. ros2: a colcon
+    package around these. casadi, onnx, torch: a file for each function.
     """
     from spelgen.exporting.export import export as exported
     from spelgen.exporting.exported import require_fitting

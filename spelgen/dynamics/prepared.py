@@ -23,14 +23,14 @@ class PreparedModel:
 
     q, qd, qdd and tau are (..., n); units are rad and Nm, or m and N. z, (..., n, K), is friction's memory; without it
     friction is that of joints which have long gone the way of qd. tip: what gives ``pose(q)`` and ``jacobian(q)``, as
-    ``tip_kinematics`` does.
+    ``tip_kinematics`` does. elements: K, of friction's memory at a joint.
     """
 
     def __init__(self, model: Any, tip: Any = None, *, dtype: torch.dtype = torch.float64) -> None:
         model = copy.deepcopy(model).to(dtype=dtype).requires_grad_(False)
         self.n: int = model.n
         self._dynamics, self._weights, self._tip = model.dynamics, model.prepare(), tip
-        self._remembers = bool(getattr(model.dynamics, "elements", 0))
+        self.elements: int = getattr(model.dynamics, "elements", 0)
 
     def mass_matrix(self, q: Tensor) -> Tensor:
         """M(q), (..., n, n) [kg m^2, kg m, kg]."""
@@ -52,7 +52,7 @@ class PreparedModel:
 
     def memory(self, qd: Tensor) -> Tensor:
         """Friction's memory z, (..., n, K), of joints that have long gone the way of qd: zero at rest."""
-        z: Tensor = self._dynamics.memory(qd) if self._remembers else qd.unsqueeze(-1)[..., :0]
+        z: Tensor = self._dynamics.memory(qd) if self.elements else qd.unsqueeze(-1)[..., :0]
         return z
 
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
@@ -151,7 +151,7 @@ class PreparedModel:
         return mass, self._dynamics.nonlinear_at(at, qd, residuals, self._weights)
 
     def _friction(self, at: Any, qd: Tensor, z: Tensor | None) -> Tensor:
-        memory = (z,) if self._remembers else ()
+        memory = (z,) if self.elements else ()
         torque: Tensor = self._dynamics.friction_at(at, qd, self._weights, *memory)
         return torque
 
@@ -184,5 +184,5 @@ class PreparedModel:
         return State(q, qd, z)
 
     def _memory_after(self, z: Tensor, moved: Tensor) -> Tensor:
-        found: Tensor = self._dynamics.memory_after(z, moved) if self._remembers else z
+        found: Tensor = self._dynamics.memory_after(z, moved) if self.elements else z
         return found

@@ -18,10 +18,10 @@ def export(
     """What a fit, the folder of a run or a model has learned, for other tools; written where a path is given.
 
     to: ``urdf``, FILE.urdf with its settings and friction beside it; ``mjcf``, FILE.xml for MuJoCo; ``c``, a folder
-    with a C99 header and source; ``casadi``, ``onnx`` and ``torch``, a folder with a file for each function. What is
-    written was compared with the model first. arm: of ``load_arm`` or the path of a URDF; by default the fit's. Raises
-    RunError where no arm is known, for a preset or a path that does not go with the format, where the comparison fails,
-    and where a file exists and ``force`` is not given.
+    with a C99 header and source; ``ros2``, a colcon package around these; ``casadi``, ``onnx`` and ``torch``, a folder
+    with a file for each function. What is written was compared with the model first. arm: of ``load_arm`` or the path
+    of a URDF; by default the fit's. Raises RunError where no arm is known, for a preset or a path that does not go with
+    the format, where the comparison fails, and where a file exists and ``force`` is not given.
     """
     if to not in FORMATS:
         raise RunError(
@@ -43,6 +43,10 @@ def _exported(to: str, trained: Trained) -> Exported:
         from spelgen.exporting.c_export import export_c
 
         return export_c(trained)
+    if to == "ros2":
+        from spelgen.exporting.ros2_export import export_ros2
+
+        return export_ros2(trained)
     if to == "onnx":
         from spelgen.exporting.onnx_export import export_onnx
 

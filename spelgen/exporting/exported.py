@@ -10,7 +10,7 @@ from typing import Literal, get_args
 from spelgen.errors import RunError
 from spelgen.files import write_bytes
 
-Format = Literal["urdf", "mjcf", "c", "casadi", "onnx", "torch"]
+Format = Literal["urdf", "mjcf", "c", "casadi", "onnx", "torch", "ros2"]
 FORMATS: tuple[str, ...] = get_args(Format)
 
 SUFFIXES = {"urdf": ".urdf", "mjcf": ".xml"}

@@ -20,6 +20,8 @@ PROGRAMS: dict[str, tuple[str, tuple[str, ...], str]] = {
 }
 """By entry point: the method of ``PreparedModel``, its inputs, (batch, n) each, and its output."""
 
+_WITH_FRICTION = ("inverse_dynamics", "forward_dynamics", "friction")
+
 
 class _Program(nn.Module):
     def __init__(self, function: Callable[..., Tensor]) -> None:
@@ -32,11 +34,18 @@ class _Program(nn.Module):
 
 def export_program(model: PreparedModel, name: str) -> torch.export.ExportedProgram:
     """An entry point; the first dimension of its inputs is the batch."""
-    method, inputs, _ = PROGRAMS[name]
+    inputs = program_inputs(model, name)
     batch = torch.export.Dim("batch")
-    given = tuple(0.1 * torch.ones(2, model.n, dtype=torch.float64) for _ in inputs)
+    sizes = [(2, model.n, model.elements) if each == "z" else (2, model.n) for each in inputs]
+    given = tuple(0.1 * torch.ones(size, dtype=torch.float64) for size in sizes)
     shapes: Any = (tuple({0: batch} for _ in inputs),)
-    return torch.export.export(_Program(getattr(model, method)), given, dynamic_shapes=shapes)
+    return torch.export.export(_Program(getattr(model, PROGRAMS[name][0])), given, dynamic_shapes=shapes)
+
+
+def program_inputs(model: PreparedModel, name: str) -> tuple[str, ...]:
+    """An entry point's inputs: z, (batch, n, K), is among them where friction has a memory and a part in it."""
+    _, inputs, _ = PROGRAMS[name]
+    return (*inputs, "z") if model.elements and name in _WITH_FRICTION else inputs
 
 
 def without_linear_algebra(program: torch.export.ExportedProgram) -> torch.export.ExportedProgram:

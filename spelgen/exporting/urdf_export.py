@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import yaml
 
 from spelgen.exporting.exported import Exported
@@ -17,7 +16,8 @@ from spelgen.listing import Listing, number
 
 LAW = (
     "viscous qd + saturation tanh(qd / saturation_velocity) + (coulomb + stribeck exp(-(qd / stribeck_velocity)^2) "
-    "+ load_dependence |gravity torque|) tanh(qd / coulomb_smoothing_velocity)"
+    "+ load_dependence |gravity torque|) direction; direction: tanh(qd / coulomb_smoothing_velocity), or of bristles "
+    "with z' = qd - |qd| z / bristle_reach the sum of bristle_fractions z / bristle_reach"
 )
 
 
@@ -79,15 +79,18 @@ def projection_summary(found: RigidBodyProjection) -> tuple[str, str]:
 
 def friction_text(trained: Trained, projection: RigidBodyProjection) -> str:
     """YAML: viscous and Coulomb friction of each joint, and the constants of the model's own law where it has one."""
-    law = trained.model.dynamics.friction.prepare()
+    friction = trained.model.dynamics.friction
+    law = friction.prepare()
     constants = law._asdict() if hasattr(law, "coulomb") else {}
+    if hasattr(friction, "bristles"):
+        constants["bristle_reach"] = friction.bristles.reach
     joints: dict[str, Any] = {}
     for index, name in enumerate(trained.joint_names):
         simple = {
             "viscous": projection.viscous[index],
             "coulomb": [projection.forward[index], projection.backward[index]],
         }
-        own = {key: value.detach().double().cpu().numpy()[index] for key, value in constants.items()}
+        own = {key: value.detach().double().cpu()[index].tolist() for key, value in constants.items()}
         joints[name] = {"viscous_coulomb": _rounded(simple)} | ({"law": _rounded(own)} if own else {})
     content = {
         "units": "Nm, Nm s/rad and rad/s of revolute joints; N, N s/m and m/s of prismatic ones",
@@ -105,4 +108,4 @@ def _rounded(values: Any) -> Any:
         return {key: _rounded(value) for key, value in values.items()}
     if isinstance(values, list):
         return [_rounded(value) for value in values]
-    return float(f"{float(np.asarray(values)):.12g}")
+    return float(f"{values:.12g}")

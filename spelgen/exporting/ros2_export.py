@@ -1,0 +1,40 @@
+"""--to ros2: a colcon package around the C, a plugin of the package inverse_dynamics_solver."""
+
+from __future__ import annotations
+
+from spelgen.exporting.c_export import c_files
+from spelgen.exporting.exported import Exported
+from spelgen.exporting.readme import UNITS, readme
+from spelgen.exporting.trained import Trained
+from spelgen.templates import render
+
+_PLACES = {
+    "package.xml": "package.xml",
+    "CMakeLists.txt": "CMakeLists.txt",
+    "plugin.xml": "plugin.xml",
+    "solver.cpp": "src/solver.cpp",
+}
+
+
+def export_ros2(trained: Trained) -> Exported:
+    """The package. Raises RunError where its C does not give what the model gives."""
+    model = trained.described
+    sources, checked = c_files(trained)
+    package = f"{model.name}_solver"
+    files = {f"src/{name}": content for name, content in sources.items()}
+    for template, place in _PLACES.items():
+        text = render(
+            f"ros2/{template}.jinja",
+            package=package,
+            name=model.name,
+            upper=model.name.upper(),
+            joints=", ".join(model.identifiers),
+        )
+        files[place] = text.encode()
+    use = (
+        f"Put this folder into a workspace, colcon build --packages-select {package}; "
+        f"the plugin is {package}/Solver, for whatever loads an inverse_dynamics_solver::InverseDynamicsSolver."
+    )
+    about = f"{UNITS}; getTorques takes friction in, of joints that have long gone the way they move."
+    files["README.md"] = readme(f"{model.robot} for ROS 2", use, trained.joint_names, about, checked)
+    return Exported("ros2", model.robot, files, (checked,))
