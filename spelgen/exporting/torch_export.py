@@ -43,7 +43,9 @@ def export_torch(trained: Trained) -> Exported:
     parity = check_parity(called, trained, list(PROGRAMS), TOLERANCE, memory=memory)
     checked = f"Checked when exported, by torch {torch.__version__}: {parity.summary}."
     # clones: some tables of an emitted module stand in two places
-    files["model.safetensors"] = save({k: v.cpu().clone() for k, v in trained.model.state_dict().items()})
+    files["model.safetensors"] = save(
+        {k: v.cpu().contiguous().clone() for k, v in trained.model.state_dict().items()}
+    )
     use = (
         "qdd = torch.export.load('forward_dynamics.pt2').module()(q, qd, tau), float64 (batch, n), any batch, then z, "
         "(batch, n, K), where friction has a memory; "
