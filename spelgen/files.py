@@ -14,19 +14,31 @@ from typing import Any
 def replacing(path: Path | str) -> Iterator[Path]:
     """A hidden neighbour to write to, which in the end takes the place of `path`, also through a power cut.
 
-    Makes the folder. An interrupted or failed write leaves what was there before. Raises OSError when the place
-    cannot be written.
+    Makes the folder. An interrupted or failed write leaves what was there before. Raises OSError naming the path
+    when it cannot be written: a full disk, say.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    with naming(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+        try:
+            yield unfinished
+            with unfinished.open("rb+") as file:
+                os.fsync(file.fileno())
+            os.replace(unfinished, path)
+        finally:
+            unfinished.unlink(missing_ok=True)
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Within it, an OSError that names no file (of a full disk) names this one."""
     try:
-        yield unfinished
-        with unfinished.open("rb+") as file:
-            os.fsync(file.fileno())
-        os.replace(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+        yield
+    except OSError as error:
+        if error.filename is not None:
+            raise
+        raise OSError(error.errno, error.strerror or str(error), str(path)) from error
 
 
 def write_bytes(path: Path | str, content: bytes) -> Path:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from spelgen.design import PRESET_NAMES, Design, Net, load_design
@@ -12,7 +12,7 @@ from spelgen.emission.plan import plan_model
 from spelgen.errors import ModuleError
 from spelgen.inspection import Inspection
 from spelgen.loaded_arm import LoadedArm, load_arm
-from spelgen.spec import Assume, ModelSpec, Options, read_facts
+from spelgen.spec import Assume, Facts, ModelSpec, Options, read_facts
 from spelgen.verify.agreement import Verification
 
 
@@ -58,6 +58,13 @@ def generate(
         depth=depth,
     )
     return emit(make_spec(loaded, options))
+
+
+def rebuilt(facts: Facts, urdf: Path) -> str:
+    """The text of the module that has these facts, written anew from a copy of its URDF. Raises as ``load_arm``."""
+    options = facts.options
+    loaded = load_arm(urdf, options.joints, options.tip, options.angle_tolerance)
+    return emit(replace(make_spec(loaded, options), urdf=facts.urdf))
 
 
 def make_spec(loaded: LoadedArm, options: Options) -> ModelSpec:

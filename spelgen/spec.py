@@ -28,6 +28,10 @@ Terms = tuple[tuple[int, float, float], ...]
 """A Fourier series: (place in ModelSpec.fourier, factor of the cosine, factor of the sine), to start from."""
 
 _FACTS_WIDTH = 100
+_FOREIGN = (
+    SyntaxError, ValueError, KeyError, TypeError, StopIteration, AttributeError, RecursionError, MemoryError,
+)  # fmt: skip
+"""What parsing a text that is no module of ours may raise."""
 
 
 @dataclass(frozen=True)
@@ -216,10 +220,12 @@ def read_facts(path: str | Path) -> Facts:
 def read_source(path: str | Path) -> str:
     """The text of the module at ``path``. Raises ModuleError."""
     path = Path(path)
+    if not path.exists():
+        raise ModuleError("no such file", file=path, do="build it with `spelgen build`")
+    if not path.is_file():  # a pipe might never end
+        raise ModuleError("no regular file", file=path, expected="a module written by `spelgen build`")
     try:
         return path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise ModuleError("no such file", file=path, do="build it with `spelgen build`") from None
     except (OSError, ValueError) as problem:
         raise _no_facts(problem, path) from None
 
@@ -237,7 +243,7 @@ def parse_facts(source: str, file: Path | None = None) -> Facts:
             joints=tuple(record["joints"]),
             joint_types=tuple(record["joints"].values()),
         )
-    except (SyntaxError, ValueError, KeyError, TypeError, StopIteration, AttributeError) as problem:
+    except _FOREIGN as problem:
         raise _no_facts(problem, file) from None
 
 

@@ -1,5 +1,6 @@
 """The command line as a user meets it: exit codes, one clear line per error, nothing half-written."""
 
+import io
 import json
 import os
 import re
@@ -388,3 +389,65 @@ def test_interrupted_training_leaves_a_run(trained, tmp_path):
     assert started.returncode == 130, err
     assert b"interrupted after" in out
     assert process("report", run, cwd=folder).returncode == 0
+
+
+# ---- words that nearly fit
+
+
+def test_bare_command_shows_the_help(spelgen):
+    assert spelgen().exit_code == 0
+    assert spelgen().stdout == spelgen("-h").stdout == spelgen("--help").stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["trian"], "No such command 'trian'. Did you mean 'train'?"),
+        (["train", "--objectve", "rollout"], "No such option: --objectve. Did you mean --objective?"),
+        (["build", "x.urdf", "--net", "mpl"], "'mpl' is none of mlp, kan. Did you mean 'mlp'?"),
+        (["logs", "x", "--robot", "y", "--format", "xml"], "'xml' is none of text, json."),
+    ],
+)
+def test_what_may_have_been_meant_is_told(spelgen, words, told):
+    result = spelgen(*words)
+    assert result.exit_code == 2
+    assert result.stderr.rstrip().endswith(told)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_values_have_names_that_people_read(spelgen, command):
+    assert not re.search(r"--\S+ <|\{|INTEGER|list\[", spelgen(command, "-h").stdout)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "coloured"), [("X", "", True), ("NO_COLOR", "1", False), ("TERM", "dumb", False)]
+)
+def test_help_is_coloured_on_terminals_alone(spelgen, monkeypatch, name, value, coloured):
+    plain = spelgen("train", "-h").stdout
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setenv(name, value)
+    terminal = type("Terminal", (io.StringIO,), {"isatty": lambda stream: True})()
+    monkeypatch.setattr(sys, "stdout", terminal)
+    with pytest.raises(SystemExit):
+        app(["train", "-h"], prog_name="spelgen")
+    shown = terminal.getvalue()
+    assert ("\x1b[" in shown) == coloured
+    assert re.sub(r"\x1b\[\d*m", "", shown).split() == plain.replace("Usage: root", "Usage: spelgen").split()
+
+
+def test_completion_completes_commands_options_and_choices():
+    def completed(words):
+        asked = {
+            "_SPELGEN_COMPLETE": "complete_bash",
+            "COMP_WORDS": words,
+            "COMP_CWORD": str(len(words.split()) - 1),
+        }
+        command = [sys.executable, "-m", "spelgen"]
+        environment = os.environ | {"PYTHONPATH": str(ROOT)} | asked
+        return subprocess.run(
+            command, capture_output=True, text=True, env=environment, check=False
+        ).stdout.split()
+
+    assert completed("spelgen tr") == ["train"]
+    assert completed("spelgen train --objective rol") == ["rollout"]

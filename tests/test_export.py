@@ -27,8 +27,12 @@ def run_of(robot, folder, preset, change=lambda model: None):
     model = build(urdf, preset)
     with torch.no_grad():
         change(model)
-    record = {"robot": robot, "objective": "torque", "config": {}, "preprocessing": {}}
-    fit = Fit(model, TorqueFit(), Preprocessing(), (), (), None, record, {}, urdf)
+    record = {"robot": robot, "objective": "torque", "config": {}, "preprocessing": {}, "mapping": {}}
+    record |= {"joints": [], "validation_fraction": 0.25, "seed": 0, "data_digest": ""}
+    record |= {"training": [], "validation": []}
+    checkpoint = dict.fromkeys(("epoch", "step", "best_epoch", "best_loss", "rollbacks", "seconds"), 0)
+    checkpoint |= {"learning_rate_factor": 1.0, "substeps": 1, "momentum_done": True, "best_weights": {}}
+    fit = Fit(model, TorqueFit(), Preprocessing(), (), (), None, record, checkpoint, urdf)
     return RunFolder(fit.save(folder / "run")), model
 
 

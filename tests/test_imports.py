@@ -36,7 +36,8 @@ logs: preprocessing windows chunks epoch_windows
 simulation: friction integration simulated_logs random_inputs tracking
 identification: samples friction base_parameters least_squares method prior identification
 excitation: trajectory criterion excitation
-fitting: run_folder gaussian_prior adaptive rollout dataset streaming torque_samples torque_jacobian torque_fit
+fitting: run_schema run_folder run_lock
+fitting: gaussian_prior adaptive rollout dataset streaming torque_samples torque_jacobian torque_fit
 fitting: optimizers torque_networks urdf_regularizer stages compiled process progress validation loop
 fitting: run_record fitted fit train
 evaluation: names stiff baselines torque rollout torque_traces traces examples invariants tables results
@@ -44,7 +45,7 @@ evaluation: subject evaluate
 verify: agreement urdf_cross_check numeric_samples verify
 explain: reasons facts
 formulas: terms printing angles shortening formulas text files
-inspection loaded_arm pipeline building
+inspection loaded_arm pipeline trust building
 simulation: simulate
 excitation: design
 identification: identify baseline
@@ -57,7 +58,7 @@ render: report_page inspection_page
 logs: statistics gravity report check_logs
 comparison: truth metrics study runs formatting
 render: logs_page comparison_page
-cli: console options formats model_commands train_start train_command log_commands simulate_command
+cli: command console options formats model_commands train_start train_command log_commands simulate_command
 cli: identify_command evaluate_command compare_command export_command main
 __init__ __main__
 """

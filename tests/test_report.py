@@ -84,7 +84,7 @@ def run(robots, tmp_path) -> Path:
         "preprocessing": {"cutoff": 8.0, "decimation": 1}, "validation_fraction": 0.25, "seed": 7,
         "training": ["traj_01", "traj_03"],
         "validation": ["traj_05"], "training_windows": 34, "validation_windows": 17,
-        "scales": {"q": [1, 1, 1], "qd": [1, 1, 1]},
+        "scales": {"q": [1, 1, 1], "qd": [1, 1, 1]}, "mapping": {},
     }  # fmt: skip
     (folder / "config.json").write_text(json.dumps(config))
     lines = [

@@ -148,8 +148,13 @@ def test_a_wrong_value_is_told_with_its_place(urdf, text, message):
         ("? [a]\n: 1", "arm.yaml:1: not plain YAML: a key that is no plain word"),
         (
             "about: !!python/object/apply:os.system [ls]",
-            "arm.yaml:1: not plain YAML: could not determine a "
-            "constructor for the tag 'tag:yaml.org,2002:python/object/apply:os.system'",
+            "arm.yaml:1: not plain YAML: the tag tag:yaml.org,2002:python/object/apply:os.system",
+        ),
+        ("about: !!bool maybe", "arm.yaml:1: not plain YAML: the tag tag:yaml.org,2002:bool"),
+        ("about: !!timestamp maybe", "arm.yaml:1: not plain YAML: the tag tag:yaml.org,2002:timestamp"),
+        (
+            "joints: {joint1: {gear: 1.0e+200}}",
+            "arm.yaml:1: joints.joint1.gear: got 1e+200, expected a number within +-1e+12",
         ),
         ("about: 2025-99-99", "arm.yaml: not plain YAML: month must be in 1..12"),
         ("about: " + 40 * "[", "arm.yaml:1: not plain YAML: more than 16 levels"),

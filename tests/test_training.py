@@ -1,18 +1,22 @@
 """Training: exact solutions, exact resumption, recovery from blow-ups, interruptions, refusals."""
 
+import io
 import json
 import math
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
 import time
+import types
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from rich.console import Console
 
 from spelgen.emission.loading import load_module
 from spelgen.errors import LogError, ModuleError, RunError
@@ -21,7 +25,7 @@ from spelgen.evaluation.subject import read_test_logs
 from spelgen.fitting.config import MomentumFit, Rollout
 from spelgen.fitting.dataset import prepare_data
 from spelgen.fitting.loop import TrainingLoop
-from spelgen.fitting.optimizers import LBFGS
+from spelgen.fitting.optimizers import LBFGS, MiniBatchAdamW
 from spelgen.fitting.progress import TrainingProgress
 from spelgen.fitting.rollout import (
     choose_substeps,
@@ -495,9 +499,54 @@ def test_the_objective_momentum_predicts_no_windows(logs, tmp_path):
 
 
 @pytest.mark.parametrize("show", [False, True])
-def test_progress_without_a_terminal_prints_no_empty_lines(show, capsys):
+def test_progress_without_a_terminal_is_a_line_for_each_stage(show, capsys):
     with TrainingProgress(2, show=show) as progress:
+        for step in (10, 20):
+            progress.momentum(step, 20, 0.7)
         progress.epoch({"epoch": 1, "step": 20, "seconds": 1.0, "loss": 0.5, "validation": 0.4, "best": 0.4})
     printed = capsys.readouterr()
-    told = "epoch 1/2: loss 0.5, validation 0.4 (best 0.4), 20.0 steps/s\n"
+    told = (
+        "momentum: 20 steps, loss 0.7\ntraining: 1 epochs, loss 0.5, validation 0.4, best 0.4, 20.0 steps/s\n"
+    )
     assert (printed.out, printed.err) == ("", told if show else "")
+
+
+def test_progress_on_a_terminal_is_one_line_of_80_columns(monkeypatch):
+    screen = io.StringIO()
+    console = Console(file=screen, width=80, force_terminal=True, legacy_windows=False)
+    monkeypatch.setattr("spelgen.fitting.progress.Console", lambda **options: console)
+    with TrainingProgress(400, show=True) as progress:
+        progress.momentum(1900, 2000, 1.234e-5)
+        losses = {"loss": 1.234e-5, "validation": 1.234e-5, "best": 1.234e-5}
+        progress.epoch({"epoch": 399, "step": 8000, "seconds": 1.0, **losses})
+        progress._bar.refresh()
+    shown = [
+        line
+        for line in re.split(r"[\r\n]+", re.sub(r"\x1b\[[^A-Za-z]*[A-Za-z]", "", screen.getvalue()))
+        if line
+    ]
+    assert max(map(len, shown)) <= 80
+    assert any(
+        re.fullmatch(r"training .* 399/400 .* validation 1.23e-05, best 1.23e-05 *", line) for line in shown
+    )
+
+
+def test_the_allowed_time_is_kept_within_an_epoch(logs, monkeypatch):
+    """An epoch of a million steps of 20 ms would take hours: by a clock that only steps move."""
+    now = [100.0]
+    monkeypatch.setattr("spelgen.fitting.loop.time", types.SimpleNamespace(monotonic=lambda: now[0]))
+    run = MiniBatchAdamW.run
+
+    def slow(self, loss, windows, steps, rate):
+        now[0] += 0.02 * steps
+        return run(self, loss, windows, min(steps, 2), rate)
+
+    monkeypatch.setattr(MiniBatchAdamW, "run", slow)
+    config = quick(epochs=10**6, patience=10**6, max_minutes=1.0, momentum_steps=0)
+    data = prepare_data(read_logs([logs], JOINTS), JOINTS, ("revolute", "revolute"), config, Preprocessing())
+    loop = TrainingLoop(load_module(STAND_IN), data, config, seconds=12.0)
+    loop.epoch_steps = 10**6
+    with TrainingProgress(1, show=False) as progress:
+        assert loop.run(progress) == "out of time"
+    assert 0.95 * 60 < now[0] - 100.0 + 12.0 <= 1.05 * 60
+    assert loop.epoch < 10

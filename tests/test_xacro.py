@@ -5,11 +5,17 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
 
 from spelgen.errors import SpelgenError
+from spelgen.fitting.config import Rollout
+from spelgen.fitting.train import train
 from spelgen.loaded_arm import load_arm
+from spelgen.logs.read import write_logs
+from spelgen.logs.trajectory import Trajectory
 from spelgen.pipeline import check, generate
+from spelgen.trust import require_own_module
 from spelgen.urdf import xacro_input
 from spelgen.urdf.document import urdf_bytes
 from spelgen.urdf.read import read_urdf
@@ -188,3 +194,20 @@ def refusal(path) -> str:
     with pytest.raises(SpelgenError) as told:
         read_urdf(path)
     return str(told.value)
+
+
+@installed
+def test_a_module_built_from_xacro_trains_with_its_robot(arm, tmp_path):
+    """The run keeps the URDF that it expands to, and the regularizer reads that too."""
+    (tmp_path / "module.py").write_text(generate(arm, width=8, depth=1))
+    t = np.arange(40) / 40.0
+    q = np.stack([np.sin(3 * t), np.cos(2 * t)], axis=1)
+    log = Trajectory(t, q, np.gradient(q, t, axis=0), q)
+    write_logs(tmp_path / "log.parquet", [log], ["joint1", "joint2"])
+    config = Rollout(epochs=1, momentum_steps=0)
+    fit = train(
+        tmp_path / "module.py", [tmp_path / "log.parquet"], tmp_path / "run", config, urdf=arm, progress=False
+    )
+    assert not [x for x in fit.diagnostics if x.code in ("no-urdf", "changed-urdf", "no-regularizer")]
+    assert read_urdf(tmp_path / "run" / "robot.urdf").digest == fit.model.facts.urdf_sha256
+    require_own_module(tmp_path / "run" / "module.py", tmp_path / "run" / "robot.urdf")

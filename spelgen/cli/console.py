@@ -13,6 +13,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
+from spelgen.cli.command import readable
 from spelgen.errors import SpelgenError
 from spelgen.labels import printable
 
@@ -46,6 +47,8 @@ def told(command: Callable[..., None]) -> Callable[..., None]:
             fail(error, debug=debug)
 
     signature = inspect.signature(command, eval_str=True)
+    for each in signature.parameters.values():
+        readable(each.annotation)
     option = inspect.Parameter("debug", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Debug)
     run.__signature__ = signature.replace(parameters=[*signature.parameters.values(), option])  # type: ignore[attr-defined]
     run.__annotations__ = {
@@ -77,6 +80,8 @@ def _told(error: BaseException, debug: bool) -> str:
         return f"this needs the package {error.name}, which is not installed; pip install 'spelgen[{extra}]'"
     if isinstance(error, OSError) and error.filename is not None:
         return f"{os.fsdecode(error.filename)}: {(error.strerror or type(error).__name__).lower()}"
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror.lower()
     where = "" if debug else "; --debug shows where"
     return f"spelgen: unexpected {type(error).__name__}: {' '.join(str(error).split())}{where}"
 

@@ -9,11 +9,16 @@ import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import note, say
-from spelgen.cli.options import Data, Filter, Mapping, MoreData, Run
+from spelgen.cli.options import Data, Filter, Mapping, MoreData, Run, Trust
 
 
 def evaluate(
-    run: Run, more: MoreData = None, data: Data = None, mapping: Mapping = None, filter: Filter = None
+    run: Run,
+    more: MoreData = None,
+    data: Data = None,
+    mapping: Mapping = None,
+    filter: Filter = None,
+    trust: Trust = False,
 ) -> None:
     """Judge a trained run on test logs, beside its baselines."""
     paths = options.logs(data, more)
@@ -22,6 +27,7 @@ def evaluate(
     from spelgen.evaluation.evaluate import evaluate as evaluated
     from spelgen.evaluation.subject import read_test_logs
     from spelgen.files import write_json
+    from spelgen.fitting.fitted import load_run
     from spelgen.fitting.run_folder import RunFolder
     from spelgen.identification.baseline import read_baseline
     from spelgen.logs.preprocessing import Preprocessing
@@ -29,7 +35,7 @@ def evaluate(
     torch.set_num_threads(1)
     used = None if filter is None else Preprocessing(cutoff=filter)
     logs, baselines = read_test_logs(run, paths, mapping), read_baseline(RunFolder(run))
-    found = evaluated(run, logs, baselines=baselines, preprocessing=used)
+    found = evaluated(load_run(run, trust=trust), logs, baselines=baselines, preprocessing=used)
     write_json(RunFolder(run).evaluation, found.to_dict())
     for each in found.diagnostics:
         note(f"{each.severity}: {each.where}: {each.message}")
@@ -42,8 +48,12 @@ def report(
         Path | None,
         typer.Option("-o", "--output", metavar="FILE", help="Default: report.html in the run folder."),
     ] = None,
+    trust: Trust = False,
 ) -> None:
     """Write one HTML page about a run."""
+    from spelgen.fitting.run_folder import RunFolder
     from spelgen.render.report_page import write_report
 
+    if trust:
+        RunFolder(run).load_module(trust=True)  # what ran once may run again
     say(f"wrote {write_report(run, output)}")

@@ -9,7 +9,7 @@ import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import say
-from spelgen.cli.options import Force
+from spelgen.cli.options import Force, Trust
 from spelgen.exporting.exported import Format
 
 
@@ -20,6 +20,7 @@ def export(
     ],
     to: Annotated[Format, typer.Option(help="What to write.")] = "urdf",
     force: Force = False,
+    trust: Trust = False,
 ) -> None:
     """Write what was learned for other tools, compared with the model before anything is written.
 
@@ -29,10 +30,11 @@ def export(
     """
     from spelgen.exporting.export import export as exported
     from spelgen.exporting.exported import require_fitting
+    from spelgen.fitting.fitted import load_run
 
     require_fitting(to, output)
     options.require_free(output, force=force)
-    found = exported(run, to)
+    found = exported(load_run(run, trust=trust), to)
     for path in found.write(output, force=force):
         say(f"wrote {path}")
     for line in found.summary:

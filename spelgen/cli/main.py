@@ -22,12 +22,15 @@ from spelgen.cli import (
     simulate_command,
     train_command,
 )
+from spelgen.cli.command import Command, Group
 from spelgen.cli.console import say, told
+
+CONTEXT = {"max_content_width": 80, "help_option_names": ["-h", "--help"]}
 
 app = typer.Typer(
     name="spelgen",
-    add_completion=False,
-    no_args_is_help=True,
+    cls=Group,
+    context_settings=CONTEXT,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
@@ -45,7 +48,7 @@ for command in (
     compare_command.compare,
     model_commands.check,
 ):
-    app.command(context_settings={"max_content_width": 80})(told(command))
+    app.command(cls=Command, context_settings=CONTEXT)(told(command))
 
 
 def _version(asked: bool) -> None:
@@ -54,13 +57,16 @@ def _version(asked: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
+@app.callback(invoke_without_command=True)
 def common(
+    ctx: typer.Context,
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
     ] = False,
 ) -> None:
     """URDF in, a PyTorch model of the arm's dynamics with its exact structure out."""
+    if ctx.invoked_subcommand is None:
+        say(ctx.get_help())
 
 
 def main() -> None:

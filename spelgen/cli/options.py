@@ -72,6 +72,9 @@ Filter = Annotated[
         "--filter", metavar="HZ", min=0.0, help="Cutoff of the zero-phase low-pass on the logs; 0: none."
     ),
 ]
+Trust = Annotated[
+    bool, typer.Option("--trust", help="Run the run folder's module, even where spelgen did not write it.")
+]
 Force = Annotated[bool, typer.Option("--force", help="Replace an output that exists.")]
 
 

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import hashlib
+import time
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import INTERRUPTED, note, say
-from spelgen.cli.options import Data, Filter, Force, Mapping, MoreData, RobotOption
+from spelgen.cli.options import Data, Filter, Force, Mapping, MoreData, RobotOption, Trust
 from spelgen.cli.train_start import Chosen, NotApplicable, begun, resumed
 from spelgen.errors import ModuleError, OptionError
 from spelgen.fitting.config import Objective, Optimizer, Solver
 from spelgen.spec import read_facts
+
+if TYPE_CHECKING:
+    from spelgen.fitting.config import WindowConfig
+    from spelgen.fitting.fitted import Fit
 
 
 def train(
@@ -31,6 +36,7 @@ def train(
     mapping: Mapping = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in the run folder.")] = False,
     force: Force = False,
+    trust: Trust = False,
     source: Annotated[
         Path | None,
         typer.Option(
@@ -102,6 +108,7 @@ def train(
     What is not given here comes from the settings beside the robot. [torque], [momentum], [rollout]: the objectives
     that an option belongs to; it is an error beside another one.
     """
+    since = time.monotonic()
     flags = {
         "window": window, "stride": stride, "momentum_steps": momentum_steps, "torque_first": torque_first,
         "epochs": epochs, "patience": patience, "solver": solver, "substeps": substeps, "compile": compile,
@@ -129,7 +136,8 @@ def train(
         found = train_files(
             start.module, paths, folder, start.config, urdf=urdf, source=source, mapping=given or start.mapping,
             preprocessing=start.preprocessing, validation=start.validation, seed=start.seed, resume=resume,
-            force=force, device=device, threads=threads, progress=not quiet,
+            force=force, trust=trust, device=device, threads=threads, progress=not quiet,
+            since=since,
         )  # fmt: skip
     except OptionError as error:
         flag = "from" if error.option == "payload" else error.option.replace("_", "-")
@@ -139,7 +147,8 @@ def train(
         from spelgen.identification.baseline import keep_baseline
 
         keep_baseline(RunFolder(folder), paths)
-    say(f"{found.status} after {found.epochs} epochs, {found.steps} steps, {found.seconds:.0f} s")
+    why = _reason(found)
+    say(f"{found.status} after {found.epochs} epochs, {found.steps} steps, {found.seconds:.0f} s{why}")
     say(f"best validation loss {found.best_validation:.3g}, at epoch {found.best_epoch}")
     say(f"run folder: {folder}")
     if found.status == "interrupted":
@@ -147,22 +156,35 @@ def train(
         raise typer.Exit(INTERRUPTED)
 
 
+def _reason(found: Fit) -> str:
+    """Why a fit to windows came to its end, where its status does not say so."""
+    config = cast("WindowConfig", found.config)
+    if found.status == "stopped early":
+        return f": no better validation loss in {config.patience} epochs"
+    if found.status == "out of time":
+        return f": {config.max_minutes:g} minutes are over"
+    if found.status == "finished" and config.epochs:
+        return ": no way further down" if found.epochs < config.epochs else ": all epochs are run"
+    return ""
+
+
 def _of_run(source: Path, robot: Path | None) -> tuple[Path, Path | None]:
     """The module and the URDF of a run."""
     from spelgen.fitting.run_folder import RunFolder
 
     run = RunFolder(source)
-    run.read_json(run.config)  # where there is no run, this says so
+    run.read_config()  # where there is no run, this says so
     return run.module, robot or (run.urdf if run.urdf.exists() else None)
 
 
 def _unchanged_urdf(module: Path) -> Path | None:
     """The URDF of the module's name near it, when it is still the one the module was built from."""
     from spelgen.pipeline import find_urdf
+    from spelgen.urdf.document import urdf_bytes
 
     facts = read_facts(module)
     try:
         path = find_urdf(module, facts.urdf)
     except ModuleError:
         return None
-    return path if hashlib.sha256(path.read_bytes()).hexdigest() == facts.urdf_sha256 else None
+    return path if hashlib.sha256(urdf_bytes(path)).hexdigest() == facts.urdf_sha256 else None

@@ -90,7 +90,7 @@ def resumed(folder: Path, chosen: Chosen) -> Start:
     from spelgen.logs.preprocessing import Preprocessing
 
     run = RunFolder(folder)
-    before = run.read_json(run.config)
+    before = run.read_config()
     said = {name: value for name, value in chosen.preprocessing.items() if value is not None}
     if before["validation_fraction"] is None:
         raise RunError(

@@ -12,6 +12,7 @@ from spelgen.arm.actuation import derive_actuation
 from spelgen.dynamics.constraint import mimic_constraint
 from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
 from spelgen.settings.settings import load_settings
+from spelgen.urdf.document import urdf_bytes
 from spelgen.urdf.read import read_urdf
 
 COULOMB_SMOOTHING_VELOCITY = (
@@ -27,7 +28,7 @@ def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) ->
     where it cannot read the file.
     """
     robot, settings = read_urdf(urdf), load_settings(urdf)
-    model = pin.buildModelFromUrdf(str(urdf))
+    model = pin.buildModelFromXML(urdf_bytes(urdf).decode(errors="replace"))
     model.gravity.linear = np.array(settings.gravity)
     constraint = mimic_constraint(robot, joints)
     missing = [name for name in constraint.names if not model.existJointName(name)]

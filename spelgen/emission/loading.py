@@ -70,9 +70,8 @@ def load_module(module: str | Path, *, seed: int = 0) -> EmittedModel:
     file = None if in_memory else Path(module)
     source = str(module) if file is None else read_source(file)
     facts = parse_facts(source, file)
-    # a private name made from the content, so that two modules never meet; torch.compile looks for it there
-    name = f"_spelgen_module_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
-    code = sys.modules[name] = ModuleType(name)
+    name = _private_name(source)
+    code = sys.modules[name] = ModuleType(name)  # torch.compile looks for it there
     path = f"<{name}>" if file is None else str(file)
     linecache.cache[path] = (len(source), None, source.splitlines(keepends=True), path)  # for tracebacks
     try:
@@ -89,6 +88,16 @@ def load_module(module: str | Path, *, seed: int = 0) -> EmittedModel:
     emitted = cast("EmittedModel", model)
     emitted.source, emitted.facts = source, facts
     return emitted
+
+
+def has_run(source: str) -> bool:
+    """Whether this very text was loaded in this process before."""
+    return _private_name(source) in sys.modules
+
+
+def _private_name(source: str) -> str:
+    """Made from the content, so that two modules never meet."""
+    return f"_spelgen_module_{hashlib.sha256(source.encode()).hexdigest()}"
 
 
 def _summary(model: EmittedModel) -> str:

@@ -83,7 +83,7 @@ def read_test_logs(
 ) -> list[Trajectory]:
     """Logs of a run's arm (a folder's test.* where there are such), mapped as those that it was trained on."""
     run = RunFolder(Path(folder))
-    record, facts = run.read_json(run.config), read_facts(run.module)
+    record, facts = run.read_config(), read_facts(run.module)
     if mapping is None:
         mapping = LogMapping(**record["mapping"])
     elif isinstance(mapping, str | Path) and run.urdf.exists():  # it may speak of all joints of the URDF

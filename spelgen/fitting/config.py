@@ -17,6 +17,7 @@ Objective = Literal["torque", "momentum", "rollout"]
 Optimizer = Literal["adamw", "lbfgs"]
 Solver = Literal["rk4", "dopri5"]
 Window = Annotated[Count, Field(ge=2)]
+Substeps = Annotated[Count, Field(le=1000)]  # more never end
 
 FEW_WINDOWS = 1024  # of which L-BFGS takes all at once
 LBFGS_DECAY, ADAMW_DECAY = 2e-5, 0.2
@@ -188,7 +189,7 @@ class Rollout(OnWindows):
     epochs: Count = 400
     patience: Count = 60
     solver: Solver = "rk4"
-    substeps: Count | None = None
+    substeps: Substeps | None = None
     compile: bool = False
 
 

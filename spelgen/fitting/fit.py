@@ -17,6 +17,7 @@ from spelgen.fitting.loop import TrainingLoop
 from spelgen.fitting.process import require_device, termination_as_interrupt, threads_of_torch
 from spelgen.fitting.progress import TrainingProgress
 from spelgen.fitting.run_folder import RunFolder
+from spelgen.fitting.run_lock import locked
 from spelgen.fitting.run_record import describe, require_same
 from spelgen.fitting.stages import default_config, fit_torque_stage, is_closed_form
 from spelgen.fitting.streaming import LargeLogs, prepare_streamed
@@ -52,6 +53,7 @@ def fit(
     mapping: LogMapping | None = None,
     progress: bool = False,
     notes: Sequence[Diagnostic] = (),
+    since: float | None = None,
 ) -> Fit:
     """Fit ``model`` to ``logs``; it then has the best weights that were found.
 
@@ -62,10 +64,12 @@ def fit(
     folder: where checkpoints go after every epoch (see `RunFolder`); without one, `Fit.save` writes all that.
     resume: go on from the folder's checkpoint, exactly as if there had been no interruption. force: replace a run.
     mapping: how the logs were read, kept with the run. notes: what was found before, to be told with the rest.
+    since: from where the allowed time counts (`time.monotonic`); None: from now.
     Ctrl-C or SIGTERM end the fit with status "interrupted".
     Raises OptionError for an option that does not apply to this model, LogError, and RunError when the folder holds a
     run or cannot be resumed with this.
     """
+    began = time.monotonic()
     logs = [logs] if isinstance(logs, Trajectory) else logs
     closed_form = is_closed_form(model)
     if config is None:
@@ -74,7 +78,7 @@ def fit(
     run = None if folder is None else RunFolder(Path(folder))
     if run is not None and not resume:
         run.require_free(force=force)
-    with threads_of_torch(threads):
+    with threads_of_torch(threads), locked(run.path if run else None):
         require_device(device)
         data = _prepared(model, logs, cast("WindowConfig", config), preprocessing, validation, seed)
         chosen = cast("WindowConfig", config.resolved(data.size))
@@ -92,7 +96,6 @@ def fit(
             found += fit_torque_stage(model, data, chosen, regularizer)
             if run is not None:
                 run.start(model.source, urdf, force=force)
-                write_json(run.config, record)
         loop = TrainingLoop(
             model,
             data,
@@ -102,9 +105,13 @@ def fit(
             regularizer=regularizer,
             stepped=stepped,
             folder=run,
+            seconds=time.monotonic() - (since or began),
         )
         if resume and run is not None:
             loop.restore(run)
+        elif run is not None:
+            loop.save()
+            write_json(run.config, record)  # now there is a run, and it can be resumed
         with TrainingProgress(chosen.epochs, show=progress) as shown, termination_as_interrupt():
             for note in found:
                 shown.note(note)

@@ -16,6 +16,7 @@ from spelgen.files import write_json
 from spelgen.fitting.config import FitConfig
 from spelgen.fitting.loop import Status
 from spelgen.fitting.run_folder import RunFolder, trained_model, write_state
+from spelgen.fitting.run_lock import locked
 from spelgen.fitting.run_record import recorded_config
 from spelgen.identification.samples import DENSE, dynamics_samples
 from spelgen.listing import Listing
@@ -135,11 +136,12 @@ class Fit:
         if not hasattr(self.model, "source"):
             raise RunError("a model without a module", expected="one of spelgen.build or spelgen.load_module")
         run = RunFolder(Path(folder))
-        run.start(self.model.source, self.urdf, force=force)
-        write_json(run.config, self.record)
-        run.write_metrics(self.history)
-        write_state(run.weights, self.model.state_dict())
-        write_state(run.checkpoint, self.checkpoint)
+        with locked(run.path):
+            run.start(self.model.source, self.urdf, force=force)
+            run.write_metrics(self.history)
+            write_state(run.weights, self.model.state_dict())
+            write_state(run.checkpoint, self.checkpoint)
+            write_json(run.config, self.record)
         return run.path
 
     def _filtered(self, piece: Trajectory) -> Trajectory:
@@ -169,19 +171,23 @@ class Fit:
         return Listing("Fit", ("", ""), tuple(rows), left=(0, 1)).html()
 
 
-def load_run(folder: Path | str) -> Fit:
-    """A run folder of `spelgen train` or `Fit.save`, with its best weights. Raises RunError and ModuleError."""
+def load_run(folder: Path | str, *, trust: bool = False) -> Fit:
+    """A run folder of `spelgen train` or `Fit.save`, with its best weights. Raises RunError and ModuleError.
+
+    Its module is a program: unless it ran in this process before, it must be what spelgen itself writes for the robot
+    in the folder, or be trusted.
+    """
     run = RunFolder(Path(folder))
-    record = run.read_json(run.config)
+    record = run.read_config()
     return Fit(
-        model=trained_model(run),
+        model=trained_model(run, trust=trust),
         config=recorded_config(record),
         preprocessing=Preprocessing(**record["preprocessing"]),
         history=run.read_metrics(),
         diagnostics=(),
         status=None,
         record=record,
-        checkpoint=run.load_state(run.checkpoint),
+        checkpoint=run.load_checkpoint(),
         urdf=run.urdf if run.urdf.exists() else None,
         folder=run.path,
     )

@@ -44,7 +44,7 @@ class TrainingLoop:
     """The changing state of one fit; `save` writes all of it, so a resumed run repeats the same numbers.
 
     config: a resolved one. stepped: what steps are taken with, the same weights, compiled maybe. folder: where
-    checkpoints go; None: nothing is written.
+    checkpoints go; None: nothing is written. seconds: what was spent before, of the allowed time.
     """
 
     def __init__(
@@ -58,6 +58,7 @@ class TrainingLoop:
         regularizer: UrdfRegularizer | None = None,
         stepped: EmittedModel | None = None,
         folder: RunFolder | None = None,
+        seconds: float = 0.0,
     ) -> None:
         self.folder, self.config, self.seed, self.device = folder, config, seed, device
         self.model = model.to(device)
@@ -76,21 +77,22 @@ class TrainingLoop:
         self.epoch_steps = EPOCH_STEPS if self.whole else max(EPOCH_STEPS, -(-windows // self.batch))
         self.validation = Validation(self.model, data, config, self.batch, device)
         self.epoch = self.step = self.best_epoch = self.rollbacks = 0
-        self.learning_rate_factor, self.seconds = 1.0, 0.0
+        self.learning_rate_factor, self.seconds = 1.0, seconds
+        self._since, self._pace, self._closing = time.monotonic() - seconds, 0.0, 0.0
         self.momentum_done = not config.momentum_steps
         self.history: list[dict[str, Any]] = []
         self._measure()
 
     def run(self, progress: TrainingProgress) -> Status:
         """Go on until an end is reached; Ctrl-C is one and leaves the checkpoint of the last whole epoch."""
-        since = time.monotonic() - self.seconds
+        self._since = time.monotonic() - self.seconds
         try:
             self.save()
             if not self.momentum_done:
                 self._momentum_stage(progress)
             while (end := self._end()) is None:
                 record = self._run_epoch()
-                self.seconds = record["seconds"] = time.monotonic() - since
+                self.seconds = record["seconds"] = time.monotonic() - self._since
                 self.history.append(record)
                 if self.folder is not None:
                     self.folder.append_metrics(record)
@@ -120,9 +122,9 @@ class TrainingLoop:
         """
         before = copy.deepcopy(self.model.state_dict()), self.best_loss
         optimizer = self._optimizer(torch.Generator().manual_seed(self.seed))
-        since, steps = time.monotonic(), self.config.momentum_steps
+        steps = self.config.momentum_steps
         for done in range(0, steps, EPOCH_STEPS):
-            spent = self._spent(time.monotonic() - since) / MOMENTUM_FRACTION
+            spent = self._spent(time.monotonic() - self._since) / MOMENTUM_FRACTION
             if spent >= 1.0:
                 break
             rate = functools.partial(self._momentum_rate, done, spent)
@@ -135,7 +137,7 @@ class TrainingLoop:
             self.model.load_state_dict(before[0])
             self._measure()
         self.momentum_done = True
-        self.seconds += time.monotonic() - since
+        self.seconds = time.monotonic() - self._since
         self.save()
 
     def _momentum_rate(self, done: int, spent: float, step: int) -> float:
@@ -154,7 +156,7 @@ class TrainingLoop:
             return "finished"
         if self.epoch - self.best_epoch >= self.config.patience:
             return "stopped early"
-        return "out of time" if self._spent(self.seconds) >= 1.0 else None
+        return "out of time" if self._spent(self.seconds + self._pace + self._closing) >= 1.0 else None
 
     def _spent(self, seconds: float) -> float:
         """The part of the allowed time that these seconds are; 0 where any time is allowed."""
@@ -165,7 +167,9 @@ class TrainingLoop:
         while True:
             before = copy.deepcopy((self.model.state_dict(), self.optimizer.state_dict(), self.step))
             loss = self._train_epoch()
+            trained = time.monotonic()
             validation = self.validation.loss(self.substeps) if math.isfinite(loss) else math.nan
+            self._closing = time.monotonic() - trained
             if math.isfinite(validation):
                 break
             self._roll_back(*before)
@@ -194,9 +198,20 @@ class TrainingLoop:
         windows = self.training
         if self.stream is not None:
             windows = self.stream.epoch(self.epoch).to(self.device)
-        loss = self.optimizer.run(self._rollout_loss, windows, self.epoch_steps, self._rate)
-        self.step += self.epoch_steps
+        steps, start = self._steps_in_time(), time.monotonic()
+        loss = self.optimizer.run(self._rollout_loss, windows, steps, self._rate)
+        self._pace = (time.monotonic() - start) / steps
+        self.step += steps
         return loss
+
+    def _steps_in_time(self) -> int:
+        """Steps of the next epoch: all, or as many as the time that is left allows at the pace so far."""
+        if self.config.max_minutes is None:
+            return self.epoch_steps
+        if not self._pace:
+            return min(self.epoch_steps, EPOCH_STEPS)
+        left = 60 * self.config.max_minutes - (time.monotonic() - self._since) - self._closing
+        return max(1, min(self.epoch_steps, int(left / self._pace)))
 
     def _penalty(self) -> torch.Tensor | float:
         """What straying from the URDF costs."""
@@ -243,14 +258,14 @@ class TrainingLoop:
 
     def restore(self, folder: RunFolder) -> None:
         """Continue from checkpoint.pt."""
-        state = folder.load_state(folder.checkpoint)
+        state = folder.load_checkpoint()
         try:
             for name in PLAIN:
                 setattr(self, name, state[name])
             self.model.load_state_dict(state["model"])
             self.optimizer.load_state_dict(state["optimizer"])
             self.generator.set_state(state["generator"])
-        except (KeyError, RuntimeError, ValueError) as error:
+        except (KeyError, RuntimeError, ValueError, TypeError, AttributeError) as error:
             raise RunError(
                 "a checkpoint of another model", file=folder.checkpoint, do="start a new run"
             ) from error

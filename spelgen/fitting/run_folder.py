@@ -6,14 +6,18 @@ import io
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 
-from spelgen.emission.loading import load_module
+from spelgen.emission.loading import has_run, load_module
 from spelgen.errors import RunError
-from spelgen.files import write_bytes
+from spelgen.files import naming, write_bytes
+from spelgen.fitting.run_schema import require_checkpoint, require_epoch, require_record
+from spelgen.spec import read_source
+from spelgen.urdf.document import urdf_bytes
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
@@ -25,7 +29,7 @@ class RunFolder:
 
     module.py: the trained module's source. robot.urdf, robot.yaml: its robot, where known. config.json: how
     it was trained. metrics.jsonl: a line per epoch. checkpoint.pt: everything needed to go on. model.pt:
-    the best state_dict so far. evaluation.json: what `evaluate` found.
+    the best state_dict so far. evaluation.json: what `evaluate` found. least_squares.json: what least squares found.
     """
 
     path: Path
@@ -65,6 +69,10 @@ class RunFolder:
     def evaluation(self) -> Path:
         return self.path / "evaluation.json"
 
+    @property
+    def baseline(self) -> Path:
+        return self.path / "least_squares.json"
+
     def require_free(self, *, force: bool) -> None:
         """Raise RunError where a run lies, unless it may be replaced."""
         if self.path.exists() and not self.path.is_dir():
@@ -78,19 +86,13 @@ class RunFolder:
 
     def start(self, source: str, urdf: Path | None, *, force: bool) -> None:
         """Make the folder, write the module's source and copy the robot into it. RunError where a run lies, unless
-        forced.
+        forced. A run it is when config.json is there: that is written last.
         """
         self.require_free(force=force)
         robot = self._robot_files(urdf)  # before anything is removed: they may be this very run's copies
-        for old in (
-            self.urdf,
-            self.settings,
-            self.config,
-            self.metrics,
-            self.checkpoint,
-            self.weights,
-            self.evaluation,
-        ):
+        robot_files = (self.urdf, self.settings)
+        found = (self.metrics, self.checkpoint, self.weights, self.evaluation, self.baseline)
+        for old in (self.config, *robot_files, *found):  # first what makes it a run
             old.unlink(missing_ok=True)
         for path, content in [(self.module, source.encode()), *robot]:
             write_bytes(path, content)
@@ -98,12 +100,13 @@ class RunFolder:
     def _robot_files(self, urdf: Path | None) -> list[tuple[Path, bytes]]:
         if urdf is None:
             return []
-        pairs = [(self.urdf, urdf), (self.settings, urdf.with_suffix(".yaml"))]
-        return [(to, source.read_bytes()) for to, source in pairs if source.exists()]
+        settings = urdf.with_suffix(".yaml")
+        robot = [(self.urdf, urdf_bytes(urdf))] if urdf.exists() else []  # what a xacro file expands to
+        return robot + ([(self.settings, settings.read_bytes())] if settings.is_file() else [])
 
     def append_metrics(self, record: dict[str, Any]) -> None:
         """Add one line to metrics.jsonl."""
-        with self.metrics.open("a", encoding="utf-8") as file:
+        with naming(self.metrics), self.metrics.open("a", encoding="utf-8") as file:
             file.write(json.dumps(record) + "\n")
 
     def write_metrics(self, records: Sequence[dict[str, Any]]) -> None:
@@ -114,44 +117,72 @@ class RunFolder:
     def keep_metrics(self, epochs: int) -> None:
         """Drop lines of epochs after the checkpoint: they will be run again."""
         if self.metrics.exists():
-            lines = self.metrics.read_text(encoding="utf-8").splitlines(keepends=True)
+            lines = _text(self.metrics, "replace").splitlines(keepends=True)
             write_bytes(self.metrics, "".join(lines[:epochs]).encode())
 
     def read_metrics(self) -> list[dict[str, Any]]:
         """The lines of metrics.jsonl, without a last one that is torn."""
-        lines = self.metrics.read_text(encoding="utf-8").splitlines() if self.metrics.exists() else []
+        lines = _text(self.metrics, "replace").splitlines() if self.metrics.exists() else []
         records = []
         for count, line in enumerate(lines, start=1):
             try:
-                records.append(json.loads(line))
-            except ValueError as error:
+                records.append(require_epoch(json.loads(line), self.metrics, count))
+            except (ValueError, RecursionError) as error:
                 if count < len(lines):
                     raise RunError(f"broken JSON ({error})", file=self.metrics, line=count) from error
         return records
 
     def read_json(self, path: Path) -> dict[str, Any]:
         """One of the folder's JSON files. Raises RunError when it is absent or broken."""
-        try:
-            return json.loads(path.read_text(encoding="utf-8"))
-        except FileNotFoundError:
+        if not path.exists():
             raise RunError(
                 "no such run", file=self.path, expected=f"a folder with {path.name}", do="spelgen train"
-            ) from None
-        except ValueError as error:
+            )
+        try:
+            found = json.loads(_text(path))
+        except (ValueError, RecursionError) as error:
             raise RunError(f"broken JSON ({error})", file=path) from error
+        if not isinstance(found, dict):
+            raise RunError(f"{type(found).__name__} in JSON", file=path, expected="an object")
+        return found
+
+    def read_config(self) -> dict[str, Any]:
+        """What config.json says. Raises RunError when it is absent, broken, or lacks what every run has."""
+        return require_record(self.read_json(self.config), self.config)
+
+    def load_checkpoint(self) -> dict[str, Any]:
+        """checkpoint.pt, with the numbers that every one has. Raises RunError."""
+        return require_checkpoint(self.load_state(self.checkpoint), self.checkpoint)
 
     def load_state(self, path: Path) -> dict[str, Any]:
         """checkpoint.pt or model.pt, on the CPU; nothing but tensors and plain values is ever unpickled."""
+        if not path.is_file():
+            raise RunError(f"no {path.name}", file=self.path, expected="a run folder", do="spelgen train")
         try:
-            return torch.load(path, map_location="cpu", weights_only=True)
-        except FileNotFoundError:
-            raise RunError(
-                f"no {path.name}", file=self.path, expected="a run folder", do="spelgen train"
-            ) from None
+            found = torch.load(path, map_location="cpu", weights_only=True)
         except Exception as error:  # torch names no common type for what a broken file raises
             raise RunError(
                 f"unreadable ({type(error).__name__})", file=path, expected="a file of `spelgen train`"
             ) from error
+        if not isinstance(found, dict):
+            raise RunError(type(found).__name__, file=path, expected="a file of `spelgen train`")
+        return found
+
+    def load_module(self, *, trust: bool = False) -> EmittedModel:
+        """The run's module with the weights that it starts with. Raises ModuleError, and RunError unless it is
+        trusted, ran in this process before, or is what spelgen itself writes for the run's robot.
+        """
+        if not trust and not has_run(read_source(self.module)):
+            # looked up when it is needed: what fits knows no symbolic algebra, and this derives the arm anew
+            import_module("spelgen.trust").require_own_module(self.module, self.urdf)
+        return load_module(self.module)
+
+
+def _text(path: Path, errors: str = "strict") -> str:
+    """The text of a file; RunError for a pipe, which might never end."""
+    if not path.is_file():
+        raise RunError("no regular file", file=path)
+    return path.read_text(encoding="utf-8", errors=errors)
 
 
 def write_state(path: Path, state: dict[str, Any]) -> None:
@@ -161,9 +192,12 @@ def write_state(path: Path, state: dict[str, Any]) -> None:
     write_bytes(path, buffer.getvalue())
 
 
-def trained_model(run: RunFolder) -> EmittedModel:
-    """A run's module with its best weights, which take no gradients. Raises ModuleError and RunError."""
-    model = load_module(run.module)
-    model.load_state_dict(run.load_state(run.weights))
+def trained_model(run: RunFolder, *, trust: bool = False) -> EmittedModel:
+    """A run's module (see `RunFolder.load_module`) with its best weights, which take no gradients."""
+    model = run.load_module(trust=trust)
+    try:
+        model.load_state_dict(run.load_state(run.weights))
+    except (RuntimeError, TypeError, AttributeError) as error:
+        raise RunError("weights of another model", file=run.weights, do="start a new run") from error
     model.requires_grad_(False).eval()
     return model

@@ -59,7 +59,7 @@ def recorded_config(record: dict[str, Any], **changed: Any) -> FitConfig:
 
 def require_same(run: RunFolder, now: dict[str, Any]) -> None:
     """Refuse to resume with other data or settings than the run was started with."""
-    started = run.read_json(run.config)
+    started = run.read_config()
     if started["data_digest"] != now["data_digest"]:
         raise RunError(
             "other logs than the run was started with",

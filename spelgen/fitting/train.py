@@ -21,6 +21,7 @@ from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.spec import Facts
+from spelgen.urdf.document import urdf_bytes
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
@@ -42,21 +43,23 @@ def train(
     mapping: LogMapping | None = None,
     preprocessing: Preprocessing = AUTOMATIC,
     resume: bool = False,
+    trust: bool = False,
     progress: bool = True,
     **options: Any,
 ) -> Fit:
     """Fit the emitted module to the logs and leave a run folder (see `RunFolder`); ``options`` are those of `fit`.
 
     urdf: the robot the module was built from, for the regularizer and the baselines of `evaluate`; by default the file
-    of that name beside the module. source: a run of this module, whose weights are where the fit starts. mapping:
-    how the logs are named and measured; by default as spelgen writes them. config: may also be a function that
-    chooses. What is not said of a run that is resumed is as before.
+    of that name beside the module. source: a run whose module and weights are where the fit starts. trust: the module
+    of a run folder is run whatever it is (see `RunFolder.load_module`). mapping: how the logs are named and measured;
+    by default as spelgen writes them. config: may also be a function that chooses. What is not said of a run that is
+    resumed is as before.
     Raises ModuleError, LogError, and RunError when the folder holds a run or cannot be resumed with this.
     """
     run = RunFolder(Path(folder))
     module = Path(module)
     if resume:
-        before = run.read_json(run.config)  # a missing run is told before anything is read
+        before = run.read_config()  # a missing run is told before anything is read
         mapping = mapping or LogMapping(**before["mapping"])
         config = config or recorded_config(before)
         options = {name: before[x] for name, x in RECORDED.items()} | options
@@ -64,7 +67,10 @@ def train(
             Preprocessing(**before["preprocessing"]) if preprocessing is AUTOMATIC else preprocessing
         )
         module = run.module
-    model = load_module(module)
+    if resume or source is not None:
+        model = (run if resume else RunFolder(Path(source or ""))).load_module(trust=trust)
+    else:
+        model = load_module(module)
     if source is not None and not resume:
         start_from(model, source)
     chosen = config(model, None) if callable(config) else config  # before logs, which may take long to read
@@ -111,7 +117,7 @@ def robot_of(module: Path, urdf: Path | str | None, facts: Facts) -> tuple[Path 
             f"no {facts.urdf} beside the module; evaluation will miss the URDF's own values as a baseline"
         )
         return None, [Diagnostic("info", "no-urdf", "run", None, message)]
-    if hashlib.sha256(path.read_bytes()).hexdigest() == facts.urdf_sha256:
+    if hashlib.sha256(urdf_bytes(path)).hexdigest() == facts.urdf_sha256:
         return path, []
     if urdf is not None:
         raise ModuleError(

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from spelgen.dynamics.regressor_dynamics import RegressorDynamics
-from spelgen.emission.loading import load_module
 from spelgen.errors import LogError, RunError
 from spelgen.evaluation.names import LEAST_SQUARES
 from spelgen.files import write_json
@@ -24,7 +23,6 @@ from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 from spelgen.spec import read_facts
 
-FILE = "least_squares.json"
 BINS = 24
 
 
@@ -42,8 +40,8 @@ def keep_baseline(run: RunFolder, paths: Iterable[Path | str]) -> None:
     What the logs cover is kept beside it. A run without URDF and logs larger than memory are left as they are; logs
     that are too sparse for accelerations give no parameters.
     """
-    record = run.read_json(run.config)
-    model = load_module(run.module)
+    record = run.read_config()
+    model = run.load_module()
     logs = open_logs(model, paths, LogMapping(**record["mapping"]))
     if isinstance(logs, LargeLogs) or not run.urdf.exists():
         return
@@ -54,12 +52,12 @@ def keep_baseline(run: RunFolder, paths: Iterable[Path | str]) -> None:
         pass
     else:
         found |= fit.to_dict() | {"parameters": fit.parameters.tolist()}
-    write_json(run.path / FILE, found)
+    write_json(run.baseline, found)
 
 
 def read_baseline(run: RunFolder) -> dict[str, RegressorDynamics]:
     """The dynamics that ``write_baseline`` found, by name; none where it found none."""
-    path = run.path / FILE
+    path = run.baseline
     found = run.read_json(path) if path.exists() else {}
     if "parameters" not in found:
         return {}

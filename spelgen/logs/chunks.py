@@ -30,12 +30,13 @@ LONGEST = 2**16  # samples of a chunk: of 7 joints, 12 MB, and 53 MB as windows
 
 @dataclass(frozen=True)
 class ParquetLog:
-    """A file and how it is read. stored: its columns that are needed. start: of its clock."""
+    """A file and how it is read. stored: columns that are needed. start: of its clock. stamp: of its last change."""
 
     file: Path
     layout: Layout
     stored: tuple[str, ...]
     start: int
+    stamp: tuple[int, int]
 
     def values(self, batch: pa.RecordBatch, row: int) -> np.ndarray:
         """What a batch from this row on holds (T, C), in SI units."""
@@ -53,6 +54,10 @@ class Chunk:
 
     def load(self) -> Trajectory:
         """The chunk's samples, the same as `scan` gave."""
+        if _stamp(self.log.file) != self.log.stamp:
+            raise LogError(
+                "a file that has changed since it was first read", file=self.log.file, do="start a new run"
+            )
         source = _source(self.log.file)
         groups, row = _row_groups(source, self.first, self.stop)
         found = []
@@ -133,6 +138,7 @@ def scan(
 
 
 def _opened_log(file: Path, joints: tuple[str, ...], mapping: LogMapping) -> ParquetLog:
+    stamp = _stamp(file)
     source = opened(file, lambda: _source(file))
     schema = source.schema_arrow
     layout = table_layout(schema, joints, mapping, file)
@@ -140,7 +146,7 @@ def _opened_log(file: Path, joints: tuple[str, ...], mapping: LogMapping) -> Par
     head = next(source.iter_batches(1, columns=[layout.columns[0]]), None)
     if head is None:
         raise LogError("no rows", file=file, expected="at least one window of samples")
-    return ParquetLog(file, layout, tuple(stored), clock_start(head.column(0)))
+    return ParquetLog(file, layout, tuple(stored), clock_start(head.column(0)), stamp)
 
 
 def _chunks(log: ParquetLog, place: str, several: bool) -> Iterator[tuple[Chunk, str, np.ndarray]]:
@@ -196,6 +202,12 @@ def _recordings(log: ParquetLog, place: str, several: bool) -> list[tuple[str, i
         seen.add(label)
     names = [f"{place}/{label}" if several else label for label in labels]
     return list(zip(names, starts, ends, strict=True))
+
+
+def _stamp(file: Path) -> tuple[int, int]:
+    """When a file was last changed [ns], and its size."""
+    status = file.stat()
+    return status.st_mtime_ns, status.st_size
 
 
 def _source(file: Path) -> pa.parquet.ParquetFile:

@@ -22,7 +22,11 @@ def log_files(
         elif path.is_dir():
             found = _folder_files(path, role)
             if not found:
-                errors.append(LogError("a folder without logs", file=path, expected=KINDS))
+                several = any(map(is_log, path.iterdir()))  # that are those of another role
+                got = f"a folder without {role}.* among its logs" if several else "a folder without logs"
+                errors.append(
+                    LogError(got, file=path, expected=f"{role}.*, or files by name" if several else KINDS)
+                )
             files |= dict.fromkeys(found)
         elif not path.exists():
             errors.append(

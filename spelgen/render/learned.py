@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from spelgen.emission.loading import load_module
 from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.render.plots import INERTIA_UNITS
 
@@ -39,7 +38,7 @@ class Learned:
 
 def read_learned(run: RunFolder) -> Learned:
     """What the best model of a run has learned. Raises ModuleError or RunError when it cannot be read."""
-    before: Any = load_module(run.module)
+    before: Any = run.load_module()
     after: Any = trained_model(run)
     found = []
     if hasattr(after.dynamics, "mass") and hasattr(after.dynamics.mass, "constants"):

@@ -14,7 +14,7 @@ from spelgen.evaluation.names import MODEL
 from spelgen.evaluation.tables import result_tables
 from spelgen.files import write_text
 from spelgen.fitting.run_folder import RunFolder, trained_model
-from spelgen.identification.baseline import FILE, run_arm
+from spelgen.identification.baseline import run_arm
 from spelgen.listing import number
 from spelgen.loaded_arm import LoadedArm
 from spelgen.logs.preprocessing import Preprocessing
@@ -102,9 +102,9 @@ def render_report(folder: Path | str) -> str:
             "no run", file=run.path, expected="a folder with module.py", do="make one with `spelgen train`"
         )
     facts, picture = read_facts(run.module), read_picture(run.module)
-    config, evaluation, identified = (
-        run.read_json(path) if path.is_file() else None
-        for path in (run.config, run.evaluation, run.path / FILE)
+    config = run.read_config() if run.config.is_file() else None
+    evaluation, identified = (
+        run.read_json(path) if path.is_file() else None for path in (run.evaluation, run.baseline)
     )
     metrics = run.read_metrics()
     arm = _arm(run)

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, ValidationInfo, field_validator
 
-from spelgen.fitting.config import OWNERS, GaussianPrior, Objective, Optimizer, Solver, Window
+from spelgen.fitting.config import OWNERS, GaussianPrior, Objective, Optimizer, Solver, Substeps, Window
 from spelgen.settings.values import Count, Group, NonNegative, Number, Positive, Whole
 
 
@@ -33,7 +33,7 @@ class TrainingSettings(Group):
     learning_rate: Positive | None = None
     weight_decay: NonNegative | None = None
     solver: Solver | None = None
-    substeps: Count | None = None
+    substeps: Substeps | None = None
     max_minutes: NonNegative | None = None
     cutoff: NonNegative | None = None
     decimation: Count | None = None

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
+
+MAX_MAGNITUDE = 1e12  # as of the numbers of a URDF
 
 
 def no_bool(value: object) -> object:
@@ -14,7 +16,14 @@ def no_bool(value: object) -> object:
     return value
 
 
-Number = Annotated[float, BeforeValidator(no_bool), Field(allow_inf_nan=False)]
+def bounded(value: float) -> float:
+    """The value; ValueError where products of a few such would be no float."""
+    if abs(value) > MAX_MAGNITUDE:
+        raise ValueError(f"a number within +-{MAX_MAGNITUDE:g}")
+    return value
+
+
+Number = Annotated[float, BeforeValidator(no_bool), Field(allow_inf_nan=False), AfterValidator(bounded)]
 Positive = Annotated[Number, Field(gt=0)]
 NonNegative = Annotated[Number, Field(ge=0)]
 Share = Annotated[Number, Field(ge=0, lt=1)]

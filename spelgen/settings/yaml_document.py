@@ -23,7 +23,7 @@ class Document:
     root: yaml.Node | None
 
     def value(self) -> Any:
-        """Return the file's content as dicts, lists and scalars; raises SettingsError for foreign tags."""
+        """Return the file's content as dicts, lists and scalars; raises SettingsError for a date that is none."""
         if self.root is None:
             return None
         try:
@@ -50,14 +50,17 @@ class Document:
 
 
 class _Loader(yaml.SafeLoader):
-    """The safe loader, without aliases (a small file could grow huge), deep nesting and repeated keys."""
+    """The safe loader, without tags, aliases (a small file could grow huge), deep nesting and repeated keys."""
 
     depth = 0
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node:
-        mark = self.peek_event().start_mark
+        event = self.peek_event()
+        mark = event.start_mark
         if self.check_event(yaml.AliasEvent):
             raise ComposerError(None, None, "an alias", mark)
+        if getattr(event, "tag", None) is not None:  # "!!bool maybe" means nothing
+            raise ComposerError(None, None, f"the tag {event.tag}", mark)
         if self.depth == MAX_DEPTH:
             raise ComposerError(None, None, f"more than {MAX_DEPTH} levels", mark)
         self.depth += 1

@@ -9,6 +9,7 @@ from lxml import etree
 from spelgen.errors import suggestion
 from spelgen.urdf.robot import MOVING, Inertial, Joint, Link, Mimic, Tensor, Transmission, Vector
 from spelgen.urdf.values import (
+    MAX_MAGNITUDE,
     Notes,
     first_child,
     note_unexpanded,
@@ -197,6 +198,11 @@ def _read_mimic(notes: Notes, element: etree._Element, where: str) -> Mimic | No
         notes.error(mimic.sourceline, where, "no joint", 'joint="..." naming the joint to follow')
         return None
     multiplier, offset = (read_number(notes, mimic, key, where) for key in ("multiplier", "offset"))
+    if (
+        multiplier and abs(multiplier) < 1 / MAX_MAGNITUDE
+    ):  # its inverse is as large as no number of a URDF may be
+        expected = f"0, or {1 / MAX_MAGNITUDE:g} at least"
+        notes.error(mimic.sourceline, f"{where} multiplier", repr(mimic.get("multiplier")), expected)
     return Mimic(joint, 1.0 if multiplier is None else multiplier, 0.0 if offset is None else offset)
 
 

@@ -1,0 +1,95 @@
+"""Kills a training at random times and resumes it, over and over: the weights in the end are those of one never killed.
+
+    python benchmarks/kills.py [--kills 50]
+
+Each kill is a SIGKILL, which nothing can catch, after a random time since the process began to write. `make bench`
+takes 5 kills.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import torch
+
+from spelgen.fitting.run_folder import RunFolder
+from spelgen.loaded_arm import load_arm
+from spelgen.logs.read import write_logs
+from spelgen.pipeline import generate
+from spelgen.simulation.simulate import simulate
+
+URDF = Path(__file__).parents[1] / "robots" / "rpr.urdf"
+LONGEST = 1.0  # [s] from the first write of a process to its death
+
+
+def main() -> None:
+    """Train once in peace and once under fire, and compare."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--kills", type=int, default=5)
+    kills = parser.parse_args().kills
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        arm = load_arm(URDF)
+        joints = [coordinate.name for coordinate in arm.arm.coordinates]
+        write_logs(folder / "train.parquet", simulate(arm, trajectories=6).train, joints)
+        (folder / "module.py").write_text(generate(arm, width=8, depth=1))
+        subprocess.run(_command(folder, folder / "whole", kills, resume=False), check=True)
+        done, draw, run = 0, random.Random(0), folder / "run"
+        while True:
+            resume = (run / "config.json").exists()
+            if not _killed(_command(folder, run, kills, resume=resume), run, draw.uniform(0, LONGEST)):
+                break
+            done += done < kills
+            if done == kills:
+                subprocess.run(_command(folder, run, kills, resume=True), check=True)
+                break
+        whole, broken = (RunFolder(x).load_state(x / "model.pt") for x in (folder / "whole", run))
+        same = all(torch.equal(whole[key], broken[key]) for key in whole)
+        epochs = [len(RunFolder(x).read_metrics()) for x in (folder / "whole", run)]
+        print(f"{done} kills, {done} resumes, epochs {epochs}: weights {'identical' if same else 'DIFFER'}")
+    if not same or done < kills or len(set(epochs)) > 1:
+        sys.exit(1)
+
+
+def _command(folder: Path, run: Path, kills: int, *, resume: bool) -> list[str]:
+    epochs = str(40 + 12 * kills)
+    options = [
+        "--epochs",
+        epochs,
+        "--patience",
+        epochs,
+        "--momentum-steps",
+        "40",
+        "--quiet",
+        "--robot",
+        str(URDF),
+    ]
+    start = ["--resume"] if resume else [str(folder / "module.py")]
+    options = options[:4] if resume else options
+    return [sys.executable, "-m", "spelgen", "train", *start, "--data", str(folder), "-o", str(run), *options]
+
+
+def _killed(command: list[str], run: Path, after: float) -> bool:
+    """Whether the process was killed before it ended: so many seconds after it first wrote to the run folder."""
+    before = _writes(run)
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=os.environ)
+    while process.poll() is None and _writes(run) == before:
+        time.sleep(0.01)
+    time.sleep(after)
+    process.kill()
+    return process.wait() != 0
+
+
+def _writes(run: Path) -> int:
+    return sum(path.stat().st_mtime_ns for path in run.glob("[!.]*")) if run.is_dir() else 0
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,302 @@
+"""A run folder from elsewhere runs nothing, belongs to one training at a time, and is whole whenever that is killed."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner
+
+import spelgen
+from spelgen.cli.main import app
+from spelgen.errors import LogError, RunError
+from spelgen.evaluation.evaluate import evaluate
+from spelgen.exporting.export import export
+from spelgen.fitting.config import Rollout
+from spelgen.fitting.fitted import load_run
+from spelgen.fitting.loop import TrainingLoop
+from spelgen.fitting.run_folder import RunFolder
+from spelgen.fitting.run_lock import locked
+from spelgen.fitting.train import train
+from spelgen.logs import chunks
+from spelgen.logs.read import write_logs
+from spelgen.logs.trajectory import Trajectory
+from spelgen.pipeline import generate
+from spelgen.trust import require_own_module
+
+JOINTS = ("joint1", "joint2")
+QUICK = Rollout(epochs=3, momentum_steps=0, optimizer="adamw", batch=8, urdf_weight=0.0, stride=3)
+
+
+def motions(count: int = 4, samples: int = 25) -> list[Trajectory]:
+    random = np.random.default_rng(0)
+    t = np.arange(samples) / 25.0
+    found = []
+    for k in range(count):
+        phase = random.uniform(0, 6, 2)
+        q, qd = np.sin(2 * t[:, None] + phase), 2 * np.cos(2 * t[:, None] + phase)
+        found.append(Trajectory(t, q, qd, random.normal(size=(samples, 2)), f"motion_{k}"))
+    return found
+
+
+@pytest.fixture(scope="module")
+def start(robots, tmp_path_factory) -> Path:
+    """A module, its URDF and a log."""
+    folder = tmp_path_factory.mktemp("start")
+    (folder / "arm.urdf").write_bytes((robots / "two_link.urdf").read_bytes())
+    (folder / "module.py").write_text(generate(folder / "arm.urdf", width=8, depth=1))
+    write_logs(folder / "train.parquet", motions(), JOINTS)
+    return folder
+
+
+def trained(start: Path, folder: Path, **options) -> Path:
+    train(start / "module.py", [start / "train.parquet"], folder, QUICK, progress=False, **options)
+    return folder
+
+
+# ---- whose module is run
+
+
+@pytest.fixture(scope="module")
+def foreign(start, tmp_path_factory) -> Path:
+    """A run whose module leaves a mark when it is run."""
+    run = trained(start, tmp_path_factory.mktemp("foreign") / "run")
+    source = (run / "module.py").read_text()
+    (run / "module.py").write_text(f"{source}\nopen({str(run / 'mark')!r}, 'w').close()\n")
+    return run
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda run, log: load_run(run),
+        lambda run, log: evaluate(run, motions()),
+        lambda run, log: export(run),
+        lambda run, log: train("", [log], run, resume=True, progress=False),
+        lambda run, log: train(run / "module.py", [log], run.parent / "more", QUICK, source=run),
+    ],
+)
+def test_a_foreign_module_is_not_run(foreign, start, use):
+    with pytest.raises(RunError) as caught:
+        use(foreign, start / "train.parquet")
+    assert str(caught.value) == (
+        f"{foreign / 'module.py'}: a module that may do anything when it is run: it is not what spelgen writes for "
+        "the URDF beside it; read it, then say --trust (in Python: trust=True), or build it again and start a new run"
+    )
+    assert not (foreign / "mark").exists()
+
+
+@pytest.mark.parametrize("command", ["evaluate", "report", "export", "train"])
+def test_commands_demand_trust_in_a_foreign_module(foreign, start, tmp_path, command):
+    more = {
+        "evaluate": ["--data", start / "train.parquet"],
+        "export": ["-o", tmp_path / "x.urdf"],
+        "report": [],
+    }
+    more["train"] = ["--resume", "--data", start, "-o", foreign]
+    first = start / "module.py" if command == "train" else foreign
+    told = CliRunner().invoke(app, [command, *map(str, [first, *more[command]])])
+    assert told.exit_code == 1
+    assert "then say --trust" in told.stderr
+    assert not (foreign / "mark").exists()
+
+
+def test_trust_runs_it(foreign):
+    assert load_run(foreign, trust=True).model.n == 2
+    assert (foreign / "mark").exists()
+    (foreign / "mark").unlink()
+
+
+def test_what_spelgen_writes_is_trusted_and_nothing_else(start, tmp_path):
+    run = trained(start, tmp_path / "run")
+    require_own_module(run / "module.py", run / "robot.urdf")
+    (run / "robot.urdf").unlink()
+    with pytest.raises(RunError, match="there is no URDF beside it to write it anew from"):
+        require_own_module(run / "module.py", run / "robot.urdf")
+
+
+# ---- one training at a time
+
+
+def test_a_second_training_is_told_who_holds_the_folder(start, tmp_path):
+    with locked(tmp_path / "run"):
+        with pytest.raises(RunError) as caught:
+            trained(start, tmp_path / "run")
+        assert re.fullmatch(
+            rf"{tmp_path}/run: process {os.getpid()} on \S+, since [-0-9]+ [:0-9]+, trains in this folder; "
+            "wait for it, or -o another",
+            str(caught.value),
+        )
+    assert not (tmp_path / "run").exists()  # nothing came of it
+    trained(start, tmp_path / "run")
+    assert not list((tmp_path / "run").glob(".*"))
+
+
+# ---- whole whenever it is killed
+
+
+def weights(run: Path) -> dict[str, torch.Tensor]:
+    return torch.load(run / "model.pt", weights_only=True)
+
+
+def killed(start: Path, run: Path, write: int, *, before: bool, **options) -> bool:
+    """Whether a training that dies without a word at its so-manieth write did so before its end."""
+    child = os.fork()
+    if child == 0:  # pragma: no cover
+        replace, left = os.replace, [write]
+
+        def dying(*paths):
+            left[0] -= 1
+            if left[0] == 0 and before:
+                os._exit(9)
+            replace(*paths)
+            if left[0] == 0:
+                os._exit(9)
+
+        os.replace = dying
+        try:
+            trained(start, run, **options)
+        except BaseException:
+            os._exit(1)
+        os._exit(0)
+    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    assert code in (0, 9)
+    return code == 9
+
+
+def test_killed_between_any_two_writes_nothing_is_lost(start, tmp_path):
+    """Every write of a training, in turn: module, robot, weights, checkpoints, config. Dead before or after it."""
+    whole = weights(trained(start, tmp_path / "whole", urdf=start / "arm.urdf"))
+    kills, write, resumed = 0, 1, set()
+    run = tmp_path / "run"
+    while True:
+        there = (run / "config.json").exists()
+        resumed.add(there)
+        if not killed(start, run, write, before=bool(write % 2), urdf=start / "arm.urdf", resume=there):
+            break
+        kills, write = kills + 1, write + 1
+    assert kills >= 6
+    assert resumed == {True, False}
+    assert all(torch.equal(whole[name], x) for name, x in weights(run).items())
+    assert [line["epoch"] for line in RunFolder(run).read_metrics()] == [1, 2, 3]
+
+
+def test_an_interruption_before_the_first_checkpoint_leaves_no_run(start, tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(TrainingLoop, "_measure", lambda loop: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            trained(start, tmp_path / "run")
+    trained(start, tmp_path / "run")
+
+
+FULL = """
+import resource, signal, sys
+from spelgen.cli.main import app
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
+app(sys.argv[1:])
+"""
+
+
+def test_a_full_disk_is_told_with_the_file(start, tmp_path):
+    """No file may grow beyond 2000 bytes: it fails as a full disk does, while it is written."""
+    trained(start, tmp_path / "run")
+    before = weights(tmp_path / "run")
+    environment = os.environ | {"PYTHONPATH": str(Path(spelgen.__file__).parents[1])}
+    command = [
+        "train",
+        start / "module.py",
+        "--data",
+        start,
+        "-o",
+        tmp_path / "run",
+        "--resume",
+        "--epochs",
+        "9",
+    ]
+    done = subprocess.run(
+        [sys.executable, "-c", FULL, *map(str, command)],
+        env=environment, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1] == f"{tmp_path}/run/model.pt: file too large"
+    assert all(torch.equal(before[name], x) for name, x in weights(tmp_path / "run").items())
+    assert trained(start, tmp_path / "run", resume=True)
+
+
+# ---- what lies in it may be anything
+
+
+CHANGES = {
+    "lost key": (lambda x: x.pop("seed"), "config.json: seed: Field required"),
+    "other type": (lambda x: x.update(training=3), "config.json: training: Input should be a valid list"),
+    "objective": (lambda x: x.update(objective="x"), "config.json: objective: Input should be 'torque', 'momentum'"),
+    "substeps": (lambda x: x["config"].update(substeps=10**9), "config.json: config: substeps: got 1000000000"),
+    "option": (lambda x: x["config"].update(lunch=1), "config.json: config: unknown option 'lunch'"),
+    "mapping": (lambda x: x.update(mapping={"units": 1}), "config.json: mapping.units: Input should be a valid"),
+    "cutoff": (lambda x: x["preprocessing"].update(cutoff=-1), "config.json: cutoff: got -1"),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def plain(start, tmp_path_factory) -> Path:
+    return trained(start, tmp_path_factory.mktemp("plain") / "run")
+
+
+@pytest.mark.parametrize("case", CHANGES)
+def test_a_config_that_is_none_is_told(plain, tmp_path, case):
+    change, message = CHANGES[case]
+    record = json.loads((plain / "config.json").read_text())
+    change(record)
+    (tmp_path / "run").mkdir()
+    for path in plain.iterdir():
+        (tmp_path / "run" / path.name).write_bytes(path.read_bytes())
+    (tmp_path / "run" / "config.json").write_text(json.dumps(record))
+    with pytest.raises(RunError) as caught:
+        load_run(tmp_path / "run")
+    assert str(caught.value).startswith(f"{tmp_path}/run/{message}")
+
+
+@pytest.mark.parametrize("name", ["config.json", "module.py", "model.pt", "checkpoint.pt", "metrics.jsonl"])
+@pytest.mark.parametrize("what", [b"", b"[]", b"\xff\xfe", b"[" * 100_000, None])
+def test_files_that_are_broken_or_pipes_are_told(plain, tmp_path, name, what):
+    for path in plain.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    (tmp_path / name).unlink()
+    if what is None:
+        os.mkfifo(tmp_path / name)
+    else:
+        (tmp_path / name).write_bytes(what)
+    if name == "metrics.jsonl" and what not in (None, b"[]"):
+        load_run(tmp_path)  # a torn last line is left out
+    else:
+        with pytest.raises(spelgen.SpelgenError, match=r"\S"):
+            load_run(tmp_path)
+
+
+def test_a_checkpoint_that_lost_a_number_is_told(plain, tmp_path):
+    for path in plain.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    state = torch.load(plain / "checkpoint.pt", weights_only=True)
+    torch.save(state | {"substeps": 10**9}, tmp_path / "checkpoint.pt")
+    with pytest.raises(
+        RunError, match=r"checkpoint\.pt: substeps: Input should be less than or equal to 1000"
+    ):
+        load_run(tmp_path)
+
+
+def test_a_log_that_changes_under_training_is_told(start, tmp_path, monkeypatch):
+    monkeypatch.setattr(chunks, "IN_MEMORY", 100)
+    monkeypatch.setattr(chunks, "LONGEST", 25)
+    path = tmp_path / "train.parquet"
+    write_logs(path, motions(), JOINTS)
+    (chunk, _), *_ = chunks.scan([path], JOINTS)
+    chunk.load()
+    write_logs(path, motions(3), JOINTS)
+    with pytest.raises(LogError, match=r"train\.parquet: a file that has changed since it was first read"):
+        chunk.load()
