@@ -47,6 +47,16 @@ def test_later_training_does_not_reach_it(pair):
         parameter.copy_(old)
 
 
+def test_momentum_rate_is_the_slope_of_momentum(pair):
+    _, prepared = pair
+    q, qd, tau = states(4)
+    qdd, h = prepared.forward_dynamics(q, qd, tau), 1e-6
+    ahead, behind = (prepared.momentum(q + s * h * qd, qd + s * h * qdd) for s in (1, -1))
+    torch.testing.assert_close(
+        prepared.momentum_rate(q, qd, tau), (ahead - behind) / (2 * h), rtol=1e-5, atol=1e-6
+    )
+
+
 def test_linearize_is_the_slope_of_rate_and_step(pair):
     _, prepared = pair
     given = torch.cat(states(3), dim=-1)  # q, qd, tau

@@ -70,6 +70,17 @@ class PreparedModel:
         tau: Tensor = self._dynamics.input_torque(at, force, self._weights)
         return tau
 
+    def momentum(self, q: Tensor, qd: Tensor) -> Tensor:
+        """p = M(q) qd, (..., n) [Nm s, N s]."""
+        return (self.mass_matrix(q) @ qd.unsqueeze(-1)).squeeze(-1)
+
+    def momentum_rate(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
+        """p', (..., n) [Nm, N], under the input tau: what a momentum observer compares with."""
+        at, weights = self._at(q), self._weights
+        residuals = self._dynamics.mass_at(at, weights)[1]
+        force: Tensor = self._dynamics.lagrangian_gradient(at, qd, residuals, weights)
+        return force + self._dynamics.input_force(at, tau, weights) - self._friction(at, qd, z)
+
     def step(
         self, q: Tensor, qd: Tensor, tau: Tensor, dt: float, z: Tensor | None = None, *, substeps: int = 1
     ) -> State:

@@ -18,7 +18,7 @@ from spelgen.exporting.entry_points import (
 )
 from spelgen.exporting.exported import Exported
 from spelgen.exporting.learned_expressions import encoded, entry_places
-from spelgen.exporting.parity import Values, check_parity
+from spelgen.exporting.parity import Called, Values, check_parity
 from spelgen.exporting.readme import UNITS, readme
 from spelgen.exporting.trained import Trained
 
@@ -30,7 +30,7 @@ def export_casadi(trained: Trained) -> Exported:
     model = trained.described
     functions = casadi_functions(model)
     names = list(functions)
-    parity = check_parity(_Called(functions), trained, names, TOLERANCE, memory=model.memory)
+    parity = check_parity(called_by_state(functions), trained, names, TOLERANCE, memory=model.memory)
     checked = f"Checked when exported, by CasADi {ca.CasadiMeta.version()}: {parity.summary}."
     use = (
         "qdd = casadi.Function.load('forward_dynamics.casadi')(q, qd, tau, z) takes numbers or symbols: "
@@ -107,19 +107,17 @@ def _saved(function: ca.Function) -> bytes:
         return path.read_bytes()
 
 
-class _Called:
-    """CasADi's functions for arrays of states."""
+def called_by_state(functions: Mapping[str, ca.Function]) -> Called:
+    """CasADi's functions, for arrays of states."""
 
-    def __init__(self, functions: Mapping[str, ca.Function]) -> None:
-        self._functions = functions
-
-    def __call__(self, name: str, inputs: Values) -> dict[str, np.ndarray]:
-        function = self._functions[name]
+    def called(name: str, inputs: Values) -> Values:
+        function = functions[name]
         rows = [inputs[key] for key in function.name_in()]
         found = [function.call([ca.DM(x) for x in state]) for state in zip(*rows, strict=True)]
-        return {
-            key: np.array([_array(each[k]) for each in found]) for k, key in enumerate(function.name_out())
-        }
+        outputs = function.name_out()
+        return {key: np.array([_array(each[k]) for each in found]) for k, key in enumerate(outputs)}
+
+    return called
 
 
 def _array(value: ca.DM) -> np.ndarray:
