@@ -8,7 +8,7 @@ and what an explicit method would make of it is not taken for an error of the dy
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -22,6 +22,7 @@ from spelgen.logs.windows import Windows
 STEPS = (1, 2, 4, 8, 16)  # between samples
 EXPLICIT, IMPLICIT = 2e-3, 2e-2  # of the dynamics' own error, what twice as many steps may change
 PROBED = 16  # windows
+SHORTEST = 1e-3  # s: shorter steps are for dynamics that leave all bounds
 GAMMA = 1 - 0.5**0.5
 VELOCITY = 1e-5  # of a joint's largest velocity, that friction is differentiated by
 
@@ -42,19 +43,22 @@ def accurate_solver(dynamics: RigidDynamics, probe: Windows) -> Solver:
         return roll_out_stiff(dynamics, windows, steps)
 
     some = probe[:: -(-len(probe) // PROBED)]
+    allowed = [steps for steps in STEPS if steps == 1 or some.dt.mean() / steps >= SHORTEST]
     for method, tolerance in ((explicit, EXPLICIT), (implicit, IMPLICIT)):
-        steps = _steps(method, some, tolerance)
+        steps = _steps(method, some, tolerance, allowed)
         if steps is not None:
             return partial(_quietly, method, steps)
-    return partial(_quietly, implicit, STEPS[-1])
+    return partial(_quietly, implicit, allowed[-1])
 
 
-def _steps(method: Callable[..., Any], probe: Windows, tolerance: float) -> int | None:
+def _steps(
+    method: Callable[..., Any], probe: Windows, tolerance: float, allowed: Sequence[int]
+) -> int | None:
     """The fewest steps between samples that twice as many agree with."""
     motion = (probe.qd - probe.qd[:, :1]).square().mean().sqrt().clamp(min=1e-9)
     try:
-        coarse = _quietly(method, STEPS[0], probe)[1]
-        for steps in STEPS:
+        coarse = _quietly(method, allowed[0], probe)[1]
+        for steps in allowed:
             fine = _quietly(method, 2 * steps, probe)[1]
             error = (fine - probe.qd[:, 1:]).square().mean().sqrt()
             if (fine - coarse).square().mean().sqrt() < tolerance * torch.maximum(0.1 * motion, error):

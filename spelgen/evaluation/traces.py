@@ -20,9 +20,10 @@ from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows, joined
 
-WINDOWS = 96  # that the growth of errors is told from
+WINDOWS = 64  # that the growth of errors is told from
 TIMES = 24  # at which it is told
 QUANTILES = (0.1, 0.5, 0.9)
+DENSEST = 150.0  # [Hz] inputs of denser logs are averaged
 SHOWN = 240  # samples of a predicted trajectory
 BINS = 24
 
@@ -58,11 +59,18 @@ def _predictions(
     tip: Any,
 ) -> dict[str, Any]:
     """How errors grow with the horizon, and the predictions of the middle and the largest error."""
-    starts = [(piece, start) for piece in pieces for start in range(0, len(piece) - steps)]
+    thin = max(1, int(max(piece.sample_rate for piece in pieces) / DENSEST))
+    steps = max(1, steps // thin)
+    starts = [(piece, start) for piece in pieces for start in range(0, len(piece) - steps * thin)]
     starts = starts[:: -(-len(starts) // WINDOWS)]
     windows = joined(
         [
-            cut_windows([piece[start : start + steps + 1]], steps + 1, measured=used.filtered)
+            cut_windows(
+                [piece[start : start + steps * thin + 1]],
+                steps + 1,
+                decimation=thin,
+                measured=used.filtered,
+            )
             for piece, start in starts
         ]
     )

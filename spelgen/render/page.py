@@ -13,7 +13,7 @@ from markupsafe import Markup
 from spelgen import __version__
 from spelgen.templates import read, render
 
-SCRIPTS = ("arm.js", "page.js")
+SCRIPTS = ("page.js", "arm.js")
 
 
 def render_page(template: str, **context: Any) -> str:

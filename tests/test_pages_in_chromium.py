@@ -1,0 +1,105 @@
+"""Pages as people see them, in a headless browser: quiet, alone, within their width, and led by the keyboard."""
+
+from __future__ import annotations
+
+import pytest
+from chromium import Chromium, executable
+from test_report import run  # noqa: F401  (a fixture)
+
+from spelgen.loaded_arm import load_arm
+from spelgen.render.inspection_page import page
+from spelgen.render.report_page import write_report
+
+pytestmark = pytest.mark.skipif(executable() is None, reason="no Chromium is installed")
+ACTIVE = "document.activeElement"
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    found = Chromium(tmp_path_factory.mktemp("profile"))
+    yield found
+    found.close()
+
+
+@pytest.fixture
+def pages(run, robots, tmp_path):  # noqa: F811
+    """The report of a run whose folder has its URDF, and what `inspect` writes of a longer arm."""
+    (run / "robot.urdf").write_bytes((robots / "rpr.urdf").read_bytes())
+    panda = load_arm(robots / "panda.urdf")
+    (tmp_path / "panda.html").write_text(page(panda.inspect(), urdf=panda.robot.path), encoding="utf-8")
+    return [write_report(run), tmp_path / "panda.html"]
+
+
+@pytest.mark.parametrize("width", [400, 1400])
+@pytest.mark.parametrize("dark", [False, True])
+def test_pages_say_nothing_ask_for_nothing_and_stay_within_their_width(browser, pages, width, dark):
+    for path in pages:
+        browser.open(path, width=width, dark=dark)
+        assert browser.run("document.documentElement.scrollWidth") <= width, path
+        assert browser.run("document.querySelector('canvas.arm').width") > 0
+        assert browser.problems == []
+        assert [url for url in browser.requests if not url.startswith("data:")] == [path.as_uri()]
+
+
+def test_without_script_the_arm_is_a_still_picture(browser, pages):
+    shown = (
+        "['.still', 'canvas.arm', '.controls'].map(x => getComputedStyle(document.querySelector(x)).display)"
+    )
+    browser.open(pages[0])
+    assert browser.run(shown) == ["none", "block", "flex"]
+    browser.open(pages[0], media="print")
+    assert browser.run(shown) == ["block", "none", "none"]
+    plain = pages[0].with_name("plain.html")
+    text = pages[0].read_text(encoding="utf-8")
+    plain.write_text(text.replace("script-src 'sha256", "script-src 'sha512"), encoding="utf-8")
+    browser.open(plain)  # the policy lets no script run whose digest it does not name
+    assert browser.run(shown) == ["block", "none", "none"]
+
+
+def test_the_policy_lets_nothing_else_run_or_load(browser, pages):
+    path = pages[0].with_name("attacked.html")
+    attack = "<script>window.attacked = 1</script><img src='http://127.0.0.1:9/x.png' onerror='window.attacked = 2'>"
+    text = pages[0].read_text(encoding="utf-8")
+    path.write_text(text.replace("</main>", attack + "</main>"), encoding="utf-8")
+    browser.open(path)
+    assert browser.run("window.attacked === undefined")
+    assert len(browser.problems) >= 2
+    assert browser.run("document.querySelector('canvas.arm').width") > 0
+
+
+def test_keys_lead_through_the_mass_matrix_and_light_its_joints(browser, pages):
+    browser.open(pages[0])
+    browser.run("document.querySelector('.matrix td').focus()")
+    told = "document.getElementById('entry').textContent"
+    assert browser.run(told).startswith("M11 depends on joints 2,3 only.")
+    before = browser.run("document.querySelector('canvas.arm').toDataURL()")
+    for key, code in (("ArrowDown", 40), ("ArrowRight", 39)):
+        browser.press(key, code)
+    assert browser.run(told).startswith("M22 is constant.")
+    assert browser.run(f"{ACTIVE}.classList.contains('lit') && {ACTIVE}.tabIndex === 0")
+    assert browser.run("document.querySelector('canvas.arm').toDataURL()") != before
+
+
+def test_keys_turn_the_arm_and_play_its_motion(browser, pages):
+    browser.open(pages[0])
+    picture = "document.querySelector('canvas.arm').toDataURL()"
+    before = browser.run(picture)
+    browser.run("document.querySelector('canvas.arm').focus()")
+    browser.press("ArrowLeft", 37)
+    assert browser.run(picture) != before
+    state = "document.getElementById('arm-play').getAttribute('aria-pressed')"
+    browser.press(" ", 32, " ")
+    assert browser.run(state) == "true"
+    browser.press(" ", 32, " ")
+    assert browser.run(state) == "false"
+    moved = "document.querySelectorAll('svg.chart[data-motion=\"prediction typical\"] .cursor').length"
+    assert browser.run(moved) == 12
+
+
+def test_everything_that_can_be_used_has_a_name(browser, pages):
+    unnamed = """[...document.querySelectorAll('button, select, input, canvas, a, [tabindex], svg[role]')]
+        .filter(x => !(x.getAttribute('aria-label') || x.textContent.trim())).map(x => x.outerHTML.slice(0, 80))"""
+    for path in pages:
+        browser.open(path)
+        assert browser.run(unnamed) == []
+        assert browser.run("document.querySelectorAll('h1').length") == 1
