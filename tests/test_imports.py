@@ -40,7 +40,7 @@ fitting: run_schema run_folder run_lock
 fitting: gaussian_prior adaptive rollout dataset streaming torque_samples torque_jacobian torque_fit
 fitting: optimizers torque_networks urdf_regularizer stages compiled process progress validation loop
 fitting: run_record fitted fit train
-evaluation: names stiff baselines torque rollout torque_traces traces examples invariants tables results
+evaluation: names stiff baselines torque rollout torque_traces traces examples invariants tables results csv_file
 evaluation: subject evaluate
 verify: agreement urdf_cross_check numeric_samples verify
 explain: reasons facts
@@ -54,7 +54,7 @@ exporting: mjcf_file mjcf_export torch_programs torch_export onnx_export
 exporting: rigid_expressions friction_expressions learned_expressions model_expressions tip_expressions entry_points
 exporting: c_statements c_networks c_code c_library c_export ros2_export casadi_export export
 render: charts plots picture page learned parameters reproduction verdict shapes scene still arm_section
-render: report_page inspection_page
+render: report_page runs_page inspection_page identification_page
 logs: statistics gravity report check_logs
 comparison: truth metrics study runs formatting
 render: logs_page comparison_page

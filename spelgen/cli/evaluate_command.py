@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import note, say
 from spelgen.cli.options import Data, Filter, Mapping, MoreData, Run, Trust
+from spelgen.files import write_text
 
 
 def evaluate(
@@ -18,9 +20,19 @@ def evaluate(
     data: Data = None,
     mapping: Mapping = None,
     filter: Filter = None,
+    format: Annotated[
+        Literal["text", "json", "csv"] | None,
+        typer.Option(help="Of the result; without it, by the suffix of -o, else text.", show_default=False),
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write it to a file.")
+    ] = None,
     trust: Trust = False,
 ) -> None:
-    """Judge a trained run on test logs, beside its baselines."""
+    """Judge a trained run on test logs, beside its baselines.
+
+    What it finds is kept in the run folder, as evaluation.json.
+    """
     paths = options.logs(data, more)
     import torch
 
@@ -39,21 +51,43 @@ def evaluate(
     write_json(RunFolder(run).evaluation, found.to_dict())
     for each in found.diagnostics:
         note(f"{each.severity}: {each.where}: {each.message}")
-    say(found.text())
+    suffix = output.suffix.lower() if output else ""
+    wanted = format or {".json": "json", ".csv": "csv"}.get(suffix, "text")
+    if wanted == "csv":
+        from spelgen.evaluation.csv_file import csv_text
+
+        text = csv_text(found.to_dict()).removesuffix("\n")
+    else:
+        text = found.text() if wanted == "text" else json.dumps(found.to_dict())
+    say(text if output is None else f"wrote {write_text(output, text + chr(10))}")
 
 
 def report(
-    run: Run,
+    runs: Annotated[
+        list[Path], typer.Argument(metavar="RUN...", help="Run folders; several are set side by side.")
+    ],
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", metavar="FILE", help="Default: report.html in the run folder."),
+        typer.Option(
+            "-o",
+            "--output",
+            metavar="FILE",
+            help="Default: report.html in the run folder; of several runs.html.",
+        ),
     ] = None,
     trust: Trust = False,
 ) -> None:
-    """Write one HTML page about a run."""
+    """Write one HTML page about a run, or about several side by side."""
     from spelgen.fitting.run_folder import RunFolder
-    from spelgen.render.report_page import write_report
 
     if trust:
-        RunFolder(run).load_module(trust=True)  # what ran once may run again
-    say(f"wrote {write_report(run, output)}")
+        for run in runs:
+            RunFolder(run).load_module(trust=True)  # what ran once may run again
+    if len(runs) == 1:
+        from spelgen.render.report_page import write_report
+
+        say(f"wrote {write_report(runs[0], output)}")
+    else:
+        from spelgen.render.runs_page import write_runs
+
+        say(f"wrote {write_runs(runs, output or Path('runs.html'))}")

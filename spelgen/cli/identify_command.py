@@ -39,7 +39,10 @@ def identify(
     coulomb_smoothing_velocity: Annotated[
         float, typer.Option(min=1e-6, help="Width of Coulomb friction's jump [rad/s, m/s].")
     ] = 0.01,
-    format: Annotated[Literal["text", "json"], typer.Option(help="Of the result.")] = "text",
+    format: Annotated[
+        Literal["text", "json", "html"] | None,
+        typer.Option(help="Of the result; without it, by the suffix of -o, else text.", show_default=False),
+    ] = None,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write to a file.")
     ] = None,
@@ -63,7 +66,14 @@ def identify(
     found = identified(arm, logs, method, preprocessing=Preprocessing(cutoff=filter))
     for each in found.diagnostics:
         note(f"{each.severity}: {each.where}: {each.message}")
-    result = found.text() if format == "text" else json.dumps(found.to_dict(), indent=2)
+    suffix = output.suffix.lower() if output else ""
+    wanted = format or {".html": "html", ".json": "json"}.get(suffix, "text")
+    if wanted == "html":
+        from spelgen.render.identification_page import page
+
+        result = page(found, arm)
+    else:
+        result = found.text() if wanted == "text" else json.dumps(found.to_dict(), indent=2)
     if output is None:
         say(result)
     else:

@@ -61,17 +61,17 @@ def result_tables(evaluation: Mapping[str, Any], joint_types: Sequence[str] = ()
     if horizons:
         heads = [_ahead(horizon) for horizon in horizons]
         title = "Error relative to the motion (0: none, 1: as if the arm had stood still)"
-        tables.append(_table(title, heads, [_of(horizon, "mean_relative_rms") for horizon in horizons]))
+        tables.append(table(title, heads, [_of(horizon, "mean_relative_rms") for horizon in horizons]))
         tips = [_of(horizon, "tip_mm") for horizon in horizons]
         if any(value is not None for tip in tips for value in tip.values()):
-            tables.append(_table("Error of the tip's position [mm]", heads, tips))
+            tables.append(table("Error of the tip's position [mm]", heads, tips))
         for k, (what, title) in enumerate((("q", "Position error"), ("qd", "Velocity error"))):
             unit, labels = _units(evaluation["joints"], types, k)
             tables.append(_by_joint(f"{title}{unit} after {heads[-1]}", labels, _of(horizons[-1], what)))
     torque = evaluation["torque"]
     if torque:
         mean = {name: errors["mean_nmse"] for name, errors in torque.items()}
-        tables.append(_table("Torque error of the inverse dynamics", ["nMSE, mean of all"], [mean]))
+        tables.append(table("Torque error of the inverse dynamics", ["nMSE, mean of all"], [mean]))
         rmse = {name: errors["rmse"] for name, errors in torque.items()}
         unit, labels = _units(evaluation["joints"], types, 2)
         tables.append(_by_joint(f"Torque error by joint, RMSE{unit}", labels, rmse))
@@ -114,12 +114,13 @@ def _of(horizon: Mapping[str, Any], what: str) -> dict[str, Any]:
 
 
 def _by_joint(title: str, joints: Sequence[str], values: Mapping[str, Sequence[float | None]]) -> Table:
-    return _table(
+    return table(
         title, joints, [{name: each[k] for name, each in values.items()} for k in range(len(joints))]
     )
 
 
-def _table(title: str, labels: Sequence[str], rows: Iterable[Mapping[str, float | None]]) -> Table:
+def table(title: str, labels: Sequence[str], rows: Iterable[Mapping[str, float | None]]) -> Table:
+    """Rows of numbers by column, the least of each marked."""
     rows = list(rows)
     cells = [_cells(list(row.values())) for row in rows]
     laid = tuple(Row(label, each) for label, each in zip(labels, cells, strict=True))

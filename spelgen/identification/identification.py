@@ -121,7 +121,7 @@ class Identification:
     def text(self) -> str:
         """For a terminal, 80 columns."""
         residuals, parameters = self.listings()
-        parts = [textwrap.fill(self._heading(), WIDTH), self._quality(), residuals.text(), parameters.text()]
+        parts = [textwrap.fill(self.heading(), WIDTH), self.quality(), residuals.text(), parameters.text()]
         formulas = zip(self.base.names, self.base.formulas(), strict=True)
         meant = [
             textwrap.fill(f"{name} = {formula}", WIDTH, initial_indent="  ", subsequent_indent=" " * 8)
@@ -152,12 +152,13 @@ class Identification:
         )
 
     def __repr__(self) -> str:
-        return f"<Identification of {self._heading()}>"
+        return f"<Identification of {self.heading()}>"
 
     def _repr_html_(self) -> str:
         return "".join(listing.html() for listing in self.listings())
 
-    def _heading(self) -> str:
+    def heading(self) -> str:
+        """What was fitted to what."""
         count, drives = len(self.trajectories), len(self.base) - self.base.bodies
         weighted = _WEIGHTED[self.method.weights]
         if self.method.ridge:
@@ -169,7 +170,8 @@ class Identification:
             f"from {self.samples} samples of {count} trajector{'y' if count == 1 else 'ies'}, {weighted}."
         )
 
-    def _quality(self) -> str:
+    def quality(self) -> str:
+        """How well posed the fit is, and how many parameters are how sure."""
         if self.unseen:
             directions = f"{self.unseen} direction{'s' * (self.unseen > 1)}"
             conditioned = (

@@ -44,7 +44,7 @@ def parameter_tables(
     """All that is known of a run's parameters; `identified`: what least squares found of the same logs."""
     found = [] if model is None else [*_bodies(model, arm), *_joints(model, arm)]
     if arm is not None and identified and "base_parameters" in identified:
-        found.insert(0, _base(model, arm, identified))
+        found.insert(0, base_table(model, arm, identified))
     return found
 
 
@@ -58,8 +58,11 @@ def body_parameters(model: Any) -> np.ndarray | None:
     return values
 
 
-def _base(model: Any | None, arm: LoadedArm, identified: Mapping[str, Any]) -> ParameterTable:
-    base = base_parameters(arm.arm, FrictionModel())
+def base_table(model: Any | None, arm: LoadedArm, identified: Mapping[str, Any]) -> ParameterTable:
+    """What least squares found, beside the URDF and, where there is one, a closed-form model."""
+    effects = identified["method"]["effects"]
+    friction = FrictionModel(stribeck="stribeck" in effects, polynomial="cubic" in effects)
+    base = base_parameters(arm.arm, friction)
     drives = len(base.parameters) - 10 * len(arm.arm.bodies)
     nominal = base.combination @ np.concatenate([urdf_parameters(arm.arm), np.zeros(drives)])
     learned = _learned(model, base.combination)

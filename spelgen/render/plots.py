@@ -65,10 +65,10 @@ def growth_charts(growth: Mapping[str, Any]) -> list[Panel]:
     for what, label in (("relative", "error / motion"), ("tip_mm", "error of the tip [mm]")):
         shown: list[Line | Band] = []
         for name, x in growth[what].items():
-            shown.append(Line(f"{name}, median", seconds, _numbers(x["median"]), style(name)))
+            shown.append(Line(f"{name}, median", seconds, numbers(x["median"]), style(name)))
             if name in (MODEL, LEAST_SQUARES):
                 shown.append(
-                    Band(f"{name}, 10 to 90 %", seconds, _numbers(x["low"]), _numbers(x["high"]), style(name))
+                    Band(f"{name}, 10 to 90 %", seconds, numbers(x["low"]), numbers(x["high"]), style(name))
                 )
         if shown:
             title = "Relative to the motion" if what == "relative" else "Of the tip"
@@ -83,8 +83,8 @@ def growth_charts(growth: Mapping[str, Any]) -> list[Panel]:
 
 def torque_panels(trace: Mapping[str, Any], joints: Sequence[str], joint_types: Sequence[str]) -> list[Panel]:
     """By joint: measured and predicted torque, what is left, and what the prediction is made of."""
-    t, measured = trace["t"], _numbers(trace["measured"])
-    predicted = _numbers(trace["predicted"][MODEL])
+    t, measured = trace["t"], numbers(trace["measured"])
+    predicted = numbers(trace["predicted"][MODEL])
     panels = []
     for k, (name, kind) in enumerate(zip(joints, joint_types, strict=True)):
         unit, motion = FORCE[kind], f"torque {trace['which']}"
@@ -93,7 +93,7 @@ def torque_panels(trace: Mapping[str, Any], joints: Sequence[str], joint_types: 
             Line("predicted", t, predicted[:, k], "predicted"),
         ]
         left = [Line("measured less predicted", t, measured[:, k] - predicted[:, k], "model")]
-        parts = [Line(part, t, _numbers(trace["parts"][part])[:, k], style) for part, style in PARTS.items()]
+        parts = [Line(part, t, numbers(trace["parts"][part])[:, k], style) for part, style in PARTS.items()]
         panels.append(
             Panel(
                 name,
@@ -116,7 +116,7 @@ def trajectory_panels(
     for k, (name, kind) in enumerate(zip(joints, joint_types, strict=True)):
         charts = []
         for (key, what), unit in zip(QUANTITIES.items(), UNITS[kind], strict=True):
-            true, found = _numbers(example[key])[:, k], _numbers(example[f"predicted_{key}"])[:, k]
+            true, found = numbers(example[key])[:, k], numbers(example[f"predicted_{key}"])[:, k]
             last = key == "qd"
             lines = [Line("measured", t, true, "truth"), Line("predicted", t, found, "predicted")]
             off = [Line("predicted less measured", t, found - true, "model")]
@@ -141,8 +141,7 @@ def mass_panels(
         if picture[i][j].kind == "zero":
             continue
         lines = [
-            Line(name, mass["t"], _numbers(x["entries"][place]), style(name))
-            for name, x in mass["by"].items()
+            Line(name, mass["t"], numbers(x["entries"][place]), style(name)) for name, x in mass["by"].items()
         ]
         unit, name = inertia_unit(joint_types[i], joint_types[j]), entry_name(i, j)
         chart = line_chart(lines, f"{name} along the trajectory", "t [s]", f"{name} [{unit}]", width=330)
@@ -153,7 +152,7 @@ def mass_panels(
 def eigenvalue_chart(mass: Mapping[str, Any]) -> Markup:
     """The least and the largest eigenvalue of M along a trajectory; what is not positive is not drawn."""
     lines = [
-        Line(f"{name}, {which}", mass["t"], _numbers(x["eigenvalues"][row]), style(name))
+        Line(f"{name}, {which}", mass["t"], numbers(x["eigenvalues"][row]), style(name))
         for name, x in mass["by"].items()
         for row, which in ((0, "least"), (-1, "largest"))
     ]
@@ -166,12 +165,12 @@ def friction_panels(
     """By joint: friction by velocity, over what the rigid bodies leave of the measured torque."""
     panels = []
     for k, (name, kind) in enumerate(zip(joints, joint_types, strict=True)):
-        curves = {label: _numbers(x[k]) for label, x in friction["by"].items()}
+        curves = {label: numbers(x[k]) for label, x in friction["by"].items()}
         left = friction["measured"][k]
         dots = Dots(
             "measured torque less that of the rigid bodies",
-            _numbers(left["qd"]),
-            _numbers(left["torque"]),
+            numbers(left["qd"]),
+            numbers(left["torque"]),
             "truth",
         )
         limits = _robust_limits(dots.y, curves.get(MODEL, np.zeros(1)))
@@ -219,7 +218,7 @@ def energy_chart(trace: Mapping[str, Any]) -> Markup:
     """Where the drives' work went."""
     styles = ("truth", "urdf", "friction", "model")
     lines = [
-        Line(name, trace["t"], _numbers(x), style)
+        Line(name, trace["t"], numbers(x), style)
         for (name, x), style in zip(trace["energy"].items(), styles, strict=True)
     ]
     return line_chart(
@@ -262,6 +261,6 @@ def _robust_limits(dots: Any, curve: np.ndarray) -> tuple[float, float] | None:
     return float(min(low, np.nanmin(curve)) - room), float(max(high, np.nanmax(curve)) + room)
 
 
-def _numbers(values: Any) -> np.ndarray:
+def numbers(values: Any) -> np.ndarray:
     """Nested lists, None where not finite, as an array."""
     return np.array(values, dtype=float)
