@@ -6,7 +6,8 @@ const arm = (() => {
   if (!canvas || !told) return null;
   const scene = JSON.parse(told.textContent);
   const context = canvas.getContext("2d");
-  const state = { motion: 0, time: 0, playing: false, yaw: scene.yaw, pitch: scene.pitch, lit: null, colour: "error" };
+  const state = { motion: 0, time: 0, playing: false, yaw: scene.yaw, pitch: scene.pitch, lit: null };
+  state.colour = scene.motions[0].error ? "error" : "known";
   const LIGHT = [-0.352, 0.624, 0.704];
   let ink = {};
   const readColours = () => {

@@ -1,17 +1,23 @@
 """Baselines: integrated as accurately as they need, whatever the model needs, and identified from the same logs."""
 
+import json
 import math
 
 import numpy as np
 import pytest
 import torch
+from typer.testing import CliRunner
 
-from spelgen.dynamics.regressor import body_torque, regressor
+from spelgen.cli.main import app
+from spelgen.dynamics.regressor import body_torque, regressor, urdf_parameters
+from spelgen.dynamics.regressor_dynamics import RegressorDynamics
 from spelgen.evaluation.baselines import of_urdf
 from spelgen.evaluation.names import URDF, URDF_WITH_DRIVES
 from spelgen.evaluation.stiff import accurate_solver, roll_out_stiff
 from spelgen.loaded_arm import load_arm
+from spelgen.logs.read import Trajectory, write_logs
 from spelgen.logs.windows import Windows
+from spelgen.pipeline import generate
 
 
 class Slider:
@@ -99,3 +105,42 @@ def test_the_urdf_stands_once_as_it_is_and_once_with_its_drives(robots):
     for found, joint in zip(back, rotors, strict=True):
         assert found == pytest.approx(-5 * joint.viscous + joint.coulomb[1])
     assert not math.isnan(sum(lost))
+
+
+def test_least_squares_is_kept_with_a_run_and_stands_in_its_evaluation(robots, tmp_path):
+    """End to end on the command line: torques of the URDF's own bodies are explained by both, the model and it."""
+    arm = load_arm(robots / "rpr.urdf")
+    bodies = RegressorDynamics(arm.arm, urdf_parameters(arm.arm), np.full(3, 0.1), lambda qd: 0.5 * qd)
+    names = [coordinate.name for coordinate in arm.arm.coordinates]
+    t = np.arange(500) / 100
+    for role, seed in (("train", 0), ("test", 1)):
+        phases = np.random.default_rng(seed).uniform(0, 6, (3, 3, 1))
+        waves = [(k + 1) * t + phases[k] for k in range(3)]
+        q = sum(0.1 * np.sin(x) for x in waves).T + np.array([0, 0.3, 0])
+        qd = sum(0.1 * (k + 1) * np.cos(x) for k, x in enumerate(waves)).T
+        qdd = sum(-0.1 * (k + 1) ** 2 * np.sin(x) for k, x in enumerate(waves)).T
+        tau = bodies.inverse_dynamics(q, qd, qdd)
+        write_logs(tmp_path / "logs" / f"{role}.parquet", [Trajectory(t=t, q=q, qd=qd, tau=tau)], names)
+    module, folder = tmp_path / "rpr.py", tmp_path / "run"
+    module.write_text(generate(robots / "rpr.urdf", "closed-form"), encoding="utf-8")
+    logs = ["--data", str(tmp_path / "logs")]
+    for command in (
+        ["train", str(module), "--robot", str(robots / "rpr.urdf"), *logs, "-o", str(folder), "--quiet"],
+        ["evaluate", str(folder), *logs, "-o", str(tmp_path / "found.csv")],
+        ["report", str(folder)],
+    ):
+        done = CliRunner().invoke(app, command)
+        assert done.exit_code == 0, done.output
+    found = json.loads((folder / "evaluation.json").read_text())
+    assert {"model", "least squares"} <= set(found["torque"])
+    assert found["torque"]["least squares"]["mean_nmse"] < 1e-3
+    assert found["horizons"][-1]["errors"]["least squares"]["mean_relative_rms"] < 0.05
+    (trace,) = found["traces"]["torques"]
+    parts = sum(np.array(part) for part in trace["parts"].values())
+    np.testing.assert_allclose(parts, trace["predicted"]["model"], atol=0.05)  # but for the offset
+    energy = {name: np.array(x) for name, x in trace["energy"].items()}
+    left = energy["work of the drives"] - energy["stored"] - energy["friction"] - energy["not explained"]
+    assert np.abs(left).max() < 1e-3
+    assert "torque nMSE" in (tmp_path / "found.csv").read_text()
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert "Base parameters" in page and "there are no epochs" in page and "Masses, centres of mass" in page

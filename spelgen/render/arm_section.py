@@ -40,12 +40,12 @@ class Cell:
 
 @dataclass(frozen=True)
 class ArmSection:
-    """data: for the script. motions: their names. coloured: whether links can be coloured by identifiability."""
+    """data: for the script. motions: their names. coloured: what the links can be coloured by."""
 
     picture: Markup
     data: Markup
     motions: tuple[str, ...]
-    coloured: bool
+    coloured: tuple[str, ...]
     found: bool
 
 
@@ -119,7 +119,11 @@ def arm_section(
         ),
         data=json_data(data),
         motions=tuple(motion["told"] for motion in motions),
-        coloured=colours is not None,
+        coloured=tuple(
+            told
+            for told, there in (("error", "error" in motions[0]), ("known", colours is not None))
+            if there
+        ),
         found=drawn.found,
     )
 

@@ -200,6 +200,8 @@ def _labelled(axis: Axis) -> list[tuple[float, str | Markup]]:
     if powers and all(math.isclose(power, round(power), abs_tol=1e-9) for power in powers):
         text = Markup('10<tspan dy="-5" class="power">{}</tspan>')
         return [(tick, text.format(round(power))) for tick, power in zip(ticks, powers, strict=True)]
+    if axis.log:
+        return [(tick, f"{tick:g}") for tick in ticks]
     decimals = max((_decimals(tick) for tick in ticks), default=0)
     plain = decimals <= 4 and max(map(abs, ticks), default=0.0) < 1e5
     return [(tick, f"{tick:.{decimals}f}" if plain else f"{tick:.2g}") for tick in ticks]

@@ -66,29 +66,33 @@ def base_table(model: Any | None, arm: LoadedArm, identified: Mapping[str, Any])
     drives = len(base.parameters) - 10 * len(arm.arm.bodies)
     nominal = base.combination @ np.concatenate([urdf_parameters(arm.arm), np.zeros(drives)])
     learned = _learned(model, base.combination)
-    known = arm.arm.has_inertials
     rows: dict[bool, list[tuple[str, ...]]] = {True: [], False: []}
     for k, each in enumerate(identified["base_parameters"]):
-        of_bodies = k < base.bodies
+        of_bodies, of_drives = k < base.bodies, each["name"].startswith("armature")
         away = each["deviation"]
+        own = [] if learned is None else [f"{learned[k]:.4g}" if of_bodies or of_drives else ""]
         rows[each["determined"] in SURE_WORDS].append(
             (
                 each["name"],
-                f"{nominal[k]:.4g}" if of_bodies and known else "",
-                f"{learned[k]:.4g}"
-                if learned is not None and (of_bodies or each["name"].startswith("armature"))
-                else "",
+                f"{nominal[k]:.4g}" if of_bodies and arm.arm.has_inertials else "",
+                *own,
                 f"{each['value']:.4g}" + ("" if away is None else f" ± {SURE * away:.2g}"),
                 each["determined"],
                 "" if each["formula"] == each["name"] else each["formula"],
             )
         )
+    model_head = () if learned is None else ("model",)
+    told = "The intervals are those of least squares on the training logs [kg, m, s]"
+    if learned is not None:
+        told += (
+            "; a value of the model outside its interval is either drawn there by the URDF, or tells of an effect "
+            "that least squares has no column for"
+        )
     return ParameterTable(
         "Base parameters: the only combinations that motion shows",
-        ("parameter", "URDF", "model", "least squares, 95 %", "determined", "made of"),
+        ("parameter", "URDF", *model_head, "least squares, 95 %", "determined", "made of"),
         tuple(rows[True]),
-        "The intervals are those of least squares on the training logs [kg, m, s]; a value of the model outside "
-        "its interval is either drawn there by the URDF, or tells of an effect that least squares has no column for.",
+        f"{told}.",
         tuple(rows[False]),
         f"{len(rows[False])} more that these logs hardly tell from zero",
     )

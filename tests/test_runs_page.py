@@ -1,0 +1,71 @@
+"""Several runs on one page, an identification as a page, and an evaluation as a table for programs."""
+
+import csv
+import io
+import json
+import shutil
+
+import numpy as np
+import pytest
+from html_page import Page
+from test_report import EVALUATION, run  # noqa: F401  (a fixture)
+from typer.testing import CliRunner
+
+from spelgen.cli.main import app
+from spelgen.errors import RunError
+from spelgen.evaluation.csv_file import HEAD, csv_text
+from spelgen.identification.identify import identify
+from spelgen.loaded_arm import load_arm
+from spelgen.logs.trajectory import Trajectory
+from spelgen.render.identification_page import page
+from spelgen.render.runs_page import render_runs
+
+
+def test_runs_stand_side_by_side_and_the_better_one_is_named(run, tmp_path):  # noqa: F811
+    better = tmp_path / "better"
+    shutil.copytree(run, better)
+    changed = json.loads(json.dumps(EVALUATION))
+    for horizon in changed["horizons"]:
+        horizon["errors"]["model"]["mean_relative_rms"] /= 2
+    changed["torque"]["model"]["mean_nmse"] = 0.02
+    (better / "evaluation.json").write_text(json.dumps(changed))
+    text = " ".join(" ".join(Page(render_runs([run, better])).text).split())
+    assert (
+        "better predicts best over 1 s (0.00615 of the motion missed) and run has the least torque error"
+        in text
+    )
+    result = CliRunner().invoke(app, ["report", str(run), str(better), "-o", str(tmp_path / "both.html")])
+    assert result.exit_code == 0 and (tmp_path / "both.html").exists()
+
+
+def test_a_run_without_evaluation_cannot_be_set_beside_others(run):  # noqa: F811
+    (run / "evaluation.json").unlink()
+    with pytest.raises(RunError, match=r"not evaluated.*spelgen evaluate"):
+        render_runs([run, run])
+
+
+def test_the_table_holds_every_figure_once_with_its_unit():
+    evaluation = EVALUATION | {"joint_types": ["revolute", "prismatic", "revolute"]}
+    head, *rows = csv.reader(io.StringIO(csv_text(evaluation)))
+    assert tuple(head) == HEAD
+    found = {tuple(row[:-1]): row[-1] for row in rows}
+    assert len(found) == len(rows)
+    assert found["q RMS", "m", "1.0", "joint2", "", "model"] == "0.02"
+    assert found["tip RMS", "mm", "1.0", "", "", "velocity stays constant"] == "26.0"
+    assert found["relative RMS", "1", "1.0", "", "", "URDF"] == ""
+    assert found["torque RMSE", "N", "", "joint2", "", "model"] == "2.0"
+    assert found["relative error, 50 % of the starts", "1", "1.0", "", "", "model"] == "0.3"
+
+
+def test_an_identification_is_a_page_that_tells_what_the_text_tells(robots):
+    arm = load_arm(robots / "rpr.urdf")
+    t = np.arange(600) / 100
+    q, qd, tau = (np.stack([f(k) for k in (1, 2, 3)], axis=1) for f in (
+        lambda k: np.sin(k * t) / 4, lambda k: k * np.cos(k * t) / 4, lambda k: np.sin(k * t + k)
+    ))  # fmt: skip
+    found = identify(arm, Trajectory(t=t, q=q, qd=qd, tau=tau))
+    shown = Page(page(found, arm))
+    text = " ".join(" ".join(shown.text).split())
+    for each in found.to_dict()["base_parameters"]:
+        assert each["name"] in text and f"{each['value']:.4g}" in text
+    assert " ".join(found.quality().split()) in text
