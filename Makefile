@@ -11,7 +11,7 @@ export OMP_NUM_THREADS ?= 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check format bench golden lock clean
+.PHONY: help demo test check docs format bench golden lock clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
@@ -35,6 +35,9 @@ check: $(STAMP) ## format, lint, types, import direction, golden files, examples
 	$(BIN)/mypy
 	$(BIN)/python -m pytest -q tests/test_imports.py tests/test_docs.py tests/test_emit.py::test_golden_text
 
+docs: $(STAMP) ## write the docs as a site into site/
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+
 format: $(STAMP) ## format the code and sort the imports
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
@@ -56,7 +59,7 @@ lock: ## write requirements.txt anew: the newest versions that the ranges of pyp
 	rm -rf .lock-venv
 
 clean: ## remove the environment, caches and demo output
-	rm -rf $(VENV) .lock-venv $(DEMO) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) .lock-venv $(DEMO) site build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
 
 # Everything pinned; made once, and again when the pins or the package's metadata change.
 $(STAMP): requirements.txt pyproject.toml
