@@ -186,12 +186,12 @@ def test_the_same_run_and_logs_give_the_same_file(run):
     assert files[0] == files[1]
     assert "stand_in on 4 test trajectories; * marks the best of a row" in shown.stdout
     found = json.loads(files[0], parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
-    assert found["schema"] == 2
-    assert [x["trajectory"] for x in found["examples"]] == ["motion_10", "motion_12"]
-    joint = found["examples"][0]["joints"][1]
-    assert joint["name"] == "elbow"
-    assert len(joint["q_true"]) == len(found["examples"][0]["t"]) == 21
-    np.testing.assert_allclose(joint["qd_pred"], joint["qd_true"], atol=1e-4)
+    assert found["schema"] == 3
+    shown = found["traces"]["trajectories"]
+    assert [x["which"] for x in shown] == ["typical", "worst"]
+    assert len(shown[0]["q"]) == len(shown[0]["t"]) == 21 and len(shown[0]["q"][0]) == 2
+    np.testing.assert_allclose(shown[0]["predicted_qd"], shown[0]["qd"], atol=1e-3)
+    assert shown[0]["error"] <= shown[1]["error"]
 
 
 def test_what_could_not_be_done_is_said(run):

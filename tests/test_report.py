@@ -66,7 +66,6 @@ EVALUATION = {
     "energy_drift": 8e-10,
     "diagnostics": [{"severity": "info", "code": "x", "where": "logs", "line": None,
                      "message": "<b>said</b>"}],
-    "examples": [],
     "traces": traces("traj_00"),
 }  # fmt: skip
 

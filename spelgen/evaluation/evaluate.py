@@ -15,7 +15,6 @@ from spelgen.evaluation.baselines import (
     of_dynamics,
     of_urdf,
 )
-from spelgen.evaluation.examples import Example, predict_examples
 from spelgen.evaluation.invariants import energy_drift
 from spelgen.evaluation.names import MODEL
 from spelgen.evaluation.results import Horizon, Results, state_errors, torque_summary
@@ -87,7 +86,6 @@ def evaluate(
             if x.torque and samples
         },
         energy_drift=energy_drift(judged.model, probe),
-        examples=_examples(predictors[0], pieces, lengths, judged.joints, used),
         traces=traces(
             predictors, pieces, max(lengths.values(), default=0), joint_types,
             used=used, tip=None if tip is None else tip.position,
@@ -148,18 +146,6 @@ def _horizon(
     position = None if tip is None else tip.position
     errors = {x.name: state_errors(x, windows, joint_types, position) for x in predictors}
     return Horizon(name, steps, windows.dt.sum(dim=1).mean().item(), len(windows), errors)
-
-
-def _examples(
-    predictor: Predictor,
-    pieces: Sequence[Trajectory],
-    lengths: dict[str, int],
-    joints: Sequence[str],
-    used: Preprocessing,
-) -> tuple[Example, ...]:
-    if not lengths:
-        return ()
-    return predict_examples(predictor, pieces, max(lengths.values()), joints, measured=used.filtered)
 
 
 def _urdf_baseline(judged: Subject, probe: Windows, notes: list[Diagnostic]) -> list[Predictor]:

@@ -11,14 +11,13 @@ import torch
 
 from spelgen.errors import Diagnostic
 from spelgen.evaluation.baselines import Predictor
-from spelgen.evaluation.examples import Example
 from spelgen.evaluation.names import MODEL
 from spelgen.evaluation.tables import result_tables, verdict
 from spelgen.evaluation.torque import TorqueErrors
 from spelgen.fitting.rollout import position_difference
 from spelgen.logs.windows import Windows
 
-SCHEMA = 2
+SCHEMA = 3
 
 
 @dataclass(frozen=True)
@@ -72,7 +71,7 @@ class Results:
     cutoff: of the filter on the test logs [Hz], None without. substeps: of rk4 between samples. parameters: trained
     numbers of the model. torque: by predictor, empty where the logs are too sparse. energy_drift: of the model
     without input and dissipation over 1 s, integrated to thirteen digits, relative to its kinetic energy; None where
-    the logs never move. examples: over the longest horizon. traces: the curves behind the figures, see `traces.py`.
+    the logs never move. traces: the curves behind the figures, see `traces.py`.
     """
 
     robot: str
@@ -84,7 +83,6 @@ class Results:
     horizons: tuple[Horizon, ...]
     torque: dict[str, TorqueSummary]
     energy_drift: float | None
-    examples: tuple[Example, ...]
     diagnostics: tuple[Diagnostic, ...]
     traces: dict[str, Any] = field(default_factory=dict)
     joint_types: tuple[str, ...] = ()
