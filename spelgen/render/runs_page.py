@@ -14,7 +14,6 @@ from spelgen.evaluation.names import MODEL
 from spelgen.evaluation.tables import Table, table
 from spelgen.files import write_text
 from spelgen.fitting.run_folder import RunFolder
-from spelgen.identification.baseline import FILE
 from spelgen.labels import listed
 from spelgen.listing import number
 from spelgen.render.charts import Band, Line, line_chart
@@ -71,11 +70,11 @@ def _names(folders: Sequence[Path]) -> list[str]:
 
 def _shown(folder: Path, name: str, index: int) -> RunShown:
     run = RunFolder(folder)
-    config = run.read_json(run.config)
+    config = run.read_config()
     if not run.evaluation.is_file():
         raise RunError("a run that is not evaluated", file=folder, do="spelgen evaluate")
     evaluation = run.read_json(run.evaluation)
-    identified = run.read_json(run.path / FILE) if (run.path / FILE).is_file() else None
+    identified = run.read_json(run.baseline) if run.baseline.is_file() else None
     return RunShown(
         name=name,
         style=STYLES[index % len(STYLES)],
