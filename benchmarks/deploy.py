@@ -30,8 +30,9 @@ from spelgen.exporting.description import FrictionLaw, TrainedModel
 from spelgen.exporting.entry_points import ENTRY_POINTS, expression_function
 from spelgen.exporting.mjcf_export import check_mjcf
 from spelgen.exporting.mjcf_file import mjcf_text
-from spelgen.exporting.onnx_export import onnx_files, onnx_session
-from spelgen.exporting.parity import Parity, check_parity
+from spelgen.exporting.onnx_export import called_by_onnx, onnx_session
+from spelgen.exporting.onnx_model import ENTRIES, onnx_model
+from spelgen.exporting.parity import Called, Parity, check_parity
 from spelgen.exporting.rigid_body_projection import rigid_body_projection
 from spelgen.exporting.trained import Trained
 from spelgen.loaded_arm import load_arm
@@ -57,28 +58,28 @@ def trained(robot: str, preset: str, size: float = 0.05) -> Trained:
 def parity() -> None:
     """The largest difference to the torch module at STATES states, relative to the largest value, by export."""
     names = [entry.name for entry in ENTRY_POINTS]
-    print(f"{'':24s}{'C double':>12s}{'C float':>12s}{'CasADi':>12s}{'MuJoCo':>12s}")
+    print(f"{'':24s}{'C double':>12s}{'C float':>12s}{'CasADi':>12s}{'ONNX':>12s}{'MuJoCo':>12s}")
     for robot in ARMS:
         for preset in PRESETS:
             each = trained(robot, preset)
             model = each.described
 
-            def worst(
-                called: Callable[..., object], each: Trained = each, memory: int = model.memory
-            ) -> float:
-                found = check_parity(called, each, names, np.inf, memory=memory, states=STATES)
-                return _largest(found)
+            def worst(called: Called, asked: list[str] = names, each: Trained = each) -> float:
+                memory = each.described.memory
+                return _largest(check_parity(called, each, asked, np.inf, memory=memory, states=STATES))
 
             with tempfile.TemporaryDirectory() as folder:
                 kinds = (("", np.float64), (f"-D{model.name.upper()}_FLOAT", np.float32))
                 c = [worst(library(model, Path(folder), flag, kind)) for flag, kind in kinds]
             casadi = worst(called_by_state(casadi_functions(model)))
+            onnx = worst(called_by_onnx({name: onnx_model(model, name) for name in ENTRIES}), list(ENTRIES))
             projection = rigid_body_projection(each.model, each.arm)
             gains = model.inputs
             text = mjcf_text(projection, gains, each.tip_in_body)
             mujoco = _largest(check_mjcf(text, projection, gains, STATES))
             print(
-                f"{robot:12s}{preset:12s}" + "".join(f"{x:12.1e}" for x in (*c, casadi, mujoco)), flush=True
+                f"{robot:12s}{preset:12s}" + "".join(f"{x:12.1e}" for x in (*c, casadi, onnx, mujoco)),
+                flush=True,
             )
 
 
@@ -177,13 +178,12 @@ def latency(robot: str = "ur10e") -> None:
             show("compiled forward_dynamics", lambda: compiled.forward_dynamics(q, qd, tau))  # noqa: B023
         print(f"{preset}, ONNX Runtime")
         given = {"q": q, "qd": qd, "tau": tau, "qdd": tau}
-        files = onnx_files(each, ["forward_dynamics", "inverse_dynamics"])
-        for name, content in files.items():
-            session = onnx_session(content)
+        for name in ("forward_dynamics", "inverse_dynamics"):
+            session = onnx_session(onnx_model(model, name))
             wanted = [x.name for x in session.get_inputs()]
             states = {key: given[key].numpy()[None] for key in wanted if key in given}
             if "z" in wanted:
-                states["z"] = np.zeros((1, model.n, model.memory // model.n))
+                states["z"] = np.zeros((1, model.memory))
             show(name, lambda: session.run(None, states))  # noqa: B023
     print("Pinocchio, Python")
     arm = load_arm(ROBOTS / f"{robot}.urdf")

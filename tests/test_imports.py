@@ -50,7 +50,7 @@ simulation: simulate
 excitation: design
 identification: identify baseline
 exporting: description tip_chain describe trained parity exported readme rigid_body_projection urdf_file urdf_export
-exporting: mjcf_file mjcf_export torch_programs torch_export onnx_export
+exporting: mjcf_file mjcf_export torch_programs torch_export onnx_graph onnx_rigid onnx_learned onnx_model onnx_export
 exporting: rigid_expressions friction_expressions learned_expressions model_expressions tip_expressions entry_points
 exporting: c_statements c_networks c_code c_library c_export ros2_export casadi_export export
 render: charts plots picture page learned parameters reproduction verdict shapes scene still arm_section

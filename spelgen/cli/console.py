@@ -24,7 +24,7 @@ BROKEN_PIPE = 141  # 128 + SIGPIPE
 EXTRAS = {
     "pinocchio": "simulate",
     "casadi": "deploy",
-    **dict.fromkeys(("mujoco", "onnx", "onnxruntime", "onnxscript", "safetensors"), "deploy"),
+    **dict.fromkeys(("mujoco", "onnx", "onnxruntime", "safetensors"), "deploy"),
 }  # top-level module that only an extra brings -> the extra
 
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]

@@ -126,5 +126,5 @@ def _foreign(preset: str, what: str) -> RunError:
     return RunError(
         f"the preset {preset}, which has {what}",
         expected="closed-form, or minimal with tanh networks",
-        do="--to onnx, torch and urdf take every preset",
+        do="--to torch, mjcf and urdf take every preset",
     )

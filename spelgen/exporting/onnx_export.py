@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
-import logging
-import warnings
-from collections.abc import Iterator
+from collections.abc import Mapping
 from typing import Any
 
 import onnxruntime
-import torch
 
 from spelgen.exporting.exported import Exported
-from spelgen.exporting.parity import Values, check_parity
+from spelgen.exporting.onnx_model import ENTRIES, onnx_model
+from spelgen.exporting.parity import Called, Values, check_parity
 from spelgen.exporting.readme import UNITS, readme
-from spelgen.exporting.torch_programs import PROGRAMS, export_program, without_linear_algebra
 from spelgen.exporting.trained import Trained
 
 TOLERANCE = 1e-10
@@ -23,58 +18,36 @@ TOLERANCE = 1e-10
 
 def export_onnx(trained: Trained) -> Exported:
     """An .onnx for each entry point. Raises RunError where ONNX Runtime gives something else than the model."""
-    files = onnx_files(trained, list(PROGRAMS))
-    sessions = {name: onnx_session(content) for name, content in files.items()}
-
-    def called(name: str, inputs: Values) -> Values:
-        _, given, output = PROGRAMS[name]
-        (found,) = sessions[f"{name}.onnx"].run([output], {key: inputs[key] for key in given})
-        return {output: found}
-
-    parity = check_parity(called, trained, list(PROGRAMS), TOLERANCE)
+    model = trained.described
+    files = {name: onnx_model(model, name) for name in ENTRIES}
+    parity = check_parity(called_by_onnx(files), trained, list(ENTRIES), TOLERANCE, memory=model.memory)
     checked = f"Checked when exported, by ONNX Runtime {onnxruntime.__version__}: {parity.summary}."
     use = (
         "onnxruntime.InferenceSession('forward_dynamics.onnx').run(['qdd'], {'q': q, 'qd': qd, 'tau': tau}), "
         "float64 (batch, n), any batch."
     )
-    about = f"{UNITS}; one file an entry point: {', '.join(PROGRAMS)}."
-    name = trained.arm.arm.name
-    text = readme(f"Dynamics of {name} in ONNX", use, trained.joint_names, about, checked)
-    return Exported("onnx", name, {**files, "README.md": text}, (checked,))
+    memory = f"; z, friction's memory, is (batch, {model.memory})" if model.memory else ""
+    about = f"{UNITS}{memory}; one file an entry point: {', '.join(ENTRIES)}."
+    text = readme(f"Dynamics of {model.robot} in ONNX", use, trained.joint_names, about, checked)
+    contents = {f"{name}.onnx": content for name, content in files.items()}
+    return Exported("onnx", model.robot, {**contents, "README.md": text}, (checked,))
 
 
-def onnx_files(trained: Trained, names: list[str]) -> dict[str, bytes]:
-    """The ONNX of these entry points, by file name."""
-    prepared, files = trained.model.prepared(), {}
-    for name in names:
-        _, inputs, output = PROGRAMS[name]
-        program = without_linear_algebra(export_program(prepared, name))
-        with _quiet():
-            made: Any = torch.onnx.export(
-                program, dynamo=True, input_names=list(inputs), output_names=[output], verbose=False
-            )
-        buffer = io.BytesIO()
-        made.save(buffer)
-        files[f"{name}.onnx"] = buffer.getvalue()
-    return files
+def called_by_onnx(files: Mapping[str, bytes]) -> Called:
+    """The entry points in ONNX Runtime, for arrays of states."""
+    sessions = {name: onnx_session(content) for name, content in files.items()}
+
+    def called(name: str, inputs: Values) -> Values:
+        session = sessions[name]
+        (found,) = session.run(None, {each.name: inputs[each.name] for each in session.get_inputs()})
+        return {ENTRIES[name][1]: found}
+
+    return called
 
 
 def onnx_session(content: bytes) -> Any:
     """A session on one core: the matrices are small."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 3  # an input that a graph does not need is no matter
     return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Without the exporter's remarks on packages that are not needed."""
-    logger = logging.getLogger("torch.onnx")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        logger.setLevel(level)

@@ -46,34 +46,3 @@ def program_inputs(model: PreparedModel, name: str) -> tuple[str, ...]:
     """An entry point's inputs: z, (batch, n, K), is among them where friction has a memory and a part in it."""
     _, inputs, _ = PROGRAMS[name]
     return (*inputs, "z") if model.elements and name in _WITH_FRICTION else inputs
-
-
-def without_linear_algebra(program: torch.export.ExportedProgram) -> torch.export.ExportedProgram:
-    """The program with its solutions and factorisations written out: what ONNX has no operators for."""
-    table: dict[Any, Any] = torch.export.default_decompositions()
-    table[torch.ops.aten.linalg_solve.default] = _solve
-    table[torch.ops.aten.linalg_cholesky_ex.default] = _cholesky_ex
-    return program.run_decompositions(table)
-
-
-def _solve(matrix: Tensor, right: Tensor, *, left: bool = True) -> Tensor:
-    """By Gauss and Jordan's elimination without pivoting, which positive definite matrices do not need."""
-    n = matrix.shape[-1]
-    rows = torch.cat([matrix.expand(*right.shape[:-2], n, n), right], dim=-1)
-    unit = torch.eye(n, dtype=matrix.dtype)
-    for k in range(n):
-        row = rows[..., k : k + 1, :] / rows[..., k : k + 1, k : k + 1]
-        rows = rows - (rows[..., :, k : k + 1] - unit[:, k : k + 1]) * row
-    return rows[..., n:]
-
-
-def _cholesky_ex(matrix: Tensor, *, upper: bool = False, check_errors: bool = False) -> tuple[Tensor, Tensor]:
-    """Whether it is positive definite is all that is asked of it: info is 0 where every pivot is positive."""
-    rest, pivots = matrix, []
-    for k in range(matrix.shape[-1]):
-        pivot = rest[..., :1, :1]
-        pivots.append(pivot[..., 0])
-        if k < matrix.shape[-1] - 1:
-            rest = rest[..., 1:, 1:] - rest[..., 1:, :1] * (rest[..., :1, 1:] / pivot)
-    definite = (torch.cat(pivots, dim=-1) > 0).all(dim=-1)
-    return matrix, torch.logical_not(definite).to(torch.int32)

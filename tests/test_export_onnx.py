@@ -1,0 +1,44 @@
+"""ONNX Runtime gives what the model gives, at any batch size."""
+
+import numpy as np
+import pytest
+import torch
+from exported_runs import COUPLED, MOTORS, arm_of, moved_model
+
+from spelgen.building import build
+from spelgen.exporting.export import export
+from spelgen.exporting.onnx_export import onnx_session
+from spelgen.loaded_arm import load_arm
+
+
+@pytest.mark.parametrize("preset", ["closed-form", "minimal"])
+@pytest.mark.parametrize("robot", ["rpr", "scara", "ur10e"])
+def test_onnx_gives_what_the_model_gives(robot, preset):
+    """The check at export time compares every file with the model to 1e-10; here another batch size, by hand."""
+    model = moved_model(robot, preset)
+    found = export(model, "onnx", arm=arm_of(robot))
+    session = onnx_session(found.files["gravity.onnx"])
+    q = torch.linspace(-1, 1, 7 * model.n, dtype=torch.float64).reshape(7, model.n)
+    (gravity,) = session.run(["gravity"], {"q": q.numpy()})
+    np.testing.assert_allclose(gravity, model.gravity(q).numpy(), rtol=1e-9, atol=1e-9)
+    assert len(found.files["README.md"].decode().splitlines()) == 5
+
+
+@pytest.mark.parametrize("preset", ["closed-form", "minimal"])
+def test_followers_motors_and_passive_joints_go_along(preset, tmp_path):
+    urdf = tmp_path / "coupled.urdf"
+    urdf.write_text(COUPLED)
+    urdf.with_suffix(".yaml").write_text(MOTORS)
+    arm = load_arm(urdf)
+    assert "from the torch module" in export(build(arm, preset), "onnx", arm=arm).summary[0]
+
+
+def test_m_is_drawn_where_it_would_not_be_positive_definite():
+    model = moved_model("panda", "minimal", 0.3)
+    q = torch.randn(50, 7, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    dynamics, prepared = model.dynamics, model.prepare()
+    part = dynamics.mass_at(dynamics.configuration(q, prepared), prepared)[1].part
+    assert (part < 1).any()
+    session = onnx_session(export(model, "onnx", arm=arm_of("panda")).files["mass_matrix.onnx"])
+    (mass,) = session.run(["mass"], {"q": q.numpy()})
+    np.testing.assert_allclose(mass, model.mass_matrix(q).numpy(), rtol=1e-9, atol=1e-9)
