@@ -81,7 +81,7 @@ class Listing:
 def _folded(name: str, width: int) -> str:
     """The name with line breaks after its separators where it is longer than the width."""
     lines = [""]
-    for part in re.split(r"(?<=[_\-/. ])", name):
+    for part in re.split(r"(?<=[_\-/. ])(?<!\d\.)(?!s\))", name):
         if lines[-1] and len(lines[-1]) + len(part) > width:
             lines.append("")
         lines[-1] += part

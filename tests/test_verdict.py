@@ -71,6 +71,15 @@ def test_what_to_record_follows_what_the_logs_cover():
     assert "record" not in verdict(inside, {"coverage": ranges(1.0)}, [None, None]).sentence
 
 
+def test_a_test_on_training_logs_is_no_proof():
+    told = verdict(evaluation() | {"diagnostics": [{"code": "tested-on-training-data"}]}).sentence
+    assert told.startswith("Judged on logs that it was trained on, which proves little: good enough for")
+
+
+def test_errors_beyond_the_motion_are_told_as_such():
+    assert "is off by 8 times the motion after 1 s" in verdict(evaluation(8.0)).because
+
+
 def test_nothing_to_judge_by_is_said():
     empty = {"joints": JOINTS, "horizons": [], "torque": {}}
     assert verdict(empty).sentence == "Nothing to judge by: no horizon and no torque was evaluated."

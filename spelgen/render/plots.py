@@ -160,31 +160,33 @@ def eigenvalue_chart(mass: Mapping[str, Any]) -> Markup:
 
 
 def friction_panels(
-    friction: Mapping[str, Any], joints: Sequence[str], joint_types: Sequence[str]
+    friction: Mapping[str, Any],
+    torques: Sequence[Mapping[str, Any]],
+    joints: Sequence[str],
+    joint_types: Sequence[str],
 ) -> list[Panel]:
-    """By joint: friction by velocity, over what the rigid bodies leave of the measured torque."""
+    """By joint: friction by velocity, and the loops that measured motion makes of it, measured and by the model.
+
+    What is measured is the torque less that of the model's rigid bodies. A model without memory of friction makes no
+    loop but for load.
+    """
     panels = []
     for k, (name, kind) in enumerate(zip(joints, joint_types, strict=True)):
         curves = {label: numbers(x[k]) for label, x in friction["by"].items()}
+        loops: list[Line | Dots] = []
+        for trace in torques[:1]:
+            qd = numbers(trace["qd"])[:, k]
+            left = numbers(trace["measured"])[:, k] - numbers(trace["without_friction"])[:, k]
+            loops.append(Line("measured, in the order of time", qd, left, "loop"))
+            loops.append(Line("model along it", qd, numbers(trace["parts"]["friction"])[:, k], "loop model"))
         left = friction["measured"][k]
-        dots = Dots(
-            "measured torque less that of the rigid bodies",
-            numbers(left["qd"]),
-            numbers(left["torque"]),
-            "truth",
-        )
+        dots = Dots("measured", numbers(left["qd"]), numbers(left["torque"]), "truth")
         limits = _robust_limits(dots.y, curves.get(MODEL, np.zeros(1)))
-        shown: list[Line | Dots] = [
-            dots,
-            *(Line(label, friction["qd"][k], y, style(label)) for label, y in curves.items()),
-        ]
+        lines = (Line(label, friction["qd"][k], y, style(label)) for label, y in curves.items())
         chart = line_chart(
-            shown,
-            f"Friction of {name}",
-            f"velocity [{UNITS[kind][1]}]",
-            f"friction [{FORCE[kind]}]",
-            limits=limits,
-        )
+            [dots, *loops, *lines], f"Friction of {name}", f"velocity [{UNITS[kind][1]}]",
+            f"friction [{FORCE[kind]}]", limits=limits, height=220,
+        )  # fmt: skip
         panels.append(Panel(name, (chart,)))
     return panels
 
@@ -203,11 +205,17 @@ def coverage_panels(
             bands = [_histogram(label, logs[what][k]) for label, logs in by_logs.items()]
             bound = limits[k] if what == "q" else None
             marks = [(bound[0], "limit"), (bound[1], "limit")] if bound else []
-            edge = [Line("", bound, (0, 0), "hold")] if bound else []
+            edge = [Line("limits", bound, (0, 0), "edge")] if bound else []
             label = f"{QUANTITIES[what]} [{unit}]"
             charts.append(
                 line_chart(
-                    [*bands, *edge], f"{QUANTITIES[what]} of {name}", label, "share", marks=marks, height=130
+                    [*bands, *edge],
+                    f"{QUANTITIES[what]} of {name}",
+                    label,
+                    "share",
+                    marks=marks,
+                    width=300,
+                    height=130,
                 )
             )
         panels.append(Panel(name, tuple(charts)))

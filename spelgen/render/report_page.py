@@ -218,7 +218,9 @@ def _curves(traces: Mapping[str, Any], facts: Facts, picture: Picture) -> Curves
         mass=tuple(mass_panels(mass, types, picture.rows)) if mass.get("by") else (),
         eigenvalues=eigenvalue_chart(mass) if mass.get("by") else None,
         along=str(mass.get("trajectory", "")),
-        friction=tuple(friction_panels(traces["friction"], joints, types)) if traces.get("friction") else (),
+        friction=tuple(friction_panels(traces["friction"], torques, joints, types))
+        if traces.get("friction")
+        else (),
         energy=energy_chart(torques[0]) if torques else None,
     )
 

@@ -21,6 +21,7 @@ CONTROL = (
     (-math.inf, "", "control"),
 )
 CLOSE, ROUGH = 0.1, 0.3  # relative RMS up to which a prediction is close, or rough
+SEEN = "tested-on-training-data"
 STANDSTILL = "near standstill"
 SLOW = 0.1  # of a joint's largest velocity
 UNEVEN = 1.4  # ratio of errors that is worth a word
@@ -45,7 +46,13 @@ def verdict(
     if not proofs:
         return Verdict("Nothing to judge by: no horizon and no torque was evaluated.", "")
     place, worst = _worst(evaluation)
+    known = any(x.get("code") == SEEN for x in evaluation.get("diagnostics", ()))
     told = f"Good enough for {listed(good)}" if good else "Not good enough yet to rely on"
+    told = (
+        f"Judged on logs that it was trained on, which proves little: {told[0].lower()}{told[1:]}"
+        if known
+        else told
+    )
     told += f", not for {listed(bad)}" if bad and good else ""
     told += f"; worst at {place}" if place else ""
     wishes = _wishes(evaluation, identified, limits, place)
@@ -64,7 +71,7 @@ def _uses(evaluation: Mapping[str, Any]) -> tuple[list[str], list[str], list[str
         bad += [missing] if missing else []
         part = 1 - nmse
         amount = "none" if part <= 0 else f"{_percent(part)}"
-        proofs.append(f"explains {amount} of the variance of torques that it has not seen")
+        proofs.append(f"explains {amount} of the variance of the torques")
     horizons = [
         (x["name"], x["errors"][MODEL]["mean_relative_rms"], x["errors"][MODEL]["tip_mm"])
         for x in evaluation["horizons"]
@@ -77,7 +84,11 @@ def _uses(evaluation: Mapping[str, Any]) -> tuple[list[str], list[str], list[str
         else:
             bad.append(f"simulation {name} ahead")
         away = "" if tip is None else f", {number(tip)} mm at the tip"
-        proofs.append(f"misses {_percent(error)} of the motion after {name}{away}")
+        proofs.append(
+            f"misses {_percent(error)} of the motion after {name}{away}"
+            if error <= 1
+            else f"is off by {error:.3g} times the motion after {name}{away}"
+        )
     elif horizons:
         bad.append("simulation")
         proofs.append("predicts nothing that stays finite")
