@@ -207,3 +207,41 @@ def test_names_from_files_are_escaped(run):
     Page(text)
     assert "<b>said</b>" not in text
     assert "{{ 7 * 7 }}" in text
+
+
+@pytest.mark.parametrize("preset", ["closed-form", "spel", "spel-kan", "phnode"])
+def test_a_run_of_any_preset_has_its_page(run, robots, preset):
+    (run / "module.py").write_text(pipeline.generate(robots / "rpr.urdf", preset), encoding="utf-8")
+    (run / "robot.urdf").write_bytes((robots / "rpr.urdf").read_bytes())
+    (run / "robot.yaml").write_bytes((robots / "rpr.yaml").read_bytes())
+    torch.save(load_module(run / "module.py").state_dict(), run / "model.pt")
+    text = render_report(run)
+    page = Page(text)
+    assert "canvas" in page.tags and len(text) < 2_000_000
+    told = " ".join(" ".join(page.text).split())
+    assert ("Masses, centres of mass" in told) == (preset == "closed-form")
+    assert f"--preset {preset}" in told and "cp RUN/robot.yaml rpr.yaml" in told
+    units = {"Nm": "joint1", "N": "joint2"}
+    for unit, joint in units.items():
+        assert f"Torque of {joint}" in text and f"torque [{unit}]" in text
+
+
+def test_what_the_page_shows_is_there_as_data(run, robots):
+    (run / "robot.urdf").write_bytes((robots / "rpr.urdf").read_bytes())
+    found = json.loads(write_report(run, run / "report.json").read_text(encoding="utf-8"))
+    assert found["evaluation"] == EVALUATION and found["least_squares"] is None
+    assert found["verdict"]["sentence"] in " ".join(Page(render_report(run)).text)
+
+
+def test_meshes_are_drawn_where_the_robot_is_named(run, robots, tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    (run / "robot.urdf").write_bytes((robots / "rpr.urdf").read_bytes())
+    trimesh.creation.icosphere(subdivisions=5, radius=0.1).export(tmp_path / "ball.stl")  # 20480 faces
+    shown = '<visual><geometry><mesh filename="ball.stl"/></geometry></visual></link>'
+    text = (robots / "rpr.urdf").read_text()
+    (tmp_path / "rpr.urdf").write_text(text.replace("</link>", shown))
+    plain, drawn = render_report(run), render_report(run, tmp_path / "rpr.urdf")
+    assert "the links are drawn as tubes" in plain and "the links are drawn as tubes" not in drawn
+    scene = json.loads(re.search(r'id="scene">(.*?)</script>', drawn)[1])
+    assert 200 < sum(len(link["f"]) for link in scene["links"]) <= 2700
+    assert len(drawn) < 2_000_000

@@ -72,8 +72,12 @@ def report(
             "-o",
             "--output",
             metavar="FILE",
-            help="Default: report.html in the run folder; of several runs.html.",
+            help="Default: report.html in the run folder; of several runs.html. A name with .json: its data.",
         ),
+    ] = None,
+    robot: Annotated[
+        Path | None,
+        typer.Option(metavar="ROBOT.urdf", help="The run's URDF where its meshes are found, to draw them."),
     ] = None,
     trust: Trust = False,
 ) -> None:
@@ -86,7 +90,7 @@ def report(
     if len(runs) == 1:
         from spelgen.render.report_page import write_report
 
-        say(f"wrote {write_report(runs[0], output)}")
+        say(f"wrote {write_report(runs[0], output, robot)}")
     else:
         from spelgen.render.runs_page import write_runs
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,16 +12,17 @@ from markupsafe import Markup
 from spelgen.errors import RunError, SpelgenError
 from spelgen.evaluation.names import MODEL
 from spelgen.evaluation.tables import result_tables
-from spelgen.files import write_text
+from spelgen.files import write_json, write_text
 from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.identification.baseline import run_arm
+from spelgen.labels import entry_name
 from spelgen.listing import number
 from spelgen.loaded_arm import LoadedArm
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.render.arm_section import LETTERS, ArmSection, Cell, arm_section, matrix
 from spelgen.render.learned import Learned, read_learned
 from spelgen.render.page import render_page
-from spelgen.render.parameters import ParameterTable, parameter_tables
+from spelgen.render.parameters import ParameterTable, body_parameters, parameter_tables
 from spelgen.render.picture import Picture, read_picture
 from spelgen.render.plots import (
     FORCE,
@@ -42,6 +43,7 @@ from spelgen.render.reproduction import commands, files
 from spelgen.render.verdict import verdict
 from spelgen.spec import Facts, read_facts
 
+SCHEMA = 1  # of the page as data
 Limits = list[tuple[float, float] | None]
 
 
@@ -85,17 +87,43 @@ class Curves:
     energy: Markup | None = None
 
 
-def write_report(folder: Path | str, output: Path | str | None = None) -> Path:
+def write_report(
+    folder: Path | str, output: Path | str | None = None, robot: Path | str | None = None
+) -> Path:
     """Write the page about a run, by default as report.html in its folder; return its path.
+
+    A name that ends with .json: the same as data. robot: the run's URDF where its meshes lie beside it.
 
     Raises RunError or ModuleError when the folder is no run, or a file of it cannot be read.
     """
     folder = Path(folder)
-    return write_text(Path(output) if output else folder / "report.html", render_report(folder))
+    path = Path(output) if output else folder / "report.html"
+    if path.suffix == ".json":
+        return write_json(path, report_data(folder))
+    return write_text(path, render_report(folder, robot))
 
 
-def render_report(folder: Path | str) -> str:
-    """The page about a run as HTML; the same folder gives the same text."""
+def report_data(folder: Path | str) -> dict[str, Any]:
+    """All that the page shows, for programs: the verdict, the evaluation, least squares, the model's parameters."""
+    run = RunFolder(Path(folder))
+    evaluation, identified = (
+        run.read_json(path) if path.is_file() else None for path in (run.evaluation, run.baseline)
+    )
+    arm, trained = _arm(run), trained_model(run) if run.weights.is_file() else None
+    limits = _limits(arm, len(read_facts(run.module).joints))
+    bodies = None if trained is None else body_parameters(trained)
+    return {
+        "schema": SCHEMA,
+        "verdict": asdict(verdict(evaluation, identified, limits)) if evaluation else None,
+        "evaluation": evaluation,
+        "least_squares": identified,
+        "bodies": None if bodies is None else bodies.tolist(),
+        "tables": [asdict(table) for table in _parameters(trained, arm, identified)],
+    }
+
+
+def render_report(folder: Path | str, robot: Path | str | None = None) -> str:
+    """The page about a run as HTML; the same folder gives the same text. robot: see ``write_report``."""
     run = RunFolder(Path(folder))
     if not run.module.is_file():
         raise RunError(
@@ -117,7 +145,7 @@ def render_report(folder: Path | str) -> str:
         facts=facts,
         picture=picture,
         cells=_cells(arm, facts, picture),
-        arm=_section(arm, traces, identified),
+        arm=_section(arm, traces, identified, robot),
         units=UNITS,
         force=FORCE,
         numbers=_numbers(learned, config, metrics, evaluation),
@@ -145,9 +173,14 @@ def _arm(run: RunFolder) -> LoadedArm | None:
 
 
 def _section(
-    arm: LoadedArm | None, traces: Mapping[str, Any], identified: Mapping[str, Any] | None
+    arm: LoadedArm | None,
+    traces: Mapping[str, Any],
+    identified: Mapping[str, Any] | None,
+    robot: Path | str | None,
 ) -> ArmSection | None:
-    return None if arm is None else arm_section(arm.arm, arm.robot.path, traces, identified)
+    if arm is None:
+        return None
+    return arm_section(arm.arm, Path(robot) if robot else arm.robot.path, traces, identified)
 
 
 def _parameters(
@@ -157,12 +190,14 @@ def _parameters(
 
 
 def _cells(arm: LoadedArm | None, facts: Facts, picture: Picture) -> list[list[Cell]]:
-    """M with reasons where the arm is at hand, else as the module's docstring pictures it."""
-    if arm is not None and facts.options.preset not in ("dense", "phnode"):
-        return matrix(arm.arm, arm.structure_for(facts.options.assume))
+    """M with reasons where the model's structure is the arm's own, else as the module's docstring pictures it."""
+    if arm is not None:
+        derived = matrix(arm.arm, arm.structure_for(facts.options.assume))
+        if [[x.kind for x in row] for row in derived] == [[x.kind for x in row] for row in picture.rows]:
+            return derived
     return [
         [
-            Cell(x.kind, LETTERS.get(x.kind, x.joints), (), f"M{i + 1}{j + 1}: {x.kind}")
+            Cell(x.kind, LETTERS.get(x.kind, x.joints), (), f"{entry_name(max(i, j), min(i, j))}: {x.kind}")
             for j, x in enumerate(row)
         ]
         for i, row in enumerate(picture.rows)
