@@ -16,6 +16,9 @@ SHOWN = 20  # trajectories that a terminal and a notebook show
 SEEN = 0.7  # correlation of torque and gravity from which on the one is certainly in the other
 
 
+_UNITS = {"revolute": "rad, rad/s, Nm", "prismatic": "m, m/s, N"}
+
+
 @dataclass(frozen=True)
 class JointReport:
     """One joint over all trajectories; [rad, m], [rad/s, m/s], [Nm, N]; None where it cannot be told.
@@ -136,7 +139,9 @@ def _ranges(found: LogReport) -> Listing:
         spans = [f"{number(joint.low[name])} .. {number(joint.high[name])}" for name in QUANTITIES]
         visited = "-" if joint.range_fraction is None else f"{joint.range_fraction:.0%}"
         rows.append((joint.name, spans[0], visited, *spans[1:]))
-    return Listing("Ranges [rad, rad/s, Nm; m, m/s, N]", head, tuple(rows))
+    kinds = {joint.kind for joint in found.joints}
+    units = "; ".join(text for kind, text in _UNITS.items() if kind in kinds)
+    return Listing(f"Ranges [{units}]", head, tuple(rows))
 
 
 def _signals(found: LogReport) -> Listing:
