@@ -60,7 +60,7 @@ def test_c_gives_what_the_model_gives(case, program, flags, compiled):
     library = link_library(compile_object(source, program, *options), program)
     library = library.rename(folder / f"{program}{len(flags)}.so")  # ctypes keeps what it has loaded by name
     called = CLibrary(library, model, np.float32 if flags else np.float64)
-    parity = check_parity(called, trained, NAMES, 1e-5 if flags else 1e-12)
+    parity = check_parity(called, trained, NAMES, 1e-5 if flags else 1e-12, memory=model.memory)
     assert set(parity.differences) == set(NAMES)
 
 
@@ -130,7 +130,7 @@ int main(void)
     static const R size[] = {{0, 1, 1e3, 1e30, 1e300, -1e300, INFINITY, NAN}};
     int k, i;
     for (k = 0; k < 8; k++) {{
-        R q[{n}], qd[{n}], x[{n}], z[1] = {{0}}, out[16], more[{square}], most[{square}], last[{square}];
+        R q[{n}], qd[{n}], x[{n}], z[{memory} + 1] = {{0}}, out[{memory} + 16], more[{square}], most[{square}], last[{square}];
         for (i = 0; i < {n}; i++) q[i] = size[k] * (i + 1), qd[i] = size[7 - k], x[i] = -size[k];
         for (i = 0; i < {square}; i++) last[i] = 0;
 {calls}
@@ -154,7 +154,9 @@ def test_c_is_sound_whatever_it_is_given(case, compiled):
         outputs = ["more"] if entry.name in ("tip_jacobian", "mass_matrix", "tip_pose") else outputs
         calls.append(f"        {name}_{entry.name}({', '.join([*given, *outputs])});")
     calls.append(f"        {name}_forward_dynamics(q, qd, x, z, out);")
-    text = DRIVER.format(name=name, n=n, square=max(n * n, 6 * n, 16), calls="\n".join(calls))
+    text = DRIVER.format(
+        name=name, n=n, memory=trained.described.memory, square=max(n * n, 6 * n, 16), calls="\n".join(calls)
+    )
     driver = folder / "driver.c"
     driver.write_text(text)
     program = folder / "driver"
