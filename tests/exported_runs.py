@@ -51,9 +51,17 @@ def arm_of(robot):
     return load_arm(ROBOTS / f"{robot}.urdf")
 
 
-def run_folder(robot, preset, folder: Path) -> RunFolder:
-    """A run folder as `spelgen train` leaves it, of a moved model."""
-    urdf = ROBOTS / f"{robot}.urdf"
-    record = {"robot": robot, "objective": "torque", "config": {}, "preprocessing": {}}
-    fit = Fit(moved_model(robot, preset), TorqueFit(), Preprocessing(), (), (), None, record, {}, urdf)
+def saved_run(model, urdf, folder: Path) -> RunFolder:
+    """A run folder as `spelgen train` leaves it, of this model."""
+    record = {"robot": urdf.stem, "objective": "torque", "config": {}, "preprocessing": {}, "mapping": {}}
+    record |= {"joints": [], "validation_fraction": 0.25, "seed": 0, "data_digest": ""}
+    record |= {"training": [], "validation": []}
+    checkpoint = dict.fromkeys(("epoch", "step", "best_epoch", "best_loss", "rollbacks", "seconds"), 0)
+    checkpoint |= {"learning_rate_factor": 1.0, "substeps": 1, "momentum_done": True, "best_weights": {}}
+    fit = Fit(model, TorqueFit(), Preprocessing(), (), (), None, record, checkpoint, urdf)
     return RunFolder(fit.save(folder / "run"))
+
+
+def run_folder(robot, preset, folder: Path) -> RunFolder:
+    """A run folder of a moved model."""
+    return saved_run(moved_model(robot, preset), ROBOTS / f"{robot}.urdf", folder)

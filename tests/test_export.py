@@ -5,6 +5,7 @@ import pytest
 import torch
 import yaml
 from emitted import ROBOTS
+from exported_runs import saved_run
 from typer.testing import CliRunner
 
 from spelgen.building import build
@@ -12,11 +13,7 @@ from spelgen.cli.main import app
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.errors import RunError
 from spelgen.exporting.export import export
-from spelgen.fitting.config import TorqueFit
-from spelgen.fitting.fitted import Fit
-from spelgen.fitting.run_folder import RunFolder
 from spelgen.loaded_arm import load_arm
-from spelgen.logs.preprocessing import Preprocessing
 
 pytest.importorskip("pinocchio")
 
@@ -27,13 +24,7 @@ def run_of(robot, folder, preset, change=lambda model: None):
     model = build(urdf, preset)
     with torch.no_grad():
         change(model)
-    record = {"robot": robot, "objective": "torque", "config": {}, "preprocessing": {}, "mapping": {}}
-    record |= {"joints": [], "validation_fraction": 0.25, "seed": 0, "data_digest": ""}
-    record |= {"training": [], "validation": []}
-    checkpoint = dict.fromkeys(("epoch", "step", "best_epoch", "best_loss", "rollbacks", "seconds"), 0)
-    checkpoint |= {"learning_rate_factor": 1.0, "substeps": 1, "momentum_done": True, "best_weights": {}}
-    fit = Fit(model, TorqueFit(), Preprocessing(), (), (), None, record, checkpoint, urdf)
-    return RunFolder(fit.save(folder / "run")), model
+    return saved_run(model, urdf, folder), model
 
 
 def exported(run, path):

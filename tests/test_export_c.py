@@ -130,7 +130,8 @@ int main(void)
     static const R size[] = {{0, 1, 1e3, 1e30, 1e300, -1e300, INFINITY, NAN}};
     int k, i;
     for (k = 0; k < 8; k++) {{
-        R q[{n}], qd[{n}], x[{n}], z[{memory} + 1] = {{0}}, out[{memory} + 16], more[{square}], most[{square}], last[{square}];
+        R q[{n}], qd[{n}], x[{n}], z[{memory} + 1] = {{0}}, out[{memory} + 16];
+        R more[{square}], most[{square}], last[{square}];
         for (i = 0; i < {n}; i++) q[i] = size[k] * (i + 1), qd[i] = size[7 - k], x[i] = -size[k];
         for (i = 0; i < {square}; i++) last[i] = 0;
 {calls}

@@ -60,16 +60,17 @@ def test_momentum_rate_is_the_slope_of_momentum(pair):
 def test_linearize_is_the_slope_of_rate_and_step(pair):
     _, prepared = pair
     given = torch.cat(states(3), dim=-1)  # q, qd, tau
+    z = prepared.memory(given[..., 3:6])
 
     def rate(x):
         q, qd, tau = x.chunk(3, dim=-1)
-        return torch.cat([qd, prepared.forward_dynamics(q, qd, tau)], dim=-1)
+        return torch.cat([qd, prepared.forward_dynamics(q, qd, tau, z)], dim=-1)
 
     def step(x):
-        return torch.cat(prepared.step(*x.chunk(3, dim=-1), 0.01)[:2], dim=-1)
+        return torch.cat(prepared.step(*x.chunk(3, dim=-1), 0.01, z)[:2], dim=-1)
 
     for function, dt in ((rate, None), (step, 0.01)):
-        found = torch.cat(prepared.linearize(*given.chunk(3, dim=-1), dt), dim=-1)
+        found = torch.cat(prepared.linearize(*given.chunk(3, dim=-1), dt, z), dim=-1)
         assert found.shape == (3, 6, 9)
         for k, unit in enumerate(1e-6 * torch.eye(9, dtype=torch.float64)):
             slope = (function(given + unit) - function(given - unit)) / 2e-6
