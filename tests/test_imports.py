@@ -40,7 +40,8 @@ fitting: run_schema run_folder run_lock
 fitting: gaussian_prior adaptive rollout dataset streaming torque_samples torque_jacobian torque_fit
 fitting: optimizers torque_networks urdf_regularizer stages compiled process progress validation loop
 fitting: run_record fitted fit train
-evaluation: names stiff baselines torque rollout torque_traces traces examples invariants tables results csv_file
+evaluation: names stiff baselines torque rollout torque_traces traces examples invariants tables verdict
+evaluation: results csv_file
 evaluation: subject evaluate
 verify: agreement urdf_cross_check numeric_samples verify
 explain: reasons facts
@@ -53,8 +54,8 @@ exporting: description tip_chain describe trained parity exported readme rigid_b
 exporting: mjcf_file mjcf_export torch_programs torch_export onnx_graph onnx_rigid onnx_learned onnx_model onnx_export
 exporting: rigid_expressions friction_expressions learned_expressions model_expressions tip_expressions entry_points
 exporting: c_statements c_networks c_code c_library c_export ros2_export casadi_export export
-render: charts plots picture page learned parameters reproduction verdict shapes scene still arm_section
-render: report_page runs_page inspection_page identification_page
+render: charts plots picture page learned parameters reproduction shapes scene still arm_section
+render: run_facts curves report_page runs_page inspection_page identification_page
 logs: statistics gravity report check_logs
 comparison: truth metrics study runs formatting
 render: logs_page comparison_page
@@ -78,9 +79,7 @@ PLAIN = {"spelgen.arm.actuation"}  # G by the files, without the exact arithmeti
 ROOMS_THAT_DERIVE = ("urdf.", "arm.", "structure.", "emission.", "verify.", "explain.", "formulas.")
 DERIVES = [x for x in LAYERS if x.startswith(ROOMS_THAT_DERIVE) and x != "emission.loading"]
 BESIDE_A_ROBOT = {"logs.gravity", "logs.report", "logs.check_logs"}  # logs held against an arm's own facts
-OF_A_RUN = {
-    f"render.{name}" for name in ("charts", "plots", "picture", "page", "learned", "verdict", "scene")
-}
+OF_A_RUN = {f"render.{name}" for name in ("charts", "plots", "picture", "page", "learned", "scene")}
 FITS = [x for x in LAYERS if x.startswith(("logs.", "fitting.", "evaluation.")) and x not in BESIDE_A_ROBOT]
 NEVER = {
     "spec": {"sympy", "flint", "torch"},

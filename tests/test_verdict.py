@@ -2,7 +2,7 @@
 
 import pytest
 
-from spelgen.render.verdict import verdict
+from spelgen.evaluation.verdict import verdict
 
 JOINTS = ["a", "b"]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
+from html import escape
 from typing import Any
 
 import torch
@@ -12,8 +13,9 @@ import torch
 from spelgen.errors import Diagnostic
 from spelgen.evaluation.baselines import Predictor
 from spelgen.evaluation.names import MODEL
-from spelgen.evaluation.tables import result_tables, verdict
+from spelgen.evaluation.tables import result_tables
 from spelgen.evaluation.torque import TorqueErrors
+from spelgen.evaluation.verdict import verdict
 from spelgen.fitting.rollout import position_difference
 from spelgen.logs.windows import Windows
 
@@ -104,7 +106,7 @@ class Results:
 
     def _repr_html_(self) -> str:
         tables = (table.listing().html() for table in result_tables(self.to_dict()))
-        return "".join([f"<p>{verdict(self.to_dict())}</p>", *tables])
+        return "".join([f"<p>{escape(verdict(self.to_dict()).sentence)}</p>", *tables])
 
     def _heading(self) -> str:
         count = len(self.trajectories)

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from spelgen.evaluation.names import MODEL
 from spelgen.listing import Listing, number
 
 
@@ -88,21 +87,6 @@ def _units(joints: Sequence[str], types: Sequence[str], quantity: int) -> tuple[
     return "", [f"{joint} [{unit}]" for joint, unit in zip(joints, units, strict=True)]
 
 
-def verdict(evaluation: Mapping[str, Any]) -> str:
-    """One sentence: at which horizons the model's relative error is the least."""
-    best: dict[str, str | None] = {}
-    for horizon in evaluation["horizons"]:
-        errors = {name: x for name, x in _of(horizon, "mean_relative_rms").items() if x is not None}
-        best[horizon["name"]] = min(errors, key=errors.__getitem__, default=None)
-    won = [name for name, predictor in best.items() if predictor == MODEL]
-    if not best:
-        return "No horizon was evaluated."
-    if not won:
-        return "At no horizon does the model predict better than its baselines."
-    lost = [f"; over {name} {each or 'nothing'} is better" for name, each in best.items() if each != MODEL]
-    return f"The model predicts best over {_listed(won)}{''.join(lost)}."
-
-
 def _ahead(horizon: Mapping[str, Any]) -> str:
     """How far a horizon looks: `10 steps (0.106 s)`."""
     name = str(horizon["name"])
@@ -130,8 +114,3 @@ def table(title: str, labels: Sequence[str], rows: Iterable[Mapping[str, float |
 def _cells(values: Sequence[float | None]) -> tuple[Cell, ...]:
     least = min((value for value in values if value is not None), default=None) if len(values) > 1 else None
     return tuple(Cell(number(value), value is not None and value == least) for value in values)
-
-
-def _listed(names: Sequence[str]) -> str:
-    """`a`, `a and b`, `a, b and c`."""
-    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)

@@ -12,6 +12,7 @@ from markupsafe import Markup
 from spelgen.errors import RunError
 from spelgen.evaluation.names import MODEL
 from spelgen.evaluation.tables import Table, table
+from spelgen.evaluation.verdict import verdict
 from spelgen.files import write_text
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.labels import listed
@@ -19,7 +20,6 @@ from spelgen.listing import number
 from spelgen.render.charts import Band, Line, line_chart
 from spelgen.render.page import render_page
 from spelgen.render.plots import FORCE, Panel, numbers
-from spelgen.render.verdict import verdict
 from spelgen.spec import Facts, read_facts
 
 STYLES = ("model", "train", "gravity", "coriolis", "friction", "hold")
