@@ -17,6 +17,9 @@ PRESET_NAMES: tuple[str, ...] = get_args(Preset)
 
 Net = Literal["mlp", "kan"]
 
+BRISTLE_REACH = {"revolute": (3e-4, 3e-3, 3e-2), "prismatic": (3e-5, 3e-4, 3e-3)}
+"""How far friction's memory reaches, by kind of joint [rad, m]: what gears do before they slide spans such decades."""
+
 PRESETS = Path(__file__).parent / "presets"
 
 
@@ -34,6 +37,8 @@ class Design:
     potential: Literal["derived", "dense", "closed-form"]
     dissipation: Literal["per-joint", "dense-n", "dense-3n", "constants"]
     input: Literal["derived", "dense-3n"]
+    memory: Literal["bristles", "none"]
+    """Whether friction remembers the way a joint came."""
     fourier: Literal["derived", "none"]
     """Whether networks add to the Fourier series that a rigid arm's functions are, where those are short."""
     net: Literal["mlp", "kan", "none"]
@@ -113,6 +118,8 @@ def _conflicts(values: Mapping[str, str]) -> Iterator[tuple[str, str, str]]:
         yield "mass", "potential", "rigid bodies give both: name closed-form for both or for neither"
     if rigid != (values["dissipation"] == "constants"):
         yield "mass", "dissipation", "dissipation: constants goes with mass: closed-form, and with it alone"
+    if values["memory"] == "bristles" and not rigid:
+        yield "memory", "dissipation", "bristles go with dissipation: constants"
     for key in ("net", "encoding"):
         if rigid != (values[key] == "none"):
             yield (

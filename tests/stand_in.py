@@ -58,7 +58,7 @@ class Model(nn.Module):
     def velocity(self, q, p, prepared=None):
         return torch.linalg.solve(self.mass_matrix(q), p)
 
-    def hamiltonian(self, q, p):
+    def hamiltonian(self, q, p, z=None):
         return 0.5 * (p * self.velocity(q, p)).sum(-1) + self.potential_energy(q)
 
     def _kinetic_slope(self, q, qd):
@@ -74,19 +74,25 @@ class Model(nn.Module):
         coriolis = (self._mass_rate(q, qd) @ qd.unsqueeze(-1)).squeeze(-1) - self._kinetic_slope(q, qd)
         return coriolis + self.gravity(q)
 
-    def friction_torque(self, q, qd):
+    def friction_torque(self, q, qd, z=None):
         return self.damping.exp() * qd
 
-    def inverse_dynamics(self, q, qd, qdd):
+    def inverse_dynamics(self, q, qd, qdd, z=None):
         return self.momentum(q, qdd) + self.nonlinear_effects(q, qd) + self.friction_torque(q, qd)
 
-    def forward_dynamics(self, q, qd, tau):
+    def forward_dynamics(self, q, qd, tau, z=None):
         return self.velocity(q, tau - self.inverse_dynamics(q, qd, torch.zeros_like(qd)))
 
     def prepare(self, definite=True):
         return None
 
-    def port_hamiltonian_rhs(self, q, p, tau, prepared):
+    def memory(self, qd):
+        return qd.unsqueeze(-1)[..., :0]
+
+    def memory_after(self, z, displacement):
+        return z
+
+    def port_hamiltonian_rhs(self, q, p, tau, prepared, z=None):
         qd = self.velocity(q, p)
         pd = self._kinetic_slope(q, qd) - self.gravity(q) - self.damping.exp() * qd
         return qd, pd if tau is None else pd + tau

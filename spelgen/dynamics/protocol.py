@@ -55,16 +55,32 @@ class PortHamiltonianDynamics(RigidDynamics, Protocol):
         """qd, (..., n)."""
 
     def port_hamiltonian_rhs(
-        self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Any
+        self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Any, z: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         """q' and p', (..., n), under the inputs tau; without, of the arm left to itself."""
+
+    def memory(self, qd: Tensor) -> Tensor:
+        """z, (..., n, K), of joints that have long gone this way."""
+
+    def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
+        """z after joints went one way by (..., n)."""
+
+
+def remembers(dynamics: Any) -> bool:
+    """Whether its friction has a memory z, which all that depends on friction then takes as its last argument."""
+    return bool(getattr(dynamics, "bristle_reach", None) is not None)
+
+
+def known_past(dynamics: Any, z: Tensor | None) -> tuple[Tensor, ...]:
+    """z as what to give to these dynamics last, where they have a use for it."""
+    return () if z is None or not remembers(dynamics) else (z,)
 
 
 class VelocityState:
     """Any dynamics where momenta are asked for: velocities take their place."""
 
     def __init__(self, dynamics: RigidDynamics) -> None:
-        self.dynamics = dynamics
+        self.dynamics: Any = dynamics
 
     def prepare(self, definite: bool = True) -> None:
         """Nothing."""
@@ -78,10 +94,21 @@ class VelocityState:
         return p
 
     def port_hamiltonian_rhs(
-        self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: None
+        self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: None, z: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         """qd and qdd."""
-        return p, self.dynamics.forward_dynamics(q, p, torch.zeros_like(q) if tau is None else tau)
+        past = known_past(self.dynamics, z)
+        return p, self.dynamics.forward_dynamics(q, p, torch.zeros_like(q) if tau is None else tau, *past)
+
+    def memory(self, qd: Tensor) -> Tensor:
+        """That of the dynamics, where they have one."""
+        found: Tensor = self.dynamics.memory(qd) if remembers(self.dynamics) else qd.unsqueeze(-1)[..., :0]
+        return found
+
+    def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
+        """Likewise."""
+        found: Tensor = self.dynamics.memory_after(z, displacement) if remembers(self.dynamics) else z
+        return found
 
 
 def integrable(dynamics: RigidDynamics) -> Any:

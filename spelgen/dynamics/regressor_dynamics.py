@@ -6,10 +6,12 @@ from collections.abc import Callable
 from typing import TypeVar
 
 import numpy as np
+import torch
 
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.arrays import like
 from spelgen.dynamics.regressor import body_torque
+from spelgen.runtime.bristles import moved_bristles
 
 Array = TypeVar("Array")
 """numpy.ndarray or torch.Tensor: what is returned is of the kind of what is given."""
@@ -19,7 +21,8 @@ class RegressorDynamics:
     """An arm of n coordinates with these parameters (see ``RigidDynamics``).
 
     parameters: (10 B,), as ``regressor`` has them. armature: (n,) [kg m^2, kg]. friction: torques (T, n) by
-    velocities (T, n). inputs: G, (n, n); without, each input is its own joint's torque.
+    velocities (T, n) and its memory z (T, n, K), or None. bristle_reach: (n, K) [rad, m], where it has one.
+    inputs: G, (n, n); without, each input is its own joint's torque.
     """
 
     def __init__(
@@ -27,10 +30,12 @@ class RegressorDynamics:
         arm: Arm,
         parameters: np.ndarray,
         armature: np.ndarray,
-        friction: Callable[[np.ndarray], np.ndarray],
+        friction: Callable[[np.ndarray, np.ndarray | None], np.ndarray],
+        bristle_reach: np.ndarray | None = None,
         inputs: np.ndarray | None = None,
     ) -> None:
         self.arm, self.parameters, self.armature, self.friction = arm, parameters, armature, friction
+        self.bristle_reach = None if bristle_reach is None else torch.from_numpy(bristle_reach)
         self.inputs = np.eye(len(armature)) if inputs is None else inputs
 
     @property
@@ -40,31 +45,41 @@ class RegressorDynamics:
 
     def mass_matrix(self, q: Array) -> Array:
         """M, (..., n, n) [kg m^2, kg m, kg]."""
-        return self._by_rows(self._mass, q)
+        return self._by_rows(lambda at, _: self._mass(at), q)
 
     def gravity(self, q: Array) -> Array:
         """dV/dq, (..., n) [Nm, N]."""
-        return self._by_rows(lambda each: self._bodies(each, 0 * each, 0 * each), q)
+        return self._by_rows(lambda each, _: self._bodies(each, 0 * each, 0 * each), q)
 
     def nonlinear_effects(self, q: Array, qd: Array) -> Array:
         """Coriolis, centrifugal and gravity torques, (..., n) [Nm, N]."""
-        return self._by_rows(lambda at, speed: self._bodies(at, speed, 0 * at), q, qd)
+        return self._by_rows(lambda at, speed, _: self._bodies(at, speed, 0 * at), q, qd)
 
-    def friction_torque(self, q: Array, qd: Array) -> Array:
+    def friction_torque(self, q: Array, qd: Array, z: Array | None = None) -> Array:
         """What friction takes, and what the measured torque shows without any, (..., n) [Nm, N]."""
-        return self._by_rows(lambda _, speed: self.friction(speed), q, qd)
+        return self._by_rows(lambda _, speed, past: self.friction(speed, past), q, qd, z=z)
 
-    def forward_dynamics(self, q: Array, qd: Array, tau: Array) -> Array:
+    def forward_dynamics(self, q: Array, qd: Array, tau: Array, z: Array | None = None) -> Array:
         """qdd, (..., n), under the inputs tau."""
-        return self._by_rows(self._forward, q, qd, tau)
+        return self._by_rows(self._forward, q, qd, tau, z=z)
 
-    def inverse_dynamics(self, q: Array, qd: Array, qdd: Array) -> Array:
+    def memory(self, qd: torch.Tensor) -> torch.Tensor:
+        """z, (..., n, K), of joints that have long gone this way."""
+        assert self.bristle_reach is not None
+        return qd.sign().unsqueeze(-1) * self.bristle_reach
+
+    def memory_after(self, z: torch.Tensor, displacement: torch.Tensor) -> torch.Tensor:
+        """z after joints went one way by (..., n)."""
+        assert self.bristle_reach is not None
+        return moved_bristles(z, displacement, self.bristle_reach)
+
+    def inverse_dynamics(self, q: Array, qd: Array, qdd: Array, z: Array | None = None) -> Array:
         """The inputs, (..., n), that make qdd; those of a passive joint are the torques that it lacks."""
-        return self._by_rows(self._inverse, q, qd, qdd)
+        return self._by_rows(self._inverse, q, qd, qdd, z=z)
 
-    def joint_torque(self, q: Array, qd: Array, qdd: Array) -> Array:
+    def joint_torque(self, q: Array, qd: Array, qdd: Array, z: Array | None = None) -> Array:
         """What all joints, passive ones too, need for qdd, (..., n) [Nm, N]."""
-        return self._by_rows(self._torque, q, qd, qdd)
+        return self._by_rows(self._torque, q, qd, qdd, z=z)
 
     def _bodies(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
         """The bodies' torques, (T, n)."""
@@ -79,20 +94,21 @@ class RegressorDynamics:
         ).reshape(n + 1, count, n)
         return np.stack([each - still for each in moved], axis=-1) + np.diag(self.armature)
 
-    def _forward(self, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> np.ndarray:
-        force = tau @ self.inputs.T - self._bodies(q, qd, 0 * q) - self.friction(qd)
+    def _forward(self, q: np.ndarray, qd: np.ndarray, tau: np.ndarray, z: np.ndarray | None) -> np.ndarray:
+        force = tau @ self.inputs.T - self._bodies(q, qd, 0 * q) - self.friction(qd, z)
         return np.linalg.solve(self._mass(q), force[..., None])[..., 0]
 
-    def _torque(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
-        return self._bodies(q, qd, qdd) + self.armature * qdd + self.friction(qd)
+    def _torque(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, z: np.ndarray | None) -> np.ndarray:
+        return self._bodies(q, qd, qdd) + self.armature * qdd + self.friction(qd, z)
 
-    def _inverse(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
-        force = self._torque(q, qd, qdd)
+    def _inverse(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, z: np.ndarray | None) -> np.ndarray:
+        force = self._torque(q, qd, qdd, z)
         moved = self.inputs + np.diag(~self.inputs.any(axis=1)).astype(float)
         return np.linalg.solve(moved, force.T).T
 
-    def _by_rows(self, function: Callable[..., np.ndarray], *states: Array) -> Array:
-        """``function`` of states (T, n), for states (..., n)."""
+    def _by_rows(self, function: Callable[..., np.ndarray], *states: Array, z: Array | None = None) -> Array:
+        """``function`` of states (T, n), and z (T, n, K) or None, for states (..., n)."""
         rows = np.broadcast_arrays(*(np.asarray(x) for x in states))
-        found = function(*(x.reshape(-1, self.n) for x in rows))
+        past = None if z is None else np.asarray(z).reshape(-1, self.n, np.asarray(z).shape[-1])
+        found = function(*(x.reshape(-1, self.n) for x in rows), past)
         return like(found.reshape(*rows[0].shape[:-1], *found.shape[1:]), states[0])

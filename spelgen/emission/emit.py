@@ -6,6 +6,7 @@ as code.
 
 from __future__ import annotations
 
+from spelgen.design import BRISTLE_REACH
 from spelgen.emission import docstring, tailored
 from spelgen.emission.bundle import bundle
 from spelgen.spec import ModelSpec, facts_json
@@ -23,6 +24,7 @@ def emit(spec: ModelSpec) -> str:
         names=tailored.names("joint_names", [joint.identifier for joint in spec.joints]),
         types=tailored.names("joint_types", [joint.kind for joint in spec.joints]),
         class_summary=docstring.class_summary(spec),
+        elements=len(BRISTLE_REACH["revolute"]) if spec.design.memory == "bristles" else 0,
         setup=tailored.setup(spec),
         mass_entries=tailored.mass_entries(spec),
         values=_values(spec),
@@ -50,10 +52,12 @@ def _values(spec: ModelSpec) -> list[Value]:
             for name, what, units in _FRICTION
         ]
         ten = "By body (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) about its joint's frame, (bodies, 10)."
+        reach = "How far the bristles of its friction reach, (n, K) [rad, m]."
         return [
             ("inertial_parameters", ten, f"{dynamics}.inertial_parameters()"),
             *_armature(dynamics),
             *friction,
+            ("bristle_reach", reach, f"{dynamics}.friction.bristles.reach"),
             (
                 "torque_offset",
                 "What the measured torque shows without any, (n,) [Nm, N].",

@@ -6,6 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterable
 from textwrap import wrap
 
+from spelgen.design import BRISTLE_REACH
 from spelgen.emission.source import WIDTH, Call, Code, assignment, call, laid_out
 from spelgen.labels import entry_name, joint_ranges
 from spelgen.spec import ModelSpec, Terms
@@ -139,7 +140,19 @@ def _rigid_bodies(spec: ModelSpec) -> list[str]:
         inertia=tuple(tuple(body.reference[k] for k in (4, 7, 9)) for body in spec.bodies),
         products=tuple(tuple(body.reference[k] for k in (5, 6, 8)) for body in spec.bodies),
     )
-    made = call("RigidBodyDynamics", Code("joints"), Code("bodies"), gravity=spec.gravity, input=_input(spec))
+    memory = (
+        {"reach": tuple(BRISTLE_REACH[x.kind] for x in spec.joints)}
+        if spec.design.memory == "bristles"
+        else {}
+    )
+    made = call(
+        "RigidBodyDynamics",
+        Code("joints"),
+        Code("bodies"),
+        gravity=spec.gravity,
+        input=_input(spec),
+        **memory,
+    )
     return [assignment("bodies", bodies, _INDENT), assignment("self.dynamics", made, _INDENT)]
 
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 
-from spelgen.dynamics.protocol import RigidDynamics, integrable
+from spelgen.dynamics.protocol import RigidDynamics, integrable, known_past
 from spelgen.evaluation.names import CONSTANT_VELOCITY, URDF, URDF_WITH_DRIVES
 from spelgen.evaluation.stiff import accurate_solver
 from spelgen.fitting.rollout import roll_out
@@ -20,12 +21,12 @@ class Predictor:
     """Something that predicts.
 
     states: windows of K samples -> predicted q, qd, both (W, K-1, n), from the first sample and the inputs.
-    torque: q, qd, qdd, each (T, n) -> tau (T, n); None for what has no dynamics. dynamics: these.
+    torque: q, qd, qdd, each (T, n), and z (T, n, K) -> tau (T, n); None for what has no dynamics. dynamics: these.
     """
 
     name: str
     states: Callable[[Windows], tuple[torch.Tensor, torch.Tensor]]
-    torque: Callable[[torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor] | None
+    torque: Callable[..., torch.Tensor] | None
     dynamics: RigidDynamics | None = None
 
 
@@ -33,13 +34,25 @@ def of_dynamics(name: str, dynamics: RigidDynamics, substeps: int) -> Predictor:
     """Dynamics as a predictor, by the classical Runge-Kutta method."""
     form = integrable(dynamics)
     return Predictor(
-        name, lambda windows: roll_out(form, windows, substeps), dynamics.inverse_dynamics, dynamics
+        name, lambda windows: roll_out(form, windows, substeps), _inverse_dynamics(dynamics), dynamics
     )
 
 
 def of_baseline(name: str, dynamics: RigidDynamics, probe: Windows) -> Predictor:
     """Dynamics that are not the model's as a predictor: by steps of their own, as many as they need on the probe."""
-    return Predictor(name, accurate_solver(dynamics, probe), dynamics.inverse_dynamics, dynamics)
+    return Predictor(name, accurate_solver(dynamics, probe), _inverse_dynamics(dynamics), dynamics)
+
+
+def _inverse_dynamics(dynamics: Any) -> Callable[..., torch.Tensor]:
+    """That of these, which may or may not have a use for friction's memory z."""
+
+    def torque(
+        q: torch.Tensor, qd: torch.Tensor, qdd: torch.Tensor, z: torch.Tensor | None = None
+    ) -> torch.Tensor:
+        found: torch.Tensor = dynamics.inverse_dynamics(q, qd, qdd, *known_past(dynamics, z))
+        return found
+
+    return torque
 
 
 def constant_velocity() -> Predictor:

@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from spelgen.dynamics.protocol import RigidDynamics
 from spelgen.errors import Diagnostic
 from spelgen.evaluation.baselines import (
@@ -63,13 +65,13 @@ def evaluate(
     used = _preprocessing(preprocessing, judged, logs)
     pieces = used.pieces(logs, shortest=2)
     lengths = _lengths(pieces, steps, seconds, notes)
-    probe = _windows(pieces, judged.window, PROBED, measured=used.filtered)
+    probe = _windows(pieces, judged.window, PROBED, used, judged.reach)
     substeps = choose_substeps(judged.model, probe, loss_scales(probe, joint_types), start=judged.substeps)
     predictors = [of_dynamics(MODEL, judged.model, substeps), constant_velocity()]
     predictors += _urdf_baseline(judged, probe, notes)
     predictors += [of_baseline(name, each, probe) for name, each in (baselines or {}).items()]
     tip = _tip(judged, notes)
-    samples = dynamics_samples(logs, preprocessing=used)
+    samples = dynamics_samples(logs, preprocessing=used, reach=judged.reach)
     return Results(
         robot=judged.robot,
         joints=tuple(judged.joints),
@@ -78,7 +80,7 @@ def evaluate(
         substeps=substeps,
         parameters=sum(parameter.numel() for parameter in judged.model.parameters()),
         horizons=tuple(
-            _horizon(name, k, pieces, predictors, joint_types, tip, used) for name, k in lengths.items()
+            _horizon(name, k, pieces, predictors, judged, tip, used) for name, k in lengths.items()
         ),
         torque={
             x.name: torque_summary(torque_errors(x.torque, samples))
@@ -125,11 +127,13 @@ def _lengths(
     return {name: k for name, k in wanted.items() if 0 < k <= longest}
 
 
-def _windows(pieces: Sequence[Trajectory], samples: int, most: int, *, measured: bool) -> Windows:
+def _windows(
+    pieces: Sequence[Trajectory], samples: int, most: int, used: Preprocessing, reach: np.ndarray
+) -> Windows:
     """About `most` windows, or all, evenly spread."""
     samples = min(samples, max(map(len, pieces)))
     starts = sum(max(0, len(x) - samples + 1) for x in pieces)
-    return cut_windows(pieces, samples, -(-starts // most), measured=measured)
+    return cut_windows(pieces, samples, -(-starts // most), measured=used.filtered, reach=reach)
 
 
 def _horizon(
@@ -137,14 +141,14 @@ def _horizon(
     steps: int,
     pieces: Sequence[Trajectory],
     predictors: Sequence[Predictor],
-    joint_types: Sequence[str],
+    judged: Subject,
     tip: TipKinematics | None,
     used: Preprocessing,
 ) -> Horizon:
     most = min(MOST_WINDOWS, PREDICTED_STEPS // steps)
-    windows = _windows(pieces, steps + 1, max(most, 1), measured=used.filtered)
+    windows = _windows(pieces, steps + 1, max(most, 1), used, judged.reach)
     position = None if tip is None else tip.position
-    errors = {x.name: state_errors(x, windows, joint_types, position) for x in predictors}
+    errors = {x.name: state_errors(x, windows, judged.model.joint_types, position) for x in predictors}
     return Horizon(name, steps, windows.dt.sum(dim=1).mean().item(), len(windows), errors)
 
 

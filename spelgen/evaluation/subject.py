@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+import numpy as np
 import torch
 
+from spelgen.dynamics.bristles import bristle_reach, reach_of
 from spelgen.fitting.fitted import Fit, load_run
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.logs.arm_mapping import GivenMapping
@@ -32,8 +34,9 @@ WINDOW = 5  # samples of the windows that say how many steps the integrator need
 class Subject:
     """A model with its joints as the URDF and logs name them.
 
-    urdf: its robot's, where known; tip: the link there, None for the last. preprocessing, window, substeps: those
-    of its fit. trained_on: names of the trajectories that it has seen.
+    urdf: its robot's, where known; tip: the link there, None for the last. preprocessing, window, substeps:
+    those of its fit. reach: (n, K) of the bristles that friction remembers with, its own or the usual ones.
+    trained_on: names of the trajectories that it has seen.
     """
 
     model: EmittedModel
@@ -44,6 +47,7 @@ class Subject:
     preprocessing: Preprocessing | None = None
     window: int = WINDOW
     substeps: int = 1
+    reach: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     trained_on: frozenset[str] = frozenset()
 
 
@@ -68,6 +72,7 @@ def _of_model(model: EmittedModel, urdf: Path | str | None) -> Subject:
     weights = next(model.parameters(), None)
     if weights is not None and (weights.dtype != torch.float64 or not weights.is_cpu):  # as logs are
         model = copy.deepcopy(model).double().cpu()
+    own = bristle_reach(model)
     facts = getattr(model, "facts", None)  # none where it is what else has an arm's dynamics
     return Subject(
         model,
@@ -75,6 +80,7 @@ def _of_model(model: EmittedModel, urdf: Path | str | None) -> Subject:
         logged_joints(model),
         None if urdf is None else Path(urdf),
         facts.options.tip if facts else None,
+        reach=own if own.size else reach_of(model.joint_types),
     )
 
 

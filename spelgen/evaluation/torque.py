@@ -24,14 +24,15 @@ class TorqueErrors:
 
 
 def torque_errors(
-    torque: Callable[[torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor],
+    torque: Callable[..., torch.Tensor],
     samples: Sequence[DynamicsSamples],
 ) -> TorqueErrors:
-    """Errors of an inverse dynamics on these samples."""
+    """Errors of an inverse dynamics on these samples; it is given q, qd, qdd and, where known, z."""
     nmse, rmse = [], []
     for sample in samples:
         with torch.no_grad():
-            found = torque(*(torch.from_numpy(x) for x in (sample.q, sample.qd, sample.qdd)))
+            known = (x for x in (sample.q, sample.qd, sample.qdd, sample.z) if x is not None)
+            found = torque(*map(torch.from_numpy, known))
             squares = (found - torch.from_numpy(sample.tau)).square().mean(dim=0).numpy()
         variance = sample.tau.var(axis=0)
         nmse.append(np.divide(squares, variance, out=np.full_like(squares, np.nan), where=variance > 0))

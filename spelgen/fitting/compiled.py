@@ -45,7 +45,12 @@ class Compiled:
         return self._model.prepare(definite)
 
     def port_hamiltonian_rhs(
-        self, q: torch.Tensor, p: torch.Tensor, tau: torch.Tensor | None, prepared: Any
+        self,
+        q: torch.Tensor,
+        p: torch.Tensor,
+        tau: torch.Tensor | None,
+        prepared: Any,
+        z: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """As the model's. A window's first q, a measured one, is made like all later ones: else it would be compiled
         for by itself, which doubles the wait.
@@ -53,7 +58,7 @@ class Compiled:
         q = q.contiguous()
         if torch.is_grad_enabled() and not q.requires_grad:
             q = q.detach().requires_grad_()
-        return self._rhs(q, p, tau, prepared)
+        return self._rhs(q, p, tau, prepared, z)
 
 
 def compiled(model: EmittedModel, windows: Windows, scales: LossScales) -> EmittedModel:

@@ -43,6 +43,7 @@ class GaussianPrior(Group):
     armature: Positive = 0.4
     sizes: Positive = 1.0
     velocities: Positive = 0.7
+    fractions: Positive = 1.0
     shared_armature: NonNegative = 3.0
     shared_sizes: NonNegative = 1.0
     shared_velocities: NonNegative = 1.0

@@ -59,11 +59,12 @@ def prepare_data(
     preprocessing: Preprocessing,
     validation: float | Sequence[Trajectory] = 0.25,
     seed: int = 0,
+    reach: np.ndarray | None = None,
 ) -> TrainingData:
     """Check the logs and make windows of them.
 
     validation: trajectories, or the fraction of the logs that is set aside, whole trajectories drawn by the seed
-    before anything is cut, so that no sample is in both parts. Raises LogError.
+    before anything is cut, so that no sample is in both parts. reach: see `cut_windows`. Raises LogError.
     """
     if not trajectories:
         raise LogError("no logs", expected="a trajectory or more")
@@ -73,7 +74,7 @@ def prepare_data(
         require_joints(trajectory, joints)
     notes = check(everything, joints, joint_types)
     resolved = preprocessing.resolved([x.sample_rate for x in everything])
-    cutting = WindowCutting(config.window, config.stride, resolved)
+    cutting = WindowCutting(config.window, config.stride, resolved, reach)
     windows = cutting.windows(split.training)
     return TrainingData(
         training=windows,

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+from spelgen.dynamics.bristles import bristle_reach
 from spelgen.errors import Diagnostic, RunError
 from spelgen.files import write_json
 from spelgen.fitting.compiled import compiled
@@ -146,12 +147,14 @@ def _prepared(
 ) -> TrainingData:
     if not isinstance(logs, LargeLogs):
         joints, kinds = logged_joints(model), model.joint_types
-        return prepare_data(logs, joints, kinds, config, preprocessing, validation, seed)
+        return prepare_data(
+            logs, joints, kinds, config, preprocessing, validation, seed, bristle_reach(model)
+        )
     if not isinstance(validation, float):
         raise RunError(
             "trajectories to validate logs larger than memory on", expected="a fraction of these logs"
         )
-    return prepare_streamed(logs, config, preprocessing, validation, seed)
+    return prepare_streamed(logs, config, preprocessing, validation, seed, bristle_reach(model))
 
 
 def _urdf(arm: Any) -> Path | None:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.errors import Diagnostic, LogError, RunError
 from spelgen.files import write_json
 from spelgen.fitting.config import FitConfig
@@ -88,13 +89,13 @@ class Fit:
 
         Velocity is filtered as in the fit and differentiated. NaN where a piece between gaps is too short for that.
         """
-        tau = np.full_like(trajectory.q, np.nan)
+        tau, reach = np.full_like(trajectory.q, np.nan), bristle_reach(self.model)
         for start, stop in pairwise(gap_ends(trajectory.t, self.preprocessing.gap)):
             if stop - start < 2:
                 continue
             piece = self._filtered(trajectory[start:stop])
             qdd = np.gradient(piece.qd, piece.t, axis=0)
-            tau[start:stop] = self._torque(piece.q, piece.qd, qdd)
+            tau[start:stop] = self._torque(piece.q, piece.qd, qdd, bristles_along(piece.q, reach))
         return tau
 
     def score(self, logs: Trajectory | Sequence[Trajectory]) -> float:
@@ -104,14 +105,15 @@ class Fit:
         where no log is sampled densely enough for accelerations.
         """
         logs = [logs] if isinstance(logs, Trajectory) else logs
-        samples = [x for x in dynamics_samples(logs, preprocessing=self.preprocessing) if len(x.q)]
+        found = dynamics_samples(logs, preprocessing=self.preprocessing, reach=bristle_reach(self.model))
+        samples = [x for x in found if len(x.q)]
         if not samples:
             raise LogError(
                 "no motion to judge torques on", expected=f"samples at {DENSE:g} Hz or more that move"
             )
         scores = []
         for x in samples:
-            squares = np.square(self._torque(x.q, x.qd, x.qdd) - x.tau).mean(axis=0)
+            squares = np.square(self._torque(x.q, x.qd, x.qdd, x.z) - x.tau).mean(axis=0)
             variance = x.tau.var(axis=0)
             varies = variance > 0  # a joint without torque says nothing
             scores.append(1 - (squares[varies] / variance[varies]).mean())
@@ -148,9 +150,10 @@ class Fit:
         cutoff = self.preprocessing.cutoff
         return low_pass(piece, cutoff) if cutoff and len(piece.t) > 3 else piece
 
-    def _torque(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
+    def _torque(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, z: np.ndarray | None) -> np.ndarray:
         some = next(self.model.parameters())
-        inputs = (torch.as_tensor(np.ascontiguousarray(x)).to(some) for x in (q, qd, qdd))
+        known = (x for x in (q, qd, qdd, z) if x is not None)
+        inputs = (torch.as_tensor(np.ascontiguousarray(x)).to(some) for x in known)
         with torch.no_grad():
             return self.model.inverse_dynamics(*inputs).cpu().double().numpy()
 

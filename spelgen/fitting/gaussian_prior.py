@@ -22,6 +22,7 @@ KINDS = {
     "armature.raw": "armature",
     "_velocity": "velocities",
     "raw_load_dependence": "sizes",
+    "raw_bristle_fractions": "fractions",
     **dict.fromkeys(SIZES, "sizes"),
 }
 

@@ -38,11 +38,14 @@ def roll_out(
     prepared = model.prepare()
     q = windows.q[:, 0]
     p = model.momentum(q, windows.qd[:, 0], prepared)
+    z = model.memory(windows.qd[:, 0]) if windows.z is None else windows.z
     positions, velocities = [], []
     for dt, tau in zip(windows.dt.unbind(1), windows.tau.unbind(1), strict=True):
         step = dt.unsqueeze(-1) / substeps
         for substep in range(substeps):
-            q, p, qd = _runge_kutta(model, q, p, tau, prepared, step)
+            start = q
+            q, p, qd = _runge_kutta(model, q, p, z, tau, prepared, step)
+            z = model.memory_after(z, q - start)
             if substep == 0:
                 velocities.append(qd)  # of the sample that the interval starts at
         positions.append(q)
@@ -54,16 +57,24 @@ def _runge_kutta(
     model: PortHamiltonianDynamics,
     q: torch.Tensor,
     p: torch.Tensor,
+    z: torch.Tensor,
     tau: torch.Tensor,
     prepared: Any,
     step: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """q and p (W, n) one `step` (W, 1) [s] later, and q' at its start (Hairer et al., Solving ODEs I, II.1)."""
-    qd1, pd1 = model.port_hamiltonian_rhs(q, p, tau, prepared)
+    """q and p (W, n) one `step` (W, 1) [s] later, and q' at its start (Hairer et al., Solving ODEs I, II.1).
+
+    Friction's memory z (W, n, K) follows the displacement exactly, so it needs no stages of its own.
+    """
+
+    def rhs(moved: torch.Tensor, momentum: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return model.port_hamiltonian_rhs(q + moved, momentum, tau, prepared, model.memory_after(z, moved))
+
+    qd1, pd1 = rhs(torch.zeros_like(q), p)
     half = step / 2
-    qd2, pd2 = model.port_hamiltonian_rhs(q + half * qd1, p + half * pd1, tau, prepared)
-    qd3, pd3 = model.port_hamiltonian_rhs(q + half * qd2, p + half * pd2, tau, prepared)
-    qd4, pd4 = model.port_hamiltonian_rhs(q + step * qd3, p + step * pd3, tau, prepared)
+    qd2, pd2 = rhs(half * qd1, p + half * pd1)
+    qd3, pd3 = rhs(half * qd2, p + half * pd2)
+    qd4, pd4 = rhs(step * qd3, p + step * pd3)
     sixth = step / 6
     q = q + sixth * (qd1 + 2 * (qd2 + qd3) + qd4)
     p = p + sixth * (pd1 + 2 * (pd2 + pd3) + pd4)
@@ -147,7 +158,10 @@ def momentum_loss(model: EmittedModel, windows: Windows, scales: LossScales) -> 
     # velocities are measured, so M need not be positive definite on the way; kept so, descent stops where it is not
     prepared = model.prepare(definite=False)
     p = model.momentum(q, qd, prepared)
-    force = model.port_hamiltonian_rhs(q, p, None, prepared)[1]
+    z = [model.memory(qd[:, 0]) if windows.z is None else windows.z]
+    for moved in q.diff(dim=1).unbind(1):
+        z.append(model.memory_after(z[-1], moved))
+    force = model.port_hamiltonian_rhs(q, p, None, prepared, torch.stack(z, dim=1))[1]
     dt = windows.dt.unsqueeze(-1)
     inputs = model.input_matrix(q[:, :-1])
     driven = (inputs @ windows.tau.unsqueeze(-1)).squeeze(-1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from spelgen.dynamics.bristles import bristle_reach
 from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.config import FitConfig, GaussianPrior, Rollout, TorqueFit, fit_config
 from spelgen.fitting.dataset import TrainingData
@@ -93,14 +94,14 @@ def _fit(
 
 def _samples(model: EmittedModel, data: TrainingData) -> TorqueSamples | None:
     """None: there are none."""
-    decimation = DECIMATION if is_closed_form(model) else 1
+    decimation, reach = DECIMATION if is_closed_form(model) else 1, bristle_reach(model)
     if not data.chunks:
-        found = dynamics_samples(data.recordings, preprocessing=data.preprocessing)
+        found = dynamics_samples(data.recordings, preprocessing=data.preprocessing, reach=reach)
         return TorqueSamples.held(found, decimation) if any(len(x.q) for x in found) else None
     each = (
         samples
         for chunk in data.chunks
-        for samples in dynamics_samples([chunk.load()], preprocessing=data.preprocessing)
+        for samples in dynamics_samples([chunk.load()], preprocessing=data.preprocessing, reach=reach)
     )
-    spooled = TorqueSamples.spooled(each, model.n, decimation)
+    spooled = TorqueSamples.spooled(each, model.n, reach.shape[1], decimation)
     return spooled if spooled.count else None

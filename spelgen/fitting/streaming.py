@@ -68,13 +68,14 @@ def prepare_streamed(
     preprocessing: Preprocessing,
     validation: float = 0.25,
     seed: int = 0,
+    reach: np.ndarray | None = None,
 ) -> TrainingData:
     """As `prepare_data`; whole chunks (see `scan`) are set aside for validation."""
     if logs.gap != preprocessing.gap:
         logs = replace(logs, gap=preprocessing.gap)
     known = logs.known
     resolved = preprocessing.resolved(known.rates)
-    cutting = WindowCutting(config.window, config.stride, resolved)
+    cutting = WindowCutting(config.window, config.stride, resolved, reach)
     training, validating = _split(known, cutting, validation, seed)
     sample = training.sample(SAMPLED_CHUNKS, SAMPLED)
     unused = len(known.chunks) - len(training.chunks) - len(validating.chunks)

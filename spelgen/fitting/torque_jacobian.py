@@ -28,6 +28,7 @@ class _Samples:
     qd: torch.Tensor
     qdd: torch.Tensor
     tau: torch.Tensor
+    z: torch.Tensor | None
     regressor: torch.Tensor
     gravity_regressor: torch.Tensor
 
@@ -102,11 +103,12 @@ class TorqueJacobian:
         return map(self._with_regressors, self.samples.blocks(BLOCK))
 
     def _with_regressors(self, block: Block) -> _Samples:
-        q, qd, qdd, tau = block
+        q, qd, qdd, tau, z = block
         still = torch.zeros_like(q)
         with torch.no_grad():
             regressor = self.model.dynamics.regressor
-            return _Samples(qd, qdd, tau, regressor(q, qd, qdd), regressor(q, still, still))
+            past = z if z.shape[-1] else None
+            return _Samples(qd, qdd, tau, past, regressor(q, qd, qdd), regressor(q, still, still))
 
     def _named(self, x: torch.Tensor) -> dict[str, torch.Tensor]:
         parts = x.split([weight.numel() for weight in self.weights.values()])
@@ -125,7 +127,7 @@ class TorqueJacobian:
             dynamics = model.dynamics
             prepared, ten = dynamics.prepare(), dynamics.inertial_parameters().flatten()
             weight = samples.gravity_regressor @ ten
-            friction = dynamics.friction(samples.qd, weight, prepared.friction)
+            friction = dynamics.friction(samples.qd, weight, prepared.friction, samples.z)
             tau = samples.tau - dynamics.torque_offset()
             given: torch.Tensor = dynamics.input.force(weight, tau, prepared.input)
             return given - samples.regressor @ ten - prepared.armature * samples.qdd - friction
@@ -148,12 +150,21 @@ class TorqueJacobian:
         def missing(value: torch.Tensor) -> torch.Tensor:
             return self._missing({**weights, name: value}, samples)
 
-        change = jvp(missing, (weights[name],), (torch.ones_like(weights[name]),))[1].detach()
-        joints = torch.arange(change.shape[1])
+        value = weights[name]
         if name.endswith("raw_gains"):
             joints = self.model.dynamics.input.rows
-        slope = change.new_zeros(*change.shape, len(joints))
-        slope[:, joints, torch.arange(len(joints))] = -change[:, joints]
+        else:
+            joints = torch.arange(len(value)).repeat_interleave(value[0].numel())
+        several = value.reshape(len(value), -1)
+        # one weight of every joint at a time
+        each = [
+            (torch.arange(several.shape[1]) == k).double().expand_as(several) for k in range(several.shape[1])
+        ]
+        changes = [jvp(missing, (value,), (one.reshape_as(value),))[1].detach() for one in each]
+        change = torch.stack(changes, dim=-1)  # (T, n, weights of a joint)
+        slope = change.new_zeros(*change.shape[:2], value.numel())
+        columns = torch.arange(value.numel())
+        slope[:, joints, columns] = -change[:, joints, columns % several.shape[1]]
         return slope
 
     def _body_slope(self, weights: Weights, samples: _Samples) -> torch.Tensor:
@@ -167,7 +178,7 @@ class TorqueJacobian:
         constants = self._ask(weights, lambda model: model.dynamics.friction.prepare())
         weight = samples.gravity_regressor @ ten(weights[BODIES])
         by_load = jvp(
-            lambda each: self.model.dynamics.friction(samples.qd, each, constants),
+            lambda each: self.model.dynamics.friction(samples.qd, each, constants, samples.z),
             (weight,),
             (torch.ones_like(weight),),
         )[1]

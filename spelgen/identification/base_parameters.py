@@ -13,7 +13,7 @@ import numpy as np
 
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.regressor import regressor
-from spelgen.identification.friction import FrictionModel
+from spelgen.identification.friction import BRISTLES, FrictionModel
 from spelgen.structure.base_parameters import base_parameters as body_base_parameters
 from spelgen.structure.base_parameters import parameter_name
 from spelgen.structure.structure import base_parameter_count
@@ -89,7 +89,8 @@ def _columns(arm: Arm, friction: FrictionModel, count: int, seed: int) -> np.nda
     n = len(arm.coordinates)
     shape = (_STATES_PER_PARAMETER * count // n + 1, n)
     q, qd, qdd = np.random.default_rng(seed).uniform(-3.0, 3.0, (3, *shape))
-    rows = np.concatenate([regressor(arm, q, qd, qdd), friction.columns(qd, qdd)], axis=2)
+    bent = np.random.default_rng(seed + 1).uniform(-1.0, 1.0, (*shape, len(BRISTLES)))
+    rows = np.concatenate([regressor(arm, q, qd, qdd), friction.columns(qd, qdd, bent)], axis=2)
     return rows.reshape(-1, count)
 
 

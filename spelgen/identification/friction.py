@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from spelgen.design import BRISTLE_REACH
+
+BRISTLES = tuple(f"bristle {k + 1}, joint " for k in range(len(BRISTLE_REACH["revolute"])))
 STRIBECK_VELOCITY = 0.1  # [rad/s, m/s] at which the extra dry friction of slow motion has fallen to 1/e
 
 
@@ -14,33 +17,42 @@ class FrictionModel:
     """Which effects have a column: armature, viscous, Coulomb and offset always.
 
     coulomb_smoothing_velocity [rad/s, m/s]: width of the tanh in place of Coulomb friction's jump. stribeck: dry
-    friction of slow motion (Gaussian, Armstrong-Helouvry 1991). polynomial: qd |qd| and qd^3.
+    friction of slow motion (Gaussian, Armstrong-Helouvry 1991). polynomial: qd |qd| and qd^3. memory: dry friction by
+    how far each bristle is bent (see ``runtime.bristles``), one column each, in place of the tanh.
     """
 
     coulomb_smoothing_velocity: float = 0.01
     stribeck: bool = False
     polynomial: bool = False
+    memory: bool = False
 
     @property
     def effects(self) -> tuple[str, ...]:
         """Their names, in the columns' order."""
         more = ("stribeck",) * self.stribeck + ("quadratic", "cubic") * self.polynomial
-        return ("armature", "viscous", "coulomb", "offset", *more)
+        dry = BRISTLES if self.memory else ("coulomb",)
+        return ("armature", "viscous", *dry, "offset", *more)
 
-    def columns(self, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
-        """(T, n, effects n): effect e of joint j is column e n + j, which no other joint's torque reads."""
-        parts = np.stack([qdd, *self._velocity_parts(qd)], axis=-2)  # (T, effects, n)
+    def columns(self, qd: np.ndarray, qdd: np.ndarray, bent: np.ndarray | None = None) -> np.ndarray:
+        """(T, n, effects n): effect e of joint j is column e n + j, which no other joint's torque reads.
+
+        bent: (T, n, K), how far the bristles are bent, relative to their reach; None: not known.
+        """
+        parts = np.stack([qdd, *self._velocity_parts(qd, bent)], axis=-2)  # (T, effects, n)
         columns: np.ndarray = parts[:, None] * np.eye(qd.shape[1])[:, None]
         return columns.reshape(*qd.shape, -1)
 
-    def torque(self, constants: np.ndarray, qd: np.ndarray) -> np.ndarray:
+    def torque(self, constants: np.ndarray, qd: np.ndarray, bent: np.ndarray | None = None) -> np.ndarray:
         """All but the armature's part, (T, n), of ``constants`` by effect and joint, (effects, n)."""
-        parts = zip(constants[1:], self._velocity_parts(qd), strict=True)
+        parts = zip(constants[1:], self._velocity_parts(qd, bent), strict=True)
         return np.sum([by_joint * part for by_joint, part in parts], axis=0)
 
-    def _velocity_parts(self, qd: np.ndarray) -> list[np.ndarray]:
+    def _velocity_parts(self, qd: np.ndarray, bent: np.ndarray | None) -> list[np.ndarray]:
         sign = np.tanh(qd / self.coulomb_smoothing_velocity)
-        parts = [qd, sign, np.ones_like(qd)]
+        dry = [sign]
+        if self.memory:  # not knowing the way here: as of a joint that has long gone the way it moves
+            dry = [sign if bent is None else bent[..., k] for k in range(len(BRISTLES))]
+        parts = [qd, *dry, np.ones_like(qd)]
         if self.stribeck:
             parts.append(sign * np.exp(-((qd / STRIBECK_VELOCITY) ** 2)))
         if self.polynomial:

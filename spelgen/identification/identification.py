@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from spelgen.arm.arm import Arm
+from spelgen.dynamics.bristles import reach_of
 from spelgen.dynamics.regressor_dynamics import RegressorDynamics
 from spelgen.errors import Diagnostic
 from spelgen.identification.base_parameters import BaseParameters
@@ -62,14 +63,22 @@ class Identification:
         n, inertial = len(self.arm.coordinates), 10 * len(self.arm.bodies)
         constants = self.parameters[inertial:].reshape(-1, n)
 
-        def friction(qd: np.ndarray) -> np.ndarray:
-            return self.method.friction.torque(constants, qd)
+        reach = None
+        if self.method.friction.memory:
+            reach = reach_of([coordinate.kind for coordinate in self.arm.coordinates])
 
-        return RegressorDynamics(self.arm, self.parameters[:inertial], constants[0], friction, self.inputs)
+        def friction(qd: np.ndarray, z: np.ndarray | None = None) -> np.ndarray:
+            bent = None if z is None or reach is None else z / reach
+            return self.method.friction.torque(constants, qd, bent)
 
-    def torque(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
-        """Joint torques (T, n) of the identified arm."""
-        found: np.ndarray = self.dynamics.joint_torque(q, qd, qdd)
+        bodies = self.parameters[:inertial]
+        return RegressorDynamics(self.arm, bodies, constants[0], friction, reach, self.inputs)
+
+    def torque(
+        self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, z: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Joint torques (T, n) of the identified arm; z: friction's memory (T, n, K)."""
+        found: np.ndarray = self.dynamics.joint_torque(q, qd, qdd, z)
         return found
 
     @property

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from spelgen.arm.arm import Arm
+from spelgen.dynamics.bristles import reach_of
 from spelgen.dynamics.regressor import regressor
 from spelgen.errors import Diagnostic, LogError
 from spelgen.identification.base_parameters import BaseParameters, base_parameters
@@ -47,13 +48,15 @@ def identify(
     for trajectory in logs:
         require_joints(trajectory, [c.name for c in coordinates])
     notes = check(logs, [c.name for c in coordinates], [c.kind for c in coordinates])
-    samples = dynamics_samples(logs, preprocessing=preprocessing or Preprocessing())
+    method = method or LeastSquares()
+    reach = reach_of([c.kind for c in coordinates]) if method.friction.memory else None
+    samples = dynamics_samples(logs, preprocessing=preprocessing or Preprocessing(), reach=reach)
     left = sorted({x.name for x in logs} - {x.name for x in samples})
     if left:
         message = f"sampled too slowly or too short for accelerations: {', '.join(left)}"
         notes.append(Diagnostic("warning", "no-accelerations", "logs", None, message))
     at_joints = [replace(x, tau=x.tau @ inputs.T) for x in samples]
-    found = least_squares(arm.arm, at_joints, method or LeastSquares())
+    found = least_squares(arm.arm, at_joints, method)
     return replace(found, inputs=inputs, diagnostics=tuple(notes))
 
 
@@ -76,9 +79,17 @@ def least_squares(
     return _result(arm, samples, method, base, fit)
 
 
-def columns(arm: Arm, friction: FrictionModel, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
+def columns(
+    arm: Arm,
+    friction: FrictionModel,
+    q: np.ndarray,
+    qd: np.ndarray,
+    qdd: np.ndarray,
+    z: np.ndarray | None = None,
+) -> np.ndarray:
     """The whole regressor (T, n, 10 B + e n): the bodies', then that of friction and drives."""
-    return np.concatenate([regressor(arm, q, qd, qdd), friction.columns(qd, qdd)], axis=2)
+    bent = None if z is None else z / reach_of([x.kind for x in arm.coordinates])
+    return np.concatenate([regressor(arm, q, qd, qdd), friction.columns(qd, qdd, bent)], axis=2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +148,8 @@ def _blocks(
     for each in samples:
         for start in range(0, len(each.q), _BLOCK):
             part = slice(start, start + _BLOCK)
-            yield columns(arm, friction, each.q[part], each.qd[part], each.qdd[part]), each.tau[part]
+            z = None if each.z is None else each.z[part]
+            yield columns(arm, friction, each.q[part], each.qd[part], each.qdd[part], z), each.tau[part]
 
 
 def _fitted(arm: Arm, samples: Sequence[DynamicsSamples], method: LeastSquares, space: _Space) -> _Fit:

@@ -11,7 +11,7 @@ from spelgen.arm.arm import Arm
 from spelgen.dynamics.regressor import urdf_parameters
 from spelgen.emission.plan import guessed_armature, guessed_friction
 from spelgen.errors import ArmError
-from spelgen.identification.friction import FrictionModel
+from spelgen.identification.friction import BRISTLES, FrictionModel
 from spelgen.structure.pseudo_inertia import parameters_of, reference_factor, sensitivity
 from spelgen.structure.sampling import float_energies
 
@@ -63,9 +63,11 @@ def _drives(arm: Arm, friction: FrictionModel, torque: np.ndarray) -> tuple[np.n
         armature[k] = guessed_armature(coordinate)
         speed[k] = coordinate.velocity or _SPEED
     means = {"armature": armature, "viscous": usual / speed, "coulomb": usual}
+    means |= dict.fromkeys(BRISTLES, usual / len(BRISTLES))
     sizes = {
         "armature": np.where(armature > 0, armature, inertia), "viscous": usual / speed, "coulomb": usual,
         "offset": usual, "stribeck": usual, "quadratic": usual / speed**2, "cubic": usual / speed**3,
+        **dict.fromkeys(BRISTLES, usual),
     }  # fmt: skip
     zero = np.zeros(n)
     return (

@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from spelgen.dynamics.bristles import bristles_along
 from spelgen.logs.filtering import AUTOMATIC_CUTOFF, low_pass, resample
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
@@ -22,27 +23,36 @@ AUTOMATIC = Preprocessing()
 
 @dataclass(frozen=True, eq=False)
 class DynamicsSamples:
-    """Samples (T, n) of one trajectory: q, qd, qdd [rad, s; m, s] and tau [Nm, N] as logged."""
+    """Samples (T, n) of one trajectory: q, qd, qdd [rad, s; m, s] and tau [Nm, N] as logged.
+
+    z: (T, n, K) [rad, m], friction's memory of the way there; None: not known.
+    """
 
     name: str
     q: np.ndarray
     qd: np.ndarray
     qdd: np.ndarray
     tau: np.ndarray
+    z: np.ndarray | None = None
 
 
 def dynamics_samples(
-    trajectories: Sequence[Trajectory], *, pauses: bool = False, preprocessing: Preprocessing = AUTOMATIC
+    trajectories: Sequence[Trajectory],
+    *,
+    pauses: bool = False,
+    preprocessing: Preprocessing = AUTOMATIC,
+    reach: np.ndarray | None = None,
 ) -> list[DynamicsSamples]:
     """The moving samples of each dense enough trajectory.
 
     At 100 Hz, through the zero-phase low-pass of ``preprocessing``, by default of 8 Hz, on q, qd and tau (before the
     change of rate where the log is denser, after it where not), qdd by central differences of the filtered qd, only
     samples with some |qd| > 0.02 rad/s; pieces between gaps separately. ``pauses``: all samples from the first that
-    moves to the last, standstill between them included.
+    moves to the last, standstill between them included. ``reach``: (n, K) of the bristles whose states z are
+    wanted, see ``bristles_along``.
     """
     return [
-        _samples(x, pauses, preprocessing)
+        _samples(x, pauses, preprocessing, reach)
         for x in trajectories
         if x.sample_rate >= DENSE and any(map(_long, _pieces(x, preprocessing.gap)))
     ]
@@ -61,7 +71,9 @@ def _long(piece: Trajectory) -> bool:
     return bool(piece.t[-1] - piece.t[0] >= SHORTEST)
 
 
-def _samples(trajectory: Trajectory, pauses: bool, preprocessing: Preprocessing) -> DynamicsSamples:
+def _samples(
+    trajectory: Trajectory, pauses: bool, preprocessing: Preprocessing, reach: np.ndarray | None
+) -> DynamicsSamples:
     parts = []
     for piece in filter(_long, _pieces(trajectory, preprocessing.gap)):
         smooth = _at_common_rate(piece, preprocessing.acceleration_cutoff)
@@ -70,7 +82,10 @@ def _samples(trajectory: Trajectory, pauses: bool, preprocessing: Preprocessing)
         if pauses and taken.any():
             first, *_, last = np.flatnonzero(taken)
             taken[first:last] = True
-        parts.append([x[taken] for x in (smooth.q, smooth.qd, qdd, smooth.tau)])
+        columns = [smooth.q, smooth.qd, qdd, smooth.tau]
+        if reach is not None and reach.size:
+            columns.append(bristles_along(smooth.q, reach))
+        parts.append([x[taken] for x in columns])
     return DynamicsSamples(
         trajectory.name, *(np.concatenate(columns) for columns in zip(*parts, strict=True))
     )

@@ -16,13 +16,14 @@ from spelgen.logs.windows import Windows, cut_windows, joined, thinned, window_c
 EPOCH = 2**17  # windows of an epoch, about: of 7 joints and 5 samples, 107 MB
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class WindowCutting:
     """How windows are cut: see `cut_windows`. preprocessing: a resolved one."""
 
     window: int
     stride: int
     preprocessing: Preprocessing
+    reach: np.ndarray | None = None
 
     @property
     def decimation(self) -> int:
@@ -42,7 +43,9 @@ class WindowCutting:
         """All windows of these trajectories, filtered piece by piece."""
         pieces = self.preprocessing.pieces(trajectories, shortest=self.shortest)
         filtered = self.preprocessing.filtered
-        return cut_windows(pieces, self.window, self.stride, self.decimation, measured=filtered)
+        return cut_windows(
+            pieces, self.window, self.stride, self.decimation, measured=filtered, reach=self.reach
+        )
 
 
 @dataclass(frozen=True)

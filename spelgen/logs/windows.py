@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from numpy.lib.stride_tricks import sliding_window_view
 
+from spelgen.dynamics.bristles import bristles_along
 from spelgen.errors import Diagnostic, LogError
 from spelgen.logs.read import Trajectory
 
@@ -20,18 +21,20 @@ class Windows:
     dt: (W, K-1) steps between the samples [s].
     q, qd: (W, K, n) measured positions and velocities.
     tau: (W, K-1, n) the input held over each step.
+    z: (W, n, B) [rad, m] friction's memory at the first sample, of the way there; None: not known.
     """
 
     dt: torch.Tensor
     q: torch.Tensor
     qd: torch.Tensor
     tau: torch.Tensor
+    z: torch.Tensor | None = None
 
     def __len__(self) -> int:
         return self.dt.shape[0]
 
     def __getitem__(self, rows: torch.Tensor | slice) -> Windows:
-        return Windows(self.dt[rows], self.q[rows], self.qd[rows], self.tau[rows])
+        return self._each(lambda x: x[rows])
 
     def split(self, size: int) -> list[Windows]:
         """Consecutive parts of at most `size` windows."""
@@ -39,7 +42,15 @@ class Windows:
 
     def to(self, device: str | torch.device) -> Windows:
         """The same windows on another device."""
-        return Windows(*(x.to(device) for x in (self.dt, self.q, self.qd, self.tau)))
+        return self._each(lambda x: x.to(device))
+
+    def columns(self) -> list[torch.Tensor]:
+        """All that is known."""
+        columns = [self.dt, self.q, self.qd, self.tau]
+        return columns if self.z is None else [*columns, self.z]
+
+    def _each(self, change: Callable[[torch.Tensor], torch.Tensor]) -> Windows:
+        return Windows(*map(change, self.columns()))
 
 
 def thinned(windows: Windows, most: int) -> Windows:
@@ -49,8 +60,7 @@ def thinned(windows: Windows, most: int) -> Windows:
 
 def joined(parts: Sequence[Windows]) -> Windows:
     """One batch of all windows, in order."""
-    columns = zip(*((x.dt, x.q, x.qd, x.tau) for x in parts), strict=True)
-    return Windows(*(torch.cat(each) for each in columns))
+    return Windows(*(torch.cat(each) for each in zip(*(x.columns() for x in parts), strict=True)))
 
 
 def window_count(samples: int, window: int, stride: int, decimation: int) -> int:
@@ -60,17 +70,23 @@ def window_count(samples: int, window: int, stride: int, decimation: int) -> int
 
 
 def cut_windows(
-    pieces: Sequence[Trajectory], window: int, stride: int = 1, decimation: int = 1, *, measured: bool
+    pieces: Sequence[Trajectory],
+    window: int,
+    stride: int = 1,
+    decimation: int = 1,
+    *,
+    measured: bool,
+    reach: np.ndarray | None = None,
 ) -> Windows:
     """All windows of `window` samples, `decimation` apart, that start at every `stride`-th sample of a piece.
 
     Between samples the input is held at its mean over time. measured: False reads tau[k] as held from t[k]
     to t[k+1], as a simulator with zero-order hold applied it. True reads it as measured at t[k] and takes
-    the mean of both ends for a step; holding tau[k] would be half a sample late. Raises LogError when
-    there is no window.
+    the mean of both ends for a step; holding tau[k] would be half a sample late. reach: (n, B) of the bristles
+    whose states z are wanted, which begin straight with each piece. Raises LogError when there is no window.
     """
     cut = [
-        _cut(piece, window, stride, decimation, measured)
+        _cut(piece, window, stride, decimation, measured, reach)
         for piece in pieces
         if len(piece.t) > (window - 1) * decimation
     ]
@@ -80,7 +96,7 @@ def cut_windows(
 
 
 def _cut(
-    piece: Trajectory, window: int, stride: int, decimation: int, measured: bool
+    piece: Trajectory, window: int, stride: int, decimation: int, measured: bool, reach: np.ndarray | None
 ) -> tuple[np.ndarray, ...]:
     held = (piece.tau[:-1] + piece.tau[1:]) / 2 if measured else piece.tau[:-1]
     impulse = sliding_window_view(held * np.diff(piece.t)[:, None], decimation, axis=0).sum(
@@ -89,7 +105,11 @@ def _cut(
     dt = (piece.t[decimation:] - piece.t[:-decimation])[:, None]
     steps = [_slide(x, window - 1, stride, decimation) for x in (dt, impulse / dt)]
     states = [_slide(x, window, stride, decimation) for x in (piece.q, piece.qd)]
-    return steps[0][..., 0], *states, steps[1]
+    columns = (steps[0][..., 0], *states, steps[1])
+    if reach is None or not reach.size:
+        return columns
+    starts = len(piece.t) - (window - 1) * decimation
+    return *columns, bristles_along(piece.q, reach)[:starts:stride]
 
 
 def _slide(values: np.ndarray, window: int, stride: int, decimation: int) -> np.ndarray:

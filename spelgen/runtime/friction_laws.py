@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
+from spelgen.runtime.bristles import Bristles
 from spelgen.runtime.joints import Joints, vector
 
 # where the constants start, relative to a joint's usual friction and speed
@@ -28,23 +30,29 @@ class FrictionConstants(NamedTuple):
     stribeck_velocity: Tensor  # [rad/s, m/s]
     coulomb_smoothing_velocity: Tensor  # [rad/s, m/s]
     load_dependence: Tensor  # dry friction by gravity torque
+    bristle_fractions: Tensor  # of dry friction, (n, K); a joint's add up to one
 
 
 class FrictionLaws(nn.Module):
     """Friction which resists whatever the weights are: they are logarithms.
 
     viscous qd + saturation tanh(qd / saturation_velocity)
-    + (coulomb + stribeck exp(-(qd / stribeck_velocity)^2) + load_dependence |gravity torque|)
-    tanh(qd / coulomb_smoothing_velocity).
+    + (coulomb + stribeck exp(-(qd / stribeck_velocity)^2) + load_dependence |gravity torque|) direction.
+
+    The direction, from -1 to 1, is that of the bristles, sum of fraction z / reach; without them, or
+    where nothing is known of the way here, tanh(qd / coulomb_smoothing_velocity).
     """
 
     nominal: Tensor
     speed: Tensor
+    raw_coulomb_smoothing_velocity: nn.Parameter | None
+    raw_bristle_fractions: nn.Parameter | None
 
-    def __init__(self, joints: Joints) -> None:
+    def __init__(self, joints: Joints, reach: Sequence[Sequence[float]] = ()) -> None:
         super().__init__()
         self.register_buffer("nominal", vector(joints.friction))
         self.register_buffer("speed", vector(joints.speed))
+        self.bristles = Bristles(reach or [[]] * joints.n)
         start = torch.zeros(joints.n, dtype=torch.float64)
         self.raw_viscous = nn.Parameter(start.clone())
         self.raw_saturation = nn.Parameter(start.clone())
@@ -52,12 +60,17 @@ class FrictionLaws(nn.Module):
         self.raw_coulomb = nn.Parameter(start.clone())
         self.raw_stribeck = nn.Parameter(start.clone())
         self.raw_stribeck_velocity = nn.Parameter(start.clone())
-        self.raw_coulomb_smoothing_velocity = nn.Parameter(start.clone())
         self.raw_load_dependence = nn.Parameter(start.clone())
+        # dry friction turns around by displacement or by velocity, never by both
+        smoothing = None if reach else nn.Parameter(start.clone())
+        self.register_parameter("raw_coulomb_smoothing_velocity", smoothing)
+        fractions = nn.Parameter(torch.zeros_like(self.bristles.reach)) if reach else None
+        self.register_parameter("raw_bristle_fractions", fractions)
 
     def prepare(self) -> FrictionConstants:
         """The constants, in their units."""
         size, speed = self.nominal, self.speed
+        smoothing, fractions = self.raw_coulomb_smoothing_velocity, self.raw_bristle_fractions
         return FrictionConstants(
             viscous=size / speed * self.raw_viscous.exp(),
             saturation=size * self.raw_saturation.exp(),
@@ -65,22 +78,48 @@ class FrictionLaws(nn.Module):
             coulomb=size * self.raw_coulomb.exp(),
             stribeck=STRIBECK * size * self.raw_stribeck.exp(),
             stribeck_velocity=STRIBECK_VELOCITY * speed * self.raw_stribeck_velocity.exp(),
-            coulomb_smoothing_velocity=SMOOTHING_VELOCITY * speed * self.raw_coulomb_smoothing_velocity.exp(),
+            coulomb_smoothing_velocity=SMOOTHING_VELOCITY
+            * speed
+            * (1 if smoothing is None else smoothing.exp()),
             load_dependence=LOAD_DEPENDENCE * size.sign() * self.raw_load_dependence.exp(),
+            bristle_fractions=self.bristles.reach if fractions is None else fractions.softmax(dim=-1),
         )
 
     def resistance(self, qd: Tensor, gravity: Tensor, constants: FrictionConstants) -> Tensor:
-        """The diagonal of D, (..., n): friction torque by velocity, under this gravity torque."""
+        """The diagonal of D, (..., n), where nothing is known of the way here: friction torque by velocity."""
         c = constants
-        slow = (-((qd / c.stribeck_velocity) ** 2)).exp()
-        dry = c.coulomb + c.stribeck * slow + c.load_dependence * gravity.abs()
-        dry = dry / c.coulomb_smoothing_velocity * tanh_ratio(qd / c.coulomb_smoothing_velocity)
-        saturating = c.saturation / c.saturation_velocity * tanh_ratio(qd / c.saturation_velocity)
-        return c.viscous + saturating + dry
+        slope = tanh_ratio(qd / c.coulomb_smoothing_velocity) / c.coulomb_smoothing_velocity
+        return self._viscous(qd, c) + self._dry(qd, gravity, c) * slope
 
-    def forward(self, qd: Tensor, gravity: Tensor, constants: FrictionConstants) -> Tensor:
-        """The friction torque D qd, (..., n) [Nm, N], under this gravity torque."""
-        return self.resistance(qd, gravity, constants) * qd
+    def forward(
+        self, qd: Tensor, gravity: Tensor, constants: FrictionConstants, z: Tensor | None = None
+    ) -> Tensor:
+        """The friction torque, (..., n) [Nm, N], under this gravity torque, of bristles at z, (..., n, K)."""
+        if z is None:
+            return self.resistance(qd, gravity, constants) * qd
+        direction = (constants.bristle_fractions * z / self.bristles.reach).sum(dim=-1)
+        return self._viscous(qd, constants) * qd + self._dry(qd, gravity, constants) * direction
+
+    def sliding(self, qd: Tensor) -> Tensor:
+        """The bristles z, (..., n, K), of joints that have long gone this way."""
+        direction = (qd / self.prepare().coulomb_smoothing_velocity).tanh()
+        return direction.unsqueeze(-1) * self.bristles.reach
+
+    def stored_energy(self, z: Tensor, constants: FrictionConstants) -> Tensor:
+        """What the bristles of Coulomb friction give back, (...) [J]."""
+        stored = constants.bristle_fractions * z.square() / self.bristles.reach
+        return 0.5 * (constants.coulomb * stored.sum(dim=-1)).sum(dim=-1)
+
+    @staticmethod
+    def _viscous(qd: Tensor, c: FrictionConstants) -> Tensor:
+        """Torque by velocity, (..., n)."""
+        return c.viscous + c.saturation / c.saturation_velocity * tanh_ratio(qd / c.saturation_velocity)
+
+    @staticmethod
+    def _dry(qd: Tensor, gravity: Tensor, c: FrictionConstants) -> Tensor:
+        """The size of dry friction, (..., n) [Nm, N]."""
+        slow = (-((qd / c.stribeck_velocity) ** 2)).exp()
+        return c.coulomb + c.stribeck * slow + c.load_dependence * gravity.abs()
 
 
 def tanh_ratio(x: Tensor) -> Tensor:

@@ -37,7 +37,7 @@ class NetworkDynamics(PortHamiltonian):
         fourier: FourierFeatures | None = None,
     ) -> None:
         super().__init__()
-        self.n = len(encoding.center)
+        self.n, self.elements = len(encoding.center), 0
         self.encoding, self.fourier = encoding, fourier
         # Any: what a part has beside its protocol is there to be asked for
         self.mass: Any = mass
@@ -115,8 +115,10 @@ class NetworkDynamics(PortHamiltonian):
             by_fourier = self.fourier.jvp(at.fourier, qd)
         return Configuration(self.encoding.jvp(at.encoded, qd), by_fourier)
 
-    def friction_at(self, at: Configuration, qd: Tensor, prepared: NetworkPrepared) -> Tensor:
-        """D(q, qd) qd, (..., n) [Nm, N]."""
+    def friction_at(
+        self, at: Configuration, qd: Tensor, prepared: NetworkPrepared, z: Tensor | None = None
+    ) -> Tensor:
+        """D(q, qd) qd, (..., n) [Nm, N]; this friction has no memory."""
         torque: Tensor = self.friction(at.encoded, qd, prepared.friction)
         return torque
 

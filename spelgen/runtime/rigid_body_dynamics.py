@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -61,10 +62,15 @@ class RigidBodyDynamics(PortHamiltonian):
     actuated: Tensor
 
     def __init__(
-        self, joints: Joints, bodies: Bodies, gravity: tuple[float, float, float], input: Input
+        self,
+        joints: Joints,
+        bodies: Bodies,
+        gravity: tuple[float, float, float],
+        input: Input,
+        reach: Sequence[Sequence[float]] = (),
     ) -> None:
         super().__init__()
-        self.n, self.parents = joints.n, bodies.parent
+        self.n, self.elements, self.parents = joints.n, len(reach[0]) if reach else 0, bodies.parent
         count = len(bodies.parent)
         tables = torch.stack([transform_table(bodies, index) for index in range(count)])
         self.register_buffer("forth", tables.mT.transpose(1, 2).flatten(2))
@@ -91,7 +97,7 @@ class RigidBodyDynamics(PortHamiltonian):
         self.register_buffer("actuated", vector(float(x) for x in joints.actuated))
         self.inertial_parameters = InertialParameters(bodies)
         self.armature = Armature(joints)
-        self.friction = FrictionLaws(joints)
+        self.friction = FrictionLaws(joints, reach)
         self.input: Any = input
         # of the measured torque, in units of the joints' usual friction
         self.raw_offset = nn.Parameter(torch.zeros(self.n, dtype=torch.float64))
@@ -224,10 +230,26 @@ class RigidBodyDynamics(PortHamiltonian):
         rows: Tensor = (columns @ wrenches).transpose(-3, -2)
         return rows.reshape(*q.shape, 10 * len(self.parents))
 
-    def friction_at(self, at: Motion, qd: Tensor, prepared: RigidPrepared) -> Tensor:
-        """D(q, qd) qd, (..., n) [Nm, N]."""
-        torque: Tensor = self.friction(qd, at.gravity, prepared.friction)
+    def friction_at(self, at: Motion, qd: Tensor, prepared: RigidPrepared, z: Tensor | None = None) -> Tensor:
+        """The friction torque, (..., n) [Nm, N]."""
+        torque: Tensor = self.friction(qd, at.gravity, prepared.friction, z)
         return torque
+
+    def stored_energy(self, z: Tensor, prepared: RigidPrepared) -> Tensor:
+        """What the bristles give back, (...) [J]."""
+        return self.friction.stored_energy(z, prepared.friction)
+
+    def memory(self, qd: Tensor) -> Tensor:
+        """z, (..., n, K), of joints that have long gone this way."""
+        return self.friction.sliding(qd)
+
+    def memory_rate(self, qd: Tensor, z: Tensor) -> Tensor:
+        """z', (..., n, K)."""
+        return self.friction.bristles.rate(qd, z)
+
+    def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
+        """z after joints went one way by (..., n), exactly."""
+        return self.friction.bristles.moved(z, displacement)
 
     def dissipation_at(self, at: Motion, qd: Tensor, prepared: RigidPrepared) -> Tensor:
         """D(q, qd), (..., n, n), diagonal."""

@@ -1,0 +1,63 @@
+"""The memory of friction along a measured path: the state z of `runtime.bristles` at every sample, in one pass."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from spelgen.design import BRISTLE_REACH
+
+ENCODER_STEPS = 1.0  # a joint that went less far may not have moved at all
+
+
+def reach_of(kinds: Sequence[str]) -> np.ndarray:
+    """(n, K) [rad, m] of joints of these kinds."""
+    return np.array([BRISTLE_REACH[kind] for kind in kinds])
+
+
+def bristle_reach(model: Any) -> np.ndarray:
+    """(n, K) [rad, m] of a model; K is 0 where its friction has no memory."""
+    reach = getattr(model, "bristle_reach", None)
+    return np.zeros((model.n, 0)) if reach is None else reach.detach().cpu().double().numpy()
+
+
+def bristles_along(q: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """z, (T, n, K) [rad, m], along the path q (T, n), straight at its start.
+
+    Between samples joints go one way, which is exact: z' is linear in the displacement.
+    """
+    moved = np.diff(encoded(q), axis=0, prepend=q[:1])[..., None]  # (T, n, 1)
+    kept = np.exp(-np.abs(moved) / reach)
+    added = np.sign(moved) * reach * (1 - kept)
+    # z[k] = kept[k] z[k - 1] + added[k]: pairs are joined, then fours, ...
+    shift = 1
+    while shift < len(q):
+        added[shift:] += kept[shift:] * added[:-shift]
+        kept[shift:] *= kept[:-shift].copy()
+        shift *= 2
+    return added
+
+
+def encoded(q: np.ndarray) -> np.ndarray:
+    """The path (T, n) without the jitter of its encoders: it follows q where this leaves a band of a step around it."""
+    half = ENCODER_STEPS * encoder_step(q) / 2
+    low, high = q - half, q + half  # clamping to a band after a band is clamping to one
+    shift = 1
+    while shift < len(q):
+        before, after = slice(None, -shift), slice(shift, None)
+        clamped = [np.clip(x[before], low[after], high[after]) for x in (low, high)]
+        low[after], high[after] = clamped
+        shift *= 2
+    return np.clip(np.broadcast_to(q[:1], q.shape), low, high)
+
+
+def encoder_step(q: np.ndarray) -> np.ndarray:
+    """The step (n,) in which positions (T, n) come; 0 where they come in none."""
+    steps = np.zeros(q.shape[1])
+    for joint, values in enumerate(q.T):
+        levels = np.unique(values)
+        if len(levels) > 1 and len(levels) < len(values) / 4:  # values that come again and again
+            steps[joint] = np.median(np.diff(levels))
+    return steps
