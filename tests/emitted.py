@@ -16,6 +16,7 @@ import torch
 from flint import fmpq_mpoly
 from torch import nn
 
+from spelgen.design import Design
 from spelgen.emission.emit import emit
 from spelgen.loaded_arm import load_arm
 from spelgen.pipeline import make_spec
@@ -47,11 +48,15 @@ def import_source(source: str, path: Path) -> ModuleType:
 
 @cache
 def built(
-    robot: str, assume: str = "kinematics", preset: str = "minimal", net: str | None = None
+    robot: str,
+    assume: str = "kinematics",
+    preset: str = "minimal",
+    net: str | None = None,
+    design: Design | None = None,
 ) -> tuple[str, Structure]:
     """Source and structure of one of the robots that come with spelgen."""
     loaded = load_arm(ROBOTS / f"{robot}.urdf")
-    options = Options(preset=preset, net=net, assume=assume)
+    options = Options(preset=preset, design=design, net=net, assume=assume)
     return emit(make_spec(loaded, options)), derive(loaded.arm, assume)
 
 

@@ -86,12 +86,6 @@ class Model(nn.Module):
     def prepare(self, definite=True):
         return None
 
-    def memory(self, qd):
-        return qd.unsqueeze(-1)[..., :0]
-
-    def memory_after(self, z, displacement):
-        return z
-
     def port_hamiltonian_rhs(self, q, p, tau, prepared, z=None):
         qd = self.velocity(q, p)
         pd = self._kinetic_slope(q, qd) - self.gravity(q) - self.damping.exp() * qd

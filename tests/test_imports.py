@@ -27,6 +27,7 @@ urdf: robot xacro_child xacro_input document values elements lint read
 arm: rational angle_rounding placement chain lump_links arm actuation axes
 structure: recursion field sampling spans basis expansion symbolic structure nominal
 structure: fourier base_parameters pseudo_inertia
+dynamics: bristles
 {" ".join(RUNTIME)}
 dynamics: protocol prepared
 emission: bodies plan source docstring tailored bundle emit loading

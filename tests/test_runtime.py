@@ -3,6 +3,7 @@
 import ast
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from emitted import SIX, built, import_source, random_model
 from torch import Tensor
 from torch.func import hessian, jacfwd, jacrev, jvp, vjp, vmap
 
+from spelgen.design import load_design
 from spelgen.emission.bundle import bundle, load_runtime, names_in
 from spelgen.runtime.encoding import JointEncoding, joint_input, lie_group_input
 from spelgen.runtime.fourier import FourierFeatures, FourierSeries, Term
@@ -229,7 +231,9 @@ def test_transforms_work_for_every_preset(robot, preset, net, tmp_path):
     near(forward, reverse, 1e-8)
     curvature = hessian(model.hamiltonian, argnums=1)(q[0], model.momentum(q[0], qd[0]))
     near(curvature, torch.linalg.inv(model.mass_matrix(q[0])), 1e-8)
-    state = torch.cat([q, qd, tau], dim=-1)
+    z = model.dynamics.memory(qd)
+    near(vmap(model.forward_dynamics)(q, qd, tau, z), model.forward_dynamics(q, qd, tau, z), 1e-9)
+    state = torch.cat([q, qd, z.flatten(-2), tau], dim=-1)
     batch = {"t": None, "state": {0: torch.export.Dim("batch")}}
     program = torch.export.export(model, (torch.zeros(()), state), dynamic_shapes=batch, strict=True)
     more = torch.cat([state, state])
@@ -267,7 +271,9 @@ def test_values_are_in_units(tmp_path):
 def test_numbers_are_those_of_the_first_stage(case, tmp_path):
     """Modules of the first stage, made by templates, gave these with the same seed and the same change of weights."""
     robot, preset, net = case.split()
-    source = built(robot, preset=preset, net=None if net == "default" else net)[0]
+    design = load_design("closed-form") if preset == "closed-form" else None
+    design = design and replace(design, memory="none")
+    source = built(robot, preset=preset, net=None if net == "default" else net, design=design)[0]
     model = import_source(source, tmp_path / f"{robot}_numbers.py").Model(seed=3)
     generator = torch.Generator().manual_seed(1)
     q, qd, tau = (torch.randn(model.n, generator=generator, dtype=torch.float64) for _ in range(3))

@@ -119,7 +119,7 @@ def test_the_prior_knows_every_weight(emitted):
     """What it knows nothing of would be taken for something else in silence."""
     module = emitted["six_dof"][0]
     kinds = {kind_of(name) for name, _ in module.Model().named_parameters()}
-    assert kinds == {"bodies", "offset", "armature", "sizes", "velocities"}
+    assert kinds == {"bodies", "offset", "armature", "sizes", "velocities", "fractions"}
     with pytest.raises(StopIteration):
         kind_of("dynamics.unheard_of")
 
@@ -134,7 +134,9 @@ def test_blocks_give_what_all_at_once_gives(emitted, monkeypatch, held, on_disk)
     expected = fit_torque(whole, samples)
     monkeypatch.setattr(torque_jacobian, "BLOCK", 64)
     monkeypatch.setattr(torque_jacobian, "HELD", 1e12 if held else 0)
-    table = TorqueSamples.spooled(iter(samples), 6, 2) if on_disk else TorqueSamples.held(samples, 2)
+    table = (
+        TorqueSamples.spooled(iter(samples), 6, decimation=2) if on_disk else TorqueSamples.held(samples, 2)
+    )
     assert (table.count, table.seen, len(list(table.blocks(64)))) == (450, 900, 8)
     found = fit_torque(parts, table)
     assert found.steps == expected.steps

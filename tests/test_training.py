@@ -109,7 +109,7 @@ class Oscillator:
     def prepare(self, definite=True):
         return None
 
-    def port_hamiltonian_rhs(self, q, p, tau, prepared):
+    def port_hamiltonian_rhs(self, q, p, tau, prepared, z=None):
         return p, tau - self.frequency**2 * q
 
     def solve(self, windows: Windows):

@@ -9,8 +9,6 @@ import numpy as np
 
 from spelgen.design import BRISTLE_REACH
 
-ENCODER_STEPS = 1.0  # a joint that went less far may not have moved at all
-
 
 def reach_of(kinds: Sequence[str]) -> np.ndarray:
     """(n, K) [rad, m] of joints of these kinds."""
@@ -19,8 +17,11 @@ def reach_of(kinds: Sequence[str]) -> np.ndarray:
 
 def bristle_reach(model: Any) -> np.ndarray:
     """(n, K) [rad, m] of a model; K is 0 where its friction has no memory."""
-    reach = getattr(model, "bristle_reach", None)
-    return np.zeros((model.n, 0)) if reach is None else reach.detach().cpu().double().numpy()
+    friction = getattr(getattr(model, "dynamics", None), "friction", None)
+    if friction is None or not hasattr(friction, "bristles"):
+        return np.zeros((model.n, 0))
+    found: np.ndarray = friction.bristles.reach.cpu().double().numpy()
+    return found
 
 
 def bristles_along(q: np.ndarray, reach: np.ndarray) -> np.ndarray:
@@ -41,9 +42,9 @@ def bristles_along(q: np.ndarray, reach: np.ndarray) -> np.ndarray:
 
 
 def encoded(q: np.ndarray) -> np.ndarray:
-    """The path (T, n) without the jitter of its encoders: it follows q where this leaves a band of a step around it."""
-    half = ENCODER_STEPS * encoder_step(q) / 2
-    low, high = q - half, q + half  # clamping to a band after a band is clamping to one
+    """The path (T, n) without the jitter of its encoders: it follows q where this leaves a band of a step to both sides."""
+    step = encoder_step(q)
+    low, high = q - step, q + step  # clamping to a band after a band is clamping to one
     shift = 1
     while shift < len(q):
         before, after = slice(None, -shift), slice(shift, None)
@@ -59,5 +60,5 @@ def encoder_step(q: np.ndarray) -> np.ndarray:
     for joint, values in enumerate(q.T):
         levels = np.unique(values)
         if len(levels) > 1 and len(levels) < len(values) / 4:  # values that come again and again
-            steps[joint] = np.median(np.diff(levels))
+            steps[joint] = np.diff(levels).min()
     return steps

@@ -59,21 +59,30 @@ class PortHamiltonianDynamics(RigidDynamics, Protocol):
     ) -> tuple[Tensor, Tensor]:
         """q' and p', (..., n), under the inputs tau; without, of the arm left to itself."""
 
-    def memory(self, qd: Tensor) -> Tensor:
-        """z, (..., n, K), of joints that have long gone this way."""
 
-    def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
-        """z after joints went one way by (..., n)."""
+def remembering(dynamics: Any) -> Any:
+    """What knows of friction's memory z, which all that depends on friction then takes last; None: nothing does."""
+    owner = getattr(dynamics, "dynamics", dynamics)  # an emitted model's, or of least squares
+    return owner if getattr(owner, "elements", 0) else None
 
 
-def remembers(dynamics: Any) -> bool:
-    """Whether its friction has a memory z, which all that depends on friction then takes as its last argument."""
-    return bool(getattr(dynamics, "bristle_reach", None) is not None)
+def sliding_memory(dynamics: Any, qd: Tensor) -> Tensor:
+    """z, (..., n, K), of joints that have long gone the way of qd."""
+    owner = remembering(dynamics)
+    found: Tensor = qd.unsqueeze(-1)[..., :0] if owner is None else owner.memory(qd)
+    return found
+
+
+def memory_after(dynamics: Any, z: Tensor, displacement: Tensor) -> Tensor:
+    """z after joints went one way by (..., n)."""
+    owner = remembering(dynamics)
+    found: Tensor = z if owner is None else owner.memory_after(z, displacement)
+    return found
 
 
 def known_past(dynamics: Any, z: Tensor | None) -> tuple[Tensor, ...]:
     """z as what to give to these dynamics last, where they have a use for it."""
-    return () if z is None or not remembers(dynamics) else (z,)
+    return () if z is None or remembering(dynamics) is None else (z,)
 
 
 class VelocityState:
@@ -99,16 +108,6 @@ class VelocityState:
         """qd and qdd."""
         past = known_past(self.dynamics, z)
         return p, self.dynamics.forward_dynamics(q, p, torch.zeros_like(q) if tau is None else tau, *past)
-
-    def memory(self, qd: Tensor) -> Tensor:
-        """That of the dynamics, where they have one."""
-        found: Tensor = self.dynamics.memory(qd) if remembers(self.dynamics) else qd.unsqueeze(-1)[..., :0]
-        return found
-
-    def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
-        """Likewise."""
-        found: Tensor = self.dynamics.memory_after(z, displacement) if remembers(self.dynamics) else z
-        return found
 
 
 def integrable(dynamics: RigidDynamics) -> Any:

@@ -43,6 +43,11 @@ class RegressorDynamics:
         """How many coordinates."""
         return len(self.armature)
 
+    @property
+    def elements(self) -> int:
+        """K, of friction's memory at a joint."""
+        return 0 if self.bristle_reach is None else self.bristle_reach.shape[1]
+
     def mass_matrix(self, q: Array) -> Array:
         """M, (..., n, n) [kg m^2, kg m, kg]."""
         return self._by_rows(lambda at, _: self._mass(at), q)

@@ -52,12 +52,10 @@ def _values(spec: ModelSpec) -> list[Value]:
             for name, what, units in _FRICTION
         ]
         ten = "By body (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) about its joint's frame, (bodies, 10)."
-        reach = "How far the bristles of its friction reach, (n, K) [rad, m]."
         return [
             ("inertial_parameters", ten, f"{dynamics}.inertial_parameters()"),
             *_armature(dynamics),
             *friction,
-            ("bristle_reach", reach, f"{dynamics}.friction.bristles.reach"),
             (
                 "torque_offset",
                 "What the measured torque shows without any, (n,) [Nm, N].",

@@ -6,6 +6,7 @@ import json
 from dataclasses import dataclass
 
 WIDTH = 110
+_FEW = 3  # equal items that are written out
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ def assignment(target: str, value: object, indent: int = 0) -> str:
 def laid_out(start: str, value: object, indent: int = 0, end: str = "") -> str:
     """``start``, ``value`` and ``end`` on one line, or with an item of the value a line."""
     flat = start + _flat(value) + end
-    if indent + len(flat) <= WIDTH or not _items(value):
+    if indent + len(flat) <= WIDTH or not _items(value) or _alike(value):
         return flat
     inner = " " * (indent + 4)
     opening, closing = (f"{value.callee}(", ")") if isinstance(value, Call) else ("(", ")")
@@ -54,6 +55,11 @@ def _items(value: object) -> list[tuple[str, object]]:
     return [("", item) for item in value] if isinstance(value, tuple) else []
 
 
+def _alike(value: object) -> bool:
+    """Whether it is a tuple of one thing again and again."""
+    return isinstance(value, tuple) and len(value) > _FEW and all(item == value[0] for item in value)
+
+
 def _flat(value: object) -> str:
     if isinstance(value, Code):
         return value.text
@@ -61,6 +67,8 @@ def _flat(value: object) -> str:
         return json.dumps(value)
     if not isinstance(value, tuple | Call):
         return repr(value)
+    if isinstance(value, tuple) and _alike(value):
+        return f"({_flat(value[0])},) * {len(value)}"
     inside = ", ".join(key + _flat(item) for key, item in _items(value))
     if isinstance(value, Call):
         return f"{value.callee}({inside})"

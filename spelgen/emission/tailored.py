@@ -58,9 +58,7 @@ def mass_entries(spec: ModelSpec) -> str:
 
 def names(target: str, values: Iterable[str]) -> str:
     """A class attribute of the model that holds these names."""
-    chosen = tuple(values)
-    alike = Code(f'("{chosen[0]}",) * {len(chosen)}')  # names are identifiers
-    return assignment(target, alike if len(set(chosen)) == 1 < len(chosen) else chosen, 4)
+    return assignment(target, tuple(values), 4)
 
 
 def units(spec: ModelSpec) -> int:
@@ -140,18 +138,14 @@ def _rigid_bodies(spec: ModelSpec) -> list[str]:
         inertia=tuple(tuple(body.reference[k] for k in (4, 7, 9)) for body in spec.bodies),
         products=tuple(tuple(body.reference[k] for k in (5, 6, 8)) for body in spec.bodies),
     )
-    memory = (
-        {"reach": tuple(BRISTLE_REACH[x.kind] for x in spec.joints)}
-        if spec.design.memory == "bristles"
-        else {}
-    )
+    reach = tuple(BRISTLE_REACH[x.kind] for x in spec.joints)
     made = call(
         "RigidBodyDynamics",
         Code("joints"),
         Code("bodies"),
         gravity=spec.gravity,
         input=_input(spec),
-        **memory,
+        **({"reach": reach} if spec.design.memory == "bristles" else {}),
     )
     return [assignment("bodies", bodies, _INDENT), assignment("self.dynamics", made, _INDENT)]
 

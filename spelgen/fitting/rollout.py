@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from spelgen.dynamics.protocol import PortHamiltonianDynamics
+from spelgen.dynamics.protocol import PortHamiltonianDynamics, memory_after, sliding_memory
 from spelgen.fitting.adaptive import roll_out_adaptive
 from spelgen.fitting.config import Solver
 from spelgen.logs.windows import Windows
@@ -38,14 +38,14 @@ def roll_out(
     prepared = model.prepare()
     q = windows.q[:, 0]
     p = model.momentum(q, windows.qd[:, 0], prepared)
-    z = model.memory(windows.qd[:, 0]) if windows.z is None else windows.z
+    z = sliding_memory(model, windows.qd[:, 0]) if windows.z is None else windows.z
     positions, velocities = [], []
     for dt, tau in zip(windows.dt.unbind(1), windows.tau.unbind(1), strict=True):
         step = dt.unsqueeze(-1) / substeps
         for substep in range(substeps):
             start = q
             q, p, qd = _runge_kutta(model, q, p, z, tau, prepared, step)
-            z = model.memory_after(z, q - start)
+            z = memory_after(model, z, q - start)
             if substep == 0:
                 velocities.append(qd)  # of the sample that the interval starts at
         positions.append(q)
@@ -68,7 +68,7 @@ def _runge_kutta(
     """
 
     def rhs(moved: torch.Tensor, momentum: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        return model.port_hamiltonian_rhs(q + moved, momentum, tau, prepared, model.memory_after(z, moved))
+        return model.port_hamiltonian_rhs(q + moved, momentum, tau, prepared, memory_after(model, z, moved))
 
     qd1, pd1 = rhs(torch.zeros_like(q), p)
     half = step / 2
@@ -158,9 +158,9 @@ def momentum_loss(model: EmittedModel, windows: Windows, scales: LossScales) -> 
     # velocities are measured, so M need not be positive definite on the way; kept so, descent stops where it is not
     prepared = model.prepare(definite=False)
     p = model.momentum(q, qd, prepared)
-    z = [model.memory(qd[:, 0]) if windows.z is None else windows.z]
+    z = [sliding_memory(model, qd[:, 0]) if windows.z is None else windows.z]
     for moved in q.diff(dim=1).unbind(1):
-        z.append(model.memory_after(z[-1], moved))
+        z.append(memory_after(model, z[-1], moved))
     force = model.port_hamiltonian_rhs(q, p, None, prepared, torch.stack(z, dim=1))[1]
     dt = windows.dt.unsqueeze(-1)
     inputs = model.input_matrix(q[:, :-1])

@@ -27,7 +27,7 @@ from torch import Tensor, nn
 
 FACTS = r"""{"robot": "rpr", "urdf": "rpr.urdf",
  "urdf_sha256": "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d",
- "spec_sha256": "4ec62acc227daebcf4ecb6477284670d398a2f6ff9e62d22cd354a7529a442c7",
+ "spec_sha256": "26cb82cbc22a8307da3876e58451a8784189ea93f99bd49395c6e7fa66bc7272",
  "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,
   "net": null, "preset": "closed-form", "tip": null, "width": 64},
  "joints": {"joint1": "revolute", "joint2": "prismatic", "joint3": "revolute"}}"""
@@ -39,6 +39,7 @@ class Model(nn.Module):
     Shapes: q, qd, qdd, tau and p are (..., n), with any leading dimensions. Units: rad and Nm for
     revolute joints, m and N for prismatic ones. M is positive definite and D positive semi-definite
     for all weights. What ``prepare`` gives as ``prepared`` saves work while the weights stay.
+    z, (..., n, 3), friction's memory, is how far its bristles are bent [rad, m]; None: they slide as qd goes.
     """
 
     n = 3
@@ -79,7 +80,11 @@ class Model(nn.Module):
             products=((0.0, 0.0, 0.0), (0.0, 0.0, -0.55647375), (0.0, 0.0, 0.00536544)),
         )
         self.dynamics = RigidBodyDynamics(
-            joints, bodies, gravity=(0.0, 0.0, -9.81), input=DirectInput(joints)
+            joints,
+            bodies,
+            gravity=(0.0, 0.0, -9.81),
+            input=DirectInput(joints),
+            reach=((0.0003, 0.003, 0.03), (3e-05, 0.0003, 0.003), (0.0003, 0.003, 0.03)),
         )
         self.to(dtype)
 
@@ -104,20 +109,17 @@ class Model(nn.Module):
     @property
     def viscous(self) -> Tensor:
         """Friction torque by velocity, (n,) [Nm s/rad, N s/m]."""
-        value: Tensor = self.dynamics.friction.prepare().viscous
-        return value
+        return self.dynamics.friction.prepare().viscous
 
     @property
     def coulomb(self) -> Tensor:
         """Dry friction, (n,) [Nm, N]."""
-        value: Tensor = self.dynamics.friction.prepare().coulomb
-        return value
+        return self.dynamics.friction.prepare().coulomb
 
     @property
     def stribeck(self) -> Tensor:
         """Dry friction that only slow motion has, (n,) [Nm, N]."""
-        value: Tensor = self.dynamics.friction.prepare().stribeck
-        return value
+        return self.dynamics.friction.prepare().stribeck
 
     @property
     def torque_offset(self) -> Tensor:
@@ -145,9 +147,9 @@ class Model(nn.Module):
         """Coriolis, centrifugal and gravity torque, (..., n) [Nm, N]."""
         return self.dynamics.nonlinear_effects(q, qd)
 
-    def friction_torque(self, q: Tensor, qd: Tensor) -> Tensor:
-        """D(q, qd) qd, (..., n) [Nm, N]."""
-        return self.dynamics.friction_torque(q, qd)
+    def friction_torque(self, q: Tensor, qd: Tensor, z: Tensor | None = None) -> Tensor:
+        """D(q, qd) qd, or what friction is with its memory at z, (..., n) [Nm, N]."""
+        return self.dynamics.friction_torque(q, qd, z)
 
     def dissipation(self, q: Tensor, qd: Tensor) -> Tensor:
         """D(q, qd), (..., n, n) [Nm s/rad, N s/m]."""
@@ -165,25 +167,27 @@ class Model(nn.Module):
         """qd = M(q)^-1 p, (..., n)."""
         return solved(self.mass_matrix(q, prepared), p)
 
-    def hamiltonian(self, q: Tensor, p: Tensor) -> Tensor:
-        """H = 1/2 p^T M(q)^-1 p + V(q), (...) [J]."""
-        return self.dynamics.hamiltonian(q, p)
+    def hamiltonian(self, q: Tensor, p: Tensor, z: Tensor | None = None) -> Tensor:
+        """H = 1/2 p^T M(q)^-1 p + V(q), (...) [J], and what friction's memory stores."""
+        return self.dynamics.hamiltonian(q, p, z)
 
-    def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
+    def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
         """qdd, (..., n), under the input tau."""
-        return self.dynamics.forward_dynamics(q, qd, tau)
+        return self.dynamics.forward_dynamics(q, qd, tau, z)
 
-    def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
+    def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None = None) -> Tensor:
         """The input, (..., n), that gives qdd."""
-        return self.dynamics.inverse_dynamics(q, qd, qdd)
+        return self.dynamics.inverse_dynamics(q, qd, qdd, z)
 
     def forward(self, t: Tensor, state: Tensor) -> Tensor:
-        """The rate of (q, p), (..., 2 n), or of (q, p, tau), (..., 3 n), where tau is held."""
+        """The rate of (q, p, z), or of (q, p, z, tau), where tau is held; z is flat, (..., n K)."""
         return self.dynamics.state_rate(state)
 
-    def port_hamiltonian_rhs(self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Any) -> State:
+    def port_hamiltonian_rhs(
+        self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Any, z: Tensor | None = None
+    ) -> State:
         """q' = dH/dp and p' = -dH/dq - D dH/dp + G tau, (..., n)."""
-        return self.dynamics.port_hamiltonian_rhs(q, p, tau, prepared)
+        return self.dynamics.port_hamiltonian_rhs(q, p, tau, prepared, z)
 
     def to_group(self, q: Tensor) -> list[Tensor]:
         """By joint, R in SO(3), (..., 3, 3), or r in R^3, (..., 3), if prismatic; z is its axis."""
@@ -218,6 +222,35 @@ class Joints(NamedTuple):
 def vector(values: Iterable[float]) -> Tensor:
     """The values as a float64 tensor."""
     return torch.tensor(list(values), dtype=torch.float64)
+
+
+class Bristles(nn.Module):
+    """K elements a joint, elastic up to their reach, sliding beyond; z is (..., n, K) [rad, m].
+
+    z' = qd - |qd| z / reach, whatever the speed: in displacement it is linear, and needs no small
+    steps (Dahl, A Solid Friction Model, 1968; several elements as in Lampaert, Al-Bender and
+    Swevers, A Generalized Maxwell-Slip Friction Model, 2003).
+    """
+
+    reach: Tensor  # (n, K)
+
+    def __init__(self, reach: Sequence[Sequence[float]]) -> None:
+        super().__init__()
+        self.register_buffer("reach", torch.tensor(reach, dtype=torch.float64))
+
+    def rate(self, qd: Tensor, z: Tensor) -> Tensor:
+        """z', (..., n, K)."""
+        return qd.unsqueeze(-1) - qd.abs().unsqueeze(-1) * z / self.reach
+
+    def moved(self, z: Tensor, displacement: Tensor) -> Tensor:
+        """z after joints went one way by (..., n), exactly."""
+        return moved_bristles(z, displacement, self.reach)
+
+
+def moved_bristles(z: Tensor, displacement: Tensor, reach: Tensor) -> Tensor:
+    """z, (..., n, K), after joints went one way by (..., n), exactly."""
+    end = displacement.sign().unsqueeze(-1) * reach
+    return end + (z - end) * (-displacement.abs().unsqueeze(-1) / reach).exp()
 
 
 def to_group(q: Tensor, joint_types: Sequence[str]) -> list[Tensor]:
@@ -262,11 +295,14 @@ class PortHamiltonian(nn.Module):
     """q' = dH/dp and p' = -dH/dq - D dH/dp + G tau, with H = 1/2 p^T M(q)^-1 p + V(q).
 
     The port-Hamiltonian form (van der Schaft and Jeltsema, Port-Hamiltonian Systems Theory, 2014).
+    Where friction remembers, z, (..., n, K), is part of the state and adds its energy to H; without
+    it friction is that of a joint that slides the way it moves.
     ``prepared`` is what ``prepare`` gave: all that depends on the weights alone. ``at`` is what
     ``configuration`` gave: all that is computed of q alone. Shapes: q, qd, tau, p are (..., n).
     """
 
     n: int
+    elements: int  # K, of friction's memory at a joint
 
     def prepare(self, definite: bool = True) -> Any:
         """All that depends on the weights alone; holds until they change.
@@ -299,9 +335,25 @@ class PortHamiltonian(nn.Module):
         """The torque that holds qd steady without friction: Coriolis, centrifugal and gravity."""
         raise NotImplementedError
 
-    def friction_at(self, at: Any, qd: Tensor, prepared: Any) -> Tensor:
-        """D(q, qd) qd, (..., n) [Nm, N]."""
+    def friction_at(self, at: Any, qd: Tensor, prepared: Any, z: Tensor | None = None) -> Tensor:
+        """The friction torque, (..., n) [Nm, N]: D(q, qd) qd, or that of bristles at z."""
         raise NotImplementedError
+
+    def stored_energy(self, z: Tensor, prepared: Any) -> Tensor:
+        """What friction's memory gives back, (...) [J]."""
+        raise NotImplementedError
+
+    def memory(self, qd: Tensor) -> Tensor:
+        """z, (..., n, K), of joints that have long gone this way."""
+        return qd.unsqueeze(-1)[..., :0]
+
+    def memory_rate(self, qd: Tensor, z: Tensor) -> Tensor:
+        """z', (..., n, K)."""
+        return z
+
+    def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
+        """z after joints went one way by (..., n), exactly."""
+        return z
 
     def dissipation_at(self, at: Any, qd: Tensor, prepared: Any) -> Tensor:
         """D(q, qd), (..., n, n)."""
@@ -340,10 +392,10 @@ class PortHamiltonian(nn.Module):
         at = self.configuration(q, prepared)
         return self.nonlinear_at(at, qd, self.mass_at(at, prepared)[1], prepared)
 
-    def friction_torque(self, q: Tensor, qd: Tensor) -> Tensor:
-        """D(q, qd) qd, (..., n) [Nm, N]."""
+    def friction_torque(self, q: Tensor, qd: Tensor, z: Tensor | None = None) -> Tensor:
+        """D(q, qd) qd, or the torque of bristles at z, (..., n) [Nm, N]."""
         prepared = self.prepare()
-        return self.friction_at(self.configuration(q, prepared), qd, prepared)
+        return self.friction_at(self.configuration(q, prepared), qd, prepared, z)
 
     def dissipation(self, q: Tensor, qd: Tensor) -> Tensor:
         """D(q, qd), (..., n, n) [Nm s/rad, N s/m]."""
@@ -355,45 +407,49 @@ class PortHamiltonian(nn.Module):
         prepared = self.prepare()
         return self.input_at(self.configuration(q, prepared), prepared)
 
-    def hamiltonian(self, q: Tensor, p: Tensor) -> Tensor:
+    def hamiltonian(self, q: Tensor, p: Tensor, z: Tensor | None = None) -> Tensor:
         """H, (...) [J]."""
         prepared = self.prepare()
         at = self.configuration(q, prepared)
         qd = solved(self.mass_at(at, prepared)[0], p)
-        return 0.5 * (p * qd).sum(dim=-1) + self.energy_at(at, prepared)
+        energy = 0.5 * (p * qd).sum(dim=-1) + self.energy_at(at, prepared)
+        return energy if z is None else energy + self.stored_energy(z, prepared)
 
-    def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
+    def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
         """qdd, (..., n), under the input tau."""
         prepared = self.prepare()
         at = self.configuration(q, prepared)
         mass, residuals = self.mass_at(at, prepared)
         force = self.input_force(at, tau, prepared)
         force = force - self.nonlinear_at(at, qd, residuals, prepared)
-        return solved(mass, force - self.friction_at(at, qd, prepared))
+        return solved(mass, force - self.friction_at(at, qd, prepared, z))
 
-    def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
+    def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None = None) -> Tensor:
         """The torque, (..., n), that gives qdd."""
         prepared = self.prepare()
         at = self.configuration(q, prepared)
         mass, residuals = self.mass_at(at, prepared)
         force = applied(mass, qdd) + self.nonlinear_at(at, qd, residuals, prepared)
-        return self.input_torque(at, force + self.friction_at(at, qd, prepared), prepared)
+        return self.input_torque(at, force + self.friction_at(at, qd, prepared, z), prepared)
 
-    def port_hamiltonian_rhs(self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Any) -> State:
+    def port_hamiltonian_rhs(
+        self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Any, z: Tensor | None = None
+    ) -> State:
         """q' and p', (..., n), under the input tau; without one, of the arm left to itself."""
         at = self.configuration(q, prepared)
         mass, residuals = self.mass_at(at, prepared)
         qd = solved(mass, p)
         force = self.lagrangian_gradient(at, qd, residuals, prepared)
-        force = force - self.friction_at(at, qd, prepared)
+        force = force - self.friction_at(at, qd, prepared, z)
         return qd, force if tau is None else force + self.input_force(at, tau, prepared)
 
     def state_rate(self, state: Tensor) -> Tensor:
-        """The rate of (q, p), (..., 2 n), or of (q, p, tau), (..., 3 n), where tau is held."""
-        n = self.n
-        q, p, tau = state.tensor_split((n, 2 * n), dim=-1)
-        qd, force = self.port_hamiltonian_rhs(q, p, tau if tau.shape[-1] else None, self.prepare())
-        return torch.cat([qd, force, torch.zeros_like(tau)], dim=-1)
+        """The rate of (q, p, z), (..., 2 n + n K), or of (q, p, z, tau), where tau is held."""
+        n, elements = self.n, self.elements
+        q, p, flat, tau = state.tensor_split((n, 2 * n, (2 + elements) * n), dim=-1)
+        z = flat.unflatten(-1, (n, elements))
+        qd, force = self.port_hamiltonian_rhs(q, p, tau if tau.shape[-1] else None, self.prepare(), z)
+        return torch.cat([qd, force, self.memory_rate(qd, z).flatten(-2), torch.zeros_like(tau)], dim=-1)
 
 
 class Armature(nn.Module):
@@ -415,95 +471,6 @@ class Armature(nn.Module):
     def rotor_inertia(self) -> Tensor:
         """As the motors feel it, before the gear, (n,) [kg m^2, kg]."""
         return self.nominal * self.raw.exp() / self.gear**2
-
-
-# where the constants start, relative to a joint's usual friction and speed
-STRIBECK = 0.3  # dry friction that only slow motion has
-
-
-STRIBECK_VELOCITY = 0.03  # where that has faded
-
-
-SMOOTHING_VELOCITY = 0.006  # over which dry friction turns around
-
-
-SATURATION_VELOCITY = 0.2  # where viscous friction begins to grow more slowly
-
-
-LOAD_DEPENDENCE = 0.03  # dry friction by gravity torque
-
-
-class FrictionConstants(NamedTuple):
-    """By joint, (n,), all positive."""
-
-    viscous: Tensor  # [Nm s/rad, N s/m]
-    saturation: Tensor  # viscous friction that stops growing [Nm, N]
-    saturation_velocity: Tensor  # [rad/s, m/s]
-    coulomb: Tensor  # [Nm, N]
-    stribeck: Tensor  # [Nm, N]
-    stribeck_velocity: Tensor  # [rad/s, m/s]
-    coulomb_smoothing_velocity: Tensor  # [rad/s, m/s]
-    load_dependence: Tensor  # dry friction by gravity torque
-
-
-class FrictionLaws(nn.Module):
-    """Friction which resists whatever the weights are: they are logarithms.
-
-    viscous qd + saturation tanh(qd / saturation_velocity)
-    + (coulomb + stribeck exp(-(qd / stribeck_velocity)^2) + load_dependence |gravity torque|)
-    tanh(qd / coulomb_smoothing_velocity).
-    """
-
-    nominal: Tensor
-    speed: Tensor
-
-    def __init__(self, joints: Joints) -> None:
-        super().__init__()
-        self.register_buffer("nominal", vector(joints.friction))
-        self.register_buffer("speed", vector(joints.speed))
-        start = torch.zeros(joints.n, dtype=torch.float64)
-        self.raw_viscous = nn.Parameter(start.clone())
-        self.raw_saturation = nn.Parameter(start.clone())
-        self.raw_saturation_velocity = nn.Parameter(start.clone())
-        self.raw_coulomb = nn.Parameter(start.clone())
-        self.raw_stribeck = nn.Parameter(start.clone())
-        self.raw_stribeck_velocity = nn.Parameter(start.clone())
-        self.raw_coulomb_smoothing_velocity = nn.Parameter(start.clone())
-        self.raw_load_dependence = nn.Parameter(start.clone())
-
-    def prepare(self) -> FrictionConstants:
-        """The constants, in their units."""
-        size, speed = self.nominal, self.speed
-        return FrictionConstants(
-            viscous=size / speed * self.raw_viscous.exp(),
-            saturation=size * self.raw_saturation.exp(),
-            saturation_velocity=SATURATION_VELOCITY * speed * self.raw_saturation_velocity.exp(),
-            coulomb=size * self.raw_coulomb.exp(),
-            stribeck=STRIBECK * size * self.raw_stribeck.exp(),
-            stribeck_velocity=STRIBECK_VELOCITY * speed * self.raw_stribeck_velocity.exp(),
-            coulomb_smoothing_velocity=SMOOTHING_VELOCITY * speed * self.raw_coulomb_smoothing_velocity.exp(),
-            load_dependence=LOAD_DEPENDENCE * size.sign() * self.raw_load_dependence.exp(),
-        )
-
-    def resistance(self, qd: Tensor, gravity: Tensor, constants: FrictionConstants) -> Tensor:
-        """The diagonal of D, (..., n): friction torque by velocity, under this gravity torque."""
-        c = constants
-        slow = (-((qd / c.stribeck_velocity) ** 2)).exp()
-        dry = c.coulomb + c.stribeck * slow + c.load_dependence * gravity.abs()
-        dry = dry / c.coulomb_smoothing_velocity * tanh_ratio(qd / c.coulomb_smoothing_velocity)
-        saturating = c.saturation / c.saturation_velocity * tanh_ratio(qd / c.saturation_velocity)
-        return c.viscous + saturating + dry
-
-    def forward(self, qd: Tensor, gravity: Tensor, constants: FrictionConstants) -> Tensor:
-        """The friction torque D qd, (..., n) [Nm, N], under this gravity torque."""
-        return self.resistance(qd, gravity, constants) * qd
-
-
-def tanh_ratio(x: Tensor) -> Tensor:
-    """tanh(x) / x."""
-    near = x.abs() < 1e-4
-    safe = torch.where(near, torch.ones_like(x), x)
-    return torch.where(near, 1 - x**2 / 3, safe.tanh() / safe)
 
 
 Row = tuple[float, float, float]
@@ -648,6 +615,132 @@ class DirectInput(nn.Module):
         return force
 
 
+# where the constants start, relative to a joint's usual friction and speed
+STRIBECK = 0.3  # dry friction that only slow motion has
+
+
+STRIBECK_VELOCITY = 0.03  # where that has faded
+
+
+SMOOTHING_VELOCITY = 0.006  # over which dry friction turns around
+
+
+SATURATION_VELOCITY = 0.2  # where viscous friction begins to grow more slowly
+
+
+LOAD_DEPENDENCE = 0.03  # dry friction by gravity torque
+
+
+class FrictionConstants(NamedTuple):
+    """By joint, (n,), all positive."""
+
+    viscous: Tensor  # [Nm s/rad, N s/m]
+    saturation: Tensor  # viscous friction that stops growing [Nm, N]
+    saturation_velocity: Tensor  # [rad/s, m/s]
+    coulomb: Tensor  # [Nm, N]
+    stribeck: Tensor  # [Nm, N]
+    stribeck_velocity: Tensor  # [rad/s, m/s]
+    coulomb_smoothing_velocity: Tensor  # [rad/s, m/s]
+    load_dependence: Tensor  # dry friction by gravity torque
+    bristle_fractions: Tensor  # of dry friction, (n, K); a joint's add up to one
+
+
+class FrictionLaws(nn.Module):
+    """Friction which resists whatever the weights are: they are logarithms.
+
+    viscous qd + saturation tanh(qd / saturation_velocity)
+    + (coulomb + stribeck exp(-(qd / stribeck_velocity)^2) + load_dependence |gravity torque|) direction.
+
+    The direction, from -1 to 1, is that of the bristles, sum of fraction z / reach; without them, or
+    where nothing is known of the way here, tanh(qd / coulomb_smoothing_velocity).
+    """
+
+    nominal: Tensor
+    speed: Tensor
+    raw_coulomb_smoothing_velocity: nn.Parameter | None
+    raw_bristle_fractions: nn.Parameter | None
+
+    def __init__(self, joints: Joints, reach: Sequence[Sequence[float]] = ()) -> None:
+        super().__init__()
+        self.register_buffer("nominal", vector(joints.friction))
+        self.register_buffer("speed", vector(joints.speed))
+        self.bristles = Bristles(reach or [[]] * joints.n)
+        start = torch.zeros(joints.n, dtype=torch.float64)
+        self.raw_viscous = nn.Parameter(start.clone())
+        self.raw_saturation = nn.Parameter(start.clone())
+        self.raw_saturation_velocity = nn.Parameter(start.clone())
+        self.raw_coulomb = nn.Parameter(start.clone())
+        self.raw_stribeck = nn.Parameter(start.clone())
+        self.raw_stribeck_velocity = nn.Parameter(start.clone())
+        self.raw_load_dependence = nn.Parameter(start.clone())
+        # dry friction turns around by displacement or by velocity, never by both
+        smoothing = None if reach else nn.Parameter(start.clone())
+        self.register_parameter("raw_coulomb_smoothing_velocity", smoothing)
+        fractions = nn.Parameter(torch.zeros_like(self.bristles.reach)) if reach else None
+        self.register_parameter("raw_bristle_fractions", fractions)
+
+    def prepare(self) -> FrictionConstants:
+        """The constants, in their units."""
+        size, speed = self.nominal, self.speed
+        smoothing, fractions = self.raw_coulomb_smoothing_velocity, self.raw_bristle_fractions
+        return FrictionConstants(
+            viscous=size / speed * self.raw_viscous.exp(),
+            saturation=size * self.raw_saturation.exp(),
+            saturation_velocity=SATURATION_VELOCITY * speed * self.raw_saturation_velocity.exp(),
+            coulomb=size * self.raw_coulomb.exp(),
+            stribeck=STRIBECK * size * self.raw_stribeck.exp(),
+            stribeck_velocity=STRIBECK_VELOCITY * speed * self.raw_stribeck_velocity.exp(),
+            coulomb_smoothing_velocity=SMOOTHING_VELOCITY
+            * speed
+            * (1 if smoothing is None else smoothing.exp()),
+            load_dependence=LOAD_DEPENDENCE * size.sign() * self.raw_load_dependence.exp(),
+            bristle_fractions=self.bristles.reach if fractions is None else fractions.softmax(dim=-1),
+        )
+
+    def resistance(self, qd: Tensor, gravity: Tensor, constants: FrictionConstants) -> Tensor:
+        """The diagonal of D, (..., n), where nothing is known of the way here: friction torque by velocity."""
+        c = constants
+        slope = tanh_ratio(qd / c.coulomb_smoothing_velocity) / c.coulomb_smoothing_velocity
+        return self._viscous(qd, c) + self._dry(qd, gravity, c) * slope
+
+    def forward(
+        self, qd: Tensor, gravity: Tensor, constants: FrictionConstants, z: Tensor | None = None
+    ) -> Tensor:
+        """The friction torque, (..., n) [Nm, N], under this gravity torque, of bristles at z, (..., n, K)."""
+        if z is None:
+            return self.resistance(qd, gravity, constants) * qd
+        direction = (constants.bristle_fractions * z / self.bristles.reach).sum(dim=-1)
+        return self._viscous(qd, constants) * qd + self._dry(qd, gravity, constants) * direction
+
+    def sliding(self, qd: Tensor) -> Tensor:
+        """The bristles z, (..., n, K), of joints that have long gone this way."""
+        direction = (qd / self.prepare().coulomb_smoothing_velocity).tanh()
+        return direction.unsqueeze(-1) * self.bristles.reach
+
+    def stored_energy(self, z: Tensor, constants: FrictionConstants) -> Tensor:
+        """What the bristles of Coulomb friction give back, (...) [J]."""
+        stored = constants.bristle_fractions * z.square() / self.bristles.reach
+        return 0.5 * (constants.coulomb * stored.sum(dim=-1)).sum(dim=-1)
+
+    @staticmethod
+    def _viscous(qd: Tensor, c: FrictionConstants) -> Tensor:
+        """Torque by velocity, (..., n)."""
+        return c.viscous + c.saturation / c.saturation_velocity * tanh_ratio(qd / c.saturation_velocity)
+
+    @staticmethod
+    def _dry(qd: Tensor, gravity: Tensor, c: FrictionConstants) -> Tensor:
+        """The size of dry friction, (..., n) [Nm, N]."""
+        slow = (-((qd / c.stribeck_velocity) ** 2)).exp()
+        return c.coulomb + c.stribeck * slow + c.load_dependence * gravity.abs()
+
+
+def tanh_ratio(x: Tensor) -> Tensor:
+    """tanh(x) / x."""
+    near = x.abs() < 1e-4
+    safe = torch.where(near, torch.ones_like(x), x)
+    return torch.where(near, 1 - x**2 / 3, safe.tanh() / safe)
+
+
 class Input(Protocol):
     """What gives G."""
 
@@ -710,10 +803,15 @@ class RigidBodyDynamics(PortHamiltonian):
     actuated: Tensor
 
     def __init__(
-        self, joints: Joints, bodies: Bodies, gravity: tuple[float, float, float], input: Input
+        self,
+        joints: Joints,
+        bodies: Bodies,
+        gravity: tuple[float, float, float],
+        input: Input,
+        reach: Sequence[Sequence[float]] = (),
     ) -> None:
         super().__init__()
-        self.n, self.parents = joints.n, bodies.parent
+        self.n, self.elements, self.parents = joints.n, len(reach[0]) if reach else 0, bodies.parent
         count = len(bodies.parent)
         tables = torch.stack([transform_table(bodies, index) for index in range(count)])
         self.register_buffer("forth", tables.mT.transpose(1, 2).flatten(2))
@@ -740,7 +838,7 @@ class RigidBodyDynamics(PortHamiltonian):
         self.register_buffer("actuated", vector(float(x) for x in joints.actuated))
         self.inertial_parameters = InertialParameters(bodies)
         self.armature = Armature(joints)
-        self.friction = FrictionLaws(joints)
+        self.friction = FrictionLaws(joints, reach)
         self.input: Any = input
         # of the measured torque, in units of the joints' usual friction
         self.raw_offset = nn.Parameter(torch.zeros(self.n, dtype=torch.float64))
@@ -873,10 +971,26 @@ class RigidBodyDynamics(PortHamiltonian):
         rows: Tensor = (columns @ wrenches).transpose(-3, -2)
         return rows.reshape(*q.shape, 10 * len(self.parents))
 
-    def friction_at(self, at: Motion, qd: Tensor, prepared: RigidPrepared) -> Tensor:
-        """D(q, qd) qd, (..., n) [Nm, N]."""
-        torque: Tensor = self.friction(qd, at.gravity, prepared.friction)
+    def friction_at(self, at: Motion, qd: Tensor, prepared: RigidPrepared, z: Tensor | None = None) -> Tensor:
+        """The friction torque, (..., n) [Nm, N]."""
+        torque: Tensor = self.friction(qd, at.gravity, prepared.friction, z)
         return torque
+
+    def stored_energy(self, z: Tensor, prepared: RigidPrepared) -> Tensor:
+        """What the bristles give back, (...) [J]."""
+        return self.friction.stored_energy(z, prepared.friction)
+
+    def memory(self, qd: Tensor) -> Tensor:
+        """z, (..., n, K), of joints that have long gone this way."""
+        return self.friction.sliding(qd)
+
+    def memory_rate(self, qd: Tensor, z: Tensor) -> Tensor:
+        """z', (..., n, K)."""
+        return self.friction.bristles.rate(qd, z)
+
+    def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
+        """z after joints went one way by (..., n), exactly."""
+        return self.friction.bristles.moved(z, displacement)
 
     def dissipation_at(self, at: Motion, qd: Tensor, prepared: RigidPrepared) -> Tensor:
         """D(q, qd), (..., n, n), diagonal."""

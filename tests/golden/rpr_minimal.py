@@ -30,7 +30,7 @@ from torch import Tensor, nn
 
 FACTS = r"""{"robot": "rpr", "urdf": "rpr.urdf",
  "urdf_sha256": "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d",
- "spec_sha256": "8eb4fc07da8e4341c31cdf78e9936e14d6003f74c56c679a48c922be10e58b81",
+ "spec_sha256": "40a853f2bc6bbd85a6f98df208b00b4e8190bb11eb2bbd744d061c9597635932",
  "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,
   "net": "mlp", "preset": "minimal", "tip": null, "width": 64},
  "joints": {"joint1": "revolute", "joint2": "prismatic", "joint3": "revolute"}}"""
@@ -170,9 +170,9 @@ class Model(nn.Module):
         """Coriolis, centrifugal and gravity torque, (..., n) [Nm, N]."""
         return self.dynamics.nonlinear_effects(q, qd)
 
-    def friction_torque(self, q: Tensor, qd: Tensor) -> Tensor:
-        """D(q, qd) qd, (..., n) [Nm, N]."""
-        return self.dynamics.friction_torque(q, qd)
+    def friction_torque(self, q: Tensor, qd: Tensor, z: Tensor | None = None) -> Tensor:
+        """D(q, qd) qd, or what friction is with its memory at z, (..., n) [Nm, N]."""
+        return self.dynamics.friction_torque(q, qd, z)
 
     def dissipation(self, q: Tensor, qd: Tensor) -> Tensor:
         """D(q, qd), (..., n, n) [Nm s/rad, N s/m]."""
@@ -190,25 +190,27 @@ class Model(nn.Module):
         """qd = M(q)^-1 p, (..., n)."""
         return solved(self.mass_matrix(q, prepared), p)
 
-    def hamiltonian(self, q: Tensor, p: Tensor) -> Tensor:
-        """H = 1/2 p^T M(q)^-1 p + V(q), (...) [J]."""
-        return self.dynamics.hamiltonian(q, p)
+    def hamiltonian(self, q: Tensor, p: Tensor, z: Tensor | None = None) -> Tensor:
+        """H = 1/2 p^T M(q)^-1 p + V(q), (...) [J], and what friction's memory stores."""
+        return self.dynamics.hamiltonian(q, p, z)
 
-    def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
+    def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
         """qdd, (..., n), under the input tau."""
-        return self.dynamics.forward_dynamics(q, qd, tau)
+        return self.dynamics.forward_dynamics(q, qd, tau, z)
 
-    def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
+    def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None = None) -> Tensor:
         """The input, (..., n), that gives qdd."""
-        return self.dynamics.inverse_dynamics(q, qd, qdd)
+        return self.dynamics.inverse_dynamics(q, qd, qdd, z)
 
     def forward(self, t: Tensor, state: Tensor) -> Tensor:
-        """The rate of (q, p), (..., 2 n), or of (q, p, tau), (..., 3 n), where tau is held."""
+        """The rate of (q, p, z), or of (q, p, z, tau), where tau is held; z is flat, (..., n K)."""
         return self.dynamics.state_rate(state)
 
-    def port_hamiltonian_rhs(self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Any) -> State:
+    def port_hamiltonian_rhs(
+        self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Any, z: Tensor | None = None
+    ) -> State:
         """q' = dH/dp and p' = -dH/dq - D dH/dp + G tau, (..., n)."""
-        return self.dynamics.port_hamiltonian_rhs(q, p, tau, prepared)
+        return self.dynamics.port_hamiltonian_rhs(q, p, tau, prepared, z)
 
     def to_group(self, q: Tensor) -> list[Tensor]:
         """By joint, R in SO(3), (..., 3, 3), or r in R^3, (..., 3), if prismatic; z is its axis."""
@@ -392,11 +394,14 @@ class PortHamiltonian(nn.Module):
     """q' = dH/dp and p' = -dH/dq - D dH/dp + G tau, with H = 1/2 p^T M(q)^-1 p + V(q).
 
     The port-Hamiltonian form (van der Schaft and Jeltsema, Port-Hamiltonian Systems Theory, 2014).
+    Where friction remembers, z, (..., n, K), is part of the state and adds its energy to H; without
+    it friction is that of a joint that slides the way it moves.
     ``prepared`` is what ``prepare`` gave: all that depends on the weights alone. ``at`` is what
     ``configuration`` gave: all that is computed of q alone. Shapes: q, qd, tau, p are (..., n).
     """
 
     n: int
+    elements: int  # K, of friction's memory at a joint
 
     def prepare(self, definite: bool = True) -> Any:
         """All that depends on the weights alone; holds until they change.
@@ -429,9 +434,25 @@ class PortHamiltonian(nn.Module):
         """The torque that holds qd steady without friction: Coriolis, centrifugal and gravity."""
         raise NotImplementedError
 
-    def friction_at(self, at: Any, qd: Tensor, prepared: Any) -> Tensor:
-        """D(q, qd) qd, (..., n) [Nm, N]."""
+    def friction_at(self, at: Any, qd: Tensor, prepared: Any, z: Tensor | None = None) -> Tensor:
+        """The friction torque, (..., n) [Nm, N]: D(q, qd) qd, or that of bristles at z."""
         raise NotImplementedError
+
+    def stored_energy(self, z: Tensor, prepared: Any) -> Tensor:
+        """What friction's memory gives back, (...) [J]."""
+        raise NotImplementedError
+
+    def memory(self, qd: Tensor) -> Tensor:
+        """z, (..., n, K), of joints that have long gone this way."""
+        return qd.unsqueeze(-1)[..., :0]
+
+    def memory_rate(self, qd: Tensor, z: Tensor) -> Tensor:
+        """z', (..., n, K)."""
+        return z
+
+    def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
+        """z after joints went one way by (..., n), exactly."""
+        return z
 
     def dissipation_at(self, at: Any, qd: Tensor, prepared: Any) -> Tensor:
         """D(q, qd), (..., n, n)."""
@@ -470,10 +491,10 @@ class PortHamiltonian(nn.Module):
         at = self.configuration(q, prepared)
         return self.nonlinear_at(at, qd, self.mass_at(at, prepared)[1], prepared)
 
-    def friction_torque(self, q: Tensor, qd: Tensor) -> Tensor:
-        """D(q, qd) qd, (..., n) [Nm, N]."""
+    def friction_torque(self, q: Tensor, qd: Tensor, z: Tensor | None = None) -> Tensor:
+        """D(q, qd) qd, or the torque of bristles at z, (..., n) [Nm, N]."""
         prepared = self.prepare()
-        return self.friction_at(self.configuration(q, prepared), qd, prepared)
+        return self.friction_at(self.configuration(q, prepared), qd, prepared, z)
 
     def dissipation(self, q: Tensor, qd: Tensor) -> Tensor:
         """D(q, qd), (..., n, n) [Nm s/rad, N s/m]."""
@@ -485,45 +506,49 @@ class PortHamiltonian(nn.Module):
         prepared = self.prepare()
         return self.input_at(self.configuration(q, prepared), prepared)
 
-    def hamiltonian(self, q: Tensor, p: Tensor) -> Tensor:
+    def hamiltonian(self, q: Tensor, p: Tensor, z: Tensor | None = None) -> Tensor:
         """H, (...) [J]."""
         prepared = self.prepare()
         at = self.configuration(q, prepared)
         qd = solved(self.mass_at(at, prepared)[0], p)
-        return 0.5 * (p * qd).sum(dim=-1) + self.energy_at(at, prepared)
+        energy = 0.5 * (p * qd).sum(dim=-1) + self.energy_at(at, prepared)
+        return energy if z is None else energy + self.stored_energy(z, prepared)
 
-    def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
+    def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
         """qdd, (..., n), under the input tau."""
         prepared = self.prepare()
         at = self.configuration(q, prepared)
         mass, residuals = self.mass_at(at, prepared)
         force = self.input_force(at, tau, prepared)
         force = force - self.nonlinear_at(at, qd, residuals, prepared)
-        return solved(mass, force - self.friction_at(at, qd, prepared))
+        return solved(mass, force - self.friction_at(at, qd, prepared, z))
 
-    def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
+    def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None = None) -> Tensor:
         """The torque, (..., n), that gives qdd."""
         prepared = self.prepare()
         at = self.configuration(q, prepared)
         mass, residuals = self.mass_at(at, prepared)
         force = applied(mass, qdd) + self.nonlinear_at(at, qd, residuals, prepared)
-        return self.input_torque(at, force + self.friction_at(at, qd, prepared), prepared)
+        return self.input_torque(at, force + self.friction_at(at, qd, prepared, z), prepared)
 
-    def port_hamiltonian_rhs(self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Any) -> State:
+    def port_hamiltonian_rhs(
+        self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Any, z: Tensor | None = None
+    ) -> State:
         """q' and p', (..., n), under the input tau; without one, of the arm left to itself."""
         at = self.configuration(q, prepared)
         mass, residuals = self.mass_at(at, prepared)
         qd = solved(mass, p)
         force = self.lagrangian_gradient(at, qd, residuals, prepared)
-        force = force - self.friction_at(at, qd, prepared)
+        force = force - self.friction_at(at, qd, prepared, z)
         return qd, force if tau is None else force + self.input_force(at, tau, prepared)
 
     def state_rate(self, state: Tensor) -> Tensor:
-        """The rate of (q, p), (..., 2 n), or of (q, p, tau), (..., 3 n), where tau is held."""
-        n = self.n
-        q, p, tau = state.tensor_split((n, 2 * n), dim=-1)
-        qd, force = self.port_hamiltonian_rhs(q, p, tau if tau.shape[-1] else None, self.prepare())
-        return torch.cat([qd, force, torch.zeros_like(tau)], dim=-1)
+        """The rate of (q, p, z), (..., 2 n + n K), or of (q, p, z, tau), where tau is held."""
+        n, elements = self.n, self.elements
+        q, p, flat, tau = state.tensor_split((n, 2 * n, (2 + elements) * n), dim=-1)
+        z = flat.unflatten(-1, (n, elements))
+        qd, force = self.port_hamiltonian_rhs(q, p, tau if tau.shape[-1] else None, self.prepare(), z)
+        return torch.cat([qd, force, self.memory_rate(qd, z).flatten(-2), torch.zeros_like(tau)], dim=-1)
 
 
 class Armature(nn.Module):
@@ -1199,7 +1224,7 @@ class NetworkDynamics(PortHamiltonian):
         fourier: FourierFeatures | None = None,
     ) -> None:
         super().__init__()
-        self.n = len(encoding.center)
+        self.n, self.elements = len(encoding.center), 0
         self.encoding, self.fourier = encoding, fourier
         # Any: what a part has beside its protocol is there to be asked for
         self.mass: Any = mass
@@ -1277,8 +1302,10 @@ class NetworkDynamics(PortHamiltonian):
             by_fourier = self.fourier.jvp(at.fourier, qd)
         return Configuration(self.encoding.jvp(at.encoded, qd), by_fourier)
 
-    def friction_at(self, at: Configuration, qd: Tensor, prepared: NetworkPrepared) -> Tensor:
-        """D(q, qd) qd, (..., n) [Nm, N]."""
+    def friction_at(
+        self, at: Configuration, qd: Tensor, prepared: NetworkPrepared, z: Tensor | None = None
+    ) -> Tensor:
+        """D(q, qd) qd, (..., n) [Nm, N]; this friction has no memory."""
         torque: Tensor = self.friction(at.encoded, qd, prepared.friction)
         return torque
 

@@ -1,0 +1,150 @@
+"""Friction that remembers: bristles are exact in displacement, passive, and blind to an encoder's jitter."""
+
+import numpy as np
+import pytest
+import torch
+from emitted import ROBOTS, built, import_source
+
+from spelgen.dynamics.bristles import bristle_reach, bristles_along, encoder_step, reach_of
+from spelgen.fitting.rollout import roll_out
+from spelgen.identification.friction import FrictionModel
+from spelgen.identification.identify import least_squares
+from spelgen.identification.method import LeastSquares
+from spelgen.identification.samples import DynamicsSamples
+from spelgen.loaded_arm import load_arm
+from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.windows import Windows, cut_windows
+from spelgen.runtime.bristles import Bristles
+from spelgen.runtime.friction_laws import FrictionLaws
+from spelgen.runtime.joints import Joints
+
+JOINTS = Joints(
+    revolute=(True, False), center=(0.0, 0.0), reach=(3.0, 1.0), speed=(2.0, 0.5), friction=(1.5, 4.0),
+    armature=(0.0, 0.0), gear=(1.0, 1.0), actuated=(True, True),
+)  # fmt: skip
+REACH = [[3e-4, 3e-3, 3e-2], [3e-5, 3e-4, 3e-3]]
+
+
+def swings(samples: int, seed: int = 0) -> np.ndarray:
+    """A smooth path, (samples, 2), that turns around again and again."""
+    t = np.linspace(0.0, 4.0, samples)[:, None]
+    phase = np.random.default_rng(seed).uniform(0, 6, (2, 3))
+    waves = [np.sin((1.0 + 2.3 * k) * t + phase[:, k]) / (1 + k) for k in range(3)]
+    return 0.05 * np.sum(waves, axis=0) * [1.0, 0.2]
+
+
+def test_one_pass_over_positions_solves_the_differential_equation():
+    bristles, q = Bristles(REACH), torch.from_numpy(swings(400_001))
+    z = torch.zeros(2, 3).double()
+    qd = q.diff(dim=0)
+    for moved in qd:  # Euler, with steps far below the least reach
+        z = z + bristles.rate(moved, z)
+    found = bristles_along(q[::4000].numpy(), np.array(REACH))[-1]
+    # between samples that lie so far apart a joint may turn around: finer ones know of it
+    finer = bristles_along(q[::40].numpy(), np.array(REACH))[-1]
+    assert np.abs(finer / REACH - (z / bristles.reach).numpy()).max() < 1e-2
+    assert np.abs(found / REACH).max() <= 1.0
+
+
+def test_a_step_of_any_length_is_exact_along_one_way():
+    bristles, z = Bristles(REACH), torch.randn(2, 3).double().clamp(-1, 1) * torch.tensor(REACH)
+    way = torch.tensor([0.02, -0.003]).double()
+    parts = z
+    for part in torch.rand(50, 1).double().softmax(dim=0):
+        parts = bristles.moved(parts, part * way)
+    torch.testing.assert_close(parts, bristles.moved(z, way), rtol=1e-12, atol=1e-18)
+
+
+def test_bristles_store_and_dissipate_but_never_give_more_than_they_hold():
+    """d/dt stored energy = power taken - what is lost, and what is lost is never negative."""
+    laws = FrictionLaws(JOINTS, REACH)
+    with torch.no_grad():
+        for weight in laws.parameters():
+            weight += torch.randn(weight.shape, generator=torch.Generator().manual_seed(1)).double()
+        laws.raw_stribeck -= 100.0  # the strengths are constant then
+        laws.raw_load_dependence -= 100.0
+        constants = laws.prepare()
+        qd = torch.randn(500, 2, generator=torch.Generator().manual_seed(2)).double()
+        z = (
+            2 * torch.rand(500, 2, 3, generator=torch.Generator().manual_seed(3)).double() - 1
+        ) * laws.bristles.reach
+        rate = laws.bristles.rate(qd, z)
+        stored = (
+            constants.coulomb.unsqueeze(-1) * constants.bristle_fractions * z / laws.bristles.reach * rate
+        )
+        power = (laws(qd, torch.zeros_like(qd), constants, z) * qd).sum(dim=-1)
+        lost = power - stored.sum(dim=(-2, -1))
+        assert lost.min() >= -1e-12
+        assert power.min() < 0  # bristles do give back
+        energy = laws.stored_energy(z, constants)
+        assert energy.min() > 0
+
+
+def test_energy_of_an_arm_left_to_itself_never_rises(tmp_path):
+    """H and what the bristles store, of a closed-form rpr, along its own motion."""
+    model = import_source(built("rpr", preset="closed-form")[0], tmp_path / "rpr.py").Model(seed=1)
+    with torch.no_grad():
+        model.dynamics.friction.raw_stribeck -= 100.0
+        model.dynamics.friction.raw_load_dependence -= 100.0
+        q, qd = torch.tensor([[0.3, 0.1, -0.4]]).double(), torch.tensor([[1.0, 0.2, -1.5]]).double()
+        steps = torch.full((1, 4000), 2.5e-4).double()
+        still = Windows(
+            steps, q[:, None], qd[:, None], torch.zeros(1, 4000, 3).double(), torch.zeros(1, 3, 3).double()
+        )
+        q, qd = (
+            torch.cat([x[:, None], y], dim=1)[0] for x, y in zip((q, qd), roll_out(model, still), strict=True)
+        )
+        z = torch.from_numpy(bristles_along(q.numpy(), bristle_reach(model)))
+        energies = model.hamiltonian(q, model.momentum(q, qd), z).numpy()
+        rises = np.diff(energies)
+        assert rises.max() < 1e-6 * energies[0]
+        assert energies[-1] < energies[0] - 0.1
+
+
+def test_jitter_of_an_encoder_is_no_motion():
+    rng, step = np.random.default_rng(0), 1e-4
+    still = np.round(rng.normal(0.3, 0.2 * step, (4000, 1)) / step) * step
+    path = np.concatenate([np.linspace(0.0, 0.3, 1000)[:, None], still])
+    path = np.round(path / step) * step
+    assert encoder_step(path) == pytest.approx(step)
+    z = bristles_along(path, np.array([[3e-4, 3e-3, 3e-2]]))
+    assert z[-1, 0] == pytest.approx(z[1005, 0], rel=0.4)  # a tremor of 4000 samples has not unwound them
+    assert encoder_step(rng.normal(size=(500, 1))) == 0
+
+
+def test_a_window_starts_with_the_bristles_of_its_past():
+    q = swings(300)
+    t = np.linspace(0.0, 3.0, 300)
+    qd = np.gradient(q, t, axis=0)
+    piece = trajectory(t, q, qd)
+    windows = cut_windows([piece], 5, 3, measured=True, reach=np.array(REACH))
+    along = bristles_along(q, np.array(REACH))
+    assert windows.z is not None and np.array_equal(windows.z.numpy(), along[: 300 - 4 : 3])
+    assert windows[2:4].z.shape == (2, 2, 3)
+
+
+def trajectory(t: np.ndarray, q: np.ndarray, qd: np.ndarray) -> Trajectory:
+    return Trajectory(t, q, qd, np.zeros_like(q))
+
+
+def test_least_squares_finds_the_strengths_of_bristles():
+    arm = load_arm(ROBOTS / "two_link.urdf").arm
+    rng = np.random.default_rng(0)
+    q = 0.3 * swings(3000) / 0.05
+    qd, qdd = np.gradient(q, 0.002, axis=0), np.gradient(np.gradient(q, 0.002, axis=0), 0.002, axis=0)
+    reach = reach_of(["revolute", "revolute"])
+    z = bristles_along(q, reach)
+    strengths = rng.uniform(0.2, 1.0, (2, 3))
+    model = LeastSquares(friction=FrictionModel(memory=True))
+    tau = (strengths * z / reach).sum(axis=-1)
+    found = least_squares(arm, [DynamicsSamples("x", q, qd, qdd, tau, z)], model)
+    names = [name for name in found.base.names if name.startswith("bristle")]
+    assert len(names) == 6
+    values = dict(zip(found.base.names, found.values, strict=True))
+    for k in range(3):
+        for joint in range(2):
+            assert values[f"bristle {k + 1}, joint {joint + 1}"] == pytest.approx(
+                strengths[joint, k], abs=1e-6
+            )
+    torque = found.torque(q, qd, qdd, z)
+    np.testing.assert_allclose(torque, tau, atol=1e-6)
