@@ -42,7 +42,7 @@ def bristles_along(q: np.ndarray, reach: np.ndarray) -> np.ndarray:
 
 
 def encoded(q: np.ndarray) -> np.ndarray:
-    """The path (T, n) without the jitter of its encoders: it follows q where this leaves a band of a step to both sides."""
+    """The path (T, n) without the jitter of encoders: it follows q out of a band of a step to both sides."""
     step = encoder_step(q)
     low, high = q - step, q + step  # clamping to a band after a band is clamping to one
     shift = 1
