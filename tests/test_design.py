@@ -39,7 +39,9 @@ def test_what_is_refused_names_the_two_options():
             second = rest.partition(";")[0]
             named = dict(part.split(": ") for part in (first, second))
             assert len(named) == 2 and named.items() <= values.items()
-    assert len(COMBINATIONS) - len(refused) == 169  # 168 with networks, and closed-form
+    assert (
+        len(COMBINATIONS) - len(refused) == 170
+    )  # 168 with networks, and closed-form with and without memory
 
 
 @pytest.mark.parametrize("mass", CHOICES["mass"])
@@ -84,10 +86,10 @@ def test_a_preset_of_your_own(rpr, robots, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"fourier": "all"}, "mine.yaml:5: fourier: got 'all', expected one of derived, none"),
-        ({"fourier": ["derived"]}, "mine.yaml:5: fourier: got ['derived'], expected one of derived, none"),
-        ({"masss": "none"}, "mine.yaml:8: unknown key 'masss'; did you mean 'mass'?"),
-        ({"net": None}, "mine.yaml:6: net: got None, expected one of mlp, kan, none"),
+        ({"fourier": "all"}, "mine.yaml:6: fourier: got 'all', expected one of derived, none"),
+        ({"fourier": ["derived"]}, "mine.yaml:6: fourier: got ['derived'], expected one of derived, none"),
+        ({"masss": "none"}, "mine.yaml:9: unknown key 'masss'; did you mean 'mass'?"),
+        ({"net": None}, "mine.yaml:7: net: got None, expected one of mlp, kan, none"),
         (
             {"mass": "closed-form"},
             "mine.yaml:1: mass: closed-form with potential: derived; rigid bodies give both: name closed-form for "

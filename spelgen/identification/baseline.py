@@ -71,7 +71,7 @@ def read_baseline(run: RunFolder) -> dict[str, RegressorDynamics]:
             arm.arm,
             parameters[:inertial],
             constants[0],
-            lambda qd: friction.torque(constants, qd),
+            lambda qd, _: friction.torque(constants, qd),
             arm.actuation.matrix(),
         )
     }

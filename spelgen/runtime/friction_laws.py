@@ -86,7 +86,7 @@ class FrictionLaws(nn.Module):
         )
 
     def resistance(self, qd: Tensor, gravity: Tensor, constants: FrictionConstants) -> Tensor:
-        """The diagonal of D, (..., n), where nothing is known of the way here: friction torque by velocity."""
+        """The diagonal of D, (..., n): friction torque by velocity, of joints that slide."""
         c = constants
         slope = tanh_ratio(qd / c.coulomb_smoothing_velocity) / c.coulomb_smoothing_velocity
         return self._viscous(qd, c) + self._dry(qd, gravity, c) * slope

@@ -517,12 +517,17 @@ class PortHamiltonian(nn.Module):
         return qd, force if tau is None else force + self.input_force(at, tau, prepared)
 
     def state_rate(self, state: Tensor) -> Tensor:
-        """The rate of (q, p, z), (..., 2 n + n K), or of (q, p, z, tau), where tau is held."""
-        n, elements = self.n, self.elements
+        """The rate of (q, p, z), (..., 2 n + n K), or of (q, p, z, tau), where tau is held.
+
+        A state that is too short for z has none: friction is then that of joints which slide.
+        """
+        n = self.n
+        elements = self.elements if state.shape[-1] >= (2 + self.elements) * n else 0
         q, p, flat, tau = state.tensor_split((n, 2 * n, (2 + elements) * n), dim=-1)
-        z = flat.unflatten(-1, (n, elements))
+        z = flat.reshape(*flat.shape[:-1], n, elements) if elements else None
         qd, force = self.port_hamiltonian_rhs(q, p, tau if tau.shape[-1] else None, self.prepare(), z)
-        return torch.cat([qd, force, self.memory_rate(qd, z).flatten(-2), torch.zeros_like(tau)], dim=-1)
+        moved = flat if z is None else self.memory_rate(qd, z).flatten(-2)
+        return torch.cat([qd, force, moved, torch.zeros_like(tau)], dim=-1)
 
 
 class Armature(nn.Module):
