@@ -26,6 +26,7 @@ from characters import read_characters, write_arm
 
 from spelgen.arm.arm import Arm
 from spelgen.building import build
+from spelgen.dynamics.bristles import reach_of
 from spelgen.evaluation.baselines import of_dynamics
 from spelgen.evaluation.results import state_errors
 from spelgen.fitting.torque_fit import PAYLOAD, fit_torque, last_body
@@ -39,9 +40,9 @@ from spelgen.loaded_arm import load_arm
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
-from spelgen.logs.windows import Windows, cut_windows
+from spelgen.logs.windows import Windows, cut_windows, joined
 
-Torque = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+Torque = Callable[..., np.ndarray]
 
 TRAINING = ("20_02_10_30sec_12harm", "20_02_12_50sec_12harm", "20_02_05_20sec_8harm")
 TESTS = (
@@ -70,14 +71,12 @@ def ur10e(folder: Path) -> None:
     urdf = folder / "ur10e.urdf"
     arm, model = load_arm(urdf).arm, build(urdf, "closed-form")
     logs = {name: read(folder / f"{name}.parquet", arm) for name in (*TRAINING, *TESTS, OUTSIDE, *LOADED)}
-    training = dynamics_samples([logs[name] for name in TRAINING])
-    tests = [
-        (dynamics_samples([logs[x] for x in (*TESTS, OUTSIDE)], pauses=pauses)) for pauses in (True, False)
-    ]
+    training = samples_of([logs[name] for name in TRAINING])
+    tests = [samples_of([logs[x] for x in (*TESTS, OUTSIDE)], pauses=pauses) for pauses in (True, False)]
     baseline = least_squares(arm, training, LeastSquares("range"))
     features = FrictionModel(stribeck=True, polynomial=True)
     more = least_squares(arm, training, LeastSquares("range", friction=features))
-    weighted = least_squares(arm, training, LeastSquares(friction=features))
+    remembering = least_squares(arm, training, LeastSquares("range", friction=FrictionModel(memory=True)))
     since = time.perf_counter()
     fit_torque(model, training)
     print(
@@ -86,7 +85,7 @@ def ur10e(folder: Path) -> None:
     predictors = {
         "least squares": baseline.torque,
         "with features": more.torque,
-        "by noise": weighted.torque,
+        "with memory": remembering.torque,
         "closed-form": torque_of(model),
     }
     for samples, said in zip(tests, ("pauses included", "moving samples alone"), strict=True):
@@ -113,7 +112,7 @@ def few(urdf: Path, arm: Arm, long: Trajectory, tests: Sequence[Sequence[Dynamic
     head = ("best ridge", "URDF as prior", "closed-form", "(moving)")
     print(f"{'seconds':26}" + "".join(f"{x:>15}" for x in head))
     for seconds in SECONDS:
-        samples = dynamics_samples([first(long, seconds)])
+        samples = samples_of([first(long, seconds)])
         ridges = [least_squares(arm, samples, LeastSquares("range", ridge=x)).torque for x in RIDGES]
         prior = least_squares(arm, samples, LeastSquares(prior=0.5)).torque
         model = build(urdf, "closed-form")
@@ -133,10 +132,10 @@ def payload(model: Any, logs: dict[str, Trajectory]) -> None:
         row = []
         for seconds in (0.0, 10.0, 3.0):
             model.load_state_dict(trained)
-            seen = dynamics_samples([first(logs[name], seconds)]) if seconds else []
+            seen = samples_of([first(logs[name], seconds)]) if seconds else []
             if sum(len(x.q) for x in seen):
                 fit_torque(model, seen, PAYLOAD, only_bodies=[last_body(model)])
-            rest = dynamics_samples([after(logs[name], seconds or 10.0)], pauses=True)
+            rest = samples_of([after(logs[name], seconds or 10.0)], pauses=True)
             row.append(mean(torque_of(model), rest))
         print(f"{name:26}" + "".join(f"{x:15.5f}" for x in row))
     model.load_state_dict(trained)
@@ -160,8 +159,11 @@ def tested(logs: Sequence[Trajectory], steps: int) -> Windows:
     """Evenly spread windows of each trajectory."""
     filtered = Preprocessing(cutoff=8.0)
     pieces = [piece for x in logs for piece in filtered.pieces([x], shortest=steps + 1)]
-    cut = [cut_windows([x], steps + 1, max(1, (len(x) - steps) // WINDOWS), measured=True) for x in pieces]
-    return Windows(*(torch.cat([getattr(x, k) for x in cut]) for k in ("dt", "q", "qd", "tau")))
+    cut = [
+        cut_windows([x], steps + 1, max(1, (len(x) - steps) // WINDOWS), measured=True, reach=reach(x))
+        for x in pieces
+    ]
+    return joined(cut)
 
 
 def relative_error(dynamics: Any, windows: Windows) -> float:
@@ -173,7 +175,7 @@ def relative_error(dynamics: Any, windows: Windows) -> float:
 def panda(folder: Path, urdf: Path) -> None:
     arm, model = load_arm(urdf).arm, build(urdf, "closed-form")
     whole = read(folder / "exciting_traj1.parquet", arm)
-    training, test = dynamics_samples([first(whole, 12.0)]), dynamics_samples([after(whole, 12.0)])
+    training, test = samples_of([first(whole, 12.0)]), samples_of([after(whole, 12.0)])
     fit_torque(model, training)
     predictors = {
         f"tanh {width:g}": least_squares(
@@ -181,6 +183,8 @@ def panda(folder: Path, urdf: Path) -> None:
         ).torque
         for width in (0.02, 0.05)
     }
+    remembering = LeastSquares("range", friction=FrictionModel(memory=True))
+    predictors["with memory"] = least_squares(arm, training, remembering).torque
     table("Panda: first 12 s train, last 9 s test", predictors | {"closed-form": torque_of(model)}, test, 1)
 
 
@@ -217,6 +221,14 @@ def _torques(
         return model.inverse_dynamics(q, qd, qdd).numpy(), (steady - still - friction).numpy()
 
 
+def samples_of(logs: Sequence[Trajectory], *, pauses: bool = False) -> list[DynamicsSamples]:
+    return dynamics_samples(logs, pauses=pauses, reach=reach(logs[0]))
+
+
+def reach(log: Trajectory) -> np.ndarray:
+    return reach_of(["revolute"] * log.q.shape[1])
+
+
 def read(path: Path, arm: Arm) -> Trajectory:
     (trajectory,) = read_logs([path], [coordinate.name for coordinate in arm.coordinates])
     return trajectory
@@ -231,16 +243,16 @@ def after(trajectory: Trajectory, seconds: float) -> Trajectory:
 
 
 def torque_of(model: Any) -> Torque:
-    def torque(q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
+    def torque(*state: np.ndarray) -> np.ndarray:
         with torch.no_grad():
-            found: np.ndarray = model.inverse_dynamics(*(torch.from_numpy(x) for x in (q, qd, qdd))).numpy()
+            found: np.ndarray = model.inverse_dynamics(*map(torch.from_numpy, state)).numpy()
         return found
 
     return torque
 
 
 def nmse(torque: Torque, sample: DynamicsSamples) -> float:
-    error = torque(sample.q, sample.qd, sample.qdd) - sample.tau
+    error = torque(sample.q, sample.qd, sample.qdd, sample.z) - sample.tau
     return float((np.square(error).mean(axis=0) / sample.tau.var(axis=0)).mean())
 
 

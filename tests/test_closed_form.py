@@ -161,7 +161,8 @@ def test_any_batch_shape(emitted, batch):
 def test_backpropagation_reaches_every_weight(emitted):
     model = drawn(emitted["rpr"][0], seed=0, deviation=0.3)
     q, qd, _, tau = states(3)
-    model.forward_dynamics(q, qd, tau).square().sum().backward()
+    z = 0.3 * model.dynamics.memory(qd)  # on their way from one side to the other
+    model.forward_dynamics(q, qd, tau, z * torch.rand_like(z)).square().sum().backward()
     for name, parameter in model.named_parameters():
         assert parameter.grad.abs().max() > 0, name
 

@@ -181,7 +181,7 @@ def test_the_regressors_dynamics_are_pinocchios(robot, robots):
     whole = make_arm(read_urdf(path))
     n = len(whole.coordinates)
     rotors = Settings(joints={c.name: JointSettings(rotor_inertia=0.3) for c in whole.coordinates})
-    found = RegressorDynamics(whole, urdf_parameters(whole), np.full(n, 0.3), lambda qd: 1.5 * qd)
+    found = RegressorDynamics(whole, urdf_parameters(whole), np.full(n, 0.3), lambda qd, _: 1.5 * qd)
     same_dynamics(found, arm_dynamics(whole, rotors, lambda qd: 1.5 * qd), n, 1e-9)
 
 
