@@ -36,6 +36,9 @@ def identify(
     ] = None,
     stribeck: Annotated[bool, typer.Option("--stribeck", help="Dry friction of slow motion.")] = False,
     polynomial: Annotated[bool, typer.Option("--polynomial", help="Friction in qd |qd| and qd^3.")] = False,
+    memory: Annotated[
+        bool, typer.Option("--memory", help="Dry friction by the way the joint came (bristles).")
+    ] = False,
     coulomb_smoothing_velocity: Annotated[
         float, typer.Option(min=1e-6, help="Width of Coulomb friction's jump [rad/s, m/s].")
     ] = 0.01,
@@ -56,7 +59,7 @@ def identify(
     from spelgen.logs.preprocessing import Preprocessing
     from spelgen.logs.read import read_logs
 
-    friction = FrictionModel(coulomb_smoothing_velocity, stribeck, polynomial)
+    friction = FrictionModel(coulomb_smoothing_velocity, stribeck, polynomial, memory)
     try:
         method = LeastSquares(weights, ridge, prior, friction)
     except OptionError as error:
