@@ -125,8 +125,17 @@ def _comment(text: str) -> str:
     return "\n * ".join(wrap(text[0].upper() + text[1:] + ".", _WIDTH - 6))
 
 
-def _wrapped(text: str) -> str:
-    return "\n".join(wrap(text, _WIDTH, subsequent_indent="    "))
+def _wrapped(signature: str) -> str:
+    """A signature in lines that end after a parameter."""
+    lines = [""]
+    for part in signature.split(", "):
+        longer = f"{lines[-1]}, {part}" if lines[-1].strip() else lines[-1] + part
+        if len(longer) < _WIDTH:
+            lines[-1] = longer
+        else:
+            lines[-1] += ","
+            lines.append(f"    {part}")
+    return "\n".join(lines)
 
 
 def _indented(line: str) -> list[str]:

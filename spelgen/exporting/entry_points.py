@@ -49,7 +49,7 @@ ENTRY_POINTS = (
         (("bias", _TORQUE),), "rates", lambda m: (m.bias,),
     ),
     EntryPoint(
-        "gravity", "dV/dq: the torques that hold the arm still", ("q",),
+        "gravity", "the torques that hold the arm still, dV/dq", ("q",),
         (("gravity", _TORQUE),), "rates", lambda m: (m.gravity,),
     ),
     EntryPoint(
