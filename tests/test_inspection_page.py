@@ -47,5 +47,5 @@ def test_names_are_escaped(robots, tmp_path):
     )
     (tmp_path / "evil.urdf").write_text(text.replace(HOSTILE, HOSTILE.replace("<", "&lt;")))
     found = inspect(tmp_path / "evil.urdf")
-    shown = Page(page(found, found.closed_forms()))
+    shown = Page(page(found, found.closed_forms(), urdf=tmp_path / "evil.urdf"))
     assert "".join(shown.text).count("<script>alert(1)</script>{{ 7 * 7 }}\"'&") >= 3

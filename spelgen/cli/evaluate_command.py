@@ -87,6 +87,8 @@ def report(
     if trust:
         for run in runs:
             RunFolder(run).load_module(trust=True)  # what ran once may run again
+    if robot is not None and len(runs) > 1:
+        raise typer.BadParameter("belongs to the page of one run", param_hint="'--robot'")
     if len(runs) == 1:
         from spelgen.render.report_page import write_report
 
