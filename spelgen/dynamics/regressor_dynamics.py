@@ -31,8 +31,8 @@ class RegressorDynamics:
         parameters: np.ndarray,
         armature: np.ndarray,
         friction: Callable[[np.ndarray, np.ndarray | None], np.ndarray],
-        bristle_reach: np.ndarray | None = None,
         inputs: np.ndarray | None = None,
+        bristle_reach: np.ndarray | None = None,
     ) -> None:
         self.arm, self.parameters, self.armature, self.friction = arm, parameters, armature, friction
         self.bristle_reach = None if bristle_reach is None else torch.from_numpy(bristle_reach)

@@ -72,7 +72,7 @@ class Identification:
             return self.method.friction.torque(constants, qd, bent)
 
         bodies = self.parameters[:inertial]
-        return RegressorDynamics(self.arm, bodies, constants[0], friction, reach, self.inputs)
+        return RegressorDynamics(self.arm, bodies, constants[0], friction, self.inputs, reach)
 
     def torque(
         self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, z: np.ndarray | None = None
