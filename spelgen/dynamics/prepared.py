@@ -30,7 +30,7 @@ class PreparedModel:
         model = copy.deepcopy(model).to(dtype=dtype).requires_grad_(False)
         self.n: int = model.n
         self._dynamics, self._weights, self._tip = model.dynamics, model.prepare(), tip
-        self.elements: int = getattr(model.dynamics, "elements", 0)
+        self.elements: int = model.dynamics.elements
 
     def mass_matrix(self, q: Tensor) -> Tensor:
         """M(q), (..., n, n) [kg m^2, kg m, kg]."""
@@ -52,7 +52,7 @@ class PreparedModel:
 
     def memory(self, qd: Tensor) -> Tensor:
         """Friction's memory z, (..., n, K), of joints that have long gone the way of qd: zero at rest."""
-        z: Tensor = self._dynamics.memory(qd) if self.elements else qd.unsqueeze(-1)[..., :0]
+        z: Tensor = self._dynamics.memory(qd)
         return z
 
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
@@ -162,8 +162,7 @@ class PreparedModel:
         return mass, self._dynamics.nonlinear_at(at, qd, residuals, self._weights)
 
     def _friction(self, at: Any, qd: Tensor, z: Tensor | None) -> Tensor:
-        memory = (z,) if self.elements else ()
-        torque: Tensor = self._dynamics.friction_at(at, qd, self._weights, *memory)
+        torque: Tensor = self._dynamics.friction_at(at, qd, self._weights, z if self.elements else None)
         return torque
 
     def _mass_and_force(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -195,5 +194,5 @@ class PreparedModel:
         return State(q, qd, z)
 
     def _memory_after(self, z: Tensor, moved: Tensor) -> Tensor:
-        found: Tensor = self._dynamics.memory_after(z, moved) if self.elements else z
+        found: Tensor = self._dynamics.memory_after(z, moved)
         return found
