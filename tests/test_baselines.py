@@ -110,7 +110,7 @@ def test_the_urdf_stands_once_as_it_is_and_once_with_its_drives(robots):
 def test_least_squares_is_kept_with_a_run_and_stands_in_its_evaluation(robots, tmp_path):
     """End to end on the command line: torques of the URDF's own bodies are explained by both, the model and it."""
     arm = load_arm(robots / "rpr.urdf")
-    bodies = RegressorDynamics(arm.arm, urdf_parameters(arm.arm), np.full(3, 0.1), lambda qd: 0.5 * qd)
+    bodies = RegressorDynamics(arm.arm, urdf_parameters(arm.arm), np.full(3, 0.1), lambda qd, _: 0.5 * qd)
     names = [coordinate.name for coordinate in arm.arm.coordinates]
     t = np.arange(500) / 100
     for role, seed in (("train", 0), ("test", 1)):

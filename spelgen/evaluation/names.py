@@ -3,4 +3,5 @@
 MODEL = "model"  # the trained model
 URDF, URDF_WITH_DRIVES = "URDF", "URDF and drives"
 LEAST_SQUARES = "least squares"
+LEAST_SQUARES_WITH_MEMORY = "least squares with memory"
 CONSTANT_VELOCITY = "velocity stays constant"

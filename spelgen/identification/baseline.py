@@ -10,13 +10,15 @@ import numpy as np
 
 from spelgen.dynamics.regressor_dynamics import RegressorDynamics
 from spelgen.errors import LogError, RunError
-from spelgen.evaluation.names import LEAST_SQUARES
+from spelgen.evaluation.names import LEAST_SQUARES, LEAST_SQUARES_WITH_MEMORY
 from spelgen.files import write_json
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.streaming import LargeLogs
 from spelgen.fitting.train import open_logs
 from spelgen.identification.friction import FrictionModel
+from spelgen.identification.identification import identified_dynamics
 from spelgen.identification.identify import identify
+from spelgen.identification.method import LeastSquares
 from spelgen.loaded_arm import LoadedArm, load_arm
 from spelgen.logs.mapping import LogMapping
 from spelgen.logs.preprocessing import Preprocessing
@@ -24,6 +26,7 @@ from spelgen.logs.trajectory import Trajectory
 from spelgen.spec import read_facts
 
 BINS = 24
+REMEMBERING = FrictionModel(memory=True)
 
 
 def run_arm(run: RunFolder) -> LoadedArm:
@@ -47,11 +50,14 @@ def keep_baseline(run: RunFolder, paths: Iterable[Path | str]) -> None:
         return
     found: dict[str, Any] = {"coverage": _coverage(logs)}
     try:
-        fit = identify(run_arm(run), logs, preprocessing=Preprocessing(**record["preprocessing"]))
+        arm, used = run_arm(run), Preprocessing(**record["preprocessing"])
+        fit = identify(arm, logs, preprocessing=used)
+        remembering = identify(arm, logs, LeastSquares(friction=REMEMBERING), preprocessing=used)
     except (LogError, np.linalg.LinAlgError):
         pass
     else:
         found |= fit.to_dict() | {"parameters": fit.parameters.tolist()}
+        found |= {"parameters_with_memory": remembering.parameters.tolist()}
     write_json(run.baseline, found)
 
 
@@ -61,19 +67,15 @@ def read_baseline(run: RunFolder) -> dict[str, RegressorDynamics]:
     found = run.read_json(path) if path.exists() else {}
     if "parameters" not in found:
         return {}
-    arm, method = run_arm(run), found["method"]
-    n, inertial = len(arm.arm.coordinates), 10 * len(arm.arm.bodies)
-    friction = FrictionModel(coulomb_smoothing_velocity=method["coulomb_smoothing_velocity"])
-    parameters = np.array(found["parameters"])
-    constants = parameters[inertial:].reshape(-1, n)
+    arm = run_arm(run)
+    inputs = arm.actuation.matrix()
+    kept = {
+        LEAST_SQUARES: (FrictionModel(), found["parameters"]),
+        LEAST_SQUARES_WITH_MEMORY: (REMEMBERING, found["parameters_with_memory"]),
+    }
     return {
-        LEAST_SQUARES: RegressorDynamics(
-            arm.arm,
-            parameters[:inertial],
-            constants[0],
-            lambda qd, _: friction.torque(constants, qd),
-            arm.actuation.matrix(),
-        )
+        name: identified_dynamics(arm.arm, friction, np.array(parameters), inputs)
+        for name, (friction, parameters) in kept.items()
     }
 
 

@@ -14,6 +14,7 @@ from spelgen.dynamics.bristles import reach_of
 from spelgen.dynamics.regressor_dynamics import RegressorDynamics
 from spelgen.errors import Diagnostic
 from spelgen.identification.base_parameters import BaseParameters
+from spelgen.identification.friction import FrictionModel
 from spelgen.identification.method import LeastSquares
 from spelgen.listing import WIDTH, Listing
 
@@ -60,19 +61,7 @@ class Identification:
     @cached_property
     def dynamics(self) -> RegressorDynamics:
         """The identified arm, e.g. as a baseline of ``evaluate``."""
-        n, inertial = len(self.arm.coordinates), 10 * len(self.arm.bodies)
-        constants = self.parameters[inertial:].reshape(-1, n)
-
-        reach = None
-        if self.method.friction.memory:
-            reach = reach_of([coordinate.kind for coordinate in self.arm.coordinates])
-
-        def friction(qd: np.ndarray, z: np.ndarray | None = None) -> np.ndarray:
-            bent = None if z is None or reach is None else z / reach
-            return self.method.friction.torque(constants, qd, bent)
-
-        bodies = self.parameters[:inertial]
-        return RegressorDynamics(self.arm, bodies, constants[0], friction, self.inputs, reach)
+        return identified_dynamics(self.arm, self.method.friction, self.parameters, self.inputs)
 
     def torque(
         self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, z: np.ndarray | None = None
@@ -193,6 +182,20 @@ class Identification:
         words = [word for _, word in _DETERMINED if word in self.determined]
         counts = ", ".join(f"{self.determined.count(word)} {word}" for word in words)
         return textwrap.fill(conditioned, WIDTH) + f"\nParameters: {counts}."
+
+
+def identified_dynamics(
+    arm: Arm, friction: FrictionModel, parameters: np.ndarray, inputs: np.ndarray | None
+) -> RegressorDynamics:
+    """The arm with these parameters, (K,), the bodies' first; inputs: G, (n, n)."""
+    n, inertial = len(arm.coordinates), 10 * len(arm.bodies)
+    constants = parameters[inertial:].reshape(-1, n)
+    reach = reach_of([coordinate.kind for coordinate in arm.coordinates]) if friction.memory else None
+
+    def torque(qd: np.ndarray, z: np.ndarray | None) -> np.ndarray:
+        return friction.torque(constants, qd, None if z is None or reach is None else z / reach)
+
+    return RegressorDynamics(arm, parameters[:inertial], constants[0], torque, inputs, reach)
 
 
 def _finite(value: float) -> float | None:
