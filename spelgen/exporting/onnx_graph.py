@@ -57,11 +57,6 @@ class OnnxGraph:
         found: list[str] = self.Split(x, np.array(sizes), axis=axis, outputs=len(sizes))
         return found
 
-    def rows_times(self, row: str, matrix: Any) -> str:
-        """row @ matrix; row (..., n)."""
-        found: str = self.MatMul(row, matrix)
-        return found
-
     def solved(self, matrix: str, right: str, n: int) -> str:
         """matrix^-1 right, (batch, n, 1), by Gauss and Jordan: positive definite matrices need no pivoting."""
         rows = self.Concat(matrix, right, axis=2)
