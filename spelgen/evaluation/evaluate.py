@@ -90,7 +90,7 @@ def evaluate(
         energy_drift=energy_drift(judged.model, probe),
         traces=traces(
             predictors, pieces, max(lengths.values(), default=0), joint_types,
-            used=used, tip=None if tip is None else tip.position,
+            used=used, reach=judged.reach, tip=None if tip is None else tip.position,
         ),
         diagnostics=tuple(notes),
         joint_types=tuple(joint_types),

@@ -18,7 +18,7 @@ from spelgen.evaluation.torque_traces import plain, torque_trace
 from spelgen.fitting.rollout import loss_scales, position_difference
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
-from spelgen.logs.windows import Windows, cut_windows, joined
+from spelgen.logs.windows import Windows, cut_windows
 
 WINDOWS = 64  # that the growth of errors is told from
 TIMES = 24  # at which it is told
@@ -35,16 +35,20 @@ def traces(
     joint_types: Sequence[str],
     *,
     used: Preprocessing,
+    reach: np.ndarray,
     tip: Any = None,
 ) -> dict[str, Any]:
-    """All curves. pieces: gap-free and filtered. steps: of the longest horizon, 0: none. tip: its position [m] by q."""
+    """All curves. pieces: gap-free and filtered. steps: of the longest horizon, 0: none. tip: its position [m] by q.
+
+    reach: of the bristles that friction remembers with.
+    """
     dynamics = {x.name: x.dynamics for x in predictors if x.dynamics is not None}
     found: dict[str, Any] = {"coverage": _coverage(pieces)}
     if steps:
-        found |= _predictions(predictors, pieces, steps, joint_types, used, tip)
+        found |= _predictions(predictors, pieces, steps, joint_types, used, tip, reach)
     model = next((x for x in predictors if x.name == MODEL and x.dynamics is not None), None)
     if model is not None and model.dynamics is not None:
-        found["torques"] = torque_trace(model.dynamics, dynamics, pieces, used)
+        found["torques"] = torque_trace(model.dynamics, dynamics, pieces, used, reach)
         found["mass"] = _masses(dynamics, found)
         found["friction"] = _friction(dynamics, pieces, found["torques"])
     return found
@@ -57,23 +61,15 @@ def _predictions(
     joint_types: Sequence[str],
     used: Preprocessing,
     tip: Any,
+    reach: np.ndarray,
 ) -> dict[str, Any]:
     """How errors grow with the horizon, and the predictions of the middle and the largest error."""
     thin = max(1, int(max(piece.sample_rate for piece in pieces) / DENSEST))
     steps = max(1, steps // thin)
-    starts = [(piece, start) for piece in pieces for start in range(0, len(piece) - steps * thin)]
-    starts = starts[:: -(-len(starts) // WINDOWS)]
-    windows = joined(
-        [
-            cut_windows(
-                [piece[start : start + steps * thin + 1]],
-                steps + 1,
-                decimation=thin,
-                measured=used.filtered,
-            )
-            for piece, start in starts
-        ]
-    )
+    fitting = [piece for piece in pieces if len(piece) > steps * thin]
+    stride = -(-sum(len(piece) - steps * thin for piece in fitting) // WINDOWS)
+    starts = [(piece, k) for piece in fitting for k in range(0, len(piece) - steps * thin, stride)]
+    windows = cut_windows(fitting, steps + 1, stride, thin, measured=used.filtered, reach=reach)
     times = np.unique(np.geomspace(1, steps, TIMES).round().astype(int)) - 1
     scales = loss_scales(windows, joint_types)
     grown: dict[str, Any] = {}
