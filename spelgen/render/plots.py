@@ -9,7 +9,14 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from spelgen.evaluation.names import CONSTANT_VELOCITY, LEAST_SQUARES, MODEL, URDF, URDF_WITH_DRIVES
+from spelgen.evaluation.names import (
+    CONSTANT_VELOCITY,
+    LEAST_SQUARES,
+    LEAST_SQUARES_WITH_MEMORY,
+    MODEL,
+    URDF,
+    URDF_WITH_DRIVES,
+)
 from spelgen.labels import entry_name
 from spelgen.render.charts import Band, Dots, Line, line_chart
 
@@ -22,6 +29,7 @@ STYLES = {
     URDF: "urdf",
     URDF_WITH_DRIVES: "drives",
     LEAST_SQUARES: "squares",
+    LEAST_SQUARES_WITH_MEMORY: "remembering",
     CONSTANT_VELOCITY: "hold",
 }
 PARTS = {"inertia": "inertia", "Coriolis": "coriolis", "gravity": "gravity", "friction": "friction"}
