@@ -5,13 +5,14 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 DEMO := demo
+MINUTES ?= 20
 
 # The networks are tiny: more threads than one only cost time, and one makes runs repeatable.
 export OMP_NUM_THREADS ?= 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check docs format bench golden lock clean
+.PHONY: help demo test fuzz check docs format bench golden lock clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
@@ -28,6 +29,9 @@ demo: $(STAMP) ## the whole way on robots/rpr.urdf: inspect, build, simulate, tr
 
 test: $(STAMP) ## run the tests
 	$(BIN)/python -m pytest
+
+fuzz: $(STAMP) ## URDFs, logs, settings and run folders drawn at random, new ones for MINUTES=20
+	FUZZ_MINUTES=$(MINUTES) $(BIN)/python -m pytest -q tests/test_fuzz.py tests/test_fuzz_files.py
 
 check: $(STAMP) ## format, lint, types, import direction, golden files, examples in the docs
 	$(BIN)/ruff format --check .

@@ -11,9 +11,10 @@ from typer.testing import CliRunner
 
 from spelgen.cli.main import app
 from spelgen.dynamics.regressor import regressor, urdf_parameters
-from spelgen.errors import LogError
+from spelgen.errors import LogError, SpelgenErrors
 from spelgen.loaded_arm import load_arm
-from spelgen.logs.check_logs import check_logs
+from spelgen.logs.check_logs import check_logs, require_possible_torques
+from spelgen.logs.mapping import LogMapping
 from spelgen.logs.read import write_logs
 from spelgen.logs.statistics import noise_level, quantisation_step, statistics
 from spelgen.logs.trajectory import Trajectory
@@ -83,7 +84,7 @@ def loaded_joint(loaded, log) -> int:
     return max(range(3), key=lambda k: check_logs([log], loaded).joints[k].gravity.relative_deviation or 0)
 
 
-@pytest.mark.parametrize("code", ["torque-without-gravity", "torque-against-gravity", "torque-scale"])
+@pytest.mark.parametrize("code", ["torque-without-gravity", "torque-scale"])
 def test_a_torque_that_is_none_is_found(loaded, arm, log, code):
     joint, tau = loaded_joint(loaded, log), log.tau.copy()
     still = np.zeros_like(log.q)
@@ -91,13 +92,48 @@ def test_a_torque_that_is_none_is_found(loaded, arm, log, code):
     random = np.random.default_rng(1)
     tau[:, joint] = {
         "torque-without-gravity": (tau - gravity)[:, joint] + 0.1 * random.standard_normal(len(tau)),
-        "torque-against-gravity": -tau[:, joint],
-        "torque-scale": tau[:, joint] / 20,
+        "torque-scale": tau[:, joint] / 8,
     }[code]
     findings = check_logs([replace(log, tau=tau)], loaded).findings
     assert [(x.severity, x.code, x.where) for x in findings] == [
         ("warning", code, f"joint {arm.coordinates[joint].name!r}")
     ]
+
+
+IMPOSSIBLE = {
+    "sign": (-1.0, "torques that move against gravity, -"),
+    "unit": (1e-3, "torques that move with 0.000988 times the URDF's gravity torque"),
+    "drives": (1e4, "up to 1.622e+04, 811 times what the drive can give"),
+}
+
+
+@pytest.mark.parametrize("case", IMPOSSIBLE)
+def test_torques_of_another_sense_or_unit_are_errors_before_anything_is_fitted(loaded, arm, log, case):
+    factor, told = IMPOSSIBLE[case]
+    joint, tau = loaded_joint(loaded, log), log.tau.copy()
+    tau[:, joint] *= factor
+    wrong = [replace(log, tau=tau)]
+    where = f"joint {arm.coordinates[joint].name!r}, tau: got {told}"
+    (error,) = check_logs(wrong, loaded).errors
+    assert str(error).startswith(where)
+    with pytest.raises(LogError) as caught:
+        require_possible_torques(wrong, loaded)
+    assert str(caught.value) == str(error)
+    said = LogMapping.model_validate({"units": {"tau": "Nm"}})
+    assert bool(check_logs(wrong, loaded, said).errors) == (case == "sign")
+    require_possible_torques([log], loaded)
+
+
+def test_torques_beyond_all_drives_are_errors(loaded, arm, log):
+    """Where gravity says nothing: of a joint with an effort limit and torques of noise."""
+    random = np.random.default_rng(0)
+    coordinates = tuple(replace(each, effort=10.0) for each in arm.coordinates)
+    weak = replace(loaded, arm=replace(arm, coordinates=coordinates))
+    wrong = replace(log, tau=500 * random.standard_normal(log.tau.shape))
+    with pytest.raises(
+        SpelgenErrors, match=r"times what the drive can give, expected Nm or N at the joint; say 'un"
+    ):
+        require_possible_torques([wrong], weak)
 
 
 def test_limits_overrun_are_said(loaded, arm, log):

@@ -6,7 +6,7 @@ import random
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from fuzzing import fuzz
 from hypothesis import strategies as st
 
 from spelgen import pipeline
@@ -17,14 +17,6 @@ OURS = sorted((ROOT / "robots").glob("*.urdf"))
 THEIRS = sorted((ROOT.parent / "shared" / "arms").rglob("*.urdf"))[::9]
 LARGEST = 60_000  # bytes of a file that is mutated: longer ones only take longer
 MUTANTS = 1000
-FUZZ = settings(
-    max_examples=1500,
-    deadline=None,
-    derandomize=True,
-    database=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
-
 NAMES = st.sampled_from(["a", "b", "c", "d", "base", "", "a b", "é", "{{ a }}", "a'b", "l" * 200])
 TYPES = st.sampled_from(
     ["revolute", "continuous", "prismatic", "fixed", "floating", "planar", "", "hinge"]
@@ -92,12 +84,13 @@ def nearly_right(draw: st.DrawFn) -> str:
     return f'<robot name="r">{"".join(told)}</robot>'
 
 
-@FUZZ
-@given(text=st.one_of(robots_of_any_kind(), nearly_right()))
-def test_generated_files(tmp_path, text):
-    path = tmp_path / "drawn.urdf"
-    path.write_text(text, encoding="utf-8")
-    require_answer(path)
+def test_generated_files(tmp_path):
+    def use(text):
+        path = tmp_path / "drawn.urdf"
+        path.write_text(text, encoding="utf-8")
+        require_answer(path)
+
+    fuzz(st.one_of(robots_of_any_kind(), nearly_right()), 1500, use)
 
 
 @pytest.mark.parametrize("kind", ["bytes", "tokens"])

@@ -18,7 +18,7 @@ CARRIED = {"__future__", "collections", "functools", "math", "torch", "typing"}
 # A file may import only from files above it, or to its left.
 ROWS = f"""
 errors files labels listing templates
-settings: values yaml_document
+settings: values yaml_document starter
 logs: mapping
 fitting: config
 settings: joint simulation training comparison messages settings
@@ -32,7 +32,7 @@ dynamics: bristles
 dynamics: protocol prepared
 emission: bodies plan source docstring tailored bundle emit loading
 dynamics: arrays constraint pinocchio_dynamics pinocchio_arm pinocchio_urdf regressor regressor_dynamics tip
-logs: arm_mapping trajectory bags tables npz readers values log_files read checks filtering
+logs: arm_mapping trajectory bags tables npz readers values log_files suggest read checks filtering
 logs: preprocessing windows chunks epoch_windows
 simulation: friction integration simulated_logs random_inputs tracking
 identification: samples friction base_parameters least_squares method prior identification

@@ -1,14 +1,20 @@
 """The sidecar file: what is read, and what a wrong one is told."""
 
+import re
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from pydantic import ValidationError
+from typer.testing import CliRunner
 
+from spelgen.cli.main import app
 from spelgen.errors import SettingsError, SpelgenErrors
+from spelgen.loaded_arm import load_arm
 from spelgen.settings.joint import JointSettings
 from spelgen.settings.settings import OF_A_STEP, Settings, load_mapping, load_settings
+from spelgen.simulation.friction import make_friction
 
 
 @pytest.fixture
@@ -82,8 +88,8 @@ def test_settings_do_not_change(urdf):
         ),
         (
             "tracking:\n  x: 1",
-            "arm.yaml:2: tracking: unknown key 'x'; known are 'amplitude', 'frequency', 'paths', 'bandwidths', "
-            "'control_rate', 'resolution', 'cutoff'",
+            "arm.yaml:2: tracking: unknown key 'x'; known are 'amplitude', 'frequency', 'paths', 'control', "
+            "'bandwidths', 'control_rate', 'resolution', 'cutoff'",
         ),
         (
             "joints:\n  a: {viscous: -1}",
@@ -232,3 +238,27 @@ def test_reading_settings_imports_nothing_heavy():
     )
     shown = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert shown.stdout == "set()\n"
+
+
+@pytest.mark.parametrize("name", ["rpr", "scara", "panda", "ur10e"])
+def test_a_starter_says_what_holds_anyway_and_can_be_said(robots, tmp_path, name):
+    """As it is written it changes nothing; with every line said it is right, and still changes nothing."""
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_bytes((robots / f"{name}.urdf").read_bytes())
+    assert CliRunner().invoke(app, ["init", str(urdf)]).stdout == f"wrote {tmp_path}/arm.yaml\n"
+    text = (tmp_path / "arm.yaml").read_text()
+    plain = load_arm(urdf)
+    assert plain.settings == Settings()
+    (tmp_path / "arm.yaml").write_text(re.sub(r"^# ", "", text, flags=re.MULTILINE))
+    said = load_arm(urdf)
+    assert not said.settings.diagnostics
+    assert (
+        said.settings.joints.keys()
+        == {x.name for x in said.arm.coordinates}
+        == said.settings.logs.joints.keys()
+    )
+    kinds = [x.kind for x in said.arm.coordinates]
+    assert not said.settings.logs.misfits([x.name for x in said.arm.coordinates], kinds)
+    ours, theirs = (make_friction(x.arm, x.settings) for x in (plain, said))
+    assert np.array_equal(ours(np.ones(len(kinds))), theirs(np.ones(len(kinds))))
+    assert "this output exists already" in CliRunner().invoke(app, ["init", str(urdf)]).stderr

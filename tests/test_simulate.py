@@ -283,11 +283,12 @@ class TestInMemory:
     def test_settings_of_other_steps_are_not_looked_at(self, robots, tmp_path):
         (tmp_path / "arm.urdf").write_bytes((robots / "two_link.urdf").read_bytes())
         (tmp_path / "arm.yaml").write_text("training: {nonsense: 1}\nlogs: {units: {q: furlongs}}\n")
-        assert len(simulate(load_arm(tmp_path / "arm.urdf"), trajectories=1, duration=0.1)) == 1
+        assert len(simulate(load_arm(tmp_path / "arm.urdf"), trajectories=1, duration=0.1)) == 2
 
     def test_a_mimic_joint_moves_along(self, tmp_path):
         """Both joints by Pinocchio, the second driven along: tau = K^T rnea(K q + offset, K qd, K qdd)."""
         coupled = coupled_urdf(tmp_path / "coupled.urdf")
+        coupled.with_suffix(".yaml").write_text("simulation: {protocol: random-inputs}")
         logs = simulate(load_arm(coupled), trajectories=2, duration=0.2, sample_rate=200.0)
         assert all(x.q.shape == (41, 1) for x in logs)
         model = pin.buildModelFromUrdf(str(coupled))

@@ -1,5 +1,7 @@
 """Logs of a controlled arm: it follows its sines, encoders count in steps, what is logged is near what happened."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -10,6 +12,8 @@ from spelgen.loaded_arm import load_arm
 from spelgen.settings.settings import Settings
 from spelgen.simulation import tracking
 from spelgen.simulation.friction import make_friction
+from spelgen.simulation.random_inputs import initial_range
+from spelgen.simulation.simulate import simulate
 from spelgen.simulation.tracking import Sines, measured, record, track, tuned_gains
 from tests.hand_built import arm, body, coordinate, point, slider
 
@@ -209,4 +213,26 @@ def test_every_joint_whose_range_is_too_small_is_told():
     joints = [coordinate(upper=-0.5), coordinate("b", upper=-0.4)]
     bodies = [body(name, parent=k - 1, coordinate=k, inertia=point(1, 0.1)) for k, name in enumerate("ab")]
     with pytest.raises(SpelgenErrors, match=r"of 'a'.*\n.*of 'b'"):
-        track(arm(joints, bodies), changed(Settings(), sample_rate=500.0))
+        track(arm(joints, bodies), changed(Settings(), {"amplitude": 0.5}, sample_rate=500.0))
+
+
+def test_where_nothing_is_said_an_arm_is_controlled_and_follows(shared):
+    """An arm of seven joints without friction that would fall within a second, and one that friction stops at once."""
+    for name in ("kinova_gen3_7dof_2f85", "kuka_iiwa14_lbrstack"):
+        loaded = load_arm(shared / "arms" / f"{name}.urdf")
+        logs = simulate(loaded, trajectories=1, duration=1.0)
+        assert logs.integration_error < 1e-6
+        low, high = initial_range(loaded.arm, loaded.settings)
+        middle, reach = (low + high) / 2, np.minimum(np.radians(30), 0.35 * (high - low))
+        for log in logs:
+            assert (np.abs(log.q - middle) < 1.02 * reach + 0.005).all()
+        assert max(np.ptp(log.q, axis=0).max() for log in logs) > 0.1
+
+
+def test_said_inputs_or_a_protocol_are_taken_at_their_word(robots):
+    loaded = load_arm(robots / "two_link.urdf")
+    assert len(np.unique(simulate(loaded, trajectories=2, duration=0.5)[0].tau)) <= 5
+    bare = replace(loaded, settings=Settings())
+    assert simulate(bare, trajectories=1, duration=0.2).train[0].sample_rate == pytest.approx(125.0)
+    chosen = Settings.model_validate({"simulation": {"protocol": "random-inputs", "duration": 0.2}})
+    assert simulate(replace(loaded, settings=chosen), trajectories=2)[0].sample_rate == pytest.approx(20.0)

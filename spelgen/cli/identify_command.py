@@ -56,6 +56,8 @@ def identify(
     from spelgen.identification.identify import identify as identified
     from spelgen.identification.method import LeastSquares
     from spelgen.loaded_arm import load_arm
+    from spelgen.logs.arm_mapping import log_source
+    from spelgen.logs.check_logs import require_possible_torques
     from spelgen.logs.preprocessing import Preprocessing
     from spelgen.logs.read import read_logs
 
@@ -66,6 +68,7 @@ def identify(
         raise typer.BadParameter(error.got, param_hint=f"'--{error.element}'") from None
     arm = load_arm(robot, options.names(joints), tip, angle_tolerance)
     logs = read_logs(paths, arm, mapping, role="train")
+    require_possible_torques(logs, arm, log_source(arm, mapping).mapping)
     found = identified(arm, logs, method, preprocessing=Preprocessing(cutoff=filter))
     for each in found.diagnostics:
         note(f"{each.severity}: {each.where}: {each.message}")

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import FAILED, counted, note, say
 from spelgen.cli.options import AngleTolerance, Force, Joints, Mapping, Robot, Tip
+from spelgen.errors import SpelgenError
 from spelgen.files import write_text
+
+if TYPE_CHECKING:
+    from spelgen.loaded_arm import LoadedArm
 
 
 def excite(
@@ -71,6 +75,10 @@ def logs(
     mapping: Mapping = None,
     format: Annotated[Literal["text", "json"], typer.Option(help="Of the result.")] = "text",
     html: Annotated[Path | None, typer.Option(metavar="FILE", help="Write a page with plots too.")] = None,
+    suggest: Annotated[
+        Path | None, typer.Option(help="Write the mapping that names and numbers of the first log suggest.")
+    ] = None,
+    force: Force = False,
     strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 if there is any warning.")] = False,
 ) -> None:
     """Check logs: what they hold, and what is odd about them.
@@ -78,12 +86,16 @@ def logs(
     Nothing is changed. Exit code 1 where the logs cannot be trained on.
     """
     from spelgen.loaded_arm import load_arm
+    from spelgen.logs.arm_mapping import log_source
     from spelgen.logs.check_logs import check_logs
     from spelgen.logs.chunks import stream_logs
     from spelgen.render.logs_page import page
 
     arm = load_arm(robot, options.names(joints), tip, angle_tolerance)
-    found = check_logs(stream_logs(paths, arm, mapping), arm)
+    if suggest is not None:
+        options.require_free(suggest, force=force)
+        mapping = _suggested(paths, arm, suggest)
+    found = check_logs(stream_logs(paths, arm, mapping), arm, log_source(arm, mapping).mapping)
     say(found.text() if format == "text" else json.dumps(found.to_dict(), indent=2))
     if html is not None:
         note(f"wrote {write_text(html, page(found, arm.arm, arm.actuation.matrix()))}")
@@ -94,3 +106,21 @@ def logs(
         note(f"{warnings} warning{'s' * (warnings > 1)}, and --strict allows none")
     if found.errors or (strict and warnings):
         raise typer.Exit(FAILED)
+
+
+def _suggested(paths: list[Path], arm: LoadedArm, file: Path) -> Path:
+    """The mapping that the first log suggests, written to a file; ends the command where it lacks columns."""
+    from spelgen.errors import collect
+    from spelgen.logs.log_files import log_files
+    from spelgen.logs.suggest import suggest_mapping
+
+    errors: list[SpelgenError] = []
+    logs = log_files(paths, None, errors)
+    collect(errors)
+    coordinates = arm.arm.coordinates
+    found = suggest_mapping(logs[0], [x.name for x in coordinates], [x.kind for x in coordinates])
+    say(f"wrote {write_text(file, found.text)}: to be read, then used by --mapping")
+    if found.missing:
+        note(f"no column was found for {', '.join(found.missing)}; say their names in {file}")
+        raise typer.Exit(FAILED)
+    return file

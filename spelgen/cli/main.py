@@ -36,6 +36,7 @@ app = typer.Typer(
 )
 for command in (
     model_commands.inspect,
+    model_commands.init,
     model_commands.build,
     simulate_command.simulate,
     identify_command.identify,

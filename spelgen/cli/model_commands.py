@@ -71,6 +71,27 @@ def inspect(
         raise typer.Exit(FAILED)
 
 
+def init(
+    robot: Robot,
+    joints: Joints = None,
+    tip: Tip = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="FILE.yaml", help="Default: beside the URDF.")
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Write a commented file of settings for an arm: drives, gravity, logs, simulation."""
+    from spelgen.arm.arm import make_arm
+    from spelgen.settings.starter import StarterJoint, starter
+    from spelgen.urdf.read import read_urdf
+
+    path = output or robot.with_suffix(".yaml")
+    options.require_free(path, force=force)
+    arm = make_arm(read_urdf(robot), joints=options.names(joints), tip=tip)
+    drives = [StarterJoint(x.name, x.kind, x.damping, x.friction) for x in arm.coordinates]
+    say(f"wrote {write_text(path, starter(robot.name, drives))}")
+
+
 def build(
     robot: Robot,
     joints: Joints = None,

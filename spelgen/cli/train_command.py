@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
@@ -20,6 +21,8 @@ from spelgen.spec import read_facts
 if TYPE_CHECKING:
     from spelgen.fitting.config import WindowConfig
     from spelgen.fitting.fitted import Fit
+    from spelgen.logs.mapping import LogMapping
+    from spelgen.logs.trajectory import Trajectory
 
 
 def train(
@@ -137,7 +140,7 @@ def train(
             start.module, paths, folder, start.config, urdf=urdf, source=source, mapping=given or start.mapping,
             preprocessing=start.preprocessing, validation=start.validation, seed=start.seed, resume=resume,
             force=force, trust=trust, device=device, threads=threads, progress=not quiet,
-            since=since,
+            since=since, require=None if urdf is None else _torque_check(urdf, start.module, given or start.mapping),
         )  # fmt: skip
     except OptionError as error:
         flag = "from" if error.option == "payload" else error.option.replace("_", "-")
@@ -147,25 +150,38 @@ def train(
         from spelgen.identification.baseline import keep_baseline
 
         keep_baseline(RunFolder(folder), paths)
-    why = _reason(found)
-    say(f"{found.status} after {found.epochs} epochs, {found.steps} steps, {found.seconds:.0f} s{why}")
-    say(f"best validation loss {found.best_validation:.3g}, at epoch {found.best_epoch}")
+    for line in _outcome(found):
+        say(line)
     say(f"run folder: {folder}")
     if found.status == "interrupted":
         note("the best model so far is in the run folder; --resume goes on")
         raise typer.Exit(INTERRUPTED)
 
 
-def _reason(found: Fit) -> str:
-    """Why a fit to windows came to its end, where its status does not say so."""
-    config = cast("WindowConfig", found.config)
-    if found.status == "stopped early":
-        return f": no better validation loss in {config.patience} epochs"
-    if found.status == "out of time":
-        return f": {config.max_minutes:g} minutes are over"
-    if found.status == "finished" and config.epochs:
-        return ": no way further down" if found.epochs < config.epochs else ": all epochs are run"
-    return ""
+def _torque_check(
+    urdf: Path, module: Path, mapping: LogMapping | None
+) -> Callable[[Sequence[Trajectory]], None]:
+    """What raises LogError for logs whose torques cannot be those of the module's arm."""
+    from spelgen.loaded_arm import load_arm
+    from spelgen.logs.check_logs import require_possible_torques
+
+    options = read_facts(module).options
+    arm = load_arm(urdf, options.joints, options.tip, options.angle_tolerance)
+    return lambda logs: require_possible_torques(logs, arm, mapping)
+
+
+def _outcome(found: Fit) -> tuple[str, str]:
+    """How a fit ended, and why where its status does not say so; what it came to."""
+    config, loss = cast("WindowConfig", found.config), f"validation loss {found.best_validation:.3g}"
+    if not config.epochs:  # windows only judge
+        return f"{found.status}: {config.objective} fitted in {found.seconds:.0f} s", loss
+    why = {
+        "stopped early": f": no better validation loss in {config.patience} epochs",
+        "out of time": f": {config.max_minutes or 0:g} minutes are over",
+        "finished": ": all epochs are run" if found.epochs >= config.epochs else ": no way further down",
+    }.get(found.status or "", "")
+    ended = f"{found.status} after {found.epochs} epochs, {found.steps} steps, {found.seconds:.0f} s"
+    return ended + why, f"best {loss}, at epoch {found.best_epoch}"
 
 
 def _of_run(source: Path, robot: Path | None) -> tuple[Path, Path | None]:

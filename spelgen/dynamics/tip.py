@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import redirect_stderr
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +28,8 @@ class TipKinematics:
     def __init__(self, robot: Robot, content: bytes, joints: Sequence[str], link: str) -> None:
         self.link = link
         # bytes: of text with an encoding declaration the parser would raise
-        chain = pk.build_serial_chain_from_urdf(content, link)
+        with redirect_stderr(StringIO()):  # it names every tag that it does not know
+            chain = pk.build_serial_chain_from_urdf(content, link)
         self._chain = chain.to(dtype=torch.float64)
         constraint = mimic_constraint(robot, joints)
         order = [constraint.names.index(name) for name in chain.get_joint_parameter_names()]

@@ -55,6 +55,7 @@ class Epoch(BaseModel):
     loss: float
     validation: float
     best: float
+    seconds: NonNegative
 
 
 def require_record(found: dict[str, Any], file: Path) -> dict[str, Any]:

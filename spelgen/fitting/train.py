@@ -45,6 +45,7 @@ def train(
     resume: bool = False,
     trust: bool = False,
     progress: bool = True,
+    require: Callable[[Sequence[Trajectory]], None] | None = None,
     **options: Any,
 ) -> Fit:
     """Fit the emitted module to the logs and leave a run folder (see `RunFolder`); ``options`` are those of `fit`.
@@ -52,8 +53,9 @@ def train(
     urdf: the robot the module was built from, for the regularizer and the baselines of `evaluate`; by default the file
     of that name beside the module. source: a run whose module and weights are where the fit starts. trust: the module
     of a run folder is run whatever it is (see `RunFolder.load_module`). mapping: how the logs are named and measured;
-    by default as spelgen writes them. config: may also be a function that chooses. What is not said of a run that is
-    resumed is as before.
+    by default as spelgen writes them. config: may also be a function that chooses. require: raises where it finds
+    logs wrong, before anything is fitted; logs larger than memory are not shown to it. What is not said of a run that
+    is resumed is as before.
     Raises ModuleError, LogError, and RunError when the folder holds a run or cannot be resumed with this.
     """
     run = RunFolder(Path(folder))
@@ -75,6 +77,8 @@ def train(
         start_from(model, source)
     chosen = config(model, None) if callable(config) else config  # before logs, which may take long to read
     logs = open_logs(model, data, mapping, preprocessing)
+    if require is not None and not isinstance(logs, LargeLogs):
+        require(logs)
     if chosen is None and callable(config):
         chosen = config(model, sample_rates(logs))
     robot, notes = (None, []) if resume else robot_of(module, urdf, model.facts)

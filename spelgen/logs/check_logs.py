@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from spelgen.arm.arm import Coordinate
-from spelgen.errors import Diagnostic, LogError, SpelgenError, SpelgenErrors
+from spelgen.errors import Diagnostic, LogError, SpelgenError, SpelgenErrors, collect
 from spelgen.logs.checks import Finding, findings, gap_diagnostics, summarised
 from spelgen.logs.gravity import GravityFit, StateSamples, fit_gravity, state_samples
 from spelgen.logs.report import SEEN, JointReport, LogReport
@@ -17,18 +17,23 @@ from spelgen.logs.trajectory import QUANTITIES, Trajectory, require_joints
 
 if TYPE_CHECKING:
     from spelgen.loaded_arm import LoadedArm
+    from spelgen.logs.mapping import LogMapping
 
 EXAMPLES = 2  # trajectories that are drawn
 BEYOND = 1e-3  # [rad, m, of a limit] a limit overrun by less is rounding
 LOADED = 0.2  # deviation of the URDF's gravity torque, of the torque's: from here on it must be seen
 UNSEEN = 0.3  # correlation of torque and gravity below which the one is not in the other
 FACTORS = (0.2, 5.0)  # inertials in URDFs are often wrong, but not like this
+CERTAIN = 0.9  # correlation from which on a wrong sign or unit is an error, where it is a warning before
+IMPOSSIBLE = (0.1, 10.0)  # factors that only another unit has
+BEYOND_DRIVES = 20.0  # times its effort limit no drive gives, in whatever unit
 
 
-def check_logs(logs: Iterable[Trajectory], arm: LoadedArm) -> LogReport:
+def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping | None = None) -> LogReport:
     """All about the logs of an arm, read once, one trajectory after another; nothing is repaired or raised.
 
-    What keeps logs from being trained on is among the report's `errors`. Logged torques go through the arm's
+    What keeps logs from being trained on is among the report's `errors`. mapping: by which they were read, that of
+    the arm's settings unless given; a unit that it says of torques is believed. Logged torques go through the arm's
     input matrix to the joints'. Raises LogError without any trajectory, or with one of another number of joints.
     """
     coordinates, inputs = arm.arm.coordinates, arm.actuation.matrix()
@@ -57,8 +62,13 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm) -> LogReport:
         errors = (error,)
     gravity = fit_gravity(arm.arm, samples)
     reports = [_joint(k, *each, measured) for k, each in enumerate(zip(coordinates, gravity, strict=True))]
+    mapping = mapping or arm.settings.logs
     for coordinate, report in zip(coordinates, reports, strict=True):
-        notes += [*_limits(coordinate, report), *_gravity(report)]
+        largest = max(abs(report.low["tau"]), abs(report.high["tau"]))
+        declared = mapping.unit("tau", coordinate.name) is not None
+        wrong = torque_errors(coordinate, report.gravity, largest, declared=declared)
+        errors += tuple(wrong)
+        notes += [*_limits(coordinate, report), *([] if wrong else _gravity(report))]
     return LogReport(
         robot=arm.arm.name,
         files=len({each.clock.file for each in measured} - {None}),
@@ -147,3 +157,47 @@ def _gravity(joint: JointReport) -> list[Diagnostic]:
         message = f"tau moves with {fit.factor:.3g} times the URDF's gravity torque; check its unit and gain"
         return [Diagnostic("warning", "torque-scale", where, None, message)]
     return []
+
+
+def torque_errors(
+    coordinate: Coordinate, fit: GravityFit, largest: float, *, declared: bool
+) -> list[LogError]:
+    """Why a joint's torques cannot be what they are said to be: certain where the URDF's gravity is in them.
+
+    largest: that was logged [Nm, N]. declared: the mapping says the unit of the torques, so their size is believed.
+    """
+    where = f"joint {coordinate.name!r}, tau"
+    do = "say 'units: {tau: ...}' or a 'gain' under 'logs' in the robot's YAML; 'Nm' says that they are right"
+    seen = (fit.relative_deviation or 0.0) >= LOADED if fit.factor is not None else False
+    if seen and fit.factor is not None and fit.correlation is not None:
+        if fit.correlation < -CERTAIN:
+            got = f"torques that move against gravity, {fit.factor:.3g} times the URDF's"
+            return [LogError(
+                got, element=where, expected="the URDF's sense",
+                do="say 'sign: -1' or a negative 'gain' of the joint under 'logs', or the gravity of this mounting",
+            )]  # fmt: skip
+        low, high = IMPOSSIBLE
+        if fit.correlation > CERTAIN and not declared and not low < fit.factor < high:
+            got = f"torques that move with {fit.factor:.3g} times the URDF's gravity torque"
+            return [LogError(got, element=where, expected="Nm or N at the joint", do=do)]
+    limit = coordinate.effort or 0.0
+    if not declared and limit > 0 and largest > BEYOND_DRIVES * limit:
+        got = f"up to {largest:.4g}, {largest / limit:.3g} times what the drive can give"
+        return [LogError(got, element=where, expected="Nm or N at the joint", do=do)]
+    return []
+
+
+def require_possible_torques(
+    logs: Sequence[Trajectory], arm: LoadedArm, mapping: LogMapping | None = None
+) -> None:
+    """Raise LogError where the torques of logs cannot be an arm's, before anything is fitted to them."""
+    inputs = arm.actuation.matrix()
+    fits = fit_gravity(arm.arm, [state_samples(trajectory, inputs) for trajectory in logs])
+    collect([
+        error
+        for k, (coordinate, fit) in enumerate(zip(arm.arm.coordinates, fits, strict=True))
+        for error in torque_errors(
+            coordinate, fit, max(float(np.abs(x.tau[:, k]).max()) for x in logs),
+            declared=(mapping or arm.settings.logs).unit("tau", coordinate.name) is not None,
+        )
+    ])  # fmt: skip

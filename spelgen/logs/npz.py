@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from spelgen.errors import LogError
 from spelgen.logs.mapping import LogMapping
-from spelgen.logs.tables import LogTable, made_layout, missing_columns, opened, wanted_quantities
+from spelgen.logs.tables import LogTable, element, made_layout, missing_columns, opened, wanted_quantities
 
 NAMES = "joints"  # the array of joint names, by the columns of the matrices
 ENDING = ".npy"
@@ -60,6 +60,15 @@ def read_npz(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
         return [_npz_table(text, arrays, file, joints, mapping.of_trajectory(text)) for text in texts]
 
 
+def npz_table(file: Path) -> pa.Table:
+    """All arrays of numbers with a value, or a row, for each of the most samples that any has: matrices as lists."""
+    with opened(file, lambda: zipfile.ZipFile(file)) as archive:
+        arrays = {name: array for name, array in NpzArrays(file, archive).items() if array.ndim in (1, 2)}
+    samples = max((len(array) for array in arrays.values()), default=0)
+    kept = {name: _plain(array) for name, array in arrays.items() if len(array) == samples}
+    return opened(file, lambda: pa.table({k: x if x.ndim == 1 else x.tolist() for k, x in kept.items()}))
+
+
 def _trajectory_text(pattern: str, name: str) -> str | None:
     """What stands for `{trajectory}` in a name, everywhere the same; None where the name does not fit the pattern."""
     parts = pattern.split("{trajectory}")
@@ -85,6 +94,9 @@ def _npz_table(
                 found[name] = arrays[matrix][:, at]
             elif name in arrays:
                 found[name] = arrays[name]
+            elif (place := element(name, list(arrays))) and arrays[place[0]].ndim == 2:
+                columns = arrays[place[0]].T[place[1] : place[1] + 1]  # none where it is too narrow
+                found.update(zip([name], columns, strict=False))
             names.append(name)
     if missing := [name for name in names if name not in found]:
         raise missing_columns(missing, list(arrays), file, mapping, joints)

@@ -48,6 +48,11 @@ def values_in_si(
     return data
 
 
+def column_values(table: pa.Table, name: str, file: Path) -> np.ndarray:
+    """A column (T,) as it was logged. Raises LogError where a value is no number."""
+    return _numbers(_column(table, name), name, file, 0)
+
+
 def made_trajectory(data: np.ndarray, layout: Layout, **about: Any) -> Trajectory:
     """A trajectory of these rows (T, C) in SI units, velocities differentiated where there are none."""
     quantities = wanted_quantities(layout.mapping)

@@ -7,6 +7,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from jinja2 import TemplateError
+
 from spelgen.errors import RunError, SpelgenError
 from spelgen.evaluation.tables import result_tables
 from spelgen.evaluation.verdict import verdict
@@ -71,6 +73,16 @@ def render_report(folder: Path | str, robot: Path | str | None = None) -> str:
         raise RunError(
             "no run", file=run.path, expected="a folder with module.py", do="make one with `spelgen train`"
         )
+    try:
+        return _rendered(run, robot)
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, TemplateError) as error:
+        raise RunError(
+            f"files that do not hold what a report needs ({type(error).__name__}: {error})", file=run.path,
+            do="run `spelgen evaluate` again",
+        ) from error  # fmt: skip
+
+
+def _rendered(run: RunFolder, robot: Path | str | None) -> str:
     facts, picture = read_facts(run.module), read_picture(run.module)
     config = run.read_config() if run.config.is_file() else None
     evaluation, identified = (

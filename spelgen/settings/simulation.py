@@ -12,7 +12,8 @@ from spelgen.settings.values import Count, Group, Inputs, Number, Positive, Shar
 class SimulationSettings(Group):
     """How `spelgen simulate` makes logs.
 
-    protocol: random-inputs, or tracking: controlled motions, see `TrackingSettings`.
+    protocol: random-inputs, or tracking: controlled motions, see `TrackingSettings`. Where neither it nor any `inputs`
+        are said: tracking, of fewer and longer trajectories than these (`simulation.simulate.CONTROLLED`).
     trajectories: number, each from its own initial position, at rest.
     duration: of each [s]. sample_rate: of samples and of the inputs, which are held in between [Hz].
     inputs: the torques each actuated joint draws from, every sample anew [Nm].
@@ -43,10 +44,12 @@ class SimulationSettings(Group):
 class TrackingSettings(Group):
     """How an arm moves and is seen in `simulation.protocol: tracking`.
 
-    amplitude [rad; m], frequency [Hz]: of each joint's sine about the middle of `simulation.positions`.
+    amplitude [rad; m], frequency [Hz]: of each joint's sine about the middle of `simulation.positions`; unless said,
+        less where the range is narrow.
     paths: "same": all trajectories follow one closed path, each beginning further on; "own": each has phases of
     its own, so that its test part lies where no training part was.
-    bandwidths: of the PID controllers of the first, second, ... trajectory, then over again [Hz].
+    control: "pid" of each joint by itself, or "computed-torque", which knows the arm: for arms that fall otherwise.
+    bandwidths: of the controllers of the first, second, ... trajectory, then over again [Hz].
     control_rate: of the controllers, which hold their torques; simulation.sample_rate is a multiple of it [Hz].
     resolution: of the encoders [rad; m]. cutoff: of the zero-phase low-pass on their positions [Hz].
     """
@@ -54,6 +57,7 @@ class TrackingSettings(Group):
     amplitude: Positive = 0.5235987755982988
     frequency: Positive = 0.125
     paths: Literal["same", "own"] = "same"
+    control: Literal["pid", "computed-torque"] = "pid"
     bandwidths: Annotated[tuple[Positive, ...], Field(min_length=1)] = (2.0, 2.5, 3.0, 3.5, 4.0, 4.5)
     control_rate: Positive = 125.0
     resolution: Positive = 4.8e-5

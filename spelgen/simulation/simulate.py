@@ -10,6 +10,7 @@ from pydantic import ValidationError
 
 from spelgen.errors import collect
 from spelgen.settings.messages import explain
+from spelgen.settings.settings import Settings
 from spelgen.settings.simulation import SimulationSettings
 from spelgen.settings.yaml_document import Document
 from spelgen.simulation.random_inputs import random_inputs
@@ -19,6 +20,10 @@ from spelgen.simulation.tracking import track
 if TYPE_CHECKING:
     from spelgen.loaded_arm import LoadedArm
 
+CONTROL_RATE = 125.0  # [Hz] about
+CONTROLLED = {
+    "protocol": "tracking", "trajectories": 4, "duration": 8.0, "sample_rate": 125.0, "test_fraction": 0.25,
+}  # fmt: skip
 PROTOCOLS = {"random-inputs": random_inputs, "tracking": track}
 
 
@@ -45,14 +50,35 @@ def simulate(
         "test_fraction": test_fraction, "seed": seed,
     }  # fmt: skip
     changes = {key: value for key, value in given.items() if value is not None}
-    settings = arm.settings.model_copy(update={"simulation": _changed(arm.settings.simulation, changes)})
+    changed = _changed(arm.settings.simulation, changes)
+    settings = _controlled(arm.settings.model_copy(update={"simulation": changed}))
     run = PROTOCOLS[settings.simulation.protocol]
     return run(arm.arm, settings, arm.actuation.matrix(), progress=progress)
 
 
+def _controlled(settings: Settings) -> Settings:
+    """The settings, with the arm controlled where nobody says how it is driven: under random torques it would fall."""
+    simulation, tracking = settings.simulation, settings.tracking
+    said = {"protocol", "inputs"} & simulation.model_fields_set
+    if said or any(joint.inputs for joint in settings.joints.values()):
+        return settings
+    simulation = _changed(SimulationSettings(), CONTROLLED | simulation.model_dump(exclude_unset=True))
+    rate = simulation.sample_rate
+    usual: dict[str, object] = {
+        "control": "computed-torque",
+        "paths": "own",
+        "control_rate": rate / max(1, round(rate / CONTROL_RATE)),
+        "cutoff": min(tracking.cutoff, rate / 4),
+    }
+    usual = {name: value for name, value in usual.items() if name not in tracking.model_fields_set}
+    return settings.model_copy(
+        update={"simulation": simulation, "tracking": tracking.model_copy(update=usual)}
+    )
+
+
 def _changed(settings: SimulationSettings, changes: Mapping[str, object]) -> SimulationSettings:
     try:
-        return SimulationSettings.model_validate({**settings.model_dump(), **changes})
+        return SimulationSettings.model_validate({**settings.model_dump(exclude_unset=True), **changes})
     except ValidationError as error:
         keys = Document(Path("simulate"), None)
         collect([explain(each, keys, SimulationSettings) for each in error.errors(include_url=False)])

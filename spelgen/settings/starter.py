@@ -1,0 +1,80 @@
+"""A sidecar file to begin with: every key at the value that holds without it, commented out and explained."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+
+class StarterJoint(NamedTuple):
+    """What a URDF says of a joint. kind: "revolute" or "prismatic"; damping, friction: its <dynamics>."""
+
+    name: str
+    kind: str
+    damping: float
+    friction: float
+
+
+def starter(urdf: str, joints: Sequence[StarterJoint]) -> str:
+    """YAML for the URDF of this file name: prose after ``##``, settings after ``# ``; without that they are said."""
+    lines = [
+        f"## What {json.dumps(urdf)} does not say of its arm. Each line that begins with one # and a space says what",
+        "## holds without it: take these two characters away, also above it where it is indented, and change it.",
+        "",
+        "## What this arm is, and where the values come from.",
+        '# about: ""',
+        "",
+        "## Gravity in the frame of the root link [m/s^2]: turn it for an arm on a wall or under a ceiling.",
+        "# gravity: [0.0, 0.0, -9.81]",
+        "",
+        "## Whether the logs' tau are those of the joints, or of the motors, before the gears: joint or motor.",
+        "# torque: joint",
+        "",
+        "## Drives. rotor_inertia [kg m^2] before the gear; gear: motor turns per joint turn; viscous [Nm s/rad] and",
+        "## coulomb [Nm], for qd > 0 and for qd < 0, after the gear; actuated: false for a passive joint; gain:",
+        "## trained where the gear between logged motor torques and the joint is to be learned.",
+        "# joints:",
+    ]
+    for each in joints:
+        drive = {
+            "rotor_inertia": 0.0, "gear": 1.0, "viscous": each.damping,
+            "coulomb": [each.friction, -each.friction], "actuated": True, "gain": "known",
+        }  # fmt: skip
+        lines.append(f"#   {json.dumps(each.name)}: {_flow(drive)}")
+    lines += [
+        "",
+        "## How this arm's logs are named and measured: docs/logs.md; `spelgen logs LOG --robot ROBOT --suggest FILE`",
+        "## drafts the same keys from a log. velocity: differentiated where none is logged; sign: -1 where the log's",
+        "## sense is the opposite of the URDF's axis; offset: the position where the log says 0 [rad, m].",
+        "# logs:",
+        "#   velocity: logged",
+        '#   columns: {t: t, trajectory: trajectory, q: "q_{joint}", qd: "qd_{joint}", tau: "tau_{joint}"}',
+        "#   units: {t: s}",
+        "#   joints:",
+    ]
+    for each in joints:
+        turns = each.kind == "revolute"
+        units = {"q": "rad", "qd": "rad/s", "tau": "Nm"} if turns else {"q": "m", "qd": "m/s", "tau": "N"}
+        log = {"name": each.name, "sign": 1, "offset": 0.0, "torque_offset": 0.0, "units": units}
+        lines.append(f"#     {json.dumps(each.name)}: {_flow(log)}")
+    lines += [
+        "",
+        "## How `spelgen simulate` drives the arm: tracking, or random-inputs: torques drawn from `inputs` [Nm].",
+        "# simulation:",
+        "#   {protocol: tracking, trajectories: 4, duration: 8.0, sample_rate: 125.0, test_fraction: 0.25, seed: 0}",
+        "# tracking: {control: computed-torque, paths: own, frequency: 0.125, control_rate: 125.0}",
+        "",
+        "## Defaults of `spelgen train`: its options, with _ in place of -.",
+        "# training: {validation_fraction: 0.25, seed: 0}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _flow(keys: dict[str, Any]) -> str:
+    """Keys and values on one line of YAML."""
+    return (
+        "{"
+        + ", ".join(f"{key}: {_flow(x) if isinstance(x, dict) else json.dumps(x)}" for key, x in keys.items())
+        + "}"
+    )

@@ -1,0 +1,68 @@
+"""How files drawn at random are tried: in `make test` always the same few, in `make fuzz` new ones until time is up.
+
+A test hands over what it does with one example, which must end within SECONDS as users may expect: with an answer or a
+SpelgenError whose lines name what is wrong. The memory that all of them took is looked at in the end.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import time
+from collections.abc import Callable
+from typing import Any
+
+from hypothesis import HealthCheck, given, seed, settings
+from hypothesis import strategies as st
+
+from spelgen.errors import SpelgenError
+
+MINUTES = float(
+    os.environ.get("FUZZ_MINUTES", "0")
+)  # of all tests that fuzz; 0: the same examples every time
+TESTS = 6  # among which they are shared
+SECONDS = 20
+MEMORY = 2_000_000  # kB
+
+
+def fuzz(draw: st.SearchStrategy, examples: int, use: Callable[[Any], Any]) -> None:
+    """Use examples of what is drawn."""
+    kept = {"deadline": None, "database": None, "suppress_health_check": list(HealthCheck)}
+
+    def run(number: int) -> None:
+        def once(example: Any) -> None:
+            answered(lambda: use(example))
+
+        drawn = seed(number)(given(draw)(once))
+        settings(max_examples=examples, derandomize=not MINUTES, print_blob=bool(MINUTES), **kept)(drawn)()
+
+    if not MINUTES:
+        run(0)
+        return
+    number, end = int(time.time()), time.monotonic() + 60 * MINUTES / TESTS
+    while time.monotonic() < end:
+        number += 1
+        run(number)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < MEMORY
+
+
+def answered(use: Callable[[], Any]) -> bool:
+    """Whether there was an answer; if not, that it was refused as users may expect."""
+    for each in (signal.SIGALRM, signal.SIGPROF):
+        signal.signal(each, _late)
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)  # of its own time: others may use the machine
+    signal.alarm(10 * SECONDS)  # and what waits uses none
+    try:
+        use()
+        return True
+    except SpelgenError as error:
+        assert str(error).strip()
+        return False
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.alarm(0)
+
+
+def _late(number: int, frame: object) -> None:
+    raise AssertionError(f"no answer within {SECONDS} s")

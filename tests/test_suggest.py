@@ -1,0 +1,117 @@
+"""A mapping read off the names and numbers of a log as loggers write it: the log is read by it as it was."""
+
+import csv
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from spelgen.cli.main import app
+from spelgen.errors import LogError
+from spelgen.loaded_arm import load_arm
+from spelgen.logs.read import read_logs
+from spelgen.logs.suggest import suggest_mapping
+
+T = np.arange(200) * 0.008
+Q = np.stack([0.8 * np.sin(3 * T), 0.7 * np.cos(2 * T), 0.1 + 0.02 * np.sin(T), np.sin(T)], axis=1)
+QD = np.gradient(Q, T, axis=0)
+TAU = np.stack([np.cos(3 * T), T, np.full(200, 20.0) - T, 0.1 * T], axis=1)
+
+
+@pytest.fixture(scope="module")
+def scara(robots):
+    return load_arm(robots / "scara.urdf")
+
+
+def suggested(path, arm):
+    """The trajectory as the mapping reads it, and the mapping's text."""
+    coordinates = arm.arm.coordinates
+    found = suggest_mapping(path, [x.name for x in coordinates], [x.kind for x in coordinates])
+    assert not found.missing
+    path.with_suffix(".yaml").write_text(found.text)
+    (read,) = read_logs(path, arm, path.with_suffix(".yaml"))
+    return read, found.text
+
+
+def written(path, head, rows):
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows([head, *rows])
+    return path
+
+
+def require_same(found, rtol=1e-9, qd=QD):
+    for values, expected in ((found.q, Q), (found.qd, qd), (found.tau, TAU)):
+        np.testing.assert_allclose(values, expected, rtol=rtol, atol=1e-9)
+    np.testing.assert_allclose(found.t - found.t[0], T, atol=1e-6)  # a double of 1.7e9 s has no more
+
+
+def test_lists_of_a_joint_state_in_an_order_of_its_own_in_degrees_and_milliseconds(scara, tmp_path):
+    names, order = [x.name for x in scara.arm.coordinates], [2, 0, 3, 1]
+    degrees = np.array([1.0 if x.kind == "prismatic" else 180 / np.pi for x in scara.arm.coordinates])
+    rows = [
+        [
+            1000 * t,
+            [names[k] for k in order],
+            *(list(map(float, x[order])) for x in (q * degrees, qd * degrees, tau)),
+        ]
+        for t, q, qd, tau in zip(T, Q, QD, TAU, strict=True)
+    ]
+    path = written(tmp_path / "log.csv", ["time", "name", "position", "velocity", "effort"], rows)
+    found, text = suggested(path, scara)
+    require_same(found)
+    assert 'units: {"t": "ms"}' in text
+    rows[7][1] = rows[7][1][::-1]
+    written(path, ["time", "name", "position", "velocity", "effort"], rows)
+    with pytest.raises(
+        LogError, match="column name: got 2 orders of joints, expected the same names in each row"
+    ):
+        suggested(path, scara)
+
+
+def test_numbered_columns_beside_set_points_without_velocities(scara, tmp_path):
+    head = ["timestamp", *(f"target_q_{k}" for k in range(4)), *(f"actual_q_{k}" for k in range(4))]
+    head += [f"actual_current_{k}" for k in range(4)]
+    rows = [[1.7e9 + t, *(0 * q), *q, *tau] for t, q, tau in zip(T, Q, TAU, strict=True)]
+    found, text = suggested(written(tmp_path / "log.csv", head, rows), scara)
+    require_same(found, rtol=1e-4, qd=found.qd)
+    assert "velocity: differentiated" in text
+    assert "# Joints are taken in the URDF's order" in text
+    assert 'units: {"t": "s", "tau": "A"}' in text
+    assert text.count("gain: 1.0 # Nm per A at the joint, the gear included: say what it is") == 4
+
+
+def test_names_of_joints_count_before_numbers(scara, tmp_path):
+    names = [x.name for x in scara.arm.coordinates]
+    order = [3, 1, 0, 2]
+    head = ["t", *(f"/{what}/{names[k]}/x0" for what in ("position", "velocity", "torque") for k in order)]
+    rows = [[t, *q[order], *qd[order], *tau[order]] for t, q, qd, tau in zip(T, Q, QD, TAU, strict=True)]
+    require_same(suggested(written(tmp_path / "log.csv", head, rows), scara)[0])
+
+
+def test_matrices_of_an_archive(scara, tmp_path):
+    np.savez(tmp_path / "log.npz", time=T, positions=Q, velocities=QD, torques=TAU, image=np.zeros((3, 3)))
+    require_same(suggested(tmp_path / "log.npz", scara)[0])
+
+
+def test_the_command_writes_it_and_goes_on_with_it(robots, tmp_path):
+    head = ["time", "pos1", "pos2", "pos3", "pos4", "effort1"]
+    path = written(tmp_path / "log.csv", head, [[t, *q, tau[0]] for t, q, tau in zip(T, Q, TAU, strict=True)])
+    command = [
+        "logs",
+        str(path),
+        "--robot",
+        str(robots / "scara.urdf"),
+        "--suggest",
+        str(tmp_path / "map.yaml"),
+    ]
+    told = CliRunner().invoke(app, command)
+    assert told.exit_code == 1
+    assert "no column was found for tau of joint1, tau of joint2" in told.stderr
+    assert (tmp_path / "map.yaml").exists()
+    assert "this output exists already" in CliRunner().invoke(app, command).stderr
+    head += ["effort2", "effort3", "effort4"]
+    written(path, head, [[t, *q, *tau] for t, q, tau in zip(T, Q, TAU, strict=True)])
+    told = CliRunner().invoke(app, [*command, "--force"])
+    assert told.stdout.startswith(
+        f"wrote {tmp_path}/map.yaml: to be read, then used by --mapping\nscara: 1 trajectory"
+    )
