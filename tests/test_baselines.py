@@ -9,6 +9,7 @@ import torch
 from typer.testing import CliRunner
 
 from spelgen.cli.main import app
+from spelgen.dynamics.protocol import VelocityState
 from spelgen.dynamics.regressor import body_torque, regressor, urdf_parameters
 from spelgen.dynamics.regressor_dynamics import RegressorDynamics
 from spelgen.evaluation.baselines import of_urdf
@@ -18,6 +19,7 @@ from spelgen.loaded_arm import load_arm
 from spelgen.logs.read import Trajectory, write_logs
 from spelgen.logs.windows import Windows
 from spelgen.pipeline import generate
+from spelgen.runtime.bristles import moved_bristles
 
 
 class Slider:
@@ -38,6 +40,24 @@ class Slider:
         return (tau - self.damping * qd) / self.mass
 
 
+class Bristled(Slider):
+    """The slider with friction that remembers, stiff at standstill: 2000 N/m on 1 g, and damping of 5000 1/s."""
+
+    elements, reach, force = 1, torch.tensor([[1e-3]], dtype=torch.float64), 2.0
+
+    def friction_torque(self, q, qd, z):
+        return self.damping * qd + self.force * z[..., 0] / self.reach[:, 0]
+
+    def forward_dynamics(self, q, qd, tau, z):
+        return (tau - self.friction_torque(q, qd, z)) / self.mass
+
+    def memory(self, qd):
+        return qd.sign().unsqueeze(-1) * self.reach
+
+    def memory_after(self, z, displacement):
+        return moved_bristles(z, displacement, self.reach)
+
+
 def pushed(steps=20, dt=0.05, push=2.0):
     shape = (3, steps + 1, 1)
     qd = torch.zeros(shape, dtype=torch.float64)
@@ -54,14 +74,25 @@ def exact(slider, windows):
 
 def test_damping_far_beyond_an_explicit_step_is_integrated():
     stiff, windows = Slider(1e-3, 5.0), pushed()  # rate 5000 1/s: RK4 at 0.05 s multiplies by 1e7 a step
-    qd = roll_out_stiff(stiff, windows, 1)[1]
+    qd = roll_out_stiff(VelocityState(stiff), windows, 1)[1]
     assert (qd[:, 2:] - exact(stiff, windows)[:, 2:]).abs().max() < 1e-2
+
+
+def test_friction_that_remembers_is_integrated_however_stiff_it_is():
+    stiff, windows = Bristled(1e-3, 5.0), pushed(push=1.0)  # less than the 2 N that make it slide
+    q, qd = roll_out_stiff(VelocityState(stiff), windows, 8)
+    held = 1e-3 * math.log(2)  # z / reach = 1 - exp(-displacement / reach) = 1 / 2 where it stands
+    torch.testing.assert_close(q[0, -1], torch.tensor([held], dtype=torch.float64), atol=1e-7, rtol=0)
+    assert qd[0, -1].abs() < 1e-5
+    fast = pushed(push=6.0)  # 6 - 2 = 4 N against 5 N s/m
+    assert (roll_out_stiff(VelocityState(stiff), fast, 8)[1][:2, -1] - 0.8).abs().max() < 1e-6
 
 
 def test_the_method_has_order_two():
     slider, windows = Slider(1.0, 1.5), pushed()
     errors = [
-        (roll_out_stiff(slider, windows, steps)[1] - exact(slider, windows)).abs().max() for steps in (2, 4)
+        (roll_out_stiff(VelocityState(slider), windows, steps)[1] - exact(slider, windows)).abs().max()
+        for steps in (2, 4)
     ]
     assert 3.4 < errors[0] / errors[1] < 4.6
 

@@ -38,12 +38,11 @@ simulation: friction integration simulated_logs random_inputs tracking
 identification: samples friction base_parameters least_squares method prior identification
 excitation: trajectory criterion excitation
 fitting: run_schema run_folder run_lock
-fitting: gaussian_prior adaptive rollout dataset streaming torque_samples torque_jacobian torque_fit
+fitting: gaussian_prior adaptive rollout calibration dataset streaming torque_samples torque_jacobian torque_fit
 fitting: optimizers torque_networks urdf_regularizer stages compiled process progress validation loop
 fitting: run_record fitted fit train
-evaluation: names stiff baselines torque rollout torque_traces traces examples invariants tables verdict
-evaluation: results csv_file
-evaluation: subject evaluate
+evaluation: names disturbance stiff baselines trust forecast torque rollout torque_traces traces examples invariants
+evaluation: tables verdict results csv_file subject evaluate
 verify: agreement urdf_cross_check numeric_samples verify
 explain: reasons facts
 formulas: terms printing angles shortening formulas text files

@@ -152,6 +152,13 @@ def train(
         keep_baseline(RunFolder(folder), paths)
     for line in _outcome(found):
         say(line)
+    if found.calibration is not None and found.status != "interrupted":
+        from spelgen.evaluation.forecast import good_for
+        from spelgen.evaluation.subject import subject
+
+        reach = good_for(subject(found).model, found.calibration)
+        place = "nowhere" if reach is None else f"up to {reach:g} s ahead"
+        say(f"forecasts clearly better than a constant velocity: {place}")
     say(f"run folder: {folder}")
     if found.status == "interrupted":
         note("the best model so far is in the run folder; --resume goes on")

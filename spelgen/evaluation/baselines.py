@@ -11,7 +11,7 @@ import torch
 
 from spelgen.dynamics.protocol import RigidDynamics, integrable, known_past
 from spelgen.evaluation.names import CONSTANT_VELOCITY, URDF, URDF_WITH_DRIVES
-from spelgen.evaluation.stiff import accurate_solver
+from spelgen.evaluation.stiff import Solver, States, accurate_solver
 from spelgen.fitting.rollout import roll_out
 from spelgen.logs.windows import Windows
 
@@ -20,27 +20,30 @@ from spelgen.logs.windows import Windows
 class Predictor:
     """Something that predicts.
 
-    states: windows of K samples -> predicted q, qd, both (W, K-1, n), from the first sample and the inputs.
-    torque: q, qd, qdd, each (T, n), and z (T, n, K) -> tau (T, n); None for what has no dynamics. dynamics: these.
+    states: windows of K samples, and where wanted a disturbance (W, n) -> predicted q, qd, both (W, K-1, n), from the
+    first sample and the inputs. torque: q, qd, qdd, each (T, n), and z (T, n, K) -> tau (T, n). dynamics: these. form:
+    what is integrated, to whose p' a disturbance is added. The last three are None for what has no dynamics.
     """
 
     name: str
-    states: Callable[[Windows], tuple[torch.Tensor, torch.Tensor]]
-    torque: Callable[..., torch.Tensor] | None
+    states: Callable[..., States]
+    torque: Callable[..., torch.Tensor] | None = None
     dynamics: RigidDynamics | None = None
+    form: Any = None
 
 
 def of_dynamics(name: str, dynamics: RigidDynamics, substeps: int) -> Predictor:
     """Dynamics as a predictor, by the classical Runge-Kutta method."""
-    form = integrable(dynamics)
-    return Predictor(
-        name, lambda windows: roll_out(form, windows, substeps), _inverse_dynamics(dynamics), dynamics
-    )
+    return _of_solver(name, dynamics, Solver(integrable(dynamics), roll_out, substeps))
 
 
 def of_baseline(name: str, dynamics: RigidDynamics, probe: Windows) -> Predictor:
     """Dynamics that are not the model's as a predictor: by steps of their own, as many as they need on the probe."""
-    return Predictor(name, accurate_solver(dynamics, probe), _inverse_dynamics(dynamics), dynamics)
+    return _of_solver(name, dynamics, accurate_solver(dynamics, probe))
+
+
+def _of_solver(name: str, dynamics: RigidDynamics, solver: Solver) -> Predictor:
+    return Predictor(name, solver, _inverse_dynamics(dynamics), dynamics, solver.form)
 
 
 def _inverse_dynamics(dynamics: Any) -> Callable[..., torch.Tensor]:
@@ -58,12 +61,12 @@ def _inverse_dynamics(dynamics: Any) -> Callable[..., torch.Tensor]:
 def constant_velocity() -> Predictor:
     """The first velocity stays: what any model of short horizons must beat."""
 
-    def hold(windows: Windows) -> tuple[torch.Tensor, torch.Tensor]:
+    def hold(windows: Windows) -> States:
         elapsed = windows.dt.cumsum(dim=1).unsqueeze(-1)  # (W, K-1, 1)
         qd = windows.qd[:, :1]
         return windows.q[:, :1] + qd * elapsed, qd.expand(-1, elapsed.shape[1], -1)
 
-    return Predictor(CONSTANT_VELOCITY, hold, None)
+    return Predictor(CONSTANT_VELOCITY, hold)
 
 
 def of_urdf(urdf: Path, joints: Sequence[str], probe: Windows) -> list[Predictor]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
 from spelgen.dynamics.protocol import RigidDynamics
 from spelgen.errors import Diagnostic
@@ -17,9 +18,25 @@ from spelgen.evaluation.baselines import (
     of_dynamics,
     of_urdf,
 )
+from spelgen.evaluation.disturbance import without_past
+from spelgen.evaluation.forecast import (
+    Disturbance,
+    Forecast,
+    for_calibration,
+    forecast_of,
+    past_steps,
+    rolled,
+)
 from spelgen.evaluation.invariants import energy_drift
 from spelgen.evaluation.names import MODEL
-from spelgen.evaluation.results import Horizon, Results, state_errors, torque_summary
+from spelgen.evaluation.results import (
+    Horizon,
+    Results,
+    end_errors,
+    forecast_summary,
+    state_errors,
+    torque_summary,
+)
 from spelgen.evaluation.subject import Subject, subject
 from spelgen.evaluation.torque import torque_errors
 from spelgen.evaluation.traces import traces
@@ -47,6 +64,7 @@ def evaluate(
     preprocessing: Preprocessing | None = None,
     steps: Sequence[int] = (1, 10),
     seconds: Sequence[float] = (1.0,),
+    disturbance: Disturbance = "held",
 ) -> Results:
     """Predict the states and torques of test logs and measure the errors.
 
@@ -54,7 +72,9 @@ def evaluate(
     the fit's: it gives the URDF as a baseline, and errors of the tip. baselines: any dynamics to be judged beside
     it, by name, e.g. ``{"least squares": identify(...).dynamics}``. preprocessing: of states and torques; by
     default as the model was fitted. steps, seconds: horizons in samples and in time; those longer than every
-    trajectory are left out, and said. The result depends on nothing else: no random numbers. Raises LogError.
+    trajectory are left out, and said. disturbance: "held" judges forecasts (see `forecast.py`) where the model comes
+    with windows of its training logs; "none" rollouts by themselves, open loop. The result depends on nothing else:
+    no random numbers. Raises LogError.
     """
     judged = subject(model, arm)
     joint_types, logs = judged.model.joint_types, [logs] if isinstance(logs, Trajectory) else list(logs)
@@ -66,10 +86,12 @@ def evaluate(
     pieces = used.pieces(logs, shortest=2)
     lengths = _lengths(pieces, steps, seconds, notes)
     probe = _windows(pieces, judged.window, PROBED, used, judged.reach)
-    substeps = choose_substeps(judged.model, probe, loss_scales(probe, joint_types), start=judged.substeps)
+    scales = loss_scales(probe, joint_types)
+    substeps = choose_substeps(judged.model, probe, scales, start=judged.substeps_per_sample)
     predictors = [of_dynamics(MODEL, judged.model, substeps), constant_velocity()]
     predictors += _urdf_baseline(judged, probe, notes)
     predictors += [of_baseline(name, each, probe) for name, each in (baselines or {}).items()]
+    forecasts = _forecasts(predictors, judged, notes) if disturbance == "held" else {}
     tip = _tip(judged, notes)
     samples = dynamics_samples(logs, preprocessing=used, reach=judged.reach)
     return Results(
@@ -80,7 +102,8 @@ def evaluate(
         substeps=substeps,
         parameters=sum(parameter.numel() for parameter in judged.model.parameters()),
         horizons=tuple(
-            _horizon(name, k, pieces, predictors, judged, tip, used) for name, k in lengths.items()
+            _horizon(name, k, pieces, predictors, forecasts, judged, tip, used, notes)
+            for name, k in lengths.items()
         ),
         torque={
             x.name: torque_summary(torque_errors(x.torque, samples))
@@ -88,6 +111,7 @@ def evaluate(
             if x.torque and samples
         },
         energy_drift=energy_drift(judged.model, probe),
+        forecasts={name: forecast_summary(x.trust) for name, x in forecasts.items()},
         traces=traces(
             predictors, pieces, max(lengths.values(), default=0), joint_types,
             used=used, reach=judged.reach, tip=None if tip is None else tip.position,
@@ -116,7 +140,7 @@ def _lengths(
     pieces: Sequence[Trajectory], steps: Sequence[int], seconds: Sequence[float], notes: list[Diagnostic]
 ) -> dict[str, int]:
     """Horizon name -> number of samples ahead."""
-    frequency = sum(x.sample_rate for x in pieces) / len(pieces)
+    frequency = _rate(pieces)
     wanted = {f"{k} step{'s' if k > 1 else ''}": k for k in steps}
     wanted |= {f"{duration:g} s": round(duration * frequency) for duration in seconds}
     longest = max(map(len, pieces)) - 1
@@ -125,6 +149,10 @@ def _lengths(
             message = f"no prediction over {name}: the longest trajectory has {longest} steps"
             notes.append(Diagnostic("info", "horizon-too-long", "logs", None, message))
     return {name: k for name, k in wanted.items() if 0 < k <= longest}
+
+
+def _rate(pieces: Sequence[Trajectory]) -> float:
+    return sum(x.sample_rate for x in pieces) / len(pieces)
 
 
 def _windows(
@@ -136,20 +164,64 @@ def _windows(
     return cut_windows(pieces, samples, -(-starts // most), measured=used.filtered, reach=reach)
 
 
+def _forecasts(
+    predictors: Sequence[Predictor], judged: Subject, notes: list[Diagnostic]
+) -> dict[str, Forecast]:
+    """Of all that have dynamics, by the same training windows; none where these are not known."""
+    calibration, types = judged.calibration, judged.model.joint_types
+    dynamic = [x for x in predictors if x.form is not None]
+    if calibration is not None:
+        found = {x.name: forecast_of(for_calibration(x, calibration), calibration, types) for x in dynamic}
+        known = {name: each for name, each in found.items() if each is not None}
+        if known:
+            return known
+    reason = (
+        "no windows of its training logs are known" if calibration is None else "its training logs are short"
+    )
+    notes.append(_open_loop(f"no forecasts, rollouts are open loop: {reason}"))
+    return {}
+
+
+def _open_loop(message: str) -> Diagnostic:
+    return Diagnostic("info", "open-loop", "logs", None, message)
+
+
 def _horizon(
     name: str,
     steps: int,
     pieces: Sequence[Trajectory],
     predictors: Sequence[Predictor],
+    forecasts: Mapping[str, Forecast],
     judged: Subject,
     tip: TipKinematics | None,
     used: Preprocessing,
+    notes: list[Diagnostic],
 ) -> Horizon:
-    most = min(MOST_WINDOWS, PREDICTED_STEPS // steps)
-    windows = _windows(pieces, steps + 1, max(most, 1), used, judged.reach)
-    position = None if tip is None else tip.position
-    errors = {x.name: state_errors(x, windows, judged.model.joint_types, position) for x in predictors}
-    return Horizon(name, steps, windows.dt.sum(dim=1).mean().item(), len(windows), errors)
+    """Errors over so many steps: of forecasts, where these reach that far and pieces are long enough for a past."""
+    most, rate = max(min(MOST_WINDOWS, PREDICTED_STEPS // steps), 1), _rate(pieces)
+    past = past_steps(rate)
+    reached = all(x.trust.reaches(steps / rate) for x in forecasts.values())
+    if not forecasts or not reached or past + steps >= max(map(len, pieces)):
+        past = 0
+    if forecasts and not past:
+        reason = "these trajectories have no past" if reached else "windows of its training logs are shorter"
+        notes.append(_open_loop(f"no forecasts over {name}, rollouts are open loop: {reason}"))
+    windows = _windows(pieces, past + steps + 1, most, used, judged.reach)
+    types, position = judged.model.joint_types, None if tip is None else tip.position
+    errors, open_loop = {}, {}
+    for predictor in predictors:
+        forecast = forecasts.get(predictor.name)
+        if past and forecast is not None:
+            found = rolled(predictor, windows, past)
+            q, qd = torch.from_numpy(found.open_loop)
+            open_loop[predictor.name] = end_errors((q, qd), found.ahead, types, position)
+            errors[predictor.name] = end_errors(forecast.states(found), found.ahead, types, position)
+            continue
+        errors[predictor.name] = state_errors(predictor, without_past(windows, past), types, position)
+        if past:
+            open_loop[predictor.name] = errors[predictor.name]
+    ahead = windows.dt[:, past:].sum(dim=1).mean().item()
+    return Horizon(name, steps, ahead, len(windows), errors, open_loop)
 
 
 def _urdf_baseline(judged: Subject, probe: Windows, notes: list[Diagnostic]) -> list[Predictor]:

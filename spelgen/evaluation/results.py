@@ -13,13 +13,15 @@ import torch
 from spelgen.errors import Diagnostic
 from spelgen.evaluation.baselines import Predictor
 from spelgen.evaluation.names import MODEL
+from spelgen.evaluation.stiff import States
 from spelgen.evaluation.tables import result_tables
 from spelgen.evaluation.torque import TorqueErrors
+from spelgen.evaluation.trust import Trust
 from spelgen.evaluation.verdict import verdict
 from spelgen.fitting.rollout import position_difference
 from spelgen.logs.windows import Windows
 
-SCHEMA = 3
+SCHEMA = 4
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,8 @@ class StateErrors:
 class Horizon:
     """How far ahead: a number of samples, in the mean `seconds`; from `windows` starting points.
 
-    errors: by predictor.
+    errors: by predictor, of its forecasts; open_loop: of its rollouts by themselves, from the same starting points.
+    This is empty, and the errors are those of rollouts, where there are no forecasts.
     """
 
     name: str
@@ -51,6 +54,23 @@ class Horizon:
     seconds: float
     windows: int
     errors: dict[str, StateErrors]
+    open_loop: dict[str, StateErrors]
+
+
+@dataclass(frozen=True)
+class ForecastSummary:
+    """What training windows showed of a predictor's forecasts, see `trust.Trust`.
+
+    good_for: the longest time [s] up to which they are clearly better than a constant velocity, None: there is none.
+    times: [s]. relative_error: for each, of windows left out, relative to the constant velocity. trust, held: for each
+    time and joint.
+    """
+
+    good_for: float | None
+    times: tuple[float, ...]
+    relative_error: tuple[float, ...]
+    trust: tuple[tuple[float, ...], ...]
+    held: tuple[tuple[float, ...], ...]
 
 
 @dataclass(frozen=True)
@@ -73,7 +93,8 @@ class Results:
     cutoff: of the filter on the test logs [Hz], None without. substeps: of rk4 between samples. parameters: trained
     numbers of the model. torque: by predictor, empty where the logs are too sparse. energy_drift: of the model
     without input and dissipation over 1 s, integrated to thirteen digits, relative to its kinetic energy; None where
-    the logs never move. traces: the curves behind the figures, see `traces.py`.
+    the logs never move. forecasts: by predictor, empty where there are none. traces: the curves behind the figures,
+    open loop, see `traces.py`.
     """
 
     robot: str
@@ -86,6 +107,7 @@ class Results:
     torque: dict[str, TorqueSummary]
     energy_drift: float | None
     diagnostics: tuple[Diagnostic, ...]
+    forecasts: dict[str, ForecastSummary] = field(default_factory=dict)
     traces: dict[str, Any] = field(default_factory=dict)
     joint_types: tuple[str, ...] = ()
 
@@ -119,16 +141,26 @@ def state_errors(
     joint_types: Sequence[str],
     tip: Callable[[torch.Tensor], torch.Tensor] | None,
 ) -> StateErrors:
-    """Errors at the ends of these windows. tip: its position (..., 3) [m] by q."""
+    """Errors of a predictor at the ends of these windows. tip: its position (..., 3) [m] by q."""
     with torch.no_grad():
-        q, qd = (x[:, -1] for x in predictor.states(windows))  # (W, n)
-        measured_q, measured_qd = windows.q[:, -1], windows.qd[:, -1]
-        error = position_difference(q, measured_q, joint_types), qd - measured_qd
-        change = position_difference(measured_q, windows.q[:, 0], joint_types), measured_qd - windows.qd[:, 0]
-        relative = [_rms(e) / _rms(c) for e, c in zip(error, change, strict=True)]
-        away = math.nan
-        if tip is not None:
-            away = 1000 * _rms((tip(q) - tip(measured_q)).norm(dim=-1, keepdim=True)).item()
+        return end_errors(predictor.states(windows), windows, joint_types, tip)
+
+
+def end_errors(
+    predicted: States,
+    windows: Windows,
+    joint_types: Sequence[str],
+    tip: Callable[[torch.Tensor], torch.Tensor] | None,
+) -> StateErrors:
+    """Errors of what was predicted of these windows, q and qd (W, K-1, n), at their ends."""
+    q, qd = (x[:, -1] for x in predicted)  # (W, n)
+    measured_q, measured_qd = windows.q[:, -1], windows.qd[:, -1]
+    error = position_difference(q, measured_q, joint_types), qd - measured_qd
+    change = position_difference(measured_q, windows.q[:, 0], joint_types), measured_qd - windows.qd[:, 0]
+    relative = [_rms(e) / _rms(c) for e, c in zip(error, change, strict=True)]
+    away = math.nan
+    if tip is not None:
+        away = 1000 * _rms((tip(q) - tip(measured_q)).norm(dim=-1, keepdim=True)).item()
     return StateErrors(
         q=_finite(_rms(error[0])),
         qd=_finite(_rms(error[1])),
@@ -157,4 +189,14 @@ def torque_summary(errors: TorqueErrors) -> TorqueSummary:
         nmse=dict(zip(errors.trajectories, _finite(by_trajectory), strict=True)),
         mean_nmse=_finite(by_trajectory.mean().unsqueeze(0))[0],
         rmse=_finite(torch.from_numpy(errors.rmse).mean(dim=0)),
+    )
+
+
+def forecast_summary(trust: Trust) -> ForecastSummary:
+    """What is told of a trust, to three digits."""
+    return ForecastSummary(
+        trust.good_for,
+        tuple(trust.times.round(4).tolist()),
+        tuple(trust.error.mean(axis=-1).round(3).tolist()),
+        *(tuple(map(tuple, x.round(3).tolist())) for x in (trust.trust, trust.held)),
     )

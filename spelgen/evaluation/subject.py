@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from spelgen.dynamics.bristles import bristle_reach, reach_of
+from spelgen.fitting.calibration import CalibrationWindows
 from spelgen.fitting.fitted import Fit, load_run
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.logs.arm_mapping import GivenMapping
@@ -36,7 +37,7 @@ class Subject:
 
     urdf: its robot's, where known; tip: the link there, None for the last. preprocessing, window, substeps:
     those of its fit. reach: (n, K) of the bristles that friction remembers with, its own or the usual ones.
-    trained_on: names of the trajectories that it has seen.
+    trained_on: names of the trajectories that it has seen; calibration: windows of them, None where they are not known.
     """
 
     model: EmittedModel
@@ -49,6 +50,13 @@ class Subject:
     substeps: int = 1
     reach: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     trained_on: frozenset[str] = frozenset()
+    calibration: CalibrationWindows | None = None
+
+    @property
+    def substeps_per_sample(self) -> int:
+        """Of the logs as they were recorded: samples of the fit's windows may lie farther apart."""
+        decimation = self.preprocessing.decimation if self.preprocessing else None
+        return -(-self.substeps // (decimation or 1))
 
 
 def subject(judged: Any, arm: Any = None) -> Subject:
@@ -65,6 +73,7 @@ def subject(judged: Any, arm: Any = None) -> Subject:
         window=cast("WindowConfig", judged.config).window,
         substeps=judged.substeps,
         trained_on=seen,
+        calibration=judged.calibration,
     )
 
 

@@ -47,6 +47,7 @@ class Table:
         return Listing(self.title, head, rows)
 
 
+FORECAST = ", with the disturbance of the last 0.1 s held, trusted as far as training windows show"
 UNITS = {"revolute": ("rad", "rad/s", "Nm"), "prismatic": ("m", "m/s", "N")}
 
 
@@ -60,7 +61,13 @@ def result_tables(evaluation: Mapping[str, Any], joint_types: Sequence[str] = ()
     if horizons:
         heads = [_ahead(horizon) for horizon in horizons]
         title = "Error relative to the motion (0: none, 1: as if the arm had stood still)"
+        forecast = [horizon for horizon in horizons if horizon.get("open_loop")]
+        if forecast:
+            title += FORECAST
         tables.append(table(title, heads, [_of(horizon, "mean_relative_rms") for horizon in horizons]))
+        if forecast:
+            rows = [_of(horizon, "mean_relative_rms", "open_loop") for horizon in forecast]
+            tables.append(table("The same without that: open loop", [_ahead(x) for x in forecast], rows))
         tips = [_of(horizon, "tip_mm") for horizon in horizons]
         if any(value is not None for tip in tips for value in tip.values()):
             tables.append(table("Error of the tip's position [mm]", heads, tips))
@@ -93,8 +100,8 @@ def _ahead(horizon: Mapping[str, Any]) -> str:
     return name if name.endswith(" s") else f"{name} ({horizon['seconds']:.3g} s)"
 
 
-def _of(horizon: Mapping[str, Any], what: str) -> dict[str, Any]:
-    return {predictor: errors[what] for predictor, errors in horizon["errors"].items()}
+def _of(horizon: Mapping[str, Any], what: str, which: str = "errors") -> dict[str, Any]:
+    return {predictor: errors[what] for predictor, errors in horizon[which].items()}
 
 
 def _by_joint(title: str, joints: Sequence[str], values: Mapping[str, Sequence[float | None]]) -> Table:

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from spelgen.dynamics.bristles import reach_of
 from spelgen.errors import Diagnostic, LogError
+from spelgen.fitting.calibration import CalibrationWindows, calibration_windows, held_sources
 from spelgen.fitting.rollout import LossScales, loss_scales
 from spelgen.logs.checks import check
 from spelgen.logs.epoch_windows import EpochWindows, WindowCutting
@@ -30,7 +32,8 @@ class TrainingData:
 
     training: all of them, or where the logs are larger than memory an even sample, and `stream` draws those
     that are fitted. preprocessing: as it was resolved. digest: of every number, to resume on the same data only.
-    recordings: what all was cut from, validation included; of logs larger than memory chunks.
+    recordings: what all was cut from, validation included; of logs larger than memory chunks. calibration: of all of
+    these, None where they are too short.
     """
 
     training: Windows
@@ -44,6 +47,7 @@ class TrainingData:
     recordings: tuple[Trajectory, ...] = ()
     chunks: tuple[Chunk, ...] = ()
     stream: EpochWindows | None = None
+    calibration: CalibrationWindows | None = None
 
     @property
     def size(self) -> int:
@@ -86,7 +90,13 @@ def prepare_data(
         diagnostics=(*notes, *resolved.diagnostics, split.note),
         digest=digest(everything),
         recordings=tuple(everything),
+        calibration=calibration_windows(held_sources(everything), resolved, known_reach(reach, joint_types)),
     )
+
+
+def known_reach(reach: np.ndarray | None, joint_types: Sequence[str]) -> np.ndarray:
+    """That of a model's bristles (n, K) [rad, m]; the usual ones where it has none, for what it is compared with."""
+    return reach if reach is not None and reach.size else reach_of(joint_types)
 
 
 def _split(trajectories: Sequence[Trajectory], validation: float | Sequence[Trajectory], seed: int) -> Split:

@@ -97,6 +97,8 @@ def fit(
             found += fit_torque_stage(model, data, chosen, regularizer)
             if run is not None:
                 run.start(model.source, urdf, force=force)
+                if data.calibration is not None:
+                    data.calibration.save(run.calibration)
         loop = TrainingLoop(
             model,
             data,
@@ -129,6 +131,7 @@ def fit(
         checkpoint=loop.state(),
         urdf=urdf,
         folder=None if run is None else run.path,
+        calibration=data.calibration,
     )
 
 

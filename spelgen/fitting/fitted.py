@@ -14,6 +14,7 @@ import torch
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.errors import Diagnostic, LogError, RunError
 from spelgen.files import write_json
+from spelgen.fitting.calibration import CalibrationWindows, read_calibration
 from spelgen.fitting.config import FitConfig
 from spelgen.fitting.loop import Status
 from spelgen.fitting.run_folder import RunFolder, trained_model, write_state
@@ -35,7 +36,8 @@ class Fit:
 
     config, preprocessing: as they were resolved. history: a record for each epoch. status: how the fit ended; None:
     not known, of a run that was loaded. record: what config.json holds. checkpoint: what checkpoint.pt holds.
-    urdf: of the robot, where it is known. folder: of the run, where there is one.
+    urdf: of the robot, where it is known. folder: of the run, where there is one. calibration: windows of
+    the training logs, where these are long enough.
     """
 
     model: EmittedModel
@@ -48,6 +50,7 @@ class Fit:
     checkpoint: dict[str, Any]
     urdf: Path | None = None
     folder: Path | None = None
+    calibration: CalibrationWindows | None = None
 
     @property
     def epochs(self) -> int:
@@ -141,6 +144,8 @@ class Fit:
         with locked(run.path):
             run.start(self.model.source, self.urdf, force=force)
             run.write_metrics(self.history)
+            if self.calibration is not None:
+                self.calibration.save(run.calibration)
             write_state(run.weights, self.model.state_dict())
             write_state(run.checkpoint, self.checkpoint)
             write_json(run.config, self.record)
@@ -193,4 +198,5 @@ def load_run(folder: Path | str, *, trust: bool = False) -> Fit:
         checkpoint=run.load_checkpoint(),
         urdf=run.urdf if run.urdf.exists() else None,
         folder=run.path,
+        calibration=read_calibration(run.calibration, len(record["joints"])),
     )

@@ -29,7 +29,8 @@ class RunFolder:
 
     module.py: the trained module's source. robot.urdf, robot.yaml: its robot, where known. config.json: how
     it was trained. metrics.jsonl: a line per epoch. checkpoint.pt: everything needed to go on. model.pt:
-    the best state_dict so far. evaluation.json: what `evaluate` found. least_squares.json: what least squares found.
+    the best state_dict so far. calibration.npz: windows of the training logs, where these are long enough.
+    evaluation.json: what `evaluate` found. least_squares.json: what least squares found.
     """
 
     path: Path
@@ -66,6 +67,10 @@ class RunFolder:
         return self.path / "model.pt"
 
     @property
+    def calibration(self) -> Path:
+        return self.path / "calibration.npz"
+
+    @property
     def evaluation(self) -> Path:
         return self.path / "evaluation.json"
 
@@ -91,7 +96,14 @@ class RunFolder:
         self.require_free(force=force)
         robot = self._robot_files(urdf)  # before anything is removed: they may be this very run's copies
         robot_files = (self.urdf, self.settings)
-        found = (self.metrics, self.checkpoint, self.weights, self.evaluation, self.baseline)
+        found = (
+            self.metrics,
+            self.checkpoint,
+            self.weights,
+            self.calibration,
+            self.evaluation,
+            self.baseline,
+        )
         for old in (self.config, *robot_files, *found):  # first what makes it a run
             old.unlink(missing_ok=True)
         for path, content in [(self.module, source.encode()), *robot]:

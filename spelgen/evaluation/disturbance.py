@@ -1,0 +1,76 @@
+"""What is missing from a model's forces, estimated from the past of a window and held on: offset-free prediction.
+
+The mean generalised force over the past that the momentum balance lacks, as a momentum observer finds it (De Luca and
+Mattone, ICRA 2003) and offset-free model predictive control holds it (Pannocchia and Rawlings, AIChE J. 49:426, 2003).
+No accelerations are needed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+
+from spelgen.dynamics.protocol import memory_after, sliding_memory
+from spelgen.logs.windows import Windows
+
+INTERVALS = 10  # of the past, at most, over which forces are integrated
+
+
+class Disturbed:
+    """What is integrated (see ``integrable``) under a force, (W, n), that is added to p'."""
+
+    def __init__(self, form: Any, disturbance: torch.Tensor) -> None:
+        self.form, self.disturbance = form, disturbance
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.form, name)
+
+    def port_hamiltonian_rhs(
+        self,
+        q: torch.Tensor,
+        p: torch.Tensor,
+        tau: torch.Tensor,
+        prepared: Any,
+        z: torch.Tensor | None = None,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """q' and p'."""
+        qd, force = self.form.port_hamiltonian_rhs(q, p, tau, prepared, z)
+        return qd, force + self.disturbance
+
+
+def without_past(windows: Windows, past: int) -> Windows:
+    """Windows without their first `past` steps; z stays as it is, for what has no use for it."""
+    dt, q, qd, tau = (x[:, past:] for x in windows.columns()[:4])
+    return Windows(dt, q, qd, tau, windows.z)
+
+
+def after_past(form: Any, windows: Windows, past: int) -> tuple[Windows, torch.Tensor]:
+    """Windows without their first `past` steps, and the disturbance (W, n) that was missing in these.
+
+    That is what p' lacks: a generalised force where the form's p is momentum, an acceleration where it is velocity.
+    """
+    q, qd = windows.q[:, : past + 1], windows.qd[:, : past + 1]
+    along = [sliding_memory(form, qd[:, 0]) if windows.z is None else windows.z]
+    for moved in q.diff(dim=1).unbind(1):
+        along.append(memory_after(form, along[-1], moved))
+    ahead = replace(without_past(windows, past), z=along[-1])
+    chosen = torch.linspace(0, past, min(past, INTERVALS) + 1, dtype=torch.float64).round().long()
+    q, qd, z = q[:, chosen], qd[:, chosen], torch.stack(along, dim=1)[:, chosen]
+    steps = windows.dt[:, :past].unsqueeze(-1)
+    dt, impulse = (_between(x, chosen) for x in (steps, steps * windows.tau[:, :past]))
+    prepared = form.prepare()
+    p = form.momentum(q, qd, prepared)
+    ends = [
+        form.port_hamiltonian_rhs(q[:, at], p[:, at], impulse / dt, prepared, z[:, at])[1]
+        for at in (slice(None, -1), slice(1, None))
+    ]
+    told = (dt * (ends[0] + ends[1]) / 2).sum(dim=1)  # the trapezium rule
+    return ahead, (p[:, -1] - p[:, 0] - told) / dt.sum(dim=1)
+
+
+def _between(values: torch.Tensor, chosen: torch.Tensor) -> torch.Tensor:
+    """Sums of (W, past, n) between chosen samples."""
+    summed = torch.cat([torch.zeros_like(values[:, :1]), values.cumsum(dim=1)], dim=1)
+    return summed[:, chosen].diff(dim=1)

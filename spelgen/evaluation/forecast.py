@@ -1,0 +1,139 @@
+"""Forecasts: rollouts with the disturbance of the past held, followed as far as training windows show that it pays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from spelgen.evaluation.baselines import Predictor, constant_velocity, of_baseline, of_dynamics
+from spelgen.evaluation.disturbance import after_past
+from spelgen.evaluation.names import MODEL
+from spelgen.evaluation.stiff import States
+from spelgen.evaluation.trust import LEAST_BLOCKS, TIMES, Trust, calibrated, relative_activity
+from spelgen.fitting.calibration import PAST, CalibrationWindows
+from spelgen.fitting.rollout import choose_substeps, loss_scales, position_difference
+from spelgen.logs.windows import Windows
+
+PARTS = 16  # that windows are predicted in where some blow up
+Disturbance = Literal["held", "none"]
+
+
+@dataclass(frozen=True, eq=False)
+class Rollouts:
+    """Predictions of windows after their past, (2, W, K-1, n), of q and qd.
+
+    ahead: what they predict. still: at constant velocity. open_loop, held: by dynamics without and with the
+    disturbance. qd, change: (W, n) the velocity at the start and its change over the past.
+    """
+
+    ahead: Windows
+    still: np.ndarray
+    open_loop: np.ndarray
+    held: np.ndarray
+    qd: np.ndarray
+    change: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Forecast:
+    """What a predictor's rollouts are worth. qd, change: of the training windows, see `Rollouts`."""
+
+    trust: Trust
+    qd: np.ndarray
+    change: np.ndarray
+
+    def states(self, rollouts: Rollouts) -> States:
+        """q and qd, (W, K-1, n), for what these rollouts predict."""
+        activity = relative_activity(rollouts.qd, rollouts.change, self.qd, self.change)
+        times = rollouts.ahead.dt.cumsum(dim=1).mean(dim=0).numpy()
+        still = rollouts.still
+        added = self.trust.added(rollouts.open_loop - still, rollouts.held - still, activity, times)
+        q, qd = torch.from_numpy(still + added)
+        return q, qd
+
+
+def good_for(model: Any, calibration: CalibrationWindows) -> float | None:
+    """The longest time [s] ahead up to which a model's forecasts of training windows are clearly better than a constant
+    velocity; None: there is none.
+    """
+    forecast = forecast_of(
+        for_calibration(of_dynamics(MODEL, model, 1), calibration), calibration, model.joint_types
+    )
+    return None if forecast is None else forecast.trust.good_for
+
+
+def for_calibration(predictor: Predictor, calibration: CalibrationWindows) -> Predictor:
+    """The same dynamics, in the steps that they need on training windows, whose samples may lie farther apart."""
+    probe, dynamics = calibration.probe, predictor.dynamics
+    assert dynamics is not None
+    if predictor.name != MODEL:
+        return of_baseline(predictor.name, dynamics, probe)
+    model: Any = dynamics
+    return of_dynamics(MODEL, model, choose_substeps(model, probe, loss_scales(probe, model.joint_types)))
+
+
+def past_steps(rate: float) -> int:
+    """Steps at this rate [Hz] that the disturbance is estimated from."""
+    return max(1, round(PAST * rate))
+
+
+def rolled(predictor: Predictor, windows: Windows, past: int) -> Rollouts:
+    """Rollouts of windows of `past` steps, a present sample and more."""
+    with torch.no_grad(), np.errstate(over="ignore", invalid="ignore"):  # bad dynamics leave all bounds
+        ahead, disturbance = after_past(predictor.form, windows, past)
+        predicted = (
+            constant_velocity().states(ahead),
+            _safe(predictor, ahead),
+            _safe(predictor, ahead, disturbance),
+        )
+    still, open_loop, held = (torch.stack(x).numpy() for x in predicted)
+    qd = windows.qd[:, past]
+    return Rollouts(ahead, still, open_loop, held, qd.numpy(), (qd - windows.qd[:, 0]).numpy())
+
+
+def _safe(predictor: Predictor, windows: Windows, disturbance: torch.Tensor | None = None) -> States:
+    """Predictions; where numbers blow up they are NaN, for few windows beside those that are to blame."""
+    try:
+        q, qd = predictor.states(windows, disturbance)
+    except torch.linalg.LinAlgError:
+        rows = torch.arange(len(windows)).tensor_split(PARTS)
+        parts = [_whole_or_none(predictor, windows, disturbance, each) for each in rows if len(each)]
+        q, qd = (torch.cat(x) for x in zip(*parts, strict=True))
+    return q, qd
+
+
+def _whole_or_none(
+    predictor: Predictor, windows: Windows, disturbance: torch.Tensor | None, rows: torch.Tensor
+) -> States:
+    part = windows[rows]
+    try:
+        q, qd = predictor.states(part, None if disturbance is None else disturbance[rows])
+    except torch.linalg.LinAlgError:
+        q = qd = torch.full_like(part.q[:, 1:], torch.nan)
+    return q, qd
+
+
+def forecast_of(
+    predictor: Predictor, calibration: CalibrationWindows, joint_types: Sequence[str]
+) -> Forecast | None:
+    """The forecasts that training windows show to be worth it; None: these are of too few stretches of time."""
+    if calibration.blocks.max() + 1 < LEAST_BLOCKS:
+        return None
+    found = rolled(predictor, calibration.windows, calibration.past)
+    elapsed = found.ahead.dt.cumsum(dim=1).mean(dim=0).numpy()
+    wanted = [time for time in TIMES if time <= 1.02 * elapsed[-1]]
+    chosen = np.unique([np.abs(elapsed - time).argmin() for time in wanted]) if wanted else np.array([0])
+    start = found.ahead.q[:, :1]
+    steps = position_difference(found.ahead.q[:, 1:], found.ahead.q[:, :-1], joint_types)
+    q = start + steps.cumsum(dim=1)  # as rollouts go: on past a turn
+    measured = np.stack([q.numpy(), found.ahead.qd[:, 1:].numpy()]) - found.still
+    activity = relative_activity(found.qd, found.change, found.qd, found.change)
+    open_loop, held, measured = (
+        x[:, :, chosen] for x in (found.open_loop - found.still, found.held - found.still, measured)
+    )
+    trust = calibrated(open_loop, held, measured, activity, calibration.blocks, elapsed[chosen])
+    return Forecast(trust, found.qd, found.change)

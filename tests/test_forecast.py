@@ -1,0 +1,261 @@
+"""Forecasts: what the past tells of forces that a model lacks, and how far training windows show it to be trusted."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from spelgen.dynamics.bristles import bristles_along
+from spelgen.emission.loading import load_module
+from spelgen.errors import RunError
+from spelgen.evaluation.baselines import Predictor, of_dynamics
+from spelgen.evaluation.disturbance import after_past, without_past
+from spelgen.evaluation.evaluate import evaluate
+from spelgen.evaluation.forecast import forecast_of, past_steps, rolled
+from spelgen.evaluation.names import CONSTANT_VELOCITY, MODEL
+from spelgen.evaluation.rollout import rollout
+from spelgen.evaluation.trust import calibrated, relative_activity, weight
+from spelgen.fitting.calibration import calibration_windows, held_sources
+from spelgen.fitting.config import Rollout
+from spelgen.fitting.fit import fit
+from spelgen.fitting.fitted import load_run
+from spelgen.logs.preprocessing import Preprocessing
+from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.windows import cut_windows
+
+STAND_IN = Path(__file__).with_name("stand_in.py")
+RATE = 100.0
+OFFSET = torch.tensor([0.6, -0.4], dtype=torch.float64)  # Nm that logs do not tell of
+HELD = Preprocessing(cutoff=0, decimation=1)
+REACH = np.full((2, 1), 0.01)
+
+
+def motions(count=4, seconds=3.0, seed=0, offset=0.0) -> list[Trajectory]:
+    """Of the stand-in under smooth torques, and an offset that is not logged."""
+    model = load_module(STAND_IN)
+    generator = torch.Generator().manual_seed(seed)
+    t = torch.arange(round(seconds * RATE) + 1) / RATE
+    phases, speeds = (torch.rand(count, 1, 2, generator=generator, dtype=torch.float64) for _ in "ab")
+    tau = 2 * torch.sin(6.28 * (phases + (0.5 + speeds) * t[:, None]))  # (count, T, 2)
+    start = 2 * phases[:, 0] - 1
+    with torch.no_grad():
+        q, qd = rollout(model, start, torch.zeros_like(start), tau[:, :-1] + offset, 1 / RATE, substeps=2)
+    return [Trajectory(t, q[k], qd[k], tau[k], f"motion_{seed}{k}") for k in range(count)]
+
+
+def fitted(logs):
+    """The stand-in, as it is, with a record of these logs."""
+    config = Rollout(epochs=1, optimizer="adamw", batch=64, learning_rate=1e-12, momentum_steps=0)
+    return fit(load_module(STAND_IN), logs, config, preprocessing=HELD, progress=False)
+
+
+@pytest.fixture(scope="module")
+def offset_logs():
+    return motions(offset=OFFSET)
+
+
+@pytest.fixture(scope="module")
+def offset_fit(offset_logs):
+    return fitted(offset_logs)
+
+
+def test_a_constant_torque_that_nothing_tells_of_is_found_in_the_past_and_held(offset_logs):
+    model, past = load_module(STAND_IN), past_steps(RATE)
+    windows = cut_windows(offset_logs, past + 51, 20, measured=False)
+    ahead, disturbance = after_past(model, windows, past)
+    torch.testing.assert_close(disturbance, OFFSET.expand_as(disturbance), atol=0.01, rtol=0)
+    torch.testing.assert_close(ahead.q, windows.q[:, past:])
+    found = rolled(of_dynamics(MODEL, model, 2), windows, past)
+    open_loop, held = (
+        np.sqrt(np.square(x[1] - ahead.qd[:, 1:].numpy())[:, -1].mean())
+        for x in (found.open_loop, found.held)
+    )
+    assert held < 0.05 * open_loop
+
+
+def test_what_has_velocities_as_its_state_lacks_an_acceleration(offset_logs):
+    model, past = load_module(STAND_IN), past_steps(RATE)
+
+    class Dynamics:
+        """The stand-in without its momenta."""
+
+        n = 2
+        mass_matrix, forward_dynamics, inverse_dynamics = (
+            model.mass_matrix, model.forward_dynamics, model.inverse_dynamics,
+        )  # fmt: skip
+
+    windows = cut_windows(offset_logs, past + 51, 20, measured=False)
+    predictor = of_dynamics("other", Dynamics(), 2)
+    found = rolled(predictor, windows, past)
+    _, disturbance = after_past(predictor.form, windows, past)
+    mass = model.mass_matrix(windows.q[:, past // 2])
+    missing = torch.linalg.solve(mass, OFFSET.expand_as(disturbance).unsqueeze(-1)).squeeze(-1)
+    torch.testing.assert_close(disturbance, missing, atol=0.1, rtol=0.1)
+    errors = [
+        np.abs(x - found.ahead.qd[:, 1:].numpy())[:, -1].mean() for x in (found.open_loop[1], found.held[1])
+    ]
+    assert errors[1] < 0.3 * errors[0]
+
+
+def test_evaluation_tells_forecasts_and_open_loop_of_the_same_windows(offset_fit):
+    result = evaluate(offset_fit, motions(seed=1, offset=OFFSET), steps=(), seconds=(0.1, 0.5))
+    for horizon in result.horizons:
+        assert horizon.errors[MODEL].mean_relative_rms < 0.1 * horizon.open_loop[MODEL].mean_relative_rms
+        assert horizon.errors[CONSTANT_VELOCITY] == horizon.open_loop[CONSTANT_VELOCITY]
+    assert result.forecasts[MODEL].good_for == 1.0
+    text = " ".join(result.text().split())
+    assert "with the disturbance of the last 0.1 s held, trusted as far as training windows show" in text
+    assert "The same without that: open loop" in text
+    assert "predictions up to 1 s ahead" in result._repr_html_()
+    alone = evaluate(offset_fit, motions(seed=1, offset=OFFSET), steps=(), seconds=(0.5,), disturbance="none")
+    assert alone.forecasts == {} and alone.horizons[0].open_loop == {}
+    assert alone.horizons[0].errors[MODEL].mean_relative_rms > 0.2
+    assert "open loop" not in alone.text()
+    far = evaluate(offset_fit, motions(seed=1, offset=OFFSET), steps=(), seconds=(2.0,))
+    assert far.horizons[0].open_loop == {}
+    assert {x.message for x in far.diagnostics if x.code == "open-loop"} == {
+        "no forecasts over 2 s, rollouts are open loop: windows of its training logs are shorter"
+    }
+
+
+def test_the_true_model_is_trusted_and_nonsense_is_not(offset_fit):
+    calibration, kinds = offset_fit.calibration, ("revolute", "revolute")
+    model = load_module(STAND_IN)
+    noise = torch.Generator().manual_seed(0)
+
+    def nonsense(windows, disturbance=None):
+        shape = windows.q[:, 1:].shape
+        q, qd = (torch.randn(shape, generator=noise, dtype=torch.float64) for _ in "ab")
+        return windows.q[:, :1] + q, windows.qd[:, :1] + qd
+
+    true = forecast_of(of_dynamics(MODEL, model, 2), calibration, kinds)
+    none = forecast_of(Predictor("nonsense", nonsense, form=model), calibration, kinds)
+    assert true.trust.trust[2:].min() > 0.9  # from 0.05 s on
+    assert true.trust.good_for == 1.0
+    assert np.count_nonzero(none.trust.trust) <= 0.05 * none.trust.trust.size
+    assert none.trust.good_for is None
+
+
+def test_trust_is_one_for_what_is_measured_and_nothing_for_what_never_moves():
+    generator = np.random.default_rng(0)
+    measured = generator.normal(size=(2, 60, 3, 4))
+    measured[:, :, :, 3] = 0.0
+    activity, blocks = np.ones((60, 4)), np.arange(60) // 6
+    times = np.array([0.1, 0.5, 1.0])
+    trust = calibrated(0 * measured, measured, measured, activity, blocks, times)
+    np.testing.assert_array_equal(trust.trust[..., :3], 1.0)
+    np.testing.assert_array_equal(trust.held[..., :3], 1.0)
+    np.testing.assert_array_equal(trust.trust[..., 3], 0.0)
+    other = calibrated(measured, generator.normal(size=measured.shape), measured, activity, blocks, times)
+    assert (other.held[..., :3] == 0).all()
+    added = trust.added(0 * measured, measured, activity, np.array([0.1, 0.2, 2.0]))
+    np.testing.assert_allclose(added[:, :, 0, :3], measured[:, :, 0, :3])
+
+
+def test_windows_that_overlap_count_as_one():
+    """The same errors, told by many windows of few stretches of time, prove less than by many stretches."""
+    generator = np.random.default_rng(1)
+    once = generator.normal(size=(2, 6, 1, 3))
+    noise = 0.7 * generator.normal(size=once.shape)
+    several, error = (np.repeat(x, 10, axis=1) for x in (once, noise))
+    activity, times = np.ones((60, 3)), np.array([1.0])
+    few, many = (
+        calibrated(several + error, several + error, several, activity, blocks, times).trust
+        for blocks in (np.repeat(np.arange(6), 10), np.arange(60))
+    )
+    assert few.mean() < 0.9 * many.mean()
+
+
+def test_a_joint_that_moves_less_than_in_training_is_trusted_less():
+    assert weight(np.array(0.5), np.array(1.0)) == pytest.approx(0.5)
+    assert weight(np.array(0.5), np.array(0.01)) == pytest.approx(0.01 / 1.01)
+    assert weight(np.array(1.0), np.array(0.01)) == pytest.approx(1.0)
+    assert weight(np.array(0.0), np.array(9.0)) == 0.0
+    ones = np.ones((5, 2))
+    np.testing.assert_allclose(relative_activity(0.1 * ones, 0 * ones, ones, ones), 0.005)
+
+
+def test_calibration_reads_no_test_windows(offset_fit):
+    """Whatever is tested, the same training windows tell what is trusted; forecasts of one window need no other."""
+    results = [
+        evaluate(offset_fit, motions(seed=seed, count=count, offset=offset), steps=(), seconds=(0.5,))
+        for seed, count, offset in ((1, 2, OFFSET), (2, 3, -OFFSET))
+    ]
+    assert results[0].forecasts == results[1].forecasts
+    assert results[0].horizons[0].errors[MODEL] != results[1].horizons[0].errors[MODEL]
+    predictor, past = of_dynamics(MODEL, offset_fit.model, 2), past_steps(RATE)
+    forecast = forecast_of(predictor, offset_fit.calibration, ("revolute", "revolute"))
+    windows = cut_windows(motions(seed=3, count=1), past + 11, 40, measured=False)
+    together = forecast.states(rolled(predictor, windows, past))
+    alone = forecast.states(rolled(predictor, windows[:1], past))
+    torch.testing.assert_close(together[1][:1], alone[1])
+
+
+def test_a_run_folder_keeps_the_windows(offset_fit, tmp_path):
+    offset_fit.save(tmp_path / "run")
+    kept = load_run(tmp_path / "run").calibration
+    for before, after in zip(offset_fit.calibration.windows.columns(), kept.windows.columns(), strict=True):
+        torch.testing.assert_close(before, after, atol=0, rtol=0)
+    np.testing.assert_array_equal(kept.blocks, offset_fit.calibration.blocks)
+    assert kept.past == offset_fit.calibration.past == 10
+    test = motions(seed=1, count=1)
+    assert evaluate(tmp_path / "run", test, steps=(5,), seconds=()).forecasts.keys() == {MODEL}
+    (tmp_path / "run" / "calibration.npz").write_bytes(b"PK broken")
+    with pytest.raises(RunError, match=r"calibration\.npz: got unreadable"):
+        load_run(tmp_path / "run")
+    (tmp_path / "run" / "calibration.npz").unlink()
+    result = evaluate(tmp_path / "run", test, steps=(5,), seconds=())
+    assert result.forecasts == {} and result.horizons[0].open_loop == {}
+    assert "no forecasts, rollouts are open loop: no windows of its training logs are known" in {
+        x.message for x in result.diagnostics
+    }
+
+
+def test_windows_are_spread_evenly_and_stretches_of_time_share_no_recording(offset_logs):
+    long, short = offset_logs[0], offset_logs[1][:151]
+    found = calibration_windows(held_sources([long, short]), HELD, REACH)
+    assert found.past == 10
+    assert found.windows.q.shape[1:] == (111, 2)
+    of_long = np.isin(found.windows.q[:, 0, 0].numpy(), long.q[:, 0])
+    assert (
+        0.6 < of_long.mean() < 0.85
+    )  # two thirds of all samples, and the ends of the short one are too short
+    assert not set(found.blocks[of_long]) & set(found.blocks[~of_long])
+    assert sorted(set(found.blocks)) == list(range(found.blocks.max() + 1))
+    first = int(np.flatnonzero(long.q[:, 0] == found.windows.q[5, 0, 0].item())[0])
+    np.testing.assert_allclose(found.windows.z[5], bristles_along(long.q, REACH)[first])
+
+
+def test_samples_of_windows_are_not_denser_than_needed():
+    t = np.arange(3001) / 1000
+    dense = Trajectory(t, np.sin(t)[:, None], np.cos(t)[:, None], -np.sin(t)[:, None], "dense")
+    found = calibration_windows(held_sources([dense]), HELD, REACH[:1])
+    np.testing.assert_allclose(found.windows.dt, 0.01)
+    assert found.past == 10
+    assert calibration_windows(held_sources([dense[:60]]), HELD, REACH[:1]) is None
+
+
+def test_a_window_whose_numbers_blow_up_spoils_no_other(offset_logs):
+    model, past = load_module(STAND_IN), past_steps(RATE)
+    windows = cut_windows(offset_logs, past + 11, 60, measured=False)
+    sound = of_dynamics(MODEL, model, 1)
+
+    def fragile(part, disturbance=None):
+        if (part.q[:, 0] == windows.q[3, past]).all(dim=-1).any():
+            raise torch.linalg.LinAlgError("singular")
+        return sound.states(part, disturbance)
+
+    found = rolled(replace(sound, states=fragile), windows, past)
+    expected = rolled(sound, windows, past)
+    kept = np.isfinite(found.held).all(axis=(0, 2, 3))
+    assert not kept[3] and kept.sum() >= 0.9 * len(windows)
+    np.testing.assert_allclose(found.held[:, kept], expected.held[:, kept])
+
+
+def test_without_a_past_windows_are_what_follows(offset_logs):
+    windows = cut_windows(offset_logs, 21, 60, measured=False)
+    ahead = without_past(windows, 10)
+    torch.testing.assert_close(ahead.tau, windows.tau[:, 10:])
+    assert ahead.q.shape[1] == 11 and ahead.dt.shape[1] == 10
