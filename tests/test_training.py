@@ -206,7 +206,14 @@ def test_training_finds_the_true_parameters(logs, tmp_path):
 def test_the_run_folder_tells_what_was_done(logs, tmp_path):
     result = train(STAND_IN, [logs], tmp_path / "run", quick(epochs=2), progress=False)
     names = {path.name for path in (tmp_path / "run").iterdir()}
-    assert names == {"module.py", "config.json", "metrics.jsonl", "checkpoint.pt", "model.pt"}
+    assert names == {
+        "module.py",
+        "config.json",
+        "metrics.jsonl",
+        "checkpoint.pt",
+        "model.pt",
+        "calibration.npz",
+    }
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     assert config["joints"] == list(JOINTS)
     assert set(config["training"]).isdisjoint(config["validation"])
