@@ -17,7 +17,7 @@ PRESET_NAMES: tuple[str, ...] = get_args(Preset)
 
 Net = Literal["mlp", "kan"]
 
-BRISTLE_REACH = {"revolute": (3e-4, 3e-3, 3e-2), "prismatic": (3e-5, 3e-4, 3e-3)}
+BRISTLE_REACH = {"revolute": (1e-4, 1e-3, 1e-2, 1e-1), "prismatic": (1e-5, 1e-4, 1e-3, 1e-2)}
 """How far friction's memory reaches, by kind of joint [rad, m]: what gears do before they slide spans such decades."""
 
 PRESETS = Path(__file__).parent / "presets"

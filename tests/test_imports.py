@@ -38,7 +38,8 @@ simulation: friction integration simulated_logs random_inputs tracking
 identification: samples friction base_parameters least_squares method prior identification
 excitation: trajectory criterion excitation
 fitting: run_schema run_folder run_lock
-fitting: gaussian_prior adaptive rollout calibration dataset streaming torque_samples torque_jacobian torque_fit
+fitting: gaussian_prior adaptive rollout calibration dataset streaming torque_samples torque_jacobian
+fitting: torque_fit torque_report
 fitting: optimizers torque_networks urdf_regularizer stages compiled process progress validation loop
 fitting: run_record fitted fit train
 evaluation: names disturbance stiff baselines trust forecast torque rollout torque_traces traces examples invariants

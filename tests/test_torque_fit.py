@@ -7,6 +7,7 @@ import pytest
 import torch
 from characters import TESTS, read_characters, write_arm
 from emitted import import_source
+from scipy.optimize import minimize_scalar
 from typer.testing import CliRunner
 
 from spelgen.cli.main import app
@@ -15,9 +16,10 @@ from spelgen.errors import LogError
 from spelgen.fitting import torque_fit, torque_jacobian
 from spelgen.fitting.config import GaussianPrior, Rollout, TorqueFit
 from spelgen.fitting.fit import fit
-from spelgen.fitting.gaussian_prior import SIZES, covariance, kind_of
+from spelgen.fitting.gaussian_prior import SIZES, covariance, kind_of, most_probable
 from spelgen.fitting.stages import default_objective
 from spelgen.fitting.torque_fit import fit_torque
+from spelgen.fitting.torque_report import torque_notes
 from spelgen.fitting.torque_samples import TorqueSamples
 from spelgen.fitting.train import train
 from spelgen.identification.samples import DynamicsSamples, dynamics_samples
@@ -120,8 +122,101 @@ def test_the_prior_knows_every_weight(emitted):
     module = emitted["six_dof"][0]
     kinds = {kind_of(name) for name, _ in module.Model().named_parameters()}
     assert kinds == {"bodies", "offset", "armature", "sizes", "velocities", "fractions"}
+    assert kind_of(torque_jacobian.COMPENSATION) == "friction_compensation"
     with pytest.raises(StopIteration):
         kind_of("dynamics.unheard_of")
+
+
+def test_deviations_are_those_of_the_largest_marginal_likelihood():
+    """Of a linear problem, where it is known in closed form."""
+    rng = np.random.default_rng(0)
+    rows, noise = rng.normal(size=(40, 20)), 0.5
+    y = rows @ (0.8 * rng.normal(size=20)) + noise * rng.normal(size=40)
+
+    def minus_log_likelihood(log_deviation):
+        total = noise**2 * np.eye(40) + np.exp(2 * log_deviation) * rows @ rows.T
+        return float(np.linalg.slogdet(total)[1] + y @ np.linalg.solve(total, y)) / 2
+
+    best = np.exp(minimize_scalar(minus_log_likelihood, bounds=(-4, 3), method="bounded").x)
+    weights = {"inertial_parameters.raw": torch.zeros(2, 10), "raw_offset": torch.zeros(2)}
+    guess = prior = GaussianPrior(bodies=0.1, offset=0.1, degrees_of_freedom=1e-9)
+    for _ in range(200):
+        posterior = np.linalg.inv(rows.T @ rows / noise**2 + np.eye(20) / prior.bodies**2)
+        mean = torch.from_numpy(posterior @ rows.T @ y / noise**2)
+        variance = torch.from_numpy(np.diag(posterior).copy())
+        both = [torch.cat([x, torch.full((2,), unit).double()]) for x, unit in ((mean, 0.1), (variance, 0.0))]
+        prior = most_probable(prior, guess, weights, *both)
+    assert prior.bodies == pytest.approx(best, rel=1e-4)
+    certain = prior.model_copy(update={"degrees_of_freedom": 1e12})
+    assert most_probable(certain, guess, weights, *both).bodies == pytest.approx(guess.bodies)
+
+
+def test_a_urdf_that_is_wrong_is_given_up_and_that_is_said(emitted):
+    module = emitted["six_dof"][0]
+    true, fixed, found = drawn(module, seed=2, deviation=0.3), module.Model(), module.Model()
+    true.get_parameter(BODIES).data[:, [0, 2, 5, 9]] += 1.6  # 25 times the mass
+    few, test = [recorded(true, 3.0, 0.02, seed=1)], recorded(true, 10.0, 0.0, seed=9)
+    certain = GaussianPrior(bodies=0.2, degrees_of_freedom=1e9)
+    fit_torque(fixed, few, certain)
+    wrong = fit_torque(found, few, certain.model_copy(update={"degrees_of_freedom": 8.0}))
+    assert wrong.prior.bodies > 0.6
+    assert nmse(found, test) < 0.5 * nmse(fixed, test)
+    right = fit_torque(module.Model(), [recorded(module.Model(), 3.0, 0.02, seed=1)])
+    assert right.prior.bodies < 0.35
+    samples = TorqueSamples.held(few)
+    told = [next(torque_notes(found, samples, each)).message for each in (wrong, right)]
+    assert told == [
+        f"the URDF's inertias are believed to within a factor of {np.exp(2 * each.prior.bodies):.2g}"
+        for each in (wrong, right)
+    ]
+
+
+def test_a_drive_that_compensates_friction_unseen_is_found_out(emitted):
+    module = emitted["six_dof"][0]
+    true, found = drawn(module, seed=2, deviation=0.2), module.Model()
+    true.dynamics.raw_friction_compensation[4] = 40.0
+    logs = [recorded(true, 6.0, 0.05, seed=1)]
+    fit = fit_torque(found, logs)
+    assert fit.compensated.tolist() == [False] * 4 + [True, False]
+    value, known = (x.dynamics.friction_compensation() for x in (found, true))
+    assert value[4].item() == pytest.approx(known[4].item(), rel=0.15)
+    assert value[[0, 1, 2, 3, 5]].abs().max() == 0
+    assert nmse(found, recorded(true, 10.0, 0.0, seed=9)) < 5e-3
+    notes = {note.code: note for note in torque_notes(found, TorqueSamples.held(logs), fit)}
+    assert f"{found.joint_names[4]} {value[4].item():.3g} Nm s/rad" in notes["friction-compensated"].message
+
+
+def test_compensation_belongs_to_the_input(emitted):
+    """It is added to what the torque does, and is no friction."""
+    model = drawn(emitted["six_dof"][0], seed=2)
+    q, qd, qdd = (torch.rand(5, 6, dtype=torch.float64) for _ in range(3))
+    tau, friction = model.inverse_dynamics(q, qd, qdd), model.friction_torque(q, qd)
+    model.dynamics.raw_friction_compensation += 3.0
+    added = 3.0 * model.dynamics.friction.nominal / model.dynamics.friction.speed * qd
+    torch.testing.assert_close(model.inverse_dynamics(q, qd, qdd), tau - added)
+    torch.testing.assert_close(model.forward_dynamics(q, qd, tau - added), qdd)
+    torch.testing.assert_close(model.friction_torque(q, qd), friction)
+    p, prepared = model.momentum(q, qd), model.prepare()
+    (_, driven), (_, free) = (model.port_hamiltonian_rhs(q, p, x, prepared) for x in (0 * tau, None))
+    torch.testing.assert_close(driven - free, added - model.input_matrix(q) @ model.torque_offset)
+
+
+def test_slow_logs_are_told_to_say_little_of_inertia(emitted):
+    module = emitted["six_dof"][0]
+    true = drawn(module, seed=2, deviation=0.2)
+    codes = {}
+    for name, pace in (("quick", 1.0), ("slow", 0.02)):
+        motion = recorded(true, 8.0 / pace, 0.0, seed=1)
+        every = round(1 / pace)
+        q, qd, qdd = motion.q[::every], motion.qd[::every] * pace, motion.qdd[::every] * pace**2
+        with torch.no_grad():
+            tau = true.inverse_dynamics(*(torch.from_numpy(x) for x in (q, qd, qdd))).numpy()
+        tau = tau + 0.05 * tau.std(0) * np.random.default_rng(0).normal(size=tau.shape)
+        samples, found = TorqueSamples.held([DynamicsSamples(name, q, qd, qdd, tau)]), module.Model()
+        fit = fit_torque(found, samples)
+        codes[name] = {note.code for note in torque_notes(found, samples, fit)}
+    assert codes["quick"] == {"urdf-believed"}
+    assert codes["slow"] == {"urdf-believed", "inertia-undetermined", "acceleration-unseen"}
 
 
 @pytest.mark.parametrize("held", [True, False])

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 from spelgen.dynamics.bristles import bristle_reach
 from spelgen.errors import Diagnostic, LogError
-from spelgen.fitting.config import FitConfig, GaussianPrior, Rollout, TorqueFit, fit_config
+from spelgen.fitting.config import FitConfig, Rollout, TorqueFit, fit_config
 from spelgen.fitting.dataset import TrainingData
 from spelgen.fitting.torque_fit import DECIMATION, PAYLOAD, fit_torque, last_body
 from spelgen.fitting.torque_networks import fit_networks
+from spelgen.fitting.torque_report import torque_notes
 from spelgen.fitting.torque_samples import TorqueSamples
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer
 from spelgen.identification.samples import DENSE, dynamics_samples
@@ -68,28 +69,27 @@ def fit_torque_stage(
             )  # fmt: skip
         message = f"no torque fit: these logs are sampled below {DENSE:g} Hz"
         return [Diagnostic("warning", "no-torque-fit", "logs", None, message)]
-    steps = _fit(model, samples, config, regularizer)
+    steps, notes = _fit(model, samples, config, regularizer)
     what = "the last body alone fitted" if isinstance(config, TorqueFit) and config.payload else "fitted"
     message = (
         f"{what} to the torques of {samples.seen} samples, those of validation included, in {steps} steps"
     )
-    return [Diagnostic("info", "torque-fit", "logs", None, message)]
+    return [Diagnostic("info", "torque-fit", "logs", None, message), *notes]
 
 
 def _fit(
     model: EmittedModel, samples: TorqueSamples, config: FitConfig, regularizer: UrdfRegularizer | None
-) -> int:
-    """Fit the model; the steps it took."""
-    if not isinstance(config, TorqueFit):
-        return fit_torque(model, samples).steps
+) -> tuple[int, list[Diagnostic]]:
+    """Fit the model; the steps it took, and what there is to say."""
     if is_closed_form(model):
-        prior = config.prior or (PAYLOAD if config.payload else GaussianPrior())
-        return fit_torque(model, samples, prior, [last_body(model)] if config.payload else None).steps
+        if isinstance(config, TorqueFit) and config.payload:
+            return fit_torque(model, samples, config.prior or PAYLOAD, [last_body(model)]).steps, []
+        found = fit_torque(model, samples, config.prior if isinstance(config, TorqueFit) else None)
+        return found.steps, [*torque_notes(model, samples, found)]
+    assert isinstance(config, TorqueFit)
     weight = config.urdf_weight
-    if regularizer is None:
-        return fit_networks(model, samples, config.weight_decay, evaluations=config.evaluations)
-    penalty = lambda: weight * regularizer.loss(model)  # noqa: E731
-    return fit_networks(model, samples, config.weight_decay, penalty, config.evaluations)
+    penalty = lambda: weight * regularizer.loss(model) if regularizer else 0.0  # noqa: E731
+    return fit_networks(model, samples, config.weight_decay, penalty, config.evaluations), []
 
 
 def _samples(model: EmittedModel, data: TrainingData) -> TorqueSamples | None:

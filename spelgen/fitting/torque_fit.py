@@ -6,21 +6,22 @@ few constants of each joint: seconds are enough, and no step size is to be chose
     sum over joints and samples of (missing torque / noise)^2 + (weights - start)^T covariance^-1 (weights - start),
 
 with the covariance of a Gaussian prior (see ``covariance``). The noise of a joint is what is left of its torque, found
-in rounds. Sums over samples are made block by block, so that memory does not grow with the logs.
+in rounds, and so is how far the start is to be believed (see ``most_probable``). Sums over samples are made block by
+block, so that memory does not grow with the logs.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from spelgen.fitting.config import GaussianPrior
-from spelgen.fitting.gaussian_prior import covariance
-from spelgen.fitting.torque_jacobian import TorqueJacobian
+from spelgen.fitting.gaussian_prior import covariance, most_probable
+from spelgen.fitting.torque_jacobian import COMPENSATION, TorqueJacobian
 from spelgen.fitting.torque_samples import TorqueSamples
 from spelgen.identification.samples import DynamicsSamples
 
@@ -31,7 +32,10 @@ DECIMATION = (
     2  # samples taken of so many: filtered at 8 Hz and sampled at 100 Hz they say all that is to be said
 )
 ALIKE = 20.0  # of those: so many in a row, 0.4 s, err alike and count once
-ROUNDS = 6  # of weighing joints by what is left of their torque
+ROUNDS = 8  # of weighing joints by what is left of their torque, and the start by how far it was left
+FIRST_ROUNDS = 3  # after which it is seen whether friction explains what is missed
+COMPENSATED = 0.1  # of what is missed: explained by a drive that adds torque with velocity,
+SIGNIFICANT = 4.0  # by so many standard deviations
 STEPS = 8  # at most in a round
 LARGE = 2**15  # samples; of more, FEW of them are fitted first
 FEW, LAST_ROUNDS = 2**14, 2
@@ -46,21 +50,30 @@ PAYLOAD = GaussianPrior(bodies=10.0)
 
 @dataclass(frozen=True, eq=False)
 class TorqueSolution:
-    """How a fit ended. residual: (n,) root mean square of the torque that is missed [Nm, N]."""
+    """How a fit ended.
+
+    residual: (n,) root mean square of the torque that is missed [Nm, N]. prior: as the fit found it. covariance: of the
+    weights after the fit (K, K), zero for those that did not move. compensated: (n,) joints whose drives add torque
+    that is not measured.
+    """
 
     residual: np.ndarray
     steps: int
     cost: float
+    prior: GaussianPrior
+    covariance: torch.Tensor
+    compensated: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class _Step:
-    """Weights, the sums of squares of the torque that they miss (n,), their cost, the damping of the next step."""
+    """Weights, the sums of squares of the torque that they miss (n,), their cost; damping of the next step; steps."""
 
     x: torch.Tensor
     squares: torch.Tensor
     cost: float
     damping: float
+    steps: int = 0
 
 
 def last_body(model: EmittedModel) -> int:
@@ -76,50 +89,104 @@ def fit_torque(
 ) -> TorqueSolution:
     """Set the weights of a closed-form ``model`` to the most probable ones after ``samples`` (torques as logged).
 
-    The prior is centred on the weights as they are. ``only_bodies``: nothing moves but these bodies' parameters.
+    The prior is centred on the weights as they are. ``only_bodies``: nothing moves but these bodies' parameters, and
+    the prior is taken as it is.
     """
     if not isinstance(samples, TorqueSamples):
         samples = TorqueSamples.held(samples, DECIMATION)
-    prior = prior or GaussianPrior()
-    problem = _Problem(TorqueJacobian(model, samples), prior, only_bodies)
-    if samples.count <= LARGE:
-        at, steps = problem.solve(problem.start, ALIKE**0.5 * FIRST_NOISE * problem.range, ROUNDS)
-    else:  # few of many samples come near, all of them finish
-        few = _Problem(TorqueJacobian(model, samples.thinned(FEW)), prior, only_bodies)
-        near, first = few.solve(few.start, ALIKE**0.5 * FIRST_NOISE * few.range, ROUNDS)
-        at, steps = problem.solve(near.x, few.noise(near.squares), LAST_ROUNDS, near.damping)
-        steps += first
+    large = samples.count > LARGE
+    few = samples.thinned(FEW) if large else samples
+    problem = _Problem(TorqueJacobian(model, few), prior or GaussianPrior(), only_bodies)
+    at, noise = problem.solve(*problem.near(), ROUNDS - FIRST_ROUNDS)
+    if large:  # few of many samples came near, all of them finish
+        problem.take(TorqueJacobian(model, samples))
+        at, _ = problem.solve(replace(at, squares=problem.jacobian.squares(at.x)), noise, LAST_ROUNDS)
     problem.jacobian.write(at.x)
-    return TorqueSolution((at.squares / samples.count).sqrt().numpy(), steps, at.cost)
+    return TorqueSolution(
+        residual=(at.squares / samples.count).sqrt().numpy(),
+        steps=at.steps,
+        cost=at.cost,
+        prior=problem.prior,
+        covariance=problem.covariance,
+        compensated=problem.compensated.numpy(),
+    )
 
 
 class _Problem:
     def __init__(
         self, jacobian: TorqueJacobian, prior: GaussianPrior, only_bodies: Sequence[int] | None
     ) -> None:
+        self.start, self.guess, self.only_bodies = jacobian.start, prior, only_bodies
+        self.compensated = jacobian.weights[COMPENSATION] != 0
+        self.covariance = torch.zeros(len(self.start), len(self.start)).double()
+        self.take(jacobian)
+        self.believe(prior)
+
+    def take(self, jacobian: TorqueJacobian) -> None:
+        """Go on with these samples."""
         self.jacobian, self.count = jacobian, jacobian.samples.count
-        self.start = jacobian.start
-        self.precision = torch.linalg.inv(covariance(prior, jacobian.weights))
-        self.free = jacobian.free(only_bodies)
         deviation = jacobian.torque_deviation()
         self.range = torch.maximum(deviation, 1e-3 * deviation.max())
 
-    def solve(
-        self, x: torch.Tensor, noise: torch.Tensor, rounds: int, damping: float = DAMPING[1]
-    ) -> tuple[_Step, int]:
-        """Steps down from x, and how many; the noise (n,) is found anew after each round."""
-        at, steps = _Step(x, self.jacobian.squares(x), float("inf"), damping), 0
+    def believe(self, prior: GaussianPrior) -> None:
+        """Go on with this prior."""
+        self.prior = prior
+        self.precision = torch.linalg.inv(covariance(prior, self.jacobian.weights))
+
+    @property
+    def free(self) -> torch.Tensor:
+        """Which weights (K,) move."""
+        return self.jacobian.free(self.only_bodies, self.compensated)
+
+    def near(self) -> tuple[_Step, torch.Tensor]:
+        """As `solve`, some rounds from the start; from there anew while further joints want a compensation, for what
+        a fit made of their torque without one leads astray.
+        """
+        start = _Step(self.start, self.jacobian.squares(self.start), float("inf"), DAMPING[1])
+        while True:
+            self.believe(self.guess)
+            at, noise = self.solve(start, ALIKE**0.5 * FIRST_NOISE * self.range, FIRST_ROUNDS)
+            if self.only_bodies is not None or not self.compensate(at.x):
+                return at, noise
+            start = replace(start, steps=at.steps)
+
+    def compensate(self, x: torch.Tensor) -> bool:
+        """Give a compensation to further joints that want one; whether there are such.
+
+        No friction explains a torque that falls with velocity: a drive that compensates friction by itself, after
+        its torque was measured, does.
+        """
+        slope, explained = self.jacobian.by_velocity(x)
+        sure = explained * self.count / ALIKE > SIGNIFICANT**2 * (1 - explained)
+        found = (slope < 0) & (explained > COMPENSATED) & sure & ~self.compensated
+        self.compensated = self.compensated | found
+        return bool(found.any())
+
+    def solve(self, at: _Step, noise: torch.Tensor, rounds: int) -> tuple[_Step, torch.Tensor]:
+        """Steps down, and the noise (n,) after them; after each round it is found anew, as the prior is."""
         for _ in range(rounds):
-            at = _Step(at.x, at.squares, self.cost(at.x, at.squares, noise), at.damping)
+            at = replace(at, cost=self.cost(at.x, at.squares, noise))
             for _ in range(STEPS):
-                after = self.step(at, noise)
+                curvature, target = self.normal_equations(at.x, noise)
+                after = self.step(at, curvature, target, noise)
                 if after is None:
                     break
-                gained, at, steps = at.cost - after.cost, after, steps + 1
+                gained, at = at.cost - after.cost, after
                 if gained < GAIN * at.cost:
                     break
             noise = self.noise(at.squares)
-        return at, steps
+            self.covariance[self.free[:, None] & self.free] = torch.linalg.inv(curvature).flatten()
+            if self.only_bodies is None:
+                weights, variance = self.jacobian.weights, self.covariance.diagonal()
+                self.believe(most_probable(self.prior, self.guess, weights, at.x - self.start, variance))
+        return at, noise
+
+    def normal_equations(self, x: torch.Tensor, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """The cost's second derivative by the weights that move, and minus its first."""
+        free = self.free
+        curvature, target = self.jacobian.normal_equations(x, noise, free)
+        away = self.precision @ (x - self.start)
+        return curvature + self.precision[free][:, free], target - away[free]
 
     def noise(self, squares: torch.Tensor) -> torch.Tensor:
         """Standard deviations (n,) of errors as if they were independent from sample to sample."""
@@ -129,11 +196,10 @@ class _Problem:
         away = x - self.start
         return float(((squares / noise.square()).sum() + away @ self.precision @ away) / 2)
 
-    def step(self, at: _Step, noise: torch.Tensor) -> _Step | None:
+    def step(
+        self, at: _Step, curvature: torch.Tensor, target: torch.Tensor, noise: torch.Tensor
+    ) -> _Step | None:
         """A step that lowers the cost; None: there is none."""
-        curvature, target = self.jacobian.normal_equations(at.x, noise, self.free)
-        curvature = curvature + self.precision[self.free][:, self.free]
-        target = target - (self.precision @ (at.x - self.start))[self.free]
         damping = at.damping
         while damping < DAMPING[2]:
             damped = curvature + damping * torch.diag(curvature.diagonal())
@@ -145,6 +211,6 @@ class _Problem:
             squares = self.jacobian.squares(moved)
             lower = self.cost(moved, squares, noise)
             if lower < at.cost:
-                return _Step(moved, squares, lower, max(damping / 10, DAMPING[0]))
+                return _Step(moved, squares, lower, max(damping / 10, DAMPING[0]), at.steps + 1)
             damping *= 10
         return None

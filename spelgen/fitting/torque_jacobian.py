@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import torch
-from torch.func import functional_call, jacfwd, jvp
+from torch.func import functional_call, jacfwd, jvp, vmap
 
 from spelgen.fitting.torque_samples import Block, TorqueSamples
 
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 BLOCK = 2**13  # samples at a time: of seven joints some 100 MB with their derivatives
 HELD = 2e8  # bytes of regressors up to which they are kept from pass to pass
 BODIES = "dynamics.inertial_parameters.raw"
+COMPENSATION = "dynamics.raw_friction_compensation"
 
 Weights = Mapping[str, torch.Tensor]
 
@@ -33,7 +34,7 @@ class _Samples:
     gravity_regressor: torch.Tensor
 
 
-class _Asked(torch.nn.Module):
+class Asked(torch.nn.Module):
     """Answers questions about a model, so that ``functional_call`` can ask them under other weights."""
 
     def __init__(self, model: EmittedModel) -> None:
@@ -50,10 +51,14 @@ class TorqueJacobian:
     def __init__(self, model: EmittedModel, samples: TorqueSamples) -> None:
         self.model: Any = model
         self.samples = samples
-        self._asked = _Asked(model)
-        self.weights = {name: x.detach().clone() for name, x in model.named_parameters()}
+        self._asked = Asked(model)
+        compensation = {COMPENSATION: model.get_buffer(COMPENSATION)}
+        self.weights = {
+            x: y.detach().clone() for x, y in {**dict(model.named_parameters()), **compensation}.items()
+        }
         self.start = torch.cat([x.flatten() for x in self.weights.values()])
         numbers = 2 * samples.count * samples.joints * self.weights[BODIES].numel()
+        self._directions, self._direction, self._moved = self._by_joint()
         self._held = [*self._computed()] if 8 * numbers <= HELD else None
 
     def squares(self, x: torch.Tensor) -> torch.Tensor:
@@ -81,12 +86,25 @@ class TorqueJacobian:
             q = next(self.samples.blocks(1))[0]
             return self.samples.torque_deviation(self.model.input_matrix(q)[0], BLOCK)
 
-    def free(self, only_bodies: Sequence[int] | None) -> torch.Tensor:
-        """Which weights (K,) move: all, or those of some bodies."""
+    def by_velocity(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Of the missing torque the slope by velocity (n,) [Nm s/rad, N s/m], and how much of its sum of squares this
+        line explains (n,).
+        """
+        weights = self._named(x)
+        pairs = [(self._missing(weights, each).detach(), each.qd) for each in self._blocks()]
+        sums = [torch.stack([tau * qd, qd * qd, tau * tau]).sum(dim=1) for tau, qd in pairs]
+        both, speeds, squares = torch.stack(sums).sum(dim=0)
+        slope = both / speeds.clamp(min=1e-300)
+        return slope, slope * both / squares.clamp(min=1e-300)
+
+    def free(self, only_bodies: Sequence[int] | None, compensated: torch.Tensor) -> torch.Tensor:
+        """Which weights (K,) move: those of some bodies, or all, compensation only of the joints (n,) that have one."""
+        every = only_bodies is None
+        chosen = {name: torch.full_like(x, every, dtype=torch.bool) for name, x in self.weights.items()}
         if only_bodies is None:
-            return torch.ones_like(self.start, dtype=torch.bool)
-        chosen = {name: torch.zeros_like(x, dtype=torch.bool) for name, x in self.weights.items()}
-        chosen[BODIES][list(only_bodies)] = True
+            chosen[COMPENSATION] = compensated
+        else:
+            chosen[BODIES][list(only_bodies)] = True
         return torch.cat([x.flatten() for x in chosen.values()])
 
     def write(self, x: torch.Tensor) -> None:
@@ -95,6 +113,7 @@ class TorqueJacobian:
         with torch.no_grad():
             for name, parameter in self.model.named_parameters():
                 parameter.copy_(named[name])
+            self.model.get_buffer(COMPENSATION).copy_(named[COMPENSATION])
 
     def _blocks(self) -> Iterator[_Samples]:
         yield from self._computed() if self._held is None else self._held
@@ -109,6 +128,26 @@ class TorqueJacobian:
             regressor = self.model.dynamics.regressor
             past = z if z.shape[-1] else None
             return _Samples(qd, qdd, tau, past, regressor(q, qd, qdd), regressor(q, still, still))
+
+    def _by_joint(self) -> tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor]:
+        """Directions (D, *shape) of the joints' weights, in each of which one weight of every joint changes; of each of
+        these weights (K - 10 B) its direction, and whose torque it moves, (K - 10 B, n).
+        """
+        own = {name: x for name, x in self.weights.items() if name != BODIES}
+        identity = torch.eye(self.samples.joints).double()
+        found, direction, moved, count = {}, [], [], 0
+        sizes = {name: x[0].numel() if name in own else 0 for name, x in own.items()}
+        total = sum(sizes.values())
+        for name, x in own.items():
+            size = sizes[name]
+            each = torch.zeros(total, len(x), size).double()
+            each[count : count + size] = torch.eye(size).double()[:, None]
+            found[name] = each.reshape(total, *x.shape)
+            joints = self.model.dynamics.input.rows if name.endswith("raw_gains") else torch.arange(len(x))
+            direction.append(count + torch.arange(size).repeat(len(x)))
+            moved.append(identity[joints.repeat_interleave(size)])
+            count += size
+        return found, torch.cat(direction), torch.cat(moved)
 
     def _named(self, x: torch.Tensor) -> dict[str, torch.Tensor]:
         parts = x.split([weight.numel() for weight in self.weights.values()])
@@ -129,43 +168,35 @@ class TorqueJacobian:
             weight = samples.gravity_regressor @ ten
             friction = dynamics.friction(samples.qd, weight, prepared.friction, samples.z)
             tau = samples.tau - dynamics.torque_offset()
-            given: torch.Tensor = dynamics.input.force(weight, tau, prepared.input)
-            return given - samples.regressor @ ten - prepared.armature * samples.qdd - friction
+            given = dynamics.input.force(weight, tau, prepared.input)
+            given = given + dynamics.friction_compensation() * samples.qd
+            missing: torch.Tensor = (
+                given - samples.regressor @ ten - prepared.armature * samples.qdd - friction
+            )
+            return missing
 
         return self._ask(weights, missing)
 
     def _slope(self, weights: Weights, samples: _Samples) -> torch.Tensor:
         """Minus d(missing torque) / d(weights), (T, n, K)."""
-        parts = [
-            self._body_slope(weights, samples)
-            if name == BODIES
-            else self._joint_slope(weights, samples, name)
-            for name in weights
-        ]
-        return torch.cat(parts, dim=-1)
+        bodies, joints = self._body_slope(weights, samples), self._joint_slope(weights, samples)
+        sizes = [x.numel() for name, x in weights.items() if name != BODIES]
+        rest = iter(joints.split(sizes, dim=-1))
+        return torch.cat([bodies if name == BODIES else next(rest) for name in weights], dim=-1)
 
-    def _joint_slope(self, weights: Weights, samples: _Samples, name: str) -> torch.Tensor:
-        """By weights of which each joint has its own, which move its own torque alone: all at once."""
+    def _joint_slope(self, weights: Weights, samples: _Samples) -> torch.Tensor:
+        """By weights of which each joint has its own, which move its own torque alone: one of every joint at once."""
+        own = {name: x for name, x in weights.items() if name != BODIES}
 
-        def missing(value: torch.Tensor) -> torch.Tensor:
-            return self._missing({**weights, name: value}, samples)
+        def missing(changed: Weights) -> torch.Tensor:
+            return self._missing({**weights, **changed}, samples)
 
-        value = weights[name]
-        if name.endswith("raw_gains"):
-            joints = self.model.dynamics.input.rows
-        else:
-            joints = torch.arange(len(value)).repeat_interleave(value[0].numel())
-        several = value.reshape(len(value), -1)
-        # one weight of every joint at a time
-        each = [
-            (torch.arange(several.shape[1]) == k).double().expand_as(several) for k in range(several.shape[1])
-        ]
-        changes = [jvp(missing, (value,), (one.reshape_as(value),))[1].detach() for one in each]
-        change = torch.stack(changes, dim=-1)  # (T, n, weights of a joint)
-        slope = change.new_zeros(*change.shape[:2], value.numel())
-        columns = torch.arange(value.numel())
-        slope[:, joints, columns] = -change[:, joints, columns % several.shape[1]]
-        return slope
+        def change(direction: Weights) -> torch.Tensor:
+            found: torch.Tensor = jvp(missing, (own,), (direction,))[1]
+            return found
+
+        changes = vmap(change)(self._directions).detach()  # (directions, T, n)
+        return -(changes[self._direction] * self._moved[:, None]).permute(1, 2, 0)
 
     def _body_slope(self, weights: Weights, samples: _Samples) -> torch.Tensor:
         """By the bodies' weights: through the torque and through the load that friction grows with."""

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from spelgen.dynamics.bristles import bristles_along
-from spelgen.logs.filtering import AUTOMATIC_CUTOFF, low_pass, resample
+from spelgen.logs.filtering import AUTOMATIC_CUTOFF, low_pass, low_pass_regular, resample
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 
@@ -49,7 +49,7 @@ def dynamics_samples(
     change of rate where the log is denser, after it where not), qdd by central differences of the filtered qd, only
     samples with some |qd| > 0.02 rad/s; pieces between gaps separately. ``pauses``: all samples from the first that
     moves to the last, standstill between them included. ``reach``: (n, K) of the bristles whose states z are
-    wanted, see ``bristles_along``.
+    wanted, through the same filter; see ``bristles_along``.
     """
     return [
         _samples(x, pauses, preprocessing, reach)
@@ -84,7 +84,9 @@ def _samples(
             taken[first:last] = True
         columns = [smooth.q, smooth.qd, qdd, smooth.tau]
         if reach is not None and reach.size:
-            columns.append(bristles_along(smooth.q, reach))
+            z, cutoff = bristles_along(smooth.q, reach), preprocessing.acceleration_cutoff
+            # the torque's steps where joints turn around went through the filter, so must these
+            columns.append(z if cutoff is None else low_pass_regular(z, FREQUENCY, cutoff))
         parts.append([x[taken] for x in columns])
     return DynamicsSamples(
         trajectory.name, *(np.concatenate(columns) for columns in zip(*parts, strict=True))

@@ -45,21 +45,27 @@ def low_pass(trajectory: Trajectory, cutoff: float) -> Trajectory:
     rate, filtered and interpolated back, so that the result stands at the log's own times. All three go
     through the same filter, so that a linear system's filtered input still explains its filtered output.
     """
-    t, samples = trajectory.t, len(trajectory.t)
-    mean_rate = (samples - 1) / (t[-1] - t[0])
+    t = trajectory.t
+    mean_rate = (len(t) - 1) / (t[-1] - t[0])
     if cutoff >= mean_rate / 2:
         raise LogError(
             f"a filter of {cutoff:g} Hz on samples at {mean_rate:.3g} Hz", file=trajectory.file,
             element=f"trajectory {trajectory.name}", expected=f"below {mean_rate / 2:.3g} Hz",
             do="lower or drop the filter",
         )  # fmt: skip
-    sections = butter(FILTER_ORDER, cutoff, fs=mean_rate, output="sos")
-    grid = np.linspace(t[0], t[-1], samples)
     signals = np.concatenate([trajectory.q, trajectory.qd, trajectory.tau], axis=1)  # (T, 3n)
-    padding = min(samples - 1, int(3 * mean_rate / cutoff))  # three periods of the cutoff settle the ends
-    filtered = sosfiltfilt(sections, CubicSpline(t, signals)(grid), axis=0, padlen=padding)
+    grid = np.linspace(t[0], t[-1], len(t))
+    filtered = low_pass_regular(CubicSpline(t, signals)(grid), mean_rate, cutoff)
     q, qd, tau = np.split(CubicSpline(grid, filtered)(t), 3, axis=1)
     return replace(trajectory, q=q, qd=qd, tau=tau)
+
+
+def low_pass_regular(signals: np.ndarray, rate: float, cutoff: float) -> np.ndarray:
+    """Signals (T, ...) at a regular rate [Hz] through that filter."""
+    sections = butter(FILTER_ORDER, cutoff, fs=rate, output="sos")
+    padding = min(len(signals) - 1, int(3 * rate / cutoff))  # three periods of the cutoff settle the ends
+    filtered: np.ndarray = sosfiltfilt(sections, signals, axis=0, padlen=padding)
+    return filtered
 
 
 def resample(trajectory: Trajectory, frequency: float) -> Trajectory:

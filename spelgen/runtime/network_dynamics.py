@@ -132,12 +132,12 @@ class NetworkDynamics(PortHamiltonian):
         matrix: Tensor = self.input(at.encoded, prepared.input)
         return matrix
 
-    def input_force(self, at: Configuration, tau: Tensor, prepared: NetworkPrepared) -> Tensor:
+    def input_force(self, at: Configuration, qd: Tensor, tau: Tensor, prepared: NetworkPrepared) -> Tensor:
         """G tau, (..., n) [Nm, N]."""
         force: Tensor = self.input.force(at.encoded, tau, prepared.input)
         return force
 
-    def input_torque(self, at: Configuration, force: Tensor, prepared: NetworkPrepared) -> Tensor:
+    def input_torque(self, at: Configuration, qd: Tensor, force: Tensor, prepared: NetworkPrepared) -> Tensor:
         """The tau, (..., n), that makes this force."""
         tau: Tensor = self.input.solve(at.encoded, force, prepared.input)
         return tau

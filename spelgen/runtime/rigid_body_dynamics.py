@@ -60,6 +60,7 @@ class RigidBodyDynamics(PortHamiltonian):
     crossing: Tensor
     base: Tensor
     actuated: Tensor
+    raw_friction_compensation: Tensor
 
     def __init__(
         self,
@@ -101,10 +102,16 @@ class RigidBodyDynamics(PortHamiltonian):
         self.input: Any = input
         # of the measured torque, in units of the joints' usual friction
         self.raw_offset = nn.Parameter(torch.zeros(self.n, dtype=torch.float64))
+        # in units of usual friction at usual speed; no parameter: only a fit to torques may find one
+        self.register_buffer("raw_friction_compensation", torch.zeros(self.n, dtype=torch.float64))
 
     def torque_offset(self) -> Tensor:
         """What the measured torque shows without any, (n,) [Nm, N]."""
         return self.raw_offset * self.friction.nominal * self.actuated
+
+    def friction_compensation(self) -> Tensor:
+        """What the drives add by velocity, unseen in the measured torque, (n,) [Nm s/rad, N s/m]."""
+        return self.raw_friction_compensation * self.friction.nominal / self.friction.speed * self.actuated
 
     def prepare(self, definite: bool = True) -> RigidPrepared:
         """All that depends on the weights alone; holds until they change."""
@@ -260,12 +267,13 @@ class RigidBodyDynamics(PortHamiltonian):
         matrix: Tensor = self.input(at.gravity, prepared.input)
         return matrix
 
-    def input_force(self, at: Motion, tau: Tensor, prepared: RigidPrepared) -> Tensor:
-        """G (tau - torque offset), (..., n) [Nm, N]."""
+    def input_force(self, at: Motion, qd: Tensor, tau: Tensor, prepared: RigidPrepared) -> Tensor:
+        """G (tau - torque offset) + friction compensation qd, (..., n) [Nm, N]."""
         force: Tensor = self.input.force(at.gravity, tau - self.torque_offset(), prepared.input)
-        return force
+        return force + self.friction_compensation() * qd
 
-    def input_torque(self, at: Motion, force: Tensor, prepared: RigidPrepared) -> Tensor:
-        """The tau, (..., n), that makes this force."""
-        tau: Tensor = self.input.solve(at.gravity, force, prepared.input)
+    def input_torque(self, at: Motion, qd: Tensor, force: Tensor, prepared: RigidPrepared) -> Tensor:
+        """The tau, (..., n), that is measured while the drives make this force."""
+        shown = force - self.friction_compensation() * qd
+        tau: Tensor = self.input.solve(at.gravity, shown, prepared.input)
         return tau + self.torque_offset()

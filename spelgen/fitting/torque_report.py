@@ -1,0 +1,71 @@
+"""What a fit to torques says in words: how far the URDF was believed, and what the logs leave open."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch.func import functional_call, jacrev
+
+from spelgen.errors import Diagnostic
+from spelgen.fitting.torque_fit import TorqueSolution
+from spelgen.fitting.torque_jacobian import BLOCK, Asked
+from spelgen.fitting.torque_samples import TorqueSamples
+
+if TYPE_CHECKING:
+    from spelgen.emission.loading import EmittedModel
+
+UNDETERMINED = 0.5  # relative standard deviation from which on logs do not determine an inertia
+HARDLY = 5.0  # a factor within which the URDF is believed that is no belief any more
+WEAK = 2.0  # torque missed, by what accelerates a joint, from which on its states are poorly predicted
+POSITIONS = 50  # at which inertias are looked at
+
+
+def torque_notes(model: EmittedModel, samples: TorqueSamples, found: TorqueSolution) -> Iterator[Diagnostic]:
+    """Of a closed-form model that was fitted to samples."""
+    names = np.array(model.joint_names)
+    # a deviation s of a coordinate is a factor e^s in a root of the pseudo-inertia
+    factor = float(np.exp(2 * found.prior.bodies))
+    how = "hardly believed, only" if factor > HARDLY else "believed"
+    message = f"the URDF's inertias are {how} to within a factor of {factor:.2g}"
+    yield Diagnostic("info", "urdf-believed", "bodies", None, message)
+    if found.compensated.any():
+        value = model.dynamics.friction_compensation().detach().numpy()
+        each = ", ".join(f"{names[k]} {value[k]:.3g}" for k in np.flatnonzero(found.compensated))
+        message = (
+            "the measured torque falls as velocity grows, as of a drive that compensates friction unseen: "
+            f"{each} Nm s/rad (N s/m) are added; check the torques' signs and what the controller subtracts"
+        )
+        yield Diagnostic("warning", "friction-compensated", "logs", None, message)
+    q, _, qdd, *_ = (x[:: max(1, len(x) // POSITIONS)] for x in next(samples.blocks(BLOCK)))
+    inertia, deviation = _inertia(model, q, found.covariance)
+    if (undetermined := deviation > UNDETERMINED).any():
+        message = (
+            f"these logs hardly tell the inertia at {', '.join(names[undetermined])}: it is mostly a guess"
+        )
+        yield Diagnostic("warning", "inertia-undetermined", "logs", None, message)
+    if (weak := found.residual > WEAK * inertia * qdd.std(dim=0).numpy()).any():
+        message = (
+            f"far more torque is missed than accelerates {', '.join(names[weak])}: torques are predicted, but motion "
+            "under the measured torque may be predicted worse than by constant velocity; record faster motion"
+        )
+        yield Diagnostic("warning", "acceleration-unseen", "logs", None, message)
+
+
+def _inertia(model: EmittedModel, q: torch.Tensor, covariance: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """The mean diagonal of M at q (n,) [kg m^2, kg], and the standard deviations of its logarithm (n,)."""
+    asked = Asked(model)
+    weights = {f"model.{name}": x.detach() for name, x in model.named_parameters()}
+    count = sum(x.numel() for x in weights.values())
+
+    def diagonal(changed: dict[str, torch.Tensor]) -> Any:
+        mass = functional_call(asked, changed, (lambda other: other.mass_matrix(q),))
+        return mass.diagonal(dim1=-2, dim2=-1).mean(dim=0)
+
+    value = diagonal(weights).detach()
+    slopes = jacrev(diagonal)(weights)
+    slope = torch.cat([slopes[name].flatten(1).detach() for name in weights], dim=1) / value.unsqueeze(-1)
+    variance = torch.einsum("jk,kl,jl->j", slope, covariance[:count, :count], slope)
+    return value.numpy(), variance.clamp(min=0).sqrt().numpy()
