@@ -143,8 +143,8 @@ def _rigid_bodies(spec: ModelSpec) -> list[str]:
         "RigidBodyDynamics",
         Code("joints"),
         Code("bodies"),
-        gravity=spec.gravity,
-        input=_input(spec),
+        spec.gravity,
+        _input(spec),
         **({"reach": reach} if spec.design.memory == "bristles" else {}),
     )
     return [assignment("bodies", bodies, _INDENT), assignment("self.dynamics", made, _INDENT)]
