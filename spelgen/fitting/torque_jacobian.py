@@ -24,14 +24,17 @@ Weights = Mapping[str, torch.Tensor]
 
 @dataclass(frozen=True, eq=False)
 class _Samples:
-    """Samples (T, n), and the regressors (T, n, 10 B) of torque and of gravity torque at them."""
+    """Samples (T, n) with the drives' speeds, and the regressors (T, n, 10 B) of torque and of the gravity torque that
+    the drives bear.
+    """
 
     qd: torch.Tensor
     qdd: torch.Tensor
     tau: torch.Tensor
     z: torch.Tensor | None
+    speed: torch.Tensor
     regressor: torch.Tensor
-    gravity_regressor: torch.Tensor
+    load_regressor: torch.Tensor
 
 
 class Asked(torch.nn.Module):
@@ -125,29 +128,38 @@ class TorqueJacobian:
         q, qd, qdd, tau, z = block
         still = torch.zeros_like(q)
         with torch.no_grad():
-            regressor = self.model.dynamics.regressor
+            dynamics = self.model.dynamics
             past = z if z.shape[-1] else None
-            return _Samples(qd, qdd, tau, past, regressor(q, qd, qdd), regressor(q, still, still))
+            load = torch.einsum("jm,tjk->tmk", dynamics.loads, dynamics.regressor(q, still, still))
+            speed = qd @ dynamics.motors.mT
+            return _Samples(qd, qdd, tau, past, speed, dynamics.regressor(q, qd, qdd), load)
 
     def _by_joint(self) -> tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor]:
-        """Directions (D, *shape) of the joints' weights, in each of which one weight of every joint changes; of each of
-        these weights (K - 10 B) its direction, and whose torque it moves, (K - 10 B, n).
+        """Directions (D, *shape) of the joints' weights, in each of which one weight of every joint changes, but of
+        joints with a coupling only one; of each of these weights (K - 10 B) its direction, and whose torque it moves,
+        (K - 10 B, n).
         """
         own = {name: x for name, x in self.weights.items() if name != BODIES}
-        identity = torch.eye(self.samples.joints).double()
-        found, direction, moved, count = {}, [], [], 0
-        sizes = {name: x[0].numel() if name in own else 0 for name, x in own.items()}
-        total = sum(sizes.values())
+        moves = (self.model.dynamics.motors != 0).double()
+        turn: list[int] = []  # of a joint, among those that have torques in common
+        for coupled in moves @ moves.mT > 0:
+            taken = {turn[k] for k in range(len(turn)) if coupled[k]}
+            turn.append(next(k for k in range(len(taken) + 1) if k not in taken))
+        turns = max(turn) + 1
+        total = turns * sum(x[0].numel() for x in own.values())
+        found, directions, moved, count = {}, [], [], 0
         for name, x in own.items():
-            size = sizes[name]
+            size = x[0].numel()
+            row, weight = torch.arange(len(x)).repeat_interleave(size), torch.arange(size).repeat(len(x))
+            joint = self.model.dynamics.input.rows[row] if name.endswith("raw_gains") else row
+            direction = count + turns * weight + torch.tensor(turn)[joint]
             each = torch.zeros(total, len(x), size).double()
-            each[count : count + size] = torch.eye(size).double()[:, None]
+            each[direction, row, weight] = 1.0
             found[name] = each.reshape(total, *x.shape)
-            joints = self.model.dynamics.input.rows if name.endswith("raw_gains") else torch.arange(len(x))
-            direction.append(count + torch.arange(size).repeat(len(x)))
-            moved.append(identity[joints.repeat_interleave(size)])
-            count += size
-        return found, torch.cat(direction), torch.cat(moved)
+            directions.append(direction)
+            moved.append(moves[joint])
+            count += turns * size
+        return found, torch.cat(directions), torch.cat(moved)
 
     def _named(self, x: torch.Tensor) -> dict[str, torch.Tensor]:
         parts = x.split([weight.numel() for weight in self.weights.values()])
@@ -165,13 +177,13 @@ class TorqueJacobian:
         def missing(model: Any) -> torch.Tensor:
             dynamics = model.dynamics
             prepared, ten = dynamics.prepare(), dynamics.inertial_parameters().flatten()
-            weight = samples.gravity_regressor @ ten
-            friction = dynamics.friction(samples.qd, weight, prepared.friction, samples.z)
+            load = samples.load_regressor @ ten
+            friction = dynamics.friction(samples.speed, load, prepared.friction, samples.z) @ dynamics.motors
             tau = samples.tau - dynamics.torque_offset()
-            given = dynamics.input.force(weight, tau, prepared.input)
+            given = dynamics.input.force(load, tau, prepared.input)
             given = given + dynamics.friction_compensation() * samples.qd
             missing: torch.Tensor = (
-                given - samples.regressor @ ten - prepared.armature * samples.qdd - friction
+                given - samples.regressor @ ten - samples.qdd @ prepared.armature - friction
             )
             return missing
 
@@ -207,11 +219,12 @@ class TorqueJacobian:
 
         change = jacfwd(ten)(weights[BODIES]).flatten(1).detach()  # (10 B, K)
         constants = self._ask(weights, lambda model: model.dynamics.friction.prepare())
-        weight = samples.gravity_regressor @ ten(weights[BODIES])
+        load = samples.load_regressor @ ten(weights[BODIES])
         by_load = jvp(
-            lambda each: self.model.dynamics.friction(samples.qd, each, constants, samples.z),
-            (weight,),
-            (torch.ones_like(weight),),
+            lambda each: self.model.dynamics.friction(samples.speed, each, constants, samples.z),
+            (load,),
+            (torch.ones_like(load),),
         )[1]
-        loaded = samples.regressor + by_load.unsqueeze(-1) * samples.gravity_regressor
+        at_drives = by_load.unsqueeze(-1) * samples.load_regressor
+        loaded = samples.regressor + torch.einsum("mj,tmk->tjk", self.model.dynamics.motors, at_drives)
         return (loaded @ change).detach()

@@ -12,6 +12,19 @@ from spelgen.runtime.joints import Joints, vector
 from spelgen.runtime.network import Network
 
 
+def motor_speeds(gains: Tensor) -> Tensor:
+    """C, (n, n): the motors' speeds are C qd, where the joints' torques are ``gains`` times the motors'.
+
+    By the same power, each motor's in the units of the joint that it moves most: C is the identity where
+    each moves its own joint alone.
+    """
+    largest = gains.gather(0, gains.abs().argmax(dim=0, keepdim=True))
+    passive = largest == 0
+    return (gains / torch.where(passive, torch.ones_like(largest), largest)).mT + torch.diag(
+        passive[0].to(gains)
+    )
+
+
 class DirectInput(nn.Module):
     """G is the identity: each input is the torque of its own joint, and none that of a passive one."""
 

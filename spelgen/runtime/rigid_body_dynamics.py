@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from spelgen.runtime.actuation import motor_speeds
 from spelgen.runtime.armature import Armature
 from spelgen.runtime.friction_laws import FrictionConstants, FrictionLaws
 from spelgen.runtime.joints import Joints, vector
@@ -27,7 +28,7 @@ class RigidPrepared(NamedTuple):
     """What depends on the weights alone, worked out once for many states."""
 
     inertia: Tensor  # spatial inertias on the diagonal, (6 bodies, 6 bodies)
-    armature: Tensor  # (n,)
+    armature: Tensor  # what the rotors add to M, (n, n)
     friction: FrictionConstants
     input: Tensor
 
@@ -60,6 +61,8 @@ class RigidBodyDynamics(PortHamiltonian):
     crossing: Tensor
     base: Tensor
     actuated: Tensor
+    motors: Tensor  # C: the drives' speeds are C qd, (n, n)
+    loads: Tensor  # its inverse
     raw_friction_compensation: Tensor
 
     def __init__(
@@ -100,6 +103,9 @@ class RigidBodyDynamics(PortHamiltonian):
         self.armature = Armature(joints)
         self.friction = FrictionLaws(joints, reach)
         self.input: Any = input
+        gains = input(torch.zeros(self.n, dtype=torch.float64), input.prepare()).detach()
+        self.register_buffer("motors", motor_speeds(gains))
+        self.register_buffer("loads", torch.linalg.inv(self.motors))
         # of the measured torque, in units of the joints' usual friction
         self.raw_offset = nn.Parameter(torch.zeros(self.n, dtype=torch.float64))
         # in units of usual friction at usual speed; no parameter: only a fit to torques may find one
@@ -118,7 +124,7 @@ class RigidBodyDynamics(PortHamiltonian):
         inertia = torch.tensordot(self.inertial_parameters(), self.basis, dims=1)
         return RigidPrepared(
             inertia=block_diagonal(inertia),
-            armature=self.armature(),
+            armature=self.motors.mT @ (self.armature().unsqueeze(-1) * self.motors),
             friction=self.friction.prepare(),
             input=self.input.prepare(),
         )
@@ -152,7 +158,7 @@ class RigidBodyDynamics(PortHamiltonian):
 
     def mass_at(self, at: Motion, prepared: RigidPrepared) -> tuple[Tensor, None]:
         """M(q), (..., n, n)."""
-        return (at.twists @ prepared.inertia) @ at.twists.mT + torch.diag(prepared.armature), None
+        return (at.twists @ prepared.inertia) @ at.twists.mT + prepared.armature, None
 
     def energy_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
         """V(q), (...) [J]; zero for a mass at the base's origin."""
@@ -238,29 +244,31 @@ class RigidBodyDynamics(PortHamiltonian):
         return rows.reshape(*q.shape, 10 * len(self.parents))
 
     def friction_at(self, at: Motion, qd: Tensor, prepared: RigidPrepared, z: Tensor | None = None) -> Tensor:
-        """The friction torque, (..., n) [Nm, N]."""
-        torque: Tensor = self.friction(qd, at.gravity, prepared.friction, z)
-        return torque
+        """The friction torque C^T f(C qd), (..., n) [Nm, N]."""
+        torque: Tensor = self.friction(qd @ self.motors.mT, at.gravity @ self.loads, prepared.friction, z)
+        return torque @ self.motors
 
     def stored_energy(self, z: Tensor, prepared: RigidPrepared) -> Tensor:
         """What the bristles give back, (...) [J]."""
         return self.friction.stored_energy(z, prepared.friction)
 
     def memory(self, qd: Tensor) -> Tensor:
-        """z, (..., n, K), of joints that have long gone this way."""
-        return self.friction.sliding(qd)
+        """z, (..., n, K), of drives that have long gone this way."""
+        return self.friction.sliding(qd @ self.motors.mT)
 
     def memory_rate(self, qd: Tensor, z: Tensor) -> Tensor:
         """z', (..., n, K)."""
-        return self.friction.bristles.rate(qd, z)
+        return self.friction.bristles.rate(qd @ self.motors.mT, z)
 
     def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
         """z after joints went one way by (..., n), exactly."""
-        return self.friction.bristles.moved(z, displacement)
+        return self.friction.bristles.moved(z, displacement @ self.motors.mT)
 
     def dissipation_at(self, at: Motion, qd: Tensor, prepared: RigidPrepared) -> Tensor:
-        """D(q, qd), (..., n, n), diagonal."""
-        return torch.diag_embed(self.friction.resistance(qd, at.gravity, prepared.friction))
+        """D(q, qd), (..., n, n), diagonal where each drive moves its own joint alone."""
+        speeds, loads = qd @ self.motors.mT, at.gravity @ self.loads
+        resistance = self.friction.resistance(speeds, loads, prepared.friction)
+        return self.motors.mT @ (resistance.unsqueeze(-1) * self.motors)
 
     def input_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
         """G, (..., n, n)."""
