@@ -26,7 +26,7 @@ from characters import read_characters, write_arm
 
 from spelgen.arm.arm import Arm
 from spelgen.building import build
-from spelgen.dynamics.bristles import reach_of
+from spelgen.dynamics.bristles import BristleReach, reach_of
 from spelgen.evaluation.baselines import of_dynamics
 from spelgen.evaluation.results import state_errors
 from spelgen.fitting.torque_fit import PAYLOAD, fit_torque, last_body
@@ -225,7 +225,7 @@ def samples_of(logs: Sequence[Trajectory], *, pauses: bool = False) -> list[Dyna
     return dynamics_samples(logs, pauses=pauses, reach=reach(logs[0]))
 
 
-def reach(log: Trajectory) -> np.ndarray:
+def reach(log: Trajectory) -> BristleReach:
     return reach_of(["revolute"] * log.q.shape[1])
 
 

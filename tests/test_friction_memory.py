@@ -5,7 +5,7 @@ import pytest
 import torch
 from emitted import ROBOTS, built, import_source
 
-from spelgen.dynamics.bristles import bristle_reach, bristles_along, encoder_step, reach_of
+from spelgen.dynamics.bristles import BristleReach, bristle_reach, bristles_along, encoder_step, reach_of
 from spelgen.fitting.rollout import roll_out
 from spelgen.identification.friction import FrictionModel
 from spelgen.identification.identify import least_squares
@@ -39,9 +39,9 @@ def test_one_pass_over_positions_solves_the_differential_equation():
     qd = q.diff(dim=0)
     for moved in qd:  # Euler, with steps far below the least reach
         z = z + bristles.rate(moved, z)
-    found = bristles_along(q[::4000].numpy(), np.array(REACH))[-1]
+    found = bristles_along(q[::4000].numpy(), BristleReach(np.array(REACH)))[-1]
     # between samples that lie so far apart a joint may turn around: finer ones know of it
-    finer = bristles_along(q[::40].numpy(), np.array(REACH))[-1]
+    finer = bristles_along(q[::40].numpy(), BristleReach(np.array(REACH)))[-1]
     assert np.abs(finer / REACH - (z / bristles.reach).numpy()).max() < 1e-2
     assert np.abs(found / REACH).max() <= 1.0
 
@@ -89,7 +89,7 @@ def test_energy_of_an_arm_left_to_itself_never_rises(tmp_path):
         q, qd = torch.tensor([[0.3, 0.1, -0.4]]).double(), torch.tensor([[1.0, 0.2, -1.5]]).double()
         steps = torch.full((1, 4000), 2.5e-4).double()
         still = Windows(
-            steps, q[:, None], qd[:, None], torch.zeros(1, 4000, 3).double(), torch.zeros(1, 3, 3).double()
+            steps, q[:, None], qd[:, None], torch.zeros(1, 4000, 3).double(), torch.zeros(1, 3, 4).double()
         )
         q, qd = (
             torch.cat([x[:, None], y], dim=1)[0] for x, y in zip((q, qd), roll_out(model, still), strict=True)
@@ -107,7 +107,7 @@ def test_jitter_of_an_encoder_is_no_motion():
     path = np.concatenate([np.linspace(0.0, 0.3, 1000)[:, None], still])
     path = np.round(path / step) * step
     assert encoder_step(path) == pytest.approx(step)
-    z = bristles_along(path, np.array([[3e-4, 3e-3, 3e-2]]))
+    z = bristles_along(path, BristleReach(np.array([[3e-4, 3e-3, 3e-2]])))
     assert z[-1, 0] == pytest.approx(z[1005, 0], rel=0.4)  # a tremor of 4000 samples has not unwound them
     assert encoder_step(rng.normal(size=(500, 1))) == 0
 
@@ -117,8 +117,8 @@ def test_a_window_starts_with_the_bristles_of_its_past():
     t = np.linspace(0.0, 3.0, 300)
     qd = np.gradient(q, t, axis=0)
     piece = trajectory(t, q, qd)
-    windows = cut_windows([piece], 5, 3, measured=True, reach=np.array(REACH))
-    along = bristles_along(q, np.array(REACH))
+    windows = cut_windows([piece], 5, 3, measured=True, reach=BristleReach(np.array(REACH)))
+    along = bristles_along(q, BristleReach(np.array(REACH)))
     assert windows.z is not None and np.array_equal(windows.z.numpy(), along[: 300 - 4 : 3])
     assert windows[2:4].z.shape == (2, 2, 3)
 
@@ -134,14 +134,14 @@ def test_least_squares_finds_the_strengths_of_bristles():
     qd, qdd = np.gradient(q, 0.002, axis=0), np.gradient(np.gradient(q, 0.002, axis=0), 0.002, axis=0)
     reach = reach_of(["revolute", "revolute"])
     z = bristles_along(q, reach)
-    strengths = rng.uniform(0.2, 1.0, (2, 3))
+    strengths = rng.uniform(0.2, 1.0, (2, 4))
     model = LeastSquares(friction=FrictionModel(memory=True))
-    tau = (strengths * z / reach).sum(axis=-1)
+    tau = (strengths * z / reach.values).sum(axis=-1)
     found = least_squares(arm, [DynamicsSamples("x", q, qd, qdd, tau, z)], model)
     names = [name for name in found.base.names if name.startswith("bristle")]
-    assert len(names) == 6
+    assert len(names) == 8
     values = dict(zip(found.base.names, found.values, strict=True))
-    for k in range(3):
+    for k in range(4):
         for joint in range(2):
             assert values[f"bristle {k + 1}, joint {joint + 1}"] == pytest.approx(
                 strengths[joint, k], abs=1e-6

@@ -52,6 +52,18 @@ class Actuation:
         return full
 
 
+def motor_speeds(inputs: np.ndarray) -> np.ndarray:
+    """C, (n, n): the motors' speeds are C qd, where the joints' torques are ``inputs`` times the motors'.
+
+    By the same power, each motor's in the units of the joint that it moves most: C is the identity where each moves
+    its own joint alone. A joint without a motor stands for its own.
+    """
+    largest = np.take_along_axis(inputs, np.abs(inputs).argmax(axis=0)[None], axis=0)
+    passive = largest == 0
+    speeds: np.ndarray = (inputs / np.where(passive, 1.0, largest)).T + np.diag(passive[0].astype(float))
+    return speeds
+
+
 def derive_actuation(robot: Robot, settings: Settings, joints: Sequence[str]) -> Actuation:
     """G of the arm with these ``joints``.
 

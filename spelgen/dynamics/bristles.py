@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,26 +11,45 @@ import numpy as np
 from spelgen.design import BRISTLE_REACH
 
 
-def reach_of(kinds: Sequence[str]) -> np.ndarray:
-    """(n, K) [rad, m] of joints of these kinds."""
-    return np.array([BRISTLE_REACH[kind] for kind in kinds])
+@dataclass(frozen=True, eq=False)
+class BristleReach:
+    """How far the bristles of an arm's drives reach: values, (n, K) [rad, m]; K is 0 where there are none.
+
+    motors: C, (n, n), the drives turn by C times what the joints do (see ``Actuation.motor_speeds``); None: each moves
+    its own joint alone.
+    """
+
+    values: np.ndarray
+    motors: np.ndarray | None = None
+
+    @property
+    def elements(self) -> int:
+        """K."""
+        return int(self.values.shape[1])
 
 
-def bristle_reach(model: Any) -> np.ndarray:
-    """(n, K) [rad, m] of a model; K is 0 where its friction has no memory."""
+def reach_of(kinds: Sequence[str], motors: np.ndarray | None = None) -> BristleReach:
+    """Of joints of these kinds."""
+    return BristleReach(np.array([BRISTLE_REACH[kind] for kind in kinds]), motors)
+
+
+def bristle_reach(model: Any) -> BristleReach:
+    """Of a model."""
     friction = getattr(getattr(model, "dynamics", None), "friction", None)
     if friction is None or not hasattr(friction, "bristles"):
-        return np.zeros((model.n, 0))
-    found: np.ndarray = friction.bristles.reach.cpu().double().numpy()
-    return found
+        return BristleReach(np.zeros((model.n, 0)))
+    reach, motors = (x.cpu().double().numpy() for x in (friction.bristles.reach, model.dynamics.motors))
+    return BristleReach(reach, motors)
 
 
-def bristles_along(q: np.ndarray, reach: np.ndarray) -> np.ndarray:
+def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
     """z, (T, n, K) [rad, m], along the path q (T, n), straight at its start.
 
-    Between samples joints go one way, which is exact: z' is linear in the displacement.
+    Between samples drives go one way, which is exact: z' is linear in the displacement.
     """
-    moved = np.diff(encoded(q), axis=0, prepend=q[:1])[..., None]  # (T, n, 1)
+    moved = np.diff(encoded(q), axis=0, prepend=q[:1])
+    moved = (moved if bristles.motors is None else moved @ bristles.motors.T)[..., None]  # (T, n, 1)
+    reach = bristles.values
     kept = np.exp(-np.abs(moved) / reach)
     added = np.sign(moved) * reach * (1 - kept)
     # z[k] = kept[k] z[k - 1] + added[k]: pairs are joined, then fours, ...

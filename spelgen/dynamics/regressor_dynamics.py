@@ -8,6 +8,7 @@ from typing import TypeVar
 import numpy as np
 import torch
 
+from spelgen.arm.actuation import motor_speeds
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.arrays import like
 from spelgen.dynamics.regressor import body_torque
@@ -20,8 +21,8 @@ Array = TypeVar("Array")
 class RegressorDynamics:
     """An arm of n coordinates with these parameters (see ``RigidDynamics``).
 
-    parameters: (10 B,), as ``regressor`` has them. armature: (n,) [kg m^2, kg]. friction: torques (T, n) by
-    velocities (T, n) and its memory z (T, n, K), or None. bristle_reach: (n, K) [rad, m], where it has one.
+    parameters: (10 B,), as ``regressor`` has them. armature: of the drives, (n,) [kg m^2, kg]. friction: torques (T, n)
+    by velocities (T, n) and its memory z (T, n, K), or None. bristle_reach: (n, K) [rad, m], where it has one.
     inputs: G, (n, n); without, each input is its own joint's torque.
     """
 
@@ -37,6 +38,7 @@ class RegressorDynamics:
         self.arm, self.parameters, self.armature, self.friction = arm, parameters, armature, friction
         self.bristle_reach = None if bristle_reach is None else torch.from_numpy(bristle_reach)
         self.inputs = np.eye(len(armature)) if inputs is None else inputs
+        self.motors = motor_speeds(self.inputs)
 
     @property
     def n(self) -> int:
@@ -69,14 +71,14 @@ class RegressorDynamics:
         return self._by_rows(self._forward, q, qd, tau, z=z)
 
     def memory(self, qd: torch.Tensor) -> torch.Tensor:
-        """z, (..., n, K), of joints that have long gone this way."""
+        """z, (..., n, K), of drives that have long gone this way."""
         assert self.bristle_reach is not None
-        return qd.sign().unsqueeze(-1) * self.bristle_reach
+        return self._driven(qd).sign().unsqueeze(-1) * self.bristle_reach
 
     def memory_after(self, z: torch.Tensor, displacement: torch.Tensor) -> torch.Tensor:
         """z after joints went one way by (..., n)."""
         assert self.bristle_reach is not None
-        return moved_bristles(z, displacement, self.bristle_reach)
+        return moved_bristles(z, self._driven(displacement), self.bristle_reach)
 
     def inverse_dynamics(self, q: Array, qd: Array, qdd: Array, z: Array | None = None) -> Array:
         """The inputs, (..., n), that make qdd; those of a passive joint are the torques that it lacks."""
@@ -97,14 +99,23 @@ class RegressorDynamics:
         still, *moved = self._bodies(
             np.tile(q, (n + 1, 1)), np.zeros_like(accelerations), accelerations
         ).reshape(n + 1, count, n)
-        return np.stack([each - still for each in moved], axis=-1) + np.diag(self.armature)
+        return np.stack([each - still for each in moved], axis=-1) + self._rotors()
+
+    def _driven(self, joints: torch.Tensor) -> torch.Tensor:
+        """Of the drives, (..., n)."""
+        return joints @ torch.from_numpy(self.motors.T).to(joints)
+
+    def _rotors(self) -> np.ndarray:
+        """What the drives add to M, (n, n)."""
+        rotors: np.ndarray = self.motors.T @ (self.armature[:, None] * self.motors)
+        return rotors
 
     def _forward(self, q: np.ndarray, qd: np.ndarray, tau: np.ndarray, z: np.ndarray | None) -> np.ndarray:
         force = tau @ self.inputs.T - self._bodies(q, qd, 0 * q) - self.friction(qd, z)
         return np.linalg.solve(self._mass(q), force[..., None])[..., 0]
 
     def _torque(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, z: np.ndarray | None) -> np.ndarray:
-        return self._bodies(q, qd, qdd) + self.armature * qdd + self.friction(qd, z)
+        return self._bodies(q, qd, qdd) + qdd @ self._rotors() + self.friction(qd, z)
 
     def _inverse(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, z: np.ndarray | None) -> np.ndarray:
         force = self._torque(q, qd, qdd, z)

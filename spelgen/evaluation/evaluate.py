@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from spelgen.dynamics.bristles import BristleReach
 from spelgen.dynamics.protocol import RigidDynamics
 from spelgen.errors import Diagnostic
 from spelgen.evaluation.baselines import (
@@ -156,7 +157,7 @@ def _rate(pieces: Sequence[Trajectory]) -> float:
 
 
 def _windows(
-    pieces: Sequence[Trajectory], samples: int, most: int, used: Preprocessing, reach: np.ndarray
+    pieces: Sequence[Trajectory], samples: int, most: int, used: Preprocessing, reach: BristleReach | None
 ) -> Windows:
     """About `most` windows, or all, evenly spread."""
     samples = min(samples, max(map(len, pieces)))

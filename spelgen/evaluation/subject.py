@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-import numpy as np
 import torch
 
-from spelgen.dynamics.bristles import bristle_reach, reach_of
+from spelgen.dynamics.bristles import BristleReach, bristle_reach, reach_of
 from spelgen.fitting.calibration import CalibrationWindows
 from spelgen.fitting.fitted import Fit, load_run
 from spelgen.fitting.run_folder import RunFolder
@@ -48,7 +47,7 @@ class Subject:
     preprocessing: Preprocessing | None = None
     window: int = WINDOW
     substeps: int = 1
-    reach: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    reach: BristleReach | None = None
     trained_on: frozenset[str] = frozenset()
     calibration: CalibrationWindows | None = None
 
@@ -89,7 +88,7 @@ def _of_model(model: EmittedModel, urdf: Path | str | None) -> Subject:
         logged_joints(model),
         None if urdf is None else Path(urdf),
         facts.options.tip if facts else None,
-        reach=own if own.size else reach_of(model.joint_types),
+        reach=own if own.elements else reach_of(model.joint_types),
     )
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from spelgen.dynamics.bristles import reach_of
+from spelgen.dynamics.bristles import BristleReach, reach_of
 from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.calibration import CalibrationWindows, calibration_windows, held_sources
 from spelgen.fitting.rollout import LossScales, loss_scales
@@ -63,7 +63,7 @@ def prepare_data(
     preprocessing: Preprocessing,
     validation: float | Sequence[Trajectory] = 0.25,
     seed: int = 0,
-    reach: np.ndarray | None = None,
+    reach: BristleReach | None = None,
 ) -> TrainingData:
     """Check the logs and make windows of them.
 

@@ -103,5 +103,5 @@ def _samples(model: EmittedModel, data: TrainingData) -> TorqueSamples | None:
         for chunk in data.chunks
         for samples in dynamics_samples([chunk.load()], preprocessing=data.preprocessing, reach=reach)
     )
-    spooled = TorqueSamples.spooled(each, model.n, reach.shape[1], decimation)
+    spooled = TorqueSamples.spooled(each, model.n, reach.elements, decimation)
     return spooled if spooled.count else None

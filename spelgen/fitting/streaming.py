@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from spelgen.dynamics.bristles import BristleReach
 from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.calibration import Source, calibration_windows
 from spelgen.fitting.dataset import LARGEST_VALIDATION, TrainingData, known_reach
@@ -70,7 +71,7 @@ def prepare_streamed(
     preprocessing: Preprocessing,
     validation: float = 0.25,
     seed: int = 0,
-    reach: np.ndarray | None = None,
+    reach: BristleReach | None = None,
 ) -> TrainingData:
     """As `prepare_data`; whole chunks (see `scan`) are set aside for validation."""
     if logs.gap != preprocessing.gap:

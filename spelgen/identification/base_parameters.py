@@ -57,13 +57,15 @@ class BaseParameters:
         }
 
 
-def base_parameters(arm: Arm, friction: FrictionModel, seed: int = 0) -> BaseParameters:
-    """The base parameters of ``arm`` and of this friction."""
+def base_parameters(
+    arm: Arm, friction: FrictionModel, motors: np.ndarray | None = None, seed: int = 0
+) -> BaseParameters:
+    """The base parameters of ``arm`` and of this friction of its drives (see ``FrictionModel.columns``)."""
     n, inertial = len(arm.coordinates), 10 * len(arm.bodies)
     exact = body_base_parameters(arm, base_parameter_count(arm))
     names = [parameter_name(k) for k in range(inertial)]
     names += [f"{effect}{joint + 1}" for effect in friction.effects for joint in range(n)]
-    columns = _columns(arm, friction, len(names), seed)
+    columns = _columns(arm, friction, motors, len(names), seed)
     chosen = [parameter.index for parameter in exact]
     basis = np.linalg.qr(columns[:, chosen])[0]
     for k in range(inertial, len(names)):
@@ -84,13 +86,15 @@ def base_parameters(arm: Arm, friction: FrictionModel, seed: int = 0) -> BasePar
     return BaseParameters(tuple(named), np.array(chosen), combination, tuple(names), len(exact))
 
 
-def _columns(arm: Arm, friction: FrictionModel, count: int, seed: int) -> np.ndarray:
+def _columns(
+    arm: Arm, friction: FrictionModel, motors: np.ndarray | None, count: int, seed: int
+) -> np.ndarray:
     """The whole regressor at random states, (rows, count)."""
     n = len(arm.coordinates)
     shape = (_STATES_PER_PARAMETER * count // n + 1, n)
     q, qd, qdd = np.random.default_rng(seed).uniform(-3.0, 3.0, (3, *shape))
     bent = np.random.default_rng(seed + 1).uniform(-1.0, 1.0, (*shape, len(BRISTLES)))
-    rows = np.concatenate([regressor(arm, q, qd, qdd), friction.columns(qd, qdd, bent)], axis=2)
+    rows = np.concatenate([regressor(arm, q, qd, qdd), friction.columns(qd, qdd, bent, motors)], axis=2)
     return rows.reshape(-1, count)
 
 

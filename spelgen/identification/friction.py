@@ -33,19 +33,36 @@ class FrictionModel:
         dry = BRISTLES if self.memory else ("coulomb",)
         return ("armature", "viscous", *dry, "offset", *more)
 
-    def columns(self, qd: np.ndarray, qdd: np.ndarray, bent: np.ndarray | None = None) -> np.ndarray:
-        """(T, n, effects n): effect e of joint j is column e n + j, which no other joint's torque reads.
+    def columns(
+        self,
+        qd: np.ndarray,
+        qdd: np.ndarray,
+        bent: np.ndarray | None = None,
+        motors: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """(T, n, effects n): effect e of drive j is column e n + j, which only the joints that it moves read.
 
-        bent: (T, n, K), how far the bristles are bent, relative to their reach; None: not known.
+        bent: (T, n, K), how far the bristles are bent, relative to their reach; None: not known. motors: (n, n), takes
+        joints' velocities to the drives' (see ``motor_speeds``); None: each drive moves its own joint alone.
         """
+        motors = np.eye(qd.shape[1]) if motors is None else motors
+        qd, qdd = qd @ motors.T, qdd @ motors.T
         parts = np.stack([qdd, *self._velocity_parts(qd, bent)], axis=-2)  # (T, effects, n)
-        columns: np.ndarray = parts[:, None] * np.eye(qd.shape[1])[:, None]
+        columns: np.ndarray = parts[:, None] * motors.T[:, None]
         return columns.reshape(*qd.shape, -1)
 
-    def torque(self, constants: np.ndarray, qd: np.ndarray, bent: np.ndarray | None = None) -> np.ndarray:
-        """All but the armature's part, (T, n), of ``constants`` by effect and joint, (effects, n)."""
-        parts = zip(constants[1:], self._velocity_parts(qd, bent), strict=True)
-        return np.sum([by_joint * part for by_joint, part in parts], axis=0)
+    def torque(
+        self,
+        constants: np.ndarray,
+        qd: np.ndarray,
+        bent: np.ndarray | None = None,
+        motors: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """All but the armature's part, (T, n), of ``constants`` by effect and drive, (effects, n)."""
+        motors = np.eye(qd.shape[1]) if motors is None else motors
+        parts = zip(constants[1:], self._velocity_parts(qd @ motors.T, bent), strict=True)
+        torque: np.ndarray = np.sum([by_drive * part for by_drive, part in parts], axis=0) @ motors
+        return torque
 
     def _velocity_parts(self, qd: np.ndarray, bent: np.ndarray | None) -> list[np.ndarray]:
         sign = np.tanh(qd / self.coulomb_smoothing_velocity)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from spelgen.arm.actuation import motor_speeds
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.bristles import reach_of
 from spelgen.dynamics.regressor_dynamics import RegressorDynamics
@@ -190,10 +191,12 @@ def identified_dynamics(
     """The arm with these parameters, (K,), the bodies' first; inputs: G, (n, n)."""
     n, inertial = len(arm.coordinates), 10 * len(arm.bodies)
     constants = parameters[inertial:].reshape(-1, n)
-    reach = reach_of([coordinate.kind for coordinate in arm.coordinates]) if friction.memory else None
+    motors = None if inputs is None else motor_speeds(inputs)
+    reach = reach_of([x.kind for x in arm.coordinates]).values if friction.memory else None
 
     def torque(qd: np.ndarray, z: np.ndarray | None) -> np.ndarray:
-        return friction.torque(constants, qd, None if z is None or reach is None else z / reach)
+        bent = None if z is None or reach is None else z / reach
+        return friction.torque(constants, qd, bent, motors)
 
     return RegressorDynamics(arm, parameters[:inertial], constants[0], torque, inputs, reach)
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from spelgen.arm.actuation import motor_speeds
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.bristles import reach_of
 from spelgen.dynamics.regressor import regressor
@@ -49,34 +50,42 @@ def identify(
         require_joints(trajectory, [c.name for c in coordinates])
     notes = check(logs, [c.name for c in coordinates], [c.kind for c in coordinates])
     method = method or LeastSquares()
-    reach = reach_of([c.kind for c in coordinates]) if method.friction.memory else None
+    kinds = [c.kind for c in coordinates]
+    reach = reach_of(kinds, motor_speeds(inputs)) if method.friction.memory else None
     samples = dynamics_samples(logs, preprocessing=preprocessing or Preprocessing(), reach=reach)
     left = sorted({x.name for x in logs} - {x.name for x in samples})
     if left:
         message = f"sampled too slowly or too short for accelerations: {', '.join(left)}"
         notes.append(Diagnostic("warning", "no-accelerations", "logs", None, message))
     at_joints = [replace(x, tau=x.tau @ inputs.T) for x in samples]
-    found = least_squares(arm.arm, at_joints, method)
-    return replace(found, inputs=inputs, diagnostics=tuple(notes))
+    found = least_squares(arm.arm, at_joints, method, inputs)
+    return replace(found, diagnostics=tuple(notes))
 
 
 def least_squares(
-    arm: Arm, samples: Sequence[DynamicsSamples], method: LeastSquares | None = None
+    arm: Arm,
+    samples: Sequence[DynamicsSamples],
+    method: LeastSquares | None = None,
+    inputs: np.ndarray | None = None,
 ) -> Identification:
-    """Fit ``arm`` to samples of joint torques; errors as for ``identify``."""
+    """Fit ``arm`` to samples of joint torques; errors as for ``identify``.
+
+    inputs: G, (n, n), of the drives whose friction and armature are fitted; None: each moves its own joint alone.
+    """
     method = method or LeastSquares()
     if not any(len(x.q) for x in samples):
         raise LogError(
             "no samples to identify from",
             expected="motion sampled at 50 Hz or faster, 1 s without a gap at least",
         )
-    triangles = reduce((rows, tau) for rows, tau in _blocks(arm, samples, method.friction))
-    base = base_parameters(arm, method.friction)
+    motors = None if inputs is None else motor_speeds(inputs)
+    triangles = reduce((rows, tau) for rows, tau in _blocks(arm, samples, method.friction, motors))
+    base = base_parameters(arm, method.friction, motors)
     prior = None
     if method.prior is not None:
         prior = gaussian_prior(arm, method.friction, triangles.deviation, method.prior)
-    fit = _fitted(arm, samples, method, _space(base, triangles, prior, method))
-    return _result(arm, samples, method, base, fit)
+    fit = _fitted(arm, samples, method, motors, _space(base, triangles, prior, method))
+    return replace(_result(arm, samples, method, base, fit), inputs=inputs)
 
 
 def columns(
@@ -86,10 +95,11 @@ def columns(
     qd: np.ndarray,
     qdd: np.ndarray,
     z: np.ndarray | None = None,
+    motors: np.ndarray | None = None,
 ) -> np.ndarray:
     """The whole regressor (T, n, 10 B + e n): the bodies', then that of friction and drives."""
-    bent = None if z is None else z / reach_of([x.kind for x in arm.coordinates])
-    return np.concatenate([regressor(arm, q, qd, qdd), friction.columns(qd, qdd, bent)], axis=2)
+    bent = None if z is None else z / reach_of([x.kind for x in arm.coordinates]).values
+    return np.concatenate([regressor(arm, q, qd, qdd), friction.columns(qd, qdd, bent, motors)], axis=2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,23 +153,32 @@ def _space(
 
 
 def _blocks(
-    arm: Arm, samples: Sequence[DynamicsSamples], friction: FrictionModel
+    arm: Arm, samples: Sequence[DynamicsSamples], friction: FrictionModel, motors: np.ndarray | None
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     for each in samples:
         for start in range(0, len(each.q), _BLOCK):
             part = slice(start, start + _BLOCK)
             z = None if each.z is None else each.z[part]
-            yield columns(arm, friction, each.q[part], each.qd[part], each.qdd[part], z), each.tau[part]
+            rows = columns(arm, friction, each.q[part], each.qd[part], each.qdd[part], z, motors)
+            yield rows, each.tau[part]
 
 
-def _fitted(arm: Arm, samples: Sequence[DynamicsSamples], method: LeastSquares, space: _Space) -> _Fit:
+def _fitted(
+    arm: Arm,
+    samples: Sequence[DynamicsSamples],
+    method: LeastSquares,
+    motors: np.ndarray | None,
+    space: _Space,
+) -> _Fit:
     deviation = space.triangles.deviation
     range_ = np.maximum(deviation, 1e-3 * deviation.max())
     weights = np.ones_like(range_) if method.weights == "equal" else 1.0 / range_
     for left in reversed(range(1 + (_ROUNDS if method.weights == "noise" else 0))):
         found = space.solve(weights)
         used = found.rank if space.penalty is None else 0
-        residuals = [rows @ found.parameters - tau for rows, tau in _blocks(arm, samples, method.friction)]
+        residuals = [
+            rows @ found.parameters - tau for rows, tau in _blocks(arm, samples, method.friction, motors)
+        ]
         noise = np.maximum(deviations(residuals, used), _LEAST_NOISE * range_)
         if left:
             weights = 1.0 / noise

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from spelgen.dynamics.bristles import bristles_along
+from spelgen.dynamics.bristles import BristleReach, bristles_along
 from spelgen.logs.filtering import AUTOMATIC_CUTOFF, low_pass, low_pass_regular, resample
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
@@ -41,14 +41,14 @@ def dynamics_samples(
     *,
     pauses: bool = False,
     preprocessing: Preprocessing = AUTOMATIC,
-    reach: np.ndarray | None = None,
+    reach: BristleReach | None = None,
 ) -> list[DynamicsSamples]:
     """The moving samples of each dense enough trajectory.
 
     At 100 Hz, through the zero-phase low-pass of ``preprocessing``, by default of 8 Hz, on q, qd and tau (before the
     change of rate where the log is denser, after it where not), qdd by central differences of the filtered qd, only
     samples with some |qd| > 0.02 rad/s; pieces between gaps separately. ``pauses``: all samples from the first that
-    moves to the last, standstill between them included. ``reach``: (n, K) of the bristles whose states z are
+    moves to the last, standstill between them included. ``reach``: of the bristles whose states z are
     wanted, through the same filter; see ``bristles_along``.
     """
     return [
@@ -72,7 +72,7 @@ def _long(piece: Trajectory) -> bool:
 
 
 def _samples(
-    trajectory: Trajectory, pauses: bool, preprocessing: Preprocessing, reach: np.ndarray | None
+    trajectory: Trajectory, pauses: bool, preprocessing: Preprocessing, reach: BristleReach | None
 ) -> DynamicsSamples:
     parts = []
     for piece in filter(_long, _pieces(trajectory, preprocessing.gap)):
@@ -83,7 +83,7 @@ def _samples(
             first, *_, last = np.flatnonzero(taken)
             taken[first:last] = True
         columns = [smooth.q, smooth.qd, qdd, smooth.tau]
-        if reach is not None and reach.size:
+        if reach is not None and reach.elements:
             z, cutoff = bristles_along(smooth.q, reach), preprocessing.acceleration_cutoff
             # the torque's steps where joints turn around went through the filter, so must these
             columns.append(z if cutoff is None else low_pass_regular(z, FREQUENCY, cutoff))

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pyarrow as pa
 
+from spelgen.dynamics.bristles import BristleReach
 from spelgen.logs.chunks import Chunk
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
@@ -23,7 +24,7 @@ class WindowCutting:
     window: int
     stride: int
     preprocessing: Preprocessing
-    reach: np.ndarray | None = None
+    reach: BristleReach | None = None
 
     @property
     def decimation(self) -> int:

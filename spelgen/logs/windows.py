@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.lib.stride_tricks import sliding_window_view
 
-from spelgen.dynamics.bristles import bristles_along
+from spelgen.dynamics.bristles import BristleReach, bristles_along
 from spelgen.errors import Diagnostic, LogError
 from spelgen.logs.read import Trajectory
 
@@ -76,7 +76,7 @@ def cut_windows(
     decimation: int = 1,
     *,
     measured: bool,
-    reach: np.ndarray | None = None,
+    reach: BristleReach | None = None,
 ) -> Windows:
     """All windows of `window` samples, `decimation` apart, that start at every `stride`-th sample of a piece.
 
@@ -96,7 +96,7 @@ def cut_windows(
 
 
 def _cut(
-    piece: Trajectory, window: int, stride: int, decimation: int, measured: bool, reach: np.ndarray | None
+    piece: Trajectory, window: int, stride: int, decimation: int, measured: bool, reach: BristleReach | None
 ) -> tuple[np.ndarray, ...]:
     held = (piece.tau[:-1] + piece.tau[1:]) / 2 if measured else piece.tau[:-1]
     impulse = sliding_window_view(held * np.diff(piece.t)[:, None], decimation, axis=0).sum(
@@ -106,7 +106,7 @@ def _cut(
     steps = [_slide(x, window - 1, stride, decimation) for x in (dt, impulse / dt)]
     states = [_slide(x, window, stride, decimation) for x in (piece.q, piece.qd)]
     columns = (steps[0][..., 0], *states, steps[1])
-    if reach is None or not reach.size:
+    if reach is None or not reach.elements:
         return columns
     starts = len(piece.t) - (window - 1) * decimation
     return *columns, bristles_along(piece.q, reach)[:starts:stride]
