@@ -115,7 +115,9 @@ def test_the_fit_knows_that_a_motor_moves_both_joints(wrist):
         step = torch.zeros_like(x)
         step[k] = 1e-5
         change = (jacobian.squares(x + step).sum() - jacobian.squares(x - step).sum()) / 2e-5
-        assert change.item() == pytest.approx(-2 * slope[k].item(), rel=1e-4, abs=1e-4 * float(slope.abs().max()))
+        assert change.item() == pytest.approx(
+            -2 * slope[k].item(), rel=1e-4, abs=1e-4 * float(slope.abs().max())
+        )
 
 
 def test_energy_and_memory_are_those_of_the_motors(wrist):

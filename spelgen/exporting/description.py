@@ -114,8 +114,10 @@ class Learned:
 class TrainedModel:
     """A trained arm of n joints. Units: rad and Nm, or m and N.
 
-    name: for code. inertias: (bodies, 10) about the joints' frames, None where M and V are learned functions. armature:
-    (n,), where it is not among these. inputs: G, (n, n); actuated: (n,), 0 for a passive joint.
+    name: for code. inertias: (bodies, 10) about the joints' frames, None where M and V are learned functions. rotors:
+    what these add to M, (n, n), where it is not among these. motors: (n, n), the drives' speeds by the joints', which
+    friction follows. inputs: G, (n, n); actuated: (n,), 0 for a passive joint. friction_compensation: (n,) what the
+    drives add by velocity.
     """
 
     name: str
@@ -126,13 +128,15 @@ class TrainedModel:
     gravity: np.ndarray
     bodies: tuple[Body, ...]
     inertias: np.ndarray | None
-    armature: np.ndarray
+    rotors: np.ndarray
+    motors: np.ndarray
     learned: Learned | None
     friction: FrictionLaw | FrictionNetwork
     bristles: Bristles | None
     inputs: np.ndarray
     actuated: np.ndarray
     torque_offset: np.ndarray
+    friction_compensation: np.ndarray
     tip_link: str
     tip: tuple[TipJoint, ...]
     tip_end: np.ndarray

@@ -47,7 +47,7 @@ class ModelExpressions:
     @cached_property
     def _known_mass(self) -> ca.SX:
         """What of M needs no network."""
-        mass = ca.SX(ca.diag(ca.sparsify(ca.DM(self.model.armature))))
+        mass = ca.SX(_sparse(self.model.rotors))
         if self._rigid is not None:
             mass = mass + self._composite[0]
         if self.model.learned is not None:
@@ -140,26 +140,33 @@ class ModelExpressions:
         """What friction takes, its memory included, (n, 1)."""
         law = self.model.friction
         if isinstance(law, FrictionLaw):
-            gravity = self.gravity if law.load_dependence.any() else ca.SX(self.n, 1)
+            speed, back = self._driven(self.qd), _sparse(self.model.motors.T)
+            gravity = ca.SX(self.n, 1)
+            if law.load_dependence.any():
+                gravity = _sparse(np.linalg.inv(self.model.motors).T) @ self.gravity
             bristles = self.model.bristles
             direction = (
-                friction_expressions.sliding_direction(law, self.qd)
+                friction_expressions.sliding_direction(law, speed)
                 if bristles is None
                 else friction_expressions.bristle_direction(bristles, self.z)
             )
-            found = friction_expressions.law_torque(law, self.qd, gravity, direction)
+            found = back @ friction_expressions.law_torque(law, speed, gravity, direction)
         else:
             assert self.model.learned is not None
             read = learned_expressions.encoded(self.model.learned.encoding, self.q)
             found = friction_expressions.network_torque(law, read, self.qd)
         return found
 
+    def _driven(self, joints: ca.SX) -> ca.SX:
+        """Velocities or displacements of the drives, (n, 1), by the joints'."""
+        return _sparse(self.model.motors) @ joints
+
     @cached_property
     def friction_step(self) -> ca.SX:
         """Friction's memory after each joint went one way by dq, (memory, 1)."""
         if self.model.bristles is None:
             return self.z
-        return friction_expressions.bristle_step(self.model.bristles, self.z, self.dq)
+        return friction_expressions.bristle_step(self.model.bristles, self.z, self._driven(self.dq))
 
     @cached_property
     def friction_memory(self) -> ca.SX:
@@ -167,22 +174,27 @@ class ModelExpressions:
         law, bristles = self.model.friction, self.model.bristles
         if bristles is None or not isinstance(law, FrictionLaw):
             return self.z
-        return friction_expressions.sliding_bristles(bristles, law, self.qd)
+        return friction_expressions.sliding_bristles(bristles, law, self._driven(self.qd))
 
     @cached_property
     def force(self) -> ca.SX:
-        """M qdd + h + friction, (n, 1)."""
+        """What the inputs do: M qdd + h + friction, less what the drives add unseen, (n, 1)."""
         if self.model.learned is None:
             assert self._rigid is not None
-            moved = self._rigid.torque(self.qd, self.qdd) + self.model.armature * self.qdd
+            moved = self._rigid.torque(self.qd, self.qdd) + _sparse(self.model.rotors) @ self.qdd
         else:
             moved = self.mass_matrix @ self.qdd + self.bias
-        return moved + self.friction
+        return moved + self.friction - self._compensation
 
     @cached_property
     def inverse_dynamics(self) -> ca.SX:
         """tau, (n, 1)."""
         return self._inputs(self.force) + self.model.torque_offset
+
+    @cached_property
+    def _compensation(self) -> ca.SX:
+        """What the drives add unseen, (n, 1)."""
+        return _sparse(np.diag(self.model.friction_compensation)) @ self.qd
 
     def _inputs(self, force: ca.SX) -> ca.SX:
         """The inputs that make these forces; (n, columns)."""
@@ -193,7 +205,7 @@ class ModelExpressions:
     def forward_dynamics(self) -> ca.SX:
         """qdd, (n, 1)."""
         force = _sparse(self.model.inputs) @ (self.tau - self.model.torque_offset)
-        return solved(self.mass_matrix, force - self.bias - self.friction)
+        return solved(self.mass_matrix, force + self._compensation - self.bias - self.friction)
 
     @cached_property
     def momentum(self) -> ca.SX:

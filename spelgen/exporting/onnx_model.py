@@ -46,8 +46,8 @@ class _OnnxModel:
             parts.append(self._rigid.mass)
         if self._learned is not None:
             parts.append(self._learned.mass)
-        if self.model.armature.any():
-            parts.append(g.constant(np.diag(self.model.armature)))
+        if self.model.rotors.any():
+            parts.append(g.constant(self.model.rotors))
         found: str = parts[0] if len(parts) == 1 else g.Sum(*parts)
         return found
 
@@ -119,17 +119,23 @@ class _OnnxModel:
 
     def _law(self, law: FrictionLaw) -> str:
         g, bristles = self.g, self.model.bristles
-        slow = g.Mul("qd", 1 / law.stribeck_velocity)
+        speed, loads = self._turned("qd", self.model.motors.T), np.linalg.inv(self.model.motors)
+        slow = g.Mul(speed, 1 / law.stribeck_velocity)
         dry = g.Add(g.Mul(g.Exp(g.Neg(g.Mul(slow, slow))), law.stribeck), law.coulomb)
         if law.load_dependence.any():
-            dry = g.Add(dry, g.Mul(g.Abs(self.gravity), law.load_dependence))
+            dry = g.Add(dry, g.Mul(g.Abs(self._turned(self.gravity, loads)), law.load_dependence))
         if bristles is None:
-            direction = g.Tanh(g.Mul("qd", 1 / law.coulomb_smoothing_velocity))
+            direction = g.Tanh(g.Mul(speed, 1 / law.coulomb_smoothing_velocity))
         else:
             share = np.kron(np.eye(self.n), np.ones((bristles.count, 1)))
             direction = g.MatMul("z", (bristles.fractions / bristles.reach).reshape(-1, 1) * share)
-        saturating = g.Mul(g.Tanh(g.Mul("qd", 1 / law.saturation_velocity)), law.saturation)
-        found: str = g.Sum(g.Mul("qd", law.viscous), saturating, g.Mul(dry, direction))
+        saturating = g.Mul(g.Tanh(g.Mul(speed, 1 / law.saturation_velocity)), law.saturation)
+        found = g.Sum(g.Mul(speed, law.viscous), saturating, g.Mul(dry, direction))
+        return self._turned(found, self.model.motors)
+
+    def _turned(self, rows: str, by: np.ndarray) -> str:
+        """Rows times a matrix that is mostly the identity."""
+        found: str = rows if np.array_equal(by, np.eye(self.n)) else self.g.MatMul(rows, by)
         return found
 
     @cached_property
@@ -138,6 +144,8 @@ class _OnnxModel:
         g, n, model = self.g, self.n, self.model
         moved = g.reshaped(g.MatMul(self.mass_matrix, g.reshaped("qdd", 0, n, 1)), 0, n)
         force = g.Sum(moved, self.bias, self.friction)
+        if model.friction_compensation.any():
+            force = g.Sub(force, g.Mul("qd", model.friction_compensation))
         inputs = model.inputs + np.diag(1 - model.actuated)
         if not np.array_equal(inputs, np.eye(n)):
             force = g.MatMul(force, np.linalg.inv(inputs).T)
@@ -151,6 +159,8 @@ class _OnnxModel:
         tau = g.Sub("tau", model.torque_offset) if model.torque_offset.any() else "tau"
         if not np.array_equal(model.inputs, np.eye(n)):
             tau = g.MatMul(tau, model.inputs.T)
+        if model.friction_compensation.any():
+            tau = g.Add(tau, g.Mul("qd", model.friction_compensation))
         force = g.Sub(g.Sub(tau, self.bias), self.friction)
         found: str = g.reshaped(g.solved(self.mass_matrix, g.reshaped(force, 0, n, 1), n), 0, n)
         return found
