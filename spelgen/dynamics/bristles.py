@@ -28,6 +28,9 @@ class BristleReach:
         return int(self.values.shape[1])
 
 
+NO_BRISTLES = BristleReach(np.zeros((0, 0)))
+
+
 def reach_of(kinds: Sequence[str], motors: np.ndarray | None = None) -> BristleReach:
     """Of joints of these kinds."""
     return BristleReach(np.array([BRISTLE_REACH[kind] for kind in kinds]), motors)

@@ -157,7 +157,7 @@ def _rate(pieces: Sequence[Trajectory]) -> float:
 
 
 def _windows(
-    pieces: Sequence[Trajectory], samples: int, most: int, used: Preprocessing, reach: BristleReach | None
+    pieces: Sequence[Trajectory], samples: int, most: int, used: Preprocessing, reach: BristleReach
 ) -> Windows:
     """About `most` windows, or all, evenly spread."""
     samples = min(samples, max(map(len, pieces)))

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 import torch
 
-from spelgen.dynamics.bristles import BristleReach, bristle_reach, reach_of
 from spelgen.fitting.calibration import CalibrationWindows
+from spelgen.dynamics.bristles import NO_BRISTLES, BristleReach, bristle_reach, reach_of
 from spelgen.fitting.fitted import Fit, load_run
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.logs.arm_mapping import GivenMapping
@@ -47,7 +47,7 @@ class Subject:
     preprocessing: Preprocessing | None = None
     window: int = WINDOW
     substeps: int = 1
-    reach: BristleReach | None = None
+    reach: BristleReach = NO_BRISTLES
     trained_on: frozenset[str] = frozenset()
     calibration: CalibrationWindows | None = None
 

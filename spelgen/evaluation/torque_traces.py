@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from spelgen.dynamics.bristles import bristles_along
+from spelgen.dynamics.bristles import BristleReach, bristles_along
 from spelgen.dynamics.protocol import known_past
 from spelgen.identification.samples import DENSE, FREQUENCY, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
@@ -25,7 +25,7 @@ def torque_trace(
     dynamics: Mapping[str, Any],
     pieces: Sequence[Trajectory],
     used: Preprocessing,
-    reach: np.ndarray,
+    reach: BristleReach,
 ) -> list[dict[str, Any]]:
     """Of the trajectory with the middle and the one with the largest torque error, by the model."""
     states = {x.name: state for x in pieces if (state := _states(x, used, reach)) is not None}
@@ -41,7 +41,7 @@ def torque_trace(
     return [_trace(which, name, model, dynamics, states[name]) for which, name in chosen.items()]
 
 
-def _states(piece: Trajectory, used: Preprocessing, reach: np.ndarray) -> State | None:
+def _states(piece: Trajectory, used: Preprocessing, reach: BristleReach) -> State | None:
     """t, q, qd, qdd, tau, z of up to ten seconds from the middle of what moves; the torque that acted at these times.
 
     Of a log too sparse for accelerations the differences from sample to sample, at the middle of each step.
@@ -56,7 +56,7 @@ def _states(piece: Trajectory, used: Preprocessing, reach: np.ndarray) -> State 
         columns = (np.arange(len(found.q)) / FREQUENCY, found.q, found.qd, found.qdd, found.tau, z)
     else:
         steps = np.diff(piece.t)[:, None]
-        z = bristles_along(piece.q, reach) if reach.size else np.zeros((*piece.q.shape, 0))
+        z = bristles_along(piece.q, reach) if reach.elements else np.zeros((*piece.q.shape, 0))
         q, qd, z = ((x[1:] + x[:-1]) / 2 for x in (piece.q, piece.qd, z))
         tau = (piece.tau[1:] + piece.tau[:-1]) / 2 if used.filtered else piece.tau[:-1]
         columns = ((piece.t[1:] + piece.t[:-1]) / 2, q, qd, np.diff(piece.qd, axis=0) / steps, tau, z)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from spelgen.dynamics.bristles import BristleReach
 from spelgen.dynamics.protocol import RigidDynamics
 from spelgen.evaluation.baselines import Predictor
 from spelgen.evaluation.names import MODEL
@@ -35,7 +36,7 @@ def traces(
     joint_types: Sequence[str],
     *,
     used: Preprocessing,
-    reach: np.ndarray,
+    reach: BristleReach,
     tip: Any = None,
 ) -> dict[str, Any]:
     """All curves. pieces: gap-free and filtered. steps: of the longest horizon, 0: none. tip: its position [m] by q.
@@ -61,7 +62,7 @@ def _predictions(
     joint_types: Sequence[str],
     used: Preprocessing,
     tip: Any,
-    reach: np.ndarray,
+    reach: BristleReach,
 ) -> dict[str, Any]:
     """How errors grow with the horizon, and the predictions of the middle and the largest error."""
     thin = max(1, int(max(piece.sample_rate for piece in pieces) / DENSEST))

@@ -39,7 +39,7 @@ class Model(nn.Module):
     Shapes: q, qd, qdd, tau and p are (..., n), with any leading dimensions. Units: rad and Nm for
     revolute joints, m and N for prismatic ones. M is positive definite and D positive semi-definite
     for all weights. What ``prepare`` gives as ``prepared`` saves work while the weights stay.
-    z, (..., n, 3), friction's memory, is how far its bristles are bent [rad, m]; None: they slide as qd goes.
+    z, (..., n, 4), friction's memory, is how far its bristles are bent [rad, m]; None: they slide as qd goes.
     """
 
     n = 3
@@ -82,9 +82,9 @@ class Model(nn.Module):
         self.dynamics = RigidBodyDynamics(
             joints,
             bodies,
-            gravity=(0.0, 0.0, -9.81),
-            input=DirectInput(joints),
-            reach=((0.0003, 0.003, 0.03), (3e-05, 0.0003, 0.003), (0.0003, 0.003, 0.03)),
+            (0.0, 0.0, -9.81),
+            DirectInput(joints),
+            reach=((0.0001, 0.001, 0.01, 0.1), (1e-05, 0.0001, 0.001, 0.01), (0.0001, 0.001, 0.01, 0.1)),
         )
         self.to(dtype)
 
@@ -363,11 +363,11 @@ class PortHamiltonian(nn.Module):
         """G, (..., n, n)."""
         raise NotImplementedError
 
-    def input_force(self, at: Any, tau: Tensor, prepared: Any) -> Tensor:
-        """G tau, (..., n) [Nm, N]."""
+    def input_force(self, at: Any, qd: Tensor, tau: Tensor, prepared: Any) -> Tensor:
+        """What the drives do at qd under the input tau: G tau, (..., n) [Nm, N]."""
         raise NotImplementedError
 
-    def input_torque(self, at: Any, force: Tensor, prepared: Any) -> Tensor:
+    def input_torque(self, at: Any, qd: Tensor, force: Tensor, prepared: Any) -> Tensor:
         """The tau, (..., n), that makes this force."""
         raise NotImplementedError
 
@@ -420,7 +420,7 @@ class PortHamiltonian(nn.Module):
         prepared = self.prepare()
         at = self.configuration(q, prepared)
         mass, residuals = self.mass_at(at, prepared)
-        force = self.input_force(at, tau, prepared)
+        force = self.input_force(at, qd, tau, prepared)
         force = force - self.nonlinear_at(at, qd, residuals, prepared)
         return solved(mass, force - self.friction_at(at, qd, prepared, z))
 
@@ -430,7 +430,7 @@ class PortHamiltonian(nn.Module):
         at = self.configuration(q, prepared)
         mass, residuals = self.mass_at(at, prepared)
         force = applied(mass, qdd) + self.nonlinear_at(at, qd, residuals, prepared)
-        return self.input_torque(at, force + self.friction_at(at, qd, prepared, z), prepared)
+        return self.input_torque(at, qd, force + self.friction_at(at, qd, prepared, z), prepared)
 
     def port_hamiltonian_rhs(
         self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Any, z: Tensor | None = None
@@ -441,7 +441,7 @@ class PortHamiltonian(nn.Module):
         qd = solved(mass, p)
         force = self.lagrangian_gradient(at, qd, residuals, prepared)
         force = force - self.friction_at(at, qd, prepared, z)
-        return qd, force if tau is None else force + self.input_force(at, tau, prepared)
+        return qd, force if tau is None else force + self.input_force(at, qd, tau, prepared)
 
     def state_rate(self, state: Tensor) -> Tensor:
         """The rate of (q, p, z), (..., 2 n + n K), or of (q, p, z, tau), where tau is held.
@@ -592,6 +592,19 @@ class InertialParameters(nn.Module):
         xy, xz, yz = tensor[:, 0, 1], tensor[:, 0, 2], tensor[:, 1, 2]
         six = torch.stack([xx, xy, xz, yy, yz, zz], dim=-1)
         return torch.cat([pseudo[:, 3, 3:], moments, six], dim=-1)
+
+
+def motor_speeds(gains: Tensor) -> Tensor:
+    """C, (n, n): the motors' speeds are C qd, where the joints' torques are ``gains`` times the motors'.
+
+    By the same power, each motor's in the units of the joint that it moves most: C is the identity where
+    each moves its own joint alone.
+    """
+    largest = gains.gather(0, gains.abs().argmax(dim=0, keepdim=True))
+    passive = largest == 0
+    return (gains / torch.where(passive, torch.ones_like(largest), largest)).mT + torch.diag(
+        passive[0].to(gains)
+    )
 
 
 class DirectInput(nn.Module):
@@ -773,7 +786,7 @@ class RigidPrepared(NamedTuple):
     """What depends on the weights alone, worked out once for many states."""
 
     inertia: Tensor  # spatial inertias on the diagonal, (6 bodies, 6 bodies)
-    armature: Tensor  # (n,)
+    armature: Tensor  # what the rotors add to M, (n, n)
     friction: FrictionConstants
     input: Tensor
 
@@ -806,6 +819,9 @@ class RigidBodyDynamics(PortHamiltonian):
     crossing: Tensor
     base: Tensor
     actuated: Tensor
+    motors: Tensor  # C: the drives' speeds are C qd, (n, n)
+    loads: Tensor  # its inverse
+    raw_friction_compensation: Tensor
 
     def __init__(
         self,
@@ -845,19 +861,28 @@ class RigidBodyDynamics(PortHamiltonian):
         self.armature = Armature(joints)
         self.friction = FrictionLaws(joints, reach)
         self.input: Any = input
+        gains = input(torch.zeros(self.n, dtype=torch.float64), input.prepare()).detach()
+        self.register_buffer("motors", motor_speeds(gains))
+        self.register_buffer("loads", torch.linalg.inv(self.motors))
         # of the measured torque, in units of the joints' usual friction
         self.raw_offset = nn.Parameter(torch.zeros(self.n, dtype=torch.float64))
+        # in units of usual friction at usual speed; no parameter: only a fit to torques may find one
+        self.register_buffer("raw_friction_compensation", torch.zeros(self.n, dtype=torch.float64))
 
     def torque_offset(self) -> Tensor:
         """What the measured torque shows without any, (n,) [Nm, N]."""
         return self.raw_offset * self.friction.nominal * self.actuated
+
+    def friction_compensation(self) -> Tensor:
+        """What the drives add by velocity, unseen in the measured torque, (n,) [Nm s/rad, N s/m]."""
+        return self.raw_friction_compensation * self.friction.nominal / self.friction.speed * self.actuated
 
     def prepare(self, definite: bool = True) -> RigidPrepared:
         """All that depends on the weights alone; holds until they change."""
         inertia = torch.tensordot(self.inertial_parameters(), self.basis, dims=1)
         return RigidPrepared(
             inertia=block_diagonal(inertia),
-            armature=self.armature(),
+            armature=self.motors.mT @ (self.armature().unsqueeze(-1) * self.motors),
             friction=self.friction.prepare(),
             input=self.input.prepare(),
         )
@@ -891,7 +916,7 @@ class RigidBodyDynamics(PortHamiltonian):
 
     def mass_at(self, at: Motion, prepared: RigidPrepared) -> tuple[Tensor, None]:
         """M(q), (..., n, n)."""
-        return (at.twists @ prepared.inertia) @ at.twists.mT + torch.diag(prepared.armature), None
+        return (at.twists @ prepared.inertia) @ at.twists.mT + prepared.armature, None
 
     def energy_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
         """V(q), (...) [J]; zero for a mass at the base's origin."""
@@ -977,41 +1002,44 @@ class RigidBodyDynamics(PortHamiltonian):
         return rows.reshape(*q.shape, 10 * len(self.parents))
 
     def friction_at(self, at: Motion, qd: Tensor, prepared: RigidPrepared, z: Tensor | None = None) -> Tensor:
-        """The friction torque, (..., n) [Nm, N]."""
-        torque: Tensor = self.friction(qd, at.gravity, prepared.friction, z)
-        return torque
+        """The friction torque C^T f(C qd), (..., n) [Nm, N]."""
+        torque: Tensor = self.friction(qd @ self.motors.mT, at.gravity @ self.loads, prepared.friction, z)
+        return torque @ self.motors
 
     def stored_energy(self, z: Tensor, prepared: RigidPrepared) -> Tensor:
         """What the bristles give back, (...) [J]."""
         return self.friction.stored_energy(z, prepared.friction)
 
     def memory(self, qd: Tensor) -> Tensor:
-        """z, (..., n, K), of joints that have long gone this way."""
-        return self.friction.sliding(qd)
+        """z, (..., n, K), of drives that have long gone this way."""
+        return self.friction.sliding(qd @ self.motors.mT)
 
     def memory_rate(self, qd: Tensor, z: Tensor) -> Tensor:
         """z', (..., n, K)."""
-        return self.friction.bristles.rate(qd, z)
+        return self.friction.bristles.rate(qd @ self.motors.mT, z)
 
     def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
         """z after joints went one way by (..., n), exactly."""
-        return self.friction.bristles.moved(z, displacement)
+        return self.friction.bristles.moved(z, displacement @ self.motors.mT)
 
     def dissipation_at(self, at: Motion, qd: Tensor, prepared: RigidPrepared) -> Tensor:
-        """D(q, qd), (..., n, n), diagonal."""
-        return torch.diag_embed(self.friction.resistance(qd, at.gravity, prepared.friction))
+        """D(q, qd), (..., n, n), diagonal where each drive moves its own joint alone."""
+        speeds, loads = qd @ self.motors.mT, at.gravity @ self.loads
+        resistance = self.friction.resistance(speeds, loads, prepared.friction)
+        return self.motors.mT @ (resistance.unsqueeze(-1) * self.motors)
 
     def input_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
         """G, (..., n, n)."""
         matrix: Tensor = self.input(at.gravity, prepared.input)
         return matrix
 
-    def input_force(self, at: Motion, tau: Tensor, prepared: RigidPrepared) -> Tensor:
-        """G (tau - torque offset), (..., n) [Nm, N]."""
+    def input_force(self, at: Motion, qd: Tensor, tau: Tensor, prepared: RigidPrepared) -> Tensor:
+        """G (tau - torque offset) + friction compensation qd, (..., n) [Nm, N]."""
         force: Tensor = self.input.force(at.gravity, tau - self.torque_offset(), prepared.input)
-        return force
+        return force + self.friction_compensation() * qd
 
-    def input_torque(self, at: Motion, force: Tensor, prepared: RigidPrepared) -> Tensor:
-        """The tau, (..., n), that makes this force."""
-        tau: Tensor = self.input.solve(at.gravity, force, prepared.input)
+    def input_torque(self, at: Motion, qd: Tensor, force: Tensor, prepared: RigidPrepared) -> Tensor:
+        """The tau, (..., n), that is measured while the drives make this force."""
+        shown = force - self.friction_compensation() * qd
+        tau: Tensor = self.input.solve(at.gravity, shown, prepared.input)
         return tau + self.torque_offset()

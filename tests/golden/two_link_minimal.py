@@ -436,11 +436,11 @@ class PortHamiltonian(nn.Module):
         """G, (..., n, n)."""
         raise NotImplementedError
 
-    def input_force(self, at: Any, tau: Tensor, prepared: Any) -> Tensor:
-        """G tau, (..., n) [Nm, N]."""
+    def input_force(self, at: Any, qd: Tensor, tau: Tensor, prepared: Any) -> Tensor:
+        """What the drives do at qd under the input tau: G tau, (..., n) [Nm, N]."""
         raise NotImplementedError
 
-    def input_torque(self, at: Any, force: Tensor, prepared: Any) -> Tensor:
+    def input_torque(self, at: Any, qd: Tensor, force: Tensor, prepared: Any) -> Tensor:
         """The tau, (..., n), that makes this force."""
         raise NotImplementedError
 
@@ -493,7 +493,7 @@ class PortHamiltonian(nn.Module):
         prepared = self.prepare()
         at = self.configuration(q, prepared)
         mass, residuals = self.mass_at(at, prepared)
-        force = self.input_force(at, tau, prepared)
+        force = self.input_force(at, qd, tau, prepared)
         force = force - self.nonlinear_at(at, qd, residuals, prepared)
         return solved(mass, force - self.friction_at(at, qd, prepared, z))
 
@@ -503,7 +503,7 @@ class PortHamiltonian(nn.Module):
         at = self.configuration(q, prepared)
         mass, residuals = self.mass_at(at, prepared)
         force = applied(mass, qdd) + self.nonlinear_at(at, qd, residuals, prepared)
-        return self.input_torque(at, force + self.friction_at(at, qd, prepared, z), prepared)
+        return self.input_torque(at, qd, force + self.friction_at(at, qd, prepared, z), prepared)
 
     def port_hamiltonian_rhs(
         self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Any, z: Tensor | None = None
@@ -514,7 +514,7 @@ class PortHamiltonian(nn.Module):
         qd = solved(mass, p)
         force = self.lagrangian_gradient(at, qd, residuals, prepared)
         force = force - self.friction_at(at, qd, prepared, z)
-        return qd, force if tau is None else force + self.input_force(at, tau, prepared)
+        return qd, force if tau is None else force + self.input_force(at, qd, tau, prepared)
 
     def state_rate(self, state: Tensor) -> Tensor:
         """The rate of (q, p, z), (..., 2 n + n K), or of (q, p, z, tau), where tau is held.
@@ -1298,12 +1298,12 @@ class NetworkDynamics(PortHamiltonian):
         matrix: Tensor = self.input(at.encoded, prepared.input)
         return matrix
 
-    def input_force(self, at: Configuration, tau: Tensor, prepared: NetworkPrepared) -> Tensor:
+    def input_force(self, at: Configuration, qd: Tensor, tau: Tensor, prepared: NetworkPrepared) -> Tensor:
         """G tau, (..., n) [Nm, N]."""
         force: Tensor = self.input.force(at.encoded, tau, prepared.input)
         return force
 
-    def input_torque(self, at: Configuration, force: Tensor, prepared: NetworkPrepared) -> Tensor:
+    def input_torque(self, at: Configuration, qd: Tensor, force: Tensor, prepared: NetworkPrepared) -> Tensor:
         """The tau, (..., n), that makes this force."""
         tau: Tensor = self.input.solve(at.encoded, force, prepared.input)
         return tau
