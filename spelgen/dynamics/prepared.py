@@ -67,7 +67,7 @@ class PreparedModel:
         mass, bias = self._mass_and_bias(at, qd)
         force = (mass @ qdd.unsqueeze(-1)).squeeze(-1) + bias
         force = force + self._friction(at, qd, z)
-        tau: Tensor = self._dynamics.input_torque(at, force, self._weights)
+        tau: Tensor = self._dynamics.input_torque(at, qd, force, self._weights)
         return tau
 
     def momentum(self, q: Tensor, qd: Tensor) -> Tensor:
@@ -79,7 +79,7 @@ class PreparedModel:
         at, weights = self._at(q), self._weights
         residuals = self._dynamics.mass_at(at, weights)[1]
         force: Tensor = self._dynamics.lagrangian_gradient(at, qd, residuals, weights)
-        return force + self._dynamics.input_force(at, tau, weights) - self._friction(at, qd, z)
+        return force + self._dynamics.input_force(at, qd, tau, weights) - self._friction(at, qd, z)
 
     def step(
         self, q: Tensor, qd: Tensor, tau: Tensor, dt: float, z: Tensor | None = None, *, substeps: int = 1
@@ -168,7 +168,7 @@ class PreparedModel:
     def _mass_and_force(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None) -> tuple[Tensor, Tensor]:
         at = self._at(q)
         mass, bias = self._mass_and_bias(at, qd)
-        force = self._dynamics.input_force(at, tau, self._weights) - bias
+        force = self._dynamics.input_force(at, qd, tau, self._weights) - bias
         return mass, force - self._friction(at, qd, z)
 
     def _differentiable(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
