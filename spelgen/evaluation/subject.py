@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 import torch
 
-from spelgen.fitting.calibration import CalibrationWindows
 from spelgen.dynamics.bristles import NO_BRISTLES, BristleReach, bristle_reach, reach_of
+from spelgen.fitting.calibration import CalibrationWindows
 from spelgen.fitting.fitted import Fit, load_run
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.logs.arm_mapping import GivenMapping

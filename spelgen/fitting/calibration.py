@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from spelgen.dynamics.bristles import bristles_along
+from spelgen.dynamics.bristles import BristleReach, bristles_along
 from spelgen.errors import RunError
 from spelgen.files import write_bytes
 from spelgen.logs.preprocessing import Preprocessing
@@ -116,7 +116,7 @@ def held_sources(trajectories: Iterable[Trajectory]) -> list[Source]:
 
 
 def calibration_windows(
-    sources: Sequence[Source], preprocessing: Preprocessing, reach: np.ndarray
+    sources: Sequence[Source], preprocessing: Preprocessing, reach: BristleReach
 ) -> CalibrationWindows | None:
     """About `MOST` windows, evenly spread over all samples; None: no recording is long enough.
 
@@ -145,7 +145,7 @@ def calibration_windows(
 
 
 def _cut(
-    source: Source, middles: np.ndarray, samples: int, preprocessing: Preprocessing, reach: np.ndarray
+    source: Source, middles: np.ndarray, samples: int, preprocessing: Preprocessing, reach: BristleReach
 ) -> Iterator[tuple[Windows, np.ndarray]]:
     """The windows about these samples, piece by piece, and of each the stretch that it is of."""
     span, measured = (samples - 1) * source.decimation, preprocessing.filtered

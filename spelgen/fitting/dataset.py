@@ -94,9 +94,9 @@ def prepare_data(
     )
 
 
-def known_reach(reach: np.ndarray | None, joint_types: Sequence[str]) -> np.ndarray:
+def known_reach(reach: BristleReach | None, joint_types: Sequence[str]) -> BristleReach:
     """That of a model's bristles (n, K) [rad, m]; the usual ones where it has none, for what it is compared with."""
-    return reach if reach is not None and reach.size else reach_of(joint_types)
+    return reach if reach is not None and reach.elements else reach_of(joint_types)
 
 
 def _split(trajectories: Sequence[Trajectory], validation: float | Sequence[Trajectory], seed: int) -> Split:
