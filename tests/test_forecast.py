@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from spelgen.dynamics.bristles import bristles_along
+from spelgen.dynamics.bristles import BristleReach, bristles_along
 from spelgen.emission.loading import load_module
 from spelgen.errors import RunError
 from spelgen.evaluation.baselines import Predictor, of_dynamics
@@ -29,7 +29,7 @@ STAND_IN = Path(__file__).with_name("stand_in.py")
 RATE = 100.0
 OFFSET = torch.tensor([0.6, -0.4], dtype=torch.float64)  # Nm that logs do not tell of
 HELD = Preprocessing(cutoff=0, decimation=1)
-REACH = np.full((2, 1), 0.01)
+REACH = BristleReach(np.full((2, 1), 0.01))
 
 
 def motions(count=4, seconds=3.0, seed=0, offset=0.0) -> list[Trajectory]:
