@@ -231,10 +231,10 @@ def test_windows_are_spread_evenly_and_stretches_of_time_share_no_recording(offs
 def test_samples_of_windows_are_not_denser_than_needed():
     t = np.arange(3001) / 1000
     dense = Trajectory(t, np.sin(t)[:, None], np.cos(t)[:, None], -np.sin(t)[:, None], "dense")
-    found = calibration_windows(held_sources([dense]), HELD, REACH[:1])
+    found = calibration_windows(held_sources([dense]), HELD, BristleReach(REACH.values[:1]))
     np.testing.assert_allclose(found.windows.dt, 0.01)
     assert found.past == 10
-    assert calibration_windows(held_sources([dense[:60]]), HELD, REACH[:1]) is None
+    assert calibration_windows(held_sources([dense[:60]]), HELD, BristleReach(REACH.values[:1])) is None
 
 
 def test_a_window_whose_numbers_blow_up_spoils_no_other(offset_logs):
