@@ -36,9 +36,8 @@ FACTS = r"""{"robot": "rpr", "urdf": "rpr.urdf",
 class Model(nn.Module):
     """The arm's dynamics: 3 rigid bodies with trained inertial parameters.
 
-    Shapes: q, qd, qdd, tau and p are (..., n), with any leading dimensions. Units: rad and Nm for
-    revolute joints, m and N for prismatic ones. M is positive definite and D positive semi-definite
-    for all weights. What ``prepare`` gives as ``prepared`` saves work while the weights stay.
+    q, qd, qdd, tau and p are (..., n), with any leading dimensions; rad and Nm, m and N if prismatic. For all
+    weights M is positive definite, D positive semi-definite; they stay while ``prepared`` of ``prepare`` is used.
     z, (..., n, 4), friction's memory, is how far its bristles are bent [rad, m]; None: they slide as qd goes.
     """
 

@@ -37,9 +37,8 @@ FACTS = r"""{"robot": "two_link", "urdf": "two_link.urdf",
 class Model(nn.Module):
     """The arm's dynamics: 1 learned function of q and 2 constants make the mass matrix.
 
-    Shapes: q, qd, qdd, tau and p are (..., n), with any leading dimensions. Units: rad and Nm for
-    revolute joints, m and N for prismatic ones. M is positive definite and D positive semi-definite
-    for all weights. What ``prepare`` gives as ``prepared`` saves work while the weights stay.
+    q, qd, qdd, tau and p are (..., n), with any leading dimensions; rad and Nm, m and N if prismatic. For all
+    weights M is positive definite, D positive semi-definite; they stay while ``prepared`` of ``prepare`` is used.
     """
 
     n = 2
