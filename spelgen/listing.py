@@ -17,6 +17,7 @@ WIDTH = 80
 SHORTEST = (
     8  # characters of a name in one line; a longer name goes on in the next where a table would be too wide
 )
+HEAD = 14  # likewise of a column's name
 
 
 @dataclass(frozen=True)
@@ -59,8 +60,16 @@ class Listing:
         from rich.table import Table
         from rich.text import Text
 
-        lines = [self.head, *self.rows]
-        widths = [max(cell_len(line[k]) for line in lines) for k in range(len(self.head))]
+        needed = [max((cell_len(row[k]) for row in self.rows), default=0) for k in range(len(self.head))]
+        head = self.head
+        if sum(2 + max(cell_len(name), width) for name, width in zip(head, needed, strict=True)) > WIDTH:
+            head = (
+                head[0],
+                *(_folded(x, max(HEAD, width)) for x, width in zip(head[1:], needed[1:], strict=True)),
+            )
+        named = [max(map(cell_len, name.split("\n"))) for name in head]
+        widths = [max(pair) for pair in zip(needed, named, strict=True)]
+        lines = [head, *self.rows]
         widths[0] = min(widths[0], SHORTEST)
         table = Table(box=None, show_header=False, padding=(0, 0, 0, 2))
         for k, width in enumerate(widths):
