@@ -26,7 +26,7 @@ from spelgen.pipeline import generate
 from spelgen.simulation.simulate import simulate
 
 URDF = Path(__file__).parents[1] / "robots" / "rpr.urdf"
-LONGEST = 1.0  # [s] from the first write of a process to its death
+LONGEST = 8.0  # [s] from the first write of a process to its death
 
 
 def main() -> None:
@@ -48,7 +48,8 @@ def main() -> None:
                 break
             done += done < kills
             if done == kills:
-                subprocess.run(_command(folder, run, kills, resume=True), check=True)
+                ready = (run / "config.json").exists()
+                subprocess.run(_command(folder, run, kills, resume=ready), check=True)
                 break
         whole, broken = (RunFolder(x).load_state(x / "model.pt") for x in (folder / "whole", run))
         same = all(torch.equal(whole[key], broken[key]) for key in whole)
@@ -71,7 +72,7 @@ def _command(folder: Path, run: Path, kills: int, *, resume: bool) -> list[str]:
         "--robot",
         str(URDF),
     ]
-    start = ["--resume"] if resume else [str(folder / "module.py")]
+    start = [str(folder / "module.py"), *(["--resume"] if resume else [])]
     options = options[:4] if resume else options
     return [sys.executable, "-m", "spelgen", "train", *start, "--data", str(folder), "-o", str(run), *options]
 
