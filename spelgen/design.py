@@ -29,7 +29,8 @@ class Design:
 
     derived: by the arm's structure. dense: as if nothing were known of the arm (Wang et al., Sci Rep
     15:33179, 2025, and Duong et al., IEEE T-RO 40:3695, 2024), over all three axes of each joint where it
-    says 3n. closed-form: that of rigid bodies with trained inertial parameters. constants: friction's laws with
+    says 3n. closed-form: that of rigid bodies with trained inertial parameters, and networks for
+    what those leave, if any. constants: friction's laws with
     trained constants. Raises SettingsError for a combination that stands for no model.
     """
 
@@ -39,9 +40,8 @@ class Design:
     input: Literal["derived", "dense-3n"]
     memory: Literal["bristles", "none"]
     """Whether friction remembers the way a joint came."""
-    fourier: Literal["derived", "none"]
-    """Whether networks add to the Fourier series that a rigid arm's functions are, where those are short."""
     net: Literal["mlp", "kan", "none"]
+    """What networks are made of: those that M and V are, or that stand beside rigid bodies."""
     encoding: Literal["joint", "lie-group", "none"]
     """What a network reads: cos q and sin q or scaled q of the joints it depends on, or the nine or three
     numbers of every joint's R or r.
@@ -120,14 +120,11 @@ def _conflicts(values: Mapping[str, str]) -> Iterator[tuple[str, str, str]]:
         yield "mass", "dissipation", "dissipation: constants goes with mass: closed-form, and with it alone"
     if values["memory"] == "bristles" and not rigid:
         yield "memory", "dissipation", "bristles go with dissipation: constants"
-    for key in ("net", "encoding"):
-        if rigid != (values[key] == "none"):
-            yield (
-                "mass",
-                key,
-                f"{key}: none goes with mass: closed-form, which has no networks, and with it alone",
-            )
+    if values["net"] == "none" and not rigid:
+        yield "mass", "net", "net: none goes with mass: closed-form alone"
+    if (values["net"] == "none") != (values["encoding"] == "none"):
+        yield "net", "encoding", "encoding says what networks read: none where there are none"
+    if rigid and values["encoding"] == "lie-group":
+        yield "mass", "encoding", "what stands beside rigid bodies reads single joints: encoding: joint"
     if rigid and values["input"] != "derived":
-        yield "mass", "input", "input: derived goes with mass: closed-form, which has no networks"
-    if values["fourier"] == "derived" and "derived" not in (values["mass"], values["potential"]):
-        yield "fourier", "mass", "fourier: derived needs mass: derived or potential: derived"
+        yield "mass", "input", "input: derived goes with mass: closed-form"

@@ -24,9 +24,6 @@ Kind = Literal["zero", "constant", "varying"]
 Entries = tuple[tuple[int, int, float], ...]
 """A sparse symmetric matrix by its lower triangle: (row, column, value), 0-based."""
 
-Terms = tuple[tuple[int, float, float], ...]
-"""A Fourier series: (place in ModelSpec.fourier, factor of the cosine, factor of the sine), to start from."""
-
 _FACTS_WIDTH = 100
 _FOREIGN = (
     SyntaxError, ValueError, KeyError, TypeError, StopIteration, AttributeError, RecursionError, MemoryError,
@@ -101,9 +98,6 @@ class OutputSpec:
     basis: Entries
     mean: float
     scale: float
-    offset: float | None = None
-    series: Terms = ()
-    """With an offset: f(q) = offset + its Fourier series + a part of the network."""
 
 
 @dataclass(frozen=True)
@@ -135,10 +129,6 @@ class ModelSpec:
     margin: float
     """The least eigenvalue of M, relative to the nominal mean M, that is left as it is."""
     started_from_urdf: bool
-    fourier: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...] = ()
-    """(frequencies, powers), by joint, of x^powers cos(frequencies q) and x^powers sin(frequencies q)."""
-    potential_series: Terms | None = None
-    """The Fourier series of V, beside a part of the network; None: of the network alone."""
     bodies: tuple[BodySpec, ...] = ()
     """Of a closed-form model."""
     inputs: tuple[tuple[int, int, float, bool], ...] = ()

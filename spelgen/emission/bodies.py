@@ -11,6 +11,7 @@ from spelgen.arm.rational import Vector
 from spelgen.spec import BodySpec, Triple
 from spelgen.structure.pseudo_inertia import parameters_of, reference_factor
 
+_DIGITS = 10  # of inertial parameters: more than any URDF is known to
 _LIGHT = 0.01  # of the heaviest body's mass: a body that is said to weigh nothing
 
 
@@ -33,7 +34,7 @@ def body_specs(arm: Arm, inertias: Sequence[Sequence[float]]) -> tuple[BodySpec,
 
 
 def _possible(arm: Arm, index: int, ten: Sequence[float], heaviest: float) -> tuple[float, ...]:
-    values = np.array([float(x) for x in ten])
+    values = np.array([float(f"{float(x):.{_DIGITS}g}") for x in ten])
     if values[0] <= 0:
         values = _light_ball(_reach(arm, index), _LIGHT * heaviest)
     factor, possible = reference_factor(values)

@@ -16,22 +16,28 @@ def title(spec: ModelSpec) -> str:
 
 def class_summary(spec: ModelSpec) -> str:
     """What the model consists of, in a line."""
-    bodies = len(spec.bodies)
-    made = f"{bodies} rigid bod{'ies' if bodies > 1 else 'y'} with trained inertial parameters"
-    return f"The arm's dynamics: {made if bodies else _count(spec)}."
+    beside = ", and networks for what they leave" if _residual(spec) else ""
+    return f"The arm's dynamics: {_bodies(spec) if spec.bodies else _count(spec)}{beside}."
+
+
+def _bodies(spec: ModelSpec) -> str:
+    count = len(spec.bodies)
+    return f"{count} rigid bod{'ies' if count > 1 else 'y'} with trained inertial parameters"
 
 
 def _count(spec: ModelSpec) -> str:
     if spec.bodies:
-        return f"{len(spec.bodies)} bodies with trained inertial parameters make mass matrix and potential energy"
+        return _bodies(spec)
     if spec.design.mass == "dense-3n":
         rows = 3 * len(spec.joints)
         return f"{rows * (rows + 1) // 2} learned functions of q make M^-1 over all axes"
+    return f"{_functions(spec)} make the mass matrix"
+
+
+def _functions(spec: ModelSpec) -> str:
     outputs, constants = len(spec.outputs), len(spec.constants)
-    return (
-        f"{outputs} learned function{'s' * (outputs != 1)} of q and {constants} constant{'s' * (constants != 1)} "
-        "make the mass matrix"
-    )
+    functions = f"{outputs} learned function{'s' * (outputs != 1)} of q"
+    return f"{functions} and {constants} constant{'s' * (constants != 1)}"
 
 
 def summary(spec: ModelSpec) -> str:
@@ -46,13 +52,13 @@ def summary(spec: ModelSpec) -> str:
         if spec.started_from_urdf
         else "The URDF's inertials are missing or impossible: sizes and starting values are those of 1 kg links."
     )
-    parts = ["M"] * any(x.offset is not None for x in spec.outputs) + ["V"] * bool(spec.potential_series)
-    sums = (
-        f"\n{' and '.join(parts)}: Fourier series with trained coefficients, and a part for a network."
-        if parts
-        else ""
-    )
-    return f"{_count(spec)[0].upper()}{_count(spec)[1:]}.\n{potential}{sums}\n{start}"
+    beside = f";\nnetworks for what they leave: {_functions(spec)} in M" if _residual(spec) else ""
+    return f"{_count(spec)[0].upper()}{_count(spec)[1:]}{beside}.\n{potential}\n{start}"
+
+
+def _residual(spec: ModelSpec) -> bool:
+    """Whether networks stand beside rigid bodies."""
+    return bool(spec.bodies) and spec.design.net != "none"
 
 
 def picture(spec: ModelSpec) -> str:

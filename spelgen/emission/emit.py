@@ -28,6 +28,7 @@ def emit(spec: ModelSpec) -> str:
         setup=tailored.setup(spec),
         mass_entries=tailored.mass_entries(spec),
         values=_values(spec),
+        typed=bool(spec.bodies),
     )
     imports, runtime = bundle(model)
     return render(
@@ -53,7 +54,7 @@ def _values(spec: ModelSpec) -> list[Value]:
         ]
         ten = "By body (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) about its joint's frame, (bodies, 10)."
         return [
-            ("inertial_parameters", ten, f"{dynamics}.inertial_parameters()"),
+            ("inertial_parameters", ten, f"{dynamics}.inertial_parameters.forward()"),
             *_armature(dynamics),
             *friction,
             (
@@ -73,7 +74,11 @@ def _values(spec: ModelSpec) -> list[Value]:
 
 def _armature(owner: str) -> list[Value]:
     return [
-        ("armature", "What the drives add to M's diagonal, (n,) [kg m^2, kg].", f"{owner}.armature()"),
+        (
+            "armature",
+            "What the drives add to M's diagonal, (n,) [kg m^2, kg].",
+            f"{owner}.armature.forward()",
+        ),
         (
             "rotor_inertia",
             "The drives' inertia before the gear, (n,) [kg m^2, kg].",
@@ -85,5 +90,4 @@ def _armature(owner: str) -> list[Value]:
 _FRICTION = (
     ("viscous", "Friction torque by velocity", "[Nm s/rad, N s/m]"),
     ("coulomb", "Dry friction", "[Nm, N]"),
-    ("stribeck", "Dry friction that only slow motion has", "[Nm, N]"),
 )

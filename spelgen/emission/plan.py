@@ -14,7 +14,6 @@ from spelgen.emission.bodies import body_specs
 from spelgen.settings.joint import JointSettings
 from spelgen.spec import ConstantSpec, Entries, JointSpec, ModelSpec, Options, OutputSpec
 from spelgen.structure.basis import Weights
-from spelgen.structure.fourier import NO_SERIES, fourier_expansion
 from spelgen.structure.nominal import Nominal, nominal, nominal_inertias, working_range
 from spelgen.structure.structure import Structure
 
@@ -46,7 +45,6 @@ def plan_model(
     everything = tuple(range(len(arm.coordinates)))
     sizes = nominal(arm, structure)
     inertias = nominal_inertias(arm, sizes.from_urdf)
-    series = fourier_expansion(arm, structure, inertias) if design.fourier == "derived" else NO_SERIES
     identifiers = _identifiers([coordinate.name for coordinate in arm.coordinates])
     x, y, z = (float(g) for g in arm.gravity)
     return ModelSpec(
@@ -67,14 +65,9 @@ def plan_model(
                 _floats(output.basis),
                 center,
                 scale,
-                *((function.offset, function.terms) if function else ()),
             )
-            for output, center, scale, function in zip(
-                structure.outputs,
-                sizes.output_means,
-                sizes.output_scales,
-                series.outputs or [None] * len(structure.outputs),
-                strict=True,
+            for output, center, scale in zip(
+                structure.outputs, sizes.output_means, sizes.output_scales, strict=True
             )
         ),
         constants=tuple(
@@ -87,8 +80,6 @@ def plan_model(
         potential_scale=sizes.potential_scale,
         margin=float(f"{max(_MARGIN * sizes.least_eigenvalue, 1e-4):.0e}"),
         started_from_urdf=sizes.from_urdf,
-        fourier=tuple((term.frequencies, term.powers) for term in series.terms),
-        potential_series=series.potential.terms if series.potential and structure.potential else None,
         bodies=body_specs(arm, inertias) if design.mass == "closed-form" else (),
         inputs=()
         if actuation.direct

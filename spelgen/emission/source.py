@@ -34,18 +34,34 @@ def assignment(target: str, value: object, indent: int = 0) -> str:
     return " " * indent + laid_out(f"{target} = ", value, indent)
 
 
-def laid_out(start: str, value: object, indent: int = 0, end: str = "") -> str:
-    """``start``, ``value`` and ``end`` on one line, or with an item of the value a line."""
-    flat = start + _flat(value) + end
+def laid_out(start: str, value: object, indent: int = 0) -> str:
+    """``start`` and ``value`` as a formatter lays them out, where that takes three lines at most; else densely, for
+    numbers are read by the row, and marked for the formatter to leave alone.
+    """
+    inner = " " * (indent + 4)
+    flat = start + _flat(value)
     if indent + len(flat) <= WIDTH or not _items(value) or _alike(value):
         return flat
-    inner = " " * (indent + 4)
+    if isinstance(value, Call):
+        body = inner + ", ".join(key + _flat(item) for key, item in _items(value))
+        if len(body) <= WIDTH:
+            return "\n".join([f"{start}{value.callee}(", body, " " * indent + ")"])
+    return f"{_dense(start, value, indent)}  # fmt: skip"
+
+
+def _dense(start: str, value: object, indent: int) -> str:
+    """``start`` and ``value``, whose items share lines where they fit."""
     opening, closing = (f"{value.callee}(", ")") if isinstance(value, Call) else ("(", ")")
-    body = inner + ", ".join(key + _flat(item) for key, item in _items(value))
-    if isinstance(value, Call) and len(body) <= WIDTH:
-        return "\n".join([start + opening, body, " " * indent + closing + end])
-    lines = [inner + laid_out(key, item, indent + 4, ",") for key, item in _items(value)]
-    return "\n".join([start + opening, *lines, " " * indent + closing + end])
+    inner = " " * (indent + 4)
+    lines = [start + opening, inner]
+    for key, item in _items(value):
+        text = f"{key}{_flat(item)},"
+        if len(inner + text) > WIDTH and _items(item) and not _alike(item):
+            text = f"{_dense(key, item, indent + 4)},"
+        if lines[-1] != inner and ("\n" in text or "\n" in lines[-1] or len(lines[-1]) + len(text) >= WIDTH):
+            lines.append(inner)
+        lines[-1] += text if lines[-1] == inner else f" {text}"
+    return "\n".join([*lines, " " * indent + closing])
 
 
 def _items(value: object) -> list[tuple[str, object]]:

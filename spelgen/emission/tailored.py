@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from itertools import groupby
 from textwrap import wrap
 
 from spelgen.design import BRISTLE_REACH
 from spelgen.emission.source import WIDTH, Call, Code, assignment, call, laid_out
 from spelgen.labels import entry_name, joint_ranges
-from spelgen.spec import ModelSpec, Terms
+from spelgen.spec import ModelSpec
 
 _LEAST_UNITS = 4
 _LEAST_KAN_UNITS = 2
@@ -32,7 +33,7 @@ def setup(spec: ModelSpec) -> str:
 
 def mass_entries(spec: ModelSpec) -> str:
     """The statements that give M from its functions f and constants c; empty where M is not made of them."""
-    if spec.design.mass != "derived":
+    if spec.design.mass != "derived" and (not spec.bodies or spec.design.net == "none"):
         return ""
     cells: defaultdict[tuple[int, int], list[tuple[float, str]]] = defaultdict(list)
     functions, constants = [each.basis for each in spec.outputs], [each.basis for each in spec.constants]
@@ -138,16 +139,38 @@ def _rigid_bodies(spec: ModelSpec) -> list[str]:
         inertia=tuple(tuple(body.reference[k] for k in (4, 7, 9)) for body in spec.bodies),
         products=tuple(tuple(body.reference[k] for k in (5, 6, 8)) for body in spec.bodies),
     )
+    made: list[tuple[str, object]] = [("bodies", bodies)]
+    parts: list[object] = [Code("joints"), Code("bodies"), spec.gravity, _input(spec)]
+    kind = "RigidBodyDynamics"
+    if spec.design.net != "none":
+        kind = "ResidualDynamics"
+        made += _residuals(spec)
+        parts += [Code("mass"), Code("potential") if spec.potential else None]
     reach = tuple(BRISTLE_REACH[x.kind] for x in spec.joints)
-    made = call(
-        "RigidBodyDynamics",
-        Code("joints"),
-        Code("bodies"),
-        spec.gravity,
-        _input(spec),
-        **({"reach": reach} if spec.design.memory == "bristles" else {}),
-    )
-    return [assignment("bodies", bodies, _INDENT), assignment("self.dynamics", made, _INDENT)]
+    remembers = {"reach": reach} if spec.design.memory == "bristles" else {}
+    made.append(("self.dynamics", call(kind, *parts, **remembers)))
+    return [assignment(name, value, _INDENT) for name, value in made]
+
+
+def _residuals(spec: ModelSpec) -> list[tuple[str, object]]:
+    """What stands beside rigid bodies, in the order in which it draws its random weights."""
+    made: list[tuple[str, object]] = [("generator", Code("torch.Generator().manual_seed(seed)"))]
+    network: object = None
+    if spec.outputs:
+        made += [
+            ("functions", _grouped([each.joints for each in spec.outputs])),
+            ("network", _mass_network(spec, Code("functions"))),
+        ]
+        network = Code("network")
+    sizes = len(spec.outputs), len(spec.constants)
+    mass = call("ResidualMass", Code("joints"), Code("self.mass_entries"), *sizes, network)
+    return [*made, ("mass", mass), *_potential(spec)]
+
+
+def _grouped(rows: Sequence[tuple[int, ...]]) -> Code:
+    """The tuple of these rows, of which those that are alike stand together."""
+    groups = [(row, len([*alike])) for row, alike in groupby(rows)]
+    return Code(" + ".join(f"({row!r},)" + f" * {count}" * (count > 1) for row, count in groups))
 
 
 def _networks(spec: ModelSpec) -> list[str]:
@@ -156,77 +179,46 @@ def _networks(spec: ModelSpec) -> list[str]:
         ("generator", Code("torch.Generator().manual_seed(seed)")),
         ("encoding", Code("JointEncoding(joints)")),
     ]
-    series = []
-    if _mass_series(spec):
-        made.append(("functions", _functions(spec)))
-        series.append(Code("*(function.series for function in functions)"))
-    if spec.potential_series:
-        made.append(("potential_series", _terms(spec, spec.potential_series)))
-        series.append(Code("potential_series"))
-    if series:
-        items = ", ".join(each.text for each in series)
-        made.append(("fourier", call("FourierFeatures", Code("joints"), Code(f"[{items}]"))))
     made += [*_mass(spec), *_potential(spec), ("friction", _friction(spec))]
     parts: list[object] = [Code(name) for name in ("encoding", "mass", "potential", "friction")]
     if not spec.potential:
         parts[2] = None
     parts.append(_input(spec))
-    made.append(("self.dynamics", call("NetworkDynamics", *parts, *([Code("fourier")] if series else []))))
+    made.append(("self.dynamics", call("NetworkDynamics", *parts)))
     return [assignment(name, value, _INDENT) for name, value in made]
 
 
-def _mass_series(spec: ModelSpec) -> bool:
-    return spec.design.mass == "derived" and any(output.offset is not None for output in spec.outputs)
-
-
-def _functions(spec: ModelSpec) -> tuple[Call, ...]:
-    return tuple(
-        call(
-            "MassFunction",
-            each.joints,
-            mean=each.mean,
-            scale=each.scale,
-            **({} if each.offset is None else {"offset": each.offset, "series": _terms(spec, each.series)}),
-        )
-        for each in spec.outputs
-    )
-
-
-def _terms(spec: ModelSpec, series: Terms) -> tuple[Call, ...]:
-    prismatic = any(joint.kind == "prismatic" for joint in spec.joints)
-    return tuple(
-        call("Term", spec.fourier[place][0], spec.fourier[place][1] if prismatic else (), cos, sin)
-        for place, cos, sin in series
-    )
-
-
 def _mass(spec: ModelSpec) -> list[tuple[str, object]]:
-    sensitivity = tuple(joint.mass_sensitivity for joint in spec.joints)
-    group = spec.design.encoding == "lie-group"
-    everything = tuple(range(len(spec.joints)))
     if spec.design.mass == "dense-3n":
+        sensitivity = tuple(joint.mass_sensitivity for joint in spec.joints)
         rows = 3 * len(spec.joints)
         outputs = Code(f"[range({len(spec.joints)})] * {rows * (rows + 1) // 2}")
-        network = _network(spec, outputs, everything, sensitivity)
+        network = _network(spec, outputs, tuple(range(len(spec.joints))), sensitivity)
         made = call("DenseMass", Code("joints"), mean=mean_mass(spec), network=network)
         return [("mass", made)]
     constants = tuple((each.start, each.scale) for each in spec.constants)
     if not spec.outputs:
         return [("mass", call("ConstantMass", Code("joints"), Code("self.mass_entries"), constants))]
-    series = _mass_series(spec)
-    outputs = Code("[function.joints for function in functions]")
-    least = _LEAST_UNITS if spec.design.net == "mlp" else _LEAST_KAN_UNITS
-    read = everything if group else tuple(sorted({joint for each in spec.outputs for joint in each.joints}))
-    network = _network(spec, outputs, read, Code("sensitivity"), series=series, least=least)
+    functions = tuple(
+        call("MassFunction", each.joints, mean=each.mean, scale=each.scale) for each in spec.outputs
+    )
     parts = [Code(name) for name in ("joints", "self.mass_entries", "functions", "constants", "network")]
-    more = {"fourier": Code("fourier"), "sensitivity": Code("sensitivity")} if series else {}
     return [
-        *([] if series else [("functions", _functions(spec))]),
+        ("functions", functions),
         ("constants", constants),
-        ("sensitivity", sensitivity),
-        ("network", network),
-        ("mass", call("DerivedMass", *parts, spec.margin, **more)),
+        ("network", _mass_network(spec, Code("[function.joints for function in functions]"))),
+        ("mass", call("DerivedMass", *parts, spec.margin)),
     ]
+
+
+def _mass_network(spec: ModelSpec, outputs: Code) -> Call:
+    """The network of M's functions, which reads the joints that they depend on."""
+    least = _LEAST_UNITS if spec.design.net == "mlp" else _LEAST_KAN_UNITS
+    read = tuple(sorted({joint for each in spec.outputs for joint in each.joints}))
+    if spec.design.encoding == "lie-group":
+        read = tuple(range(len(spec.joints)))
+    sensitivity = tuple(joint.mass_sensitivity for joint in spec.joints)
+    return _network(spec, outputs, read, sensitivity, least=least)
 
 
 def _potential(spec: ModelSpec) -> list[tuple[str, object]]:
@@ -234,13 +226,9 @@ def _potential(spec: ModelSpec) -> list[tuple[str, object]]:
         return []
     sensitivity = tuple(joint.potential_sensitivity for joint in spec.joints)
     width = max(_LEAST_UNITS, round(_POTENTIAL_FRACTION * units(spec)))
-    series = bool(spec.potential_series)
-    network = _network(
-        spec, (spec.potential,), spec.potential, Code("sensitivity"), series=series, width=width
-    )
-    more = [Code("fourier"), Code("potential_series"), Code("sensitivity")] if series else []
-    made = call("LearnedPotential", spec.potential_scale, Code("network"), *more)
-    return [("sensitivity", sensitivity), ("network", network), ("potential", made)]
+    network = _network(spec, (spec.potential,), spec.potential, sensitivity, width=width)
+    made = call("LearnedPotential", spec.potential_scale, Code("network"))
+    return [("network", network), ("potential", made)]
 
 
 def _network(
@@ -250,7 +238,6 @@ def _network(
     sensitivity: object,
     *,
     axes: int = 0,
-    series: bool = False,
     width: int | None = None,
     least: int | None = None,
 ) -> Call:
@@ -263,8 +250,7 @@ def _network(
         inputs = call("with_velocities", inputs, Code("joints"), axes)
     size = {"width": width or units(spec), "depth": spec.options.depth} | ({"least": least} if least else {})
     kind = "MaskedMLP" if spec.design.net == "mlp" else "MaskedKAN"
-    fraction = [Code("NETWORK_FRACTION")] if series else []
-    return call(kind, inputs, call("unit_joints", outputs, **size), _SEED, *fraction)
+    return call(kind, inputs, call("unit_joints", outputs, **size), _SEED)
 
 
 def _friction(spec: ModelSpec) -> Call:

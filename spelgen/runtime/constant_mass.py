@@ -8,7 +8,6 @@ import torch
 from torch import Tensor, nn
 
 from spelgen.runtime.armature import Armature
-from spelgen.runtime.configuration import Configuration
 from spelgen.runtime.joints import Joints, vector
 from spelgen.runtime.symmetric import Entries, entry_basis
 
@@ -41,14 +40,14 @@ class ConstantMass(nn.Module):
         rows = self.constants() @ self.constant_basis
         return rows.reshape(self.n, self.n) + torch.diag(self.armature())
 
-    def forward(self, at: Configuration, prepared: Tensor) -> tuple[Tensor, None]:
+    def forward(self, encoded: Tensor, prepared: Tensor) -> tuple[Tensor, None]:
         """M, for each state."""
-        return prepared.expand(*at.encoded.shape[:-1], self.n, self.n), None
+        return prepared.expand(*encoded.shape[:-1], self.n, self.n), None
 
-    def kinetic_vjp(self, at: Configuration, qd: Tensor, residuals: None) -> tuple[Tensor, None]:
+    def kinetic_vjp(self, encoded: Tensor, qd: Tensor, residuals: None) -> Tensor:
         """The derivative of 1/2 qd^T M qd by the encoding: zero."""
-        return torch.zeros_like(at.encoded), None
+        return torch.zeros_like(encoded)
 
-    def jvp(self, rate: Configuration, residuals: None) -> Tensor:
+    def jvp(self, rate: Tensor, residuals: None) -> Tensor:
         """dM/dt, (..., n, n): zero."""
-        return rate.encoded.new_zeros(*rate.encoded.shape[:-1], self.n, self.n)
+        return rate.new_zeros(*rate.shape[:-1], self.n, self.n)

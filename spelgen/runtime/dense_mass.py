@@ -10,7 +10,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from spelgen.runtime.configuration import Configuration
 from spelgen.runtime.joints import Joints, vector
 from spelgen.runtime.network import Network
 
@@ -72,9 +71,9 @@ class DenseMass(nn.Module):
         """The network's weights made ready for many states."""
         return self.network.prepare(torch.diag(0 * self.start + 1), self.start)
 
-    def inverse(self, at: Configuration, prepared: Any) -> Tensor:
+    def inverse(self, encoded: Tensor, prepared: Any) -> Tensor:
         """M^-1 over all three axes of every joint, of which z moves; (..., 3 n, 3 n)."""
-        factor, scale = self._factor(self.network(at.encoded, prepared)[0])
+        factor, scale = self._factor(self.network(encoded, prepared)[0])
         lower = self.nominal @ (factor + torch.eye(self.size).to(factor))
         return (lower * scale.unsqueeze(-2)) @ lower.mT
 
@@ -94,15 +93,15 @@ class DenseMass(nn.Module):
         solution: Tensor = torch.linalg.solve_triangular(factor, right, upper=upper, unitriangular=True)
         return solution
 
-    def forward(self, at: Configuration, prepared: Any) -> tuple[Tensor, DenseResiduals]:
+    def forward(self, encoded: Tensor, prepared: Any) -> tuple[Tensor, DenseResiduals]:
         """M(q), and what its derivatives need."""
-        raw, residuals = self.network(at.encoded, prepared)
+        raw, residuals = self.network(encoded, prepared)
         factor, scale = self._factor(raw)
         moved = self._unit_solved(factor, self.moving)
         mass = moved.mT @ (moved / scale.unsqueeze(-1))
         return mass, DenseResiduals(residuals, factor, moved, scale)
 
-    def kinetic_vjp(self, at: Configuration, qd: Tensor, residuals: DenseResiduals) -> tuple[Tensor, None]:
+    def kinetic_vjp(self, encoded: Tensor, qd: Tensor, residuals: DenseResiduals) -> Tensor:
         """The derivative of 1/2 qd^T M(q) qd by the encoding."""
         _, factor, moved, scale = residuals
         speed = moved @ qd.unsqueeze(-1)
@@ -111,12 +110,12 @@ class DenseMass(nn.Module):
         by_entry = by_factor.flatten(-2).index_select(-1, self.below)
         by_scale = 0.5 * momentum.squeeze(-1) ** 2 * torch.expm1(-scale)
         cotangent = torch.cat([by_entry, by_scale], dim=-1)
-        return self.network.vjp(residuals.network, cotangent), None
+        return self.network.vjp(residuals.network, cotangent)
 
-    def jvp(self, rate: Configuration, residuals: DenseResiduals) -> Tensor:
-        """dM/dt, (..., n, n), where the configuration changes at this rate."""
+    def jvp(self, rate: Tensor, residuals: DenseResiduals) -> Tensor:
+        """dM/dt, (..., n, n), where the encoding changes at this rate."""
         _, factor, moved, scale = residuals
-        pushed = self.network.jvp(residuals.network, rate.encoded)
+        pushed = self.network.jvp(residuals.network, rate)
         entries, raw_rate = pushed.tensor_split((len(self.below),), dim=-1)
         turned = self._unit_solved(factor, self._lower(entries) @ moved)
         by_factor = moved.mT @ (turned / scale.unsqueeze(-1))

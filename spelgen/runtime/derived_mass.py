@@ -6,38 +6,27 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from spelgen.runtime.armature import Armature
-from spelgen.runtime.configuration import Configuration
-from spelgen.runtime.fourier import FourierFeatures, FourierSeries, Term
 from spelgen.runtime.joints import Joints, vector
 from spelgen.runtime.network import Network
 from spelgen.runtime.regularisation import PositiveDefiniteBound
 from spelgen.runtime.symmetric import Entries, entry_basis
 
-NETWORK_FRACTION = 0.1  # how much of a function that is a Fourier series is left to its network
-
 
 class MassFunction(NamedTuple):
-    """A learned function f of some joints: mean + scale * network.
-
-    With a ``series``, f = offset + Fourier series + NETWORK_FRACTION * scale * network.
-    """
+    """A learned function f of some joints: mean + scale * network."""
 
     joints: tuple[int, ...]
     mean: float  # over the workspace, with nominal inertias
     scale: float
-    offset: float = 0.0
-    series: tuple[Term, ...] = ()
 
 
 class MassPrepared(NamedTuple):
     """What depends on the weights alone."""
 
     layers: Any  # of the network
-    series: Tensor | None  # takes Fourier features to M
     definite: bool  # whether M is kept positive definite
 
 
@@ -45,7 +34,6 @@ class MassResiduals(NamedTuple):
     """What M's derivatives need of the work done for M."""
 
     network: Any
-    series: Tensor | None
     part: Tensor  # of the functions' changes that M takes, see PositiveDefiniteBound
 
 
@@ -71,8 +59,6 @@ class DerivedMass(nn.Module):
         constants: Sequence[tuple[float, float]],
         network: Network,
         margin: float,
-        fourier: FourierFeatures | None = None,
-        sensitivity: Sequence[float] = (),
     ) -> None:
         super().__init__()
         self.n = joints.n
@@ -87,12 +73,6 @@ class DerivedMass(nn.Module):
         self.bound = PositiveDefiniteBound(self._square(mean), margin)
         self.raw_constants = nn.Parameter(start / self.constant_scale)
         self.network = network
-        self.series: FourierSeries | None = None
-        if fourier is not None:
-            scales = [each.scale for each in functions]
-            self.series = FourierSeries(fourier, [each.series for each in functions], scales, sensitivity)
-            levels = vector((each.offset - each.mean) / each.scale for each in functions)
-            network.set_output_bias(levels)
         self.armature = Armature(joints)
 
     def constants(self) -> Tensor:
@@ -105,39 +85,28 @@ class DerivedMass(nn.Module):
         constant = self.constants() @ self.constant_basis
         constant = constant + self.function_mean @ self.function_basis + armature.flatten()
         output_map = (self.function_scale.unsqueeze(-1) * self.function_basis).mT
-        return MassPrepared(
-            layers=self.network.prepare(output_map, constant),
-            series=None if self.series is None else self.series.prepare(output_map),
-            definite=definite,
-        )
+        return MassPrepared(self.network.prepare(output_map, constant), definite)
 
     def _square(self, rows: Tensor) -> Tensor:
         """(..., n n) as (..., n, n)."""
         return rows.reshape(*rows.shape[:-1], self.n, self.n)
 
-    def forward(self, at: Configuration, prepared: MassPrepared) -> tuple[Tensor, MassResiduals]:
+    def forward(self, encoded: Tensor, prepared: MassPrepared) -> tuple[Tensor, MassResiduals]:
         """M(q), and what its derivatives need."""
-        rows, residuals = self.network(at.encoded, prepared.layers)
-        if at.fourier is not None and prepared.series is not None:
-            rows = rows + F.linear(at.fourier, prepared.series)
+        rows, residuals = self.network(encoded, prepared.layers)
         mass = self._square(rows)
         part = torch.ones_like(mass[..., 0, 0])
         if prepared.definite:
             mass, part = self.bound(mass)
-        return mass, MassResiduals(residuals, prepared.series, part)
+        return mass, MassResiduals(residuals, part)
 
-    def kinetic_vjp(
-        self, at: Configuration, qd: Tensor, residuals: MassResiduals
-    ) -> tuple[Tensor, Tensor | None]:
-        """The derivative of 1/2 qd^T M(q) qd by the encoding, and by the Fourier features."""
+    def kinetic_vjp(self, encoded: Tensor, qd: Tensor, residuals: MassResiduals) -> Tensor:
+        """The derivative of 1/2 qd^T M(q) qd by the encoding."""
         half = 0.5 * residuals.part.unsqueeze(-1) * qd
         weight = (half.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2)
-        by_series = None if residuals.series is None else weight @ residuals.series
-        return self.network.vjp(residuals.network, weight), by_series
+        return self.network.vjp(residuals.network, weight)
 
-    def jvp(self, rate: Configuration, residuals: MassResiduals) -> Tensor:
-        """dM/dt, (..., n, n), where the configuration changes at this rate."""
-        rows = self.network.jvp(residuals.network, rate.encoded)
-        if rate.fourier is not None and residuals.series is not None:
-            rows = rows + F.linear(rate.fourier, residuals.series)
+    def jvp(self, rate: Tensor, residuals: MassResiduals) -> Tensor:
+        """dM/dt, (..., n, n), where the encoding changes at this rate."""
+        rows = self.network.jvp(residuals.network, rate)
         return residuals.part[..., None, None] * self._square(rows)

@@ -40,8 +40,7 @@ class MaskedKAN(nn.Module):
     2404.19756). It starts nearly straight, with a random slope: few samples do not smooth what
     starts wavy. tanh keeps what a layer hands on within the grid. ``layers`` names, unit by unit,
     the joints that each layer's units may read; edges between others are masked, so that a unit
-    has no path to a joint it must not depend on. ``output_fraction`` scales what the last layer
-    gives, but for its biases.
+    has no path to a joint it must not depend on.
     """
 
     matrix: Tensor
@@ -53,7 +52,6 @@ class MaskedKAN(nn.Module):
         inputs: NetworkInput,
         layers: Sequence[Sequence[frozenset[int]]],
         generator: torch.Generator,
-        output_fraction: float = 1.0,
     ) -> None:
         super().__init__()
         grid = torch.linspace(-1, 1, GRID, dtype=torch.float64)
@@ -73,15 +71,10 @@ class MaskedKAN(nn.Module):
             slope = torch.randn(mask.shape, dtype=torch.float64, generator=generator)
             self.weights.append(nn.Parameter(slope * grid / mask.sum(dim=1, keepdim=True).sqrt()))
             mask = mask * inputs.sensitivity.unsqueeze(-1) if index == 0 else mask
-            last = index == len(layers) - 1
-            self.register_buffer(f"mask{index}", mask * output_fraction if last else mask)
+            self.register_buffer(f"mask{index}", mask)
             self.biases.append(nn.Parameter(torch.zeros(len(units), dtype=torch.float64)))
             below = list(units)
-        nn.init.zeros_(self.weights[-1])  # so that the model starts at its nominal values
-
-    def set_output_bias(self, values: Tensor) -> None:
-        """Start the outputs from these values."""
-        self.biases[-1].data = values
+        nn.init.zeros_(self.weights[-1])  # so that nothing is learned yet
 
     def prepare(self, output_map: Tensor, offset: Tensor) -> KANLayers:
         """The weights for the encoding as it is, and for offset + output_map y in place of y."""

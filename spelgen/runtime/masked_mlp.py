@@ -33,7 +33,6 @@ class MaskedMLP(nn.Module):
 
     ``layers`` names, unit by unit, the joints that each layer's units may read; weights between
     others are masked, so that a unit has no path to a joint it must not depend on.
-    ``output_fraction`` scales what the last layer gives, but for its biases.
     """
 
     matrix: Tensor
@@ -44,7 +43,6 @@ class MaskedMLP(nn.Module):
         inputs: NetworkInput,
         layers: Sequence[Sequence[frozenset[int]]],
         generator: torch.Generator,
-        output_fraction: float = 1.0,
     ) -> None:
         super().__init__()
         self.register_buffer("matrix", inputs.matrix)
@@ -58,15 +56,10 @@ class MaskedMLP(nn.Module):
             weight = torch.randn(mask.shape, dtype=torch.float64, generator=generator)
             self.weights.append(nn.Parameter(weight / mask.sum(dim=1, keepdim=True).sqrt()))
             mask = mask * inputs.sensitivity if index == 0 else mask
-            last = index == len(layers) - 1
-            self.register_buffer(f"mask{index}", mask * output_fraction if last else mask)
+            self.register_buffer(f"mask{index}", mask)
             self.biases.append(nn.Parameter(torch.zeros(len(units), dtype=torch.float64)))
             below = list(units)
-        nn.init.zeros_(self.weights[-1])  # so that the model starts at its nominal values
-
-    def set_output_bias(self, values: Tensor) -> None:
-        """Start the outputs from these values."""
-        self.biases[-1].data = values
+        nn.init.zeros_(self.weights[-1])  # so that nothing is learned yet
 
     def prepare(self, output_map: Tensor, offset: Tensor) -> MLPLayers:
         """The weights for the encoding as it is, and for offset + output_map y in place of y.

@@ -24,9 +24,6 @@ class Network(Protocol):
     def jvp(self, residuals: Any, tangent: Tensor) -> Tensor:
         """d/d encoded times the encoding's tangent, (..., rows)."""
 
-    def set_output_bias(self, values: Tensor) -> None:
-        """Start the outputs from these values."""
-
 
 def unit_joints(
     outputs: Sequence[Sequence[int]], width: int, depth: int, least: int = 1

@@ -6,8 +6,6 @@ from typing import Any, Protocol
 
 from torch import Tensor
 
-from spelgen.runtime.configuration import Configuration
-
 
 class Mass(Protocol):
     """What gives M(q) and its derivatives."""
@@ -15,14 +13,14 @@ class Mass(Protocol):
     def prepare(self, definite: bool = True) -> Any:
         """All that depends on the weights alone; ``definite``: keep M positive definite."""
 
-    def __call__(self, at: Configuration, prepared: Any) -> tuple[Tensor, Any]:
+    def __call__(self, encoded: Tensor, prepared: Any) -> tuple[Tensor, Any]:
         """M(q), (..., n, n), and what its derivatives need."""
 
-    def kinetic_vjp(self, at: Configuration, qd: Tensor, residuals: Any) -> tuple[Tensor, Tensor | None]:
-        """The derivative of 1/2 qd^T M(q) qd by the encoding, and by the Fourier features."""
+    def kinetic_vjp(self, encoded: Tensor, qd: Tensor, residuals: Any) -> Tensor:
+        """The derivative of 1/2 qd^T M(q) qd by the encoding."""
 
-    def jvp(self, rate: Configuration, residuals: Any) -> Tensor:
-        """dM/dt, (..., n, n), where the configuration changes at this rate."""
+    def jvp(self, rate: Tensor, residuals: Any) -> Tensor:
+        """dM/dt, (..., n, n), where the encoding changes at this rate."""
 
 
 class Friction(Protocol):

@@ -1,62 +1,35 @@
-"""V(q): a network, beside a Fourier series where one is short."""
+"""V(q) of a network."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from spelgen.runtime.configuration import Configuration
-from spelgen.runtime.fourier import FourierFeatures, FourierSeries, Term
 from spelgen.runtime.network import Network
 
 
-class PotentialPrepared(NamedTuple):
-    """What depends on the weights alone."""
-
-    layers: Any  # of the network
-    energy: Tensor | None  # takes Fourier features to V, (2 K,)
-    gradient: Tensor | None  # and to dV/dq, (2 K, n)
-
-
 class LearnedPotential(nn.Module):
-    """V(q) [J], of one network and, with ``series``, one Fourier series, both in units of ``scale``."""
+    """V(q) [J], of one network, in units of ``scale``."""
 
     scale: Tensor
 
-    def __init__(
-        self,
-        scale: float,
-        network: Network,
-        fourier: FourierFeatures | None = None,
-        series: Sequence[Term] = (),
-        sensitivity: Sequence[float] = (),
-    ) -> None:
+    def __init__(self, scale: float, network: Network) -> None:
         super().__init__()
         self.register_buffer("scale", torch.full((1, 1), scale, dtype=torch.float64))
-        self.network, self.fourier = network, fourier
-        self.series: FourierSeries | None = None
-        if fourier is not None:
-            self.series = FourierSeries(fourier, [series], [scale], sensitivity)
+        self.network = network
 
-    def prepare(self) -> PotentialPrepared:
+    def prepare(self) -> Any:
         """All that depends on the weights alone."""
-        layers = self.network.prepare(self.scale, 0 * self.scale[0])
-        if self.series is None or self.fourier is None:
-            return PotentialPrepared(layers, None, None)
-        energy = self.series.prepare(self.scale)[0]
-        return PotentialPrepared(layers, energy, self.fourier.gradient_map(energy))
+        return self.network.prepare(self.scale, 0 * self.scale[0])
 
-    def forward(self, at: Configuration, prepared: PotentialPrepared) -> Tensor:
+    def forward(self, encoded: Tensor, prepared: Any) -> Tensor:
         """V(q), (...) [J]."""
-        energy: Tensor = self.network(at.encoded, prepared.layers)[0].squeeze(-1)
-        if at.fourier is None or prepared.energy is None:
-            return energy
-        return energy + at.fourier @ prepared.energy
+        energy: Tensor = self.network(encoded, prepared)[0].squeeze(-1)
+        return energy
 
-    def network_vjp(self, at: Configuration, prepared: PotentialPrepared) -> Tensor:
-        """The derivative of the network's part of V by the encoding."""
-        _, residuals = self.network(at.encoded, prepared.layers)
-        return self.network.vjp(residuals, at.encoded.new_ones(1))
+    def vjp(self, encoded: Tensor, prepared: Any) -> Tensor:
+        """The derivative of V by the encoding."""
+        _, residuals = self.network(encoded, prepared)
+        return self.network.vjp(residuals, encoded.new_ones(1))

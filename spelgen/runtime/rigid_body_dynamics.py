@@ -31,6 +31,7 @@ class RigidPrepared(NamedTuple):
     armature: Tensor  # what the rotors add to M, (n, n)
     friction: FrictionConstants
     input: Tensor
+    residual: Any = None  # of what a model has beside rigid bodies
 
 
 class Motion(NamedTuple):
@@ -39,7 +40,8 @@ class Motion(NamedTuple):
     terms: Tensor  # cos and sin of a body's angle, or its displacement and 0, (..., bodies, 2)
     twists: Tensor  # by joint velocity, (..., n, 6 bodies)
     weight: Tensor  # acceleration that stands for gravity, (..., 6 bodies)
-    gravity: Tensor  # dV/dq, (..., n)
+    gravity: Tensor  # dV/dq of the bodies, (..., n)
+    q: Tensor
 
 
 class RigidBodyDynamics(PortHamiltonian):
@@ -147,7 +149,7 @@ class RigidBodyDynamics(PortHamiltonian):
             below = rows.expand(*q.shape[:-1], -1, -1) if parent < 0 else moved[parent]
             moved.append(self._carried(self.forth[index], below, terms[..., index, :]) + own[:, index])
         columns = torch.cat(moved, dim=-1)
-        return Motion(terms, columns[..., :-1, :], columns[..., -1, :], torch.zeros_like(q))
+        return Motion(terms, columns[..., :-1, :], columns[..., -1, :], torch.zeros_like(q), q)
 
     @staticmethod
     def _carried(table: Tensor, rows: Tensor, terms: Tensor) -> Tensor:

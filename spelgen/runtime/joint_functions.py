@@ -1,0 +1,73 @@
+"""What each joint adds by itself, by its position alone: springs, cables, gear ripple, friction that varies."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from spelgen.runtime.joints import Joints, vector
+
+SPLINES = 34  # over the range of a joint
+HARMONICS = 40  # of a turn: teeth and motor poles make ripple that comes again
+
+
+class JointFunctions(nn.Module):
+    """By joint a torque t(q) = dV/dq, its energy V(q), and a factor on friction, from q of that joint alone.
+
+    t is a sum of cubic B-splines over the joint's range and, of a revolute joint, of harmonics of its turn;
+    the factor is the exponential of such a spline. Splines vanish where the range ends, so that nothing
+    is added where nothing was seen. Weights are zero at first; torques are in units of usual friction.
+    """
+
+    scale: Tensor
+    center: Tensor
+    spacing: Tensor
+    revolute: Tensor
+    knots: Tensor
+    harmonics: Tensor
+
+    def __init__(self, joints: Joints) -> None:
+        super().__init__()
+        n = joints.n
+        self.register_buffer("scale", vector(joints.friction))
+        self.register_buffer("center", vector(joints.center))
+        self.register_buffer("spacing", 2 * vector(joints.reach) / (SPLINES - 3))
+        self.register_buffer("revolute", vector(float(each) for each in joints.revolute))
+        self.register_buffer("knots", torch.arange(SPLINES).double() - (SPLINES - 1) / 2)
+        self.register_buffer("harmonics", torch.arange(1, HARMONICS + 1).double())
+        self.raw_torque_splines = nn.Parameter(torch.zeros(n, SPLINES, dtype=torch.float64))
+        self.raw_torque_ripple = nn.Parameter(torch.zeros(n, 2 * HARMONICS, dtype=torch.float64))
+        self.raw_friction_splines = nn.Parameter(torch.zeros(n, SPLINES, dtype=torch.float64))
+
+    def splines(self, q: Tensor) -> Tensor:
+        """The cubic B-splines at q, (..., n, SPLINES), each 2/3 high."""
+        away = self._places(q).abs()
+        return ((2 - away).relu() ** 3 - 4 * (1 - away).relu() ** 3) / 6
+
+    def ripple(self, q: Tensor) -> Tensor:
+        """cos(k q), then sin(k q), (..., n, 2 HARMONICS); zero for a prismatic joint."""
+        phase = q.unsqueeze(-1) * self.harmonics
+        return torch.cat([phase.cos(), phase.sin()], dim=-1) * self.revolute.unsqueeze(-1)
+
+    def torque(self, q: Tensor) -> Tensor:
+        """dV/dq, (..., n) [Nm, N]."""
+        smooth = (self.splines(q) * self.raw_torque_splines).sum(dim=-1)
+        return self.scale * (smooth + (self.ripple(q) * self.raw_torque_ripple).sum(dim=-1))
+
+    def energy(self, q: Tensor) -> Tensor:
+        """V, (...) [J]; of what ends where the range does, half on either side."""
+        place = self._places(q)
+        away = place.abs()
+        part = 0.5 - (2 - away).relu() ** 4 / 24 + (1 - away).relu() ** 4 / 6
+        smooth = self.spacing * (place.sign() * part * self.raw_torque_splines).sum(dim=-1)
+        by_cos, by_sin = (self.ripple(q) / self.harmonics.repeat(2)).chunk(2, dim=-1)
+        turned = torch.cat([by_sin, -by_cos], dim=-1)
+        return (self.scale * (smooth + (turned * self.raw_torque_ripple).sum(dim=-1))).sum(dim=-1)
+
+    def friction_factor(self, q: Tensor) -> Tensor:
+        """How much more friction there is at q than elsewhere, (..., n), positive."""
+        return (self.splines(q) * self.raw_friction_splines).sum(dim=-1).exp()
+
+    def _places(self, q: Tensor) -> Tensor:
+        """How far q is from each spline's middle, in spacings, (..., n, SPLINES)."""
+        return ((q - self.center) / self.spacing).unsqueeze(-1) - self.knots

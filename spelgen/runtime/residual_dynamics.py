@@ -1,0 +1,115 @@
+"""Rigid bodies, and what logs show beside them: functions of single joints, and networks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from spelgen.runtime.encoding import JointEncoding
+from spelgen.runtime.joint_functions import JointFunctions
+from spelgen.runtime.joints import Joints
+from spelgen.runtime.parts import Input
+from spelgen.runtime.port_hamiltonian import applied
+from spelgen.runtime.potential import LearnedPotential
+from spelgen.runtime.residual_mass import ResidualMass
+from spelgen.runtime.rigid_body import Bodies
+from spelgen.runtime.rigid_body_dynamics import Motion, RigidBodyDynamics, RigidPrepared
+
+
+class ResidualPrepared(NamedTuple):
+    """What depends on the weights of the networks alone."""
+
+    mass: Any
+    potential: Any
+
+
+class ResidualDynamics(RigidBodyDynamics):
+    """Rigid bodies with residuals in M, V and friction; with all their weights zero they are the bodies alone.
+
+    M = that of bodies and drives + R(q), positive definite for all weights (see ``ResidualMass``).
+    V = that of bodies + a network's + each joint's own. Friction is multiplied by a positive factor.
+    """
+
+    def __init__(
+        self,
+        joints: Joints,
+        bodies: Bodies,
+        gravity: tuple[float, float, float],
+        input: Input,
+        mass: ResidualMass,
+        potential: LearnedPotential | None,
+        reach: Sequence[Sequence[float]] = (),
+    ) -> None:
+        super().__init__(joints, bodies, gravity, input, reach)
+        self.encoding = JointEncoding(joints)
+        self.joint_functions = JointFunctions(joints)
+        self.residual_mass = mass
+        self.residual_potential = potential
+
+    def prepare(self, definite: bool = True) -> RigidPrepared:
+        """All that depends on the weights alone; holds until they change."""
+        prepared = super().prepare(definite)
+        potential = None if self.residual_potential is None else self.residual_potential.prepare()
+        mass = self.residual_mass.prepare(prepared.armature)
+        return prepared._replace(residual=ResidualPrepared(mass, potential))
+
+    def mass_at(self, at: Motion, prepared: RigidPrepared) -> tuple[Tensor, Any]:
+        """M(q), (..., n, n), and what its derivatives need."""
+        encoded = self.encoding(at.q)
+        more, residuals = self.residual_mass(encoded, prepared.residual.mass)
+        return super().mass_at(at, prepared)[0] + more, (encoded, residuals)
+
+    def energy_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
+        """V(q), (...) [J]."""
+        energy = super().energy_at(at, prepared) + self.joint_functions.energy(at.q)
+        if self.residual_potential is None:
+            return energy
+        more: Tensor = self.residual_potential(self.encoding(at.q), prepared.residual.potential)
+        return energy + more
+
+    def gravity_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
+        """dV/dq, (..., n) [Nm, N]."""
+        gradient = at.gravity + self.joint_functions.torque(at.q)
+        if self.residual_potential is None:
+            return gradient
+        encoded = self.encoding(at.q)
+        by_encoded = self.residual_potential.vjp(encoded, prepared.residual.potential)
+        more: Tensor = self.encoding.vjp(encoded, by_encoded)
+        return gradient + more
+
+    def lagrangian_gradient(self, at: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
+        """d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
+        return super().lagrangian_gradient(at, qd, None, prepared) + self._residual_gradient(
+            at, qd, residuals, prepared
+        )
+
+    def nonlinear_at(self, at: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
+        """The torque that holds qd steady without friction, (..., n)."""
+        encoded, network = residuals
+        rate = self.residual_mass.jvp(self.encoding.jvp(encoded, qd), network)
+        gradient = self._residual_gradient(at, qd, residuals, prepared)
+        return super().nonlinear_at(at, qd, None, prepared) + applied(rate, qd) - gradient
+
+    def _residual_gradient(self, at: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
+        """d/dq of what the residuals add to 1/2 qd^T M(q) qd - V(q), (..., n)."""
+        encoded, network = residuals
+        by_encoded = self.residual_mass.kinetic_vjp(encoded, qd, network)
+        if self.residual_potential is not None:
+            by_encoded = by_encoded - self.residual_potential.vjp(encoded, prepared.residual.potential)
+        gradient: Tensor = self.encoding.vjp(encoded, by_encoded)
+        return gradient - self.joint_functions.torque(at.q)
+
+    def friction_at(self, at: Motion, qd: Tensor, prepared: RigidPrepared, z: Tensor | None = None) -> Tensor:
+        """The friction torque C^T (factor f(C qd)), (..., n) [Nm, N]."""
+        torque: Tensor = self.friction(qd @ self.motors.mT, at.gravity @ self.loads, prepared.friction, z)
+        return (self.joint_functions.friction_factor(at.q) * torque) @ self.motors
+
+    def dissipation_at(self, at: Motion, qd: Tensor, prepared: RigidPrepared) -> Tensor:
+        """D(q, qd), (..., n, n), diagonal where each drive moves its own joint alone."""
+        speeds, loads = qd @ self.motors.mT, at.gravity @ self.loads
+        resistance = self.friction.resistance(speeds, loads, prepared.friction)
+        resistance = self.joint_functions.friction_factor(at.q) * resistance
+        return self.motors.mT @ (resistance.unsqueeze(-1) * self.motors)

@@ -1,0 +1,92 @@
+"""What M(q) has beside rigid bodies, by the fewest functions and constants."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from spelgen.runtime.joints import Joints
+from spelgen.runtime.network import Network
+from spelgen.runtime.symmetric import Entries, entry_basis
+
+PART = 0.9  # of the drives' inertia, which the residual may take away at most
+NEVER = 1e30  # how large a function may be by an entry where it does not stand
+
+
+class ResidualMassPrepared(NamedTuple):
+    """What depends on the weights alone."""
+
+    layers: Any  # of the network
+    functions: Tensor  # what each function adds to M at its largest, (functions, n n)
+    constant: Tensor  # what the constants add, (n n,)
+
+
+class ResidualMass(nn.Module):
+    """R(q), (..., n, n), with ``entries`` saying where functions and constants stand.
+
+    Each is its bound times the tanh of a network's output, or of a weight: the bounds are such that
+    ``armature`` + R is positive definite for all q and all weights (see ``bounds``).
+    """
+
+    basis: Tensor  # (functions + constants, n, n)
+    inverse: Tensor  # one by |basis|, NEVER where that is zero
+
+    def __init__(
+        self, joints: Joints, entries: Entries, functions: int, constants: int, network: Network | None
+    ) -> None:
+        super().__init__()
+        n = self.n = joints.n
+        basis = torch.cat(entry_basis(entries, functions, constants)).reshape(-1, n, n)
+        stands = basis != 0
+        self.register_buffer("basis", basis)
+        self.register_buffer("inverse", torch.where(stands, 1 / basis.abs(), NEVER))
+        self.part = PART / float(stands.sum(dim=(0, 2)).max())  # of all that meet in a row of M
+        self.functions, self.network = functions, network
+        self.raw_constants = nn.Parameter(torch.zeros(constants, dtype=torch.float64))
+
+    def bounds(self, armature: Tensor) -> Tensor:
+        """How large each function and constant may be, beside an armature matrix, (n, n).
+
+        armature - diag(d) is positive semi-definite for d = 1 / (row sums of |armature^-1|), and so is
+        diag(d) - R where no row of |R| / sqrt(d d^T) adds up to more than one: by diagonal dominance both.
+        """
+        root = torch.linalg.inv(armature).abs().sum(dim=-1).rsqrt()
+        pairs = root.unsqueeze(-1) * root
+        return self.part * (pairs * self.inverse).amin(dim=(-2, -1))
+
+    def prepare(self, armature: Tensor) -> ResidualMassPrepared:
+        """All that depends on the weights alone."""
+        rows = self.bounds(armature).unsqueeze(-1) * self.basis.flatten(1)
+        functions, constants = rows.tensor_split((self.functions,))
+        layers = None
+        if self.network is not None:
+            identity = torch.eye(self.functions, dtype=rows.dtype, device=rows.device)
+            layers = self.network.prepare(identity, rows.new_zeros(self.functions))
+        return ResidualMassPrepared(layers, functions, self.raw_constants.tanh() @ constants)
+
+    def forward(self, encoded: Tensor, prepared: ResidualMassPrepared) -> tuple[Tensor, Any]:
+        """R(q), and what its derivatives need."""
+        if self.network is None:
+            return prepared.constant.expand(*encoded.shape[:-1], -1).unflatten(-1, (self.n, self.n)), None
+        y, residuals = self.network(encoded, prepared.layers)
+        height = y.tanh()
+        rows = prepared.constant + height @ prepared.functions
+        return rows.unflatten(-1, (self.n, self.n)), (residuals, 1 - height * height, prepared.functions)
+
+    def kinetic_vjp(self, encoded: Tensor, qd: Tensor, residuals: Any) -> Tensor:
+        """The derivative of 1/2 qd^T R(q) qd by the encoding."""
+        if self.network is None:
+            return torch.zeros_like(encoded)
+        network, slope, functions = residuals
+        weight = 0.5 * (qd.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2)
+        return self.network.vjp(network, slope * (weight @ functions.mT))
+
+    def jvp(self, rate: Tensor, residuals: Any) -> Tensor:
+        """dR/dt, (..., n, n), where the encoding changes at this rate."""
+        if self.network is None:
+            return rate.new_zeros(*rate.shape[:-1], self.n, self.n)
+        network, slope, functions = residuals
+        rows = (slope * self.network.jvp(network, rate)) @ functions
+        return rows.unflatten(-1, (self.n, self.n))
