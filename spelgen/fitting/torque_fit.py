@@ -1,4 +1,4 @@
-"""Fit a closed-form model to torques: its most probable weights, by Gauss-Newton steps (Levenberg-Marquardt).
+"""Fit rigid bodies to torques: their most probable weights, by Gauss-Newton steps (Levenberg-Marquardt).
 
 The torque is linear in the bodies' parameters, which the log-Cholesky weights make possible ones, and smooth in the
 few constants of each joint: seconds are enough, and no step size is to be chosen. What is minimised is
@@ -7,7 +7,8 @@ few constants of each joint: seconds are enough, and no step size is to be chose
 
 with the covariance of a Gaussian prior (see ``covariance``). The noise of a joint is what is left of its torque, found
 in rounds, and so is how far the start is to be believed (see ``most_probable``). Sums over samples are made block by
-block, so that memory does not grow with the logs.
+block, so that memory does not grow with the logs. What a model has beside rigid bodies is fitted to what these leave, where it
+pays (see ``residual_fit``), and then both in turn.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import torch
 
 from spelgen.fitting.config import GaussianPrior
 from spelgen.fitting.gaussian_prior import covariance, most_probable
+from spelgen.fitting.residual_fit import Residual, enter, refine
 from spelgen.fitting.torque_jacobian import COMPENSATION, TorqueJacobian
 from spelgen.fitting.torque_samples import TorqueSamples
 from spelgen.identification.samples import DynamicsSamples
@@ -39,6 +41,7 @@ SIGNIFICANT = 4.0  # by so many standard deviations
 STEPS = 5  # at most in a round
 LARGE = 2**15  # samples; of more, FEW of them are fitted first
 FEW, LAST_ROUNDS = 2**14, 2
+TURNS = 3  # of rigid bodies and what stands beside them, where something does
 GAIN = 1e-4  # relative: a step that gains less ends a round
 NO_GAIN = 1e-10  # likewise: a step that promises less is not tried
 FIRST_NOISE = 0.1  # of a joint's torque range
@@ -54,7 +57,7 @@ class TorqueSolution:
 
     residual: (n,) root mean square of the torque that is missed [Nm, N]. prior: as the fit found it. covariance: of the
     weights after the fit (K, K), zero for those that did not move. compensated: (n,) joints whose drives add torque
-    that is not measured.
+    that is not measured. residuals: what entered beside rigid bodies.
     """
 
     residual: np.ndarray
@@ -63,6 +66,7 @@ class TorqueSolution:
     prior: GaussianPrior
     covariance: torch.Tensor
     compensated: np.ndarray
+    residuals: tuple[Residual, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +102,19 @@ def fit_torque(
     few = samples.thinned(FEW) if large else samples
     problem = _Problem(TorqueJacobian(model, few), prior or GaussianPrior(), only_bodies)
     at, noise = problem.solve(*problem.near(), ROUNDS - FIRST_ROUNDS)
+    residuals: list[Residual] = []
+    if only_bodies is None and hasattr(model.dynamics, "joint_functions"):
+        alike = max(1.0, ALIKE * few.count / samples.count)
+        problem.jacobian.write(at.x)
+        residuals = enter(model, problem.jacobian.left(at.x), alike)
+        for _ in range(TURNS if residuals else 0):
+            problem.take(TorqueJacobian(model, few))
+            at = replace(at, squares=problem.jacobian.squares(at.x))
+            at, noise = problem.solve(at, problem.noise(at.squares), LAST_ROUNDS)
+            problem.jacobian.write(at.x)
+            refine(model, problem.jacobian.left(at.x), residuals, alike)
+        problem.take(TorqueJacobian(model, few))
+        at = replace(at, squares=problem.jacobian.squares(at.x))
     if large:  # few of many samples came near, all of them finish
         problem.take(TorqueJacobian(model, samples))
         at, _ = problem.solve(replace(at, squares=problem.jacobian.squares(at.x)), noise, LAST_ROUNDS)
@@ -109,6 +126,7 @@ def fit_torque(
         prior=problem.prior,
         covariance=problem.covariance,
         compensated=problem.compensated.numpy(),
+        residuals=tuple(residuals),
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch.func import functional_call, jacfwd, jvp, vmap
@@ -18,6 +18,7 @@ BLOCK = 2**13  # samples at a time: of seven joints some 100 MB with their deriv
 HELD = 2e8  # bytes of regressors up to which they are kept from pass to pass
 BODIES = "dynamics.inertial_parameters.raw"
 COMPENSATION = "dynamics.raw_friction_compensation"
+RESIDUALS = ("dynamics.joint_functions.", "dynamics.residual_")  # what stands beside rigid bodies
 
 Weights = Mapping[str, torch.Tensor]
 
@@ -25,7 +26,7 @@ Weights = Mapping[str, torch.Tensor]
 @dataclass(frozen=True, eq=False)
 class _Samples:
     """Samples (T, n) with the drives' speeds, and the regressors (T, n, 10 B) of torque and of the gravity torque that
-    the drives bear.
+    the drives bear. residual: (T, n) torque of what stands beside rigid bodies. factor: (T, n) on friction.
     """
 
     qd: torch.Tensor
@@ -35,6 +36,18 @@ class _Samples:
     speed: torch.Tensor
     regressor: torch.Tensor
     load_regressor: torch.Tensor
+    residual: torch.Tensor
+    factor: torch.Tensor
+
+
+class Left(NamedTuple):
+    """Samples (T, n) with the torque that is missing, and friction's at the drives."""
+
+    q: torch.Tensor
+    qd: torch.Tensor
+    qdd: torch.Tensor
+    missing: torch.Tensor
+    friction: torch.Tensor
 
 
 class Asked(torch.nn.Module):
@@ -48,17 +61,24 @@ class Asked(torch.nn.Module):
         return question(self.model)
 
 
+def rigid_weights(model: Any) -> dict[str, torch.Tensor]:
+    """The parameters of bodies, drives and friction laws: all but those of residuals."""
+    named = model.named_parameters()
+    return {name: x.detach() for name, x in named if not name.startswith(RESIDUALS)}
+
+
 class TorqueJacobian:
-    """Of a closed-form ``model`` on ``samples``; x is all weights (K,), flattened one after the other."""
+    """Of a model of rigid bodies on ``samples``; x is all their weights (K,), flattened one after the other.
+
+    Residuals are taken as they are when this is made.
+    """
 
     def __init__(self, model: EmittedModel, samples: TorqueSamples) -> None:
         self.model: Any = model
         self.samples = samples
         self._asked = Asked(model)
         compensation = {COMPENSATION: model.get_buffer(COMPENSATION)}
-        self.weights = {
-            x: y.detach().clone() for x, y in {**dict(model.named_parameters()), **compensation}.items()
-        }
+        self.weights = {x: y.detach().clone() for x, y in {**rigid_weights(model), **compensation}.items()}
         self.start = torch.cat([x.flatten() for x in self.weights.values()])
         numbers = 2 * samples.count * samples.joints * self.weights[BODIES].numel()
         self._directions, self._direction, self._moved = self._by_joint()
@@ -82,6 +102,17 @@ class TorqueJacobian:
             curvature += slope.mT @ slope
             target += slope.mT @ (self._missing(weights, block).detach() / noise).flatten()
         return curvature, target
+
+    def left(self, x: torch.Tensor) -> Left:
+        """What these weights leave, of all samples."""
+        weights, parts = self._named(x), []
+        dynamics = self.model.dynamics
+        for each, (q, *_) in zip(self._blocks(), self.samples.blocks(BLOCK), strict=True):
+            ten = self._ask(weights, lambda model: model.dynamics.inertial_parameters().flatten())
+            constants = self._ask(weights, lambda model: model.dynamics.friction.prepare())
+            friction = dynamics.friction(each.speed, each.load_regressor @ ten, constants, each.z)
+            parts.append(Left(q, each.qd, each.qdd, self._missing(weights, each), each.factor * friction))
+        return Left(*(torch.cat(column).detach() for column in zip(*parts, strict=True)))
 
     def torque_deviation(self) -> torch.Tensor:
         """Standard deviations (n,) of the measured torque, as the joints feel it."""
@@ -114,8 +145,8 @@ class TorqueJacobian:
         """Put the weights into the model."""
         named = self._named(x)
         with torch.no_grad():
-            for name, parameter in self.model.named_parameters():
-                parameter.copy_(named[name])
+            for name in rigid_weights(self.model):
+                self.model.get_parameter(name).copy_(named[name])
             self.model.get_buffer(COMPENSATION).copy_(named[COMPENSATION])
 
     def _blocks(self) -> Iterator[_Samples]:
@@ -132,7 +163,9 @@ class TorqueJacobian:
             past = z if z.shape[-1] else None
             load = torch.einsum("jm,tjk->tmk", dynamics.loads, dynamics.regressor(q, still, still))
             speed = qd @ dynamics.motors.mT
-            return _Samples(qd, qdd, tau, past, speed, dynamics.regressor(q, qd, qdd), load)
+            residual = dynamics.residual_torque(q, qd, qdd, dynamics.prepare())
+            factor, regressor = dynamics.friction_factor(q), dynamics.regressor(q, qd, qdd)
+            return _Samples(qd, qdd, tau, past, speed, regressor, load, residual, factor)
 
     def _by_joint(self) -> tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor]:
         """Directions (D, *shape) of the joints' weights, in each of which one weight of every joint changes, but of
@@ -178,14 +211,14 @@ class TorqueJacobian:
             dynamics = model.dynamics
             prepared, ten = dynamics.prepare(), dynamics.inertial_parameters().flatten()
             load = samples.load_regressor @ ten
-            friction = dynamics.friction(samples.speed, load, prepared.friction, samples.z) @ dynamics.motors
+            friction = samples.factor * dynamics.friction(samples.speed, load, prepared.friction, samples.z)
             tau = samples.tau - dynamics.torque_offset()
             given = dynamics.input.force(load, tau, prepared.input)
             given = given + dynamics.friction_compensation() * samples.qd
             missing: torch.Tensor = (
-                given - samples.regressor @ ten - samples.qdd @ prepared.armature - friction
+                given - samples.regressor @ ten - samples.qdd @ prepared.armature - samples.residual
             )
-            return missing
+            return missing - friction @ dynamics.motors
 
         return self._ask(weights, missing)
 
@@ -225,6 +258,6 @@ class TorqueJacobian:
             (load,),
             (torch.ones_like(load),),
         )[1]
-        at_drives = by_load.unsqueeze(-1) * samples.load_regressor
+        at_drives = (samples.factor * by_load).unsqueeze(-1) * samples.load_regressor
         loaded = samples.regressor + torch.einsum("mj,tmk->tjk", self.model.dynamics.motors, at_drives)
         return (loaded @ change).detach()

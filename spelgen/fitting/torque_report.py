@@ -11,7 +11,7 @@ from torch.func import functional_call, jacrev
 
 from spelgen.errors import Diagnostic
 from spelgen.fitting.torque_fit import TorqueSolution
-from spelgen.fitting.torque_jacobian import BLOCK, Asked
+from spelgen.fitting.torque_jacobian import BLOCK, Asked, rigid_weights
 from spelgen.fitting.torque_samples import TorqueSamples
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def torque_notes(model: EmittedModel, samples: TorqueSamples, found: TorqueSolut
 def _inertia(model: EmittedModel, q: torch.Tensor, covariance: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
     """The mean diagonal of M at q (n,) [kg m^2, kg], and the standard deviations of its logarithm (n,)."""
     asked = Asked(model)
-    weights = {f"model.{name}": x.detach() for name, x in model.named_parameters()}
+    weights = {f"model.{name}": x for name, x in rigid_weights(model).items()}
     count = sum(x.numel() for x in weights.values())
 
     def diagonal(changed: dict[str, torch.Tensor]) -> Any:

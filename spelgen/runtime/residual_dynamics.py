@@ -82,34 +82,36 @@ class ResidualDynamics(RigidBodyDynamics):
 
     def lagrangian_gradient(self, at: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
         """d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
-        return super().lagrangian_gradient(at, qd, None, prepared) + self._residual_gradient(
-            at, qd, residuals, prepared
-        )
+        own = self._residual_gradient(at.q, qd, residuals, prepared)
+        return super().lagrangian_gradient(at, qd, None, prepared) + own
 
     def nonlinear_at(self, at: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
         """The torque that holds qd steady without friction, (..., n)."""
+        own = self._residual_nonlinear(at.q, qd, residuals, prepared)
+        return super().nonlinear_at(at, qd, None, prepared) + own
+
+    def residual_torque(self, q: Tensor, qd: Tensor, qdd: Tensor, prepared: RigidPrepared) -> Tensor:
+        """What the residuals of M and V take, (..., n) [Nm, N]."""
+        encoded = self.encoding(q)
+        mass, residuals = self.residual_mass(encoded, prepared.residual.mass)
+        return applied(mass, qdd) + self._residual_nonlinear(q, qd, (encoded, residuals), prepared)
+
+    def friction_factor(self, q: Tensor) -> Tensor:
+        """How much more friction the drives have at q than their laws say, (..., n)."""
+        factor: Tensor = self.joint_functions.friction_factor(q)
+        return factor
+
+    def _residual_nonlinear(self, q: Tensor, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
+        """dR/dt qd - d/dq of what the residuals add to 1/2 qd^T M(q) qd - V(q), (..., n)."""
         encoded, network = residuals
         rate = self.residual_mass.jvp(self.encoding.jvp(encoded, qd), network)
-        gradient = self._residual_gradient(at, qd, residuals, prepared)
-        return super().nonlinear_at(at, qd, None, prepared) + applied(rate, qd) - gradient
+        return applied(rate, qd) - self._residual_gradient(q, qd, residuals, prepared)
 
-    def _residual_gradient(self, at: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
+    def _residual_gradient(self, q: Tensor, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
         """d/dq of what the residuals add to 1/2 qd^T M(q) qd - V(q), (..., n)."""
         encoded, network = residuals
         by_encoded = self.residual_mass.kinetic_vjp(encoded, qd, network)
         if self.residual_potential is not None:
             by_encoded = by_encoded - self.residual_potential.vjp(encoded, prepared.residual.potential)
         gradient: Tensor = self.encoding.vjp(encoded, by_encoded)
-        return gradient - self.joint_functions.torque(at.q)
-
-    def friction_at(self, at: Motion, qd: Tensor, prepared: RigidPrepared, z: Tensor | None = None) -> Tensor:
-        """The friction torque C^T (factor f(C qd)), (..., n) [Nm, N]."""
-        torque: Tensor = self.friction(qd @ self.motors.mT, at.gravity @ self.loads, prepared.friction, z)
-        return (self.joint_functions.friction_factor(at.q) * torque) @ self.motors
-
-    def dissipation_at(self, at: Motion, qd: Tensor, prepared: RigidPrepared) -> Tensor:
-        """D(q, qd), (..., n, n), diagonal where each drive moves its own joint alone."""
-        speeds, loads = qd @ self.motors.mT, at.gravity @ self.loads
-        resistance = self.friction.resistance(speeds, loads, prepared.friction)
-        resistance = self.joint_functions.friction_factor(at.q) * resistance
-        return self.motors.mT @ (resistance.unsqueeze(-1) * self.motors)
+        return gradient - self.joint_functions.torque(q)

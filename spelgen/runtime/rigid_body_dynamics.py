@@ -245,10 +245,18 @@ class RigidBodyDynamics(PortHamiltonian):
         rows: Tensor = (columns @ wrenches).transpose(-3, -2)
         return rows.reshape(*q.shape, 10 * len(self.parents))
 
+    def residual_torque(self, q: Tensor, qd: Tensor, qdd: Tensor, prepared: RigidPrepared) -> Tensor:
+        """What else than bodies, drives and friction takes torque, (..., n) [Nm, N]: nothing."""
+        return torch.zeros_like(q)
+
+    def friction_factor(self, q: Tensor) -> Tensor:
+        """How much more friction the drives have at q than their laws say, (..., n): nowhere any."""
+        return torch.ones_like(q)
+
     def friction_at(self, at: Motion, qd: Tensor, prepared: RigidPrepared, z: Tensor | None = None) -> Tensor:
         """The friction torque C^T f(C qd), (..., n) [Nm, N]."""
         torque: Tensor = self.friction(qd @ self.motors.mT, at.gravity @ self.loads, prepared.friction, z)
-        return torque @ self.motors
+        return (self.friction_factor(at.q) * torque) @ self.motors
 
     def stored_energy(self, z: Tensor, prepared: RigidPrepared) -> Tensor:
         """What the bristles give back, (...) [J]."""
@@ -270,6 +278,7 @@ class RigidBodyDynamics(PortHamiltonian):
         """D(q, qd), (..., n, n), diagonal where each drive moves its own joint alone."""
         speeds, loads = qd @ self.motors.mT, at.gravity @ self.loads
         resistance = self.friction.resistance(speeds, loads, prepared.friction)
+        resistance = self.friction_factor(at.q) * resistance
         return self.motors.mT @ (resistance.unsqueeze(-1) * self.motors)
 
     def input_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
