@@ -8,15 +8,23 @@ from torch import Tensor, nn
 from spelgen.runtime.joints import Joints, vector
 
 SPLINES = 34  # over the range of a joint
-HARMONICS = 40  # of a turn: teeth and motor poles make ripple that comes again
+HARMONICS = 64  # of a turn of the joint, and the first two of a turn of the motor: teeth and poles come again
+
+
+def ripple_frequencies(joints: Joints) -> Tensor:
+    """How often in a turn of the joint a ripple may come again, (n, HARMONICS + 2)."""
+    few = tuple(range(1, HARMONICS + 3))
+    rows = [(*few[:-2], gear, 2 * gear) if gear > HARMONICS else few for gear in joints.gear]
+    return torch.tensor(rows, dtype=torch.float64)
 
 
 class JointFunctions(nn.Module):
     """By joint a torque t(q) = dV/dq, its energy V(q), and a factor on friction, from q of that joint alone.
 
-    t is a sum of cubic B-splines over the joint's range and, of a revolute joint, of harmonics of its turn;
-    the factor is the exponential of such a spline. Splines vanish where the range ends, so that nothing
-    is added where nothing was seen. Weights are zero at first; torques are in units of usual friction.
+    t is a sum of cubic B-splines over the joint's range and, of a revolute joint, of harmonics of its
+    turns and of its motor's; the factor is the exponential of such a spline. Splines vanish where the
+    range ends, so that nothing is added where nothing was seen. Weights are zero at first; torques are
+    in units of usual friction.
     """
 
     scale: Tensor
@@ -24,7 +32,7 @@ class JointFunctions(nn.Module):
     spacing: Tensor
     revolute: Tensor
     knots: Tensor
-    harmonics: Tensor
+    frequencies: Tensor
 
     def __init__(self, joints: Joints) -> None:
         super().__init__()
@@ -34,9 +42,9 @@ class JointFunctions(nn.Module):
         self.register_buffer("spacing", 2 * vector(joints.reach) / (SPLINES - 3))
         self.register_buffer("revolute", vector(float(each) for each in joints.revolute))
         self.register_buffer("knots", torch.arange(SPLINES).double() - (SPLINES - 1) / 2)
-        self.register_buffer("harmonics", torch.arange(1, HARMONICS + 1).double())
+        self.register_buffer("frequencies", ripple_frequencies(joints))
         self.raw_torque_splines = nn.Parameter(torch.zeros(n, SPLINES, dtype=torch.float64))
-        self.raw_torque_ripple = nn.Parameter(torch.zeros(n, 2 * HARMONICS, dtype=torch.float64))
+        self.raw_torque_ripple = nn.Parameter(torch.zeros(n, 2 * (HARMONICS + 2), dtype=torch.float64))
         self.raw_friction_splines = nn.Parameter(torch.zeros(n, SPLINES, dtype=torch.float64))
 
     def splines(self, q: Tensor) -> Tensor:
@@ -45,8 +53,8 @@ class JointFunctions(nn.Module):
         return ((2 - away).relu() ** 3 - 4 * (1 - away).relu() ** 3) / 6
 
     def ripple(self, q: Tensor) -> Tensor:
-        """cos(k q), then sin(k q), (..., n, 2 HARMONICS); zero for a prismatic joint."""
-        phase = q.unsqueeze(-1) * self.harmonics
+        """Cosines, then sines of frequency times q, (..., n, 2 HARMONICS + 4); zero for a prismatic joint."""
+        phase = q.unsqueeze(-1) * self.frequencies
         return torch.cat([phase.cos(), phase.sin()], dim=-1) * self.revolute.unsqueeze(-1)
 
     def torque(self, q: Tensor) -> Tensor:
@@ -60,7 +68,7 @@ class JointFunctions(nn.Module):
         away = place.abs()
         part = 0.5 - (2 - away).relu() ** 4 / 24 + (1 - away).relu() ** 4 / 6
         smooth = self.spacing * (place.sign() * part * self.raw_torque_splines).sum(dim=-1)
-        by_cos, by_sin = (self.ripple(q) / self.harmonics.repeat(2)).chunk(2, dim=-1)
+        by_cos, by_sin = (self.ripple(q) / self.frequencies.repeat(1, 2)).chunk(2, dim=-1)
         turned = torch.cat([by_sin, -by_cos], dim=-1)
         return (self.scale * (smooth + (turned * self.raw_torque_ripple).sum(dim=-1))).sum(dim=-1)
 
