@@ -31,6 +31,11 @@ GANTRY = """<robot name="gantry"><link name="base"/><link name="bridge"/><link n
 <joint name="across" type="prismatic"><parent link="bridge"/><child link="trolley"/><axis xyz="0 1 0"/>
 <limit lower="-1" upper="1" effort="10" velocity="1"/></joint></robot>"""
 """Nothing of its M or V depends on q: no network is needed."""
+NETWORKS = Design(
+    mass="derived", potential="derived", dissipation="per-joint", input="derived", memory="none", net="mlp",
+    encoding="joint",
+)  # fmt: skip
+"""M and V by networks of the derived structure alone."""
 SIX = ("two_link", "rpr", "six_dof", "scara", "panda", "ur10e")
 
 
@@ -68,9 +73,10 @@ def random_model(
     deviation: float | None = None,
     preset: str = "minimal",
     net: str | None = None,
+    design: Design | None = None,
 ) -> nn.Module:
     """The robot's model with random weights, as ``randomise`` draws them."""
-    source = built(robot, preset=preset, net=net)[0]
+    source = built(robot, preset=preset, net=net, design=design)[0]
     model = import_source(source, folder / f"{robot}_spel.py").Model(seed=seed)
     randomise(model, seed, deviation)
     return model
@@ -85,6 +91,8 @@ def randomise(model: nn.Module, seed: int, deviation: float | None = None) -> No
             parameter.data = draw
         elif deviation is not None:
             parameter.data = deviation * draw
+        elif "joint_functions" in name or "residual_mass.raw" in name:
+            parameter.data = 0.3 * draw
         elif "network" in name:
             # a Kolmogorov-Arnold network has a grid of weights for each input
             inputs = parameter[0].numel() if parameter.dim() == 3 else parameter.shape[-1]
@@ -164,7 +172,7 @@ def exact_model(robot: str, folder: Path) -> nn.Module:
     """The robot's emitted model with the URDF's true values: exact functions for networks, exact constants,
     no friction.
     """
-    source, structure = built(robot)
+    source, structure = built(robot, design=NETWORKS)
     module = import_source(source, folder / f"{robot}_exact.py")
     model = frictionless(module.Model())
     mass, potential = model.dynamics.mass, model.dynamics.potential
@@ -179,9 +187,6 @@ def exact_model(robot: str, folder: Path) -> nn.Module:
         potential.network = ExactFunctions(
             [true.potential], torch.zeros_like(scale), scale, model.dynamics.encoding
         )
-    for part in (mass, potential):  # the functions are whole without them
-        if getattr(part, "series", None) is not None:
-            part.series.units.zero_()
     constants = [true.combination(constant.reads) for constant in structure.constants]
     assert all(sum(c.degrees()) == 0 for c in constants), "a constant depends on q"
     values = torch.tensor([_float(c.leading_coefficient()) for c in constants], dtype=torch.float64)

@@ -73,11 +73,11 @@ def test_presets_are_the_files(preset):
 
 def test_a_preset_of_your_own(rpr, robots, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    own = asdict(load_design("minimal")) | {"dissipation": "dense-n", "about": "Friction of all joints."}
+    own = asdict(load_design("spel")) | {"dissipation": "dense-3n", "about": "Friction of all joints."}
     (tmp_path / "mine.yaml").write_text("".join(f"{key}: {value}\n" for key, value in own.items()))
     source = generate(rpr, "mine.yaml")
     options = load_module(source).facts.options
-    assert (options.preset, options.design.dissipation) == ("mine", "dense-n")
+    assert (options.preset, options.design.dissipation) == ("mine", "dense-3n")
     (tmp_path / "module.py").write_text(source, encoding="utf-8")
     (tmp_path / "mine.yaml").unlink()  # the module knows how it was made
     assert check(tmp_path / "module.py", robots / "rpr.urdf").reasons == ()
@@ -86,13 +86,13 @@ def test_a_preset_of_your_own(rpr, robots, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"fourier": "all"}, "mine.yaml:6: fourier: got 'all', expected one of derived, none"),
-        ({"fourier": ["derived"]}, "mine.yaml:6: fourier: got ['derived'], expected one of derived, none"),
-        ({"masss": "none"}, "mine.yaml:9: unknown key 'masss'; did you mean 'mass'?"),
-        ({"net": None}, "mine.yaml:7: net: got None, expected one of mlp, kan, none"),
+        ({"memory": "all"}, "mine.yaml:5: memory: got 'all', expected one of bristles, none"),
+        ({"memory": ["none"]}, "mine.yaml:5: memory: got ['none'], expected one of bristles, none"),
+        ({"masss": "none"}, "mine.yaml:8: unknown key 'masss'; did you mean 'mass'?"),
+        ({"net": None}, "mine.yaml:6: net: got None, expected one of mlp, kan, none"),
         (
-            {"mass": "closed-form"},
-            "mine.yaml:1: mass: closed-form with potential: derived; rigid bodies give both: name closed-form for "
+            {"mass": "derived"},
+            "mine.yaml:1: mass: derived with potential: closed-form; rigid bodies give both: name closed-form for "
             "both or for neither",
         ),
     ],
@@ -112,5 +112,5 @@ def test_no_preset_at_all():
         load_design("minmal")
     expected = "minimal, spel, spel-kan, phnode, closed-form, or a YAML file"
     assert str(error.value) == f"got the preset 'minmal', expected one of {expected}"
-    with pytest.raises(SettingsError, match="mass: closed-form with net: kan"):
+    with pytest.raises(SettingsError, match="net: kan with encoding: none"):
         load_design("closed-form", "kan")

@@ -26,7 +26,7 @@ design spec
 urdf: robot xacro_child xacro_input document values elements lint read
 arm: rational angle_rounding placement chain lump_links arm actuation axes
 structure: recursion field sampling spans basis expansion symbolic structure nominal
-structure: fourier base_parameters pseudo_inertia
+structure: base_parameters pseudo_inertia
 dynamics: bristles
 {" ".join(RUNTIME)}
 dynamics: protocol prepared
@@ -39,8 +39,8 @@ identification: samples friction base_parameters least_squares method prior iden
 excitation: trajectory criterion excitation
 fitting: run_schema run_folder run_lock
 fitting: gaussian_prior adaptive rollout calibration dataset streaming torque_samples torque_jacobian
-fitting: torque_fit torque_report
-fitting: optimizers torque_networks urdf_regularizer stages compiled process progress validation loop
+fitting: optimizers residual_fit torque_fit torque_report
+fitting: torque_networks urdf_regularizer stages compiled process progress validation loop
 fitting: run_record fitted fit train
 evaluation: names disturbance stiff baselines trust forecast torque rollout torque_traces traces examples invariants
 evaluation: tables verdict results csv_file subject evaluate

@@ -15,13 +15,14 @@ from torch.func import hessian, jacfwd, jacrev, jvp, vjp, vmap
 from spelgen.design import load_design
 from spelgen.emission.bundle import bundle, load_runtime, names_in
 from spelgen.runtime.encoding import JointEncoding, joint_input, lie_group_input
-from spelgen.runtime.fourier import FourierFeatures, FourierSeries, Term
 from spelgen.runtime.friction_laws import FrictionLaws, tanh_ratio
-from spelgen.runtime.joints import Joints
+from spelgen.runtime.joint_functions import HARMONICS, SPLINES, JointFunctions
+from spelgen.runtime.joints import Joints, vector
 from spelgen.runtime.masked_kan import MaskedKAN
 from spelgen.runtime.masked_mlp import MaskedMLP
 from spelgen.runtime.network import unit_joints
 from spelgen.runtime.regularisation import PositiveDefiniteBound
+from spelgen.runtime.residual_mass import ResidualMass
 from spelgen.runtime.rigid_body import Bodies, InertialParameters, pseudo_inertia
 from spelgen.runtime.symmetric import entry_basis, symmetric
 
@@ -44,7 +45,6 @@ JOINTS = Joints(
     gear=(1.0, 10.0, 50.0),
     actuated=(True, True, True),
 )
-SERIES = (Term((0, 0, 2), (0, 0, 0), 0.5, -0.2), Term((1, 0, 0), (0, 2, 0), 0.3, 0.7))
 
 
 def draw(*shape: int, seed: int = 0) -> Tensor:
@@ -103,25 +103,59 @@ def test_units_are_shared_out_by_how_many_outputs_read_the_same_joints():
     assert len(crowded[0]) == 18, "each group keeps its least"
 
 
-def test_fourier_series_and_its_derivatives():
+def test_joint_functions_are_a_gradient_and_vanish_outside_the_range():
+    functions = JointFunctions(JOINTS._replace(friction=(1.0, 2.0, 0.5), gear=(1.0, 10.0, 101.0)))
+    for weight in functions.parameters():
+        weight.data = draw(*weight.shape, seed=weight.numel())
+    q = draw(50, 3)
+    gradient = vjp(lambda at: functions.energy(at).sum(), q)[1](torch.ones((), dtype=torch.float64))[0]
+    near(functions.torque(q), gradient, 1e-10)
+    assert (functions.friction_factor(q) > 0).all()
+    inside = torch.linspace(-3, 3, 20, dtype=torch.float64)[:, None] * torch.tensor([0.9, 0.075, 0.6])
+    inside = inside + torch.tensor(JOINTS.center)
+    near(functions.splines(inside).sum(dim=-1), torch.ones(20, 3).double(), 1e-12)
+    far = 100 * torch.ones(1, 3, dtype=torch.float64)
+    near(functions.splines(far), torch.zeros(1, 3, SPLINES).double())
+    assert not functions.ripple(q)[:, 1].any(), "a prismatic joint has no turns"
+    near(functions.ripple(q)[:, 2, HARMONICS + 1], (202 * q[:, 2]).cos())
+
+
+def test_residual_of_m_never_takes_more_than_the_armature():
+    def entries(f, c):
+        return symmetric([f[0]], [f[0] - 2 * f[1], c[0]], [0, f[1], 3 * f[1]])
+
     encoding = JointEncoding(JOINTS)
-    features = FourierFeatures(JOINTS, [SERIES])
-    assert features.count == 4, "x^2 cos q1 brings x cos q1 and cos q1"
-    q, qd = draw(5, 3), draw(5, 3, seed=1)
-    series = FourierSeries(features, [SERIES], [2.0], (0.5, 0.25, 1.0))
-    heights = series.prepare(torch.ones(1, 1, dtype=torch.float64) * 2.0)[0]
-
-    def value(at: Tensor) -> Tensor:
-        return features(at, encoding.scaled(at)) @ heights
-
-    x = encoding.scaled(q)[:, 1]
-    expected = 0.5 * (2 * q[:, 2]).cos() - 0.2 * (2 * q[:, 2]).sin()
-    near(value(q), expected + x**2 * (0.3 * q[:, 0].cos() + 0.7 * q[:, 0].sin()))
-    found = features(q, encoding.scaled(q))
-    near(features.jvp(found, qd) @ heights, jvp(value, (q,), (qd,))[1])
-    gradient = vjp(lambda at: value(at).sum(), q)[1](torch.ones((), dtype=torch.float64))[0]
-    near(features.vjp(found, heights.expand(5, -1)), gradient)
-    near(found @ features.gradient_map(heights), gradient)
+    layers = unit_joints([(0, 1), (2,)], width=8, depth=2)
+    inputs = joint_input(JOINTS, (0, 1, 2), (1.0, 1.0, 1.0))
+    mass = ResidualMass(JOINTS, entries, 2, 1, MaskedMLP(inputs, layers, torch.Generator().manual_seed(0)))
+    motors = torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.8], [0.0, -0.7, 1.2]], dtype=torch.float64)
+    encoded, qd, qdd = encoding(draw(200, 3)), draw(200, 3, seed=1), draw(200, 3, seed=2)
+    for armature in (
+        torch.diag(vector((0.1, 20.0, 3.0))),
+        motors.mT @ torch.diag(vector((1.0, 0.2, 5.0))) @ motors,
+    ):
+        for size in (1.0, 1e3):
+            for weight in mass.parameters():
+                weight.data = size * draw(*weight.shape, seed=weight.numel())
+            prepared = mass.prepare(armature)
+            residual, kept = mass(encoded, prepared)
+            near(residual, residual.mT)
+            assert residual.abs().max() > 1e-3
+            assert (
+                torch.linalg.eigvalsh(armature + residual).min() > 0.05 * torch.linalg.eigvalsh(armature)[0]
+            )
+    for weight in mass.parameters():
+        weight.data = draw(*weight.shape, seed=weight.numel())
+    prepared = mass.prepare(armature)
+    kept = mass(encoded, prepared)[1]
+    near(
+        mass.jvp(qdd @ draw(3, 9), kept),
+        jvp(lambda x: mass(x, prepared)[0], (encoded,), (qdd @ draw(3, 9),))[1],
+    )
+    kinetic = lambda x: 0.5 * torch.einsum("ti,tij,tj->", qd, mass(x, prepared)[0], qd)  # noqa: E731
+    near(
+        mass.kinetic_vjp(encoded, qd, kept), vjp(kinetic, encoded)[1](torch.ones((), dtype=torch.float64))[0]
+    )
 
 
 def test_entries_of_a_symmetric_matrix_and_their_basis():

@@ -1,7 +1,7 @@
 """Networks fitted to torques: the torques of an arm that they can be, met to many digits."""
 
 import torch
-from emitted import built, import_source
+from emitted import NETWORKS, built, import_source
 
 from spelgen.fitting import torque_networks
 from spelgen.fitting.config import MomentumFit, Rollout
@@ -27,11 +27,9 @@ def missed(model, samples):
 
 def test_another_arms_torques_are_met(tmp_path):
     """Of an arm with other masses, rotors and friction, on positions that were not seen."""
-    module = import_source(built("two_link")[0], tmp_path / "two_link_spel.py")
+    module = import_source(built("two_link", design=NETWORKS)[0], tmp_path / "two_link_spel.py")
     true, model = module.Model(seed=0), module.Model(seed=1)
     with torch.no_grad():
-        true.dynamics.mass.series.raw_coefficients *= 1.3
-        true.dynamics.potential.series.raw_coefficients *= 0.8
         true.dynamics.mass.raw_constants *= 1.5
         true.dynamics.mass.armature.raw += 0.5
         true.dynamics.friction.raw_viscous += 1.0
@@ -44,7 +42,7 @@ def test_another_arms_torques_are_met(tmp_path):
 
 def test_what_is_penalised_stays(tmp_path):
     """A penalty against the torques leaves an error that nothing else would."""
-    module = import_source(built("two_link")[0], tmp_path / "two_link_spel.py")
+    module = import_source(built("two_link", design=NETWORKS)[0], tmp_path / "two_link_spel.py")
     true, model = module.Model(seed=0), module.Model(seed=0)
     constants = model.dynamics.mass.raw_constants
     with torch.no_grad():
@@ -55,7 +53,7 @@ def test_what_is_penalised_stays(tmp_path):
 
 def test_blocks_give_what_all_at_once_gives(tmp_path, monkeypatch):
     """The loss and its gradient; what many steps make of the last digits is another thing."""
-    module = import_source(built("two_link")[0], tmp_path / "two_link_spel.py")
+    module = import_source(built("two_link", design=NETWORKS)[0], tmp_path / "two_link_spel.py")
     true = module.Model(seed=0)
     samples = [recorded(true, 5), recorded(true, 6)]
     whole, parts = module.Model(seed=1), module.Model(seed=1)
@@ -69,7 +67,7 @@ def test_blocks_give_what_all_at_once_gives(tmp_path, monkeypatch):
 
 def test_networks_are_fitted_to_torques_only_where_that_is_asked_for(tmp_path):
     """Without a word on it windows are predicted; the objective momentum leaves its own steps alone."""
-    model = import_source(built("two_link")[0], tmp_path / "two_link_spel.py").Model()
+    model = import_source(built("two_link", design=NETWORKS)[0], tmp_path / "two_link_spel.py").Model()
     assert default_objective(model, [1000.0]) == "rollout"
     weights = {name: value.clone() for name, value in model.state_dict().items()}
     for config in (Rollout(), MomentumFit()):
