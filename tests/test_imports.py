@@ -39,7 +39,7 @@ identification: samples friction base_parameters least_squares method prior iden
 excitation: trajectory criterion excitation
 fitting: run_schema run_folder run_lock
 fitting: gaussian_prior adaptive rollout calibration dataset streaming torque_samples torque_jacobian
-fitting: optimizers residual_fit torque_fit torque_report
+fitting: optimizers idle_residuals residual_fit torque_fit torque_report
 fitting: torque_networks urdf_regularizer stages compiled process progress validation loop
 fitting: run_record fitted fit train
 evaluation: names disturbance stiff baselines trust forecast torque rollout torque_traces traces examples invariants

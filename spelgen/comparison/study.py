@@ -46,6 +46,7 @@ VARIANTS = (
     Variant("spel-kan", "spel-kan"),
     Variant("minimal", "minimal"),
     Variant("minimal-kan", "minimal", "kan"),
+    Variant("closed-form", "closed-form"),
 )
 
 

@@ -56,6 +56,11 @@ def summary(spec: ModelSpec) -> str:
     return f"{_count(spec)[0].upper()}{_count(spec)[1:]}{beside}.\n{potential}\n{start}"
 
 
+def mass_entries(spec: ModelSpec) -> str:
+    """What functions and constants make."""
+    return f"{'R, what M has beside rigid bodies' if _residual(spec) else 'M without armature'}, (..., n, n)"
+
+
 def _residual(spec: ModelSpec) -> bool:
     """Whether networks stand beside rigid bodies."""
     return bool(spec.bodies) and spec.design.net != "none"

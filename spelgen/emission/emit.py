@@ -27,6 +27,7 @@ def emit(spec: ModelSpec) -> str:
         elements=len(BRISTLE_REACH["revolute"]) if spec.design.memory == "bristles" else 0,
         setup=tailored.setup(spec),
         mass_entries=tailored.mass_entries(spec),
+        mass_about=docstring.mass_entries(spec),
         values=_values(spec),
         typed=bool(spec.bodies),
     )

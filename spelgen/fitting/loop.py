@@ -13,6 +13,7 @@ import torch
 from spelgen.errors import RunError
 from spelgen.fitting.config import BATCH, LEARNING_RATE, WindowConfig
 from spelgen.fitting.dataset import TrainingData
+from spelgen.fitting.idle_residuals import idle_residuals
 from spelgen.fitting.optimizers import LBFGS, MiniBatchAdamW, WindowOptimizer
 from spelgen.fitting.progress import TrainingProgress
 from spelgen.fitting.rollout import momentum_loss, rollout_loss
@@ -29,12 +30,13 @@ MOMENTUM_FACTOR = 10.0  # on the learning rate of the momentum steps, which are 
 WARM_UP = 0.02  # part of all steps over which the learning rate rises
 FINAL_RATE = 0.01  # the cosine ends at this part of the learning rate
 EPOCH_STEPS = 20  # at least; few windows are passed over several times between validations
+FIRST_STAGE = 0.5  # of all steps or minutes, at most, while residuals of rigid bodies rest
 PROBE_EVERY = 5  # epochs: friction that is learned may be too stiff for the substeps so far
 MAX_ROLLBACKS = 8
 
 PLAIN = (
     "epoch", "step", "best_epoch", "best_loss", "best_weights", "rollbacks", "learning_rate_factor", "seconds",
-    "substeps", "momentum_done",
+    "substeps", "momentum_done", "resting", "stage_from", "stage_epoch",
 )  # fmt: skip
 
 Status = Literal["finished", "stopped early", "out of time", "interrupted"]
@@ -45,6 +47,9 @@ class TrainingLoop:
 
     config: a resolved one. stepped: what steps are taken with, the same weights, compiled maybe. folder: where
     checkpoints go; None: nothing is written. seconds: what was spent before, of the allowed time.
+
+    What stands beside rigid bodies and has not entered before rests until the bodies are done, for short windows are
+    explained by it too, and worse. It then moves from the best weights so far, and stays where validation says so.
     """
 
     def __init__(
@@ -70,6 +75,7 @@ class TrainingLoop:
         self.stream = data.stream
         self.batch = min(getattr(config, "batch", None) or BATCH, len(self.training))
         self.whole = getattr(config, "optimizer", "lbfgs") == "lbfgs"  # all windows at once
+        self.resting, self.stage_from, self.stage_epoch = idle_residuals(self.model), 0.0, 0
         self.optimizer = self._optimizer(self.generator)
         windows = len(self.training)
         if self.stream is not None:
@@ -90,7 +96,7 @@ class TrainingLoop:
             self.save()
             if not self.momentum_done:
                 self._momentum_stage(progress)
-            while (end := self._end()) is None:
+            while (end := self._end()) is None or self._release(end):
                 record = self._run_epoch()
                 self.seconds = record["seconds"] = time.monotonic() - self._since
                 self.history.append(record)
@@ -109,7 +115,9 @@ class TrainingLoop:
         self.best_weights = copy.deepcopy(self.model.state_dict())
 
     def _optimizer(self, generator: torch.Generator) -> WindowOptimizer:
-        """From the present weights; ``generator`` orders batches."""
+        """From the present weights, of those that do not rest; ``generator`` orders batches."""
+        for name, parameter in self.model.named_parameters():
+            parameter.requires_grad_(name not in self.resting)
         if self.whole:
             return LBFGS(self.model, self.config.weight_decay or 0.0)
         return MiniBatchAdamW(self.model, self.batch, self.config.weight_decay or 0.0, generator)
@@ -152,9 +160,9 @@ class TrainingLoop:
         return rollout_loss(self.stepped, windows, self.scales, self.substeps, solver) + self._penalty()
 
     def _end(self) -> Status | None:
-        if self.epoch >= self.config.epochs or self.optimizer.stalled:
+        if self.epoch >= self.config.epochs or self._done() >= self._stage_to or self.optimizer.stalled:
             return "finished"
-        if self.epoch - self.best_epoch >= self.config.patience:
+        if self.epoch - max(self.best_epoch, self.stage_epoch) >= self.config.patience:
             return "stopped early"
         return "out of time" if self._spent(self.seconds + self._pace + self._closing) >= 1.0 else None
 
@@ -225,9 +233,26 @@ class TrainingLoop:
 
     def _rate(self, ahead: int = 0) -> float:
         """Learning rate so many steps ahead, over all steps or minutes, whichever end sooner."""
-        steps = self.config.epochs * self.epoch_steps
-        part = max((self.step + ahead) / steps, self._spent(self.seconds))
+        part = (self._done(ahead) - self.stage_from) / (self._stage_to - self.stage_from)
         return self._largest_rate * self.learning_rate_factor * _schedule(part)
+
+    def _done(self, ahead: int = 0) -> float:
+        """The part of all steps or minutes that is gone so many steps ahead."""
+        steps = self.config.epochs * self.epoch_steps
+        return max((self.step + ahead) / steps, self._spent(self.seconds))
+
+    @property
+    def _stage_to(self) -> float:
+        return FIRST_STAGE if self.resting else 1.0
+
+    def _release(self, end: Status) -> bool:
+        """Let what rests move where the stage before ended by itself; whether it does."""
+        if not self.resting or end == "out of time" or not self.epoch:
+            return False
+        self.model.load_state_dict(self.best_weights)
+        self.resting, self.stage_from, self.stage_epoch = [], self._done(), self.epoch
+        self.optimizer = self._optimizer(self.generator)
+        return self._end() is None
 
     def _roll_back(self, weights: dict[str, Any], optimizer: dict[str, Any], step: int) -> None:
         """Undo an epoch whose numbers were not finite, and halve the learning rate from here on."""
@@ -262,6 +287,7 @@ class TrainingLoop:
         try:
             for name in PLAIN:
                 setattr(self, name, state[name])
+            self.optimizer = self._optimizer(self.generator)
             self.model.load_state_dict(state["model"])
             self.optimizer.load_state_dict(state["optimizer"])
             self.generator.set_state(state["generator"])

@@ -27,7 +27,7 @@ Blocks = Callable[[], Iterable[Any]]  # the same ones whenever it is called
 
 
 class WindowOptimizer(Protocol):
-    """Moves the weights of one model. stalled: whether there is no way down from here."""
+    """Moves the weights of one model that require a gradient when it is made. stalled: whether there is no way down from here."""
 
     @property
     def stalled(self) -> bool: ...
@@ -51,7 +51,7 @@ class MiniBatchAdamW:
     def __init__(
         self, model: torch.nn.Module, batch: int, weight_decay: float, generator: torch.Generator
     ) -> None:
-        self._parameters = list(model.parameters())
+        self._parameters = [x for x in model.parameters() if x.requires_grad]
         self._batch, self._generator = batch, generator
         weights = [parameter for parameter in self._parameters if parameter.dim() > 1]
         numbers = [parameter for parameter in self._parameters if parameter.dim() <= 1]
@@ -108,7 +108,7 @@ class LBFGS:
     """
 
     def __init__(self, model: torch.nn.Module, weight_decay: float) -> None:
-        self._parameters = list(model.parameters())
+        self._parameters = [x for x in model.parameters() if x.requires_grad]
         self._weights = [parameter for parameter in self._parameters if parameter.dim() > 1]
         self._decay, self._finite = weight_decay, True
         self._waits, self._reached = 0, (math.inf, math.inf)  # loss, and with the penalty

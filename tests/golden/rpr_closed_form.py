@@ -1,6 +1,6 @@
 r"""Port-Hamiltonian model of an arm with 3 joints, written by `spelgen build`.
 
-3 bodies with trained inertial parameters make mass matrix and potential energy.
+3 rigid bodies with trained inertial parameters.
 The potential energy depends on joint 3.
 Sizes and starting values are the URDF's inertials.
 
@@ -27,7 +27,7 @@ from torch import Tensor, nn
 
 FACTS = r"""{"robot": "rpr", "urdf": "rpr.urdf",
  "urdf_sha256": "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d",
- "spec_sha256": "26cb82cbc22a8307da3876e58451a8784189ea93f99bd49395c6e7fa66bc7272",
+ "spec_sha256": "5749d27750f265dce1c8451f5ac6960b7c391ed7748debfd74c6fb89b677b012",
  "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,
   "net": null, "preset": "closed-form", "tip": null, "width": 64},
  "joints": {"joint1": "revolute", "joint2": "prismatic", "joint3": "revolute"}}"""
@@ -48,62 +48,46 @@ class Model(nn.Module):
     def __init__(self, seed: int = 0, dtype: torch.dtype = torch.float64) -> None:
         super().__init__()
         joints = Joints(
-            revolute=(True, False, True),
-            center=(0.0, 0.7875, 0.0),
-            reach=(2.96706, 0.4825, 2.96706),
-            speed=(3.0, 1.0, 6.0),
-            friction=(0.4, 0.4, 0.4),
-            armature=(2.19, 0.782, 0.106),
-            gear=(1.0, 1.0, 1.0),
-            actuated=(True, True, True),
-        )
+            revolute=(True, False, True), center=(0.0, 0.7875, 0.0), reach=(2.96706, 0.4825, 2.96706),
+            speed=(3.0, 1.0, 6.0), friction=(0.4, 0.4, 0.4), armature=(2.19, 0.782, 0.106),
+            gear=(1.0, 1.0, 1.0), actuated=(True, True, True),
+        )  # fmt: skip
         bodies = Bodies(
-            parent=(-1, 0, 1),
-            joint=(0, 1, 2),
-            revolute=(True, False, True),
-            ratio=(1.0, 1.0, 1.0),
+            parent=(-1, 0, 1), joint=(0, 1, 2), revolute=(True, False, True), ratio=(1.0, 1.0, 1.0),
             offset=(0.0, 0.0, 0.0),
             rotation=(
                 ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
                 ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
                 ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
             ),
-            position=((0.0, 0.0, 0.0), (0.0, 0.0, 0.154), (0.0, -0.0203, 0.0)),
-            mass=(5.01, 4.25, 1.08),
+            position=((0.0, 0.0, 0.0), (0.0, 0.0, 0.154), (0.0, -0.0203, 0.0)), mass=(5.01, 4.25, 1.08),
             moment=((0.0, 0.0, -4.48896), (0.0, -0.086275, -27.4125), (0.0, 0.09936, -0.05832)),
             inertia=(
-                (4.13010816, 4.12210816, 0.018),
-                (179.3223763825, 179.320625, 0.0077513825),
+                (4.13010816, 4.12210816, 0.018), (179.3223764, 179.320625, 0.0077513825),
                 (0.0142904, 0.00425851, 0.0102504),
             ),
             products=((0.0, 0.0, 0.0), (0.0, 0.0, -0.55647375), (0.0, 0.0, 0.00536544)),
-        )
+        )  # fmt: skip
         self.dynamics = RigidBodyDynamics(
-            joints,
-            bodies,
-            (0.0, 0.0, -9.81),
-            DirectInput(joints),
+            joints, bodies, (0.0, 0.0, -9.81), DirectInput(joints),
             reach=((0.0001, 0.001, 0.01, 0.1), (1e-05, 0.0001, 0.001, 0.01), (0.0001, 0.001, 0.01, 0.1)),
-        )
+        )  # fmt: skip
         self.to(dtype)
 
     @property
     def inertial_parameters(self) -> Tensor:
         """By body (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) about its joint's frame, (bodies, 10)."""
-        value: Tensor = self.dynamics.inertial_parameters()
-        return value
+        return self.dynamics.inertial_parameters.forward()
 
     @property
     def armature(self) -> Tensor:
         """What the drives add to M's diagonal, (n,) [kg m^2, kg]."""
-        value: Tensor = self.dynamics.armature()
-        return value
+        return self.dynamics.armature.forward()
 
     @property
     def rotor_inertia(self) -> Tensor:
         """The drives' inertia before the gear, (n,) [kg m^2, kg]."""
-        value: Tensor = self.dynamics.armature.rotor_inertia()
-        return value
+        return self.dynamics.armature.rotor_inertia()
 
     @property
     def viscous(self) -> Tensor:
@@ -116,15 +100,9 @@ class Model(nn.Module):
         return self.dynamics.friction.prepare().coulomb
 
     @property
-    def stribeck(self) -> Tensor:
-        """Dry friction that only slow motion has, (n,) [Nm, N]."""
-        return self.dynamics.friction.prepare().stribeck
-
-    @property
     def torque_offset(self) -> Tensor:
         """What the measured torque shows without any, (n,) [Nm, N]."""
-        value: Tensor = self.dynamics.torque_offset()
-        return value
+        return self.dynamics.torque_offset()
 
     def prepare(self, definite: bool = True) -> Any:
         """All that depends on the weights alone, until they change; M made ``definite``, or as learned."""
@@ -273,6 +251,22 @@ def from_group(parts: Sequence[Tensor], joint_types: Sequence[str]) -> Tensor:
         for kind, part in zip(joint_types, parts, strict=True)
     ]
     return torch.stack(values, dim=-1)
+
+
+class Input(Protocol):
+    """What gives G."""
+
+    def prepare(self) -> Any:
+        """All that depends on the weights alone."""
+
+    def __call__(self, encoded: Tensor, prepared: Any) -> Tensor:
+        """G, (..., n, n)."""
+
+    def force(self, encoded: Tensor, tau: Tensor, prepared: Any) -> Tensor:
+        """G tau, (..., n)."""
+
+    def solve(self, encoded: Tensor, force: Tensor, prepared: Any) -> Tensor:
+        """The inputs, (..., n), that make this force."""
 
 
 def solved(matrix: Tensor, right: Tensor) -> Tensor:
@@ -758,22 +752,6 @@ def tanh_ratio(x: Tensor) -> Tensor:
     return torch.where(near, 1 - x**2 / 3, safe.tanh() / safe)
 
 
-class Input(Protocol):
-    """What gives G."""
-
-    def prepare(self) -> Any:
-        """All that depends on the weights alone."""
-
-    def __call__(self, encoded: Tensor, prepared: Any) -> Tensor:
-        """G, (..., n, n)."""
-
-    def force(self, encoded: Tensor, tau: Tensor, prepared: Any) -> Tensor:
-        """G tau, (..., n)."""
-
-    def solve(self, encoded: Tensor, force: Tensor, prepared: Any) -> Tensor:
-        """The inputs, (..., n), that make this force."""
-
-
 def block_diagonal(blocks: Tensor) -> Tensor:
     """The matrix, (k m, k m), with these blocks, (k, m, m), on its diagonal."""
     k, m, _ = blocks.shape
@@ -788,6 +766,7 @@ class RigidPrepared(NamedTuple):
     armature: Tensor  # what the rotors add to M, (n, n)
     friction: FrictionConstants
     input: Tensor
+    residual: Any = None  # of what a model has beside rigid bodies
 
 
 class Motion(NamedTuple):
@@ -796,7 +775,8 @@ class Motion(NamedTuple):
     terms: Tensor  # cos and sin of a body's angle, or its displacement and 0, (..., bodies, 2)
     twists: Tensor  # by joint velocity, (..., n, 6 bodies)
     weight: Tensor  # acceleration that stands for gravity, (..., 6 bodies)
-    gravity: Tensor  # dV/dq, (..., n)
+    gravity: Tensor  # dV/dq of the bodies, (..., n)
+    q: Tensor
 
 
 class RigidBodyDynamics(PortHamiltonian):
@@ -904,7 +884,7 @@ class RigidBodyDynamics(PortHamiltonian):
             below = rows.expand(*q.shape[:-1], -1, -1) if parent < 0 else moved[parent]
             moved.append(self._carried(self.forth[index], below, terms[..., index, :]) + own[:, index])
         columns = torch.cat(moved, dim=-1)
-        return Motion(terms, columns[..., :-1, :], columns[..., -1, :], torch.zeros_like(q))
+        return Motion(terms, columns[..., :-1, :], columns[..., -1, :], torch.zeros_like(q), q)
 
     @staticmethod
     def _carried(table: Tensor, rows: Tensor, terms: Tensor) -> Tensor:
@@ -1000,10 +980,18 @@ class RigidBodyDynamics(PortHamiltonian):
         rows: Tensor = (columns @ wrenches).transpose(-3, -2)
         return rows.reshape(*q.shape, 10 * len(self.parents))
 
+    def residual_torque(self, q: Tensor, qd: Tensor, qdd: Tensor, prepared: RigidPrepared) -> Tensor:
+        """What else than bodies, drives and friction takes torque, (..., n) [Nm, N]: nothing."""
+        return torch.zeros_like(q)
+
+    def friction_factor(self, q: Tensor) -> Tensor:
+        """How much more friction the drives have at q than their laws say, (..., n): nowhere any."""
+        return torch.ones_like(q)
+
     def friction_at(self, at: Motion, qd: Tensor, prepared: RigidPrepared, z: Tensor | None = None) -> Tensor:
         """The friction torque C^T f(C qd), (..., n) [Nm, N]."""
         torque: Tensor = self.friction(qd @ self.motors.mT, at.gravity @ self.loads, prepared.friction, z)
-        return torque @ self.motors
+        return (self.friction_factor(at.q) * torque) @ self.motors
 
     def stored_energy(self, z: Tensor, prepared: RigidPrepared) -> Tensor:
         """What the bristles give back, (...) [J]."""
@@ -1025,6 +1013,7 @@ class RigidBodyDynamics(PortHamiltonian):
         """D(q, qd), (..., n, n), diagonal where each drive moves its own joint alone."""
         speeds, loads = qd @ self.motors.mT, at.gravity @ self.loads
         resistance = self.friction.resistance(speeds, loads, prepared.friction)
+        resistance = self.friction_factor(at.q) * resistance
         return self.motors.mT @ (resistance.unsqueeze(-1) * self.motors)
 
     def input_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:

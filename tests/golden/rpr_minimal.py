@@ -1,8 +1,8 @@
 r"""Port-Hamiltonian model of an arm with 3 joints, written by `spelgen build`.
 
-3 learned functions of q and 2 constants make the mass matrix.
+3 rigid bodies with trained inertial parameters;
+networks for what they leave: 3 learned functions of q and 2 constants in M.
 The potential energy depends on joint 3.
-M and V: Fourier series with trained coefficients, and a part for a network.
 Sizes and starting values are the URDF's inertials.
 
 Mass matrix: the joints each entry depends on, C where it is constant, . where it is always zero.
@@ -30,17 +30,18 @@ from torch import Tensor, nn
 
 FACTS = r"""{"robot": "rpr", "urdf": "rpr.urdf",
  "urdf_sha256": "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d",
- "spec_sha256": "40a853f2bc6bbd85a6f98df208b00b4e8190bb11eb2bbd744d061c9597635932",
+ "spec_sha256": "dba7ec6cead031bb5bdd0f17b6dc9be521be22c26c61fb88eb3bab92198f365d",
  "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,
   "net": "mlp", "preset": "minimal", "tip": null, "width": 64},
  "joints": {"joint1": "revolute", "joint2": "prismatic", "joint3": "revolute"}}"""
 
 
 class Model(nn.Module):
-    """The arm's dynamics: 3 learned functions of q and 2 constants make the mass matrix.
+    """The arm's dynamics: 3 rigid bodies with trained inertial parameters, and networks for what they leave.
 
     q, qd, qdd, tau and p are (..., n), with any leading dimensions; rad and Nm, m and N if prismatic. For all
     weights M is positive definite, D positive semi-definite. ``prepared``: what ``prepare`` gave, for speed.
+    z, (..., n, 4), friction's memory, is how far its bristles are bent [rad, m]; None: they slide as qd goes.
     """
 
     n = 3
@@ -50,104 +51,80 @@ class Model(nn.Module):
     def __init__(self, seed: int = 0, dtype: torch.dtype = torch.float64) -> None:
         super().__init__()
         joints = Joints(
-            revolute=(True, False, True),
-            center=(0.0, 0.7875, 0.0),
-            reach=(2.96706, 0.4825, 2.96706),
-            speed=(3.0, 1.0, 6.0),
-            friction=(0.4, 0.4, 0.4),
-            armature=(2.19, 0.782, 0.106),
-            gear=(1.0, 1.0, 1.0),
-            actuated=(True, True, True),
-        )
+            revolute=(True, False, True), center=(0.0, 0.7875, 0.0), reach=(2.96706, 0.4825, 2.96706),
+            speed=(3.0, 1.0, 6.0), friction=(0.4, 0.4, 0.4), armature=(2.19, 0.782, 0.106),
+            gear=(1.0, 1.0, 1.0), actuated=(True, True, True),
+        )  # fmt: skip
+        bodies = Bodies(
+            parent=(-1, 0, 1), joint=(0, 1, 2), revolute=(True, False, True), ratio=(1.0, 1.0, 1.0),
+            offset=(0.0, 0.0, 0.0),
+            rotation=(
+                ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+                ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
+                ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+            ),
+            position=((0.0, 0.0, 0.0), (0.0, 0.0, 0.154), (0.0, -0.0203, 0.0)), mass=(5.01, 4.25, 1.08),
+            moment=((0.0, 0.0, -4.48896), (0.0, -0.086275, -27.4125), (0.0, 0.09936, -0.05832)),
+            inertia=(
+                (4.13010816, 4.12210816, 0.018), (179.3223764, 179.320625, 0.0077513825),
+                (0.0142904, 0.00425851, 0.0102504),
+            ),
+            products=((0.0, 0.0, 0.0), (0.0, 0.0, -0.55647375), (0.0, 0.0, 0.00536544)),
+        )  # fmt: skip
         generator = torch.Generator().manual_seed(seed)
-        encoding = JointEncoding(joints)
-        functions = (
-            MassFunction(
-                (2,),
-                mean=-0.00167665,
-                scale=1.36528,
-                offset=0.0,
-                series=(Term((0, 0, 1), (0, 0, 0), -0.09936, 0.0),),
-            ),
-            MassFunction(
-                (1, 2),
-                mean=-0.00154309,
-                scale=0.0595527,
-                offset=0.0,
-                series=(
-                    Term((0, 0, 1), (0, 0, 0), 0.0, -0.07288056),
-                    Term((0, 0, 1), (0, 1, 0), 0.0, -0.0479412),
-                ),
-            ),
-            MassFunction(
-                (1, 2),
-                mean=139.887,
-                scale=12.6351,
-                offset=139.386736,
-                series=(
-                    Term((0, 0, 2), (0, 0, 0), 0.00507056, 0.0),
-                    Term((0, 0, 0), (0, 1, 0), -22.4588744, 0.0),
-                    Term((0, 0, 0), (0, 2, 0), 1.24085731, 0.0),
-                ),
-            ),
-        )
-        potential_series = (Term((0, 0, 1), (0, 0, 0), 0.0, 0.9747216),)
-        fourier = FourierFeatures(joints, [*(function.series for function in functions), potential_series])
-        constants = ((0.0101411, 0.0101411), (5.33, 5.33))
-        sensitivity = (0.02, 1.0, 0.518)
+        functions = ((2,),) + ((1, 2),) * 2
         network = MaskedMLP(
-            joint_input(joints, (1, 2), sensitivity),
-            unit_joints([function.joints for function in functions], width=64, depth=2, least=4),
-            generator,
-            NETWORK_FRACTION,
-        )
-        mass = DerivedMass(
-            joints,
-            self.mass_entries,
-            functions,
-            constants,
-            network,
-            0.08,
-            fourier=fourier,
-            sensitivity=sensitivity,
-        )
-        sensitivity = (0.02, 0.02, 1.0)
+            joint_input(joints, (1, 2), (0.02, 1.0, 0.518)),
+            unit_joints(functions, width=64, depth=2, least=4), generator,
+        )  # fmt: skip
+        mass = ResidualMass(joints, self.mass_entries, 3, 2, network)
         network = MaskedMLP(
-            joint_input(joints, (2,), sensitivity),
-            unit_joints(((2,),), width=32, depth=2),
-            generator,
-            NETWORK_FRACTION,
+            joint_input(joints, (2,), (0.02, 0.02, 1.0)), unit_joints(((2,),), width=32, depth=2), generator
         )
-        potential = LearnedPotential(0.703291, network, fourier, potential_series, sensitivity)
-        friction = JointFriction(joints, encoding, generator)
-        self.dynamics = NetworkDynamics(encoding, mass, potential, friction, DirectInput(joints), fourier)
+        potential = LearnedPotential(0.703291, network)
+        self.dynamics = ResidualDynamics(
+            joints, bodies, (0.0, 0.0, -9.81), DirectInput(joints), mass, potential,
+            reach=((0.0001, 0.001, 0.01, 0.1), (1e-05, 0.0001, 0.001, 0.01), (0.0001, 0.001, 0.01, 0.1)),
+        )  # fmt: skip
         self.to(dtype)
 
     @staticmethod
     def mass_entries(f: Sequence[Tensor], c: Sequence[Tensor]) -> Tensor:
-        """M, (..., n, n), without armature, by its functions f(q) and its constants c."""
+        """R, what M has beside rigid bodies, (..., n, n), by its functions f(q) and its constants c."""
         # f1(q3), f2(q2,3), f3(q2,3)
         f1, f2, f3 = f
         c1, c2 = c
         return symmetric([f3], [f1, c2], [f2, 0, c1])
 
     @property
+    def inertial_parameters(self) -> Tensor:
+        """By body (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) about its joint's frame, (bodies, 10)."""
+        return self.dynamics.inertial_parameters.forward()
+
+    @property
     def armature(self) -> Tensor:
         """What the drives add to M's diagonal, (n,) [kg m^2, kg]."""
-        value: Tensor = self.dynamics.mass.armature()
-        return value
+        return self.dynamics.armature.forward()
 
     @property
     def rotor_inertia(self) -> Tensor:
         """The drives' inertia before the gear, (n,) [kg m^2, kg]."""
-        value: Tensor = self.dynamics.mass.armature.rotor_inertia()
-        return value
+        return self.dynamics.armature.rotor_inertia()
 
     @property
     def viscous(self) -> Tensor:
         """Friction torque by velocity, (n,) [Nm s/rad, N s/m]."""
-        value: Tensor = self.dynamics.friction.viscous()
-        return value
+        return self.dynamics.friction.prepare().viscous
+
+    @property
+    def coulomb(self) -> Tensor:
+        """Dry friction, (n,) [Nm, N]."""
+        return self.dynamics.friction.prepare().coulomb
+
+    @property
+    def torque_offset(self) -> Tensor:
+        """What the measured torque shows without any, (n,) [Nm, N]."""
+        return self.dynamics.torque_offset()
 
     def prepare(self, definite: bool = True) -> Any:
         """All that depends on the weights alone, until they change; M made ``definite``, or as learned."""
@@ -261,9 +238,6 @@ class Network(Protocol):
     def jvp(self, residuals: Any, tangent: Tensor) -> Tensor:
         """d/d encoded times the encoding's tangent, (..., rows)."""
 
-    def set_output_bias(self, values: Tensor) -> None:
-        """Start the outputs from these values."""
-
 
 def unit_joints(
     outputs: Sequence[Sequence[int]], width: int, depth: int, least: int = 1
@@ -290,11 +264,33 @@ def unit_joints(
     return (*((hidden,) * depth), tuple(frozenset(joints) for joints in outputs))
 
 
-class Configuration(NamedTuple):
-    """A position as networks and Fourier series read it; or how fast that changes."""
+class Bristles(nn.Module):
+    """K elements a joint, elastic up to their reach, sliding beyond; z is (..., n, K) [rad, m].
 
-    encoded: Tensor  # (..., 2 n) or (..., 3 n), see JointEncoding
-    fourier: Tensor | None  # (..., 2 K), see FourierFeatures
+    z' = qd - |qd| z / reach, whatever the speed: in displacement it is linear, and needs no small
+    steps (Dahl, A Solid Friction Model, 1968; several elements as in Lampaert, Al-Bender and
+    Swevers, A Generalized Maxwell-Slip Friction Model, 2003).
+    """
+
+    reach: Tensor  # (n, K)
+
+    def __init__(self, reach: Sequence[Sequence[float]]) -> None:
+        super().__init__()
+        self.register_buffer("reach", torch.tensor(reach, dtype=torch.float64))
+
+    def rate(self, qd: Tensor, z: Tensor) -> Tensor:
+        """z', (..., n, K)."""
+        return qd.unsqueeze(-1) - qd.abs().unsqueeze(-1) * z / self.reach
+
+    def moved(self, z: Tensor, displacement: Tensor) -> Tensor:
+        """z after joints went one way by (..., n), exactly."""
+        return moved_bristles(z, displacement, self.reach)
+
+
+def moved_bristles(z: Tensor, displacement: Tensor, reach: Tensor) -> Tensor:
+    """z, (..., n, K), after joints went one way by (..., n), exactly."""
+    end = displacement.sign().unsqueeze(-1) * reach
+    return end + (z - end) * (-displacement.abs().unsqueeze(-1) / reach).exp()
 
 
 Entries = Callable[[Sequence[Tensor], Sequence[Tensor]], Tensor]
@@ -320,37 +316,6 @@ def entry_basis(entries: Entries, functions: int, constants: int) -> tuple[Tenso
     return by_function.flatten(1), by_constant.flatten(1)
 
 
-class PositiveDefiniteBound(nn.Module):
-    """Draws M towards a positive definite matrix C, as far as M needs it to be positive definite.
-
-    M' = C + t (M - C), with t = 1 wherever M - margin C is positive definite. Elsewhere t = 2^-k is
-    the first such power with t |M - C| <= 1 - margin, |.| being at least the norm relative to C:
-    then M' - margin C is positive definite. t is constant in pieces, so that derivatives of M' are
-    t times those of M. C has M's own zeros and linear relations, which therefore hold in M'.
-    """
-
-    center: Tensor  # C
-    least: Tensor  # margin C
-    unit: Tensor  # an entry's largest part in the norm relative to C, divided by 1 - margin
-
-    def __init__(self, center: Tensor, margin: float) -> None:
-        super().__init__()
-        scale = center.diagonal().rsqrt()
-        scaled = scale.unsqueeze(-1) * center * scale
-        least = torch.linalg.eigvalsh(scaled)[0]
-        self.register_buffer("center", center)
-        self.register_buffer("least", margin * center)
-        self.register_buffer("unit", scale.unsqueeze(-1) * scale / least / (1 - margin))
-
-    def forward(self, mass: Tensor) -> tuple[Tensor, Tensor]:
-        """M', (..., n, n), and t, (...)."""
-        fixed = mass.detach()
-        indefinite = torch.linalg.cholesky_ex(fixed - self.least).info != 0
-        size = torch.linalg.vector_norm(self.unit * (fixed - self.center), dim=(-2, -1))
-        part = torch.where(indefinite, torch.exp2(-torch.ceil(torch.log2(size)).clamp(min=1.0)), 1.0)
-        return torch.lerp(self.center, mass, part[..., None, None]), part
-
-
 def to_group(q: Tensor, joint_types: Sequence[str]) -> list[Tensor]:
     """By joint, R in SO(3), (..., 3, 3), or r in R^3, (..., 3), if prismatic; z is its axis."""
     parts = []
@@ -372,6 +337,22 @@ def from_group(parts: Sequence[Tensor], joint_types: Sequence[str]) -> Tensor:
         for kind, part in zip(joint_types, parts, strict=True)
     ]
     return torch.stack(values, dim=-1)
+
+
+class Input(Protocol):
+    """What gives G."""
+
+    def prepare(self) -> Any:
+        """All that depends on the weights alone."""
+
+    def __call__(self, encoded: Tensor, prepared: Any) -> Tensor:
+        """G, (..., n, n)."""
+
+    def force(self, encoded: Tensor, tau: Tensor, prepared: Any) -> Tensor:
+        """G tau, (..., n)."""
+
+    def solve(self, encoded: Tensor, force: Tensor, prepared: Any) -> Tensor:
+        """The inputs, (..., n), that make this force."""
 
 
 def solved(matrix: Tensor, right: Tensor) -> Tensor:
@@ -634,140 +615,209 @@ def joint_input(joints: Joints, chosen: Iterable[int], sensitivity: Sequence[flo
     return NetworkInput(owners, vector(sensitivity[j] for j in owners), matrix, 0 * matrix.sum(dim=1))
 
 
-class Term(NamedTuple):
-    """x^powers (cos_factor cos(frequencies q) + sin_factor sin(frequencies q)), x the scaled q."""
-
-    frequencies: tuple[int, ...]  # by joint
-    powers: tuple[int, ...]  # by joint; none where no joint is prismatic
-    cos_factor: float
-    sin_factor: float
+SPLINES = 34  # over the range of a joint
 
 
-class FourierFeatures(nn.Module):
-    """x^powers cos(frequencies q), then x^powers sin(frequencies q), (..., 2 K), of all terms of ``series``.
+HARMONICS = 64  # of a turn of the joint, and the first two of a turn of the motor: teeth and poles come again
 
-    With every power its lower powers are there too, for the derivatives.
+
+def ripple_frequencies(joints: Joints) -> Tensor:
+    """How often in a turn of the joint a ripple may come again, (n, HARMONICS + 2)."""
+    few = tuple(range(1, HARMONICS + 3))
+    rows = [(*few[:-2], gear, 2 * gear) if gear > HARMONICS else few for gear in joints.gear]
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+class JointFunctions(nn.Module):
+    """By joint a torque t(q) = dV/dq, its energy V(q), and a factor on friction, from q of that joint alone.
+
+    t is a sum of cubic B-splines over the joint's range and, of a revolute joint, of harmonics of its
+    turns and of its motor's; the factor is the exponential of such a spline. Splines vanish where the
+    range ends, so that nothing is added where nothing was seen. Weights are zero at first; torques are
+    in units of usual friction.
     """
 
-    frequencies: Tensor  # (n, K)
-    powers: Tensor  # (K, n)
-    lower: Tensor  # takes K features to their derivatives by each joint that slides, (K, n K)
+    scale: Tensor
+    center: Tensor
+    spacing: Tensor
+    revolute: Tensor
+    knots: Tensor
+    frequencies: Tensor
 
-    def __init__(self, joints: Joints, series: Iterable[Sequence[Term]]) -> None:
+    def __init__(self, joints: Joints) -> None:
         super().__init__()
-        still = (0,) * joints.n
-        keys = {(term.frequencies, term.powers or still) for terms in series for term in terms}
-        waiting = list(keys)
-        while waiting:
-            frequencies, powers = waiting.pop()
-            below = {(frequencies, _less(powers, joint)) for joint, power in enumerate(powers) if power}
-            waiting += below - keys
-            keys |= below
-        self.keys = sorted(keys)
-        self.count, self.joints = len(keys), joints.n
-        self.prismatic = any(any(powers) for _, powers in keys)
-        self.register_buffer("frequencies", torch.stack([vector(each) for each, _ in self.keys]).mT)
-        self.register_buffer("powers", torch.stack([vector(each) for _, each in self.keys]))
-        lower = torch.zeros(self.count, joints.n, self.count, dtype=torch.float64)
-        for place, (frequencies, powers) in enumerate(self.keys):
-            for joint, power in enumerate(powers):
-                if power:
-                    below_place = self.keys.index((frequencies, _less(powers, joint)))
-                    lower[below_place, joint, place] = power / joints.reach[joint]
-        self.register_buffer("lower", lower.flatten(1))
+        n = joints.n
+        self.register_buffer("scale", vector(joints.friction))
+        self.register_buffer("center", vector(joints.center))
+        self.register_buffer("spacing", 2 * vector(joints.reach) / (SPLINES - 3))
+        self.register_buffer("revolute", vector(float(each) for each in joints.revolute))
+        self.register_buffer("knots", torch.arange(SPLINES).double() - (SPLINES - 1) / 2)
+        self.register_buffer("frequencies", ripple_frequencies(joints))
+        self.raw_torque_splines = nn.Parameter(torch.zeros(n, SPLINES, dtype=torch.float64))
+        self.raw_torque_ripple = nn.Parameter(torch.zeros(n, 2 * (HARMONICS + 2), dtype=torch.float64))
+        self.raw_friction_splines = nn.Parameter(torch.zeros(n, SPLINES, dtype=torch.float64))
 
-    def place(self, term: Term) -> int:
-        """Where a term's cosine stands among the features."""
-        return self.keys.index((term.frequencies, term.powers or (0,) * self.joints))
+    def splines(self, q: Tensor) -> Tensor:
+        """The cubic B-splines at q, (..., n, SPLINES), each 2/3 high."""
+        away = self._places(q).abs()
+        return ((2 - away).relu() ** 3 - 4 * (1 - away).relu() ** 3) / 6
 
-    def forward(self, q: Tensor, scaled: Tensor) -> Tensor:
-        """The features of q, with the scaled q at hand."""
-        angle = q @ self.frequencies
-        cos, sin = angle.cos(), angle.sin()
-        if self.prismatic:
-            size = (scaled.unsqueeze(-2) ** self.powers).prod(dim=-1)
-            cos, sin = size * cos, size * sin
-        return torch.cat([cos, sin], dim=-1)
+    def ripple(self, q: Tensor) -> Tensor:
+        """Cosines, then sines of frequency times q, (..., n, 2 HARMONICS + 4); zero for a prismatic joint."""
+        phase = q.unsqueeze(-1) * self.frequencies
+        return torch.cat([phase.cos(), phase.sin()], dim=-1) * self.revolute.unsqueeze(-1)
 
-    def _by_sliding(self, feature: Tensor) -> Tensor:
-        """d/dq of K features by prismatic joints, (..., n, K)."""
-        return (feature @ self.lower).reshape(*feature.shape[:-1], self.joints, self.count)
+    def torque(self, q: Tensor) -> Tensor:
+        """dV/dq, (..., n) [Nm, N]."""
+        smooth = (self.splines(q) * self.raw_torque_splines).sum(dim=-1)
+        return self.scale * (smooth + (self.ripple(q) * self.raw_torque_ripple).sum(dim=-1))
 
-    def jvp(self, features: Tensor, qd: Tensor) -> Tensor:
-        """How fast the features change along qd."""
-        cos, sin = features.chunk(2, dim=-1)
-        turned = qd @ self.frequencies
-        by_cos, by_sin = -sin * turned, cos * turned
-        if self.prismatic:
-            slid = [(qd.unsqueeze(-2) @ self._by_sliding(x)).squeeze(-2) for x in (cos, sin)]
-            by_cos, by_sin = slid[0] + by_cos, slid[1] + by_sin
-        return torch.cat([by_cos, by_sin], dim=-1)
+    def energy(self, q: Tensor) -> Tensor:
+        """V, (...) [J]; of what ends where the range does, half on either side."""
+        place = self._places(q)
+        away = place.abs()
+        part = 0.5 - (2 - away).relu() ** 4 / 24 + (1 - away).relu() ** 4 / 6
+        smooth = self.spacing * (place.sign() * part * self.raw_torque_splines).sum(dim=-1)
+        by_cos, by_sin = (self.ripple(q) / self.frequencies.repeat(1, 2)).chunk(2, dim=-1)
+        turned = torch.cat([by_sin, -by_cos], dim=-1)
+        return (self.scale * (smooth + (turned * self.raw_torque_ripple).sum(dim=-1))).sum(dim=-1)
 
-    def vjp(self, features: Tensor, cotangent: Tensor) -> Tensor:
-        """d/dq, (..., n), of what has the derivative ``cotangent`` by the features."""
-        cos, sin = features.chunk(2, dim=-1)
-        by_cos, by_sin = cotangent.chunk(2, dim=-1)
-        by_joint = (by_sin * cos - by_cos * sin) @ self.frequencies.mT
-        if self.prismatic:
-            for feature, by_feature in ((cos, by_cos), (sin, by_sin)):
-                slid = self._by_sliding(feature) @ by_feature.unsqueeze(-1)
-                by_joint = by_joint + slid.squeeze(-1)
-        return by_joint
+    def friction_factor(self, q: Tensor) -> Tensor:
+        """How much more friction there is at q than elsewhere, (..., n), positive."""
+        return (self.splines(q) * self.raw_friction_splines).sum(dim=-1).exp()
 
-    def gradient_map(self, coefficients: Tensor) -> Tensor:
-        """What takes the features to d/dq of features @ coefficients, (2 K, n)."""
-        by_cos, by_sin = coefficients.unsqueeze(-1).chunk(2)
-        turned = torch.cat([by_sin * self.frequencies.mT, -by_cos * self.frequencies.mT])
-        if not self.prismatic:
-            return turned
-        lower = self.lower.reshape(self.count, self.joints, self.count)
-        return turned + torch.cat([lower @ by_cos, lower @ by_sin]).squeeze(-1)
+    def _places(self, q: Tensor) -> Tensor:
+        """How far q is from each spline's middle, in spacings, (..., n, SPLINES)."""
+        return ((q - self.center) / self.spacing).unsqueeze(-1) - self.knots
 
 
-class FourierSeries(nn.Module):
-    """Fourier series with trained coefficients, one for each output of a network beside it.
+Row = tuple[float, float, float]
 
-    ``series`` has, for each output, the terms that coefficients start from. They are trained in
-    units of the output's scale times the least sensitivity of the joints that the term depends on.
+
+class Bodies(NamedTuple):
+    """All that moves rigidly with a joint, an entry for each; a body turns about its frame's z, or
+    slides along it, by ratio * q + offset.
     """
 
-    outputs: Tensor  # of each coefficient
-    places: Tensor
-    units: Tensor
+    parent: tuple[int, ...]  # -1: the base
+    joint: tuple[int, ...]
+    revolute: tuple[bool, ...]
+    ratio: tuple[float, ...]
+    offset: tuple[float, ...]
+    rotation: tuple[tuple[Row, Row, Row], ...]  # of the joint's frame in its parent's
+    position: tuple[Row, ...]  # likewise [m]
+    mass: tuple[float, ...]  # nominal m [kg]
+    moment: tuple[Row, ...]  # nominal m c [kg m]
+    inertia: tuple[Row, ...]  # nominal Ixx, Iyy, Izz about the joint [kg m^2]
+    products: tuple[Row, ...]  # likewise Ixy, Ixz, Iyz
 
-    def __init__(
-        self,
-        features: FourierFeatures,
-        series: Sequence[Sequence[Term]],
-        scales: Sequence[float],
-        sensitivity: Sequence[float],
-    ) -> None:
+
+def skew(a: Tensor) -> Tensor:
+    """[a]x, (..., 3, 3), with [a]x b = a x b."""
+    x, y, z = a.unbind(dim=-1)
+    zero = torch.zeros_like(x)
+    rows = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1)
+    return rows.reshape(*a.shape[:-1], 3, 3)
+
+
+def twist_map(rotation: Tensor, position: Tensor) -> Tensor:
+    """Takes twists (angular, linear) to a frame at ``position`` turned by ``rotation``^T, (6, 6)."""
+    top = torch.cat([rotation, torch.zeros_like(rotation)], dim=1)
+    return torch.cat([top, torch.cat([-rotation @ skew(position), rotation], dim=1)])
+
+
+def transform_table(bodies: Bodies, index: int) -> Tensor:
+    """A body's twist map from its parent's frame is table[0] + table[1] cos + table[2] sin, (3, 6, 6).
+
+    A prismatic one's is table[0] + displacement table[1].
+    """
+    rotation = torch.stack([vector(row) for row in bodies.rotation[index]]).mT
+    position = vector(bodies.position[index])
+    table = torch.zeros(3, 6, 6, dtype=torch.float64)
+    if bodies.revolute[index]:
+        about = torch.zeros(3, 3, 3, dtype=torch.float64)
+        about[0, 2, 2] = about[1, 0, 0] = about[1, 1, 1] = about[2, 0, 1] = 1
+        about[2, 1, 0] = -1
+        for term in range(3):
+            table[term] = twist_map(about[term] @ rotation, position)
+    else:
+        table[0] = twist_map(rotation, position)
+        table[1] = twist_map(rotation, position + rotation[2]) - table[0]
+    return table
+
+
+def inertia_basis() -> Tensor:
+    """Spatial inertias of bodies with one parameter one and the others zero, (10, 6, 6)."""
+    basis = torch.zeros(10, 6, 6, dtype=torch.float64)
+    basis[0, 3:, 3:] = torch.eye(3)
+    for axis, unit in enumerate(torch.eye(3, dtype=torch.float64)):
+        basis[1 + axis, :3, 3:], basis[1 + axis, 3:, :3] = skew(unit), -skew(unit)
+    for place, (row, column) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))):
+        basis[4 + place, row, column] = basis[4 + place, column, row] = 1
+    return basis
+
+
+def pseudo_inertia(ten: Tensor) -> Tensor:
+    """[[tr(I)/2 - I, m c], [(m c)^T, m]], (..., 4, 4), of (m, m c, I), (..., 10).
+
+    It is positive definite exactly where some distribution of mass has these parameters (Wensing,
+    Kim and Slotine, IEEE RA-L 3:60, 2018).
+    """
+    m, x, y, z, xx, xy, xz, yy, yz, zz = ten.unbind(dim=-1)
+    half = (xx + yy + zz) / 2
+    rows = [half - xx, -xy, -xz, x, -xy, half - yy, -yz, y, -xz, -yz, half - zz, z, x, y, z, m]
+    return torch.stack(rows, dim=-1).reshape(*ten.shape[:-1], 4, 4)
+
+
+class InertialParameters(nn.Module):
+    """Trained inertial parameters of rigid bodies, possible ones for all weights; zero is nominal.
+
+    A body's pseudo-inertia is C T T^T C^T, with C of the nominal body and T lower triangular, its
+    diagonal exponentials (Rucker and Wensing, IEEE RA-L 7:4352, 2022).
+    """
+
+    factors: Tensor
+    triangle: Tensor
+
+    def __init__(self, bodies: Bodies) -> None:
         super().__init__()
-        self.count = features.count
-        moving = (features.frequencies.mT != 0) | (features.powers != 0)  # (K, n)
-        rows = []
-        for output, (terms, scale) in enumerate(zip(series, scales, strict=True)):
-            for term in terms:
-                place = features.place(term)
-                unit = min(s for s, moves in zip(sensitivity, moving[place], strict=True) if moves)
-                rows.append((output, place, term.cos_factor / scale / unit, unit))
-                rows.append((output, features.count + place, term.sin_factor / scale / unit, unit))
-        outputs, places, starts, units = zip(*rows, strict=True)
-        self.register_buffer("outputs", torch.tensor(outputs))
-        self.register_buffer("places", torch.tensor(places))
-        self.register_buffer("units", vector(units))
-        self.raw_coefficients = nn.Parameter(vector(starts))
+        columns = zip(bodies.mass, bodies.moment, bodies.inertia, bodies.products, strict=True)
+        nominal = torch.stack(
+            [
+                vector((m, *moment, xx, xy, xz, yy, yz, zz))
+                for m, moment, (xx, yy, zz), (xy, xz, yz) in columns
+            ]
+        )
+        self.register_buffer("factors", torch.linalg.cholesky(pseudo_inertia(nominal)))
+        row, column = torch.tril_indices(4, 4)
+        self.register_buffer("triangle", torch.eye(16, dtype=torch.float64)[4 * row + column])
+        self.raw = nn.Parameter(torch.zeros(len(bodies.mass), 10, dtype=torch.float64))
 
-    def prepare(self, output_map: Tensor) -> Tensor:
-        """What takes features to output_map y, (rows, 2 K), where y are the series."""
-        known = output_map.new_zeros(output_map.shape[1], 2 * self.count)
-        coefficients = self.units * self.raw_coefficients
-        return output_map @ known.index_put((self.outputs, self.places), coefficients)
+    def forward(self) -> Tensor:
+        """By body (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) about its joint's frame, (bodies, 10)."""
+        on_diagonal = self.triangle[:, ::5].sum(dim=1) > 0
+        lower = torch.where(on_diagonal, self.raw.exp(), self.raw) @ self.triangle
+        root = self.factors @ lower.reshape(-1, 4, 4)
+        pseudo = root @ root.mT
+        moments, tensor = pseudo[:, 3, :3], -pseudo[:, :3, :3]
+        trace = -tensor.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
+        xx, yy, zz = (trace.unsqueeze(-1) + tensor.diagonal(dim1=-2, dim2=-1)).unbind(dim=-1)
+        xy, xz, yz = tensor[:, 0, 1], tensor[:, 0, 2], tensor[:, 1, 2]
+        six = torch.stack([xx, xy, xz, yy, yz, zz], dim=-1)
+        return torch.cat([pseudo[:, 3, 3:], moments, six], dim=-1)
 
 
-def _less(powers: tuple[int, ...], joint: int) -> tuple[int, ...]:
-    """The powers with one less of a joint."""
-    return tuple(power - (k == joint) for k, power in enumerate(powers))
+def motor_speeds(gains: Tensor) -> Tensor:
+    """C, (n, n): the motors' speeds are C qd, where the joints' torques are ``gains`` times the motors'.
+
+    By the same power, each motor's in the units of the joint that it moves most: C is the identity where
+    each moves its own joint alone.
+    """
+    largest = gains.gather(0, gains.abs().argmax(dim=0, keepdim=True))
+    passive = largest == 0
+    return (gains / torch.where(passive, torch.ones_like(largest), largest)).mT + torch.diag(
+        passive[0].to(gains)
+    )
 
 
 class DirectInput(nn.Module):
@@ -796,141 +846,238 @@ class DirectInput(nn.Module):
         return force
 
 
-class Mass(Protocol):
-    """What gives M(q) and its derivatives."""
+class LearnedPotential(nn.Module):
+    """V(q) [J], of one network, in units of ``scale``."""
 
-    def prepare(self, definite: bool = True) -> Any:
-        """All that depends on the weights alone; ``definite``: keep M positive definite."""
+    scale: Tensor
 
-    def __call__(self, at: Configuration, prepared: Any) -> tuple[Tensor, Any]:
-        """M(q), (..., n, n), and what its derivatives need."""
-
-    def kinetic_vjp(self, at: Configuration, qd: Tensor, residuals: Any) -> tuple[Tensor, Tensor | None]:
-        """The derivative of 1/2 qd^T M(q) qd by the encoding, and by the Fourier features."""
-
-    def jvp(self, rate: Configuration, residuals: Any) -> Tensor:
-        """dM/dt, (..., n, n), where the configuration changes at this rate."""
-
-
-class Friction(Protocol):
-    """What gives D(q, qd)."""
-
-    def prepare(self) -> Any:
-        """All that depends on the weights alone."""
-
-    def __call__(self, encoded: Tensor, qd: Tensor, prepared: Any) -> Tensor:
-        """D qd, (..., n) [Nm, N]."""
-
-    def dissipation(self, encoded: Tensor, qd: Tensor, prepared: Any) -> Tensor:
-        """D, (..., n, n)."""
-
-
-class Input(Protocol):
-    """What gives G."""
-
-    def prepare(self) -> Any:
-        """All that depends on the weights alone."""
-
-    def __call__(self, encoded: Tensor, prepared: Any) -> Tensor:
-        """G, (..., n, n)."""
-
-    def force(self, encoded: Tensor, tau: Tensor, prepared: Any) -> Tensor:
-        """G tau, (..., n)."""
-
-    def solve(self, encoded: Tensor, force: Tensor, prepared: Any) -> Tensor:
-        """The inputs, (..., n), that make this force."""
-
-
-HIDDEN = 8  # units of a joint's network
-
-
-POSITION_SENSITIVITY = 0.1  # of friction's networks, relative to velocity
-
-
-SMOOTHING = 0.03  # below this fraction of its usual speed dry friction fades to zero, to start from
-
-
-LEAST_SMOOTHING = 0.001  # and at the least
-
-
-class FrictionLayers(NamedTuple):
-    """The weights made ready for many states, all joints' networks in one."""
-
-    weight: Tensor
-    bias: Tensor
-    out: Tensor
-    offset: Tensor
-    viscous: Tensor  # [Nm s/rad, N s/m]
-    smoothing: Tensor  # coulomb smoothing velocity squared [rad^2/s^2, m^2/s^2]
-
-
-class JointFriction(nn.Module):
-    """A diagonal D(q, qd), positive for all weights."""
-
-    matrix: Tensor  # where the inputs of a joint's network stand, (joints, inputs, encoded + 2 n)
-    speed: Tensor
-    nominal: Tensor
-
-    def __init__(self, joints: Joints, encoding: JointEncoding, generator: torch.Generator) -> None:
+    def __init__(self, scale: float, network: Network) -> None:
         super().__init__()
-        n, inputs = joints.n, 4
-        matrix = torch.zeros(n, inputs, encoding.size + 2 * n, dtype=torch.float64)
-        for i, revolute in enumerate(joints.revolute):
-            cos, sin = (i, n + i) if revolute else (2 * n + i, 2 * n + i)
-            matrix[i, 0, cos] = matrix[i, 1, sin] = POSITION_SENSITIVITY
-            matrix[i, 2, i - 2 * n], matrix[i, 3, i - n] = 1 / joints.speed[i], 1.0
-        self.register_buffer("matrix", matrix)
-        self.register_buffer("speed", vector(joints.speed))
+        self.register_buffer("scale", torch.full((1, 1), scale, dtype=torch.float64))
+        self.network = network
+
+    def prepare(self) -> Any:
+        """All that depends on the weights alone."""
+        return self.network.prepare(self.scale, 0 * self.scale[0])
+
+    def forward(self, encoded: Tensor, prepared: Any) -> Tensor:
+        """V(q), (...) [J]."""
+        energy: Tensor = self.network(encoded, prepared)[0].squeeze(-1)
+        return energy
+
+    def vjp(self, encoded: Tensor, prepared: Any) -> Tensor:
+        """The derivative of V by the encoding."""
+        _, residuals = self.network(encoded, prepared)
+        return self.network.vjp(residuals, encoded.new_ones(1))
+
+
+# where the constants start, relative to a joint's usual friction and speed
+STRIBECK = 0.3  # dry friction that only slow motion has
+
+
+STRIBECK_VELOCITY = 0.03  # where that has faded
+
+
+SMOOTHING_VELOCITY = 0.006  # over which dry friction turns around
+
+
+SATURATION_VELOCITY = 0.2  # where viscous friction begins to grow more slowly
+
+
+LOAD_DEPENDENCE = 0.03  # dry friction by gravity torque
+
+
+class FrictionConstants(NamedTuple):
+    """By joint, (n,), all positive."""
+
+    viscous: Tensor  # [Nm s/rad, N s/m]
+    saturation: Tensor  # viscous friction that stops growing [Nm, N]
+    saturation_velocity: Tensor  # [rad/s, m/s]
+    coulomb: Tensor  # [Nm, N]
+    stribeck: Tensor  # [Nm, N]
+    stribeck_velocity: Tensor  # [rad/s, m/s]
+    coulomb_smoothing_velocity: Tensor  # [rad/s, m/s]
+    load_dependence: Tensor  # dry friction by gravity torque
+    bristle_fractions: Tensor  # of dry friction, (n, K); a joint's add up to one
+
+
+class FrictionLaws(nn.Module):
+    """Friction which resists whatever the weights are: they are logarithms.
+
+    viscous qd + saturation tanh(qd / saturation_velocity)
+    + (coulomb + stribeck exp(-(qd / stribeck_velocity)^2) + load_dependence |gravity torque|) direction.
+
+    The direction, from -1 to 1, is that of the bristles, sum of fraction z / reach; without them, or
+    where nothing is known of the way here, tanh(qd / coulomb_smoothing_velocity).
+    """
+
+    nominal: Tensor
+    speed: Tensor
+    raw_coulomb_smoothing_velocity: nn.Parameter | None
+    raw_bristle_fractions: nn.Parameter | None
+
+    def __init__(self, joints: Joints, reach: Sequence[Sequence[float]] = ()) -> None:
+        super().__init__()
         self.register_buffer("nominal", vector(joints.friction))
-        self.raw_smoothing = nn.Parameter(torch.zeros(n, dtype=torch.float64))
-        self.raw_viscous = nn.Parameter(torch.full((n,), -2.0, dtype=torch.float64))
-        shape = (n, inputs, HIDDEN)
-        weight = torch.randn(shape, dtype=torch.float64, generator=generator)
-        self.weight = nn.Parameter(weight / inputs**0.5)
-        self.bias = nn.Parameter(torch.zeros(n, HIDDEN, dtype=torch.float64))
-        self.out = nn.Parameter(torch.zeros(n, HIDDEN, dtype=torch.float64))
-        self.offset = nn.Parameter(torch.full((n,), -2.0, dtype=torch.float64))
+        self.register_buffer("speed", vector(joints.speed))
+        self.bristles = Bristles(reach or [[]] * joints.n)
+        start = torch.zeros(joints.n, dtype=torch.float64)
+        self.raw_viscous = nn.Parameter(start.clone())
+        self.raw_saturation = nn.Parameter(start.clone())
+        self.raw_saturation_velocity = nn.Parameter(start.clone())
+        self.raw_coulomb = nn.Parameter(start.clone())
+        self.raw_stribeck = nn.Parameter(start.clone())
+        self.raw_stribeck_velocity = nn.Parameter(start.clone())
+        self.raw_load_dependence = nn.Parameter(start.clone())
+        # dry friction turns around by displacement or by velocity, never by both
+        smoothing = None if reach else nn.Parameter(start.clone())
+        self.register_parameter("raw_coulomb_smoothing_velocity", smoothing)
+        fractions = nn.Parameter(torch.zeros_like(self.bristles.reach)) if reach else None
+        self.register_parameter("raw_bristle_fractions", fractions)
 
-    def viscous(self) -> Tensor:
-        """Torque per velocity, (n,) [Nm s/rad, N s/m]."""
-        return self.nominal * F.softplus(self.raw_viscous) / self.speed
-
-    def coulomb_smoothing_velocity(self) -> Tensor:
-        """Where dry friction has turned around, (n,) [rad/s, m/s]."""
-        return self.speed * (LEAST_SMOOTHING**2 + (SMOOTHING * self.raw_smoothing.exp()) ** 2).sqrt()
-
-    def prepare(self) -> FrictionLayers:
-        """All joints' networks as one: block matrices are faster than a loop over joints.
-
-        Their tanh x is computed as 2 sigmoid(2 x) - 1, which takes a fraction of the time.
-        """
-        own = torch.eye(self.out.shape[0], dtype=self.out.dtype, device=self.out.device)
-        return FrictionLayers(
-            weight=2 * (self.weight.mT @ self.matrix).flatten(0, 1),
-            bias=2 * self.bias.flatten(),
-            out=2 * (own.unsqueeze(-1) * self.out).flatten(1),
-            offset=self.offset - self.out.sum(dim=1),
-            viscous=self.viscous(),
-            smoothing=self.coulomb_smoothing_velocity() ** 2,
+    def prepare(self) -> FrictionConstants:
+        """The constants, in their units."""
+        size, speed = self.nominal, self.speed
+        smoothing, fractions = self.raw_coulomb_smoothing_velocity, self.raw_bristle_fractions
+        return FrictionConstants(
+            viscous=size / speed * self.raw_viscous.exp(),
+            saturation=size * self.raw_saturation.exp(),
+            saturation_velocity=SATURATION_VELOCITY * speed * self.raw_saturation_velocity.exp(),
+            coulomb=size * self.raw_coulomb.exp(),
+            stribeck=STRIBECK * size * self.raw_stribeck.exp(),
+            stribeck_velocity=STRIBECK_VELOCITY * speed * self.raw_stribeck_velocity.exp(),
+            coulomb_smoothing_velocity=SMOOTHING_VELOCITY
+            * speed
+            * (1 if smoothing is None else smoothing.exp()),
+            load_dependence=LOAD_DEPENDENCE * size.sign() * self.raw_load_dependence.exp(),
+            bristle_fractions=self.bristles.reach if fractions is None else fractions.softmax(dim=-1),
         )
 
-    def _dry(self, encoded: Tensor, qd: Tensor, direction: Tensor, layers: FrictionLayers) -> Tensor:
-        """Dry friction relative to its usual size, (..., n)."""
-        inputs = torch.cat([encoded, qd, direction], dim=-1)
-        hidden = torch.sigmoid(F.linear(inputs, layers.weight, layers.bias))
-        return F.softplus(F.linear(hidden, layers.out, layers.offset))
+    def resistance(self, qd: Tensor, gravity: Tensor, constants: FrictionConstants) -> Tensor:
+        """The diagonal of D, (..., n): friction torque by velocity, of joints that slide."""
+        c = constants
+        slope = tanh_ratio(qd / c.coulomb_smoothing_velocity) / c.coulomb_smoothing_velocity
+        return self._viscous(qd, c) + self._dry(qd, gravity, c) * slope
 
-    def forward(self, encoded: Tensor, qd: Tensor, layers: FrictionLayers) -> Tensor:
-        """The friction torque D qd, (..., n) [Nm, N]."""
-        direction = qd * torch.rsqrt(qd * qd + layers.smoothing)  # -1 or 1, smooth at standstill
-        dry = self._dry(encoded, qd, direction, layers)
-        return layers.viscous * qd + self.nominal * direction * dry
+    def forward(
+        self, qd: Tensor, gravity: Tensor, constants: FrictionConstants, z: Tensor | None = None
+    ) -> Tensor:
+        """The friction torque, (..., n) [Nm, N], under this gravity torque, of bristles at z, (..., n, K)."""
+        if z is None:
+            return self.resistance(qd, gravity, constants) * qd
+        direction = (constants.bristle_fractions * z / self.bristles.reach).sum(dim=-1)
+        return self._viscous(qd, constants) * qd + self._dry(qd, gravity, constants) * direction
 
-    def dissipation(self, encoded: Tensor, qd: Tensor, layers: FrictionLayers) -> Tensor:
-        """D, (..., n, n) [Nm s/rad, N s/m], diagonal."""
-        smooth_speed = torch.sqrt(qd * qd + layers.smoothing)
-        dry = self._dry(encoded, qd, qd / smooth_speed, layers)
-        return torch.diag_embed(layers.viscous + self.nominal * dry / smooth_speed)
+    def sliding(self, qd: Tensor) -> Tensor:
+        """The bristles z, (..., n, K), of joints that have long gone this way."""
+        direction = (qd / self.prepare().coulomb_smoothing_velocity).tanh()
+        return direction.unsqueeze(-1) * self.bristles.reach
+
+    def stored_energy(self, z: Tensor, constants: FrictionConstants) -> Tensor:
+        """What the bristles of Coulomb friction give back, (...) [J]."""
+        stored = constants.bristle_fractions * z.square() / self.bristles.reach
+        return 0.5 * (constants.coulomb * stored.sum(dim=-1)).sum(dim=-1)
+
+    @staticmethod
+    def _viscous(qd: Tensor, c: FrictionConstants) -> Tensor:
+        """Torque by velocity, (..., n)."""
+        return c.viscous + c.saturation / c.saturation_velocity * tanh_ratio(qd / c.saturation_velocity)
+
+    @staticmethod
+    def _dry(qd: Tensor, gravity: Tensor, c: FrictionConstants) -> Tensor:
+        """The size of dry friction, (..., n) [Nm, N]."""
+        slow = (-((qd / c.stribeck_velocity) ** 2)).exp()
+        return c.coulomb + c.stribeck * slow + c.load_dependence * gravity.abs()
+
+
+def tanh_ratio(x: Tensor) -> Tensor:
+    """tanh(x) / x."""
+    near = x.abs() < 1e-4
+    safe = torch.where(near, torch.ones_like(x), x)
+    return torch.where(near, 1 - x**2 / 3, safe.tanh() / safe)
+
+
+PART = 0.9  # of the drives' inertia, which the residual may take away at most
+
+
+NEVER = 1e30  # how large a function may be by an entry where it does not stand
+
+
+class ResidualMassPrepared(NamedTuple):
+    """What depends on the weights alone."""
+
+    layers: Any  # of the network
+    functions: Tensor  # what each function adds to M at its largest, (functions, n n)
+    constant: Tensor  # what the constants add, (n n,)
+
+
+class ResidualMass(nn.Module):
+    """R(q), (..., n, n), with ``entries`` saying where functions and constants stand.
+
+    Each is its bound times the tanh of a network's output, or of a weight: the bounds are such that
+    ``armature`` + R is positive definite for all q and all weights (see ``bounds``).
+    """
+
+    basis: Tensor  # (functions + constants, n, n)
+    inverse: Tensor  # one by |basis|, NEVER where that is zero
+
+    def __init__(
+        self, joints: Joints, entries: Entries, functions: int, constants: int, network: Network | None
+    ) -> None:
+        super().__init__()
+        n = self.n = joints.n
+        basis = torch.cat(entry_basis(entries, functions, constants)).reshape(-1, n, n)
+        stands = basis != 0
+        self.register_buffer("basis", basis)
+        self.register_buffer("inverse", torch.where(stands, 1 / basis.abs(), NEVER))
+        self.part = PART / float(stands.sum(dim=(0, 2)).max())  # of all that meet in a row of M
+        self.functions, self.network = functions, network
+        self.raw_constants = nn.Parameter(torch.zeros(constants, dtype=torch.float64))
+
+    def bounds(self, armature: Tensor) -> Tensor:
+        """How large each function and constant may be, beside an armature matrix, (n, n).
+
+        armature - diag(d) is positive semi-definite for d = 1 / (row sums of |armature^-1|), and so is
+        diag(d) - R where no row of |R| / sqrt(d d^T) adds up to more than one: by diagonal dominance both.
+        """
+        root = torch.linalg.inv(armature).abs().sum(dim=-1).rsqrt()
+        pairs = root.unsqueeze(-1) * root
+        return self.part * (pairs * self.inverse).amin(dim=(-2, -1))
+
+    def prepare(self, armature: Tensor) -> ResidualMassPrepared:
+        """All that depends on the weights alone."""
+        rows = self.bounds(armature).unsqueeze(-1) * self.basis.flatten(1)
+        functions, constants = rows.tensor_split((self.functions,))
+        layers = None
+        if self.network is not None:
+            identity = torch.eye(self.functions, dtype=rows.dtype, device=rows.device)
+            layers = self.network.prepare(identity, rows.new_zeros(self.functions))
+        return ResidualMassPrepared(layers, functions, self.raw_constants.tanh() @ constants)
+
+    def forward(self, encoded: Tensor, prepared: ResidualMassPrepared) -> tuple[Tensor, Any]:
+        """R(q), and what its derivatives need."""
+        if self.network is None:
+            return prepared.constant.expand(*encoded.shape[:-1], -1).unflatten(-1, (self.n, self.n)), None
+        y, residuals = self.network(encoded, prepared.layers)
+        height = y.tanh()
+        rows = prepared.constant + height @ prepared.functions
+        return rows.unflatten(-1, (self.n, self.n)), (residuals, 1 - height * height, prepared.functions)
+
+    def kinetic_vjp(self, encoded: Tensor, qd: Tensor, residuals: Any) -> Tensor:
+        """The derivative of 1/2 qd^T R(q) qd by the encoding."""
+        if self.network is None:
+            return torch.zeros_like(encoded)
+        network, slope, functions = residuals
+        weight = 0.5 * (qd.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2)
+        return self.network.vjp(network, slope * (weight @ functions.mT))
+
+    def jvp(self, rate: Tensor, residuals: Any) -> Tensor:
+        """dR/dt, (..., n, n), where the encoding changes at this rate."""
+        if self.network is None:
+            return rate.new_zeros(*rate.shape[:-1], self.n, self.n)
+        network, slope, functions = residuals
+        rows = (slope * self.network.jvp(network, rate)) @ functions
+        return rows.unflatten(-1, (self.n, self.n))
 
 
 class MLPLayers(NamedTuple):
@@ -954,7 +1101,6 @@ class MaskedMLP(nn.Module):
 
     ``layers`` names, unit by unit, the joints that each layer's units may read; weights between
     others are masked, so that a unit has no path to a joint it must not depend on.
-    ``output_fraction`` scales what the last layer gives, but for its biases.
     """
 
     matrix: Tensor
@@ -965,7 +1111,6 @@ class MaskedMLP(nn.Module):
         inputs: NetworkInput,
         layers: Sequence[Sequence[frozenset[int]]],
         generator: torch.Generator,
-        output_fraction: float = 1.0,
     ) -> None:
         super().__init__()
         self.register_buffer("matrix", inputs.matrix)
@@ -979,15 +1124,10 @@ class MaskedMLP(nn.Module):
             weight = torch.randn(mask.shape, dtype=torch.float64, generator=generator)
             self.weights.append(nn.Parameter(weight / mask.sum(dim=1, keepdim=True).sqrt()))
             mask = mask * inputs.sensitivity if index == 0 else mask
-            last = index == len(layers) - 1
-            self.register_buffer(f"mask{index}", mask * output_fraction if last else mask)
+            self.register_buffer(f"mask{index}", mask)
             self.biases.append(nn.Parameter(torch.zeros(len(units), dtype=torch.float64)))
             below = list(units)
-        nn.init.zeros_(self.weights[-1])  # so that the model starts at its nominal values
-
-    def set_output_bias(self, values: Tensor) -> None:
-        """Start the outputs from these values."""
-        self.biases[-1].data = values
+        nn.init.zeros_(self.weights[-1])  # so that nothing is learned yet
 
     def prepare(self, output_map: Tensor, offset: Tensor) -> MLPLayers:
         """The weights for the encoding as it is, and for offset + output_map y in place of y.
@@ -1031,304 +1171,380 @@ class MaskedMLP(nn.Module):
         return F.linear(tangent, layers.weights[-1])
 
 
-NETWORK_FRACTION = 0.1  # how much of a function that is a Fourier series is left to its network
+def block_diagonal(blocks: Tensor) -> Tensor:
+    """The matrix, (k m, k m), with these blocks, (k, m, m), on its diagonal."""
+    k, m, _ = blocks.shape
+    own = torch.eye(k, dtype=blocks.dtype, device=blocks.device)
+    return (own[:, None, :, None] * blocks[:, :, None, :]).reshape(k * m, k * m)
 
 
-class MassFunction(NamedTuple):
-    """A learned function f of some joints: mean + scale * network.
+class RigidPrepared(NamedTuple):
+    """What depends on the weights alone, worked out once for many states."""
 
-    With a ``series``, f = offset + Fourier series + NETWORK_FRACTION * scale * network.
+    inertia: Tensor  # spatial inertias on the diagonal, (6 bodies, 6 bodies)
+    armature: Tensor  # what the rotors add to M, (n, n)
+    friction: FrictionConstants
+    input: Tensor
+    residual: Any = None  # of what a model has beside rigid bodies
+
+
+class Motion(NamedTuple):
+    """How the bodies may move at a position, each in its own frame; 6 numbers a body, side by side."""
+
+    terms: Tensor  # cos and sin of a body's angle, or its displacement and 0, (..., bodies, 2)
+    twists: Tensor  # by joint velocity, (..., n, 6 bodies)
+    weight: Tensor  # acceleration that stands for gravity, (..., 6 bodies)
+    gravity: Tensor  # dV/dq of the bodies, (..., n)
+    q: Tensor
+
+
+class RigidBodyDynamics(PortHamiltonian):
+    """Rigid bodies with trained inertial parameters, friction by laws, a trained torque offset.
+
+    Spatial vectors are (angular, linear), as in Featherstone, Rigid Body Dynamics Algorithms, 2008.
+    They are rows here, and all bodies' stand side by side: so most products are of one large matrix.
     """
 
-    joints: tuple[int, ...]
-    mean: float  # over the workspace, with nominal inertias
-    scale: float
-    offset: float = 0.0
-    series: tuple[Term, ...] = ()
-
-
-class MassPrepared(NamedTuple):
-    """What depends on the weights alone."""
-
-    layers: Any  # of the network
-    series: Tensor | None  # takes Fourier features to M
-    definite: bool  # whether M is kept positive definite
-
-
-class MassResiduals(NamedTuple):
-    """What M's derivatives need of the work done for M."""
-
-    network: Any
-    series: Tensor | None
-    part: Tensor  # of the functions' changes that M takes, see PositiveDefiniteBound
-
-
-class DerivedMass(nn.Module):
-    """M(q), (..., n, n), with ``entries`` saying where functions and constants stand.
-
-    A constant starts at the first of its two numbers, and is trained in units of the second. Where
-    M would not exceed margin * its nominal mean, it is drawn towards that mean (see
-    PositiveDefiniteBound): M is positive definite for all q and all weights.
-    """
-
-    constant_scale: Tensor
-    constant_basis: Tensor  # (constants, n n)
-    function_mean: Tensor
-    function_scale: Tensor
-    function_basis: Tensor  # (functions, n n)
+    forth: Tensor  # takes twists from the parent's frame: constant part, that of each term, (bodies, 6, 18)
+    back: Tensor  # takes wrenches to the parent's frame, likewise
+    axes: Tensor  # twists of the bodies by joint velocity alone, (n, 6 bodies)
+    turning: Tensor  # takes a body's twist to how its joint's axis turns, (6 bodies, 6 bodies)
+    owner: Tensor  # sums six numbers of a body to its joint, (6 bodies, n)
+    revolute: Tensor
+    ratios: Tensor  # (bodies, n)
+    offsets: Tensor
+    basis: Tensor
+    crossing: Tensor
+    base: Tensor
+    actuated: Tensor
+    motors: Tensor  # C: the drives' speeds are C qd, (n, n)
+    loads: Tensor  # its inverse
+    raw_friction_compensation: Tensor
 
     def __init__(
         self,
         joints: Joints,
-        entries: Entries,
-        functions: Sequence[MassFunction],
-        constants: Sequence[tuple[float, float]],
-        network: Network,
-        margin: float,
-        fourier: FourierFeatures | None = None,
-        sensitivity: Sequence[float] = (),
-    ) -> None:
-        super().__init__()
-        self.n = joints.n
-        start = vector(first for first, _ in constants)
-        by_function, by_constant = entry_basis(entries, len(functions), len(constants))
-        self.register_buffer("constant_scale", vector(unit for _, unit in constants))
-        self.register_buffer("constant_basis", by_constant)
-        self.register_buffer("function_mean", vector(each.mean for each in functions))
-        self.register_buffer("function_scale", vector(each.scale for each in functions))
-        self.register_buffer("function_basis", by_function)
-        mean = start @ self.constant_basis + self.function_mean @ self.function_basis
-        self.bound = PositiveDefiniteBound(self._square(mean), margin)
-        self.raw_constants = nn.Parameter(start / self.constant_scale)
-        self.network = network
-        self.series: FourierSeries | None = None
-        if fourier is not None:
-            scales = [each.scale for each in functions]
-            self.series = FourierSeries(fourier, [each.series for each in functions], scales, sensitivity)
-            levels = vector((each.offset - each.mean) / each.scale for each in functions)
-            network.set_output_bias(levels)
-        self.armature = Armature(joints)
-
-    def constants(self) -> Tensor:
-        """The constants of M, (constants,), in their units."""
-        return self.constant_scale * self.raw_constants
-
-    def prepare(self, definite: bool = True) -> MassPrepared:
-        """All that depends on the weights alone; ``definite``: keep M positive definite."""
-        armature = torch.diag(self.armature())
-        constant = self.constants() @ self.constant_basis
-        constant = constant + self.function_mean @ self.function_basis + armature.flatten()
-        output_map = (self.function_scale.unsqueeze(-1) * self.function_basis).mT
-        return MassPrepared(
-            layers=self.network.prepare(output_map, constant),
-            series=None if self.series is None else self.series.prepare(output_map),
-            definite=definite,
-        )
-
-    def _square(self, rows: Tensor) -> Tensor:
-        """(..., n n) as (..., n, n)."""
-        return rows.reshape(*rows.shape[:-1], self.n, self.n)
-
-    def forward(self, at: Configuration, prepared: MassPrepared) -> tuple[Tensor, MassResiduals]:
-        """M(q), and what its derivatives need."""
-        rows, residuals = self.network(at.encoded, prepared.layers)
-        if at.fourier is not None and prepared.series is not None:
-            rows = rows + F.linear(at.fourier, prepared.series)
-        mass = self._square(rows)
-        part = torch.ones_like(mass[..., 0, 0])
-        if prepared.definite:
-            mass, part = self.bound(mass)
-        return mass, MassResiduals(residuals, prepared.series, part)
-
-    def kinetic_vjp(
-        self, at: Configuration, qd: Tensor, residuals: MassResiduals
-    ) -> tuple[Tensor, Tensor | None]:
-        """The derivative of 1/2 qd^T M(q) qd by the encoding, and by the Fourier features."""
-        half = 0.5 * residuals.part.unsqueeze(-1) * qd
-        weight = (half.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2)
-        by_series = None if residuals.series is None else weight @ residuals.series
-        return self.network.vjp(residuals.network, weight), by_series
-
-    def jvp(self, rate: Configuration, residuals: MassResiduals) -> Tensor:
-        """dM/dt, (..., n, n), where the configuration changes at this rate."""
-        rows = self.network.jvp(residuals.network, rate.encoded)
-        if rate.fourier is not None and residuals.series is not None:
-            rows = rows + F.linear(rate.fourier, residuals.series)
-        return residuals.part[..., None, None] * self._square(rows)
-
-
-class PotentialPrepared(NamedTuple):
-    """What depends on the weights alone."""
-
-    layers: Any  # of the network
-    energy: Tensor | None  # takes Fourier features to V, (2 K,)
-    gradient: Tensor | None  # and to dV/dq, (2 K, n)
-
-
-class LearnedPotential(nn.Module):
-    """V(q) [J], of one network and, with ``series``, one Fourier series, both in units of ``scale``."""
-
-    scale: Tensor
-
-    def __init__(
-        self,
-        scale: float,
-        network: Network,
-        fourier: FourierFeatures | None = None,
-        series: Sequence[Term] = (),
-        sensitivity: Sequence[float] = (),
-    ) -> None:
-        super().__init__()
-        self.register_buffer("scale", torch.full((1, 1), scale, dtype=torch.float64))
-        self.network, self.fourier = network, fourier
-        self.series: FourierSeries | None = None
-        if fourier is not None:
-            self.series = FourierSeries(fourier, [series], [scale], sensitivity)
-
-    def prepare(self) -> PotentialPrepared:
-        """All that depends on the weights alone."""
-        layers = self.network.prepare(self.scale, 0 * self.scale[0])
-        if self.series is None or self.fourier is None:
-            return PotentialPrepared(layers, None, None)
-        energy = self.series.prepare(self.scale)[0]
-        return PotentialPrepared(layers, energy, self.fourier.gradient_map(energy))
-
-    def forward(self, at: Configuration, prepared: PotentialPrepared) -> Tensor:
-        """V(q), (...) [J]."""
-        energy: Tensor = self.network(at.encoded, prepared.layers)[0].squeeze(-1)
-        if at.fourier is None or prepared.energy is None:
-            return energy
-        return energy + at.fourier @ prepared.energy
-
-    def network_vjp(self, at: Configuration, prepared: PotentialPrepared) -> Tensor:
-        """The derivative of the network's part of V by the encoding."""
-        _, residuals = self.network(at.encoded, prepared.layers)
-        return self.network.vjp(residuals, at.encoded.new_ones(1))
-
-
-class NetworkPrepared(NamedTuple):
-    """What depends on the weights alone, by part."""
-
-    mass: Any
-    potential: Any
-    friction: Any
-    input: Any
-
-
-class NetworkDynamics(PortHamiltonian):
-    """The dynamics made of these parts; without a ``potential`` gravity does no work."""
-
-    def __init__(
-        self,
-        encoding: JointEncoding,
-        mass: Mass,
-        potential: LearnedPotential | None,
-        friction: Friction,
+        bodies: Bodies,
+        gravity: tuple[float, float, float],
         input: Input,
-        fourier: FourierFeatures | None = None,
+        reach: Sequence[Sequence[float]] = (),
     ) -> None:
         super().__init__()
-        self.n, self.elements = len(encoding.center), 0
-        self.encoding, self.fourier = encoding, fourier
-        # Any: what a part has beside its protocol is there to be asked for
-        self.mass: Any = mass
-        self.friction: Any = friction
+        self.n, self.elements, self.parents = joints.n, len(reach[0]) if reach else 0, bodies.parent
+        count = len(bodies.parent)
+        tables = torch.stack([transform_table(bodies, index) for index in range(count)])
+        self.register_buffer("forth", tables.mT.transpose(1, 2).flatten(2))
+        self.register_buffer("back", tables.transpose(1, 2).flatten(2))
+        crossing = torch.zeros(6, 6, 6, dtype=torch.float64)
+        for axis, unit in enumerate(torch.eye(3, dtype=torch.float64)):
+            crossing[axis, :3, :3] = crossing[axis, 3:, 3:] = skew(unit)
+            crossing[3 + axis, 3:, :3] = skew(unit)
+        axes = torch.zeros(count, 6, dtype=torch.float64)
+        ratios = torch.zeros(count, self.n, dtype=torch.float64)
+        for index, revolute in enumerate(bodies.revolute):
+            axes[index, 2 if revolute else 5] = bodies.ratio[index]
+            ratios[index, bodies.joint[index]] = bodies.ratio[index]
+        owner = (ratios != 0).double().repeat_interleave(6, dim=0)
+        self.register_buffer("axes", owner.mT * axes.flatten())
+        self.register_buffer("turning", block_diagonal(torch.stack([crossing @ axis for axis in axes])))
+        self.register_buffer("owner", owner)
+        self.register_buffer("revolute", vector(float(each) for each in bodies.revolute))
+        self.register_buffer("ratios", ratios)
+        self.register_buffer("offsets", vector(bodies.offset))
+        self.register_buffer("basis", inertia_basis())
+        self.register_buffer("crossing", crossing)
+        self.register_buffer("base", vector((0, 0, 0, *(-g for g in gravity))))
+        self.register_buffer("actuated", vector(float(x) for x in joints.actuated))
+        self.inertial_parameters = InertialParameters(bodies)
+        self.armature = Armature(joints)
+        self.friction = FrictionLaws(joints, reach)
         self.input: Any = input
-        self.potential = potential
+        gains = input(torch.zeros(self.n, dtype=torch.float64), input.prepare()).detach()
+        self.register_buffer("motors", motor_speeds(gains))
+        self.register_buffer("loads", torch.linalg.inv(self.motors))
+        # of the measured torque, in units of the joints' usual friction
+        self.raw_offset = nn.Parameter(torch.zeros(self.n, dtype=torch.float64))
+        # in units of usual friction at usual speed; no parameter: only a fit to torques may find one
+        self.register_buffer("raw_friction_compensation", torch.zeros(self.n, dtype=torch.float64))
 
-    def prepare(self, definite: bool = True) -> NetworkPrepared:
+    def torque_offset(self) -> Tensor:
+        """What the measured torque shows without any, (n,) [Nm, N]."""
+        return self.raw_offset * self.friction.nominal * self.actuated
+
+    def friction_compensation(self) -> Tensor:
+        """What the drives add by velocity, unseen in the measured torque, (n,) [Nm s/rad, N s/m]."""
+        return self.raw_friction_compensation * self.friction.nominal / self.friction.speed * self.actuated
+
+    def prepare(self, definite: bool = True) -> RigidPrepared:
         """All that depends on the weights alone; holds until they change."""
-        return NetworkPrepared(
-            mass=self.mass.prepare(definite),
-            potential=None if self.potential is None else self.potential.prepare(),
+        inertia = torch.tensordot(self.inertial_parameters(), self.basis, dims=1)
+        return RigidPrepared(
+            inertia=block_diagonal(inertia),
+            armature=self.motors.mT @ (self.armature().unsqueeze(-1) * self.motors),
             friction=self.friction.prepare(),
             input=self.input.prepare(),
         )
 
-    def configuration(self, q: Tensor, prepared: NetworkPrepared) -> Configuration:
-        """What networks and Fourier series read of q."""
-        encoded = self.encoding(q)
-        if self.fourier is None:
-            return Configuration(encoded, None)
-        return Configuration(encoded, self.fourier(q, encoded[..., 2 * self.n :]))
+    def configuration(self, q: Tensor, prepared: RigidPrepared) -> Motion:
+        """How the bodies may move at q, and what they weigh there."""
+        motion = self._motion(q)
+        return motion._replace(gravity=applied(motion.twists, motion.weight @ prepared.inertia))
 
-    def mass_at(self, at: Configuration, prepared: NetworkPrepared) -> tuple[Tensor, Any]:
-        """M(q), (..., n, n), and what its derivatives need."""
-        found: tuple[Tensor, Any] = self.mass(at, prepared.mass)
-        return found
+    def _motion(self, q: Tensor) -> Motion:
+        value = q @ self.ratios.mT + self.offsets
+        sliding = 1 - self.revolute
+        terms = torch.stack(
+            [self.revolute * value.cos() + sliding * value, self.revolute * value.sin()], dim=-1
+        )
+        rows = torch.cat([torch.zeros_like(self.axes[:, :6]), self.base.unsqueeze(0)])
+        own = torch.cat([self.axes, torch.zeros_like(self.axes[:1])]).reshape(self.n + 1, -1, 6)
+        moved: list[Tensor] = []
+        for index, parent in enumerate(self.parents):
+            below = rows.expand(*q.shape[:-1], -1, -1) if parent < 0 else moved[parent]
+            moved.append(self._carried(self.forth[index], below, terms[..., index, :]) + own[:, index])
+        columns = torch.cat(moved, dim=-1)
+        return Motion(terms, columns[..., :-1, :], columns[..., -1, :], torch.zeros_like(q), q)
 
-    def energy_at(self, at: Configuration, prepared: NetworkPrepared) -> Tensor:
-        """V(q), (...) [J]."""
-        if self.potential is None:
-            return at.encoded.new_zeros(at.encoded.shape[:-1])
-        energy: Tensor = self.potential(at, prepared.potential)
-        return energy
+    @staticmethod
+    def _carried(table: Tensor, rows: Tensor, terms: Tensor) -> Tensor:
+        """Rows, (..., k, 6), taken to a neighbour's frame."""
+        constant, by_cos, by_sin = (rows @ table).chunk(3, dim=-1)
+        cos, sin = terms.unsqueeze(-2).chunk(2, dim=-1)
+        return constant + cos * by_cos + sin * by_sin
 
-    def gravity_at(self, at: Configuration, prepared: NetworkPrepared) -> Tensor:
+    def mass_at(self, at: Motion, prepared: RigidPrepared) -> tuple[Tensor, None]:
+        """M(q), (..., n, n)."""
+        return (at.twists @ prepared.inertia) @ at.twists.mT + prepared.armature, None
+
+    def energy_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
+        """V(q), (...) [J]; zero for a mass at the base's origin."""
+        height = at.terms.new_zeros(at.terms.shape[:-2])
+        still = torch.eye(6, dtype=height.dtype, device=height.device).expand(*height.shape, 6, 6)
+        placed: list[Tensor] = []
+        for index, parent in enumerate(self.parents):
+            below = still if parent < 0 else placed[parent]
+            placed.append(self._carried(self.forth[index], below, at.terms[..., index, :]))
+            own = slice(6 * index, 6 * index + 6)
+            # in the base's frame the moment of mass stands in the inertia's upper right block
+            seen = placed[index] @ prepared.inertia[own, own] @ placed[index].mT
+            moment = torch.stack([seen[..., 2, 4], seen[..., 0, 5], seen[..., 1, 3]], dim=-1)
+            height = height + moment @ self.base[3:]
+        return height
+
+    def gravity_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
         """dV/dq, (..., n) [Nm, N]."""
-        if self.potential is None:
-            return torch.zeros_like(at.encoded[..., : self.n])
-        by_network = self.potential.network_vjp(at, prepared.potential)
-        gradient: Tensor = self.encoding.vjp(at.encoded, by_network)
-        if at.fourier is None or prepared.potential.gradient is None:
-            return gradient
-        by_series: Tensor = at.fourier @ prepared.potential.gradient
-        return gradient + by_series
+        return at.gravity
 
-    def lagrangian_gradient(
-        self, at: Configuration, qd: Tensor, residuals: Any, prepared: NetworkPrepared
-    ) -> Tensor:
+    def _velocities(self, motion: Motion, qd: Tensor) -> Tensor:
+        """The bodies' twists, (..., 6 bodies)."""
+        return (qd.unsqueeze(-2) @ motion.twists).squeeze(-2)
+
+    def _accelerations(self, motion: Motion, qd: Tensor, twists: Tensor) -> Tensor:
+        """The bodies' accelerations at steady qd, gravity taken as one, (..., 6 bodies)."""
+        turned = (twists @ self.turning) * (qd @ self.owner.mT)
+        found: list[Tensor] = []
+        for index, (parent, own) in enumerate(
+            zip(self.parents, turned.chunk(len(self.parents), dim=-1), strict=True)
+        ):
+            if parent >= 0:
+                below = found[parent].unsqueeze(-2)
+                own = own + self._carried(self.forth[index], below, motion.terms[..., index, :]).squeeze(-2)
+            found.append(own)
+        return torch.cat(found, dim=-1) + motion.weight
+
+    def lagrangian_gradient(self, at: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
+        """d/dq of 1/2 qd^T M(q) qd - V(q), (..., n).
+
+        The kinetic part: the momentum of all that a joint carries, by what its displacement adds to
+        their twist.
+        """
+        twists = self._velocities(at, qd)
+        carried = list((twists @ prepared.inertia).chunk(len(self.parents), dim=-1))
+        for index in reversed(range(len(self.parents))):
+            parent = self.parents[index]
+            if parent >= 0:
+                below = self._carried(self.back[index], carried[index].unsqueeze(-2), at.terms[..., index, :])
+                carried[parent] = carried[parent] + below.squeeze(-2)
+        turned = twists @ self.turning
+        return (torch.cat(carried, dim=-1) * turned) @ self.owner - at.gravity
+
+    def nonlinear_at(self, at: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
+        """The torque that holds qd steady without friction, (..., n)."""
+        twists = self._velocities(at, qd)
+        wrenches = self._accelerations(at, qd, twists) @ prepared.inertia
+        momenta = self._by_body(twists @ prepared.inertia)
+        turned = applied(self._cross(self._by_body(twists)).mT, momenta)
+        return applied(at.twists, wrenches - turned.flatten(-2))
+
+    def _by_body(self, rows: Tensor) -> Tensor:
+        """(..., 6 bodies) as (..., bodies, 6)."""
+        return rows.reshape(*rows.shape[:-1], len(self.parents), 6)
+
+    def _cross(self, twist: Tensor) -> Tensor:
+        """What a frame with this twist makes of a constant twist in it, (..., 6, 6)."""
+        rows = twist @ self.crossing.flatten(1)
+        return rows.reshape(*twist.shape[:-1], 6, 6)
+
+    def regressor(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
+        """Y, (..., n, 10 bodies): Y @ inertial parameters is the bodies' torque."""
+        motion = self._motion(q)
+        twists = self._velocities(motion, qd)
+        accelerations = self._accelerations(motion, qd, twists) + self._velocities(motion, qdd)
+        twists = self._by_body(twists)
+        # by body and parameter: (..., bodies, 6, 10)
+        rises = torch.tensordot(self._by_body(accelerations), self.basis, dims=([-1], [2])).mT
+        momenta = torch.tensordot(twists, self.basis, dims=([-1], [2])).mT
+        wrenches = rises - self._cross(twists).mT @ momenta
+        columns = self._by_body(motion.twists).transpose(-3, -2)  # (..., bodies, n, 6)
+        rows: Tensor = (columns @ wrenches).transpose(-3, -2)
+        return rows.reshape(*q.shape, 10 * len(self.parents))
+
+    def residual_torque(self, q: Tensor, qd: Tensor, qdd: Tensor, prepared: RigidPrepared) -> Tensor:
+        """What else than bodies, drives and friction takes torque, (..., n) [Nm, N]: nothing."""
+        return torch.zeros_like(q)
+
+    def friction_factor(self, q: Tensor) -> Tensor:
+        """How much more friction the drives have at q than their laws say, (..., n): nowhere any."""
+        return torch.ones_like(q)
+
+    def friction_at(self, at: Motion, qd: Tensor, prepared: RigidPrepared, z: Tensor | None = None) -> Tensor:
+        """The friction torque C^T f(C qd), (..., n) [Nm, N]."""
+        torque: Tensor = self.friction(qd @ self.motors.mT, at.gravity @ self.loads, prepared.friction, z)
+        return (self.friction_factor(at.q) * torque) @ self.motors
+
+    def stored_energy(self, z: Tensor, prepared: RigidPrepared) -> Tensor:
+        """What the bristles give back, (...) [J]."""
+        return self.friction.stored_energy(z, prepared.friction)
+
+    def memory(self, qd: Tensor) -> Tensor:
+        """z, (..., n, K), of drives that have long gone this way."""
+        return self.friction.sliding(qd @ self.motors.mT)
+
+    def memory_rate(self, qd: Tensor, z: Tensor) -> Tensor:
+        """z', (..., n, K)."""
+        return self.friction.bristles.rate(qd @ self.motors.mT, z)
+
+    def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
+        """z after joints went one way by (..., n), exactly."""
+        return self.friction.bristles.moved(z, displacement @ self.motors.mT)
+
+    def dissipation_at(self, at: Motion, qd: Tensor, prepared: RigidPrepared) -> Tensor:
+        """D(q, qd), (..., n, n), diagonal where each drive moves its own joint alone."""
+        speeds, loads = qd @ self.motors.mT, at.gravity @ self.loads
+        resistance = self.friction.resistance(speeds, loads, prepared.friction)
+        resistance = self.friction_factor(at.q) * resistance
+        return self.motors.mT @ (resistance.unsqueeze(-1) * self.motors)
+
+    def input_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
+        """G, (..., n, n)."""
+        matrix: Tensor = self.input(at.gravity, prepared.input)
+        return matrix
+
+    def input_force(self, at: Motion, qd: Tensor, tau: Tensor, prepared: RigidPrepared) -> Tensor:
+        """G (tau - torque offset) + friction compensation qd, (..., n) [Nm, N]."""
+        force: Tensor = self.input.force(at.gravity, tau - self.torque_offset(), prepared.input)
+        return force + self.friction_compensation() * qd
+
+    def input_torque(self, at: Motion, qd: Tensor, force: Tensor, prepared: RigidPrepared) -> Tensor:
+        """The tau, (..., n), that is measured while the drives make this force."""
+        shown = force - self.friction_compensation() * qd
+        tau: Tensor = self.input.solve(at.gravity, shown, prepared.input)
+        return tau + self.torque_offset()
+
+
+class ResidualPrepared(NamedTuple):
+    """What depends on the weights of the networks alone."""
+
+    mass: Any
+    potential: Any
+
+
+class ResidualDynamics(RigidBodyDynamics):
+    """Rigid bodies with residuals in M, V and friction; with all their weights zero they are the bodies alone.
+
+    M = that of bodies and drives + R(q), positive definite for all weights (see ``ResidualMass``).
+    V = that of bodies + a network's + each joint's own. Friction is multiplied by a positive factor.
+    """
+
+    def __init__(
+        self,
+        joints: Joints,
+        bodies: Bodies,
+        gravity: tuple[float, float, float],
+        input: Input,
+        mass: ResidualMass,
+        potential: LearnedPotential | None,
+        reach: Sequence[Sequence[float]] = (),
+    ) -> None:
+        super().__init__(joints, bodies, gravity, input, reach)
+        self.encoding = JointEncoding(joints)
+        self.joint_functions = JointFunctions(joints)
+        self.residual_mass = mass
+        self.residual_potential = potential
+
+    def prepare(self, definite: bool = True) -> RigidPrepared:
+        """All that depends on the weights alone; holds until they change."""
+        prepared = super().prepare(definite)
+        potential = None if self.residual_potential is None else self.residual_potential.prepare()
+        mass = self.residual_mass.prepare(prepared.armature)
+        return prepared._replace(residual=ResidualPrepared(mass, potential))
+
+    def mass_at(self, at: Motion, prepared: RigidPrepared) -> tuple[Tensor, Any]:
+        """M(q), (..., n, n), and what its derivatives need."""
+        encoded = self.encoding(at.q)
+        more, residuals = self.residual_mass(encoded, prepared.residual.mass)
+        return super().mass_at(at, prepared)[0] + more, (encoded, residuals)
+
+    def energy_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
+        """V(q), (...) [J]."""
+        energy = super().energy_at(at, prepared) + self.joint_functions.energy(at.q)
+        if self.residual_potential is None:
+            return energy
+        more: Tensor = self.residual_potential(self.encoding(at.q), prepared.residual.potential)
+        return energy + more
+
+    def gravity_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
+        """dV/dq, (..., n) [Nm, N]."""
+        gradient = at.gravity + self.joint_functions.torque(at.q)
+        if self.residual_potential is None:
+            return gradient
+        encoded = self.encoding(at.q)
+        by_encoded = self.residual_potential.vjp(encoded, prepared.residual.potential)
+        more: Tensor = self.encoding.vjp(encoded, by_encoded)
+        return gradient + more
+
+    def lagrangian_gradient(self, at: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
         """d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
-        by_encoded, by_fourier = self.mass.kinetic_vjp(at, qd, residuals)
-        if self.potential is not None:
-            by_encoded = by_encoded - self.potential.network_vjp(at, prepared.potential)
-        gradient: Tensor = self.encoding.vjp(at.encoded, by_encoded)
-        if self.fourier is None or at.fourier is None:
-            return gradient
-        if by_fourier is not None:
-            gradient = gradient + self.fourier.vjp(at.fourier, by_fourier)
-        if self.potential is not None and prepared.potential.gradient is not None:
-            gradient = gradient - at.fourier @ prepared.potential.gradient
-        return gradient
+        own = self._residual_gradient(at.q, qd, residuals, prepared)
+        return super().lagrangian_gradient(at, qd, None, prepared) + own
 
-    def nonlinear_at(
-        self, at: Configuration, qd: Tensor, residuals: Any, prepared: NetworkPrepared
-    ) -> Tensor:
-        """dM/dt qd - d/dq (1/2 qd^T M qd) + dV/dq, (..., n)."""
-        gradient = self.lagrangian_gradient(at, qd, residuals, prepared)
-        mass_rate: Tensor = self.mass.jvp(self._rate(at, qd), residuals)
-        return applied(mass_rate, qd) - gradient
+    def nonlinear_at(self, at: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
+        """The torque that holds qd steady without friction, (..., n)."""
+        own = self._residual_nonlinear(at.q, qd, residuals, prepared)
+        return super().nonlinear_at(at, qd, None, prepared) + own
 
-    def _rate(self, at: Configuration, qd: Tensor) -> Configuration:
-        """How fast the configuration changes along qd."""
-        by_fourier = None
-        if self.fourier is not None and at.fourier is not None:
-            by_fourier = self.fourier.jvp(at.fourier, qd)
-        return Configuration(self.encoding.jvp(at.encoded, qd), by_fourier)
+    def residual_torque(self, q: Tensor, qd: Tensor, qdd: Tensor, prepared: RigidPrepared) -> Tensor:
+        """What the residuals of M and V take, (..., n) [Nm, N]."""
+        encoded = self.encoding(q)
+        mass, residuals = self.residual_mass(encoded, prepared.residual.mass)
+        return applied(mass, qdd) + self._residual_nonlinear(q, qd, (encoded, residuals), prepared)
 
-    def friction_at(
-        self, at: Configuration, qd: Tensor, prepared: NetworkPrepared, z: Tensor | None = None
-    ) -> Tensor:
-        """D(q, qd) qd, (..., n) [Nm, N]; this friction has no memory."""
-        torque: Tensor = self.friction(at.encoded, qd, prepared.friction)
-        return torque
+    def friction_factor(self, q: Tensor) -> Tensor:
+        """How much more friction the drives have at q than their laws say, (..., n)."""
+        factor: Tensor = self.joint_functions.friction_factor(q)
+        return factor
 
-    def dissipation_at(self, at: Configuration, qd: Tensor, prepared: NetworkPrepared) -> Tensor:
-        """D(q, qd), (..., n, n)."""
-        matrix: Tensor = self.friction.dissipation(at.encoded, qd, prepared.friction)
-        return matrix
+    def _residual_nonlinear(self, q: Tensor, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
+        """dR/dt qd - d/dq of what the residuals add to 1/2 qd^T M(q) qd - V(q), (..., n)."""
+        encoded, network = residuals
+        rate = self.residual_mass.jvp(self.encoding.jvp(encoded, qd), network)
+        return applied(rate, qd) - self._residual_gradient(q, qd, residuals, prepared)
 
-    def input_at(self, at: Configuration, prepared: NetworkPrepared) -> Tensor:
-        """G(q), (..., n, n)."""
-        matrix: Tensor = self.input(at.encoded, prepared.input)
-        return matrix
-
-    def input_force(self, at: Configuration, qd: Tensor, tau: Tensor, prepared: NetworkPrepared) -> Tensor:
-        """G tau, (..., n) [Nm, N]."""
-        force: Tensor = self.input.force(at.encoded, tau, prepared.input)
-        return force
-
-    def input_torque(self, at: Configuration, qd: Tensor, force: Tensor, prepared: NetworkPrepared) -> Tensor:
-        """The tau, (..., n), that makes this force."""
-        tau: Tensor = self.input.solve(at.encoded, force, prepared.input)
-        return tau
+    def _residual_gradient(self, q: Tensor, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
+        """d/dq of what the residuals add to 1/2 qd^T M(q) qd - V(q), (..., n)."""
+        encoded, network = residuals
+        by_encoded = self.residual_mass.kinetic_vjp(encoded, qd, network)
+        if self.residual_potential is not None:
+            by_encoded = by_encoded - self.residual_potential.vjp(encoded, prepared.residual.potential)
+        gradient: Tensor = self.encoding.vjp(encoded, by_encoded)
+        return gradient - self.joint_functions.torque(q)

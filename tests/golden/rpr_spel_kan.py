@@ -29,7 +29,7 @@ from torch import Tensor, nn
 
 FACTS = r"""{"robot": "rpr", "urdf": "rpr.urdf",
  "urdf_sha256": "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d",
- "spec_sha256": "8f5a1b9af8a10d9ab901644f282d672d0b19f0ad2a7164b0966895867aa9204a",
+ "spec_sha256": "50674d6bc31873ed115094782325d003f50429f64939f3a15c24e932594e742c",
  "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,
   "net": "kan", "preset": "spel-kan", "tip": null, "width": 64},
  "joints": {"joint1": "revolute", "joint2": "prismatic", "joint3": "revolute"}}"""
@@ -49,50 +49,41 @@ class Model(nn.Module):
     def __init__(self, seed: int = 0, dtype: torch.dtype = torch.float64) -> None:
         super().__init__()
         joints = Joints(
-            revolute=(True, False, True),
-            center=(0.0, 0.7875, 0.0),
-            reach=(2.96706, 0.4825, 2.96706),
-            speed=(3.0, 1.0, 6.0),
-            friction=(0.4, 0.4, 0.4),
-            armature=(2.19, 0.782, 0.106),
-            gear=(1.0, 1.0, 1.0),
-            actuated=(True, True, True),
-        )
+            revolute=(True, False, True), center=(0.0, 0.7875, 0.0), reach=(2.96706, 0.4825, 2.96706),
+            speed=(3.0, 1.0, 6.0), friction=(0.4, 0.4, 0.4), armature=(2.19, 0.782, 0.106),
+            gear=(1.0, 1.0, 1.0), actuated=(True, True, True),
+        )  # fmt: skip
         generator = torch.Generator().manual_seed(seed)
         encoding = JointEncoding(joints)
         functions = (
             MassFunction((0, 1, 2), mean=-0.00167665, scale=1.36528),
             MassFunction((0, 1, 2), mean=-0.00154309, scale=0.0595527),
             MassFunction((0, 1, 2), mean=139.887, scale=12.6351),
-        )
+        )  # fmt: skip
         constants = ((0.0101411, 0.0101411), (5.33, 5.33))
-        sensitivity = (0.02, 1.0, 0.518)
         network = MaskedKAN(
-            lie_group_input(joints, sensitivity),
-            unit_joints([function.joints for function in functions], width=16, depth=2, least=2),
-            generator,
-        )
+            lie_group_input(joints, (0.02, 1.0, 0.518)),
+            unit_joints([function.joints for function in functions], width=16, depth=2, least=2), generator,
+        )  # fmt: skip
         mass = DerivedMass(joints, self.mass_entries, functions, constants, network, 0.08)
-        sensitivity = (0.02, 0.02, 1.0)
         network = MaskedKAN(
-            lie_group_input(joints, sensitivity), unit_joints(((0, 1, 2),), width=8, depth=2), generator
+            lie_group_input(joints, (0.02, 0.02, 1.0)), unit_joints(((0, 1, 2),), width=8, depth=2), generator
         )
         potential = LearnedPotential(0.703291, network)
         friction = DenseFriction(
             joints,
             MaskedKAN(
                 with_velocities(lie_group_input(joints, (0.1, 0.1, 0.1)), joints, 1),
-                unit_joints([range(3)] * 6, width=16, depth=2),
-                generator,
+                unit_joints([range(3)] * 6, width=16, depth=2), generator,
             ),
             axes=1,
-        )
+        )  # fmt: skip
         self.dynamics = NetworkDynamics(encoding, mass, potential, friction, DirectInput(joints))
         self.to(dtype)
 
     @staticmethod
     def mass_entries(f: Sequence[Tensor], c: Sequence[Tensor]) -> Tensor:
-        """M, (..., n, n), without armature, by its functions f(q) and its constants c."""
+        """M without armature, (..., n, n), by its functions f(q) and its constants c."""
         # f1(q1-3), f2(q1-3), f3(q1-3)
         f1, f2, f3 = f
         c1, c2 = c
@@ -101,7 +92,7 @@ class Model(nn.Module):
     @property
     def armature(self) -> Tensor:
         """What the drives add to M's diagonal, (n,) [kg m^2, kg]."""
-        value: Tensor = self.dynamics.mass.armature()
+        value: Tensor = self.dynamics.mass.armature.forward()
         return value
 
     @property
@@ -222,9 +213,6 @@ class Network(Protocol):
     def jvp(self, residuals: Any, tangent: Tensor) -> Tensor:
         """d/d encoded times the encoding's tangent, (..., rows)."""
 
-    def set_output_bias(self, values: Tensor) -> None:
-        """Start the outputs from these values."""
-
 
 def unit_joints(
     outputs: Sequence[Sequence[int]], width: int, depth: int, least: int = 1
@@ -249,13 +237,6 @@ def unit_joints(
         units[lost.index(max(lost))] += 1
     hidden = tuple(frozenset(g) for g, number in zip(groups, units, strict=True) for _ in range(number))
     return (*((hidden,) * depth), tuple(frozenset(joints) for joints in outputs))
-
-
-class Configuration(NamedTuple):
-    """A position as networks and Fourier series read it; or how fast that changes."""
-
-    encoded: Tensor  # (..., 2 n) or (..., 3 n), see JointEncoding
-    fourier: Tensor | None  # (..., 2 K), see FourierFeatures
 
 
 Entries = Callable[[Sequence[Tensor], Sequence[Tensor]], Tensor]
@@ -333,6 +314,51 @@ def from_group(parts: Sequence[Tensor], joint_types: Sequence[str]) -> Tensor:
         for kind, part in zip(joint_types, parts, strict=True)
     ]
     return torch.stack(values, dim=-1)
+
+
+class Mass(Protocol):
+    """What gives M(q) and its derivatives."""
+
+    def prepare(self, definite: bool = True) -> Any:
+        """All that depends on the weights alone; ``definite``: keep M positive definite."""
+
+    def __call__(self, encoded: Tensor, prepared: Any) -> tuple[Tensor, Any]:
+        """M(q), (..., n, n), and what its derivatives need."""
+
+    def kinetic_vjp(self, encoded: Tensor, qd: Tensor, residuals: Any) -> Tensor:
+        """The derivative of 1/2 qd^T M(q) qd by the encoding."""
+
+    def jvp(self, rate: Tensor, residuals: Any) -> Tensor:
+        """dM/dt, (..., n, n), where the encoding changes at this rate."""
+
+
+class Friction(Protocol):
+    """What gives D(q, qd)."""
+
+    def prepare(self) -> Any:
+        """All that depends on the weights alone."""
+
+    def __call__(self, encoded: Tensor, qd: Tensor, prepared: Any) -> Tensor:
+        """D qd, (..., n) [Nm, N]."""
+
+    def dissipation(self, encoded: Tensor, qd: Tensor, prepared: Any) -> Tensor:
+        """D, (..., n, n)."""
+
+
+class Input(Protocol):
+    """What gives G."""
+
+    def prepare(self) -> Any:
+        """All that depends on the weights alone."""
+
+    def __call__(self, encoded: Tensor, prepared: Any) -> Tensor:
+        """G, (..., n, n)."""
+
+    def force(self, encoded: Tensor, tau: Tensor, prepared: Any) -> Tensor:
+        """G tau, (..., n)."""
+
+    def solve(self, encoded: Tensor, force: Tensor, prepared: Any) -> Tensor:
+        """The inputs, (..., n), that make this force."""
 
 
 def solved(matrix: Tensor, right: Tensor) -> Tensor:
@@ -627,142 +653,6 @@ def with_velocities(inputs: NetworkInput, joints: Joints, axes: int) -> NetworkI
     )
 
 
-class Term(NamedTuple):
-    """x^powers (cos_factor cos(frequencies q) + sin_factor sin(frequencies q)), x the scaled q."""
-
-    frequencies: tuple[int, ...]  # by joint
-    powers: tuple[int, ...]  # by joint; none where no joint is prismatic
-    cos_factor: float
-    sin_factor: float
-
-
-class FourierFeatures(nn.Module):
-    """x^powers cos(frequencies q), then x^powers sin(frequencies q), (..., 2 K), of all terms of ``series``.
-
-    With every power its lower powers are there too, for the derivatives.
-    """
-
-    frequencies: Tensor  # (n, K)
-    powers: Tensor  # (K, n)
-    lower: Tensor  # takes K features to their derivatives by each joint that slides, (K, n K)
-
-    def __init__(self, joints: Joints, series: Iterable[Sequence[Term]]) -> None:
-        super().__init__()
-        still = (0,) * joints.n
-        keys = {(term.frequencies, term.powers or still) for terms in series for term in terms}
-        waiting = list(keys)
-        while waiting:
-            frequencies, powers = waiting.pop()
-            below = {(frequencies, _less(powers, joint)) for joint, power in enumerate(powers) if power}
-            waiting += below - keys
-            keys |= below
-        self.keys = sorted(keys)
-        self.count, self.joints = len(keys), joints.n
-        self.prismatic = any(any(powers) for _, powers in keys)
-        self.register_buffer("frequencies", torch.stack([vector(each) for each, _ in self.keys]).mT)
-        self.register_buffer("powers", torch.stack([vector(each) for _, each in self.keys]))
-        lower = torch.zeros(self.count, joints.n, self.count, dtype=torch.float64)
-        for place, (frequencies, powers) in enumerate(self.keys):
-            for joint, power in enumerate(powers):
-                if power:
-                    below_place = self.keys.index((frequencies, _less(powers, joint)))
-                    lower[below_place, joint, place] = power / joints.reach[joint]
-        self.register_buffer("lower", lower.flatten(1))
-
-    def place(self, term: Term) -> int:
-        """Where a term's cosine stands among the features."""
-        return self.keys.index((term.frequencies, term.powers or (0,) * self.joints))
-
-    def forward(self, q: Tensor, scaled: Tensor) -> Tensor:
-        """The features of q, with the scaled q at hand."""
-        angle = q @ self.frequencies
-        cos, sin = angle.cos(), angle.sin()
-        if self.prismatic:
-            size = (scaled.unsqueeze(-2) ** self.powers).prod(dim=-1)
-            cos, sin = size * cos, size * sin
-        return torch.cat([cos, sin], dim=-1)
-
-    def _by_sliding(self, feature: Tensor) -> Tensor:
-        """d/dq of K features by prismatic joints, (..., n, K)."""
-        return (feature @ self.lower).reshape(*feature.shape[:-1], self.joints, self.count)
-
-    def jvp(self, features: Tensor, qd: Tensor) -> Tensor:
-        """How fast the features change along qd."""
-        cos, sin = features.chunk(2, dim=-1)
-        turned = qd @ self.frequencies
-        by_cos, by_sin = -sin * turned, cos * turned
-        if self.prismatic:
-            slid = [(qd.unsqueeze(-2) @ self._by_sliding(x)).squeeze(-2) for x in (cos, sin)]
-            by_cos, by_sin = slid[0] + by_cos, slid[1] + by_sin
-        return torch.cat([by_cos, by_sin], dim=-1)
-
-    def vjp(self, features: Tensor, cotangent: Tensor) -> Tensor:
-        """d/dq, (..., n), of what has the derivative ``cotangent`` by the features."""
-        cos, sin = features.chunk(2, dim=-1)
-        by_cos, by_sin = cotangent.chunk(2, dim=-1)
-        by_joint = (by_sin * cos - by_cos * sin) @ self.frequencies.mT
-        if self.prismatic:
-            for feature, by_feature in ((cos, by_cos), (sin, by_sin)):
-                slid = self._by_sliding(feature) @ by_feature.unsqueeze(-1)
-                by_joint = by_joint + slid.squeeze(-1)
-        return by_joint
-
-    def gradient_map(self, coefficients: Tensor) -> Tensor:
-        """What takes the features to d/dq of features @ coefficients, (2 K, n)."""
-        by_cos, by_sin = coefficients.unsqueeze(-1).chunk(2)
-        turned = torch.cat([by_sin * self.frequencies.mT, -by_cos * self.frequencies.mT])
-        if not self.prismatic:
-            return turned
-        lower = self.lower.reshape(self.count, self.joints, self.count)
-        return turned + torch.cat([lower @ by_cos, lower @ by_sin]).squeeze(-1)
-
-
-class FourierSeries(nn.Module):
-    """Fourier series with trained coefficients, one for each output of a network beside it.
-
-    ``series`` has, for each output, the terms that coefficients start from. They are trained in
-    units of the output's scale times the least sensitivity of the joints that the term depends on.
-    """
-
-    outputs: Tensor  # of each coefficient
-    places: Tensor
-    units: Tensor
-
-    def __init__(
-        self,
-        features: FourierFeatures,
-        series: Sequence[Sequence[Term]],
-        scales: Sequence[float],
-        sensitivity: Sequence[float],
-    ) -> None:
-        super().__init__()
-        self.count = features.count
-        moving = (features.frequencies.mT != 0) | (features.powers != 0)  # (K, n)
-        rows = []
-        for output, (terms, scale) in enumerate(zip(series, scales, strict=True)):
-            for term in terms:
-                place = features.place(term)
-                unit = min(s for s, moves in zip(sensitivity, moving[place], strict=True) if moves)
-                rows.append((output, place, term.cos_factor / scale / unit, unit))
-                rows.append((output, features.count + place, term.sin_factor / scale / unit, unit))
-        outputs, places, starts, units = zip(*rows, strict=True)
-        self.register_buffer("outputs", torch.tensor(outputs))
-        self.register_buffer("places", torch.tensor(places))
-        self.register_buffer("units", vector(units))
-        self.raw_coefficients = nn.Parameter(vector(starts))
-
-    def prepare(self, output_map: Tensor) -> Tensor:
-        """What takes features to output_map y, (rows, 2 K), where y are the series."""
-        known = output_map.new_zeros(output_map.shape[1], 2 * self.count)
-        coefficients = self.units * self.raw_coefficients
-        return output_map @ known.index_put((self.outputs, self.places), coefficients)
-
-
-def _less(powers: tuple[int, ...], joint: int) -> tuple[int, ...]:
-    """The powers with one less of a joint."""
-    return tuple(power - (k == joint) for k, power in enumerate(powers))
-
-
 class DirectInput(nn.Module):
     """G is the identity: each input is the torque of its own joint, and none that of a passive one."""
 
@@ -842,49 +732,126 @@ class DenseFriction(nn.Module):
         return factor @ factor.mT
 
 
-class Mass(Protocol):
-    """What gives M(q) and its derivatives."""
+class LearnedPotential(nn.Module):
+    """V(q) [J], of one network, in units of ``scale``."""
 
-    def prepare(self, definite: bool = True) -> Any:
+    scale: Tensor
+
+    def __init__(self, scale: float, network: Network) -> None:
+        super().__init__()
+        self.register_buffer("scale", torch.full((1, 1), scale, dtype=torch.float64))
+        self.network = network
+
+    def prepare(self) -> Any:
+        """All that depends on the weights alone."""
+        return self.network.prepare(self.scale, 0 * self.scale[0])
+
+    def forward(self, encoded: Tensor, prepared: Any) -> Tensor:
+        """V(q), (...) [J]."""
+        energy: Tensor = self.network(encoded, prepared)[0].squeeze(-1)
+        return energy
+
+    def vjp(self, encoded: Tensor, prepared: Any) -> Tensor:
+        """The derivative of V by the encoding."""
+        _, residuals = self.network(encoded, prepared)
+        return self.network.vjp(residuals, encoded.new_ones(1))
+
+
+class MassFunction(NamedTuple):
+    """A learned function f of some joints: mean + scale * network."""
+
+    joints: tuple[int, ...]
+    mean: float  # over the workspace, with nominal inertias
+    scale: float
+
+
+class MassPrepared(NamedTuple):
+    """What depends on the weights alone."""
+
+    layers: Any  # of the network
+    definite: bool  # whether M is kept positive definite
+
+
+class MassResiduals(NamedTuple):
+    """What M's derivatives need of the work done for M."""
+
+    network: Any
+    part: Tensor  # of the functions' changes that M takes, see PositiveDefiniteBound
+
+
+class DerivedMass(nn.Module):
+    """M(q), (..., n, n), with ``entries`` saying where functions and constants stand.
+
+    A constant starts at the first of its two numbers, and is trained in units of the second. Where
+    M would not exceed margin * its nominal mean, it is drawn towards that mean (see
+    PositiveDefiniteBound): M is positive definite for all q and all weights.
+    """
+
+    constant_scale: Tensor
+    constant_basis: Tensor  # (constants, n n)
+    function_mean: Tensor
+    function_scale: Tensor
+    function_basis: Tensor  # (functions, n n)
+
+    def __init__(
+        self,
+        joints: Joints,
+        entries: Entries,
+        functions: Sequence[MassFunction],
+        constants: Sequence[tuple[float, float]],
+        network: Network,
+        margin: float,
+    ) -> None:
+        super().__init__()
+        self.n = joints.n
+        start = vector(first for first, _ in constants)
+        by_function, by_constant = entry_basis(entries, len(functions), len(constants))
+        self.register_buffer("constant_scale", vector(unit for _, unit in constants))
+        self.register_buffer("constant_basis", by_constant)
+        self.register_buffer("function_mean", vector(each.mean for each in functions))
+        self.register_buffer("function_scale", vector(each.scale for each in functions))
+        self.register_buffer("function_basis", by_function)
+        mean = start @ self.constant_basis + self.function_mean @ self.function_basis
+        self.bound = PositiveDefiniteBound(self._square(mean), margin)
+        self.raw_constants = nn.Parameter(start / self.constant_scale)
+        self.network = network
+        self.armature = Armature(joints)
+
+    def constants(self) -> Tensor:
+        """The constants of M, (constants,), in their units."""
+        return self.constant_scale * self.raw_constants
+
+    def prepare(self, definite: bool = True) -> MassPrepared:
         """All that depends on the weights alone; ``definite``: keep M positive definite."""
+        armature = torch.diag(self.armature())
+        constant = self.constants() @ self.constant_basis
+        constant = constant + self.function_mean @ self.function_basis + armature.flatten()
+        output_map = (self.function_scale.unsqueeze(-1) * self.function_basis).mT
+        return MassPrepared(self.network.prepare(output_map, constant), definite)
 
-    def __call__(self, at: Configuration, prepared: Any) -> tuple[Tensor, Any]:
-        """M(q), (..., n, n), and what its derivatives need."""
+    def _square(self, rows: Tensor) -> Tensor:
+        """(..., n n) as (..., n, n)."""
+        return rows.reshape(*rows.shape[:-1], self.n, self.n)
 
-    def kinetic_vjp(self, at: Configuration, qd: Tensor, residuals: Any) -> tuple[Tensor, Tensor | None]:
-        """The derivative of 1/2 qd^T M(q) qd by the encoding, and by the Fourier features."""
+    def forward(self, encoded: Tensor, prepared: MassPrepared) -> tuple[Tensor, MassResiduals]:
+        """M(q), and what its derivatives need."""
+        rows, residuals = self.network(encoded, prepared.layers)
+        mass = self._square(rows)
+        part = torch.ones_like(mass[..., 0, 0])
+        if prepared.definite:
+            mass, part = self.bound(mass)
+        return mass, MassResiduals(residuals, part)
 
-    def jvp(self, rate: Configuration, residuals: Any) -> Tensor:
-        """dM/dt, (..., n, n), where the configuration changes at this rate."""
+    def kinetic_vjp(self, encoded: Tensor, qd: Tensor, residuals: MassResiduals) -> Tensor:
+        """The derivative of 1/2 qd^T M(q) qd by the encoding."""
+        half = 0.5 * residuals.part.unsqueeze(-1) * qd
+        weight = (half.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2)
+        return self.network.vjp(residuals.network, weight)
 
-
-class Friction(Protocol):
-    """What gives D(q, qd)."""
-
-    def prepare(self) -> Any:
-        """All that depends on the weights alone."""
-
-    def __call__(self, encoded: Tensor, qd: Tensor, prepared: Any) -> Tensor:
-        """D qd, (..., n) [Nm, N]."""
-
-    def dissipation(self, encoded: Tensor, qd: Tensor, prepared: Any) -> Tensor:
-        """D, (..., n, n)."""
-
-
-class Input(Protocol):
-    """What gives G."""
-
-    def prepare(self) -> Any:
-        """All that depends on the weights alone."""
-
-    def __call__(self, encoded: Tensor, prepared: Any) -> Tensor:
-        """G, (..., n, n)."""
-
-    def force(self, encoded: Tensor, tau: Tensor, prepared: Any) -> Tensor:
-        """G tau, (..., n)."""
-
-    def solve(self, encoded: Tensor, force: Tensor, prepared: Any) -> Tensor:
-        """The inputs, (..., n), that make this force."""
+    def jvp(self, rate: Tensor, residuals: MassResiduals) -> Tensor:
+        """dM/dt, (..., n, n), where the encoding changes at this rate."""
+        rows = self.network.jvp(residuals.network, rate)
+        return residuals.part[..., None, None] * self._square(rows)
 
 
 GRID = 4  # bumps on an edge
@@ -918,8 +885,7 @@ class MaskedKAN(nn.Module):
     2404.19756). It starts nearly straight, with a random slope: few samples do not smooth what
     starts wavy. tanh keeps what a layer hands on within the grid. ``layers`` names, unit by unit,
     the joints that each layer's units may read; edges between others are masked, so that a unit
-    has no path to a joint it must not depend on. ``output_fraction`` scales what the last layer
-    gives, but for its biases.
+    has no path to a joint it must not depend on.
     """
 
     matrix: Tensor
@@ -931,7 +897,6 @@ class MaskedKAN(nn.Module):
         inputs: NetworkInput,
         layers: Sequence[Sequence[frozenset[int]]],
         generator: torch.Generator,
-        output_fraction: float = 1.0,
     ) -> None:
         super().__init__()
         grid = torch.linspace(-1, 1, GRID, dtype=torch.float64)
@@ -951,15 +916,10 @@ class MaskedKAN(nn.Module):
             slope = torch.randn(mask.shape, dtype=torch.float64, generator=generator)
             self.weights.append(nn.Parameter(slope * grid / mask.sum(dim=1, keepdim=True).sqrt()))
             mask = mask * inputs.sensitivity.unsqueeze(-1) if index == 0 else mask
-            last = index == len(layers) - 1
-            self.register_buffer(f"mask{index}", mask * output_fraction if last else mask)
+            self.register_buffer(f"mask{index}", mask)
             self.biases.append(nn.Parameter(torch.zeros(len(units), dtype=torch.float64)))
             below = list(units)
-        nn.init.zeros_(self.weights[-1])  # so that the model starts at its nominal values
-
-    def set_output_bias(self, values: Tensor) -> None:
-        """Start the outputs from these values."""
-        self.biases[-1].data = values
+        nn.init.zeros_(self.weights[-1])  # so that nothing is learned yet
 
     def prepare(self, output_map: Tensor, offset: Tensor) -> KANLayers:
         """The weights for the encoding as it is, and for offset + output_map y in place of y."""
@@ -1007,178 +967,6 @@ class MaskedKAN(nn.Module):
         return tangent
 
 
-class MassFunction(NamedTuple):
-    """A learned function f of some joints: mean + scale * network.
-
-    With a ``series``, f = offset + Fourier series + NETWORK_FRACTION * scale * network.
-    """
-
-    joints: tuple[int, ...]
-    mean: float  # over the workspace, with nominal inertias
-    scale: float
-    offset: float = 0.0
-    series: tuple[Term, ...] = ()
-
-
-class MassPrepared(NamedTuple):
-    """What depends on the weights alone."""
-
-    layers: Any  # of the network
-    series: Tensor | None  # takes Fourier features to M
-    definite: bool  # whether M is kept positive definite
-
-
-class MassResiduals(NamedTuple):
-    """What M's derivatives need of the work done for M."""
-
-    network: Any
-    series: Tensor | None
-    part: Tensor  # of the functions' changes that M takes, see PositiveDefiniteBound
-
-
-class DerivedMass(nn.Module):
-    """M(q), (..., n, n), with ``entries`` saying where functions and constants stand.
-
-    A constant starts at the first of its two numbers, and is trained in units of the second. Where
-    M would not exceed margin * its nominal mean, it is drawn towards that mean (see
-    PositiveDefiniteBound): M is positive definite for all q and all weights.
-    """
-
-    constant_scale: Tensor
-    constant_basis: Tensor  # (constants, n n)
-    function_mean: Tensor
-    function_scale: Tensor
-    function_basis: Tensor  # (functions, n n)
-
-    def __init__(
-        self,
-        joints: Joints,
-        entries: Entries,
-        functions: Sequence[MassFunction],
-        constants: Sequence[tuple[float, float]],
-        network: Network,
-        margin: float,
-        fourier: FourierFeatures | None = None,
-        sensitivity: Sequence[float] = (),
-    ) -> None:
-        super().__init__()
-        self.n = joints.n
-        start = vector(first for first, _ in constants)
-        by_function, by_constant = entry_basis(entries, len(functions), len(constants))
-        self.register_buffer("constant_scale", vector(unit for _, unit in constants))
-        self.register_buffer("constant_basis", by_constant)
-        self.register_buffer("function_mean", vector(each.mean for each in functions))
-        self.register_buffer("function_scale", vector(each.scale for each in functions))
-        self.register_buffer("function_basis", by_function)
-        mean = start @ self.constant_basis + self.function_mean @ self.function_basis
-        self.bound = PositiveDefiniteBound(self._square(mean), margin)
-        self.raw_constants = nn.Parameter(start / self.constant_scale)
-        self.network = network
-        self.series: FourierSeries | None = None
-        if fourier is not None:
-            scales = [each.scale for each in functions]
-            self.series = FourierSeries(fourier, [each.series for each in functions], scales, sensitivity)
-            levels = vector((each.offset - each.mean) / each.scale for each in functions)
-            network.set_output_bias(levels)
-        self.armature = Armature(joints)
-
-    def constants(self) -> Tensor:
-        """The constants of M, (constants,), in their units."""
-        return self.constant_scale * self.raw_constants
-
-    def prepare(self, definite: bool = True) -> MassPrepared:
-        """All that depends on the weights alone; ``definite``: keep M positive definite."""
-        armature = torch.diag(self.armature())
-        constant = self.constants() @ self.constant_basis
-        constant = constant + self.function_mean @ self.function_basis + armature.flatten()
-        output_map = (self.function_scale.unsqueeze(-1) * self.function_basis).mT
-        return MassPrepared(
-            layers=self.network.prepare(output_map, constant),
-            series=None if self.series is None else self.series.prepare(output_map),
-            definite=definite,
-        )
-
-    def _square(self, rows: Tensor) -> Tensor:
-        """(..., n n) as (..., n, n)."""
-        return rows.reshape(*rows.shape[:-1], self.n, self.n)
-
-    def forward(self, at: Configuration, prepared: MassPrepared) -> tuple[Tensor, MassResiduals]:
-        """M(q), and what its derivatives need."""
-        rows, residuals = self.network(at.encoded, prepared.layers)
-        if at.fourier is not None and prepared.series is not None:
-            rows = rows + F.linear(at.fourier, prepared.series)
-        mass = self._square(rows)
-        part = torch.ones_like(mass[..., 0, 0])
-        if prepared.definite:
-            mass, part = self.bound(mass)
-        return mass, MassResiduals(residuals, prepared.series, part)
-
-    def kinetic_vjp(
-        self, at: Configuration, qd: Tensor, residuals: MassResiduals
-    ) -> tuple[Tensor, Tensor | None]:
-        """The derivative of 1/2 qd^T M(q) qd by the encoding, and by the Fourier features."""
-        half = 0.5 * residuals.part.unsqueeze(-1) * qd
-        weight = (half.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2)
-        by_series = None if residuals.series is None else weight @ residuals.series
-        return self.network.vjp(residuals.network, weight), by_series
-
-    def jvp(self, rate: Configuration, residuals: MassResiduals) -> Tensor:
-        """dM/dt, (..., n, n), where the configuration changes at this rate."""
-        rows = self.network.jvp(residuals.network, rate.encoded)
-        if rate.fourier is not None and residuals.series is not None:
-            rows = rows + F.linear(rate.fourier, residuals.series)
-        return residuals.part[..., None, None] * self._square(rows)
-
-
-class PotentialPrepared(NamedTuple):
-    """What depends on the weights alone."""
-
-    layers: Any  # of the network
-    energy: Tensor | None  # takes Fourier features to V, (2 K,)
-    gradient: Tensor | None  # and to dV/dq, (2 K, n)
-
-
-class LearnedPotential(nn.Module):
-    """V(q) [J], of one network and, with ``series``, one Fourier series, both in units of ``scale``."""
-
-    scale: Tensor
-
-    def __init__(
-        self,
-        scale: float,
-        network: Network,
-        fourier: FourierFeatures | None = None,
-        series: Sequence[Term] = (),
-        sensitivity: Sequence[float] = (),
-    ) -> None:
-        super().__init__()
-        self.register_buffer("scale", torch.full((1, 1), scale, dtype=torch.float64))
-        self.network, self.fourier = network, fourier
-        self.series: FourierSeries | None = None
-        if fourier is not None:
-            self.series = FourierSeries(fourier, [series], [scale], sensitivity)
-
-    def prepare(self) -> PotentialPrepared:
-        """All that depends on the weights alone."""
-        layers = self.network.prepare(self.scale, 0 * self.scale[0])
-        if self.series is None or self.fourier is None:
-            return PotentialPrepared(layers, None, None)
-        energy = self.series.prepare(self.scale)[0]
-        return PotentialPrepared(layers, energy, self.fourier.gradient_map(energy))
-
-    def forward(self, at: Configuration, prepared: PotentialPrepared) -> Tensor:
-        """V(q), (...) [J]."""
-        energy: Tensor = self.network(at.encoded, prepared.layers)[0].squeeze(-1)
-        if at.fourier is None or prepared.energy is None:
-            return energy
-        return energy + at.fourier @ prepared.energy
-
-    def network_vjp(self, at: Configuration, prepared: PotentialPrepared) -> Tensor:
-        """The derivative of the network's part of V by the encoding."""
-        _, residuals = self.network(at.encoded, prepared.layers)
-        return self.network.vjp(residuals, at.encoded.new_ones(1))
-
-
 class NetworkPrepared(NamedTuple):
     """What depends on the weights alone, by part."""
 
@@ -1189,7 +977,10 @@ class NetworkPrepared(NamedTuple):
 
 
 class NetworkDynamics(PortHamiltonian):
-    """The dynamics made of these parts; without a ``potential`` gravity does no work."""
+    """The dynamics made of these parts; without a ``potential`` gravity does no work.
+
+    ``at``, all that is computed of q alone, is q as networks read it (see ``JointEncoding``).
+    """
 
     def __init__(
         self,
@@ -1198,11 +989,10 @@ class NetworkDynamics(PortHamiltonian):
         potential: LearnedPotential | None,
         friction: Friction,
         input: Input,
-        fourier: FourierFeatures | None = None,
     ) -> None:
         super().__init__()
         self.n, self.elements = len(encoding.center), 0
-        self.encoding, self.fourier = encoding, fourier
+        self.encoding = encoding
         # Any: what a part has beside its protocol is there to be asked for
         self.mass: Any = mass
         self.friction: Any = friction
@@ -1218,90 +1008,69 @@ class NetworkDynamics(PortHamiltonian):
             input=self.input.prepare(),
         )
 
-    def configuration(self, q: Tensor, prepared: NetworkPrepared) -> Configuration:
-        """What networks and Fourier series read of q."""
-        encoded = self.encoding(q)
-        if self.fourier is None:
-            return Configuration(encoded, None)
-        return Configuration(encoded, self.fourier(q, encoded[..., 2 * self.n :]))
+    def configuration(self, q: Tensor, prepared: NetworkPrepared) -> Tensor:
+        """What networks read of q."""
+        encoded: Tensor = self.encoding(q)
+        return encoded
 
-    def mass_at(self, at: Configuration, prepared: NetworkPrepared) -> tuple[Tensor, Any]:
+    def mass_at(self, at: Tensor, prepared: NetworkPrepared) -> tuple[Tensor, Any]:
         """M(q), (..., n, n), and what its derivatives need."""
         found: tuple[Tensor, Any] = self.mass(at, prepared.mass)
         return found
 
-    def energy_at(self, at: Configuration, prepared: NetworkPrepared) -> Tensor:
+    def energy_at(self, at: Tensor, prepared: NetworkPrepared) -> Tensor:
         """V(q), (...) [J]."""
         if self.potential is None:
-            return at.encoded.new_zeros(at.encoded.shape[:-1])
+            return at.new_zeros(at.shape[:-1])
         energy: Tensor = self.potential(at, prepared.potential)
         return energy
 
-    def gravity_at(self, at: Configuration, prepared: NetworkPrepared) -> Tensor:
+    def gravity_at(self, at: Tensor, prepared: NetworkPrepared) -> Tensor:
         """dV/dq, (..., n) [Nm, N]."""
         if self.potential is None:
-            return torch.zeros_like(at.encoded[..., : self.n])
-        by_network = self.potential.network_vjp(at, prepared.potential)
-        gradient: Tensor = self.encoding.vjp(at.encoded, by_network)
-        if at.fourier is None or prepared.potential.gradient is None:
-            return gradient
-        by_series: Tensor = at.fourier @ prepared.potential.gradient
-        return gradient + by_series
-
-    def lagrangian_gradient(
-        self, at: Configuration, qd: Tensor, residuals: Any, prepared: NetworkPrepared
-    ) -> Tensor:
-        """d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
-        by_encoded, by_fourier = self.mass.kinetic_vjp(at, qd, residuals)
-        if self.potential is not None:
-            by_encoded = by_encoded - self.potential.network_vjp(at, prepared.potential)
-        gradient: Tensor = self.encoding.vjp(at.encoded, by_encoded)
-        if self.fourier is None or at.fourier is None:
-            return gradient
-        if by_fourier is not None:
-            gradient = gradient + self.fourier.vjp(at.fourier, by_fourier)
-        if self.potential is not None and prepared.potential.gradient is not None:
-            gradient = gradient - at.fourier @ prepared.potential.gradient
+            return torch.zeros_like(at[..., : self.n])
+        gradient: Tensor = self.encoding.vjp(at, self.potential.vjp(at, prepared.potential))
         return gradient
 
-    def nonlinear_at(
-        self, at: Configuration, qd: Tensor, residuals: Any, prepared: NetworkPrepared
+    def lagrangian_gradient(
+        self, at: Tensor, qd: Tensor, residuals: Any, prepared: NetworkPrepared
     ) -> Tensor:
+        """d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
+        by_encoded = self.mass.kinetic_vjp(at, qd, residuals)
+        if self.potential is not None:
+            by_encoded = by_encoded - self.potential.vjp(at, prepared.potential)
+        gradient: Tensor = self.encoding.vjp(at, by_encoded)
+        return gradient
+
+    def nonlinear_at(self, at: Tensor, qd: Tensor, residuals: Any, prepared: NetworkPrepared) -> Tensor:
         """dM/dt qd - d/dq (1/2 qd^T M qd) + dV/dq, (..., n)."""
         gradient = self.lagrangian_gradient(at, qd, residuals, prepared)
-        mass_rate: Tensor = self.mass.jvp(self._rate(at, qd), residuals)
+        mass_rate: Tensor = self.mass.jvp(self.encoding.jvp(at, qd), residuals)
         return applied(mass_rate, qd) - gradient
 
-    def _rate(self, at: Configuration, qd: Tensor) -> Configuration:
-        """How fast the configuration changes along qd."""
-        by_fourier = None
-        if self.fourier is not None and at.fourier is not None:
-            by_fourier = self.fourier.jvp(at.fourier, qd)
-        return Configuration(self.encoding.jvp(at.encoded, qd), by_fourier)
-
     def friction_at(
-        self, at: Configuration, qd: Tensor, prepared: NetworkPrepared, z: Tensor | None = None
+        self, at: Tensor, qd: Tensor, prepared: NetworkPrepared, z: Tensor | None = None
     ) -> Tensor:
         """D(q, qd) qd, (..., n) [Nm, N]; this friction has no memory."""
-        torque: Tensor = self.friction(at.encoded, qd, prepared.friction)
+        torque: Tensor = self.friction(at, qd, prepared.friction)
         return torque
 
-    def dissipation_at(self, at: Configuration, qd: Tensor, prepared: NetworkPrepared) -> Tensor:
+    def dissipation_at(self, at: Tensor, qd: Tensor, prepared: NetworkPrepared) -> Tensor:
         """D(q, qd), (..., n, n)."""
-        matrix: Tensor = self.friction.dissipation(at.encoded, qd, prepared.friction)
+        matrix: Tensor = self.friction.dissipation(at, qd, prepared.friction)
         return matrix
 
-    def input_at(self, at: Configuration, prepared: NetworkPrepared) -> Tensor:
+    def input_at(self, at: Tensor, prepared: NetworkPrepared) -> Tensor:
         """G(q), (..., n, n)."""
-        matrix: Tensor = self.input(at.encoded, prepared.input)
+        matrix: Tensor = self.input(at, prepared.input)
         return matrix
 
-    def input_force(self, at: Configuration, qd: Tensor, tau: Tensor, prepared: NetworkPrepared) -> Tensor:
+    def input_force(self, at: Tensor, qd: Tensor, tau: Tensor, prepared: NetworkPrepared) -> Tensor:
         """G tau, (..., n) [Nm, N]."""
-        force: Tensor = self.input.force(at.encoded, tau, prepared.input)
+        force: Tensor = self.input.force(at, tau, prepared.input)
         return force
 
-    def input_torque(self, at: Configuration, qd: Tensor, force: Tensor, prepared: NetworkPrepared) -> Tensor:
+    def input_torque(self, at: Tensor, qd: Tensor, force: Tensor, prepared: NetworkPrepared) -> Tensor:
         """The tau, (..., n), that makes this force."""
-        tau: Tensor = self.input.solve(at.encoded, force, prepared.input)
+        tau: Tensor = self.input.solve(at, force, prepared.input)
         return tau
