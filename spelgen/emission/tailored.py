@@ -158,7 +158,7 @@ def _residuals(spec: ModelSpec) -> list[tuple[str, object]]:
     network: object = None
     if spec.outputs:
         made += [
-            ("functions", _grouped([each.joints for each in spec.outputs])),
+            ("functions", _grouped("functions = ", [each.joints for each in spec.outputs])),
             ("network", _mass_network(spec, Code("functions"))),
         ]
         network = Code("network")
@@ -167,10 +167,20 @@ def _residuals(spec: ModelSpec) -> list[tuple[str, object]]:
     return [*made, ("mass", mass), *_potential(spec)]
 
 
-def _grouped(rows: Sequence[tuple[int, ...]]) -> Code:
-    """The tuple of these rows, of which those that are alike stand together."""
+def _grouped(start: str, rows: Sequence[tuple[int, ...]]) -> Code:
+    """The tuple of these rows, of which those that are alike stand together; ``start`` precedes it."""
     groups = [(row, len([*alike])) for row, alike in groupby(rows)]
-    return Code(" + ".join(f"({row!r},)" + f" * {count}" * (count > 1) for row, count in groups))
+    terms = [f"({row!r},)" + f" * {count}" * (count > 1) for row, count in groups]
+    if _INDENT + len(start + " + ".join(terms)) <= WIDTH:
+        return Code(" + ".join(terms))
+    inner = " " * (_INDENT + 4)
+    lines = [inner + terms[0]]
+    for term in terms[1:]:
+        if len(lines[-1]) + len(term) + 3 > WIDTH:
+            lines.append(f"{inner}+ {term}")
+        else:
+            lines[-1] += f" + {term}"
+    return Code("\n".join(["(", *lines, " " * _INDENT + ")  # fmt: skip"]))
 
 
 def _networks(spec: ModelSpec) -> list[str]:

@@ -27,7 +27,7 @@ class ResidualPrepared(NamedTuple):
 
 
 class ResidualDynamics(RigidBodyDynamics):
-    """Rigid bodies with residuals in M, V and friction; with all their weights zero they are the bodies alone.
+    """Rigid bodies with residuals in M, V and friction; with their weights zero they are bodies alone.
 
     M = that of bodies and drives + R(q), positive definite for all weights (see ``ResidualMass``).
     V = that of bodies + a network's + each joint's own. Friction is multiplied by a positive factor.

@@ -54,7 +54,8 @@ class ResidualMass(nn.Module):
         """
         root = torch.linalg.inv(armature).abs().sum(dim=-1).rsqrt()
         pairs = root.unsqueeze(-1) * root
-        return self.part * (pairs * self.inverse).amin(dim=(-2, -1))
+        smallest: Tensor = (pairs * self.inverse).amin(dim=(-2, -1))
+        return self.part * smallest
 
     def prepare(self, armature: Tensor) -> ResidualMassPrepared:
         """All that depends on the weights alone."""
@@ -69,11 +70,15 @@ class ResidualMass(nn.Module):
     def forward(self, encoded: Tensor, prepared: ResidualMassPrepared) -> tuple[Tensor, Any]:
         """R(q), and what its derivatives need."""
         if self.network is None:
-            return prepared.constant.expand(*encoded.shape[:-1], -1).unflatten(-1, (self.n, self.n)), None
+            return self._square(prepared.constant).expand(*encoded.shape[:-1], -1, -1), None
         y, residuals = self.network(encoded, prepared.layers)
         height = y.tanh()
         rows = prepared.constant + height @ prepared.functions
-        return rows.unflatten(-1, (self.n, self.n)), (residuals, 1 - height * height, prepared.functions)
+        return self._square(rows), (residuals, 1 - height * height, prepared.functions)
+
+    def _square(self, rows: Tensor) -> Tensor:
+        """(..., n n) as (..., n, n)."""
+        return rows.reshape(*rows.shape[:-1], self.n, self.n)
 
     def kinetic_vjp(self, encoded: Tensor, qd: Tensor, residuals: Any) -> Tensor:
         """The derivative of 1/2 qd^T R(q) qd by the encoding."""
@@ -81,7 +86,8 @@ class ResidualMass(nn.Module):
             return torch.zeros_like(encoded)
         network, slope, functions = residuals
         weight = 0.5 * (qd.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2)
-        return self.network.vjp(network, slope * (weight @ functions.mT))
+        by_encoded: Tensor = self.network.vjp(network, slope * (weight @ functions.mT))
+        return by_encoded
 
     def jvp(self, rate: Tensor, residuals: Any) -> Tensor:
         """dR/dt, (..., n, n), where the encoding changes at this rate."""
@@ -89,4 +95,4 @@ class ResidualMass(nn.Module):
             return rate.new_zeros(*rate.shape[:-1], self.n, self.n)
         network, slope, functions = residuals
         rows = (slope * self.network.jvp(network, rate)) @ functions
-        return rows.unflatten(-1, (self.n, self.n))
+        return self._square(rows)
