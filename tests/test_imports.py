@@ -29,7 +29,7 @@ structure: recursion field sampling spans basis expansion symbolic structure nom
 structure: base_parameters pseudo_inertia
 dynamics: bristles
 {" ".join(RUNTIME)}
-dynamics: protocol prepared
+dynamics: protocol residuals prepared
 emission: bodies plan source docstring tailored bundle emit loading
 dynamics: arrays constraint pinocchio_dynamics pinocchio_arm pinocchio_urdf regressor regressor_dynamics tip
 logs: arm_mapping trajectory bags tables npz readers values log_files suggest read checks filtering

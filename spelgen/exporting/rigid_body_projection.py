@@ -13,6 +13,7 @@ from scipy.optimize import nnls
 
 from spelgen.arm.arm import Arm
 from spelgen.building import build
+from spelgen.dynamics.residuals import without_residuals
 from spelgen.fitting.optimizers import minimise
 from spelgen.fitting.stages import is_closed_form
 from spelgen.loaded_arm import LoadedArm
@@ -94,9 +95,7 @@ def sampled_positions(arm: Arm) -> torch.Tensor:
 def _own(model: EmittedModel) -> EmittedModel:
     """The model without what it has beside rigid bodies."""
     alone = copy.deepcopy(model)
-    for name, weights in alone.dynamics.named_parameters():
-        if name.startswith(("residual_", "joint_functions.")):
-            weights.zero_()
+    alone.dynamics = without_residuals(alone.dynamics)
     return alone
 
 
