@@ -114,4 +114,6 @@ def test_what_is_zero_takes_no_time():
     torch.testing.assert_close(model.prepared().forward_dynamics(q, qd, x), model.forward_dynamics(q, qd, x))
     model.dynamics.joint_functions.raw_torque_splines[1] += 1.0
     assert type(model.dynamics).__name__ == "ResidualDynamics"
+    assert model.prepared()._dynamics.residual_mass.network is None
+    assert model.dynamics.residual_mass.network is not None
     torch.testing.assert_close(model.prepared().forward_dynamics(q, qd, x), model.forward_dynamics(q, qd, x))

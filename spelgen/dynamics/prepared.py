@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from spelgen.dynamics.residuals import has_residuals, without_residuals
+from spelgen.dynamics.residuals import without_idle_residuals
 
 
 class State(NamedTuple):
@@ -30,8 +30,9 @@ class PreparedModel:
 
     def __init__(self, model: Any, tip: Any = None, *, dtype: torch.dtype = torch.float64) -> None:
         model = copy.deepcopy(model).to(dtype=dtype).requires_grad_(False)
-        if not has_residuals(model.dynamics):  # networks that give nothing would take most of the time
-            model.dynamics = without_residuals(model.dynamics)
+        model.dynamics = without_idle_residuals(
+            model.dynamics
+        )  # networks that give nothing take most of the time
         self.n: int = model.n
         self._dynamics, self._weights, self._tip = model.dynamics, model.prepare(), tip
         self.elements: int = model.dynamics.elements
