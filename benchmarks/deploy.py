@@ -3,7 +3,8 @@
     python benchmarks/deploy.py [--parity] [--latency]
 
 Needs the extras deploy and simulate and a C compiler. Models: the six arms of robots/, both presets that go to C, every
-weight moved by a normal number so that no part is idle.
+weight moved by a normal number so that no part is idle; latencies also of minimal as fits mostly leave it, with nothing
+beside its bodies.
 """
 
 from __future__ import annotations
@@ -40,18 +41,20 @@ from spelgen.loaded_arm import load_arm
 ROBOTS = Path(__file__).parents[1] / "robots"
 ARMS = ("two_link", "rpr", "scara", "six_dof", "ur10e", "panda")
 PRESETS = ("closed-form", "minimal")
+RESIDUALS = ("dynamics.joint_functions.", "dynamics.residual_")
 STATES = 10_000
 CALLS = 50  # of which the clock sees the sum: it ticks in tens of nanoseconds
 FLAGS = ("-O2",)
 
 
-def trained(robot: str, preset: str, size: float = 0.05) -> Trained:
-    """A model of an arm whose weights have all moved."""
+def trained(robot: str, preset: str, size: float = 0.05, *, residuals: bool = True) -> Trained:
+    """A model of an arm whose weights have all moved; without ``residuals`` those of its bodies and drives alone."""
     arm = load_arm(ROBOTS / f"{robot}.urdf")
     model, random = build(arm, preset), torch.Generator().manual_seed(0)
     with torch.no_grad():
-        for parameter in model.parameters():
-            parameter += size * torch.randn(parameter.shape, dtype=torch.float64, generator=random)
+        for name, parameter in model.named_parameters():
+            if residuals or not name.startswith(RESIDUALS):
+                parameter += size * torch.randn(parameter.shape, dtype=torch.float64, generator=random)
     return Trained(model.requires_grad_(False), arm)
 
 
@@ -64,13 +67,17 @@ def parity() -> None:
             each = trained(robot, preset)
             model = each.described
 
-            def worst(called: Called, asked: list[str] = names, each: Trained = each) -> float:
+            def worst(
+                called: Called, asked: list[str] = names, each: Trained = each, dtype: type = np.float64
+            ) -> float:
                 memory = each.described.memory
-                return _largest(check_parity(called, each, asked, np.inf, memory=memory, states=STATES))
+                return _largest(
+                    check_parity(called, each, asked, np.inf, memory=memory, states=STATES, dtype=dtype)
+                )
 
             with tempfile.TemporaryDirectory() as folder:
                 kinds = (("", np.float64), (f"-D{model.name.upper()}_FLOAT", np.float32))
-                c = [worst(library(model, Path(folder), flag, kind)) for flag, kind in kinds]
+                c = [worst(library(model, Path(folder), flag, kind), dtype=kind) for flag, kind in kinds]
             casadi = worst(called_by_state(casadi_functions(model)))
             onnx = worst(called_by_onnx({name: onnx_model(model, name) for name in ENTRIES}), list(ENTRIES))
             projection = rigid_body_projection(each.model, each.arm)
@@ -156,8 +163,11 @@ int main(void)
 def latency(robot: str = "ur10e") -> None:
     """Medians and p99 [us] of one call, one core."""
     print(f"{robot}, one call on one core; {compiler()} {' '.join(FLAGS)}{'':20s} median      p99  [us]")
-    for preset in PRESETS:
-        each = trained(robot, preset)
+    for preset, each in (
+        ("closed-form", trained(robot, "closed-form")),
+        ("minimal", trained(robot, "minimal", residuals=False)),
+        ("minimal with all residuals", trained(robot, "minimal")),
+    ):
         model = each.described
         print(f"{preset}, C")
         time_c(model, beside_casadi=preset == "closed-form")

@@ -75,14 +75,35 @@ def test_friction_goes_back_as_the_urdf_can_say_it(tmp_path):
         assert urdf.damping == pytest.approx(joint.viscous)
 
 
-def test_other_models_go_back_as_the_nearest_bodies(tmp_path):
-    """An untrained minimal model is the URDF's arm: its projection must be that arm again."""
-    run, model = run_of("two_link", tmp_path, "minimal")
+def test_what_stands_beside_bodies_is_told(tmp_path):
+    """The bodies of minimal go back exactly; what else M, gravity and friction have is told as figures."""
+    run, model = run_of("two_link", tmp_path, "minimal", heavier)
+    loaded, told = exported(run, tmp_path / "bodies.urdf")
+    assert max(differences(model, loaded)) < 1e-8
+    assert "bodies: the model's own" in told
+    assert "position_factor" not in (tmp_path / "bodies.friction.yaml").read_text().split("joints:")[1]
+    functions = model.dynamics.joint_functions
+    with torch.no_grad():
+        model.dynamics.residual_mass.raw_constants += 0.5
+        functions.raw_torque_ripple[0, 5] = 3.0
+        functions.raw_friction_splines += 0.3 * torch.linspace(-1, 1, 34)
+    found = export(model, arm=load_arm(ROBOTS / "two_link.urdf"))
+    assert "bodies: its own, without what it has beside them; M differs by" in repr(found)
+    assert found.urdf.split(b"<dynamics")[0] == (tmp_path / "bodies.urdf").read_bytes().split(b"<dynamics")[0]
+    assert found.projection.mass_error > 1e-3
+    assert found.projection.gravity_error > 1e-3
+    assert (found.projection.friction_error > 0.05).all()
+    law = yaml.safe_load(found.files[".friction.yaml"])["joints"]["joint1"]["law"]
+    assert law["position_factor"][0] < 0.9 < 1.1 < law["position_factor"][1]
+
+
+def test_networks_go_back_as_the_nearest_bodies(tmp_path):
+    run, model = run_of("two_link", tmp_path, "spel")
     loaded, told = exported(run, tmp_path / "learned.urdf")
     mass, load_torque = differences(model, loaded)
-    assert mass < 1e-3
-    assert load_torque < 1e-3
-    assert "M differs by 0.0%, gravity by 0.0%" in told
+    assert mass > 0.1  # that of an untrained spel is no body's
+    assert load_torque < 1e-8
+    assert "bodies: nearest to the model; M differs by" in told
 
 
 def test_the_models_own_friction_law_lies_beside(tmp_path):

@@ -40,11 +40,15 @@ def test_closed_form_bodies_go_to_mujoco_exactly(robot):
     assert (simulated.dof_frictionloss > 0).all()
 
 
-def test_networks_go_as_the_nearest_bodies(tmp_path):
-    run = run_folder("two_link", "minimal", tmp_path)
+@pytest.mark.parametrize(
+    ("preset", "which"),
+    [("minimal", "its own, without what it has beside them"), ("spel", "nearest to the model")],
+)
+def test_what_mujoco_has_no_words_for_is_told(preset, which, tmp_path):
+    run = run_folder("two_link", preset, tmp_path)
     told = CliRunner().invoke(app, ["export", str(run.path), "--to", "mjcf", "-o", str(tmp_path / "arm.xml")])
     assert told.exit_code == 0, told.output
-    assert "bodies: nearest to the model; M differs by" in told.output
+    assert f"bodies: {which}; M differs by" in told.output.replace("\n", " ")
     assert "by MuJoCo" in told.output
     assert mujoco.MjModel.from_xml_path(str(tmp_path / "arm.xml")).nv == 2
     assert len((tmp_path / "arm.README.md").read_text().splitlines()) == 5

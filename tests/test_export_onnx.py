@@ -31,17 +31,8 @@ def test_followers_motors_and_passive_joints_go_along(preset, tmp_path):
     urdf.with_suffix(".yaml").write_text(MOTORS)
     arm = load_arm(urdf)
     model = build(arm, preset)
-    if preset == "closed-form":
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter += 0.1
         model.dynamics.raw_friction_compensation += 0.3
     assert "from the torch module" in export(model, "onnx", arm=arm).summary[0]
-
-
-def test_m_is_drawn_where_it_would_not_be_positive_definite():
-    model = moved_model("panda", "minimal", 0.3)
-    q = torch.randn(50, 7, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
-    dynamics, prepared = model.dynamics, model.prepare()
-    part = dynamics.mass_at(dynamics.configuration(q, prepared), prepared)[1].part
-    assert (part < 1).any()
-    session = onnx_session(export(model, "onnx", arm=arm_of("panda")).files["mass_matrix.onnx"])
-    (mass,) = session.run(["mass"], {"q": q.numpy()})
-    np.testing.assert_allclose(mass, model.mass_matrix(q).numpy(), rtol=1e-9, atol=1e-9)

@@ -29,7 +29,7 @@ structure: recursion field sampling spans basis expansion symbolic structure nom
 structure: base_parameters pseudo_inertia
 dynamics: bristles
 {" ".join(RUNTIME)}
-dynamics: protocol prepared
+dynamics: protocol residuals prepared
 emission: bodies plan source docstring tailored bundle emit loading
 dynamics: arrays constraint pinocchio_dynamics pinocchio_arm pinocchio_urdf regressor regressor_dynamics tip
 logs: arm_mapping trajectory bags tables npz readers values log_files suggest read checks filtering
@@ -51,10 +51,13 @@ inspection loaded_arm pipeline trust building
 simulation: simulate
 excitation: design
 identification: identify baseline
-exporting: description tip_chain describe trained parity exported readme rigid_body_projection urdf_file urdf_export
-exporting: mjcf_file mjcf_export torch_programs torch_export onnx_graph onnx_rigid onnx_learned onnx_model onnx_export
-exporting: rigid_expressions friction_expressions learned_expressions model_expressions tip_expressions entry_points
-exporting: c_statements c_networks c_code c_library c_export ros2_export casadi_export export
+exporting: description tip_chain describe_residuals describe trained parity exported readme rigid_body_projection
+exporting: urdf_file urdf_export mjcf_file mjcf_export torch_programs torch_export
+exporting: onnx_graph onnx_rigid onnx_residuals onnx_model onnx_export
+exporting: rigid_expressions friction_expressions residual_expressions solved_expressions model_expressions
+exporting: tip_expressions entry_points
+exporting: c_statements c_tables c_networks c_joint_functions c_residual_calls c_code c_library c_export ros2_export
+exporting: casadi_residuals casadi_export export
 render: charts plots picture page learned parameters reproduction shapes scene still arm_section
 render: run_facts curves report_page runs_page inspection_page identification_page
 logs: statistics gravity report check_logs

@@ -5,6 +5,7 @@ import pytest
 import torch
 from exported_runs import arm_of, moved_model
 
+from spelgen.building import build
 from spelgen.dynamics.tip import tip_kinematics
 
 
@@ -103,3 +104,16 @@ def test_kinematics_of_the_tip(pair):
         np.testing.assert_allclose(prepared.jacobian(q)[:3, k], moved, atol=1e-4)
     with pytest.raises(ValueError, match="no tip: give"):
         moved_model("two_link", "closed-form").prepared().pose(q[:2])
+
+
+def test_what_is_zero_takes_no_time():
+    """Without residuals minimal is prepared as the bodies alone; with them it is not, and neither changes the model."""
+    model = build(arm_of("rpr"), "minimal").requires_grad_(False)
+    q, qd, x = states(4)
+    assert type(model.prepared()._dynamics).__name__ == "RigidBodyDynamics"
+    torch.testing.assert_close(model.prepared().forward_dynamics(q, qd, x), model.forward_dynamics(q, qd, x))
+    model.dynamics.joint_functions.raw_torque_splines[1] += 1.0
+    assert type(model.dynamics).__name__ == "ResidualDynamics"
+    assert model.prepared()._dynamics.residual_mass.network is None
+    assert model.dynamics.residual_mass.network is not None
+    torch.testing.assert_close(model.prepared().forward_dynamics(q, qd, x), model.forward_dynamics(q, qd, x))

@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from spelgen.dynamics.residuals import without_idle_residuals
+
 
 class State(NamedTuple):
     """q and qd, (..., n), and friction's memory z, (..., n, K)."""
@@ -28,6 +30,9 @@ class PreparedModel:
 
     def __init__(self, model: Any, tip: Any = None, *, dtype: torch.dtype = torch.float64) -> None:
         model = copy.deepcopy(model).to(dtype=dtype).requires_grad_(False)
+        model.dynamics = without_idle_residuals(
+            model.dynamics
+        )  # networks that give nothing take most of the time
         self.n: int = model.n
         self._dynamics, self._weights, self._tip = model.dynamics, model.prepare(), tip
         self.elements: int = model.dynamics.elements

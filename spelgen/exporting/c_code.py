@@ -8,10 +8,12 @@ from textwrap import wrap
 
 import casadi as ca
 
-from spelgen.exporting.c_networks import network_calls, network_source
+from spelgen.exporting.c_joint_functions import joint_function_source
+from spelgen.exporting.c_networks import network_source
+from spelgen.exporting.c_residual_calls import residual_calls
 from spelgen.exporting.c_statements import statements
 from spelgen.exporting.description import TrainedModel
-from spelgen.exporting.entry_points import ENTRY_POINTS, EntryPoint, expression_function, networks_needed
+from spelgen.exporting.entry_points import ENTRY_POINTS, EntryPoint, expression_function, residuals_needed
 from spelgen.templates import render
 
 _WIDTH = 118
@@ -63,7 +65,7 @@ def c_source(model: TrainedModel, entries: Sequence[CEntry]) -> str:
         title=_title(model),
         name=model.name,
         upper=model.name.upper(),
-        networks=network_source(model),
+        residuals=[text for text in (network_source(model), joint_function_source(model)) if text],
         entries=entries,
     )
 
@@ -86,7 +88,7 @@ def _entry(model: TrainedModel, entry: EntryPoint) -> CEntry:
     shapes = ", ".join(
         f"{name} {_shape(function, k)} [{unit}]" for k, (name, unit) in enumerate(entry.outputs)
     )
-    body = network_calls(model, networks_needed(function))
+    body = residual_calls(model, residuals_needed(function))
     unread = [name for name in entry.inputs if not _is_read(function, name) and not _read_in(body, name)]
     outputs = [name for name, _ in entry.outputs]
     lines = statements(function, function.name_in(), outputs)

@@ -11,31 +11,18 @@ _UNARY = {
     ca.OP_SQ: "{0} * {0}",
     ca.OP_TWICE: "{0} + {0}",
     ca.OP_INV: "R(1) / {0}",
-    ca.OP_SQRT: "SQRT({0})",
     ca.OP_SIN: "SIN({0})",
     ca.OP_COS: "COS({0})",
     ca.OP_TANH: "TANH({0})",
     ca.OP_EXP: "EXP({0})",
-    ca.OP_LOG: "LOG({0})",
-    ca.OP_LOG1P: "LOG1P({0})",
-    ca.OP_CEIL: "CEIL({0})",
     ca.OP_FABS: "FABS({0})",
     ca.OP_SIGN: "SIGN({0})",
-    ca.OP_NOT: "!({0} != R(0))",
-    ca.OP_ASSIGN: "{0}",
 }
 _BINARY = {
     ca.OP_ADD: "{0} + {1}",
     ca.OP_SUB: "{0} - {1}",
     ca.OP_MUL: "{0} * {1}",
     ca.OP_DIV: "{0} / {1}",
-    ca.OP_FMAX: "FMAX({0}, {1})",
-    ca.OP_POW: "POW({0}, {1})",
-    ca.OP_CONSTPOW: "POW({0}, {1})",
-    ca.OP_LT: "{0} < {1}",
-    ca.OP_LE: "{0} <= {1}",
-    ca.OP_AND: "({0} != R(0)) && ({1} != R(0))",
-    ca.OP_IF_ELSE_ZERO: "({0} != R(0)) ? {1} : R(0)",
 }
 
 

@@ -9,15 +9,15 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 
-from spelgen.exporting.description import Functions, TrainedModel
+from spelgen.exporting.casadi_residuals import residual_values
+from spelgen.exporting.description import TrainedModel
 from spelgen.exporting.entry_points import (
     ENTRY_POINTS,
     EntryPoint,
     expression_function,
-    networks_needed,
+    residuals_needed,
 )
 from spelgen.exporting.exported import Exported
-from spelgen.exporting.learned_expressions import encoded, entry_places
 from spelgen.exporting.parity import Called, Values, check_parity
 from spelgen.exporting.readme import UNITS, readme
 from spelgen.exporting.trained import Trained
@@ -43,52 +43,27 @@ def export_casadi(trained: Trained) -> Exported:
 
 
 def casadi_functions(model: TrainedModel) -> dict[str, ca.Function]:
-    """Every entry point: of scalar expressions, or where there are networks, of matrices."""
+    """Every entry point: of scalar expressions, and of matrices what stands beside rigid bodies."""
     found: dict[str, ca.Function] = {}
     for entry in ENTRY_POINTS:
-        if entry.level == "jets" and model.learned is not None:
+        if entry.level == "jets" and model.residuals:
             found[entry.name] = _derivatives(entry, found[entry.name.removesuffix("_derivatives")])
         else:
-            found[entry.name] = _with_networks(entry, model)
+            found[entry.name] = _with_residuals(entry, model)
     return found
 
 
-def _with_networks(entry: EntryPoint, model: TrainedModel) -> ca.Function:
+def _with_residuals(entry: EntryPoint, model: TrainedModel) -> ca.Function:
     expressions = expression_function(entry, model)
-    needed = networks_needed(expressions)
+    needed = residuals_needed(expressions)
     if not needed:
         return expressions
     given = [ca.MX.sym(name, expressions.size1_in(name)) for name in entry.inputs]
     states = dict(zip(entry.inputs, given, strict=True))
-    networks = _network_values(model, states["q"], states.get("qd"))
-    arguments = [*given, *(networks[name] for name in needed)]
+    residuals = residual_values(model, states["q"], states.get("qd"))
+    arguments = [*given, *(residuals[name] for name in needed)]
     names = [name for name, _ in entry.outputs]
     return ca.Function(entry.name, given, expressions.call(arguments), list(entry.inputs), names)
-
-
-def _network_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[str, ca.MX]:
-    """What networks give at q, by its name in ``NetworkSymbols``."""
-    learned, n, found = model.learned, model.n, {}
-    assert learned is not None
-    read, places = encoded(learned.encoding, q), entry_places(model)
-    if places:
-        rows = [row * n + column for row, column in places]
-        mass = found["mass"] = _network(learned.mass, rows, read)
-        if qd is not None:
-            found["rate"] = ca.jtimes(mass, q, qd)
-            squares = [(0.5 if row == column else 1.0) * qd[row] * qd[column] for row, column in places]
-            found["kinetic"] = ca.jtimes(mass, q, ca.vertcat(*squares), True)
-    if learned.potential is not None and learned.potential.reached.any():
-        found["energy"] = _network(learned.potential, [0], read)
-        found["gravity"] = ca.gradient(found["energy"], q)
-    return found
-
-
-def _network(functions: Functions, rows: list[int], read: ca.MX) -> ca.MX:
-    layer = read
-    for weight, bias in zip(functions.weights[:-1], functions.biases, strict=False):
-        layer = 1 / (1 + ca.exp(-(ca.sparsify(ca.DM(weight)) @ layer + bias)))
-    return ca.sparsify(ca.DM(functions.weights[-1][rows])) @ layer + functions.biases[-1][rows]
 
 
 def _derivatives(entry: EntryPoint, function: ca.Function) -> ca.Function:

@@ -50,74 +50,79 @@ class Bristles:
 
 
 @dataclass(frozen=True, eq=False)
-class FrictionNetwork:
-    """The weights of ``runtime.joint_friction`` made ready: see ``FrictionLayers``; nominal is (n,) [Nm, N]."""
+class Network:
+    """Learned functions of q: layers of sigmoids of the encoding, the last one linear.
 
-    weight: np.ndarray
-    bias: np.ndarray
-    out: np.ndarray
-    offset: np.ndarray
-    viscous: np.ndarray
-    smoothing: np.ndarray
-    nominal: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class Functions:
-    """Learned functions of q: layers of sigmoids of the encoding, the last one linear, plus a Fourier series.
-
-    weights: by layer, (units, units below). series: what takes the Fourier features to the rows, (rows, 2 K).
+    weights: by layer, (units, units below).
     """
 
     weights: tuple[np.ndarray, ...]
     biases: tuple[np.ndarray, ...]
-    series: np.ndarray | None
-
-    @property
-    def reached(self) -> np.ndarray:
-        """The rows that the network changes, (rows,)."""
-        found = np.zeros(len(self.biases[-1]), dtype=bool)
-        return found if not self.weights else found | (self.weights[-1] != 0).any(axis=1)
 
 
 @dataclass(frozen=True, eq=False)
 class Encoding:
-    """cos q, sin q and, where some joint is prismatic, (q - center) / reach; the Fourier features' keys, by joint."""
+    """What networks read: cos q, sin q and, where some joint is prismatic, (q - center) / reach."""
 
     prismatic: bool
     center: np.ndarray
     reach: np.ndarray
-    frequencies: np.ndarray
-    powers: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
-class Bound:
-    """``runtime.regularisation``: center, least and unit, (n, n)."""
+class Splines:
+    """Of some joints each a sum of cubic B-splines, as in ``runtime.joint_functions``.
 
+    The k-th of S is 2/3 high at center + spacing (k - (S - 1) / 2); weights: (joints, S).
+    """
+
+    joints: tuple[int, ...]
     center: np.ndarray
-    least: np.ndarray
-    unit: np.ndarray
+    spacing: np.ndarray
+    weights: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
-class Learned:
-    """What networks and Fourier series give: M's rows (n n) and V."""
+class Harmonics:
+    """A joint's torque [Nm]: cosines @ cos(k frequency q) + sines @ sin(k frequency q), k from 1 on."""
+
+    joint: int
+    frequency: float
+    cosines: np.ndarray
+    sines: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """What a model has beside rigid bodies, as far as it is not zero.
+
+    mass: gives what is added to M, (n n) rows; potential: to V, one row. torque and ripple: dV/dq by joint [Nm, N].
+    friction: the logarithm of a factor on a drive's friction.
+    """
 
     encoding: Encoding
-    mass: Functions
-    potential: Functions | None
-    bound: Bound | None
+    mass: Network | None
+    potential: Network | None
+    torque: Splines
+    ripple: tuple[Harmonics, ...]
+    friction: Splines
+
+    def __bool__(self) -> bool:
+        return bool(self.mass or self.potential or self.has_torque or self.friction.joints)
+
+    @property
+    def has_torque(self) -> bool:
+        """Whether some joint has a torque of its own."""
+        return bool(self.torque.joints or self.ripple)
 
 
 @dataclass(frozen=True, eq=False)
 class TrainedModel:
     """A trained arm of n joints. Units: rad and Nm, or m and N.
 
-    name: for code. inertias: (bodies, 10) about the joints' frames, None where M and V are learned functions. rotors:
-    what these add to M, (n, n), where it is not among these. motors: (n, n), the drives' speeds by the joints', which
-    friction follows. inputs: G, (n, n); actuated: (n,), 0 for a passive joint. friction_compensation: (n,) what the
-    drives add by velocity.
+    name: for code. inertias: (bodies, 10) about the joints' frames. constant_mass: what rotors and other constants add
+    to M, (n, n). motors: (n, n), the drives' speeds by the joints', which friction follows. inputs: G, (n, n);
+    actuated: (n,), 0 for a passive joint. friction_compensation: (n,) what the drives add by velocity.
     """
 
     name: str
@@ -127,11 +132,11 @@ class TrainedModel:
     identifiers: tuple[str, ...]
     gravity: np.ndarray
     bodies: tuple[Body, ...]
-    inertias: np.ndarray | None
-    rotors: np.ndarray
+    inertias: np.ndarray
+    constant_mass: np.ndarray
     motors: np.ndarray
-    learned: Learned | None
-    friction: FrictionLaw | FrictionNetwork
+    residuals: Residuals
+    friction: FrictionLaw
     bristles: Bristles | None
     inputs: np.ndarray
     actuated: np.ndarray

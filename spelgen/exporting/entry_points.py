@@ -8,8 +8,8 @@ from dataclasses import dataclass, fields
 import casadi as ca
 
 from spelgen.exporting.description import TrainedModel
-from spelgen.exporting.learned_expressions import Level
 from spelgen.exporting.model_expressions import ModelExpressions
+from spelgen.exporting.residual_expressions import Level
 from spelgen.exporting.tip_expressions import tip
 
 
@@ -28,7 +28,7 @@ class EntryPoint:
     expressions: Callable[[ModelExpressions], tuple[ca.SX, ...]]
 
 
-NETWORK = "network_"  # before the names of what networks give
+RESIDUAL = "residual_"  # before the names of what is given of residuals
 _TORQUE, _MASS = "Nm, N", "kg m^2, kg m, kg"
 
 ENTRY_POINTS = (
@@ -94,19 +94,19 @@ ENTRY_POINTS = (
 
 
 def expression_function(entry: EntryPoint, model: TrainedModel) -> ca.Function:
-    """The entry point as a function of its inputs, then of what it needs of the networks; outputs are dense."""
+    """The entry point as a function of its inputs, then of what it needs of the residuals; outputs are dense."""
     made = ModelExpressions(model, entry.level)
     outputs = [ca.densify(each) for each in entry.expressions(made)]
     inputs = {name: getattr(made, name) for name in entry.inputs}
     every = ca.vertcat(*(ca.vec(each) for each in outputs))
-    for field in fields(made.networks):
-        symbols = getattr(made.networks, field.name)
+    for field in fields(made.residuals):
+        symbols = getattr(made.residuals, field.name)
         if symbols.numel() and ca.depends_on(every, symbols):
-            inputs[f"{NETWORK}{field.name}"] = symbols
+            inputs[f"{RESIDUAL}{field.name}"] = symbols
     names = [name for name, _ in entry.outputs]
     return ca.Function(entry.name, list(inputs.values()), outputs, list(inputs), names, {"cse": True})
 
 
-def networks_needed(function: ca.Function) -> list[str]:
-    """What an ``expression_function`` is given of the networks."""
-    return [name.removeprefix(NETWORK) for name in function.name_in() if name.startswith(NETWORK)]
+def residuals_needed(function: ca.Function) -> list[str]:
+    """What an ``expression_function`` is given of the residuals."""
+    return [name.removeprefix(RESIDUAL) for name in function.name_in() if name.startswith(RESIDUAL)]

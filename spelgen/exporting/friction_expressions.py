@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import casadi as ca
-import numpy as np
 
-from spelgen.exporting.description import Bristles, FrictionLaw, FrictionNetwork
+from spelgen.exporting.description import Bristles, FrictionLaw
 
 
 def law_torque(law: FrictionLaw, qd: ca.SX, gravity: ca.SX, direction: ca.SX) -> ca.SX:
@@ -19,17 +18,6 @@ def law_torque(law: FrictionLaw, qd: ca.SX, gravity: ca.SX, direction: ca.SX) ->
 def sliding_direction(law: FrictionLaw, qd: ca.SX) -> ca.SX:
     """The direction of dry friction of joints that have long gone this way, (n, 1)."""
     return ca.tanh(qd / law.coulomb_smoothing_velocity)
-
-
-def network_torque(network: FrictionNetwork, encoded: ca.SX, qd: ca.SX) -> ca.SX:
-    """``runtime.joint_friction``: (n, 1) [Nm, N]."""
-    direction = qd / ca.sqrt(qd * qd + network.smoothing)
-    inputs = ca.vertcat(encoded, qd, direction)
-    hidden = 1 / (1 + ca.exp(-(_sparse(network.weight) @ inputs + network.bias)))
-    dry = _sparse(network.out) @ hidden + network.offset
-    # log(1 + exp x) without overflow
-    size = ca.fmax(dry, 0) + ca.log1p(ca.exp(-ca.fabs(dry)))
-    return network.viscous * qd + network.nominal * direction * size
 
 
 def bristle_direction(bristles: Bristles, z: ca.SX) -> ca.SX:
@@ -56,7 +44,3 @@ def bristle_step(bristles: Bristles, z: ca.SX, dq: ca.SX) -> ca.SX:
 def _by_element(bristles: Bristles, values: ca.SX) -> ca.SX:
     """A joint's value for each of its elements, (n count, 1)."""
     return ca.vec(ca.repmat(values.T, bristles.count, 1))
-
-
-def _sparse(matrix: np.ndarray) -> ca.DM:
-    return ca.sparsify(ca.DM(matrix))

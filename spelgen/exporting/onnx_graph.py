@@ -66,18 +66,6 @@ class OnnxGraph:
             rows = self.Sub(rows, self.Mul(self.Div(column, self._slice(row, k, k + 1, 2)), row))
         return self._slice(rows, n, n + 1, 2)
 
-    def least_pivot(self, matrix: str, n: int) -> str:
-        """The smallest pivot, (batch, 1, 1), of the elimination of a symmetric matrix, up to the first negative one."""
-        pivots = []
-        for k in range(n):
-            row = self._slice(matrix, k, k + 1, 1)
-            pivots.append(self._slice(row, k, k + 1, 2))
-            if k < n - 1:
-                column = self._slice(matrix, k, k + 1, 2)
-                matrix = self.Sub(matrix, self.Mul(self.Div(column, pivots[-1]), row))
-        found: str = self.Min(*pivots)
-        return found
-
     def _slice(self, x: str, start: int, stop: int, axis: int) -> str:
         found: str = self.Slice(x, np.array([start]), np.array([stop]), np.array([axis]))
         return found

@@ -6,9 +6,9 @@ from functools import cached_property
 
 import numpy as np
 
-from spelgen.exporting.description import FrictionLaw, TrainedModel
+from spelgen.exporting.description import TrainedModel
 from spelgen.exporting.onnx_graph import OnnxGraph
-from spelgen.exporting.onnx_learned import OnnxLearned
+from spelgen.exporting.onnx_residuals import OnnxResiduals
 from spelgen.exporting.onnx_rigid import OnnxRigid
 
 ENTRIES: dict[str, tuple[tuple[str, ...], str]] = {
@@ -36,94 +36,47 @@ class _OnnxModel:
 
     def __init__(self, model: TrainedModel) -> None:
         self.model, self.n, self.g = model, model.n, OnnxGraph()
-        self._rigid = None if model.inertias is None else OnnxRigid(model, self.g, "q")
-        self._learned = None if model.learned is None else OnnxLearned(model, self.g, "q")
-
-    @cached_property
-    def _unbounded(self) -> str:
-        g, parts = self.g, []
-        if self._rigid is not None:
-            parts.append(self._rigid.mass)
-        if self._learned is not None:
-            parts.append(self._learned.mass)
-        if self.model.rotors.any():
-            parts.append(g.constant(self.model.rotors))
-        found: str = parts[0] if len(parts) == 1 else g.Sum(*parts)
-        return found
-
-    @cached_property
-    def _part(self) -> str | None:
-        """t of the bound, (batch, 1, 1)."""
-        bound = None if self.model.learned is None else self.model.learned.bound
-        if bound is None:
-            return None
-        g = self.g
-        definite = g.Greater(g.least_pivot(g.Sub(self._unbounded, bound.least), self.n), 0.0)
-        missed = g.Mul(g.Sub(self._unbounded, bound.center), bound.unit)
-        size = g.ReduceL2(missed, np.array([1, 2]), keepdims=1)
-        halvings = g.Max(g.Ceil(g.Mul(g.Log(size), 1 / np.log(2))), 1.0)
-        found: str = g.Where(definite, 1.0, g.Pow(0.5, halvings))
-        return found
+        self._rigid = OnnxRigid(model, self.g, "q")
+        self._residuals = OnnxResiduals(model, self.g, "q")
 
     @cached_property
     def mass_matrix(self) -> str:
         """(batch, n, n)."""
-        bound = None if self.model.learned is None else self.model.learned.bound
-        if bound is None or self._part is None:
-            return self._unbounded
-        g = self.g
-        found: str = g.Add(g.Mul(g.Sub(self._unbounded, bound.center), self._part), bound.center)
-        return found
+        parts = [self._rigid.mass]
+        if self.model.constant_mass.any():
+            parts.append(self.g.constant(self.model.constant_mass))
+        return self._sum([*parts, self._residuals.mass])
+
+    @cached_property
+    def _rigid_gravity(self) -> str:
+        return self.g.reshaped(self._rigid.gravity, 0, self.n)
 
     @cached_property
     def gravity(self) -> str:
         """dV/dq."""
-        parts = []
-        if self._rigid is not None:
-            parts.append(self.g.reshaped(self._rigid.gravity, 0, self.n))
-        if self._learned is not None:
-            parts.append(self._learned.gravity())
-        found: str = parts[0] if len(parts) == 1 else self.g.Sum(*parts)
-        return found
+        return self._sum([self._rigid_gravity, *self._residuals.gravity])
 
     @cached_property
     def bias(self) -> str:
         """Coriolis, centrifugal and gravity torque."""
-        g, n = self.g, self.n
-        if self._learned is None:
-            assert self._rigid is not None
-            return g.reshaped(self._rigid.bias(g.reshaped("qd", 0, 1, n)), 0, n)
-        found = self._learned.coriolis("qd")
-        if self._rigid is not None:
-            by_bodies = self._rigid.bias(g.reshaped("qd", 0, 1, n), gravity=False)
-            found = g.Add(found, g.reshaped(by_bodies, 0, n))
-        if self._part is not None:
-            found = g.Mul(found, g.reshaped(self._part, 0, 1))
-        whole: str = g.Add(found, self.gravity)
-        return whole
+        bodies = self.g.reshaped(self._rigid.bias(self.g.reshaped("qd", 0, 1, self.n)), 0, self.n)
+        return self._sum([bodies, self._residuals.coriolis("qd"), *self._residuals.gravity])
+
+    def _sum(self, parts: list[str | None]) -> str:
+        """Of those that are there."""
+        there = [part for part in parts if part is not None]
+        found: str = there[0] if len(there) == 1 else self.g.Sum(*there)
+        return found
 
     @cached_property
     def friction(self) -> str:
         """What friction takes."""
-        g, law = self.g, self.model.friction
-        if isinstance(law, FrictionLaw):
-            return self._law(law)
-        assert self._learned is not None
-        direction = g.Div("qd", g.Sqrt(g.Add(g.Mul("qd", "qd"), law.smoothing)))
-        read = g.Concat(self._learned.encoded, "qd", direction, axis=1)
-        hidden = g.Sigmoid(g.Gemm(read, law.weight, law.bias, transB=1))
-        size = g.Softplus(g.Gemm(hidden, law.out, law.offset, transB=1))
-        dry = g.Mul(g.Mul(direction, law.nominal), size)
-        found: str = g.Add(g.Mul("qd", law.viscous), dry)
-        return found
-
-    def _law(self, law: FrictionLaw) -> str:
-        g, bristles = self.g, self.model.bristles
+        g, law, bristles = self.g, self.model.friction, self.model.bristles
         speed, loads = self._turned("qd", self.model.motors.T), np.linalg.inv(self.model.motors)
         slow = g.Mul(speed, 1 / law.stribeck_velocity)
         dry = g.Add(g.Mul(g.Exp(g.Neg(g.Mul(slow, slow))), law.stribeck), law.coulomb)
         if law.load_dependence.any():
-            dry = g.Add(dry, g.Mul(g.Abs(self._turned(self.gravity, loads)), law.load_dependence))
+            dry = g.Add(dry, g.Mul(g.Abs(self._turned(self._rigid_gravity, loads)), law.load_dependence))
         if bristles is None:
             direction = g.Tanh(g.Mul(speed, 1 / law.coulomb_smoothing_velocity))
         else:
@@ -131,6 +84,8 @@ class _OnnxModel:
             direction = g.MatMul("z", (bristles.fractions / bristles.reach).reshape(-1, 1) * share)
         saturating = g.Mul(g.Tanh(g.Mul(speed, 1 / law.saturation_velocity)), law.saturation)
         found = g.Sum(g.Mul(speed, law.viscous), saturating, g.Mul(dry, direction))
+        if self._residuals.friction_factor is not None:
+            found = g.Mul(found, self._residuals.friction_factor)
         return self._turned(found, self.model.motors)
 
     def _turned(self, rows: str, by: np.ndarray) -> str:

@@ -15,7 +15,6 @@ class OnnxRigid:
     """M, bias and gravity of the bodies at q, (batch, n); armature is not among them."""
 
     def __init__(self, model: TrainedModel, graph: OnnxGraph, q: str) -> None:
-        assert model.inertias is not None
         self.g, self.n, self._q = graph, model.n, q
         self._bodies, self.b = model.bodies, len(model.bodies)
         tables = [transform_table(_geometry(model), index).mT.numpy() for index in range(self.b)]
@@ -80,7 +79,7 @@ class OnnxRigid:
         found: str = self.g.MatMul(self.g.MatMul(self._motion[1], self._inertia), self._back)
         return found
 
-    def bias(self, qd: str, *, gravity: bool = True) -> str:
+    def bias(self, qd: str) -> str:
         """(batch, 1, n); qd: (batch, 1, n)."""
         g, b = self.g, self.b
         turning, crossing = np.zeros((6 * b, 6 * b)), _crossing()
@@ -93,8 +92,7 @@ class OnnxRigid:
         for k, body in enumerate(self._bodies):
             below = [] if body.parent < 0 else [g.MatMul(rises[body.parent], self._transforms[k])]
             rises.append(g.Add(own[k], below[0]) if below else own[k])
-        rise = rises[0] if b == 1 else g.Concat(*rises, axis=2)
-        rise = g.Add(rise, self._motion[1]) if gravity else rise
+        rise = g.Add(rises[0] if b == 1 else g.Concat(*rises, axis=2), self._motion[1])
         cross = g.reshaped(g.MatMul(g.reshaped(twists, 0, b, 6), crossing.reshape(6, 36)), 0, b, 6, 6)
         momenta = g.reshaped(g.MatMul(twists, self._inertia), 0, b, 1, 6)
         turned = g.reshaped(g.MatMul(momenta, cross), 0, 1, 6 * b)

@@ -71,12 +71,14 @@ def check_parity(
     *,
     memory: int = 0,
     states: int = STATES,
+    dtype: Any = np.float64,
 ) -> Parity:
     """``called`` held against the torch model at random states, at each of these entry points. Raises RunError.
 
-    memory: numbers of friction's.
+    memory: numbers of friction's. dtype: of what ``called`` is given, to which the states are rounded.
     """
-    inputs = random_inputs(trained.arm.arm.coordinates, states, memory)
+    random = random_inputs(trained.arm.arm.coordinates, states, memory)
+    inputs = {key: value.astype(dtype).astype(np.float64) for key, value in random.items()}
     exact = copy.deepcopy(trained.model).double().cpu().requires_grad_(False)
     differences: dict[str, float] = {}
     for name in names:

@@ -13,6 +13,7 @@ from scipy.optimize import nnls
 
 from spelgen.arm.arm import Arm
 from spelgen.building import build
+from spelgen.dynamics.residuals import without_residuals
 from spelgen.fitting.optimizers import minimise
 from spelgen.fitting.stages import is_closed_form
 from spelgen.loaded_arm import LoadedArm
@@ -34,9 +35,9 @@ class RigidBodyProjection:
 
     inertias: by body, ten parameters about the joint's frame as in ``Body``, (bodies, 10). armature: what the
     drives add to M, (n,) [kg m^2, kg]. viscous, forward, backward: friction, (n,); backward is not positive.
-    mass_error, gravity_error: root mean square of what M and gravity torque of bodies and model differ by,
-    relative to the model's; None where the bodies are the model's own. friction_error: (n,) likewise, of friction.
-    bodies: a closed-form model of these bodies, float64.
+    own: whether the bodies are the model's own. mass_error, gravity_error: root mean square of what M and gravity
+    torque of bodies and model differ by, relative to the model's. friction_error: (n,) likewise, of friction.
+    bodies: a model of these bodies alone, float64.
     """
 
     arm: LoadedArm
@@ -46,8 +47,9 @@ class RigidBodyProjection:
     forward: np.ndarray
     backward: np.ndarray
     friction_error: np.ndarray
-    mass_error: float | None
-    gravity_error: float | None
+    own: bool
+    mass_error: float
+    gravity_error: float
     bodies: Any
 
     @property
@@ -63,10 +65,10 @@ class RigidBodyProjection:
 def rigid_body_projection(model: EmittedModel, arm: LoadedArm) -> RigidBodyProjection:
     """The bodies, armature and friction of a trained model of ``arm``."""
     model = copy.deepcopy(model).double().requires_grad_(False)
-    q = _positions(arm.arm)
+    q = sampled_positions(arm.arm)
     own = is_closed_form(model)
-    bodies: Any = model if own else _nearest(model, arm, q)
-    mass, gravity = (None, None) if own else _errors(model, bodies, q)
+    bodies: Any = _own(model) if own else _nearest(model, arm, q)
+    mass, gravity = _errors(model, bodies, q)
     viscous, forward, backward, missed = _friction(arm.arm, model, q)
     return RigidBodyProjection(
         arm=arm,
@@ -76,16 +78,25 @@ def rigid_body_projection(model: EmittedModel, arm: LoadedArm) -> RigidBodyProje
         forward=forward,
         backward=backward,
         friction_error=missed,
+        own=own,
         mass_error=mass,
         gravity_error=gravity,
         bodies=bodies,
     )
 
 
-def _positions(arm: Arm) -> torch.Tensor:
+def sampled_positions(arm: Arm) -> torch.Tensor:
+    """Positions over the joints' ranges, (POINTS, n), the same each time."""
     random = np.random.default_rng(0)
     columns = [random.uniform(*working_range(coordinate), POINTS) for coordinate in arm.coordinates]
     return torch.from_numpy(np.stack(columns, axis=-1))
+
+
+def _own(model: EmittedModel) -> EmittedModel:
+    """The model without what it has beside rigid bodies."""
+    alone = copy.deepcopy(model)
+    alone.dynamics = without_residuals(alone.dynamics)
+    return alone
 
 
 def _nearest(model: EmittedModel, arm: LoadedArm, q: torch.Tensor) -> EmittedModel:
@@ -123,17 +134,16 @@ def _errors(model: EmittedModel, bodies: EmittedModel, q: torch.Tensor) -> tuple
 
 
 def _friction(arm: Arm, model: EmittedModel, q: torch.Tensor) -> tuple[np.ndarray, ...]:
-    """Viscous and Coulomb friction nearest to the model's, mean over positions, and what is missed of it."""
+    """Viscous and Coulomb friction nearest to the model's at these positions, and what is missed of it."""
     usual = np.array([c.velocity or USUAL_SPEED[c.kind] for c in arm.coordinates])
     qd = torch.from_numpy(np.outer(SPEEDS, usual))
     places = q[:: POINTS // 32].unsqueeze(1).expand(-1, len(qd), -1)
-    lost = model.friction_torque(places, qd.expand_as(places)).mean(dim=0).numpy()
+    lost = model.friction_torque(places, qd.expand_as(places)).numpy()
     found = []
-    for speed, torque in zip(qd.numpy().T, lost.T, strict=True):
-        columns = np.stack([speed, speed > 0, -1.0 * (speed < 0)], axis=-1)
-        (viscous, forward, backward), missed = nnls(
-            columns * np.sign(speed)[:, None], torque * np.sign(speed)
-        )
-        size = np.linalg.norm(torque)
+    for speed, torque in zip(qd.numpy().T, lost.T, strict=True):  # torque: (speeds, positions)
+        columns = np.stack([speed, speed > 0, -1.0 * (speed < 0)], axis=-1) * np.sign(speed)[:, None]
+        (viscous, forward, backward), _ = nnls(columns, torque.mean(axis=1) * np.sign(speed))
+        fitted = columns @ (viscous, forward, backward) * np.sign(speed)
+        missed, size = np.linalg.norm(torque - fitted[:, None]), np.linalg.norm(torque)
         found.append((viscous, forward, -backward, missed / size if size else 0.0))
     return tuple(np.array(column) for column in zip(*found, strict=True))

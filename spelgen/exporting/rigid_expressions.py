@@ -34,12 +34,11 @@ class RigidExpressions:
     """An arm's rigid bodies at q, a column of n symbols; armature is not among them."""
 
     def __init__(self, model: TrainedModel, q: ca.SX) -> None:
-        assert model.inertias is not None
         self.n = model.n
         self.weight = ca.SX(-model.gravity)
         self.links = [_link(model, index, q) for index in range(len(model.bodies))]
 
-    def torque(self, qd: ca.SX | None, qdd: ca.SX | None, *, gravity: bool = True) -> ca.SX:
+    def torque(self, qd: ca.SX | None, qdd: ca.SX | None) -> ca.SX:
         """What the joints must give for this motion, (n, 1); None: zero."""
         still = qd is None and qdd is None
         zero = ca.SX(3, 1)
@@ -50,7 +49,7 @@ class RigidExpressions:
         for link in self.links:
             below = link.parent >= 0
             w = turns[link.parent] if below else zero
-            spin, rise = moves[link.parent] if below else (ca.SX(3, 3), self.weight if gravity else zero)
+            spin, rise = moves[link.parent] if below else (ca.SX(3, 3), self.weight)
             # the acceleration of the origin; spin is [w']x + [w]x [w]x
             rise = link.rotation.T @ (rise + spin @ link.position)
             w = link.rotation.T @ w
@@ -134,7 +133,6 @@ class RigidExpressions:
 
 
 def _link(model: TrainedModel, index: int, q: ca.SX) -> _Link:
-    assert model.inertias is not None
     body, ten = model.bodies[index], model.inertias[index]
     value = float(body.multiplier) * q[body.coordinate] + body.offset
     rotation, position = _exact(body.rotation), _exact(body.translation)

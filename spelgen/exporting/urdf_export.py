@@ -5,11 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import torch
 import yaml
 
 from spelgen.exporting.exported import Exported
 from spelgen.exporting.readme import UNITS, readme
-from spelgen.exporting.rigid_body_projection import RigidBodyProjection, rigid_body_projection
+from spelgen.exporting.rigid_body_projection import (
+    RigidBodyProjection,
+    rigid_body_projection,
+    sampled_positions,
+)
 from spelgen.exporting.trained import Trained
 from spelgen.exporting.urdf_file import settings_text, urdf_text
 from spelgen.listing import Listing, number
@@ -17,7 +22,8 @@ from spelgen.listing import Listing, number
 LAW = (
     "viscous qd + saturation tanh(qd / saturation_velocity) + (coulomb + stribeck exp(-(qd / stribeck_velocity)^2) "
     "+ load_dependence |gravity torque|) direction; direction: tanh(qd / coulomb_smoothing_velocity), or of bristles "
-    "with z' = qd - |qd| z / bristle_reach the sum of bristle_fractions z / bristle_reach"
+    "with z' = qd - |qd| z / bristle_reach the sum of bristle_fractions z / bristle_reach; all of it times a factor "
+    "that goes with the joint's position, between the two numbers of position_factor, or one where there are none"
 )
 
 
@@ -67,10 +73,10 @@ def export_urdf(trained: Trained) -> ExportedUrdf:
 def projection_summary(found: RigidBodyProjection) -> tuple[str, str]:
     """How near bodies and friction are to the model's, a sentence each."""
     bodies = "bodies: the model's own"
-    if found.mass_error is not None:
+    if not found.own or found.mass_error or found.gravity_error:
         bodies = (
-            f"bodies: nearest to the model; M differs by {found.mass_error:.1%}, "
-            f"gravity by {found.gravity_error:.1%}"
+            f"bodies: {'its own, without what it has beside them' if found.own else 'nearest to the model'}; "
+            f"M differs by {found.mass_error:.1%}, gravity by {found.gravity_error:.1%}"
         )
     joints = zip(found.arm.arm.coordinates, found.friction_error, strict=True)
     missed = ", ".join(f"{coordinate.name} {error:.0%}" for coordinate, error in joints)
@@ -82,6 +88,10 @@ def friction_text(trained: Trained, projection: RigidBodyProjection) -> str:
     friction = trained.model.dynamics.friction
     law = friction.prepare()
     constants = law._asdict() if hasattr(law, "coulomb") else {}
+    if projection.own:
+        factor = trained.model.dynamics.friction_factor(sampled_positions(projection.arm.arm))
+        if (factor != 1).any():
+            constants["position_factor"] = torch.stack([factor.amin(dim=0), factor.amax(dim=0)], dim=-1)
     if hasattr(friction, "bristles"):
         constants["bristle_reach"] = friction.bristles.reach
     joints: dict[str, Any] = {}

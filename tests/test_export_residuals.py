@@ -1,0 +1,145 @@
+"""What minimal has beside rigid bodies: exported where it is not zero, left out where it is."""
+
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from exported_runs import arm_of, moved_model
+
+from spelgen.building import build
+from spelgen.errors import RunError
+from spelgen.exporting.c_code import c_entries, c_header, c_source
+from spelgen.exporting.c_library import CLibrary, compile_object, link_library
+from spelgen.exporting.casadi_export import called_by_state, casadi_functions
+from spelgen.exporting.describe import describe
+from spelgen.exporting.entry_points import ENTRY_POINTS
+from spelgen.exporting.onnx_export import called_by_onnx
+from spelgen.exporting.onnx_model import ENTRIES, onnx_model
+from spelgen.exporting.parity import check_parity
+from spelgen.exporting.trained import Trained
+
+needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc on this machine")
+PARTS = {
+    "springs": "joint_functions.raw_torque_splines",
+    "ripple": "joint_functions.raw_torque_ripple",
+    "friction": "joint_functions.raw_friction_splines",
+    "constants": "residual_mass.raw_constants",
+    "mass": "residual_mass.network",
+    "potential": "residual_potential.network",
+}
+RESIDUALS = ("joint_functions.", "residual_")
+
+
+def with_parts(robot, *parts, net=None):
+    """A minimal model whose bodies have moved, and of what stands beside them these parts alone."""
+    model, moved = build(arm_of(robot), "minimal", net=net), moved_model(robot, "minimal")
+    names = tuple(PARTS[part] for part in parts)
+    with torch.no_grad():
+        for name, parameter in model.dynamics.named_parameters():
+            if name.startswith(names) or not name.startswith(RESIDUALS):
+                parameter.copy_(moved.dynamics.get_parameter(name))
+    return model.requires_grad_(False)
+
+
+def closed_form(model, robot):
+    """The closed-form model of the same bodies and drives."""
+    found = build(arm_of(robot), "closed-form").requires_grad_(False)
+    found.load_state_dict(
+        {key: value for key, value in model.state_dict().items() if key in found.state_dict()}
+    )
+    return found
+
+
+def c_library(model, folder):
+    """The model's C, compiled."""
+    source, entries = folder / f"{model.name}.c", c_entries(model)
+    source.write_text(c_source(model, entries))
+    source.with_suffix(".h").write_text(c_header(model, entries, ""))
+    return CLibrary(link_library(compile_object(source, "gcc"), "gcc"), model)
+
+
+def test_what_is_zero_is_left_out():
+    """C and ONNX of a fit without residuals are those of closed-form, byte for byte."""
+    model = with_parts("rpr")
+    ours = describe(model, arm_of("rpr"))
+    other = describe(closed_form(model, "rpr"), arm_of("rpr"))
+    assert not ours.residuals
+    text, plain = (c_source(each, c_entries(each)).split("\n", 1)[1] for each in (ours, other))
+    assert text == plain
+    assert all(onnx_model(ours, name) == onnx_model(other, name) for name in ENTRIES)
+
+
+@needs_gcc
+@pytest.mark.parametrize(
+    "parts",
+    [
+        ["springs"],
+        ["ripple"],
+        ["friction"],
+        ["mass", "constants"],
+        ["potential"],
+    ],
+    ids="-".join,
+)
+def test_each_part_goes_alone(parts, tmp_path):
+    """Unused functions and tables would be refused by the compiler."""
+    trained = Trained(with_parts("scara", *parts), arm_of("scara"))
+    model, names = trained.described, [entry.name for entry in ENTRY_POINTS]
+    check_parity(c_library(model, tmp_path), trained, names, 1e-12, memory=model.memory, states=20)
+    values = [name for name in names if not name.endswith("derivatives")]
+    casadi = called_by_state(casadi_functions(model))
+    check_parity(casadi, trained, values, 1e-12, memory=model.memory, states=20)
+    onnx = called_by_onnx({name: onnx_model(model, name) for name in ENTRIES})
+    check_parity(onnx, trained, list(ENTRIES), 1e-10, memory=model.memory, states=20)
+
+
+def test_a_function_of_one_joint_stays_with_it():
+    model = with_parts("scara")
+    functions = model.dynamics.joint_functions
+    functions.raw_torque_splines[1, 20] = 1.0
+    functions.raw_torque_ripple[0, [2, 65]] = torch.tensor([1.0, 2.0], dtype=torch.float64)  # twice the gear
+    functions.raw_torque_ripple[2, 3] = 1.0  # of a prismatic joint: no turns, no ripple
+    found = describe(model, arm_of("scara")).residuals
+    assert (found.torque.joints, found.friction.joints) == ((1,), ())
+    assert [(each.joint, each.frequency, len(each.cosines)) for each in found.ripple] == [
+        (0, 1, 3),
+        (0, 80, 2),
+    ]
+
+
+@needs_gcc
+def test_splines_at_their_ends_and_beyond(tmp_path):
+    """On knots, where the range ends, far outside: by C and CasADi as by torch, and slopes as torch has them."""
+    model = with_parts("two_link", "springs", "friction")
+    described, functions = describe(model, arm_of("two_link")), model.dynamics.joint_functions
+    knots = functions.center + functions.spacing * torch.arange(-19.5, 20, 0.5, dtype=torch.float64)[:, None]
+    q = torch.cat([knots, torch.tensor([[50.0, -50.0], [1e6, -1e6]], dtype=torch.float64)]).contiguous()
+    inputs = {key: 0 * q.numpy() + 0.3 for key in ("qd", "qdd")} | {
+        "q": q.numpy(),
+        "z": np.zeros((len(q), 8)),
+    }
+    expected = model.inverse_dynamics(q, 0 * q + 0.3, 0 * q + 0.3, torch.zeros(len(q), 2, 4)).numpy()
+    still = model.gravity(q).numpy()
+    for called in (c_library(described, tmp_path), called_by_state(casadi_functions(described))):
+        np.testing.assert_allclose(called("inverse_dynamics", inputs)["tau"], expected, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(called("gravity", inputs)["gravity"], still, rtol=1e-9, atol=1e-9)
+        energy = called("energy", inputs)["energy"][:, 1]
+        np.testing.assert_allclose(energy, model.potential_energy(q).numpy(), rtol=1e-9, atol=1e-9)
+        slope = called("inverse_dynamics_derivatives", inputs)["dtau_dq"]
+        near = {"qd": inputs["qd"], "qdd": inputs["qdd"], "z": inputs["z"]}
+        ahead, behind = (
+            called("inverse_dynamics", near | {"q": q.numpy() + step * np.eye(2)[0]})["tau"]
+            for step in (1e-6, -1e-6)
+        )
+        np.testing.assert_allclose(slope[:, :, 0], (ahead - behind) / 2e-6, rtol=1e-4, atol=1e-4)
+
+
+def test_kolmogorov_arnold_networks_are_refused_unless_zero():
+    model = with_parts("two_link", net="kan")
+    assert not describe(model, arm_of("two_link")).residuals
+    model.dynamics.residual_mass.network.weights[-1].add_(0.1)
+    with pytest.raises(
+        RunError, match="Kolmogorov-Arnold networks beside rigid bodies, expected closed-form"
+    ):
+        describe(model, arm_of("two_link"))
