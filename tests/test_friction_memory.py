@@ -6,7 +6,8 @@ import torch
 from emitted import ROBOTS, built, import_source
 
 from spelgen.dynamics.bristles import BristleReach, bristle_reach, bristles_along, encoder_step, reach_of
-from spelgen.fitting.rollout import roll_out
+from spelgen.emission.loading import load_module
+from spelgen.fitting.rollout import loss_scales, momentum_loss, roll_out
 from spelgen.identification.friction import FrictionModel
 from spelgen.identification.identify import least_squares
 from spelgen.identification.method import LeastSquares
@@ -148,3 +149,29 @@ def test_least_squares_finds_the_strengths_of_bristles():
             )
     torque = found.torque(q, qd, qdd, z)
     np.testing.assert_allclose(torque, tau, atol=1e-6)
+
+
+def test_the_weak_form_counts_all_that_the_drives_do():
+    """An offset of the measured torque and friction that drives make up for are no fault of the rigid bodies."""
+    model = load_module(built("rpr", preset="closed-form")[0])
+    dynamics = model.dynamics
+    with torch.no_grad():
+        dynamics.raw_offset += 2.0
+        dynamics.raw_friction_compensation += 1.0
+    q, qd, tau = (torch.rand(3, 20, 1, 3, generator=torch.Generator().manual_seed(4)).double() - 0.5).unbind()
+    held = Windows(
+        torch.full((20, 8), 2e-3).double(),
+        *(x.expand(-1, 9, -1) for x in (q, qd)),
+        20 * tau.expand(-1, 8, -1),
+    )
+    with torch.no_grad():
+        after = roll_out(model, held, 4)
+    columns = [torch.cat([x[:, :1], y], dim=1) for x, y in zip((held.q, held.qd), after, strict=True)]
+    windows = Windows(held.dt, *columns, held.tau)
+    scales = loss_scales(windows, model.joint_types)
+    true = momentum_loss(model, windows, scales).item()
+    for changed in (dynamics.raw_offset.data, dynamics.raw_friction_compensation):
+        kept = changed.clone()
+        changed.zero_()
+        assert momentum_loss(model, windows, scales).item() > 100 * true
+        changed.copy_(kept)

@@ -29,10 +29,10 @@ structure: recursion field sampling spans basis expansion symbolic structure nom
 structure: fourier base_parameters pseudo_inertia
 dynamics: bristles
 {" ".join(RUNTIME)}
-dynamics: protocol prepared
+dynamics: protocol runge_kutta prepared
 emission: bodies plan source docstring tailored bundle emit loading
 dynamics: arrays constraint pinocchio_dynamics pinocchio_arm pinocchio_urdf regressor regressor_dynamics tip
-logs: arm_mapping trajectory bags tables npz readers values log_files suggest read checks filtering
+logs: arm_mapping trajectory coverage bags tables npz readers values log_files suggest read checks filtering
 logs: preprocessing windows chunks epoch_windows
 simulation: friction integration simulated_logs random_inputs tracking
 identification: samples friction base_parameters least_squares method prior identification

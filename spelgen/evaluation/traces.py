@@ -17,6 +17,7 @@ from spelgen.evaluation.baselines import Predictor
 from spelgen.evaluation.names import MODEL
 from spelgen.evaluation.torque_traces import plain, torque_trace
 from spelgen.fitting.rollout import loss_scales, position_difference
+from spelgen.logs.coverage import coverage
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
@@ -26,7 +27,6 @@ TIMES = 24  # at which it is told
 QUANTILES = (0.1, 0.5, 0.9)
 DENSEST = 150.0  # [Hz] inputs of denser logs are averaged
 SHOWN = 240  # samples of a predicted trajectory
-BINS = 24
 
 
 def traces(
@@ -44,7 +44,7 @@ def traces(
     reach: of the bristles that friction remembers with.
     """
     dynamics = {x.name: x.dynamics for x in predictors if x.dynamics is not None}
-    found: dict[str, Any] = {"coverage": _coverage(pieces)}
+    found: dict[str, Any] = {"coverage": coverage(pieces)}
     if steps:
         found |= _predictions(predictors, pieces, steps, joint_types, used, tip, reach)
     model = next((x for x in predictors if x.name == MODEL and x.dynamics is not None), None)
@@ -187,19 +187,3 @@ def _friction(
         for k in range(n)
     ]
     return {"qd": plain(speeds.mT), "by": curves, "measured": left}
-
-
-def _coverage(pieces: Sequence[Trajectory]) -> dict[str, Any]:
-    """Of each joint: its range, and how many samples fall into equal bins of it; of q and of qd."""
-    found: dict[str, Any] = {"seconds": plain(sum(piece.duration for piece in pieces))}
-    for name in ("q", "qd"):
-        values = np.concatenate([getattr(piece, name) for piece in pieces])
-        found[name] = [
-            {
-                "low": plain(x.min()),
-                "high": plain(x.max()),
-                "counts": np.histogram(x, BINS)[0].tolist(),
-            }
-            for x in values.T
-        ]
-    return found
