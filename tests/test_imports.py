@@ -58,10 +58,12 @@ exporting: c_statements c_networks c_code c_library c_export ros2_export casadi_
 render: charts plots picture page learned parameters reproduction shapes scene still arm_section
 render: run_facts curves report_page runs_page inspection_page identification_page
 logs: statistics gravity report check_logs
+fleet: ray_engine engine
 comparison: truth metrics study runs formatting
-render: logs_page comparison_page
+fleet: schema prepare jobs search units fleet ranking progress
+render: logs_page comparison_page fleet_page
 cli: command console options formats model_commands train_start train_command log_commands simulate_command
-cli: identify_command evaluate_command compare_command export_command main
+cli: identify_command evaluate_command compare_command fleet_command export_command main
 __init__ __main__
 """
 

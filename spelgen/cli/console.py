@@ -24,6 +24,7 @@ BROKEN_PIPE = 141  # 128 + SIGPIPE
 EXTRAS = {
     "pinocchio": "simulate",
     "casadi": "deploy",
+    "optuna": "fleet",
     **dict.fromkeys(("mujoco", "onnx", "onnxruntime", "safetensors"), "deploy"),
 }  # top-level module that only an extra brings -> the extra
 
