@@ -31,7 +31,8 @@ dynamics: bristles
 {" ".join(RUNTIME)}
 dynamics: protocol runge_kutta prepared
 emission: bodies plan source docstring tailored bundle emit loading
-dynamics: arrays constraint pinocchio_dynamics pinocchio_arm pinocchio_urdf regressor regressor_dynamics tip
+dynamics: arrays constraint pinocchio_dynamics pinocchio_arm pinocchio_urdf
+dynamics: regressor rigid_bodies regressor_dynamics tip
 logs: arm_mapping trajectory coverage bags tables npz readers values log_files suggest read checks filtering
 logs: preprocessing windows chunks epoch_windows
 simulation: friction integration simulated_logs random_inputs tracking
@@ -42,8 +43,8 @@ fitting: gaussian_prior adaptive rollout calibration dataset streaming torque_sa
 fitting: torque_fit torque_report
 fitting: optimizers torque_networks urdf_regularizer stages compiled process progress validation loop
 fitting: run_record fitted fit train
-evaluation: names disturbance stiff baselines trust forecast torque rollout torque_traces traces examples invariants
-evaluation: tables verdict results csv_file subject evaluate
+evaluation: names disturbance stiff baselines trust forecast torque rollout invariants examples
+evaluation: tables verdict results horizons torque_traces traces csv_file subject evaluate
 verify: agreement urdf_cross_check numeric_samples verify
 explain: reasons facts
 formulas: terms printing angles shortening formulas text files

@@ -11,7 +11,6 @@ from typing import Any
 import torch
 
 from spelgen.errors import Diagnostic
-from spelgen.evaluation.baselines import Predictor
 from spelgen.evaluation.names import MODEL
 from spelgen.evaluation.stiff import States
 from spelgen.evaluation.tables import result_tables
@@ -93,8 +92,8 @@ class Results:
     cutoff: of the filter on the test logs [Hz], None without. substeps: of rk4 between samples. parameters: trained
     numbers of the model. torque: by predictor, empty where the logs are too sparse. energy_drift: of the model
     without input and dissipation over 1 s, integrated to thirteen digits, relative to its kinetic energy; None where
-    the logs never move. forecasts: by predictor, empty where there are none. traces: the curves behind the figures,
-    open loop, see `traces.py`.
+    the logs never move. forecasts: by predictor, empty where there are none. traces: the curves behind the figures;
+    those of predictions are the longest horizon's, see `traces.py`.
     """
 
     robot: str
@@ -133,17 +132,6 @@ class Results:
     def _heading(self) -> str:
         count = len(self.trajectories)
         return f"{self.robot} on {count} test trajector{'ies' if count != 1 else 'y'}"
-
-
-def state_errors(
-    predictor: Predictor,
-    windows: Windows,
-    joint_types: Sequence[str],
-    tip: Callable[[torch.Tensor], torch.Tensor] | None,
-) -> StateErrors:
-    """Errors of a predictor at the ends of these windows. tip: its position (..., 3) [m] by q."""
-    with torch.no_grad():
-        return end_errors(predictor.states(windows), windows, joint_types, tip)
 
 
 def end_errors(
