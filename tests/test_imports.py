@@ -39,7 +39,7 @@ simulation: friction integration simulated_logs random_inputs tracking
 identification: samples friction base_parameters least_squares method prior identification
 excitation: trajectory criterion excitation
 fitting: run_schema run_folder run_lock
-fitting: gaussian_prior adaptive rollout calibration dataset streaming torque_samples torque_jacobian
+fitting: gaussian_prior adaptive rollout calibration dataset streaming workers torque_samples torque_jacobian
 fitting: torque_fit torque_report
 fitting: optimizers torque_networks urdf_regularizer stages compiled process progress validation loop
 fitting: run_record fitted fit train

@@ -133,18 +133,23 @@ def train(
     chosen = Chosen(objective, flags, {"cutoff": filter, "decimation": decimation}, validation_fraction, seed)
     start = resumed(folder, chosen) if resume else begun(module, urdf, chosen)
     given = options.mapping(mapping, urdf, read_facts(start.module).joints)
+    from spelgen.fitting import workers
     from spelgen.fitting.train import train as train_files
 
     try:
-        found = train_files(
-            start.module, paths, folder, start.config, urdf=urdf, source=source, mapping=given or start.mapping,
-            preprocessing=start.preprocessing, validation=start.validation, seed=start.seed, resume=resume,
-            force=force, trust=trust, device=device, threads=threads, progress=not quiet,
-            since=since, require=None if urdf is None else _torque_check(urdf, start.module, given or start.mapping),
-        )  # fmt: skip
+        with workers.group(device) as own:
+            found = train_files(
+                start.module, paths, folder, start.config, urdf=urdf, source=source, mapping=given or start.mapping,
+                preprocessing=start.preprocessing, validation=start.validation, seed=start.seed, resume=resume,
+                force=force, trust=trust, device=own, threads=threads, progress=not quiet,
+                since=since, require=None if urdf is None else _torque_check(urdf, start.module, given or start.mapping),
+            )  # fmt: skip
+            first = workers.rank() == 0
     except OptionError as error:
         flag = "from" if error.option == "payload" else error.option.replace("_", "-")
         raise NotApplicable(f"--{flag}: {error.got}") from error
+    if not first:
+        return
     if not resume and found.status != "interrupted":
         from spelgen.fitting.run_folder import RunFolder
         from spelgen.identification.baseline import keep_baseline
