@@ -133,6 +133,7 @@ def train(
     chosen = Chosen(objective, flags, {"cutoff": filter, "decimation": decimation}, validation_fraction, seed)
     start = resumed(folder, chosen) if resume else begun(module, urdf, chosen)
     given = options.mapping(mapping, urdf, read_facts(start.module).joints)
+    check = None if urdf is None else _torque_check(urdf, start.module, given or start.mapping)
     from spelgen.fitting import workers
     from spelgen.fitting.train import train as train_files
 
@@ -142,7 +143,7 @@ def train(
                 start.module, paths, folder, start.config, urdf=urdf, source=source, mapping=given or start.mapping,
                 preprocessing=start.preprocessing, validation=start.validation, seed=start.seed, resume=resume,
                 force=force, trust=trust, device=own, threads=threads, progress=not quiet,
-                since=since, require=None if urdf is None else _torque_check(urdf, start.module, given or start.mapping),
+                since=since, require=check,
             )  # fmt: skip
             first = workers.rank() == 0
     except OptionError as error:

@@ -12,11 +12,11 @@ import torch
 
 from spelgen.errors import RunError
 from spelgen.fitting import workers
-from spelgen.fitting.config import BATCH, LEARNING_RATE, WindowConfig
+from spelgen.fitting.config import BATCH, FEW_WINDOWS, LEARNING_RATE, WindowConfig
 from spelgen.fitting.dataset import TrainingData
 from spelgen.fitting.optimizers import LBFGS, MiniBatchAdamW, WindowOptimizer
 from spelgen.fitting.progress import TrainingProgress
-from spelgen.fitting.rollout import momentum_loss, rollout_loss
+from spelgen.fitting.rollout import Mean, momentum_loss, rollout_loss
 from spelgen.fitting.run_folder import RunFolder, write_state
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer
 from spelgen.fitting.validation import Validation
@@ -64,14 +64,18 @@ class TrainingLoop:
         self.folder, self.config, self.seed, self.device = folder, config, seed, device
         self.model = model.to(device)
         self.stepped = stepped or self.model
-        self.training: Any = workers.shard(data.training, data.counts).to(device)
         self.together = workers.Together(self.model)
+        self.training: Any = data.training.to(device)
         self.scales = data.scales.to(device)
         self.regularizer = None if regularizer is None else regularizer.to(device)
         self.generator = torch.Generator().manual_seed(seed)
         self.stream = data.stream
         self.batch = min(getattr(config, "batch", None) or BATCH, len(self.training))
         self.whole = getattr(config, "optimizer", "lbfgs") == "lbfgs"  # all windows at once
+        if (
+            not self.whole or len(data.training) > FEW_WINDOWS
+        ):  # L-BFGS on few is the same to the last bit unshared
+            self.training = workers.shard(self.training, data.counts)
         self.optimizer = self._optimizer(self.generator)
         windows = len(self.training)
         if self.stream is not None:
@@ -152,12 +156,13 @@ class TrainingLoop:
         return MOMENTUM_FACTOR * self._largest_rate * _schedule(part)
 
     def _momentum_loss(self, windows: Any) -> torch.Tensor:
-        return (
-            self.together(lambda own: momentum_loss(self.model, own, self.scales), windows) + self._penalty()
-        )
+        def loss(own: Windows, everywhere: Mean) -> torch.Tensor:
+            return momentum_loss(self.model, own, self.scales, everywhere)
+
+        return self.together(loss, windows) + self._penalty()
 
     def _rollout_loss(self, windows: Any) -> torch.Tensor:
-        def loss(own: Windows) -> torch.Tensor:
+        def loss(own: Windows, everywhere: Mean) -> torch.Tensor:
             return rollout_loss(self.stepped, own, self.scales, self.substeps, self.config.solver)
 
         return self.together(loss, windows) + self._penalty()

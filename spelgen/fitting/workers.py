@@ -1,7 +1,7 @@
-"""Several processes that fit one model together, as `torchrun` starts them; of a process alone all this changes nothing.
+"""Several processes that fit one model together, as `torchrun` starts them; to a process alone this changes nothing.
 
-Each steps on its own part of the windows, and all have the same gradient, the same loss and the same clock, so that they
-take the same steps and hold the same weights; the first one writes. torch.distributed carries sums between them.
+Each steps on its own part of the windows, and all have the same gradient, the same loss and the same clock, so that
+they take the same steps and hold the same weights; the first one writes. torch.distributed carries sums between them.
 """
 
 from __future__ import annotations
@@ -17,8 +17,12 @@ import torch
 import torch.distributed as dist
 from torch.nn.parallel import DistributedDataParallel
 
+from spelgen.fitting.rollout import Mean
 from spelgen.logs.epoch_windows import EpochWindows
 from spelgen.logs.windows import Windows
+
+PartLoss = Callable[[Windows, Mean], torch.Tensor]
+"""A mean over windows, given these and what makes of a mean over them that over the windows of all processes."""
 
 
 @contextmanager
@@ -53,6 +57,12 @@ def total(part: torch.Tensor) -> torch.Tensor:
         part = part.clone()
         dist.all_reduce(part)
     return part
+
+
+def own(rows: torch.Tensor) -> torch.Tensor:
+    """Of rows that all of them have, the part that is this one's."""
+    start, stop = (len(rows) * k // count() for k in (rank(), rank() + 1))
+    return rows[start:stop]
 
 
 def agreed(value: float) -> float:
@@ -145,9 +155,9 @@ class _Loss(torch.nn.Module):
         super().__init__()
         self.model = model
 
-    def forward(self, loss: Callable[[Windows], torch.Tensor], part: Shard) -> torch.Tensor:
+    def forward(self, loss: PartLoss, part: Shard) -> torch.Tensor:
         try:
-            return part.share * count() * loss(part.windows)
+            return part.share * count() * loss(part.windows, lambda mean: total(part.share * mean))
         except torch.linalg.LinAlgError:  # the others wait for a gradient
             return torch.stack([x.sum() for x in self.model.parameters()]).sum() * torch.nan
 
@@ -157,14 +167,12 @@ class Together:
 
     def __init__(self, model: torch.nn.Module) -> None:
         self._parallel: Any = (
-            DistributedDataParallel(_Loss(model), find_unused_parameters=True)
-            if count() > 1
-            else None
+            DistributedDataParallel(_Loss(model), find_unused_parameters=True) if count() > 1 else None
         )
 
-    def __call__(self, loss: Callable[[Windows], torch.Tensor], windows: Any) -> torch.Tensor:
-        """The mean ``loss`` of the windows, or of the shards of all processes."""
-        if self._parallel is None:
-            return loss(windows)
+    def __call__(self, loss: PartLoss, windows: Any) -> torch.Tensor:
+        """The mean ``loss`` of windows that are not shared, or over the shards of all processes."""
+        if not isinstance(windows, Shard):
+            return loss(windows, lambda mean: mean)
         mean: torch.Tensor = _Mean.apply(self._parallel(loss, windows))
         return mean
