@@ -66,10 +66,6 @@ class EpochWindows:
         """Epochs in which all windows are passed over once."""
         return min(len(self.chunks), -(-len(self) // EPOCH))
 
-    def epoch(self, number: int) -> Windows:
-        """The windows of one epoch."""
-        return self.windows(self.drawn(number))
-
     def drawn(self, number: int) -> list[int]:
         """The chunks of one epoch: each pass over all chunks takes each once, in an order of its own.
 
