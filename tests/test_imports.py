@@ -29,12 +29,12 @@ structure: recursion field sampling spans basis expansion symbolic structure nom
 structure: fourier base_parameters pseudo_inertia
 dynamics: bristles
 {" ".join(RUNTIME)}
-dynamics: protocol runge_kutta prepared
+dynamics: protocol runge_kutta prepared servo_rollout
 emission: bodies plan source docstring tailored bundle emit loading
 dynamics: arrays constraint pinocchio_dynamics pinocchio_arm pinocchio_urdf
 dynamics: regressor rigid_bodies regressor_dynamics tip
 logs: arm_mapping trajectory coverage bags tables npz readers values log_files suggest read checks filtering
-logs: preprocessing windows chunks epoch_windows
+logs: preprocessing windows chunks epoch_windows commands
 simulation: friction integration simulated_logs random_inputs tracking
 identification: samples friction base_parameters least_squares method prior identification
 excitation: trajectory criterion excitation
@@ -42,8 +42,9 @@ fitting: run_schema run_folder run_lock
 fitting: gaussian_prior adaptive rollout calibration dataset streaming workers torque_samples torque_jacobian
 fitting: torque_fit torque_report
 fitting: optimizers torque_networks urdf_regularizer stages compiled process progress validation loop
-fitting: run_record fitted fit train
-evaluation: names disturbance stiff baselines trust forecast torque rollout invariants examples
+fitting: run_record fitted servo_windows servo_start servo_problem servo_fit servo_report linear_servo servo_run
+fitting: fit train
+evaluation: names replay disturbance stiff baselines trust forecast torque rollout invariants examples
 evaluation: tables verdict results horizons torque_traces traces csv_file subject evaluate
 verify: agreement urdf_cross_check numeric_samples verify
 explain: reasons facts

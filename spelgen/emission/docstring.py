@@ -52,7 +52,12 @@ def summary(spec: ModelSpec) -> str:
         if parts
         else ""
     )
-    return f"{_count(spec)[0].upper()}{_count(spec)[1:]}.\n{potential}{sums}\n{start}"
+    servos = (
+        "\nG is the spring of position servos: tau = clip(kp (u - q) - kd qd), which stores 1/2 kp (q - u)^2."
+        if spec.servos
+        else ""
+    )
+    return f"{_count(spec)[0].upper()}{_count(spec)[1:]}.\n{potential}{sums}{servos}\n{start}"
 
 
 def picture(spec: ModelSpec) -> str:

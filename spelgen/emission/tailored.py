@@ -147,7 +147,19 @@ def _rigid_bodies(spec: ModelSpec) -> list[str]:
         _input(spec),
         **({"reach": reach} if spec.design.memory == "bristles" else {}),
     )
-    return [assignment("bodies", bodies, _INDENT), assignment("self.dynamics", made, _INDENT)]
+    lines = [assignment("bodies", bodies, _INDENT), assignment("self.dynamics", made, _INDENT)]
+    return lines + ([assignment("self.servo", _servo(spec), _INDENT)] if spec.servos else [])
+
+
+def _servo(spec: ModelSpec) -> Call:
+    infinite = Code('float("inf")')
+    return call(
+        "PositionServo",
+        kp=tuple(servo.kp for servo in spec.servos),
+        kd=tuple(servo.kd for servo in spec.servos),
+        limit=tuple(infinite if servo.limit is None else servo.limit for servo in spec.servos),
+        known=tuple(servo.known for servo in spec.servos),
+    )
 
 
 def _networks(spec: ModelSpec) -> list[str]:

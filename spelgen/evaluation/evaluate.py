@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from spelgen.dynamics.protocol import RigidDynamics
-from spelgen.errors import Diagnostic
+from spelgen.errors import Diagnostic, LogError
 from spelgen.evaluation.baselines import (
     Predictor,
     constant_velocity,
@@ -19,6 +19,7 @@ from spelgen.evaluation.forecast import Disturbance, Forecast, for_windows, fore
 from spelgen.evaluation.horizons import PROBED, JudgedLogs, horizon_lengths, open_loop_note, predict
 from spelgen.evaluation.invariants import energy_drift
 from spelgen.evaluation.names import MODEL
+from spelgen.evaluation.replay import replays
 from spelgen.evaluation.results import Results, forecast_summary, torque_summary
 from spelgen.evaluation.subject import Subject, subject
 from spelgen.evaluation.torque import torque_errors
@@ -61,6 +62,8 @@ def evaluate(
         require_joints(trajectory, judged.joints)
     notes = check(logs, judged.joints, joint_types)
     notes += _seen(logs, judged)
+    if hasattr(judged.model, "servo"):
+        return _replayed(judged, logs, notes)
     used = _preprocessing(preprocessing, judged, logs)
     pieces = used.pieces(logs, shortest=2)
     tests = JudgedLogs(pieces, used, judged.reach)
@@ -98,6 +101,22 @@ def evaluate(
         traces=traces(predictors, pieces, longest, joint_types, used=used, reach=judged.reach, tip=position),
         diagnostics=tuple(notes),
         joint_types=tuple(joint_types),
+    )  # fmt: skip
+
+
+def _replayed(judged: Subject, logs: Sequence[Trajectory], notes: list[Diagnostic]) -> Results:
+    """Of an arm under position servos: its commands are replayed."""
+    if any(x.u is None for x in logs):
+        raise LogError(
+            "logs without commanded positions",
+            element=logs[0].name,
+            expected="u: the model is one of position servos",
+        )
+    return Results(
+        robot=judged.robot, joints=tuple(judged.joints), trajectories=tuple(x.name for x in logs), cutoff=None,
+        substeps=1, parameters=sum(x.numel() for x in judged.model.parameters()), horizons=(), torque={},
+        energy_drift=None, replays=replays(judged.model, logs, judged.linear_servos, notes),
+        diagnostics=tuple(notes), joint_types=tuple(judged.model.joint_types),
     )  # fmt: skip
 
 

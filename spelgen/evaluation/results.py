@@ -12,6 +12,7 @@ import torch
 
 from spelgen.errors import Diagnostic
 from spelgen.evaluation.names import MODEL
+from spelgen.evaluation.replay import Replay
 from spelgen.evaluation.stiff import States
 from spelgen.evaluation.tables import result_tables
 from spelgen.evaluation.torque import TorqueErrors
@@ -93,7 +94,8 @@ class Results:
     numbers of the model. torque: by predictor, empty where the logs are too sparse. energy_drift: of the model
     without input and dissipation over 1 s, integrated to thirteen digits, relative to its kinetic energy; None where
     the logs never move. forecasts: by predictor, empty where there are none. traces: the curves behind the figures;
-    those of predictions are the longest horizon's, see `traces.py`.
+    those of predictions are the longest horizon's, see `traces.py`. replays: of commands, of an arm under
+    position servos.
     """
 
     robot: str
@@ -109,10 +111,12 @@ class Results:
     forecasts: dict[str, ForecastSummary] = field(default_factory=dict)
     traces: dict[str, Any] = field(default_factory=dict)
     joint_types: tuple[str, ...] = ()
+    replays: tuple[Replay, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """JSON form, versioned by `schema`."""
-        return {"schema": SCHEMA} | asdict(self)
+        found = {"schema": SCHEMA} | asdict(self)
+        return found if self.replays else {name: x for name, x in found.items() if name != "replays"}
 
     def text(self) -> str:
         """For a terminal: every table, the best of each row starred."""

@@ -62,7 +62,7 @@ def result_tables(evaluation: Mapping[str, Any], joint_types: Sequence[str] = ()
 
     joint_types: those of the evaluation by default; units are only those of joints that there are.
     """
-    tables, horizons = [], evaluation["horizons"]
+    tables, horizons = _replay_tables(evaluation), evaluation["horizons"]
     types = joint_types or evaluation.get("joint_types") or ()
     if horizons:
         title = "Error relative to the motion (0: none, 1: as if the arm had stood still)"
@@ -93,6 +93,22 @@ def result_tables(evaluation: Mapping[str, Any], joint_types: Sequence[str] = ()
         rmse = {name: errors["rmse"] for name, errors in torque.items()}
         unit, labels = _units(evaluation["joints"], types, 2)
         tables.append(_by_joint(f"Torque error by joint, RMSE{unit}", labels, rmse))
+    return tables
+
+
+def _replay_tables(evaluation: Mapping[str, Any]) -> list[Table]:
+    """Of commands replayed: by trajectory and by joint."""
+    tables = []
+    for replay in evaluation.get("replays", ()):
+        errors = replay["errors"]
+        names = list(next(iter(errors.values()))["trajectories"])
+        rows = [{who: 1000 * each["trajectories"][name] for who, each in errors.items()} for name in names]
+        rows.append({who: 1000 * each["mean"] for who, each in errors.items()})
+        title = f"Commands replayed, {replay['name']}: RMS of positions over all joints [mrad; mm]"
+        tables.append(table(title, [*names, "mean of these"], rows))
+        by_joint = {who: [1000 * x for x in each["joints"]] for who, each in errors.items()}
+        title = "The same by joint, over all trajectories [mrad; mm]"
+        tables.append(_by_joint(title, evaluation["joints"], by_joint))
     return tables
 
 

@@ -12,7 +12,7 @@ from spelgen.errors import Diagnostic, RunError
 from spelgen.files import write_json
 from spelgen.fitting import workers
 from spelgen.fitting.compiled import compiled
-from spelgen.fitting.config import FitConfig, Rollout, WindowConfig
+from spelgen.fitting.config import FitConfig, Rollout, ServoFit, WindowConfig
 from spelgen.fitting.dataset import TrainingData, prepare_data
 from spelgen.fitting.fitted import Fit, load_run
 from spelgen.fitting.loop import TrainingLoop
@@ -21,6 +21,7 @@ from spelgen.fitting.progress import TrainingProgress
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.run_lock import locked
 from spelgen.fitting.run_record import describe, require_same
+from spelgen.fitting.servo_run import fit_commands, require_input
 from spelgen.fitting.stages import default_config, fit_torque_stage, is_closed_form
 from spelgen.fitting.streaming import LargeLogs, prepare_streamed
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer, urdf_regularizer
@@ -59,7 +60,8 @@ def fit(
 ) -> Fit:
     """Fit ``model`` to ``logs``; it then has the best weights that were found.
 
-    config: a `TorqueFit`, `MomentumFit` or `Rollout`; by default torque for a closed-form model, where logs are
+    config: a `TorqueFit`, `MomentumFit` or `Rollout`, or of an arm under position servos a `ServoFit`, all that it
+    takes, which needs no validation; by default torque for a closed-form model, where logs are
     dense enough for accelerations, and rollout for networks. validation: the fraction of the logs that is set aside,
     whole trajectories drawn by ``seed``, or trajectories. arm: the arm or the URDF that the model was made from,
     for the regularizer towards it and for the run folder.
@@ -78,6 +80,12 @@ def fit(
     if config is None:
         config = default_config(model, sample_rates(logs))
     config.require(closed_form=closed_form)
+    require_input(model, config)
+    if isinstance(config, ServoFit):
+        return fit_commands(
+            model, logs, config, preprocessing, seed=seed, urdf=_urdf(arm), resume=resume, force=force,
+            folder=None if workers.rank() else folder, mapping=mapping, notes=notes, threads=threads,
+        )  # fmt: skip
     known = None if folder is None else RunFolder(Path(folder))
     run = known if workers.rank() == 0 else None  # of several processes one writes
     if run is not None and not resume:
