@@ -35,14 +35,14 @@ def swings(samples: int, seed: int = 0) -> np.ndarray:
 
 
 def test_one_pass_over_positions_solves_the_differential_equation():
-    bristles, q = Bristles(REACH), torch.from_numpy(swings(400_001))
+    bristles, q = Bristles(REACH), torch.from_numpy(swings(100_001))
     z = torch.zeros(2, 3).double()
     qd = q.diff(dim=0)
     for moved in qd:  # Euler, with steps far below the least reach
         z = z + bristles.rate(moved, z)
-    found = bristles_along(q[::4000].numpy(), BristleReach(np.array(REACH)))[-1]
+    found = bristles_along(q[::1000].numpy(), BristleReach(np.array(REACH)))[-1]
     # between samples that lie so far apart a joint may turn around: finer ones know of it
-    finer = bristles_along(q[::40].numpy(), BristleReach(np.array(REACH)))[-1]
+    finer = bristles_along(q[::10].numpy(), BristleReach(np.array(REACH)))[-1]
     assert np.abs(finer / REACH - (z / bristles.reach).numpy()).max() < 1e-2
     assert np.abs(found / REACH).max() <= 1.0
 
@@ -88,9 +88,9 @@ def test_energy_of_an_arm_left_to_itself_never_rises(tmp_path):
         model.dynamics.friction.raw_stribeck -= 100.0
         model.dynamics.friction.raw_load_dependence -= 100.0
         q, qd = torch.tensor([[0.3, 0.1, -0.4]]).double(), torch.tensor([[1.0, 0.2, -1.5]]).double()
-        steps = torch.full((1, 4000), 2.5e-4).double()
+        steps = torch.full((1, 2000), 5e-4).double()
         still = Windows(
-            steps, q[:, None], qd[:, None], torch.zeros(1, 4000, 3).double(), torch.zeros(1, 3, 4).double()
+            steps, q[:, None], qd[:, None], torch.zeros(1, 2000, 3).double(), torch.zeros(1, 3, 4).double()
         )
         q, qd = (
             torch.cat([x[:, None], y], dim=1)[0] for x, y in zip((q, qd), roll_out(model, still), strict=True)
