@@ -17,7 +17,7 @@ CARRIED = {"__future__", "collections", "functools", "math", "torch", "typing"}
 
 # A file may import only from files above it, or to its left.
 ROWS = f"""
-errors files labels listing templates
+errors addresses files labels listing templates
 settings: values yaml_document starter
 logs: mapping
 fitting: config
