@@ -1,8 +1,11 @@
 """Arms under position servos: from settings to a module, from logs to ratios to kp, and to replayed commands."""
 
+import re
+
 import numpy as np
 import pytest
 import torch
+import yaml
 from emitted import import_source
 from servo_arm import COM, GRAVITY, MASS, Servos, servo_logs, write_servo_arm
 
@@ -98,6 +101,18 @@ def test_commands_are_read_and_written(tmp_path, logs, arm):
         assert again[0].tau.shape == (len(logs[0]), 0)
 
 
+def test_exports_hold_the_servos(fitted, arm, tmp_path):
+    kp, kd = (x.detach().numpy() for x in fitted.model.servo.prepare()[:2])
+    xml = fitted.export("mjcf").files[".xml"].decode()
+    found = re.findall(r'<position name="\w+" joint="\w+" kp="([^"]+)" kv="([^"]+)" forcerange="-6 6"', xml)
+    assert np.array(found, dtype=float) == pytest.approx(np.stack([kp, kd], axis=1))
+    held = yaml.safe_load(fitted.export("urdf").files[".friction.yaml"])
+    assert held["delay"] == pytest.approx(float(fitted.model.delay))
+    assert held["joints"]["elbow"]["servo"]["kp"] == pytest.approx(kp[1])
+    files = fitted.export("c").files  # checked against the module when exported, where there is a compiler
+    assert b"servo_arm_servo_torque(const servo_arm_real u[SERVO_ARM_N]" in files["servo_arm.h"]
+
+
 @pytest.mark.parametrize("quantity", ["u", "q"])
 def test_a_missing_column_is_named(tmp_path, logs, arm, quantity):
     path = spelgen.write_logs(tmp_path / "logs.csv", logs[:1], arm)
@@ -111,6 +126,9 @@ def test_what_does_not_belong_together_is_told(arm, logs, robots):
         spelgen.build(arm, "spel")
     with pytest.raises(OptionError, match="this arm has position servos"):
         spelgen.fit(spelgen.build(arm, "closed-form"), logs, spelgen.TorqueFit())
+    for asked in (spelgen.identify, lambda arm, logs: spelgen.check_logs(logs, arm)):
+        with pytest.raises(LogError, match="commanded positions and no torques"):
+            asked(arm, logs)
     t = np.arange(9) * 0.1
     nothing = Trajectory(t, np.zeros((9, 2)), np.zeros((9, 2)), np.zeros((9, 2)))
     with pytest.raises(LogError, match="no commanded positions"):

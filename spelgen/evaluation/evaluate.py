@@ -28,7 +28,7 @@ from spelgen.fitting.rollout import choose_substeps, loss_scales
 from spelgen.identification.samples import dynamics_samples
 from spelgen.logs.checks import check
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.trajectory import Trajectory, require_joints
+from spelgen.logs.trajectory import Trajectory, require_joints, require_torques
 from spelgen.logs.windows import Windows
 
 if TYPE_CHECKING:
@@ -64,6 +64,7 @@ def evaluate(
     notes += _seen(logs, judged)
     if hasattr(judged.model, "servo"):
         return _replayed(judged, logs, notes)
+    require_torques(logs)
     used = _preprocessing(preprocessing, judged, logs)
     pieces = used.pieces(logs, shortest=2)
     tests = JudgedLogs(pieces, used, judged.reach)

@@ -11,8 +11,8 @@ import numpy as np
 
 from spelgen.exporting.description import Functions, TrainedModel
 from spelgen.exporting.entry_points import (
-    ENTRY_POINTS,
     EntryPoint,
+    entry_points,
     expression_function,
     networks_needed,
 )
@@ -45,7 +45,7 @@ def export_casadi(trained: Trained) -> Exported:
 def casadi_functions(model: TrainedModel) -> dict[str, ca.Function]:
     """Every entry point: of scalar expressions, or where there are networks, of matrices."""
     found: dict[str, ca.Function] = {}
-    for entry in ENTRY_POINTS:
+    for entry in entry_points(model):
         if entry.level == "jets" and model.learned is not None:
             found[entry.name] = _derivatives(entry, found[entry.name.removesuffix("_derivatives")])
         else:

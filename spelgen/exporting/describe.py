@@ -19,6 +19,7 @@ from spelgen.exporting.description import (
     FrictionNetwork,
     Functions,
     Learned,
+    Servos,
     TrainedModel,
 )
 from spelgen.exporting.tip_chain import tip_chain
@@ -59,6 +60,7 @@ def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
             tip_link=tip_link,
             tip=tip,
             tip_end=end,
+            servos=servos_of(exact),
         )
 
 
@@ -90,6 +92,14 @@ def _bristles(dynamics: Any, prepared: Any) -> Bristles | None:
     if fractions is None or not fractions.shape[-1]:
         return None
     return Bristles(_array(dynamics.friction.bristles.reach), _array(fractions))
+
+
+def servos_of(model: Any) -> Servos | None:
+    """The position servos of a model, None where it has none."""
+    if not hasattr(model, "servo"):
+        return None
+    kp, kd, limit = (_array(x) for x in model.servo.prepare())
+    return Servos(kp, kd, limit, float(model.servo.delay))
 
 
 def _learned(dynamics: Any, prepared: Any, preset: str) -> Learned:

@@ -111,6 +111,16 @@ class Learned:
 
 
 @dataclass(frozen=True, eq=False)
+class Servos:
+    """``runtime.position_servo``: kp, kd and limit, (n,), the last infinite where nothing limits; delay [s]."""
+
+    kp: np.ndarray
+    kd: np.ndarray
+    limit: np.ndarray
+    delay: float
+
+
+@dataclass(frozen=True, eq=False)
 class TrainedModel:
     """A trained arm of n joints. Units: rad and Nm, or m and N.
 
@@ -140,6 +150,7 @@ class TrainedModel:
     tip_link: str
     tip: tuple[TipJoint, ...]
     tip_end: np.ndarray
+    servos: Servos | None = None
 
     @property
     def n(self) -> int:

@@ -16,7 +16,7 @@ from spelgen.fitting.rollout import LossScales, loss_scales
 from spelgen.logs.checks import check
 from spelgen.logs.epoch_windows import EpochWindows, WindowCutting
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.trajectory import Trajectory, gap_ends, require_joints
+from spelgen.logs.trajectory import Trajectory, gap_ends, require_joints, require_torques
 from spelgen.logs.windows import Split, Windows, split_validation, thinned
 
 if TYPE_CHECKING:
@@ -77,6 +77,7 @@ def prepare_data(
     everything = [*trajectories] if isinstance(validation, float) else [*trajectories, *validation]
     for trajectory in everything:
         require_joints(trajectory, joints)
+    require_torques(everything)
     notes = check(everything, joints, joint_types)
     resolved = preprocessing.resolved([x.sample_rate for x in everything])
     cutting = WindowCutting(config.window, config.stride, resolved, reach)

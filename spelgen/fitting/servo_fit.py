@@ -40,7 +40,6 @@ class ServoSolution:
     steps: int
     cost: float
     covariance: torch.Tensor
-    deviations: torch.Tensor
 
 
 def fit_servos(model: Any, windows: ServoWindows, logs: Sequence[Trajectory]) -> ServoSolution:
@@ -63,7 +62,7 @@ def fit_servos(model: Any, windows: ServoWindows, logs: Sequence[Trajectory]) ->
     errors = problem.errors(point)
     return ServoSolution(
         tuple(problem.names), errors.square().mean(dim=0).sqrt(), steps, cost,
-        torch.linalg.inv(descent.curvature(point, errors)[0]), problem.deviations(),
+        torch.linalg.inv(descent.curvature(point, errors)[0]),
     )  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,7 +12,7 @@ from spelgen.fitting.servo_fit import ServoSolution
 from spelgen.listing import Listing, number
 
 SURE = 1.96  # standard deviations of an interval: 95 %
-OPEN = 0.5  # of its prior's deviation: what is left no surer is not determined
+OPEN = 2.0  # what may be larger by such a factor within its interval is not determined
 VALUES = {
     "kd": ("servo.raw_kd", "s"),
     "armature": ("dynamics.armature.raw", "s^2"),
@@ -37,7 +38,7 @@ def servo_record(model: Any, solution: ServoSolution) -> dict[str, Any]:
         for what, (weight, unit) in VALUES.items():
             value = float((getattr(model, what)[joint] / model.kp[joint]).detach())
             ratio = [(places[weight], joint, 1.0), (kp, joint, -trained)]
-            about[what] = {"unit": unit, **_interval(value, *_spread(solution, n, ratio))}
+            about[what] = {"unit": unit, **_interval(value, _spread(solution, n, ratio))}
         joints.append(about)
     delay = float(solution.covariance.diagonal()[-1].sqrt())
     return {
@@ -48,23 +49,17 @@ def servo_record(model: Any, solution: ServoSolution) -> dict[str, Any]:
     }
 
 
-def _spread(solution: ServoSolution, n: int, terms: list[tuple[int, int, float]]) -> tuple[float, float]:
-    """Standard deviation of a sum of weights (row, joint, factor), after the fit and before it."""
+def _spread(solution: ServoSolution, n: int, terms: list[tuple[int, int, float]]) -> float:
+    """Standard deviation of a sum of weights (row, joint, factor) after the fit."""
     direction = torch.zeros(len(solution.covariance)).double()
     for row, joint, factor in terms:
         direction[row * n + joint] = factor
-    after = float((direction @ solution.covariance @ direction).clamp(min=0).sqrt())
-    return after, float((direction * solution.deviations).norm())
+    return float((direction @ solution.covariance @ direction).clamp(min=0).sqrt())
 
 
-def _interval(value: float, spread: float, before: float) -> dict[str, Any]:
-    factor = float(torch.tensor(SURE * spread).exp())
-    return {
-        "value": value,
-        "low": value / factor,
-        "high": value * factor,
-        "determined": spread < OPEN * before,
-    }
+def _interval(value: float, spread: float) -> dict[str, Any]:
+    factor = math.exp(min(SURE * spread, 50.0))
+    return {"value": value, "low": value / factor, "high": value * factor, "determined": factor < OPEN}
 
 
 def servo_text(record: Mapping[str, Any]) -> str:

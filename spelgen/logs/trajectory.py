@@ -114,6 +114,16 @@ class Trajectory:
         return LogError(got, file=self.file, element=f"trajectory {self.name}: {column}", expected=expected)
 
 
+def require_torques(trajectories: Sequence[Trajectory]) -> None:
+    """Raise LogError where no torques were logged."""
+    for each in trajectories:
+        if each.u is not None:
+            raise LogError(
+                "commanded positions and no torques", file=each.file, element=f"trajectory {each.name}",
+                expected="torques", do="arms under position servos are fitted and judged by `train` and `evaluate`",
+            )  # fmt: skip
+
+
 def trajectory_listing(trajectories: Sequence[Trajectory]) -> Listing:
     """Trajectories as a table: samples, duration, sample rate, joints."""
     head = ("trajectory", "samples", "duration", "sample rate", "joints")
