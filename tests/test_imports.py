@@ -33,7 +33,7 @@ dynamics: protocol runge_kutta prepared servo_rollout
 emission: bodies plan source docstring tailored bundle emit loading
 dynamics: arrays constraint pinocchio_dynamics pinocchio_arm pinocchio_urdf
 dynamics: regressor rigid_bodies regressor_dynamics tip
-logs: arm_mapping trajectory coverage bags tables npz readers values log_files suggest read checks filtering
+logs: arm_mapping trajectory coverage bags lerobot tables npz readers values log_files suggest read checks filtering
 logs: preprocessing windows chunks epoch_windows commands
 simulation: friction integration simulated_logs random_inputs tracking
 identification: samples friction base_parameters least_squares method prior identification

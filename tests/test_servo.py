@@ -1,8 +1,11 @@
 """Arms under position servos: from settings to a module, from logs to ratios to kp, and to replayed commands."""
 
+import json
 import re
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet
 import pytest
 import torch
 import yaml
@@ -111,6 +114,34 @@ def test_exports_hold_the_servos(fitted, arm, tmp_path):
     assert held["joints"]["elbow"]["servo"]["kp"] == pytest.approx(kp[1])
     files = fitted.export("c").files  # checked against the module when exported, where there is a compiler
     assert b"servo_arm_servo_torque(const servo_arm_real u[SERVO_ARM_N]" in files["servo_arm.h"]
+
+
+def dataset(folder, logs, motors):
+    """A data set of LeRobot 3: an episode for each log, in degrees."""
+    (folder / "meta").mkdir(parents=True)
+    feature = {"dtype": "float32", "shape": [len(motors)], "names": motors}
+    features = {"action": feature, "observation.state": feature}
+    (folder / "meta" / "info.json").write_text(json.dumps({"fps": 50, "features": features}))
+    (folder / "data" / "chunk-000").mkdir(parents=True)
+    columns = {
+        "observation.state": np.degrees(np.concatenate([x.q[:, ::-1] for x in logs])).tolist(),
+        "action": np.degrees(np.concatenate([x.u[:, ::-1] for x in logs])).tolist(),
+        "timestamp": np.concatenate([x.t for x in logs]),
+        "episode_index": np.repeat(range(len(logs)), [len(x) for x in logs]),
+    }
+    pa.parquet.write_table(pa.table(columns), folder / "data" / "chunk-000" / "file-000.parquet")
+    return folder
+
+
+def test_a_data_set_of_lerobot_is_read_by_its_own_names(tmp_path, logs):
+    arm = spelgen.load_arm(write_servo_arm(tmp_path, "input: position\nlogs: {units: {q: deg}}\n"))
+    path = dataset(tmp_path / "set", logs[:2], ["elbow.pos", "shoulder.pos"])
+    found = spelgen.read_logs(path, arm)
+    assert [x.name for x in found] == ["0", "1"]
+    for each, log in zip(found, logs, strict=False):
+        assert each.q == pytest.approx(log.q) and each.u == pytest.approx(log.u)
+    with pytest.raises(LogError, match=r"joint elbow: got the motors a, shoulder, expected elbow among them"):
+        spelgen.read_logs(dataset(tmp_path / "other", logs[:1], ["a", "shoulder.pos"]), arm)
 
 
 @pytest.mark.parametrize("quantity", ["u", "q"])

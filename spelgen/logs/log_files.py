@@ -9,7 +9,7 @@ from spelgen.addresses import local
 from spelgen.errors import LogError, SpelgenError
 from spelgen.logs.tables import SUFFIXES, is_log
 
-KINDS = f"{', '.join(SUFFIXES)}, or the folder of a ROS 2 bag"
+KINDS = f"{', '.join(SUFFIXES)}, the folder of a ROS 2 bag or of a LeRobot data set"
 
 
 def log_files(

@@ -18,6 +18,7 @@ import pyarrow as pa
 from spelgen.errors import LogError
 from spelgen.logs.bags import SUFFIXES as BAG_SUFFIXES
 from spelgen.logs.bags import is_bag
+from spelgen.logs.lerobot import is_dataset
 from spelgen.logs.mapping import TIMES, LogMapping
 from spelgen.logs.trajectory import QUANTITIES
 
@@ -63,7 +64,7 @@ class LogTable:
 
 def is_log(path: Path) -> bool:
     """Whether there is a reader for this file or folder; what is neither, a pipe or a device, might never end."""
-    return is_bag(path) if path.is_dir() else path.suffix in SUFFIXES and path.is_file()
+    return is_bag(path) or is_dataset(path) if path.is_dir() else path.suffix in SUFFIXES and path.is_file()
 
 
 def wanted_quantities(mapping: LogMapping) -> tuple[str, ...]:
