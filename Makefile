@@ -56,7 +56,7 @@ lock: ## write requirements.txt anew: the newest versions that the ranges of pyp
 	rm -rf .lock-venv
 	$(PYTHON) -m venv .lock-venv
 	.lock-venv/bin/pip install -qq torch==2.13.0
-	.lock-venv/bin/pip install -qq --editable '.[simulate,ros,deploy,xacro,dev]'
+	.lock-venv/bin/pip install -qq --editable '.[simulate,ros,deploy,xacro,fleet,dev]'
 	sed -n '/^#/p' requirements.txt > .lock-venv/header
 	.lock-venv/bin/pip freeze --exclude-editable | sed 's/+cpu$$//' | cat .lock-venv/header - > .lock-venv/lock
 	mv .lock-venv/lock requirements.txt

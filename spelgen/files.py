@@ -9,13 +9,15 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from spelgen.addresses import sent
+
 
 @contextmanager
 def replacing(path: Path | str) -> Iterator[Path]:
     """A hidden neighbour to write to, which in the end takes the place of `path`, also through a power cut.
 
-    Makes the folder. An interrupted or failed write leaves what was there before. Raises OSError naming the path
-    when it cannot be written: a full disk, say.
+    Makes the folder, and sends the file to its address if it has one. An interrupted or failed write leaves what was
+    there before. Raises OSError naming the path when it cannot be written: a full disk, say.
     """
     path = Path(path)
     with naming(path):
@@ -26,8 +28,15 @@ def replacing(path: Path | str) -> Iterator[Path]:
             with unfinished.open("rb+") as file:
                 os.fsync(file.fileno())
             os.replace(unfinished, path)
+            sent(path)
         finally:
             unfinished.unlink(missing_ok=True)
+
+
+def remove(path: Path) -> None:
+    """Remove a file, at its address too; nothing where there is none."""
+    path.unlink(missing_ok=True)
+    sent(path)
 
 
 @contextmanager

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import textwrap
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from spelgen.arm.actuation import Actuation
 from spelgen.arm.arm import Arm, Coordinate
@@ -21,6 +21,10 @@ if TYPE_CHECKING:  # SymPy is read in only for formulas
     from spelgen.formulas.formulas import Formulas
 
 SCHEMA = 1
+POSITION = (
+    "the springs of position servos: tau = clip(kp (u - q) - kd qd), which store 1/2 kp (q - u)^2; logs of positions "
+    "determine inertia, weight and friction in ratio to kp only, unless a mass, a load or one kp is known"
+)
 
 
 @dataclass(frozen=True, repr=False)
@@ -31,6 +35,7 @@ class Inspection:
     structure: Structure
     actuation: Actuation
     diagnostics: tuple[Diagnostic, ...]
+    input: Literal["torque", "position"] = "torque"
 
     @property
     def facts(self) -> tuple[Fact, ...]:
@@ -64,7 +69,8 @@ class Inspection:
                 "joints": self._names(structure.potential),
             },
             "input_matrix": {
-                "entries": [self._input(row, column) for row in range(n) for column in range(n)]
+                **({} if self.input == "torque" else {"input": self.input}),
+                "entries": [self._input(row, column) for row in range(n) for column in range(n)],
             },
             "base_parameters": structure.base_parameter_count,
             "facts": [fact.to_dict() for fact in self.facts],
@@ -119,7 +125,7 @@ class Inspection:
     def _inputs(self) -> str:
         """What is to be said of G."""
         entries = self.actuation.entries
-        told = ["fixed"]
+        told = ["fixed" if self.input == "torque" else POSITION]
         if not self.actuation.direct:
             told = ["motor torques"]
             for kind, what in (("fixed", "gear known"), ("gain", "gain trained"), ("coupled", "coupled")):

@@ -65,7 +65,9 @@ class LoadedArm:
 
     def inspect(self, assume: Assume = "kinematics") -> Inspection:
         """The structure as people and programs read it. Raises ArmError as ``structure_for`` does."""
-        return Inspection(self.arm, self.structure_for(assume), self.actuation, self.diagnostics)
+        return Inspection(
+            self.arm, self.structure_for(assume), self.actuation, self.diagnostics, self.settings.input
+        )
 
     def verify(self, assume: Assume = "kinematics") -> Verification:
         """The structure once more, by numbers and by other programs. Raises SpelgenError without Pinocchio."""

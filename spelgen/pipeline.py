@@ -77,6 +77,7 @@ def make_spec(loaded: LoadedArm, options: Options) -> ModelSpec:
         urdf=loaded.robot.path.name,
         urdf_sha256=loaded.robot.digest,
         drives={each.name: loaded.settings.joint(each.name) for each in loaded.arm.coordinates},
+        servos=loaded.settings.input == "position",
     )
 
 

@@ -91,6 +91,20 @@ class BodySpec:
 
 
 @dataclass(frozen=True)
+class ServoSpec:
+    """The position servo of a joint; N and m in place of Nm and rad where it is prismatic."""
+
+    kp: float
+    """Torque by the distance from the command [Nm/rad], to start from."""
+    known: bool
+    """Whether kp is known, and so no weight."""
+    kd: float
+    """Torque by velocity [Nm s/rad], to start from."""
+    limit: float | None
+    """The most torque that it gives; None: nothing says."""
+
+
+@dataclass(frozen=True)
 class OutputSpec:
     """One learned function of ``joints``: f(q) = mean + scale x network, entering M through ``basis``."""
 
@@ -133,10 +147,15 @@ class ModelSpec:
     """Of a closed-form model."""
     inputs: tuple[tuple[int, int, float, bool], ...] = ()
     """(row, column, value, trained) of G; none where each torque acts on its own actuated joint as it is."""
+    servos: tuple[ServoSpec, ...] = ()
+    """Of joints that are commanded positions."""
 
     def to_json(self) -> str:
         """Canonical JSON; ``from_json`` gives the same spec back."""
-        return json.dumps(asdict(self), sort_keys=True, ensure_ascii=True)
+        plain = asdict(self)
+        if not self.servos:  # arms that are commanded torques keep the digest of before there were servos
+            del plain["servos"]
+        return json.dumps(plain, sort_keys=True, ensure_ascii=True)
 
     @classmethod
     def from_json(cls, text: str) -> ModelSpec:
@@ -147,6 +166,7 @@ class ModelSpec:
         data["joints"] = tuple(JointSpec(**joint) for joint in data["joints"])
         data["outputs"] = tuple(OutputSpec(**output) for output in data["outputs"])
         data["bodies"] = tuple(BodySpec(**body) for body in data["bodies"])
+        data["servos"] = tuple(ServoSpec(**servo) for servo in data.get("servos", ()))
         data["constants"] = tuple(ConstantSpec(**constant) for constant in data["constants"])
         return cls(**data)
 

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Iterator, Sequence
 from fractions import Fraction
+from functools import cache
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from spelgen.arm.arm import Arm, Body, Coordinate
+from spelgen.arm.arm import Arm, Body, Coordinate, make_arm
+from spelgen.structure.structure import Structure, derive
+from spelgen.urdf.read import read_urdf
 
 Rows = tuple[tuple[Fraction, Fraction, Fraction], ...]
 
@@ -65,3 +71,17 @@ def random_rotation(rng: np.random.Generator) -> Rows:
         (2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z),
     )
     return tuple(tuple(a / n for a in row) for row in rows)
+
+
+def reference_arms(shared: Path, assume: str) -> Iterator[tuple[str, dict[str, Any], Arm, Structure]]:
+    """The arms of the reference data with what is known of each, derived once for all tests."""
+    for name, known in json.loads((shared / "arms" / "expected.json").read_text()).items():
+        if known[assume] is not None:
+            joints = known["joints"] and tuple(known["joints"])
+            yield name, known[assume], *_reference(shared / "arms" / f"{name}.urdf", joints, assume)
+
+
+@cache
+def _reference(path: Path, joints: tuple[str, ...] | None, assume: str) -> tuple[Arm, Structure]:
+    arm = make_arm(read_urdf(path), joints=joints)
+    return arm, derive(arm, assume)

@@ -86,9 +86,32 @@ class Model(nn.Module):
     def prepare(self, definite=True):
         return None
 
+    @property
+    def dynamics(self):
+        """An emitted model's parts stand apart; here they are the model's own, and of q all that is kept is q."""
+        return self
+
+    def configuration(self, q, prepared):
+        return q
+
+    def mass_at(self, at, prepared):
+        return self.mass_matrix(at), None
+
+    def lagrangian_gradient(self, at, qd, residuals, prepared):
+        return self._kinetic_slope(at, qd) - self.gravity(at)
+
+    def friction_at(self, at, qd, prepared, z=None):
+        return self.friction_torque(at, qd)
+
+    def input_at(self, at, prepared):
+        return self.input_matrix(at)
+
+    def input_force(self, at, qd, tau, prepared):
+        return tau
+
     def port_hamiltonian_rhs(self, q, p, tau, prepared, z=None):
         qd = self.velocity(q, p)
-        pd = self._kinetic_slope(q, qd) - self.gravity(q) - self.damping.exp() * qd
+        pd = self.lagrangian_gradient(q, qd, None, None) - self.friction_torque(q, qd)
         return qd, pd if tau is None else pd + tau
 
     def forward(self, t, state):

@@ -325,7 +325,7 @@ def trained(robots, tmp_path_factory):
         text = (robots / f"two_link{suffix}").read_text(encoding="utf-8")
         (folder / f"arm{suffix}").write_text(
             re.sub(r"trajectories: \d+", "trajectories: 6", text).replace(
-                "  window: 5", "  window: 5\n  momentum_steps: 40"
+                "  window: 5", "  window: 5\n  momentum_steps: 10"
             ),
             encoding="utf-8",
         )

@@ -21,6 +21,7 @@ from spelgen.errors import RunError
 from spelgen.evaluation import invariants
 from spelgen.evaluation.baselines import constant_velocity
 from spelgen.evaluation.examples import predict_examples
+from spelgen.fleet.engine import InProcess
 from spelgen.logs.read import Trajectory, read_logs
 from spelgen.render.comparison_page import write_comparison
 from spelgen.urdf.read import read_urdf
@@ -58,7 +59,7 @@ def notes():
 @pytest.fixture(scope="module")
 def study(robot, quick, notes, tmp_path_factory):
     found = prepare_study(robot, tmp_path_factory.mktemp("study"), variants=CHOSEN)
-    run_study(found, jobs=1, note=notes.append)
+    run_study(found, InProcess(), note=notes.append)
     return found
 
 
@@ -97,7 +98,7 @@ def test_a_comparison_goes_on_where_it_stopped(study, robot, quick):
     lost.unlink()
     notes = []
     again = prepare_study(robot, study.folder, variants=CHOSEN)
-    run_study(again, jobs=1, note=notes.append)
+    run_study(again, InProcess(), note=notes.append)
     assert notes[0] == "1 of 2 runs are done already"
     assert kept.stat().st_mtime_ns == before[1]
     first, second = (json.loads(x) for x in (before[0], lost.read_text()))

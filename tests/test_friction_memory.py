@@ -6,7 +6,8 @@ import torch
 from emitted import ROBOTS, built, import_source
 
 from spelgen.dynamics.bristles import BristleReach, bristle_reach, bristles_along, encoder_step, reach_of
-from spelgen.fitting.rollout import roll_out
+from spelgen.emission.loading import load_module
+from spelgen.fitting.rollout import loss_scales, momentum_loss, roll_out
 from spelgen.identification.friction import FrictionModel
 from spelgen.identification.identify import least_squares
 from spelgen.identification.method import LeastSquares
@@ -34,14 +35,14 @@ def swings(samples: int, seed: int = 0) -> np.ndarray:
 
 
 def test_one_pass_over_positions_solves_the_differential_equation():
-    bristles, q = Bristles(REACH), torch.from_numpy(swings(400_001))
+    bristles, q = Bristles(REACH), torch.from_numpy(swings(100_001))
     z = torch.zeros(2, 3).double()
     qd = q.diff(dim=0)
     for moved in qd:  # Euler, with steps far below the least reach
         z = z + bristles.rate(moved, z)
-    found = bristles_along(q[::4000].numpy(), BristleReach(np.array(REACH)))[-1]
+    found = bristles_along(q[::1000].numpy(), BristleReach(np.array(REACH)))[-1]
     # between samples that lie so far apart a joint may turn around: finer ones know of it
-    finer = bristles_along(q[::40].numpy(), BristleReach(np.array(REACH)))[-1]
+    finer = bristles_along(q[::10].numpy(), BristleReach(np.array(REACH)))[-1]
     assert np.abs(finer / REACH - (z / bristles.reach).numpy()).max() < 1e-2
     assert np.abs(found / REACH).max() <= 1.0
 
@@ -87,9 +88,9 @@ def test_energy_of_an_arm_left_to_itself_never_rises(tmp_path):
         model.dynamics.friction.raw_stribeck -= 100.0
         model.dynamics.friction.raw_load_dependence -= 100.0
         q, qd = torch.tensor([[0.3, 0.1, -0.4]]).double(), torch.tensor([[1.0, 0.2, -1.5]]).double()
-        steps = torch.full((1, 4000), 2.5e-4).double()
+        steps = torch.full((1, 2000), 5e-4).double()
         still = Windows(
-            steps, q[:, None], qd[:, None], torch.zeros(1, 4000, 3).double(), torch.zeros(1, 3, 4).double()
+            steps, q[:, None], qd[:, None], torch.zeros(1, 2000, 3).double(), torch.zeros(1, 3, 4).double()
         )
         q, qd = (
             torch.cat([x[:, None], y], dim=1)[0] for x, y in zip((q, qd), roll_out(model, still), strict=True)
@@ -148,3 +149,29 @@ def test_least_squares_finds_the_strengths_of_bristles():
             )
     torque = found.torque(q, qd, qdd, z)
     np.testing.assert_allclose(torque, tau, atol=1e-6)
+
+
+def test_the_weak_form_counts_all_that_the_drives_do():
+    """An offset of the measured torque and friction that drives make up for are no fault of the rigid bodies."""
+    model = load_module(built("rpr", preset="closed-form")[0])
+    dynamics = model.dynamics
+    with torch.no_grad():
+        dynamics.raw_offset += 2.0
+        dynamics.raw_friction_compensation += 1.0
+    q, qd, tau = (torch.rand(3, 20, 1, 3, generator=torch.Generator().manual_seed(4)).double() - 0.5).unbind()
+    held = Windows(
+        torch.full((20, 8), 2e-3).double(),
+        *(x.expand(-1, 9, -1) for x in (q, qd)),
+        20 * tau.expand(-1, 8, -1),
+    )
+    with torch.no_grad():
+        after = roll_out(model, held, 4)
+    columns = [torch.cat([x[:, :1], y], dim=1) for x, y in zip((held.q, held.qd), after, strict=True)]
+    windows = Windows(held.dt, *columns, held.tau)
+    scales = loss_scales(windows, model.joint_types)
+    true = momentum_loss(model, windows, scales).item()
+    for changed in (dynamics.raw_offset.data, dynamics.raw_friction_compensation):
+        kept = changed.clone()
+        changed.zero_()
+        assert momentum_loss(model, windows, scales).item() > 100 * true
+        changed.copy_(kept)

@@ -216,4 +216,4 @@ def test_run_folders(run, tmp_path):
 
     of_json = st.sampled_from(texts).flatmap(odd)
     of_bytes = st.tuples(st.sampled_from(sorted(whole)), st.integers(0, 10**9), st.none())
-    fuzz(st.one_of(of_json, of_bytes), 40, use)
+    fuzz(st.one_of(of_json, of_bytes), 24, use)

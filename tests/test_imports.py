@@ -17,7 +17,7 @@ CARRIED = {"__future__", "collections", "functools", "math", "torch", "typing"}
 
 # A file may import only from files above it, or to its left.
 ROWS = f"""
-errors files labels listing templates
+errors addresses files labels listing templates
 settings: values yaml_document starter
 logs: mapping
 fitting: config
@@ -29,21 +29,23 @@ structure: recursion field sampling spans basis expansion symbolic structure nom
 structure: base_parameters pseudo_inertia
 dynamics: bristles
 {" ".join(RUNTIME)}
-dynamics: protocol residuals prepared
+dynamics: protocol runge_kutta residuals prepared servo_rollout
 emission: bodies plan source docstring tailored bundle emit loading
-dynamics: arrays constraint pinocchio_dynamics pinocchio_arm pinocchio_urdf regressor regressor_dynamics tip
-logs: arm_mapping trajectory bags tables npz readers values log_files suggest read checks filtering
-logs: preprocessing windows chunks epoch_windows
+dynamics: arrays constraint pinocchio_dynamics pinocchio_arm pinocchio_urdf
+dynamics: regressor rigid_bodies regressor_dynamics tip
+logs: arm_mapping trajectory coverage bags lerobot tables npz readers values log_files suggest read checks filtering
+logs: preprocessing windows chunks epoch_windows commands
 simulation: friction integration simulated_logs random_inputs tracking
 identification: samples friction base_parameters least_squares method prior identification
 excitation: trajectory criterion excitation
 fitting: run_schema run_folder run_lock
-fitting: gaussian_prior adaptive rollout calibration dataset streaming torque_samples torque_jacobian
+fitting: gaussian_prior adaptive rollout calibration dataset streaming workers torque_samples torque_jacobian
 fitting: optimizers idle_residuals residual_fit torque_fit torque_report
 fitting: torque_networks urdf_regularizer stages compiled process progress validation loop
-fitting: run_record fitted fit train
-evaluation: names disturbance stiff baselines trust forecast torque rollout torque_traces traces examples invariants
-evaluation: tables verdict results csv_file subject evaluate
+fitting: run_record fitted servo_windows servo_start servo_problem servo_fit servo_report linear_servo servo_run
+fitting: fit train
+evaluation: names replay disturbance stiff baselines trust forecast torque rollout invariants examples
+evaluation: tables verdict results horizons torque_traces traces csv_file subject evaluate
 verify: agreement urdf_cross_check numeric_samples verify
 explain: reasons facts
 formulas: terms printing angles shortening formulas text files
@@ -61,10 +63,12 @@ exporting: casadi_residuals casadi_export export
 render: charts plots picture page learned parameters reproduction shapes scene still arm_section
 render: run_facts curves report_page runs_page inspection_page identification_page
 logs: statistics gravity report check_logs
+fleet: ray_engine engine
 comparison: truth metrics study runs formatting
-render: logs_page comparison_page
+fleet: schema prepare jobs search units fleet ranking progress
+render: logs_page comparison_page fleet_page
 cli: command console options formats model_commands train_start train_command log_commands simulate_command
-cli: identify_command evaluate_command compare_command export_command main
+cli: identify_command evaluate_command compare_command fleet_command export_command main
 __init__ __main__
 """
 

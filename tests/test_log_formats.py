@@ -156,7 +156,7 @@ def test_a_mapping_may_be_a_dict_a_file_or_that_of_the_arm(robots, tmp_path):
         read_logs(path, joints, {"columns": {"time": "clock"}})
     assert (
         str(caught.value)
-        == "mapping: columns: unknown key 'time'; known are 't', 'trajectory', 'q', 'qd', 'tau'"
+        == "mapping: columns: unknown key 'time'; known are 't', 'trajectory', 'q', 'qd', 'tau', 'u'"
     )
 
 

@@ -132,7 +132,7 @@ def test_settings_do_not_change(urdf):
         ),
         (
             "logs:\n  joints:\n    a: {units: {p: deg}}",
-            "arm.yaml:3: logs.joints.a.units: unknown key 'p'; known are 'q', 'qd', 'tau'",
+            "arm.yaml:3: logs.joints.a.units: unknown key 'p'; known are 'q', 'qd', 'tau', 'u'",
         ),
         ("logs:\n  units: {t: h}", "arm.yaml:2: logs.units.t: got 'h', expected 's', 'ms', 'us' or 'ns'"),
         (
@@ -179,8 +179,8 @@ def test_all_errors_of_a_file_are_told_at_once(urdf):
         load_settings(urdf("gear: 1\njoints:\n  a: {gear: 0}\n"))
     assert str(error.value).splitlines() == [
         "arm.yaml:3: joints.a.gear: got 0, expected greater than 0",
-        "arm.yaml:1: unknown key 'gear'; known are 'about', 'torque', 'couplings', 'gravity', 'joints', "
-        "'simulation', 'tracking', 'training', 'comparison', 'logs'",
+        "arm.yaml:1: unknown key 'gear'; known are 'about', 'input', 'torque', 'couplings', 'gravity', 'joints', "
+        "'simulation', 'tracking', 'training', 'comparison' and 1 more",
     ]
 
 

@@ -108,15 +108,17 @@ def test_a_pass_over_all_shares_gives_every_window_once(log, monkeypatch, cutoff
     found = streamed(log, cutting)
     assert (len(found), found.epochs_per_pass) == (len(expected), -(-len(expected) // 900))
     for turn in range(2):
-        shares = [found.epoch(turn * found.epochs_per_pass + k) for k in range(found.epochs_per_pass)]
+        shares = [
+            found.windows(found.drawn(turn * found.epochs_per_pass + k)) for k in range(found.epochs_per_pass)
+        ]
         drawn = torch.cat([share.q for share in shares])
         order, expected_order = drawn[:, 0, 0].argsort(), expected.q[:, 0, 0].argsort()
         for name in ("dt", "q", "qd", "tau"):
             values = torch.cat([getattr(share, name) for share in shares])
             assert torch.equal(values[order], getattr(expected, name)[expected_order])
-    first = [found.epoch(k).q[0, 0, 0].item() for k in range(2 * found.epochs_per_pass)]
+    first = [found.windows(found.drawn(k)).q[0, 0, 0].item() for k in range(2 * found.epochs_per_pass)]
     assert first[: found.epochs_per_pass] != first[found.epochs_per_pass :]
-    assert torch.equal(found.epoch(3).q, streamed(log, cutting).epoch(3).q)
+    assert found.drawn(3) == streamed(log, cutting).drawn(3)
 
 
 def test_preparation_finds_what_it_finds_in_memory(log):
@@ -131,7 +133,8 @@ def test_preparation_finds_what_it_finds_in_memory(log):
     assert codes == {"gap", "filter", "streamed"}
     starts = {round(x, 12) for x in found.validation.q[:, 0, 0].tolist()}
     for number in range(found.stream.epochs_per_pass):
-        assert starts.isdisjoint(round(x, 12) for x in found.stream.epoch(number).q[:, 0, 0].tolist())
+        drawn = found.stream.windows(found.stream.drawn(number))
+        assert starts.isdisjoint(round(x, 12) for x in drawn.q[:, 0, 0].tolist())
 
 
 def test_a_last_sample_alone_changes_nothing(log, monkeypatch):
@@ -151,7 +154,7 @@ def lines(run: Path) -> list[dict]:
 @pytest.mark.parametrize("log", [1000], indirect=True)
 def test_training_streams_and_resumes_with_the_same_numbers(log, tmp_path, monkeypatch):
     monkeypatch.setattr(epoch_windows, "EPOCH", 400)
-    drawn, share = [], EpochWindows.epoch
+    drawn, share = [], EpochWindows.drawn
 
     def drawing(self, number):
         drawn.append(number)
@@ -159,7 +162,7 @@ def test_training_streams_and_resumes_with_the_same_numbers(log, tmp_path, monke
             raise KeyboardInterrupt
         return share(self, number)
 
-    monkeypatch.setattr(EpochWindows, "epoch", drawing)
+    monkeypatch.setattr(EpochWindows, "drawn", drawing)
     whole = train(STAND_IN, [log], tmp_path / "whole", CONFIG, preprocessing=EVERY_OTHER, progress=False)
     half = train(STAND_IN, [log], tmp_path / "half", CONFIG, preprocessing=EVERY_OTHER, progress=False)
     assert (whole.status, half.status, half.epochs) == ("finished", "interrupted", 2)

@@ -2,12 +2,11 @@
 growth.
 """
 
-import json
 from fractions import Fraction
 
 import numpy as np
 import pytest
-from arms import planar, random_arm
+from arms import planar, random_arm, reference_arms
 
 from spelgen.arm.arm import make_arm
 from spelgen.loaded_arm import load_arm
@@ -25,6 +24,7 @@ COUNTS = {  # outputs, constants, zero entries
     "ur10e": (18, 3, 0),
 }
 
+REFERENCE_ARMS = {"kinematics": 189, "inertials": 152}
 # expected.json answers these by numerical ranks that hang on its tolerance; see docs/structure.md
 TOLERANCE_CASES = {
     ("edo", "kinematics"): {"outputs_only_from_joint"},
@@ -85,18 +85,15 @@ def test_factors_are_exact_fractions(robots):
 @pytest.mark.parametrize("assume", ["kinematics", "inertials"])
 def test_reference_arms(shared, assume):
     """Every arm of the reference set, fact by fact."""
-    expected = json.loads((shared / "arms" / "expected.json").read_text())
-    wrong = {}
-    for name, facts in expected.items():
-        if facts[assume] is None:
-            continue
-        arm = make_arm(read_urdf(shared / "arms" / f"{name}.urdf"), joints=facts["joints"])
-        got = _facts(derive(arm, assume))
-        differing = {key for key, value in facts[assume].items() if got[key] != value}
+    wrong, names = {}, set()
+    for name, known, _, structure in reference_arms(shared, assume):
+        names.add(name)
+        got = _facts(structure)
+        differing = {key for key, value in known.items() if got[key] != value}
         if differing != TOLERANCE_CASES.get((name, assume), set()):
-            wrong[name] = {key: (got[key], facts[assume][key]) for key in differing}
+            wrong[name] = {key: (got[key], known[key]) for key in differing}
     assert not wrong
-    assert len(expected) == 189
+    assert len(names) == REFERENCE_ARMS[assume]
 
 
 @pytest.mark.parametrize(("joints", "seed"), [(6, 0), (7, 1), (8, 2), (10, 3)])

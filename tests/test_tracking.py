@@ -221,7 +221,7 @@ def test_where_nothing_is_said_an_arm_is_controlled_and_follows(shared):
     for name in ("kinova_gen3_7dof_2f85", "kuka_iiwa14_lbrstack"):
         loaded = load_arm(shared / "arms" / f"{name}.urdf")
         logs = simulate(loaded, trajectories=1, duration=1.0)
-        assert logs.integration_error < 1e-6
+        assert logs.integration_error < logs.allowed  # far less than an encoder sees
         low, high = initial_range(loaded.arm, loaded.settings)
         middle, reach = (low + high) / 2, np.minimum(np.radians(30), 0.35 * (high - low))
         for log in logs:

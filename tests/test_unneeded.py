@@ -66,7 +66,7 @@ def test_couplings_of_locked_joints_are_not_needed(odd):
             "rpr.urdf:56: transmission 'drive' mechanicalReduction: got 'fifty', "
             "expected one number in decimal notation",
         ),
-        ("", "gravity: [0, 0]", "rpr.yaml:1: gravity.2: got [0, 0], expected Field required"),
+        ("", "gravity: [0, 0]", "rpr.yaml:1: gravity.2: got [0, 0], expected a value"),
         (
             FIXED.replace("fixed", "revolute"),
             "",

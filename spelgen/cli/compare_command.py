@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from spelgen.cli.console import counted, note, say
-from spelgen.cli.options import Force, Robot
+from spelgen.cli.options import Address, Force, Robot
 from spelgen.errors import SpelgenError, suggestion
 
 
@@ -22,7 +22,10 @@ def compare(
     ] = None,
     seeds: Annotated[int | None, typer.Option(min=1, help="Runs of each preset.")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Training steps of each run.")] = None,
-    jobs: Annotated[int, typer.Option(min=1, help="Runs at a time, one core each.")] = 2,
+    jobs: Annotated[
+        int, typer.Option(min=1, help="Runs at a time, one core each; of several Ray runs them.")
+    ] = 1,
+    address: Address = None,
     force: Force = False,
 ) -> None:
     """Train every preset on the same simulated logs, and set them beside one another.
@@ -32,6 +35,7 @@ def compare(
     from spelgen.comparison.formatting import comparison_tables
     from spelgen.comparison.runs import run_study, time_steps
     from spelgen.comparison.study import VARIANTS, prepare_study
+    from spelgen.fleet.engine import engine
     from spelgen.render.comparison_page import write_comparison
 
     known = {variant.name: variant for variant in VARIANTS}
@@ -52,7 +56,8 @@ def compare(
             force=force,
             progress=progress,
         )
-    run_study(study, jobs=jobs, note=note)
+    with engine(jobs, address) as runs:
+        run_study(study, runs, note=note)
     tables = comparison_tables(list(study.results()), time_steps(study), study.settings.published)
     for table in tables:
         say(table.text() + "\n")

@@ -9,10 +9,12 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import typer
 
+from spelgen.addresses import local
 from spelgen.cli.command import readable
 from spelgen.errors import SpelgenError
 from spelgen.labels import printable
@@ -24,6 +26,7 @@ BROKEN_PIPE = 141  # 128 + SIGPIPE
 EXTRAS = {
     "pinocchio": "simulate",
     "casadi": "deploy",
+    "optuna": "fleet",
     **dict.fromkeys(("mujoco", "onnx", "onnxruntime", "safetensors"), "deploy"),
 }  # top-level module that only an extra brings -> the extra
 
@@ -39,7 +42,7 @@ def told(command: Callable[..., None]) -> Callable[..., None]:
     @functools.wraps(command)
     def run(*args: Any, debug: bool = False, **kwargs: Any) -> None:
         try:
-            command(*args, **kwargs)
+            command(*args, **{name: _local(value) for name, value in kwargs.items()})
             sys.stdout.flush()  # a closed pipe shows here, where it is handled, and not at exit
         except (typer.Exit, typer.Abort, typer.BadParameter):
             raise
@@ -55,6 +58,13 @@ def told(command: Callable[..., None]) -> Callable[..., None]:
         name: each.annotation for name, each in [*signature.parameters.items(), ("debug", option)]
     }
     return run
+
+
+def _local(value: Any) -> Any:
+    """Paths that are addresses become their local copies."""
+    if isinstance(value, list):
+        return [_local(each) for each in value]
+    return local(value) if isinstance(value, Path) else value
 
 
 def fail(error: BaseException, *, debug: bool = False) -> NoReturn:

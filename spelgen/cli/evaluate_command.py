@@ -10,8 +10,10 @@ import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import note, say
-from spelgen.cli.options import Data, Filter, Mapping, MoreData, Run, Trust
+from spelgen.cli.options import Data, Filter, Mapping, MoreData, Output, Run, Trust
 from spelgen.files import write_text
+
+Format = Literal["text", "json", "csv"]
 
 
 def evaluate(
@@ -20,13 +22,8 @@ def evaluate(
     data: Data = None,
     mapping: Mapping = None,
     filter: Filter = None,
-    format: Annotated[
-        Literal["text", "json", "csv"] | None,
-        typer.Option(help="Of the result; without it, by the suffix of -o, else text.", show_default=False),
-    ] = None,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write it to a file.")
-    ] = None,
+    format: Annotated[Format | None, options.result_format()] = None,
+    output: Output = None,
     disturbance: Annotated[
         Literal["held", "none"],
         typer.Option(
@@ -59,8 +56,7 @@ def evaluate(
     write_json(RunFolder(run).evaluation, found.to_dict())
     for each in found.diagnostics:
         note(f"{each.severity}: {each.where}: {each.message}")
-    suffix = output.suffix.lower() if output else ""
-    wanted = format or {".json": "json", ".csv": "csv"}.get(suffix, "text")
+    wanted = options.chosen(format, output, Format)
     if wanted == "csv":
         from spelgen.evaluation.csv_file import csv_text
 

@@ -1,4 +1,4 @@
-"""What `inspect` writes: its formats, which one is meant, and the text of each."""
+"""What `inspect` writes: its formats, and the text of each."""
 
 from __future__ import annotations
 
@@ -14,17 +14,11 @@ if TYPE_CHECKING:
     from spelgen.verify.agreement import Verification
 
 Format = Literal["text", "json", "html", "latex", "sympy"]
-_OF_SUFFIX: dict[str, Format] = {".json": "json", ".html": "html", ".tex": "latex", ".py": "sympy"}
-
-
-def chosen(format: Format | None, output: Path | None) -> Format:
-    """The format named, else that of the output's suffix, else text."""
-    return format or _OF_SUFFIX.get(output.suffix.lower() if output else "", "text")
 
 
 def rendered(
     found: Inspection,
-    format: Format,
+    format: str,
     *,
     formulas: bool,
     entry: Entry | None,

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import note, say
-from spelgen.cli.options import AngleTolerance, Data, Filter, Joints, Mapping, MoreData, Robot, Tip
+from spelgen.cli.options import AngleTolerance, Data, Filter, Joints, Mapping, MoreData, Output, Robot, Tip
 from spelgen.errors import OptionError
 from spelgen.files import write_text
+
+Format = Literal["text", "json", "html"]
 
 
 def identify(
@@ -42,13 +43,8 @@ def identify(
     coulomb_smoothing_velocity: Annotated[
         float, typer.Option(min=1e-6, help="Width of Coulomb friction's jump [rad/s, m/s].")
     ] = 0.01,
-    format: Annotated[
-        Literal["text", "json", "html"] | None,
-        typer.Option(help="Of the result; without it, by the suffix of -o, else text.", show_default=False),
-    ] = None,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write to a file.")
-    ] = None,
+    format: Annotated[Format | None, options.result_format()] = None,
+    output: Output = None,
 ) -> None:
     """Identify an arm's base parameters, friction and armature from logs by least squares."""
     paths = options.logs(data, more)
@@ -72,8 +68,7 @@ def identify(
     found = identified(arm, logs, method, preprocessing=Preprocessing(cutoff=filter))
     for each in found.diagnostics:
         note(f"{each.severity}: {each.where}: {each.message}")
-    suffix = output.suffix.lower() if output else ""
-    wanted = format or {".html": "html", ".json": "json"}.get(suffix, "text")
+    wanted = options.chosen(format, output, Format)
     if wanted == "html":
         from spelgen.render.identification_page import page
 

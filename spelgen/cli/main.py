@@ -16,6 +16,7 @@ from spelgen.cli import (
     compare_command,
     evaluate_command,
     export_command,
+    fleet_command,
     identify_command,
     log_commands,
     model_commands,
@@ -47,6 +48,7 @@ for command in (
     evaluate_command.report,
     export_command.export,
     compare_command.compare,
+    fleet_command.fleet,
     model_commands.check,
 ):
     app.command(cls=Command, context_settings=CONTEXT)(told(command))

@@ -9,7 +9,7 @@ import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import FAILED, note, say
-from spelgen.cli.formats import Format, chosen, rendered
+from spelgen.cli.formats import Format, rendered
 from spelgen.cli.options import (
     AngleTolerance,
     Assumption,
@@ -17,6 +17,7 @@ from spelgen.cli.options import (
     Force,
     Joints,
     Module,
+    Output,
     Robot,
     RobotOption,
     Tip,
@@ -35,16 +36,8 @@ def inspect(
         bool, typer.Option("--formulas", help="Write M and V as expressions in q and base parameters.")
     ] = False,
     entry: Entry = None,
-    format: Annotated[
-        Format | None,
-        typer.Option(
-            help="Of the result; without it, by the suffix of -o: .json, .html, .tex, .py, else text.",
-            show_default=False,
-        ),
-    ] = None,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write to a file.")
-    ] = None,
+    format: Annotated[Format | None, options.result_format()] = None,
+    output: Output = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 if there is any warning.")] = False,
     verify: Annotated[bool, typer.Option("--verify", help="Prove it again by other programs.")] = False,
 ) -> None:
@@ -56,7 +49,12 @@ def inspect(
     found = arm.inspect(assume)
     proof = arm.verify(assume) if verify else None
     text = rendered(
-        found, chosen(format, output), formulas=formulas, entry=wanted, proof=proof, urdf=arm.robot.path
+        found,
+        options.chosen(format, output, Format),
+        formulas=formulas,
+        entry=wanted,
+        proof=proof,
+        urdf=arm.robot.path,
     )
     if output is None:
         say(text.removesuffix("\n"))

@@ -6,7 +6,7 @@ import csv
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import typer
 
@@ -15,6 +15,8 @@ from spelgen.spec import Assume
 
 if TYPE_CHECKING:
     from spelgen.logs.mapping import LogMapping
+
+SUFFIXES = {".json": "json", ".csv": "csv", ".html": "html", ".tex": "latex", ".py": "sympy"}
 
 Robot = Annotated[
     Path, typer.Argument(metavar="ROBOT.urdf", help="The arm's URDF; ROBOT.yaml beside it holds settings.")
@@ -75,7 +77,25 @@ Filter = Annotated[
 Trust = Annotated[
     bool, typer.Option("--trust", help="Run the run folder's module, even where spelgen did not write it.")
 ]
+Output = Annotated[
+    Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write the result to a file.")
+]
+Address = Annotated[
+    str | None,
+    typer.Option(metavar="HOST:PORT", help="A Ray cluster that runs already; default: one on this machine."),
+]
 Force = Annotated[bool, typer.Option("--force", help="Replace an output that exists.")]
+
+
+def result_format() -> Any:
+    """The option `--format`; one for each command, whose formats are its own."""
+    return typer.Option(help="Of the result; without it, by the suffix of -o, else text.", show_default=False)
+
+
+def chosen(format: str | None, output: Path | None, formats: Any) -> str:
+    """The format named, else the one of these (a Literal) that the output's suffix means, else text."""
+    meant = SUFFIXES.get(output.suffix.lower() if output else "")
+    return format or (meant if meant in get_args(formats) else None) or "text"
 
 
 def names(text: str | None) -> list[str] | None:

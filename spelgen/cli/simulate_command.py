@@ -11,8 +11,6 @@ from spelgen.cli import options
 from spelgen.cli.console import counted, note, say
 from spelgen.cli.options import AngleTolerance, Force, Joints, Robot, Tip
 
-WORST_INTEGRATION = 1e-8  # [rad, rad/s; m, m/s] above this simulated logs are no reference
-
 
 def simulate(
     robot: Robot,
@@ -42,5 +40,5 @@ def simulate(
             write_logs(path, trajectories, names)
             say(f"wrote {path}: {len(trajectories)} trajectories, {sum(map(len, trajectories))} samples")
     say(f"largest integration error: {logs.integration_error:.1e} [rad, rad/s; m, m/s]")
-    if logs.integration_error > WORST_INTEGRATION:
-        note(f"warning: more than {WORST_INTEGRATION:g}; do not take these logs as a reference")
+    if logs.integration_error > logs.allowed:
+        note(f"warning: more than {logs.allowed:g}; do not take these logs as a reference")

@@ -133,19 +133,25 @@ def train(
     chosen = Chosen(objective, flags, {"cutoff": filter, "decimation": decimation}, validation_fraction, seed)
     start = resumed(folder, chosen) if resume else begun(module, urdf, chosen)
     given = options.mapping(mapping, urdf, read_facts(start.module).joints)
+    check = None if urdf is None else _torque_check(urdf, start.module, given or start.mapping)
+    from spelgen.fitting import workers
     from spelgen.fitting.train import train as train_files
 
     try:
-        found = train_files(
-            start.module, paths, folder, start.config, urdf=urdf, source=source, mapping=given or start.mapping,
-            preprocessing=start.preprocessing, validation=start.validation, seed=start.seed, resume=resume,
-            force=force, trust=trust, device=device, threads=threads, progress=not quiet,
-            since=since, require=None if urdf is None else _torque_check(urdf, start.module, given or start.mapping),
-        )  # fmt: skip
+        with workers.group(device) as own:
+            found = train_files(
+                start.module, paths, folder, start.config, urdf=urdf, source=source, mapping=given or start.mapping,
+                preprocessing=start.preprocessing, validation=start.validation, seed=start.seed, resume=resume,
+                force=force, trust=trust, device=own, threads=threads, progress=not quiet,
+                since=since, require=check,
+            )  # fmt: skip
+            first = workers.rank() == 0
     except OptionError as error:
         flag = "from" if error.option == "payload" else error.option.replace("_", "-")
         raise NotApplicable(f"--{flag}: {error.got}") from error
-    if not resume and found.status != "interrupted":
+    if not first:
+        return
+    if not resume and found.status != "interrupted" and found.config.objective != "servo":
         from spelgen.fitting.run_folder import RunFolder
         from spelgen.identification.baseline import keep_baseline
 
@@ -167,18 +173,24 @@ def train(
 
 def _torque_check(
     urdf: Path, module: Path, mapping: LogMapping | None
-) -> Callable[[Sequence[Trajectory]], None]:
-    """What raises LogError for logs whose torques cannot be those of the module's arm."""
+) -> Callable[[Sequence[Trajectory]], None] | None:
+    """What raises LogError for logs whose torques cannot be those of the module's arm; None: logs have no torques."""
     from spelgen.loaded_arm import load_arm
     from spelgen.logs.check_logs import require_possible_torques
 
     options = read_facts(module).options
     arm = load_arm(urdf, options.joints, options.tip, options.angle_tolerance)
+    if arm.settings.input == "position":
+        return None
     return lambda logs: require_possible_torques(logs, arm, mapping)
 
 
 def _outcome(found: Fit) -> tuple[str, str]:
     """How a fit ended, and why where its status does not say so; what it came to."""
+    if found.config.objective == "servo":
+        from spelgen.fitting.servo_report import servo_text
+
+        return f"{found.status}: servos fitted in {found.seconds:.0f} s", servo_text(found.record["servo"])
     config, loss = cast("WindowConfig", found.config), f"validation loss {found.best_validation:.3g}"
     if not config.epochs:  # windows only judge
         return f"{found.status}: {config.objective} fitted in {found.seconds:.0f} s", loss

@@ -1,11 +1,10 @@
-"""The runs of a comparison: train and measure what is not yet done, several at a time."""
+"""The runs of a comparison: train and measure what is not yet done."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
-from multiprocessing import get_context
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -23,6 +22,7 @@ from spelgen.fitting.config import BATCH
 from spelgen.fitting.rollout import LossScales, loss_scales
 from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.fitting.train import train
+from spelgen.fleet.engine import Engine
 from spelgen.logs.read import read_logs
 from spelgen.spec import read_facts
 
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 HORIZON = 1.0  # s, over which trajectories are predicted
 
 
-def run_study(study: Study, *, jobs: int, note: Callable[[str], None]) -> None:
-    """Train and measure what is not yet done, `jobs` runs at a time; `note` hears of each that ends."""
+def run_study(study: Study, engine: Engine, *, note: Callable[[str], None]) -> None:
+    """Train and measure what is not yet done; `note` hears of each run that ends. What a run raises ends all."""
     waiting = [
         (variant, seed)
         for seed in range(study.settings.seeds)
@@ -44,7 +44,9 @@ def run_study(study: Study, *, jobs: int, note: Callable[[str], None]) -> None:
     done = count - len(waiting)
     if done:
         note(f"{done} of {count} runs are done already")
-    for variant, seed, result in _finished(study, waiting, jobs):
+    for (variant, seed), result in engine.results(partial(_run, study), waiting):
+        if isinstance(result, Exception):
+            raise result
         done += 1
         loss = result["prediction"]["loss"]
         shown = "not finite" if loss is None else f"{loss:.3g}"
@@ -52,26 +54,9 @@ def run_study(study: Study, *, jobs: int, note: Callable[[str], None]) -> None:
         note(f"{done}/{count} {variant.name}, seed {seed}: prediction loss {shown}, {took}")
 
 
-def _finished(
-    study: Study, waiting: Sequence[tuple[Variant, int]], jobs: int
-) -> Iterator[tuple[Variant, int, dict[str, Any]]]:
-    """The runs as they end, each in a process of its own where there are several at a time."""
-    if jobs == 1:
-        for variant, seed in waiting:
-            yield variant, seed, _run(study, variant, seed)
-        return
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        futures = {pool.submit(_run, study, *each): each for each in waiting}
-        try:
-            for future in as_completed(futures):
-                yield *futures[future], future.result()
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-
-
-def _run(study: Study, variant: Variant, seed: int) -> dict[str, Any]:
+def _run(study: Study, chosen: tuple[Variant, int]) -> dict[str, Any]:
     """Train one variant with one seed, or go on where it was stopped, and measure it."""
+    variant, seed = chosen
     folder = study.run(variant, seed)
     run = RunFolder(folder)
     ended = train(

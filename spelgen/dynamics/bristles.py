@@ -67,6 +67,8 @@ def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
 def encoded(q: np.ndarray) -> np.ndarray:
     """The path (T, n) without the jitter of encoders: it follows q out of a band of a step to both sides."""
     step = encoder_step(q)
+    if not step.any():
+        return q
     low, high = q - step, q + step  # clamping to a band after a band is clamping to one
     shift = 1
     while shift < len(q):

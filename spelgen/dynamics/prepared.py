@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from spelgen.dynamics.protocol import memory_after
+from spelgen.dynamics.runge_kutta import runge_kutta
 from spelgen.dynamics.residuals import without_idle_residuals
 
 
@@ -185,19 +187,12 @@ class PreparedModel:
     def _stepped(
         self, accelerations: Callable[..., Tensor], start: State, tau: Tensor, dt: float, substeps: int
     ) -> State:
-        h, (q, qd, z) = dt / substeps, start
+        q, qd, z = start
         for _ in range(substeps):
-            a1 = accelerations(q, qd, tau, z)
-            q2, v2 = q + 0.5 * h * qd, qd + 0.5 * h * a1
-            a2 = accelerations(q2, v2, tau, self._memory_after(z, q2 - q))
-            q3, v3 = q + 0.5 * h * v2, qd + 0.5 * h * a2
-            a3 = accelerations(q3, v3, tau, self._memory_after(z, q3 - q))
-            q4, v4 = q + h * v3, qd + h * a3
-            a4 = accelerations(q4, v4, tau, self._memory_after(z, q4 - q))
-            moved = h / 6 * (qd + 2 * v2 + 2 * v3 + v4)
-            q, qd, z = q + moved, qd + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4), self._memory_after(z, moved)
-        return State(q, qd, z)
 
-    def _memory_after(self, z: Tensor, moved: Tensor) -> Tensor:
-        found: Tensor = self._dynamics.memory_after(z, moved)
-        return found
+            def rhs(moved: Tensor, speed: Tensor, q: Tensor = q, z: Tensor = z) -> tuple[Tensor, Tensor]:
+                return speed, accelerations(q + moved, speed, tau, memory_after(self._dynamics, z, moved))
+
+            moved, qd, _ = runge_kutta(rhs, qd, dt / substeps)
+            q, z = q + moved, memory_after(self._dynamics, z, moved)
+        return State(q, qd, z)

@@ -80,6 +80,17 @@ def memory_after(dynamics: Any, z: Tensor, displacement: Tensor) -> Tensor:
     return found
 
 
+def memory_along(dynamics: Any, q: Tensor, qd: Tensor, z: Tensor | None = None) -> Tensor:
+    """z, (W, K, n, elements), along the samples q and qd, (W, K, n), each straight to the next.
+
+    It starts at z, (W, n, elements), by default as of joints that have long gone the way of the first qd.
+    """
+    found = [sliding_memory(dynamics, qd[:, 0]) if z is None else z]
+    for moved in q.diff(dim=1).unbind(1):
+        found.append(memory_after(dynamics, found[-1], moved))
+    return torch.stack(found, dim=1)
+
+
 def known_past(dynamics: Any, z: Tensor | None) -> tuple[Tensor, ...]:
     """z as what to give to these dynamics last, where they have a use for it."""
     return () if z is None or remembering(dynamics) is None else (z,)

@@ -57,38 +57,6 @@ def regressor(arm: Arm, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.nd
     return result
 
 
-def body_torque(
-    arm: Arm, parameters: np.ndarray, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray
-) -> np.ndarray:
-    """The bodies' torque (T, n), as ``regressor`` times the parameters (10 B,), in a fraction of its time."""
-    states: list[_State] = []
-    wrenches: list[tuple[np.ndarray, np.ndarray]] = []
-    for body, ten in zip(arm.bodies, parameters.reshape(-1, 10), strict=True):
-        states.append(_moved(arm, body, states, q, qd, qdd))
-        wrenches.append(_loaded(states[-1], ten))
-    torque = np.zeros_like(q)
-    for index in reversed(range(len(states))):
-        body, state, (force, moment) = arm.bodies[index], states[index], wrenches[index]
-        along = moment if body.kind == "revolute" else force
-        torque[:, body.coordinate] += float(body.multiplier) * along[:, 2]
-        if body.parent >= 0:
-            below, around = wrenches[body.parent]
-            force, moment = ((state.rotation @ x[..., None])[..., 0] for x in (force, moment))
-            moment = moment + np.cross(state.position, force)
-            wrenches[body.parent] = below + force, around + moment
-    return torque
-
-
-def _loaded(state: _State, ten: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Force and moment about the origin, each (T, 3), of a body with these parameters."""
-    mass, first, tensor = ten[0], ten[1:4], _TENSOR @ ten[4:]
-    spin, momentum = state.velocity, state.velocity @ tensor
-    force = mass * state.acceleration + np.cross(state.angular, first)
-    force = force + np.cross(spin, np.cross(spin, first))
-    moment = np.cross(first, state.acceleration) + state.angular @ tensor + np.cross(spin, momentum)
-    return force, moment
-
-
 def urdf_parameters(arm: Arm) -> np.ndarray:
     """The URDF's own inertial parameters, (10 B,); zero for a body without."""
     return np.array([[float(x) for x in body.inertia or (0,) * 10] for body in arm.bodies]).ravel()

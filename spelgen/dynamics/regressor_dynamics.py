@@ -11,7 +11,7 @@ import torch
 from spelgen.arm.actuation import motor_speeds
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.arrays import like
-from spelgen.dynamics.regressor import body_torque
+from spelgen.dynamics.rigid_bodies import RigidBodies
 from spelgen.runtime.bristles import moved_bristles
 
 Array = TypeVar("Array")
@@ -35,7 +35,7 @@ class RegressorDynamics:
         inputs: np.ndarray | None = None,
         bristle_reach: np.ndarray | None = None,
     ) -> None:
-        self.arm, self.parameters, self.armature, self.friction = arm, parameters, armature, friction
+        self.bodies, self.armature, self.friction = RigidBodies(arm, parameters), armature, friction
         self.bristle_reach = None if bristle_reach is None else torch.from_numpy(bristle_reach)
         self.inputs = np.eye(len(armature)) if inputs is None else inputs
         self.motors = motor_speeds(self.inputs)
@@ -52,15 +52,15 @@ class RegressorDynamics:
 
     def mass_matrix(self, q: Array) -> Array:
         """M, (..., n, n) [kg m^2, kg m, kg]."""
-        return self._by_rows(lambda at, _: self._mass(at), q)
+        return self._by_rows(lambda at, _: self._mass_and_bias(at, 0 * at)[0], q)
 
     def gravity(self, q: Array) -> Array:
         """dV/dq, (..., n) [Nm, N]."""
-        return self._by_rows(lambda each, _: self._bodies(each, 0 * each, 0 * each), q)
+        return self._by_rows(lambda at, _: self._mass_and_bias(at, 0 * at)[1], q)
 
     def nonlinear_effects(self, q: Array, qd: Array) -> Array:
         """Coriolis, centrifugal and gravity torques, (..., n) [Nm, N]."""
-        return self._by_rows(lambda at, speed, _: self._bodies(at, speed, 0 * at), q, qd)
+        return self._by_rows(lambda at, speed, _: self._mass_and_bias(at, speed)[1], q, qd)
 
     def friction_torque(self, q: Array, qd: Array, z: Array | None = None) -> Array:
         """What friction takes, and what the measured torque shows without any, (..., n) [Nm, N]."""
@@ -88,34 +88,23 @@ class RegressorDynamics:
         """What all joints, passive ones too, need for qdd, (..., n) [Nm, N]."""
         return self._by_rows(self._torque, q, qd, qdd, z=z)
 
-    def _bodies(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
-        """The bodies' torques, (T, n)."""
-        return body_torque(self.arm, self.parameters, q, qd, qdd)
-
-    def _mass(self, q: np.ndarray) -> np.ndarray:
-        """Column by column: what each unit acceleration adds to the torque at rest."""
-        count, n = q.shape
-        accelerations = np.concatenate([np.zeros((1, n)), np.eye(n)]).repeat(count, axis=0)
-        still, *moved = self._bodies(
-            np.tile(q, (n + 1, 1)), np.zeros_like(accelerations), accelerations
-        ).reshape(n + 1, count, n)
-        return np.stack([each - still for each in moved], axis=-1) + self._rotors()
-
     def _driven(self, joints: torch.Tensor) -> torch.Tensor:
         """Of the drives, (..., n)."""
         return joints @ torch.from_numpy(self.motors.T).to(joints)
 
-    def _rotors(self) -> np.ndarray:
-        """What the drives add to M, (n, n)."""
-        rotors: np.ndarray = self.motors.T @ (self.armature[:, None] * self.motors)
-        return rotors
+    def _mass_and_bias(self, q: np.ndarray, qd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """M, (T, n, n), what the drives add included, and the bodies' torques at steady qd, (T, n)."""
+        mass, bias = self.bodies.mass_and_bias(q, qd)
+        return mass + self.motors.T @ (self.armature[:, None] * self.motors), bias
 
     def _forward(self, q: np.ndarray, qd: np.ndarray, tau: np.ndarray, z: np.ndarray | None) -> np.ndarray:
-        force = tau @ self.inputs.T - self._bodies(q, qd, 0 * q) - self.friction(qd, z)
-        return np.linalg.solve(self._mass(q), force[..., None])[..., 0]
+        mass, bias = self._mass_and_bias(q, qd)
+        force = tau @ self.inputs.T - bias - self.friction(qd, z)
+        return np.linalg.solve(mass, force[..., None])[..., 0]
 
     def _torque(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, z: np.ndarray | None) -> np.ndarray:
-        return self._bodies(q, qd, qdd) + qdd @ self._rotors() + self.friction(qd, z)
+        mass, bias = self._mass_and_bias(q, qd)
+        return (mass @ qdd[..., None])[..., 0] + bias + self.friction(qd, z)
 
     def _inverse(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, z: np.ndarray | None) -> np.ndarray:
         force = self._torque(q, qd, qdd, z)

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import redirect_stderr
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import pytorch_kinematics as pk
 import torch
+from lxml import etree
 
 from spelgen.dynamics.constraint import mimic_constraint
-from spelgen.urdf.document import urdf_bytes
 from spelgen.urdf.read import read_urdf
 from spelgen.urdf.robot import Robot
 
@@ -25,11 +23,9 @@ class TipKinematics:
     In float32 throughout, the chain's products would add to that ten times over.
     """
 
-    def __init__(self, robot: Robot, content: bytes, joints: Sequence[str], link: str) -> None:
+    def __init__(self, robot: Robot, joints: Sequence[str], link: str) -> None:
         self.link = link
-        # bytes: of text with an encoding declaration the parser would raise
-        with redirect_stderr(StringIO()):  # it names every tag that it does not know
-            chain = pk.build_serial_chain_from_urdf(content, link)
+        chain = pk.build_serial_chain_from_urdf(_way(robot, link), link)
         self._chain = chain.to(dtype=torch.float64)
         constraint = mimic_constraint(robot, joints)
         order = [constraint.names.index(name) for name in chain.get_joint_parameter_names()]
@@ -65,7 +61,7 @@ def tip_kinematics(
     or the end of the fixed links behind it.
 
     arm: of ``load_arm``, or the path of a URDF, with the names of its ``joints``. Raises ValueError where the joints
-    do not lead to the link, and what pytorch-kinematics raises where it cannot read the file.
+    do not lead to the link.
     """
     if isinstance(arm, str | Path):
         robot, names = read_urdf(Path(arm)), list(joints or ())
@@ -74,7 +70,7 @@ def tip_kinematics(
         link = link or arm.tip
     if not names:
         raise ValueError("no joints are named")
-    return TipKinematics(robot, urdf_bytes(robot.path), names, link or last_link(robot, names))
+    return TipKinematics(robot, names, link or last_link(robot, names))
 
 
 def last_link(robot: Robot, joints: Sequence[str]) -> str:
@@ -85,3 +81,26 @@ def last_link(robot: Robot, joints: Sequence[str]) -> str:
         if len(fixed) != 1:
             return link
         link = fixed[0]
+
+
+def _way(robot: Robot, link: str) -> bytes:
+    """The links and joints from the root to ``link`` as a URDF of their own.
+
+    pytorch-kinematics' parser is stricter than others about what nobody here needs: colours, meshes, transmissions.
+    """
+    path = robot.path_to(link)
+    root = etree.Element("robot", name="way")
+    for name in (robot.root, *(joint.child for joint in path)):
+        etree.SubElement(root, "link", name=name)
+    for joint in path:
+        own = etree.SubElement(root, "joint", name=joint.name, type=joint.type if joint.moves else "fixed")
+        etree.SubElement(own, "origin", xyz=_numbers(joint.xyz), rpy=_numbers(joint.rpy))
+        etree.SubElement(own, "parent", link=joint.parent)
+        etree.SubElement(own, "child", link=joint.child)
+        etree.SubElement(own, "axis", xyz=_numbers(joint.axis))
+    found: bytes = etree.tostring(root)
+    return found
+
+
+def _numbers(values: Sequence[float]) -> str:
+    return " ".join(map(repr, values))

@@ -53,7 +53,12 @@ def summary(spec: ModelSpec) -> str:
         else "The URDF's inertials are missing or impossible: sizes and starting values are those of 1 kg links."
     )
     beside = f";\nnetworks for what they leave: {_functions(spec)} in M" if _residual(spec) else ""
-    return f"{_count(spec)[0].upper()}{_count(spec)[1:]}{beside}.\n{potential}\n{start}"
+    servos = (
+        "\nG is the spring of position servos: tau = clip(kp (u - q) - kd qd), which stores 1/2 kp (q - u)^2."
+        if spec.servos
+        else ""
+    )
+    return f"{_count(spec)[0].upper()}{_count(spec)[1:]}{beside}.\n{potential}{servos}\n{start}"
 
 
 def mass_entries(spec: ModelSpec) -> str:

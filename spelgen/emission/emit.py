@@ -63,6 +63,7 @@ def _values(spec: ModelSpec) -> list[Value]:
                 "What the measured torque shows without any, (n,) [Nm, N].",
                 f"{dynamics}.torque_offset()",
             ),
+            *(_SERVO if spec.servos else ()),
         ]
     values: list[Value] = []
     if spec.design.mass == "derived":
@@ -71,6 +72,13 @@ def _values(spec: ModelSpec) -> list[Value]:
         viscous = "Friction torque by velocity, (n,) [Nm s/rad, N s/m]."
         values.append(("viscous", viscous, f"{dynamics}.friction.viscous()"))
     return values
+
+
+_SERVO: tuple[Value, ...] = (
+    ("kp", "Of the servos, torque by the distance from the command, (n,) [Nm/rad, N/m].", "self.servo.kp()"),
+    ("kd", "Of the servos, torque by velocity, (n,) [Nm s/rad, N s/m].", "self.servo.kd()"),
+    ("delay", "Of the commands [s].", "self.servo.delay"),
+)
 
 
 def _armature(owner: str) -> list[Value]:

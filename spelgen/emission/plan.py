@@ -11,8 +11,9 @@ from spelgen.arm.actuation import Actuation
 from spelgen.arm.arm import Arm, Coordinate
 from spelgen.design import load_design
 from spelgen.emission.bodies import body_specs
+from spelgen.errors import SettingsError
 from spelgen.settings.joint import JointSettings
-from spelgen.spec import ConstantSpec, Entries, JointSpec, ModelSpec, Options, OutputSpec
+from spelgen.spec import ConstantSpec, Entries, JointSpec, ModelSpec, Options, OutputSpec, ServoSpec
 from spelgen.structure.basis import Weights
 from spelgen.structure.nominal import Nominal, nominal, nominal_inertias, working_range
 from spelgen.structure.structure import Structure
@@ -23,6 +24,9 @@ _FRICTION_OF_TORQUE = 0.1
 _LARGEST_EFFORT = 1e4  # Nm, N: what stands above is a placeholder
 _LARGEST_SPEED = 100.0  # rad/s, m/s: likewise
 _RISE = 0.02  # s
+_EFFORT = 5.0  # Nm, N: of a servo of which nothing is said
+_FULL_EFFORT_AT = 0.5  # rad, m: from the command
+_SERVO_LAG = 0.05  # s
 _DEFAULT_SPEED = {"revolute": 2.0, "prismatic": 0.5}  # rad/s, m/s
 
 
@@ -35,13 +39,20 @@ def plan_model(
     urdf: str,
     urdf_sha256: str,
     drives: Mapping[str, JointSettings] | None = None,
+    servos: bool = False,
 ) -> ModelSpec:
     """The model of ``arm`` under ``options``; ``urdf`` is the file's name without its folder.
 
     ``drives``: what is known of the joints' motors and gears; where no rotor inertia is, one is guessed.
+    ``servos``: whether positions are commanded. Raises SettingsError where the design has no friction that remembers.
     """
     known = drives or {}
     design = load_design(options.design or options.preset, options.net)
+    if servos and design.memory == "none":
+        raise SettingsError(
+            f"position servos with the preset {options.preset}", element="input",
+            expected="a preset whose friction remembers: what servos hold rests on it", do="--preset closed-form",
+        )  # fmt: skip
     everything = tuple(range(len(arm.coordinates)))
     sizes = nominal(arm, structure)
     inertias = nominal_inertias(arm, sizes.from_urdf)
@@ -84,6 +95,9 @@ def plan_model(
         inputs=()
         if actuation.direct
         else tuple((x.row, x.column, x.value, x.kind == "gain") for x in actuation.entries),
+        servos=tuple(_servo(x, known.get(x.name, JointSettings())) for x in arm.coordinates)
+        if servos
+        else (),
     )
 
 
@@ -108,6 +122,13 @@ def _joint(
         potential_sensitivity=sizes.potential_sensitivities[index],
         actuated=not coordinate.passive,
     )
+
+
+def _servo(coordinate: Coordinate, drive: JointSettings) -> ServoSpec:
+    """The servo of a joint: one that nothing is known of gives its full effort half a unit from its command."""
+    effort = coordinate.effort if coordinate.effort and coordinate.effort <= _LARGEST_EFFORT else None
+    kp = drive.kp or float(f"{(effort or _EFFORT) / _FULL_EFFORT_AT:.3g}")
+    return ServoSpec(kp, drive.kp is not None, float(f"{_SERVO_LAG * kp:.3g}"), effort)
 
 
 def guessed_armature(coordinate: Coordinate) -> float:

@@ -149,6 +149,8 @@ def _rigid_bodies(spec: ModelSpec) -> list[str]:
     reach = tuple(BRISTLE_REACH[x.kind] for x in spec.joints)
     remembers = {"reach": reach} if spec.design.memory == "bristles" else {}
     made.append(("self.dynamics", call(kind, *parts, **remembers)))
+    if spec.servos:
+        made.append(("self.servo", _servo(spec)))
     return [assignment(name, value, _INDENT) for name, value in made]
 
 
@@ -181,6 +183,17 @@ def _grouped(start: str, rows: Sequence[tuple[int, ...]]) -> Code:
         else:
             lines[-1] += f" + {term}"
     return Code("\n".join(["(", *lines, " " * _INDENT + ")  # fmt: skip"]))
+
+
+def _servo(spec: ModelSpec) -> Call:
+    infinite = Code('float("inf")')
+    return call(
+        "PositionServo",
+        kp=tuple(servo.kp for servo in spec.servos),
+        kd=tuple(servo.kd for servo in spec.servos),
+        limit=tuple(infinite if servo.limit is None else servo.limit for servo in spec.servos),
+        known=tuple(servo.known for servo in spec.servos),
+    )
 
 
 def _networks(spec: ModelSpec) -> list[str]:

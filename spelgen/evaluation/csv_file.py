@@ -20,9 +20,25 @@ def csv_text(evaluation: Mapping[str, Any]) -> str:
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(HEAD)
-    for *row, value in (*_states(evaluation), *_torques(evaluation), *_growth(evaluation)):
+    for *row, value in (
+        *_replays(evaluation),
+        *_states(evaluation),
+        *_torques(evaluation),
+        *_growth(evaluation),
+    ):
         writer.writerow([*row, "" if value is None else value])
     return file.getvalue()
+
+
+def _replays(evaluation: Mapping[str, Any]) -> Iterator[Row]:
+    joints = list(zip(evaluation["joints"], evaluation["joint_types"], strict=True))
+    for replay in evaluation.get("replays", ()):
+        quantity = f"q RMS of commands replayed, {replay['name']}"
+        for name, errors in replay["errors"].items():
+            for trajectory, value in errors["trajectories"].items():
+                yield quantity, "rad; m", "", "", trajectory, name, value
+            for (joint, kind), value in zip(joints, errors["joints"], strict=True):
+                yield quantity, UNITS[kind]["q"], "", joint, "", name, value
 
 
 def _states(evaluation: Mapping[str, Any]) -> Iterator[Row]:

@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from spelgen.dynamics.protocol import memory_after, sliding_memory
+from spelgen.dynamics.protocol import memory_along
 from spelgen.logs.windows import Windows
 
 INTERVALS = 10  # of the past, at most, over which forces are integrated
@@ -52,12 +52,10 @@ def after_past(form: Any, windows: Windows, past: int) -> tuple[Windows, torch.T
     That is what p' lacks: a generalised force where the form's p is momentum, an acceleration where it is velocity.
     """
     q, qd = windows.q[:, : past + 1], windows.qd[:, : past + 1]
-    along = [sliding_memory(form, qd[:, 0]) if windows.z is None else windows.z]
-    for moved in q.diff(dim=1).unbind(1):
-        along.append(memory_after(form, along[-1], moved))
-    ahead = replace(without_past(windows, past), z=along[-1])
+    along = memory_along(form, q, qd, windows.z)
+    ahead = replace(without_past(windows, past), z=along[:, -1])
     chosen = torch.linspace(0, past, min(past, INTERVALS) + 1, dtype=torch.float64).round().long()
-    q, qd, z = q[:, chosen], qd[:, chosen], torch.stack(along, dim=1)[:, chosen]
+    q, qd, z = (x[:, chosen] for x in (q, qd, along))
     steps = windows.dt[:, :past].unsqueeze(-1)
     dt, impulse = (_between(x, chosen) for x in (steps, steps * windows.tau[:, :past]))
     prepared = form.prepare()

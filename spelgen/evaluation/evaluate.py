@@ -6,11 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import torch
-
-from spelgen.dynamics.bristles import BristleReach
 from spelgen.dynamics.protocol import RigidDynamics
-from spelgen.errors import Diagnostic
+from spelgen.errors import Diagnostic, LogError
 from spelgen.evaluation.baselines import (
     Predictor,
     constant_velocity,
@@ -18,25 +15,12 @@ from spelgen.evaluation.baselines import (
     of_dynamics,
     of_urdf,
 )
-from spelgen.evaluation.disturbance import without_past
-from spelgen.evaluation.forecast import (
-    Disturbance,
-    Forecast,
-    for_calibration,
-    forecast_of,
-    past_steps,
-    rolled,
-)
+from spelgen.evaluation.forecast import Disturbance, Forecast, for_windows, forecast_of
+from spelgen.evaluation.horizons import PROBED, JudgedLogs, horizon_lengths, open_loop_note, predict
 from spelgen.evaluation.invariants import energy_drift
 from spelgen.evaluation.names import MODEL
-from spelgen.evaluation.results import (
-    Horizon,
-    Results,
-    end_errors,
-    forecast_summary,
-    state_errors,
-    torque_summary,
-)
+from spelgen.evaluation.replay import replays
+from spelgen.evaluation.results import Results, forecast_summary, torque_summary
 from spelgen.evaluation.subject import Subject, subject
 from spelgen.evaluation.torque import torque_errors
 from spelgen.evaluation.traces import traces
@@ -44,15 +28,11 @@ from spelgen.fitting.rollout import choose_substeps, loss_scales
 from spelgen.identification.samples import dynamics_samples
 from spelgen.logs.checks import check
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.trajectory import Trajectory, require_joints
-from spelgen.logs.windows import Windows, cut_windows
+from spelgen.logs.trajectory import Trajectory, require_joints, require_torques
+from spelgen.logs.windows import Windows
 
 if TYPE_CHECKING:
     from spelgen.dynamics.tip import TipKinematics
-
-PREDICTED_STEPS = 40_000  # per horizon and predictor: windows are thinned evenly to about this many
-MOST_WINDOWS = 2000
-PROBED = 64  # windows that say how many steps the integrator needs
 
 
 def evaluate(
@@ -82,10 +62,14 @@ def evaluate(
         require_joints(trajectory, judged.joints)
     notes = check(logs, judged.joints, joint_types)
     notes += _seen(logs, judged)
+    if hasattr(judged.model, "servo"):
+        return _replayed(judged, logs, notes)
+    require_torques(logs)
     used = _preprocessing(preprocessing, judged, logs)
     pieces = used.pieces(logs, shortest=2)
-    lengths = _lengths(pieces, steps, seconds, notes)
-    probe = _windows(pieces, judged.window, PROBED, used, judged.reach)
+    tests = JudgedLogs(pieces, used, judged.reach)
+    lengths = horizon_lengths(tests, steps, seconds, notes)
+    probe = tests.windows(judged.window, PROBED)
     scales = loss_scales(probe, joint_types)
     substeps = choose_substeps(judged.model, probe, scales, start=judged.substeps_per_sample)
     predictors = [of_dynamics(MODEL, judged.model, substeps), constant_velocity()]
@@ -93,6 +77,12 @@ def evaluate(
     predictors += [of_baseline(name, each, probe) for name, each in (baselines or {}).items()]
     forecasts = _forecasts(predictors, judged, notes) if disturbance == "held" else {}
     tip = _tip(judged, notes)
+    position = None if tip is None else tip.position
+    predicted = [
+        predict(name, k, tests, predictors, forecasts, joint_types, position, judged.window, notes)
+        for name, k in lengths.items()
+    ]
+    longest = max(predicted, key=lambda x: x[0].steps)[1] if predicted else None
     samples = dynamics_samples(logs, preprocessing=used, reach=judged.reach)
     return Results(
         robot=judged.robot,
@@ -101,10 +91,7 @@ def evaluate(
         cutoff=used.cutoff or None,
         substeps=substeps,
         parameters=sum(parameter.numel() for parameter in judged.model.parameters()),
-        horizons=tuple(
-            _horizon(name, k, pieces, predictors, forecasts, judged, tip, used, notes)
-            for name, k in lengths.items()
-        ),
+        horizons=tuple(horizon for horizon, _ in predicted),
         torque={
             x.name: torque_summary(torque_errors(x.torque, samples))
             for x in predictors
@@ -112,12 +99,25 @@ def evaluate(
         },
         energy_drift=energy_drift(judged.model, probe),
         forecasts={name: forecast_summary(x.trust) for name, x in forecasts.items()},
-        traces=traces(
-            predictors, pieces, max(lengths.values(), default=0), joint_types,
-            used=used, reach=judged.reach, tip=None if tip is None else tip.position,
-        ),
+        traces=traces(predictors, pieces, longest, joint_types, used=used, reach=judged.reach, tip=position),
         diagnostics=tuple(notes),
         joint_types=tuple(joint_types),
+    )  # fmt: skip
+
+
+def _replayed(judged: Subject, logs: Sequence[Trajectory], notes: list[Diagnostic]) -> Results:
+    """Of an arm under position servos: its commands are replayed."""
+    if any(x.u is None for x in logs):
+        raise LogError(
+            "logs without commanded positions",
+            element=logs[0].name,
+            expected="u: the model is one of position servos",
+        )
+    return Results(
+        robot=judged.robot, joints=tuple(judged.joints), trajectories=tuple(x.name for x in logs), cutoff=None,
+        substeps=1, parameters=sum(x.numel() for x in judged.model.parameters()), horizons=(), torque={},
+        energy_drift=None, replays=replays(judged.model, logs, judged.linear_servos, notes),
+        diagnostics=tuple(notes), joint_types=tuple(judged.model.joint_types),
     )  # fmt: skip
 
 
@@ -136,34 +136,6 @@ def _seen(logs: Sequence[Trajectory], judged: Subject) -> list[Diagnostic]:
     return [Diagnostic("warning", "tested-on-training-data", "logs", None, message)]
 
 
-def _lengths(
-    pieces: Sequence[Trajectory], steps: Sequence[int], seconds: Sequence[float], notes: list[Diagnostic]
-) -> dict[str, int]:
-    """Horizon name -> number of samples ahead."""
-    frequency = _rate(pieces)
-    wanted = {f"{k} step{'s' if k > 1 else ''}": k for k in steps}
-    wanted |= {f"{duration:g} s": round(duration * frequency) for duration in seconds}
-    longest = max(map(len, pieces)) - 1
-    for name, k in wanted.items():
-        if not 0 < k <= longest:
-            message = f"no prediction over {name}: the longest trajectory has {longest} steps"
-            notes.append(Diagnostic("info", "horizon-too-long", "logs", None, message))
-    return {name: k for name, k in wanted.items() if 0 < k <= longest}
-
-
-def _rate(pieces: Sequence[Trajectory]) -> float:
-    return sum(x.sample_rate for x in pieces) / len(pieces)
-
-
-def _windows(
-    pieces: Sequence[Trajectory], samples: int, most: int, used: Preprocessing, reach: BristleReach
-) -> Windows:
-    """About `most` windows, or all, evenly spread."""
-    samples = min(samples, max(map(len, pieces)))
-    starts = sum(max(0, len(x) - samples + 1) for x in pieces)
-    return cut_windows(pieces, samples, -(-starts // most), measured=used.filtered, reach=reach)
-
-
 def _forecasts(
     predictors: Sequence[Predictor], judged: Subject, notes: list[Diagnostic]
 ) -> dict[str, Forecast]:
@@ -171,57 +143,15 @@ def _forecasts(
     calibration, types = judged.calibration, judged.model.joint_types
     dynamic = [x for x in predictors if x.form is not None]
     if calibration is not None:
-        found = {x.name: forecast_of(for_calibration(x, calibration), calibration, types) for x in dynamic}
+        found = {x.name: forecast_of(for_windows(x, calibration.probe), calibration, types) for x in dynamic}
         known = {name: each for name, each in found.items() if each is not None}
         if known:
             return known
     reason = (
         "no windows of its training logs are known" if calibration is None else "its training logs are short"
     )
-    notes.append(_open_loop(f"no forecasts, rollouts are open loop: {reason}"))
+    notes.append(open_loop_note(f"no forecasts, rollouts are open loop: {reason}"))
     return {}
-
-
-def _open_loop(message: str) -> Diagnostic:
-    return Diagnostic("info", "open-loop", "logs", None, message)
-
-
-def _horizon(
-    name: str,
-    steps: int,
-    pieces: Sequence[Trajectory],
-    predictors: Sequence[Predictor],
-    forecasts: Mapping[str, Forecast],
-    judged: Subject,
-    tip: TipKinematics | None,
-    used: Preprocessing,
-    notes: list[Diagnostic],
-) -> Horizon:
-    """Errors over so many steps: of forecasts, where these reach that far and pieces are long enough for a past."""
-    most, rate = max(min(MOST_WINDOWS, PREDICTED_STEPS // steps), 1), _rate(pieces)
-    past = past_steps(rate)
-    reached = all(x.trust.reaches(steps / rate) for x in forecasts.values())
-    if not forecasts or not reached or past + steps >= max(map(len, pieces)):
-        past = 0
-    if forecasts and not past:
-        reason = "these trajectories have no past" if reached else "windows of its training logs are shorter"
-        notes.append(_open_loop(f"no forecasts over {name}, rollouts are open loop: {reason}"))
-    windows = _windows(pieces, past + steps + 1, most, used, judged.reach)
-    types, position = judged.model.joint_types, None if tip is None else tip.position
-    errors, open_loop = {}, {}
-    for predictor in predictors:
-        forecast = forecasts.get(predictor.name)
-        if past and forecast is not None:
-            found = rolled(predictor, windows, past)
-            q, qd = torch.from_numpy(found.open_loop)
-            open_loop[predictor.name] = end_errors((q, qd), found.ahead, types, position)
-            errors[predictor.name] = end_errors(forecast.states(found), found.ahead, types, position)
-            continue
-        errors[predictor.name] = state_errors(predictor, without_past(windows, past), types, position)
-        if past:
-            open_loop[predictor.name] = errors[predictor.name]
-    ahead = windows.dt[:, past:].sum(dim=1).mean().item()
-    return Horizon(name, steps, ahead, len(windows), errors, open_loop)
 
 
 def _urdf_baseline(judged: Subject, probe: Windows, notes: list[Diagnostic]) -> list[Predictor]:

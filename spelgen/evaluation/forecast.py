@@ -16,9 +16,9 @@ from spelgen.evaluation.stiff import States
 from spelgen.evaluation.trust import LEAST_BLOCKS, TIMES, Trust, calibrated, relative_activity
 from spelgen.fitting.calibration import PAST, CalibrationWindows
 from spelgen.fitting.rollout import choose_substeps, loss_scales, position_difference
-from spelgen.logs.windows import Windows
+from spelgen.logs.windows import Windows, joined
 
-PARTS = 16  # that windows are predicted in where some blow up
+PARTS = 32  # that windows are predicted in where some blow up
 Disturbance = Literal["held", "none"]
 
 
@@ -61,15 +61,16 @@ def good_for(model: Any, calibration: CalibrationWindows) -> float | None:
     velocity; None: there is none.
     """
     forecast = forecast_of(
-        for_calibration(of_dynamics(MODEL, model, 1), calibration), calibration, model.joint_types
+        for_windows(of_dynamics(MODEL, model, 1), calibration.probe), calibration, model.joint_types
     )
     return None if forecast is None else forecast.trust.good_for
 
 
-def for_calibration(predictor: Predictor, calibration: CalibrationWindows) -> Predictor:
-    """The same dynamics, in the steps that they need on training windows, whose samples may lie farther apart."""
-    probe, dynamics = calibration.probe, predictor.dynamics
-    assert dynamics is not None
+def for_windows(predictor: Predictor, probe: Windows) -> Predictor:
+    """The same dynamics, in the steps that they need on such windows, whose samples may lie farther apart."""
+    dynamics = predictor.dynamics
+    if dynamics is None:
+        return predictor
     if predictor.name != MODEL:
         return of_baseline(predictor.name, dynamics, probe)
     model: Any = dynamics
@@ -85,17 +86,15 @@ def rolled(predictor: Predictor, windows: Windows, past: int) -> Rollouts:
     """Rollouts of windows of `past` steps, a present sample and more."""
     with torch.no_grad(), np.errstate(over="ignore", invalid="ignore"):  # bad dynamics leave all bounds
         ahead, disturbance = after_past(predictor.form, windows, past)
-        predicted = (
-            constant_velocity().states(ahead),
-            _safe(predictor, ahead),
-            _safe(predictor, ahead, disturbance),
-        )
-    still, open_loop, held = (torch.stack(x).numpy() for x in predicted)
+        both = joined([ahead, ahead])  # one rollout of twice the windows takes about as long as one
+        predicted = _safe(predictor, both, torch.cat([torch.zeros_like(disturbance), disturbance]))
+        still = torch.stack(constant_velocity().states(ahead)).numpy()
+    open_loop, held = np.split(torch.stack(predicted).numpy(), 2, axis=1)
     qd = windows.qd[:, past]
     return Rollouts(ahead, still, open_loop, held, qd.numpy(), (qd - windows.qd[:, 0]).numpy())
 
 
-def _safe(predictor: Predictor, windows: Windows, disturbance: torch.Tensor | None = None) -> States:
+def _safe(predictor: Predictor, windows: Windows, disturbance: torch.Tensor) -> States:
     """Predictions; where numbers blow up they are NaN, for few windows beside those that are to blame."""
     try:
         q, qd = predictor.states(windows, disturbance)
@@ -107,11 +106,11 @@ def _safe(predictor: Predictor, windows: Windows, disturbance: torch.Tensor | No
 
 
 def _whole_or_none(
-    predictor: Predictor, windows: Windows, disturbance: torch.Tensor | None, rows: torch.Tensor
+    predictor: Predictor, windows: Windows, disturbance: torch.Tensor, rows: torch.Tensor
 ) -> States:
     part = windows[rows]
     try:
-        q, qd = predictor.states(part, None if disturbance is None else disturbance[rows])
+        q, qd = predictor.states(part, disturbance[rows])
     except torch.linalg.LinAlgError:
         q = qd = torch.full_like(part.q[:, 1:], torch.nan)
     return q, qd

@@ -92,8 +92,10 @@ def energy_drift(model: EmittedModel, windows: Windows) -> float | None:
         if calls > DRIFT_CALLS:
             raise _TooStiff
         q, p = state.chunk(2, dim=-1)
-        qd, force = model.port_hamiltonian_rhs(q, p, None, prepared)
-        return torch.cat([qd, force + model.friction_torque(q, qd)], dim=-1)
+        at = model.dynamics.configuration(q, prepared)
+        mass, residuals = model.dynamics.mass_at(at, prepared)
+        qd = torch.linalg.solve(mass, p)
+        return torch.cat([qd, model.dynamics.lagrangian_gradient(at, qd, residuals, prepared)], dim=-1)
 
     times = torch.linspace(0.0, DRIFT_SECONDS, DRIFT_TIMES, dtype=q.dtype)
     with torch.no_grad(), warnings.catch_warnings():

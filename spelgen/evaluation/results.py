@@ -11,8 +11,8 @@ from typing import Any
 import torch
 
 from spelgen.errors import Diagnostic
-from spelgen.evaluation.baselines import Predictor
 from spelgen.evaluation.names import MODEL
+from spelgen.evaluation.replay import Replay
 from spelgen.evaluation.stiff import States
 from spelgen.evaluation.tables import result_tables
 from spelgen.evaluation.torque import TorqueErrors
@@ -93,8 +93,9 @@ class Results:
     cutoff: of the filter on the test logs [Hz], None without. substeps: of rk4 between samples. parameters: trained
     numbers of the model. torque: by predictor, empty where the logs are too sparse. energy_drift: of the model
     without input and dissipation over 1 s, integrated to thirteen digits, relative to its kinetic energy; None where
-    the logs never move. forecasts: by predictor, empty where there are none. traces: the curves behind the figures,
-    open loop, see `traces.py`.
+    the logs never move. forecasts: by predictor, empty where there are none. traces: the curves behind the figures;
+    those of predictions are the longest horizon's, see `traces.py`. replays: of commands, of an arm under
+    position servos.
     """
 
     robot: str
@@ -110,10 +111,12 @@ class Results:
     forecasts: dict[str, ForecastSummary] = field(default_factory=dict)
     traces: dict[str, Any] = field(default_factory=dict)
     joint_types: tuple[str, ...] = ()
+    replays: tuple[Replay, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """JSON form, versioned by `schema`."""
-        return {"schema": SCHEMA} | asdict(self)
+        found = {"schema": SCHEMA} | asdict(self)
+        return found if self.replays else {name: x for name, x in found.items() if name != "replays"}
 
     def text(self) -> str:
         """For a terminal: every table, the best of each row starred."""
@@ -133,17 +136,6 @@ class Results:
     def _heading(self) -> str:
         count = len(self.trajectories)
         return f"{self.robot} on {count} test trajector{'ies' if count != 1 else 'y'}"
-
-
-def state_errors(
-    predictor: Predictor,
-    windows: Windows,
-    joint_types: Sequence[str],
-    tip: Callable[[torch.Tensor], torch.Tensor] | None,
-) -> StateErrors:
-    """Errors of a predictor at the ends of these windows. tip: its position (..., 3) [m] by q."""
-    with torch.no_grad():
-        return end_errors(predictor.states(windows), windows, joint_types, tip)
 
 
 def end_errors(

@@ -13,6 +13,7 @@ import torch
 from spelgen.dynamics.bristles import NO_BRISTLES, BristleReach, bristle_reach, reach_of
 from spelgen.fitting.calibration import CalibrationWindows
 from spelgen.fitting.fitted import Fit, load_run
+from spelgen.fitting.linear_servo import LinearServos
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.logs.arm_mapping import GivenMapping
 from spelgen.logs.mapping import LogMapping
@@ -37,6 +38,7 @@ class Subject:
     urdf: its robot's, where known; tip: the link there, None for the last. preprocessing, window, substeps:
     those of its fit. reach: (n, K) of the bristles that friction remembers with, its own or the usual ones.
     trained_on: names of the trajectories that it has seen; calibration: windows of them, None where they are not known.
+    linear_servos: fitted to them, what a model of position servos is compared with.
     """
 
     model: EmittedModel
@@ -50,6 +52,7 @@ class Subject:
     reach: BristleReach = NO_BRISTLES
     trained_on: frozenset[str] = frozenset()
     calibration: CalibrationWindows | None = None
+    linear_servos: LinearServos | None = None
 
     @property
     def substeps_per_sample(self) -> int:
@@ -73,6 +76,9 @@ def subject(judged: Any, arm: Any = None) -> Subject:
         substeps=judged.substeps,
         trained_on=seen,
         calibration=judged.calibration,
+        linear_servos=LinearServos.from_dict(judged.record["servo"]["linear"])
+        if "servo" in judged.record
+        else None,
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from spelgen.listing import Listing, number
@@ -27,11 +27,12 @@ class Row:
 
 @dataclass(frozen=True)
 class Table:
-    """Quantities down, predictors or models across; `title` says what the numbers are."""
+    """Quantities down, predictors or models across; `title` says what the numbers are, `note` what rows mean."""
 
     title: str
     columns: tuple[str, ...]
     rows: tuple[Row, ...]
+    note: str = ""
 
     def text(self) -> str:
         """For a terminal; the best of each row is starred."""
@@ -44,10 +45,15 @@ class Table:
             (row.label, *(cell.text + (" *" if cell.best else "  ") for cell in row.cells))
             for row in self.rows
         )
-        return Listing(self.title, head, rows)
+        return Listing(self.title, head, rows, self.note)
 
 
 FORECAST = ", with the disturbance of the last 0.1 s held, trusted as far as training windows show"
+OPEN_LOOP = ", open loop"
+WHY_OPEN_LOOP = (
+    "open loop: a rollout with nothing held, as windows of the training logs are shorter, or the test"
+    " trajectories have no past"
+)
 UNITS = {"revolute": ("rad", "rad/s", "Nm"), "prismatic": ("m", "m/s", "N")}
 
 
@@ -56,15 +62,21 @@ def result_tables(evaluation: Mapping[str, Any], joint_types: Sequence[str] = ()
 
     joint_types: those of the evaluation by default; units are only those of joints that there are.
     """
-    tables, horizons = [], evaluation["horizons"]
+    tables, horizons = _replay_tables(evaluation), evaluation["horizons"]
     types = joint_types or evaluation.get("joint_types") or ()
     if horizons:
-        heads = [_ahead(horizon) for horizon in horizons]
         title = "Error relative to the motion (0: none, 1: as if the arm had stood still)"
         forecast = [horizon for horizon in horizons if horizon.get("open_loop")]
+        heads, note = [_ahead(horizon) for horizon in horizons], ""
         if forecast:
             title += FORECAST
-        tables.append(table(title, heads, [_of(horizon, "mean_relative_rms") for horizon in horizons]))
+            heads = [
+                name if horizon in forecast else name + OPEN_LOOP
+                for name, horizon in zip(heads, horizons, strict=True)
+            ]
+            note = WHY_OPEN_LOOP if len(forecast) < len(horizons) else ""
+        rows = [_of(horizon, "mean_relative_rms") for horizon in horizons]
+        tables.append(replace(table(title, heads, rows), note=note))
         if forecast:
             rows = [_of(horizon, "mean_relative_rms", "open_loop") for horizon in forecast]
             tables.append(table("The same without that: open loop", [_ahead(x) for x in forecast], rows))
@@ -81,6 +93,22 @@ def result_tables(evaluation: Mapping[str, Any], joint_types: Sequence[str] = ()
         rmse = {name: errors["rmse"] for name, errors in torque.items()}
         unit, labels = _units(evaluation["joints"], types, 2)
         tables.append(_by_joint(f"Torque error by joint, RMSE{unit}", labels, rmse))
+    return tables
+
+
+def _replay_tables(evaluation: Mapping[str, Any]) -> list[Table]:
+    """Of commands replayed: by trajectory and by joint."""
+    tables = []
+    for replay in evaluation.get("replays", ()):
+        errors = replay["errors"]
+        names = list(next(iter(errors.values()))["trajectories"])
+        rows = [{who: 1000 * each["trajectories"][name] for who, each in errors.items()} for name in names]
+        rows.append({who: 1000 * each["mean"] for who, each in errors.items()})
+        title = f"Commands replayed, {replay['name']}: RMS of positions over all joints [mrad; mm]"
+        tables.append(table(title, [*names, "mean of these"], rows))
+        by_joint = {who: [1000 * x for x in each["joints"]] for who, each in errors.items()}
+        title = "The same by joint, over all trajectories [mrad; mm]"
+        tables.append(_by_joint(title, evaluation["joints"], by_joint))
     return tables
 
 

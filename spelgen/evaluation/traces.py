@@ -14,39 +14,38 @@ import torch
 from spelgen.dynamics.bristles import BristleReach
 from spelgen.dynamics.protocol import RigidDynamics
 from spelgen.evaluation.baselines import Predictor
+from spelgen.evaluation.horizons import Predictions
 from spelgen.evaluation.names import MODEL
 from spelgen.evaluation.torque_traces import plain, torque_trace
 from spelgen.fitting.rollout import loss_scales, position_difference
+from spelgen.logs.coverage import coverage
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
-from spelgen.logs.windows import Windows, cut_windows
+from spelgen.logs.windows import Windows
 
-WINDOWS = 64  # that the growth of errors is told from
 TIMES = 24  # at which it is told
 QUANTILES = (0.1, 0.5, 0.9)
-DENSEST = 150.0  # [Hz] inputs of denser logs are averaged
 SHOWN = 240  # samples of a predicted trajectory
-BINS = 24
 
 
 def traces(
     predictors: Sequence[Predictor],
     pieces: Sequence[Trajectory],
-    steps: int,
+    predicted: Predictions | None,
     joint_types: Sequence[str],
     *,
     used: Preprocessing,
     reach: BristleReach,
     tip: Any = None,
 ) -> dict[str, Any]:
-    """All curves. pieces: gap-free and filtered. steps: of the longest horizon, 0: none. tip: its position [m] by q.
+    """All curves. pieces: gap-free and filtered. predicted: of the longest horizon. tip: its position [m] by q.
 
     reach: of the bristles that friction remembers with.
     """
     dynamics = {x.name: x.dynamics for x in predictors if x.dynamics is not None}
-    found: dict[str, Any] = {"coverage": _coverage(pieces)}
-    if steps:
-        found |= _predictions(predictors, pieces, steps, joint_types, used, tip, reach)
+    found: dict[str, Any] = {"coverage": coverage(pieces)}
+    if predicted is not None:
+        found |= _predictions(predicted, joint_types, tip)
     model = next((x for x in predictors if x.name == MODEL and x.dynamics is not None), None)
     if model is not None and model.dynamics is not None:
         found["torques"] = torque_trace(model.dynamics, dynamics, pieces, used, reach)
@@ -55,42 +54,28 @@ def traces(
     return found
 
 
-def _predictions(
-    predictors: Sequence[Predictor],
-    pieces: Sequence[Trajectory],
-    steps: int,
-    joint_types: Sequence[str],
-    used: Preprocessing,
-    tip: Any,
-    reach: BristleReach,
-) -> dict[str, Any]:
+def _predictions(found: Predictions, joint_types: Sequence[str], tip: Any) -> dict[str, Any]:
     """How errors grow with the horizon, and the predictions of the middle and the largest error."""
-    thin = max(1, int(max(piece.sample_rate for piece in pieces) / DENSEST))
-    steps = max(1, steps // thin)
-    fitting = [piece for piece in pieces if len(piece) > steps * thin]
-    stride = -(-sum(len(piece) - steps * thin for piece in fitting) // WINDOWS)
-    starts = [(piece, k) for piece in fitting for k in range(0, len(piece) - steps * thin, stride)]
-    windows = cut_windows(fitting, steps + 1, stride, thin, measured=used.filtered, reach=reach)
+    windows = found.windows
+    steps = windows.dt.shape[1]
     times = np.unique(np.geomspace(1, steps, TIMES).round().astype(int)) - 1
     scales = loss_scales(windows, joint_types)
     grown: dict[str, Any] = {}
     tips: dict[str, Any] = {}
     examples: list[dict[str, Any]] = []
-    for predictor in predictors:
-        with torch.no_grad():
-            q, qd = predictor.states(windows)
+    for name, (q, qd) in found.states.items():
         away = position_difference(q, windows.q[:, 1:], joint_types)
         error = torch.cat([away / scales.q, (qd - windows.qd[:, 1:]) / scales.qd], dim=-1)
         size = error.square().mean(dim=-1).sqrt()  # (W, steps)
-        grown[predictor.name] = _quantiles(size[:, times])
+        grown[name] = _quantiles(size[:, times])
         if tip is not None:
             distance = 1000 * (tip(q[:, times]) - tip(windows.q[:, 1:][:, times])).norm(dim=-1)
-            tips[predictor.name] = _quantiles(distance)
-        if predictor.name == MODEL:
+            tips[name] = _quantiles(distance)
+        if name == MODEL:
             order = size[:, -1].nan_to_num(nan=torch.inf).argsort()
             chosen = {"typical": int(order[len(order) // 2]), "worst": int(order[-1])}
             examples = [
-                _example(which, starts[k], windows[k : k + 1], q[k], qd[k], size[k, -1].item())
+                _example(which, found.starts[k], windows[k : k + 1], q[k], qd[k], size[k, -1].item())
                 for which, k in chosen.items()
             ]
     seconds = windows.dt.cumsum(dim=1).mean(dim=0)[times]
@@ -187,19 +172,3 @@ def _friction(
         for k in range(n)
     ]
     return {"qd": plain(speeds.mT), "by": curves, "measured": left}
-
-
-def _coverage(pieces: Sequence[Trajectory]) -> dict[str, Any]:
-    """Of each joint: its range, and how many samples fall into equal bins of it; of q and of qd."""
-    found: dict[str, Any] = {"seconds": plain(sum(piece.duration for piece in pieces))}
-    for name in ("q", "qd"):
-        values = np.concatenate([getattr(piece, name) for piece in pieces])
-        found[name] = [
-            {
-                "low": plain(x.min()),
-                "high": plain(x.max()),
-                "counts": np.histogram(x, BINS)[0].tolist(),
-            }
-            for x in values.T
-        ]
-    return found

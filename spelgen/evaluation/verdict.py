@@ -99,7 +99,15 @@ def _uses(evaluation: Mapping[str, Any]) -> tuple[list[str], list[str], list[str
             if error <= 1
             else f"is off by {error:.3g} times the motion after {name}{away}"
         )
-    elif horizons:
+    replay = next(iter(evaluation.get("replays") or ()), None)
+    if replay:
+        errors = {name: each["mean"] for name, each in replay["errors"].items()}
+        good += ["simulation from commands"] if errors[MODEL] == min(errors.values()) else []
+        bad += [] if good else ["simulation from commands"]
+        proofs.append(
+            f"misses {1000 * errors[MODEL]:.3g} mrad of the positions that follow commands, {replay['name']}"
+        )
+    elif horizons and not known:
         bad.append("simulation")
         proofs.append("predicts nothing that stays finite")
     return good, bad, proofs

@@ -13,7 +13,7 @@ from spelgen.exporting.c_networks import network_source
 from spelgen.exporting.c_residual_calls import residual_calls
 from spelgen.exporting.c_statements import statements
 from spelgen.exporting.description import TrainedModel
-from spelgen.exporting.entry_points import ENTRY_POINTS, EntryPoint, expression_function, residuals_needed
+from spelgen.exporting.entry_points import EntryPoint, entry_points, expression_function, residuals_needed
 from spelgen.templates import render
 
 _WIDTH = 118
@@ -32,7 +32,7 @@ class CEntry:
 
 def c_entries(model: TrainedModel) -> tuple[CEntry, ...]:
     """Every entry point of the model in C."""
-    return tuple(_entry(model, entry) for entry in ENTRY_POINTS)
+    return tuple(_entry(model, entry) for entry in entry_points(model))
 
 
 def c_header(model: TrainedModel, entries: Sequence[CEntry], measured: str) -> str:
@@ -41,6 +41,11 @@ def c_header(model: TrainedModel, entries: Sequence[CEntry], measured: str) -> s
     facts = [
         f"{measured}; at most {count.operations} operations, in {count.name}, beside those of networks.",
     ]
+    if model.servos is not None:
+        facts.append(
+            f"Joints are under position servos: tau of {model.name}_servo_torque goes into forward_dynamics, with the "
+            f"command of {model.servos.delay:.4g} s before as u."
+        )
     shape = (
         f": joint by joint, {model.bristles.count} each" if model.bristles else ": none, and z may be NULL"
     )

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from spelgen.exporting.c_code import c_entries, c_header, c_source
 from spelgen.exporting.c_library import CLibrary, compile_object, compiler, link_library, measured
-from spelgen.exporting.entry_points import ENTRY_POINTS
+from spelgen.exporting.entry_points import entry_points
 from spelgen.exporting.exported import Exported
 from spelgen.exporting.parity import check_parity
 from spelgen.exporting.readme import UNITS, readme
@@ -46,7 +46,7 @@ def c_files(trained: Trained) -> tuple[dict[str, bytes], str]:
             compiled = compile_object(place, program)
             sizes = measured(compiled, program)
             library = CLibrary(link_library(compiled, program), model)
-            names = [entry.name for entry in ENTRY_POINTS]
+            names = [entry.name for entry in entry_points(model)]
             parity = check_parity(library, trained, names, TOLERANCE, memory=model.memory)
         checked = f"Checked when exported, compiled by {Path(program).name}: {parity.summary}."
     files = {header: c_header(model, entries, sizes), f"{model.name}.c": source}

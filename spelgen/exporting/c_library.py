@@ -15,7 +15,7 @@ import numpy as np
 
 from spelgen.errors import RunError
 from spelgen.exporting.description import TrainedModel
-from spelgen.exporting.entry_points import ENTRY_POINTS
+from spelgen.exporting.entry_points import ENTRY_POINTS, SERVO
 from spelgen.exporting.parity import Values
 
 FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror")
@@ -48,7 +48,7 @@ def measured(object_file: Path, program: str) -> str:
     usage = object_file.with_suffix(".su")
     frames = [line.split("\t") for line in usage.read_text().splitlines()] if usage.exists() else []
     own = {name.rsplit(":", 1)[-1]: int(size) for name, size, _ in frames}
-    public = [own[name] for name in own if any(name.endswith(entry.name) for entry in ENTRY_POINTS)]
+    public = [own[name] for name in own if any(name.endswith(entry.name) for entry in (*ENTRY_POINTS, SERVO))]
     inner = sum(own.values()) - sum(public)  # at most: as if each called the next
     version = subprocess.run([program, "-dumpfullversion"], capture_output=True, text=True, check=False)
     which = f"{Path(program).name} {version.stdout.strip()} -O2 on {platform.machine()}"
@@ -70,7 +70,7 @@ class CLibrary:
 
     def __init__(self, library: Path, model: TrainedModel, dtype: Any = np.float64) -> None:
         self._library, self._model, self._dtype = ctypes.CDLL(str(library)), model, dtype
-        self._entries = {entry.name: entry for entry in ENTRY_POINTS}
+        self._entries = {entry.name: entry for entry in (*ENTRY_POINTS, SERVO)}
 
     def __call__(self, name: str, inputs: Values) -> Mapping[str, np.ndarray]:
         """An entry point's outputs, (states, ...), as float64."""

@@ -12,8 +12,8 @@ import numpy as np
 from spelgen.exporting.casadi_residuals import residual_values
 from spelgen.exporting.description import TrainedModel
 from spelgen.exporting.entry_points import (
-    ENTRY_POINTS,
     EntryPoint,
+    entry_points,
     expression_function,
     residuals_needed,
 )
@@ -45,7 +45,7 @@ def export_casadi(trained: Trained) -> Exported:
 def casadi_functions(model: TrainedModel) -> dict[str, ca.Function]:
     """Every entry point: of scalar expressions, and of matrices what stands beside rigid bodies."""
     found: dict[str, ca.Function] = {}
-    for entry in ENTRY_POINTS:
+    for entry in entry_points(model):
         if entry.level == "jets" and model.residuals:
             found[entry.name] = _derivatives(entry, found[entry.name.removesuffix("_derivatives")])
         else:

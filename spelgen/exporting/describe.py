@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from spelgen.exporting.describe_residuals import array, constant_residual, residuals, unsupported
-from spelgen.exporting.description import Bristles, FrictionLaw, TrainedModel
+from spelgen.exporting.description import Bristles, FrictionLaw, Servos, TrainedModel
 from spelgen.exporting.tip_chain import tip_chain
 from spelgen.fitting.stages import is_closed_form
 from spelgen.loaded_arm import LoadedArm
@@ -51,6 +51,7 @@ def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
             tip_link=tip_link,
             tip=tip,
             tip_end=end,
+            servos=servos_of(exact),
         )
 
 
@@ -70,3 +71,11 @@ def _bristles(dynamics: Any, prepared: Any) -> Bristles | None:
     if fractions is None or not fractions.shape[-1]:
         return None
     return Bristles(array(dynamics.friction.bristles.reach), array(fractions))
+
+
+def servos_of(model: Any) -> Servos | None:
+    """The position servos of a model, None where it has none."""
+    if not hasattr(model, "servo"):
+        return None
+    kp, kd, limit = (array(x) for x in model.servo.prepare())
+    return Servos(kp, kd, limit, float(model.servo.delay))

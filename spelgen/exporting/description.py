@@ -117,6 +117,16 @@ class Residuals:
 
 
 @dataclass(frozen=True, eq=False)
+class Servos:
+    """``runtime.position_servo``: kp, kd and limit, (n,), the last infinite where nothing limits; delay [s]."""
+
+    kp: np.ndarray
+    kd: np.ndarray
+    limit: np.ndarray
+    delay: float
+
+
+@dataclass(frozen=True, eq=False)
 class TrainedModel:
     """A trained arm of n joints. Units: rad and Nm, or m and N.
 
@@ -145,6 +155,7 @@ class TrainedModel:
     tip_link: str
     tip: tuple[TipJoint, ...]
     tip_end: np.ndarray
+    servos: Servos | None = None
 
     @property
     def n(self) -> int:

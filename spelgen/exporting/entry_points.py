@@ -17,7 +17,7 @@ from spelgen.exporting.tip_expressions import tip
 class EntryPoint:
     """A question: what is given, and what is answered (name, unit).
 
-    ``inputs`` are among q, qd, qdd, tau, dq (n rows) and z (friction's memory).
+    ``inputs`` are among q, qd, qdd, tau, u, dq (n rows) and z (friction's memory).
     """
 
     name: str
@@ -91,6 +91,17 @@ ENTRY_POINTS = (
         lambda m: m.forward_dynamics_derivatives(),
     ),
 )  # fmt: skip
+
+
+SERVO = EntryPoint(
+    "servo_torque", "what position servos give under a command u, delayed as it was found", ("u", "q", "qd"),
+    (("tau", _TORQUE),), "values", lambda m: (m.servo_torque,),
+)  # fmt: skip
+
+
+def entry_points(model: TrainedModel) -> tuple[EntryPoint, ...]:
+    """What this model can be asked."""
+    return ENTRY_POINTS if model.servos is None else (*ENTRY_POINTS, SERVO)
 
 
 def expression_function(entry: EntryPoint, model: TrainedModel) -> ca.Function:

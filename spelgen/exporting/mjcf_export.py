@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import torch
 
+from spelgen.exporting.describe import servos_of
 from spelgen.exporting.exported import Exported
 from spelgen.exporting.mjcf_file import mjcf_text
 from spelgen.exporting.parity import STATES, Parity, random_inputs, relative
@@ -28,14 +29,18 @@ def export_mjcf(trained: Trained) -> Exported:
     projection = rigid_body_projection(trained.model, trained.arm)
     exact: Any = copy.deepcopy(trained.model).double().cpu().requires_grad_(False)
     gains = exact.input_matrix(torch.zeros(exact.n, dtype=torch.float64)).numpy()
-    text = mjcf_text(projection, gains, trained.tip_in_body)
+    servos = servos_of(exact)
+    text = mjcf_text(projection, gains, trained.tip_in_body, servos)
     summary = projection_summary(projection)
-    parity = check_mjcf(text, projection, gains)
+    parity = check_mjcf(text, projection, gains, exact.servo if servos else None)
     checked = f"Checked when exported, by MuJoCo {mujoco.__version__}, friction apart: {parity.summary}"
     use = (
         "mujoco.MjModel.from_xml_path(FILE.xml): bodies by the names of the links that their joints move, armature, "
         "viscous friction as damping and Coulomb friction as frictionloss, a motor for each input."
     )
+    if servos is not None:
+        use = use.replace("a motor for each input", "a position actuator for each servo")
+        use += f" Give ctrl the command of {servos.delay:.4g} s before."
     about = f"{UNITS}; a body's frame has its joint's axis as z; torque offsets of the sensors are left out."
     name = trained.arm.arm.name
     last = f"{'; '.join((checked, *summary))}."
@@ -44,9 +49,12 @@ def export_mjcf(trained: Trained) -> Exported:
 
 
 def check_mjcf(
-    text: bytes, projection: RigidBodyProjection, gains: np.ndarray, states: int = STATES
+    text: bytes, projection: RigidBodyProjection, gains: np.ndarray, servo: Any = None, states: int = STATES
 ) -> Parity:
-    """M, bias and forward dynamics without friction, by MuJoCo and by the bodies' own model. Raises RunError."""
+    """M, bias and forward dynamics without friction, by MuJoCo and by the bodies' own model. Raises RunError.
+
+    servo: of a model with position servos, whose actuators are given commands.
+    """
     model, arm = projection.bodies, projection.arm.arm
     simulated = mujoco.MjModel.from_xml_string(text.decode())
     simulated.dof_damping[:], simulated.dof_frictionloss[:] = 0.0, 0.0
@@ -60,9 +68,10 @@ def check_mjcf(
     actuators = [simulated.actuator(c.name).id for c in arm.coordinates if _driven(simulated, c.name)]
     driven = [k for k, c in enumerate(arm.coordinates) if _driven(simulated, c.name)]
     masses, biases, accelerations = [], [], []
-    for q, qd, tau in zip(inputs["q"], inputs["qd"], inputs["tau"], strict=True):
+    controls = inputs["tau"] if servo is None else inputs["u"]
+    for q, qd, control in zip(inputs["q"], inputs["qd"], controls, strict=True):
         data.qpos[:], data.qvel[:] = jacobian @ q + offset, jacobian @ qd
-        data.ctrl[actuators] = tau[driven]
+        data.ctrl[actuators] = control[driven]
         mujoco.mj_forward(simulated, data)
         full = np.zeros((simulated.nv, simulated.nv))
         mujoco.mj_fullM(simulated, data, full)
@@ -75,6 +84,7 @@ def check_mjcf(
         "bias": relative(np.array(biases), model.nonlinear_effects(q, qd).numpy()),
     }
     if simulated.nv == model.n:  # with followers MuJoCo's constraint is soft
+        tau = tau if servo is None else servo(torch.from_numpy(inputs["u"]), q, qd)
         force = tau @ torch.from_numpy(gains.T) - model.nonlinear_effects(q, qd)
         free = torch.linalg.solve(model.mass_matrix(q), force.unsqueeze(-1))
         differences["forward_dynamics"] = relative(np.array(accelerations), free.squeeze(-1).numpy())

@@ -8,14 +8,21 @@ import numpy as np
 from lxml import etree
 
 from spelgen.arm.arm import Body, Coordinate
+from spelgen.exporting.description import Servos
 from spelgen.exporting.rigid_body_projection import RigidBodyProjection
 from spelgen.exporting.urdf_file import about_center
 
 
-def mjcf_text(projection: RigidBodyProjection, inputs: np.ndarray, tip: tuple[str, int, np.ndarray]) -> bytes:
+def mjcf_text(
+    projection: RigidBodyProjection,
+    inputs: np.ndarray,
+    tip: tuple[str, int, np.ndarray],
+    servos: Servos | None = None,
+) -> bytes:
     """The MJCF of these bodies.
 
-    inputs: G, (n, n), each of whose columns that is not zero becomes an actuator. tip: a link, the body that it moves
+    inputs: G, (n, n), each of whose columns that is not zero becomes an actuator; under position servos each joint has
+    one for its position instead. tip: a link, the body that it moves
     with, and its pose in that body's frame, (4, 4).
     """
     arm = projection.arm.arm
@@ -31,7 +38,10 @@ def mjcf_text(projection: RigidBodyProjection, inputs: np.ndarray, tip: tuple[st
     pose_of = {"pos": _numbers(pose[:3, 3]), "quat": _numbers(_quaternion(pose[:3, :3]))}
     etree.SubElement(placed[carrier], "site", name=link, **pose_of)
     _couple(root, arm.bodies, arm.coordinates)
-    _drive(root, arm.coordinates, inputs)
+    if servos is None:
+        _drive(root, arm.coordinates, inputs)
+    else:
+        _hold(root, arm.coordinates, servos)
     etree.indent(root)
     return etree.tostring(root, xml_declaration=True, encoding="utf-8") + b"\n"
 
@@ -99,6 +109,16 @@ def _drive(root: etree._Element, coordinates: tuple[Coordinate, ...], inputs: np
             (joint,) = np.flatnonzero(column)
             where = coordinates[int(joint)].name
             etree.SubElement(actuators, "motor", name=name, joint=where, gear=_number(column[joint]))
+
+
+def _hold(root: etree._Element, coordinates: tuple[Coordinate, ...], servos: Servos) -> None:
+    """A position actuator for each joint; its control is the delayed command."""
+    actuators = etree.SubElement(root, "actuator")
+    for coordinate, kp, kd, limit in zip(coordinates, servos.kp, servos.kd, servos.limit, strict=True):
+        about = {"name": coordinate.name, "joint": coordinate.name, "kp": _number(kp), "kv": _number(kd)}
+        if np.isfinite(limit):
+            about["forcerange"] = _numbers((-limit, limit))
+        etree.SubElement(actuators, "position", about)
 
 
 def _quaternion(rotation: np.ndarray) -> np.ndarray:

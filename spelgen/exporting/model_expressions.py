@@ -22,20 +22,32 @@ from spelgen.exporting.solved_expressions import solved
 
 
 class ModelExpressions:
-    """M(q) qdd + h(q, qd) + friction = G (tau - offset), in symbols q, qd, qdd, tau, z, dq of n or ``memory`` rows.
+    """M(q) qdd + h(q, qd) + friction = G (tau - offset), in symbols q, qd, qdd, tau, u, z, dq of n or ``memory`` rows.
 
     level: in which form ``residuals`` come in, see ``ResidualSymbols``.
     """
 
     def __init__(self, model: TrainedModel, level: Level = "rates") -> None:
         self.model, self.n, self.level = model, model.n, level
-        self.q, self.qd, self.qdd, self.tau, self.dq = (
-            ca.SX.sym(name, self.n) for name in ("q", "qd", "qdd", "tau", "dq")
+        self.q, self.qd, self.qdd, self.tau, self.dq, self.u = (
+            ca.SX.sym(name, self.n) for name in ("q", "qd", "qdd", "tau", "dq", "u")
         )
         self.z = ca.SX.sym("z", model.memory)
         self.residuals = ResidualSymbols.of(model)
         self._places = entry_places(model)
         self._rigid = RigidExpressions(model, self.q)
+
+    @property
+    def servo_torque(self) -> ca.SX:
+        """What position servos give under the delayed command u."""
+        servos = self.model.servos
+        assert servos is not None
+        torque = ca.DM(servos.kp) * (self.u - self.q) - ca.DM(servos.kd) * self.qd
+        rows = [
+            ca.fmax(-ca.fmax(-torque[k], -limit), -limit) if np.isfinite(limit) else torque[k]
+            for k, limit in enumerate(servos.limit.tolist())
+        ]
+        return ca.vertcat(*rows)
 
     @cached_property
     def _composite(self) -> tuple[ca.SX, ca.SX]:

@@ -97,7 +97,8 @@ def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 
     qd, qdd, dq = (size * speed * random.standard_normal(q.shape) for size in (0.5, 2.0, 0.05))
     z = 1e-4 * random.standard_normal((states, memory))
     tau = 10.0 * random.standard_normal(q.shape)
-    return {"q": q, "qd": qd, "qdd": qdd, "tau": tau, "z": z, "dq": dq}
+    u = q + 0.3 * random.standard_normal(q.shape)
+    return {"q": q, "qd": qd, "qdd": qdd, "tau": tau, "z": z, "dq": dq, "u": u}
 
 
 def relative(found: np.ndarray, expected: np.ndarray) -> float:
@@ -117,6 +118,8 @@ def reference(name: str, model: Any, arm: LoadedArm, inputs: Values) -> dict[str
         if name.startswith("tip_"):
             tip = tip_kinematics(arm)
             found = {"pose": tip.pose(q)} if name == "tip_pose" else {"jacobian": tip.jacobian(q)}
+        elif name == "servo_torque":
+            found = {"tau": model.servo(torch.from_numpy(inputs["u"]), q, qd)}
         elif name == "energy":
             kinetic = 0.5 * (model.momentum(q, qd) * qd).sum(dim=-1)
             found = {"energy": torch.stack([kinetic, model.potential_energy(q)], dim=-1)}

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 import yaml
 
+from spelgen.exporting.describe import servos_of
 from spelgen.exporting.exported import Exported
 from spelgen.exporting.readme import UNITS, readme
 from spelgen.exporting.rigid_body_projection import (
@@ -25,6 +26,9 @@ LAW = (
     "with z' = qd - |qd| z / bristle_reach the sum of bristle_fractions z / bristle_reach; all of it times a factor "
     "that goes with the joint's position, between the two numbers of position_factor, or one where there are none"
 )
+
+
+SERVO = "clip(kp (u - q) - kd qd, -limit, limit), u commanded `delay` [s] before"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -95,6 +99,7 @@ def friction_text(trained: Trained, projection: RigidBodyProjection) -> str:
     if hasattr(friction, "bristles"):
         constants["bristle_reach"] = friction.bristles.reach
     joints: dict[str, Any] = {}
+    servos = servos_of(trained.model)
     for index, name in enumerate(trained.joint_names):
         simple = {
             "viscous": projection.viscous[index],
@@ -102,12 +107,18 @@ def friction_text(trained: Trained, projection: RigidBodyProjection) -> str:
         }
         own = {key: value.detach().double().cpu()[index].tolist() for key, value in constants.items()}
         joints[name] = {"viscous_coulomb": _rounded(simple)} | ({"law": _rounded(own)} if own else {})
+        if servos is not None:
+            held = {"kp": servos.kp[index], "kd": servos.kd[index], "limit": servos.limit[index]}
+            joints[name]["servo"] = _rounded({key: x for key, x in held.items() if x < float("inf")})
     content = {
         "units": "Nm, Nm s/rad and rad/s of revolute joints; N, N s/m and m/s of prismatic ones",
         "viscous_coulomb": "viscous qd + coulomb[0] where qd > 0, + coulomb[1] where qd < 0",
     }
     return yaml.safe_dump(
-        content | ({"law": LAW} if constants else {}) | {"joints": joints},
+        content
+        | ({"law": LAW} if constants else {})
+        | ({"servo": SERVO, "delay": _rounded(servos.delay)} if servos else {})
+        | {"joints": joints},
         sort_keys=False,
         allow_unicode=True,
     )

@@ -13,7 +13,7 @@ from pydantic import Field, ValidationError, model_validator
 from spelgen.errors import OptionError, SettingsError, collect, suggestion
 from spelgen.settings.values import Count, Group, NonNegative, Positive, Whole
 
-Objective = Literal["torque", "momentum", "rollout"]
+Objective = Literal["torque", "momentum", "rollout", "servo"]
 Optimizer = Literal["adamw", "lbfgs"]
 Solver = Literal["rk4", "dopri5"]
 Window = Annotated[Count, Field(ge=2)]
@@ -199,8 +199,21 @@ class Rollout(OnWindows):
     compile: bool = False
 
 
+class ServoFit(FitConfig):
+    """Fit position servos, friction and weight of an arm to the positions that follow its commands (see `fit_servos`).
+
+    windows: at most so many, of 4 s, evenly spread over the logs.
+    """
+
+    objective: ClassVar[Objective] = "servo"
+    epochs: ClassVar[int] = 0
+    window: ClassVar[int] = 5
+
+    windows: Count = 200
+
+
 WindowConfig = TorqueFit | MomentumFit | Rollout
-CONFIGS: dict[str, type[FitConfig]] = {x.objective: x for x in (TorqueFit, MomentumFit, Rollout)}
+CONFIGS: dict[str, type[FitConfig]] = {x.objective: x for x in (TorqueFit, MomentumFit, Rollout, ServoFit)}
 OWNERS: dict[str, list[str]] = {
     name: [objective for objective, config in CONFIGS.items() if name in config.model_fields]
     for name in dict.fromkeys(name for config in CONFIGS.values() for name in config.model_fields)

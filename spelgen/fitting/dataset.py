@@ -16,7 +16,7 @@ from spelgen.fitting.rollout import LossScales, loss_scales
 from spelgen.logs.checks import check
 from spelgen.logs.epoch_windows import EpochWindows, WindowCutting
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.trajectory import Trajectory, require_joints
+from spelgen.logs.trajectory import Trajectory, gap_ends, require_joints, require_torques
 from spelgen.logs.windows import Split, Windows, split_validation, thinned
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ class TrainingData:
     training: all of them, or where the logs are larger than memory an even sample, and `stream` draws those
     that are fitted. preprocessing: as it was resolved. digest: of every number, to resume on the same data only.
     recordings: what all was cut from, validation included; of logs larger than memory chunks. calibration: of all of
-    these, None where they are too short.
+    these, None where they are too short. counts: training windows of each trajectory; none of logs larger than memory.
     """
 
     training: Windows
@@ -48,6 +48,7 @@ class TrainingData:
     chunks: tuple[Chunk, ...] = ()
     stream: EpochWindows | None = None
     calibration: CalibrationWindows | None = None
+    counts: tuple[int, ...] = ()
 
     @property
     def size(self) -> int:
@@ -76,6 +77,7 @@ def prepare_data(
     everything = [*trajectories] if isinstance(validation, float) else [*trajectories, *validation]
     for trajectory in everything:
         require_joints(trajectory, joints)
+    require_torques(everything)
     notes = check(everything, joints, joint_types)
     resolved = preprocessing.resolved([x.sample_rate for x in everything])
     cutting = WindowCutting(config.window, config.stride, resolved, reach)
@@ -91,6 +93,9 @@ def prepare_data(
         digest=digest(everything),
         recordings=tuple(everything),
         calibration=calibration_windows(held_sources(everything), resolved, known_reach(reach, joint_types)),
+        counts=tuple(
+            sum(map(cutting.count, np.diff(gap_ends(x.t, resolved.gap)).tolist())) for x in split.training
+        ),
     )
 
 

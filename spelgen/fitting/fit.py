@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any, cast
 from spelgen.dynamics.bristles import bristle_reach
 from spelgen.errors import Diagnostic, RunError
 from spelgen.files import write_json
+from spelgen.fitting import workers
 from spelgen.fitting.compiled import compiled
-from spelgen.fitting.config import FitConfig, Rollout, WindowConfig
+from spelgen.fitting.config import FitConfig, Rollout, ServoFit, WindowConfig
 from spelgen.fitting.dataset import TrainingData, prepare_data
 from spelgen.fitting.fitted import Fit, load_run
 from spelgen.fitting.loop import TrainingLoop
@@ -20,6 +21,7 @@ from spelgen.fitting.progress import TrainingProgress
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.run_lock import locked
 from spelgen.fitting.run_record import describe, require_same
+from spelgen.fitting.servo_run import fit_commands, require_input
 from spelgen.fitting.stages import default_config, fit_torque_stage, is_closed_form
 from spelgen.fitting.streaming import LargeLogs, prepare_streamed
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer, urdf_regularizer
@@ -58,7 +60,8 @@ def fit(
 ) -> Fit:
     """Fit ``model`` to ``logs``; it then has the best weights that were found.
 
-    config: a `TorqueFit`, `MomentumFit` or `Rollout`; by default torque for a closed-form model, where logs are
+    config: a `TorqueFit`, `MomentumFit` or `Rollout`, or of an arm under position servos a `ServoFit`, all that it
+    takes, which needs no validation; by default torque for a closed-form model, where logs are
     dense enough for accelerations, and rollout for networks. validation: the fraction of the logs that is set aside,
     whole trajectories drawn by ``seed``, or trajectories. arm: the arm or the URDF that the model was made from,
     for the regularizer towards it and for the run folder.
@@ -66,6 +69,7 @@ def fit(
     resume: go on from the folder's checkpoint, exactly as if there had been no interruption. force: replace a run.
     mapping: how the logs were read, kept with the run. notes: what was found before, to be told with the rest.
     since: from where the allowed time counts (`time.monotonic`); None: from now.
+    In processes that `torchrun` started, each of which calls this, all fit together (see `workers.py`).
     Ctrl-C or SIGTERM end the fit with status "interrupted".
     Raises OptionError for an option that does not apply to this model, LogError, and RunError when the folder holds a
     run or cannot be resumed with this.
@@ -76,7 +80,14 @@ def fit(
     if config is None:
         config = default_config(model, sample_rates(logs))
     config.require(closed_form=closed_form)
-    run = None if folder is None else RunFolder(Path(folder))
+    require_input(model, config)
+    if isinstance(config, ServoFit):
+        return fit_commands(
+            model, logs, config, preprocessing, seed=seed, urdf=_urdf(arm), resume=resume, force=force,
+            folder=None if workers.rank() else folder, mapping=mapping, notes=notes, threads=threads,
+        )  # fmt: skip
+    known = None if folder is None else RunFolder(Path(folder))
+    run = known if workers.rank() == 0 else None  # of several processes one writes
     if run is not None and not resume:
         run.require_free(force=force)
     with threads_of_torch(threads), locked(run.path if run else None):
@@ -89,9 +100,9 @@ def fit(
             "device": device,
             "threads": threads,
         }
-        urdf = run.urdf if resume and run is not None else _urdf(arm)
-        if resume and run is not None:
-            require_same(run, record)
+        urdf = known.urdf if resume and known is not None else _urdf(arm)
+        if resume and known is not None:
+            require_same(known, record)
         regularizer = _regularizer(urdf, model, chosen, data, found)
         if not resume:
             found += fit_torque_stage(model, data, chosen, regularizer)
@@ -108,14 +119,17 @@ def fit(
             regularizer=regularizer,
             stepped=stepped,
             folder=run,
-            seconds=time.monotonic() - (since or began),
+            seconds=workers.agreed(time.monotonic() - (since or began)),
         )
-        if resume and run is not None:
-            loop.restore(run)
+        if resume and known is not None:
+            loop.restore(known)
         elif run is not None:
             loop.save()
             write_json(run.config, record)  # now there is a run, and it can be resumed
-        with TrainingProgress(chosen.epochs, show=progress) as shown, termination_as_interrupt():
+        with (
+            TrainingProgress(chosen.epochs, show=progress and workers.rank() == 0) as shown,
+            termination_as_interrupt(),
+        ):
             for note in found:
                 shown.note(note)
             status = loop.run(shown)
@@ -130,7 +144,7 @@ def fit(
         record=record,
         checkpoint=loop.state(),
         urdf=urdf,
-        folder=None if run is None else run.path,
+        folder=None if known is None else known.path,
         calibration=data.calibration,
     )
 

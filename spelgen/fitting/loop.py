@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 
 from spelgen.errors import RunError
-from spelgen.fitting.config import BATCH, LEARNING_RATE, WindowConfig
+from spelgen.fitting import workers
+from spelgen.fitting.config import BATCH, FEW_WINDOWS, LEARNING_RATE, WindowConfig
 from spelgen.fitting.dataset import TrainingData
 from spelgen.fitting.idle_residuals import idle_residuals
 from spelgen.fitting.optimizers import LBFGS, MiniBatchAdamW, WindowOptimizer
 from spelgen.fitting.progress import TrainingProgress
-from spelgen.fitting.rollout import momentum_loss, rollout_loss
+from spelgen.fitting.rollout import Mean, momentum_loss, rollout_loss
 from spelgen.fitting.run_folder import RunFolder, write_state
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer
 from spelgen.fitting.validation import Validation
@@ -68,13 +69,18 @@ class TrainingLoop:
         self.folder, self.config, self.seed, self.device = folder, config, seed, device
         self.model = model.to(device)
         self.stepped = stepped or self.model
-        self.training = data.training.to(device)
+        self.together = workers.Together(self.model)
+        self.training: Any = data.training.to(device)
         self.scales = data.scales.to(device)
         self.regularizer = None if regularizer is None else regularizer.to(device)
         self.generator = torch.Generator().manual_seed(seed)
         self.stream = data.stream
         self.batch = min(getattr(config, "batch", None) or BATCH, len(self.training))
         self.whole = getattr(config, "optimizer", "lbfgs") == "lbfgs"  # all windows at once
+        if (
+            not self.whole or len(data.training) > FEW_WINDOWS
+        ):  # L-BFGS on few is the same to the last bit unshared
+            self.training = workers.shard(self.training, data.counts)
         self.resting, self.stage_from, self.stage_epoch = idle_residuals(self.model), 0.0, 0
         self.optimizer = self._optimizer(self.generator)
         windows = len(self.training)
@@ -84,21 +90,21 @@ class TrainingLoop:
         self.validation = Validation(self.model, data, config, self.batch, device)
         self.epoch = self.step = self.best_epoch = self.rollbacks = 0
         self.learning_rate_factor, self.seconds = 1.0, seconds
-        self._since, self._pace, self._closing = time.monotonic() - seconds, 0.0, 0.0
+        self._since, self._pace, self._closing = self._now() - seconds, 0.0, 0.0
         self.momentum_done = not config.momentum_steps
         self.history: list[dict[str, Any]] = []
         self._measure()
 
     def run(self, progress: TrainingProgress) -> Status:
         """Go on until an end is reached; Ctrl-C is one and leaves the checkpoint of the last whole epoch."""
-        self._since = time.monotonic() - self.seconds
+        self._since = self._now() - self.seconds
         try:
             self.save()
             if not self.momentum_done:
                 self._momentum_stage(progress)
             while (end := self._end()) is None or self._release(end):
                 record = self._run_epoch()
-                self.seconds = record["seconds"] = time.monotonic() - self._since
+                self.seconds = record["seconds"] = self._now() - self._since
                 self.history.append(record)
                 if self.folder is not None:
                     self.folder.append_metrics(record)
@@ -107,6 +113,11 @@ class TrainingLoop:
         except KeyboardInterrupt:
             return "interrupted"
         return end
+
+    @staticmethod
+    def _now() -> float:
+        """The time [s] by one clock for all processes that fit together, for it decides what they do."""
+        return workers.agreed(time.monotonic())
 
     def _measure(self) -> None:
         """Begin anew from the present weights: substeps, validation loss and best so far."""
@@ -132,7 +143,7 @@ class TrainingLoop:
         optimizer = self._optimizer(torch.Generator().manual_seed(self.seed))
         steps = self.config.momentum_steps
         for done in range(0, steps, EPOCH_STEPS):
-            spent = self._spent(time.monotonic() - self._since) / MOMENTUM_FRACTION
+            spent = self._spent(self._now() - self._since) / MOMENTUM_FRACTION
             if spent >= 1.0:
                 break
             rate = functools.partial(self._momentum_rate, done, spent)
@@ -145,19 +156,24 @@ class TrainingLoop:
             self.model.load_state_dict(before[0])
             self._measure()
         self.momentum_done = True
-        self.seconds = time.monotonic() - self._since
+        self.seconds = self._now() - self._since
         self.save()
 
     def _momentum_rate(self, done: int, spent: float, step: int) -> float:
         part = max((done + step) / self.config.momentum_steps, spent)
         return MOMENTUM_FACTOR * self._largest_rate * _schedule(part)
 
-    def _momentum_loss(self, windows: Windows) -> torch.Tensor:
-        return momentum_loss(self.model, windows, self.scales) + self._penalty()
+    def _momentum_loss(self, windows: Any) -> torch.Tensor:
+        def loss(own: Windows, everywhere: Mean) -> torch.Tensor:
+            return momentum_loss(self.model, own, self.scales, everywhere)
 
-    def _rollout_loss(self, windows: Windows) -> torch.Tensor:
-        solver = self.config.solver
-        return rollout_loss(self.stepped, windows, self.scales, self.substeps, solver) + self._penalty()
+        return self.together(loss, windows) + self._penalty()
+
+    def _rollout_loss(self, windows: Any) -> torch.Tensor:
+        def loss(own: Windows, everywhere: Mean) -> torch.Tensor:
+            return rollout_loss(self.stepped, own, self.scales, self.substeps, self.config.solver)
+
+        return self.together(loss, windows) + self._penalty()
 
     def _end(self) -> Status | None:
         if self.epoch >= self.config.epochs or self._done() >= self._stage_to or self.optimizer.stalled:
@@ -175,9 +191,9 @@ class TrainingLoop:
         while True:
             before = copy.deepcopy((self.model.state_dict(), self.optimizer.state_dict(), self.step))
             loss = self._train_epoch()
-            trained = time.monotonic()
+            trained = self._now()
             validation = self.validation.loss(self.substeps) if math.isfinite(loss) else math.nan
-            self._closing = time.monotonic() - trained
+            self._closing = self._now() - trained
             if math.isfinite(validation):
                 break
             self._roll_back(*before)
@@ -205,10 +221,10 @@ class TrainingLoop:
         """Mean loss over the epoch's steps; NaN as soon as a step has no finite loss or gradient."""
         windows = self.training
         if self.stream is not None:
-            windows = self.stream.epoch(self.epoch).to(self.device)
-        steps, start = self._steps_in_time(), time.monotonic()
+            windows = workers.shard_of_epoch(self.stream, self.epoch).to(self.device)
+        steps, start = self._steps_in_time(), self._now()
         loss = self.optimizer.run(self._rollout_loss, windows, steps, self._rate)
-        self._pace = (time.monotonic() - start) / steps
+        self._pace = (self._now() - start) / steps
         self.step += steps
         return loss
 
@@ -218,7 +234,7 @@ class TrainingLoop:
             return self.epoch_steps
         if not self._pace:
             return min(self.epoch_steps, EPOCH_STEPS)
-        left = 60 * self.config.max_minutes - (time.monotonic() - self._since) - self._closing
+        left = 60 * self.config.max_minutes - (self._now() - self._since) - self._closing
         return max(1, min(self.epoch_steps, int(left / self._pace)))
 
     def _penalty(self) -> torch.Tensor | float:
@@ -295,8 +311,9 @@ class TrainingLoop:
             raise RunError(
                 "a checkpoint of another model", file=folder.checkpoint, do="start a new run"
             ) from error
-        folder.keep_metrics(self.epoch)
-        self.history = folder.read_metrics()
+        if self.folder is not None:  # it writes
+            folder.keep_metrics(self.epoch)
+        self.history = folder.read_metrics()[: self.epoch]
 
 
 def _schedule(part: float) -> float:

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import torch
 
-from spelgen.dynamics.protocol import PortHamiltonianDynamics, memory_after, sliding_memory
+from spelgen.dynamics.protocol import PortHamiltonianDynamics, memory_after, memory_along, sliding_memory
+from spelgen.dynamics.runge_kutta import runge_kutta
 from spelgen.fitting.adaptive import roll_out_adaptive
 from spelgen.fitting.config import Solver
 from spelgen.logs.windows import Windows
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
+
+Mean = Callable[[torch.Tensor], torch.Tensor]
 
 SUBSTEPS = (1, 2, 4, 8, 16, 32)  # rk4 steps between samples
 INTEGRATION_FRACTION = 0.03  # of the model's own error, what the integrator may add
@@ -43,9 +47,9 @@ def roll_out(
     for dt, tau in zip(windows.dt.unbind(1), windows.tau.unbind(1), strict=True):
         step = dt.unsqueeze(-1) / substeps
         for substep in range(substeps):
-            start = q
-            q, p, qd = _runge_kutta(model, q, p, z, tau, prepared, step)
-            z = memory_after(model, z, q - start)
+            rhs = partial(_rate, model, q, z, tau, prepared)
+            moved, p, qd = runge_kutta(rhs, p, step)
+            q, z = q + moved, memory_after(model, z, moved)
             if substep == 0:
                 velocities.append(qd)  # of the sample that the interval starts at
         positions.append(q)
@@ -53,32 +57,17 @@ def roll_out(
     return torch.stack(positions, dim=1), torch.stack(velocities, dim=1)  # each (W, K-1, n)
 
 
-def _runge_kutta(
+def _rate(
     model: PortHamiltonianDynamics,
     q: torch.Tensor,
-    p: torch.Tensor,
     z: torch.Tensor,
     tau: torch.Tensor,
     prepared: Any,
-    step: torch.Tensor,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """q and p (W, n) one `step` (W, 1) [s] later, and q' at its start (Hairer et al., Solving ODEs I, II.1).
-
-    Friction's memory z (W, n, K) follows the displacement exactly, so it needs no stages of its own.
-    """
-
-    def rhs(moved: torch.Tensor, momentum: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        return model.port_hamiltonian_rhs(q + moved, momentum, tau, prepared, memory_after(model, z, moved))
-
-    qd1, pd1 = rhs(torch.zeros_like(q), p)
-    half = step / 2
-    qd2, pd2 = rhs(half * qd1, p + half * pd1)
-    qd3, pd3 = rhs(half * qd2, p + half * pd2)
-    qd4, pd4 = rhs(step * qd3, p + step * pd3)
-    sixth = step / 6
-    q = q + sixth * (qd1 + 2 * (qd2 + qd3) + qd4)
-    p = p + sixth * (pd1 + 2 * (pd2 + pd3) + pd4)
-    return q, p, qd1
+    moved: torch.Tensor,
+    p: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """q' and p' where joints have moved so far from q, where friction's memory was z."""
+    return model.port_hamiltonian_rhs(q + moved, p, tau, prepared, memory_after(model, z, moved))
 
 
 def position_difference(
@@ -145,29 +134,36 @@ def rollout_loss(
     return rollout_errors(model, windows, scales, substeps, solver).square().mean()
 
 
-def momentum_loss(model: EmittedModel, windows: Windows, scales: LossScales) -> torch.Tensor:
+def momentum_loss(
+    model: EmittedModel, windows: Windows, scales: LossScales, everywhere: Mean | None = None
+) -> torch.Tensor:
     """The weak form of the equations: p(t) - p(0) against the impulse of all forces along the measured
     samples.
 
     Forces between samples are the mean of their values at both ends (trapezium rule): no ODE is solved and no
     acceleration needed. What is missing is told as mean torque, in units of its standard deviation at the
     joint. (Told as a velocity, M(q)^-1 times it, it would reward an M that is too large: errors of the measured
-    torque would count less.)
+    torque would count less.) everywhere: from a mean over these windows that over those of all processes.
     """
-    q, qd = windows.q, windows.qd  # (W, K, n)
+    q, qd, tau = windows.q, windows.qd, windows.tau  # (W, K, n), (W, K, n), (W, K-1, n)
+    dynamics, dt = model.dynamics, windows.dt.unsqueeze(-1)
     # velocities are measured, so M need not be positive definite on the way; kept so, descent stops where it is not
     prepared = model.prepare(definite=False)
-    p = model.momentum(q, qd, prepared)
-    z = [sliding_memory(model, qd[:, 0]) if windows.z is None else windows.z]
-    for moved in q.diff(dim=1).unbind(1):
-        z.append(memory_after(model, z[-1], moved))
-    force = model.port_hamiltonian_rhs(q, p, None, prepared, torch.stack(z, dim=1))[1]
-    dt = windows.dt.unsqueeze(-1)
-    inputs = model.input_matrix(q[:, :-1])
-    driven = (inputs @ windows.tau.unsqueeze(-1)).squeeze(-1)
-    impulse = (dt * (driven + (force[:, :-1] + force[:, 1:]) / 2)).cumsum(dim=1)  # (W, K-1, n)
-    missing = (p[:, 1:] - p[:, :1] - impulse) / dt.cumsum(dim=1)
-    unit = (inputs.detach().abs() @ scales.tau).mean(dim=(0, 1))  # gears may stand between motor and joint
+    at = dynamics.configuration(q, prepared)
+    mass, residuals = dynamics.mass_at(at, prepared)
+    p = (mass @ qd.unsqueeze(-1)).squeeze(-1)
+    force = dynamics.lagrangian_gradient(at, qd, residuals, prepared)
+    force = force - dynamics.friction_at(at, qd, prepared, memory_along(model, q, qd, windows.z))
+    driven = [
+        dynamics.input_force(at, qd, torch.cat(held, dim=1), prepared)
+        for held in ((tau, tau[:, -1:]), (tau[:, :1], tau))  # over the interval after each sample, and before
+    ]
+    mean = (force[:, :-1] + driven[0][:, :-1] + force[:, 1:] + driven[1][:, 1:]) / 2
+    missing = (p[:, 1:] - p[:, :1] - (dt * mean).cumsum(dim=1)) / dt.cumsum(dim=1)
+    with torch.no_grad():
+        inputs = dynamics.input_at(at, prepared).abs()
+    unit = (inputs @ scales.tau).mean(dim=(0, 1))  # gears may stand between motor and joint
+    unit = unit if everywhere is None else everywhere(unit)
     return (missing / torch.maximum(unit, 1e-2 * unit.amax())).square().mean()
 
 

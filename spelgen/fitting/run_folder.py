@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from spelgen.addresses import local, sent
 from spelgen.emission.loading import has_run, load_module
 from spelgen.errors import RunError
-from spelgen.files import naming, write_bytes
+from spelgen.files import naming, remove, write_bytes
 from spelgen.fitting.run_schema import require_checkpoint, require_epoch, require_record
 from spelgen.spec import read_source
 from spelgen.urdf.document import urdf_bytes
@@ -36,7 +37,7 @@ class RunFolder:
     path: Path
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "path", Path(self.path))
+        object.__setattr__(self, "path", local(self.path))
 
     @property
     def module(self) -> Path:
@@ -105,7 +106,7 @@ class RunFolder:
             self.baseline,
         )
         for old in (self.config, *robot_files, *found):  # first what makes it a run
-            old.unlink(missing_ok=True)
+            remove(old)
         for path, content in [(self.module, source.encode()), *robot]:
             write_bytes(path, content)
 
@@ -120,6 +121,7 @@ class RunFolder:
         """Add one line to metrics.jsonl."""
         with naming(self.metrics), self.metrics.open("a", encoding="utf-8") as file:
             file.write(json.dumps(record) + "\n")
+        sent(self.metrics)
 
     def write_metrics(self, records: Sequence[dict[str, Any]]) -> None:
         """All lines of metrics.jsonl; no file for none."""

@@ -26,9 +26,11 @@ def is_closed_form(model: Any) -> bool:
 
 
 def default_objective(model: EmittedModel, rates: Sequence[float]) -> str:
-    """What is fitted where nobody says: torque to a closed-form model, where logs are sampled densely enough for
-    accelerations (rates [Hz]); else windows.
+    """What is fitted where nobody says: to an arm under position servos what follows its commands; torque to a
+    closed-form model, where logs are sampled densely enough for accelerations (rates [Hz]); else windows.
     """
+    if hasattr(model, "servo"):
+        return "servo"
     return "torque" if is_closed_form(model) and any(rate >= DENSE for rate in rates) else "rollout"
 
 

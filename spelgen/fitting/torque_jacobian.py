@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch.func import functional_call, jacfwd, jvp, vmap
 
+from spelgen.fitting import workers
 from spelgen.fitting.torque_samples import Block, TorqueSamples
 
 if TYPE_CHECKING:
@@ -38,6 +39,12 @@ class _Samples:
     load_regressor: torch.Tensor
     residual: torch.Tensor
     factor: torch.Tensor
+
+    def own(self) -> _Samples:
+        """Those of this process."""
+        columns: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(self)}
+        mine: dict[str, Any] = {name: x if x is None else workers.own(x) for name, x in columns.items()}
+        return _Samples(**mine)
 
 
 class Left(NamedTuple):
@@ -87,8 +94,8 @@ class TorqueJacobian:
     def squares(self, x: torch.Tensor) -> torch.Tensor:
         """Sums of squares (n,) of the missing torque [Nm^2, N^2]."""
         weights = self._named(x)
-        parts = [self._missing(weights, each).detach().square().sum(dim=0) for each in self._blocks()]
-        return torch.stack(parts).sum(dim=0)
+        parts = [self._missing(weights, each).detach().square().sum(dim=0) for each in self._own_blocks()]
+        return workers.total(torch.stack(parts).sum(dim=0))
 
     def normal_equations(
         self, x: torch.Tensor, noise: torch.Tensor, free: torch.Tensor
@@ -97,11 +104,11 @@ class TorqueJacobian:
         weights = self._named(x)
         count = int(free.sum())
         curvature, target = torch.zeros(count, count).double(), torch.zeros(count).double()
-        for block in self._blocks():
+        for block in self._own_blocks():
             slope = (self._slope(weights, block) / noise[:, None]).flatten(0, 1)[:, free]
             curvature += slope.mT @ slope
             target += slope.mT @ (self._missing(weights, block).detach() / noise).flatten()
-        return curvature, target
+        return workers.total(curvature), workers.total(target)
 
     def left(self, x: torch.Tensor) -> Left:
         """What these weights leave, of all samples."""
@@ -125,9 +132,9 @@ class TorqueJacobian:
         line explains (n,).
         """
         weights = self._named(x)
-        pairs = [(self._missing(weights, each).detach(), each.qd) for each in self._blocks()]
+        pairs = [(self._missing(weights, each).detach(), each.qd) for each in self._own_blocks()]
         sums = [torch.stack([tau * qd, qd * qd, tau * tau]).sum(dim=1) for tau, qd in pairs]
-        both, speeds, squares = torch.stack(sums).sum(dim=0)
+        both, speeds, squares = workers.total(torch.stack(sums).sum(dim=0))
         slope = both / speeds.clamp(min=1e-300)
         return slope, slope * both / squares.clamp(min=1e-300)
 
@@ -151,6 +158,13 @@ class TorqueJacobian:
 
     def _blocks(self) -> Iterator[_Samples]:
         yield from self._computed() if self._held is None else self._held
+
+    def _own_blocks(self) -> Iterator[_Samples]:
+        """As `_blocks`, of each what is this process's (see `workers.py`): sums over all are made of theirs."""
+        if self._held is None:
+            own: Any = (tuple(map(workers.own, block)) for block in self.samples.blocks(BLOCK))
+            return map(self._with_regressors, own)
+        return (block.own() for block in self._held)
 
     def _computed(self) -> Iterator[_Samples]:
         return map(self._with_regressors, self.samples.blocks(BLOCK))

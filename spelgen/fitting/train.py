@@ -94,6 +94,12 @@ def start_from(model: EmittedModel, source: Path | str) -> None:
     model.load_state_dict(run.load_state(run.weights))
 
 
+def mapping_of(model: Any, mapping: LogMapping | None) -> LogMapping:
+    """The mapping, by default as spelgen writes logs, for what this model is commanded."""
+    mapping = mapping or LogMapping()
+    return mapping.model_copy(update={"input": "position"}) if hasattr(model, "servo") else mapping
+
+
 def open_logs(
     model: EmittedModel,
     paths: Iterable[Path | str],
@@ -103,11 +109,10 @@ def open_logs(
     """The training part of log files; of Parquet larger than memory one chunk at a time. Raises LogError, and
     SettingsError where the mapping does not fit.
     """
-    paths, joints = list(paths), model.facts.joints
+    paths, joints, mapping = list(paths), model.facts.joints, mapping_of(model, mapping)
     large = large_files(paths, joints, role="train")
     if large:
         return LargeLogs(tuple(large), joints, tuple(model.joint_types), mapping, preprocessing.gap)
-    mapping = mapping or LogMapping()
     return read_logs(paths, joints, mapping, role="train", joint_types=model.joint_types)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +20,11 @@ from spelgen.identification.identification import identified_dynamics
 from spelgen.identification.identify import identify
 from spelgen.identification.method import LeastSquares
 from spelgen.loaded_arm import LoadedArm, load_arm
+from spelgen.logs.coverage import coverage
 from spelgen.logs.mapping import LogMapping
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.trajectory import Trajectory
 from spelgen.spec import read_facts
 
-BINS = 24
 REMEMBERING = FrictionModel(memory=True)
 
 
@@ -48,7 +47,7 @@ def keep_baseline(run: RunFolder, paths: Iterable[Path | str]) -> None:
     logs = open_logs(model, paths, LogMapping(**record["mapping"]))
     if isinstance(logs, LargeLogs) or not run.urdf.exists():
         return
-    found: dict[str, Any] = {"coverage": _coverage(logs)}
+    found: dict[str, Any] = {"coverage": coverage(logs)}
     try:
         arm, used = run_arm(run), Preprocessing(**record["preprocessing"])
         fit = identify(arm, logs, preprocessing=used)
@@ -76,16 +75,4 @@ def read_baseline(run: RunFolder) -> dict[str, RegressorDynamics]:
     return {
         name: identified_dynamics(arm.arm, friction, np.array(parameters), inputs)
         for name, (friction, parameters) in kept.items()
-    }
-
-
-def _coverage(logs: Sequence[Trajectory]) -> dict[str, list[dict[str, Any]]]:
-    """By joint: the range of q and of qd, and how many samples fall into equal bins of it."""
-    columns = {name: np.concatenate([getattr(log, name) for log in logs]).T for name in ("q", "qd")}
-    return {
-        name: [
-            {"low": float(x.min()), "high": float(x.max()), "counts": np.histogram(x, BINS)[0].tolist()}
-            for x in rows
-        ]
-        for name, rows in columns.items()
     }

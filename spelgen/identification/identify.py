@@ -23,7 +23,7 @@ from spelgen.identification.samples import DynamicsSamples, dynamics_samples
 from spelgen.loaded_arm import LoadedArm, load_arm
 from spelgen.logs.checks import check
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.trajectory import Trajectory, require_joints
+from spelgen.logs.trajectory import Trajectory, require_joints, require_torques
 
 _BLOCK = 2000  # samples in memory at a time
 _ROUNDS = 4  # of weighing each joint by what is left of its torque
@@ -48,6 +48,7 @@ def identify(
     coordinates, inputs = arm.arm.coordinates, arm.actuation.matrix()
     for trajectory in logs:
         require_joints(trajectory, [c.name for c in coordinates])
+    require_torques(logs)
     notes = check(logs, [c.name for c in coordinates], [c.kind for c in coordinates])
     method = method or LeastSquares()
     kinds = [c.kind for c in coordinates]

@@ -13,7 +13,7 @@ from spelgen.logs.checks import Finding, findings, gap_diagnostics, summarised
 from spelgen.logs.gravity import GravityFit, StateSamples, fit_gravity, state_samples
 from spelgen.logs.report import SEEN, JointReport, LogReport
 from spelgen.logs.statistics import Statistics, statistics
-from spelgen.logs.trajectory import QUANTITIES, Trajectory, require_joints
+from spelgen.logs.trajectory import QUANTITIES, Trajectory, require_joints, require_torques
 
 if TYPE_CHECKING:
     from spelgen.loaded_arm import LoadedArm
@@ -45,6 +45,7 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping |
     odd: list[Finding] = []
     for trajectory in logs:
         require_joints(trajectory, joints)
+        require_torques([trajectory])
         measured.append(statistics(trajectory))
         samples.append(state_samples(trajectory, inputs))
         odd += findings(trajectory, joints, kinds, measured[-1].agreement)
@@ -191,6 +192,7 @@ def require_possible_torques(
     logs: Sequence[Trajectory], arm: LoadedArm, mapping: LogMapping | None = None
 ) -> None:
     """Raise LogError where the torques of logs cannot be an arm's, before anything is fitted to them."""
+    require_torques(logs)
     inputs = arm.actuation.matrix()
     fits = fit_gravity(arm.arm, [state_samples(trajectory, inputs) for trajectory in logs])
     collect([

@@ -154,10 +154,14 @@ def velocity_agreement(trajectory: Trajectory) -> VelocityAgreement:
 
 def _constant(trajectory: Trajectory, index: int) -> Iterator[tuple[Code, str, bool]]:
     """Columns that never change."""
-    q, qd, tau = (getattr(trajectory, name)[:, index] for name in ("q", "qd", "tau"))
+    q, qd, tau = trajectory.q[:, index], trajectory.qd[:, index], trajectory.tau[:, index : index + 1]
     drift = np.abs(np.cumsum((qd[1:] + qd[:-1]) / 2 * np.diff(trajectory.t))).max(initial=0.0)
-    if np.ptp(tau) == 0:
-        yield ("constant-torque", (f"tau is always {tau[0]:g}: right for a joint without a motor only"), True)
+    if tau.size and np.ptp(tau) == 0:
+        yield (
+            "constant-torque",
+            (f"tau is always {tau[0, 0]:g}: right for a joint without a motor only"),
+            True,
+        )
     if np.ptp(q) > 0 and np.ptp(qd) == 0 and np.ptp(q) > DRIFT:
         yield "frozen", f"qd always {qd[0]:g} while q goes from {q.min():.3g} to {q.max():.3g}", False
     elif np.ptp(q) == 0 and drift > DRIFT:

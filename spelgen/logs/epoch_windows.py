@@ -66,23 +66,24 @@ class EpochWindows:
         """Epochs in which all windows are passed over once."""
         return min(len(self.chunks), -(-len(self) // EPOCH))
 
-    def epoch(self, number: int) -> Windows:
-        """The windows of one epoch: each pass over all chunks takes each once, in an order of its own.
+    def drawn(self, number: int) -> list[int]:
+        """The chunks of one epoch: each pass over all chunks takes each once, in an order of its own.
 
         It depends on the number and the seed alone, so that a resumed run draws the same.
         """
         turn, place = divmod(number, self.epochs_per_pass)
         order = np.random.default_rng([self.seed, turn]).permutation(len(self.chunks))
-        return self._windows(sorted(np.array_split(order, self.epochs_per_pass)[place].tolist()))
+        return sorted(np.array_split(order, self.epochs_per_pass)[place].tolist())
 
     def sample(self, most_chunks: int, most: int) -> Windows:
         """About `most` windows, evenly spread over at most so many chunks, evenly spread themselves."""
         chosen = range(0, len(self.chunks), -(-len(self.chunks) // most_chunks))
         each = max(1, most // len(chosen))
         # joined one by one: a slice would keep all windows of its chunk
-        return joined([joined([thinned(self._windows([index]), each)]) for index in chosen])
+        return joined([joined([thinned(self.windows([index]), each)]) for index in chosen])
 
-    def _windows(self, chunks: Sequence[int]) -> Windows:
+    def windows(self, chunks: Sequence[int]) -> Windows:
+        """All windows of these chunks, in their order."""
         found = joined([self.cutting.windows([self.chunks[index].load()]) for index in chunks])
         pa.default_memory_pool().release_unused()
         return found

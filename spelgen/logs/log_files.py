@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
+from spelgen.addresses import local
 from spelgen.errors import LogError, SpelgenError
 from spelgen.logs.tables import SUFFIXES, is_log
 
-KINDS = f"{', '.join(SUFFIXES)}, or the folder of a ROS 2 bag"
+KINDS = f"{', '.join(SUFFIXES)}, the folder of a ROS 2 bag or of a LeRobot data set"
 
 
 def log_files(
@@ -16,7 +17,8 @@ def log_files(
 ) -> list[Path]:
     """The files and bags that these paths name, each once; what cannot be one is added to the errors."""
     files: dict[Path, None] = {}
-    for path in map(Path, [paths] if isinstance(paths, str | Path) else paths):
+    for given in [paths] if isinstance(paths, str | Path) else paths:
+        path = local(given)
         if is_log(path):
             files[path] = None
         elif path.is_dir():
@@ -30,7 +32,7 @@ def log_files(
             files |= dict.fromkeys(found)
         elif not path.exists():
             errors.append(
-                LogError("no such file or folder", file=path, expected="a log", do="check the path")
+                LogError("no such file or folder", file=given, expected="a log", do="check the path")
             )
         elif not path.is_file():
             errors.append(LogError("a pipe or a device", file=path, expected=f"a file: {KINDS}"))

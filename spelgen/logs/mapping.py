@@ -1,6 +1,7 @@
 """How a user's logs are named and measured: the group `logs` of a sidecar file, or a mapping file of its own.
 
-q = sign * unit * value + offset, qd = sign * unit * value, tau = sign * gain * unit * value + torque_offset.
+q = sign * unit * value + offset, and so is u, a commanded position; qd = sign * unit * value,
+tau = sign * gain * unit * value + torque_offset.
 """
 
 from __future__ import annotations
@@ -14,7 +15,14 @@ from pydantic import Field, model_validator
 from spelgen.errors import SettingsError
 from spelgen.settings.values import Group, Number, Positive
 
-PLAIN = {"t": "t", "trajectory": "trajectory", "q": "q_{joint}", "qd": "qd_{joint}", "tau": "tau_{joint}"}
+PLAIN = {
+    "t": "t",
+    "trajectory": "trajectory",
+    "q": "q_{joint}",
+    "qd": "qd_{joint}",
+    "tau": "tau_{joint}",
+    "u": "u_{joint}",
+}
 """Columns as spelgen itself writes them."""
 
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
@@ -43,6 +51,7 @@ class LogColumns(Group):
     q: str = PLAIN["q"]
     qd: str = PLAIN["qd"]
     tau: str = PLAIN["tau"]
+    u: str = PLAIN["u"]
 
 
 class JointColumns(Group):
@@ -51,6 +60,7 @@ class JointColumns(Group):
     q: str | None = None
     qd: str | None = None
     tau: str | None = None
+    u: str | None = None
 
 
 class JointUnits(Group):
@@ -59,6 +69,7 @@ class JointUnits(Group):
     q: Position | None = None
     qd: Velocity | None = None
     tau: Effort | None = None
+    u: Position | None = None
 
 
 class LogUnits(JointUnits):
@@ -94,8 +105,9 @@ class JointLog(Group):
 
 
 class LogMapping(Group):
-    """From a log's columns to t, q, qd, tau in SI units.
+    """From a log's columns to t, q, qd, tau in SI units, or to t, q and the commanded positions u.
 
+    input: "position" where joints are commanded positions: u is read, and neither qd nor tau are.
     topic: of the ROS 2 bag, where it holds several with joint states. velocity: "differentiated" where the
     log has none. Files that spelgen wrote itself are read as they are, whatever stands here.
     """
@@ -103,6 +115,7 @@ class LogMapping(Group):
     topic: str | None = None
     columns: LogColumns = LogColumns()
     units: LogUnits = LogUnits()
+    input: Literal["torque", "position"] = "torque"
     velocity: Literal["logged", "differentiated"] = "logged"
     joints: dict[str, JointLog] = Field(default={})
 
@@ -115,7 +128,7 @@ class LogMapping(Group):
         return self.joint(joint).name or joint
 
     def column(self, quantity: str, joint: str) -> str:
-        """The column that holds "q", "qd" or "tau" of a joint."""
+        """The column that holds "q", "qd", "tau" or "u" of a joint."""
         own: str | None = getattr(self.joint(joint).columns, quantity)
         pattern: str = getattr(self.columns, quantity)
         return own or pattern.replace("{joint}", self.log_name(joint))
@@ -126,9 +139,9 @@ class LogMapping(Group):
         return self.model_copy(update={"columns": LogColumns(**named)})
 
     def unit(self, quantity: str, joint: str) -> str | None:
-        """The unit of "q", "qd" or "tau" of a joint; None where none was said."""
-        own: str | None = getattr(self.joint(joint).units, quantity)
-        return own or getattr(self.units, quantity)
+        """The unit of "q", "qd", "tau" or "u" of a joint; None where none was said: commands are measured as q is."""
+        own: str | None = getattr(self.joint(joint).units, quantity) or getattr(self.units, quantity)
+        return self.unit("q", joint) if own is None and quantity == "u" else own
 
     def scale(self, quantity: str, joint: str) -> float:
         """What a logged value is multiplied with, sign included."""
@@ -143,14 +156,14 @@ class LogMapping(Group):
     def offset(self, quantity: str, joint: str) -> float:
         """What is added after that."""
         logged = self.joint(joint)
-        return {"q": logged.offset, "tau": logged.torque_offset}.get(quantity, 0.0)
+        return {"q": logged.offset, "u": logged.offset, "tau": logged.torque_offset}.get(quantity, 0.0)
 
     def misfits(self, joints: Sequence[str], joint_types: Sequence[str] | None = None) -> list[SettingsError]:
         """What the mapping lacks for these joints, or says of them that cannot be; empty where it fits."""
         found = []
         kinds: Sequence[str | None] = joint_types or [None] * len(joints)
         for joint, kind in zip(joints, kinds, strict=True):
-            for quantity in ("q", "qd", "tau"):
+            for quantity in ("q", "u") if self.input == "position" else ("q", "qd", "tau"):
                 unit = self.unit(quantity, joint)
                 missing = self._missing(unit, self.joint(joint), kind)
                 if missing:

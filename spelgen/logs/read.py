@@ -19,7 +19,7 @@ from spelgen.logs.arm_mapping import GivenMapping, log_source
 from spelgen.logs.log_files import log_files
 from spelgen.logs.readers import read_tables
 from spelgen.logs.tables import UNITS, UNITS_KEY, LogTable
-from spelgen.logs.trajectory import QUANTITIES, Trajectory, require_joints
+from spelgen.logs.trajectory import Trajectory, require_joints
 from spelgen.logs.values import clock_start, made_trajectory, require_increasing_times, values_in_si
 
 ROW_GROUP = 2**16  # rows that are written together: a log too large for memory is read by them
@@ -77,7 +77,7 @@ def write_logs(path: Path | str, trajectories: Sequence[Trajectory], arm: Any) -
         "trajectory": [x.name for x in trajectories for _ in x.t],
         "t": np.concatenate([x.t for x in trajectories]),
     }
-    for quantity in QUANTITIES:
+    for quantity in trajectories[0].quantities:
         values = np.concatenate([getattr(x, quantity) for x in trajectories])
         columns |= {f"{quantity}_{joint}": values[:, i] for i, joint in enumerate(joints)}
     table = pa.table(columns).replace_schema_metadata({UNITS_KEY: UNITS})

@@ -11,6 +11,7 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from spelgen.logs.bags import is_bag, read_bag
+from spelgen.logs.lerobot import dataset_files, dataset_mapping, is_dataset
 from spelgen.logs.mapping import PLAIN, LogMapping
 from spelgen.logs.npz import read_npz
 from spelgen.logs.tables import LogTable, made_layout, opened, stored_columns, table_layout, wanted_quantities
@@ -23,6 +24,9 @@ def read_tables(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[
 
     A Parquet file that spelgen itself wrote is read as such, whatever the mapping says.
     """
+    if is_dataset(file):
+        mapping = dataset_mapping(file, joints, mapping)
+        return [each for part in dataset_files(file) for each in read_tables(part, joints, mapping)]
     if is_bag(file):
         return [_bag(file, joints, mapping)]
     if file.suffix == ".npz":

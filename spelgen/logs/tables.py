@@ -18,6 +18,7 @@ import pyarrow as pa
 from spelgen.errors import LogError
 from spelgen.logs.bags import SUFFIXES as BAG_SUFFIXES
 from spelgen.logs.bags import is_bag
+from spelgen.logs.lerobot import is_dataset
 from spelgen.logs.mapping import TIMES, LogMapping
 from spelgen.logs.trajectory import QUANTITIES
 
@@ -63,11 +64,13 @@ class LogTable:
 
 def is_log(path: Path) -> bool:
     """Whether there is a reader for this file or folder; what is neither, a pipe or a device, might never end."""
-    return is_bag(path) if path.is_dir() else path.suffix in SUFFIXES and path.is_file()
+    return is_bag(path) or is_dataset(path) if path.is_dir() else path.suffix in SUFFIXES and path.is_file()
 
 
 def wanted_quantities(mapping: LogMapping) -> tuple[str, ...]:
     """The quantities that a log must hold."""
+    if mapping.input == "position":
+        return ("q", "u")
     return tuple(x for x in QUANTITIES if x != "qd" or mapping.velocity == "logged")
 
 
@@ -78,7 +81,7 @@ def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, 
     """
     metadata = schema.metadata or {}
     if metadata.get(UNITS_KEY) == UNITS:
-        mapping = LogMapping()
+        mapping = LogMapping(input=mapping.input)
     quantities = wanted_quantities(mapping)
     columns = (mapping.columns.t, *(mapping.column(what, joint) for what in quantities for joint in joints))
     _require_columns(schema.names, columns, file, mapping, joints)
@@ -138,7 +141,10 @@ def missing_columns(
 ) -> LogError:
     """What is told of columns that are not there."""
     columns = mapping.columns
-    expected = [columns.t, *(getattr(columns, x).replace("{joint}", "<joint>") for x in QUANTITIES)]
+    expected = [
+        columns.t,
+        *(getattr(columns, x).replace("{joint}", "<joint>") for x in wanted_quantities(mapping)),
+    ]
     return LogError(
         f"only the columns {', '.join(present)}", file=file,
         element=f"missing column{'s' * (len(missing) > 1)} {', '.join(missing)}",
@@ -150,7 +156,9 @@ def _advice(
     missing: Sequence[str], present: Collection[str], mapping: LogMapping, joints: Sequence[str]
 ) -> str:
     """What to do; a column is offered only where it names the same joint and is not another quantity's."""
-    owner = {mapping.column(what, joint): (what, joint) for what in QUANTITIES for joint in joints}
+    owner = {
+        mapping.column(what, joint): (what, joint) for what in wanted_quantities(mapping) for joint in joints
+    }
     if all(owner.get(name, ("", ""))[0] == "qd" for name in missing):
         return "say 'velocity: differentiated' under 'logs' in the robot's YAML where none were logged"
     joint = mapping.log_name(owner[missing[0]][1]) if missing[0] in owner else ""

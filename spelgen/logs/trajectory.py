@@ -25,7 +25,8 @@ class Trajectory:
     t: (T,) sample times [s], strictly increasing, not necessarily regular.
     q, qd: (T, n) joint positions and velocities [rad, rad/s; m, m/s for prismatic joints].
     tau: (T, n) joint torques or forces [Nm; N]. In a simulated log tau[k] is held from t[k] to t[k+1]; in a
-        measured one it is the torque measured at t[k].
+        measured one it is the torque measured at t[k]. (T, 0) where none was logged, beside commands u.
+    u: (T, n) commanded positions [rad; m] of joints that servos move, u[k] held from t[k] to t[k+1]; None of others.
     name: unique among the trajectories that are used together.
     file: where it was read from, None if it was not.
     declares_units: the file itself, or the mapping it was read by, says in what units its columns are.
@@ -40,19 +41,20 @@ class Trajectory:
     name: str = "trajectory"
     file: Path | None = None
     declares_units: bool = False
+    u: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        for column in ("t", *QUANTITIES):
+        for column in ("t", *self.quantities):
             object.__setattr__(self, column, self._numbers(column))
         if self.t.ndim != 1 or not self.t.size:
             raise self._error("t", f"an array of shape {self.t.shape}", "(T,), a time for each sample")
         samples, joints = len(self.t), self.q.shape[1] if self.q.ndim == 2 else "n"
-        for column in QUANTITIES:
+        for column in self.quantities:
             shape = getattr(self, column).shape
             if len(shape) != 2 or shape != (samples, joints):
                 wanted = f"({samples}, {joints}), a row for each time and a column for each joint"
                 raise self._error(column, f"an array of shape {shape}", wanted)
-        for column in ("t", *QUANTITIES):
+        for column in ("t", *self.quantities):
             values = getattr(self, column)
             bad = ~np.isfinite(values) if column == "t" else ~(np.abs(values) < LARGEST)
             if bad.any():
@@ -72,7 +74,13 @@ class Trajectory:
 
     def __getitem__(self, rows: slice) -> Trajectory:
         """The same recording, only these rows."""
-        return replace(self, t=self.t[rows], q=self.q[rows], qd=self.qd[rows], tau=self.tau[rows])
+        cut = {name: getattr(self, name)[rows] for name in ("t", "tau", *self.quantities)}
+        return replace(self, **cut)
+
+    @property
+    def quantities(self) -> tuple[str, ...]:
+        """What it holds beside times: q, qd, and tau or u."""
+        return QUANTITIES if self.u is None else (*QUANTITIES[:2], "u")
 
     @property
     def duration(self) -> float:
@@ -104,6 +112,16 @@ class Trajectory:
 
     def _error(self, column: str, got: str, expected: str) -> LogError:
         return LogError(got, file=self.file, element=f"trajectory {self.name}: {column}", expected=expected)
+
+
+def require_torques(trajectories: Sequence[Trajectory]) -> None:
+    """Raise LogError where no torques were logged."""
+    for each in trajectories:
+        if each.u is not None:
+            raise LogError(
+                "commanded positions and no torques", file=each.file, element=f"trajectory {each.name}",
+                expected="torques", do="arms under position servos are fitted and judged by `train` and `evaluate`",
+            )  # fmt: skip
 
 
 def trajectory_listing(trajectories: Sequence[Trajectory]) -> Listing:

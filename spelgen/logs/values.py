@@ -58,7 +58,10 @@ def made_trajectory(data: np.ndarray, layout: Layout, **about: Any) -> Trajector
     quantities = wanted_quantities(layout.mapping)
     t, found = data[:, 0], dict(zip(quantities, np.split(data[:, 1:], len(quantities), axis=1), strict=True))
     qd = found["qd"] if "qd" in found else _differentiated(t, found["q"])
-    return Trajectory(t, found["q"], qd, found["tau"], declares_units=layout.declares_units, **about)
+    return Trajectory(
+        t, found["q"], qd, found.get("tau", np.zeros((len(t), 0))), u=found.get("u"),
+        declares_units=layout.declares_units, **about,
+    )  # fmt: skip
 
 
 def _differentiated(t: np.ndarray, q: np.ndarray) -> np.ndarray:

@@ -89,7 +89,7 @@ class FrictionLaws(nn.Module):
         """The diagonal of D, (..., n): friction torque by velocity, of joints that slide."""
         c = constants
         slope = tanh_ratio(qd / c.coulomb_smoothing_velocity) / c.coulomb_smoothing_velocity
-        return self._viscous(qd, c) + self._dry(qd, gravity, c) * slope
+        return self.viscosity(qd, c) + self.dry(qd, gravity, c) * slope
 
     def forward(
         self, qd: Tensor, gravity: Tensor, constants: FrictionConstants, z: Tensor | None = None
@@ -98,7 +98,7 @@ class FrictionLaws(nn.Module):
         if z is None:
             return self.resistance(qd, gravity, constants) * qd
         direction = (constants.bristle_fractions * z / self.bristles.reach).sum(dim=-1)
-        return self._viscous(qd, constants) * qd + self._dry(qd, gravity, constants) * direction
+        return self.viscosity(qd, constants) * qd + self.dry(qd, gravity, constants) * direction
 
     def sliding(self, qd: Tensor) -> Tensor:
         """The bristles z, (..., n, K), of joints that have long gone this way."""
@@ -111,12 +111,12 @@ class FrictionLaws(nn.Module):
         return 0.5 * (constants.coulomb * stored.sum(dim=-1)).sum(dim=-1)
 
     @staticmethod
-    def _viscous(qd: Tensor, c: FrictionConstants) -> Tensor:
+    def viscosity(qd: Tensor, c: FrictionConstants) -> Tensor:
         """Torque by velocity, (..., n)."""
         return c.viscous + c.saturation / c.saturation_velocity * tanh_ratio(qd / c.saturation_velocity)
 
     @staticmethod
-    def _dry(qd: Tensor, gravity: Tensor, c: FrictionConstants) -> Tensor:
+    def dry(qd: Tensor, gravity: Tensor, c: FrictionConstants) -> Tensor:
         """The size of dry friction, (..., n) [Nm, N]."""
         slow = (-((qd / c.stribeck_velocity) ** 2)).exp()
         return c.coulomb + c.stribeck * slow + c.load_dependence * gravity.abs()

@@ -18,6 +18,7 @@ class JointSettings(Group):
     viscous: friction torque per joint velocity, after the gear [Nm s/rad].
     coulomb: friction torque for qd > 0 and for qd < 0, after the gear [Nm], e.g. (0.395, -0.435).
     actuated: False for a passive joint, which never gets an input.
+    kp: of a position servo whose gain is known [Nm/rad]; None: it is trained.
     gain: "trained" where the gear between logged motor torques and the joint is to be learned; it starts at `gear`.
     inputs: the torques it draws from in a simulation, in place of `simulation.inputs` [Nm].
     """
@@ -27,6 +28,7 @@ class JointSettings(Group):
     viscous: NonNegative = 0.0
     coulomb: tuple[Number, Number] = (0.0, 0.0)
     actuated: bool = True
+    kp: Positive | None = None
     gain: Literal["known", "trained"] = "known"
     inputs: Inputs | None = None
 

@@ -18,13 +18,17 @@ def explain(detail: Mapping[str, Any], document: Document, group: type[BaseModel
         known = list(_group_at(group, location[:-1]).model_fields)
         return unknown_name(location, "key", str(location[-1]), known, document)
     if location[-1:] == ("[key]",):
-        location, kind = location[:-1], "key"
+        location, kind = location[:-1], "name" if kind == "string_pattern_mismatch" else "key"
     expected = {
         "key": "a name; write it in quotes",
+        "name": "a name of letters, digits, '.', '_' and '-'",
+        "missing": "a value",
         "model_type": "keys with values",
         "dict_type": "keys with values",
     }.get(kind, detail["msg"].removeprefix("Input should be ").removeprefix("Value error, "))
     got = repr(detail["input"]) if location or kind != "value_error" else "these settings"
+    if kind == "missing" and isinstance(detail["input"], Mapping):
+        got = "nothing"
     return SettingsError(
         got if len(got) <= 60 else got[:57] + "...",
         file=document.path,

@@ -42,11 +42,13 @@ class Settings(Group):
     """One robot's sidecar file. about: why the robot is here and where its values come from.
 
     gravity: in the frame of the root link [m/s^2]. joints: by URDF name; a joint not listed has the defaults.
+    input: what commands the joints and is logged: torques, or positions ("u") of servos that hold them like springs.
     torque: whether the logs' tau are joint torques, or motor torques before the gear. couplings: of motors
     that move several joints, for motor torques. logs: how this robot's logs are named and measured.
     """
 
     about: str = ""
+    input: Literal["torque", "position"] = "torque"
     torque: Literal["joint", "motor"] = "joint"
     couplings: tuple[Coupling, ...] = ()
     gravity: tuple[Number, Number, Number] = (0.0, 0.0, -9.81)
@@ -59,6 +61,8 @@ class Settings(Group):
 
     @model_validator(mode="after")
     def _drives(self) -> Settings:
+        if self.input == "position" and (self.torque == "motor" or self.couplings):
+            raise ValueError("'input: position' or 'torque: motor' with couplings, not both")
         if self.couplings and self.torque == "joint":
             raise ValueError("'torque: motor' where there are couplings: joint torques know none")
         coupled = [name for coupling in self.couplings for name in coupling.joints]
@@ -111,6 +115,8 @@ def load_settings(urdf_path: Path | str, joints: Iterable[str] | None = None) ->
         groups[name] = Unusable(wrong) if wrong else getattr(read, name)
         of_steps += wrong
     collect(errors and [*errors, *of_steps])
+    if settings.input == "position" and not isinstance(groups.get("logs"), Unusable):
+        groups["logs"] = groups.get("logs", settings.logs).model_copy(update={"input": "position"})
     return settings.model_copy(update=groups)
 
 

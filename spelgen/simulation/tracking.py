@@ -26,6 +26,7 @@ from spelgen.simulation.simulated_logs import SimulatedLogs
 
 FILTER_ORDER = 4
 STRETCH = 32  # samples
+UNSEEN = 0.01  # of an encoder's step: an error of integration that nobody sees
 USED = 0.7  # of a joint's range, where no amplitude is said
 INTEGRAL_GAIN = 0.2  # a tenth of what makes a joint without friction unstable
 
@@ -111,7 +112,7 @@ def track(
             test.append(replace(log[kept:], name=f"{log.name}_end"))
         if progress is not None:
             progress(number + 1, protocol.trajectories)
-    return SimulatedLogs(train, test, float(max(errors)))
+    return SimulatedLogs(train, test, float(max(errors)), allowed=UNSEEN * settings.tracking.resolution)
 
 
 def _integration_error(

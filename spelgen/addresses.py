@@ -1,0 +1,92 @@
+"""Files at addresses that fsspec knows, `s3://bucket/logs` say: copied here to be read, and sent there once written.
+
+All else in spelgen works on local paths. What is fetched lies in a temporary folder for as long as the process lives.
+"""
+
+from __future__ import annotations
+
+import atexit
+import re
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from spelgen.errors import SpelgenError
+
+# `Path` makes one slash of two; a Windows drive is one letter
+ADDRESS = re.compile(r"^([a-z][a-z0-9+.-]+):/+(?=[^/])")
+
+_copies: dict[str, Path] = {}  # address -> its local copy
+
+
+def local(path: Path | str) -> Path:
+    """A local path as it is; of an address the copy of what lies there, a file or a folder: what is written to it, and
+    into it, is sent to the address (see `sent`). Raises SpelgenError where the address cannot be reached.
+    """
+    match = ADDRESS.match(str(path))
+    if match is None or Path(path).exists():
+        return Path(path)
+    address = f"{match[1]}://{str(path)[match.end() :]}".rstrip("/")
+    if address not in _copies:
+        _copies[address] = _fetched(address)
+    return _copies[address]
+
+
+def sent(path: Path) -> None:
+    """Send a file that was written, or tell of one that was removed, to the address that it is of, if it is of one."""
+    for address, copy in _copies.items():
+        if path == copy or copy in path.parents:
+            below = path.relative_to(copy).as_posix()
+            target = address if path == copy else f"{address}/{below}"
+            with _Reached(target):
+                system, place = _at(target)
+                if path.exists():
+                    system.makedirs(system._parent(place), exist_ok=True)
+                    system.put_file(str(path), place)
+                elif system.exists(place):
+                    system.rm_file(place)
+
+
+def _fetched(address: str) -> Path:
+    folder = Path(tempfile.mkdtemp(prefix="spelgen-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    copy = folder / address.rsplit("/", 1)[-1]
+    with _Reached(address):
+        system, place = _at(address)
+        if system.isdir(place):
+            copy.mkdir()
+            for each in system.find(place):
+                target = copy / each[len(place.rstrip("/")) :].lstrip("/")
+                target.parent.mkdir(parents=True, exist_ok=True)
+                system.get_file(each, str(target))
+        elif system.exists(place):
+            system.get_file(place, str(copy))
+    return copy
+
+
+def _at(address: str) -> tuple[Any, str]:
+    """The file system of an address, and the path there."""
+    import fsspec
+
+    system, place = fsspec.core.url_to_fs(address)
+    return system, place
+
+
+class _Reached:
+    """Within it, whatever a file system raises names the address: each has kinds of its own."""
+
+    def __init__(self, address: str) -> None:
+        self._address = address
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, ImportError):
+            raise SpelgenError(
+                f"an address that needs a package ({error})", file=self._address, do="install it"
+            ) from error
+        if isinstance(error, Exception):
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise SpelgenError(f"cannot be reached ({reason})", file=self._address) from error

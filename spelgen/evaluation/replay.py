@@ -1,0 +1,125 @@
+"""Arms that position servos move, judged by replaying commands: whole logs from their start, and windows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from spelgen.dynamics.servo_rollout import STEP, replayed
+from spelgen.errors import Diagnostic
+from spelgen.evaluation.names import MODEL
+from spelgen.fitting.linear_servo import LinearServos
+from spelgen.fitting.servo_windows import derivatives
+from spelgen.logs.commands import delayed_commands, steps_between
+from spelgen.logs.trajectory import Trajectory, split_at_gaps
+
+LATE, LINEAR = "delayed command", "linear servo"
+AHEAD = 1.0  # s, of a window
+
+
+@dataclass(frozen=True)
+class ReplayErrors:
+    """Of one predictor, root mean squares over time [rad, m]: by trajectory (over joints too), the mean of these, by
+    joint over all trajectories.
+    """
+
+    trajectories: dict[str, float]
+    mean: float
+    joints: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Replay:
+    """What was replayed, and how wrong each predictor was."""
+
+    name: str
+    errors: dict[str, ReplayErrors]
+
+
+def replays(
+    model: Any, logs: Sequence[Trajectory], linear: LinearServos | None, notes: list[Diagnostic]
+) -> tuple[Replay, ...]:
+    """Of the model and, where they are known, linear servos: whole logs, and windows of `AHEAD`, one after another."""
+    pieces = [x for log in logs for x in split_at_gaps(log) if len(x) > 2]
+    whole = [(x, slice(0, len(x))) for x in pieces]
+    windows = [
+        (x, slice(a, a + span))
+        for x in pieces
+        for span in [round(AHEAD * x.sample_rate) + 1]
+        for a in range(0, len(x) - span + 1, span - 1)
+    ]
+    if linear is None:
+        message = "no linear servos to compare with: they are fitted by `train`"
+        notes.append(Diagnostic("info", "no-linear-servos", "logs", None, message))
+    found = [Replay("whole log", _errors(model, whole, linear, still=True))]
+    if windows:
+        found.append(Replay(f"windows of {AHEAD:g} s", _errors(model, windows, linear, still=False)))
+    return tuple(found)
+
+
+Part = tuple[Trajectory, slice]
+
+
+def _errors(
+    model: Any, parts: Sequence[Part], linear: LinearServos | None, *, still: bool
+) -> dict[str, ReplayErrors]:
+    """still: each part starts at rest, else with the velocity measured there."""
+    wrong = {MODEL: _of_model(model, parts, still)}
+    if linear is not None:
+        wrong[LINEAR] = _of_linear(linear, parts, still)
+        late = [delayed_commands(x, rows, linear.late, 1)[:, 0] for x, rows in parts]
+        wrong[LATE] = [u - x.q[rows][1:] for u, (x, rows) in zip(late, parts, strict=True)]
+    names = [x.name for x, _ in parts]
+    return {predictor: _summary(names, errors) for predictor, errors in wrong.items()}
+
+
+def _summary(names: Sequence[str], errors: Sequence[np.ndarray]) -> ReplayErrors:
+    joined = {
+        name: np.concatenate([x for each, x in zip(names, errors, strict=True) if each == name])
+        for name in dict.fromkeys(names)
+    }
+    by_name = {name: float(np.sqrt(np.square(x).mean())) for name, x in joined.items()}
+    joints = np.sqrt(np.square(np.concatenate([*joined.values()])).mean(axis=0))
+    return ReplayErrors(by_name, float(np.mean([*by_name.values()])), tuple(joints.tolist()))
+
+
+def _starts(parts: Sequence[Part], still: bool) -> tuple[np.ndarray, np.ndarray]:
+    q = np.stack([x.q[rows.start] for x, rows in parts])
+    if still:
+        return q, np.zeros_like(q)
+    measured = {id(x): derivatives(x)[0] for x, _ in parts}
+    return q, np.stack([measured[id(x)][rows.start] for x, rows in parts])
+
+
+def _of_model(model: Any, parts: Sequence[Part], still: bool) -> list[np.ndarray]:
+    """Errors (K, n) of each part; all run beside each other, the shorter ones on and on."""
+    q, qd = _starts(parts, still)
+    steps = max(steps_between(x, STEP) for x, _ in parts)
+    delay, longest = float(model.servo.delay), max(rows.stop - rows.start for _, rows in parts) - 1
+    commands = [delayed_commands(x, rows, delay, steps) for x, rows in parts]
+    held = [np.pad(u, ((0, longest - len(u)), (0, 0), (0, 0)), mode="edge") for u in commands]
+    times = [
+        np.pad(dt, (0, longest - len(dt)), mode="edge") for dt in (np.diff(x.t[rows]) for x, rows in parts)
+    ]
+    arrays = (q, qd, np.stack(held), np.stack(times))
+    found = replayed(model, *(torch.from_numpy(x) for x in arrays)).numpy()
+    return [each[: len(u)] - x.q[rows][1:] for each, u, (x, rows) in zip(found, commands, parts, strict=True)]
+
+
+def _of_linear(linear: LinearServos, parts: Sequence[Part], still: bool) -> list[np.ndarray]:
+    q, qd = _starts(parts, still)
+    found = []
+    for k, (x, rows) in enumerate(parts):
+        predicted = [
+            linear.positions(
+                joint, q[k : k + 1, joint], qd[k : k + 1, joint],
+                delayed_commands(x, rows, delay, 1)[None, :, 0, joint], float(np.diff(x.t[rows]).mean()),
+            )[0]
+            for joint, delay in enumerate(linear.delay)
+        ]  # fmt: skip
+        found.append(np.stack(predicted, axis=1) - x.q[rows][1:])
+    return found

@@ -1,0 +1,98 @@
+"""What logs of commanded positions determine, after a fit: ratios to kp, with intervals, and what they leave open."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+
+from spelgen.fitting.servo_fit import ServoSolution
+from spelgen.listing import Listing, number
+
+SURE = 1.96  # standard deviations of an interval: 95 %
+OPEN = 2.0  # what may be larger by such a factor within its interval is not determined
+VALUES = {
+    "kd": ("servo.raw_kd", "s"),
+    "armature": ("dynamics.armature.raw", "s^2"),
+    "coulomb": ("dynamics.friction.raw_coulomb", "rad, m"),
+    "stribeck": ("dynamics.friction.raw_stribeck", "rad, m"),
+}
+"""What is told in ratio to kp: its weight, and the ratio's unit. All weights are logarithms."""
+ABOUT = (
+    "divided by kp, +- half an interval of 95 %: logs of positions tell no more. kp itself rests on the URDF's masses, "
+    "where it is not known. kd stands for kd and viscous friction, which such logs cannot tell apart"
+)
+
+
+def servo_record(model: Any, solution: ServoSolution) -> dict[str, Any]:
+    """For config.json: delay [s], errors, and by joint kp, and the ratios to it with intervals of 95 %."""
+    n, places = model.n, {name: k for k, (name, _) in enumerate(solution.names)}
+    kp = places["servo.raw_kp"]
+    joints = []
+    for joint, name in enumerate(model.facts.joints):
+        trained = float(model.servo.trained[joint])
+        about: dict[str, Any] = {"joint": name}
+        about["kp"] = {"value": float(model.kp[joint].detach()), "known": not trained}
+        for what, (weight, unit) in VALUES.items():
+            value = float((getattr(model, what)[joint] / model.kp[joint]).detach())
+            ratio = [(places[weight], joint, 1.0), (kp, joint, -trained)]
+            about[what] = {"unit": unit, **_interval(value, _spread(solution, n, ratio))}
+        joints.append(about)
+    delay = float(solution.covariance.diagonal()[-1].sqrt())
+    return {
+        "delay": {"value": float(model.delay), "sigma": delay},
+        "rms": solution.rms.tolist(),
+        "steps": solution.steps,
+        "joints": joints,
+    }
+
+
+def _spread(solution: ServoSolution, n: int, terms: list[tuple[int, int, float]]) -> float:
+    """Standard deviation of a sum of weights (row, joint, factor) after the fit."""
+    direction = torch.zeros(len(solution.covariance)).double()
+    for row, joint, factor in terms:
+        direction[row * n + joint] = factor
+    return float((direction @ solution.covariance @ direction).clamp(min=0).sqrt())
+
+
+def _interval(value: float, spread: float) -> dict[str, Any]:
+    factor = math.exp(min(SURE * spread, 50.0))
+    return {"value": value, "low": value / factor, "high": value * factor, "determined": factor < OPEN}
+
+
+def servo_text(record: Mapping[str, Any]) -> str:
+    """For a terminal: delay, ratios with intervals, and what the logs left open."""
+    rows = [
+        (each["joint"], number(each["kp"]["value"]), *(_shown(each[what]) for what in VALUES))
+        for each in record["joints"]
+    ]
+    head = ("joint", "kp [Nm/rad]", *(f"{what}/kp [{unit}]" for what, (_, unit) in VALUES.items()))
+    table = Listing("Servos", head, tuple(rows), f"Ratios are {ABOUT}.").text()
+    open_ones = undetermined(record)
+    left = (
+        f"not determined by these logs: {', '.join(open_ones)}"
+        if open_ones
+        else "all of these are determined"
+    )
+    delay = record["delay"]
+    late = f"delay {1000 * delay['value']:.1f} ms, +- {1000 * SURE * delay['sigma']:.1f} ms"
+    errors = ", ".join(number(1000 * x) for x in record["rms"])
+    return f"{late}\nerrors on training windows, RMS by joint: {errors} mrad\n{table}\n{left}"
+
+
+def undetermined(record: Mapping[str, Any]) -> list[str]:
+    """What the logs left as unsure as it was."""
+    return [
+        f"{what}/kp of {each['joint']}"
+        for each in record["joints"]
+        for what in VALUES
+        if not each[what]["determined"]
+    ]
+
+
+def _shown(interval: Mapping[str, Any]) -> str:
+    if not interval["determined"]:
+        return "open"
+    return f"{number(interval['value'])} +- {100 * (interval['high'] / interval['value'] - 1):.2g} %"

@@ -1,0 +1,119 @@
+"""Windows of logs of commanded positions, and what the arm's bodies are to its drives along them.
+
+The bodies' load is taken along the measured motion, so that in a fit each joint is rolled out by itself: the predicted
+motion is a hundredth of a radian away, and as far off is what the arm weighs there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.signal import savgol_filter
+
+from spelgen.dynamics.servo_rollout import STEP
+from spelgen.errors import LogError
+from spelgen.logs.commands import delayed_commands, steps_between
+from spelgen.logs.preprocessing import Preprocessing
+from spelgen.logs.trajectory import Trajectory, split_at_gaps
+
+LENGTH, SETTLING = (
+    4.0,
+    1.0,
+)  # s, of a window, and of its beginning, which is not judged: friction's memory forms there
+MOST = 400  # windows
+SMOOTHING = 0.18  # s over which derivatives are taken
+BLOCK = 2**13  # samples at a time
+
+
+@dataclass(frozen=True, eq=False)
+class ServoWindows:
+    """q, qd and qdd (W, K, n), the latter two smoothed; dt (W, K-1) [s]; `settling` samples at the start of each."""
+
+    pieces: tuple[tuple[Trajectory, int], ...]
+    q: torch.Tensor
+    qd: torch.Tensor
+    qdd: torch.Tensor
+    dt: torch.Tensor
+    settling: int
+    steps: int
+
+    @property
+    def rate(self) -> float:
+        """Samples in a second [Hz]."""
+        return float(1 / self.dt.mean())
+
+    def commands(self, delay: float) -> torch.Tensor:
+        """Of ``delay`` [s] ago, over the steps between samples (W, K-1, S, n)."""
+        length = self.q.shape[1]
+        found = [delayed_commands(x, slice(a, a + length), delay, self.steps) for x, a in self.pieces]
+        return torch.from_numpy(np.stack(found))
+
+
+def servo_windows(logs: Sequence[Trajectory], preprocessing: Preprocessing, most: int = MOST) -> ServoWindows:
+    """About so many windows, evenly spread; shorter ones where all logs are. Raises LogError for logs too short."""
+    pieces = [x for log in logs for x in split_at_gaps(log, preprocessing.gap)]
+    rate = float(np.median([x.sample_rate for x in pieces]))
+    length = min(round(LENGTH * rate), max(map(len, pieces)))
+    settling = min(round(SETTLING * rate), length // 2)
+    if length < 8:
+        raise LogError(f"at most {length} samples without a gap", expected="a second of motion or more")
+    starts = [(x, a) for x in pieces for a in range(0, len(x) - length + 1, max(1, length - settling))]
+    starts = starts[:: -(-len(starts) // most)]
+    smooth = {id(x): derivatives(x) for x in pieces if len(x) >= length}
+    columns = [
+        torch.from_numpy(np.stack([source(x)[a : a + length] for x, a in starts]))
+        for source in (lambda x: x.q, lambda x: smooth[id(x)][0], lambda x: smooth[id(x)][1])
+    ]
+    dt = torch.from_numpy(np.stack([np.diff(x.t[a : a + length]) for x, a in starts]))
+    steps = max(steps_between(x, STEP) for x, _ in starts)
+    q, qd, qdd = columns
+    return ServoWindows(tuple(starts), q, qd, qdd, dt, settling, steps)
+
+
+def derivatives(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
+    """qd and qdd (T, n), by cubic polynomials over `SMOOTHING` (Savitzky and Golay, 1964)."""
+    width = max(5, 2 * round(SMOOTHING * trajectory.sample_rate / 2) + 1)
+    width = min(width, len(trajectory) - 1 + len(trajectory) % 2)
+    step = 1 / trajectory.sample_rate
+    first, second = (
+        savgol_filter(trajectory.q, width, 3, deriv=order, delta=step, axis=0) for order in (1, 2)
+    )
+    return first, second
+
+
+@dataclass(frozen=True, eq=False)
+class BodyLoad:
+    """What the bodies are to the drives along windows.
+
+    inertia: (W, K, n) of each joint by itself, without the drives'. bias: the torque (W, K, n) that everything else
+    takes, gravity: its part of that. weights: what directions of the bodies' weights add to gravity, (W, K, n, r).
+    """
+
+    inertia: torch.Tensor
+    bias: torch.Tensor
+    gravity: torch.Tensor
+    weights: torch.Tensor
+
+
+def body_load(model: Any, windows: ServoWindows, directions: torch.Tensor) -> BodyLoad:
+    """Of the model as it is; directions: of the ten parameters of all bodies, (10 bodies, r)."""
+    dynamics = model.dynamics
+    flat = [x.flatten(0, 1) for x in (windows.q, windows.qd, windows.qdd)]
+    found: list[tuple[torch.Tensor, ...]] = []
+    with torch.no_grad():
+        prepared, armature = dynamics.prepare(), dynamics.armature()
+        for q, qd, qdd in zip(*(x.split(BLOCK) for x in flat), strict=True):
+            at = dynamics.configuration(q, prepared)
+            mass, residuals = dynamics.mass_at(at, prepared)
+            inertia = mass.diagonal(dim1=-2, dim2=-1) - armature
+            others = (mass @ qdd.unsqueeze(-1)).squeeze(-1) - (inertia + armature) * qdd
+            bias = dynamics.nonlinear_at(at, qd, residuals, prepared) + others
+            still = torch.zeros_like(q)
+            weights = dynamics.regressor(q, still, still) @ directions
+            found.append((inertia, bias, dynamics.gravity_at(at, prepared), weights))
+    shape = windows.q.shape[:2]
+    return BodyLoad(*(torch.cat(x).unflatten(0, shape) for x in zip(*found, strict=True)))

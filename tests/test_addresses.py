@@ -1,0 +1,62 @@
+"""Logs and runs at addresses that fsspec knows are as those on the disk."""
+
+import json
+
+import fsspec
+import pytest
+from typer.testing import CliRunner
+
+from spelgen.addresses import local
+from spelgen.cli.main import app
+from spelgen.errors import LogError, SpelgenError
+from spelgen.fitting.run_folder import RunFolder
+from spelgen.loaded_arm import load_arm
+from spelgen.logs.read import read_logs, write_logs
+from spelgen.simulation.simulate import simulate
+
+JOINTS = ("joint1", "joint2")
+
+
+@pytest.fixture
+def memory():
+    """A file system in memory, empty."""
+    system = fsspec.filesystem("memory")
+    system.store.clear()
+    return system
+
+
+def test_a_run_and_its_logs_may_be_elsewhere(robots, tmp_path, memory):
+    arm = load_arm(robots / "two_link.urdf")
+    logs = simulate(arm, trajectories=4)
+    write_logs(local("memory://data/train.parquet"), logs.train, JOINTS)
+    assert memory.exists("/data/train.parquet")
+    module = tmp_path / "module.py"
+    options = ["--epochs", "2", "--momentum-steps", "0", "--quiet", "--robot", str(robots / "two_link.urdf")]
+    for words in (
+        ["build", str(robots / "two_link.urdf"), "--preset", "spel", "--width", "4", "-o", str(module)],
+        ["train", str(module), "--data", "memory://data", "-o", "memory://runs/first", *options],
+    ):
+        done = CliRunner().invoke(app, words)
+        assert done.exit_code == 0, done.output
+    assert {"config.json", "model.pt", "checkpoint.pt", "metrics.jsonl"} <= {
+        path.rsplit("/", 1)[-1] for path in memory.find("/runs/first")
+    }
+    assert len(memory.cat("/runs/first/metrics.jsonl").splitlines()) == 2
+    assert json.loads(memory.cat("/runs/first/config.json")) == RunFolder("memory://runs/first").read_config()
+
+
+def test_what_is_removed_here_is_removed_there(memory):
+    memory.pipe("/old/run/config.json", b"{}")
+    run = RunFolder("memory://old/run")
+    assert run.config.read_text() == "{}"
+    run.start("source", None, force=True)
+    assert memory.find("/old/run") == ["/old/run/module.py"]
+
+
+def test_addresses_that_lead_nowhere(memory, tmp_path):
+    with pytest.raises(LogError, match=r"^memory://none: got no such file or folder, expected a log"):
+        read_logs("memory://none", JOINTS)
+    with pytest.raises(SpelgenError, match=r"^nowhere://x/y: cannot be reached \(.*nowhere"):
+        local("nowhere://x/y")
+    assert local(tmp_path / "a:" / "b") == tmp_path / "a:" / "b"
+    assert local("C:/x").name == "x"

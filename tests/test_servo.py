@@ -1,0 +1,166 @@
+"""Arms under position servos: from settings to a module, from logs to ratios to kp, and to replayed commands."""
+
+import json
+import re
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet
+import pytest
+import torch
+import yaml
+from emitted import import_source
+from servo_arm import COM, GRAVITY, MASS, Servos, servo_logs, write_servo_arm
+
+import spelgen
+from spelgen.errors import LogError, OptionError, SettingsError
+from spelgen.evaluation.replay import LATE, LINEAR
+from spelgen.fitting import servo_fit
+from spelgen.logs.commands import delayed_commands
+from spelgen.logs.trajectory import Trajectory
+
+TRUTH = Servos()
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory):
+    return spelgen.load_arm(write_servo_arm(tmp_path_factory.mktemp("servo")))
+
+
+@pytest.fixture(scope="module")
+def logs():
+    return servo_logs(5, 16.0)
+
+
+@pytest.fixture(scope="module")
+def fitted(arm, logs, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run") / "run"
+    return spelgen.fit(spelgen.build(arm, "closed-form"), logs[:4], arm=arm, folder=folder)
+
+
+def test_ratios_to_kp_are_found(fitted):
+    model, kp = fitted.model, np.array(TRUTH.kp)
+    with torch.no_grad():
+        found = {name: getattr(model, name).numpy() / model.kp.numpy() for name in ("kd", "coulomb")}
+        pointing = torch.tensor([[0.0, np.pi / 2]]).double()
+        weight = (model.gravity(pointing) / model.kp).numpy()[0, 1]
+        inertia = (model.mass_matrix(pointing)[0].diagonal() / model.kp).numpy()
+    assert found["kd"] == pytest.approx(np.array(TRUTH.kd) / kp, rel=0.05)
+    assert abs(weight) == pytest.approx(GRAVITY * MASS[1] * COM[1] / kp[1], rel=0.03)
+    assert inertia[1] == pytest.approx((6e-4 + MASS[1] * COM[1] ** 2 + TRUTH.armature[1]) / kp[1], rel=0.08)
+    assert float(model.delay) == pytest.approx(TRUTH.delay, abs=0.004)
+
+
+def test_replay_of_another_motion_beats_the_baselines(fitted, logs):
+    results = fitted.evaluate(logs[4:])
+    for replay in results.replays:
+        errors = {name: each.mean for name, each in replay.errors.items()}
+        assert errors["model"] < 0.4 * min(errors[LINEAR], errors[LATE])
+    assert results.replays[0].errors["model"].mean < 3e-3
+    assert "Commands replayed, whole log" in results.text()
+    again = spelgen.evaluate(fitted.folder, logs[4:])
+    assert again.to_dict() == results.to_dict()
+
+
+def test_a_module_of_servos_stands_alone_and_says_so(arm, tmp_path):
+    source = spelgen.generate(arm, "closed-form")
+    assert "stores 1/2 kp (q - u)^2" in source
+    model = import_source(source, tmp_path / "servo.py").Model()
+    q, u = torch.tensor([[0.1, -0.2]]).double(), torch.tensor([[0.3, -0.2]]).double()
+    with torch.no_grad():
+        assert model.servo(u, q, torch.zeros_like(q)).tolist() == [[pytest.approx(0.2 * 12.0), 0.0]]
+        assert float(model.servo.stored_energy(u, q)) == pytest.approx(0.5 * 12.0 * 0.04)
+        far = model.servo(u + 9, q, torch.zeros_like(q))
+    assert far.tolist() == [[6.0, 6.0]]  # the URDF's effort
+    assert "in ratio to kp only" in " ".join(arm.inspect().text().split())
+
+
+def test_a_known_kp_stays(tmp_path, logs, monkeypatch):
+    monkeypatch.setattr(servo_fit, "ROUNDS", 1)
+    monkeypatch.setattr(servo_fit, "STEPS", 1)
+    settings = "input: position\njoints: {shoulder: {kp: 14.0}}\n"
+    model = spelgen.build(write_servo_arm(tmp_path, settings), "closed-form")
+    fit = spelgen.fit(model, logs[:2])
+    assert float(model.servo.kp()[0].detach()) == pytest.approx(14.0)
+    assert [x["kp"]["known"] for x in fit.record["servo"]["joints"]] == [True, False]
+
+
+def test_commands_are_held_and_late():
+    t = np.arange(5) * 0.02
+    u = np.array([[0.0], [1.0], [2.0], [3.0], [4.0]])
+    log = Trajectory(t, u, u, np.zeros((5, 0)), u=u)
+    assert delayed_commands(log, slice(0, 5), 0.0, 2)[..., 0].tolist() == [
+        [pytest.approx(x), pytest.approx(x)] for x in (0.0, 1.0, 2.0, 3.0)
+    ]
+    late = delayed_commands(log, slice(1, 4), 0.025, 2)[..., 0]
+    assert late == pytest.approx(np.array([[0.0, 0.0], [0.5, 1.0]]), abs=1e-9)
+
+
+def test_commands_are_read_and_written(tmp_path, logs, arm):
+    for suffix in (".csv", ".parquet"):
+        path = spelgen.write_logs(tmp_path / f"logs{suffix}", logs[:2], arm)
+        again = spelgen.read_logs(path, arm)
+        assert [np.array_equal(x.u, y.u) for x, y in zip(again, logs, strict=False)] == [True, True]
+        assert again[0].tau.shape == (len(logs[0]), 0)
+
+
+def test_exports_hold_the_servos(fitted, arm, tmp_path):
+    kp, kd = (x.detach().numpy() for x in fitted.model.servo.prepare()[:2])
+    xml = fitted.export("mjcf").files[".xml"].decode()
+    found = re.findall(r'<position name="\w+" joint="\w+" kp="([^"]+)" kv="([^"]+)" forcerange="-6 6"', xml)
+    assert np.array(found, dtype=float) == pytest.approx(np.stack([kp, kd], axis=1))
+    held = yaml.safe_load(fitted.export("urdf").files[".friction.yaml"])
+    assert held["delay"] == pytest.approx(float(fitted.model.delay))
+    assert held["joints"]["elbow"]["servo"]["kp"] == pytest.approx(kp[1])
+    files = fitted.export("c").files  # checked against the module when exported, where there is a compiler
+    assert b"servo_arm_servo_torque(const servo_arm_real u[SERVO_ARM_N]" in files["servo_arm.h"]
+
+
+def dataset(folder, logs, motors):
+    """A data set of LeRobot 3: an episode for each log, in degrees."""
+    (folder / "meta").mkdir(parents=True)
+    feature = {"dtype": "float32", "shape": [len(motors)], "names": motors}
+    features = {"action": feature, "observation.state": feature}
+    (folder / "meta" / "info.json").write_text(json.dumps({"fps": 50, "features": features}))
+    (folder / "data" / "chunk-000").mkdir(parents=True)
+    columns = {
+        "observation.state": np.degrees(np.concatenate([x.q[:, ::-1] for x in logs])).tolist(),
+        "action": np.degrees(np.concatenate([x.u[:, ::-1] for x in logs])).tolist(),
+        "timestamp": np.concatenate([x.t for x in logs]),
+        "episode_index": np.repeat(range(len(logs)), [len(x) for x in logs]),
+    }
+    pa.parquet.write_table(pa.table(columns), folder / "data" / "chunk-000" / "file-000.parquet")
+    return folder
+
+
+def test_a_data_set_of_lerobot_is_read_by_its_own_names(tmp_path, logs):
+    arm = spelgen.load_arm(write_servo_arm(tmp_path, "input: position\nlogs: {units: {q: deg}}\n"))
+    path = dataset(tmp_path / "set", logs[:2], ["elbow.pos", "shoulder.pos"])
+    found = spelgen.read_logs(path, arm)
+    assert [x.name for x in found] == ["0", "1"]
+    for each, log in zip(found, logs, strict=False):
+        assert each.q == pytest.approx(log.q) and each.u == pytest.approx(log.u)
+    with pytest.raises(LogError, match=r"joint elbow: got the motors a, shoulder, expected elbow among them"):
+        spelgen.read_logs(dataset(tmp_path / "other", logs[:1], ["a", "shoulder.pos"]), arm)
+
+
+@pytest.mark.parametrize("quantity", ["u", "q"])
+def test_a_missing_column_is_named(tmp_path, logs, arm, quantity):
+    path = spelgen.write_logs(tmp_path / "logs.csv", logs[:1], arm)
+    path.write_text(path.read_text().replace(f"{quantity}_elbow", "nothing"))
+    with pytest.raises(LogError, match=f"missing column {quantity}_elbow"):
+        spelgen.read_logs(path, arm)
+
+
+def test_what_does_not_belong_together_is_told(arm, logs, robots):
+    with pytest.raises(SettingsError, match="preset whose friction remembers"):
+        spelgen.build(arm, "spel")
+    with pytest.raises(OptionError, match="this arm has position servos"):
+        spelgen.fit(spelgen.build(arm, "closed-form"), logs, spelgen.TorqueFit())
+    for asked in (spelgen.identify, lambda arm, logs: spelgen.check_logs(logs, arm)):
+        with pytest.raises(LogError, match="commanded positions and no torques"):
+            asked(arm, logs)
+    t = np.arange(9) * 0.1
+    nothing = Trajectory(t, np.zeros((9, 2)), np.zeros((9, 2)), np.zeros((9, 2)))
+    with pytest.raises(LogError, match="no commanded positions"):
+        spelgen.fit(spelgen.build(arm, "closed-form"), nothing)
