@@ -116,7 +116,7 @@ def networks_alone(model: EmittedModel, data: Data) -> None:
         total = (
             total + dynamics.mass.network(features, getattr(prepared.mass, "layers", prepared.mass))[0].sum()
         )
-        total = total + dynamics.potential.network(features, prepared.potential.layers)[0].sum()
+        total = total + dynamics.potential.network(features, prepared.potential)[0].sum()
         total = total + dynamics.friction(features, qd, prepared.friction).sum()
         if hasattr(dynamics.input, "network"):
             total = total + dynamics.input.network(features, prepared.input)[0].sum()

@@ -178,14 +178,14 @@ def test_networks_read_rotation_matrices(net, part, tmp_path):
     parts[1] = (parts[1] - encoding.center[1] * torch.tensor([0, 0, 1.0], dtype=q.dtype)) / encoding.reach[1]
     layer = torch.cat([part.reshape(len(q), -1) for part in parts], dim=-1)
     count = len(model.weights)
-    for index, (weight, bias) in enumerate(zip(model.weights, model.biases, strict=True)):
+    for index, (weight, level) in enumerate(zip(model.weights, model.biases, strict=True)):
         weight = weight * getattr(model, f"mask{index}")
         if net == "mlp":
-            layer = layer @ weight.T + bias
+            layer = layer @ weight.T + level
         else:
             grid = torch.linspace(-1, 1, weight.shape[-1], dtype=torch.float64)
             bumps = torch.exp(-(((layer.unsqueeze(-1) - grid) / (grid[1] - grid[0])) ** 2))
-            layer = torch.einsum("big,oig->bo", bumps, weight) + bias
+            layer = torch.einsum("big,oig->bo", bumps, weight) + level
         layer = torch.tanh(layer) if index < count - 1 else layer
     near(outputs_alone(model, network_inputs(owner, q)), layer)
 

@@ -65,15 +65,16 @@ def predict(model: EmittedModel, windows: Windows, substeps: int) -> Prediction:
 def sizes(model: EmittedModel) -> Sizes:
     """How many numbers the model's networks give and read, and how many are trained."""
     dynamics = model.dynamics
+    beside = "residual_" if hasattr(dynamics, "residual_mass") else ""  # rigid bodies
+    names = (f"{beside}mass", "friction", "input", f"{beside}potential")
     mass, friction, input, potential = (
-        getattr(part, "network", None)
-        for part in (dynamics.mass, dynamics.friction, dynamics.input, dynamics.potential)
+        getattr(getattr(dynamics, name, None), "network", None) for name in names
     )
     outputs = [
         0 if network is None else len(network.biases[-1]) for network in (mass, friction, input, potential)
     ]
     if friction is None:
-        outputs[1] = model.n  # a network of each joint's own
+        outputs[1] = model.n  # a function of each joint's own
     parameters = sum(parameter.numel() for parameter in model.parameters())
     inputs = 0 if mass is None else int(mass.weights[0].shape[1])
     return Sizes((outputs[0], outputs[1], outputs[2], outputs[3]), inputs, parameters)

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from spelgen.dynamics.protocol import memory_after
-from spelgen.dynamics.runge_kutta import runge_kutta
 from spelgen.dynamics.residuals import without_idle_residuals
+from spelgen.dynamics.runge_kutta import runge_kutta
 
 
 class State(NamedTuple):

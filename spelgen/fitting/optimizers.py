@@ -27,7 +27,9 @@ Blocks = Callable[[], Iterable[Any]]  # the same ones whenever it is called
 
 
 class WindowOptimizer(Protocol):
-    """Moves the weights of one model that require a gradient when it is made. stalled: whether there is no way down from here."""
+    """Moves those weights of one model that required a gradient when this was made. stalled: whether there is no way
+    down from here.
+    """
 
     @property
     def stalled(self) -> bool: ...

@@ -7,8 +7,8 @@ few constants of each joint: seconds are enough, and no step size is to be chose
 
 with the covariance of a Gaussian prior (see ``covariance``). The noise of a joint is what is left of its torque, found
 in rounds, and so is how far the start is to be believed (see ``most_probable``). Sums over samples are made block by
-block, so that memory does not grow with the logs. What a model has beside rigid bodies is fitted to what these leave, where it
-pays (see ``residual_fit``), and then both in turn.
+block, so that memory does not grow with the logs. What a model has beside rigid bodies is fitted to what these leave,
+where it pays (see ``residual_fit``), and then both in turn.
 """
 
 from __future__ import annotations

@@ -39,6 +39,8 @@ def torque_notes(model: EmittedModel, samples: TorqueSamples, found: TorqueSolut
             f"{each} Nm s/rad (N s/m) are added; check the torques' signs and what the controller subtracts"
         )
         yield Diagnostic("warning", "friction-compensated", "logs", None, message)
+    if hasattr(model.dynamics, "joint_functions"):
+        yield Diagnostic("info", "residuals", "model", None, _entered(found, names))
     q, _, qdd, *_ = (x[:: max(1, len(x) // POSITIONS)] for x in next(samples.blocks(BLOCK)))
     inertia, deviation = _inertia(model, q, found.covariance)
     if (undetermined := deviation > UNDETERMINED).any():
@@ -52,6 +54,26 @@ def torque_notes(model: EmittedModel, samples: TorqueSamples, found: TorqueSolut
             "under the measured torque may be predicted worse than by constant velocity; record faster motion"
         )
         yield Diagnostic("warning", "acceleration-unseen", "logs", None, message)
+
+
+EFFECTS = {
+    "raw_torque_splines": "a torque by position (spring, cable)",
+    "raw_torque_ripple": "ripple",
+    "raw_friction_splines": "friction that varies with position",
+    "residual_potential": "a network in V",
+    "residual_mass": "networks in M",
+}
+
+
+def _entered(found: TorqueSolution, names: np.ndarray) -> str:
+    """What stands beside rigid bodies, with the part that it explains of what was missed where it acts."""
+    if not found.residuals:
+        return "nothing beside rigid bodies and friction's laws: held-out samples ask for no more"
+    each = ", ".join(
+        f"{EFFECTS[x.name]}{'' if x.joint is None else f' at {names[x.joint]}'} ({x.gain:.1%})"
+        for x in found.residuals
+    )
+    return f"beside rigid bodies, with the part of the missed torque's squares that held-out samples lost: {each}"
 
 
 def _inertia(model: EmittedModel, q: torch.Tensor, covariance: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
