@@ -26,10 +26,11 @@ from torch import Tensor, nn
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from emitted import network_inputs
+from emitted import NETWORKS, network_inputs
 from published_phnode import Published
 
 from spelgen.building import build
+from spelgen.design import Design
 from spelgen.fitting.compiled import Compiled
 from spelgen.fitting.rollout import position_difference
 
@@ -37,10 +38,11 @@ if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
 ROBOT = Path(__file__).parents[1] / "robots" / "six_dof.urdf"
-PRESETS: dict[str, tuple[str, Literal["mlp", "kan"] | None]] = {
+PRESETS: dict[str, tuple[str | Design, Literal["mlp", "kan"] | None]] = {
     "phnode": ("phnode", "mlp"),
     "spel": ("spel", "mlp"),
     "spel-kan": ("spel-kan", "kan"),
+    "derived M, V": (NETWORKS, "mlp"),
     "minimal": ("minimal", "mlp"),
     "minimal-kan": ("minimal", "kan"),
     "closed-form": ("closed-form", None),
@@ -184,7 +186,7 @@ def main() -> None:
             steps[name].append(seconds(lambda model=model: training_step(model, data)))
             if (free := plain[name]) is not None:
                 bare[name].append(seconds(lambda model=free: training_step(model, data)))
-            if PRESETS[name][1] is not None:
+            if hasattr(model.dynamics, "mass"):
                 floors[name].append(seconds(lambda model=model: networks_alone(model, data)))
     published = Published(JOINTS, WIDTH, WIDTH // 2)
     slow = median([seconds(lambda: published_step(published, data)) for _ in range(SLOW_REPEATS)])
@@ -202,7 +204,7 @@ def main() -> None:
         bound = "" if math.isnan(share) else f"{share:.1%}"
         alone = "" if math.isnan(floor) else f"{1e3 * floor:7.1f} ms {step / floor:4.1f}x"
         print(
-            f"{name:12} {1e3 * step:6.1f} ms {bound:>7} {alone:16} {slow / step:12.0f}"
+            f"{name:13} {1e3 * step:6.1f} ms {bound:>7} {alone:16} {slow / step:12.0f}"
             f" {fast / step:10.1f} {count:11}       {sizes(model)}"
         )
     if shutil.which("g++"):
@@ -221,7 +223,7 @@ def print_compiled(models: dict[str, EmittedModel], data: Data, plain: dict[str,
             step = statistics.median(
                 seconds(lambda ready=ready: training_step(ready, data)) for _ in range(REPEATS)
             )
-        print(f"{name:12} {1e3 * step:6.1f} ms {plain[name] / step:6.2f}x {compiling:8.1f} s", flush=True)
+        print(f"{name:13} {1e3 * step:6.1f} ms {plain[name] / step:6.2f}x {compiling:8.1f} s", flush=True)
 
 
 if __name__ == "__main__":

@@ -44,9 +44,9 @@ def test_an_option_applies_or_is_told_where_it_belongs(option, objective, closed
         several = "objectives" if len(owners) > 1 else "objective"
         told = f"{option}: belongs to the {several} {' and '.join(owners)}, this fits {objective}"
     elif closed_form and objective == "momentum":
-        told = "objective: momentum belongs to models of networks, this is a closed-form one"
+        told = "objective: momentum belongs to models of networks alone, this is one of rigid bodies"
     elif option in (OF_NETWORKS if closed_form else OF_CLOSED_FORM).get(objective, ()):
-        kind = "models of networks" if closed_form else "closed-form models"
+        kind = "models of networks alone" if closed_form else "models of rigid bodies"
         told = f"{option}: with the objective {objective} belongs to {kind}"
     else:
         config = make()
@@ -134,13 +134,16 @@ def test_the_command_line_names_the_flag(robots, tmp_path):
     told = refused(module, *data, "--objective", "torque", "--learning-rate", "0.1")
     assert told == "Error: --learning-rate: belongs to the objectives momentum and rollout, this fits torque"
     told = refused(module, *data, "--objective", "torque", "--urdf-weight", "0")
-    assert told == "Error: --urdf-weight: with the objective torque belongs to models of networks"
+    assert told == "Error: --urdf-weight: with the objective torque belongs to models of networks alone"
     told = refused(module, *data, "--objective", "momentum")
-    assert told == "Error: --objective: momentum belongs to models of networks, this is a closed-form one"
+    assert (
+        told
+        == "Error: --objective: momentum belongs to models of networks alone, this is one of rigid bodies"
+    )
     told = refused(STAND_IN, *data, "--evaluations", "40")
     assert told == "Error: --evaluations: belongs to the objective torque, this fits rollout"
     told = refused(STAND_IN, *data, "--no-torque-first")
-    assert told == "Error: --torque-first: with the objective rollout belongs to closed-form models"
+    assert told == "Error: --torque-first: with the objective rollout belongs to models of rigid bodies"
     told = refused(STAND_IN, *data, "--optimizer", "lbfgs", "--batch", "4")
     assert told == "Error: --batch: belongs to the optimizer adamw, this is lbfgs"
     assert not (tmp_path / "run").exists()

@@ -340,7 +340,7 @@ def test_logs_too_slow_for_accelerations_are_fitted_by_windows(emitted, robots):
 
 def test_a_model_of_networks_is_not_adapted_to_a_load(robots, run, tmp_path):
     folder, _, fitting = run
-    build_ = ["build", str(robots / "six_dof.urdf"), "-o", str(folder / "networks.py"), "--force"]
+    build_ = ["build", str(robots / "six_dof.urdf"), "-o", str(folder / "networks.py"), "--preset", "spel"]
     assert CliRunner().invoke(app, build_).exit_code == 0
     command = ["train", str(folder / "networks.py"), *fitting[2:6], "--quiet", "--objective", "torque"]
     done = CliRunner().invoke(app, [*command, "--evaluations", "20", "-o", str(tmp_path / "networks")])
@@ -348,7 +348,7 @@ def test_a_model_of_networks_is_not_adapted_to_a_load(robots, run, tmp_path):
     command = ["train", "--from", str(tmp_path / "networks"), "--data", str(folder / "logs.parquet")]
     done = CliRunner().invoke(app, [*command, "-o", str(tmp_path / "x")])
     assert done.exit_code == 2
-    assert "--from: with the objective torque belongs to closed-form models" in done.output
+    assert "--from: with the objective torque belongs to models of rigid bodies" in done.output
 
 
 def test_the_same_logs_give_the_same_weights(run, tmp_path):

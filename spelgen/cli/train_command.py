@@ -43,12 +43,12 @@ def train(
     source: Annotated[
         Path | None,
         typer.Option(
-            "--from", metavar="RUN", help="Adapt a closed-form run to a load at the tip; no MODULE."
+            "--from", metavar="RUN", help="Adapt a run of rigid bodies to a load at the tip; no MODULE."
         ),
     ] = None,
     objective: Annotated[
         Objective | None,
-        typer.Option(help="Default: of closed-form models torque, else rollout, after momentum steps."),
+        typer.Option(help="Default: of rigid bodies torque, else rollout, after momentum steps."),
     ] = None,
     window: Annotated[
         int | None, typer.Option(min=2, help="[momentum, rollout] Samples in a window.")
@@ -61,7 +61,7 @@ def train(
         typer.Option(min=0, help="[momentum, rollout] On the weak form, before windows are predicted."),
     ] = None,
     torque_first: Annotated[
-        bool | None, typer.Option(help="[rollout] Fit torques first; of closed-form models.")
+        bool | None, typer.Option(help="[rollout] Fit torques first; of rigid bodies.")
     ] = None,
     epochs: Annotated[int | None, typer.Option(min=1, help="[rollout] At most so many.")] = None,
     patience: Annotated[

@@ -30,7 +30,7 @@ UNLESS = {  # options that belong to one value of another option
 
 
 class GaussianPrior(Group):
-    """How far the weights of a closed-form model may be from where they start: standard deviations.
+    """How far the weights of a model of rigid bodies may be from where they start: standard deviations.
 
     The weights are logarithms or fractions and so have no unit. bodies: in the affine-invariant metric, 0.1 is about
     20 % in mass. offset: in usual sizes of friction. armature, sizes and velocities of friction: of each joint by
@@ -81,9 +81,9 @@ class FitConfig(Group):
         """Raise OptionError for an option that was given and does not apply to this kind of model."""
         if closed_form and self.objective == "momentum":
             raise OptionError(
-                "objective", "momentum belongs to models of networks, this is a closed-form one"
+                "objective", "momentum belongs to models of networks alone, this is one of rigid bodies"
             )
-        kind = "models of networks" if closed_form else "closed-form models"
+        kind = "models of networks alone" if closed_form else "models of rigid bodies"
         for name in self.of_networks if closed_form else self.of_closed_form:
             if name in self.model_fields_set:
                 raise OptionError(name, f"with the objective {self.objective} belongs to {kind}")
@@ -101,7 +101,7 @@ class FitConfig(Group):
 class TorqueFit(FitConfig):
     """Fit the torque of the model's inverse dynamics to the measured one, on samples at 100 Hz that move.
 
-    A closed-form model by Gauss-Newton steps to its most probable weights after `prior`; with `payload` its last
+    Rigid bodies by Gauss-Newton steps to its most probable weights after `prior`; with `payload` its last
     body alone moves: a load at the tip of an arm that was fitted without one. A model of networks by L-BFGS, with
     at most `evaluations` of the loss, to which are added `weight_decay` times half the sum of squares of all
     weights, and `urdf_weight` times the distance from the URDF (see `UrdfRegularizer`).
@@ -181,7 +181,7 @@ class MomentumFit(OnWindows):
 class Rollout(OnWindows):
     """Fit predicted windows, in up to three stages: torque, momentum, windows (SPEL, Algorithm 1, no PD penalty).
 
-    First, with `torque_first`, a closed-form model is fitted to torques as `TorqueFit` does. Then come
+    First, with `torque_first`, rigid bodies are fitted to torques as `TorqueFit` does. Then come
     `momentum_steps` as of `MomentumFit`, kept where they help. Then windows are predicted by `solver`: rk4 with
     `substeps` per sample interval (None: as many as the robot needs) or dopri5 of torchdiffeq.
     epochs: passes over all windows, at most. patience: epochs without a better validation loss before the end.

@@ -61,7 +61,7 @@ def fit(
     """Fit ``model`` to ``logs``; it then has the best weights that were found.
 
     config: a `TorqueFit`, `MomentumFit` or `Rollout`, or of an arm under position servos a `ServoFit`, all that it
-    takes, which needs no validation; by default torque for a closed-form model, where logs are
+    takes, which needs no validation; by default torque for rigid bodies, where logs are
     dense enough for accelerations, and rollout for networks. validation: the fraction of the logs that is set aside,
     whole trajectories drawn by ``seed``, or trajectories. arm: the arm or the URDF that the model was made from,
     for the regularizer towards it and for the run folder.
@@ -188,7 +188,7 @@ def _regularizer(
     data: TrainingData,
     notes: list[Diagnostic],
 ) -> UrdfRegularizer | None:
-    """Where it is wanted and can be had; the torques of a closed-form model have a prior of their own."""
+    """Where it is wanted and can be had; the torques of rigid bodies have a prior of their own."""
     wanted = isinstance(config, Rollout) or not is_closed_form(model)
     if not wanted or not config.urdf_weight or urdf is None or not urdf.exists():
         return None

@@ -1,4 +1,4 @@
-"""What a closed-form model is fitted towards: a Gaussian over its weights, centred on where they start.
+"""What rigid bodies are fitted towards: a Gaussian over its weights, centred on where they start.
 
 Bodies are taken link by link. Friction and armatures are guessed from the drives' efforts: such a guess is mostly wrong
 by factors that all joints share (torques measured before the gear or after it, one make of gear), so a joint's own

@@ -1,4 +1,4 @@
-"""The stage before windows: the fit to all logs' torques, after which a closed-form model is mostly done."""
+"""The stage before windows: the fit to all logs' torques, after which rigid bodies are mostly done."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def is_closed_form(model: Any) -> bool:
 
 def default_objective(model: EmittedModel, rates: Sequence[float]) -> str:
     """What is fitted where nobody says: to an arm under position servos what follows its commands; torque to a
-    closed-form model, where logs are sampled densely enough for accelerations (rates [Hz]); else windows.
+    model of rigid bodies, where logs are sampled densely enough for accelerations (rates [Hz]); else windows.
     """
     if hasattr(model, "servo"):
         return "servo"

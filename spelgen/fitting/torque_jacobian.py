@@ -1,4 +1,4 @@
-"""The torque that a closed-form model misses on samples, and its derivative by all weights, block by block."""
+"""The torque that rigid bodies miss on samples, and its derivative by all weights, block by block."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ POSITIONS = 50  # at which inertias are looked at
 
 
 def torque_notes(model: EmittedModel, samples: TorqueSamples, found: TorqueSolution) -> Iterator[Diagnostic]:
-    """Of a closed-form model that was fitted to samples."""
+    """Of rigid bodies that were fitted to samples."""
     names = np.array(model.joint_names)
     # a deviation s of a coordinate is a factor e^s in a root of the pseudo-inertia
     factor = float(np.exp(2 * found.prior.bodies))
