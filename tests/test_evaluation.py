@@ -248,7 +248,7 @@ def test_a_urdf_run_is_compared_in_torque_and_at_the_tip(cart):
     names = load_module(module).joint_names
     dynamics = urdf_dynamics(cart, names)
     for role, seed in (("train", 0), ("test", 1)):
-        logs = motions(dynamics, count=2, samples=200, rate=100.0, seed=seed)
+        logs = motions(dynamics, count=2, samples=130, rate=100.0, seed=seed)
         write_logs(cart.parent / "logs" / f"{role}.parquet", logs, names)
     config, unfiltered = Rollout(epochs=1, momentum_steps=0), Preprocessing(cutoff=0.0)
     logs = [cart.parent / "logs"]
@@ -276,10 +276,11 @@ def test_a_model_in_memory_is_judged_beside_any_dynamics(cart):
         assert horizon.errors["truth"] == horizon.errors["URDF"]
     assert repr(result).startswith("<Results of cart on 2 test trajectories, relative RMS ")
     assert "velocity stays constant" in result._repr_html_()
-    filtered = evaluate(model, logs, arm=arm, preprocessing=Preprocessing(cutoff=3.0))
+    short = {"steps": (1,), "seconds": ()}
+    filtered = evaluate(model, logs, arm=arm, preprocessing=Preprocessing(cutoff=3.0), **short)
     assert filtered.cutoff == 3.0
     assert filtered.torque["model"] != result.torque["model"]
-    assert "no-urdf-baseline" in {x.code for x in evaluate(model, logs).diagnostics}
+    assert "no-urdf-baseline" in {x.code for x in evaluate(model, logs, **short).diagnostics}
 
 
 def test_mimic_joints_have_baselines_tips_and_predictions(cart):
@@ -289,7 +290,7 @@ def test_mimic_joints_have_baselines_tips_and_predictions(cart):
     mimic = '<axis xyz="0 -1 0"/><mimic joint="slide" multiplier="2" offset="0.1"/>'
     cart.write_text(CART.replace('<axis xyz="0 -1 0"/>', mimic))
     arm = load_arm(cart)
-    (log,) = motions(urdf_dynamics(cart, ["slide"]), count=1, samples=200, rate=100.0)
+    (log,) = motions(urdf_dynamics(cart, ["slide"]), count=1, samples=130, rate=100.0)
     model = build(arm, preset="closed-form")
     result = evaluate(model, log, arm=arm, preprocessing=Preprocessing(cutoff=0.0))
     assert result.joints == ("slide",)
@@ -297,7 +298,9 @@ def test_mimic_joints_have_baselines_tips_and_predictions(cart):
     for horizon in result.horizons:
         assert horizon.errors["URDF"].mean_relative_rms < 1e-3
         assert 0 <= horizon.errors["URDF"].tip_mm < horizon.errors["model"].tip_mm
-    single = evaluate(model.float(), log, arm=arm, preprocessing=Preprocessing(cutoff=0.0))
+    single = evaluate(
+        model.float(), log, arm=arm, preprocessing=Preprocessing(cutoff=0.0), steps=(1,), seconds=()
+    )
     assert single.horizons[0].errors["model"].mean_relative_rms == pytest.approx(
         result.horizons[0].errors["model"].mean_relative_rms, rel=1e-3
     )
