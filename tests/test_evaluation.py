@@ -359,3 +359,12 @@ def test_the_ur10e_urdf_has_its_known_torque_error(shared):
     assert len(samples) == 9
     torque = urdf_dynamics(folder / "ur10e.urdf", UR10E).inverse_dynamics
     assert torque_errors(torque, samples).nmse.mean() == pytest.approx(0.67, abs=0.005)
+
+
+def test_logs_that_never_move_have_no_torque_errors(robots):
+    t, still = np.arange(300) / 100, np.zeros((300, 2))
+    found = evaluate(
+        build(robots / "two_link.urdf", "phnode", width=4, depth=1), Trajectory(t, still, still, still)
+    )
+    assert found.torque == {}
+    assert found.horizons
