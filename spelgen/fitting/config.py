@@ -200,7 +200,7 @@ class Rollout(OnWindows):
 
 
 class ServoFit(FitConfig):
-    """Fit position servos, friction and weight of an arm to the positions that follow its commands (see `fit_servos`)."""
+    """Fit position servos, friction and weight of an arm to what follows its commands (see `fit_servos`)."""
 
     objective: ClassVar[Objective] = "servo"
     epochs: ClassVar[int] = 0
