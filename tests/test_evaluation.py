@@ -10,6 +10,7 @@ import torch
 import typer
 from typer.testing import CliRunner
 
+from spelgen.building import build
 from spelgen.cli import evaluate_command
 from spelgen.dynamics.pinocchio_urdf import urdf_dynamics
 from spelgen.dynamics.tip import tip_kinematics
