@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import torch
@@ -26,7 +27,7 @@ from spelgen.pipeline import generate
 from spelgen.simulation.simulate import simulate
 
 URDF = Path(__file__).parents[1] / "robots" / "rpr.urdf"
-LONGEST = 3.0  # [s] from the first write of a process to its death
+LONGEST = 2.0  # [s] from the first write of a process to its death
 
 
 def main() -> None:
@@ -51,8 +52,12 @@ def main() -> None:
                 ready = (run / "config.json").exists()
                 subprocess.run(_command(folder, run, kills, resume=ready), check=True)
                 break
-        whole, broken = (RunFolder(x).load_state(x / "model.pt") for x in (folder / "whole", run))
-        same = all(torch.equal(whole[key], broken[key]) for key in whole)
+        whole, broken = (RunFolder(x).load_checkpoint() for x in (folder / "whole", run))
+        same = all(
+            torch.equal(whole[what][key], broken[what][key])
+            for what in ("model", "best_weights")
+            for key in whole[what]
+        )
         epochs = [len(RunFolder(x).read_metrics()) for x in (folder / "whole", run)]
         print(f"{done} kills, {done} resumes, epochs {epochs}: weights {'identical' if same else 'DIFFER'}")
     if not same or done < kills or len(set(epochs)) > 1:
@@ -60,7 +65,7 @@ def main() -> None:
 
 
 def _command(folder: Path, run: Path, kills: int, *, resume: bool) -> list[str]:
-    epochs = str(40 + 8 * kills)  # of some 0.2 s: more than are done before the last kill
+    epochs = str(20 + 6 * kills)  # of some 0.2 s: more than are done before the last kill
     options = ["--data", str(folder), "-o", str(run), "--epochs", epochs, "--patience", epochs]
     if resume:
         options.append("--resume")
@@ -71,7 +76,7 @@ def _command(folder: Path, run: Path, kills: int, *, resume: bool) -> list[str]:
             "--batch",
             "8",
             "--momentum-steps",
-            "40",
+            "0",
             "--quiet",
             "--robot",
             str(URDF),
@@ -91,7 +96,12 @@ def _killed(command: list[str], run: Path, after: float) -> bool:
 
 
 def _writes(run: Path) -> int:
-    return sum(path.stat().st_mtime_ns for path in run.glob("[!.]*")) if run.is_dir() else 0
+    """A number that grows with each file that is written to the folder; some go away meanwhile."""
+    found = 0
+    for path in run.glob("[!.]*"):
+        with suppress(FileNotFoundError):
+            found += path.stat().st_mtime_ns
+    return found
 
 
 if __name__ == "__main__":

@@ -105,6 +105,15 @@ def test_a_comparison_goes_on_where_it_stopped(study, robot, quick):
     assert first["prediction"] == second["prediction"]
 
 
+def test_a_comparison_with_a_module_of_somebody_else_is_refused(study, robot):
+    module = study.module(CHOSEN[0])
+    own = module.read_text()
+    module.write_text(own + "print('anything')\n")
+    with pytest.raises(RunError, match="a module that may do anything"):
+        prepare_study(robot, study.folder, variants=CHOSEN)
+    module.write_text(own)
+
+
 def test_another_comparison_in_the_folder_is_refused(study, robot):
     with pytest.raises(RunError, match="a comparison with other settings"):
         prepare_study(robot, study.folder, variants=CHOSEN, seeds=2)

@@ -10,6 +10,7 @@ import torch
 import typer
 from typer.testing import CliRunner
 
+from spelgen.building import build
 from spelgen.cli import evaluate_command
 from spelgen.dynamics.pinocchio_urdf import urdf_dynamics
 from spelgen.dynamics.tip import tip_kinematics
@@ -248,7 +249,7 @@ def test_a_urdf_run_is_compared_in_torque_and_at_the_tip(cart):
     names = load_module(module).joint_names
     dynamics = urdf_dynamics(cart, names)
     for role, seed in (("train", 0), ("test", 1)):
-        logs = motions(dynamics, count=2, samples=200, rate=100.0, seed=seed)
+        logs = motions(dynamics, count=2, samples=130, rate=100.0, seed=seed)
         write_logs(cart.parent / "logs" / f"{role}.parquet", logs, names)
     config, unfiltered = Rollout(epochs=1, momentum_steps=0), Preprocessing(cutoff=0.0)
     logs = [cart.parent / "logs"]
@@ -276,10 +277,11 @@ def test_a_model_in_memory_is_judged_beside_any_dynamics(cart):
         assert horizon.errors["truth"] == horizon.errors["URDF"]
     assert repr(result).startswith("<Results of cart on 2 test trajectories, relative RMS ")
     assert "velocity stays constant" in result._repr_html_()
-    filtered = evaluate(model, logs, arm=arm, preprocessing=Preprocessing(cutoff=3.0))
+    short = {"steps": (1,), "seconds": ()}
+    filtered = evaluate(model, logs, arm=arm, preprocessing=Preprocessing(cutoff=3.0), **short)
     assert filtered.cutoff == 3.0
     assert filtered.torque["model"] != result.torque["model"]
-    assert "no-urdf-baseline" in {x.code for x in evaluate(model, logs).diagnostics}
+    assert "no-urdf-baseline" in {x.code for x in evaluate(model, logs, **short).diagnostics}
 
 
 def test_mimic_joints_have_baselines_tips_and_predictions(cart):
@@ -289,7 +291,7 @@ def test_mimic_joints_have_baselines_tips_and_predictions(cart):
     mimic = '<axis xyz="0 -1 0"/><mimic joint="slide" multiplier="2" offset="0.1"/>'
     cart.write_text(CART.replace('<axis xyz="0 -1 0"/>', mimic))
     arm = load_arm(cart)
-    (log,) = motions(urdf_dynamics(cart, ["slide"]), count=1, samples=200, rate=100.0)
+    (log,) = motions(urdf_dynamics(cart, ["slide"]), count=1, samples=130, rate=100.0)
     model = build(arm, preset="closed-form")
     result = evaluate(model, log, arm=arm, preprocessing=Preprocessing(cutoff=0.0))
     assert result.joints == ("slide",)
@@ -297,7 +299,9 @@ def test_mimic_joints_have_baselines_tips_and_predictions(cart):
     for horizon in result.horizons:
         assert horizon.errors["URDF"].mean_relative_rms < 1e-3
         assert 0 <= horizon.errors["URDF"].tip_mm < horizon.errors["model"].tip_mm
-    single = evaluate(model.float(), log, arm=arm, preprocessing=Preprocessing(cutoff=0.0))
+    single = evaluate(
+        model.float(), log, arm=arm, preprocessing=Preprocessing(cutoff=0.0), steps=(1,), seconds=()
+    )
     assert single.horizons[0].errors["model"].mean_relative_rms == pytest.approx(
         result.horizons[0].errors["model"].mean_relative_rms, rel=1e-3
     )
@@ -356,3 +360,12 @@ def test_the_ur10e_urdf_has_its_known_torque_error(shared):
     assert len(samples) == 9
     torque = urdf_dynamics(folder / "ur10e.urdf", UR10E).inverse_dynamics
     assert torque_errors(torque, samples).nmse.mean() == pytest.approx(0.67, abs=0.005)
+
+
+def test_logs_that_never_move_have_no_torque_errors(robots):
+    t, still = np.arange(300) / 100, np.zeros((300, 2))
+    found = evaluate(
+        build(robots / "two_link.urdf", "phnode", width=4, depth=1), Trajectory(t, still, still, still)
+    )
+    assert found.torque == {}
+    assert found.horizons

@@ -16,6 +16,7 @@ import spelgen
 from spelgen.errors import LogError, OptionError, SettingsError
 from spelgen.evaluation.replay import LATE, LINEAR
 from spelgen.fitting import servo_fit
+from spelgen.fitting.servo_report import servo_text
 from spelgen.logs.commands import delayed_commands
 from spelgen.logs.trajectory import Trajectory
 
@@ -102,6 +103,25 @@ def test_commands_are_read_and_written(tmp_path, logs, arm):
         again = spelgen.read_logs(path, arm)
         assert [np.array_equal(x.u, y.u) for x, y in zip(again, logs, strict=False)] == [True, True]
         assert again[0].tau.shape == (len(logs[0]), 0)
+
+
+def test_what_is_told_covers_the_truth(fitted):
+    told = fitted.record["servo"]["joints"]
+    for k, joint in enumerate(told):
+        for what, truth in (("kd", TRUTH.kd), ("armature", TRUTH.armature), ("dry", TRUTH.coulomb)):
+            assert joint[what]["determined"]
+            assert joint[what]["value"] == pytest.approx(truth[k] / TRUTH.kp[k], rel=0.15), what
+    assert "all of these are determined" in servo_text(fitted.record["servo"])
+
+
+def test_simulated_commands_and_positions(tmp_path):
+    arm = spelgen.load_arm(write_servo_arm(tmp_path, "input: position\nsimulation: {delay: 0.04}\n"))
+    logs = spelgen.simulate(arm, trajectories=2, duration=4.0)
+    assert len(logs.train) == 1 and logs[0].u.shape == (201, 2)
+    again = spelgen.simulate(arm, trajectories=2, duration=4.0)
+    assert np.array_equal(logs[0].q, again[0].q)
+    late = np.abs(logs[0].q[3:] - logs[0].u[:-3]).mean()
+    assert late < np.abs(logs[0].q - logs[0].u).mean() < 0.1
 
 
 def test_exports_hold_the_servos(fitted, arm, tmp_path):

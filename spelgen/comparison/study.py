@@ -27,6 +27,7 @@ from spelgen.logs.read import Trajectory, write_logs
 from spelgen.settings.comparison import ComparisonSettings
 from spelgen.settings.settings import Settings
 from spelgen.structure.nominal import working_range
+from spelgen.trust import require_own_module
 
 SCHEMA = 3
 
@@ -107,7 +108,8 @@ def prepare_study(
 ) -> Study:
     """Simulate the logs and write the modules, or find them as an earlier call left them.
 
-    Raises RunError where the folder holds another comparison, and what `load_arm` and `simulate` raise.
+    Raises RunError where the folder holds another comparison, or modules that spelgen does not write so, and what
+    `load_arm` and `simulate` raise.
     """
     loaded = load_arm(robot)
     chosen = {name: value for name, value in {"seeds": seeds, "steps": steps}.items() if value is not None}
@@ -127,6 +129,8 @@ def prepare_study(
     )
     description = _description(study, loaded)
     if _known(folder, description, force=force):
+        for variant in study.variants:  # the folder may come from elsewhere
+            require_own_module(study.module(variant), study.urdf)
         return study
     _write_logs(study, loaded, progress)
     study.urdf.write_bytes(_without_inertials(robot))

@@ -83,7 +83,8 @@ def evaluate(
         for name, k in lengths.items()
     ]
     longest = max(predicted, key=lambda x: x[0].steps)[1] if predicted else None
-    samples = dynamics_samples(logs, preprocessing=used, reach=judged.reach)
+    moving = dynamics_samples(logs, preprocessing=used, reach=judged.reach)
+    samples = [x for x in moving if len(x.q)]
     return Results(
         robot=judged.robot,
         joints=tuple(judged.joints),

@@ -200,16 +200,11 @@ class Rollout(OnWindows):
 
 
 class ServoFit(FitConfig):
-    """Fit position servos, friction and weight of an arm to the positions that follow its commands (see `fit_servos`).
-
-    windows: at most so many, of 4 s, evenly spread over the logs.
-    """
+    """Fit position servos, friction and weight of an arm to what follows its commands (see `fit_servos`)."""
 
     objective: ClassVar[Objective] = "servo"
     epochs: ClassVar[int] = 0
     window: ClassVar[int] = 5
-
-    windows: Count = 200
 
 
 WindowConfig = TorqueFit | MomentumFit | Rollout

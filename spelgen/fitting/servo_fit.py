@@ -32,7 +32,8 @@ GAIN = 2e-3  # relative: a step that gains less ends a round
 @dataclass(frozen=True, eq=False)
 class ServoSolution:
     """How a fit ended. rms: (n,) root mean square errors of positions over windows [rad, m]; covariance (k, k): of the
-    weights of joints (p, n), of directions of bodies and of the delay, in the order of `Point.flat`.
+    weights of joints (p, n), of directions of bodies and of the delay, in the order of `Point.flat`. gravity: (n,)
+    mean size of its torque along the windows.
     """
 
     names: tuple[tuple[str, int], ...]
@@ -40,6 +41,7 @@ class ServoSolution:
     steps: int
     cost: float
     covariance: torch.Tensor
+    gravity: torch.Tensor
 
 
 def fit_servos(model: Any, windows: ServoWindows, logs: Sequence[Trajectory]) -> ServoSolution:
@@ -62,7 +64,7 @@ def fit_servos(model: Any, windows: ServoWindows, logs: Sequence[Trajectory]) ->
     errors = problem.errors(point)
     return ServoSolution(
         tuple(problem.names), errors.square().mean(dim=0).sqrt(), steps, cost,
-        torch.linalg.inv(descent.curvature(point, errors)[0]),
+        torch.linalg.inv(descent.curvature(point, errors)[0]), problem.load.gravity.abs().mean(dim=(0, 1)),
     )  # fmt: skip
 
 

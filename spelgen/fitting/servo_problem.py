@@ -17,7 +17,7 @@ from spelgen.fitting.servo_windows import BodyLoad, ServoWindows, body_load
 from spelgen.fitting.torque_jacobian import Asked
 
 DEVIATIONS = {
-    "servo.raw_kp": 1.0,
+    "servo.raw_kp": 3.0,
     "servo.raw_kd": 2.0,
     "dynamics.armature.raw": 2.0,
     "dynamics.raw_offset": 2.0,

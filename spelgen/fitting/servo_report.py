@@ -13,16 +13,12 @@ from spelgen.listing import Listing, number
 
 SURE = 1.96  # standard deviations of an interval: 95 %
 OPEN = 2.0  # what may be larger by such a factor within its interval is not determined
-VALUES = {
-    "kd": ("servo.raw_kd", "s"),
-    "armature": ("dynamics.armature.raw", "s^2"),
-    "coulomb": ("dynamics.friction.raw_coulomb", "rad, m"),
-    "stribeck": ("dynamics.friction.raw_stribeck", "rad, m"),
-}
-"""What is told in ratio to kp: its weight, and the ratio's unit. All weights are logarithms."""
+UNITS = {"kd": "s", "armature": "s^2", "dry": "rad, m"}
+"""What is told in ratio to kp, and the ratio's unit; dry: friction of a joint that slides, under the usual load."""
 ABOUT = (
     "divided by kp, +- half an interval of 95 %: logs of positions tell no more. kp itself rests on the URDF's masses, "
-    "where it is not known. kd stands for kd and viscous friction, which such logs cannot tell apart"
+    "where it is not known. dry: friction of a joint that slides under its usual load. kd "
+    "stands for kd and viscous friction, which such logs cannot tell apart"
 )
 
 
@@ -35,10 +31,11 @@ def servo_record(model: Any, solution: ServoSolution) -> dict[str, Any]:
         trained = float(model.servo.trained[joint])
         about: dict[str, Any] = {"joint": name}
         about["kp"] = {"value": float(model.kp[joint].detach()), "known": not trained}
-        for what, (weight, unit) in VALUES.items():
-            value = float((getattr(model, what)[joint] / model.kp[joint]).detach())
-            ratio = [(places[weight], joint, 1.0), (kp, joint, -trained)]
-            about[what] = {"unit": unit, **_interval(value, _spread(solution, n, ratio))}
+        for what, parts in _parts(model, solution, joint).items():
+            whole = sum(parts.values())
+            ratio = [(places[weight], joint, part / whole) for weight, part in parts.items()]
+            spread = _spread(solution, n, [*ratio, (kp, joint, -trained)])
+            about[what] = {"unit": UNITS[what], **_interval(whole / about["kp"]["value"], spread)}
         joints.append(about)
     delay = float(solution.covariance.diagonal()[-1].sqrt())
     return {
@@ -47,6 +44,21 @@ def servo_record(model: Any, solution: ServoSolution) -> dict[str, Any]:
         "steps": solution.steps,
         "joints": joints,
     }
+
+
+def _parts(model: Any, solution: ServoSolution, joint: int) -> dict[str, dict[str, float]]:
+    """What each of `UNITS` is a sum of at a joint [Nm ...], by weight: weights are logarithms of these parts."""
+    with torch.no_grad():
+        friction = model.dynamics.friction.prepare()
+        found = {
+            "kd": {"servo.raw_kd": model.kd},
+            "armature": {"dynamics.armature.raw": model.armature},
+            "dry": {
+                "dynamics.friction.raw_coulomb": friction.coulomb,
+                "dynamics.friction.raw_load_dependence": friction.load_dependence * solution.gravity,
+            },
+        }
+        return {what: {name: float(x[joint]) for name, x in parts.items()} for what, parts in found.items()}
 
 
 def _spread(solution: ServoSolution, n: int, terms: list[tuple[int, int, float]]) -> float:
@@ -65,10 +77,10 @@ def _interval(value: float, spread: float) -> dict[str, Any]:
 def servo_text(record: Mapping[str, Any]) -> str:
     """For a terminal: delay, ratios with intervals, and what the logs left open."""
     rows = [
-        (each["joint"], number(each["kp"]["value"]), *(_shown(each[what]) for what in VALUES))
+        (each["joint"], number(each["kp"]["value"]), *(_shown(each[what]) for what in UNITS))
         for each in record["joints"]
     ]
-    head = ("joint", "kp [Nm/rad]", *(f"{what}/kp [{unit}]" for what, (_, unit) in VALUES.items()))
+    head = ("joint", "kp [Nm/rad]", *(f"{what}/kp [{unit}]" for what, unit in UNITS.items()))
     table = Listing("Servos", head, tuple(rows), f"Ratios are {ABOUT}.").text()
     open_ones = undetermined(record)
     left = (
@@ -87,7 +99,7 @@ def undetermined(record: Mapping[str, Any]) -> list[str]:
     return [
         f"{what}/kp of {each['joint']}"
         for each in record["joints"]
-        for what in VALUES
+        for what in UNITS
         if not each[what]["determined"]
     ]
 

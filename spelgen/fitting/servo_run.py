@@ -71,7 +71,7 @@ def fit_commands(
     found = [*check(logs, model.facts.joints, model.joint_types), *notes]
     since = time.monotonic()
     with threads_of_torch(threads):
-        windows = servo_windows(logs, preprocessing, config.windows)
+        windows = servo_windows(logs, preprocessing)
         solution = fit_servos(model, windows, logs)
     servo = servo_record(model, solution) | {"linear": fit_linear_servos(windows).to_dict()}
     rms = float(solution.rms.square().mean().sqrt())

@@ -24,7 +24,7 @@ LENGTH, SETTLING = (
     4.0,
     1.0,
 )  # s, of a window, and of its beginning, which is not judged: friction's memory forms there
-MOST = 400  # windows
+MOST = 200  # windows
 SMOOTHING = 0.18  # s over which derivatives are taken
 BLOCK = 2**13  # samples at a time
 

@@ -139,9 +139,5 @@ def _unit_listing(units: Units, quantity: Quantity) -> Listing:
 
 
 def _failures(found: FleetResults) -> Listing:
-    return Listing(
-        "What failed; started again, it is tried again",
-        ("", "why"),
-        tuple(found.failures.items()),
-        left=(0, 1),
-    )
+    rows = tuple((f"{name}: {why}",) for name, why in found.failures.items())
+    return Listing("What failed; started again, it is tried again", ("",), rows)

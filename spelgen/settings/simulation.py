@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator
 
-from spelgen.settings.values import Count, Group, Inputs, Number, Positive, Share, Whole
+from spelgen.settings.values import Count, Group, Inputs, NonNegative, Number, Positive, Share, Whole
 
 
 class SimulationSettings(Group):
@@ -20,6 +20,7 @@ class SimulationSettings(Group):
     test_fraction: part of the trajectories kept for testing; with tracking, of each trajectory, its end.
     positions: joint -> (lowest, highest) initial position [rad]; not given: its limits, +-pi if continuous.
     coulomb_smoothing_velocity: width of the tanh in place of Coulomb friction's jump [rad/s].
+    delay: of the commands of position servos [s], whose motions are of their own kind, see `simulation.servo_motions`.
     """
 
     protocol: Literal["random-inputs", "tracking"] = "random-inputs"
@@ -30,6 +31,7 @@ class SimulationSettings(Group):
     test_fraction: Share = 0.5
     positions: dict[str, tuple[Number, Number]] | None = None
     coulomb_smoothing_velocity: Positive = 0.05
+    delay: NonNegative = 0.02
     seed: Whole = 0
 
     @field_validator("positions")

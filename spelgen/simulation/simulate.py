@@ -14,6 +14,7 @@ from spelgen.settings.settings import Settings
 from spelgen.settings.simulation import SimulationSettings
 from spelgen.settings.yaml_document import Document
 from spelgen.simulation.random_inputs import random_inputs
+from spelgen.simulation.servo_motions import servo_motions
 from spelgen.simulation.simulated_logs import SimulatedLogs
 from spelgen.simulation.tracking import track
 
@@ -24,6 +25,7 @@ CONTROL_RATE = 125.0  # [Hz] about
 CONTROLLED = {
     "protocol": "tracking", "trajectories": 4, "duration": 8.0, "sample_rate": 125.0, "test_fraction": 0.25,
 }  # fmt: skip
+SERVOS = {"trajectories": 6, "duration": 20.0, "sample_rate": 50.0, "test_fraction": 0.34}
 PROTOCOLS = {"random-inputs": random_inputs, "tracking": track}
 
 
@@ -52,13 +54,16 @@ def simulate(
     changes = {key: value for key, value in given.items() if value is not None}
     changed = _changed(arm.settings.simulation, changes)
     settings = _controlled(arm.settings.model_copy(update={"simulation": changed}))
-    run = PROTOCOLS[settings.simulation.protocol]
+    run = servo_motions if settings.input == "position" else PROTOCOLS[settings.simulation.protocol]
     return run(arm.arm, settings, arm.actuation.matrix(), progress=progress)
 
 
 def _controlled(settings: Settings) -> Settings:
     """The settings, with the arm controlled where nobody says how it is driven: under random torques it would fall."""
     simulation, tracking = settings.simulation, settings.tracking
+    if settings.input == "position":
+        usual_of_servos = SERVOS | simulation.model_dump(exclude_unset=True)
+        return settings.model_copy(update={"simulation": _changed(SimulationSettings(), usual_of_servos)})
     said = {"protocol", "inputs"} & simulation.model_fields_set
     if said or any(joint.inputs for joint in settings.joints.values()):
         return settings
