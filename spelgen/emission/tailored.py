@@ -156,7 +156,9 @@ def _rigid_bodies(spec: ModelSpec) -> list[str]:
 
 def _residuals(spec: ModelSpec) -> list[tuple[str, object]]:
     """What stands beside rigid bodies, in the order in which it draws its random weights."""
-    made: list[tuple[str, object]] = [("generator", Code("torch.Generator().manual_seed(seed)"))]
+    made: list[tuple[str, object]] = []
+    if spec.outputs or spec.potential:
+        made.append(("generator", Code("torch.Generator().manual_seed(seed)")))
     network: object = None
     if spec.outputs:
         made += [

@@ -23,6 +23,7 @@ _BINARY = {
     ca.OP_SUB: "{0} - {1}",
     ca.OP_MUL: "{0} * {1}",
     ca.OP_DIV: "{0} / {1}",
+    ca.OP_FMAX: "FMAX({0}, {1})",
 }
 
 

@@ -957,7 +957,7 @@ class FrictionLaws(nn.Module):
         """The diagonal of D, (..., n): friction torque by velocity, of joints that slide."""
         c = constants
         slope = tanh_ratio(qd / c.coulomb_smoothing_velocity) / c.coulomb_smoothing_velocity
-        return self._viscous(qd, c) + self._dry(qd, gravity, c) * slope
+        return self.viscosity(qd, c) + self.dry(qd, gravity, c) * slope
 
     def forward(
         self, qd: Tensor, gravity: Tensor, constants: FrictionConstants, z: Tensor | None = None
@@ -966,7 +966,7 @@ class FrictionLaws(nn.Module):
         if z is None:
             return self.resistance(qd, gravity, constants) * qd
         direction = (constants.bristle_fractions * z / self.bristles.reach).sum(dim=-1)
-        return self._viscous(qd, constants) * qd + self._dry(qd, gravity, constants) * direction
+        return self.viscosity(qd, constants) * qd + self.dry(qd, gravity, constants) * direction
 
     def sliding(self, qd: Tensor) -> Tensor:
         """The bristles z, (..., n, K), of joints that have long gone this way."""
@@ -979,12 +979,12 @@ class FrictionLaws(nn.Module):
         return 0.5 * (constants.coulomb * stored.sum(dim=-1)).sum(dim=-1)
 
     @staticmethod
-    def _viscous(qd: Tensor, c: FrictionConstants) -> Tensor:
+    def viscosity(qd: Tensor, c: FrictionConstants) -> Tensor:
         """Torque by velocity, (..., n)."""
         return c.viscous + c.saturation / c.saturation_velocity * tanh_ratio(qd / c.saturation_velocity)
 
     @staticmethod
-    def _dry(qd: Tensor, gravity: Tensor, c: FrictionConstants) -> Tensor:
+    def dry(qd: Tensor, gravity: Tensor, c: FrictionConstants) -> Tensor:
         """The size of dry friction, (..., n) [Nm, N]."""
         slow = (-((qd / c.stribeck_velocity) ** 2)).exp()
         return c.coulomb + c.stribeck * slow + c.load_dependence * gravity.abs()
@@ -1042,7 +1042,8 @@ class ResidualMass(nn.Module):
         """
         root = torch.linalg.inv(armature).abs().sum(dim=-1).rsqrt()
         pairs = root.unsqueeze(-1) * root
-        return self.part * (pairs * self.inverse).amin(dim=(-2, -1))
+        smallest: Tensor = (pairs * self.inverse).amin(dim=(-2, -1))
+        return self.part * smallest
 
     def prepare(self, armature: Tensor) -> ResidualMassPrepared:
         """All that depends on the weights alone."""
@@ -1057,11 +1058,15 @@ class ResidualMass(nn.Module):
     def forward(self, encoded: Tensor, prepared: ResidualMassPrepared) -> tuple[Tensor, Any]:
         """R(q), and what its derivatives need."""
         if self.network is None:
-            return prepared.constant.expand(*encoded.shape[:-1], -1).unflatten(-1, (self.n, self.n)), None
+            return self._square(prepared.constant).expand(*encoded.shape[:-1], -1, -1), None
         y, residuals = self.network(encoded, prepared.layers)
         height = y.tanh()
         rows = prepared.constant + height @ prepared.functions
-        return rows.unflatten(-1, (self.n, self.n)), (residuals, 1 - height * height, prepared.functions)
+        return self._square(rows), (residuals, 1 - height * height, prepared.functions)
+
+    def _square(self, rows: Tensor) -> Tensor:
+        """(..., n n) as (..., n, n)."""
+        return rows.reshape(*rows.shape[:-1], self.n, self.n)
 
     def kinetic_vjp(self, encoded: Tensor, qd: Tensor, residuals: Any) -> Tensor:
         """The derivative of 1/2 qd^T R(q) qd by the encoding."""
@@ -1069,7 +1074,8 @@ class ResidualMass(nn.Module):
             return torch.zeros_like(encoded)
         network, slope, functions = residuals
         weight = 0.5 * (qd.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2)
-        return self.network.vjp(network, slope * (weight @ functions.mT))
+        by_encoded: Tensor = self.network.vjp(network, slope * (weight @ functions.mT))
+        return by_encoded
 
     def jvp(self, rate: Tensor, residuals: Any) -> Tensor:
         """dR/dt, (..., n, n), where the encoding changes at this rate."""
@@ -1077,7 +1083,7 @@ class ResidualMass(nn.Module):
             return rate.new_zeros(*rate.shape[:-1], self.n, self.n)
         network, slope, functions = residuals
         rows = (slope * self.network.jvp(network, rate)) @ functions
-        return rows.unflatten(-1, (self.n, self.n))
+        return self._square(rows)
 
 
 class MLPLayers(NamedTuple):
@@ -1460,7 +1466,7 @@ class ResidualPrepared(NamedTuple):
 
 
 class ResidualDynamics(RigidBodyDynamics):
-    """Rigid bodies with residuals in M, V and friction; with all their weights zero they are the bodies alone.
+    """Rigid bodies with residuals in M, V and friction; with their weights zero they are bodies alone.
 
     M = that of bodies and drives + R(q), positive definite for all weights (see ``ResidualMass``).
     V = that of bodies + a network's + each joint's own. Friction is multiplied by a positive factor.
