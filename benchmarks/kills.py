@@ -27,7 +27,7 @@ from spelgen.pipeline import generate
 from spelgen.simulation.simulate import simulate
 
 URDF = Path(__file__).parents[1] / "robots" / "rpr.urdf"
-LONGEST = 2.0  # [s] from the first write of a process to its death
+LONGEST = 6.0  # [s] from the first write of a process to its death
 
 
 def main() -> None:
@@ -65,7 +65,7 @@ def main() -> None:
 
 
 def _command(folder: Path, run: Path, kills: int, *, resume: bool) -> list[str]:
-    epochs = str(20 + 6 * kills)  # of some 0.2 s: more than are done before the last kill
+    epochs = str(20 + 16 * kills)  # of some 0.2 s: more than are done before the last kill
     options = ["--data", str(folder), "-o", str(run), "--epochs", epochs, "--patience", epochs]
     if resume:
         options.append("--resume")

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 import torch
-from emitted import NETWORKS, random_model
+from emitted import random_model
 
 import spelgen
 from spelgen.errors import LogError, RunError
@@ -179,10 +179,10 @@ def test_a_fit_tells_what_it_is():
     assert "momentum steps" in found._repr_html_()
 
 
-@pytest.mark.parametrize("samples", [4, LONG + 2])
-def test_both_solvers_agree(tmp_path, samples):
+@pytest.mark.parametrize("samples, preset", [(4, "spel"), (4, "closed-form"), (LONG + 2, "phnode")])
+def test_both_solvers_agree(tmp_path, samples, preset):
     """In what they predict and in its gradient, which over long horizons comes from the adjoint equation."""
-    model = random_model("two_link", tmp_path, seed=0, design=NETWORKS)
+    model = random_model("two_link", tmp_path, seed=0, preset=preset)
     torch.manual_seed(0)
     q, qd, tau = torch.rand(3, 5, samples, model.n, dtype=torch.float64)
     windows = Windows(0.01 + 0.01 * torch.rand(5, samples - 1).double(), q, qd, tau[:, 1:])

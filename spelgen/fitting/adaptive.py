@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import torch
 from torchdiffeq import odeint, odeint_adjoint
 
+from spelgen.dynamics.protocol import memory_after, remembering, sliding_memory
 from spelgen.logs.windows import Windows
 
 RELATIVE, ABSOLUTE = 1e-7, 1e-9  # tolerances of a step
@@ -18,17 +20,20 @@ def roll_out_adaptive(model: Any, windows: Windows) -> tuple[torch.Tensor, torch
 
     Intervals between samples are solved one after the other, each over [0, 1] in units of the window's own step.
     Gradients go through the solver (Dormand and Prince, J. Comput. Appl. Math. 6, 1980), over long horizons by the
-    adjoint equation (Chen et al., Neural Ordinary Differential Equations, NeurIPS 2018).
+    adjoint equation (Chen et al., Neural Ordinary Differential Equations, NeurIPS 2018). Friction's memory follows the
+    displacement since the last sample, as in `roll_out`; of it the adjoint equation knows nothing.
     """
-    adjoint = windows.dt.shape[1] >= LONG and isinstance(model, torch.nn.Module) and torch.is_grad_enabled()
+    long = windows.dt.shape[1] >= LONG and isinstance(model, torch.nn.Module) and torch.is_grad_enabled()
+    adjoint = long and remembering(model) is None
     # the adjoint equation sees weights alone, so what is made of them cannot be prepared once for it
     prepared = None if adjoint else model.prepare()
     q = windows.q[:, 0]
+    z = sliding_memory(model, windows.qd[:, 0]) if windows.z is None else windows.z
     state = torch.cat([q, model.momentum(q, windows.qd[:, 0])], dim=-1)  # (W, 2n)
     unit = torch.tensor([0.0, 1.0], dtype=q.dtype, device=q.device)
     states = []
     for dt, tau in zip(windows.dt.unbind(1), windows.tau.unbind(1), strict=True):
-        interval = _Interval(model, dt.unsqueeze(-1), tau, prepared)
+        interval = _Interval(model, dt.unsqueeze(-1), tau, prepared, q, z)
         if adjoint:
             weights = tuple(x for x in model.parameters() if x.requires_grad)
             solved = odeint_adjoint(
@@ -36,22 +41,36 @@ def roll_out_adaptive(model: Any, windows: Windows) -> tuple[torch.Tensor, torch
             )
         else:
             solved = odeint(interval, state, unit, rtol=RELATIVE, atol=ABSOLUTE, method="dopri5")
-        state = solved[-1]
+        state, start = solved[-1], q
+        q = state.chunk(2, dim=-1)[0]
+        z = memory_after(model, z, q - start)
         states.append(state)
     positions, momenta = torch.stack(states, dim=1).chunk(2, dim=-1)
     return positions, model.velocity(positions, momenta)
 
 
 class _Interval(torch.nn.Module):
-    """The equations of motion under a held input (W, n), in time relative to the step (W, 1)."""
+    """The equations of motion under a held input (W, n), in time relative to the step (W, 1).
 
-    def __init__(self, model: Any, step: torch.Tensor, tau: torch.Tensor, prepared: Any) -> None:
+    start, z: q (W, n) and friction's memory (W, n, K) at its beginning.
+    """
+
+    def __init__(
+        self,
+        model: Any,
+        step: torch.Tensor,
+        tau: torch.Tensor,
+        prepared: Any,
+        start: torch.Tensor,
+        z: torch.Tensor,
+    ) -> None:
         super().__init__()
+        self.past = partial(memory_after, model, z)
         # functions, not parts of this module: the weights are the model's own
         self.rhs, self.prepare, self.prepared = model.port_hamiltonian_rhs, model.prepare, prepared
-        self.step, self.tau = step, tau
+        self.step, self.tau, self.start = step, tau, start
 
     def forward(self, t: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
         q, p = state.chunk(2, dim=-1)
         prepared = self.prepare() if self.prepared is None else self.prepared
-        return self.step * torch.cat(self.rhs(q, p, self.tau, prepared), dim=-1)
+        return self.step * torch.cat(self.rhs(q, p, self.tau, prepared, self.past(q - self.start)), dim=-1)

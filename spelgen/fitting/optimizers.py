@@ -70,17 +70,16 @@ class MiniBatchAdamW:
         """See ``WindowOptimizer``."""
         rows, size = steps * self._batch, len(windows)
         passes = [torch.randperm(size, generator=self._generator) for _ in range(-(-rows // size))]
-        total = 0.0
+        total: torch.Tensor | float = 0.0  # on the device: a GPU is not waited for between steps
         for step, batch in enumerate(torch.cat(passes)[:rows].split(self._batch)):
             for group in self._optimizer.param_groups:
                 group["lr"] = learning_rate(step) * group["factor"]
-            value = self._step(loss, windows[batch.to(windows.q.device)])
-            if not math.isfinite(value):
-                return math.nan
-            total += value
-        return total / steps
+            total = total + self._step(loss, windows[batch.to(windows.q.device)])
+        mean = float(total) / steps
+        return mean if math.isfinite(mean) else math.nan
 
-    def _step(self, loss: Loss, windows: Windows) -> float:
+    def _step(self, loss: Loss, windows: Windows) -> torch.Tensor | float:
+        """The loss before the step; NaN where it or its gradient is not finite, and the weights are not either then."""
         self._optimizer.zero_grad()
         try:
             value = loss(windows)
@@ -88,10 +87,8 @@ class MiniBatchAdamW:
             return math.nan
         value.backward()
         norm = torch.nn.utils.clip_grad_norm_(self._parameters, GRADIENT_NORM)
-        if not torch.isfinite(norm):
-            return math.nan
         self._optimizer.step()
-        return value.item()
+        return value.detach() + 0.0 * norm
 
     def state_dict(self) -> dict[str, Any]:
         """All that a resumed run needs."""

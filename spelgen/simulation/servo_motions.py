@@ -94,6 +94,7 @@ def _positions(
     h, late = (t[1] - t[0]) / per, round(delay * per / (t[1] - t[0]))
     q, qd = u[0].copy(), np.zeros(u.shape[1])
     friction, found = held.friction, np.empty_like(u)
+    damping = np.diag(h / 2 * (held.kd + friction.viscous))  # at a step's middle, as the positions are
     least, most = -h * friction.forward, -h * friction.backward
     for k in range(len(t)):
         found[k] = q
@@ -101,7 +102,7 @@ def _positions(
             command = u[max(0, k * per + step - late) // per]
             torque = np.clip(held.kp * (command - q) - held.kd * qd, -held.limit, held.limit)
             force = torque - friction.viscous * qd - dynamics.nonlinear_effects(q, qd)
-            inverse = np.linalg.inv(dynamics.mass_matrix(q))
+            inverse = np.linalg.inv(dynamics.mass_matrix(q) + damping)
             qd = _slowed(qd + h * inverse @ force, inverse, least, most)
             q = q + h * qd
     return found
