@@ -28,9 +28,8 @@ from spelgen.arm.arm import Arm
 from spelgen.building import build
 from spelgen.dynamics.bristles import BristleReach, reach_of
 from spelgen.evaluation.baselines import of_dynamics
-from spelgen.evaluation.results import state_errors
+from spelgen.evaluation.results import end_errors
 from spelgen.fitting.torque_fit import PAYLOAD, fit_torque, last_body
-from spelgen.fitting.torque_networks import fit_networks
 from spelgen.identification.friction import FrictionModel
 from spelgen.identification.identification import Identification
 from spelgen.identification.identify import least_squares
@@ -168,7 +167,9 @@ def tested(logs: Sequence[Trajectory], steps: int) -> Windows:
 
 def relative_error(dynamics: Any, windows: Windows) -> float:
     predictor = of_dynamics("", dynamics, SUBSTEPS)
-    found = state_errors(predictor, windows, ("revolute",) * windows.q.shape[-1], None)
+    with torch.no_grad():
+        predicted = predictor.states(windows)
+    found = end_errors(predicted, windows, ("revolute",) * windows.q.shape[-1], None)
     return found.mean_relative_rms or np.nan
 
 
@@ -190,11 +191,11 @@ def panda(folder: Path, urdf: Path) -> None:
 
 def characters(folder: Path, scratch: Path) -> None:
     urdf = write_arm(scratch)
-    model, networks = build(urdf, "closed-form"), build(urdf, "minimal")
+    model, minimal = build(urdf, "closed-form"), build(urdf, "minimal")
     samples, forces = read_characters(folder)
     training = [x for x in samples if x.name not in CHARACTERS]
     fit_torque(model, training)
-    fit_networks(networks, training)
+    fit_torque(minimal, training)
     tests = [i for i, x in enumerate(samples) if x.name in CHARACTERS]
     q, qd, qdd = (
         torch.from_numpy(np.concatenate([getattr(samples[i], k) for i in tests])) for k in ("q", "qd", "qdd")
@@ -202,7 +203,7 @@ def characters(folder: Path, scratch: Path) -> None:
     tau, coriolis = (np.concatenate(x) for x in ([samples[i].tau for i in tests], [forces[i] for i in tests]))
     print("Characters (DeLaN's data): nMSE, total error by total variance\n")
     print(f"{'':26}{'closed-form':>15}{'minimal':>15}")
-    found = [_torques(each, q, qd, qdd) for each in (model, networks)]
+    found = [_torques(each, q, qd, qdd) for each in (model, minimal)]
     for name, true, columns in (
         ("torque", tau, [each[0] for each in found]),
         ("Coriolis torque", coriolis, [each[1] for each in found]),
