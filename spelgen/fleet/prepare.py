@@ -56,7 +56,11 @@ def prepare(preparation: Preparation) -> Prepared:
     mapping = _mapping(robot, arm)
     group = _digest(arm.robot.digest, robot.joints, robot.tip)
     key = _digest(
-        group, arm.settings.model_dump_json(), mapping.model_dump_json(), _stamps(robot), preparation.splits
+        group,
+        arm.settings.model_dump_json(exclude_unset=True),
+        mapping.model_dump_json(exclude_unset=True),
+        _stamps(robot),
+        preparation.splits,
     )
     names = [coordinate.name for coordinate in arm.arm.coordinates]
     if robot.data and large_files(robot.data, names):
