@@ -40,7 +40,7 @@ identification: samples friction base_parameters least_squares method prior iden
 excitation: trajectory criterion excitation
 fitting: run_schema run_folder run_lock
 fitting: gaussian_prior adaptive rollout calibration dataset streaming workers torque_samples torque_jacobian
-fitting: optimizers idle_residuals residual_fit torque_fit torque_report
+fitting: optimizers residual_fit torque_fit torque_report
 fitting: torque_networks urdf_regularizer stages compiled process progress validation loop
 fitting: run_record fitted servo_windows servo_start servo_problem servo_fit servo_report linear_servo servo_run
 fitting: fit train

@@ -6,6 +6,25 @@ import copy
 from typing import Any
 
 
+def idle_residuals(model: Any) -> list[str]:
+    """The names of a model's parameters of residuals that add nothing to it as it is."""
+    dynamics = model.dynamics
+    if not hasattr(dynamics, "residual_mass"):
+        return []
+    parts = [("joint_functions.", dynamics.joint_functions), ("residual_mass.", dynamics.residual_mass)]
+    idle = [
+        f"dynamics.{part}{name}"
+        for part, module in parts
+        for name, x in module.named_parameters(recurse=False)
+        if not x.any()
+    ]
+    for part in ("residual_mass", "residual_potential"):
+        network = getattr(getattr(dynamics, part), "network", None)
+        if network is not None and _idle(network):
+            idle += [f"dynamics.{part}.network.{name}" for name, _ in network.named_parameters()]
+    return idle
+
+
 def without_residuals(dynamics: Any) -> Any:
     """The rigid bodies alone, of the same weights."""
     found = copy.copy(dynamics)

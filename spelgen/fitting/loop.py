@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 
+from spelgen.dynamics.residuals import idle_residuals
 from spelgen.errors import RunError
 from spelgen.fitting import workers
 from spelgen.fitting.config import BATCH, FEW_WINDOWS, LEARNING_RATE, WindowConfig
 from spelgen.fitting.dataset import TrainingData
-from spelgen.fitting.idle_residuals import idle_residuals
 from spelgen.fitting.optimizers import LBFGS, MiniBatchAdamW, WindowOptimizer
 from spelgen.fitting.progress import TrainingProgress
 from spelgen.fitting.rollout import Mean, momentum_loss, rollout_loss
