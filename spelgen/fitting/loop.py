@@ -32,6 +32,7 @@ WARM_UP = 0.02  # part of all steps over which the learning rate rises
 FINAL_RATE = 0.01  # the cosine ends at this part of the learning rate
 EPOCH_STEPS = 20  # at least; few windows are passed over several times between validations
 FIRST_STAGE = 0.5  # of all steps or minutes, at most, while residuals of rigid bodies rest
+SECOND_PATIENCE = 10  # epochs: residuals that belong to the arm soon help
 PROBE_EVERY = 5  # epochs: friction that is learned may be too stiff for the substeps so far
 MAX_ROLLBACKS = 8
 
@@ -178,7 +179,8 @@ class TrainingLoop:
     def _end(self) -> Status | None:
         if self.epoch >= self.config.epochs or self._done() >= self._stage_to or self.optimizer.stalled:
             return "finished"
-        if self.epoch - max(self.best_epoch, self.stage_epoch) >= self.config.patience:
+        patience = min(self.config.patience, SECOND_PATIENCE) if self.stage_epoch else self.config.patience
+        if self.epoch - max(self.best_epoch, self.stage_epoch) >= patience:
             return "stopped early"
         return "out of time" if self._spent(self.seconds + self._pace + self._closing) >= 1.0 else None
 
