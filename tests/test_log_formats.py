@@ -331,7 +331,7 @@ def test_pipes_among_logs_are_not_waited_for(tmp_path, suffix):
     os.mkfifo(tmp_path / f"live{suffix}")
     with pytest.raises(LogError) as caught:
         read_logs(tmp_path / f"live{suffix}", JOINTS)
-    kinds = ".parquet, .csv, .npz, .mcap, .db3, or the folder of a ROS 2 bag"
+    kinds = ".parquet, .csv, .npz, .mcap, .db3, the folder of a ROS 2 bag or of a LeRobot data set"
     assert str(caught.value) == f"{tmp_path}/live{suffix}: got a pipe or a device, expected a file: {kinds}"
     parquet(tmp_path / "x.parquet", columns())
     check(read_logs(tmp_path, JOINTS)[0], "x")

@@ -213,7 +213,7 @@ def test_missing_files_and_folders_are_told_at_once(tmp_path):
     csv(tmp_path / "log.txt", "")
     with pytest.raises(SpelgenErrors) as caught:
         read_logs([tmp_path / "none.csv", tmp_path / "empty", tmp_path / "log.txt"], JOINTS)
-    kinds = ".parquet, .csv, .npz, .mcap, .db3, or the folder of a ROS 2 bag"
+    kinds = ".parquet, .csv, .npz, .mcap, .db3, the folder of a ROS 2 bag or of a LeRobot data set"
     assert str(caught.value).splitlines() == [
         f"{tmp_path}/none.csv: got no such file or folder, expected a log; check the path",
         f"{tmp_path}/empty: got a folder without logs, expected {kinds}",

@@ -177,12 +177,14 @@ class TrainingLoop:
         return self.together(loss, windows) + self._penalty()
 
     def _end(self) -> Status | None:
-        if self.epoch >= self.config.epochs or self._done() >= self._stage_to or self.optimizer.stalled:
+        if self.epoch >= self.config.epochs or self.optimizer.stalled:
             return "finished"
         patience = min(self.config.patience, SECOND_PATIENCE) if self.stage_epoch else self.config.patience
         if self.epoch - max(self.best_epoch, self.stage_epoch) >= patience:
             return "stopped early"
-        return "out of time" if self._spent(self.seconds + self._pace + self._closing) >= 1.0 else None
+        if self._spent(self.seconds + self._pace + self._closing) >= 1.0:
+            return "out of time"
+        return "finished" if self._done() >= self._stage_to else None
 
     def _spent(self, seconds: float) -> float:
         """The part of the allowed time that these seconds are; 0 where any time is allowed."""
