@@ -13,7 +13,6 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +25,7 @@ from real_logs import TESTS, TRAINING, after, first, mean, read, samples_of, tor
 from torch import nn
 
 from spelgen.building import build
+from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.fitting.torque_fit import fit_torque
 from spelgen.identification.friction import FrictionModel
 from spelgen.identification.identify import least_squares
@@ -125,10 +125,11 @@ def recorded(model: Any, effects: Sequence[str], seed: int, noise: float = 0.0) 
     size, angle = rng.uniform(0.2, 0.5, (5, 6)), speed * t + phase
     q, qd = (size * np.sin(angle)).sum(1), (size * speed * np.cos(angle)).sum(1)
     qdd = -(size * speed**2 * np.sin(angle)).sum(1)
-    states = [torch.from_numpy(x) for x in (q, qd, qdd)]
+    z = bristles_along(q, bristle_reach(model))
+    states = [torch.from_numpy(x) for x in (q, qd, qdd, z)]
     with torch.no_grad():
         tau = model.inverse_dynamics(*states).numpy()
-        friction = model.friction_torque(*states[:2]).numpy()
+        friction = model.friction_torque(*states[:2], states[3]).numpy()
     if "spring" in effects:
         tau[:, 1] += 120 * np.sin(q[:, 1] - 0.4)
         tau[:, 0] += 8 * q[:, 0]
@@ -137,8 +138,7 @@ def recorded(model: Any, effects: Sequence[str], seed: int, noise: float = 0.0) 
     if "friction" in effects:
         tau += 0.5 * np.sin(q + 0.7) * friction
     tau += noise * tau.std(axis=0) * rng.normal(size=tau.shape)
-    empty = np.zeros((*q.shape, 0))
-    return replace(DynamicsSamples("simulated", q, qd, qdd, tau), z=empty)
+    return DynamicsSamples("simulated", q, qd, qdd, tau, z)
 
 
 def network(training: Sequence[DynamicsSamples], beside: Torque | None = None) -> Torque:

@@ -31,8 +31,8 @@ MOMENTUM_FACTOR = 10.0  # on the learning rate of the momentum steps, which are 
 WARM_UP = 0.02  # part of all steps over which the learning rate rises
 FINAL_RATE = 0.01  # the cosine ends at this part of the learning rate
 EPOCH_STEPS = 20  # at least; few windows are passed over several times between validations
-FIRST_STAGE = 0.5  # of all steps or minutes, at most, while residuals of rigid bodies rest
-SECOND_PATIENCE = 10  # epochs: residuals that belong to the arm soon help
+FIRST_STAGE = 0.8  # of all steps or minutes, at most, while residuals of rigid bodies rest
+SECOND_PATIENCE = 3  # epochs: residuals that belong to the arm soon help
 PROBE_EVERY = 5  # epochs: friction that is learned may be too stiff for the substeps so far
 MAX_ROLLBACKS = 8
 
