@@ -134,6 +134,7 @@ def fit(
                 shown.note(note)
             status = loop.run(shown)
     model.load_state_dict(loop.best_weights)
+    model.requires_grad_(True)  # of what rested, too
     return Fit(
         model=model,
         config=chosen,
