@@ -70,9 +70,12 @@ def fleet(robots, logs, tmp_path):
 def kill_two(folder: Path, killed: list[int]) -> None:
     """Kills the worker that trains arm a, and tells that of arm b to end, once each has a checkpoint."""
     waiting = {"a": signal.SIGKILL, "b": signal.SIGTERM}
-    for _ in range(6000):
+    for _ in range(30_000):  # a machine under load takes minutes to start workers
         for lock in folder.glob("runs/*/*/.lock"):
-            text, arm = lock.read_text(), lock.parts[-3]
+            try:
+                text, arm = lock.read_text(), lock.parts[-3]
+            except FileNotFoundError:  # a run ended between two looks
+                continue
             if arm in waiting and text.startswith("process") and (lock.parent / "config.json").exists():
                 killed.append(int(text.split()[1]))
                 os.kill(killed[-1], waiting.pop(arm))

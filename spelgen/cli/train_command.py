@@ -195,7 +195,7 @@ def _outcome(found: Fit) -> tuple[str, str]:
     if not config.epochs:  # windows only judge
         return f"{found.status}: {config.objective} fitted in {found.seconds:.0f} s", loss
     why = {
-        "stopped early": f": no better validation loss in {config.patience} epochs",
+        "stopped early": f": no better validation loss since epoch {found.best_epoch}",
         "out of time": f": {config.max_minutes or 0:g} minutes are over",
         "finished": ": all epochs are run" if found.epochs >= config.epochs else ": no way further down",
     }.get(found.status or "", "")
