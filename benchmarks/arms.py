@@ -20,7 +20,9 @@ import numpy as np
 import torch
 
 sys.path.insert(0, str(Path(__file__).parent))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
+from motions import smooth_motion
 from real_logs import TESTS, TRAINING, after, first, mean, read, samples_of, torque_of
 from torch import nn
 
@@ -120,11 +122,7 @@ def simulated() -> Iterator[Case]:
 def recorded(model: Any, effects: Sequence[str], seed: int, noise: float = 0.0) -> DynamicsSamples:
     """30 s of a smooth random motion with the model's torque and what else acts; noise by the torque's deviation."""
     rng = np.random.default_rng(seed)
-    t = np.arange(0.0, 30.0, 0.01)[:, None, None]
-    speed, phase = 2 * np.pi * rng.uniform(0.1, 0.7, (5, 6)), rng.uniform(0, 2 * np.pi, (5, 6))
-    size, angle = rng.uniform(0.2, 0.5, (5, 6)), speed * t + phase
-    q, qd = (size * np.sin(angle)).sum(1), (size * speed * np.cos(angle)).sum(1)
-    qdd = -(size * speed**2 * np.sin(angle)).sum(1)
+    q, qd, qdd = smooth_motion(model.n, 30.0, rng)
     z = bristles_along(q, bristle_reach(model))
     states = [torch.from_numpy(x) for x in (q, qd, qdd, z)]
     with torch.no_grad():

@@ -7,6 +7,7 @@ import pytest
 import torch
 from characters import TESTS, read_characters, write_arm
 from emitted import import_source
+from motions import smooth_motion
 from scipy.optimize import minimize_scalar
 from typer.testing import CliRunner
 
@@ -50,13 +51,7 @@ def emitted(robots, tmp_path_factory):
 def recorded(model, seconds, noise, seed=0):
     """Samples of a smooth random motion with the model's own torque."""
     rng = np.random.default_rng(seed)
-    t = np.arange(0.0, seconds, 0.01)[:, None, None]
-    n = model.n
-    speed, phase = 2 * np.pi * rng.uniform(0.1, 0.7, (5, n)), rng.uniform(0, 2 * np.pi, (5, n))
-    size = rng.uniform(0.2, 0.5, (5, n))
-    angle = speed * t + phase
-    q, qd = (size * np.sin(angle)).sum(1), (size * speed * np.cos(angle)).sum(1)
-    qdd = -(size * speed**2 * np.sin(angle)).sum(1)
+    q, qd, qdd = smooth_motion(model.n, seconds, rng)
     with torch.no_grad():
         tau = model.inverse_dynamics(*(torch.from_numpy(x) for x in (q, qd, qdd))).numpy()
     tau = tau + noise * tau.std(0) * rng.normal(size=tau.shape)

@@ -32,9 +32,8 @@ class PreparedModel:
 
     def __init__(self, model: Any, tip: Any = None, *, dtype: torch.dtype = torch.float64) -> None:
         model = copy.deepcopy(model).to(dtype=dtype).requires_grad_(False)
-        model.dynamics = without_idle_residuals(
-            model.dynamics
-        )  # networks that give nothing take most of the time
+        # networks that give nothing would take most of the time
+        model.dynamics = without_idle_residuals(model.dynamics)
         self.n: int = model.n
         self._dynamics, self._weights, self._tip = model.dynamics, model.prepare(), tip
         self.elements: int = model.dynamics.elements

@@ -78,9 +78,8 @@ class TrainingLoop:
         self.stream = data.stream
         self.batch = min(getattr(config, "batch", None) or BATCH, len(self.training))
         self.whole = getattr(config, "optimizer", "lbfgs") == "lbfgs"  # all windows at once
-        if (
-            not self.whole or len(data.training) > FEW_WINDOWS
-        ):  # L-BFGS on few is the same to the last bit unshared
+        if not self.whole or len(data.training) > FEW_WINDOWS:
+            # L-BFGS on few is the same to the last bit unshared
             self.training = workers.shard(self.training, data.counts)
         self.resting, self.stage_from, self.stage_epoch = idle_residuals(self.model), 0.0, 0
         self.optimizer = self._optimizer(self.generator)

@@ -108,16 +108,14 @@ def fit_torque(
         problem.jacobian.write(at.x)
         residuals = enter(model, problem.jacobian.left(at.x), alike)
         for _ in range(TURNS if residuals else 0):
-            problem.take(TorqueJacobian(model, few))
-            at = replace(at, squares=problem.jacobian.squares(at.x))
+            at = problem.again(at, TorqueJacobian(model, few))
             at, noise = problem.solve(at, problem.noise(at.squares), LAST_ROUNDS)
             problem.jacobian.write(at.x)
             refine(model, problem.jacobian.left(at.x), residuals, alike)
-        problem.take(TorqueJacobian(model, few))
-        at = replace(at, squares=problem.jacobian.squares(at.x))
+        if residuals:  # seen with what was refined last
+            at = problem.again(at, TorqueJacobian(model, few))
     if large:  # few of many samples came near, all of them finish
-        problem.take(TorqueJacobian(model, samples))
-        at, _ = problem.solve(replace(at, squares=problem.jacobian.squares(at.x)), noise, LAST_ROUNDS)
+        at, _ = problem.solve(problem.again(at, TorqueJacobian(model, samples)), noise, LAST_ROUNDS)
     problem.jacobian.write(at.x)
     return TorqueSolution(
         residual=(at.squares / samples.count).sqrt().numpy(),
@@ -145,6 +143,11 @@ class _Problem:
         self.jacobian, self.count = jacobian, jacobian.samples.count
         deviation = jacobian.torque_deviation()
         self.range = torch.maximum(deviation, 1e-3 * deviation.max())
+
+    def again(self, at: _Step, jacobian: TorqueJacobian) -> _Step:
+        """Go on from these weights with these samples."""
+        self.take(jacobian)
+        return replace(at, squares=jacobian.squares(at.x))
 
     def believe(self, prior: GaussianPrior) -> None:
         """Go on with this prior."""
