@@ -34,23 +34,23 @@ def test_every_option_has_a_value_here_and_a_place_in_the_settings():
     assert TrainingSettings.model_fields.keys() == in_a_file | beside
 
 
-@pytest.mark.parametrize("closed_form", [False, True])
+@pytest.mark.parametrize("rigid_bodies", [False, True])
 @pytest.mark.parametrize("objective", ["torque", "momentum", "rollout"])
 @pytest.mark.parametrize("option", VALUES)
-def test_an_option_applies_or_is_told_where_it_belongs(option, objective, closed_form):
-    make = lambda: fit_config(objective, closed_form=closed_form, options={option: VALUES[option]})  # noqa: E731
+def test_an_option_applies_or_is_told_where_it_belongs(option, objective, rigid_bodies):
+    make = lambda: fit_config(objective, rigid_bodies=rigid_bodies, options={option: VALUES[option]})  # noqa: E731
     owners = [x for x in ("torque", "momentum", "rollout") if option in CONFIGS[x].model_fields]
     if objective not in owners:
         several = "objectives" if len(owners) > 1 else "objective"
         told = f"{option}: belongs to the {several} {' and '.join(owners)}, this fits {objective}"
-    elif closed_form and objective == "momentum":
+    elif rigid_bodies and objective == "momentum":
         told = "objective: momentum belongs to models of networks alone, this is one of rigid bodies"
-    elif option in (OF_NETWORKS if closed_form else OF_CLOSED_FORM).get(objective, ()):
-        kind = "models of networks alone" if closed_form else "models of rigid bodies"
+    elif option in (OF_NETWORKS if rigid_bodies else OF_CLOSED_FORM).get(objective, ()):
+        kind = "models of networks alone" if rigid_bodies else "models of rigid bodies"
         told = f"{option}: with the objective {objective} belongs to {kind}"
     else:
         config = make()
-        assert config.record(closed_form=closed_form)[option]
+        assert config.record(rigid_bodies=rigid_bodies)[option]
         return
     with pytest.raises(OptionError) as caught:
         make()
@@ -77,7 +77,7 @@ def test_from_python_too():
     with pytest.raises(ValidationError, match="frozen"):
         Rollout().window = 3
     with pytest.raises(SettingsError) as caught:
-        fit_config("rollout", closed_form=False, options={"learning_rate": 0.0})
+        fit_config("rollout", rigid_bodies=False, options={"learning_rate": 0.0})
     assert str(caught.value) == "learning_rate: got 0.0, expected greater than 0"
     for wrong in ({"cutoff": -1.0}, {"decimation": 0}, {"gap": 1.0}):
         with pytest.raises(SettingsError, match=next(iter(wrong))):
@@ -87,8 +87,8 @@ def test_from_python_too():
 def test_what_a_robot_settles_for_another_objective_is_left_out():
     settled = {"window": 9, "batch": 8, "substeps": 4, "weight_decay": 0.3, "prior": {"bodies": 1.0}}
     make = lambda objective, **chosen: fit_config(  # noqa: E731
-        objective, closed_form=False, options=chosen, defaults=settled
-    ).record(closed_form=False)
+        objective, rigid_bodies=False, options=chosen, defaults=settled
+    ).record(rigid_bodies=False)
     assert make("torque") == {"evaluations": 2000, "weight_decay": 0.3, "urdf_weight": 1.0}
     found = make("rollout", solver="dopri5", optimizer="lbfgs")
     assert (found["window"], "batch" in found, "substeps" in found) == (9, False, False)

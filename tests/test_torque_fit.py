@@ -38,7 +38,7 @@ BODIES = "dynamics.inertial_parameters.raw"
 @pytest.fixture(scope="module")
 def emitted(robots, tmp_path_factory):
     """Robot name -> (module, arm)."""
-    folder = tmp_path_factory.mktemp("closed_form")
+    folder = tmp_path_factory.mktemp("rigid_bodies")
     (folder / "followed.urdf").write_text(FOLLOWED, encoding="utf-8")
     made = {}
     for name in (*ROBOTS, "followed"):

@@ -459,7 +459,7 @@ def test_the_learning_rate_rises_and_falls(logs, tmp_path):
 def test_few_windows_are_taken_all_at_once(logs, tmp_path):
     """L-BFGS comes nearer in as many steps, and a weight decay of its own is what it gets."""
     config = Rollout(momentum_steps=0, epochs=6)
-    assert config.resolved(100).record(closed_form=False).keys() & {"batch", "learning_rate"} == set()
+    assert config.resolved(100).record(rigid_bodies=False).keys() & {"batch", "learning_rate"} == set()
     assert (config.resolved(100).optimizer, config.resolved(100).weight_decay) == ("lbfgs", 2e-5)
     resolved = config.resolved(5000)
     assert (resolved.optimizer, resolved.batch, resolved.learning_rate) == ("adamw", 256, 1e-3)

@@ -52,7 +52,7 @@ class Start:
 def begun(module: Path, urdf: Path | None, chosen: Chosen) -> Start:
     """A new run: what the command line does not say, the robot's settings do."""
     from spelgen.fitting.config import fit_config
-    from spelgen.fitting.stages import default_config, is_closed_form
+    from spelgen.fitting.stages import default_config, has_rigid_bodies
     from spelgen.logs.preprocessing import Preprocessing
     from spelgen.settings.settings import load_settings
     from spelgen.settings.training import TrainingSettings
@@ -64,9 +64,12 @@ def begun(module: Path, urdf: Path | None, chosen: Chosen) -> Start:
     def config(model: EmittedModel, rates: Sequence[float] | None) -> FitConfig | None:
         if objective is not None:
             return fit_config(
-                objective, closed_form=is_closed_form(model), options=chosen.flags, defaults=settings.options
+                objective,
+                rigid_bodies=has_rigid_bodies(model),
+                options=chosen.flags,
+                defaults=settings.options,
             )
-        if rates is None and is_closed_form(model):
+        if rates is None and has_rigid_bodies(model):
             return None  # the logs decide
         return default_config(model, rates or [], chosen.flags, settings.options)
 
@@ -85,7 +88,7 @@ def resumed(folder: Path, chosen: Chosen) -> Start:
     from spelgen.fitting.config import fit_config
     from spelgen.fitting.run_folder import RunFolder
     from spelgen.fitting.run_record import recorded_config
-    from spelgen.fitting.stages import is_closed_form
+    from spelgen.fitting.stages import has_rigid_bodies
     from spelgen.logs.mapping import LogMapping
     from spelgen.logs.preprocessing import Preprocessing
 
@@ -100,9 +103,9 @@ def resumed(folder: Path, chosen: Chosen) -> Start:
 
     def config(model: EmittedModel, rates: Sequence[float] | None) -> FitConfig:
         if chosen.objective not in (None, before["objective"]):
-            return fit_config(chosen.objective, closed_form=is_closed_form(model), options=chosen.flags)
+            return fit_config(chosen.objective, rigid_bodies=has_rigid_bodies(model), options=chosen.flags)
         found = recorded_config(before, **chosen.flags)
-        found.require(closed_form=is_closed_form(model))
+        found.require(rigid_bodies=has_rigid_bodies(model))
         return found
 
     return Start(

@@ -153,7 +153,7 @@ def _training(settings: Settings, comparison: ComparisonSettings) -> Rollout:
     if comparison.weight_decay is not None:
         options["weight_decay"] = comparison.weight_decay
     defaults = settings.training.options
-    return cast("Rollout", fit_config("rollout", closed_form=False, options=options, defaults=defaults))
+    return cast("Rollout", fit_config("rollout", rigid_bodies=False, options=options, defaults=defaults))
 
 
 def _description(study: Study, loaded: LoadedArm) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import torch
 from spelgen.exporting.describe_residuals import array, constant_residual, residuals, unsupported
 from spelgen.exporting.description import Bristles, FrictionLaw, Servos, TrainedModel
 from spelgen.exporting.tip_chain import tip_chain
-from spelgen.fitting.stages import is_closed_form
+from spelgen.fitting.stages import has_rigid_bodies
 from spelgen.loaded_arm import LoadedArm
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
     """The numbers of a trained model of this arm. Raises RunError for a preset that has no such description."""
     exact: Any = copy.deepcopy(model).double().cpu().requires_grad_(False)
     dynamics, preset = exact.dynamics, model.facts.options.preset
-    if not is_closed_form(exact):
+    if not has_rigid_bodies(exact):
         raise unsupported(f"the preset {preset}, which is not of rigid bodies")
     with torch.no_grad():
         prepared = dynamics.prepare()

@@ -15,7 +15,7 @@ from spelgen.arm.arm import Arm
 from spelgen.building import build
 from spelgen.dynamics.residuals import without_residuals
 from spelgen.fitting.optimizers import minimise
-from spelgen.fitting.stages import is_closed_form
+from spelgen.fitting.stages import has_rigid_bodies
 from spelgen.loaded_arm import LoadedArm
 from spelgen.structure.nominal import working_range
 
@@ -66,7 +66,7 @@ def rigid_body_projection(model: EmittedModel, arm: LoadedArm) -> RigidBodyProje
     """The bodies, armature and friction of a trained model of ``arm``."""
     model = copy.deepcopy(model).double().requires_grad_(False)
     q = sampled_positions(arm.arm)
-    own = is_closed_form(model)
+    own = has_rigid_bodies(model)
     bodies: Any = _own(model) if own else _nearest(model, arm, q)
     mass, gravity = _errors(model, bodies, q)
     viscous, forward, backward, missed = _friction(arm.arm, model, q)

@@ -59,7 +59,7 @@ class FitConfig(Group):
     """What the objectives have in common: to know which options are theirs."""
 
     objective: ClassVar[Objective]
-    of_closed_form: ClassVar[tuple[str, ...]] = ()
+    of_rigid_bodies: ClassVar[tuple[str, ...]] = ()
     of_networks: ClassVar[tuple[str, ...]] = ()
 
     @model_validator(mode="before")
@@ -77,20 +77,20 @@ class FitConfig(Group):
                 raise OptionError(name, f"belongs to the {other} {needed}, this is {against}")
         return self
 
-    def require(self, *, closed_form: bool) -> None:
+    def require(self, *, rigid_bodies: bool) -> None:
         """Raise OptionError for an option that was given and does not apply to this kind of model."""
-        if closed_form and self.objective == "momentum":
+        if rigid_bodies and self.objective == "momentum":
             raise OptionError(
                 "objective", "momentum belongs to models of networks alone, this is one of rigid bodies"
             )
-        kind = "models of networks alone" if closed_form else "models of rigid bodies"
-        for name in self.of_networks if closed_form else self.of_closed_form:
+        kind = "models of networks alone" if rigid_bodies else "models of rigid bodies"
+        for name in self.of_networks if rigid_bodies else self.of_rigid_bodies:
             if name in self.model_fields_set:
                 raise OptionError(name, f"with the objective {self.objective} belongs to {kind}")
 
-    def record(self, *, closed_form: bool) -> dict[str, Any]:
+    def record(self, *, rigid_bodies: bool) -> dict[str, Any]:
         """The options that apply, for config.json."""
-        unused = self.of_networks if closed_form else self.of_closed_form
+        unused = self.of_networks if rigid_bodies else self.of_rigid_bodies
         return self.model_dump(mode="json", exclude_none=True, exclude=set(unused))
 
     def resolved(self, windows: int) -> Self:
@@ -108,7 +108,7 @@ class TorqueFit(FitConfig):
     """
 
     objective: ClassVar[Objective] = "torque"
-    of_closed_form: ClassVar[tuple[str, ...]] = ("prior", "payload")
+    of_rigid_bodies: ClassVar[tuple[str, ...]] = ("prior", "payload")
     of_networks: ClassVar[tuple[str, ...]] = ("evaluations", "weight_decay", "urdf_weight")
     # windows are not fitted, only judged by
     window: ClassVar[int] = 5
@@ -189,7 +189,7 @@ class Rollout(OnWindows):
     """
 
     objective: ClassVar[Objective] = "rollout"
-    of_closed_form: ClassVar[tuple[str, ...]] = ("torque_first",)
+    of_rigid_bodies: ClassVar[tuple[str, ...]] = ("torque_first",)
 
     torque_first: bool = True
     epochs: Count = 400
@@ -218,7 +218,7 @@ OWNERS: dict[str, list[str]] = {
 def fit_config(
     objective: str,
     *,
-    closed_form: bool,
+    rigid_bodies: bool,
     options: Mapping[str, Any] | None = None,
     defaults: Mapping[str, Any] | None = None,
 ) -> FitConfig:
@@ -227,7 +227,7 @@ def fit_config(
     Of ``defaults``, a robot's settings for whatever is fitted, those that do not apply are left out.
     """
     kind, options = CONFIGS[objective], dict(options or {})
-    unused = kind.of_networks if closed_form else kind.of_closed_form
+    unused = kind.of_networks if rigid_bodies else kind.of_rigid_bodies
     usual = {k: x for k, x in (defaults or {}).items() if k in kind.model_fields and k not in unused}
     for name, (other, _, against) in UNLESS.items():
         if options.get(other, usual.get(other)) == against:
@@ -235,7 +235,7 @@ def fit_config(
         elif name in options and other not in options and usual.get(other) == against:
             usual.pop(other)
     found = made(kind, usual | options)
-    found.require(closed_form=closed_form)
+    found.require(rigid_bodies=rigid_bodies)
     return found
 
 

@@ -22,7 +22,7 @@ from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.run_lock import locked
 from spelgen.fitting.run_record import describe, require_same
 from spelgen.fitting.servo_run import fit_commands, require_input
-from spelgen.fitting.stages import default_config, fit_torque_stage, is_closed_form
+from spelgen.fitting.stages import default_config, fit_torque_stage, has_rigid_bodies
 from spelgen.fitting.streaming import LargeLogs, prepare_streamed
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer, urdf_regularizer
 from spelgen.logs.mapping import LogMapping
@@ -76,10 +76,10 @@ def fit(
     """
     began = time.monotonic()
     logs = [logs] if isinstance(logs, Trajectory) else logs
-    closed_form = is_closed_form(model)
+    rigid_bodies = has_rigid_bodies(model)
     if config is None:
         config = default_config(model, sample_rates(logs))
-    config.require(closed_form=closed_form)
+    config.require(rigid_bodies=rigid_bodies)
     require_input(model, config)
     if isinstance(config, ServoFit):
         return fit_commands(
@@ -190,7 +190,7 @@ def _regularizer(
     notes: list[Diagnostic],
 ) -> UrdfRegularizer | None:
     """Where it is wanted and can be had; the torques of rigid bodies have a prior of their own."""
-    wanted = isinstance(config, Rollout) or not is_closed_form(model)
+    wanted = isinstance(config, Rollout) or not has_rigid_bodies(model)
     if not wanted or not config.urdf_weight or urdf is None or not urdf.exists():
         return None
     try:

@@ -10,7 +10,7 @@ from spelgen.errors import RunError
 from spelgen.fitting.config import CONFIGS, FitConfig, WindowConfig, made
 from spelgen.fitting.dataset import TrainingData
 from spelgen.fitting.run_folder import RunFolder
-from spelgen.fitting.stages import is_closed_form
+from spelgen.fitting.stages import has_rigid_bodies
 from spelgen.logs.mapping import LogMapping
 from spelgen.logs.trajectory import Trajectory
 from spelgen.spec import logged_joints
@@ -38,7 +38,7 @@ def describe(
         "preset": facts.options.preset if facts else None,
         "joints": list(logged_joints(model)),
         "objective": config.objective,
-        "config": config.record(closed_form=is_closed_form(model)),
+        "config": config.record(rigid_bodies=has_rigid_bodies(model)),
         "preprocessing": asdict(data.preprocessing),
         "validation_fraction": validation if isinstance(validation, float) else None,
         "seed": seed,

@@ -79,7 +79,7 @@ def fit_commands(
     facts = model.facts
     record = {
         "schema": 2, "robot": facts.robot, "preset": facts.options.preset, "joints": list(facts.joints),
-        "objective": config.objective, "config": config.record(closed_form=True),
+        "objective": config.objective, "config": config.record(rigid_bodies=True),
         "preprocessing": asdict(preprocessing), "validation_fraction": None, "seed": seed,
         "data_digest": digest(logs), "training": names, "validation": [], "training_windows": len(windows.q),
         "validation_windows": 0, "mapping": (mapping or LogMapping(input="position")).model_dump(exclude_defaults=True),

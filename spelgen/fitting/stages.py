@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
 
-def is_closed_form(model: Any) -> bool:
-    """Whether the model is one of rigid bodies and friction laws, without networks."""
+def has_rigid_bodies(model: Any) -> bool:
+    """Whether the model is of rigid bodies and friction laws, whatever stands beside them."""
     return hasattr(model, "inertial_parameters")
 
 
@@ -31,7 +31,7 @@ def default_objective(model: EmittedModel, rates: Sequence[float]) -> str:
     """
     if hasattr(model, "servo"):
         return "servo"
-    return "torque" if is_closed_form(model) and any(rate >= DENSE for rate in rates) else "rollout"
+    return "torque" if has_rigid_bodies(model) and any(rate >= DENSE for rate in rates) else "rollout"
 
 
 def default_config(
@@ -41,10 +41,10 @@ def default_config(
     defaults: Mapping[str, Any] | None = None,
 ) -> FitConfig:
     """The configuration of `default_objective`; options and defaults as for `fit_config`."""
-    objective, closed_form = default_objective(model, rates), is_closed_form(model)
-    if closed_form and objective == "rollout":  # bodies need no regularizer where nobody asks for one
+    objective, rigid_bodies = default_objective(model, rates), has_rigid_bodies(model)
+    if rigid_bodies and objective == "rollout":  # bodies need no regularizer where nobody asks for one
         defaults = {"urdf_weight": 0.0, **(defaults or {})}
-    return fit_config(objective, closed_form=closed_form, options=options, defaults=defaults)
+    return fit_config(objective, rigid_bodies=rigid_bodies, options=options, defaults=defaults)
 
 
 def fit_torque_stage(
@@ -58,7 +58,7 @@ def fit_torque_stage(
     Of logs larger than memory the samples lie in a temporary file. Raises LogError where torques are the objective
     and no log is sampled densely enough for accelerations.
     """
-    first = isinstance(config, Rollout) and config.torque_first and is_closed_form(model)
+    first = isinstance(config, Rollout) and config.torque_first and has_rigid_bodies(model)
     if not isinstance(config, TorqueFit) and not first:
         return []
     samples = _samples(model, data)
@@ -83,7 +83,7 @@ def _fit(
     model: EmittedModel, samples: TorqueSamples, config: FitConfig, regularizer: UrdfRegularizer | None
 ) -> tuple[int, list[Diagnostic]]:
     """Fit the model; the steps it took, and what there is to say."""
-    if is_closed_form(model):
+    if has_rigid_bodies(model):
         if isinstance(config, TorqueFit) and config.payload:
             return fit_torque(model, samples, config.prior or PAYLOAD, [last_body(model)]).steps, []
         found = fit_torque(model, samples, config.prior if isinstance(config, TorqueFit) else None)
@@ -96,7 +96,7 @@ def _fit(
 
 def _samples(model: EmittedModel, data: TrainingData) -> TorqueSamples | None:
     """None: there are none."""
-    decimation, reach = DECIMATION if is_closed_form(model) else 1, bristle_reach(model)
+    decimation, reach = DECIMATION if has_rigid_bodies(model) else 1, bristle_reach(model)
     if not data.chunks:
         found = dynamics_samples(data.recordings, preprocessing=data.preprocessing, reach=reach)
         return TorqueSamples.held(found, decimation) if any(len(x.q) for x in found) else None

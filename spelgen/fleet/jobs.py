@@ -19,7 +19,7 @@ from spelgen.files import write_json, write_text
 from spelgen.fitting.config import FitConfig, GaussianPrior, fit_config
 from spelgen.fitting.fitted import load_run
 from spelgen.fitting.run_folder import RunFolder
-from spelgen.fitting.stages import default_config, is_closed_form
+from spelgen.fitting.stages import default_config, has_rigid_bodies
 from spelgen.fitting.train import train
 from spelgen.identification.baseline import keep_baseline
 from spelgen.loaded_arm import load_arm
@@ -163,11 +163,11 @@ def _config(job: Job) -> Any:
     said = _training(job)
 
     def config(model: EmittedModel, rates: Sequence[float] | None) -> FitConfig | None:
-        closed_form = is_closed_form(model)
+        rigid_bodies = has_rigid_bodies(model)
         own = {} if job.prior is None else {"prior": job.prior}
-        if said.objective is not None and not (closed_form and said.objective == "momentum"):
-            return fit_config(said.objective, closed_form=closed_form, options=own, defaults=said.options)
-        if rates is None and closed_form:
+        if said.objective is not None and not (rigid_bodies and said.objective == "momentum"):
+            return fit_config(said.objective, rigid_bodies=rigid_bodies, options=own, defaults=said.options)
+        if rates is None and rigid_bodies:
             return None  # the logs decide
         return default_config(model, rates or [], own, said.options)
 
