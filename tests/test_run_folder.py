@@ -3,8 +3,7 @@
 import json
 import os
 import re
-import subprocess
-import sys
+import resource
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +16,9 @@ from spelgen.cli.main import app
 from spelgen.errors import LogError, RunError
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.exporting.export import export
+from spelgen.fitting import loop
 from spelgen.fitting.config import Rollout
 from spelgen.fitting.fitted import load_run
-from spelgen.fitting.loop import TrainingLoop
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.run_lock import locked
 from spelgen.fitting.train import train
@@ -30,7 +29,7 @@ from spelgen.pipeline import generate
 from spelgen.trust import require_own_module
 
 JOINTS = ("joint1", "joint2")
-QUICK = Rollout(epochs=3, momentum_steps=0, optimizer="adamw", batch=8, urdf_weight=0.0, stride=3)
+QUICK = Rollout(epochs=3, momentum_steps=0, optimizer="adamw", batch=32, urdf_weight=0.0, stride=3)
 
 
 def motions(count: int = 4, samples: int = 25) -> list[Trajectory]:
@@ -42,6 +41,14 @@ def motions(count: int = 4, samples: int = 25) -> list[Trajectory]:
         q, qd = np.sin(2 * t[:, None] + phase), 2 * np.cos(2 * t[:, None] + phase)
         found.append(Trajectory(t, q, qd, random.normal(size=(samples, 2)), f"motion_{k}"))
     return found
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short_epochs():
+    """Two steps an epoch: what is written, and when, is the same after twenty."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loop, "EPOCH_STEPS", 2)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -188,45 +195,27 @@ def test_killed_between_any_two_writes_nothing_is_lost(start, tmp_path):
 
 def test_an_interruption_before_the_first_checkpoint_leaves_no_run(start, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr(TrainingLoop, "_measure", lambda loop: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(loop.TrainingLoop, "_measure", lambda loop: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             trained(start, tmp_path / "run")
     trained(start, tmp_path / "run")
 
 
-FULL = """
-import resource, signal, sys
-from spelgen.cli.main import app
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
-app(sys.argv[1:])
-"""
-
-
 def test_a_full_disk_is_told_with_the_file(start, tmp_path):
     """No file may grow beyond 2000 bytes: it fails as a full disk does, while it is written."""
-    trained(start, tmp_path / "run")
-    before = weights(tmp_path / "run")
-    environment = os.environ | {"PYTHONPATH": str(Path(spelgen.__file__).parents[1])}
-    command = [
-        "train",
-        start / "module.py",
-        "--data",
-        start,
-        "-o",
-        tmp_path / "run",
-        "--resume",
-        "--epochs",
-        "9",
-    ]
-    done = subprocess.run(
-        [sys.executable, "-c", FULL, *map(str, command)],
-        env=environment, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert done.returncode == 1
-    assert done.stderr.splitlines()[-1] == f"{tmp_path}/run/model.pt: file too large"
-    assert all(torch.equal(before[name], x) for name, x in weights(tmp_path / "run").items())
-    assert trained(start, tmp_path / "run", resume=True)
+    run = trained(start, tmp_path / "run")
+    before = weights(run)
+    command = ["train", start / "module.py", "--data", start, "-o", run, "--resume", "--epochs", "9"]
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, limits[1]))
+    try:
+        told = CliRunner().invoke(app, list(map(str, command)))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert told.exit_code == 1
+    assert told.stderr.splitlines()[-1] == f"{run}/model.pt: file too large"
+    assert all(torch.equal(before[name], x) for name, x in weights(run).items())
+    assert trained(start, run, resume=True)
 
 
 # ---- what lies in it may be anything
