@@ -18,10 +18,10 @@ from torch import nn
 
 from spelgen.design import Design
 from spelgen.emission.emit import emit
-from spelgen.loaded_arm import load_arm
+from spelgen.loaded_arm import LoadedArm, load_arm
 from spelgen.pipeline import make_spec
 from spelgen.spec import Options
-from spelgen.structure.structure import Structure, derive
+from spelgen.structure.structure import Structure
 from spelgen.structure.symbolic import polynomials
 
 ROBOTS = Path(__file__).parents[1] / "robots"
@@ -60,9 +60,14 @@ def built(
     design: Design | None = None,
 ) -> tuple[str, Structure]:
     """Source and structure of one of the robots that come with spelgen."""
-    loaded = load_arm(ROBOTS / f"{robot}.urdf")
+    loaded = _loaded(robot)
     options = Options(preset=preset, design=design, net=net, assume=assume)
-    return emit(make_spec(loaded, options)), derive(loaded.arm, assume)
+    return emit(make_spec(loaded, options)), loaded.structure_for(assume)
+
+
+@cache
+def _loaded(robot: str) -> LoadedArm:
+    return load_arm(ROBOTS / f"{robot}.urdf")
 
 
 def random_model(
@@ -177,7 +182,7 @@ def exact_model(robot: str, folder: Path) -> nn.Module:
     model = frictionless(module.Model())
     mass, potential = model.dynamics.mass, model.dynamics.potential
     mass.armature.nominal.zero_()
-    true = polynomials(load_arm(ROBOTS / f"{robot}.urdf").arm, inertials=True)
+    true = polynomials(_loaded(robot).arm, inertials=True)
     if structure.outputs:
         functions = [true.combination(output.reads) for output in structure.outputs]
         encoding = model.dynamics.encoding

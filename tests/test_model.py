@@ -107,14 +107,14 @@ def _near(ours: torch.Tensor, reference: torch.Tensor) -> None:
 
 @pytest.mark.parametrize("robot", SIX)
 def test_mass_matrix_is_positive_definite_for_any_weights(robot, tmp_path):
-    """10,000 random q for each of 100 draws of all weights, constants included, with standard deviation 30."""
+    """1,000 random q for each of 100 draws of all weights, constants included, with standard deviation 30."""
     model = random_model(robot, tmp_path, seed=0, design=NETWORKS)
     generator = torch.Generator().manual_seed(0)
     needed = 0
     with torch.no_grad():
         for draw in range(100):
             randomise(model, seed=draw, deviation=30.0)
-            q = 8 * torch.rand(10_000, model.n, dtype=torch.float64, generator=generator) - 4
+            q = 8 * torch.rand(1_000, model.n, dtype=torch.float64, generator=generator) - 4
             mass = model.mass_matrix(q)
             assert torch.linalg.eigvalsh(mass)[:, 0].min() > 0
             needed += bounded(model, q).any().item()
@@ -156,7 +156,7 @@ def test_outputs_read_their_own_joints_only(robot, tmp_path):
 
 @pytest.mark.parametrize("robot", ["two_link", "rpr", "ur10e"])
 def test_energy_stays_without_input_and_dissipation(robot, tmp_path):
-    """Random weights, Runge-Kutta with 1 ms over 2 s: relative drift of H below 1e-8."""
+    """Random weights, Runge-Kutta with 2.5 ms over 2 s: relative drift of H below 1e-8."""
     model = frictionless(random_model(robot, tmp_path, seed=0))
     for weight in model.dynamics.joint_functions.parameters():
         weight.data.zero_()  # ripple of 66 waves in a turn takes shorter steps
@@ -164,14 +164,14 @@ def test_energy_stays_without_input_and_dissipation(robot, tmp_path):
     with torch.no_grad():
         prepared, q, p = model.prepare(), at, model.momentum(at, qd)
         energies = [model.hamiltonian(q, p)]
-        for step in range(2000):
+        for step in range(800):
 
             def rhs(moved, momentum, q=q):
                 return model.port_hamiltonian_rhs(q + moved, momentum, None, prepared)
 
-            moved, p, _ = runge_kutta(rhs, p, 1e-3)
+            moved, p, _ = runge_kutta(rhs, p, 2.5e-3)
             q = q + moved
-            if step % 100 == 99:
+            if step % 40 == 39:
                 energies.append(model.hamiltonian(q, p))
     drift = torch.stack(energies) - energies[0]
     assert (drift / energies[0]).abs().max() < 1e-8
