@@ -1,5 +1,6 @@
 """The command line as a user meets it: exit codes, one clear line per error, nothing half-written."""
 
+import contextlib
 import io
 import json
 import os
@@ -336,13 +337,14 @@ def trained(robots, tmp_path_factory):
         "evaluate": ["evaluate", "run", "--data", "logs"],
         "report": ["report", "run"],
     }
-    return folder, {name: process(*arguments, cwd=folder) for name, arguments in steps.items()}
+    with contextlib.chdir(folder):
+        return folder, {name: CliRunner().invoke(app, words) for name, words in steps.items()}
 
 
 def test_the_whole_way_succeeds(trained):
     folder, results = trained
     for name, result in results.items():
-        assert result.returncode == 0, (name, result.stderr)
+        assert result.exit_code == 0, (name, result.stderr)
         assert max(map(len, result.stdout.splitlines())) <= 80, name
     assert {"arm_spel.py", "logs/train.parquet", "logs/test.parquet", "run/report.html"} <= set(
         everything(folder)
@@ -360,19 +362,19 @@ def test_evaluate_tells_rivals(trained):
     assert "velocity stays constant" in results["evaluate"].stdout
 
 
-def test_a_second_run_needs_force_or_resume(trained):
+def test_a_second_run_needs_force_or_resume(trained, monkeypatch):
     folder, _ = trained
-    again = process("train", "arm_spel.py", "--data", "logs", "-o", "run", cwd=folder)
-    assert again.returncode == 1
+    monkeypatch.chdir(folder)
+    command = ["train", "arm_spel.py", "--data", "logs", "-o", "run"]
+    again = CliRunner().invoke(app, command)
+    assert again.exit_code == 1
     assert again.stderr.startswith("run: ") and "--resume" in again.stderr
-    more = process(
-        "train", "arm_spel.py", "--data", "logs", "-o", "run", "--resume", "--epochs", "3", cwd=folder
-    )
-    assert more.returncode == 0, more.stderr
+    more = CliRunner().invoke(app, [*command, "--resume", "--epochs", "3"])
+    assert more.exit_code == 0, more.stderr
     assert "after 3 epochs" in more.stdout
 
 
-def test_interrupted_training_leaves_a_run(trained, tmp_path):
+def test_interrupted_training_leaves_a_run(spelgen, trained, tmp_path):
     folder, _ = trained
     run = tmp_path / "run"
     command = [sys.executable, "-m", "spelgen", "train", "arm_spel.py", "--data", "logs", "-o", str(run)]
@@ -388,7 +390,7 @@ def test_interrupted_training_leaves_a_run(trained, tmp_path):
         out, err = started.communicate(timeout=60)
     assert started.returncode == 130, err
     assert b"interrupted after" in out
-    assert process("report", run, cwd=folder).returncode == 0
+    assert spelgen("report", run).exit_code == 0
 
 
 # ---- words that nearly fit
