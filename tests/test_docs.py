@@ -8,11 +8,12 @@ import contextlib
 import re
 import shlex
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
+
+from spelgen.cli.main import app
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")])
@@ -44,16 +45,8 @@ def run_commands(block: str, folder: Path) -> str:
     for command in re.findall(r"^\$ (.*)$", block, re.MULTILINE):
         program, *arguments = shlex.split(command)
         assert program == "spelgen", f"only spelgen is run here, not: {command}"
-        done = subprocess.run(
-            [sys.executable, "-m", "spelgen", *arguments],
-            cwd=folder,
-            env={"PYTHONPATH": str(ROOT)},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            check=False,
-        )
-        told.append(f"$ {command}\n{done.stdout}")
+        with contextlib.chdir(folder):
+            told.append(f"$ {command}\n{CliRunner().invoke(app, arguments, prog_name=program).output}")
     return "\n".join(told)
 
 

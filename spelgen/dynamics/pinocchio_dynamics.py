@@ -13,7 +13,7 @@ from typing import TypeVar
 import numpy as np
 import pinocchio as pin
 
-from spelgen.dynamics.arrays import by_state
+from spelgen.dynamics.arrays import on_arrays
 from spelgen.dynamics.constraint import Constraint
 
 Array = TypeVar("Array")
@@ -23,7 +23,7 @@ Array = TypeVar("Array")
 class PinocchioDynamics:
     """An arm of n coordinates (see ``RigidDynamics``); the model has b joints, the reflected rotors as armature.
 
-    constraint: what its names leave out stands still. friction: torque (n,) by velocity (n,).
+    constraint: what its names leave out stands still. friction: torque (..., n) by velocity (..., n).
     inputs: G, (n, n); without, each input is its own joint's torque.
     """
 
@@ -56,68 +56,84 @@ class PinocchioDynamics:
 
     def mass_matrix(self, q: Array) -> Array:
         """M, (..., n, n) [kg m^2, kg m, kg]."""
-        return by_state(self._mass, q)
+        return on_arrays(self._mass, q)
 
     def nonlinear_effects(self, q: Array, qd: Array) -> Array:
         """Coriolis, centrifugal and gravity torques, (..., n) [Nm, N]."""
-        return by_state(self._effects, q, qd)
+        return on_arrays(self._effects, q, qd)
 
     def gravity(self, q: Array) -> Array:
         """dV/dq, (..., n) [Nm, N]."""
-        return by_state(lambda each: self._effects(each, np.zeros_like(each)), q)
+        return on_arrays(lambda at: self._effects(at, np.zeros_like(at)), q)
 
     def friction_torque(self, q: Array, qd: Array) -> Array:
         """What friction takes, (..., n) [Nm, N]."""
-        return by_state(lambda _, each: self._lost(each), q, qd)
+        return on_arrays(lambda _, velocity: self._lost(velocity), q, qd)
 
     def forward_dynamics(self, q: Array, qd: Array, tau: Array) -> Array:
         """qdd, (..., n), under the inputs tau."""
-        return by_state(self._forward, q, qd, tau)
+        return on_arrays(self._forward, q, qd, tau)
 
     def inverse_dynamics(self, q: Array, qd: Array, qdd: Array) -> Array:
         """The inputs, (..., n), that make qdd; those of a passive joint are the torques that it lacks."""
-        return by_state(self._inverse, q, qd, qdd)
+        return on_arrays(self._inverse, q, qd, qdd)
 
     def configuration(self, q: np.ndarray) -> np.ndarray:
-        """Pinocchio's configuration (nq,) at q (n,)."""
-        positions = self.jacobian @ q + self.offset
+        """Pinocchio's configuration (..., nq) at q (..., n)."""
+        positions = q @ self.jacobian.T + self.offset
         if self._plain:
             return positions
-        configuration: np.ndarray = pin.neutral(self.model)
-        configuration[self._lines[:, 0]] = positions[self._lines[:, 1]]
+        configuration: np.ndarray = np.tile(pin.neutral(self.model), (*q.shape[:-1], 1))
+        configuration[..., self._lines[:, 0]] = positions[..., self._lines[:, 1]]
         for place, row in self._circles:  # a continuous joint is (cos, sin) in Pinocchio
-            configuration[place : place + 2] = np.cos(positions[row]), np.sin(positions[row])
+            configuration[..., place] = np.cos(positions[..., row])
+            configuration[..., place + 1] = np.sin(positions[..., row])
         return configuration
 
+    def _by_joint(self, algorithm: Callable[..., np.ndarray], *states: np.ndarray) -> np.ndarray:
+        """What the algorithm gives of states (..., nq), (..., nv), ...; it takes one at a time."""
+        batch = states[0].shape[:-1]
+        if not batch:
+            return algorithm(self.model, self.data, *states)
+        rows = zip(*(x.reshape(-1, x.shape[-1]) for x in states), strict=True)
+        # copies, for it writes to one place
+        found = np.array([algorithm(self.model, self.data, *each).copy() for each in rows])
+        return found.reshape(*batch, *found.shape[1:])
+
     def _mass(self, q: np.ndarray) -> np.ndarray:
-        upper = np.triu(pin.crba(self.model, self.data, self.configuration(q)))
-        joints = upper + np.triu(upper, 1).T  # Pinocchio promises the upper triangle only
+        upper = np.triu(self._by_joint(pin.crba, self.configuration(q)))
+        joints = upper + np.triu(upper, 1).swapaxes(-1, -2)  # Pinocchio promises the upper triangle only
         mass: np.ndarray = self.jacobian.T @ joints @ self.jacobian
         return mass
 
     def _effects(self, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
-        effects = pin.nle(self.model, self.data, self.configuration(q), self.jacobian @ qd)
-        found: np.ndarray = self.jacobian.T @ effects
+        effects = self._by_joint(pin.nle, self.configuration(q), qd @ self.jacobian.T)
+        found: np.ndarray = effects @ self.jacobian
         return found
 
     def _lost(self, qd: np.ndarray) -> np.ndarray:
         return np.zeros_like(qd) if self.friction is None else self.friction(qd)
 
     def _forward(self, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> np.ndarray:
-        force = tau if self.inputs is None else self.inputs @ tau
+        force = tau if self.inputs is None else tau @ self.inputs.T
         if self.friction is not None:
             force = force - self.friction(qd)
         if not self._direct:
-            return np.linalg.solve(self._mass(q), force - self._effects(q, qd))
-        by_joint = (self.jacobian @ x for x in (qd, force))
-        found: np.ndarray = self.jacobian.T @ pin.aba(self.model, self.data, self.configuration(q), *by_joint)
+            return _solved(self._mass(q), force - self._effects(q, qd))
+        by_joint = (x @ self.jacobian.T for x in (qd, force))
+        found: np.ndarray = self._by_joint(pin.aba, self.configuration(q), *by_joint) @ self.jacobian
         return found
 
     def _inverse(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
-        velocity, acceleration = (self.jacobian @ x for x in (qd, qdd))
-        needed = pin.rnea(self.model, self.data, self.configuration(q), velocity, acceleration)
-        force = self.jacobian.T @ needed + self._lost(qd)
+        by_joint = (x @ self.jacobian.T for x in (qd, qdd))
+        force = self._by_joint(pin.rnea, self.configuration(q), *by_joint) @ self.jacobian + self._lost(qd)
         if self.inputs is None:
             return force
         moved = self.inputs + np.diag(~self.inputs.any(axis=1)).astype(float)
-        return np.linalg.solve(moved, force)
+        return _solved(moved, force)
+
+
+def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """x (..., n) of matrix (..., n, n) x = right (..., n)."""
+    found: np.ndarray = np.linalg.solve(matrix, right[..., None])[..., 0]
+    return found
