@@ -29,7 +29,7 @@ from spelgen.building import build
 from spelgen.dynamics.bristles import BristleReach, reach_of
 from spelgen.evaluation.baselines import of_dynamics
 from spelgen.evaluation.results import end_errors
-from spelgen.fitting.torque_fit import PAYLOAD, fit_torque, last_body
+from spelgen.fitting.torque_fit import fit_torque
 from spelgen.identification.friction import FrictionModel
 from spelgen.identification.identification import Identification
 from spelgen.identification.identify import least_squares
@@ -133,7 +133,7 @@ def payload(model: Any, logs: dict[str, Trajectory]) -> None:
             model.load_state_dict(trained)
             seen = samples_of([first(logs[name], seconds)]) if seconds else []
             if sum(len(x.q) for x in seen):
-                fit_torque(model, seen, PAYLOAD, only_bodies=[last_body(model)])
+                fit_torque(model, seen, adapt="load")
             rest = samples_of([after(logs[name], seconds or 10.0)], pauses=True)
             row.append(mean(torque_of(model), rest))
         print(f"{name:26}" + "".join(f"{x:15.5f}" for x in row))

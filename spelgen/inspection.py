@@ -131,6 +131,9 @@ class Inspection:
             for kind, what in (("fixed", "gear known"), ("gain", "gain trained"), ("coupled", "coupled")):
                 joints = tuple(sorted({entry.row for entry in entries if entry.kind == kind}))
                 told += [f"{what} at {joints_in_ranges(joints)}"] if joints else []
+        if self.actuation.couplings:
+            joints = tuple(sorted({entry.row for entry in self.actuation.couplings}))
+            told.append(f"motors coupled at {joints_in_ranges(joints)}")
         passive = self.structure.passive
         return ", ".join(told + ([f"{joints_in_ranges(passive)} without a drive"] if passive else []))
 

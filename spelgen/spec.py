@@ -147,14 +147,17 @@ class ModelSpec:
     """Of a closed-form model."""
     inputs: tuple[tuple[int, int, float, bool], ...] = ()
     """(row, column, value, trained) of G; none where each torque acts on its own actuated joint as it is."""
+    motor_speeds: tuple[tuple[float, ...], ...] = ()
+    """By joint velocities, where G is none and motors move several joints all the same."""
     servos: tuple[ServoSpec, ...] = ()
     """Of joints that are commanded positions."""
 
     def to_json(self) -> str:
         """Canonical JSON; ``from_json`` gives the same spec back."""
         plain = asdict(self)
-        if not self.servos:  # arms that are commanded torques keep the digest of before there were servos
-            del plain["servos"]
+        for name in ("servos", "motor_speeds"):  # arms without keep the digest of before there were such
+            if not plain[name]:
+                del plain[name]
         return json.dumps(plain, sort_keys=True, ensure_ascii=True)
 
     @classmethod

@@ -118,10 +118,6 @@ def test_a_joint_without_a_transmission_is_told(tmp_path):
 
 
 WRONG = {
-    "couplings:\n- {joints: [pitch, roll], matrix: [[1, 0], [0, 1]]}\n": (
-        "arm.yaml:1: got these settings, expected 'torque: motor' where there are couplings: joint torques "
-        "know none"
-    ),
     MOTOR + "couplings:\n- {joints: [pitch, rol], matrix: [[1, 0], [0, 1]]}\n": (
         "arm.yaml:3: couplings.0.joints: unknown joint 'rol'; did you mean 'roll'?"
     ),

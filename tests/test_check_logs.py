@@ -9,6 +9,7 @@ import pytest
 from html_page import Page
 from typer.testing import CliRunner
 
+from spelgen.arm.actuation import Drives
 from spelgen.cli.main import app
 from spelgen.dynamics.regressor import regressor, urdf_parameters
 from spelgen.errors import LogError, SpelgenErrors
@@ -52,6 +53,9 @@ class Geared:
 
     def matrix(self):
         return self.gear * np.eye(3)
+
+    def drives(self):
+        return Drives(self.matrix(), np.eye(3))
 
 
 def test_a_sound_log_is_measured_and_not_doubted(loaded, arm, log):

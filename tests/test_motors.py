@@ -1,23 +1,31 @@
-"""Drives that move several joints: friction, its memory and rotor inertia belong to the motors' speeds."""
+"""Drives that move several joints: friction, its memory and rotors belong to the motors' speeds; logs show it."""
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import torch
 from emitted import ROBOTS, import_source
 
 from spelgen.arm.actuation import motor_speeds
+from spelgen.building import build
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.dynamics.regressor import regressor, urdf_parameters
 from spelgen.fitting.torque_fit import fit_torque
 from spelgen.fitting.torque_jacobian import TorqueJacobian
 from spelgen.fitting.torque_samples import TorqueSamples
-from spelgen.identification.identify import least_squares
+from spelgen.identification.identify import identify, least_squares
 from spelgen.identification.method import LeastSquares
-from spelgen.identification.samples import DynamicsSamples
+from spelgen.identification.samples import DynamicsSamples, dynamics_samples
 from spelgen.loaded_arm import load_arm
-from spelgen.pipeline import generate
+from spelgen.logs.check_logs import check_logs
+from spelgen.logs.mapping import LogMapping
+from spelgen.logs.read import read_logs
+from spelgen.logs.trajectory import Trajectory
+from spelgen.pipeline import generate, inspect
 from spelgen.runtime.actuation import motor_speeds as runtime_motor_speeds
 
 WRIST = np.array([[50.0, 50.0], [40.0, -40.0]])  # joint torques by motor torques of the last two joints
@@ -71,14 +79,14 @@ def test_least_squares_finds_friction_and_rotors_of_coupled_motors(wrist):
     module, arm = wrist
     strength, armature = np.array([5.0, 5.0, 4.0, 3.0, 2.0, 1.0]), np.full(6, 0.2)
     errors = []
-    for inputs in (arm.actuation.matrix(), None):
+    for drives in (arm.actuation.drives(), None):
         motion = moved(module, 20.0)
         tau, _ = on_motors(*motion, arm, strength, armature)
-        found = least_squares(arm.arm, [DynamicsSamples("x", *motion, tau)], LeastSquares("range"), inputs)
+        found = least_squares(arm.arm, [DynamicsSamples("x", *motion, tau)], LeastSquares("range"), drives)
         fresh = moved(module, 10.0, seed=1)
         tau, measured = on_motors(*fresh, arm, strength, armature)
         errors.append(np.square(found.torque(*fresh) - tau).mean(axis=0) / tau.var(axis=0))
-        if inputs is not None:
+        if drives is not None:
             np.testing.assert_allclose(found.dynamics.inverse_dynamics(*fresh), measured, atol=1e-6)
             qdd = found.dynamics.forward_dynamics(fresh[0][:20], fresh[1][:20], measured[:20])
             np.testing.assert_allclose(qdd, fresh[2][:20], atol=1e-5)
@@ -137,3 +145,112 @@ def test_energy_and_memory_are_those_of_the_motors(wrist):
         assert more[:4].abs().max() < 1e-12
         z = torch.from_numpy(bristles_along(q.numpy(), bristle_reach(model)))
         torch.testing.assert_close(model.dynamics.memory_after(z[:-1], q.diff(dim=0)), z[1:])
+
+
+def test_motors_may_be_coupled_where_joint_torques_are_logged(wrist, tmp_path):
+    """Friction and rotors are the motors' all the same: in least squares, in what is emitted, in what is shown."""
+    _, driven = wrist
+    names = [x.name for x in driven.arm.coordinates]
+    shutil.copy(ROBOTS / "six_dof.urdf", tmp_path / "arm.urdf")
+    coupling = f"couplings:\n- {{joints: [{names[4]}, {names[5]}], matrix: {WRIST.tolist()}}}\n"
+    (tmp_path / "arm.yaml").write_text(coupling, encoding="utf-8")
+    arm = load_arm(tmp_path / "arm.urdf")
+    np.testing.assert_array_equal(arm.actuation.matrix(), np.eye(6))
+    np.testing.assert_allclose(arm.actuation.drives().speeds, driven.actuation.drives().speeds)
+    strength, armature = np.array([5.0, 5.0, 4.0, 3.0, 2.0, 1.0]), np.full(6, 0.2)
+    module = import_source(generate(arm, preset="closed-form"), tmp_path / "joint_torques.py")
+    motion, fresh = moved(module, 20.0), moved(module, 10.0, seed=1)
+    (tau, _), (expected, _) = (on_motors(*x, driven, strength, armature) for x in (motion, fresh))
+    samples = [DynamicsSamples("x", *motion, tau)]
+    found = least_squares(arm.arm, samples, LeastSquares("range"), arm.actuation.drives())
+    assert (np.square(found.torque(*fresh) - expected).mean(axis=0) / expected.var(axis=0)).max() < 1e-10
+    model = module.Model()
+    fit_torque(model, samples)
+    with torch.no_grad():
+        learned = model.inverse_dynamics(*(torch.from_numpy(x) for x in fresh)).numpy()
+    assert (np.square(learned - expected).mean(axis=0) / expected.var(axis=0)).max() < 2e-3
+    assert "motors coupled at joints 5,6" in inspect(tmp_path / "arm.urdf").text()
+
+
+def recorded(arm, logged_at, ratio, late=0.0):
+    """20 s of a six-joint arm whose sixth motor turns `ratio` times with the fifth joint too, torques 2 % noisy."""
+    rng = np.random.default_rng(0)
+    t = np.arange(0.0, 20.0, 0.01)
+    q, qd, qdd = moved(None, 20.0, seed=3)
+    speeds = np.eye(6)
+    speeds[5, 4] = ratio
+    friction = np.array([5.0, 5.0, 4.0, 3.0, 2.0, 1.0])
+    at_motors = friction * (np.tanh(qd @ speeds.T / 0.01) + 0.3 * qd @ speeds.T) + 0.2 * qdd @ speeds.T
+    tau = regressor(arm.arm, q, qd, qdd) @ urdf_parameters(arm.arm) + at_motors @ speeds
+    if logged_at == "motors":
+        tau = np.linalg.solve(speeds.T, tau.T).T
+    tau = tau + 0.02 * tau.std(axis=0) * rng.normal(size=tau.shape)
+    tau = np.stack([np.interp(t - late, t, column) for column in tau.T], axis=1)
+    return Trajectory(t, q, qd, tau, "motion", declares_units=True)
+
+
+@pytest.fixture(scope="module")
+def uncoupled():
+    return load_arm(ROBOTS / "six_dof.urdf")
+
+
+def told(report, code):
+    return [x.message for x in report.findings if x.code == code]
+
+
+@pytest.mark.parametrize(("logged_at", "ratio"), [("joints", 1.0), ("motors", -0.5)])
+def test_logs_show_a_coupling_and_what_is_said_then_mends_it(uncoupled, tmp_path, logged_at, ratio):
+    log = recorded(uncoupled, logged_at, ratio)
+    (message,) = told(check_logs([log], uncoupled), "coupled-motors")
+    assert f"{ratio:g} times as fast" in message and f"those of the {logged_at}" in message
+    shutil.copy(ROBOTS / "six_dof.urdf", tmp_path / "arm.urdf")
+    names = [x.name for x in uncoupled.arm.coordinates]
+    sidecar = f"couplings: [{{joints: [{names[4]}, {names[5]}], matrix: [[1.0, {ratio}], [0.0, 1.0]]}}]\n"
+    assert sidecar.split(", matrix")[1].strip() in message
+    if logged_at == "motors":
+        sidecar += "torque: motor\njoints: {" + ", ".join(f"{x}: {{gear: 1}}" for x in names[:4]) + "}\n"
+    (tmp_path / "arm.yaml").write_text(sidecar, encoding="utf-8")
+    coupled = load_arm(tmp_path / "arm.urdf")
+    assert not told(check_logs([log], coupled), "coupled-motors")
+    before, after = (identify(arm, log).nmse[4:].mean() for arm in (uncoupled, coupled))
+    assert after < 0.1 * before
+
+
+def test_logs_show_torques_that_are_late(uncoupled, tmp_path):
+    log = recorded(uncoupled, "joints", 0.0, late=0.013)
+    (message,) = told(check_logs([log], uncoupled), "torque-delay")
+    delay = float(message.split("torque_delay: ")[1].split("'")[0])
+    assert delay == pytest.approx(0.013, abs=0.0015)
+    names = [x.name for x in uncoupled.arm.coordinates]
+    table = {"t": log.t} | {
+        f"{key}_{name}": getattr(log, key)[:, k] for key in ("q", "qd", "tau") for k, name in enumerate(names)
+    }
+    pq.write_table(pa.table(table), tmp_path / "late.parquet")
+    read = read_logs(tmp_path / "late.parquet", uncoupled, LogMapping(torque_delay=delay))
+    assert not told(check_logs(read, uncoupled), "torque-delay")
+    before, after = (identify(uncoupled, x).nmse.mean() for x in (log, read))
+    assert after < 0.7 * before  # noise is the rest
+
+
+def test_logs_of_plain_drives_suggest_nothing(uncoupled):
+    codes = {x.code for x in check_logs([recorded(uncoupled, "joints", 0.0)], uncoupled).findings}
+    assert not codes & {"coupled-motors", "torque-delay"}
+
+
+def test_gains_of_currents_are_found(uncoupled, tmp_path):
+    """Torques logged in units of their own, joint by joint: the gains are found beside bodies, friction and rotors."""
+    gains = np.array([1.5, 0.7, 1.3, 0.8, 1.2, 0.9])
+    logs = [recorded(uncoupled, "joints", 0.0)]
+    shutil.copy(ROBOTS / "six_dof.urdf", tmp_path / "arm.urdf")
+    names = [x.name for x in uncoupled.arm.coordinates]
+    sidecar = (
+        "torque: motor\njoints: {" + ", ".join(f"{x}: {{gear: 1, gain: trained}}" for x in names) + "}\n"
+    )
+    (tmp_path / "arm.yaml").write_text(sidecar, encoding="utf-8")
+    model = build(tmp_path / "arm.urdf", "closed-form")
+    samples = dynamics_samples([replace(x, tau=x.tau / gains) for x in logs])
+    fit_torque(model, samples)
+    with torch.no_grad():
+        found = model.input_matrix(torch.zeros(6).double()).diagonal().numpy()
+    np.testing.assert_allclose(found / gains, 1.0, atol=0.15)
+    assert np.abs(np.log(found)).max() > 0.2  # they did not stay where they started

@@ -11,6 +11,7 @@ from motions import smooth_motion
 from scipy.optimize import minimize_scalar
 from typer.testing import CliRunner
 
+from spelgen.building import build
 from spelgen.cli.main import app
 from spelgen.emission.loading import load_module
 from spelgen.errors import LogError
@@ -20,6 +21,7 @@ from spelgen.fitting.fit import fit
 from spelgen.fitting.gaussian_prior import SIZES, covariance, kind_of, most_probable
 from spelgen.fitting.stages import default_objective
 from spelgen.fitting.torque_fit import fit_torque
+from spelgen.fitting.torque_networks import adapt_networks
 from spelgen.fitting.torque_report import torque_notes
 from spelgen.fitting.torque_samples import TorqueSamples
 from spelgen.fitting.train import train
@@ -88,7 +90,7 @@ def test_only_the_named_bodies_move(emitted):
     module = emitted["six_dof"][0]
     true, found = module.Model(), module.Model()
     true.get_parameter(BODIES).data[5] = torch.tensor([0.3, 0.5, -0.2, 0.1, 0.4, 0.2, 0.6, -0.3, 0.2, 0.9])
-    fit_torque(found, [recorded(true, 5.0, 0.01)], GaussianPrior(bodies=10.0), only_bodies=[5])
+    fit_torque(found, [recorded(true, 5.0, 0.01)], adapt="load")
     assert nmse(found, recorded(true, 5.0, 0.0, seed=4)) < 1e-4
     before = module.Model().state_dict()
     for name, value in found.state_dict().items():
@@ -328,22 +330,88 @@ def test_logs_too_slow_for_accelerations_are_fitted_by_windows(emitted, robots):
     assert [note.code for note in found.diagnostics].count("no-torque-fit") == 1
     assert default_objective(model, [20.0]) == "rollout"
     assert default_objective(model, [20.0, 100.0]) == "torque"
-    for payload, what in ((False, "to fit torques to"), (True, "to fit a load to")):
+    for adapt, what in ((None, "to fit torques to"), ("load", "to adapt to")):
         with pytest.raises(LogError, match=f"no motion {what}, expected samples at 50 Hz or more that move"):
-            fit(model, logs, TorqueFit(payload=payload))
+            fit(model, logs, TorqueFit(adapt=adapt))
 
 
-def test_a_model_of_networks_is_not_adapted_to_a_load(robots, run, tmp_path):
-    folder, _, fitting = run
-    build_ = ["build", str(robots / "six_dof.urdf"), "-o", str(folder / "networks.py"), "--preset", "spel"]
-    assert CliRunner().invoke(app, build_).exit_code == 0
-    command = ["train", str(folder / "networks.py"), *fitting[2:6], "--quiet", "--objective", "torque"]
-    done = CliRunner().invoke(app, [*command, "--evaluations", "20", "-o", str(tmp_path / "networks")])
+@pytest.mark.parametrize("adapt", ["friction", "unit"])
+def test_a_run_is_adapted_to_another_day_or_unit(run, emitted, tmp_path, adapt):
+    """Friction of another day is found, bodies stay; another unit's bodies differ too."""
+    folder, true, _ = run
+    module, arm = emitted["six_dof"]
+    other = module.Model()
+    other.load_state_dict(true.state_dict())
+    other.get_parameter("dynamics.friction.raw_coulomb").data += 0.4
+    other.get_parameter("dynamics.friction.raw_viscous").data -= 0.3
+    other.get_parameter("dynamics.raw_offset").data += torch.tensor([0.2, -0.1, 0.0, 0.1, 0.0, -0.2]).double()
+    if adapt == "unit":
+        other.get_parameter(BODIES).data[2:, 9] += 0.1
+    write(tmp_path / "other.parquet", [recorded(other, 5.0, 0.01, seed=3)], arm)
+    command = [
+        "train",
+        "--from",
+        str(folder / "run"),
+        "--data",
+        str(tmp_path / "other.parquet"),
+        "--adapt",
+        adapt,
+    ]
+    done = CliRunner().invoke(app, [*command, "-o", str(tmp_path / "adapted"), "--quiet"])
     assert done.exit_code == 0, done.output
-    command = ["train", "--from", str(tmp_path / "networks"), "--data", str(folder / "logs.parquet")]
-    done = CliRunner().invoke(app, [*command, "-o", str(tmp_path / "x")])
-    assert done.exit_code == 2
-    assert "--from: with the objective torque belongs to models of rigid bodies" in done.output
+    before, after = (
+        torch.load(x / "model.pt", weights_only=True) for x in (folder / "run", tmp_path / "adapted")
+    )
+    moved = {name for name in before if not torch.equal(before[name], after[name])}
+    of_friction = ("dynamics.friction.", "dynamics.raw_offset")
+    assert moved and (adapt == "unit" or all(name.startswith(of_friction) for name in moved))
+    assert (BODIES in moved) == (adapt == "unit")
+    errors = []
+    for state in (before, after):
+        model = module.Model()
+        model.load_state_dict(state)
+        errors.append(nmse(model, recorded(other, 5.0, 0.0, seed=6)))
+    assert errors[1] < 0.1 * errors[0]
+
+
+def test_a_part_of_a_model_of_networks_is_adapted(robots, run, emitted):
+    _, true, _ = run
+    samples = [recorded(true, 2.0, 0.01, seed=3)]
+    for adapt, part in (
+        ("friction", "dynamics.friction."),
+        ("load", ("dynamics.mass.", "dynamics.potential.")),
+    ):
+        model = build(robots / "six_dof.urdf", "spel", width=8)
+        before = {name: x.clone() for name, x in model.state_dict().items()}
+        missed = nmse(model, samples[0])
+        adapt_networks(model, samples, adapt, evaluations=40)
+        moved = {name for name, x in model.state_dict().items() if not torch.equal(x, before[name])}
+        assert moved and all(name.startswith(part) for name in moved)
+        assert nmse(model, samples[0]) < missed
+        assert all(x.requires_grad for x in model.parameters())
+
+
+def test_adapt_belongs_to_a_run_and_to_torques(run, tmp_path):
+    folder, _, fitting = run
+    for command, message in (
+        ([*fitting, "--adapt", "unit"], "--adapt: belongs to --from"),
+        (
+            [
+                "train",
+                "--from",
+                str(folder / "run"),
+                *fitting[2:4],
+                "--adapt",
+                "unit",
+                "--objective",
+                "rollout",
+            ],
+            "--adapt: belongs to the objective torque, this fits rollout",
+        ),
+    ):
+        done = CliRunner().invoke(app, command)
+        assert done.exit_code == 2
+        assert message in done.output
 
 
 def test_the_same_logs_give_the_same_weights(run, tmp_path):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -31,13 +31,28 @@ class InputEntry:
     value: float
 
 
+class Drives(NamedTuple):
+    """Matrices (n, n) of the motors of n joints.
+
+    inputs: G, the joints' torques are G times what is logged. speeds: C, the motors' speeds are C qd, in units of the
+    joints: friction and rotors belong to them (see `motor_speeds`).
+    """
+
+    inputs: np.ndarray
+    speeds: np.ndarray
+
+
 @dataclass(frozen=True)
 class Actuation:
-    """G of n joints by its entries, and what there is to tell about it."""
+    """G of n joints by its entries, and what there is to tell about it.
+
+    couplings: joint torques by motor torques where what is logged is at the joints already, but motors move several.
+    """
 
     joints: int
     entries: tuple[InputEntry, ...]
     diagnostics: tuple[Diagnostic, ...] = ()
+    couplings: tuple[InputEntry, ...] = ()
 
     @property
     def direct(self) -> bool:
@@ -46,8 +61,17 @@ class Actuation:
 
     def matrix(self) -> np.ndarray:
         """G (n, n), gains at their start."""
+        return self._matrix(self.entries)
+
+    def drives(self) -> Drives:
+        """G, and how the motors turn."""
+        coupled = {entry.row for entry in self.couplings}
+        own = tuple(entry for entry in self.entries if entry.row not in coupled)
+        return Drives(self.matrix(), motor_speeds(self._matrix((*own, *self.couplings))))
+
+    def _matrix(self, entries: Sequence[InputEntry]) -> np.ndarray:
         full = np.zeros((self.joints, self.joints))
-        for entry in self.entries:
+        for entry in entries:
             full[entry.row, entry.column] = entry.value
         return full
 
@@ -74,9 +98,9 @@ def derive_actuation(robot: Robot, settings: Settings, joints: Sequence[str]) ->
     notes = tuple(_undriven(robot, settings, driven))
     if settings.torque == "joint":
         entries = [InputEntry(joints.index(x), joints.index(x), "fixed", 1.0) for x in driven]
-        return Actuation(len(joints), tuple(entries), notes)
-    coupled = _couplings(robot, settings, joints)
-    entries = [entry for coupling in coupled for entry in coupling]
+        coupled = [entry for coupling in _couplings(robot, settings, joints) for entry in coupling]
+        return Actuation(len(joints), tuple(entries), notes, tuple(coupled))
+    entries = [entry for coupling in _couplings(robot, settings, joints) for entry in coupling]
     taken = {entry.row for entry in entries}
     for name in driven:
         index = joints.index(name)
@@ -125,6 +149,8 @@ def _couplings(robot: Robot, settings: Settings, joints: Sequence[str]) -> list[
         names = [name for name, _, _ in each.joints]
         two = len(names) == len(each.actuators) == 2
         if _DIFFERENTIAL in each.type and two and set(names) <= set(joints) - coupled:
+            if each.errors and settings.torque == "joint":
+                continue  # what is not needed must not refuse the arm
             collect(each.errors)
             found.append(_block([joints.index(name) for name in names], _differential(each)))
             coupled |= set(names)

@@ -6,7 +6,7 @@ import hashlib
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
@@ -15,7 +15,7 @@ from spelgen.cli.console import INTERRUPTED, note, say
 from spelgen.cli.options import Data, Filter, Force, Mapping, MoreData, RobotOption, Trust
 from spelgen.cli.train_start import Chosen, NotApplicable, begun, resumed
 from spelgen.errors import ModuleError, OptionError
-from spelgen.fitting.config import Objective, Optimizer, Solver
+from spelgen.fitting.config import Adaptation, Objective, Optimizer, Solver
 from spelgen.spec import read_facts
 
 if TYPE_CHECKING:
@@ -43,7 +43,14 @@ def train(
     source: Annotated[
         Path | None,
         typer.Option(
-            "--from", metavar="RUN", help="Adapt a run of rigid bodies to a load at the tip; no MODULE."
+            "--from", metavar="RUN", help="Begin from a run; no MODULE. Torques adapt it, see --adapt."
+        ),
+    ] = None,
+    adapt: Annotated[
+        Adaptation | None,
+        typer.Option(
+            help="[torque] What differs from the run of --from: a load at the tip (the default), the friction of "
+            "another day, or all of another unit."
         ),
     ] = None,
     objective: Annotated[
@@ -112,7 +119,7 @@ def train(
     that an option belongs to; it is an error beside another one.
     """
     since = time.monotonic()
-    flags = {
+    flags: dict[str, Any] = {
         "window": window, "stride": stride, "momentum_steps": momentum_steps, "torque_first": torque_first,
         "epochs": epochs, "patience": patience, "solver": solver, "substeps": substeps, "compile": compile,
         "optimizer": optimizer, "batch": batch, "learning_rate": learning_rate, "max_minutes": max_minutes,
@@ -122,15 +129,20 @@ def train(
     if source is not None:
         more = [*([module] if module else []), *(more or [])]  # all that stands there is logs
         module, robot = _of_run(source, robot)
-        if objective not in (None, "torque"):
-            raise NotApplicable(f"--from: belongs to the objective torque, this fits {objective}")
-        objective, flags["payload"] = "torque", True
+        objective = objective or "torque"
+        if objective == "torque":
+            flags["adapt"] = adapt or "load"
+        elif adapt is not None:
+            raise NotApplicable(f"--adapt: belongs to the objective torque, this fits {objective}")
+    elif adapt is not None:
+        raise NotApplicable("--adapt: belongs to --from")
     if module is None:
         raise typer.BadParameter("name a module, or a run with --from", param_hint="'MODULE.py'")
     paths = options.logs(data, more)
     folder = output or Path("runs") / module.stem
     urdf = None if resume else robot or _unchanged_urdf(module)
-    chosen = Chosen(objective, flags, {"cutoff": filter, "decimation": decimation}, validation_fraction, seed)
+    chosen = Chosen(objective, flags, {"cutoff": filter, "decimation": decimation}, validation_fraction, seed,
+                    fitted=source is not None)  # fmt: skip
     start = resumed(folder, chosen) if resume else begun(module, urdf, chosen)
     given = options.mapping(mapping, urdf, read_facts(start.module).joints)
     check = None if urdf is None else _torque_check(urdf, start.module, given or start.mapping)
@@ -147,8 +159,7 @@ def train(
             )  # fmt: skip
             first = workers.rank() == 0
     except OptionError as error:
-        flag = "from" if error.option == "payload" else error.option.replace("_", "-")
-        raise NotApplicable(f"--{flag}: {error.got}") from error
+        raise NotApplicable(f"--{error.option.replace('_', '-')}: {error.got}") from error
     if not first:
         return
     if not resume and found.status != "interrupted" and found.config.objective != "servo":

@@ -28,13 +28,14 @@ class NotApplicable(typer.BadParameter):
 
 @dataclass(frozen=True)
 class Chosen:
-    """What the command line says."""
+    """What the command line says. fitted: the model that it begins with was fitted before."""
 
     objective: str | None
     flags: dict[str, Any]
     preprocessing: dict[str, Any]
     validation: float | None
     seed: int | None
+    fitted: bool = False
 
 
 @dataclass(frozen=True)
@@ -62,13 +63,11 @@ def begun(module: Path, urdf: Path | None, chosen: Chosen) -> Start:
     objective = chosen.objective or settings.objective
 
     def config(model: EmittedModel, rates: Sequence[float] | None) -> FitConfig | None:
+        rigid_bodies, defaults = has_rigid_bodies(model), settings.options
+        if chosen.fitted and objective == "rollout" and rigid_bodies:
+            defaults = {**defaults, "torque_first": False}  # which would begin anew
         if objective is not None:
-            return fit_config(
-                objective,
-                rigid_bodies=has_rigid_bodies(model),
-                options=chosen.flags,
-                defaults=settings.options,
-            )
+            return fit_config(objective, rigid_bodies=rigid_bodies, options=chosen.flags, defaults=defaults)
         if rates is None and has_rigid_bodies(model):
             return None  # the logs decide
         return default_config(model, rates or [], chosen.flags, settings.options)

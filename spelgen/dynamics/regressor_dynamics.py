@@ -8,7 +8,7 @@ from typing import TypeVar
 import numpy as np
 import torch
 
-from spelgen.arm.actuation import motor_speeds
+from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.arrays import like
 from spelgen.dynamics.rigid_bodies import RigidBodies
@@ -23,7 +23,7 @@ class RegressorDynamics:
 
     parameters: (10 B,), as ``regressor`` has them. armature: of the drives, (n,) [kg m^2, kg]. friction: torques (T, n)
     by velocities (T, n) and its memory z (T, n, K), or None. bristle_reach: (n, K) [rad, m], where it has one.
-    inputs: G, (n, n); without, each input is its own joint's torque.
+    drives: without, each input is its own joint's torque.
     """
 
     def __init__(
@@ -32,13 +32,13 @@ class RegressorDynamics:
         parameters: np.ndarray,
         armature: np.ndarray,
         friction: Callable[[np.ndarray, np.ndarray | None], np.ndarray],
-        inputs: np.ndarray | None = None,
+        drives: Drives | None = None,
         bristle_reach: np.ndarray | None = None,
     ) -> None:
         self.bodies, self.armature, self.friction = RigidBodies(arm, parameters), armature, friction
         self.bristle_reach = None if bristle_reach is None else torch.from_numpy(bristle_reach)
-        self.inputs = np.eye(len(armature)) if inputs is None else inputs
-        self.motors = motor_speeds(self.inputs)
+        alone = np.eye(len(armature))
+        self.inputs, self.motors = drives or Drives(alone, alone)
 
     @property
     def n(self) -> int:

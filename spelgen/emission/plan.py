@@ -95,6 +95,7 @@ def plan_model(
         inputs=()
         if actuation.direct
         else tuple((x.row, x.column, x.value, x.kind == "gain") for x in actuation.entries),
+        motor_speeds=tuple(map(tuple, actuation.drives().speeds.tolist())) if actuation.couplings else (),
         servos=tuple(_servo(x, known.get(x.name, JointSettings())) for x in arm.coordinates)
         if servos
         else (),

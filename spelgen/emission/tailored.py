@@ -297,7 +297,8 @@ def _input(spec: ModelSpec) -> Call:
         network = _network(spec, outputs, everything, (1.0,) * n)
         return call("DenseInput", Code("joints"), network)
     if not spec.inputs:
-        return call("DirectInput", Code("joints"))
+        speeds = {"motor_speeds": spec.motor_speeds} if spec.motor_speeds else {}
+        return call("DirectInput", Code("joints"), **speeds)
     gains = tuple(
         call("MotorGain", joint, motor, value, trained=trained)
         for joint, motor, value, trained in spec.inputs

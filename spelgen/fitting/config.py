@@ -15,6 +15,7 @@ from spelgen.settings.values import Count, Group, NonNegative, Positive, Whole
 
 Objective = Literal["torque", "momentum", "rollout", "servo"]
 Optimizer = Literal["adamw", "lbfgs"]
+Adaptation = Literal["load", "friction", "unit"]
 Solver = Literal["rk4", "dopri5"]
 Window = Annotated[Count, Field(ge=2)]
 Substeps = Annotated[Count, Field(le=1000)]  # more never end
@@ -101,14 +102,15 @@ class FitConfig(Group):
 class TorqueFit(FitConfig):
     """Fit the torque of the model's inverse dynamics to the measured one, on samples at 100 Hz that move.
 
-    Rigid bodies by Gauss-Newton steps to its most probable weights after `prior`; with `payload` its last
-    body alone moves: a load at the tip of an arm that was fitted without one. A model of networks by L-BFGS, with
+    Rigid bodies by Gauss-Newton steps to their most probable weights after `prior`. A model of networks by L-BFGS, with
     at most `evaluations` of the loss, to which are added `weight_decay` times half the sum of squares of all
     weights, and `urdf_weight` times the distance from the URDF (see `UrdfRegularizer`).
+    adapt: what of a fitted model moves, from where it is: a `load` at the tip (the last body; of networks M and V), the
+    `friction` of another day with the torque offsets, or all that tells another `unit` of the same arm from the first.
     """
 
     objective: ClassVar[Objective] = "torque"
-    of_rigid_bodies: ClassVar[tuple[str, ...]] = ("prior", "payload")
+    of_rigid_bodies: ClassVar[tuple[str, ...]] = ("prior",)
     of_networks: ClassVar[tuple[str, ...]] = ("evaluations", "weight_decay", "urdf_weight")
     # windows are not fitted, only judged by
     window: ClassVar[int] = 5
@@ -122,7 +124,7 @@ class TorqueFit(FitConfig):
     compile: ClassVar[bool] = False
 
     prior: GaussianPrior | None = None
-    payload: bool = False
+    adapt: Adaptation | None = None
     evaluations: Count = 2000
     weight_decay: NonNegative = LBFGS_DECAY
     urdf_weight: NonNegative = 1.0

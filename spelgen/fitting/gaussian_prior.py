@@ -11,7 +11,7 @@ from collections.abc import Mapping
 
 import torch
 
-from spelgen.fitting.config import GaussianPrior
+from spelgen.fitting.config import Adaptation, GaussianPrior
 
 # weights of a module's parts, by how their names end
 SIZES = ("raw_viscous", "raw_saturation", "raw_coulomb", "raw_stribeck")
@@ -26,6 +26,16 @@ KINDS = {
     "raw_bristle_fractions": "fractions",
     **dict.fromkeys(SIZES, "sizes"),
 }
+
+AS_FITTED = {"sizes": 0.3, "velocities": 0.3, "fractions": 0.3, "shared_sizes": 0.3, "shared_velocities": 0.3}
+PRIORS: dict[Adaptation, GaussianPrior] = {
+    "load": GaussianPrior(bodies=10.0),  # nothing is known of it before
+    "friction": GaussianPrior(**AS_FITTED, shared_friction=0.5),
+    "unit": GaussianPrior(
+        **AS_FITTED, bodies=0.1, gains=0.1, armature=0.1, shared_armature=0.1, shared_friction=0.5
+    ),
+}
+"""About a model that was fitted to another load, on another day, or to another unit of the same arm."""
 
 ADAPTED = ("bodies", "offset")  # kinds whose deviations the fit finds
 

@@ -9,8 +9,8 @@ from spelgen.dynamics.bristles import bristle_reach
 from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.config import FitConfig, Rollout, TorqueFit, fit_config
 from spelgen.fitting.dataset import TrainingData
-from spelgen.fitting.torque_fit import DECIMATION, PAYLOAD, fit_torque, last_body
-from spelgen.fitting.torque_networks import fit_networks
+from spelgen.fitting.torque_fit import DECIMATION, fit_torque
+from spelgen.fitting.torque_networks import adapt_networks, fit_networks
 from spelgen.fitting.torque_report import torque_notes
 from spelgen.fitting.torque_samples import TorqueSamples
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer
@@ -18,6 +18,12 @@ from spelgen.identification.samples import DENSE, dynamics_samples
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
+
+MOVED = {
+    "load": "a load at the tip alone fitted",
+    "friction": "friction and torque offsets alone fitted",
+    "unit": "what sets this unit apart fitted",
+}
 
 
 def has_rigid_bodies(model: Any) -> bool:
@@ -64,7 +70,7 @@ def fit_torque_stage(
     samples = _samples(model, data)
     if samples is None:
         if isinstance(config, TorqueFit):
-            what = "to fit a load to" if config.payload else "to fit torques to"
+            what = "to adapt to" if config.adapt else "to fit torques to"
             raise LogError(
                 f"no motion {what}", expected=f"samples at {DENSE:g} Hz or more that move",
                 do="fit windows: the objective rollout",
@@ -72,7 +78,7 @@ def fit_torque_stage(
         message = f"no torque fit: these logs are sampled below {DENSE:g} Hz"
         return [Diagnostic("warning", "no-torque-fit", "logs", None, message)]
     steps, notes = _fit(model, samples, config, regularizer)
-    what = "the last body alone fitted" if isinstance(config, TorqueFit) and config.payload else "fitted"
+    what = MOVED[config.adapt] if isinstance(config, TorqueFit) and config.adapt else "fitted"
     message = (
         f"{what} to the torques of {samples.seen} samples, those of validation included, in {steps} steps"
     )
@@ -84,11 +90,12 @@ def _fit(
 ) -> tuple[int, list[Diagnostic]]:
     """Fit the model; the steps it took, and what there is to say."""
     if has_rigid_bodies(model):
-        if isinstance(config, TorqueFit) and config.payload:
-            return fit_torque(model, samples, config.prior or PAYLOAD, [last_body(model)]).steps, []
-        found = fit_torque(model, samples, config.prior if isinstance(config, TorqueFit) else None)
-        return found.steps, [*torque_notes(model, samples, found)]
+        prior, adapt = (config.prior, config.adapt) if isinstance(config, TorqueFit) else (None, None)
+        found = fit_torque(model, samples, prior, adapt)
+        return found.steps, [] if adapt else [*torque_notes(model, samples, found)]
     assert isinstance(config, TorqueFit)
+    if config.adapt:
+        return adapt_networks(model, samples, config.adapt, config.weight_decay, config.evaluations), []
     weight = config.urdf_weight
     penalty = lambda: weight * regularizer.loss(model) if regularizer else 0.0  # noqa: E731
     return fit_networks(model, samples, config.weight_decay, penalty, config.evaluations), []

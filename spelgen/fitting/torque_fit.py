@@ -5,10 +5,11 @@ few constants of each joint: seconds are enough, and no step size is to be chose
 
     sum over joints and samples of (missing torque / noise)^2 + (weights - start)^T covariance^-1 (weights - start),
 
-with the covariance of a Gaussian prior (see ``covariance``). The noise of a joint is what is left of its torque, found
-in rounds, and so is how far the start is to be believed (see ``most_probable``). Sums over samples are made block by
-block, so that memory does not grow with the logs. What a model has beside rigid bodies is fitted to what these leave,
-where it pays (see ``residual_fit``), and then both in turn.
+with the covariance of a Gaussian prior (see ``covariance``). Where gains between logged and joint torques are trained,
+what is missed is told in the logged ones, else all torques would shrink with their gains. The noise of a joint is what
+is left of its torque, found in rounds, and so is how far the start is to be believed (see ``most_probable``). Sums over
+samples are made block by block, so that memory does not grow with the logs. What a model has beside rigid bodies is
+fitted to what these leave, where it pays (see ``residual_fit``), and then both in turn.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from spelgen.fitting.config import GaussianPrior
-from spelgen.fitting.gaussian_prior import covariance, most_probable
+from spelgen.fitting.config import Adaptation, GaussianPrior
+from spelgen.fitting.gaussian_prior import PRIORS, covariance, most_probable
 from spelgen.fitting.residual_fit import Residual, enter, refine
 from spelgen.fitting.torque_jacobian import COMPENSATION, TorqueJacobian
 from spelgen.fitting.torque_samples import TorqueSamples
@@ -47,8 +48,6 @@ NO_GAIN = 1e-10  # likewise: a step that promises less is not tried
 FIRST_NOISE = 0.1  # of a joint's torque range
 LEAST_NOISE = 1e-4  # likewise: noise-free samples are fitted to four digits of their torque's range
 DAMPING = (1e-9, 1e-3, 1e6)  # of the steps, relative to the curvature: least, first, most
-PAYLOAD = GaussianPrior(bodies=10.0)
-"""Of a load at the tip nothing is known before."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,30 +79,26 @@ class _Step:
     steps: int = 0
 
 
-def last_body(model: EmittedModel) -> int:
-    """The body that holds the tip, and what the tip holds."""
-    return len(model.dynamics.inertial_parameters()) - 1
-
-
 def fit_torque(
     model: EmittedModel,
     samples: TorqueSamples | Sequence[DynamicsSamples],
     prior: GaussianPrior | None = None,
-    only_bodies: Sequence[int] | None = None,
+    adapt: Adaptation | None = None,
 ) -> TorqueSolution:
     """Set the weights of a closed-form ``model`` to the most probable ones after ``samples`` (torques as logged).
 
-    The prior is centred on the weights as they are. ``only_bodies``: nothing moves but these bodies' parameters, and
-    the prior is taken as it is.
+    The prior is centred on the weights as they are. ``adapt``: these move alone, what stands beside rigid bodies stays
+    as it is, and so does the prior, but for another unit's (see ``TorqueFit``).
     """
     if not isinstance(samples, TorqueSamples):
         samples = TorqueSamples.held(samples, DECIMATION)
     large = samples.count > LARGE
     few = samples.thinned(FEW) if large else samples
-    problem = _Problem(TorqueJacobian(model, few), prior or GaussianPrior(), only_bodies)
+    prior = prior or (PRIORS[adapt] if adapt else GaussianPrior())
+    problem = _Problem(TorqueJacobian(model, few), prior, adapt)
     at, noise = problem.solve(*problem.near(), ROUNDS - FIRST_ROUNDS)
     residuals: list[Residual] = []
-    if only_bodies is None and hasattr(model.dynamics, "joint_functions"):
+    if adapt is None and hasattr(model.dynamics, "joint_functions"):
         alike = max(1.0, ALIKE * few.count / samples.count)
         problem.jacobian.write(at.x)
         residuals = enter(model, problem.jacobian.left(at.x), alike)
@@ -118,7 +113,7 @@ def fit_torque(
         at, _ = problem.solve(problem.again(at, TorqueJacobian(model, samples)), noise, LAST_ROUNDS)
     problem.jacobian.write(at.x)
     return TorqueSolution(
-        residual=(at.squares / samples.count).sqrt().numpy(),
+        residual=((at.squares / samples.count).sqrt() / problem.jacobian.per_gain(at.x)).numpy(),
         steps=at.steps,
         cost=at.cost,
         prior=problem.prior,
@@ -129,10 +124,8 @@ def fit_torque(
 
 
 class _Problem:
-    def __init__(
-        self, jacobian: TorqueJacobian, prior: GaussianPrior, only_bodies: Sequence[int] | None
-    ) -> None:
-        self.start, self.guess, self.only_bodies = jacobian.start, prior, only_bodies
+    def __init__(self, jacobian: TorqueJacobian, prior: GaussianPrior, adapt: Adaptation | None) -> None:
+        self.start, self.guess, self.adapt = jacobian.start, prior, adapt
         self.compensated = jacobian.weights[COMPENSATION] != 0
         self.covariance = torch.zeros(len(self.start), len(self.start)).double()
         self.take(jacobian)
@@ -157,7 +150,7 @@ class _Problem:
     @property
     def free(self) -> torch.Tensor:
         """Which weights (K,) move."""
-        return self.jacobian.free(self.only_bodies, self.compensated)
+        return self.jacobian.free(self.adapt, self.compensated)
 
     def near(self) -> tuple[_Step, torch.Tensor]:
         """As `solve`, some rounds from the start; from there anew while further joints want a compensation, for what
@@ -167,7 +160,7 @@ class _Problem:
         while True:
             self.believe(self.guess)
             at, noise = self.solve(start, ALIKE**0.5 * FIRST_NOISE * self.range, FIRST_ROUNDS)
-            if self.only_bodies is not None or not self.compensate(at.x):
+            if self.adapt is not None or not self.compensate(at.x):
                 return at, noise
             start = replace(start, steps=at.steps)
 
@@ -197,7 +190,7 @@ class _Problem:
                     break
             noise = self.noise(at.squares)
             self.covariance[self.free[:, None] & self.free] = torch.linalg.inv(curvature).flatten()
-            if self.only_bodies is None:
+            if self.adapt in (None, "unit"):
                 weights, variance = self.jacobian.weights, self.covariance.diagonal()
                 self.believe(most_probable(self.prior, self.guess, weights, at.x - self.start, variance))
         return at, noise

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -10,6 +10,7 @@ import torch
 from torch.func import functional_call, jacfwd, jvp, vmap
 
 from spelgen.fitting import workers
+from spelgen.fitting.config import Adaptation
 from spelgen.fitting.torque_samples import Block, TorqueSamples
 
 if TYPE_CHECKING:
@@ -19,6 +20,8 @@ BLOCK = 2**13  # samples at a time: of seven joints some 100 MB with their deriv
 HELD = 2e8  # bytes of regressors up to which they are kept from pass to pass
 BODIES = "dynamics.inertial_parameters.raw"
 COMPENSATION = "dynamics.raw_friction_compensation"
+GAINS = "raw_gains"  # logarithms of gains between logged and joint torques
+FRICTION = ("dynamics.friction.", "dynamics.raw_offset")  # what changes from day to day
 RESIDUALS = ("dynamics.joint_functions.", "dynamics.residual_")  # what stands beside rigid bodies
 
 Weights = Mapping[str, torch.Tensor]
@@ -92,10 +95,22 @@ class TorqueJacobian:
         self._held = [*self._computed()] if 8 * numbers <= HELD else None
 
     def squares(self, x: torch.Tensor) -> torch.Tensor:
-        """Sums of squares (n,) of the missing torque [Nm^2, N^2]."""
+        """Sums of squares (n,) of the missing torque [Nm^2, N^2], as logged where gains are trained."""
         weights = self._named(x)
-        parts = [self._missing(weights, each).detach().square().sum(dim=0) for each in self._own_blocks()]
+        parts = [self._logged(weights, each).detach().square().sum(dim=0) for each in self._own_blocks()]
         return workers.total(torch.stack(parts).sum(dim=0))
+
+    def per_gain(self, x: torch.Tensor) -> torch.Tensor:
+        """What of a joint torque is logged (n,), relative to the start: 1, but where gains are trained."""
+        return self._per_gain(self._named(x)).detach()
+
+    def _per_gain(self, weights: Weights) -> torch.Tensor:
+        found = torch.ones(self.samples.joints).double()
+        trained = [name for name in weights if name.endswith(GAINS)]
+        if not trained:
+            return found
+        change = weights[trained[0]] - self.weights[trained[0]]
+        return found.index_put((self.model.dynamics.input.rows,), (-change).exp())
 
     def normal_equations(
         self, x: torch.Tensor, noise: torch.Tensor, free: torch.Tensor
@@ -107,7 +122,7 @@ class TorqueJacobian:
         for block in self._own_blocks():
             slope = (self._slope(weights, block) / noise[:, None]).flatten(0, 1)[:, free]
             curvature += slope.mT @ slope
-            target += slope.mT @ (self._missing(weights, block).detach() / noise).flatten()
+            target += slope.mT @ (self._logged(weights, block).detach() / noise).flatten()
         return workers.total(curvature), workers.total(target)
 
     def left(self, x: torch.Tensor) -> Left:
@@ -138,14 +153,17 @@ class TorqueJacobian:
         slope = both / speeds.clamp(min=1e-300)
         return slope, slope * both / squares.clamp(min=1e-300)
 
-    def free(self, only_bodies: Sequence[int] | None, compensated: torch.Tensor) -> torch.Tensor:
-        """Which weights (K,) move: those of some bodies, or all, compensation only of the joints (n,) that have one."""
-        every = only_bodies is None
-        chosen = {name: torch.full_like(x, every, dtype=torch.bool) for name, x in self.weights.items()}
-        if only_bodies is None:
-            chosen[COMPENSATION] = compensated
+    def free(self, adapt: Adaptation | None, compensated: torch.Tensor) -> torch.Tensor:
+        """Which weights (K,) move: all, or those of an adaptation; compensation of the joints (n,) that have one."""
+        moving = {"load": (), "friction": FRICTION}.get(adapt or "", ("",))
+        chosen = {
+            name: torch.full_like(x, name.startswith(moving), dtype=torch.bool)
+            for name, x in self.weights.items()
+        }
+        if adapt == "load":
+            chosen[BODIES][-1] = True
         else:
-            chosen[BODIES][list(only_bodies)] = True
+            chosen[COMPENSATION] = compensated
         return torch.cat([x.flatten() for x in chosen.values()])
 
     def write(self, x: torch.Tensor) -> None:
@@ -198,7 +216,7 @@ class TorqueJacobian:
         for name, x in own.items():
             size = x[0].numel()
             row, weight = torch.arange(len(x)).repeat_interleave(size), torch.arange(size).repeat(len(x))
-            joint = self.model.dynamics.input.rows[row] if name.endswith("raw_gains") else row
+            joint = self.model.dynamics.input.rows[row] if name.endswith(GAINS) else row
             direction = count + turns * weight + torch.tensor(turn)[joint]
             each = torch.zeros(total, len(x), size).double()
             each[direction, row, weight] = 1.0
@@ -236,8 +254,12 @@ class TorqueJacobian:
 
         return self._ask(weights, missing)
 
+    def _logged(self, weights: Weights, samples: _Samples) -> torch.Tensor:
+        """The missing torque in the units of what was logged, (T, n)."""
+        return self._missing(weights, samples) * self._per_gain(weights)
+
     def _slope(self, weights: Weights, samples: _Samples) -> torch.Tensor:
-        """Minus d(missing torque) / d(weights), (T, n, K)."""
+        """Minus d(missing torque, as logged) / d(weights), (T, n, K)."""
         bodies, joints = self._body_slope(weights, samples), self._joint_slope(weights, samples)
         sizes = [x.numel() for name, x in weights.items() if name != BODIES]
         rest = iter(joints.split(sizes, dim=-1))
@@ -248,7 +270,7 @@ class TorqueJacobian:
         own = {name: x for name, x in weights.items() if name != BODIES}
 
         def missing(changed: Weights) -> torch.Tensor:
-            return self._missing({**weights, **changed}, samples)
+            return self._logged({**weights, **changed}, samples)
 
         def change(direction: Weights) -> torch.Tensor:
             found: torch.Tensor = jvp(missing, (own,), (direction,))[1]
@@ -274,4 +296,4 @@ class TorqueJacobian:
         )[1]
         at_drives = (samples.factor * by_load).unsqueeze(-1) * samples.load_regressor
         loaded = samples.regressor + torch.einsum("mj,tmk->tjk", self.model.dynamics.motors, at_drives)
-        return (loaded @ change).detach()
+        return ((loaded @ change) * self._per_gain(weights)[:, None]).detach()

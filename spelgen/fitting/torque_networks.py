@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from spelgen.fitting.config import LBFGS_DECAY
+from spelgen.fitting.config import LBFGS_DECAY, Adaptation
 from spelgen.fitting.optimizers import minimise_sum
 from spelgen.fitting.torque_samples import Block, TorqueSamples
 from spelgen.identification.samples import DynamicsSamples
@@ -15,6 +15,12 @@ from spelgen.identification.samples import DynamicsSamples
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
+PARTS: dict[Adaptation, tuple[str, ...]] = {
+    "load": ("dynamics.mass", "dynamics.potential"),
+    "friction": ("dynamics.friction",),
+    "unit": ("",),
+}
+"""How the names of the weights begin that an adaptation moves."""
 BLOCK = 2**16  # samples in memory with all that their gradient needs
 
 
@@ -43,3 +49,28 @@ def fit_networks(
         return part if number else part + penalty()
 
     return minimise_sum(model, missed, lambda: enumerate(samples.blocks(BLOCK)), evaluations, weight_decay)
+
+
+def adapt_networks(
+    model: EmittedModel,
+    samples: TorqueSamples | Sequence[DynamicsSamples],
+    adapt: Adaptation,
+    weight_decay: float = LBFGS_DECAY,
+    evaluations: int = 2000,
+) -> int:
+    """Move a part of a fitted model to what meets the samples' torques best; return the evaluations it took.
+
+    weight_decay: of half the sum of squared changes, so that what these samples do not show stays as it was.
+    """
+    moving = {name: x for name, x in model.named_parameters() if name.startswith(PARTS[adapt])}
+    before = {name: x.detach().clone() for name, x in moving.items()}
+
+    def changed() -> torch.Tensor | float:
+        return weight_decay / 2 * sum((x - before[name]).square().sum() for name, x in moving.items())
+
+    try:
+        for name, parameter in model.named_parameters():
+            parameter.requires_grad_(name in moving)
+        return fit_networks(model, samples, 0.0, changed, evaluations)
+    finally:
+        model.requires_grad_(True)

@@ -67,12 +67,12 @@ def read_baseline(run: RunFolder) -> dict[str, RegressorDynamics]:
     if "parameters" not in found:
         return {}
     arm = run_arm(run)
-    inputs = arm.actuation.matrix()
+    drives = arm.actuation.drives()
     kept = {
         LEAST_SQUARES: (FrictionModel(), found["parameters"]),
         LEAST_SQUARES_WITH_MEMORY: (REMEMBERING, found["parameters_with_memory"]),
     }
     return {
-        name: identified_dynamics(arm.arm, friction, np.array(parameters), inputs)
+        name: identified_dynamics(arm.arm, friction, np.array(parameters), drives)
         for name, (friction, parameters) in kept.items()
     }

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from spelgen.arm.actuation import motor_speeds
+from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.bristles import reach_of
 from spelgen.dynamics.regressor_dynamics import RegressorDynamics
@@ -41,7 +41,7 @@ class Identification:
     parameters: (K,), whose torque is the fit's; without prior those outside the base are zero. values, deviations:
     (r,) of the base parameters. condition: of the regressor (columns of length one, joints weighted). unseen:
     directions of the base parameters in which these logs say nothing. residual: (n,) root mean square [Nm, N];
-    nmse: (n,) its square by the torque's variance. inputs: G, (n, n), of the logs' torques.
+    nmse: (n,) its square by the torque's variance. drives: between logged torques and joints; None: nothing is.
     """
 
     arm: Arm
@@ -56,13 +56,13 @@ class Identification:
     nmse: np.ndarray
     trajectories: tuple[str, ...]
     samples: int
-    inputs: np.ndarray | None = None
+    drives: Drives | None = None
     diagnostics: tuple[Diagnostic, ...] = ()
 
     @cached_property
     def dynamics(self) -> RegressorDynamics:
         """The identified arm, e.g. as a baseline of ``evaluate``."""
-        return identified_dynamics(self.arm, self.method.friction, self.parameters, self.inputs)
+        return identified_dynamics(self.arm, self.method.friction, self.parameters, self.drives)
 
     def torque(
         self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, z: np.ndarray | None = None
@@ -186,19 +186,19 @@ class Identification:
 
 
 def identified_dynamics(
-    arm: Arm, friction: FrictionModel, parameters: np.ndarray, inputs: np.ndarray | None
+    arm: Arm, friction: FrictionModel, parameters: np.ndarray, drives: Drives | None
 ) -> RegressorDynamics:
-    """The arm with these parameters, (K,), the bodies' first; inputs: G, (n, n)."""
+    """The arm with these parameters, (K,), the bodies' first."""
     n, inertial = len(arm.coordinates), 10 * len(arm.bodies)
     constants = parameters[inertial:].reshape(-1, n)
-    motors = None if inputs is None else motor_speeds(inputs)
+    motors = None if drives is None else drives.speeds
     reach = reach_of([x.kind for x in arm.coordinates]).values if friction.memory else None
 
     def torque(qd: np.ndarray, z: np.ndarray | None) -> np.ndarray:
         bent = None if z is None or reach is None else z / reach
         return friction.torque(constants, qd, bent, motors)
 
-    return RegressorDynamics(arm, parameters[:inertial], constants[0], torque, inputs, reach)
+    return RegressorDynamics(arm, parameters[:inertial], constants[0], torque, drives, reach)
 
 
 def _finite(value: float) -> float | None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from spelgen.arm.actuation import motor_speeds
+from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.bristles import reach_of
 from spelgen.dynamics.regressor import regressor
@@ -45,21 +45,21 @@ def identify(
     """
     arm = arm if isinstance(arm, LoadedArm) else load_arm(arm)
     logs = [logs] if isinstance(logs, Trajectory) else logs
-    coordinates, inputs = arm.arm.coordinates, arm.actuation.matrix()
+    coordinates, drives = arm.arm.coordinates, arm.actuation.drives()
     for trajectory in logs:
         require_joints(trajectory, [c.name for c in coordinates])
     require_torques(logs)
     notes = check(logs, [c.name for c in coordinates], [c.kind for c in coordinates])
     method = method or LeastSquares()
     kinds = [c.kind for c in coordinates]
-    reach = reach_of(kinds, motor_speeds(inputs)) if method.friction.memory else None
+    reach = reach_of(kinds, drives.speeds) if method.friction.memory else None
     samples = dynamics_samples(logs, preprocessing=preprocessing or Preprocessing(), reach=reach)
     left = sorted({x.name for x in logs} - {x.name for x in samples})
     if left:
         message = f"sampled too slowly or too short for accelerations: {', '.join(left)}"
         notes.append(Diagnostic("warning", "no-accelerations", "logs", None, message))
-    at_joints = [replace(x, tau=x.tau @ inputs.T) for x in samples]
-    found = least_squares(arm.arm, at_joints, method, inputs)
+    at_joints = [replace(x, tau=x.tau @ drives.inputs.T) for x in samples]
+    found = least_squares(arm.arm, at_joints, method, drives)
     return replace(found, diagnostics=tuple(notes))
 
 
@@ -67,11 +67,11 @@ def least_squares(
     arm: Arm,
     samples: Sequence[DynamicsSamples],
     method: LeastSquares | None = None,
-    inputs: np.ndarray | None = None,
+    drives: Drives | None = None,
 ) -> Identification:
     """Fit ``arm`` to samples of joint torques; errors as for ``identify``.
 
-    inputs: G, (n, n), of the drives whose friction and armature are fitted; None: each moves its own joint alone.
+    drives: those whose friction and armature are fitted; None: each moves its own joint alone.
     """
     method = method or LeastSquares()
     if not any(len(x.q) for x in samples):
@@ -79,14 +79,14 @@ def least_squares(
             "no samples to identify from",
             expected="motion sampled at 50 Hz or faster, 1 s without a gap at least",
         )
-    motors = None if inputs is None else motor_speeds(inputs)
+    motors = None if drives is None else drives.speeds
     triangles = reduce((rows, tau) for rows, tau in _blocks(arm, samples, method.friction, motors))
     base = base_parameters(arm, method.friction, motors)
     prior = None
     if method.prior is not None:
         prior = gaussian_prior(arm, method.friction, triangles.deviation, method.prior)
     fit = _fitted(arm, samples, method, motors, _space(base, triangles, prior, method))
-    return replace(_result(arm, samples, method, base, fit), inputs=inputs)
+    return replace(_result(arm, samples, method, base, fit), drives=drives)
 
 
 def columns(

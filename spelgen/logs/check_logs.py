@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from spelgen.arm.arm import Coordinate
 from spelgen.errors import Diagnostic, LogError, SpelgenError, SpelgenErrors, collect
+from spelgen.identification.drive_hints import Coupling, DriveLog, coupled_inputs, coupling, torque_delay
 from spelgen.logs.checks import Finding, findings, gap_diagnostics, summarised
 from spelgen.logs.gravity import GravityFit, StateSamples, fit_gravity, state_samples
 from spelgen.logs.report import SEEN, JointReport, LogReport
@@ -38,6 +40,7 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping |
     """
     coordinates, inputs = arm.arm.coordinates, arm.actuation.matrix()
     joints, kinds = [c.name for c in coordinates], [c.kind for c in coordinates]
+    drives = DriveLog(inputs)
     measured: list[Statistics] = []
     samples: list[StateSamples] = []
     examples: list[Trajectory] = []
@@ -48,6 +51,7 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping |
         require_torques([trajectory])
         measured.append(statistics(trajectory))
         samples.append(state_samples(trajectory, inputs))
+        drives.add(trajectory)
         odd += findings(trajectory, joints, kinds, measured[-1].agreement)
         notes += gap_diagnostics(trajectory)
         if len(examples) < EXAMPLES:
@@ -70,6 +74,8 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping |
         wrong = torque_errors(coordinate, report.gravity, largest, declared=declared)
         errors += tuple(wrong)
         notes += [*_limits(coordinate, report), *([] if wrong else _gravity(report))]
+    if not errors:
+        notes += _drives(arm, drives, mapping)
     return LogReport(
         robot=arm.arm.name,
         files=len({each.clock.file for each in measured} - {None}),
@@ -79,6 +85,44 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping |
         errors=errors,
         examples=tuple(examples),
     )
+
+
+def _drives(arm: LoadedArm, log: DriveLog, mapping: LogMapping) -> list[Diagnostic]:
+    """What the logs show of drives that the sidecar does not say."""
+    samples, speeds = log.samples(), arm.actuation.drives().speeds
+    if samples is None:
+        return []
+    found = coupling(arm.arm, samples, speeds)
+    if found is not None:
+        return [_coupled(arm, found)]
+    late = torque_delay(arm.arm, samples, speeds)
+    if late is None:
+        return []
+    delay, left = mapping.torque_delay + late[0], late[1]
+    message = (
+        f"torques are logged {late[0] * 1e3:.3g} ms later than they act: so moved, least squares misses {left:.0%} of "
+        f"what it missed (mean square); say 'torque_delay: {delay:.4g}' under 'logs' in the robot's YAML"
+    )
+    return [Diagnostic("warning", "torque-delay", "logs", None, message)]
+
+
+def _coupled(arm: LoadedArm, found: Coupling) -> Diagnostic:
+    """A coupling that the logs show, in the sidecar's words."""
+    names = [c.name for c in arm.arm.coordinates]
+    joints = [found.moved_by, found.joint]
+    matrix = coupled_inputs(arm.actuation.drives(), found)[np.ix_(joints, joints)]
+    said = f"couplings: [{{joints: {json.dumps([names[k] for k in joints])}, matrix: {matrix.round(6).tolist()}}}]"
+    if found.logged_at == "motors" and arm.settings.torque == "joint":
+        others = [name for k, name in enumerate(names) if k not in joints]
+        gears = ", ".join(f"{json.dumps(name)}: {{gear: 1}}" for name in others)
+        said += f", 'torque: motor' and joints: {{{gears}}}"
+    moved, by = (repr(names[k]) for k in (found.joint, found.moved_by))
+    message = (
+        f"its motor turns with {by} too, {found.ratio:g} times as fast, and the logged torques are those of the "
+        f"{found.logged_at}: least squares then misses {found.left:.0%} of what it missed of both torques (mean "
+        f"square); say {said} in the robot's YAML"
+    )
+    return Diagnostic("warning", "coupled-motors", f"joint {moved}", None, message)
 
 
 def _joint(
@@ -155,7 +199,10 @@ def _gravity(joint: JointReport) -> list[Diagnostic]:
         message = f"tau moves against gravity: {fit.factor:.3g} times the URDF's; a sign of tau or q is wrong"
         return [Diagnostic("warning", "torque-against-gravity", where, None, message)]
     if fit.correlation > SEEN and not low < fit.factor < high:
-        message = f"tau moves with {fit.factor:.3g} times the URDF's gravity torque; check its unit and gain"
+        message = (
+            f"tau moves with {fit.factor:.3g} times the URDF's gravity torque; check its unit and gain, or let the "
+            f"gain be found: 'torque: motor', and 'gear: {1 / fit.factor:.3g}' with 'gain: trained' of this joint"
+        )
         return [Diagnostic("warning", "torque-scale", where, None, message)]
     return []
 

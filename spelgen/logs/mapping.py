@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import pi
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
@@ -36,6 +36,8 @@ ONLY = {  # units that a joint of this kind cannot have
     "revolute": ("m", "mm", "m/s", "mm/s", "N"),
     "prismatic": ("rad", "deg", "turns", "rad/s", "deg/s", "turns/s", "rpm", "Nm", "mNm"),
 }
+
+LONGEST_DELAY = 1.0  # s
 
 Time = Literal["s", "ms", "us", "ns"]
 Position = Literal["rad", "deg", "turns", "counts", "m", "mm"]
@@ -109,7 +111,8 @@ class LogMapping(Group):
 
     input: "position" where joints are commanded positions: u is read, and neither qd nor tau are.
     topic: of the ROS 2 bag, where it holds several with joint states. velocity: "differentiated" where the
-    log has none. Files that spelgen wrote itself are read as they are, whatever stands here.
+    log has none. torque_delay: how much later than positions a log shows torques [s], see what `spelgen logs` suggests.
+    Files that spelgen wrote itself are read as they are, whatever stands here.
     """
 
     topic: str | None = None
@@ -117,6 +120,7 @@ class LogMapping(Group):
     units: LogUnits = LogUnits()
     input: Literal["torque", "position"] = "torque"
     velocity: Literal["logged", "differentiated"] = "logged"
+    torque_delay: Annotated[Number, Field(ge=-LONGEST_DELAY, le=LONGEST_DELAY)] = 0.0
     joints: dict[str, JointLog] = Field(default={})
 
     def joint(self, name: str) -> JointLog:

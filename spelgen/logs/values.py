@@ -58,8 +58,9 @@ def made_trajectory(data: np.ndarray, layout: Layout, **about: Any) -> Trajector
     quantities = wanted_quantities(layout.mapping)
     t, found = data[:, 0], dict(zip(quantities, np.split(data[:, 1:], len(quantities), axis=1), strict=True))
     qd = found["qd"] if "qd" in found else _differentiated(t, found["q"])
+    tau = _earlier(t, found["tau"], layout.mapping.torque_delay) if "tau" in found else np.zeros((len(t), 0))
     return Trajectory(
-        t, found["q"], qd, found.get("tau", np.zeros((len(t), 0))), u=found.get("u"),
+        t, found["q"], qd, tau, u=found.get("u"),
         declares_units=layout.declares_units, **about,
     )  # fmt: skip
 
@@ -71,6 +72,18 @@ def _differentiated(t: np.ndarray, q: np.ndarray) -> np.ndarray:
         if stop - start > 1:
             qd[start:stop] = np.gradient(q[start:stop], t[start:stop], axis=0)
     return qd
+
+
+def _earlier(t: np.ndarray, values: np.ndarray, delay: float) -> np.ndarray:
+    """What is logged so much later [s], (T, n), held at the ends of each gap-free piece."""
+    if not delay:
+        return values
+    moved = values.copy()
+    for start, stop in pairwise(gap_ends(t)):
+        piece = slice(start, stop)
+        for column, logged in zip(moved.T, values.T, strict=True):
+            column[piece] = np.interp(t[piece] + delay, t[piece], logged[piece])
+    return moved
 
 
 def _times(table: pa.Table | pa.RecordBatch, layout: Layout, file: Path, start: int, row: int) -> np.ndarray:

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from spelgen.arm.actuation import motor_speeds
 from spelgen.dynamics.regressor import urdf_parameters
 from spelgen.identification.base_parameters import base_parameters
 from spelgen.identification.friction import FrictionModel
@@ -63,7 +62,7 @@ def base_table(model: Any | None, arm: LoadedArm, identified: Mapping[str, Any])
     """What least squares found, beside the URDF and, where there is one, a closed-form model."""
     effects = identified["method"]["effects"]
     friction = FrictionModel(stribeck="stribeck" in effects, polynomial="cubic" in effects)
-    base = base_parameters(arm.arm, friction, motor_speeds(arm.actuation.matrix()))
+    base = base_parameters(arm.arm, friction, arm.actuation.drives().speeds)
     drives = len(base.parameters) - 10 * len(arm.arm.bodies)
     nominal = base.combination @ np.concatenate([urdf_parameters(arm.arm), np.zeros(drives)])
     learned = _learned(model, base.combination)

@@ -26,13 +26,23 @@ def motor_speeds(gains: Tensor) -> Tensor:
 
 
 class DirectInput(nn.Module):
-    """G is the identity: each input is the torque of its own joint, and none that of a passive one."""
+    """G is the identity: each input is the torque of its own joint, and none that of a passive one.
+
+    motor_speeds: C, (n, n), where motors move several joints all the same: they turn by C qd.
+    """
 
     actuated: Tensor
 
-    def __init__(self, joints: Joints) -> None:
+    def __init__(self, joints: Joints, motor_speeds: Sequence[Sequence[float]] = ()) -> None:
         super().__init__()
         self.register_buffer("actuated", vector(float(x) for x in joints.actuated))
+        self._motor_speeds = motor_speeds
+
+    def motor_speeds(self) -> Tensor:
+        """C, (n, n), by joint velocities."""
+        if not self._motor_speeds:
+            return torch.eye(len(self.actuated), dtype=torch.float64)
+        return torch.tensor(self._motor_speeds, dtype=torch.float64)
 
     def prepare(self) -> Tensor:
         """The diagonal of G, (n,)."""
@@ -82,6 +92,10 @@ class MotorInput(nn.Module):
         self.register_buffer("rows", torch.tensor(rows, dtype=torch.long))
         raw = nn.Parameter(torch.zeros(len(rows), dtype=torch.float64)) if rows else None
         self.register_parameter("raw_gains", raw)
+
+    def motor_speeds(self) -> Tensor:
+        """C, (n, n), by joint velocities."""
+        return motor_speeds(self.prepare().detach())
 
     def prepare(self) -> Tensor:
         """G, (n, n)."""

@@ -50,3 +50,10 @@ class Input(Protocol):
 
     def solve(self, encoded: Tensor, force: Tensor, prepared: Any) -> Tensor:
         """The inputs, (..., n), that make this force."""
+
+
+class DriveInput(Input, Protocol):
+    """What gives a constant G, and how the drives turn."""
+
+    def motor_speeds(self) -> Tensor:
+        """C, (n, n): the drives' speeds are C qd."""

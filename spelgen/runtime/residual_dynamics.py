@@ -10,7 +10,7 @@ from torch import Tensor
 from spelgen.runtime.encoding import JointEncoding
 from spelgen.runtime.joint_functions import JointFunctions
 from spelgen.runtime.joints import Joints
-from spelgen.runtime.parts import Input
+from spelgen.runtime.parts import DriveInput
 from spelgen.runtime.port_hamiltonian import applied
 from spelgen.runtime.potential import LearnedPotential
 from spelgen.runtime.residual_mass import ResidualMass
@@ -37,7 +37,7 @@ class ResidualDynamics(RigidBodyDynamics):
         joints: Joints,
         bodies: Bodies,
         gravity: tuple[float, float, float],
-        input: Input,
+        input: DriveInput,
         mass: ResidualMass,
         potential: LearnedPotential | None,
         reach: Sequence[Sequence[float]] = (),

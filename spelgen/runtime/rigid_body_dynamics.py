@@ -8,11 +8,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from spelgen.runtime.actuation import motor_speeds
 from spelgen.runtime.armature import Armature
 from spelgen.runtime.friction_laws import FrictionConstants, FrictionLaws
 from spelgen.runtime.joints import Joints, vector
-from spelgen.runtime.parts import Input
+from spelgen.runtime.parts import DriveInput
 from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied
 from spelgen.runtime.rigid_body import Bodies, InertialParameters, inertia_basis, skew, transform_table
 
@@ -72,7 +71,7 @@ class RigidBodyDynamics(PortHamiltonian):
         joints: Joints,
         bodies: Bodies,
         gravity: tuple[float, float, float],
-        input: Input,
+        input: DriveInput,
         reach: Sequence[Sequence[float]] = (),
     ) -> None:
         super().__init__()
@@ -104,9 +103,8 @@ class RigidBodyDynamics(PortHamiltonian):
         self.inertial_parameters = InertialParameters(bodies)
         self.armature = Armature(joints)
         self.friction = FrictionLaws(joints, reach)
-        self.input: Any = input
-        gains = input(torch.zeros(self.n, dtype=torch.float64), input.prepare()).detach()
-        self.register_buffer("motors", motor_speeds(gains))
+        self.input = input
+        self.register_buffer("motors", self.input.motor_speeds())
         self.register_buffer("loads", torch.linalg.inv(self.motors))
         # of the measured torque, in units of the joints' usual friction
         self.raw_offset = nn.Parameter(torch.zeros(self.n, dtype=torch.float64))

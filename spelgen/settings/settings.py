@@ -43,8 +43,9 @@ class Settings(Group):
 
     gravity: in the frame of the root link [m/s^2]. joints: by URDF name; a joint not listed has the defaults.
     input: what commands the joints and is logged: torques, or positions ("u") of servos that hold them like springs.
-    torque: whether the logs' tau are joint torques, or motor torques before the gear. couplings: of motors
-    that move several joints, for motor torques. logs: how this robot's logs are named and measured.
+    torque: whether the logs' tau are joint torques, or motor torques before the gear. couplings: of motors that move
+    several joints: their friction and rotors belong to the motors, whatever the logged torques are.
+    logs: how this robot's logs are named and measured.
     """
 
     about: str = ""
@@ -62,9 +63,7 @@ class Settings(Group):
     @model_validator(mode="after")
     def _drives(self) -> Settings:
         if self.input == "position" and (self.torque == "motor" or self.couplings):
-            raise ValueError("'input: position' or 'torque: motor' with couplings, not both")
-        if self.couplings and self.torque == "joint":
-            raise ValueError("'torque: motor' where there are couplings: joint torques know none")
+            raise ValueError("'input: position' or 'torque: motor' and couplings, not both")
         coupled = [name for coupling in self.couplings for name in coupling.joints]
         for name in coupled:
             if coupled.count(name) > 1:

@@ -654,14 +654,37 @@ def with_velocities(inputs: NetworkInput, joints: Joints, axes: int) -> NetworkI
     )
 
 
+def motor_speeds(gains: Tensor) -> Tensor:
+    """C, (n, n): the motors' speeds are C qd, where the joints' torques are ``gains`` times the motors'.
+
+    By the same power, each motor's in the units of the joint that it moves most: C is the identity where
+    each moves its own joint alone.
+    """
+    largest = gains.gather(0, gains.abs().argmax(dim=0, keepdim=True))
+    passive = largest == 0
+    return (gains / torch.where(passive, torch.ones_like(largest), largest)).mT + torch.diag(
+        passive[0].to(gains)
+    )
+
+
 class DirectInput(nn.Module):
-    """G is the identity: each input is the torque of its own joint, and none that of a passive one."""
+    """G is the identity: each input is the torque of its own joint, and none that of a passive one.
+
+    motor_speeds: C, (n, n), where motors move several joints all the same: they turn by C qd.
+    """
 
     actuated: Tensor
 
-    def __init__(self, joints: Joints) -> None:
+    def __init__(self, joints: Joints, motor_speeds: Sequence[Sequence[float]] = ()) -> None:
         super().__init__()
         self.register_buffer("actuated", vector(float(x) for x in joints.actuated))
+        self._motor_speeds = motor_speeds
+
+    def motor_speeds(self) -> Tensor:
+        """C, (n, n), by joint velocities."""
+        if not self._motor_speeds:
+            return torch.eye(len(self.actuated), dtype=torch.float64)
+        return torch.tensor(self._motor_speeds, dtype=torch.float64)
 
     def prepare(self) -> Tensor:
         """The diagonal of G, (n,)."""
