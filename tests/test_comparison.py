@@ -3,7 +3,8 @@
 import json
 import math
 import shutil
-from dataclasses import replace
+from dataclasses import asdict, replace
+from itertools import pairwise
 
 import numpy as np
 import pinocchio as pin
@@ -11,18 +12,22 @@ import pytest
 import torch
 import yaml
 
-from spelgen.comparison import metrics
+from spelgen.comparison import metrics, runs
 from spelgen.comparison.formatting import comparison_tables
+from spelgen.comparison.known_urdf import with_wrong_inertials
 from spelgen.comparison.runs import run_study, time_steps
-from spelgen.comparison.study import VARIANTS, prepare_study
+from spelgen.comparison.study import VARIANTS, ablation, prepare_study
 from spelgen.comparison.truth import example_positions, mass_error, true_mass
+from spelgen.design import load_design
 from spelgen.emission.loading import load_module
 from spelgen.errors import RunError
 from spelgen.evaluation import invariants
 from spelgen.evaluation.baselines import constant_velocity
 from spelgen.evaluation.examples import predict_examples
+from spelgen.fitting.rollout import roll_out
 from spelgen.fleet.engine import InProcess
 from spelgen.logs.read import Trajectory, read_logs
+from spelgen.logs.windows import cut_windows, joined
 from spelgen.render.comparison_page import write_comparison
 from spelgen.urdf.read import read_urdf
 
@@ -70,6 +75,51 @@ def test_models_know_the_kinematics_alone(study):
     assert "joints" not in yaml.safe_load(study.urdf.with_suffix(".yaml").read_text())
 
 
+def test_inertials_that_are_wrong_are_possible_ones(robot, tmp_path):
+    """Each body's own, by about the error that is asked; friction and drives are not told."""
+    true = {x.name: x.inertial for x in read_urdf(robot).links if x.inertial}
+    for error in (0.0, 0.3, 1.0):
+        path = tmp_path / f"wrong_{error}.urdf"
+        path.write_bytes(with_wrong_inertials(robot, error))
+        found = {x.name: x.inertial for x in read_urdf(path).links if x.inertial}
+        away = [abs(np.log(float(found[x].mass) / float(true[x].mass))) for x in true]
+        assert found.keys() == true.keys()
+        assert (max(away) == 0) if error == 0 else (0.1 * error < np.mean(away) < 3 * error)
+        for inertial in found.values():
+            ixx, ixy, ixz, iyy, iyz, izz = inertial.tensor
+            moments = np.linalg.eigvalsh([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
+            assert moments[0] > 0 and moments[2] <= moments[0] + moments[1] + 1e-9
+    assert b"<dynamics" not in path.read_bytes()
+
+
+def test_with_a_wrong_urdf_models_are_trained_by_defaults(robot, quick, tmp_path):
+    found = prepare_study(robot, tmp_path, variants=CHOSEN[1:], urdf_error=0.3)
+    assert found.urdf.read_bytes() == with_wrong_inertials(robot, 0.3)
+    with pytest.MonkeyPatch.context() as patch:
+        seen = []
+
+        def train(*arguments, **options):
+            seen.append(arguments[3])
+            raise KeyboardInterrupt
+
+        patch.setattr(runs, "train", train)
+        with pytest.raises(KeyboardInterrupt):
+            run_study(found, InProcess(), note=print)
+    assert seen == [None]
+    with pytest.raises(RunError, match="a comparison with other settings"):
+        prepare_study(robot, tmp_path, variants=CHOSEN[1:], urdf_error=1.0)
+
+
+def test_the_ablation_changes_one_thing_at_a_time():
+    designs = [load_design(x.preset) for x in ablation()]
+    changes = [
+        {key for key, value in asdict(a).items() if value != asdict(b)[key]} for a, b in pairwise(designs)
+    ]
+    assert changes[:3] == [{"dissipation"}, {"input"}, {"mass"}]
+    assert changes[3] == {"potential", "encoding"}
+    assert designs[-1] == load_design("minimal")
+
+
 def test_training_sees_the_beginning_only(study):
     names = load_module(study.module(CHOSEN[0])).joint_names
     training, testing = (read_logs([study.logs], names, role=role) for role in ("train", "test"))
@@ -90,6 +140,28 @@ def test_every_run_is_noted_and_measured(study, notes):
     assert results["minimal"]["sizes"]["outputs"] == [1, 2, 0, 1]
     assert results["phnode"]["sizes"]["outputs"] == [21, 21, 6, 1]  # as in the paper
     assert results["phnode"]["sizes"]["inputs"] == 18
+
+
+def test_losses_are_of_the_logs_that_they_are_named_after(study):
+    """Worked out again from the logs of each role: sums over joints, means over samples and windows."""
+    (result,) = (x for x in study.results() if x["variant"] == "minimal")
+    model = load_module(study.module(CHOSEN[1]))
+    model.load_state_dict(torch.load(study.run(CHOSEN[1], 0) / "model.pt"))
+    for key, role, samples in (("train", "train", 5), ("test", "test", 5), ("prediction", "test", 21)):
+        cut = [
+            log[start : start + samples]
+            for log in read_logs([study.logs], model.joint_names, role=role)
+            for start in range(len(log.t) - samples + 1)
+        ]
+        windows = joined([cut_windows([each], samples, measured=False) for each in cut])
+        with torch.no_grad():
+            predicted = [x.numpy() for x in roll_out(model, windows, result["substeps"])]
+        q, qd = (np.stack([getattr(each, name)[1:] for each in cut]) for name in ("q", "qd"))
+        away = (predicted[0] - q + np.pi) % (2 * np.pi) - np.pi
+        position, velocity = (x.sum(axis=-1).mean() for x in (away**2, (predicted[1] - qd) ** 2))
+        assert result[key]["position"] == pytest.approx(position, rel=1e-9), key
+        assert result[key]["velocity"] == pytest.approx(velocity, rel=1e-9), key
+    assert result["train"] != result["test"]
 
 
 def test_a_comparison_goes_on_where_it_stopped(study, robot, quick):

@@ -61,6 +61,18 @@ def test_a_fit_in_memory_is_that_of_files(tmp_path):
     assert again.epochs == 7
 
 
+def test_the_seed_orders_batches():
+    """On the same training and validation logs: other batches, other weights; the same ones, the same weights."""
+    logs, held = motions(), motions(2, seed=1)
+    weights = []
+    for seed in (0, 0, 1):
+        model = spelgen.load_module(STAND_IN)
+        spelgen.fit(model, logs, quick(epochs=2), seed=seed, validation=held)
+        weights.append(torch.cat([x.detach().flatten() for x in model.parameters()]))
+    assert torch.equal(weights[0], weights[1])
+    assert not torch.equal(weights[0], weights[2])
+
+
 def test_a_saved_fit_is_loaded_as_it_was(tmp_path):
     found = spelgen.fit(spelgen.load_module(STAND_IN), motions(), quick(epochs=2), seed=3)
     folder = found.save(tmp_path / "run")

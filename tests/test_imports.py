@@ -64,7 +64,7 @@ render: charts plots picture page learned parameters reproduction shapes scene s
 render: run_facts curves report_page runs_page inspection_page identification_page
 logs: statistics gravity report check_logs
 fleet: ray_engine engine
-comparison: truth metrics study runs formatting
+comparison: truth metrics known_urdf study runs formatting
 fleet: schema prepare jobs search units fleet ranking progress
 render: logs_page comparison_page fleet_page
 cli: command console options formats model_commands train_start train_command log_commands simulate_command

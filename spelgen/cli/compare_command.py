@@ -9,6 +9,7 @@ import typer
 
 from spelgen.cli.console import counted, note, say
 from spelgen.cli.options import Address, Force, Robot
+from spelgen.cli.train_start import NotApplicable
 from spelgen.errors import SpelgenError, suggestion
 
 
@@ -22,6 +23,18 @@ def compare(
     ] = None,
     seeds: Annotated[int | None, typer.Option(min=1, help="Runs of each preset.")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Training steps of each run.")] = None,
+    ablation: Annotated[
+        bool, typer.Option("--ablation", help="From phnode to minimal, one change after the other.")
+    ] = False,
+    urdf_error: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            metavar="PART",
+            help="Models know the URDF's inertials, wrong by so much (0.3: 30 %), and are "
+            "trained as `train` does by itself. Default: kinematics alone, the same steps for all.",
+        ),
+    ] = None,
     jobs: Annotated[
         int, typer.Option(min=1, help="Runs at a time, one core each; of several Ray runs them.")
     ] = 1,
@@ -35,17 +48,27 @@ def compare(
     from spelgen.comparison.formatting import comparison_tables
     from spelgen.comparison.runs import run_study, time_steps
     from spelgen.comparison.study import VARIANTS, prepare_study
+    from spelgen.comparison.study import ablation as steps_of_ablation
     from spelgen.fleet.engine import engine
     from spelgen.render.comparison_page import write_comparison
 
-    known = {variant.name: variant for variant in VARIANTS}
+    if urdf_error is not None and steps is not None:
+        raise NotApplicable(
+            "--steps: belongs to models that know kinematics alone, these are trained by defaults"
+        )
+    known = {variant.name: variant for variant in (steps_of_ablation() if ablation else VARIANTS)}
     chosen = list(known) if presets is None else [name.strip() for name in presets.split(",")]
     for name in chosen:
         if name not in known:
             raise SpelgenError(
                 f"unknown preset {name!r}", expected=", ".join(known), do=suggestion(name, known)
             )
-    folder = output or Path("comparisons") / robot.stem
+    about = [
+        robot.stem,
+        *(["ablation"] if ablation else []),
+        *([f"urdf-{urdf_error:g}"] if urdf_error is not None else []),
+    ]
+    folder = output or Path("comparisons") / "-".join(about)
     with counted("simulating") as progress:
         study = prepare_study(
             robot,
@@ -53,6 +76,7 @@ def compare(
             variants=[known[name] for name in chosen],
             seeds=seeds,
             steps=steps,
+            urdf_error=urdf_error,
             force=force,
             progress=progress,
         )

@@ -18,7 +18,7 @@ from spelgen.evaluation.examples import predict_examples
 from spelgen.evaluation.invariants import invariants
 from spelgen.evaluation.names import MODEL
 from spelgen.files import write_json
-from spelgen.fitting.config import BATCH
+from spelgen.fitting.config import BATCH, Rollout
 from spelgen.fitting.rollout import LossScales, loss_scales
 from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.fitting.train import train
@@ -84,7 +84,7 @@ def _measured(study: Study, model: EmittedModel, joints: Sequence[str], substeps
     training, testing = (read_logs([study.logs], joints, role=role) for role in ("train", "test"))
     steps = round(HORIZON / (decimation * float(testing[0].t[1] - testing[0].t[0])))
     far = thinned(testing, steps + 1, decimation)
-    near_train, near_test = (thinned(x, study.training.window, decimation) for x in (training, testing))
+    near_train, near_test = (thinned(x, study.window, decimation) for x in (training, testing))
     low, high = (torch.tensor(x, dtype=torch.float64) for x in (study.low, study.high))
     examples = predict_examples(
         of_dynamics(MODEL, model, substeps), testing, steps, joints, decimation=decimation, measured=False
@@ -109,8 +109,8 @@ def time_steps(study: Study) -> dict[str, float]:
     """Seconds of a training step of each variant, one after the other in this process."""
     joints = read_facts(study.module(study.variants[0])).joints
     training = read_logs([study.logs], joints, role="train")
-    windows = thinned(training, study.training.window, study.preprocessing.decimation or 1)
-    windows = windows[: study.training.batch or BATCH]
+    windows = thinned(training, study.window, study.preprocessing.decimation or 1)
+    windows = windows[: (study.training or Rollout()).batch or BATCH]
     times = {}
     torch.set_num_threads(1)
     for variant in study.variants:

@@ -1,22 +1,24 @@
 """A comparison: one robot's logs, a module for each variant, a run for each seed; interrupted, it goes on.
 
-The simulated robot is known to the models by its kinematics alone: they are built from a copy of the URDF without
-inertials, and without the sidecar's drives, so that no model starts from the truth that it is judged by.
+The simulated robot is known to the models by its kinematics alone, or with inertials that are wrong: they are built
+from such a copy of the URDF, and without the sidecar's drives, so that no model starts from the truth that it is judged
+by. With kinematics alone all are trained for the same steps, as the robot's settings say; with wrong inertials as
+`spelgen train` does by itself.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
 import yaml
-from lxml import etree
 
 from spelgen import pipeline
-from spelgen.design import Net, Preset
+from spelgen.comparison.known_urdf import with_wrong_inertials, without_inertials
+from spelgen.design import Design, Net, Preset, load_design
 from spelgen.errors import RunError
 from spelgen.files import write_json, write_text
 from spelgen.fitting.config import Rollout, fit_config
@@ -29,15 +31,15 @@ from spelgen.settings.settings import Settings
 from spelgen.structure.nominal import working_range
 from spelgen.trust import require_own_module
 
-SCHEMA = 3
+SCHEMA = 4
 
 
 @dataclass(frozen=True)
 class Variant:
-    """A preset with a kind of network."""
+    """A preset, or a design of one's own, with a kind of network."""
 
     name: str
-    preset: Preset
+    preset: Preset | Design
     net: Net | None = None
 
 
@@ -51,25 +53,48 @@ VARIANTS = (
 )
 
 
+def ablation() -> tuple[Variant, ...]:
+    """From phnode to minimal, one change after the other."""
+    phnode = load_design("phnode")
+    friction = replace(phnode, dissipation="per-joint")
+    inputs = replace(friction, input="derived")
+    outputs = replace(inputs, mass="derived")
+    return (
+        Variant("phnode", "phnode"),
+        Variant("per-joint-friction", friction),
+        Variant("known-inputs", inputs),
+        Variant("fewest-outputs", outputs),
+        Variant("fewest-inputs", replace(outputs, potential="derived", encoding="joint")),
+        Variant("minimal", "minimal"),
+    )
+
+
 @dataclass(frozen=True)
 class Study:
     """The files of a comparison.
 
     source: the robot's own URDF. logs: train.parquet and test.parquet. kinematics.urdf: what the models are
-    built from. modules and runs by variant and seed; each finished run holds result.json. low, high: range of
-    q [rad; m] in which M is looked at.
+    built from. modules and runs by variant and seed; each finished run holds result.json. training: None, as
+    `spelgen train` does by itself. urdf_error: of the inertials that the models know (see `with_wrong_inertials`);
+    None: they know none. low, high: range of q [rad; m] in which M is looked at.
     """
 
     folder: Path
     source: Path
     robot: str
     settings: ComparisonSettings
-    training: Rollout
+    training: Rollout | None
     preprocessing: Preprocessing
     validation_fraction: float
     variants: tuple[Variant, ...]
+    urdf_error: float | None
     low: tuple[float, ...]
     high: tuple[float, ...]
+
+    @property
+    def window(self) -> int:
+        """Samples predicted together in training."""
+        return (self.training or Rollout()).window
 
     @property
     def logs(self) -> Path:
@@ -103,6 +128,7 @@ def prepare_study(
     variants: Sequence[Variant] = VARIANTS,
     seeds: int | None = None,
     steps: int | None = None,
+    urdf_error: float | None = None,
     force: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Study:
@@ -120,10 +146,11 @@ def prepare_study(
         source=robot,
         robot=loaded.arm.name,
         settings=settings,
-        training=_training(loaded.settings, settings),
+        training=_training(loaded.settings, settings) if urdf_error is None else None,
         preprocessing=Preprocessing(**{**loaded.settings.training.preprocessing, "cutoff": 0.0}),
         validation_fraction=loaded.settings.training.validation_fraction,
         variants=tuple(variants),
+        urdf_error=urdf_error,
         low=tuple(low for low, _ in ranges),
         high=tuple(high for _, high in ranges),
     )
@@ -133,12 +160,13 @@ def prepare_study(
             require_own_module(study.module(variant), study.urdf)
         return study
     _write_logs(study, loaded, progress)
-    study.urdf.write_bytes(_without_inertials(robot))
+    known = without_inertials(robot) if urdf_error is None else with_wrong_inertials(robot, urdf_error)
+    study.urdf.write_bytes(known)
     gravity = yaml.safe_dump({"gravity": list(loaded.settings.gravity)})
     write_text(study.urdf.with_suffix(".yaml"), gravity)
     for variant in variants:
         source = pipeline.generate(
-            study.urdf, preset=variant.preset, net=variant.net, width=settings.width, depth=settings.depth
+            study.urdf, variant.preset, net=variant.net, width=settings.width, depth=settings.depth
         )
         write_text(study.module(variant), source)
     write_json(folder / "study.json", description)
@@ -165,7 +193,8 @@ def _description(study: Study, loaded: LoadedArm) -> dict[str, Any]:
         "simulation": loaded.settings.simulation.model_dump(mode="json"),
         "tracking": loaded.settings.tracking.model_dump(mode="json"),
         "comparison": study.settings.model_dump(mode="json"),
-        "training": study.training.model_dump(mode="json"),
+        "training": None if study.training is None else study.training.model_dump(mode="json"),
+        "urdf_error": study.urdf_error,
         "preprocessing": asdict(study.preprocessing),
         "variants": [variant.name for variant in study.variants],
     }
@@ -204,14 +233,3 @@ def _beginning(trajectory: Trajectory, seconds: float | None) -> Trajectory:
         return trajectory
     elapsed = trajectory.t - trajectory.t[0]
     return trajectory[: int((elapsed < seconds - 1e-9).sum())]
-
-
-def _without_inertials(robot: Path) -> bytes:
-    """The URDF with nothing but kinematics and limits; it was read before, so it is known to be harmless."""
-    tree = etree.fromstring(
-        robot.read_bytes(), etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True)
-    )
-    for name in ("inertial", "dynamics", "visual", "collision"):
-        for element in tree.findall(f".//{name}"):
-            element.getparent().remove(element)
-    return etree.tostring(tree, xml_declaration=True, encoding="utf-8")

@@ -19,7 +19,7 @@ from spelgen.render.charts import Line, line_chart
 from spelgen.render.page import render_page
 from spelgen.render.plots import QUANTITIES, UNITS, Panel, inertia_unit
 
-STYLES = ("c1", "c2", "c3", "c4", "c5")
+STYLES = ("c1", "c2", "c3", "c4", "c5", "c6")
 
 
 def write_comparison(study: Study, tables: Sequence[Table]) -> Path:
