@@ -113,7 +113,8 @@ def test_splines_at_their_ends_and_beyond(tmp_path):
     """On knots, where the range ends, far outside: by C and CasADi as by torch, and slopes as torch has them."""
     model = with_parts("two_link", "springs", "friction")
     described, functions = describe(model, arm_of("two_link")), model.dynamics.joint_functions
-    knots = functions.center + functions.spacing * torch.arange(-19.5, 20, 0.5, dtype=torch.float64)[:, None]
+    center, spacing = functions.middles.mean(dim=1), functions.spacing.flatten()
+    knots = center + spacing * torch.arange(-19.5, 20, 0.5, dtype=torch.float64)[:, None]
     q = torch.cat([knots, torch.tensor([[50.0, -50.0], [1e6, -1e6]], dtype=torch.float64)]).contiguous()
     inputs = {key: 0 * q.numpy() + 0.3 for key in ("qd", "qdd")} | {
         "q": q.numpy(),

@@ -109,8 +109,8 @@ def test_joint_functions_are_a_gradient_and_vanish_outside_the_range():
         weight.data = draw(*weight.shape, seed=weight.numel())
     q = draw(50, 3)
     gradient = vjp(lambda at: functions.energy(at).sum(), q)[1](torch.ones((), dtype=torch.float64))[0]
-    near(functions.torque(q), gradient, 1e-10)
-    assert (functions.friction_factor(q) > 0).all()
+    near(functions.torque(q, functions.splines(q)), gradient, 1e-10)
+    assert (functions.friction_factor(functions.splines(q)) > 0).all()
     inside = torch.linspace(-3, 3, 20, dtype=torch.float64)[:, None] * torch.tensor([0.9, 0.075, 0.6])
     inside = inside + torch.tensor(JOINTS.center)
     near(functions.splines(inside).sum(dim=-1), torch.ones(20, 3).double(), 1e-12)
@@ -148,10 +148,10 @@ def test_residual_of_m_never_takes_more_than_the_armature():
         weight.data = draw(*weight.shape, seed=weight.numel())
     prepared = mass.prepare(armature)
     kept = mass(encoded, prepared)[1]
-    near(
-        mass.jvp(qdd @ draw(3, 9), kept),
-        jvp(lambda x: mass(x, prepared)[0], (encoded,), (qdd @ draw(3, 9),))[1],
-    )
+    moved, by_encoded = mass.coriolis(qdd @ draw(3, 9), qd, kept)
+    rate = jvp(lambda x: mass(x, prepared)[0], (encoded,), (qdd @ draw(3, 9),))[1]
+    near(moved, torch.einsum("tij,tj->ti", rate, qd))
+    near(by_encoded, mass.kinetic_vjp(encoded, qd, kept), 0)
     kinetic = lambda x: 0.5 * torch.einsum("ti,tij,tj->", qd, mass(x, prepared)[0], qd)  # noqa: E731
     near(
         mass.kinetic_vjp(encoded, qd, kept), vjp(kinetic, encoded)[1](torch.ones((), dtype=torch.float64))[0]

@@ -88,8 +88,8 @@ def _splines(functions: Any, weights: torch.Tensor) -> Splines:
     joints = [joint for joint, row in enumerate(weights) if row.any()]
     return Splines(
         joints=tuple(joints),
-        center=array(functions.center[joints]),
-        spacing=array(functions.spacing[joints]),
+        center=array(functions.middles[joints].mean(dim=-1)),
+        spacing=array(functions.spacing[joints, 0]),
         weights=array(weights[joints]),
     )
 
@@ -97,7 +97,7 @@ def _splines(functions: Any, weights: torch.Tensor) -> Splines:
 def _ripple(functions: Any, weights: torch.Tensor) -> tuple[Harmonics, ...]:
     """By joint the multiples of a turn, then, where they stand for themselves, those of a turn of the motor."""
     found: list[Harmonics] = []
-    cosines, sines = (array(half) for half in (weights * functions.revolute.unsqueeze(-1)).chunk(2, dim=-1))
+    cosines, sines = (array(half) for half in (weights * functions.revolute).chunk(2, dim=-1))
     for joint, frequencies in enumerate(array(functions.frequencies)):
         turns = np.arange(1, len(frequencies) + 1)
         own = int(np.argmin(frequencies == turns)) or len(turns)  # how many follow one another from one on

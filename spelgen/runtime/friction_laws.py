@@ -95,10 +95,13 @@ class FrictionLaws(nn.Module):
         self, qd: Tensor, gravity: Tensor, constants: FrictionConstants, z: Tensor | None = None
     ) -> Tensor:
         """The friction torque, (..., n) [Nm, N], under this gravity torque, of bristles at z, (..., n, K)."""
+        c = constants
         if z is None:
-            return self.resistance(qd, gravity, constants) * qd
-        direction = (constants.bristle_fractions * z / self.bristles.reach).sum(dim=-1)
-        return self.viscosity(qd, constants) * qd + self.dry(qd, gravity, constants) * direction
+            direction = (qd / c.coulomb_smoothing_velocity).tanh()
+        else:
+            direction = (c.bristle_fractions / self.bristles.reach * z).sum(dim=-1)
+        saturating = c.saturation * (qd / c.saturation_velocity).tanh()
+        return c.viscous * qd + saturating + self.dry(qd, gravity, c) * direction
 
     def sliding(self, qd: Tensor) -> Tensor:
         """The bristles z, (..., n, K), of joints that have long gone this way."""

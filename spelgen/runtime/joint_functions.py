@@ -28,20 +28,21 @@ class JointFunctions(nn.Module):
     """
 
     scale: Tensor
-    center: Tensor
     spacing: Tensor
+    middles: Tensor
     revolute: Tensor
-    knots: Tensor
     frequencies: Tensor
 
     def __init__(self, joints: Joints) -> None:
         super().__init__()
         n = joints.n
+        self.prismatic = not all(joints.revolute)
+        spacing = 2 * vector(joints.reach).unsqueeze(-1) / (SPLINES - 3)
+        knots = torch.arange(SPLINES).double() - (SPLINES - 1) / 2
         self.register_buffer("scale", vector(joints.friction))
-        self.register_buffer("center", vector(joints.center))
-        self.register_buffer("spacing", 2 * vector(joints.reach) / (SPLINES - 3))
-        self.register_buffer("revolute", vector(float(each) for each in joints.revolute))
-        self.register_buffer("knots", torch.arange(SPLINES).double() - (SPLINES - 1) / 2)
+        self.register_buffer("spacing", spacing)
+        self.register_buffer("middles", vector(joints.center).unsqueeze(-1) + spacing * knots)
+        self.register_buffer("revolute", vector(float(each) for each in joints.revolute).unsqueeze(-1))
         self.register_buffer("frequencies", ripple_frequencies(joints))
         self.raw_torque_splines = nn.Parameter(torch.zeros(n, SPLINES, dtype=torch.float64))
         self.raw_torque_ripple = nn.Parameter(torch.zeros(n, 2 * (HARMONICS + 2), dtype=torch.float64))
@@ -49,17 +50,18 @@ class JointFunctions(nn.Module):
 
     def splines(self, q: Tensor) -> Tensor:
         """The cubic B-splines at q, (..., n, SPLINES), each 2/3 high."""
-        away = self._places(q).abs()
-        return ((2 - away).relu() ** 3 - 4 * (1 - away).relu() ** 3) / 6
+        wide = (2 - self._places(q).abs()).relu()
+        return torch.sub(wide**3, (wide - 1).relu() ** 3, alpha=4) / 6
 
     def ripple(self, q: Tensor) -> Tensor:
         """Cosines, then sines of frequency times q, (..., n, 2 HARMONICS + 4); zero for a prismatic joint."""
         phase = q.unsqueeze(-1) * self.frequencies
-        return torch.cat([phase.cos(), phase.sin()], dim=-1) * self.revolute.unsqueeze(-1)
+        both = torch.cat([phase.cos(), phase.sin()], dim=-1)
+        return both * self.revolute if self.prismatic else both
 
-    def torque(self, q: Tensor) -> Tensor:
-        """dV/dq, (..., n) [Nm, N]."""
-        smooth = (self.splines(q) * self.raw_torque_splines).sum(dim=-1)
+    def torque(self, q: Tensor, splines: Tensor) -> Tensor:
+        """dV/dq, (..., n) [Nm, N], where the splines are these."""
+        smooth = (splines * self.raw_torque_splines).sum(dim=-1)
         return self.scale * (smooth + (self.ripple(q) * self.raw_torque_ripple).sum(dim=-1))
 
     def energy(self, q: Tensor) -> Tensor:
@@ -67,15 +69,15 @@ class JointFunctions(nn.Module):
         place = self._places(q)
         away = place.abs()
         part = 0.5 - (2 - away).relu() ** 4 / 24 + (1 - away).relu() ** 4 / 6
-        smooth = self.spacing * (place.sign() * part * self.raw_torque_splines).sum(dim=-1)
+        smooth = (self.spacing * place.sign() * part * self.raw_torque_splines).sum(dim=-1)
         by_cos, by_sin = (self.ripple(q) / self.frequencies.repeat(1, 2)).chunk(2, dim=-1)
         turned = torch.cat([by_sin, -by_cos], dim=-1)
         return (self.scale * (smooth + (turned * self.raw_torque_ripple).sum(dim=-1))).sum(dim=-1)
 
-    def friction_factor(self, q: Tensor) -> Tensor:
-        """How much more friction there is at q than elsewhere, (..., n), positive."""
-        return (self.splines(q) * self.raw_friction_splines).sum(dim=-1).exp()
+    def friction_factor(self, splines: Tensor) -> Tensor:
+        """How much more friction there is than elsewhere, (..., n), positive, where the splines are these."""
+        return (splines * self.raw_friction_splines).sum(dim=-1).exp()
 
     def _places(self, q: Tensor) -> Tensor:
         """How far q is from each spline's middle, in spacings, (..., n, SPLINES)."""
-        return ((q - self.center) / self.spacing).unsqueeze(-1) - self.knots
+        return (q.unsqueeze(-1) - self.middles) / self.spacing

@@ -17,7 +17,16 @@ def solved(matrix: Tensor, right: Tensor) -> Tensor:
 
 def applied(matrix: Tensor, vector: Tensor) -> Tensor:
     """matrix vector, (..., n)."""
+    if vector.dim() == 1:  # fewer steps, which is what one state costs
+        return matrix @ vector
     return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
+
+
+def combined(weights: Tensor, rows: Tensor) -> Tensor:
+    """The sum of weighted rows, weights^T rows, (..., m)."""
+    if weights.dim() == 1:
+        return weights @ rows
+    return (weights.unsqueeze(-2) @ rows).squeeze(-2)
 
 
 State = tuple[Tensor, Tensor]  # q and p, or how fast they change

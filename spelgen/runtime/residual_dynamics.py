@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import torch
 from torch import Tensor
 
 from spelgen.runtime.encoding import JointEncoding
@@ -23,6 +24,14 @@ class ResidualPrepared(NamedTuple):
 
     mass: Any
     potential: Any
+
+
+class ResidualMotion(NamedTuple):
+    """What residuals read of a position."""
+
+    q: Tensor
+    encoded: Tensor
+    splines: Tensor  # (..., n, SPLINES)
 
 
 class ResidualDynamics(RigidBodyDynamics):
@@ -55,62 +64,66 @@ class ResidualDynamics(RigidBodyDynamics):
         mass = self.residual_mass.prepare(prepared.armature)
         return prepared._replace(residual=ResidualPrepared(mass, potential))
 
+    def configuration(self, q: Tensor, prepared: RigidPrepared) -> Motion:
+        """How the bodies may move at q, and what residuals read of q."""
+        return super().configuration(q, prepared)._replace(residual=self._read(q))
+
+    def _read(self, q: Tensor) -> ResidualMotion:
+        return ResidualMotion(q, self.encoding(q), self.joint_functions.splines(q))
+
     def mass_at(self, at: Motion, prepared: RigidPrepared) -> tuple[Tensor, Any]:
         """M(q), (..., n, n), and what its derivatives need."""
-        encoded = self.encoding(at.q)
-        more, residuals = self.residual_mass(encoded, prepared.residual.mass)
-        return super().mass_at(at, prepared)[0] + more, (encoded, residuals)
+        more, residuals = self.residual_mass(at.residual.encoded, prepared.residual.mass)
+        return super().mass_at(at, prepared)[0] + more, residuals
 
     def energy_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
         """V(q), (...) [J]."""
-        energy = super().energy_at(at, prepared) + self.joint_functions.energy(at.q)
+        energy = super().energy_at(at, prepared) + self.joint_functions.energy(at.residual.q)
         if self.residual_potential is None:
             return energy
-        more: Tensor = self.residual_potential(self.encoding(at.q), prepared.residual.potential)
+        more: Tensor = self.residual_potential(at.residual.encoded, prepared.residual.potential)
         return energy + more
 
     def gravity_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
         """dV/dq, (..., n) [Nm, N]."""
-        gradient = at.gravity + self.joint_functions.torque(at.q)
-        if self.residual_potential is None:
-            return gradient
-        encoded = self.encoding(at.q)
-        by_encoded = self.residual_potential.vjp(encoded, prepared.residual.potential)
-        more: Tensor = self.encoding.vjp(encoded, by_encoded)
-        return gradient + more
+        kinetic = torch.zeros_like(at.residual.encoded)
+        return at.gravity - self._gradient(at.residual, kinetic, prepared)
 
     def lagrangian_gradient(self, at: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
         """d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
-        own = self._residual_gradient(at.q, qd, residuals, prepared)
+        kinetic = self.residual_mass.kinetic_vjp(at.residual.encoded, qd, residuals)
+        own = self._gradient(at.residual, kinetic, prepared)
         return super().lagrangian_gradient(at, qd, None, prepared) + own
 
     def nonlinear_at(self, at: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
         """The torque that holds qd steady without friction, (..., n)."""
-        own = self._residual_nonlinear(at.q, qd, residuals, prepared)
+        own = self._nonlinear(at.residual, qd, residuals, prepared)
         return super().nonlinear_at(at, qd, None, prepared) + own
 
     def residual_torque(self, q: Tensor, qd: Tensor, qdd: Tensor, prepared: RigidPrepared) -> Tensor:
         """What the residuals of M and V take, (..., n) [Nm, N]."""
-        encoded = self.encoding(q)
-        mass, residuals = self.residual_mass(encoded, prepared.residual.mass)
-        return applied(mass, qdd) + self._residual_nonlinear(q, qd, (encoded, residuals), prepared)
+        read = self._read(q)
+        mass, residuals = self.residual_mass(read.encoded, prepared.residual.mass)
+        return applied(mass, qdd) + self._nonlinear(read, qd, residuals, prepared)
 
     def friction_factor(self, q: Tensor) -> Tensor:
         """How much more friction the drives have at q than their laws say, (..., n)."""
-        factor: Tensor = self.joint_functions.friction_factor(q)
+        factor: Tensor = self.joint_functions.friction_factor(self.joint_functions.splines(q))
         return factor
 
-    def _residual_nonlinear(self, q: Tensor, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
-        """dR/dt qd - d/dq of what the residuals add to 1/2 qd^T M(q) qd - V(q), (..., n)."""
-        encoded, network = residuals
-        rate = self.residual_mass.jvp(self.encoding.jvp(encoded, qd), network)
-        return applied(rate, qd) - self._residual_gradient(q, qd, residuals, prepared)
+    def _varied(self, friction: Tensor, at: Motion) -> Tensor:
+        """The laws' friction of the drives as it is at this position, (..., n)."""
+        return self.joint_functions.friction_factor(at.residual.splines) * friction
 
-    def _residual_gradient(self, q: Tensor, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
-        """d/dq of what the residuals add to 1/2 qd^T M(q) qd - V(q), (..., n)."""
-        encoded, network = residuals
-        by_encoded = self.residual_mass.kinetic_vjp(encoded, qd, network)
+    def _nonlinear(self, read: ResidualMotion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
+        """dR/dt qd - d/dq of what the residuals add to 1/2 qd^T M(q) qd - V(q), (..., n)."""
+        rate = self.encoding.jvp(read.encoded, qd)
+        moved, kinetic = self.residual_mass.coriolis(rate, qd, residuals)
+        return moved - self._gradient(read, kinetic, prepared)
+
+    def _gradient(self, read: ResidualMotion, kinetic: Tensor, prepared: RigidPrepared) -> Tensor:
+        """d/dq of what the residuals add to 1/2 qd^T M(q) qd - V(q), (..., n); kinetic: by the encoding."""
         if self.residual_potential is not None:
-            by_encoded = by_encoded - self.residual_potential.vjp(encoded, prepared.residual.potential)
-        gradient: Tensor = self.encoding.vjp(encoded, by_encoded)
-        return gradient - self.joint_functions.torque(q)
+            kinetic = kinetic - self.residual_potential.vjp(read.encoded, prepared.residual.potential)
+        gradient: Tensor = self.encoding.vjp(read.encoded, kinetic)
+        return gradient - self.joint_functions.torque(read.q, read.splines)

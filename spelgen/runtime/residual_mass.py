@@ -5,10 +5,12 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
-from spelgen.runtime.joints import Joints
+from spelgen.runtime.joints import Joints, blocks
 from spelgen.runtime.network import Network
+from spelgen.runtime.port_hamiltonian import applied, combined
 from spelgen.runtime.symmetric import Entries, entry_basis
 
 PART = 0.9  # of the drives' inertia, which the residual may take away at most
@@ -73,26 +75,30 @@ class ResidualMass(nn.Module):
             return self._square(prepared.constant).expand(*encoded.shape[:-1], -1, -1), None
         y, residuals = self.network(encoded, prepared.layers)
         height = y.tanh()
-        rows = prepared.constant + height @ prepared.functions
+        rows = F.linear(height, prepared.functions.mT, prepared.constant)
         return self._square(rows), (residuals, 1 - height * height, prepared.functions)
 
     def _square(self, rows: Tensor) -> Tensor:
         """(..., n n) as (..., n, n)."""
         return rows.reshape(*rows.shape[:-1], self.n, self.n)
 
+    def coriolis(self, rate: Tensor, qd: Tensor, residuals: Any) -> tuple[Tensor, Tensor]:
+        """dR/dt qd, (..., n), where the encoding changes at this rate, and what ``kinetic_vjp`` gives."""
+        if self.network is None:
+            return torch.zeros_like(qd), torch.zeros_like(rate)
+        network, slope, functions = residuals
+        moved = self._moved(qd, functions)
+        by_encoded = self.network.vjp(network, 0.5 * slope * applied(moved, qd))
+        return combined(slope * self.network.jvp(network, rate), moved), by_encoded
+
     def kinetic_vjp(self, encoded: Tensor, qd: Tensor, residuals: Any) -> Tensor:
         """The derivative of 1/2 qd^T R(q) qd by the encoding."""
         if self.network is None:
             return torch.zeros_like(encoded)
         network, slope, functions = residuals
-        weight = 0.5 * (qd.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2)
-        by_encoded: Tensor = self.network.vjp(network, slope * (weight @ functions.mT))
+        by_encoded: Tensor = self.network.vjp(network, 0.5 * slope * applied(self._moved(qd, functions), qd))
         return by_encoded
 
-    def jvp(self, rate: Tensor, residuals: Any) -> Tensor:
-        """dR/dt, (..., n, n), where the encoding changes at this rate."""
-        if self.network is None:
-            return rate.new_zeros(*rate.shape[:-1], self.n, self.n)
-        network, slope, functions = residuals
-        rows = (slope * self.network.jvp(network, rate)) @ functions
-        return self._square(rows)
+    def _moved(self, qd: Tensor, functions: Tensor) -> Tensor:
+        """What each function adds to R qd at its largest, (..., functions, n)."""
+        return blocks(F.linear(qd, functions.reshape(-1, self.n)), self.n)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -62,6 +63,47 @@ def transform_table(bodies: Bodies, index: int) -> Tensor:
         table[0] = twist_map(rotation, position)
         table[1] = twist_map(rotation, position + rotation[2]) - table[0]
     return table
+
+
+def motion_table(bodies: Bodies) -> tuple[Tensor, Tensor]:
+    """Takes cos, sin and value of all displacements to what takes rows of twists from parents' frames.
+
+    (36 bodies, 3 bodies), and what is added, (36 bodies,). Offsets of the displacements are in both.
+    """
+    count = len(bodies.parent)
+    by_term = torch.zeros(count, 6, 6, 3, count, dtype=torch.float64)
+    fixed = torch.zeros(count, 6, 6, dtype=torch.float64)
+    for index, (revolute, offset) in enumerate(zip(bodies.revolute, bodies.offset, strict=True)):
+        constant, first, second = transform_table(bodies, index).mT
+        if revolute:
+            cos, sin = math.cos(offset), math.sin(offset)
+            by_term[index, :, :, 0, index] = cos * first + sin * second
+            by_term[index, :, :, 1, index] = cos * second - sin * first
+            fixed[index] = constant
+        else:
+            by_term[index, :, :, 2, index] = first
+            fixed[index] = constant + offset * first
+    return by_term.reshape(36 * count, 3 * count), fixed.flatten()
+
+
+def crossed(twists: Tensor, others: Tensor) -> Tensor:
+    """How twists that are carried along by ``twists`` change; columns, (..., 6, k) each.
+
+    Featherstone's cross product of motion vectors (2008, eq. 2.31).
+    """
+    (w, u), (a, m) = twists.chunk(2, dim=-2), others.chunk(2, dim=-2)
+    linear = torch.linalg.cross(w, m, dim=-2) + torch.linalg.cross(u, a, dim=-2)
+    return torch.cat([torch.linalg.cross(w, a, dim=-2), linear], dim=-2)
+
+
+def pushed_along(twists: Tensor, momenta: Tensor) -> Tensor:
+    """How momenta that are carried along by ``twists`` change; columns, (..., 6, k) each.
+
+    Featherstone's cross product of force vectors (2008, eq. 2.32).
+    """
+    (w, u), (n, f) = twists.chunk(2, dim=-2), momenta.chunk(2, dim=-2)
+    angular = torch.linalg.cross(w, n, dim=-2) + torch.linalg.cross(u, f, dim=-2)
+    return torch.cat([angular, torch.linalg.cross(w, f, dim=-2)], dim=-2)
 
 
 def inertia_basis() -> Tensor:

@@ -20,6 +20,7 @@ Joints, in the order of q, qd and tau:
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple, Protocol
@@ -223,6 +224,11 @@ def vector(values: Iterable[float]) -> Tensor:
     return torch.tensor(list(values), dtype=torch.float64)
 
 
+def blocks(rows: Tensor, *shape: int) -> Tensor:
+    """(..., m) as (..., m / size, *shape), size the product of the shape."""
+    return rows.reshape(*rows.shape[:-1], rows.shape[-1] // math.prod(shape), *shape)
+
+
 class Network(Protocol):
     """Learned functions y of an encoding, each of its own joints, with derivatives written out."""
 
@@ -264,104 +270,6 @@ def unit_joints(
     return (*((hidden,) * depth), tuple(frozenset(joints) for joints in outputs))
 
 
-class Bristles(nn.Module):
-    """K elements a joint, elastic up to their reach, sliding beyond; z is (..., n, K) [rad, m].
-
-    z' = qd - |qd| z / reach, whatever the speed: in displacement it is linear, and needs no small
-    steps (Dahl, A Solid Friction Model, 1968; several elements as in Lampaert, Al-Bender and
-    Swevers, A Generalized Maxwell-Slip Friction Model, 2003).
-    """
-
-    reach: Tensor  # (n, K)
-
-    def __init__(self, reach: Sequence[Sequence[float]]) -> None:
-        super().__init__()
-        self.register_buffer("reach", torch.tensor(reach, dtype=torch.float64))
-
-    def rate(self, qd: Tensor, z: Tensor) -> Tensor:
-        """z', (..., n, K)."""
-        return qd.unsqueeze(-1) - qd.abs().unsqueeze(-1) * z / self.reach
-
-    def moved(self, z: Tensor, displacement: Tensor) -> Tensor:
-        """z after joints went one way by (..., n), exactly."""
-        return moved_bristles(z, displacement, self.reach)
-
-
-def moved_bristles(z: Tensor, displacement: Tensor, reach: Tensor) -> Tensor:
-    """z, (..., n, K), after joints went one way by (..., n), exactly."""
-    end = displacement.sign().unsqueeze(-1) * reach
-    return end + (z - end) * (-displacement.abs().unsqueeze(-1) / reach).exp()
-
-
-Entries = Callable[[Sequence[Tensor], Sequence[Tensor]], Tensor]
-
-
-def symmetric(*rows: Sequence[Tensor | float]) -> Tensor:
-    """The matrix, (..., n, n), with these rows as its lower triangle; entries are (...) or numbers."""
-    some = next(entry for row in rows for entry in row if isinstance(entry, Tensor))
-    lower = [[entry if isinstance(entry, Tensor) else some * 0 + entry for entry in row] for row in rows]
-    n = len(lower)
-    whole = [[lower[max(i, j)][min(i, j)] for j in range(n)] for i in range(n)]
-    return torch.stack([torch.stack(row, dim=-1) for row in whole], dim=-2)
-
-
-def entry_basis(entries: Entries, functions: int, constants: int) -> tuple[Tensor, Tensor]:
-    """What each function and each constant adds to a matrix that is linear in them, as rows.
-
-    (functions, n n) and (constants, n n); found by asking ``entries`` for one at a time.
-    """
-    f, c = torch.eye(functions).double(), torch.eye(constants).double()
-    by_function = entries(f.unbind(), f.new_zeros(constants, functions).unbind())
-    by_constant = entries(c.new_zeros(functions, constants).unbind(), c.unbind())
-    return by_function.flatten(1), by_constant.flatten(1)
-
-
-def to_group(q: Tensor, joint_types: Sequence[str]) -> list[Tensor]:
-    """By joint, R in SO(3), (..., 3, 3), or r in R^3, (..., 3), if prismatic; z is its axis."""
-    parts = []
-    for kind, value in zip(joint_types, q.unbind(dim=-1), strict=True):
-        zero, one = torch.zeros_like(value), torch.ones_like(value)
-        if kind == "revolute":
-            c, s = value.cos(), value.sin()
-            rows = ((c, -s, zero), (s, c, zero), (zero, zero, one))
-            parts.append(torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2))
-        else:
-            parts.append(torch.stack((zero, zero, value), dim=-1))
-    return parts
-
-
-def from_group(parts: Sequence[Tensor], joint_types: Sequence[str]) -> Tensor:
-    """q, (..., n), with angles in [-pi, pi]; the inverse of ``to_group``."""
-    values = [
-        torch.atan2(part[..., 1, 0], part[..., 0, 0]) if kind == "revolute" else part[..., 2]
-        for kind, part in zip(joint_types, parts, strict=True)
-    ]
-    return torch.stack(values, dim=-1)
-
-
-class Input(Protocol):
-    """What gives G."""
-
-    def prepare(self) -> Any:
-        """All that depends on the weights alone."""
-
-    def __call__(self, encoded: Tensor, prepared: Any) -> Tensor:
-        """G, (..., n, n)."""
-
-    def force(self, encoded: Tensor, tau: Tensor, prepared: Any) -> Tensor:
-        """G tau, (..., n)."""
-
-    def solve(self, encoded: Tensor, force: Tensor, prepared: Any) -> Tensor:
-        """The inputs, (..., n), that make this force."""
-
-
-class DriveInput(Input, Protocol):
-    """What gives a constant G, and how the drives turn."""
-
-    def motor_speeds(self) -> Tensor:
-        """C, (n, n): the drives' speeds are C qd."""
-
-
 def solved(matrix: Tensor, right: Tensor) -> Tensor:
     """matrix^-1 right, (..., n)."""
     # its derivative costs one more solution; a Cholesky factor's would cost several times that
@@ -371,7 +279,16 @@ def solved(matrix: Tensor, right: Tensor) -> Tensor:
 
 def applied(matrix: Tensor, vector: Tensor) -> Tensor:
     """matrix vector, (..., n)."""
+    if vector.dim() == 1:  # fewer steps, which is what one state costs
+        return matrix @ vector
     return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
+
+
+def combined(weights: Tensor, rows: Tensor) -> Tensor:
+    """The sum of weighted rows, weights^T rows, (..., m)."""
+    if weights.dim() == 1:
+        return weights @ rows
+    return (weights.unsqueeze(-2) @ rows).squeeze(-2)
 
 
 State = tuple[Tensor, Tensor]  # q and p, or how fast they change
@@ -543,6 +460,97 @@ class PortHamiltonian(nn.Module):
         return torch.cat([qd, force, moved, torch.zeros_like(tau)], dim=-1)
 
 
+class Bristles(nn.Module):
+    """K elements a joint, elastic up to their reach, sliding beyond; z is (..., n, K) [rad, m].
+
+    z' = qd - |qd| z / reach, whatever the speed: in displacement it is linear, and needs no small
+    steps (Dahl, A Solid Friction Model, 1968; several elements as in Lampaert, Al-Bender and
+    Swevers, A Generalized Maxwell-Slip Friction Model, 2003).
+    """
+
+    reach: Tensor  # (n, K)
+
+    def __init__(self, reach: Sequence[Sequence[float]]) -> None:
+        super().__init__()
+        self.register_buffer("reach", torch.tensor(reach, dtype=torch.float64))
+
+    def rate(self, qd: Tensor, z: Tensor) -> Tensor:
+        """z', (..., n, K)."""
+        return qd.unsqueeze(-1) - qd.abs().unsqueeze(-1) * z / self.reach
+
+    def moved(self, z: Tensor, displacement: Tensor) -> Tensor:
+        """z after joints went one way by (..., n), exactly."""
+        return moved_bristles(z, displacement, self.reach)
+
+
+def moved_bristles(z: Tensor, displacement: Tensor, reach: Tensor) -> Tensor:
+    """z, (..., n, K), after joints went one way by (..., n), exactly."""
+    end = displacement.sign().unsqueeze(-1) * reach
+    return end + (z - end) * (-displacement.abs().unsqueeze(-1) / reach).exp()
+
+
+Entries = Callable[[Sequence[Tensor], Sequence[Tensor]], Tensor]
+
+
+def symmetric(*rows: Sequence[Tensor | float]) -> Tensor:
+    """The matrix, (..., n, n), with these rows as its lower triangle; entries are (...) or numbers."""
+    some = next(entry for row in rows for entry in row if isinstance(entry, Tensor))
+    lower = [[entry if isinstance(entry, Tensor) else some * 0 + entry for entry in row] for row in rows]
+    n = len(lower)
+    whole = [[lower[max(i, j)][min(i, j)] for j in range(n)] for i in range(n)]
+    return torch.stack([torch.stack(row, dim=-1) for row in whole], dim=-2)
+
+
+def entry_basis(entries: Entries, functions: int, constants: int) -> tuple[Tensor, Tensor]:
+    """What each function and each constant adds to a matrix that is linear in them, as rows.
+
+    (functions, n n) and (constants, n n); found by asking ``entries`` for one at a time.
+    """
+    f, c = torch.eye(functions).double(), torch.eye(constants).double()
+    by_function = entries(f.unbind(), f.new_zeros(constants, functions).unbind())
+    by_constant = entries(c.new_zeros(functions, constants).unbind(), c.unbind())
+    return by_function.flatten(1), by_constant.flatten(1)
+
+
+def to_group(q: Tensor, joint_types: Sequence[str]) -> list[Tensor]:
+    """By joint, R in SO(3), (..., 3, 3), or r in R^3, (..., 3), if prismatic; z is its axis."""
+    parts = []
+    for kind, value in zip(joint_types, q.unbind(dim=-1), strict=True):
+        zero, one = torch.zeros_like(value), torch.ones_like(value)
+        if kind == "revolute":
+            c, s = value.cos(), value.sin()
+            rows = ((c, -s, zero), (s, c, zero), (zero, zero, one))
+            parts.append(torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2))
+        else:
+            parts.append(torch.stack((zero, zero, value), dim=-1))
+    return parts
+
+
+def from_group(parts: Sequence[Tensor], joint_types: Sequence[str]) -> Tensor:
+    """q, (..., n), with angles in [-pi, pi]; the inverse of ``to_group``."""
+    values = [
+        torch.atan2(part[..., 1, 0], part[..., 0, 0]) if kind == "revolute" else part[..., 2]
+        for kind, part in zip(joint_types, parts, strict=True)
+    ]
+    return torch.stack(values, dim=-1)
+
+
+class Input(Protocol):
+    """What gives G."""
+
+    def prepare(self) -> Any:
+        """All that depends on the weights alone."""
+
+    def __call__(self, encoded: Tensor, prepared: Any) -> Tensor:
+        """G, (..., n, n)."""
+
+    def force(self, encoded: Tensor, tau: Tensor, prepared: Any) -> Tensor:
+        """G tau, (..., n)."""
+
+    def solve(self, encoded: Tensor, force: Tensor, prepared: Any) -> Tensor:
+        """The inputs, (..., n), that make this force."""
+
+
 class Armature(nn.Module):
     """Rotor inertia times gear squared of each joint, never negative; the weights are logarithms."""
 
@@ -645,20 +653,21 @@ class JointFunctions(nn.Module):
     """
 
     scale: Tensor
-    center: Tensor
     spacing: Tensor
+    middles: Tensor
     revolute: Tensor
-    knots: Tensor
     frequencies: Tensor
 
     def __init__(self, joints: Joints) -> None:
         super().__init__()
         n = joints.n
+        self.prismatic = not all(joints.revolute)
+        spacing = 2 * vector(joints.reach).unsqueeze(-1) / (SPLINES - 3)
+        knots = torch.arange(SPLINES).double() - (SPLINES - 1) / 2
         self.register_buffer("scale", vector(joints.friction))
-        self.register_buffer("center", vector(joints.center))
-        self.register_buffer("spacing", 2 * vector(joints.reach) / (SPLINES - 3))
-        self.register_buffer("revolute", vector(float(each) for each in joints.revolute))
-        self.register_buffer("knots", torch.arange(SPLINES).double() - (SPLINES - 1) / 2)
+        self.register_buffer("spacing", spacing)
+        self.register_buffer("middles", vector(joints.center).unsqueeze(-1) + spacing * knots)
+        self.register_buffer("revolute", vector(float(each) for each in joints.revolute).unsqueeze(-1))
         self.register_buffer("frequencies", ripple_frequencies(joints))
         self.raw_torque_splines = nn.Parameter(torch.zeros(n, SPLINES, dtype=torch.float64))
         self.raw_torque_ripple = nn.Parameter(torch.zeros(n, 2 * (HARMONICS + 2), dtype=torch.float64))
@@ -666,17 +675,18 @@ class JointFunctions(nn.Module):
 
     def splines(self, q: Tensor) -> Tensor:
         """The cubic B-splines at q, (..., n, SPLINES), each 2/3 high."""
-        away = self._places(q).abs()
-        return ((2 - away).relu() ** 3 - 4 * (1 - away).relu() ** 3) / 6
+        wide = (2 - self._places(q).abs()).relu()
+        return torch.sub(wide**3, (wide - 1).relu() ** 3, alpha=4) / 6
 
     def ripple(self, q: Tensor) -> Tensor:
         """Cosines, then sines of frequency times q, (..., n, 2 HARMONICS + 4); zero for a prismatic joint."""
         phase = q.unsqueeze(-1) * self.frequencies
-        return torch.cat([phase.cos(), phase.sin()], dim=-1) * self.revolute.unsqueeze(-1)
+        both = torch.cat([phase.cos(), phase.sin()], dim=-1)
+        return both * self.revolute if self.prismatic else both
 
-    def torque(self, q: Tensor) -> Tensor:
-        """dV/dq, (..., n) [Nm, N]."""
-        smooth = (self.splines(q) * self.raw_torque_splines).sum(dim=-1)
+    def torque(self, q: Tensor, splines: Tensor) -> Tensor:
+        """dV/dq, (..., n) [Nm, N], where the splines are these."""
+        smooth = (splines * self.raw_torque_splines).sum(dim=-1)
         return self.scale * (smooth + (self.ripple(q) * self.raw_torque_ripple).sum(dim=-1))
 
     def energy(self, q: Tensor) -> Tensor:
@@ -684,18 +694,18 @@ class JointFunctions(nn.Module):
         place = self._places(q)
         away = place.abs()
         part = 0.5 - (2 - away).relu() ** 4 / 24 + (1 - away).relu() ** 4 / 6
-        smooth = self.spacing * (place.sign() * part * self.raw_torque_splines).sum(dim=-1)
+        smooth = (self.spacing * place.sign() * part * self.raw_torque_splines).sum(dim=-1)
         by_cos, by_sin = (self.ripple(q) / self.frequencies.repeat(1, 2)).chunk(2, dim=-1)
         turned = torch.cat([by_sin, -by_cos], dim=-1)
         return (self.scale * (smooth + (turned * self.raw_torque_ripple).sum(dim=-1))).sum(dim=-1)
 
-    def friction_factor(self, q: Tensor) -> Tensor:
-        """How much more friction there is at q than elsewhere, (..., n), positive."""
-        return (self.splines(q) * self.raw_friction_splines).sum(dim=-1).exp()
+    def friction_factor(self, splines: Tensor) -> Tensor:
+        """How much more friction there is than elsewhere, (..., n), positive, where the splines are these."""
+        return (splines * self.raw_friction_splines).sum(dim=-1).exp()
 
     def _places(self, q: Tensor) -> Tensor:
         """How far q is from each spline's middle, in spacings, (..., n, SPLINES)."""
-        return ((q - self.center) / self.spacing).unsqueeze(-1) - self.knots
+        return (q.unsqueeze(-1) - self.middles) / self.spacing
 
 
 Row = tuple[float, float, float]
@@ -751,6 +761,47 @@ def transform_table(bodies: Bodies, index: int) -> Tensor:
         table[0] = twist_map(rotation, position)
         table[1] = twist_map(rotation, position + rotation[2]) - table[0]
     return table
+
+
+def motion_table(bodies: Bodies) -> tuple[Tensor, Tensor]:
+    """Takes cos, sin and value of all displacements to what takes rows of twists from parents' frames.
+
+    (36 bodies, 3 bodies), and what is added, (36 bodies,). Offsets of the displacements are in both.
+    """
+    count = len(bodies.parent)
+    by_term = torch.zeros(count, 6, 6, 3, count, dtype=torch.float64)
+    fixed = torch.zeros(count, 6, 6, dtype=torch.float64)
+    for index, (revolute, offset) in enumerate(zip(bodies.revolute, bodies.offset, strict=True)):
+        constant, first, second = transform_table(bodies, index).mT
+        if revolute:
+            cos, sin = math.cos(offset), math.sin(offset)
+            by_term[index, :, :, 0, index] = cos * first + sin * second
+            by_term[index, :, :, 1, index] = cos * second - sin * first
+            fixed[index] = constant
+        else:
+            by_term[index, :, :, 2, index] = first
+            fixed[index] = constant + offset * first
+    return by_term.reshape(36 * count, 3 * count), fixed.flatten()
+
+
+def crossed(twists: Tensor, others: Tensor) -> Tensor:
+    """How twists that are carried along by ``twists`` change; columns, (..., 6, k) each.
+
+    Featherstone's cross product of motion vectors (2008, eq. 2.31).
+    """
+    (w, u), (a, m) = twists.chunk(2, dim=-2), others.chunk(2, dim=-2)
+    linear = torch.linalg.cross(w, m, dim=-2) + torch.linalg.cross(u, a, dim=-2)
+    return torch.cat([torch.linalg.cross(w, a, dim=-2), linear], dim=-2)
+
+
+def pushed_along(twists: Tensor, momenta: Tensor) -> Tensor:
+    """How momenta that are carried along by ``twists`` change; columns, (..., 6, k) each.
+
+    Featherstone's cross product of force vectors (2008, eq. 2.32).
+    """
+    (w, u), (n, f) = twists.chunk(2, dim=-2), momenta.chunk(2, dim=-2)
+    angular = torch.linalg.cross(w, n, dim=-2) + torch.linalg.cross(u, f, dim=-2)
+    return torch.cat([angular, torch.linalg.cross(w, f, dim=-2)], dim=-2)
 
 
 def inertia_basis() -> Tensor:
@@ -828,23 +879,13 @@ def motor_speeds(gains: Tensor) -> Tensor:
 
 
 class DirectInput(nn.Module):
-    """G is the identity: each input is the torque of its own joint, and none that of a passive one.
-
-    motor_speeds: C, (n, n), where motors move several joints all the same: they turn by C qd.
-    """
+    """G is the identity: each input is the torque of its own joint, and none that of a passive one."""
 
     actuated: Tensor
 
-    def __init__(self, joints: Joints, motor_speeds: Sequence[Sequence[float]] = ()) -> None:
+    def __init__(self, joints: Joints) -> None:
         super().__init__()
         self.register_buffer("actuated", vector(float(x) for x in joints.actuated))
-        self._motor_speeds = motor_speeds
-
-    def motor_speeds(self) -> Tensor:
-        """C, (n, n), by joint velocities."""
-        if not self._motor_speeds:
-            return torch.eye(len(self.actuated), dtype=torch.float64)
-        return torch.tensor(self._motor_speeds, dtype=torch.float64)
 
     def prepare(self) -> Tensor:
         """The diagonal of G, (n,)."""
@@ -980,10 +1021,13 @@ class FrictionLaws(nn.Module):
         self, qd: Tensor, gravity: Tensor, constants: FrictionConstants, z: Tensor | None = None
     ) -> Tensor:
         """The friction torque, (..., n) [Nm, N], under this gravity torque, of bristles at z, (..., n, K)."""
+        c = constants
         if z is None:
-            return self.resistance(qd, gravity, constants) * qd
-        direction = (constants.bristle_fractions * z / self.bristles.reach).sum(dim=-1)
-        return self.viscosity(qd, constants) * qd + self.dry(qd, gravity, constants) * direction
+            direction = (qd / c.coulomb_smoothing_velocity).tanh()
+        else:
+            direction = (c.bristle_fractions / self.bristles.reach * z).sum(dim=-1)
+        saturating = c.saturation * (qd / c.saturation_velocity).tanh()
+        return c.viscous * qd + saturating + self.dry(qd, gravity, c) * direction
 
     def sliding(self, qd: Tensor) -> Tensor:
         """The bristles z, (..., n, K), of joints that have long gone this way."""
@@ -1078,29 +1122,33 @@ class ResidualMass(nn.Module):
             return self._square(prepared.constant).expand(*encoded.shape[:-1], -1, -1), None
         y, residuals = self.network(encoded, prepared.layers)
         height = y.tanh()
-        rows = prepared.constant + height @ prepared.functions
+        rows = F.linear(height, prepared.functions.mT, prepared.constant)
         return self._square(rows), (residuals, 1 - height * height, prepared.functions)
 
     def _square(self, rows: Tensor) -> Tensor:
         """(..., n n) as (..., n, n)."""
         return rows.reshape(*rows.shape[:-1], self.n, self.n)
 
+    def coriolis(self, rate: Tensor, qd: Tensor, residuals: Any) -> tuple[Tensor, Tensor]:
+        """dR/dt qd, (..., n), where the encoding changes at this rate, and what ``kinetic_vjp`` gives."""
+        if self.network is None:
+            return torch.zeros_like(qd), torch.zeros_like(rate)
+        network, slope, functions = residuals
+        moved = self._moved(qd, functions)
+        by_encoded = self.network.vjp(network, 0.5 * slope * applied(moved, qd))
+        return combined(slope * self.network.jvp(network, rate), moved), by_encoded
+
     def kinetic_vjp(self, encoded: Tensor, qd: Tensor, residuals: Any) -> Tensor:
         """The derivative of 1/2 qd^T R(q) qd by the encoding."""
         if self.network is None:
             return torch.zeros_like(encoded)
         network, slope, functions = residuals
-        weight = 0.5 * (qd.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2)
-        by_encoded: Tensor = self.network.vjp(network, slope * (weight @ functions.mT))
+        by_encoded: Tensor = self.network.vjp(network, 0.5 * slope * applied(self._moved(qd, functions), qd))
         return by_encoded
 
-    def jvp(self, rate: Tensor, residuals: Any) -> Tensor:
-        """dR/dt, (..., n, n), where the encoding changes at this rate."""
-        if self.network is None:
-            return rate.new_zeros(*rate.shape[:-1], self.n, self.n)
-        network, slope, functions = residuals
-        rows = (slope * self.network.jvp(network, rate)) @ functions
-        return self._square(rows)
+    def _moved(self, qd: Tensor, functions: Tensor) -> Tensor:
+        """What each function adds to R qd at its largest, (..., functions, n)."""
+        return blocks(F.linear(qd, functions.reshape(-1, self.n)), self.n)
 
 
 class MLPLayers(NamedTuple):
@@ -1194,6 +1242,117 @@ class MaskedMLP(nn.Module):
         return F.linear(tangent, layers.weights[-1])
 
 
+class Chain(NamedTuple):
+    """The bodies at a position; 6 numbers a body, side by side."""
+
+    frames: Tensor  # takes twists from the base's frame to the bodies', (..., 6, 6 bodies)
+    axes: Tensor  # twists that bodies have by their own displacements, in the base's frame, (..., 6, bodies)
+    twists: Tensor  # by joint velocity, in the bodies' frames, (..., n, 6 bodies)
+    weight: Tensor  # acceleration that stands for gravity, likewise, (..., 6 bodies)
+
+
+class BodyChain(nn.Module):
+    """Bodies that turn about or slide along axes, each carried by another or by the base.
+
+    Spatial vectors are (angular, linear), as in Featherstone, Rigid Body Dynamics Algorithms, 2008; they
+    are rows in the bodies' frames and columns in the base's. Only frames are followed body by body: sums
+    over all that carries a body, or that it carries, are products with a mask, so few operations are left.
+    """
+
+    table: (
+        Tensor  # takes cos, sin and value of the displacements to frames in parents', (36 bodies, 3 bodies)
+    )
+    fixed: Tensor  # what is added there, (36 bodies,)
+    reading: Tensor  # where axes stand in ``frames``, (6 bodies, bodies)
+    carriers: Tensor  # whether a body carries another, or is it, (bodies, bodies)
+    carried: Tensor  # likewise, six times each, (bodies, 6 bodies)
+    base: Tensor  # acceleration of the base that stands for gravity, (6,)
+    ratios: Tensor  # displacements by q, (bodies, n)
+
+    def __init__(self, n: int, bodies: Bodies, gravity: tuple[float, float, float]) -> None:
+        super().__init__()
+        self.parents, count = bodies.parent, len(bodies.parent)
+        reading = torch.zeros(count, 6, count, dtype=torch.float64)
+        carriers = torch.eye(count, dtype=torch.float64)
+        ratios = torch.zeros(count, n, dtype=torch.float64)
+        for index, parent in enumerate(bodies.parent):
+            ratios[index, bodies.joint[index]] = bodies.ratio[index]
+            # an inverse's rows are columns whose halves are swapped
+            reading[index, 5 if bodies.revolute[index] else 2, index] = 1
+            if parent >= 0:
+                carriers[:, index] += carriers[:, parent]
+        table, fixed = motion_table(bodies)
+        self.register_buffer("table", table)
+        self.register_buffer("fixed", fixed)
+        self.register_buffer("reading", reading.flatten(0, 1))
+        self.register_buffer("carriers", carriers)
+        self.register_buffer("carried", carriers.repeat_interleave(6, dim=1))
+        self.register_buffer("base", vector((0, 0, 0, *(-g for g in gravity))))
+        self.register_buffer("ratios", ratios)
+        self.single = torch.equal(ratios, torch.eye(n).double())  # no joint moves several bodies
+
+    def forward(self, q: Tensor) -> Chain:
+        """The bodies at q, (..., n)."""
+        value = self._by_bodies(q)
+        features = torch.cat([value.cos(), value.sin(), value], dim=-1)
+        own = blocks(F.linear(features, self.table, self.fixed), 6, 6).unbind(dim=-3)
+        placed: list[Tensor] = []
+        for index, parent in enumerate(self.parents):
+            placed.append(own[index] if parent < 0 else placed[parent] @ own[index])
+        frames = torch.cat(placed, dim=-1)
+        axes = (frames @ self.reading).roll(3, dims=-2)
+        twists = (axes.mT @ frames) * self.carried
+        twists = twists if self.single else self.ratios.mT @ twists
+        return Chain(frames, axes, twists, combined(self.base, frames))
+
+    def _by_bodies(self, joints: Tensor) -> Tensor:
+        """What is given by joint, (..., n), for the bodies that they move, (..., bodies)."""
+        return joints if self.single else joints @ self.ratios.mT
+
+    def turning(self, at: Chain, qd: Tensor) -> tuple[Tensor, Tensor]:
+        """The bodies' twists, and how these turn the bodies' axes; in the base's frame, (..., 6, bodies)."""
+        twists = (at.axes * self._by_bodies(qd).unsqueeze(-2)) @ self.carriers
+        return twists, crossed(twists, at.axes)
+
+    def accelerations(self, at: Chain, qd: Tensor, turning: Tensor) -> Tensor:
+        """The bodies' accelerations at steady qd, gravity taken as one, (..., 6 bodies)."""
+        steady = (turning * self._by_bodies(qd).unsqueeze(-2)) @ self.carriers
+        bodies = blocks(at.frames, 6) * steady.unsqueeze(-1)
+        return bodies.sum(dim=-3).flatten(-2) + at.weight
+
+    def at_base(self, at: Chain, momenta: Tensor) -> Tensor:
+        """Momenta of the bodies, (..., 6 bodies), in the base's frame, (..., 6, bodies)."""
+        return blocks(at.frames * momenta.unsqueeze(-2), 6).sum(dim=-1)
+
+    def by_joints(self, axes: Tensor, wrenches: Tensor) -> Tensor:
+        """What joints feel along ``axes`` of wrenches on all that they carry, (..., n)."""
+        felt = (axes * (wrenches @ self.carriers.mT)).sum(dim=-2)
+        return felt if self.single else felt @ self.ratios
+
+    def energy(self, at: Chain, inertia: Tensor) -> Tensor:
+        """The bodies' energy in gravity, (...) [J]; zero at the base's origin."""
+        # of all bodies together; the moment of mass stands in the inertia's upper right block
+        whole = at.frames @ inertia @ at.frames.mT
+        moment = torch.stack([whole[..., 2, 4], whole[..., 0, 5], whole[..., 1, 3]], dim=-1)
+        return applied(moment.unsqueeze(-2), self.base[3:]).squeeze(-1)
+
+    def regressor(self, q: Tensor, qd: Tensor, qdd: Tensor, basis: Tensor) -> Tensor:
+        """Y, (..., n, 10 bodies): Y @ inertial parameters is the bodies' torque.
+
+        basis: ``inertia_basis()``.
+        """
+        at = self(q)
+        rises = self.accelerations(at, qd, self.turning(at, qd)[1]) + combined(qdd, at.twists)
+        rises, twists = (blocks(rows, 6) for rows in (rises, combined(qd, at.twists)))
+        # by body and parameter: (..., bodies, 6, 10)
+        momenta = torch.tensordot(twists, basis, dims=([-1], [2])).mT
+        wrenches = torch.tensordot(rises, basis, dims=([-1], [2])).mT
+        wrenches = wrenches + pushed_along(twists.unsqueeze(-1), momenta)
+        columns = blocks(at.twists, 6).transpose(-3, -2)  # (..., bodies, n, 6)
+        rows: Tensor = (columns @ wrenches).transpose(-3, -2)
+        return rows.reshape(*q.shape, 10 * len(self.parents))
+
+
 def block_diagonal(blocks: Tensor) -> Tensor:
     """The matrix, (k m, k m), with these blocks, (k, m, m), on its diagonal."""
     k, m, _ = blocks.shape
@@ -1208,37 +1367,24 @@ class RigidPrepared(NamedTuple):
     armature: Tensor  # what the rotors add to M, (n, n)
     friction: FrictionConstants
     input: Tensor
+    offset: Tensor  # what the measured torque shows without any, (n,)
+    compensation: Tensor  # what the drives add by velocity, unseen, (n,)
     residual: Any = None  # of what a model has beside rigid bodies
 
 
 class Motion(NamedTuple):
-    """How the bodies may move at a position, each in its own frame; 6 numbers a body, side by side."""
+    """What is computed of a position alone."""
 
-    terms: Tensor  # cos and sin of a body's angle, or its displacement and 0, (..., bodies, 2)
-    twists: Tensor  # by joint velocity, (..., n, 6 bodies)
-    weight: Tensor  # acceleration that stands for gravity, (..., 6 bodies)
+    chain: Chain
+    momenta: Tensor  # of the chain's twists, by joint velocity, (..., n, 6 bodies)
     gravity: Tensor  # dV/dq of the bodies, (..., n)
-    q: Tensor
+    residual: Any = None  # of what a model has beside rigid bodies
 
 
 class RigidBodyDynamics(PortHamiltonian):
-    """Rigid bodies with trained inertial parameters, friction by laws, a trained torque offset.
+    """Rigid bodies with trained inertial parameters, friction by laws, a trained torque offset."""
 
-    Spatial vectors are (angular, linear), as in Featherstone, Rigid Body Dynamics Algorithms, 2008.
-    They are rows here, and all bodies' stand side by side: so most products are of one large matrix.
-    """
-
-    forth: Tensor  # takes twists from the parent's frame: constant part, that of each term, (bodies, 6, 18)
-    back: Tensor  # takes wrenches to the parent's frame, likewise
-    axes: Tensor  # twists of the bodies by joint velocity alone, (n, 6 bodies)
-    turning: Tensor  # takes a body's twist to how its joint's axis turns, (6 bodies, 6 bodies)
-    owner: Tensor  # sums six numbers of a body to its joint, (6 bodies, n)
-    revolute: Tensor
-    ratios: Tensor  # (bodies, n)
-    offsets: Tensor
     basis: Tensor
-    crossing: Tensor
-    base: Tensor
     actuated: Tensor
     motors: Tensor  # C: the drives' speeds are C qd, (n, n)
     loads: Tensor  # its inverse
@@ -1249,41 +1395,22 @@ class RigidBodyDynamics(PortHamiltonian):
         joints: Joints,
         bodies: Bodies,
         gravity: tuple[float, float, float],
-        input: DriveInput,
+        input: Input,
         reach: Sequence[Sequence[float]] = (),
     ) -> None:
         super().__init__()
-        self.n, self.elements, self.parents = joints.n, len(reach[0]) if reach else 0, bodies.parent
-        count = len(bodies.parent)
-        tables = torch.stack([transform_table(bodies, index) for index in range(count)])
-        self.register_buffer("forth", tables.mT.transpose(1, 2).flatten(2))
-        self.register_buffer("back", tables.transpose(1, 2).flatten(2))
-        crossing = torch.zeros(6, 6, 6, dtype=torch.float64)
-        for axis, unit in enumerate(torch.eye(3, dtype=torch.float64)):
-            crossing[axis, :3, :3] = crossing[axis, 3:, 3:] = skew(unit)
-            crossing[3 + axis, 3:, :3] = skew(unit)
-        axes = torch.zeros(count, 6, dtype=torch.float64)
-        ratios = torch.zeros(count, self.n, dtype=torch.float64)
-        for index, revolute in enumerate(bodies.revolute):
-            axes[index, 2 if revolute else 5] = bodies.ratio[index]
-            ratios[index, bodies.joint[index]] = bodies.ratio[index]
-        owner = (ratios != 0).double().repeat_interleave(6, dim=0)
-        self.register_buffer("axes", owner.mT * axes.flatten())
-        self.register_buffer("turning", block_diagonal(torch.stack([crossing @ axis for axis in axes])))
-        self.register_buffer("owner", owner)
-        self.register_buffer("revolute", vector(float(each) for each in bodies.revolute))
-        self.register_buffer("ratios", ratios)
-        self.register_buffer("offsets", vector(bodies.offset))
+        self.n, self.elements = joints.n, len(reach[0]) if reach else 0
+        self.chain = BodyChain(joints.n, bodies, gravity)
         self.register_buffer("basis", inertia_basis())
-        self.register_buffer("crossing", crossing)
-        self.register_buffer("base", vector((0, 0, 0, *(-g for g in gravity))))
         self.register_buffer("actuated", vector(float(x) for x in joints.actuated))
         self.inertial_parameters = InertialParameters(bodies)
         self.armature = Armature(joints)
         self.friction = FrictionLaws(joints, reach)
-        self.input = input
-        self.register_buffer("motors", self.input.motor_speeds())
+        self.input: Any = input
+        gains = input(torch.zeros(self.n, dtype=torch.float64), input.prepare()).detach()
+        self.register_buffer("motors", motor_speeds(gains))
         self.register_buffer("loads", torch.linalg.inv(self.motors))
+        self.coupled = not torch.equal(self.motors, torch.eye(self.n).double())
         # of the measured torque, in units of the joints' usual friction
         self.raw_offset = nn.Parameter(torch.zeros(self.n, dtype=torch.float64))
         # in units of usual friction at usual speed; no parameter: only a fit to torques may find one
@@ -1305,74 +1432,27 @@ class RigidBodyDynamics(PortHamiltonian):
             armature=self.motors.mT @ (self.armature().unsqueeze(-1) * self.motors),
             friction=self.friction.prepare(),
             input=self.input.prepare(),
+            offset=self.torque_offset(),
+            compensation=self.friction_compensation(),
         )
 
     def configuration(self, q: Tensor, prepared: RigidPrepared) -> Motion:
         """How the bodies may move at q, and what they weigh there."""
-        motion = self._motion(q)
-        return motion._replace(gravity=applied(motion.twists, motion.weight @ prepared.inertia))
-
-    def _motion(self, q: Tensor) -> Motion:
-        value = q @ self.ratios.mT + self.offsets
-        sliding = 1 - self.revolute
-        terms = torch.stack(
-            [self.revolute * value.cos() + sliding * value, self.revolute * value.sin()], dim=-1
-        )
-        rows = torch.cat([torch.zeros_like(self.axes[:, :6]), self.base.unsqueeze(0)])
-        own = torch.cat([self.axes, torch.zeros_like(self.axes[:1])]).reshape(self.n + 1, -1, 6)
-        moved: list[Tensor] = []
-        for index, parent in enumerate(self.parents):
-            below = rows.expand(*q.shape[:-1], -1, -1) if parent < 0 else moved[parent]
-            moved.append(self._carried(self.forth[index], below, terms[..., index, :]) + own[:, index])
-        columns = torch.cat(moved, dim=-1)
-        return Motion(terms, columns[..., :-1, :], columns[..., -1, :], torch.zeros_like(q), q)
-
-    @staticmethod
-    def _carried(table: Tensor, rows: Tensor, terms: Tensor) -> Tensor:
-        """Rows, (..., k, 6), taken to a neighbour's frame."""
-        constant, by_cos, by_sin = (rows @ table).chunk(3, dim=-1)
-        cos, sin = terms.unsqueeze(-2).chunk(2, dim=-1)
-        return constant + cos * by_cos + sin * by_sin
+        chain: Chain = self.chain(q)
+        momenta = chain.twists @ prepared.inertia
+        return Motion(chain, momenta, applied(momenta, chain.weight))
 
     def mass_at(self, at: Motion, prepared: RigidPrepared) -> tuple[Tensor, None]:
         """M(q), (..., n, n)."""
-        return (at.twists @ prepared.inertia) @ at.twists.mT + prepared.armature, None
+        return at.momenta @ at.chain.twists.mT + prepared.armature, None
 
     def energy_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
         """V(q), (...) [J]; zero for a mass at the base's origin."""
-        height = at.terms.new_zeros(at.terms.shape[:-2])
-        still = torch.eye(6, dtype=height.dtype, device=height.device).expand(*height.shape, 6, 6)
-        placed: list[Tensor] = []
-        for index, parent in enumerate(self.parents):
-            below = still if parent < 0 else placed[parent]
-            placed.append(self._carried(self.forth[index], below, at.terms[..., index, :]))
-            own = slice(6 * index, 6 * index + 6)
-            # in the base's frame the moment of mass stands in the inertia's upper right block
-            seen = placed[index] @ prepared.inertia[own, own] @ placed[index].mT
-            moment = torch.stack([seen[..., 2, 4], seen[..., 0, 5], seen[..., 1, 3]], dim=-1)
-            height = height + moment @ self.base[3:]
-        return height
+        return self.chain.energy(at.chain, prepared.inertia)
 
     def gravity_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
         """dV/dq, (..., n) [Nm, N]."""
         return at.gravity
-
-    def _velocities(self, motion: Motion, qd: Tensor) -> Tensor:
-        """The bodies' twists, (..., 6 bodies)."""
-        return (qd.unsqueeze(-2) @ motion.twists).squeeze(-2)
-
-    def _accelerations(self, motion: Motion, qd: Tensor, twists: Tensor) -> Tensor:
-        """The bodies' accelerations at steady qd, gravity taken as one, (..., 6 bodies)."""
-        turned = (twists @ self.turning) * (qd @ self.owner.mT)
-        found: list[Tensor] = []
-        for index, (parent, own) in enumerate(
-            zip(self.parents, turned.chunk(len(self.parents), dim=-1), strict=True)
-        ):
-            if parent >= 0:
-                below = found[parent].unsqueeze(-2)
-                own = own + self._carried(self.forth[index], below, motion.terms[..., index, :]).squeeze(-2)
-            found.append(own)
-        return torch.cat(found, dim=-1) + motion.weight
 
     def lagrangian_gradient(self, at: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
         """d/dq of 1/2 qd^T M(q) qd - V(q), (..., n).
@@ -1380,46 +1460,20 @@ class RigidBodyDynamics(PortHamiltonian):
         The kinetic part: the momentum of all that a joint carries, by what its displacement adds to
         their twist.
         """
-        twists = self._velocities(at, qd)
-        carried = list((twists @ prepared.inertia).chunk(len(self.parents), dim=-1))
-        for index in reversed(range(len(self.parents))):
-            parent = self.parents[index]
-            if parent >= 0:
-                below = self._carried(self.back[index], carried[index].unsqueeze(-2), at.terms[..., index, :])
-                carried[parent] = carried[parent] + below.squeeze(-2)
-        turned = twists @ self.turning
-        return (torch.cat(carried, dim=-1) * turned) @ self.owner - at.gravity
+        momenta = self.chain.at_base(at.chain, combined(qd, at.momenta))
+        return self.chain.by_joints(self.chain.turning(at.chain, qd)[1], momenta) - at.gravity
 
     def nonlinear_at(self, at: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
-        """The torque that holds qd steady without friction, (..., n)."""
-        twists = self._velocities(at, qd)
-        wrenches = self._accelerations(at, qd, twists) @ prepared.inertia
-        momenta = self._by_body(twists @ prepared.inertia)
-        turned = applied(self._cross(self._by_body(twists)).mT, momenta)
-        return applied(at.twists, wrenches - turned.flatten(-2))
-
-    def _by_body(self, rows: Tensor) -> Tensor:
-        """(..., 6 bodies) as (..., bodies, 6)."""
-        return rows.reshape(*rows.shape[:-1], len(self.parents), 6)
-
-    def _cross(self, twist: Tensor) -> Tensor:
-        """What a frame with this twist makes of a constant twist in it, (..., 6, 6)."""
-        rows = twist @ self.crossing.flatten(1)
-        return rows.reshape(*twist.shape[:-1], 6, 6)
+        """The torque that holds qd steady without friction, (..., n), by Newton and Euler."""
+        chain = self.chain
+        twists, turning = chain.turning(at.chain, qd)
+        rising = applied(at.momenta, chain.accelerations(at.chain, qd, turning))
+        pushed = pushed_along(twists, chain.at_base(at.chain, combined(qd, at.momenta)))
+        return rising + chain.by_joints(at.chain.axes, pushed)
 
     def regressor(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
         """Y, (..., n, 10 bodies): Y @ inertial parameters is the bodies' torque."""
-        motion = self._motion(q)
-        twists = self._velocities(motion, qd)
-        accelerations = self._accelerations(motion, qd, twists) + self._velocities(motion, qdd)
-        twists = self._by_body(twists)
-        # by body and parameter: (..., bodies, 6, 10)
-        rises = torch.tensordot(self._by_body(accelerations), self.basis, dims=([-1], [2])).mT
-        momenta = torch.tensordot(twists, self.basis, dims=([-1], [2])).mT
-        wrenches = rises - self._cross(twists).mT @ momenta
-        columns = self._by_body(motion.twists).transpose(-3, -2)  # (..., bodies, n, 6)
-        rows: Tensor = (columns @ wrenches).transpose(-3, -2)
-        return rows.reshape(*q.shape, 10 * len(self.parents))
+        return self.chain.regressor(q, qd, qdd, self.basis)
 
     def residual_torque(self, q: Tensor, qd: Tensor, qdd: Tensor, prepared: RigidPrepared) -> Tensor:
         """What else than bodies, drives and friction takes torque, (..., n) [Nm, N]: nothing."""
@@ -1429,10 +1483,19 @@ class RigidBodyDynamics(PortHamiltonian):
         """How much more friction the drives have at q than their laws say, (..., n): nowhere any."""
         return torch.ones_like(q)
 
+    def _varied(self, friction: Tensor, at: Motion) -> Tensor:
+        """The laws' friction of the drives as it is at this position, (..., n)."""
+        return friction
+
+    def _by_motors(self, joints: Tensor, matrix: Tensor) -> Tensor:
+        """Rows times a matrix that is the identity where each motor moves its own joint alone."""
+        return joints @ matrix if self.coupled else joints
+
     def friction_at(self, at: Motion, qd: Tensor, prepared: RigidPrepared, z: Tensor | None = None) -> Tensor:
         """The friction torque C^T f(C qd), (..., n) [Nm, N]."""
-        torque: Tensor = self.friction(qd @ self.motors.mT, at.gravity @ self.loads, prepared.friction, z)
-        return (self.friction_factor(at.q) * torque) @ self.motors
+        speeds, loads = self._by_motors(qd, self.motors.mT), self._by_motors(at.gravity, self.loads)
+        torque: Tensor = self.friction(speeds, loads, prepared.friction, z)
+        return self._by_motors(self._varied(torque, at), self.motors)
 
     def stored_energy(self, z: Tensor, prepared: RigidPrepared) -> Tensor:
         """What the bristles give back, (...) [J]."""
@@ -1454,7 +1517,7 @@ class RigidBodyDynamics(PortHamiltonian):
         """D(q, qd), (..., n, n), diagonal where each drive moves its own joint alone."""
         speeds, loads = qd @ self.motors.mT, at.gravity @ self.loads
         resistance = self.friction.resistance(speeds, loads, prepared.friction)
-        resistance = self.friction_factor(at.q) * resistance
+        resistance = self._varied(resistance, at)
         return self.motors.mT @ (resistance.unsqueeze(-1) * self.motors)
 
     def input_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
@@ -1464,14 +1527,14 @@ class RigidBodyDynamics(PortHamiltonian):
 
     def input_force(self, at: Motion, qd: Tensor, tau: Tensor, prepared: RigidPrepared) -> Tensor:
         """G (tau - torque offset) + friction compensation qd, (..., n) [Nm, N]."""
-        force: Tensor = self.input.force(at.gravity, tau - self.torque_offset(), prepared.input)
-        return force + self.friction_compensation() * qd
+        force: Tensor = self.input.force(at.gravity, tau - prepared.offset, prepared.input)
+        return force + prepared.compensation * qd
 
     def input_torque(self, at: Motion, qd: Tensor, force: Tensor, prepared: RigidPrepared) -> Tensor:
         """The tau, (..., n), that is measured while the drives make this force."""
-        shown = force - self.friction_compensation() * qd
+        shown = force - prepared.compensation * qd
         tau: Tensor = self.input.solve(at.gravity, shown, prepared.input)
-        return tau + self.torque_offset()
+        return tau + prepared.offset
 
 
 class ResidualPrepared(NamedTuple):
@@ -1479,6 +1542,14 @@ class ResidualPrepared(NamedTuple):
 
     mass: Any
     potential: Any
+
+
+class ResidualMotion(NamedTuple):
+    """What residuals read of a position."""
+
+    q: Tensor
+    encoded: Tensor
+    splines: Tensor  # (..., n, SPLINES)
 
 
 class ResidualDynamics(RigidBodyDynamics):
@@ -1493,7 +1564,7 @@ class ResidualDynamics(RigidBodyDynamics):
         joints: Joints,
         bodies: Bodies,
         gravity: tuple[float, float, float],
-        input: DriveInput,
+        input: Input,
         mass: ResidualMass,
         potential: LearnedPotential | None,
         reach: Sequence[Sequence[float]] = (),
@@ -1511,62 +1582,66 @@ class ResidualDynamics(RigidBodyDynamics):
         mass = self.residual_mass.prepare(prepared.armature)
         return prepared._replace(residual=ResidualPrepared(mass, potential))
 
+    def configuration(self, q: Tensor, prepared: RigidPrepared) -> Motion:
+        """How the bodies may move at q, and what residuals read of q."""
+        return super().configuration(q, prepared)._replace(residual=self._read(q))
+
+    def _read(self, q: Tensor) -> ResidualMotion:
+        return ResidualMotion(q, self.encoding(q), self.joint_functions.splines(q))
+
     def mass_at(self, at: Motion, prepared: RigidPrepared) -> tuple[Tensor, Any]:
         """M(q), (..., n, n), and what its derivatives need."""
-        encoded = self.encoding(at.q)
-        more, residuals = self.residual_mass(encoded, prepared.residual.mass)
-        return super().mass_at(at, prepared)[0] + more, (encoded, residuals)
+        more, residuals = self.residual_mass(at.residual.encoded, prepared.residual.mass)
+        return super().mass_at(at, prepared)[0] + more, residuals
 
     def energy_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
         """V(q), (...) [J]."""
-        energy = super().energy_at(at, prepared) + self.joint_functions.energy(at.q)
+        energy = super().energy_at(at, prepared) + self.joint_functions.energy(at.residual.q)
         if self.residual_potential is None:
             return energy
-        more: Tensor = self.residual_potential(self.encoding(at.q), prepared.residual.potential)
+        more: Tensor = self.residual_potential(at.residual.encoded, prepared.residual.potential)
         return energy + more
 
     def gravity_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
         """dV/dq, (..., n) [Nm, N]."""
-        gradient = at.gravity + self.joint_functions.torque(at.q)
-        if self.residual_potential is None:
-            return gradient
-        encoded = self.encoding(at.q)
-        by_encoded = self.residual_potential.vjp(encoded, prepared.residual.potential)
-        more: Tensor = self.encoding.vjp(encoded, by_encoded)
-        return gradient + more
+        kinetic = torch.zeros_like(at.residual.encoded)
+        return at.gravity - self._gradient(at.residual, kinetic, prepared)
 
     def lagrangian_gradient(self, at: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
         """d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
-        own = self._residual_gradient(at.q, qd, residuals, prepared)
+        kinetic = self.residual_mass.kinetic_vjp(at.residual.encoded, qd, residuals)
+        own = self._gradient(at.residual, kinetic, prepared)
         return super().lagrangian_gradient(at, qd, None, prepared) + own
 
     def nonlinear_at(self, at: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
         """The torque that holds qd steady without friction, (..., n)."""
-        own = self._residual_nonlinear(at.q, qd, residuals, prepared)
+        own = self._nonlinear(at.residual, qd, residuals, prepared)
         return super().nonlinear_at(at, qd, None, prepared) + own
 
     def residual_torque(self, q: Tensor, qd: Tensor, qdd: Tensor, prepared: RigidPrepared) -> Tensor:
         """What the residuals of M and V take, (..., n) [Nm, N]."""
-        encoded = self.encoding(q)
-        mass, residuals = self.residual_mass(encoded, prepared.residual.mass)
-        return applied(mass, qdd) + self._residual_nonlinear(q, qd, (encoded, residuals), prepared)
+        read = self._read(q)
+        mass, residuals = self.residual_mass(read.encoded, prepared.residual.mass)
+        return applied(mass, qdd) + self._nonlinear(read, qd, residuals, prepared)
 
     def friction_factor(self, q: Tensor) -> Tensor:
         """How much more friction the drives have at q than their laws say, (..., n)."""
-        factor: Tensor = self.joint_functions.friction_factor(q)
+        factor: Tensor = self.joint_functions.friction_factor(self.joint_functions.splines(q))
         return factor
 
-    def _residual_nonlinear(self, q: Tensor, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
-        """dR/dt qd - d/dq of what the residuals add to 1/2 qd^T M(q) qd - V(q), (..., n)."""
-        encoded, network = residuals
-        rate = self.residual_mass.jvp(self.encoding.jvp(encoded, qd), network)
-        return applied(rate, qd) - self._residual_gradient(q, qd, residuals, prepared)
+    def _varied(self, friction: Tensor, at: Motion) -> Tensor:
+        """The laws' friction of the drives as it is at this position, (..., n)."""
+        return self.joint_functions.friction_factor(at.residual.splines) * friction
 
-    def _residual_gradient(self, q: Tensor, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
-        """d/dq of what the residuals add to 1/2 qd^T M(q) qd - V(q), (..., n)."""
-        encoded, network = residuals
-        by_encoded = self.residual_mass.kinetic_vjp(encoded, qd, network)
+    def _nonlinear(self, read: ResidualMotion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
+        """dR/dt qd - d/dq of what the residuals add to 1/2 qd^T M(q) qd - V(q), (..., n)."""
+        rate = self.encoding.jvp(read.encoded, qd)
+        moved, kinetic = self.residual_mass.coriolis(rate, qd, residuals)
+        return moved - self._gradient(read, kinetic, prepared)
+
+    def _gradient(self, read: ResidualMotion, kinetic: Tensor, prepared: RigidPrepared) -> Tensor:
+        """d/dq of what the residuals add to 1/2 qd^T M(q) qd - V(q), (..., n); kinetic: by the encoding."""
         if self.residual_potential is not None:
-            by_encoded = by_encoded - self.residual_potential.vjp(encoded, prepared.residual.potential)
-        gradient: Tensor = self.encoding.vjp(encoded, by_encoded)
-        return gradient - self.joint_functions.torque(q)
+            kinetic = kinetic - self.residual_potential.vjp(read.encoded, prepared.residual.potential)
+        gradient: Tensor = self.encoding.vjp(read.encoded, kinetic)
+        return gradient - self.joint_functions.torque(read.q, read.splines)

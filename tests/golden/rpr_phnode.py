@@ -226,74 +226,6 @@ def unit_joints(
     return (*((hidden,) * depth), tuple(frozenset(joints) for joints in outputs))
 
 
-def to_group(q: Tensor, joint_types: Sequence[str]) -> list[Tensor]:
-    """By joint, R in SO(3), (..., 3, 3), or r in R^3, (..., 3), if prismatic; z is its axis."""
-    parts = []
-    for kind, value in zip(joint_types, q.unbind(dim=-1), strict=True):
-        zero, one = torch.zeros_like(value), torch.ones_like(value)
-        if kind == "revolute":
-            c, s = value.cos(), value.sin()
-            rows = ((c, -s, zero), (s, c, zero), (zero, zero, one))
-            parts.append(torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2))
-        else:
-            parts.append(torch.stack((zero, zero, value), dim=-1))
-    return parts
-
-
-def from_group(parts: Sequence[Tensor], joint_types: Sequence[str]) -> Tensor:
-    """q, (..., n), with angles in [-pi, pi]; the inverse of ``to_group``."""
-    values = [
-        torch.atan2(part[..., 1, 0], part[..., 0, 0]) if kind == "revolute" else part[..., 2]
-        for kind, part in zip(joint_types, parts, strict=True)
-    ]
-    return torch.stack(values, dim=-1)
-
-
-class Mass(Protocol):
-    """What gives M(q) and its derivatives."""
-
-    def prepare(self, definite: bool = True) -> Any:
-        """All that depends on the weights alone; ``definite``: keep M positive definite."""
-
-    def __call__(self, encoded: Tensor, prepared: Any) -> tuple[Tensor, Any]:
-        """M(q), (..., n, n), and what its derivatives need."""
-
-    def kinetic_vjp(self, encoded: Tensor, qd: Tensor, residuals: Any) -> Tensor:
-        """The derivative of 1/2 qd^T M(q) qd by the encoding."""
-
-    def jvp(self, rate: Tensor, residuals: Any) -> Tensor:
-        """dM/dt, (..., n, n), where the encoding changes at this rate."""
-
-
-class Friction(Protocol):
-    """What gives D(q, qd)."""
-
-    def prepare(self) -> Any:
-        """All that depends on the weights alone."""
-
-    def __call__(self, encoded: Tensor, qd: Tensor, prepared: Any) -> Tensor:
-        """D qd, (..., n) [Nm, N]."""
-
-    def dissipation(self, encoded: Tensor, qd: Tensor, prepared: Any) -> Tensor:
-        """D, (..., n, n)."""
-
-
-class Input(Protocol):
-    """What gives G."""
-
-    def prepare(self) -> Any:
-        """All that depends on the weights alone."""
-
-    def __call__(self, encoded: Tensor, prepared: Any) -> Tensor:
-        """G, (..., n, n)."""
-
-    def force(self, encoded: Tensor, tau: Tensor, prepared: Any) -> Tensor:
-        """G tau, (..., n)."""
-
-    def solve(self, encoded: Tensor, force: Tensor, prepared: Any) -> Tensor:
-        """The inputs, (..., n), that make this force."""
-
-
 def solved(matrix: Tensor, right: Tensor) -> Tensor:
     """matrix^-1 right, (..., n)."""
     # its derivative costs one more solution; a Cholesky factor's would cost several times that
@@ -303,6 +235,8 @@ def solved(matrix: Tensor, right: Tensor) -> Tensor:
 
 def applied(matrix: Tensor, vector: Tensor) -> Tensor:
     """matrix vector, (..., n)."""
+    if vector.dim() == 1:  # fewer steps, which is what one state costs
+        return matrix @ vector
     return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
 
 
@@ -473,6 +407,74 @@ class PortHamiltonian(nn.Module):
         qd, force = self.port_hamiltonian_rhs(q, p, tau if tau.shape[-1] else None, self.prepare(), z)
         moved = flat if z is None else self.memory_rate(qd, z).flatten(-2)
         return torch.cat([qd, force, moved, torch.zeros_like(tau)], dim=-1)
+
+
+def to_group(q: Tensor, joint_types: Sequence[str]) -> list[Tensor]:
+    """By joint, R in SO(3), (..., 3, 3), or r in R^3, (..., 3), if prismatic; z is its axis."""
+    parts = []
+    for kind, value in zip(joint_types, q.unbind(dim=-1), strict=True):
+        zero, one = torch.zeros_like(value), torch.ones_like(value)
+        if kind == "revolute":
+            c, s = value.cos(), value.sin()
+            rows = ((c, -s, zero), (s, c, zero), (zero, zero, one))
+            parts.append(torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2))
+        else:
+            parts.append(torch.stack((zero, zero, value), dim=-1))
+    return parts
+
+
+def from_group(parts: Sequence[Tensor], joint_types: Sequence[str]) -> Tensor:
+    """q, (..., n), with angles in [-pi, pi]; the inverse of ``to_group``."""
+    values = [
+        torch.atan2(part[..., 1, 0], part[..., 0, 0]) if kind == "revolute" else part[..., 2]
+        for kind, part in zip(joint_types, parts, strict=True)
+    ]
+    return torch.stack(values, dim=-1)
+
+
+class Mass(Protocol):
+    """What gives M(q) and its derivatives."""
+
+    def prepare(self, definite: bool = True) -> Any:
+        """All that depends on the weights alone; ``definite``: keep M positive definite."""
+
+    def __call__(self, encoded: Tensor, prepared: Any) -> tuple[Tensor, Any]:
+        """M(q), (..., n, n), and what its derivatives need."""
+
+    def kinetic_vjp(self, encoded: Tensor, qd: Tensor, residuals: Any) -> Tensor:
+        """The derivative of 1/2 qd^T M(q) qd by the encoding."""
+
+    def jvp(self, rate: Tensor, residuals: Any) -> Tensor:
+        """dM/dt, (..., n, n), where the encoding changes at this rate."""
+
+
+class Friction(Protocol):
+    """What gives D(q, qd)."""
+
+    def prepare(self) -> Any:
+        """All that depends on the weights alone."""
+
+    def __call__(self, encoded: Tensor, qd: Tensor, prepared: Any) -> Tensor:
+        """D qd, (..., n) [Nm, N]."""
+
+    def dissipation(self, encoded: Tensor, qd: Tensor, prepared: Any) -> Tensor:
+        """D, (..., n, n)."""
+
+
+class Input(Protocol):
+    """What gives G."""
+
+    def prepare(self) -> Any:
+        """All that depends on the weights alone."""
+
+    def __call__(self, encoded: Tensor, prepared: Any) -> Tensor:
+        """G, (..., n, n)."""
+
+    def force(self, encoded: Tensor, tau: Tensor, prepared: Any) -> Tensor:
+        """G tau, (..., n)."""
+
+    def solve(self, encoded: Tensor, force: Tensor, prepared: Any) -> Tensor:
+        """The inputs, (..., n), that make this force."""
 
 
 class JointEncoding(nn.Module):

@@ -239,128 +239,6 @@ def unit_joints(
     return (*((hidden,) * depth), tuple(frozenset(joints) for joints in outputs))
 
 
-Entries = Callable[[Sequence[Tensor], Sequence[Tensor]], Tensor]
-
-
-def symmetric(*rows: Sequence[Tensor | float]) -> Tensor:
-    """The matrix, (..., n, n), with these rows as its lower triangle; entries are (...) or numbers."""
-    some = next(entry for row in rows for entry in row if isinstance(entry, Tensor))
-    lower = [[entry if isinstance(entry, Tensor) else some * 0 + entry for entry in row] for row in rows]
-    n = len(lower)
-    whole = [[lower[max(i, j)][min(i, j)] for j in range(n)] for i in range(n)]
-    return torch.stack([torch.stack(row, dim=-1) for row in whole], dim=-2)
-
-
-def entry_basis(entries: Entries, functions: int, constants: int) -> tuple[Tensor, Tensor]:
-    """What each function and each constant adds to a matrix that is linear in them, as rows.
-
-    (functions, n n) and (constants, n n); found by asking ``entries`` for one at a time.
-    """
-    f, c = torch.eye(functions).double(), torch.eye(constants).double()
-    by_function = entries(f.unbind(), f.new_zeros(constants, functions).unbind())
-    by_constant = entries(c.new_zeros(functions, constants).unbind(), c.unbind())
-    return by_function.flatten(1), by_constant.flatten(1)
-
-
-class PositiveDefiniteBound(nn.Module):
-    """Draws M towards a positive definite matrix C, as far as M needs it to be positive definite.
-
-    M' = C + t (M - C), with t = 1 wherever M - margin C is positive definite. Elsewhere t = 2^-k is
-    the first such power with t |M - C| <= 1 - margin, |.| being at least the norm relative to C:
-    then M' - margin C is positive definite. t is constant in pieces, so that derivatives of M' are
-    t times those of M. C has M's own zeros and linear relations, which therefore hold in M'.
-    """
-
-    center: Tensor  # C
-    least: Tensor  # margin C
-    unit: Tensor  # an entry's largest part in the norm relative to C, divided by 1 - margin
-
-    def __init__(self, center: Tensor, margin: float) -> None:
-        super().__init__()
-        scale = center.diagonal().rsqrt()
-        scaled = scale.unsqueeze(-1) * center * scale
-        least = torch.linalg.eigvalsh(scaled)[0]
-        self.register_buffer("center", center)
-        self.register_buffer("least", margin * center)
-        self.register_buffer("unit", scale.unsqueeze(-1) * scale / least / (1 - margin))
-
-    def forward(self, mass: Tensor) -> tuple[Tensor, Tensor]:
-        """M', (..., n, n), and t, (...)."""
-        fixed = mass.detach()
-        indefinite = torch.linalg.cholesky_ex(fixed - self.least).info != 0
-        size = torch.linalg.vector_norm(self.unit * (fixed - self.center), dim=(-2, -1))
-        part = torch.where(indefinite, torch.exp2(-torch.ceil(torch.log2(size)).clamp(min=1.0)), 1.0)
-        return torch.lerp(self.center, mass, part[..., None, None]), part
-
-
-def to_group(q: Tensor, joint_types: Sequence[str]) -> list[Tensor]:
-    """By joint, R in SO(3), (..., 3, 3), or r in R^3, (..., 3), if prismatic; z is its axis."""
-    parts = []
-    for kind, value in zip(joint_types, q.unbind(dim=-1), strict=True):
-        zero, one = torch.zeros_like(value), torch.ones_like(value)
-        if kind == "revolute":
-            c, s = value.cos(), value.sin()
-            rows = ((c, -s, zero), (s, c, zero), (zero, zero, one))
-            parts.append(torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2))
-        else:
-            parts.append(torch.stack((zero, zero, value), dim=-1))
-    return parts
-
-
-def from_group(parts: Sequence[Tensor], joint_types: Sequence[str]) -> Tensor:
-    """q, (..., n), with angles in [-pi, pi]; the inverse of ``to_group``."""
-    values = [
-        torch.atan2(part[..., 1, 0], part[..., 0, 0]) if kind == "revolute" else part[..., 2]
-        for kind, part in zip(joint_types, parts, strict=True)
-    ]
-    return torch.stack(values, dim=-1)
-
-
-class Mass(Protocol):
-    """What gives M(q) and its derivatives."""
-
-    def prepare(self, definite: bool = True) -> Any:
-        """All that depends on the weights alone; ``definite``: keep M positive definite."""
-
-    def __call__(self, encoded: Tensor, prepared: Any) -> tuple[Tensor, Any]:
-        """M(q), (..., n, n), and what its derivatives need."""
-
-    def kinetic_vjp(self, encoded: Tensor, qd: Tensor, residuals: Any) -> Tensor:
-        """The derivative of 1/2 qd^T M(q) qd by the encoding."""
-
-    def jvp(self, rate: Tensor, residuals: Any) -> Tensor:
-        """dM/dt, (..., n, n), where the encoding changes at this rate."""
-
-
-class Friction(Protocol):
-    """What gives D(q, qd)."""
-
-    def prepare(self) -> Any:
-        """All that depends on the weights alone."""
-
-    def __call__(self, encoded: Tensor, qd: Tensor, prepared: Any) -> Tensor:
-        """D qd, (..., n) [Nm, N]."""
-
-    def dissipation(self, encoded: Tensor, qd: Tensor, prepared: Any) -> Tensor:
-        """D, (..., n, n)."""
-
-
-class Input(Protocol):
-    """What gives G."""
-
-    def prepare(self) -> Any:
-        """All that depends on the weights alone."""
-
-    def __call__(self, encoded: Tensor, prepared: Any) -> Tensor:
-        """G, (..., n, n)."""
-
-    def force(self, encoded: Tensor, tau: Tensor, prepared: Any) -> Tensor:
-        """G tau, (..., n)."""
-
-    def solve(self, encoded: Tensor, force: Tensor, prepared: Any) -> Tensor:
-        """The inputs, (..., n), that make this force."""
-
-
 def solved(matrix: Tensor, right: Tensor) -> Tensor:
     """matrix^-1 right, (..., n)."""
     # its derivative costs one more solution; a Cholesky factor's would cost several times that
@@ -370,6 +248,8 @@ def solved(matrix: Tensor, right: Tensor) -> Tensor:
 
 def applied(matrix: Tensor, vector: Tensor) -> Tensor:
     """matrix vector, (..., n)."""
+    if vector.dim() == 1:  # fewer steps, which is what one state costs
+        return matrix @ vector
     return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
 
 
@@ -540,6 +420,128 @@ class PortHamiltonian(nn.Module):
         qd, force = self.port_hamiltonian_rhs(q, p, tau if tau.shape[-1] else None, self.prepare(), z)
         moved = flat if z is None else self.memory_rate(qd, z).flatten(-2)
         return torch.cat([qd, force, moved, torch.zeros_like(tau)], dim=-1)
+
+
+Entries = Callable[[Sequence[Tensor], Sequence[Tensor]], Tensor]
+
+
+def symmetric(*rows: Sequence[Tensor | float]) -> Tensor:
+    """The matrix, (..., n, n), with these rows as its lower triangle; entries are (...) or numbers."""
+    some = next(entry for row in rows for entry in row if isinstance(entry, Tensor))
+    lower = [[entry if isinstance(entry, Tensor) else some * 0 + entry for entry in row] for row in rows]
+    n = len(lower)
+    whole = [[lower[max(i, j)][min(i, j)] for j in range(n)] for i in range(n)]
+    return torch.stack([torch.stack(row, dim=-1) for row in whole], dim=-2)
+
+
+def entry_basis(entries: Entries, functions: int, constants: int) -> tuple[Tensor, Tensor]:
+    """What each function and each constant adds to a matrix that is linear in them, as rows.
+
+    (functions, n n) and (constants, n n); found by asking ``entries`` for one at a time.
+    """
+    f, c = torch.eye(functions).double(), torch.eye(constants).double()
+    by_function = entries(f.unbind(), f.new_zeros(constants, functions).unbind())
+    by_constant = entries(c.new_zeros(functions, constants).unbind(), c.unbind())
+    return by_function.flatten(1), by_constant.flatten(1)
+
+
+class PositiveDefiniteBound(nn.Module):
+    """Draws M towards a positive definite matrix C, as far as M needs it to be positive definite.
+
+    M' = C + t (M - C), with t = 1 wherever M - margin C is positive definite. Elsewhere t = 2^-k is
+    the first such power with t |M - C| <= 1 - margin, |.| being at least the norm relative to C:
+    then M' - margin C is positive definite. t is constant in pieces, so that derivatives of M' are
+    t times those of M. C has M's own zeros and linear relations, which therefore hold in M'.
+    """
+
+    center: Tensor  # C
+    least: Tensor  # margin C
+    unit: Tensor  # an entry's largest part in the norm relative to C, divided by 1 - margin
+
+    def __init__(self, center: Tensor, margin: float) -> None:
+        super().__init__()
+        scale = center.diagonal().rsqrt()
+        scaled = scale.unsqueeze(-1) * center * scale
+        least = torch.linalg.eigvalsh(scaled)[0]
+        self.register_buffer("center", center)
+        self.register_buffer("least", margin * center)
+        self.register_buffer("unit", scale.unsqueeze(-1) * scale / least / (1 - margin))
+
+    def forward(self, mass: Tensor) -> tuple[Tensor, Tensor]:
+        """M', (..., n, n), and t, (...)."""
+        fixed = mass.detach()
+        indefinite = torch.linalg.cholesky_ex(fixed - self.least).info != 0
+        size = torch.linalg.vector_norm(self.unit * (fixed - self.center), dim=(-2, -1))
+        part = torch.where(indefinite, torch.exp2(-torch.ceil(torch.log2(size)).clamp(min=1.0)), 1.0)
+        return torch.lerp(self.center, mass, part[..., None, None]), part
+
+
+def to_group(q: Tensor, joint_types: Sequence[str]) -> list[Tensor]:
+    """By joint, R in SO(3), (..., 3, 3), or r in R^3, (..., 3), if prismatic; z is its axis."""
+    parts = []
+    for kind, value in zip(joint_types, q.unbind(dim=-1), strict=True):
+        zero, one = torch.zeros_like(value), torch.ones_like(value)
+        if kind == "revolute":
+            c, s = value.cos(), value.sin()
+            rows = ((c, -s, zero), (s, c, zero), (zero, zero, one))
+            parts.append(torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2))
+        else:
+            parts.append(torch.stack((zero, zero, value), dim=-1))
+    return parts
+
+
+def from_group(parts: Sequence[Tensor], joint_types: Sequence[str]) -> Tensor:
+    """q, (..., n), with angles in [-pi, pi]; the inverse of ``to_group``."""
+    values = [
+        torch.atan2(part[..., 1, 0], part[..., 0, 0]) if kind == "revolute" else part[..., 2]
+        for kind, part in zip(joint_types, parts, strict=True)
+    ]
+    return torch.stack(values, dim=-1)
+
+
+class Mass(Protocol):
+    """What gives M(q) and its derivatives."""
+
+    def prepare(self, definite: bool = True) -> Any:
+        """All that depends on the weights alone; ``definite``: keep M positive definite."""
+
+    def __call__(self, encoded: Tensor, prepared: Any) -> tuple[Tensor, Any]:
+        """M(q), (..., n, n), and what its derivatives need."""
+
+    def kinetic_vjp(self, encoded: Tensor, qd: Tensor, residuals: Any) -> Tensor:
+        """The derivative of 1/2 qd^T M(q) qd by the encoding."""
+
+    def jvp(self, rate: Tensor, residuals: Any) -> Tensor:
+        """dM/dt, (..., n, n), where the encoding changes at this rate."""
+
+
+class Friction(Protocol):
+    """What gives D(q, qd)."""
+
+    def prepare(self) -> Any:
+        """All that depends on the weights alone."""
+
+    def __call__(self, encoded: Tensor, qd: Tensor, prepared: Any) -> Tensor:
+        """D qd, (..., n) [Nm, N]."""
+
+    def dissipation(self, encoded: Tensor, qd: Tensor, prepared: Any) -> Tensor:
+        """D, (..., n, n)."""
+
+
+class Input(Protocol):
+    """What gives G."""
+
+    def prepare(self) -> Any:
+        """All that depends on the weights alone."""
+
+    def __call__(self, encoded: Tensor, prepared: Any) -> Tensor:
+        """G, (..., n, n)."""
+
+    def force(self, encoded: Tensor, tau: Tensor, prepared: Any) -> Tensor:
+        """G tau, (..., n)."""
+
+    def solve(self, encoded: Tensor, force: Tensor, prepared: Any) -> Tensor:
+        """The inputs, (..., n), that make this force."""
 
 
 class Armature(nn.Module):

@@ -1,0 +1,124 @@
+"""How the bodies of an arm may move: their frames along the chain, and what velocities make of them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from spelgen.runtime.joints import blocks, vector
+from spelgen.runtime.port_hamiltonian import applied, combined
+from spelgen.runtime.rigid_body import Bodies, crossed, motion_table, pushed_along
+
+
+class Chain(NamedTuple):
+    """The bodies at a position; 6 numbers a body, side by side."""
+
+    frames: Tensor  # takes twists from the base's frame to the bodies', (..., 6, 6 bodies)
+    axes: Tensor  # twists that bodies have by their own displacements, in the base's frame, (..., 6, bodies)
+    twists: Tensor  # by joint velocity, in the bodies' frames, (..., n, 6 bodies)
+    weight: Tensor  # acceleration that stands for gravity, likewise, (..., 6 bodies)
+
+
+class BodyChain(nn.Module):
+    """Bodies that turn about or slide along axes, each carried by another or by the base.
+
+    Spatial vectors are (angular, linear), as in Featherstone, Rigid Body Dynamics Algorithms, 2008; they
+    are rows in the bodies' frames and columns in the base's. Only frames are followed body by body: sums
+    over all that carries a body, or that it carries, are products with a mask, so few operations are left.
+    """
+
+    table: (
+        Tensor  # takes cos, sin and value of the displacements to frames in parents', (36 bodies, 3 bodies)
+    )
+    fixed: Tensor  # what is added there, (36 bodies,)
+    reading: Tensor  # where axes stand in ``frames``, (6 bodies, bodies)
+    carriers: Tensor  # whether a body carries another, or is it, (bodies, bodies)
+    carried: Tensor  # likewise, six times each, (bodies, 6 bodies)
+    base: Tensor  # acceleration of the base that stands for gravity, (6,)
+    ratios: Tensor  # displacements by q, (bodies, n)
+
+    def __init__(self, n: int, bodies: Bodies, gravity: tuple[float, float, float]) -> None:
+        super().__init__()
+        self.parents, count = bodies.parent, len(bodies.parent)
+        reading = torch.zeros(count, 6, count, dtype=torch.float64)
+        carriers = torch.eye(count, dtype=torch.float64)
+        ratios = torch.zeros(count, n, dtype=torch.float64)
+        for index, parent in enumerate(bodies.parent):
+            ratios[index, bodies.joint[index]] = bodies.ratio[index]
+            # an inverse's rows are columns whose halves are swapped
+            reading[index, 5 if bodies.revolute[index] else 2, index] = 1
+            if parent >= 0:
+                carriers[:, index] += carriers[:, parent]
+        table, fixed = motion_table(bodies)
+        self.register_buffer("table", table)
+        self.register_buffer("fixed", fixed)
+        self.register_buffer("reading", reading.flatten(0, 1))
+        self.register_buffer("carriers", carriers)
+        self.register_buffer("carried", carriers.repeat_interleave(6, dim=1))
+        self.register_buffer("base", vector((0, 0, 0, *(-g for g in gravity))))
+        self.register_buffer("ratios", ratios)
+        self.single = torch.equal(ratios, torch.eye(n).double())  # no joint moves several bodies
+
+    def forward(self, q: Tensor) -> Chain:
+        """The bodies at q, (..., n)."""
+        value = self._by_bodies(q)
+        features = torch.cat([value.cos(), value.sin(), value], dim=-1)
+        own = blocks(F.linear(features, self.table, self.fixed), 6, 6).unbind(dim=-3)
+        placed: list[Tensor] = []
+        for index, parent in enumerate(self.parents):
+            placed.append(own[index] if parent < 0 else placed[parent] @ own[index])
+        frames = torch.cat(placed, dim=-1)
+        axes = (frames @ self.reading).roll(3, dims=-2)
+        twists = (axes.mT @ frames) * self.carried
+        twists = twists if self.single else self.ratios.mT @ twists
+        return Chain(frames, axes, twists, combined(self.base, frames))
+
+    def _by_bodies(self, joints: Tensor) -> Tensor:
+        """What is given by joint, (..., n), for the bodies that they move, (..., bodies)."""
+        return joints if self.single else joints @ self.ratios.mT
+
+    def turning(self, at: Chain, qd: Tensor) -> tuple[Tensor, Tensor]:
+        """The bodies' twists, and how these turn the bodies' axes; in the base's frame, (..., 6, bodies)."""
+        twists = (at.axes * self._by_bodies(qd).unsqueeze(-2)) @ self.carriers
+        return twists, crossed(twists, at.axes)
+
+    def accelerations(self, at: Chain, qd: Tensor, turning: Tensor) -> Tensor:
+        """The bodies' accelerations at steady qd, gravity taken as one, (..., 6 bodies)."""
+        steady = (turning * self._by_bodies(qd).unsqueeze(-2)) @ self.carriers
+        bodies = blocks(at.frames, 6) * steady.unsqueeze(-1)
+        return bodies.sum(dim=-3).flatten(-2) + at.weight
+
+    def at_base(self, at: Chain, momenta: Tensor) -> Tensor:
+        """Momenta of the bodies, (..., 6 bodies), in the base's frame, (..., 6, bodies)."""
+        return blocks(at.frames * momenta.unsqueeze(-2), 6).sum(dim=-1)
+
+    def by_joints(self, axes: Tensor, wrenches: Tensor) -> Tensor:
+        """What joints feel along ``axes`` of wrenches on all that they carry, (..., n)."""
+        felt = (axes * (wrenches @ self.carriers.mT)).sum(dim=-2)
+        return felt if self.single else felt @ self.ratios
+
+    def energy(self, at: Chain, inertia: Tensor) -> Tensor:
+        """The bodies' energy in gravity, (...) [J]; zero at the base's origin."""
+        # of all bodies together; the moment of mass stands in the inertia's upper right block
+        whole = at.frames @ inertia @ at.frames.mT
+        moment = torch.stack([whole[..., 2, 4], whole[..., 0, 5], whole[..., 1, 3]], dim=-1)
+        return applied(moment.unsqueeze(-2), self.base[3:]).squeeze(-1)
+
+    def regressor(self, q: Tensor, qd: Tensor, qdd: Tensor, basis: Tensor) -> Tensor:
+        """Y, (..., n, 10 bodies): Y @ inertial parameters is the bodies' torque.
+
+        basis: ``inertia_basis()``.
+        """
+        at = self(q)
+        rises = self.accelerations(at, qd, self.turning(at, qd)[1]) + combined(qdd, at.twists)
+        rises, twists = (blocks(rows, 6) for rows in (rises, combined(qd, at.twists)))
+        # by body and parameter: (..., bodies, 6, 10)
+        momenta = torch.tensordot(twists, basis, dims=([-1], [2])).mT
+        wrenches = torch.tensordot(rises, basis, dims=([-1], [2])).mT
+        wrenches = wrenches + pushed_along(twists.unsqueeze(-1), momenta)
+        columns = blocks(at.twists, 6).transpose(-3, -2)  # (..., bodies, n, 6)
+        rows: Tensor = (columns @ wrenches).transpose(-3, -2)
+        return rows.reshape(*q.shape, 10 * len(self.parents))
