@@ -55,7 +55,7 @@ excitation: design
 identification: identify baseline drive_hints
 exporting: description tip_chain describe_residuals describe trained parity exported readme rigid_body_projection
 exporting: urdf_file urdf_export mjcf_file mjcf_export torch_programs torch_export
-exporting: onnx_graph onnx_rigid onnx_residuals onnx_model onnx_export
+exporting: onnx_graph onnx_rigid onnx_joint_functions onnx_residuals onnx_model onnx_export
 exporting: rigid_expressions friction_expressions residual_expressions solved_expressions model_expressions
 exporting: tip_expressions entry_points
 exporting: c_statements c_tables c_networks c_joint_functions c_residual_calls c_code c_library c_export ros2_export

@@ -1,4 +1,4 @@
-"""ONNX operators by name, and the few programs of linear algebra that ONNX has no operators for."""
+"""ONNX operators by name, and the inverse of a matrix, for which ONNX has no operator."""
 
 from __future__ import annotations
 
@@ -10,18 +10,21 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 _OPSET, _IR = 18, 9
+_OPSETS = (helper.make_opsetid("", _OPSET), helper.make_opsetid("com.microsoft", 1))
 
 
 class OnnxGraph:
     """A graph as it is written: ``graph.Add(a, b)`` adds a node and gives its output's name; arrays become constants.
 
-    Everything is float64; the first dimension is the batch.
+    Everything is float64; the first dimension is the batch. What was asked before is not computed again.
     """
 
     def __init__(self) -> None:
         self._nodes: list[onnx.NodeProto] = []
+        self._known: dict[tuple[Any, ...], Any] = {}
         self._constants: dict[tuple[Any, ...], str] = {}
         self._tensors: list[onnx.TensorProto] = []
+        self._functions: list[onnx.FunctionProto] = []
 
     def __getattr__(self, operator: str) -> Any:
         if not operator[0].isupper():
@@ -29,9 +32,12 @@ class OnnxGraph:
 
         def node(*inputs: Any, outputs: int = 1, **attributes: Any) -> Any:
             names = [x if isinstance(x, str) else self.constant(x) for x in inputs]
-            made = [f"t{len(self._nodes)}_{k}" for k in range(outputs)]
-            self._nodes.append(helper.make_node(operator, names, made, **attributes))
-            return made[0] if outputs == 1 else made
+            key = (operator, *names, repr(sorted(attributes.items())))
+            if key not in self._known:
+                made = [f"t{len(self._nodes)}_{k}" for k in range(outputs)]
+                self._nodes.append(helper.make_node(operator, names, made, **attributes))
+                self._known[key] = made[0] if outputs == 1 else made
+            return self._known[key]
 
         return node
 
@@ -57,17 +63,19 @@ class OnnxGraph:
         found: list[str] = self.Split(x, np.array(sizes), axis=axis, outputs=len(sizes))
         return found
 
-    def solved(self, matrix: str, right: str, n: int) -> str:
-        """matrix^-1 right, (batch, n, 1), by Gauss and Jordan: positive definite matrices need no pivoting."""
-        rows = self.Concat(matrix, right, axis=2)
-        for k in range(n):
-            row = self._slice(rows, k, k + 1, 1)
-            column = self.Sub(self._slice(rows, k, k + 1, 2), np.eye(n)[:, k : k + 1])
-            rows = self.Sub(rows, self.Mul(self.Div(column, self._slice(row, k, k + 1, 2)), row))
-        return self._slice(rows, n, n + 1, 2)
+    def total(self, parts: Sequence[str]) -> str:
+        """The sum of one or more."""
+        found: str = parts[0] if len(parts) == 1 else self.Sum(*parts)
+        return found
 
-    def _slice(self, x: str, start: int, stop: int, axis: int) -> str:
-        found: str = self.Slice(x, np.array([start]), np.array([stop]), np.array([axis]))
+    def inverse(self, matrix: str, n: int) -> str:
+        """The inverse, (batch, n, n), of positive definite matrices.
+
+        One node of ONNX Runtime's own; to others the file tells it by operators of ONNX.
+        """
+        if not self._functions:
+            self._functions.append(_inverse(n))
+        found: str = self.Inverse(matrix, domain="com.microsoft")
         return found
 
     def model(
@@ -81,7 +89,24 @@ class OnnxGraph:
         ]
         found = helper.make_tensor_value_info(name, TensorProto.DOUBLE, ["batch", *shape])
         graph = helper.make_graph(self._nodes, name, described, [found], self._tensors)
-        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", _OPSET)], ir_version=_IR)
+        model = helper.make_model(graph, opset_imports=_OPSETS, ir_version=_IR, functions=self._functions)
         onnx.checker.check_model(model)
         content: bytes = model.SerializeToString()
         return content
+
+    def body(self) -> list[onnx.NodeProto]:
+        """All nodes, constants among them, for a function."""
+        constants = [helper.make_node("Constant", [], [each.name], value=each) for each in self._tensors]
+        return [*constants, *self._nodes]
+
+
+def _inverse(n: int) -> onnx.FunctionProto:
+    """By Gauss and Jordan: positive definite matrices need no pivoting."""
+    g, eye = OnnxGraph(), np.eye(n)
+    rows = g.Concat("X", g.Add(g.Mul("X", 0.0), eye), axis=2)
+    for k in range(n):
+        row, column = g.Gather(rows, np.array([k]), axis=1), g.Gather(rows, np.array([k]), axis=2)
+        scaled = g.Div(row, g.Gather(row, np.array([k]), axis=2))
+        rows = g.Sub(rows, g.Mul(g.Sub(column, eye[:, k : k + 1]), scaled))
+    last = helper.make_node("Identity", [g.Split(rows, np.array([n, n]), axis=2, outputs=2)[1]], ["Y"])
+    return helper.make_function("com.microsoft", "Inverse", ["X"], ["Y"], [*g.body(), last], _OPSETS[:1])

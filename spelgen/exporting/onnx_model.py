@@ -42,51 +42,48 @@ class _OnnxModel:
     @cached_property
     def mass_matrix(self) -> str:
         """(batch, n, n)."""
-        parts = [self._rigid.mass]
-        if self.model.constant_mass.any():
-            parts.append(self.g.constant(self.model.constant_mass))
-        return self._sum([*parts, self._residuals.mass])
-
-    @cached_property
-    def _rigid_gravity(self) -> str:
-        return self.g.reshaped(self._rigid.gravity, 0, self.n)
+        parts, constant = [self._rigid.mass], self.model.constant_mass
+        if constant.any():
+            parts.append(self.g.constant(constant))
+        return self.g.total([*parts, *([self._residuals.mass] if self._residuals.mass else [])])
 
     @cached_property
     def gravity(self) -> str:
         """dV/dq."""
-        return self._sum([self._rigid_gravity, *self._residuals.gravity])
+        return self.g.total([self._rigid.gravity, *self._residuals.gravity])
 
     @cached_property
     def bias(self) -> str:
         """Coriolis, centrifugal and gravity torque."""
-        bodies = self.g.reshaped(self._rigid.bias(self.g.reshaped("qd", 0, 1, self.n)), 0, self.n)
-        return self._sum([bodies, self._residuals.coriolis("qd"), *self._residuals.gravity])
-
-    def _sum(self, parts: list[str | None]) -> str:
-        """Of those that are there."""
-        there = [part for part in parts if part is not None]
-        found: str = there[0] if len(there) == 1 else self.g.Sum(*there)
-        return found
+        return self.g.total([self._rigid.coriolis("qd"), self._rigid.gravity, *self._residuals.bias("qd")])
 
     @cached_property
     def friction(self) -> str:
         """What friction takes."""
         g, law, bristles = self.g, self.model.friction, self.model.bristles
         speed, loads = self._turned("qd", self.model.motors.T), np.linalg.inv(self.model.motors)
-        slow = g.Mul(speed, 1 / law.stribeck_velocity)
-        dry = g.Add(g.Mul(g.Exp(g.Neg(g.Mul(slow, slow))), law.stribeck), law.coulomb)
+        slow = g.Exp(g.Mul(g.Mul(speed, speed), -1 / law.stribeck_velocity**2))
+        sizes, laws = [slow], [law.stribeck]
         if law.load_dependence.any():
-            dry = g.Add(dry, g.Mul(g.Abs(self._turned(self._rigid_gravity, loads)), law.load_dependence))
+            sizes.append(g.Abs(self._turned(self._rigid.gravity, loads)))
+            laws.append(law.load_dependence)
+        dry = self._combined(sizes, laws, law.coulomb)
         if bristles is None:
             direction = g.Tanh(g.Mul(speed, 1 / law.coulomb_smoothing_velocity))
         else:
             share = np.kron(np.eye(self.n), np.ones((bristles.count, 1)))
             direction = g.MatMul("z", (bristles.fractions / bristles.reach).reshape(-1, 1) * share)
-        saturating = g.Mul(g.Tanh(g.Mul(speed, 1 / law.saturation_velocity)), law.saturation)
-        found = g.Sum(g.Mul(speed, law.viscous), saturating, g.Mul(dry, direction))
+        saturating = g.Tanh(g.Mul(speed, 1 / law.saturation_velocity))
+        found = self._combined([speed, saturating], [law.viscous, law.saturation], g.Mul(dry, direction))
         if self._residuals.friction_factor is not None:
             found = g.Mul(found, self._residuals.friction_factor)
         return self._turned(found, self.model.motors)
+
+    def _combined(self, rows: list[str], factors: list[np.ndarray], rest: str | np.ndarray) -> str:
+        """Rows times factors, joint by joint, and the rest, as one product."""
+        whole = rows[0] if len(rows) == 1 else self.g.Concat(*rows, axis=1)
+        found: str = self.g.Gemm(whole, np.concatenate([np.diag(each) for each in factors]), rest)
+        return found
 
     def _turned(self, rows: str, by: np.ndarray) -> str:
         """Rows times a matrix that is mostly the identity."""
@@ -117,5 +114,5 @@ class _OnnxModel:
         if model.friction_compensation.any():
             tau = g.Add(tau, g.Mul("qd", model.friction_compensation))
         force = g.Sub(g.Sub(tau, self.bias), self.friction)
-        found: str = g.reshaped(g.solved(self.mass_matrix, g.reshaped(force, 0, n, 1), n), 0, n)
-        return found
+        inverse = g.inverse(self.mass_matrix, n)
+        return g.reshaped(g.MatMul(inverse, g.reshaped(force, 0, n, 1)), 0, n)

@@ -1,139 +1,155 @@
-"""What stands beside rigid bodies as an ONNX graph, with its derivatives written out as in the runtime."""
+"""What stands beside rigid bodies as an ONNX graph, with its derivatives written out as in the runtime.
+
+The networks of M and V go through their layers side by side: for one state a node costs more than its numbers.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from spelgen.exporting.description import Harmonics, Network, Splines, TrainedModel
+from spelgen.exporting.description import Network, TrainedModel
 from spelgen.exporting.onnx_graph import OnnxGraph
-
-
-@dataclass(frozen=True)
-class _Pass:
-    """A network's work at q: its rows (batch, rows), and by layer the slopes of its units."""
-
-    rows: str
-    slopes: tuple[str, ...]
+from spelgen.exporting.onnx_joint_functions import OnnxJointFunctions
 
 
 class OnnxResiduals:
     """Residuals at q, (batch, n); None where the model has none of that kind."""
 
     def __init__(self, model: TrainedModel, graph: OnnxGraph, q: str) -> None:
-        self.g, self.n, self._q = graph, model.n, q
-        self._residuals = model.residuals
+        self.g, self.n, self._q, self._encoding = graph, model.n, q, model.residuals.encoding
+        self._mass, self._potential = model.residuals.mass, model.residuals.potential
+        self._functions = OnnxJointFunctions(model, graph, q)
+        self._hidden = [each.weights[:-1] if each else () for each in (self._mass, self._potential)]
+        self._weights = [self._side_by_side(k) for k in range(max(map(len, self._hidden)))]
+
+    @property
+    def friction_factor(self) -> str | None:
+        """What friction is multiplied by, (batch, n)."""
+        return self._functions.friction_factor
+
+    def _units(self, layer: int) -> list[int]:
+        """How many units of a hidden layer are M's, and how many V's."""
+        return [len(weights[layer]) if layer < len(weights) else 0 for weights in self._hidden]
+
+    def _side_by_side(self, layer: int) -> np.ndarray:
+        """The weights of a hidden layer, (units, units below); both networks read the same encoding."""
+        if layer == 0:
+            return np.concatenate([weights[0] for weights in self._hidden if weights])
+        above, below = self._units(layer), self._units(layer - 1)
+        found = np.zeros((sum(above), sum(below)))
+        for rows, columns, weights in zip(_parts(above), _parts(below), self._hidden, strict=True):
+            if layer < len(weights):
+                found[rows, columns] = weights[layer]
+        return found
+
+    def _last(self, network: Network) -> tuple[int, np.ndarray]:
+        """A network's last hidden layer, and its rows by all units of that layer, (rows, units)."""
+        layer, own = len(network.weights) - 2, 0 if network is self._mass else 1
+        units = self._units(layer)
+        found = np.zeros((len(network.weights[-1]), sum(units)))
+        found[:, _parts(units)[own]] = network.weights[-1]
+        return layer, found
 
     @cached_property
     def _encoded(self) -> str:
         """What networks read, (batch, 2 n) or (batch, 3 n)."""
-        g, encoding, parts = self.g, self._residuals.encoding, [self._cosine, self._sine]
+        g, encoding, parts = self.g, self._encoding, [self.g.Cos(self._q), self.g.Sin(self._q)]
         if encoding.prismatic:
             parts.append(g.Mul(g.Sub(self._q, encoding.center), 1 / encoding.reach))
         found: str = g.Concat(*parts, axis=1)
         return found
 
     @cached_property
-    def _cosine(self) -> str:
-        found: str = self.g.Cos(self._q)
+    def _slope(self) -> str:
+        """Of the encoding by the joint that it reads, likewise."""
+        zero, one = np.zeros((self.n, self.n)), np.eye(self.n)
+        turned = np.block([[zero, one], [-one, zero]])
+        if not self._encoding.prismatic:
+            found: str = self.g.MatMul(self._encoded, turned)
+            return found
+        sliding = np.concatenate([np.zeros(2 * self.n), 1 / self._encoding.reach])
+        found = self.g.Gemm(self._encoded, np.pad(turned, ((0, self.n), (0, self.n))), sliding)
+        return found
+
+    @property
+    def _spread(self) -> np.ndarray:
+        """From joints to what is read of them, (n, 2 n) or (n, 3 n)."""
+        return np.tile(np.eye(self.n), 3 if self._encoding.prismatic else 2)
+
+    @cached_property
+    def _layers(self) -> list[str]:
+        g, layer, found = self.g, self._encoded, []
+        for k, weight in enumerate(self._weights):
+            biases = [
+                each.biases[k] for each in (self._mass, self._potential) if each and k < len(each.weights) - 1
+            ]
+            layer = g.Sigmoid(g.Gemm(layer, weight, np.concatenate(biases), transB=1))
+            found.append(layer)
         return found
 
     @cached_property
-    def _sine(self) -> str:
-        found: str = self.g.Sin(self._q)
-        return found
-
-    def _passed(self, network: Network) -> _Pass:
-        g, layer, slopes = self.g, self._encoded, []
-        for weight, bias in zip(network.weights[:-1], network.biases, strict=False):
-            layer = g.Sigmoid(g.Gemm(layer, weight, bias, transB=1))
-            slopes.append(g.Sub(layer, g.Mul(layer, layer)))
-        rows = g.Gemm(layer, network.weights[-1], network.biases[-1], transB=1)
-        return _Pass(rows, tuple(slopes))
-
-    @cached_property
-    def _mass(self) -> _Pass | None:
-        network = self._residuals.mass
-        return None if network is None else self._passed(network)
+    def _slopes(self) -> list[str]:
+        g = self.g
+        return [g.Sub(layer, g.Mul(layer, layer)) for layer in self._layers]
 
     @cached_property
     def mass(self) -> str | None:
         """What is added to M, (batch, n, n)."""
-        return None if self._mass is None else self.g.reshaped(self._mass.rows, 0, self.n, self.n)
-
-    def coriolis(self, qd: str) -> str | None:
-        """dR/dt qd - d/dq (1/2 qd^T R qd), (batch, n), of what is added to M; qd: (batch, n)."""
-        g, n, network = self.g, self.n, self._residuals.mass
-        if network is None or self._mass is None:
+        if self._mass is None:
             return None
-        tangents = [g.Neg(g.Mul(self._sine, qd)), g.Mul(self._cosine, qd)]
-        if self._residuals.encoding.prismatic:
-            tangents.append(g.Mul(qd, 1 / self._residuals.encoding.reach))
-        tangent = g.Concat(*tangents, axis=1)
-        for weight, slope in zip(network.weights[:-1], self._mass.slopes, strict=True):
-            tangent = g.Mul(g.MatMul(tangent, weight.T), slope)
-        rate = g.MatMul(tangent, network.weights[-1].T)
-        across = g.reshaped(qd, 0, n, 1)
-        squares = g.reshaped(g.Mul(across, g.reshaped(qd, 0, 1, n)), 0, n * n)
-        kinetic = self._vjp(network, self._mass, g.MatMul(squares, 0.5 * network.weights[-1]))
-        moved = g.reshaped(g.MatMul(g.reshaped(rate, 0, n, n), across), 0, n)
-        found: str = g.Sub(moved, kinetic)
-        return found
+        layer, last = self._last(self._mass)
+        rows = self.g.Gemm(self._layers[layer], last, self._mass.biases[-1], transB=1)
+        return self.g.reshaped(rows, 0, self.n, self.n)
 
     @cached_property
     def gravity(self) -> list[str]:
         """Parts of dV/dq, (batch, n) each."""
-        g, found, residuals = self.g, [], self._residuals
-        if residuals.potential is not None:
-            passed, (row,) = self._passed(residuals.potential), residuals.potential.weights[-1]
-            found.append(self._vjp(residuals.potential, passed, g.constant(row)))
-        if residuals.torque.joints:
-            found.append(self._spline_values(residuals.torque))
-        if residuals.ripple:
-            found.append(self._ripple(residuals.ripple))
+        network = [] if self._potential is None else [self.g.Neg(self._pulled(None))]
+        torque = self._functions.torque
+        return network if torque is None else [*network, torque]
+
+    def bias(self, qd: str) -> list[str]:
+        """Parts of what holds qd steady, (batch, n) each: dR/dt qd - d/dq (1/2 qd^T R qd - V)."""
+        if self._mass is None:
+            return self.gravity
+        g, n = self.g, self.n
+        layer, last = self._last(self._mass)
+        units = last.shape[1]
+        # half of what each unit adds to R qd
+        by_unit = last.reshape(n, n, units).transpose(1, 2, 0).reshape(n, units * n) / 2
+        moved = g.reshaped(g.MatMul(qd, by_unit), 0, units, n)
+        across = g.Transpose(moved, perm=[0, 2, 1])
+        kinetic = g.reshaped(g.MatMul(g.reshaped(qd, 0, 1, n), across), 0, units)
+        tangent = g.Mul(self._slope, g.MatMul(qd, 2 * self._spread))
+        for weight, slope in zip(self._weights[: layer + 1], self._slopes, strict=False):
+            tangent = g.Mul(g.MatMul(tangent, weight.T), slope)
+        changing = g.reshaped(g.MatMul(g.reshaped(tangent, 0, 1, units), moved), 0, n)
+        torque = self._functions.torque
+        own = g.Sub(changing, self._pulled(kinetic))
+        return [own] if torque is None else [own, torque]
+
+    def _pulled(self, kinetic: str | None) -> str:
+        """d/dq, (batch, n), of what has the derivative ``kinetic`` by M's last hidden layer, less V."""
+        g, top = self.g, {}
+        by: str | None = None
+        if self._potential is not None:
+            layer, last = self._last(self._potential)
+            top[layer] = -last
+        for k in reversed(range(len(self._weights))):
+            if by is not None:
+                passed = g.Mul(by, self._slopes[k + 1])
+                by = g.Gemm(passed, self._weights[k + 1], *([top[k]] if k in top else []))
+            elif k in top:
+                by = g.constant(top[k])
+            if kinetic is not None and self._mass is not None and k == len(self._mass.weights) - 2:
+                by = kinetic if by is None else g.Add(by, kinetic)
+        by_encoded = g.MatMul(g.Mul(by, self._slopes[0]), self._weights[0])
+        found: str = g.MatMul(g.Mul(by_encoded, self._slope), self._spread.T)
         return found
 
-    @cached_property
-    def friction_factor(self) -> str | None:
-        """What friction is multiplied by, (batch, n)."""
-        splines = self._residuals.friction
-        return self.g.Exp(self._spline_values(splines)) if splines.joints else None
 
-    def _vjp(self, network: Network, passed: _Pass, by_hidden: str) -> str:
-        """d/dq, (batch, n), of what has this derivative by the last hidden layer."""
-        g, encoding = self.g, self._residuals.encoding
-        for k in reversed(range(len(passed.slopes))):
-            by_hidden = g.MatMul(g.Mul(by_hidden, passed.slopes[k]), network.weights[k])
-        parts = g.split(by_hidden, [self.n] * (3 if encoding.prismatic else 2), 1)
-        found: str = g.Sub(g.Mul(parts[1], self._cosine), g.Mul(parts[0], self._sine))
-        if encoding.prismatic:
-            found = g.Add(found, g.Mul(parts[2], 1 / encoding.reach))
-        return found
-
-    def _spline_values(self, splines: Splines) -> str:
-        """The sums of splines, (batch, n); zero for joints without."""
-        g, (count, size) = self.g, splines.weights.shape
-        joints = np.repeat(np.eye(self.n)[list(splines.joints)], size, axis=0)
-        spacing = np.repeat(splines.spacing, size)
-        middle = np.repeat(splines.center, size) + spacing * np.tile(np.arange(size) - (size - 1) / 2, count)
-        away = g.Abs(g.Mul(g.Sub(g.MatMul(self._q, joints.T), middle), 1 / spacing))
-        wide, narrow = (g.Relu(g.Sub(float(reach), away)) for reach in (2, 1))
-        cubes = [g.Mul(g.Mul(x, x), x) for x in (wide, narrow)]
-        height = g.Sub(g.Mul(cubes[0], 1 / 6), g.Mul(cubes[1], 4 / 6))
-        found: str = g.MatMul(height, joints * splines.weights.reshape(-1, 1))
-        return found
-
-    def _ripple(self, ripple: tuple[Harmonics, ...]) -> str:
-        """(batch, n)."""
-        g, own = self.g, np.eye(self.n)
-        joints = np.concatenate([np.tile(own[each.joint], (len(each.cosines), 1)) for each in ripple])
-        frequencies = np.concatenate(
-            [each.frequency * np.arange(1, len(each.cosines) + 1) for each in ripple]
-        )
-        terms = np.concatenate([[each.cosines, each.sines] for each in ripple], axis=1)
-        phase = g.MatMul(self._q, joints.T * frequencies)
-        both = g.Concat(g.Cos(phase), g.Sin(phase), axis=1)
-        found: str = g.MatMul(both, (joints * terms[:, :, None]).reshape(-1, self.n))
-        return found
+def _parts(sizes: list[int]) -> list[slice]:
+    ends = np.cumsum(sizes)
+    return [slice(int(end) - size, int(end)) for end, size in zip(ends, sizes, strict=True)]

@@ -1,4 +1,4 @@
-"""Rigid bodies as an ONNX graph: twists of all bodies side by side, as in ``runtime.rigid_body_dynamics``."""
+"""Rigid bodies as an ONNX graph of few nodes, in the manner of ``runtime.body_chain``."""
 
 from __future__ import annotations
 
@@ -8,107 +8,126 @@ import numpy as np
 
 from spelgen.exporting.description import TrainedModel
 from spelgen.exporting.onnx_graph import OnnxGraph
-from spelgen.runtime.rigid_body import Bodies, inertia_basis, transform_table
+from spelgen.runtime.body_chain import BodyChain
+from spelgen.runtime.rigid_body import Bodies, inertia_basis
 
 
 class OnnxRigid:
     """M, bias and gravity of the bodies at q, (batch, n); armature is not among them."""
 
     def __init__(self, model: TrainedModel, graph: OnnxGraph, q: str) -> None:
-        self.g, self.n, self._q = graph, model.n, q
-        self._bodies, self.b = model.bodies, len(model.bodies)
-        tables = [transform_table(_geometry(model), index).mT.numpy() for index in range(self.b)]
-        self._tables = np.stack(tables).reshape(self.b, 3, 36)
+        self.g, self.n, self._q, self.b = graph, model.n, q, len(model.bodies)
+        x, y, z = (float(each) for each in model.gravity)
+        chain = BodyChain(model.n, _geometry(model), (x, y, z))
+        self._chain = {name: value.numpy() for name, value in chain.named_buffers()}
+        self._single = chain.single
+        self._turning = all(body.kind == "revolute" for body in model.bodies)
         basis = inertia_basis().numpy()
         self._inertia = np.zeros((6 * self.b, 6 * self.b))
         for k, ten in enumerate(model.inertias):
             self._inertia[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = np.tensordot(ten, basis, axes=1)
-        self._axes, self._ratios = np.zeros((self.n, 6 * self.b)), np.zeros((self.b, self.n))
-        for k, body in enumerate(self._bodies):
-            self._ratios[k, body.coordinate] = float(body.multiplier)
-            own = 6 * k + (2 if body.kind == "revolute" else 5)
-            self._axes[body.coordinate, own] = float(body.multiplier)
-        self._weight = np.array([0, 0, 0, *(-model.gravity)])
+        self._blocks = np.repeat(np.eye(self.b), 6, axis=1)  # (b, 6 b)
+        self._parents = [body.parent for body in model.bodies]
+
+    def _by_bodies(self, joints: str) -> str:
+        """(..., n) to (..., b)."""
+        found: str = joints if self._single else self.g.MatMul(joints, self._chain["ratios"].T)
+        return found
 
     @cached_property
-    def _transforms(self) -> list[str]:
-        """By body, what takes rows from the parent's frame, (batch, 6, 6)."""
-        g, offsets = self.g, np.array([body.offset for body in self._bodies])
-        value = self._q
-        if not np.array_equal(self._ratios, np.eye(self.n)) or offsets.any():
-            value = g.Add(g.MatMul(self._q, self._ratios.T), offsets)
-        turning = np.array([float(body.kind == "revolute") for body in self._bodies])
-        cosine, sine = g.Cos(value), g.Sin(value)
-        if not turning.all():  # a sliding body's table goes with its displacement
-            cosine = g.Add(g.Mul(turning, cosine), g.Mul(1 - turning, value))
-        by_cos = g.Mul(g.reshaped(cosine, 0, self.b, 1), self._tables[:, 1])
-        by_sin = g.Mul(g.reshaped(sine, 0, self.b, 1), self._tables[:, 2])
-        whole = g.Add(g.Add(by_cos, by_sin), self._tables[:, 0])
-        parts: list[str] = g.split(g.reshaped(whole, 0, 6 * self.b, 6), [6] * self.b, 1)
-        return parts
+    def _frames(self) -> str:
+        """What takes twists from the base's frame to the bodies', (batch, 6, 6 b)."""
+        g, value, table = self.g, self._by_bodies(self._q), self._chain["table"]
+        features = [g.Cos(value), g.Sin(value)]
+        if not self._turning:
+            features.append(value)
+        used = table[:, : self.b * len(features)]
+        whole = g.Gemm(g.Concat(*features, axis=1), used, self._chain["fixed"], transB=1)
+        own = g.split(g.reshaped(whole, 0, 6 * self.b, 6), [6] * self.b, 1)
+        placed: list[str] = []
+        for k, parent in enumerate(self._parents):
+            placed.append(own[k] if parent < 0 else g.MatMul(placed[parent], own[k]))
+        found: str = placed[0] if self.b == 1 else g.Concat(*placed, axis=2)
+        return found
 
     @cached_property
-    def _motion(self) -> tuple[str, str]:
-        """Twists by joint velocity, (batch, n, 6 b), and what stands for gravity, (batch, 1, 6 b)."""
+    def _axes(self) -> list[str]:
+        """The bodies' axes in the base's frame, (batch, 6, b), and what products take of them, (batch, 18, b)."""
+        g, swap = self.g, np.roll(np.eye(6), 3, axis=0)
+        # the left factors are those of twists, which are sums of axes; of forces the axes feel the products
+        table = np.concatenate([np.eye(6), _LEFT, _MOTION_RIGHT, _FORCE_SUMS.T]) @ swap
+        return g.split(g.MatMul(table, g.MatMul(self._frames, self._chain["reading"])), [6, 18, 18, 18], 1)
+
+    @cached_property
+    def _twists(self) -> str:
+        """By joint velocity, (batch, n, 6 b)."""
         g = self.g
-        base = np.vstack([np.zeros((self.n, 6)), self._weight])[None]
-        own = np.vstack([self._axes, np.zeros((1, 6 * self.b))])
-        moved: list[str] = []
-        for k, body in enumerate(self._bodies):
-            below = base if body.parent < 0 else moved[body.parent]
-            moved.append(g.Add(g.MatMul(below, self._transforms[k]), own[:, 6 * k : 6 * k + 6]))
-        columns = moved[0] if self.b == 1 else g.Concat(*moved, axis=2)
-        twists, weight = g.split(columns, [self.n, 1], 1)
-        return twists, weight
+        whole = g.MatMul(g.Transpose(self._axes[0], perm=[0, 2, 1]), self._frames)
+        bodies = g.Mul(whole, self._chain["carried"])
+        found: str = bodies if self._single else g.MatMul(self._chain["ratios"].T, bodies)
+        return found
 
     @cached_property
-    def _back(self) -> str:
-        """Twists by joint velocity, transposed, (batch, 6 b, n)."""
-        found: str = self.g.Transpose(self._motion[0], perm=[0, 2, 1])
+    def _momenta(self) -> str:
+        """Of these twists, (batch, n, 6 b)."""
+        found: str = self.g.MatMul(self._twists, self._inertia)
         return found
 
     @cached_property
     def mass(self) -> str:
         """(batch, n, n)."""
-        found: str = self.g.MatMul(self.g.MatMul(self._motion[0], self._inertia), self._back)
+        found: str = self.g.MatMul(self._momenta, self.g.Transpose(self._twists, perm=[0, 2, 1]))
         return found
+
+    def _felt(self, accelerations: str) -> str:
+        """The torques, (batch, n), of bodies with these accelerations, (batch, 1, 6 b)."""
+        back = self.g.Transpose(self._momenta, perm=[0, 2, 1])
+        return self.g.reshaped(self.g.MatMul(accelerations, back), 0, self.n)
 
     @cached_property
     def gravity(self) -> str:
-        """(batch, 1, n)."""
-        found: str = self.g.MatMul(self.g.MatMul(self._motion[1], self._inertia), self._back)
-        return found
+        """(batch, n)."""
+        return self._felt(self.g.MatMul(self._chain["base"][None, None], self._frames))
 
-    def bias(self, qd: str) -> str:
-        """(batch, 1, n); qd: (batch, 1, n)."""
-        g, b = self.g, self.b
-        turning, crossing = np.zeros((6 * b, 6 * b)), _crossing()
-        for k, axis in enumerate(self._axes.sum(axis=0).reshape(b, 6)):
-            turning[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = (crossing @ axis[:, None])[..., 0]
-        twists = g.MatMul(qd, self._motion[0])
-        owner = np.repeat((self._ratios != 0).astype(float), 6, axis=0)
-        own = g.split(g.Mul(g.MatMul(twists, turning), g.MatMul(qd, owner.T)), [6] * b, 2)
-        rises: list[str] = []
-        for k, body in enumerate(self._bodies):
-            below = [] if body.parent < 0 else [g.MatMul(rises[body.parent], self._transforms[k])]
-            rises.append(g.Add(own[k], below[0]) if below else own[k])
-        rise = g.Add(rises[0] if b == 1 else g.Concat(*rises, axis=2), self._motion[1])
-        cross = g.reshaped(g.MatMul(g.reshaped(twists, 0, b, 6), crossing.reshape(6, 36)), 0, b, 6, 6)
-        momenta = g.reshaped(g.MatMul(twists, self._inertia), 0, b, 1, 6)
-        turned = g.reshaped(g.MatMul(momenta, cross), 0, 1, 6 * b)
-        found: str = g.MatMul(g.Sub(g.MatMul(rise, self._inertia), turned), self._back)
+    def coriolis(self, qd: str) -> str:
+        """(batch, n); qd: (batch, n)."""
+        g, carriers = self.g, self._chain["carriers"]
+        by_joints = g.reshaped(qd, 0, 1, self.n)
+        velocities, (_, lefts, rights, felt) = self._by_bodies(by_joints), self._axes
+        left = g.MatMul(g.Mul(lefts, velocities), carriers)
+        turning = g.MatMul(_MOTION_SUMS, g.Mul(left, rights))
+        steady = g.MatMul(g.Mul(turning, velocities), carriers)
+        whole = g.Mul(g.MatMul(g.Transpose(steady, perm=[0, 2, 1]), self._frames), self._blocks)
+        rising = self._felt(g.MatMul(np.ones((1, 1, self.b)), whole))
+        momenta = g.MatMul(g.Mul(self._frames, g.MatMul(by_joints, self._momenta)), self._blocks.T)
+        pushed = g.MatMul(g.Mul(left, g.MatMul(_FORCE_RIGHT, momenta)), carriers.T)
+        held = g.reshaped(g.MatMul(np.ones((1, 1, 18)), g.Mul(felt, pushed)), 0, self.b)
+        found: str = g.Add(rising, held if self._single else g.MatMul(held, self._chain["ratios"]))
         return found
 
 
-def _crossing() -> np.ndarray:
-    """What a frame with each unit twist makes of a constant twist in it, (6, 6, 6); rows as in the runtime."""
-    found = np.zeros((6, 6, 6))
-    for axis, unit in enumerate(np.eye(3)):
-        x, y, z = unit
-        skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        found[axis, :3, :3] = found[axis, 3:, 3:] = skew
-        found[3 + axis, 3:, :3] = skew
+def _factors(components: tuple[int, ...], halves: tuple[int, int, int]) -> np.ndarray:
+    """Takes the components that three cross products multiply from halves of a spatial vector, (18, 6)."""
+    rows = [half + component for half in halves for component in components]
+    chosen: np.ndarray = np.eye(6)[rows]
+    return chosen
+
+
+def _sums(*halves: int) -> np.ndarray:
+    """Adds the products of three cross products to halves of a spatial vector, (6, 18)."""
+    found = np.zeros((6, 18))
+    for product, half in enumerate(halves):
+        for k in range(6):
+            found[half + k // 2, 6 * product + k] = (-1) ** k
     return found
+
+
+# by a twist (w, u) a motion vector (a, m) changes by (w x a, w x m + u x a), a force vector (n, f) by
+# (w x n + u x f, w x f): of each component two products, the second one negative
+_FIRST, _SECOND = (1, 2, 2, 0, 0, 1), (2, 1, 0, 2, 1, 0)
+_LEFT = _factors(_FIRST, (0, 0, 3))
+_MOTION_RIGHT, _MOTION_SUMS = _factors(_SECOND, (0, 3, 0)), _sums(0, 3, 3)
+_FORCE_RIGHT, _FORCE_SUMS = _factors(_SECOND, (0, 3, 3)), _sums(0, 3, 0)
 
 
 def _geometry(model: TrainedModel) -> Bodies:
