@@ -208,13 +208,6 @@ def blocks(rows: Tensor, *shape: int) -> Tensor:
     return rows.reshape(*rows.shape[:-1], rows.shape[-1] // math.prod(shape), *shape)
 
 
-class DriveInput(Input, Protocol):
-    """What gives a constant G, and how the drives turn."""
-
-    def motor_speeds(self) -> Tensor:
-        """C, (n, n): the drives' speeds are C qd."""
-
-
 def solved(matrix: Tensor, right: Tensor) -> Tensor:
     """matrix^-1 right, (..., n)."""
     # its derivative costs one more solution; a Cholesky factor's would cost several times that
@@ -471,6 +464,13 @@ class Input(Protocol):
 
     def solve(self, encoded: Tensor, force: Tensor, prepared: Any) -> Tensor:
         """The inputs, (..., n), that make this force."""
+
+
+class DriveInput(Input, Protocol):
+    """What gives a constant G, and how the drives turn."""
+
+    def motor_speeds(self) -> Tensor:
+        """C, (n, n): the drives' speeds are C qd."""
 
 
 class Armature(nn.Module):

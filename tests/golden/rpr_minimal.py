@@ -551,6 +551,13 @@ class Input(Protocol):
         """The inputs, (..., n), that make this force."""
 
 
+class DriveInput(Input, Protocol):
+    """What gives a constant G, and how the drives turn."""
+
+    def motor_speeds(self) -> Tensor:
+        """C, (n, n): the drives' speeds are C qd."""
+
+
 class Armature(nn.Module):
     """Rotor inertia times gear squared of each joint, never negative; the weights are logarithms."""
 
@@ -879,13 +886,23 @@ def motor_speeds(gains: Tensor) -> Tensor:
 
 
 class DirectInput(nn.Module):
-    """G is the identity: each input is the torque of its own joint, and none that of a passive one."""
+    """G is the identity: each input is the torque of its own joint, and none that of a passive one.
+
+    motor_speeds: C, (n, n), where motors move several joints all the same: they turn by C qd.
+    """
 
     actuated: Tensor
 
-    def __init__(self, joints: Joints) -> None:
+    def __init__(self, joints: Joints, motor_speeds: Sequence[Sequence[float]] = ()) -> None:
         super().__init__()
         self.register_buffer("actuated", vector(float(x) for x in joints.actuated))
+        self._motor_speeds = motor_speeds
+
+    def motor_speeds(self) -> Tensor:
+        """C, (n, n), by joint velocities."""
+        if not self._motor_speeds:
+            return torch.eye(len(self.actuated), dtype=torch.float64)
+        return torch.tensor(self._motor_speeds, dtype=torch.float64)
 
     def prepare(self) -> Tensor:
         """The diagonal of G, (n,)."""
@@ -1395,7 +1412,7 @@ class RigidBodyDynamics(PortHamiltonian):
         joints: Joints,
         bodies: Bodies,
         gravity: tuple[float, float, float],
-        input: Input,
+        input: DriveInput,
         reach: Sequence[Sequence[float]] = (),
     ) -> None:
         super().__init__()
@@ -1406,9 +1423,8 @@ class RigidBodyDynamics(PortHamiltonian):
         self.inertial_parameters = InertialParameters(bodies)
         self.armature = Armature(joints)
         self.friction = FrictionLaws(joints, reach)
-        self.input: Any = input
-        gains = input(torch.zeros(self.n, dtype=torch.float64), input.prepare()).detach()
-        self.register_buffer("motors", motor_speeds(gains))
+        self.input = input
+        self.register_buffer("motors", self.input.motor_speeds())
         self.register_buffer("loads", torch.linalg.inv(self.motors))
         self.coupled = not torch.equal(self.motors, torch.eye(self.n).double())
         # of the measured torque, in units of the joints' usual friction
@@ -1564,7 +1580,7 @@ class ResidualDynamics(RigidBodyDynamics):
         joints: Joints,
         bodies: Bodies,
         gravity: tuple[float, float, float],
-        input: Input,
+        input: DriveInput,
         mass: ResidualMass,
         potential: LearnedPotential | None,
         reach: Sequence[Sequence[float]] = (),
