@@ -1,11 +1,13 @@
-"""Arm by baseline by preset: torque errors on real logs, and on a simulated arm with what rigid bodies miss.
+"""Arm by baseline by preset: torques and forecasts on real logs, and torques of an arm with what rigid bodies miss.
 
     python benchmarks/arms.py [LOGS]
 
 LOGS is ../shared/logs beside the checkout by default. nMSE: mean squared torque error by the torque's variance, mean of
-the joints, pauses included. Everything is fitted to the same training samples with the defaults of spelgen; the two
-networks, two hidden layers of 64 tanh units on q, qd and qdd, are stopped by a fifth of those samples, as a careful
-user would stop them.
+the joints, pauses included. Everything is fitted to the same training samples with the defaults of spelgen. Networks
+have two hidden layers of 64 units: one of q, qd and qdd; the same for what least squares leaves; and a Deep Lagrangian
+network (Lutter, Ritter and Peters, ICLR 2019: a factor of M, and V) with viscous and Coulomb friction of each joint
+beside it. They are stopped, and the ridge is chosen, by a fifth of those samples, as a careful user would.
+Forecasts: states 0.1, 0.5 and 1 s ahead, error relative to the motion, as `spelgen evaluate` has them.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,21 +26,32 @@ sys.path.insert(0, str(Path(__file__).parent))
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from motions import smooth_motion
-from real_logs import TESTS, TRAINING, after, first, mean, read, samples_of, torque_of
-from torch import nn
+from real_logs import RIDGES, TESTS, TRAINING, after, first, mean, read, samples_of, torque_of
+from torch import Tensor, nn
+from torch.func import grad, jvp
 
+import spelgen
+from spelgen.arm.arm import Arm
 from spelgen.building import build
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
+from spelgen.dynamics.pinocchio_urdf import has_drives, urdf_dynamics
+from spelgen.evaluation.names import CONSTANT_VELOCITY, MODEL
 from spelgen.fitting.torque_fit import fit_torque
 from spelgen.identification.friction import FrictionModel
 from spelgen.identification.identify import least_squares
 from spelgen.identification.method import LeastSquares
 from spelgen.identification.samples import DynamicsSamples
 from spelgen.loaded_arm import load_arm
+from spelgen.logs.trajectory import Trajectory
 
 Torque = Callable[..., np.ndarray]
 Case = tuple[str, Path, list[DynamicsSamples], list[DynamicsSamples]]
 """Name, URDF, training samples, test samples."""
+Split = tuple[str, Path, list[Trajectory], list[Trajectory]]
+
+PRESETS = ("closed-form", "minimal")
+AHEAD = (0.1, 0.5, 1.0)  # s
+SMOOTHING = 0.02  # rad/s, of the Deep Lagrangian network's Coulomb friction
 
 SPLITS = {"xmate3": 12.0, "ar5": 36.0}  # s of training
 WIDTH, EPOCHS, PATIENCE, BATCH = 64, 400, 30, 512
@@ -54,24 +68,39 @@ def main() -> None:
     logs = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parents[2] / "shared" / "logs"
     print("Torque nMSE on real logs\n")
     table(real(logs))
+    print("\nStates ahead on real logs, error relative to the motion\n")
+    forecasts(logs)
     print("\nA simulated UR10e with: " + "; ".join(f"{k}, {x}" for k, x in EFFECTS.items()) + "\n")
     table(simulated())
 
 
 def table(cases: Iterator[Case]) -> None:
-    head = ("network", "least sq.", "+ network", "+ memory", "closed-form", "minimal", "fits [s]")
-    print(f"{'':18}" + "".join(f"{x:>12}" for x in head))
+    head = (
+        "URDF",
+        "network",
+        "DeLaN",
+        "ridge",
+        "least sq.",
+        "+ network",
+        "+ memory",
+        "closed-form",
+        "minimal",
+    )
+    print(f"{'':18}" + "".join(f"{x:>12}" for x in head) + "    fits [s]")
     for name, urdf, training, tests in cases:
         arm, times = load_arm(urdf).arm, []
         plain = least_squares(arm, training, LeastSquares("range")).torque
         memory = LeastSquares("range", friction=FrictionModel(memory=True))
         row = [
+            of_the_urdf(urdf, arm),
             network(training),
+            deep_lagrangian(training),
+            ridge(arm, training),
             plain,
             network(training, plain),
             least_squares(arm, training, memory).torque,
         ]
-        for preset in ("closed-form", "minimal"):
+        for preset in PRESETS:
             model, since = build(urdf, preset), time.perf_counter()
             fit_torque(model, training)
             times.append(f"{time.perf_counter() - since:.0f}")
@@ -80,26 +109,47 @@ def table(cases: Iterator[Case]) -> None:
         print(f"{name:18}{errors}{', '.join(times):>12}", flush=True)
 
 
-def real(folder: Path) -> Iterator[Case]:
+def forecasts(folder: Path) -> None:
+    """What `spelgen train` and `spelgen evaluate` say of each arm."""
+    head = [f"{preset} {ahead:g} s" for ahead in AHEAD for preset in ("still", *PRESETS)]
+    print(f"{'':18}" + "".join(f"{x:>18}" for x in head))
+    for name, urdf, training, tests in splits(folder):
+        errors: dict[str, list[float]] = {}
+        for preset in PRESETS:
+            found = spelgen.fit(build(urdf, preset), training, arm=urdf).evaluate(
+                tests, seconds=AHEAD, steps=()
+            )
+            for horizon in found.horizons:
+                still, ours = (horizon.errors[x].mean_relative_rms for x in (CONSTANT_VELOCITY, MODEL))
+                errors.setdefault(horizon.name, [still]).append(ours)
+        print(f"{name:18}" + "".join(f"{x:18.3f}" for row in errors.values() for x in row), flush=True)
+
+
+def splits(folder: Path) -> Iterator[Split]:
     """The arms of the reference logs, with the splits that its README gives."""
     urdf = folder / "ur10e" / "ur10e.urdf"
     arm = load_arm(urdf).arm
     logs = {x: read(folder / "ur10e" / f"{x}.parquet", arm) for x in (*TRAINING, *TESTS)}
-    yield "UR10e, nine", urdf, samples_of([logs[x] for x in TRAINING]), judged([logs[x] for x in TESTS])
+    yield "UR10e, nine", urdf, [logs[x] for x in TRAINING], [logs[x] for x in TESTS]
     urdf = folder.parent / "arms" / "panda_erd.urdf"
     whole = read(folder / "panda" / "exciting_traj1.parquet", load_arm(urdf).arm)
-    yield "Panda", urdf, samples_of([first(whole, 12.0)]), judged([after(whole, 12.0)])
+    yield "Panda", urdf, [first(whole, 12.0)], [after(whole, 12.0)]
     for name, seconds in SPLITS.items():
         urdf = folder / name / f"{name}.urdf"
         (log,) = (folder / name).glob("*.parquet")
         whole = read(log, load_arm(urdf).arm)
-        yield name, urdf, samples_of([first(whole, seconds)]), judged([after(whole, seconds)])
+        yield name, urdf, [first(whole, seconds)], [after(whole, seconds)]
     urdf = folder / "shanghai" / "shanghai.urdf"
     arm = load_arm(urdf).arm
     each = [read(log, arm) for log in sorted((folder / "shanghai").glob("*.parquet"))]
     for k, test in enumerate(each):
-        others = samples_of([x for x in each if x is not test])
-        yield f"shanghai {k + 1}", urdf, others, judged([test])
+        yield f"shanghai {k + 1}", urdf, [x for x in each if x is not test], [test]
+
+
+def real(folder: Path) -> Iterator[Case]:
+    """The same, as samples of torque."""
+    for name, urdf, training, tests in splits(folder):
+        yield name, urdf, samples_of(training), judged(tests)
 
 
 def judged(logs: Sequence[Any]) -> list[DynamicsSamples]:
@@ -139,42 +189,123 @@ def recorded(model: Any, effects: Sequence[str], seed: int, noise: float = 0.0) 
     return DynamicsSamples("simulated", q, qd, qdd, tau, z)
 
 
+def of_the_urdf(urdf: Path, arm: Arm) -> Torque:
+    """The URDF as it is, with the settings' drives where there are any."""
+    names = [x.name for x in arm.coordinates]
+    dynamics = urdf_dynamics(urdf, names, drives=has_drives(urdf, names))
+    return lambda q, qd, qdd, z=None: dynamics.inverse_dynamics(*map(torch.from_numpy, (q, qd, qdd))).numpy()
+
+
+def ridge(arm: Arm, training: Sequence[DynamicsSamples]) -> Torque:
+    """Least squares with the penalty that meets held-out blocks best."""
+    seen, held = ([part(x, out) for x in training] for out in (False, True))
+
+    def missed(size: float) -> float:
+        return mean(least_squares(arm, seen, LeastSquares("range", ridge=size)).torque, held)
+
+    return least_squares(arm, training, LeastSquares("range", ridge=min(RIDGES, key=missed))).torque
+
+
+def part(x: DynamicsSamples, out: bool) -> DynamicsSamples:
+    """The samples of one trajectory that are held out, or the others."""
+    rows = held_out(len(x.q)) == out
+    return replace(x, **{k: getattr(x, k)[rows] for k in ("q", "qd", "qdd", "tau", "z")})
+
+
+def held_out(count: int) -> np.ndarray:
+    """Every fifth of blocks of time, for samples beside one another are alike."""
+    return np.arange(count) * 10 // count % 5 == 4
+
+
 def network(training: Sequence[DynamicsSamples], beside: Torque | None = None) -> Torque:
     """A network of q, qd and qdd, fitted to torques, or to what another predictor leaves of them."""
-
-    def inputs(q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
-        return np.concatenate([q, qd, qdd], axis=-1)
-
-    x = np.concatenate([inputs(s.q, s.qd, s.qdd) for s in training])
+    inputs = [np.concatenate([s.q, s.qd, s.qdd], axis=-1) for s in training]
+    moved, scale = np.concatenate(inputs).mean(0), np.concatenate(inputs).std(0) + 1e-9
     known = [0 * s.tau if beside is None else beside(s.q, s.qd, s.qdd, s.z) for s in training]
-    y = np.concatenate([s.tau - k for s, k in zip(training, known, strict=True)])
-    moved, scale = (x.mean(0), x.std(0) + 1e-9), (y.mean(0), y.std(0) + 1e-9)
-    x, y = ((a - center) / size for a, (center, size) in ((x, moved), (y, scale)))
-    out = np.arange(len(x)) * 10 // len(x) % 5 == 4  # blocks, for samples beside one another are alike
     torch.manual_seed(0)
-    layers = [nn.Linear(x.shape[1], WIDTH), nn.Tanh(), nn.Linear(WIDTH, WIDTH), nn.Tanh()]
-    model = nn.Sequential(*layers, nn.Linear(WIDTH, y.shape[1])).double()
-    optimizer = torch.optim.AdamW(model.parameters(), lr=1e-3)
-    seen, held = ([torch.from_numpy(a[rows]) for a in (x, y)] for rows in (~out, out))
-    best, weights, waits = np.inf, model.state_dict(), 0
+    layers = mlp(len(moved), training[0].q.shape[1], nn.Tanh)
+
+    def model(q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
+        x = (torch.cat([q, qd, qdd], dim=-1) - torch.from_numpy(moved)) / torch.from_numpy(scale)
+        return layers(x)
+
+    learned = fitted(model, layers, training, [s.tau - k for s, k in zip(training, known, strict=True)])
+    if beside is None:
+        return learned
+    return lambda q, qd, qdd, z=None: learned(q, qd, qdd, z) + beside(q, qd, qdd, z)
+
+
+class DeepLagrangian(nn.Module):
+    """M = L L^T + a little, and V, by networks of cos q and sin q; friction of each joint beside them."""
+
+    def __init__(self, joints: int) -> None:
+        super().__init__()
+        rows, columns = torch.tril_indices(joints, joints)
+        places = torch.eye(joints * joints).double()[rows * joints + columns]  # of the entries of L
+        self.places = places.unflatten(-1, (joints, joints))
+        self.factor = mlp(2 * joints, joints * (joints + 1) // 2, nn.Softplus)
+        self.potential = mlp(2 * joints, 1, nn.Softplus)
+        self.viscous, self.coulomb = (nn.Parameter(torch.zeros(joints).double()) for _ in range(2))
+
+    def mass(self, q: Tensor) -> Tensor:
+        entries = self.factor(torch.cat([q.cos(), q.sin()], dim=-1))
+        lower = torch.tensordot(entries, self.places, dims=1)
+        return lower @ lower.mT + 1e-3 * torch.eye(q.shape[-1]).double()
+
+    def forward(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
+        def lagrangian(x: Tensor) -> Tensor:
+            kinetic = 0.5 * torch.einsum("...i,...ij,...j->...", qd, self.mass(x), qd)
+            return (kinetic - self.potential(torch.cat([x.cos(), x.sin()], dim=-1))[..., 0]).sum()
+
+        change = jvp(lambda x: torch.einsum("...ij,...j->...i", self.mass(x), qd), (q,), (qd,))[1]
+        inertia = torch.einsum("...ij,...j->...i", self.mass(q), qdd)
+        friction = self.viscous * qd + self.coulomb * torch.tanh(qd / SMOOTHING)
+        return inertia + change - grad(lagrangian)(q) + friction
+
+
+def deep_lagrangian(training: Sequence[DynamicsSamples]) -> Torque:
+    torch.manual_seed(0)
+    model = DeepLagrangian(training[0].q.shape[1])
+    return fitted(model, model, training, [s.tau for s in training])
+
+
+def mlp(inputs: int, outputs: int, activation: type[nn.Module]) -> nn.Sequential:
+    layers = [nn.Linear(inputs, WIDTH), activation(), nn.Linear(WIDTH, WIDTH), activation()]
+    return nn.Sequential(*layers, nn.Linear(WIDTH, outputs)).double()
+
+
+def fitted(
+    model: Callable[..., Tensor],
+    weights: nn.Module,
+    training: Sequence[DynamicsSamples],
+    torques: Sequence[np.ndarray],
+) -> Torque:
+    """The model, whose weights these are, fitted to torques in units of their deviations by AdamW, and stopped."""
+    states = [np.concatenate([getattr(s, k) for s in training]) for k in ("q", "qd", "qdd")]
+    y = np.concatenate(torques)
+    moved, scale = y.mean(0), y.std(0) + 1e-9
+    out = held_out(len(y))
+    seen, held = ([torch.from_numpy(x[rows]) for x in (*states, (y - moved) / scale)] for rows in (~out, out))
+    optimizer = torch.optim.AdamW(weights.parameters(), lr=1e-3)
+    best, kept, waits = np.inf, weights.state_dict(), 0
     for _ in range(EPOCHS):
         for batch in torch.randperm(len(seen[0])).split(BATCH):
             optimizer.zero_grad()
-            (model(seen[0][batch]) - seen[1][batch]).square().mean().backward()
+            *given, target = (x[batch] for x in seen)
+            (model(*given) - target).square().mean().backward()
             optimizer.step()
         with torch.no_grad():
-            loss = float((model(held[0]) - held[1]).square().mean())
+            loss = float((model(*held[:3]) - held[3]).square().mean())
         waits = 0 if loss < best else waits + 1
         if loss < best:
-            best, weights = loss, {name: value.clone() for name, value in model.state_dict().items()}
+            best, kept = loss, {name: value.clone() for name, value in weights.state_dict().items()}
         if waits > PATIENCE:
             break
-    model.load_state_dict(weights)
+    weights.load_state_dict(kept)
 
     def torque(q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, z: np.ndarray | None = None) -> np.ndarray:
         with torch.no_grad():
-            found = model(torch.from_numpy((inputs(q, qd, qdd) - moved[0]) / moved[1])).numpy()
-        return found * scale[1] + scale[0] + (0 if beside is None else beside(q, qd, qdd, z))
+            return model(*map(torch.from_numpy, (q, qd, qdd))).numpy() * scale + moved
 
     return torque
 

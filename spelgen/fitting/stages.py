@@ -75,7 +75,7 @@ def fit_torque_stage(
                 f"no motion {what}", expected=f"samples at {DENSE:g} Hz or more that move",
                 do="fit windows: the objective rollout",
             )  # fmt: skip
-        message = f"no torque fit: these logs are sampled below {DENSE:g} Hz"
+        message = f"no torque fit: these logs are sampled below {DENSE:g} Hz; windows alone are fitted"
         return [Diagnostic("warning", "no-torque-fit", "logs", None, message)]
     steps, notes = _fit(model, samples, config, regularizer)
     what = MOVED[config.adapt] if isinstance(config, TorqueFit) and config.adapt else "fitted"

@@ -13,7 +13,7 @@ os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is told to anyb
 os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # its new way, of which it else warns
 
 import ray
-from ray.exceptions import RayError, RayTaskError
+from ray.exceptions import LocalRayletDiedError, RayError, RayTaskError
 
 from spelgen.errors import RunError
 
@@ -58,6 +58,8 @@ def _result(reference: ray.ObjectRef) -> Any | Exception:
         return ray.get(reference)
     except RayTaskError as error:
         return error.cause if isinstance(error.cause, Exception) else error
+    except LocalRayletDiedError:
+        return RunError("Ray's own processes on a machine died", do="the same command does what is left")
     except RayError as error:  # its workers died, each time
         return RunError(f"a worker that died {RETRIES + 1} times ({type(error).__name__})")
 
