@@ -91,6 +91,7 @@ def ur10e(folder: Path) -> None:
         table(f"Torque nMSE, {said}", predictors, samples, len(TESTS))
     rollouts(model, baseline, [logs[name] for name in TESTS])
     payload(model, logs)
+    other_days(model, logs)
     few(urdf, arm, logs[TRAINING[0]], [each[: len(TESTS)] for each in tests])
 
 
@@ -139,6 +140,28 @@ def payload(model: Any, logs: dict[str, Trajectory]) -> None:
         print(f"{name:26}" + "".join(f"{x:15.5f}" for x in row))
     model.load_state_dict(trained)
     print()
+
+
+def other_days(model: Any, logs: dict[str, Trajectory]) -> None:
+    """The nine are of other days than the training: what friction and torque offsets of the day are worth."""
+    print(
+        "Friction and torque offsets fitted to the first 10 s of each, judged on the rest, pauses included\n"
+    )
+    print(f"{'':26}{'as trained':>15}{'friction':>15}{'another unit':>15}")
+    trained = {name: value.clone() for name, value in model.state_dict().items()}
+    rows = []
+    for name in TESTS:
+        seen, rest = samples_of([first(logs[name], 10.0)]), samples_of([after(logs[name], 10.0)], pauses=True)
+        row = []
+        for adapt in (None, "friction", "unit"):
+            model.load_state_dict(trained)
+            if adapt is not None:
+                fit_torque(model, seen, adapt=adapt)
+            row.append(mean(torque_of(model), rest))
+        rows.append(row)
+        print(f"{name:26}" + "".join(f"{x:15.5f}" for x in row))
+    print(f"{'mean':26}" + "".join(f"{x:15.5f}" for x in np.mean(rows, axis=0)) + "\n")
+    model.load_state_dict(trained)
 
 
 def rollouts(model: Any, found: Identification, logs: Sequence[Trajectory]) -> None:

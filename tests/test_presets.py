@@ -19,7 +19,7 @@ from emitted import (
     random_model,
 )
 from lie_group import geodesic_distance, group_rates
-from published_phnode import Published
+from published_phnode import ByJvp, Published
 from test_model import bias
 
 from spelgen.design import Preset, load_design
@@ -273,3 +273,18 @@ def test_published_formulation_keeps_its_energy():
     _, change = torch.func.jvp(energy, (state,), (rate,))
     assert change.abs().max() < 1e-12
     assert rate.abs().min() > 0
+
+
+def test_one_jvp_gives_what_a_derivative_for_each_entry_gives():
+    torch.manual_seed(0)
+    published, by_jvp = Published(2, 8, 4), ByJvp(2, 8, 4)
+    by_jvp.load_state_dict(published.state_dict())
+    state, tau = torch.randn(5, 24, dtype=torch.float64), torch.randn(5, 2, dtype=torch.float64)
+    rates = [model(state.clone(), tau) for model in (published, by_jvp)]
+    near(rates[1], rates[0], 1e-12)
+    for rate in rates:
+        rate.square().sum().backward()
+    for (name, ours), reference in zip(by_jvp.named_parameters(), published.parameters(), strict=True):
+        assert (ours.grad is None) == (reference.grad is None), name
+        if ours.grad is not None:
+            near(ours.grad, reference.grad, 1e-12)

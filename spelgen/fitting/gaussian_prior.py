@@ -27,13 +27,17 @@ KINDS = {
     **dict.fromkeys(SIZES, "sizes"),
 }
 
-AS_FITTED = {"sizes": 0.3, "velocities": 0.3, "fractions": 0.3, "shared_sizes": 0.3, "shared_velocities": 0.3}
+AS_FITTED = {
+    "sizes": 0.1, "velocities": 0.1, "fractions": 0.1,
+    "shared_sizes": 0.1, "shared_velocities": 0.1, "shared_friction": 0.3,
+}  # fmt: skip
+"""Warmth changes the friction of all joints by tens of per cent (Bittencourt and Gunnarsson, J. Dyn. Sys. Meas. Control
+134:051013, 2012); a joint by itself changes less.
+"""
 PRIORS: dict[Adaptation, GaussianPrior] = {
     "load": GaussianPrior(bodies=10.0),  # nothing is known of it before
-    "friction": GaussianPrior(**AS_FITTED, shared_friction=0.5),
-    "unit": GaussianPrior(
-        **AS_FITTED, bodies=0.1, gains=0.1, armature=0.1, shared_armature=0.1, shared_friction=0.5
-    ),
+    "friction": GaussianPrior(**AS_FITTED),
+    "unit": GaussianPrior(**AS_FITTED, bodies=0.1, gains=0.1, armature=0.1, shared_armature=0.1),
 }
 """About a model that was fitted to another load, on another day, or to another unit of the same arm."""
 

@@ -88,7 +88,7 @@ def fit_torque(
     """Set the weights of a closed-form ``model`` to the most probable ones after ``samples`` (torques as logged).
 
     The prior is centred on the weights as they are. ``adapt``: these move alone, what stands beside rigid bodies stays
-    as it is, and so does the prior, but for another unit's (see ``TorqueFit``).
+    as it is, and so does the prior of a load (see ``TorqueFit``).
     """
     if not isinstance(samples, TorqueSamples):
         samples = TorqueSamples.held(samples, DECIMATION)
@@ -190,7 +190,7 @@ class _Problem:
                     break
             noise = self.noise(at.squares)
             self.covariance[self.free[:, None] & self.free] = torch.linalg.inv(curvature).flatten()
-            if self.adapt in (None, "unit"):
+            if self.adapt != "load":
                 weights, variance = self.jacobian.weights, self.covariance.diagonal()
                 self.believe(most_probable(self.prior, self.guess, weights, at.x - self.start, variance))
         return at, noise
