@@ -344,7 +344,7 @@ def test_a_run_is_adapted_to_another_day_or_unit(run, emitted, tmp_path, adapt):
     other.load_state_dict(true.state_dict())
     other.get_parameter("dynamics.friction.raw_coulomb").data += 0.4
     other.get_parameter("dynamics.friction.raw_viscous").data -= 0.3
-    other.get_parameter("dynamics.raw_offset").data += torch.tensor([0.1, -0.1]).double()
+    other.get_parameter("dynamics.raw_offset").data += torch.tensor([0.2, -0.1]).double()
     if adapt == "unit":
         other.get_parameter(BODIES).data[:, 9] += 0.1
     write(tmp_path / "other.parquet", [recorded(other, 5.0, 0.01, seed=3)], arm)
