@@ -347,7 +347,7 @@ def test_a_run_is_adapted_to_another_day_or_unit(run, emitted, tmp_path, adapt):
     other.get_parameter("dynamics.raw_offset").data += torch.tensor([0.2, -0.1]).double()
     if adapt == "unit":
         other.get_parameter(BODIES).data[:, 9] += 0.1
-    write(tmp_path / "other.parquet", [recorded(other, 5.0, 0.01, seed=3)], arm)
+    write(tmp_path / "other.parquet", [recorded(other, 15.0, 0.01, seed=3)], arm)
     command = [
         "train",
         "--from",
