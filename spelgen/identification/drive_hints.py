@@ -7,9 +7,9 @@ explained better, in blocks of time that the parameters were not fitted to?
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -17,12 +17,9 @@ from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.regressor import regressor
 from spelgen.identification.base_parameters import base_parameters
+from spelgen.identification.drive_samples import DELAYS, DriveSamples
 from spelgen.identification.friction import FrictionModel
-from spelgen.identification.samples import dynamics_samples
-from spelgen.logs.trajectory import Trajectory
 
-DELAYS = np.arange(-60, 61, 10) * 1e-3  # s
-MOST, LEAST = 2500, 400  # samples
 BLOCKS = 10
 RATIOS = tuple(x * sign for sign in (1.0, -1.0) for x in (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0))
 STEPS = (0.2, 0.1, 0.05, 0.02, 0.01)  # of the search that follows
@@ -35,20 +32,6 @@ SLOW = FrictionModel(coulomb_smoothing_velocity=0.02)
 NEGLIGIBLE = 1e-10
 
 LoggedAt = Literal["joints", "motors"]
-
-
-class DriveSamples(NamedTuple):
-    """Samples (S, n) of motion, and the torques (D, S, n) logged later by `DELAYS`."""
-
-    q: np.ndarray
-    qd: np.ndarray
-    qdd: np.ndarray
-    tau: np.ndarray
-
-    def thinned(self, every: int) -> DriveSamples:
-        """Every so manieth sample."""
-        q, qd, qdd, tau = self
-        return DriveSamples(q[::every], qd[::every], qdd[::every], tau[:, ::every])
 
 
 @dataclass(frozen=True)
@@ -64,43 +47,6 @@ class Coupling:
     ratio: float
     logged_at: LoggedAt
     left: float
-
-
-def drive_samples(trajectory: Trajectory, inputs: np.ndarray) -> DriveSamples | None:
-    """Of one trajectory; None where it is too sparse or too short. inputs: G, (n, n)."""
-    t, shifted = trajectory.t, []
-    for delay in DELAYS:
-        tau = np.stack([np.interp(t + delay, t, column) for column in trajectory.tau.T], axis=1)
-        shifted += dynamics_samples([replace(trajectory, tau=tau @ inputs.T)])
-    if not shifted:
-        return None
-    return DriveSamples(shifted[0].q, shifted[0].qd, shifted[0].qdd, np.stack([x.tau for x in shifted]))
-
-
-class DriveLog:
-    """Samples of one trajectory after another, thinned evenly to at most twice `MOST`."""
-
-    def __init__(self, inputs: np.ndarray) -> None:
-        self.inputs, self.parts, self.every = inputs, list[DriveSamples](), 1
-
-    def add(self, trajectory: Trajectory) -> None:
-        """Take in what a trajectory has for this."""
-        found = drive_samples(trajectory, self.inputs)
-        if found is None:
-            return
-        self.parts.append(found.thinned(self.every))
-        while sum(len(x.q) for x in self.parts) > 2 * MOST:
-            self.parts = [x.thinned(2) for x in self.parts]
-            self.every *= 2
-
-    def samples(self) -> DriveSamples | None:
-        """All together; None: too few to tell anything."""
-        if sum(len(x.q) for x in self.parts) < LEAST:
-            return None
-        columns = [[getattr(x, name) for x in self.parts] for name in DriveSamples._fields]
-        q, qd, qdd = (np.concatenate(x) for x in columns[:3])
-        whole = DriveSamples(q, qd, qdd, np.concatenate(columns[3], axis=1))
-        return whole.thinned(-(-len(whole.q) // MOST))
 
 
 def torque_delay(arm: Arm, samples: DriveSamples, speeds: np.ndarray) -> tuple[float, float] | None:
@@ -171,9 +117,10 @@ class _Pair:
 
 def _sure(before: np.ndarray, after: np.ndarray, most: float) -> bool:
     """Whether errors by block (B,) fell below this part, and not by luck."""
+    if not after.min() > 0 or after.mean() >= most * before.mean():
+        return False
     gain = np.log(before / after)  # by factors: a block that is hard to tell counts as any other
-    error = gain.std(ddof=1) / np.sqrt(len(gain))
-    return bool(after.mean() < most * before.mean() and gain.mean() > SURE * error)
+    return bool(gain.mean() > SURE * gain.std(ddof=1) / np.sqrt(len(gain)))
 
 
 def _projected(values: np.ndarray, columns: np.ndarray) -> float:

@@ -10,7 +10,8 @@ import numpy as np
 
 from spelgen.arm.arm import Coordinate
 from spelgen.errors import Diagnostic, LogError, SpelgenError, SpelgenErrors, collect
-from spelgen.identification.drive_hints import Coupling, DriveLog, coupled_inputs, coupling, torque_delay
+from spelgen.identification.drive_hints import Coupling, coupled_inputs, coupling, torque_delay
+from spelgen.identification.drive_samples import DriveLog
 from spelgen.logs.checks import Finding, findings, gap_diagnostics, summarised
 from spelgen.logs.gravity import GravityFit, StateSamples, fit_gravity, state_samples
 from spelgen.logs.report import SEEN, JointReport, LogReport
