@@ -83,7 +83,7 @@ def parity() -> None:
             projection = rigid_body_projection(each.model, each.arm)
             gains = model.inputs
             text = mjcf_text(projection, gains, each.tip_in_body)
-            mujoco = _largest(check_mjcf(text, projection, gains, STATES))
+            mujoco = _largest(check_mjcf(text, projection, gains, states=STATES))
             print(
                 f"{robot:12s}{preset:12s}" + "".join(f"{x:12.1e}" for x in (*c, casadi, onnx, mujoco)),
                 flush=True,

@@ -59,22 +59,36 @@ def test_it_is_a_colcon_package(package):
     assert len((folder / "README.md").read_text().splitlines()) == 5
 
 
+def run(*command: str | Path, cwd: Path | None = None) -> str:
+    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
+    assert not done.returncode, done.stdout + done.stderr
+    return done.stdout
+
+
+def c_object(folder: Path, tmp_path: Path) -> str:
+    found = tmp_path / "two_link.o"
+    run("gcc", "-std=c99", "-O1", "-c", folder / "src" / "two_link.c", "-o", found)
+    return str(found)
+
+
+def compiled_driver(folder: Path, tmp_path: Path, *linked: str) -> Path:
+    """A program that asks the plugin for all that there is."""
+    (tmp_path / "driver.cpp").write_text(DRIVER)
+    run("g++", "-std=c++17", "-Wall", "-Wextra", "-Werror", f"-I{STUBS}", f"-I{folder / 'src'}",
+        tmp_path / "driver.cpp", *linked, "-o", tmp_path / "driver", "-lm")  # fmt: skip
+    return tmp_path / "driver"
+
+
+def driver_lines(driver: Path) -> list[str]:
+    return run(driver).splitlines()
+
+
 @pytest.mark.skipif(shutil.which("g++") is None, reason="no g++ on this machine")
 def test_the_plugin_gives_what_the_model_gives(package, tmp_path):
     model, folder = package
     (tmp_path / "driver.cpp").write_text(DRIVER)
-    commands = (
-        ["gcc", "-std=c99", "-O1", "-c", str(folder / "src" / "two_link.c"), "-o", str(tmp_path / "two_link.o")],
-        ["g++", "-std=c++17", "-Wall", "-Wextra", "-Werror", f"-I{STUBS}", f"-I{folder / 'src'}",
-         str(tmp_path / "driver.cpp"), str(folder / "src" / "solver.cpp"), str(tmp_path / "two_link.o"),
-         "-o", str(tmp_path / "driver"), "-lm"],
-    )  # fmt: skip
-    for command in commands:
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        assert not done.returncode, done.stderr
-    told = subprocess.run(
-        [tmp_path / "driver"], capture_output=True, text=True, check=True
-    ).stdout.splitlines()
+    binary = compiled_driver(folder, tmp_path, str(folder / "src" / "solver.cpp"), c_object(folder, tmp_path))
+    told = driver_lines(binary)
     assert told.pop() == "two_link has 2 joints, got 1 values"
     q, qd, qdd = (torch.tensor(x, dtype=torch.float64) for x in ([0.3, -0.7], [0.5, -1.1], [2.0, 1.0]))
     expected = [
@@ -86,3 +100,29 @@ def test_the_plugin_gives_what_the_model_gives(package, tmp_path):
     ]
     found = np.array([[float(x) for x in line.split()] for line in told])
     np.testing.assert_allclose(found, torch.stack(expected).numpy(), rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.skipif(
+    not all(shutil.which(program) for program in ("colcon", "cmake", "g++")),
+    reason="no colcon, no cmake or no g++ on this machine",
+)
+def test_colcon_builds_it(package, tmp_path):
+    """With stubs of ament and of what the package depends on: the library that colcon installs is the plugin."""
+    _, folder = package
+    shutil.copytree(folder, tmp_path / "src" / folder.name)
+    stubs = [
+        f"-D{path.stem.removesuffix('Config')}_DIR={path.parent}" for path in (STUBS / "cmake").iterdir()
+    ]
+    run("colcon", "build", "--packages-select", folder.name, "--cmake-args", *stubs, cwd=tmp_path)
+    installed = tmp_path / "install" / folder.name
+    assert (installed / "share/inverse_dynamics_solver/plugins/plugin.xml").exists()
+    library = installed / "lib" / f"lib{folder.name}.so"
+    by_colcon = compiled_driver(folder, tmp_path, str(library), f"-Wl,-rpath,{library.parent}")
+    (tmp_path / "own").mkdir()
+    own = compiled_driver(
+        folder, tmp_path / "own", str(folder / "src" / "solver.cpp"), c_object(folder, tmp_path)
+    )
+    lines = (
+        [[float(x) for x in line.split()] for line in driver_lines(each)[:-1]] for each in (by_colcon, own)
+    )
+    np.testing.assert_allclose(*lines, rtol=1e-13)
