@@ -1,9 +1,12 @@
 """MuJoCo loads what was learned and has the same M, bias and forward dynamics."""
 
+import shutil
+
 import mujoco
 import numpy as np
 import pytest
 import torch
+from emitted import ROBOTS
 from exported_runs import COUPLED, MOTORS, arm_of, moved_model, run_folder
 from typer.testing import CliRunner
 
@@ -64,6 +67,33 @@ def test_followers_motors_and_passive_joints_go_along(tmp_path):
     simulated = mujoco.MjModel.from_xml_string(found.files[".xml"].decode())
     assert (simulated.nv, simulated.nu, simulated.neq) == (4, 2, 1)
     assert simulated.actuator("shoulder").gear[0] == 50
+
+
+@pytest.mark.parametrize("torque", ["motor", "joint"])
+def test_coupled_motors_turn_by_several_joints(torque, tmp_path):
+    """Their rotors couple M: tendons' armature in MuJoCo, couplings in the settings beside a URDF."""
+    urdf = tmp_path / "wrist.urdf"
+    shutil.copy(ROBOTS / "six_dof.urdf", urdf)
+    names = [each.name for each in load_arm(urdf).arm.coordinates]
+    gears = ", ".join(f"{name}: {{gear: 100}}" for name in names[:4]) if torque == "motor" else ""
+    coupling = f"couplings: [{{joints: {names[4:]}, matrix: [[80, 60], [0, 50]]}}]"
+    urdf.with_suffix(".yaml").write_text(f"torque: {torque}\njoints: {{{gears}}}\n{coupling}\n")
+    arm = load_arm(urdf)
+    model = build(arm, "closed-form")
+    with torch.no_grad():
+        model.dynamics.armature.raw += 0.5
+    found = export(model, "mjcf", arm=arm)  # compared with the model before it is given
+    simulated = mujoco.MjModel.from_xml_string(found.files[".xml"].decode())
+    assert simulated.nu == 6
+    np.testing.assert_allclose(simulated.tendon_armature.max(), model.armature.detach()[5])
+    for suffix, content in export(model, "urdf", arm=arm).files.items():
+        (tmp_path / f"learned{suffix}").write_bytes(content)
+    again = build(load_arm(tmp_path / "learned.urdf"), "closed-form")
+    q = 0.3 * torch.ones(6, dtype=torch.float64)
+    mass = model.mass_matrix(q)
+    assert mass[4, 5].abs() > 0.5 * mass[5, 5]
+    torch.testing.assert_close(again.mass_matrix(q), mass, rtol=2e-3, atol=1e-3)
+    torch.testing.assert_close(again.input_matrix(q), model.input_matrix(q))
 
 
 def test_other_bodies_are_noticed():

@@ -38,6 +38,8 @@ def mjcf_text(
     pose_of = {"pos": _numbers(pose[:3, 3]), "quat": _numbers(_quaternion(pose[:3, :3]))}
     etree.SubElement(placed[carrier], "site", name=link, **pose_of)
     _couple(root, arm.bodies, arm.coordinates)
+    for k in _coupled(projection.motors):
+        _tendon(root, f"rotor{k + 1}", arm.coordinates, projection.motors[k], projection.armature[k])
     if servos is None:
         _drive(root, arm.coordinates, inputs)
     else:
@@ -68,7 +70,7 @@ def _body(above: etree._Element, projection: RigidBodyProjection, index: int, bo
     own = coordinates[body.coordinate]
     if own.name == body.name:
         place = body.coordinate
-        joint["armature"] = _number(projection.armature[place])
+        joint["armature"] = _number(0 if place in _coupled(projection.motors) else projection.armature[place])
         joint["damping"] = _number(projection.viscous[place])
         joint["frictionloss"] = _number((projection.forward[place] - projection.backward[place]) / 2)
         if not own.continuous and own.lower is not None and own.upper is not None:
@@ -92,14 +94,9 @@ def _couple(root: etree._Element, bodies: Iterable[Body], coordinates: tuple[Coo
 def _drive(root: etree._Element, coordinates: tuple[Coordinate, ...], inputs: np.ndarray) -> None:
     """A motor for each input: at its joint, or at a tendon where it moves several."""
     columns = [(k, column) for k, column in enumerate(inputs.T) if column.any()]
-    coupled = [(k, column) for k, column in columns if np.count_nonzero(column) > 1]
-    if coupled:
-        tendons = etree.SubElement(root, "tendon")
-        for k, column in coupled:
-            tendon = etree.SubElement(tendons, "fixed", name=f"motor{k + 1}")
-            for joint in np.flatnonzero(column):
-                name, coefficient = coordinates[int(joint)].name, _number(column[joint])
-                etree.SubElement(tendon, "joint", joint=name, coef=coefficient)
+    for k, column in columns:
+        if np.count_nonzero(column) > 1:
+            _tendon(root, f"motor{k + 1}", coordinates, column)
     actuators = etree.SubElement(root, "actuator")
     for k, column in columns:
         name = coordinates[k].name
@@ -109,6 +106,29 @@ def _drive(root: etree._Element, coordinates: tuple[Coordinate, ...], inputs: np
             (joint,) = np.flatnonzero(column)
             where = coordinates[int(joint)].name
             etree.SubElement(actuators, "motor", name=name, joint=where, gear=_number(column[joint]))
+
+
+def _coupled(motors: np.ndarray) -> list[int]:
+    """The motors that move several joints, or are moved by them."""
+    return [k for k, row in enumerate(motors) if np.count_nonzero(row) > 1]
+
+
+def _tendon(
+    root: etree._Element,
+    name: str,
+    coordinates: tuple[Coordinate, ...],
+    coefficients: np.ndarray,
+    armature: float = 0.0,
+) -> None:
+    """A sum of joint positions times coefficients; armature: of what turns by it."""
+    tendons = root.find("tendon")
+    tendons = etree.SubElement(root, "tendon") if tendons is None else tendons
+    fixed = etree.SubElement(tendons, "fixed", name=name)
+    if armature:
+        fixed.set("armature", _number(armature))
+    for joint in np.flatnonzero(coefficients):
+        coefficient = _number(coefficients[joint])
+        etree.SubElement(fixed, "joint", joint=coordinates[int(joint)].name, coef=coefficient)
 
 
 def _hold(root: etree._Element, coordinates: tuple[Coordinate, ...], servos: Servos) -> None:

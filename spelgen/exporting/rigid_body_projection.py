@@ -34,7 +34,8 @@ class RigidBodyProjection:
     """An arm of n joints as a URDF and its settings can say it.
 
     inertias: by body, ten parameters about the joint's frame as in ``Body``, (bodies, 10). armature: what the
-    drives add to M, (n,) [kg m^2, kg]. viscous, forward, backward: friction, (n,); backward is not positive.
+    drives add to M by their own speeds, (n,) [kg m^2, kg]; motors: these speeds by the joints', (n, n).
+    viscous, forward, backward: friction, (n,); backward is not positive.
     own: whether the bodies are the model's own. mass_error, gravity_error: root mean square of what M and gravity
     torque of bodies and model differ by, relative to the model's. friction_error: (n,) likewise, of friction.
     bodies: a model of these bodies alone, float64.
@@ -43,6 +44,7 @@ class RigidBodyProjection:
     arm: LoadedArm
     inertias: np.ndarray
     armature: np.ndarray
+    motors: np.ndarray
     viscous: np.ndarray
     forward: np.ndarray
     backward: np.ndarray
@@ -74,6 +76,7 @@ def rigid_body_projection(model: EmittedModel, arm: LoadedArm) -> RigidBodyProje
         arm=arm,
         inertias=bodies.inertial_parameters.numpy(),
         armature=bodies.armature.numpy(),
+        motors=bodies.dynamics.motors.numpy(),
         viscous=viscous,
         forward=forward,
         backward=backward,
