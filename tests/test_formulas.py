@@ -129,7 +129,7 @@ def test_python_users_get_sympy(robots):
     assert (one.entries, one.potential, one.mass_matrix) == ({(2, 2): m2r}, None, None)
 
 
-@settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=8, deadline=None, suppress_health_check=list(HealthCheck))
 @given(drawn=arms())
 def test_random_arms_equal_pinocchio(drawn, tmp_path_factory):
     """Any joint types, tilted and parallel axes, followers in the chain and beside it."""

@@ -187,7 +187,7 @@ def run(robots, tmp_path_factory) -> Path:
     folder = found.save(tmp_path_factory.mktemp("run") / "run")
     line = {"epoch": 1, "step": 1, "loss": 0.5, "validation": 0.5, "best": 0.5, "seconds": 1.0}
     (folder / "metrics.jsonl").write_text(2 * (json.dumps(line) + "\n"))
-    (folder / "evaluation.json").write_text(json.dumps(evaluate(load_run(folder), [motion(600)]).to_dict()))
+    (folder / "evaluation.json").write_text(json.dumps(evaluate(load_run(folder), [motion(120)]).to_dict()))
     return folder
 
 

@@ -152,7 +152,7 @@ def told(structure: Structure) -> Facts:
 
 
 RANDOM = settings(
-    max_examples=60,
+    max_examples=40,
     derandomize=True,
     deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],

@@ -11,7 +11,7 @@ import torch.multiprocessing as mp
 
 from spelgen.building import build
 from spelgen.emission.loading import load_module
-from spelgen.fitting import workers
+from spelgen.fitting import loop, workers
 from spelgen.fitting.config import Rollout, TorqueFit
 from spelgen.fitting.fit import fit
 from spelgen.loaded_arm import load_arm
@@ -22,7 +22,7 @@ from spelgen.simulation.simulate import simulate
 JOINTS = ("joint1", "joint2")
 CONFIGS = {
     "networks": Rollout(
-        optimizer="adamw", batch=32, stride=4, epochs=3, patience=3, momentum_steps=20, substeps=1
+        optimizer="adamw", batch=32, stride=4, epochs=3, patience=3, momentum_steps=6, substeps=1
     ),
     "torque": TorqueFit(),
 }
@@ -31,7 +31,9 @@ CONFIGS = {
 def fitted(folder: Path, name: str, run: str) -> None:
     """Fit a module to the logs beside it, into a run folder."""
     model = load_module(folder / f"{name}.py")
-    fit(model, read_logs([folder / "logs.parquet"], JOINTS), CONFIGS[name], folder=folder / run)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loop, "EPOCH_STEPS", 6)
+        fit(model, read_logs([folder / "logs.parquet"], JOINTS), CONFIGS[name], folder=folder / run)
 
 
 def one_of_two(rank: int, folder: Path, port: int) -> None:
@@ -67,7 +69,7 @@ def test_two_processes_take_the_steps_of_one(folder):
         [json.loads(line) for line in (folder / run / "metrics.jsonl").read_text().splitlines()]
         for run in ("networks-one", "networks-two")
     )
-    assert [x["step"] for x in one] == [x["step"] for x in two] == [20, 40, 60]
+    assert [x["step"] for x in one] == [x["step"] for x in two] == [6, 12, 18]
     for key in ("loss", "validation"):
         assert [x[key] for x in two] == pytest.approx([x[key] for x in one], abs=1e-12)
 
