@@ -188,7 +188,12 @@ def test_a_comparison_with_a_module_of_somebody_else_is_refused(study, robot):
 
 def test_another_comparison_in_the_folder_is_refused(study, robot):
     with pytest.raises(RunError, match="a comparison with other settings"):
-        prepare_study(robot, study.folder, variants=CHOSEN, seeds=2)
+        prepare_study(robot, study.folder, variants=CHOSEN, steps=40)
+
+
+def test_seeds_may_be_added(study, robot):
+    more = prepare_study(robot, study.folder, variants=CHOSEN, seeds=2)
+    assert len(list(more.results())) == 2  # those of the first seed, which is not run again
 
 
 def test_begun_anew_nothing_of_the_old_runs_goes_on(study, robot, tmp_path):

@@ -185,14 +185,14 @@ def _training(settings: Settings, comparison: ComparisonSettings) -> Rollout:
 
 
 def _description(study: Study, loaded: LoadedArm) -> dict[str, Any]:
-    """What must be the same for a comparison to go on."""
+    """What must be the same for a comparison to go on; seeds may be added."""
     return {
         "schema": SCHEMA,
         "robot": study.robot,
         "urdf_sha256": loaded.robot.digest,
         "simulation": loaded.settings.simulation.model_dump(mode="json"),
         "tracking": loaded.settings.tracking.model_dump(mode="json"),
-        "comparison": study.settings.model_dump(mode="json"),
+        "comparison": study.settings.model_dump(mode="json", exclude={"seeds"}),
         "training": None if study.training is None else study.training.model_dump(mode="json"),
         "urdf_error": study.urdf_error,
         "preprocessing": asdict(study.preprocessing),
