@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from spelgen.exporting.export import export
     from spelgen.fitting.config import GaussianPrior, MomentumFit, Rollout, TorqueFit
     from spelgen.fitting.fit import Fit, fit, load_run
+    from spelgen.identification.baseline import keep_baseline
     from spelgen.identification.friction import FrictionModel
     from spelgen.identification.identification import Identification
     from spelgen.identification.identify import identify
@@ -50,6 +51,7 @@ _HOME = {
     "excite": "excitation.design",
     "identify": "identification.identify",
     "LeastSquares": "identification.method",
+    "keep_baseline": "identification.baseline",
     "FrictionModel": "identification.friction",
     "Identification": "identification.identification",
     "fit": "fitting.fit",
@@ -95,6 +97,7 @@ __all__ = [
     "generate",
     "identify",
     "inspect",
+    "keep_baseline",
     "load_arm",
     "load_module",
     "load_run",

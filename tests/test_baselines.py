@@ -16,8 +16,9 @@ from spelgen.dynamics.rigid_bodies import RigidBodies
 from spelgen.evaluation.baselines import of_urdf
 from spelgen.evaluation.names import URDF, URDF_WITH_DRIVES
 from spelgen.evaluation.stiff import accurate_solver, roll_out_stiff
+from spelgen.fitting.fitted import load_run
 from spelgen.loaded_arm import load_arm
-from spelgen.logs.read import Trajectory, write_logs
+from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.windows import Windows
 from spelgen.pipeline import generate
 from spelgen.runtime.bristles import moved_bristles
@@ -164,6 +165,10 @@ def test_least_squares_is_kept_with_a_run_and_stands_in_its_evaluation(robots, t
     ):
         done = CliRunner().invoke(app, command)
         assert done.exit_code == 0, done.output
+    kept = json.loads((folder / "least_squares.json").read_text())
+    fit, train = load_run(folder), read_logs(tmp_path / "logs" / "train.parquet", arm)
+    again = json.loads((fit.save(tmp_path / "again", logs=train) / "least_squares.json").read_text())
+    assert again == kept, "in Python as on the command line"
     found = json.loads((folder / "evaluation.json").read_text())
     assert {"model", "least squares"} <= set(found["torque"])
     assert found["torque"]["least squares"]["mean_nmse"] < 1e-3

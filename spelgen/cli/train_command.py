@@ -163,10 +163,9 @@ def train(
     if not first:
         return
     if not resume and found.status != "interrupted" and found.config.objective != "servo":
-        from spelgen.fitting.run_folder import RunFolder
         from spelgen.identification.baseline import keep_baseline
 
-        keep_baseline(RunFolder(folder), paths)
+        keep_baseline(folder, paths)
     for line in _outcome(found):
         say(line)
     if found.calibration is not None and found.status != "interrupted":

@@ -134,9 +134,18 @@ class Fit:
 
         return spelgen.export(self, to=to, path=path, **options)
 
-    def save(self, folder: Path | str, *, force: bool = False) -> Path:
+    def save(
+        self,
+        folder: Path | str,
+        *,
+        logs: Trajectory | Sequence[Trajectory] | None = None,
+        force: bool = False,
+    ) -> Path:
         """Write the run folder that `spelgen train` writes; return its path. Raises RunError where a run lies, unless
         forced.
+
+        logs: those of the fit; least squares on them and what they cover then stand in `evaluate` and `report` too,
+        where the fit was given its arm.
         """
         if not hasattr(self.model, "source"):
             raise RunError("a model without a module", expected="one of spelgen.build or spelgen.load_module")
@@ -149,6 +158,10 @@ class Fit:
             write_state(run.weights, self.model.state_dict())
             write_state(run.checkpoint, self.checkpoint)
             write_json(run.config, self.record)
+        if logs is not None:
+            import spelgen
+
+            spelgen.keep_baseline(run.path, [logs] if isinstance(logs, Trajectory) else logs)
         return run.path
 
     def _filtered(self, piece: Trajectory) -> Trajectory:

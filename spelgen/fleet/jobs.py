@@ -179,7 +179,7 @@ def _judged(job: Job, run: RunFolder) -> dict[str, Any]:
 
     Least squares is left out: its stiff rollouts take ten times as long as all else, for every run anew.
     """
-    keep_baseline(run, job.train)
+    keep_baseline(run.path, job.train)
     logs = read_test_logs(job.folder, job.test, job.mapping)
     found = evaluate(load_run(job.folder), logs).to_dict()
     write_json(run.evaluation, found)

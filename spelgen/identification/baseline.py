@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from spelgen.loaded_arm import LoadedArm, load_arm
 from spelgen.logs.coverage import coverage
 from spelgen.logs.mapping import LogMapping
 from spelgen.logs.preprocessing import Preprocessing
+from spelgen.logs.trajectory import Trajectory
 from spelgen.spec import read_facts
 
 REMEMBERING = FrictionModel(memory=True)
@@ -36,22 +37,25 @@ def run_arm(run: RunFolder) -> LoadedArm:
     return load_arm(run.urdf, read_facts(run.module).joints, options.tip, options.angle_tolerance)
 
 
-def keep_baseline(run: RunFolder, paths: Iterable[Path | str]) -> None:
-    """Identify the run's arm from the log files that it was trained on, those of validation included.
+def keep_baseline(folder: Path | str, logs: Iterable[Path | str] | Sequence[Trajectory]) -> None:
+    """Identify a run folder's arm from the logs, or log files, that it was trained on, those of validation included.
 
     What the logs cover is kept beside it. A run without URDF and logs larger than memory are left as they are; logs
     that are too sparse for accelerations give no parameters.
     """
+    run, given = RunFolder(Path(folder)), list(logs)
     record = run.read_config()
-    model = run.load_module()
-    logs = open_logs(model, paths, LogMapping(**record["mapping"]))
-    if isinstance(logs, LargeLogs) or not run.urdf.exists():
+    trajectories: Any = [each for each in given if isinstance(each, Trajectory)]
+    if not trajectories:
+        paths = [each for each in given if not isinstance(each, Trajectory)]
+        trajectories = open_logs(run.load_module(), paths, LogMapping(**record["mapping"]))
+    if isinstance(trajectories, LargeLogs) or not run.urdf.exists():
         return
-    found: dict[str, Any] = {"coverage": coverage(logs)}
+    found: dict[str, Any] = {"coverage": coverage(trajectories)}
     try:
         arm, used = run_arm(run), Preprocessing(**record["preprocessing"])
-        fit = identify(arm, logs, preprocessing=used)
-        remembering = identify(arm, logs, LeastSquares(friction=REMEMBERING), preprocessing=used)
+        fit = identify(arm, trajectories, preprocessing=used)
+        remembering = identify(arm, trajectories, LeastSquares(friction=REMEMBERING), preprocessing=used)
     except (LogError, np.linalg.LinAlgError):
         pass
     else:
@@ -61,7 +65,7 @@ def keep_baseline(run: RunFolder, paths: Iterable[Path | str]) -> None:
 
 
 def read_baseline(run: RunFolder) -> dict[str, RegressorDynamics]:
-    """The dynamics that ``write_baseline`` found, by name; none where it found none."""
+    """The dynamics that ``keep_baseline`` found, by name; none where it found none."""
     path = run.baseline
     found = run.read_json(path) if path.exists() else {}
     if "parameters" not in found:
