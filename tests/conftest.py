@@ -25,6 +25,12 @@ def shared() -> Path:
     return folder
 
 
+@pytest.fixture
+def short_epochs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Epochs of few windows take four steps: for tests of what stands around a fit."""
+    monkeypatch.setattr("spelgen.fitting.loop.EPOCH_STEPS", 4)
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     """``--update`` writes the golden copies anew."""
     parser.addoption("--update", action="store_true", help="write golden files anew")

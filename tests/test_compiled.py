@@ -23,6 +23,7 @@ has_compiler = pytest.mark.skipif(shutil.which("g++") is None, reason="no g++ to
 
 
 @has_compiler
+@pytest.mark.usefixtures("short_epochs")
 def test_a_compiled_run_says_so_and_repeats_the_plain_one(tmp_path, monkeypatch):
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path / "cache"))
     write_logs(tmp_path / "train.parquet", motions(), JOINTS)

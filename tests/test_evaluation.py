@@ -240,6 +240,7 @@ def test_energy_drift_is_seen():
     assert energy_drift(model, windows) > 1e-5
 
 
+@pytest.mark.usefixtures("short_epochs")
 def test_a_urdf_run_is_compared_in_torque_and_at_the_tip(cart):
     """End to end on a URDF: its own dynamics made the logs, so the URDF baseline is perfect."""
     from spelgen import pipeline

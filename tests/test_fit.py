@@ -36,6 +36,7 @@ def same(first: torch.nn.Module, second: torch.nn.Module) -> bool:
     return all(a == b and torch.equal(x, y) for (a, x), (b, y) in pairs)
 
 
+@pytest.mark.usefixtures("short_epochs")
 def test_a_fit_in_memory_is_that_of_files(tmp_path):
     write_logs(tmp_path / "train.parquet", motions(), JOINTS)
     filed = train(STAND_IN, [tmp_path / "train.parquet"], tmp_path / "filed", QUICK, progress=False)
@@ -218,6 +219,7 @@ def test_dopri5_is_the_exact_solution():
     assert max((got - exact).abs().max().item() for got, exact in pairs) < 1e-6
 
 
+@pytest.mark.usefixtures("short_epochs")
 def test_windows_are_fitted_by_dopri5():
     config = Rollout(epochs=2, momentum_steps=0, solver="dopri5", optimizer="lbfgs")
     found = spelgen.fit(spelgen.load_module(STAND_IN), motions(), config)
@@ -231,6 +233,7 @@ def test_windows_are_fitted_by_dopri5():
     assert rollout_loss(truth(), windows, scales, 1, "dopri5") < 1e-12
 
 
+@pytest.mark.usefixtures("short_epochs")
 def test_the_tour_on_an_arm_with_a_joint_that_follows(tmp_path):
     """From a URDF to a saved run, networks and rigid bodies, with the regularizer towards the URDF."""
     (tmp_path / "followed.urdf").write_text(FOLLOWED)

@@ -32,6 +32,9 @@ from spelgen.simulation.simulate import simulate
 QUICK = {"presets": ["spel"], "width": 4, "depth": 1, "training": {"epochs": 2, "momentum_steps": 0}}
 
 
+pytestmark = pytest.mark.usefixtures("short_epochs")
+
+
 class Unseen:
     """Nobody watches."""
 
