@@ -96,8 +96,7 @@ class PinocchioDynamics:
         if not batch:
             return algorithm(self.model, self.data, *states)
         rows = zip(*(x.reshape(-1, x.shape[-1]) for x in states), strict=True)
-        # copies, for it writes to one place
-        found = np.array([algorithm(self.model, self.data, *each).copy() for each in rows])
+        found = np.array([algorithm(self.model, self.data, *each) for each in rows])
         return found.reshape(*batch, *found.shape[1:])
 
     def _mass(self, q: np.ndarray) -> np.ndarray:
