@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import re
 import textwrap
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from typing import Literal
 
@@ -18,6 +18,7 @@ SHORTEST = (
     8  # characters of a name in one line; a longer name goes on in the next where a table would be too wide
 )
 HEAD = 14  # likewise of a column's name
+SEPARATOR = re.compile(r"(?<=[_\-/. ])(?<!\d\.)(?!s\))")  # after it a name may go on in the next line
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,8 @@ class Listing:
     """A table with a name in the first column; the columns in `left` are aligned to the left, others to the right.
 
     text(): a title, the head and the rows, indented by two, then the note, wrapped. Where a table does not fit 80
-    columns its names are folded; numbers never are. html(): the same for notebooks; all text is escaped.
+    columns its names are folded, numbers never are; and it is cut, where words would be. html(): the same for
+    notebooks; all text is escaped.
     """
 
     title: str
@@ -37,7 +39,8 @@ class Listing:
     def text(self) -> str:
         """For a terminal or a file, without a line end."""
         note = textwrap.wrap(self.note, WIDTH - 2, initial_indent="  ", subsequent_indent="  ")
-        return "\n".join([*textwrap.wrap(self.title, WIDTH), *self._lines(), *note])
+        lines = "\n\n".join("\n".join(part._lines()) for part in self._parts())
+        return "\n".join([*textwrap.wrap(self.title, WIDTH), lines, *note])
 
     def html(self) -> str:
         """For a notebook."""
@@ -45,6 +48,30 @@ class Listing:
         note = f"<p>{escape(self.note)}</p>" if self.note else ""
         rows = "".join(self._row(row, "td") for row in self.rows)
         return f"{title}<table><thead>{self._row(self.head, 'th')}</thead><tbody>{rows}</tbody></table>{note}"
+
+    def _parts(self) -> list[Listing]:
+        """The same columns in as many tables as it takes to leave room for the words in the names of rows."""
+        widths = [
+            2 + max(len(x) for x in (*self.head[k].split("\n"), *(row[k] for row in self.rows)))
+            for k in range(len(self.head))
+        ]
+        words = (len(word) for row in self.rows for word in SEPARATOR.split(row[0]))
+        most = WIDTH - 2 - max(SHORTEST, *words, 0)
+        if sum(widths[1:]) <= most or len(widths) == 2:
+            return [self]
+        parts: list[list[int]] = [[]]
+        for k in range(1, len(widths)):
+            if parts[-1] and sum(widths[j] for j in (*parts[-1], k)) > most:
+                parts.append([])
+            parts[-1].append(k)
+        return [
+            replace(
+                self, head=(self.head[0], *(self.head[k] for k in part)),
+                rows=tuple((row[0], *(row[k] for k in part)) for row in self.rows),
+                left=tuple(j + 1 for j, k in enumerate(part) if k in self.left) + ((0,) if 0 in self.left else ()),
+            )
+            for part in parts
+        ]  # fmt: skip
 
     def _row(self, cells: tuple[str, ...], tag: str) -> str:
         sides = ["left" if k in self.left else "right" for k in range(len(cells))]
@@ -90,7 +117,7 @@ class Listing:
 def _folded(name: str, width: int) -> str:
     """The name with line breaks after its separators where it is longer than the width."""
     lines = [""]
-    for part in re.split(r"(?<=[_\-/. ])(?<!\d\.)(?!s\))", name):
+    for part in SEPARATOR.split(name):
         if lines[-1] and len(lines[-1]) + len(part) > width:
             lines.append("")
         lines[-1] += part

@@ -65,3 +65,14 @@ def test_three_digits():
         "1.00e-04",
         "1.23e+04",
     ]
+
+
+def test_a_table_too_wide_for_the_words_of_its_names_is_cut_into_several():
+    head = ("", *(f"variant {k}" for k in range(6)))
+    rows = (("published: parameters", *["1.80e-05 *"] * 6), ("training step [ms]", *["100.0 *"] * 6))
+    text = Listing("Sizes", head, rows, "A note.").text()
+    assert max(map(len, text.splitlines())) <= 80
+    assert text.count("parameters") == 2 and text.count("training step") == 2
+    assert text.count("1.80e-05 *") == 6
+    assert all(f"variant {k}" in text for k in range(6))
+    assert text.splitlines()[-1] == "  A note."
