@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from spelgen.cli.console import note
 from spelgen.errors import RunError
 
 if TYPE_CHECKING:
@@ -16,6 +17,9 @@ if TYPE_CHECKING:
     from spelgen.fitting.config import FitConfig
     from spelgen.logs.mapping import LogMapping
     from spelgen.logs.preprocessing import Preprocessing
+
+
+LIMIT = "max_minutes"
 
 
 class NotApplicable(typer.BadParameter):
@@ -70,7 +74,13 @@ def begun(module: Path, urdf: Path | None, chosen: Chosen) -> Start:
             return fit_config(objective, rigid_bodies=rigid_bodies, options=chosen.flags, defaults=defaults)
         if rates is None and has_rigid_bodies(model):
             return None  # the logs decide
-        return default_config(model, rates or [], chosen.flags, settings.options)
+        flags, defaults = dict(chosen.flags), dict(defaults)
+        if LIMIT in flags:  # whoever says it need not know what the logs will make of it
+            defaults[LIMIT] = flags.pop(LIMIT)
+        found = default_config(model, rates or [], flags, defaults)
+        if LIMIT in chosen.flags and LIMIT not in type(found).model_fields:
+            note(f"info: --max-minutes limits fits to windows; these logs are fitted by {found.objective}")
+        return found
 
     return Start(
         module,

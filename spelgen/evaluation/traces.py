@@ -115,7 +115,7 @@ def _example(
     return {
         "which": which,
         "trajectory": piece.name,
-        "start": plain(piece.t[first]),
+        "start": plain(piece.t[first] - piece.t[0]),
         "error": plain(error),
     } | told
 

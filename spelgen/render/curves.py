@@ -81,7 +81,7 @@ def curves(traces: Mapping[str, Any], facts: Facts, picture: Picture) -> Curves:
         ),
         trajectories=tuple(
             Drawn(
-                f"{x['which'].capitalize()} prediction: {x['trajectory']} from {x['start']:g} s, "
+                f"{x['which'].capitalize()} prediction: {x['trajectory']}, {x['start']:.3g} s into it, "
                 f"relative error {number(x['error'])}",
                 both,
                 tuple(trajectory_panels(x, joints, types)),
