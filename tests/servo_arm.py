@@ -96,7 +96,7 @@ def _simulated(t: np.ndarray, u: np.ndarray, servos: Servos) -> np.ndarray:
         turning = np.stack([-sway * (2 * qd[:, 0] * qd[:, 1] + qd[:, 1] ** 2), sway * qd[:, 0] ** 2], axis=1)
         mass = np.stack([np.stack([m11, m12], 1), np.stack([m12, m22], 1)], 1) + np.diag(armature)
         force = kp * (command - q) - kd * qd - weight - turning
-        inverse = np.linalg.inv(mass)
+        inverse = np.linalg.inv(mass + np.diag(STEP / 2 * kd))  # damping at a step's middle
         qd = qd + STEP * np.einsum("bij,bj->bi", inverse, force)
         impulse = np.zeros_like(qd)
         for _ in range(3):

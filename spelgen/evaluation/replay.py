@@ -13,7 +13,7 @@ from spelgen.dynamics.servo_rollout import STEP, replayed
 from spelgen.errors import Diagnostic
 from spelgen.evaluation.names import MODEL
 from spelgen.fitting.linear_servo import LinearServos
-from spelgen.fitting.servo_windows import derivatives
+from spelgen.fitting.servo_windows import velocities
 from spelgen.logs.commands import delayed_commands, steps_between
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 
@@ -91,7 +91,7 @@ def _starts(parts: Sequence[Part], still: bool) -> tuple[np.ndarray, np.ndarray]
     q = np.stack([x.q[rows.start] for x, rows in parts])
     if still:
         return q, np.zeros_like(q)
-    measured = {id(x): derivatives(x)[0] for x, _ in parts}
+    measured = {id(x): velocities(x) for x, _ in parts}
     return q, np.stack([measured[id(x)][rows.start] for x, rows in parts])
 
 

@@ -1,59 +1,23 @@
 """The rollout of windows under their commands as a function of a model's weights, and its derivatives by them.
 
-Each joint is rolled out by itself, so one weight of every joint is moved at once; weights that all joints share, those
-of the bodies' weight and the delay, are moved one after the other.
+Each joint is rolled out by itself under the load of the bodies, so one weight of every joint is moved at once; weights
+that all joints share, those of the bodies and the delay, are moved one after the other, all in one rollout.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch.func import functional_call, jacfwd
+from torch.func import functional_call
 
 from spelgen.dynamics.servo_rollout import Drives, Load, advanced, balanced, drives_of
-from spelgen.fitting.servo_windows import BodyLoad, ServoWindows, body_load
+from spelgen.fitting.servo_weights import BODIES, Point, ServoWeights, body_directions
+from spelgen.fitting.servo_windows import BodyLoad, Path, ServoWindows, body_load
 from spelgen.fitting.torque_jacobian import Asked
 
-DEVIATIONS = {
-    "servo.raw_kp": 3.0,
-    "servo.raw_kd": 2.0,
-    "dynamics.armature.raw": 2.0,
-    "dynamics.raw_offset": 2.0,
-    "dynamics.friction.raw_coulomb": 2.0,
-    "dynamics.friction.raw_stribeck": 2.0,
-    "dynamics.friction.raw_stribeck_velocity": 1.0,
-    "dynamics.friction.raw_load_dependence": 2.0,
-    "dynamics.friction.raw_bristle_fractions": 2.0,
-}
-"""Weights of joints that are fitted, with the standard deviations of their Gaussian prior."""
-BODIES = "dynamics.inertial_parameters.raw"
-BODY_DEVIATION = 0.3  # of the bodies' weights, which is some 60 % in mass
-DIRECTIONS = 6  # of the bodies' weights, those that move gravity most
-DELAY_DEVIATION = 0.1  # s
 NUDGE, DELAY_NUDGE = 1e-4, 2e-4  # s
-
-
-@dataclass(frozen=True, eq=False)
-class Point:
-    """Weights of joints (p, n), along directions of bodies (r,), and the delay [s]."""
-
-    joints: torch.Tensor
-    bodies: torch.Tensor
-    delay: float
-
-    def moved(self, step: torch.Tensor) -> Point:
-        """One step on."""
-        joints, bodies, delay = step.split([self.joints.numel(), len(self.bodies), 1])
-        later = max(0.0, self.delay + float(delay))
-        return Point(self.joints + joints.view_as(self.joints), self.bodies + bodies, later)
-
-    @property
-    def flat(self) -> torch.Tensor:
-        """All in one."""
-        delay = torch.tensor([self.delay], dtype=torch.float64)
-        return torch.cat([self.joints.flatten(), self.bodies, delay])
+GRAVITY_SAMPLES = 2000  # for the directions of the bodies
 
 
 class ServoProblem:
@@ -61,122 +25,85 @@ class ServoProblem:
 
     def __init__(self, model: Any, windows: ServoWindows) -> None:
         self.model, self.windows = model, windows
+        self.weights = ServoWeights(model)
         self._asked = Asked(model)
-        parameters = dict(model.named_parameters())
-        self.names = [
-            (name, k)
-            for name in DEVIATIONS
-            for k in range(parameters[name].flatten(1).shape[1] if parameters[name].dim() > 1 else 1)
-        ]
-        self.start = self._joints()
-        self.relinearise()
+        self.relinearise(windows.path())
 
-    def relinearise(self) -> Point:
-        """Take the bodies as the model has them now; the point where it stands."""
+    def relinearise(self, path: Path) -> Point:
+        """Take the bodies as the model has them now, moving along this path; the point where it stands."""
         self.raw = self.model.get_parameter(BODIES).detach().clone()
-        self.directions, ten = self._directions()
-        self.load: BodyLoad = body_load(self.model, self.windows, ten)
-        return Point(
-            self._joints(), torch.zeros(self.directions.shape[1]).double(), float(self.model.servo.delay)
-        )
-
-    def deviations(self) -> torch.Tensor:
-        """Of the prior, as `Point.flat`."""
-        own = torch.tensor([DEVIATIONS[name] for name, _ in self.names]).double()
-        bodies = torch.ones(self.directions.shape[1]).double()
-        delay = torch.tensor([DELAY_DEVIATION]).double()
-        return torch.cat([own.repeat_interleave(self.model.n), bodies, delay])
+        q = self.windows.q.flatten(0, 1)
+        self.directions, ten = body_directions(self.model, q[:: max(1, len(q) // GRAVITY_SAMPLES)])
+        self.load: BodyLoad = body_load(self.model, path, ten)
+        still = torch.zeros(self.directions.shape[1]).double()
+        return Point(self.weights.read(), still, float(self.model.servo.delay))
 
     def write(self, point: Point) -> None:
         """Put weights into the model."""
-        parameters = dict(self.model.named_parameters())
+        self.weights.write(point.joints)
         with torch.no_grad():
-            for name, rows in self._named(point.joints.unsqueeze(0)).items():
-                parameters[name].copy_(rows[0, 0])
-            parameters[BODIES].copy_(self.raw + (self.directions @ point.bodies).view_as(self.raw))
+            self.model.get_parameter(BODIES).copy_(
+                self.raw + (self.directions @ point.bodies).view_as(self.raw)
+            )
             self.model.servo.delay.fill_(point.delay)
 
     def errors(self, point: Point) -> torch.Tensor:
-        """Predicted less measured positions (M, n), all samples after the windows' settling."""
-        commands = self.windows.commands(point.delay)
-        return self._errors(point.joints.unsqueeze(0), self._gravity(point.bodies.unsqueeze(0)), commands)[0]
+        """Predicted less measured positions (W, K', n), all samples after the windows' settling."""
+        return self._errors(self._rolled(point, *self._where(point))[0])[0]
+
+    def path(self, point: Point) -> Path:
+        """The measured motion, whose derivatives are the predicted ones and those of what prediction misses."""
+        q, qd = (x[0] for x in self._rolled(point, *self._where(point)))
+        return self.windows.path(q, qd)
 
     def slopes(self, point: Point, errors: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Of the errors (M, n), by the joints' weights (p, M, n), and by those that all share (r + 1, M, n)."""
-        commands, p, r = self.windows.commands(point.delay), len(point.joints), len(point.bodies)
-        added = self._gravity(point.bodies.unsqueeze(0))
-        nudged = point.joints + NUDGE * torch.eye(p).double().unsqueeze(-1)
-        own = (self._errors(nudged, added, commands) - errors) / NUDGE
-        weights = self._gravity(point.bodies + NUDGE * torch.eye(r).double())
-        shared = (self._errors(point.joints.unsqueeze(0), weights, commands) - errors) / NUDGE
-        later = self.windows.commands(point.delay + DELAY_NUDGE)
-        late = (self._errors(point.joints.unsqueeze(0), added, later) - errors) / DELAY_NUDGE
-        return own, torch.cat([shared, late])
+        """Of the errors (W, K', n), by the joints' weights (p, W, K', n), and by those that all share (r + 1, ...)."""
+        p, r = len(point.joints), len(point.bodies)
+        joints, bodies, commands = self._where(point)
+        own = torch.cat([joints + NUDGE * torch.eye(p).double().unsqueeze(-1), joints.expand(r + 1, -1, -1)])
+        shared = torch.cat([bodies.expand(p, -1), bodies + NUDGE * torch.eye(r).double(), bodies])
+        late = self.windows.commands(point.delay + DELAY_NUDGE).unsqueeze(0)
+        every = torch.cat([commands.expand(p + r, -1, -1, -1, -1), late])
+        found = self._errors(self._rolled(point, own, shared, every)[0]) - errors
+        return found[:p] / NUDGE, torch.cat([found[p:-1] / NUDGE, found[-1:] / DELAY_NUDGE])
 
-    def _joints(self) -> torch.Tensor:
-        parameters = dict(self.model.named_parameters())
-        rows = [parameters[name].detach() for name in DEVIATIONS]
-        return torch.cat([x.unsqueeze(0) if x.dim() == 1 else x.mT for x in rows]).clone()
+    def _where(self, point: Point) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Weights of joints (1, p, n), of bodies (1, r), commands (1, W, K, S, n)."""
+        commands = self.windows.commands(point.delay)
+        return point.joints.unsqueeze(0), point.bodies.unsqueeze(0), commands.unsqueeze(0)
 
-    def _named(self, joints: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Weights by name, (P, 1, n) or (P, 1, n, K), of (P, p, n)."""
-        found: dict[str, list[torch.Tensor]] = {}
-        for (name, _), row in zip(self.names, joints.unsqueeze(2).unbind(1), strict=True):
-            found.setdefault(name, []).append(row)
-        several = {name for name, x in self.model.named_parameters() if x.dim() > 1}
-        return {k: torch.stack(x, dim=-1) if k in several else x[0] for k, x in found.items()}
-
-    def _gravity(self, bodies: torch.Tensor) -> torch.Tensor:
-        """What directions of the bodies' weights (P, r) add to gravity, (P, W, K, n)."""
-        return torch.einsum("wknr,pr->pwkn", self.load.weights, bodies)
-
-    def _directions(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Directions of the bodies' weights that move gravity most, (10 B, r), and of their ten parameters."""
-        bodies = self.model.dynamics.inertial_parameters
-
-        def ten(raw: torch.Tensor) -> torch.Tensor:
-            found: torch.Tensor = functional_call(bodies, {"raw": raw.view_as(self.raw)}, ()).flatten()
-            return found
-
-        change = BODY_DEVIATION * jacfwd(ten)(self.raw.flatten()).detach()
-        q = self.windows.q.flatten(0, 1)[:: max(1, self.windows.q[..., 0].numel() // 2000)]
-        with torch.no_grad():
-            gravity = self.model.dynamics.regressor(q, torch.zeros_like(q), torch.zeros_like(q)) @ change
-        _, sizes, turned = torch.linalg.svd(gravity.flatten(0, 1), full_matrices=False)
-        most = int((sizes > 1e-3 * sizes[0].clamp(min=1e-12)).sum()) if len(sizes) else 0
-        chosen = turned[: min(most, DIRECTIONS)].mT
-        return BODY_DEVIATION * chosen, change @ chosen
-
-    def _errors(self, joints: torch.Tensor, added: torch.Tensor, commands: torch.Tensor) -> torch.Tensor:
-        """Errors (P, M, n) with weights of joints (P, p, n) and more gravity (P, W, K, n); each P may be 1."""
-        weights = {f"model.{name}": x.detach() for name, x in self._named(joints).items()}
-        with torch.no_grad():
-            drives, armature = functional_call(self._asked, weights, (_drives,))
-            return self._rolled(drives, armature, added, commands).flatten(1, 2)
+    def _errors(self, q: torch.Tensor) -> torch.Tensor:
+        judged = self.windows.settling + 1
+        return q[:, :, judged:] - self.windows.q[:, judged:]
 
     def _rolled(
+        self, point: Point, joints: torch.Tensor, bodies: torch.Tensor, commands: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """q and qd (P, W, K, n) at all samples, of weights (P, p, n), (P, r) under commands (P, W, K-1, S, n)."""
+        weights = {f"model.{name}": x.detach() for name, x in self.weights.named(joints).items()}
+        with torch.no_grad():
+            drives, armature = functional_call(self._asked, weights, (_drives,))
+            added = torch.einsum("wknr,pr->pwkn", self.load.weights, bodies)
+            return self._integrated(drives, armature, added, commands)
+
+    def _integrated(
         self, drives: Drives, armature: torch.Tensor, added: torch.Tensor, commands: torch.Tensor
-    ) -> torch.Tensor:
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         windows, load = self.windows, self.load
         h = windows.dt.unsqueeze(-1) / windows.steps
-        inertia, bias, gravity = (
-            load.inertia + armature.unsqueeze(-2),
-            load.bias + added,
-            load.gravity + added,
-        )
-        found, state = [], None
-        shape = (max(len(armature), len(added)), *windows.q[:, 0].shape)
+        inertia, bias = load.inertia + armature.unsqueeze(-2), load.bias + added
+        shape = (len(added), *windows.q[:, 0].shape)
+        found, state = [tuple(x[:, 0].expand(shape) for x in (windows.q, windows.qd))], None
         for k in range(windows.q.shape[1] - 1):
             between = (bias[:, :, k] + bias[:, :, k + 1]) / 2
-            now = Load(inertia[:, :, k], between, gravity[:, :, k], coupled=False)
+            now = Load(inertia[:, :, k], between, load.gravity[:, k], coupled=False)
             if state is None:
-                q, qd = (x[:, 0].expand(shape) for x in (windows.q, windows.qd))
-                state = balanced(drives, q, qd, commands[:, k, 0], now)
-            for u in commands[:, k].unbind(1):
+                state = balanced(drives, *found[0], commands[:, :, k, 0], now)
+            for u in commands[:, :, k].unbind(2):
                 state = advanced(drives, state, u, now, h[:, k])
-            if k >= windows.settling:
-                found.append(state.q - windows.q[:, k + 1])
-        return torch.stack(found, dim=2)  # (P, W, K', n)
+            found.append((state.q, state.qd))
+        q, qd = (torch.stack(x, dim=2) for x in zip(*found, strict=True))
+        return q, qd
 
 
 def _drives(model: Any) -> tuple[Drives, torch.Tensor]:

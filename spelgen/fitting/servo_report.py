@@ -7,11 +7,13 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
+from scipy.stats import t as student
 
 from spelgen.fitting.servo_fit import ServoSolution
+from spelgen.fitting.servo_intervals import covariance
 from spelgen.listing import Listing, number
 
-SURE = 1.96  # standard deviations of an interval: 95 %
+SURE = 0.975  # quantile of an interval of 95 %, of Student's t: windows are few
 OPEN = 2.0  # what may be larger by such a factor within its interval is not determined
 UNITS = {"kd": "s", "armature": "s^2", "dry": "rad, m"}
 """What is told in ratio to kp, and the ratio's unit; dry: friction of a joint that slides, under the usual load."""
@@ -25,6 +27,8 @@ ABOUT = (
 def servo_record(model: Any, solution: ServoSolution) -> dict[str, Any]:
     """For config.json: delay [s], errors, and by joint kp, and the ratios to it with intervals of 95 %."""
     n, places = model.n, {name: k for k, (name, _) in enumerate(solution.names)}
+    unsure = covariance(solution.normal, solution.precision)
+    unsure *= student.ppf(SURE, max(1, len(solution.normal.matrix) - 1)) ** 2
     kp = places["servo.raw_kp"]
     joints = []
     for joint, name in enumerate(model.facts.joints):
@@ -34,12 +38,11 @@ def servo_record(model: Any, solution: ServoSolution) -> dict[str, Any]:
         for what, parts in _parts(model, solution, joint).items():
             whole = sum(parts.values())
             ratio = [(places[weight], joint, part / whole) for weight, part in parts.items()]
-            spread = _spread(solution, n, [*ratio, (kp, joint, -trained)])
-            about[what] = {"unit": UNITS[what], **_interval(whole / about["kp"]["value"], spread)}
+            half = _half(unsure, n, [*ratio, (kp, joint, -trained)])
+            about[what] = {"unit": UNITS[what], **_interval(whole / about["kp"]["value"], half)}
         joints.append(about)
-    delay = float(solution.covariance.diagonal()[-1].sqrt())
     return {
-        "delay": {"value": float(model.delay), "sigma": delay},
+        "delay": {"value": float(model.delay), "half": float(unsure[-1, -1].sqrt())},
         "rms": solution.rms.tolist(),
         "steps": solution.steps,
         "joints": joints,
@@ -61,16 +64,16 @@ def _parts(model: Any, solution: ServoSolution, joint: int) -> dict[str, dict[st
         return {what: {name: float(x[joint]) for name, x in parts.items()} for what, parts in found.items()}
 
 
-def _spread(solution: ServoSolution, n: int, terms: list[tuple[int, int, float]]) -> float:
-    """Standard deviation of a sum of weights (row, joint, factor) after the fit."""
-    direction = torch.zeros(len(solution.covariance)).double()
+def _half(unsure: torch.Tensor, n: int, terms: list[tuple[int, int, float]]) -> float:
+    """Half the interval of a sum of weights (row, joint, factor)."""
+    direction = torch.zeros(len(unsure)).double()
     for row, joint, factor in terms:
         direction[row * n + joint] = factor
-    return float((direction @ solution.covariance @ direction).clamp(min=0).sqrt())
+    return float((direction @ unsure @ direction).clamp(min=0).sqrt())
 
 
-def _interval(value: float, spread: float) -> dict[str, Any]:
-    factor = math.exp(min(SURE * spread, 50.0))
+def _interval(value: float, half: float) -> dict[str, Any]:
+    factor = math.exp(min(half, 50.0))
     return {"value": value, "low": value / factor, "high": value * factor, "determined": factor < OPEN}
 
 
@@ -89,7 +92,7 @@ def servo_text(record: Mapping[str, Any]) -> str:
         else "all of these are determined"
     )
     delay = record["delay"]
-    late = f"delay {1000 * delay['value']:.1f} ms, +- {1000 * SURE * delay['sigma']:.1f} ms"
+    late = f"delay {1000 * delay['value']:.1f} ms, +- {1000 * delay['half']:.1f} ms"
     errors = ", ".join(number(1000 * x) for x in record["rms"])
     return f"{late}\nerrors on training windows, RMS by joint: {errors} mrad\n{table}\n{left}"
 

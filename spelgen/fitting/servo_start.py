@@ -28,7 +28,8 @@ def start_servos(model: Any, windows: ServoWindows, load: BodyLoad, delay: float
     direction = torch.from_numpy(z / dynamics.friction.bristles.reach.numpy()).mean(dim=-1)
     rows = slice(windows.settling, -1)
     error = (u - windows.q[:, :-1])[:, windows.settling :]
-    columns = [x[:, rows] for x in (windows.qd, windows.qdd, direction, load.bias)]
+    path = windows.path()
+    columns = [x[:, rows] for x in (path.qd, path.qdd, direction, load.bias)]
     found = [
         _solved(torch.stack([*(x[..., k] for x in columns), torch.ones_like(error[..., k])]), error[..., k])
         for k in range(n)

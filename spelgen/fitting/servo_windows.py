@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -29,14 +29,21 @@ SMOOTHING = 0.18  # s over which derivatives are taken
 BLOCK = 2**13  # samples at a time
 
 
+class Path(NamedTuple):
+    """A motion along windows: q, qd and qdd, (W, K, n)."""
+
+    q: torch.Tensor
+    qd: torch.Tensor
+    qdd: torch.Tensor
+
+
 @dataclass(frozen=True, eq=False)
 class ServoWindows:
-    """q, qd and qdd (W, K, n), the latter two smoothed; dt (W, K-1) [s]; `settling` samples at the start of each."""
+    """q and, smoothed, qd (W, K, n); dt (W, K-1) [s]; `settling` samples at the start of each."""
 
     pieces: tuple[tuple[Trajectory, int], ...]
     q: torch.Tensor
     qd: torch.Tensor
-    qdd: torch.Tensor
     dt: torch.Tensor
     settling: int
     steps: int
@@ -45,6 +52,14 @@ class ServoWindows:
     def rate(self) -> float:
         """Samples in a second [Hz]."""
         return float(1 / self.dt.mean())
+
+    def path(self, q: torch.Tensor | None = None, qd: torch.Tensor | None = None) -> Path:
+        """The measured motion. q, qd: predicted, of which only what they miss is smoothed: so fast motion stays."""
+        if q is None or qd is None:
+            return Path(self.q, *(torch.from_numpy(x) for x in smoothed(self.q.numpy(), self.rate)))
+        missed = smoothed((self.q - q).numpy(), self.rate)
+        faster = np.gradient(qd.numpy(), 1 / self.rate, axis=1)
+        return Path(self.q, *(torch.from_numpy(x + y) for x, y in zip((qd.numpy(), faster), missed, strict=True)))
 
     def commands(self, delay: float) -> torch.Tensor:
         """Of ``delay`` [s] ago, over the steps between samples (W, K-1, S, n)."""
@@ -63,25 +78,26 @@ def servo_windows(logs: Sequence[Trajectory], preprocessing: Preprocessing, most
         raise LogError(f"at most {length} samples without a gap", expected="a second of motion or more")
     starts = [(x, a) for x in pieces for a in range(0, len(x) - length + 1, max(1, length - settling))]
     starts = starts[:: -(-len(starts) // most)]
-    smooth = {id(x): derivatives(x) for x in pieces if len(x) >= length}
-    columns = [
+    smooth = {id(x): velocities(x) for x in pieces if len(x) >= length}
+    q, qd = (
         torch.from_numpy(np.stack([source(x)[a : a + length] for x, a in starts]))
-        for source in (lambda x: x.q, lambda x: smooth[id(x)][0], lambda x: smooth[id(x)][1])
-    ]
+        for source in (lambda x: x.q, lambda x: smooth[id(x)])
+    )
     dt = torch.from_numpy(np.stack([np.diff(x.t[a : a + length]) for x, a in starts]))
     steps = max(steps_between(x, STEP) for x, _ in starts)
-    q, qd, qdd = columns
-    return ServoWindows(tuple(starts), q, qd, qdd, dt, settling, steps)
+    return ServoWindows(tuple(starts), q, qd, dt, settling, steps)
 
 
-def derivatives(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
-    """qd and qdd (T, n), by cubic polynomials over `SMOOTHING` (Savitzky and Golay, 1964)."""
-    width = max(5, 2 * round(SMOOTHING * trajectory.sample_rate / 2) + 1)
-    width = min(width, len(trajectory) - 1 + len(trajectory) % 2)
-    step = 1 / trajectory.sample_rate
-    first, second = (
-        savgol_filter(trajectory.q, width, 3, deriv=order, delta=step, axis=0) for order in (1, 2)
-    )
+def velocities(trajectory: Trajectory) -> np.ndarray:
+    """qd (T, n), smoothed."""
+    return smoothed(trajectory.q, trajectory.sample_rate)[0]
+
+
+def smoothed(q: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndarray]:
+    """First and second derivatives of (..., T, n), by cubic polynomials over `SMOOTHING` (Savitzky and Golay, 1964)."""
+    samples = q.shape[-2]
+    width = min(max(5, 2 * round(SMOOTHING * rate / 2) + 1), samples - 1 + samples % 2)
+    first, second = (savgol_filter(q, width, 3, deriv=order, delta=1 / rate, axis=-2) for order in (1, 2))
     return first, second
 
 
@@ -90,7 +106,7 @@ class BodyLoad:
     """What the bodies are to the drives along windows.
 
     inertia: (W, K, n) of each joint by itself, without the drives'. bias: the torque (W, K, n) that everything else
-    takes, gravity: its part of that. weights: what directions of the bodies' weights add to gravity, (W, K, n, r).
+    takes, gravity: its part of that. weights: what directions of the bodies' weights add to all of it, (W, K, n, r).
     """
 
     inertia: torch.Tensor
@@ -99,10 +115,10 @@ class BodyLoad:
     weights: torch.Tensor
 
 
-def body_load(model: Any, windows: ServoWindows, directions: torch.Tensor) -> BodyLoad:
+def body_load(model: Any, path: Path, directions: torch.Tensor) -> BodyLoad:
     """Of the model as it is; directions: of the ten parameters of all bodies, (10 bodies, r)."""
     dynamics = model.dynamics
-    flat = [x.flatten(0, 1) for x in (windows.q, windows.qd, windows.qdd)]
+    flat = [x.flatten(0, 1) for x in path]
     found: list[tuple[torch.Tensor, ...]] = []
     with torch.no_grad():
         prepared, armature = dynamics.prepare(), dynamics.armature()
@@ -112,8 +128,7 @@ def body_load(model: Any, windows: ServoWindows, directions: torch.Tensor) -> Bo
             inertia = mass.diagonal(dim1=-2, dim2=-1) - armature
             others = (mass @ qdd.unsqueeze(-1)).squeeze(-1) - (inertia + armature) * qdd
             bias = dynamics.nonlinear_at(at, qd, residuals, prepared) + others
-            still = torch.zeros_like(q)
-            weights = dynamics.regressor(q, still, still) @ directions
+            weights = dynamics.regressor(q, qd, qdd) @ directions
             found.append((inertia, bias, dynamics.gravity_at(at, prepared), weights))
-    shape = windows.q.shape[:2]
+    shape = path.q.shape[:2]
     return BodyLoad(*(torch.cat(x).unflatten(0, shape) for x in zip(*found, strict=True)))

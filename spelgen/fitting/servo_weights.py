@@ -1,0 +1,117 @@
+"""Which weights of a model logs of commanded positions move, how far they may be from where they start, and one flat
+vector of all of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch.func import functional_call, jacfwd
+
+FRICTION = "dynamics.friction.raw_"
+BODIES = "dynamics.inertial_parameters.raw"
+BODY_DEVIATION = 0.3  # of the bodies' weights, which is some 60 % in mass
+DIRECTIONS = 6  # of the bodies' weights, those that move gravity most
+FAINT = 1e-3  # of the strongest direction: weaker ones are left as they are
+DELAY_DEVIATION = 0.1  # s
+
+
+@dataclass(frozen=True)
+class JointWeight:
+    """A parameter of which each joint has its own row, and the standard deviation of its Gaussian prior."""
+
+    name: str
+    deviation: float
+
+
+JOINT_WEIGHTS = (
+    JointWeight("servo.raw_kp", 3.0),
+    JointWeight("servo.raw_kd", 2.0),
+    JointWeight("dynamics.armature.raw", 2.0),
+    JointWeight("dynamics.raw_offset", 2.0),
+    JointWeight(FRICTION + "coulomb", 2.0),
+    JointWeight(FRICTION + "stribeck", 2.0),
+    JointWeight(FRICTION + "stribeck_velocity", 1.0),
+    JointWeight(FRICTION + "load_dependence", 2.0),
+    JointWeight(FRICTION + "bristle_fractions", 2.0),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """Weights of joints (p, n), along directions of bodies (r,), and the delay [s]."""
+
+    joints: torch.Tensor
+    bodies: torch.Tensor
+    delay: float
+
+    def moved(self, step: torch.Tensor) -> Point:
+        """One step on; no command is early."""
+        joints, bodies, delay = step.split([self.joints.numel(), len(self.bodies), 1])
+        later = max(0.0, self.delay + float(delay))
+        return Point(self.joints + joints.view_as(self.joints), self.bodies + bodies, later)
+
+    @property
+    def flat(self) -> torch.Tensor:
+        """All in one, (p n + r + 1,)."""
+        delay = torch.tensor([self.delay], dtype=torch.float64)
+        return torch.cat([self.joints.flatten(), self.bodies, delay])
+
+
+class ServoWeights:
+    """The weights of a model, to and fro."""
+
+    def __init__(self, model: Any) -> None:
+        self.model = model
+        self.parameters = {each.name: model.get_parameter(each.name) for each in JOINT_WEIGHTS}
+        self.names = [
+            (each.name, k)
+            for each in JOINT_WEIGHTS
+            for k in range(self.parameters[each.name][:1].numel())  # of one joint
+        ]
+
+    def read(self) -> torch.Tensor:
+        """Of joints, as the model has them, (p, n)."""
+        return torch.cat([x.detach().reshape(self.model.n, -1).mT for x in self.parameters.values()]).clone()
+
+    def named(self, joints: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Weights by name, each (P, 1, n) or (P, 1, n, K), of (P, p, n)."""
+        shapes = [x[:1].numel() for x in self.parameters.values()]
+        parts = joints.unsqueeze(1).mT.split(shapes, dim=-1)  # (P, 1, n, K)
+        return {
+            name: part if x.dim() > 1 else part[..., 0]
+            for (name, x), part in zip(self.parameters.items(), parts, strict=True)
+        }
+
+    def write(self, joints: torch.Tensor) -> None:
+        """Put those of joints (p, n) into the model."""
+        with torch.no_grad():
+            for name, rows in self.named(joints.unsqueeze(0)).items():
+                self.parameters[name].copy_(rows[0, 0])
+
+    def deviations(self, directions: int) -> torch.Tensor:
+        """Of the prior, as `Point.flat`."""
+        by_name = {each.name: each.deviation for each in JOINT_WEIGHTS}
+        own = torch.tensor([by_name[name] for name, _ in self.names]).double()
+        shared = torch.tensor([1.0] * directions + [DELAY_DEVIATION]).double()
+        return torch.cat([own.repeat_interleave(self.model.n), shared])
+
+
+def body_directions(model: Any, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Directions of the bodies' weights that move gravity at q (M, n) most, (10 B, r), and of their ten parameters."""
+    bodies, raw = model.dynamics.inertial_parameters, model.get_parameter(BODIES).detach()
+
+    def ten(flat: torch.Tensor) -> torch.Tensor:
+        found: torch.Tensor = functional_call(bodies, {"raw": flat.view_as(raw)}, ()).flatten()
+        return found
+
+    change = BODY_DEVIATION * jacfwd(ten)(raw.flatten()).detach()
+    still = torch.zeros_like(q)
+    with torch.no_grad():
+        gravity = model.dynamics.regressor(q, still, still) @ change
+    _, sizes, turned = torch.linalg.svd(gravity.flatten(0, 1), full_matrices=False)
+    felt = int((sizes > FAINT * sizes[0].clamp(min=1e-12)).sum()) if len(sizes) else 0
+    chosen = turned[: min(felt, DIRECTIONS)].mT
+    return BODY_DEVIATION * chosen, change @ chosen
