@@ -28,7 +28,10 @@ ALIKE = 0.5  # s over which errors may be alike
 ROUNDS, STEPS, TRIES = 5, 12, 6
 FINE = 2  # rounds at the end with all steps between samples, the others with half of them
 LONGEST = 1.0  # of a step, in any weight: they are logarithms
-GAIN = (1.0, 0.05)  # of the cost, in rounds before the fine ones, and in these: a step that gains less ends a round
+GAIN = (
+    1.0,
+    0.05,
+)  # of the cost, in rounds before the fine ones, and in these: a step that gains less ends a round
 DAMPING = (1e-2, 1e-5)  # to begin with, in the first round and in the others
 
 
@@ -43,8 +46,8 @@ class Normal(NamedTuple):
 class ServoSolution:
     """How a fit ended. rms: (n,) root mean square errors of positions over windows [rad, m]. names: of the rows of
     weights of joints, (p, n), which with directions of bodies and the delay are the k unknowns of `Point.flat`.
-    normal: of windows there; precision: (k,) of the prior, away: (k,) of the unknowns from its centre. gravity: (n,)
-    mean size of its torque along the windows.
+    normal: of windows there; precision: (k,) of the prior; halved: (k,) what half as long steps of the rollouts still
+    changed at the end. gravity: (n,) mean size of its torque along the windows.
     """
 
     names: tuple[tuple[str, int], ...]
@@ -53,6 +56,7 @@ class ServoSolution:
     cost: float
     normal: Normal
     precision: torch.Tensor
+    halved: torch.Tensor
     gravity: torch.Tensor
 
 
@@ -61,36 +65,35 @@ def fit_servos(model: Any, windows: ServoWindows, logs: Sequence[Trajectory]) ->
     delay = 1 / windows.rate
     model.servo.delay.fill_(delay)
     start_servos(model, windows, ServoProblem(model, windows).load, delay)
-    problem = ServoProblem(model, replace(windows, steps=-(-windows.steps // 2)))
     noise = torch.from_numpy(np.max([encoder_step(x.q) for x in logs], axis=0)).clamp(min=1e-5) / 12**0.5
-    point = problem.relinearise(windows.path())
-    centre, steps = point.flat, 0
+    problem = ServoProblem(model, replace(windows, steps=-(-windows.steps // 2)))
+    point, steps = problem.start, 0
     for turn in range(ROUNDS):
+        fine = turn >= ROUNDS - FINE
+        if fine:
+            problem.windows = windows
         if turn:
-            problem.write(point)
-            if turn == ROUNDS - FINE:
-                problem = ServoProblem(model, windows)
-            path = problem.path(point)
-            centre = centre - torch.cat([torch.zeros_like(point.joints).flatten(), point.bodies, torch.zeros(1)])
-            point = problem.relinearise(path)
-        descent = Descent(problem, centre, noise, problem.errors(point))
-        point, cost, taken = descent.run(point, DAMPING[turn > 0], GAIN[turn >= ROUNDS - FINE])
+            problem.relinearise(point, problem.path(point))
+        descent = Descent(problem, noise, problem.errors(point))
+        point, cost, taken = descent.run(point, DAMPING[turn > 0], GAIN[fine])
         steps += taken
+    problem.windows = replace(windows, steps=2 * windows.steps)
+    normal = descent.normal(point, problem.errors(point))
+    halved = descent.step(normal, point)
+    point = point.moved(halved)
     problem.write(point)
     errors = problem.errors(point)
     return ServoSolution(
         tuple(problem.weights.names), errors.square().mean(dim=(0, 1)).sqrt(), steps, cost,
-        descent.normal(point, errors), descent.precision, problem.load.gravity.abs().mean(dim=(0, 1)),
+        normal, descent.precision, halved, problem.load.gravity.abs().mean(dim=(0, 1)),
     )  # fmt: skip
 
 
 class Descent:
     """Steps with one scale of errors (n,), of which so many (n,) are alike."""
 
-    def __init__(
-        self, problem: ServoProblem, centre: torch.Tensor, noise: torch.Tensor, errors: torch.Tensor
-    ) -> None:
-        self.problem, self.centre = problem, centre
+    def __init__(self, problem: ServoProblem, noise: torch.Tensor, errors: torch.Tensor) -> None:
+        self.problem, self.centre = problem, problem.start.flat
         self.precision = problem.weights.deviations(problem.directions.shape[1]) ** -2
         self.scale = torch.maximum(1.4826 * errors.abs().flatten(0, 1).median(dim=0).values, noise)
         self.alike = _alike(errors * self._robust(errors), max(1, round(ALIKE * problem.windows.rate)))
@@ -104,14 +107,19 @@ class Descent:
             return float("inf")
         squares = (errors / self.scale).square()
         away = point.flat - self.centre
-        return float((4 * torch.log1p(squares / 4) / self.alike).sum() + (self.precision * away.square()).sum())
+        return float(
+            (4 * torch.log1p(squares / 4) / self.alike).sum() + (self.precision * away.square()).sum()
+        )
 
     def normal(self, point: Point, errors: torch.Tensor) -> Normal:
         """Of the windows alone, without the prior."""
         own, shared = self.problem.slopes(point, errors)
         weight = self._robust(errors) / self.scale**2 / self.alike
         p, (count, _, n), s = len(own), errors.shape, len(shared)
-        matrix, target = torch.zeros(count, p * n + s, p * n + s).double(), torch.zeros(count, p * n + s).double()
+        matrix, target = (
+            torch.zeros(count, p * n + s, p * n + s).double(),
+            torch.zeros(count, p * n + s).double(),
+        )
         for k in range(n):
             slope = torch.cat([own[..., k], shared[..., k]]).transpose(0, 1)  # (W, p + s, K')
             rows = torch.cat([torch.arange(p) * n + k, p * n + torch.arange(s)])
@@ -120,17 +128,21 @@ class Descent:
             target[:, rows] += (weighted @ errors[..., k].unsqueeze(-1)).squeeze(-1)
         return Normal(matrix, target)
 
+    def step(self, normal: Normal, point: Point, damping: float = 0.0) -> torch.Tensor:
+        """To where the cost is least by its first two derivatives, (k,)."""
+        matrix = normal.matrix.sum(dim=0) + torch.diag(self.precision)
+        target = normal.target.sum(dim=0) + self.precision * (point.flat - self.centre)
+        damped = matrix + damping * torch.diag(matrix.diagonal())
+        return -torch.linalg.solve(damped, target).clamp(-LONGEST, LONGEST)
+
     def run(self, point: Point, damping: float, least: float) -> tuple[Point, float, int]:
         """The point where steps gain no more, its cost, and how many there were."""
         errors = self.problem.errors(point)
         cost, taken = self.cost(point, errors), 0
         for _ in range(STEPS):
             normal = self.normal(point, errors)
-            matrix = normal.matrix.sum(dim=0) + torch.diag(self.precision)
-            target = normal.target.sum(dim=0) + self.precision * (point.flat - self.centre)
             for _ in range(TRIES):
-                damped = matrix + damping * torch.diag(matrix.diagonal())
-                tried = point.moved(-torch.linalg.solve(damped, target).clamp(-LONGEST, LONGEST))
+                tried = point.moved(self.step(normal, point, damping))
                 found = self.problem.errors(tried)
                 new = self.cost(tried, found)
                 if new < cost:

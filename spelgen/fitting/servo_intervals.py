@@ -12,12 +12,15 @@ import torch
 from spelgen.fitting.servo_fit import Normal
 
 
-def covariance(normal: Normal, precision: torch.Tensor) -> torch.Tensor:
-    """Of the unknowns, (k, k): S^-1 (B + P) S^-1, of which the jackknife gives the first term, P is the prior's."""
+def covariance(normal: Normal, precision: torch.Tensor, halved: torch.Tensor) -> torch.Tensor:
+    """Of the unknowns, (k, k): S^-1 (B + P) S^-1, of which the jackknife gives the first term, P is the prior's; and
+    as much as they went when steps were halved.
+    """
     count, prior = len(normal.matrix), torch.diag(precision)
     whole = normal.matrix.sum(dim=0) + prior
     # where the fit ended, the slopes of all windows and of the prior add up to nothing
     moved = torch.linalg.solve(whole - normal.matrix, normal.target.unsqueeze(-1)).squeeze(-1)
     moved = moved - moved.mean(dim=0)
     inverse = torch.linalg.inv(whole)
-    return (count - 1) / count * moved.mT @ moved + inverse @ prior @ inverse
+    jackknife = (count - 1) / count * moved.mT @ moved
+    return jackknife + inverse @ prior @ inverse + torch.outer(halved, halved)

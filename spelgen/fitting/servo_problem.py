@@ -12,7 +12,7 @@ import torch
 from torch.func import functional_call
 
 from spelgen.dynamics.servo_rollout import Drives, Load, advanced, balanced, drives_of
-from spelgen.fitting.servo_weights import BODIES, Point, ServoWeights, body_directions
+from spelgen.fitting.servo_weights import BODIES, Point, ServoWeights, body_directions, inertial_slopes
 from spelgen.fitting.servo_windows import BodyLoad, Path, ServoWindows, body_load
 from spelgen.fitting.torque_jacobian import Asked
 
@@ -27,24 +27,25 @@ class ServoProblem:
         self.model, self.windows = model, windows
         self.weights = ServoWeights(model)
         self._asked = Asked(model)
-        self.relinearise(windows.path())
+        q = windows.q.flatten(0, 1)
+        self.directions = body_directions(model, q[:: max(1, len(q) // GRAVITY_SAMPLES)])
+        self._raw = model.get_parameter(BODIES).detach().clone()
+        bodies = torch.zeros(self.directions.shape[1]).double()
+        self.start = Point(self.weights.read(), bodies, float(model.servo.delay))
+        self.relinearise(self.start, windows.path())
 
-    def relinearise(self, path: Path) -> Point:
-        """Take the bodies as the model has them now, moving along this path; the point where it stands."""
-        self.raw = self.model.get_parameter(BODIES).detach().clone()
-        q = self.windows.q.flatten(0, 1)
-        self.directions, ten = body_directions(self.model, q[:: max(1, len(q) // GRAVITY_SAMPLES)])
-        self.load: BodyLoad = body_load(self.model, path, ten)
-        still = torch.zeros(self.directions.shape[1]).double()
-        return Point(self.weights.read(), still, float(self.model.servo.delay))
+    def relinearise(self, point: Point, path: Path) -> None:
+        """Take the bodies as they are at this point, moving along this path."""
+        self.write(point)
+        self._at = point.bodies
+        self.load: BodyLoad = body_load(self.model, path, inertial_slopes(self.model) @ self.directions)
 
     def write(self, point: Point) -> None:
         """Put weights into the model."""
         self.weights.write(point.joints)
+        bodies = self._raw + (self.directions @ point.bodies).view_as(self._raw)
         with torch.no_grad():
-            self.model.get_parameter(BODIES).copy_(
-                self.raw + (self.directions @ point.bodies).view_as(self.raw)
-            )
+            self.model.get_parameter(BODIES).copy_(bodies)
             self.model.servo.delay.fill_(point.delay)
 
     def errors(self, point: Point) -> torch.Tensor:
@@ -83,7 +84,7 @@ class ServoProblem:
         weights = {f"model.{name}": x.detach() for name, x in self.weights.named(joints).items()}
         with torch.no_grad():
             drives, armature = functional_call(self._asked, weights, (_drives,))
-            added = torch.einsum("wknr,pr->pwkn", self.load.weights, bodies)
+            added = torch.einsum("wknr,pr->pwkn", self.load.weights, bodies - self._at)
             return self._integrated(drives, armature, added, commands)
 
     def _integrated(
@@ -93,17 +94,17 @@ class ServoProblem:
         h = windows.dt.unsqueeze(-1) / windows.steps
         inertia, bias = load.inertia + armature.unsqueeze(-2), load.bias + added
         shape = (len(added), *windows.q[:, 0].shape)
-        found, state = [tuple(x[:, 0].expand(shape) for x in (windows.q, windows.qd))], None
+        q, qd = windows.q[:, 0].expand(shape), windows.qd[:, 0].expand(shape)
+        found, state = [(q, qd)], None
         for k in range(windows.q.shape[1] - 1):
             between = (bias[:, :, k] + bias[:, :, k + 1]) / 2
             now = Load(inertia[:, :, k], between, load.gravity[:, k], coupled=False)
             if state is None:
-                state = balanced(drives, *found[0], commands[:, :, k, 0], now)
+                state = balanced(drives, q, qd, commands[:, :, k, 0], now)
             for u in commands[:, :, k].unbind(2):
                 state = advanced(drives, state, u, now, h[:, k])
             found.append((state.q, state.qd))
-        q, qd = (torch.stack(x, dim=2) for x in zip(*found, strict=True))
-        return q, qd
+        return torch.stack([x for x, _ in found], dim=2), torch.stack([x for _, x in found], dim=2)
 
 
 def _drives(model: Any) -> tuple[Drives, torch.Tensor]:

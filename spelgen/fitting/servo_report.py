@@ -14,6 +14,7 @@ from spelgen.fitting.servo_intervals import covariance
 from spelgen.listing import Listing, number
 
 SURE = 0.975  # quantile of an interval of 95 %, of Student's t: windows are few
+LAWS = 0.01  # relative standard deviation of a ratio by what laws of friction are not, see benchmarks/servo_recovery.py
 OPEN = 2.0  # what may be larger by such a factor within its interval is not determined
 UNITS = {"kd": "s", "armature": "s^2", "dry": "rad, m"}
 """What is told in ratio to kp, and the ratio's unit; dry: friction of a joint that slides, under the usual load."""
@@ -27,8 +28,8 @@ ABOUT = (
 def servo_record(model: Any, solution: ServoSolution) -> dict[str, Any]:
     """For config.json: delay [s], errors, and by joint kp, and the ratios to it with intervals of 95 %."""
     n, places = model.n, {name: k for k, (name, _) in enumerate(solution.names)}
-    unsure = covariance(solution.normal, solution.precision)
-    unsure *= student.ppf(SURE, max(1, len(solution.normal.matrix) - 1)) ** 2
+    unsure = covariance(solution.normal, solution.precision, solution.halved)
+    sure = student.ppf(SURE, max(1, len(solution.normal.matrix) - 1))
     kp = places["servo.raw_kp"]
     joints = []
     for joint, name in enumerate(model.facts.joints):
@@ -38,11 +39,11 @@ def servo_record(model: Any, solution: ServoSolution) -> dict[str, Any]:
         for what, parts in _parts(model, solution, joint).items():
             whole = sum(parts.values())
             ratio = [(places[weight], joint, part / whole) for weight, part in parts.items()]
-            half = _half(unsure, n, [*ratio, (kp, joint, -trained)])
+            half = sure * _deviation(unsure, n, [*ratio, (kp, joint, -trained)])
             about[what] = {"unit": UNITS[what], **_interval(whole / about["kp"]["value"], half)}
         joints.append(about)
     return {
-        "delay": {"value": float(model.delay), "half": float(unsure[-1, -1].sqrt())},
+        "delay": {"value": float(model.delay), "half": sure * float(unsure[-1, -1].sqrt())},
         "rms": solution.rms.tolist(),
         "steps": solution.steps,
         "joints": joints,
@@ -64,12 +65,12 @@ def _parts(model: Any, solution: ServoSolution, joint: int) -> dict[str, dict[st
         return {what: {name: float(x[joint]) for name, x in parts.items()} for what, parts in found.items()}
 
 
-def _half(unsure: torch.Tensor, n: int, terms: list[tuple[int, int, float]]) -> float:
-    """Half the interval of a sum of weights (row, joint, factor)."""
+def _deviation(unsure: torch.Tensor, n: int, terms: list[tuple[int, int, float]]) -> float:
+    """The standard deviation of a sum of weights (row, joint, factor), and of laws."""
     direction = torch.zeros(len(unsure)).double()
     for row, joint, factor in terms:
         direction[row * n + joint] = factor
-    return float((direction @ unsure @ direction).clamp(min=0).sqrt())
+    return math.hypot(LAWS, float((direction @ unsure @ direction).clamp(min=0).sqrt()))
 
 
 def _interval(value: float, half: float) -> dict[str, Any]:

@@ -99,19 +99,23 @@ class ServoWeights:
         return torch.cat([own.repeat_interleave(self.model.n), shared])
 
 
-def body_directions(model: Any, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Directions of the bodies' weights that move gravity at q (M, n) most, (10 B, r), and of their ten parameters."""
+def body_directions(model: Any, q: torch.Tensor) -> torch.Tensor:
+    """Directions of the bodies' weights that move gravity at q (M, n) most, (10 B, r), a standard deviation long."""
+    still = torch.zeros_like(q)
+    with torch.no_grad():
+        gravity = model.dynamics.regressor(q, still, still) @ inertial_slopes(model)
+    _, sizes, turned = torch.linalg.svd(gravity.flatten(0, 1), full_matrices=False)
+    felt = int((sizes > FAINT * sizes[0].clamp(min=1e-12)).sum()) if len(sizes) else 0
+    return BODY_DEVIATION * turned[: min(felt, DIRECTIONS)].mT
+
+
+def inertial_slopes(model: Any) -> torch.Tensor:
+    """Of the ten parameters of all bodies by their weights, (10 B, 10 B)."""
     bodies, raw = model.dynamics.inertial_parameters, model.get_parameter(BODIES).detach()
 
     def ten(flat: torch.Tensor) -> torch.Tensor:
         found: torch.Tensor = functional_call(bodies, {"raw": flat.view_as(raw)}, ()).flatten()
         return found
 
-    change = BODY_DEVIATION * jacfwd(ten)(raw.flatten()).detach()
-    still = torch.zeros_like(q)
-    with torch.no_grad():
-        gravity = model.dynamics.regressor(q, still, still) @ change
-    _, sizes, turned = torch.linalg.svd(gravity.flatten(0, 1), full_matrices=False)
-    felt = int((sizes > FAINT * sizes[0].clamp(min=1e-12)).sum()) if len(sizes) else 0
-    chosen = turned[: min(felt, DIRECTIONS)].mT
-    return BODY_DEVIATION * chosen, change @ chosen
+    slopes: torch.Tensor = jacfwd(ten)(raw.flatten())
+    return slopes.detach()

@@ -59,7 +59,9 @@ class ServoWindows:
             return Path(self.q, *(torch.from_numpy(x) for x in smoothed(self.q.numpy(), self.rate)))
         missed = smoothed((self.q - q).numpy(), self.rate)
         faster = np.gradient(qd.numpy(), 1 / self.rate, axis=1)
-        return Path(self.q, *(torch.from_numpy(x + y) for x, y in zip((qd.numpy(), faster), missed, strict=True)))
+        return Path(
+            self.q, *(torch.from_numpy(x + y) for x, y in zip((qd.numpy(), faster), missed, strict=True))
+        )
 
     def commands(self, delay: float) -> torch.Tensor:
         """Of ``delay`` [s] ago, over the steps between samples (W, K-1, S, n)."""
