@@ -42,8 +42,8 @@ fitting: run_schema run_folder run_lock
 fitting: gaussian_prior adaptive rollout calibration dataset streaming workers torque_samples torque_jacobian
 fitting: optimizers residual_fit torque_fit torque_report
 fitting: torque_networks urdf_regularizer stages compiled process progress validation loop
-fitting: run_record fitted servo_windows servo_start servo_weights servo_problem servo_fit servo_intervals servo_report
-fitting: linear_servo servo_run
+fitting: run_record fitted servo_windows servo_start servo_weights servo_problem servo_descent servo_dead_zones
+fitting: servo_fit servo_intervals servo_report linear_servo servo_run
 fitting: fit train
 evaluation: names replay disturbance stiff baselines trust forecast torque rollout invariants examples
 evaluation: tables verdict results horizons torque_traces traces csv_file subject evaluate

@@ -15,7 +15,10 @@ from servo_arm import COM, GRAVITY, MASS, Servos, servo_logs, write_servo_arm
 import spelgen
 from spelgen.errors import LogError, OptionError, SettingsError
 from spelgen.evaluation.replay import LATE, LINEAR
-from spelgen.fitting import servo_fit
+from spelgen.fitting import servo_descent, servo_fit
+from spelgen.fitting.servo_dead_zones import dead_zones
+from spelgen.fitting.servo_descent import Normal
+from spelgen.fitting.servo_intervals import covariance
 from spelgen.fitting.servo_report import servo_text
 from spelgen.logs.commands import delayed_commands
 from spelgen.logs.trajectory import Trajectory
@@ -76,9 +79,44 @@ def test_a_module_of_servos_stands_alone_and_says_so(arm, tmp_path):
     assert "in ratio to kp only" in " ".join(arm.inspect().text().split())
 
 
+def test_within_its_dead_zone_a_servo_gives_nothing(arm):
+    servo = spelgen.build(arm, "closed-form").servo
+    servo.dead_zone[:] = torch.tensor([0.02, 0.0])
+    u, still = torch.tensor([[0.015, 0.1], [0.05, 0.1]]).double(), torch.zeros(2, 2).double()
+    torque = servo(u, still, still).detach()
+    assert torque[:, 0].tolist() == [0.0, pytest.approx(0.03 * 12.0)]
+    assert float(servo.stored_energy(u, still)[1].detach()) == pytest.approx(0.5 * 12 * (0.03**2 + 0.1**2))
+
+
+def test_a_dead_zone_enters_where_windows_left_out_gain():
+    rng = torch.Generator().manual_seed(0)
+    slopes = torch.randn(30, 50, 3, generator=rng).double()  # of an error by a weight and two dead zones
+    errors = torch.randn(30, 50, generator=rng).double() - slopes[..., 1] * 0.3
+    normal = Normal(slopes.mT @ slopes, (slopes.mT @ errors.unsqueeze(-1)).squeeze(-1))
+    nothing, places = torch.zeros(3).double(), torch.tensor([1, 2])
+    found = dead_zones(normal, nothing, torch.ones(3).double(), places)
+    assert found.tolist() == [pytest.approx(0.3, abs=0.06), 0.0]
+
+
+def test_intervals_count_errors_that_are_alike_once():
+    rng = torch.Generator().manual_seed(0)
+    found, told = [], []
+    for _ in range(300):
+        slopes = torch.ones(20, 50, 1).double() + 0.3 * torch.randn(20, 50, 1, generator=rng).double()
+        errors = torch.randn(20, 1, generator=rng).double().expand(20, 50)  # a window errs as a whole
+        matrix, target = slopes.mT @ slopes, (slopes.mT @ errors.unsqueeze(-1)).squeeze(-1)
+        step = -torch.linalg.solve(matrix.sum(dim=0), target.sum(dim=0))
+        at_end = Normal(matrix, (slopes.mT @ (errors.unsqueeze(-1) + slopes * step)).squeeze(-1))
+        told.append(float(covariance(at_end, torch.zeros(1).double(), torch.zeros(1).double())))
+        found.append(float(step))
+    assert np.mean(told) == pytest.approx(
+        np.var(found), rel=0.15
+    )  # a fiftieth of it, if samples were all new
+
+
 def test_a_known_kp_stays(tmp_path, logs, monkeypatch):
     monkeypatch.setattr(servo_fit, "ROUNDS", 1)
-    monkeypatch.setattr(servo_fit, "STEPS", 1)
+    monkeypatch.setattr(servo_descent, "STEPS", 1)
     settings = "input: position\njoints: {shoulder: {kp: 14.0}}\n"
     model = spelgen.build(write_servo_arm(tmp_path, settings), "closed-form")
     fit = spelgen.fit(model, logs[:2])
@@ -108,9 +146,10 @@ def test_commands_are_read_and_written(tmp_path, logs, arm):
 def test_what_is_told_covers_the_truth(fitted):
     told = fitted.record["servo"]["joints"]
     for k, joint in enumerate(told):
-        for what, truth in (("kd", TRUTH.kd), ("armature", TRUTH.armature), ("dry", TRUTH.coulomb)):
+        for what, truth in (("kd", TRUTH.kd), ("armature", TRUTH.armature), ("lost", TRUTH.coulomb)):
             assert joint[what]["determined"]
-            assert joint[what]["value"] == pytest.approx(truth[k] / TRUTH.kp[k], rel=0.15), what
+            assert joint[what]["value"] == pytest.approx(truth[k] / TRUTH.kp[k], rel=0.03), what
+            assert joint[what]["low"] < truth[k] / TRUTH.kp[k] < joint[what]["high"], what
     assert "all of these are determined" in servo_text(fitted.record["servo"])
 
 
@@ -124,7 +163,7 @@ def test_simulated_commands_and_positions(tmp_path):
     assert late < np.abs(logs[0].q - logs[0].u).mean() < 0.1
 
 
-def test_exports_hold_the_servos(fitted, arm, tmp_path):
+def test_exports_hold_the_servos(fitted, arm, tmp_path, monkeypatch):
     kp, kd = (x.detach().numpy() for x in fitted.model.servo.prepare()[:2])
     xml = fitted.export("mjcf").files[".xml"].decode()
     found = re.findall(r'<position name="\w+" joint="\w+" kp="([^"]+)" kv="([^"]+)" forcerange="-6 6"', xml)
@@ -132,6 +171,8 @@ def test_exports_hold_the_servos(fitted, arm, tmp_path):
     held = yaml.safe_load(fitted.export("urdf").files[".friction.yaml"])
     assert held["delay"] == pytest.approx(float(fitted.model.delay))
     assert held["joints"]["elbow"]["servo"]["kp"] == pytest.approx(kp[1])
+    monkeypatch.setattr(fitted.model.servo, "dead_zone", torch.tensor([0.01, 0.0]).double())
+    assert "dead zones are left out" in fitted.export("mjcf").files[".README.md"].decode()
     files = fitted.export("c").files  # checked against the module when exported, where there is a compiler
     assert b"servo_arm_servo_torque(const servo_arm_real u[SERVO_ARM_N]" in files["servo_arm.h"]
 

@@ -57,7 +57,9 @@ def drives_of(model: Any) -> Drives:
 def balanced(drives: Drives, q: Tensor, qd: Tensor, u: Tensor, load: Load) -> ServoState:
     """The state whose friction makes up, as far as it can, for what the servos' torque is not: at rest, or steady."""
     servo, laws = drives.servo, drives.laws
-    torque = (servo.kp * (u - q) - servo.kd * qd).clamp(-servo.limit, servo.limit) - drives.offset
+    torque = (servo.kp * _beyond(u - q, servo.dead_zone) - servo.kd * qd).clamp(
+        -servo.limit, servo.limit
+    ) - drives.offset
     rest = torque - load.bias - laws.viscosity(qd, drives.friction) * qd
     direction = (rest / laws.dry(qd, load.gravity, drives.friction)).clamp(-1.0, 1.0)
     return ServoState(q, qd, direction.unsqueeze(-1) * laws.bristles.reach)
@@ -70,13 +72,15 @@ def advanced(drives: Drives, state: ServoState, u: Tensor, load: Load, h: Tensor
     dry = laws.dry(qd, load.gravity, drives.friction)
     bent = 1 - qd.sign().unsqueeze(-1) * z / reach  # of each bristle, what is left until it slides
     stiffness = dry * (fractions / reach * bent).sum(dim=-1)
-    wanted = servo.kp * (u - q) - servo.kd * qd
+    pull = servo.kp * _beyond(u - q, servo.dead_zone)
+    wanted = pull - servo.kd * qd
     free = (wanted.abs() < servo.limit).to(q)
-    torque = torch.where(free > 0, servo.kp * (u - q), servo.limit * wanted.sign())
+    stiff = free * servo.kp * (pull != 0)
+    torque = torch.where(free > 0, pull, servo.limit * wanted.sign())
     force = torque - drives.offset - load.bias - dry * (fractions / reach * z).sum(dim=-1)
     # at IMPLICIT of the step; bristles at its end: they are the stiffest
     damping = free * servo.kd + laws.viscosity(qd, drives.friction)
-    damping = IMPLICIT * h * (damping + h * (IMPLICIT * free * servo.kp + stiffness))
+    damping = IMPLICIT * h * (damping + h * (IMPLICIT * stiff + stiffness))
     rest = IMPLICIT * h * force
     if load.coupled:
         momentum = (load.inertia @ qd.unsqueeze(-1)).squeeze(-1)
@@ -85,6 +89,10 @@ def advanced(drives: Drives, state: ServoState, u: Tensor, load: Load, h: Tensor
         between = (load.inertia * qd + rest) / (load.inertia + damping)
     moved = h * between
     return ServoState(q + moved, qd + (between - qd) / IMPLICIT, laws.bristles.moved(z, moved))
+
+
+def _beyond(distance: Tensor, dead_zone: Tensor) -> Tensor:
+    return distance - torch.maximum(torch.minimum(distance, dead_zone), -dead_zone)
 
 
 def replayed(model: Any, q: Tensor, qd: Tensor, commands: Tensor, dt: Tensor) -> Tensor:

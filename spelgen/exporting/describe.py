@@ -77,5 +77,5 @@ def servos_of(model: Any) -> Servos | None:
     """The position servos of a model, None where it has none."""
     if not hasattr(model, "servo"):
         return None
-    kp, kd, limit = (array(x) for x in model.servo.prepare())
-    return Servos(kp, kd, limit, float(model.servo.delay))
+    kp, kd, limit, dead_zone = (array(x) for x in model.servo.prepare())
+    return Servos(kp, kd, limit, dead_zone, float(model.servo.delay))

@@ -118,11 +118,12 @@ class Residuals:
 
 @dataclass(frozen=True, eq=False)
 class Servos:
-    """``runtime.position_servo``: kp, kd and limit, (n,), the last infinite where nothing limits; delay [s]."""
+    """``runtime.position_servo``: kp, kd, limit, infinite where nothing limits, dead_zone, (n,); delay [s]."""
 
     kp: np.ndarray
     kd: np.ndarray
     limit: np.ndarray
+    dead_zone: np.ndarray
     delay: float
 
 

@@ -32,6 +32,8 @@ def export_mjcf(trained: Trained) -> Exported:
     servos = servos_of(exact)
     text = mjcf_text(projection, gains, trained.tip_in_body, servos)
     summary = projection_summary(projection)
+    if servos is not None:
+        exact.servo.dead_zone.zero_()  # MuJoCo's actuators have none
     parity = check_mjcf(text, projection, gains, exact.servo if servos else None)
     checked = f"Checked when exported, by MuJoCo {mujoco.__version__}, friction apart: {parity.summary}"
     use = (
@@ -41,6 +43,8 @@ def export_mjcf(trained: Trained) -> Exported:
     if servos is not None:
         use = use.replace("a motor for each input", "a position actuator for each servo")
         use += f" Give ctrl the command of {servos.delay:.4g} s before."
+        if servos.dead_zone.any():
+            use += " The servos' dead zones are left out: MuJoCo's position actuators have none."
     about = f"{UNITS}; a body's frame has its joint's axis as z; torque offsets of the sensors are left out."
     name = trained.arm.arm.name
     last = f"{'; '.join((checked, *summary))}."

@@ -42,7 +42,11 @@ class ModelExpressions:
         """What position servos give under the delayed command u."""
         servos = self.model.servos
         assert servos is not None
-        torque = ca.DM(servos.kp) * (self.u - self.q) - ca.DM(servos.kd) * self.qd
+        pull = self.u - self.q
+        if servos.dead_zone.any():
+            zone = ca.DM(servos.dead_zone)
+            pull = pull - ca.fmax(ca.fmin(pull, zone), -zone)
+        torque = ca.DM(servos.kp) * pull - ca.DM(servos.kd) * self.qd
         rows = [
             ca.fmax(-ca.fmax(-torque[k], -limit), -limit) if np.isfinite(limit) else torque[k]
             for k, limit in enumerate(servos.limit.tolist())

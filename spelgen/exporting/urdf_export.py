@@ -109,6 +109,7 @@ def friction_text(trained: Trained, projection: RigidBodyProjection) -> str:
         joints[name] = {"viscous_coulomb": _rounded(simple)} | ({"law": _rounded(own)} if own else {})
         if servos is not None:
             held = {"kp": servos.kp[index], "kd": servos.kd[index], "limit": servos.limit[index]}
+            held |= {"dead_zone": servos.dead_zone[index]} if servos.dead_zone[index] else {}
             joints[name]["servo"] = _rounded({key: x for key, x in held.items() if x < float("inf")})
     content = {
         "units": "Nm, Nm s/rad and rad/s of revolute joints; N, N s/m and m/s of prismatic ones",

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import torch
 
-from spelgen.fitting.servo_fit import Normal
+from spelgen.fitting.servo_descent import Normal
 
 
 def covariance(normal: Normal, precision: torch.Tensor, halved: torch.Tensor) -> torch.Tensor:

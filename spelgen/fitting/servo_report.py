@@ -11,36 +11,38 @@ from scipy.stats import t as student
 
 from spelgen.fitting.servo_fit import ServoSolution
 from spelgen.fitting.servo_intervals import covariance
+from spelgen.fitting.servo_weights import DEAD_ZONE, FRICTION
 from spelgen.listing import Listing, number
 
 SURE = 0.975  # quantile of an interval of 95 %, of Student's t: windows are few
-LAWS = 0.01  # relative standard deviation of a ratio by what laws of friction are not, see benchmarks/servo_recovery.py
-OPEN = 2.0  # what may be larger by such a factor within its interval is not determined
-UNITS = {"kd": "s", "armature": "s^2", "dry": "rad, m"}
-"""What is told in ratio to kp, and the ratio's unit; dry: friction of a joint that slides, under the usual load."""
+LAWS = 0.015  # relative standard deviation of a ratio by what laws of friction are not, see benchmarks/servo_recovery.py
+OPEN = 1.5  # what may be larger by such a factor within its interval is not determined
+UNITS = {"kd": "s", "armature": "s^2", "dry": "rad, m", "lost": "rad, m"}
+"""What is told in ratio to kp, and the ratio's unit; dry: friction of a joint that slides, under the usual load; lost:
+dry and half the dead zone, together."""
+FRICTION_PARTS = ("coulomb", "load_dependence")
 ABOUT = (
     "divided by kp, +- half an interval of 95 %: logs of positions tell no more. kp itself rests on the URDF's masses, "
-    "where it is not known. dry: friction of a joint that slides under its usual load. kd "
-    "stands for kd and viscous friction, which such logs cannot tell apart"
+    "where it is not known. kd stands for kd and viscous friction, which such logs cannot tell apart. dry: friction of "
+    "a joint that slides under its usual load; lost: dry/kp and half the dead zone, which only gravity tells apart"
 )
 
 
 def servo_record(model: Any, solution: ServoSolution) -> dict[str, Any]:
     """For config.json: delay [s], errors, and by joint kp, and the ratios to it with intervals of 95 %."""
-    n, places = model.n, {name: k for k, (name, _) in enumerate(solution.names)}
     unsure = covariance(solution.normal, solution.precision, solution.halved)
     sure = student.ppf(SURE, max(1, len(solution.normal.matrix) - 1))
-    kp = places["servo.raw_kp"]
     joints = []
     for joint, name in enumerate(model.facts.joints):
-        trained = float(model.servo.trained[joint])
         about: dict[str, Any] = {"joint": name}
-        about["kp"] = {"value": float(model.kp[joint].detach()), "known": not trained}
-        for what, parts in _parts(model, solution, joint).items():
-            whole = sum(parts.values())
-            ratio = [(places[weight], joint, part / whole) for weight, part in parts.items()]
-            half = sure * _deviation(unsure, n, [*ratio, (kp, joint, -trained)])
-            about[what] = {"unit": UNITS[what], **_interval(whole / about["kp"]["value"], half)}
+        known = not float(model.servo.trained[joint])
+        about["kp"] = {"value": float(model.kp[joint].detach()), "known": known}
+        for what, (value, slopes) in _told(model, solution, joint).items():
+            direction = torch.zeros(len(unsure)).double()
+            for weight, slope in slopes.items():
+                direction[solution.names.index((weight, 0)) * model.n + joint] = slope / value
+            half = sure * math.hypot(LAWS, float((direction @ unsure @ direction).clamp(min=0).sqrt()))
+            about[what] = {"unit": UNITS.get(what, "rad, m"), **_interval(value, half)}
         joints.append(about)
     return {
         "delay": {"value": float(model.delay), "half": sure * float(unsure[-1, -1].sqrt())},
@@ -50,27 +52,28 @@ def servo_record(model: Any, solution: ServoSolution) -> dict[str, Any]:
     }
 
 
-def _parts(model: Any, solution: ServoSolution, joint: int) -> dict[str, dict[str, float]]:
-    """What each of `UNITS` is a sum of at a joint [Nm ...], by weight: weights are logarithms of these parts."""
+def _told(model: Any, solution: ServoSolution, joint: int) -> dict[str, tuple[float, dict[str, float]]]:
+    """What is told of a joint: its value, and its slopes by weights, which but for dead zones are logarithms."""
     with torch.no_grad():
-        friction = model.dynamics.friction.prepare()
-        found = {
-            "kd": {"servo.raw_kd": model.kd},
-            "armature": {"dynamics.armature.raw": model.armature},
-            "dry": {
-                "dynamics.friction.raw_coulomb": friction.coulomb,
-                "dynamics.friction.raw_load_dependence": friction.load_dependence * solution.gravity,
-            },
-        }
-        return {what: {name: float(x[joint]) for name, x in parts.items()} for what, parts in found.items()}
-
-
-def _deviation(unsure: torch.Tensor, n: int, terms: list[tuple[int, int, float]]) -> float:
-    """The standard deviation of a sum of weights (row, joint, factor), and of laws."""
-    direction = torch.zeros(len(unsure)).double()
-    for row, joint, factor in terms:
-        direction[row * n + joint] = factor
-    return math.hypot(LAWS, float((direction @ unsure @ direction).clamp(min=0).sqrt()))
+        laws = model.dynamics.friction.prepare()
+        kp, kd, armature, zone = (
+            float(x[joint]) for x in (model.kp, model.kd, model.armature, model.servo.dead_zone)
+        )
+        parts = (laws.coulomb, laws.load_dependence * solution.gravity)
+    sizes = [float(x[joint]) / kp for x in parts]
+    dry, by_kp = sum(sizes), -float(model.servo.trained[joint])
+    slopes = {FRICTION + name: x for name, x in zip(FRICTION_PARTS, sizes, strict=True)}
+    slopes |= {"servo.raw_kp": by_kp * dry}
+    found = {
+        "kd": (kd / kp, {"servo.raw_kd": kd / kp, "servo.raw_kp": by_kp * kd / kp}),
+        "armature": (
+            armature / kp,
+            {"dynamics.armature.raw": armature / kp, "servo.raw_kp": by_kp * armature / kp},
+        ),
+        "dry": (dry, slopes),
+        "lost": (dry + zone, slopes | {DEAD_ZONE: 1.0}),
+    }
+    return found | ({"dead_zone": (zone, {DEAD_ZONE: 1.0})} if zone else {})
 
 
 def _interval(value: float, half: float) -> dict[str, Any]:
@@ -84,7 +87,7 @@ def servo_text(record: Mapping[str, Any]) -> str:
         (each["joint"], number(each["kp"]["value"]), *(_shown(each[what]) for what in UNITS))
         for each in record["joints"]
     ]
-    head = ("joint", "kp [Nm/rad]", *(f"{what}/kp [{unit}]" for what, unit in UNITS.items()))
+    head = ("joint", "kp [Nm/rad]", *(f"{_label(what)} [{unit}]" for what, unit in UNITS.items()))
     table = Listing("Servos", head, tuple(rows), f"Ratios are {ABOUT}.").text()
     open_ones = undetermined(record)
     left = (
@@ -92,20 +95,26 @@ def servo_text(record: Mapping[str, Any]) -> str:
         if open_ones
         else "all of these are determined"
     )
+    zones = [f"{x['joint']} {_shown(x['dead_zone'])}" for x in record["joints"] if "dead_zone" in x]
     delay = record["delay"]
     late = f"delay {1000 * delay['value']:.1f} ms, +- {1000 * delay['half']:.1f} ms"
     errors = ", ".join(number(1000 * x) for x in record["rms"])
-    return f"{late}\nerrors on training windows, RMS by joint: {errors} mrad\n{table}\n{left}"
+    dead = f"half dead zones [rad, m]: {', '.join(zones)}\n" if zones else ""
+    return f"{late}\nerrors on training windows, RMS by joint: {errors} mrad\n{table}\n{dead}{left}"
 
 
 def undetermined(record: Mapping[str, Any]) -> list[str]:
     """What the logs left as unsure as it was."""
     return [
-        f"{what}/kp of {each['joint']}"
+        f"{_label(what)} of {each['joint']}"
         for each in record["joints"]
         for what in UNITS
         if not each[what]["determined"]
     ]
+
+
+def _label(what: str) -> str:
+    return what if what == "lost" else f"{what}/kp"
 
 
 def _shown(interval: Mapping[str, Any]) -> str:

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch.func import functional_call, jacfwd
 
+DEAD_ZONE = "servo.dead_zone"
 FRICTION = "dynamics.friction.raw_"
 BODIES = "dynamics.inertial_parameters.raw"
 BODY_DEVIATION = 0.3  # of the bodies' weights, which is some 60 % in mass
@@ -36,7 +37,9 @@ JOINT_WEIGHTS = (
     JointWeight(FRICTION + "stribeck_velocity", 1.0),
     JointWeight(FRICTION + "load_dependence", 2.0),
     JointWeight(FRICTION + "bristle_fractions", 2.0),
+    JointWeight(DEAD_ZONE, 0.02),  # itself [rad, m], while all others are logarithms
 )
+RESTS = 1e-9  # deviation of what is not fitted
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,16 +64,22 @@ class Point:
 
 
 class ServoWeights:
-    """The weights of a model, to and fro."""
+    """The weights of a model, to and fro. dead_zones: (n,) whether a joint's dead zone has entered."""
 
     def __init__(self, model: Any) -> None:
         self.model = model
-        self.parameters = {each.name: model.get_parameter(each.name) for each in JOINT_WEIGHTS}
+        everything = {**dict(model.named_parameters()), **dict(model.named_buffers())}
+        self.parameters = {each.name: everything[each.name] for each in JOINT_WEIGHTS}
+        self.dead_zones = torch.zeros(model.n, dtype=torch.bool)
         self.names = [
             (each.name, k)
             for each in JOINT_WEIGHTS
             for k in range(self.parameters[each.name][:1].numel())  # of one joint
         ]
+
+    def row(self, name: str) -> int:
+        """Where a weight stands in (p, n)."""
+        return self.names.index((name, 0))
 
     def read(self) -> torch.Tensor:
         """Of joints, as the model has them, (p, n)."""
@@ -90,13 +99,16 @@ class ServoWeights:
         with torch.no_grad():
             for name, rows in self.named(joints.unsqueeze(0)).items():
                 self.parameters[name].copy_(rows[0, 0])
+            self.parameters[DEAD_ZONE] *= self.dead_zones
 
-    def deviations(self, directions: int) -> torch.Tensor:
-        """Of the prior, as `Point.flat`."""
+    def precision(self, directions: int, *, every: bool = False) -> torch.Tensor:
+        """Of the prior, as `Point.flat`. every: of all dead zones, as if they had entered."""
         by_name = {each.name: each.deviation for each in JOINT_WEIGHTS}
-        own = torch.tensor([by_name[name] for name, _ in self.names]).double()
+        own = torch.stack([torch.full((self.model.n,), by_name[name]).double() for name, _ in self.names])
+        if not every:
+            own[self.row(DEAD_ZONE), ~self.dead_zones] = RESTS
         shared = torch.tensor([1.0] * directions + [DELAY_DEVIATION]).double()
-        return torch.cat([own.repeat_interleave(self.model.n), shared])
+        return torch.cat([own.flatten(), shared]) ** -2
 
 
 def body_directions(model: Any, q: torch.Tensor) -> torch.Tensor:

@@ -17,13 +17,16 @@ class ServoConstants(NamedTuple):
     kp: Tensor  # [Nm/rad, N/m]
     kd: Tensor  # [Nm s/rad, N s/m]
     limit: Tensor  # [Nm, N]
+    dead_zone: Tensor  # half its width [rad, m]; may be 0
 
 
 class PositionServo(nn.Module):
-    """tau = clip(kp (u - q) - kd qd, -limit, limit), where u was commanded ``delay`` seconds ago.
+    """tau = clip(kp d(u - q) - kd qd, -limit, limit), where u was commanded ``delay`` seconds ago.
 
-    A spring and a damper towards the command: the spring stores 1/2 kp (q - u)^2, so that an arm that
-    servos hold is port-Hamiltonian too, with u as its input. The weights are logarithms.
+    d is what a distance is beyond the dead zone, if there is one: no torque comes of less, as where
+    gears have play behind the spring, or where the servo itself leaves it. A spring and a damper
+    towards the command: the spring stores 1/2 kp d(q - u)^2, so that an arm that servos hold is
+    port-Hamiltonian too, with u as its input. The weights are logarithms.
     """
 
     nominal_kp: Tensor
@@ -31,6 +34,7 @@ class PositionServo(nn.Module):
     trained: Tensor
     limit: Tensor
     delay: Tensor
+    dead_zone: Tensor
 
     def __init__(
         self, kp: Sequence[float], kd: Sequence[float], limit: Sequence[float], known: Sequence[bool]
@@ -41,6 +45,8 @@ class PositionServo(nn.Module):
         self.register_buffer("trained", vector(float(not x) for x in known))
         self.register_buffer("limit", vector(limit))
         self.register_buffer("delay", torch.zeros((), dtype=torch.float64))  # [s]
+        # no parameter: only a fit to commands may find one
+        self.register_buffer("dead_zone", torch.zeros(len(kp), dtype=torch.float64))
         self.raw_kp = nn.Parameter(torch.zeros(len(kp), dtype=torch.float64))
         self.raw_kd = nn.Parameter(torch.zeros(len(kp), dtype=torch.float64))
 
@@ -54,13 +60,18 @@ class PositionServo(nn.Module):
 
     def prepare(self) -> ServoConstants:
         """The constants, in their units."""
-        return ServoConstants(self.kp(), self.kd(), self.limit)
+        return ServoConstants(self.kp(), self.kd(), self.limit, self.dead_zone.clamp(min=0))
 
     def forward(self, u: Tensor, q: Tensor, qd: Tensor) -> Tensor:
         """The torque, (..., n) [Nm, N], under the delayed command u, (..., n)."""
-        kp, kd, limit = self.prepare()
-        return (kp * (u - q) - kd * qd).clamp(-limit, limit)
+        kp, kd, limit, dead_zone = self.prepare()
+        return (kp * beyond(u - q, dead_zone) - kd * qd).clamp(-limit, limit)
 
     def stored_energy(self, u: Tensor, q: Tensor) -> Tensor:
         """What the springs give back, (...) [J]."""
-        return 0.5 * (self.kp() * (q - u) ** 2).sum(dim=-1)
+        return 0.5 * (self.kp() * beyond(q - u, self.dead_zone.clamp(min=0)) ** 2).sum(dim=-1)
+
+
+def beyond(distance: Tensor, dead_zone: Tensor) -> Tensor:
+    """What distances, (..., n), are beyond a dead zone, (n,), to both sides."""
+    return distance - distance.clamp(-dead_zone, dead_zone)

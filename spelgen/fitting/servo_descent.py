@@ -1,0 +1,102 @@
+"""Levenberg-Marquardt steps from weights of servos to their most probable ones, by what windows of logs say:
+
+    sum over joints and samples of 4 log(1 + (error / scale)^2 / 4) / alike + |(weights - start) / deviation|^2,
+
+Student's t with three degrees of freedom: a joint that is held by something unknown, a table maybe, counts little.
+The scale of a joint is what its errors usually are, and alike how many samples err alike.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+
+from spelgen.fitting.servo_problem import ServoProblem
+from spelgen.fitting.servo_weights import Point
+
+ALIKE = 0.5  # s over which errors may be alike
+STEPS, TRIES = 12, 6
+LONGEST = 1.0  # of a step, in any weight: they are logarithms
+
+
+class Normal(NamedTuple):
+    """Of each window, half the second and first derivatives of the cost (W, k, k), (W, k), by Gauss and Newton."""
+
+    matrix: torch.Tensor
+    target: torch.Tensor
+
+
+class Descent:
+    """Steps with one scale of errors (n,), of which so many (n,) are alike."""
+
+    def __init__(self, problem: ServoProblem, noise: torch.Tensor, errors: torch.Tensor) -> None:
+        self.problem, self.centre = problem, problem.start.flat
+        self.precision = problem.weights.precision(problem.directions.shape[1])
+        self.scale = torch.maximum(1.4826 * errors.abs().flatten(0, 1).median(dim=0).values, noise)
+        self.alike = _alike(errors * self._robust(errors), max(1, round(ALIKE * problem.windows.rate)))
+
+    def _robust(self, errors: torch.Tensor) -> torch.Tensor:
+        return 1 / (1 + (errors / self.scale).square() / 4)
+
+    def cost(self, point: Point, errors: torch.Tensor) -> float:
+        """Infinite where a rollout left all bounds."""
+        if not errors.isfinite().all():
+            return float("inf")
+        squares = (errors / self.scale).square()
+        away = point.flat - self.centre
+        return float(
+            (4 * torch.log1p(squares / 4) / self.alike).sum() + (self.precision * away.square()).sum()
+        )
+
+    def normal(self, point: Point, errors: torch.Tensor) -> Normal:
+        """Of the windows alone, without the prior."""
+        own, shared = self.problem.slopes(point, errors)
+        weight = self._robust(errors) / self.scale**2 / self.alike
+        p, (count, _, n), s = len(own), errors.shape, len(shared)
+        matrix, target = (
+            torch.zeros(count, p * n + s, p * n + s).double(),
+            torch.zeros(count, p * n + s).double(),
+        )
+        for k in range(n):
+            slope = torch.cat([own[..., k], shared[..., k]]).transpose(0, 1)  # (W, p + s, K')
+            rows = torch.cat([torch.arange(p) * n + k, p * n + torch.arange(s)])
+            weighted = slope * weight[:, None, :, k]
+            matrix[:, rows[:, None], rows] += weighted @ slope.mT
+            target[:, rows] += (weighted @ errors[..., k].unsqueeze(-1)).squeeze(-1)
+        return Normal(matrix, target)
+
+    def step(self, normal: Normal, point: Point, damping: float = 0.0) -> torch.Tensor:
+        """To where the cost is least by its first two derivatives, (k,)."""
+        matrix = normal.matrix.sum(dim=0) + torch.diag(self.precision)
+        target = normal.target.sum(dim=0) + self.precision * (point.flat - self.centre)
+        damped = matrix + damping * torch.diag(matrix.diagonal())
+        return -torch.linalg.solve(damped, target).clamp(-LONGEST, LONGEST)
+
+    def run(self, point: Point, damping: float, least: float) -> tuple[Point, float, int]:
+        """The point where steps gain no more, its cost, and how many there were."""
+        errors = self.problem.errors(point)
+        cost, taken = self.cost(point, errors), 0
+        for _ in range(STEPS):
+            normal = self.normal(point, errors)
+            for _ in range(TRIES):
+                tried = point.moved(self.step(normal, point, damping))
+                found = self.problem.errors(tried)
+                new = self.cost(tried, found)
+                if new < cost:
+                    break
+                damping *= 5
+            else:
+                return point, cost, taken
+            gain, taken = cost - new, taken + 1
+            point, errors, cost, damping = tried, found, new, max(damping / 10, 1e-7)
+            if gain < least:
+                break
+        return point, cost, taken
+
+
+def _alike(errors: torch.Tensor, span: int) -> torch.Tensor:
+    """How many neighbours among errors (W, K', n) say the same, (n,): from 1 to ``span``."""
+    blocks = errors[:, : errors.shape[1] // span * span].unflatten(1, (-1, span))
+    together, apart = blocks.sum(dim=2).square().mean(dim=(0, 1)), blocks.square().sum(dim=2).mean(dim=(0, 1))
+    return (together / apart.clamp(min=1e-300)).clamp(1.0, float(span))
