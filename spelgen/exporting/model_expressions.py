@@ -45,7 +45,7 @@ class ModelExpressions:
         pull = self.u - self.q
         if servos.dead_zone.any():
             zone = ca.DM(servos.dead_zone)
-            pull = pull - ca.fmax(ca.fmin(pull, zone), -zone)
+            pull = ca.fmax(pull - zone, 0) - ca.fmax(-pull - zone, 0)
         torque = ca.DM(servos.kp) * pull - ca.DM(servos.kd) * self.qd
         rows = [
             ca.fmax(-ca.fmax(-torque[k], -limit), -limit) if np.isfinite(limit) else torque[k]
