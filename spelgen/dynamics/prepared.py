@@ -152,7 +152,9 @@ class PreparedModel:
         """Itself, its forward and inverse dynamics compiled by ``torch.compile`` at their first calls."""
         found = copy.copy(self)
         for name in ("forward_dynamics", "inverse_dynamics"):
-            setattr(found, name, torch.compile(getattr(self, name), fullgraph=True))
+            # asserts between the kernels would take a tenth of the time
+            options = {"size_asserts": False}
+            setattr(found, name, torch.compile(getattr(self, name), fullgraph=True, options=options))
         return found
 
     def _kinematics(self) -> Any:
