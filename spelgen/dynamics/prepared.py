@@ -153,8 +153,8 @@ class PreparedModel:
         found = copy.copy(self)
         for name in ("forward_dynamics", "inverse_dynamics"):
             # asserts between the kernels would take a tenth of the time
-            options = {"size_asserts": False}
-            setattr(found, name, torch.compile(getattr(self, name), fullgraph=True, options=options))
+            ready = torch.compile(getattr(self, name), fullgraph=True, options={"size_asserts": False})
+            setattr(found, name, ready)
         return found
 
     def _kinematics(self) -> Any:
