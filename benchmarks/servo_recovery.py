@@ -25,7 +25,6 @@ RATE, STEP, RECORDINGS = 50, 1e-3, 3  # Hz; s
 KP, LAG, ARMATURE, DRY, DELAY = 20.0, 0.06, 1.4e-3, 8e-3, 0.02  # Nm/rad; s, s^2, rad: ratios to kp; s
 SMALLEST = 0.4  # drives get smaller along the arm, down to so much
 ENCODER = 2 * np.pi / 4096
-TRUTH = {"kd": LAG, "armature": ARMATURE, "dry": DRY}
 
 
 def commands(random: np.random.Generator, t: np.ndarray, n: int) -> np.ndarray:
@@ -94,21 +93,22 @@ def main() -> None:
     arm = spelgen.load_arm(asked.urdf)
     if arm.settings.input != "position":
         parser.error(f"{asked.urdf.with_suffix('.yaml')} has to say 'input: position'")
-    errors, held, left = {x: [] for x in TRUTH}, {x: [] for x in TRUTH}, {x: 0 for x in TRUTH}
+    truths = {"kd": LAG, "armature": ARMATURE, "dry": DRY, "lost": DRY + asked.dead_zone}
+    errors, held, left = {x: [] for x in truths}, {x: [] for x in truths}, {x: 0 for x in truths}
     for seed, logs in enumerate(recordings(arm, asked.seeds, asked.seconds, asked.dead_zone)):
         since = time.monotonic()
         found = spelgen.fit(spelgen.build(arm, asked.preset), logs).record["servo"]
-        for what, truth in TRUTH.items():
-            told = [joint[what] for joint in found["joints"]]
-            left[what] += sum(not x["determined"] for x in told)
-            errors[what] += [x["value"] / truth - 1 for x in told if x["determined"]]
+        for what, truth in truths.items():
+            told = [joint[what] for joint in found["joints"] if joint[what]["determined"]]
+            left[what] += len(found["joints"]) - len(told)
+            errors[what] += [x["value"] / truth - 1 for x in told]
             held[what] += [x["low"] <= truth <= x["high"] for x in told]
-        row = ", ".join(f"{what} {100 * np.median(np.abs(x)):.2f} %" for what, x in errors.items())
+        row = ", ".join(f"{what} {100 * np.median(np.abs(x)):.2f} %" for what, x in errors.items() if x)
         print(f"seed {seed}: {time.monotonic() - since:.0f} s; median errors so far {row}", flush=True)
-    print("ratio      bias   90 % of errors below   intervals that hold the truth   left open")
-    for what, x in errors.items():
+    print("           bias   90 % of errors below   intervals that hold the truth   left open")
+    for what, x in ((what, x) for what, x in errors.items() if x):
         print(
-            f"{what + '/kp':12}{100 * np.mean(x):5.2f} %{100 * np.quantile(np.abs(x), 0.9):14.2f} %"
+            f"{what:12}{100 * np.mean(x):5.2f} %{100 * np.quantile(np.abs(x), 0.9):14.2f} %"
             f"{100 * np.mean(held[what]):22.0f} % of {len(held[what])}{left[what]:14}"
         )
 

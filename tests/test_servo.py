@@ -150,7 +150,8 @@ def test_what_is_told_covers_the_truth(fitted):
             assert joint[what]["determined"]
             assert joint[what]["value"] == pytest.approx(truth[k] / TRUTH.kp[k], rel=0.03), what
             assert joint[what]["low"] < truth[k] / TRUTH.kp[k] < joint[what]["high"], what
-    assert "all of these are determined" in servo_text(fitted.record["servo"])
+    left = "not determined by these logs: dry/kp of shoulder, dry/kp of elbow"  # a dead zone would look alike
+    assert left in " ".join(servo_text(fitted.record["servo"]).split())
 
 
 def test_simulated_commands_and_positions(tmp_path):

@@ -18,7 +18,7 @@ SURE = 0.975  # quantile of an interval of 95 %, of Student's t: windows are few
 LAWS = (
     0.015  # relative deviation of ratios by what laws of friction are not, see benchmarks/servo_recovery.py
 )
-OPEN = 1.5  # what may be larger by such a factor within its interval is not determined
+OPEN = 1.25  # what may be larger by such a factor within its interval is not determined
 UNITS = {"kd": "s", "armature": "s^2", "dry": "rad, m", "lost": "rad, m"}
 """What is told in ratio to kp, and the ratio's unit; dry: friction of a joint that slides, under the usual load; lost:
 dry and half the dead zone, together."""
@@ -26,14 +26,15 @@ FRICTION_PARTS = ("coulomb", "load_dependence")
 ABOUT = (
     "divided by kp, +- half an interval of 95 %: logs of positions tell no more. kp itself rests on the URDF's masses, "
     "where it is not known. kd stands for kd and viscous friction, which such logs cannot tell apart. dry: friction of "
-    "a joint that slides under its usual load; lost: dry/kp and half the dead zone, which only gravity tells apart"
+    "a joint that slides under its usual load, open where no dead zone was seen beside it; lost: both together, dry/kp "
+    "and half the dead zone"
 )
 
 
 def servo_record(model: Any, solution: ServoSolution) -> dict[str, Any]:
     """For config.json: delay [s], errors, and by joint kp, and the ratios to it with intervals of 95 %."""
     unsure = covariance(solution.normal, solution.precision, solution.halved)
-    sure = student.ppf(SURE, max(1, len(solution.normal.matrix) - 1))
+    sure = float(student.ppf(SURE, max(1, len(solution.normal.matrix) - 1)))
     joints = []
     for joint, name in enumerate(model.facts.joints):
         about: dict[str, Any] = {"joint": name}
@@ -45,6 +46,7 @@ def servo_record(model: Any, solution: ServoSolution) -> dict[str, Any]:
                 direction[solution.names.index((weight, 0)) * model.n + joint] = slope / value
             half = sure * math.hypot(LAWS, float((direction @ unsure @ direction).clamp(min=0).sqrt()))
             about[what] = {"unit": UNITS.get(what, "rad, m"), **_interval(value, half)}
+        about["dry"]["determined"] &= "dead_zone" in about  # where none was seen, a small one may still be
         joints.append(about)
     return {
         "delay": {"value": float(model.delay), "half": sure * float(unsure[-1, -1].sqrt())},
