@@ -18,11 +18,36 @@ from spelgen.logs.windows import Windows
 INTERVALS = 10  # of the past, at most, over which forces are integrated
 
 
+class WithoutCompensation:
+    """A model of rigid bodies whose drives add nothing by velocity that is not measured.
+
+    What they add is held with the rest of the disturbance: a force that grows with velocity, in the drives of an arm
+    whose controller is not part of the model, makes rollouts blow up within tenths of a second.
+    """
+
+    def __init__(self, model: Any) -> None:
+        self.model = model
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.model, name)
+
+    def prepare(self, definite: bool = True) -> Any:
+        """What depends on the weights alone."""
+        prepared = self.model.prepare(definite)
+        return prepared._replace(compensation=torch.zeros_like(prepared.compensation))
+
+
+def without_compensation(model: Any) -> Any:
+    """The same model but for what its drives add by velocity."""
+    own = getattr(getattr(model, "dynamics", None), "friction_compensation", None)
+    return model if own is None or not own().any() else WithoutCompensation(model)
+
+
 class Disturbed:
-    """What is integrated (see ``integrable``) under a force, (W, n), that is added to p'."""
+    """What is integrated (see ``integrable``) under a force, (W, n), that is added to p', and holds what drives add."""
 
     def __init__(self, form: Any, disturbance: torch.Tensor) -> None:
-        self.form, self.disturbance = form, disturbance
+        self.form, self.disturbance = without_compensation(form), disturbance
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.form, name)
@@ -51,6 +76,7 @@ def after_past(form: Any, windows: Windows, past: int) -> tuple[Windows, torch.T
 
     That is what p' lacks: a generalised force where the form's p is momentum, an acceleration where it is velocity.
     """
+    form = without_compensation(form)
     q, qd = windows.q[:, : past + 1], windows.qd[:, : past + 1]
     along = memory_along(form, q, qd, windows.z)
     ahead = replace(without_past(windows, past), z=along[:, -1])
