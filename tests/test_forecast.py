@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 import torch
 
+from spelgen.building import build
 from spelgen.dynamics.bristles import BristleReach, bristles_along
 from spelgen.emission.loading import load_module
 from spelgen.errors import RunError
 from spelgen.evaluation.baselines import Predictor, of_dynamics
-from spelgen.evaluation.disturbance import after_past, without_past
+from spelgen.evaluation.disturbance import after_past, without_compensation, without_past
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.evaluation.forecast import forecast_of, past_steps, rolled
 from spelgen.evaluation.names import CONSTANT_VELOCITY, MODEL
@@ -74,6 +75,24 @@ def test_a_constant_torque_that_nothing_tells_of_is_found_in_the_past_and_held(o
         for x in (found.open_loop, found.held)
     )
     assert held < 0.05 * open_loop
+
+
+def test_what_drives_add_by_velocity_is_held_with_the_rest_and_blows_nothing_up(offset_logs, robots):
+    """A compensation larger than all friction makes the model's own rollouts leave all bounds, and forecasts not."""
+    model, past = build(robots / "two_link.urdf", "closed-form"), past_steps(RATE)
+    windows = cut_windows(offset_logs, past + 101, 20, measured=False)
+    plain = rolled(of_dynamics(MODEL, model, 2), windows, past)
+    speed = windows.qd[:, past // 2]
+    model.get_buffer("dynamics.raw_friction_compensation").fill_(300.0)
+    _, before = after_past(without_compensation(model), windows, past)
+    _, disturbance = after_past(model, windows, past)
+    torch.testing.assert_close(disturbance, before)
+    assert (model.dynamics.friction_compensation() * speed).abs().max() > 50
+    found = rolled(of_dynamics(MODEL, model, 2), windows, past)
+    np.testing.assert_allclose(found.held, plain.held)
+    with torch.no_grad(), np.errstate(all="ignore"):
+        q, _ = of_dynamics(MODEL, model, 2).states(without_past(windows, past))
+    assert not (q.abs() < 1e3).all()
 
 
 def test_what_has_velocities_as_its_state_lacks_an_acceleration(offset_logs):

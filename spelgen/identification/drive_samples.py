@@ -11,7 +11,7 @@ from spelgen.identification.samples import dynamics_samples
 from spelgen.logs.trajectory import Trajectory
 
 DELAYS = np.arange(-60, 61, 10) * 1e-3  # s
-MOST, LEAST = 2500, 400  # samples
+MOST, LEAST = 1500, 400  # samples
 
 
 class DriveSamples(NamedTuple):
