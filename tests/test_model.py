@@ -107,14 +107,14 @@ def _near(ours: torch.Tensor, reference: torch.Tensor) -> None:
 
 @pytest.mark.parametrize("robot", SIX)
 def test_mass_matrix_is_positive_definite_for_any_weights(robot, tmp_path):
-    """1,000 random q for each of 100 draws of all weights, constants included, with standard deviation 30."""
+    """10,000 random q for each of 100 draws of all weights, constants included, with standard deviation 30."""
     model = random_model(robot, tmp_path, seed=0, design=NETWORKS)
     generator = torch.Generator().manual_seed(0)
     needed = 0
     with torch.no_grad():
         for draw in range(100):
             randomise(model, seed=draw, deviation=30.0)
-            q = 8 * torch.rand(1_000, model.n, dtype=torch.float64, generator=generator) - 4
+            q = 8 * torch.rand(10_000, model.n, dtype=torch.float64, generator=generator) - 4
             mass = model.mass_matrix(q)
             assert torch.linalg.eigvalsh(mass)[:, 0].min() > 0
             needed += bounded(model, q).any().item()
