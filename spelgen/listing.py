@@ -49,13 +49,23 @@ class Listing:
         rows = "".join(self._row(row, "td") for row in self.rows)
         return f"{title}<table><thead>{self._row(self.head, 'th')}</thead><tbody>{rows}</tbody></table>{note}"
 
+    def _head(self) -> tuple[str, ...]:
+        """The head, its names folded where the table would be too wide."""
+        needed = [max((_wide(row[k]) for row in self.rows), default=0) for k in range(len(self.head))]
+        if sum(2 + max(_wide(name), width) for name, width in zip(self.head, needed, strict=True)) <= WIDTH:
+            return self.head
+        folded = (_folded(x, max(HEAD, width)) for x, width in zip(self.head[1:], needed[1:], strict=True))
+        return (self.head[0], *folded)
+
+    def _widths(self) -> list[int]:
+        """Of the columns under that head."""
+        columns = zip(self._head(), *self.rows, strict=True)
+        return [max(_wide(line) for cell in column for line in cell.split("\n")) for column in columns]
+
     def _parts(self) -> list[Listing]:
         """The same columns in as many tables as it takes to leave room for the words in the names of rows."""
-        widths = [
-            2 + max(len(x) for x in (*self.head[k].split("\n"), *(row[k] for row in self.rows)))
-            for k in range(len(self.head))
-        ]
-        words = (len(word) for row in self.rows for word in SEPARATOR.split(row[0]))
+        widths = [2 + width for width in self._widths()]
+        words = (_wide(word) for row in self.rows for word in SEPARATOR.split(row[0]))
         most = WIDTH - 2 - max(SHORTEST, *words, 0)
         if sum(widths[1:]) <= most or len(widths) == 2:
             return [self]
@@ -82,20 +92,11 @@ class Listing:
         return f"<tr>{text}</tr>"
 
     def _lines(self) -> list[str]:
-        from rich.cells import cell_len  # here: `--help` and `import spelgen` stay fast
-        from rich.console import Console
+        from rich.console import Console  # here: `--help` and `import spelgen` stay fast
         from rich.table import Table
         from rich.text import Text
 
-        needed = [max((cell_len(row[k]) for row in self.rows), default=0) for k in range(len(self.head))]
-        head = self.head
-        if sum(2 + max(cell_len(name), width) for name, width in zip(head, needed, strict=True)) > WIDTH:
-            head = (
-                head[0],
-                *(_folded(x, max(HEAD, width)) for x, width in zip(head[1:], needed[1:], strict=True)),
-            )
-        named = [max(map(cell_len, name.split("\n"))) for name in head]
-        widths = [max(pair) for pair in zip(needed, named, strict=True)]
+        head, widths = self._head(), self._widths()
         lines = [head, *self.rows]
         widths[0] = min(widths[0], SHORTEST)
         table = Table(box=None, show_header=False, padding=(0, 0, 0, 2))
@@ -112,6 +113,13 @@ class Listing:
         )  # fmt: skip
         console.print(table, crop=False)
         return [line.rstrip() for line in file.getvalue().rstrip("\n").split("\n")]
+
+
+def _wide(text: str) -> int:
+    """The characters of a terminal that a text takes."""
+    from rich.cells import cell_len
+
+    return cell_len(text)
 
 
 def _folded(name: str, width: int) -> str:

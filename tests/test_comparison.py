@@ -16,7 +16,7 @@ from spelgen.comparison import metrics, runs
 from spelgen.comparison.formatting import comparison_tables
 from spelgen.comparison.known_urdf import with_wrong_inertials
 from spelgen.comparison.runs import run_study, time_steps
-from spelgen.comparison.study import VARIANTS, ablation, prepare_study
+from spelgen.comparison.study import VARIANTS, ablation_variants, prepare_study
 from spelgen.comparison.truth import example_positions, mass_error, true_mass
 from spelgen.design import load_design
 from spelgen.emission.loading import load_module
@@ -111,7 +111,7 @@ def test_with_a_wrong_urdf_models_are_trained_by_defaults(robot, quick, tmp_path
 
 
 def test_the_ablation_changes_one_thing_at_a_time():
-    designs = [load_design(x.preset) for x in ablation()]
+    designs = [load_design(x.preset) for x in ablation_variants()]
     changes = [
         {key for key, value in asdict(a).items() if value != asdict(b)[key]} for a, b in pairwise(designs)
     ]

@@ -96,12 +96,11 @@ def derive_actuation(robot: Robot, settings: Settings, joints: Sequence[str]) ->
     """
     driven = [name for name in joints if settings.joint(name).actuated]
     notes = tuple(_undriven(robot, settings, driven))
+    coupled = [entry for coupling in _couplings(robot, settings, joints) for entry in coupling]
     if settings.torque == "joint":
         entries = [InputEntry(joints.index(x), joints.index(x), "fixed", 1.0) for x in driven]
-        coupled = [entry for coupling in _couplings(robot, settings, joints) for entry in coupling]
         return Actuation(len(joints), tuple(entries), notes, tuple(coupled))
-    entries = [entry for coupling in _couplings(robot, settings, joints) for entry in coupling]
-    taken = {entry.row for entry in entries}
+    entries, taken = coupled, {entry.row for entry in coupled}
     for name in driven:
         index = joints.index(name)
         if index not in taken:

@@ -47,8 +47,7 @@ def compare(
     """
     from spelgen.comparison.formatting import comparison_tables
     from spelgen.comparison.runs import run_study, time_steps
-    from spelgen.comparison.study import VARIANTS, prepare_study
-    from spelgen.comparison.study import ablation as steps_of_ablation
+    from spelgen.comparison.study import VARIANTS, ablation_variants, prepare_study
     from spelgen.fleet.engine import engine
     from spelgen.render.comparison_page import write_comparison
 
@@ -56,7 +55,7 @@ def compare(
         raise NotApplicable(
             "--steps: belongs to models that know kinematics alone, these are trained by defaults"
         )
-    known = {variant.name: variant for variant in (steps_of_ablation() if ablation else VARIANTS)}
+    known = {variant.name: variant for variant in (ablation_variants() if ablation else VARIANTS)}
     chosen = list(known) if presets is None else [name.strip() for name in presets.split(",")]
     for name in chosen:
         if name not in known:

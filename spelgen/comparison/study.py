@@ -53,7 +53,7 @@ VARIANTS = (
 )
 
 
-def ablation() -> tuple[Variant, ...]:
+def ablation_variants() -> tuple[Variant, ...]:
     """From phnode to minimal, one change after the other."""
     phnode = load_design("phnode")
     friction = replace(phnode, dissipation="per-joint")

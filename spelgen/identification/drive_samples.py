@@ -9,6 +9,7 @@ import numpy as np
 
 from spelgen.identification.samples import dynamics_samples
 from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.values import earlier
 
 DELAYS = np.arange(-60, 61, 10) * 1e-3  # s
 MOST, LEAST = 1500, 400  # samples
@@ -30,13 +31,11 @@ class DriveSamples(NamedTuple):
 
 def drive_samples(trajectory: Trajectory, inputs: np.ndarray) -> DriveSamples | None:
     """Of one trajectory; None where it is too sparse or too short. inputs: G, (n, n)."""
-    t, shifted = trajectory.t, []
-    for delay in DELAYS:
-        tau = np.stack([np.interp(t + delay, t, column) for column in trajectory.tau.T], axis=1)
-        shifted += dynamics_samples([replace(trajectory, tau=tau @ inputs.T)])
-    if not shifted:
+    torques = [earlier(trajectory.t, trajectory.tau @ inputs.T, delay) for delay in DELAYS]
+    found = dynamics_samples([replace(trajectory, tau=tau) for tau in torques])
+    if not found:
         return None
-    return DriveSamples(shifted[0].q, shifted[0].qd, shifted[0].qdd, np.stack([x.tau for x in shifted]))
+    return DriveSamples(found[0].q, found[0].qd, found[0].qdd, np.stack([x.tau for x in found]))
 
 
 class DriveLog:

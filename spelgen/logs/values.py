@@ -58,7 +58,7 @@ def made_trajectory(data: np.ndarray, layout: Layout, **about: Any) -> Trajector
     quantities = wanted_quantities(layout.mapping)
     t, found = data[:, 0], dict(zip(quantities, np.split(data[:, 1:], len(quantities), axis=1), strict=True))
     qd = found["qd"] if "qd" in found else _differentiated(t, found["q"])
-    tau = _earlier(t, found["tau"], layout.mapping.torque_delay) if "tau" in found else np.zeros((len(t), 0))
+    tau = earlier(t, found["tau"], layout.mapping.torque_delay) if "tau" in found else np.zeros((len(t), 0))
     return Trajectory(
         t, found["q"], qd, tau, u=found.get("u"),
         declares_units=layout.declares_units, **about,
@@ -74,7 +74,7 @@ def _differentiated(t: np.ndarray, q: np.ndarray) -> np.ndarray:
     return qd
 
 
-def _earlier(t: np.ndarray, values: np.ndarray, delay: float) -> np.ndarray:
+def earlier(t: np.ndarray, values: np.ndarray, delay: float) -> np.ndarray:
     """What is logged so much later [s], (T, n), held at the ends of each gap-free piece."""
     if not delay:
         return values
