@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from spelgen.runtime.position_servo import beyond
+
 STEP = 3.4e-3  # s, at most: longer ones make armatures a few percent wrong
 IMPLICIT = 0.55  # theta: 0.5 adds no damping of its own, 1 damps what is too fast for a step
 
@@ -57,7 +59,7 @@ def drives_of(model: Any) -> Drives:
 def balanced(drives: Drives, q: Tensor, qd: Tensor, u: Tensor, load: Load) -> ServoState:
     """The state whose friction makes up, as far as it can, for what the servos' torque is not: at rest, or steady."""
     servo, laws = drives.servo, drives.laws
-    torque = (servo.kp * _beyond(u - q, servo.dead_zone) - servo.kd * qd).clamp(
+    torque = (servo.kp * beyond(u - q, servo.dead_zone) - servo.kd * qd).clamp(
         -servo.limit, servo.limit
     ) - drives.offset
     rest = torque - load.bias - laws.viscosity(qd, drives.friction) * qd
@@ -72,7 +74,7 @@ def advanced(drives: Drives, state: ServoState, u: Tensor, load: Load, h: Tensor
     dry = laws.dry(qd, load.gravity, drives.friction)
     bent = 1 - qd.sign().unsqueeze(-1) * z / reach  # of each bristle, what is left until it slides
     stiffness = dry * (fractions / reach * bent).sum(dim=-1)
-    pull = servo.kp * _beyond(u - q, servo.dead_zone)
+    pull = servo.kp * beyond(u - q, servo.dead_zone)
     wanted = pull - servo.kd * qd
     free = (wanted.abs() < servo.limit).to(q)
     stiff = free * servo.kp * (pull != 0)
@@ -89,10 +91,6 @@ def advanced(drives: Drives, state: ServoState, u: Tensor, load: Load, h: Tensor
         between = (load.inertia * qd + rest) / (load.inertia + damping)
     moved = h * between
     return ServoState(q + moved, qd + (between - qd) / IMPLICIT, laws.bristles.moved(z, moved))
-
-
-def _beyond(distance: Tensor, dead_zone: Tensor) -> Tensor:
-    return distance - torch.maximum(torch.minimum(distance, dead_zone), -dead_zone)
 
 
 def replayed(model: Any, q: Tensor, qd: Tensor, commands: Tensor, dt: Tensor) -> Tensor:
