@@ -35,9 +35,10 @@ dynamics: arrays constraint pinocchio_dynamics pinocchio_arm pinocchio_urdf
 dynamics: regressor rigid_bodies regressor_dynamics tip
 logs: arm_mapping trajectory coverage bags lerobot tables npz readers values log_files suggest read checks filtering
 logs: preprocessing windows chunks epoch_windows commands
-simulation: friction integration simulated_logs random_inputs servo_motions tracking
+excitation: trajectory
+simulation: friction integration simulated_logs random_inputs servo_motions paths tracking
 identification: samples friction base_parameters least_squares method prior identification
-excitation: trajectory criterion excitation
+excitation: criterion excitation
 fitting: run_schema run_folder run_lock
 fitting: gaussian_prior adaptive rollout calibration dataset streaming workers torque_samples torque_jacobian
 fitting: optimizers residual_fit torque_fit torque_report

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from spelgen.settings.values import Count, Group, Inputs, NonNegative, Number, Positive, Share, Whole
 
@@ -46,10 +46,11 @@ class SimulationSettings(Group):
 class TrackingSettings(Group):
     """How an arm moves and is seen in `simulation.protocol: tracking`.
 
-    amplitude [rad; m], frequency [Hz]: of each joint's sine about the middle of `simulation.positions`; unless said,
-        less where the range is narrow.
+    amplitude [rad; m], frequency [Hz]: of each joint's sine about the middle of `simulation.positions`, where `paths`
+        are not excitation; unless said, less amplitude where the range is narrow.
     paths: "same": all trajectories follow one closed path, each beginning further on; "own": each has phases of
-    its own, so that its test part lies where no training part was.
+    its own, so that its test part lies where no training part was; "excitation": each goes its own way from rest to
+    rest, through five frequencies, as `spelgen excite` begins its search with.
     control: "pid" of each joint by itself, or "computed-torque", which knows the arm: for arms that fall otherwise.
     bandwidths: of the controllers of the first, second, ... trajectory, then over again [Hz].
     control_rate: of the controllers, which hold their torques; simulation.sample_rate is a multiple of it [Hz].
@@ -58,9 +59,16 @@ class TrackingSettings(Group):
 
     amplitude: Positive = 0.5235987755982988
     frequency: Positive = 0.125
-    paths: Literal["same", "own"] = "same"
+    paths: Literal["same", "own", "excitation"] = "same"
     control: Literal["pid", "computed-torque"] = "pid"
     bandwidths: Annotated[tuple[Positive, ...], Field(min_length=1)] = (2.0, 2.5, 3.0, 3.5, 4.0, 4.5)
     control_rate: Positive = 125.0
     resolution: Positive = 4.8e-5
     cutoff: Positive = 30.0
+
+    @model_validator(mode="after")
+    def _used(self) -> Self:
+        sines = {"amplitude", "frequency"} & self.model_fields_set
+        if self.paths == "excitation" and sines:
+            raise ValueError(f"{' and '.join(sorted(sines))} of sines, beside paths: excitation")
+        return self

@@ -71,7 +71,7 @@ def _controlled(settings: Settings) -> Settings:
     rate = simulation.sample_rate
     usual: dict[str, object] = {
         "control": "computed-torque",
-        "paths": "own",
+        "paths": "own" if {"amplitude", "frequency"} & tracking.model_fields_set else "excitation",
         "control_rate": rate / max(1, round(rate / CONTROL_RATE)),
         "cutoff": min(tracking.cutoff, rate / 4),
     }

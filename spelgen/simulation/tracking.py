@@ -1,4 +1,4 @@
-"""Arm + Settings -> logs as a real arm gives them: controlled along sines, seen by encoders, velocities by differences.
+"""Arm + Settings -> logs as a real arm gives them: controlled along paths, seen by encoders, velocities by differences.
 
 Stands in for the protocol of the paper's real arm (Wang, Chen, Ding, Sci Rep 15:33179, 2025), whose logs are not
 public. What the paper leaves open is ours: gains, phases, encoders and the filter's cutoff.
@@ -15,43 +15,24 @@ from scipy.signal import butter, sosfiltfilt
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
-from spelgen.errors import SettingsError, SpelgenError, collect
+from spelgen.errors import SettingsError
+from spelgen.excitation.trajectory import Motion
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.settings import Settings
 from spelgen.settings.simulation import TrackingSettings
 from spelgen.simulation.friction import Friction, make_friction
 from spelgen.simulation.integration import LOOSER, rollout
+from spelgen.simulation.paths import paths
 from spelgen.simulation.random_inputs import initial_range
 from spelgen.simulation.simulated_logs import SimulatedLogs
 
 FILTER_ORDER = 4
 STRETCH = 32  # samples
 UNSEEN = 0.01  # of an encoder's step: an error of integration that nobody sees
-USED = 0.7  # of a joint's range, where no amplitude is said
 INTEGRAL_GAIN = 0.2  # a tenth of what makes a joint without friction unstable
 
-
-@dataclass(frozen=True, eq=False)
-class Sines:
-    """Where n joints shall be: middle + amplitude sin(2 pi frequency t + phase), each (n,)."""
-
-    middle: np.ndarray
-    phase: np.ndarray
-    amplitude: np.ndarray | float
-    frequency: float
-
-    def position(self, t: float) -> np.ndarray:
-        """(n,) [rad; m] at t [s]."""
-        return self.middle + self.amplitude * np.sin(2 * np.pi * self.frequency * t + self.phase)
-
-    def velocity(self, t: float) -> np.ndarray:
-        """(n,) [rad/s; m/s] at t [s]."""
-        omega = 2 * np.pi * self.frequency
-        return self.amplitude * omega * np.cos(omega * t + self.phase)
-
-    def acceleration(self, t: float) -> np.ndarray:
-        """(n,) [rad/s^2; m/s^2] at t [s]."""
-        return -((2 * np.pi * self.frequency) ** 2) * (self.position(t) - self.middle)
+Wanted = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""q, qd and qdd (n,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +65,7 @@ def track(
     *,
     progress: Callable[[int, int], None] | None = None,
 ) -> SimulatedLogs:
-    """Return logs of the arm controlled along sines, by `settings.simulation` and `settings.tracking`.
+    """Return logs of the arm controlled along paths, by `settings.simulation` and `settings.tracking`.
 
     Every recording has its own gains, and its own phases or place to begin. The last `test_fraction` of each is
     for testing. Logged are positions from the encoders after a zero-phase low-pass, velocities by central
@@ -94,15 +75,15 @@ def track(
     protocol = settings.simulation
     dynamics, friction = arm_dynamics(arm, settings), make_friction(arm, settings)
     inputs = np.eye(len(arm.coordinates)) if input_matrix is None else input_matrix
-    middle, amplitude = _range(arm, settings)
+    middle = np.mean(initial_range(arm, settings), axis=0)
+    ticks = np.arange(_ticks(settings)) * (1.0 / settings.tracking.control_rate)
     train, test, errors = [], [], []
-    for number, phase in enumerate(_phases(settings, middle.size)):
-        sines = Sines(middle, phase, amplitude, settings.tracking.frequency)
+    for number, path in enumerate(paths(arm, settings, ticks)):
         bandwidth = settings.tracking.bandwidths[number % len(settings.tracking.bandwidths)]
         # what a joint feels when the others are free
         inertia = 1 / np.diag(np.linalg.inv(dynamics.mass_matrix(middle)))
         gains = tuned_gains(inertia, bandwidth)
-        recording = record(dynamics, friction, inputs, sines, gains, settings, 2 * np.pi * bandwidth)
+        recording = record(dynamics, friction, inputs, path, gains, settings, 2 * np.pi * bandwidth)
         effect = recording.tau @ inputs.T
         errors.append(_integration_error(dynamics, friction, recording, effect))
         log = measured(recording, settings.tracking, f"traj_{number:02d}")
@@ -142,8 +123,7 @@ def tuned_gains(inertia: np.ndarray, bandwidth: float) -> Gains:
 def computed_torque(
     dynamics: PinocchioDynamics,
     friction: Friction,
-    sines: Sines,
-    t: float,
+    wanted: Wanted,
     seen: np.ndarray,
     lag: np.ndarray,
     omega: float,
@@ -151,14 +131,15 @@ def computed_torque(
     """Return the joint torques (n,) of a controller that knows the arm: M (qdd* + 2 omega e' + omega^2 e) + what
     motion, gravity and friction take (Siciliano et al., Robotics, 2009, 8.5.2).
 
-    seen: positions (n,); lag: e', the error of velocity. Where viscous friction alone makes a joint slower than omega,
-    a stiffness of viscous * omega beside it.
+    wanted: q*, qd*, qdd* (n,). seen: positions (n,); lag: e', the error of velocity. Where viscous friction alone makes
+    a joint slower than omega, a stiffness of viscous * omega beside it.
     """
-    error, wanted = sines.position(t) - seen, sines.velocity(t)
+    q, qd, qdd = wanted
+    error = q - seen
     mass = dynamics.mass_matrix(seen)
     slow = np.where(friction.viscous > np.diag(mass) * omega, friction.viscous * omega, 0.0)
-    accelerated = mass @ (sines.acceleration(t) + 2 * omega * lag + omega**2 * error)
-    held: np.ndarray = dynamics.nonlinear_effects(seen, wanted) + friction(wanted) + slow * error
+    accelerated = mass @ (qdd + 2 * omega * lag + omega**2 * error)
+    held: np.ndarray = dynamics.nonlinear_effects(seen, qd) + friction(qd) + slow * error
     return accelerated + held
 
 
@@ -166,32 +147,31 @@ def record(
     dynamics: PinocchioDynamics,
     friction: Friction,
     inputs: np.ndarray,
-    sines: Sines,
+    path: Motion,
     gains: Gains,
     settings: Settings,
     omega: float = 0.0,
 ) -> Recording:
-    """Return a motion along the sines: the controller sees the encoders and holds its torques between its ticks.
+    """Return a motion along a path: the controller sees the encoders and holds its torques between its ticks.
 
-    inputs: G (n, n). The arm starts at rest where the sines begin, held against its weight. omega: of computed torques
-    [rad/s], where these are asked for.
+    path: at the ticks. inputs: G (n, n). The arm starts at rest where the path begins, held against its weight.
+    omega: of computed torques [rad/s], where these are asked for.
     """
-    tracking, n = settings.tracking, len(sines.middle)
+    tracking, n = settings.tracking, path.q.shape[1]
     tick, held = 1.0 / tracking.control_rate, _samples_of_a_tick(settings)
-    ticks = -(-round(settings.simulation.duration * settings.simulation.sample_rate) // held)
     to_motors = np.linalg.pinv(inputs)
-    state = np.concatenate([sines.position(0.0), np.zeros(n)])
+    state = np.concatenate([path.q[0], np.zeros(n)])
     integral = dynamics.nonlinear_effects(*np.split(state, 2))
     before = seen = _seen(state[:n], tracking)
     states, torques = [], []
-    for k in range(ticks):
+    for k, wanted in enumerate(zip(path.q, path.qd, path.qdd, strict=True)):
         before, seen = seen, _seen(state[:n], tracking)
-        error = sines.position(k * tick) - seen
-        lag = sines.velocity(k * tick) - (seen - before) / tick
+        error = wanted[0] - seen
+        lag = wanted[1] - (seen - before) / tick
         integral = integral + tick * gains.integral * error
         effort = gains.proportional * error + gains.derivative * lag + integral
         if tracking.control == "computed-torque":
-            effort = computed_torque(dynamics, friction, sines, k * tick, seen, lag, omega)
+            effort = computed_torque(dynamics, friction, wanted, seen, lag, omega)
         tau = to_motors @ effort
         t = k * tick + np.arange(held + 1) / settings.simulation.sample_rate
         passed = rollout(dynamics, friction, state, t, np.tile(inputs @ tau, (held + 1, 1)))
@@ -214,19 +194,15 @@ def measured(recording: Recording, tracking: TrackingSettings, name: str) -> Tra
     return Trajectory(recording.t, q, np.gradient(q, recording.t, axis=0), recording.tau, name)
 
 
-def _phases(settings: Settings, n: int) -> list[np.ndarray]:
-    """The phases (n,) [rad] of each trajectory's sines; no trajectory's own depend on how many there are."""
-    count = settings.simulation.trajectories
-    seeds = np.random.SeedSequence(settings.simulation.seed).spawn(count)
-    drawn = [np.random.default_rng(seed).uniform(0, 2 * np.pi, n) for seed in seeds]
-    if settings.tracking.paths == "own":
-        return drawn
-    return [drawn[0] + 2 * np.pi * number / count for number in range(count)]
-
-
 def _seen(q: np.ndarray, tracking: TrackingSettings) -> np.ndarray:
     """The nearest whole steps of the encoders."""
     return np.round(q / tracking.resolution) * tracking.resolution
+
+
+def _ticks(settings: Settings) -> int:
+    """How many there are in a trajectory."""
+    simulation = settings.simulation
+    return -(-round(simulation.duration * simulation.sample_rate) // _samples_of_a_tick(settings))
 
 
 def _samples_of_a_tick(settings: Settings) -> int:
@@ -239,21 +215,3 @@ def _samples_of_a_tick(settings: Settings) -> int:
             expected="a rate of which simulation.sample_rate is a multiple",
         )  # fmt: skip
     return count
-
-
-def _range(arm: Arm, settings: Settings) -> tuple[np.ndarray, np.ndarray]:
-    """The middle (n,) of each joint's range and the amplitude (n,) of its sines, which must fit in."""
-    lowest, highest = initial_range(arm, settings)
-    amplitude, errors = np.full(len(lowest), settings.tracking.amplitude), list[SpelgenError]()
-    if "amplitude" not in settings.tracking.model_fields_set:
-        amplitude = np.minimum(amplitude, USED * (highest - lowest) / 2)
-    for joint, low, high, wanted in zip(arm.coordinates, lowest, highest, amplitude, strict=True):
-        if high - low < 2 * wanted:
-            error = SettingsError(
-                f"{wanted:g} beside the range {low:g} to {high:g} of {joint.name!r}",
-                element="tracking.amplitude", expected="sines within the range",
-                do="make it smaller or give the joint wider simulation.positions",
-            )  # fmt: skip
-            errors.append(error)
-    collect(errors)
-    return (lowest + highest) / 2, amplitude

@@ -1,0 +1,67 @@
+"""Where a controlled arm shall be: sines of one frequency, or motions as `spelgen excite` begins its search with."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from spelgen.arm.arm import Arm
+from spelgen.errors import SettingsError, SpelgenError, collect
+from spelgen.excitation.trajectory import SPEEDS, ExcitationTrajectory, Motion, MotionBounds
+from spelgen.settings.settings import Settings
+from spelgen.simulation.random_inputs import initial_range
+
+USED = 0.7  # of a joint's range and of its speed limit, where nothing is said
+HARMONICS = 5  # of the motion's length
+
+
+def paths(arm: Arm, settings: Settings, t: np.ndarray) -> list[Motion]:
+    """The path of each trajectory at times t (T,) [s], by `settings.tracking`; none depends on how many there are.
+
+    Raises SettingsError where sines do not fit into a joint's range, or a joint has none.
+    """
+    count = settings.simulation.trajectories
+    seeds = np.random.SeedSequence(settings.simulation.seed).spawn(count)
+    randoms = [np.random.default_rng(seed) for seed in seeds]
+    low, high = initial_range(arm, settings)
+    if settings.tracking.paths == "excitation":
+        motions = ExcitationTrajectory(float(t[-1]), HARMONICS, _bounds(arm, low, high))
+        return [motions.motion(random.standard_normal(motions.size), t) for random in randoms]
+    middle, amplitude = (low + high) / 2, _amplitude(arm, settings, low, high)
+    drawn = [random.uniform(0, 2 * np.pi, len(middle)) for random in randoms]
+    if settings.tracking.paths == "same":
+        drawn = [drawn[0] + 2 * np.pi * number / count for number in range(count)]
+    return [sines(middle, amplitude, settings.tracking.frequency, phase, t) for phase in drawn]
+
+
+def sines(
+    middle: np.ndarray, amplitude: np.ndarray | float, frequency: float, phase: np.ndarray, t: np.ndarray
+) -> Motion:
+    """middle + amplitude sin(2 pi frequency t + phase), all but the frequency [Hz] and t (T,) of shape (n,)."""
+    omega = 2 * np.pi * frequency
+    angle = omega * t[:, None] + phase
+    swing = amplitude * np.sin(angle)
+    return Motion(t, middle + swing, amplitude * omega * np.cos(angle), -(omega**2) * swing)
+
+
+def _bounds(arm: Arm, low: np.ndarray, high: np.ndarray) -> MotionBounds:
+    """The middle of the ranges at moderate speeds: a first try at an arm that nobody knows."""
+    middle, half = (low + high) / 2, (high - low) / 2
+    speed = [min(USED * (x.velocity or np.inf), SPEEDS[x.kind]) for x in arm.coordinates]
+    return MotionBounds(middle - USED * half, middle + USED * half, np.array(speed))
+
+
+def _amplitude(arm: Arm, settings: Settings, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """The amplitude (n,) of each joint's sines, which must fit into its range."""
+    amplitude, errors = np.full(len(low), settings.tracking.amplitude), list[SpelgenError]()
+    if "amplitude" not in settings.tracking.model_fields_set:
+        amplitude = np.minimum(amplitude, USED * (high - low) / 2)
+    for joint, lowest, highest, wanted in zip(arm.coordinates, low, high, amplitude, strict=True):
+        if highest - lowest < 2 * wanted:
+            error = SettingsError(
+                f"{wanted:g} beside the range {lowest:g} to {highest:g} of {joint.name!r}",
+                element="tracking.amplitude", expected="sines within the range",
+                do="make it smaller or give the joint wider simulation.positions",
+            )  # fmt: skip
+            errors.append(error)
+    collect(errors)
+    return amplitude
