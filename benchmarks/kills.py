@@ -1,9 +1,10 @@
 """Kills a training at random times and resumes it, over and over: the weights in the end are those of one never killed.
 
-    python benchmarks/kills.py [--kills 50]
+    python benchmarks/kills.py [--kills 50] [--servos]
 
-AdamW on few windows, so that training ends by its epochs and not of itself. Each kill is a SIGKILL, which nothing can
-catch, after a random time since the process began to write. `make bench` takes 5 kills.
+AdamW on few windows, so that training ends by its epochs and not of itself; or position servos, whose fit has an end of
+its own. Each kill is a SIGKILL, which nothing can catch, after a random time since the process began to write.
+`make bench` takes 5 kills.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import argparse
 import os
 import random
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -27,61 +29,57 @@ from spelgen.pipeline import generate
 from spelgen.simulation.simulate import simulate
 
 URDF = Path(__file__).parents[1] / "robots" / "rpr.urdf"
-LONGEST = 6.0  # [s] from the first write of a process to its death
+ADAMW = ["--optimizer", "adamw", "--batch", "8", "--momentum-steps", "0"]
+LONGEST, SHORTER = 6.0, 2.0  # [s] from the first write of a process to its death; of servos, which end sooner
 
 
 def main() -> None:
     """Train once in peace and once under fire, and compare."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--kills", type=int, default=5)
-    kills = parser.parse_args().kills
+    parser.add_argument("--servos", action="store_true", help="a fit of position servos")
+    asked = parser.parse_args()
+    kills = asked.kills
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        arm = load_arm(URDF)
+        urdf = Path(shutil.copy(URDF, folder))
+        settings = "input: position\n" if asked.servos else URDF.with_suffix(".yaml").read_text()
+        urdf.with_suffix(".yaml").write_text(settings)
+        arm = load_arm(urdf)
         joints = [coordinate.name for coordinate in arm.arm.coordinates]
         write_logs(folder / "train.parquet", simulate(arm, trajectories=4).train, joints)
-        (folder / "module.py").write_text(generate(arm, "spel", width=4, depth=1))
-        subprocess.run(_command(folder, folder / "whole", kills, resume=False), check=True)
+        source = generate(arm, "closed-form") if asked.servos else generate(arm, "spel", width=4, depth=1)
+        (folder / "module.py").write_text(source)
+        options = ["--quiet", "--robot", str(urdf)] + ([] if asked.servos else ADAMW)
+        epochs = str(20 + 16 * kills)  # of some 0.2 s: more than are done before the last kill
+        always = [] if asked.servos else ["--epochs", epochs, "--patience", epochs]
+
+        def command(run: Path, *, resume: bool) -> list[str]:
+            said = ["--resume"] if resume else options
+            return [sys.executable, "-m", "spelgen", "train", str(folder / "module.py"), "--data", str(folder), "-o",
+                    str(run), *always, *said]  # fmt: skip
+
+        subprocess.run(command(folder / "whole", resume=False), check=True)
         done, draw, run = 0, random.Random(0), folder / "run"
         while True:
             resume = (run / "config.json").exists()
-            if not _killed(_command(folder, run, kills, resume=resume), run, draw.uniform(0, LONGEST)):
+            if not _killed(
+                command(run, resume=resume), run, draw.uniform(0, SHORTER if asked.servos else LONGEST)
+            ):
                 break
             done += done < kills
             if done == kills:
                 ready = (run / "config.json").exists()
-                subprocess.run(_command(folder, run, kills, resume=ready), check=True)
+                subprocess.run(command(run, resume=ready), check=True)
                 break
         whole, broken = (RunFolder(x).load_checkpoint() for x in (folder / "whole", run))
-        same = all(
-            torch.equal(whole[what][key], broken[what][key])
-            for what in ("model", "best_weights")
-            for key in whole[what]
-        )
+        same = all(torch.equal(x, broken["best_weights"][key]) for key, x in whole["best_weights"].items())
+        if not asked.servos:
+            same &= all(torch.equal(x, broken["model"][key]) for key, x in whole["model"].items())
         epochs = [len(RunFolder(x).read_metrics()) for x in (folder / "whole", run)]
         print(f"{done} kills, {done} resumes, epochs {epochs}: weights {'identical' if same else 'DIFFER'}")
     if not same or done < kills or len(set(epochs)) > 1:
         sys.exit(1)
-
-
-def _command(folder: Path, run: Path, kills: int, *, resume: bool) -> list[str]:
-    epochs = str(20 + 16 * kills)  # of some 0.2 s: more than are done before the last kill
-    options = ["--data", str(folder), "-o", str(run), "--epochs", epochs, "--patience", epochs]
-    if resume:
-        options.append("--resume")
-    else:
-        options += [
-            "--optimizer",
-            "adamw",
-            "--batch",
-            "8",
-            "--momentum-steps",
-            "0",
-            "--quiet",
-            "--robot",
-            str(URDF),
-        ]
-    return [sys.executable, "-m", "spelgen", "train", str(folder / "module.py"), *options]
 
 
 def _killed(command: list[str], run: Path, after: float) -> bool:

@@ -9,6 +9,8 @@ import atexit
 import re
 import shutil
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -35,25 +37,50 @@ def local(path: Path | str) -> Path:
 
 def sent(path: Path) -> None:
     """Send a file that was written, or tell of one that was removed, to the address that it is of, if it is of one."""
+    target = address_of(path)
+    if target is None:
+        return
+    with reached(target) as (system, place):
+        if path.exists():
+            system.makedirs(system._parent(place), exist_ok=True)
+            system.put_file(str(path), place)
+        elif system.exists(place):
+            system.rm_file(place)
+
+
+def address_of(path: Path) -> str | None:
+    """The address of which a path is the copy, or stands in it; None: it is a local one."""
     for address, copy in _copies.items():
         if path == copy or copy in path.parents:
-            below = path.relative_to(copy).as_posix()
-            target = address if path == copy else f"{address}/{below}"
-            with _Reached(target):
-                system, place = _at(target)
-                if path.exists():
-                    system.makedirs(system._parent(place), exist_ok=True)
-                    system.put_file(str(path), place)
-                elif system.exists(place):
-                    system.rm_file(place)
+            return address if path == copy else f"{address}/{path.relative_to(copy).as_posix()}"
+    return None
+
+
+@contextmanager
+def reached(address: str) -> Iterator[tuple[Any, str]]:
+    """The file system of an address, and the path there. Within it, whatever the file system raises names the address:
+    each has kinds of its own.
+    """
+    try:
+        import fsspec
+
+        yield fsspec.core.url_to_fs(address)
+    except SpelgenError:
+        raise
+    except ImportError as error:
+        raise SpelgenError(
+            f"an address that needs a package ({error})", file=address, do="install it"
+        ) from error
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise SpelgenError(f"cannot be reached ({reason})", file=address) from error
 
 
 def _fetched(address: str) -> Path:
     folder = Path(tempfile.mkdtemp(prefix="spelgen-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     copy = folder / address.rsplit("/", 1)[-1]
-    with _Reached(address):
-        system, place = _at(address)
+    with reached(address) as (system, place):
         if system.isdir(place):
             copy.mkdir()
             for each in system.find(place):
@@ -63,30 +90,3 @@ def _fetched(address: str) -> Path:
         elif system.exists(place):
             system.get_file(place, str(copy))
     return copy
-
-
-def _at(address: str) -> tuple[Any, str]:
-    """The file system of an address, and the path there."""
-    import fsspec
-
-    system, place = fsspec.core.url_to_fs(address)
-    return system, place
-
-
-class _Reached:
-    """Within it, whatever a file system raises names the address: each has kinds of its own."""
-
-    def __init__(self, address: str) -> None:
-        self._address = address
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, ImportError):
-            raise SpelgenError(
-                f"an address that needs a package ({error})", file=self._address, do="install it"
-            ) from error
-        if isinstance(error, Exception):
-            reason = " ".join(str(error).split()) or type(error).__name__
-            raise SpelgenError(f"cannot be reached ({reason})", file=self._address) from error

@@ -39,7 +39,7 @@ excitation: trajectory
 simulation: friction integration simulated_logs random_inputs servo_motions paths tracking
 identification: samples friction base_parameters least_squares method prior identification
 excitation: criterion excitation
-fitting: run_schema run_folder run_lock
+fitting: run_schema address_lock run_folder run_lock
 fitting: gaussian_prior adaptive rollout calibration dataset streaming workers torque_samples torque_jacobian
 fitting: optimizers residual_fit torque_fit torque_report
 fitting: torque_networks urdf_regularizer stages compiled process progress validation loop

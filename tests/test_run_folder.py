@@ -1,5 +1,6 @@
 """A run folder from elsewhere runs nothing, belongs to one training at a time, and is whole whenever that is killed."""
 
+import functools
 import json
 import os
 import re
@@ -9,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from killing import killed
 from typer.testing import CliRunner
 
 import spelgen
@@ -151,31 +153,6 @@ def weights(run: Path) -> dict[str, torch.Tensor]:
     return torch.load(run / "model.pt", weights_only=True)
 
 
-def killed(start: Path, run: Path, write: int, *, before: bool, **options) -> bool:
-    """Whether a training that dies without a word at its so-manieth write did so before its end."""
-    child = os.fork()
-    if child == 0:  # pragma: no cover
-        replace, left = os.replace, [write]
-
-        def dying(*paths):
-            left[0] -= 1
-            if left[0] == 0 and before:
-                os._exit(9)
-            replace(*paths)
-            if left[0] == 0:
-                os._exit(9)
-
-        os.replace = dying
-        try:
-            trained(start, run, **options)
-        except BaseException:
-            os._exit(1)
-        os._exit(0)
-    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    assert code in (0, 9)
-    return code == 9
-
-
 def test_killed_between_any_two_writes_nothing_is_lost(start, tmp_path):
     """Every write of a training, in turn: module, robot, weights, checkpoints, config. Dead before or after it."""
     whole = weights(trained(start, tmp_path / "whole", urdf=start / "arm.urdf"))
@@ -184,7 +161,8 @@ def test_killed_between_any_two_writes_nothing_is_lost(start, tmp_path):
     while True:
         there = (run / "config.json").exists()
         resumed.add(there)
-        if not killed(start, run, write, before=bool(write % 2), urdf=start / "arm.urdf", resume=there):
+        training = functools.partial(trained, start, run, urdf=start / "arm.urdf", resume=there)
+        if not killed(training, write, before=bool(write % 2)):
             break
         kills, write = kills + 1, write + 1
     assert kills >= 6

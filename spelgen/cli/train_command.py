@@ -200,7 +200,12 @@ def _outcome(found: Fit) -> tuple[str, str]:
     if found.config.objective == "servo":
         from spelgen.fitting.servo_report import servo_text
 
-        return f"{found.status}: servos fitted in {found.seconds:.0f} s", servo_text(found.record["servo"])
+        told = (
+            servo_text(found.record["servo"])
+            if "servo" in found.record
+            else f"{found.steps} steps were taken"
+        )
+        return f"{found.status}: servos fitted in {found.seconds:.0f} s", told
     config, loss = cast("WindowConfig", found.config), f"validation loss {found.best_validation:.3g}"
     if not config.epochs:  # windows only judge
         return f"{found.status}: {config.objective} fitted in {found.seconds:.0f} s", loss

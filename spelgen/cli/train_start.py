@@ -104,7 +104,7 @@ def resumed(folder: Path, chosen: Chosen) -> Start:
     run = RunFolder(folder)
     before = run.read_config()
     said = {name: value for name, value in chosen.preprocessing.items() if value is not None}
-    if before["validation_fraction"] is None:
+    if before["validation_fraction"] is None and before["objective"] != "servo":  # which needs none
         raise RunError(
             "a run with validation logs that were given in memory", file=folder,
             do="go on with spelgen.fit(..., folder=..., resume=True)",

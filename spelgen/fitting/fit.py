@@ -81,20 +81,20 @@ def fit(
         config = default_config(model, sample_rates(logs))
     config.require(rigid_bodies=rigid_bodies)
     require_input(model, config)
+    known = None if folder is None else RunFolder(Path(folder))
     if isinstance(config, ServoFit):
         return fit_commands(
-            model, logs, config, preprocessing, seed=seed, urdf=_urdf(arm), resume=resume, force=force,
-            folder=None if workers.rank() else folder, mapping=mapping, notes=notes, threads=threads,
+            model, logs, config, preprocessing, seed=seed, urdf=_urdf(arm), folder=known, resume=resume, force=force,
+            mapping=mapping, notes=notes, threads=threads, progress=progress and workers.rank() == 0,
         )  # fmt: skip
-    known = None if folder is None else RunFolder(Path(folder))
     run = known if workers.rank() == 0 else None  # of several processes one writes
     if run is not None and not resume:
         run.require_free(force=force)
-    with threads_of_torch(threads), locked(run.path if run else None):
+    with threads_of_torch(threads), locked(run.path if run else None) as told:
         require_device(device)
         data = _prepared(model, logs, cast("WindowConfig", config), preprocessing, validation, seed)
         chosen = cast("WindowConfig", config.resolved(data.size))
-        found = [*data.diagnostics, *notes]
+        found = [*data.diagnostics, *notes, *told]
         stepped = _compiled(model, data, chosen, device, found)
         record = describe(model, chosen, data, seed=seed, validation=validation, mapping=mapping) | {
             "device": device,

@@ -17,7 +17,7 @@ from spelgen.files import write_json
 from spelgen.fitting.calibration import CalibrationWindows, read_calibration
 from spelgen.fitting.config import FitConfig
 from spelgen.fitting.loop import Status
-from spelgen.fitting.run_folder import RunFolder, trained_model, write_state
+from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.fitting.run_lock import locked
 from spelgen.fitting.run_record import recorded_config
 from spelgen.identification.samples import DENSE, dynamics_samples
@@ -155,8 +155,7 @@ class Fit:
             run.write_metrics(self.history)
             if self.calibration is not None:
                 self.calibration.save(run.calibration)
-            write_state(run.weights, self.model.state_dict())
-            write_state(run.checkpoint, self.checkpoint)
+            run.save(self.model.state_dict(), self.checkpoint)
             write_json(run.config, self.record)
         if logs is not None:
             import spelgen

@@ -18,7 +18,7 @@ from spelgen.fitting.dataset import TrainingData
 from spelgen.fitting.optimizers import LBFGS, MiniBatchAdamW, WindowOptimizer
 from spelgen.fitting.progress import TrainingProgress
 from spelgen.fitting.rollout import Mean, momentum_loss, rollout_loss
-from spelgen.fitting.run_folder import RunFolder, write_state
+from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer
 from spelgen.fitting.validation import Validation
 from spelgen.logs.windows import Windows
@@ -297,8 +297,7 @@ class TrainingLoop:
     def save(self) -> None:
         """Write model.pt and checkpoint.pt."""
         if self.folder is not None:
-            write_state(self.folder.weights, self.best_weights)
-            write_state(self.folder.checkpoint, self.state())
+            self.folder.save(self.best_weights, self.state())
 
     def restore(self, folder: RunFolder) -> None:
         """Continue from checkpoint.pt."""

@@ -57,6 +57,12 @@ class TrainingProgress:
         if step == steps:
             self._end_stage()
 
+    def round(self, number: int, steps: int, rms: float) -> None:
+        """Show how far a fit of servos is: the round, steps in all, errors [rad, m]."""
+        state = f"{steps} steps, errors {1000 * rms:.3g} mrad"
+        self._bar.update(self._task, description="servos", completed=number, state=state)
+        self._said = f"servos: {state}"
+
     def epoch(self, record: dict[str, Any]) -> None:
         """Show one line of metrics.jsonl."""
         if not self._said.startswith("training"):

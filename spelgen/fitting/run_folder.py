@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from spelgen.addresses import local, sent
+from spelgen.addresses import address_of, local, sent
 from spelgen.emission.loading import has_run, load_module
 from spelgen.errors import RunError
 from spelgen.files import naming, remove, write_bytes
+from spelgen.fitting.address_lock import refresh
 from spelgen.fitting.run_schema import require_checkpoint, require_epoch, require_record
 from spelgen.spec import read_source
 from spelgen.urdf.document import urdf_bytes
@@ -116,6 +117,14 @@ class RunFolder:
         settings = urdf.with_suffix(".yaml")
         robot = [(self.urdf, urdf_bytes(urdf))] if urdf.exists() else []  # what a xacro file expands to
         return robot + ([(self.settings, settings.read_bytes())] if settings.is_file() else [])
+
+    def save(self, weights: dict[str, Any], checkpoint: dict[str, Any]) -> None:
+        """Write model.pt and checkpoint.pt. Raises RunError where another process has taken over (see
+        `address_lock`).
+        """
+        refresh(address_of(self.path))
+        write_state(self.weights, weights)
+        write_state(self.checkpoint, checkpoint)
 
     def append_metrics(self, record: dict[str, Any]) -> None:
         """Add one line to metrics.jsonl."""

@@ -11,20 +11,21 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO
 
-from spelgen.errors import RunError
+from spelgen.addresses import address_of
+from spelgen.errors import Diagnostic, RunError
 from spelgen.files import naming
-
-NAME = ".lock"
+from spelgen.fitting.address_lock import NAME, locked_address
 
 
 @contextmanager
-def locked(folder: Path | None) -> Iterator[None]:
-    """Make the folder, and keep others from training in it; RunError that names who does already.
+def locked(folder: Path | None) -> Iterator[list[Diagnostic]]:
+    """Make the folder, and keep others from training in it, at its address too; RunError that names who does already.
 
     The kernel lets go of the lock when its holder ends, however it ends; so the file may stay behind. None: nothing.
+    What there is to tell: of a lock at an address that was taken over.
     """
     if folder is None:
-        yield
+        yield []
         return
     new = [each for each in (folder, *folder.parents) if not each.exists()]
     with naming(folder):
@@ -35,7 +36,8 @@ def locked(folder: Path | None) -> Iterator[None]:
         lock.write(f"process {os.getpid()} on {socket.gethostname()}, since {time.strftime('%F %T')},")
         lock.flush()
         try:
-            yield
+            with locked_address(address_of(folder)) as notes:
+                yield notes
         finally:
             (folder / NAME).unlink(missing_ok=True)
             for each in new:

@@ -8,6 +8,9 @@ The scale of a joint is what its errors usually are, and alike how many samples 
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -25,6 +28,20 @@ class Normal(NamedTuple):
 
     matrix: torch.Tensor
     target: torch.Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Reached:
+    """Where steps have come to. taken: how many there were in all, steps: since they began here; over: there is none
+    to come. rms: of errors over windows, all joints [rad, m].
+    """
+
+    point: Point
+    damping: float
+    taken: int = 0
+    steps: int = 0
+    over: bool = False
+    rms: float = math.inf
 
 
 class Descent:
@@ -73,11 +90,12 @@ class Descent:
         damped = matrix + damping * torch.diag(matrix.diagonal())
         return -torch.linalg.solve(damped, target).clamp(-LONGEST, LONGEST)
 
-    def run(self, point: Point, damping: float, least: float) -> tuple[Point, float, int]:
-        """The point where steps gain no more, its cost, and how many there were."""
+    def steps(self, reached: Reached, least: float) -> Iterator[Reached]:
+        """One after the other; the last is one that gains less than ``least``, or none where none gains."""
+        point, damping = reached.point, reached.damping
         errors = self.problem.errors(point)
-        cost, taken = self.cost(point, errors), 0
-        for _ in range(STEPS):
+        cost = self.cost(point, errors)
+        while not reached.over:
             normal = self.normal(point, errors)
             for _ in range(TRIES):
                 tried = point.moved(self.step(normal, point, damping))
@@ -87,12 +105,13 @@ class Descent:
                     break
                 damping *= 5
             else:
-                return point, cost, taken
-            gain, taken = cost - new, taken + 1
+                yield replace(reached, damping=damping, over=True)
+                return
+            over = cost - new < least or reached.steps + 1 == STEPS
             point, errors, cost, damping = tried, found, new, max(damping / 10, 1e-7)
-            if gain < least:
-                break
-        return point, cost, taken
+            rms = float(errors.square().mean().sqrt())
+            reached = Reached(point, damping, reached.taken + 1, reached.steps + 1, over, rms)
+            yield reached
 
 
 def _alike(errors: torch.Tensor, span: int) -> torch.Tensor:

@@ -7,7 +7,7 @@ enter, where windows ask for them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,7 +16,7 @@ import torch
 
 from spelgen.dynamics.bristles import encoder_step
 from spelgen.fitting.servo_dead_zones import dead_zones
-from spelgen.fitting.servo_descent import Descent, Normal
+from spelgen.fitting.servo_descent import Descent, Normal, Reached
 from spelgen.fitting.servo_problem import ServoProblem
 from spelgen.fitting.servo_start import start_servos
 from spelgen.fitting.servo_weights import DEAD_ZONE, Point
@@ -43,46 +43,96 @@ class ServoSolution:
     names: tuple[tuple[str, int], ...]
     rms: torch.Tensor
     steps: int
-    cost: float
     normal: Normal
     precision: torch.Tensor
     halved: torch.Tensor
     gravity: torch.Tensor
 
 
-def fit_servos(model: Any, windows: ServoWindows, logs: Sequence[Trajectory]) -> ServoSolution:
-    """Give the model the most probable weights."""
-    delay = 1 / windows.rate
-    model.servo.delay.fill_(delay)
-    start_servos(model, windows, ServoProblem(model, windows).load, delay)
-    noise = torch.from_numpy(np.max([encoder_step(x.q) for x in logs], axis=0)).clamp(min=1e-5) / 12**0.5
-    problem = ServoProblem(model, replace(windows, steps=-(-windows.steps // 2)))
-    descent = Descent(problem, noise, problem.errors(problem.start))
-    point, cost, steps = descent.run(problem.start, DAMPING[0], GAIN[0])
-    for turn in range(1, ROUNDS):
-        if turn == ROUNDS - FINE:
-            point = _with_dead_zones(descent, point)
-            problem.windows = windows
-        problem.relinearise(point, problem.path(point))
-        descent = Descent(problem, noise, problem.errors(point))
-        point, cost, taken = descent.run(point, DAMPING[1], GAIN[turn >= ROUNDS - FINE])
-        steps += taken
-    problem.windows = replace(windows, steps=2 * windows.steps)
-    normal = descent.normal(point, problem.errors(point))
-    halved = descent.step(normal, point)
-    point = point.moved(halved)
-    problem.write(point)
-    errors = problem.errors(point)
-    return ServoSolution(
-        names=tuple(problem.weights.names),
-        rms=errors.square().mean(dim=(0, 1)).sqrt(),
-        steps=steps,
-        cost=cost,
-        normal=normal,
-        precision=problem.weights.precision(len(point.bodies), every=True),
-        halved=halved,
-        gravity=problem.load.gravity.abs().mean(dim=(0, 1)),
-    )
+class ServoRounds:
+    """The changing state of a fit; from `state` another one goes on and repeats the same numbers.
+
+    What a round computes with, the bodies' load and the scale of errors, comes of the points where it and the rounds
+    before it began: these are all that has to be kept.
+    """
+
+    def __init__(
+        self,
+        model: Any,
+        windows: ServoWindows,
+        logs: Sequence[Trajectory],
+        state: dict[str, Any] | None = None,
+    ) -> None:
+        """state: of the fit that this one goes on with. Raises KeyError, ValueError, TypeError or RuntimeError where
+        it is not one of this model.
+        """
+        self.model, self.windows, delay = model, windows, 1 / windows.rate
+        if state is None:
+            model.servo.delay.fill_(delay)
+            start_servos(model, windows, ServoProblem(model, windows).load, delay)
+        else:
+            model.load_state_dict(state["start"])
+        self._start = {name: x.clone() for name, x in model.state_dict().items()}
+        finest = np.max([encoder_step(x.q) for x in logs], axis=0)
+        self._noise = torch.from_numpy(finest).clamp(min=1e-5) / 12**0.5
+        self.problem = ServoProblem(model, replace(windows, steps=-(-windows.steps // 2)))
+        self.begun: list[Point] = []
+        for each in [vars(self.problem.start)] if state is None else state["begun"]:
+            self._begin(Point(**each))
+        self.reached = Reached(self.begun[0], DAMPING[0])
+        if state is not None:
+            self.reached = replace(Reached(**state["reached"]), point=Point(**state["reached"]["point"]))
+        self.problem.write(self.reached.point)
+
+    def _begin(self, point: Point) -> None:
+        """The next round, from here."""
+        if len(self.begun) == ROUNDS - FINE:
+            weights = self.problem.weights
+            weights.dead_zones = point.joints[weights.row(DEAD_ZONE)] > 0
+            self.problem.windows = self.windows
+        if self.begun:
+            self.problem.relinearise(point, self.problem.path(point))
+        self.begun.append(point)
+
+    def run(self) -> Iterator[ServoRounds]:
+        """Itself after each step, when `state` is to be kept and the model has the weights so far."""
+        while True:
+            descent = Descent(self.problem, self._noise, self.problem.errors(self.begun[-1]))
+            for reached in descent.steps(self.reached, GAIN[len(self.begun) > ROUNDS - FINE]):
+                self.reached = reached
+                self.problem.write(reached.point)
+                yield self
+            if len(self.begun) == ROUNDS:
+                return
+            point = self.reached.point
+            if len(self.begun) == ROUNDS - FINE:
+                point = _with_dead_zones(descent, point)
+            self._begin(point)
+            self.reached = Reached(point, DAMPING[1], self.reached.taken)
+
+    def state(self) -> dict[str, Any]:
+        """What another one needs to go on."""
+        reached = vars(self.reached) | {"point": vars(self.reached.point)}
+        return {"start": self._start, "begun": [vars(x) for x in self.begun], "reached": reached}
+
+    def solution(self) -> ServoSolution:
+        """Give the model the most probable weights, after all rounds."""
+        problem, point = self.problem, self.reached.point
+        descent = Descent(problem, self._noise, problem.errors(self.begun[-1]))
+        problem.windows = replace(self.windows, steps=2 * self.windows.steps)
+        normal = descent.normal(point, problem.errors(point))
+        halved = descent.step(normal, point)
+        point = point.moved(halved)
+        problem.write(point)
+        return ServoSolution(
+            names=tuple(problem.weights.names),
+            rms=problem.errors(point).square().mean(dim=(0, 1)).sqrt(),
+            steps=self.reached.taken,
+            normal=normal,
+            precision=problem.weights.precision(len(point.bodies), every=True),
+            halved=halved,
+            gravity=problem.load.gravity.abs().mean(dim=(0, 1)),
+        )
 
 
 def _with_dead_zones(descent: Descent, point: Point) -> Point:
@@ -92,8 +142,6 @@ def _with_dead_zones(descent: Descent, point: Point) -> Point:
     precision = weights.precision(len(point.bodies), every=True)
     normal = descent.normal(point, problem.errors(point))
     places = torch.arange(n) + row * n
-    widths = dead_zones(normal, point.flat - descent.centre, precision, places)
-    weights.dead_zones = widths > 0
     joints = point.joints.clone()
-    joints[row] = widths
+    joints[row] = dead_zones(normal, point.flat - descent.centre, precision, places)
     return replace(point, joints=joints)

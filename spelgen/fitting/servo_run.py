@@ -6,17 +6,24 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from spelgen.errors import Diagnostic, LogError, OptionError, RunError
+from spelgen.files import write_json
+from spelgen.fitting import workers
 from spelgen.fitting.config import FitConfig, ServoFit
 from spelgen.fitting.dataset import digest
 from spelgen.fitting.fitted import Fit
 from spelgen.fitting.linear_servo import fit_linear_servos
-from spelgen.fitting.process import threads_of_torch
-from spelgen.fitting.servo_fit import fit_servos
+from spelgen.fitting.loop import Status
+from spelgen.fitting.process import termination_as_interrupt, threads_of_torch
+from spelgen.fitting.progress import TrainingProgress
+from spelgen.fitting.run_folder import RunFolder
+from spelgen.fitting.run_lock import locked
+from spelgen.fitting.run_record import require_same
+from spelgen.fitting.servo_fit import ROUNDS, ServoRounds
 from spelgen.fitting.servo_report import servo_record
-from spelgen.fitting.servo_windows import servo_windows
+from spelgen.fitting.servo_windows import ServoWindows, servo_windows
 from spelgen.fitting.streaming import LargeLogs
 from spelgen.logs.checks import check
 from spelgen.logs.mapping import LogMapping
@@ -45,18 +52,66 @@ def fit_commands(
     *,
     seed: int,
     urdf: Path | None,
-    folder: Path | str | None,
+    folder: RunFolder | None,
     resume: bool,
     force: bool,
     mapping: LogMapping | None,
     notes: Sequence[Diagnostic],
     threads: int,
+    progress: bool,
 ) -> Fit:
     """Arguments and errors as of `fit`; all logs are fitted, so that none is left to validate on."""
-    if resume:
-        raise RunError(
-            "a fit of servos, which has no epochs", expected="a run to go on with", do="start a new run"
-        )
+    run = None if workers.rank() else folder  # of several processes one writes
+    if run is not None and not resume:
+        run.require_free(force=force)
+    logs = _commanded(model, logs)
+    found = [*check(logs, model.facts.joints, model.joint_types), *notes]
+    status: Status = "finished"
+    with (
+        threads_of_torch(threads),
+        locked(run.path if run else None) as told,
+        TrainingProgress(ROUNDS, show=progress) as shown,
+        termination_as_interrupt(),
+    ):
+        found += told
+        for note in found:
+            shown.note(note)
+        windows, before = servo_windows(logs, preprocessing), None
+        record = _record(model, logs, windows, config, preprocessing, seed, mapping) | {"threads": threads}
+        if resume and folder is not None:
+            require_same(folder, record)
+            before, urdf = folder.load_checkpoint(), folder.urdf
+        since = time.monotonic() - (before["seconds"] if before else 0.0)
+        rounds = _rounds(model, windows, logs, before, folder)
+        checkpoint = before or _checkpoint(rounds, since)
+        if run is not None and not resume:
+            run.start(model.source, urdf, force=force)
+            _save(run, checkpoint)
+            write_json(run.config, record)  # now there is a run, and it can be resumed
+        try:
+            for _ in rounds.run():
+                checkpoint = _checkpoint(rounds, since)
+                _save(run, checkpoint)
+                shown.round(len(rounds.begun), rounds.reached.taken, rounds.reached.rms)
+            solution = rounds.solution()
+            record["servo"] = servo_record(model, solution) | {"linear": fit_linear_servos(windows).to_dict()}
+            rms = float(solution.rms.square().mean().sqrt())
+            checkpoint = _checkpoint(rounds, since) | {"best_loss": rms}
+            _save(run, checkpoint)
+            if run is not None:
+                write_json(run.config, record)
+        except KeyboardInterrupt:
+            status = "interrupted"
+    model.load_state_dict(checkpoint["best_weights"])
+    return Fit(
+        model=model, config=config, preprocessing=preprocessing, history=[], diagnostics=tuple(found),
+        status=status, record=record, checkpoint=checkpoint, urdf=urdf,
+        folder=None if folder is None else folder.path,
+    )  # fmt: skip
+
+
+def _commanded(model: EmittedModel, logs: Sequence[Trajectory] | LargeLogs) -> Sequence[Trajectory]:
+    """The logs, which hold commands. Raises LogError where they do not."""
     if isinstance(logs, LargeLogs):
         raise LogError(
             "logs of positions larger than memory", expected="some hours of them: every tenth file, say"
@@ -68,34 +123,57 @@ def fit_commands(
                 "no commanded positions", file=each.file, element=f"trajectory {each.name}",
                 expected="u: this arm has position servos",
             )  # fmt: skip
-    found = [*check(logs, model.facts.joints, model.joint_types), *notes]
-    since = time.monotonic()
-    with threads_of_torch(threads):
-        windows = servo_windows(logs, preprocessing)
-        solution = fit_servos(model, windows, logs)
-    servo = servo_record(model, solution) | {"linear": fit_linear_servos(windows).to_dict()}
-    rms = float(solution.rms.square().mean().sqrt())
-    names = [x.name for x in logs]
+    return logs
+
+
+def _record(
+    model: EmittedModel,
+    logs: Sequence[Trajectory],
+    windows: ServoWindows,
+    config: ServoFit,
+    preprocessing: Preprocessing,
+    seed: int,
+    mapping: LogMapping | None,
+) -> dict[str, Any]:
+    """What goes into config.json before the fit (see `run_record.describe`)."""
     facts = model.facts
-    record = {
+    return {
         "schema": 2, "robot": facts.robot, "preset": facts.options.preset, "joints": list(facts.joints),
         "objective": config.objective, "config": config.record(rigid_bodies=True),
         "preprocessing": asdict(preprocessing), "validation_fraction": None, "seed": seed,
-        "data_digest": digest(logs), "training": names, "validation": [], "training_windows": len(windows.q),
-        "validation_windows": 0, "mapping": (mapping or LogMapping(input="position")).model_dump(exclude_defaults=True),
-        "servo": servo, "device": "cpu", "threads": threads,
+        "data_digest": digest(logs), "training": [x.name for x in logs], "validation": [],
+        "training_windows": len(windows.q), "validation_windows": 0, "device": "cpu",
+        "mapping": (mapping or LogMapping(input="position")).model_dump(exclude_defaults=True),
     }  # fmt: skip
-    weights = {name: x.clone() for name, x in model.state_dict().items()}
-    checkpoint = {
-        "epoch": 0, "step": solution.steps, "best_epoch": 0, "best_loss": rms, "rollbacks": 0,
-        "learning_rate_factor": 1.0, "seconds": time.monotonic() - since, "substeps": windows.steps,
-        "momentum_done": True, "best_weights": weights,
+
+
+def _rounds(
+    model: EmittedModel,
+    windows: ServoWindows,
+    logs: Sequence[Trajectory],
+    before: dict[str, Any] | None,
+    folder: RunFolder | None,
+) -> ServoRounds:
+    """Those of a new fit, or where there was one before, what its checkpoint goes on with."""
+    if before is None:
+        return ServoRounds(model, windows, logs)
+    try:
+        return ServoRounds(model, windows, logs, before["servo"])
+    except (KeyError, RuntimeError, ValueError, TypeError, AttributeError) as error:
+        file = None if folder is None else folder.checkpoint
+        raise RunError("a checkpoint of another model", file=file, do="start a new run") from error
+
+
+def _checkpoint(rounds: ServoRounds, since: float) -> dict[str, Any]:
+    """What goes into checkpoint.pt."""
+    return {
+        "epoch": 0, "step": rounds.reached.taken, "best_epoch": 0, "best_loss": rounds.reached.rms, "rollbacks": 0,
+        "learning_rate_factor": 1.0, "seconds": time.monotonic() - since, "substeps": rounds.windows.steps,
+        "momentum_done": True, "best_weights": {name: x.clone() for name, x in rounds.model.state_dict().items()},
+        "servo": rounds.state(),
     }  # fmt: skip
-    done = Fit(
-        model=model, config=config, preprocessing=preprocessing, history=[], diagnostics=tuple(found),
-        status="finished", record=record, checkpoint=checkpoint, urdf=urdf,
-        folder=None if folder is None else Path(folder),
-    )  # fmt: skip
-    if folder is not None:
-        done.save(folder, force=force)
-    return done
+
+
+def _save(run: RunFolder | None, checkpoint: dict[str, Any]) -> None:
+    if run is not None:
+        run.save(checkpoint["best_weights"], checkpoint)

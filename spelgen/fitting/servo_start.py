@@ -57,7 +57,9 @@ def start_servos(model: Any, windows: ServoWindows, load: BodyLoad, delay: float
 def _solved(columns: torch.Tensor, error: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Slopes (5,) and how many standard deviations they are, of neighbours that err alike."""
     rows = columns.flatten(1).mT
-    slopes = torch.linalg.lstsq(rows, error.flatten().unsqueeze(-1)).solution.squeeze(-1)
+    # torch leaves the pivots of its default driver to chance
+    found = torch.linalg.lstsq(rows, error.flatten().unsqueeze(-1), driver="gelsd")
+    slopes = found.solution.squeeze(-1)
     rest = error.flatten() - rows @ slopes
     alike = error.shape[1]
     variance = rest.square().mean() * torch.linalg.pinv(rows.mT @ rows).diagonal() * alike

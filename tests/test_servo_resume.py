@@ -1,0 +1,88 @@
+"""A fit of servos that is killed goes on exactly, and is told apart from a run of something else."""
+
+import functools
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from killing import killed
+from servo_arm import servo_logs, write_servo_arm
+from typer.testing import CliRunner
+
+import spelgen
+from spelgen.cli.main import app
+from spelgen.errors import RunError
+from spelgen.fitting import servo_run
+from spelgen.fitting.run_folder import RunFolder
+from spelgen.fitting.train import train
+
+
+@pytest.fixture(scope="module")
+def start(tmp_path_factory) -> Path:
+    """A module, its URDF and logs of two short windows."""
+    folder = tmp_path_factory.mktemp("start")
+    urdf = write_servo_arm(folder)
+    (folder / "module.py").write_text(spelgen.generate(urdf, "closed-form"))
+    spelgen.write_logs(folder / "train.parquet", servo_logs(2, 1.0), ("shoulder", "elbow"))
+    return folder
+
+
+def trained(start: Path, folder: Path, **options) -> Path:
+    urdf = None if "resume" in options else start / "servo_arm.urdf"
+    train(start / "module.py", [start / "train.parquet"], folder, urdf=urdf, progress=False, **options)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def whole(start, tmp_path_factory) -> Path:
+    """A run that was never killed."""
+    return trained(start, tmp_path_factory.mktemp("whole") / "run")
+
+
+def test_killed_between_writes_it_ends_as_if_it_never_was(start, whole, tmp_path):
+    run, kills, write = tmp_path / "run", 0, 3
+    while True:
+        options = {"resume": True} if (run / "config.json").exists() else {}
+        training = functools.partial(trained, start, run, **options)
+        if not killed(training, write, before=bool(write % 2)):
+            break
+        kills, write = kills + 1, write + 1
+    assert kills >= 5
+    for name in ("model.pt", "config.json"):
+        assert (run / name).read_bytes() == (whole / name).read_bytes()
+
+
+def test_an_interrupted_one_is_usable_and_goes_on(start, whole, tmp_path, monkeypatch):
+    run, shown = tmp_path / "run", servo_run.TrainingProgress.round
+
+    def interrupt(progress, number, steps, rms):
+        shown(progress, number, steps, rms)
+        if number == 3:
+            raise KeyboardInterrupt
+
+    command = ["train", start / "module.py", "--data", start, "-o", run]
+    with monkeypatch.context() as patch:
+        patch.setattr(servo_run.TrainingProgress, "round", interrupt)
+        told = CliRunner().invoke(app, list(map(str, command)))
+    assert told.exit_code == 130, told.stderr
+    assert "the best model so far is in the run folder; --resume goes on" in told.stderr
+    assert "servo" not in json.loads((run / "config.json").read_text())
+    assert spelgen.evaluate(run, servo_logs(1, 1.0)).replays[0].errors["model"].mean < 0.1
+    told = CliRunner().invoke(app, [*map(str, command), "--resume"])
+    assert told.exit_code == 0, told.stderr
+    assert (run / "model.pt").read_bytes() == (whole / "model.pt").read_bytes()
+
+
+def test_it_goes_on_with_what_it_was_started_with(start, whole, tmp_path):
+    with pytest.raises(RunError, match="there is a run in this folder"):
+        trained(start, whole)
+    spelgen.write_logs(tmp_path / "train.parquet", servo_logs(2, 1.0, seed=1), ("shoulder", "elbow"))
+    with pytest.raises(RunError, match="other logs than the run was started with"):
+        train("", [tmp_path / "train.parquet"], whole, resume=True, progress=False)
+    checkpoint, run = RunFolder(whole).load_checkpoint(), RunFolder(tmp_path / "run")
+    run.start((whole / "module.py").read_text(), start / "servo_arm.urdf", force=False)
+    run.config.write_bytes((whole / "config.json").read_bytes())
+    torch.save(checkpoint | {"servo": {}}, run.checkpoint)
+    with pytest.raises(RunError, match="a checkpoint of another model"):
+        trained(start, run.path, resume=True)
