@@ -76,16 +76,29 @@ class RunError(SpelgenError):
 
 
 class SpelgenErrors(SpelgenError):
-    """Several errors found in one pass, told one per line."""
+    """Several errors found in one pass, told one per line; what is the same in several files is told once."""
 
     def __init__(self, errors: Sequence[SpelgenError]) -> None:
         super().__init__(f"{len(errors)} errors")
         self.errors = tuple(errors)
 
     def __str__(self) -> str:
-        told = [str(error) for error in self.errors[:_TOLD_AT_MOST]]
-        left = len(self.errors) - len(told)
+        alike: dict[tuple[object, ...], list[SpelgenError]] = {}
+        for error in self.errors:
+            alike.setdefault((error.line, error.element, error.got, error.expected, error.do), []).append(
+                error
+            )
+        told = [_told_once(group) for group in list(alike.values())[:_TOLD_AT_MOST]]
+        left = len(alike) - len(told)
         return "\n".join(told + ([f"and {left} more like these"] if left else []))
+
+
+def _told_once(alike: Sequence[SpelgenError]) -> str:
+    """The first of errors that differ in their files alone, and the files of the others."""
+    others = dict.fromkeys(error.file for error in alike[1:] if error.file and error.file != alike[0].file)
+    if not others:
+        return str(alike[0])
+    return f"{alike[0]}\n  the same: {shortened(list(others), 5)}"
 
 
 def collect(errors: Sequence[SpelgenError]) -> None:
@@ -104,6 +117,12 @@ def suggestion(name: str, known: Iterable[str]) -> str:
         return f"did you mean {nearest[0]!r}?"
     listed = ", ".join(repr(each) for each in names[:10])
     return f"known are {listed}" + (f" and {len(names) - 10} more" if len(names) > 10 else "")
+
+
+def shortened(names: Sequence[str], most: int) -> str:
+    """The names, or the first ``most`` of them and how many more there are."""
+    left = len(names) - most
+    return ", ".join(names if left <= 1 else [*names[:most], f"and {left} more"])
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from spelgen.errors import Diagnostic, SpelgenError, SpelgenErrors, UrdfError, collect, suggestion
+from spelgen.errors import Diagnostic, LogError, SpelgenError, SpelgenErrors, UrdfError, collect, suggestion
 
 
 @pytest.mark.parametrize(
@@ -43,7 +43,8 @@ def test_collect_raises_nothing_one_or_all():
         collect([first, second])
     assert str(all_.value) == "a: first\nb: second"
     assert all_.value.errors == (first, second)
-    assert str(SpelgenErrors([first] * 60)).splitlines()[49:] == ["a: first", "and 10 more like these"]
+    many = SpelgenErrors([SpelgenError("first", file="a", line=k) for k in range(60)])
+    assert str(many).splitlines()[49:] == ["a:49: first", "and 10 more like these"]
 
 
 def test_suggestion_is_the_nearest_name_or_the_first_ten():
@@ -58,3 +59,14 @@ def test_a_diagnostic_is_the_public_json_object():
         '{"severity": "info", "code": "snapped-angle", "where": "joint \'a2\' origin", "line": 41, '
         '"message": "1.5708 is taken as pi/2"}'
     )
+
+
+def test_what_several_files_share_is_told_once():
+    """A hundred logs without the same column are one thing to mend."""
+    lacking = [LogError("3 columns", file=f"{k}.csv", expected="4") for k in range(9)]
+    told = str(SpelgenErrors([*lacking, LogError("another", file="0.csv")]))
+    assert told.splitlines() == [
+        "0.csv: got 3 columns, expected 4",
+        "  the same: 1.csv, 2.csv, 3.csv, 4.csv, 5.csv, and 3 more",
+        "0.csv: another",
+    ]

@@ -216,11 +216,13 @@ def test_logs_show_a_coupling_and_what_is_said_then_mends_it(uncoupled, tmp_path
     assert after < 0.1 * before
 
 
-def test_logs_show_torques_that_are_late(uncoupled, tmp_path):
-    log = recorded(uncoupled, "joints", 0.0, late=0.013)
+@pytest.mark.parametrize("late", [0.013, -0.013])
+def test_logs_show_torques_that_are_late_or_early(uncoupled, tmp_path, late):
+    log = recorded(uncoupled, "joints", 0.0, late=late)
     (message,) = told(check_logs([log], uncoupled), "torque-delay")
+    assert f"ms {'later' if late > 0 else 'earlier'} than they act" in message
     delay = float(message.split("torque_delay: ")[1].split("'")[0])
-    assert delay == pytest.approx(0.013, abs=0.0015)
+    assert delay == pytest.approx(late, abs=0.0015)
     names = [x.name for x in uncoupled.arm.coordinates]
     table = {"t": log.t} | {
         f"{key}_{name}": getattr(log, key)[:, k] for key in ("q", "qd", "tau") for k, name in enumerate(names)

@@ -1,6 +1,7 @@
 """Closed-form models fitted to torques: known arms found again, in blocks as at once, adapted to a load, real ones."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -181,6 +182,19 @@ def test_a_drive_that_compensates_friction_unseen_is_found_out(emitted):
     assert nmse(found, recorded(true, 10.0, 0.0, seed=9)) < 5e-3
     notes = {note.code: note for note in torque_notes(found, TorqueSamples.held(logs), fit)}
     assert f"{found.joint_names[4]} {value[4].item():.3g} Nm s/rad" in notes["friction-compensated"].message
+
+
+def test_a_torque_that_falls_with_velocity_by_little_is_no_compensation(emitted):
+    """Half a sample between torque and motion looks like a drive that adds torque with velocity: a hundredth of it."""
+    module = emitted["six_dof"][0]
+    true = module.Model()
+    with torch.no_grad():
+        true.dynamics.friction.raw_coulomb -= 20.0
+        true.dynamics.friction.raw_viscous -= 20.0
+    plain = recorded(true, 40.0, 0.0, seed=1)
+    falling = 0.03 * plain.tau.std(axis=0) / plain.qd.std(axis=0) * plain.qd
+    log = replace(plain, tau=plain.tau - falling)
+    assert not fit_torque(module.Model(), [log]).compensated.any()
 
 
 def test_compensation_belongs_to_the_input(emitted):

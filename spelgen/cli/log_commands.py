@@ -11,7 +11,7 @@ import typer
 from spelgen.cli import options
 from spelgen.cli.console import FAILED, counted, note, say
 from spelgen.cli.options import AngleTolerance, Force, Joints, Mapping, Robot, Tip
-from spelgen.errors import SpelgenError
+from spelgen.errors import SpelgenError, SpelgenErrors
 from spelgen.files import write_text
 
 if TYPE_CHECKING:
@@ -99,8 +99,8 @@ def logs(
     say(found.text() if format == "text" else json.dumps(found.to_dict(), indent=2))
     if html is not None:
         note(f"wrote {write_text(html, page(found, arm.arm, arm.actuation.matrix()))}")
-    for error in found.errors:
-        note(str(error))
+    if found.errors:
+        note(str(SpelgenErrors(found.errors)))
     warnings = len(found.warnings)
     if strict and warnings:
         note(f"{warnings} warning{'s' * (warnings > 1)}, and --strict allows none")

@@ -38,7 +38,8 @@ ALIKE = 20.0  # of those: so many in a row, 0.4 s, err alike and count once
 ROUNDS = 8  # of weighing joints by what is left of their torque, and the start by how far it was left
 FIRST_ROUNDS = 3  # after which it is seen whether friction explains what is missed
 COMPENSATED = 0.1  # of what is missed: explained by a drive that adds torque with velocity,
-SIGNIFICANT = 4.0  # by so many standard deviations
+SIGNIFICANT = 4.0  # by so many standard deviations,
+VISIBLE = 0.05  # and so much of the torque's deviation: milliseconds between torque and motion look alike, but smaller
 STEPS = 5  # at most in a round
 LARGE = 2**15  # samples; of more, FEW of them are fitted first
 FEW, LAST_ROUNDS = 2**14, 2
@@ -170,9 +171,10 @@ class _Problem:
         No friction explains a torque that falls with velocity: a drive that compensates friction by itself, after
         its torque was measured, does.
         """
-        slope, explained = self.jacobian.by_velocity(x)
+        slope, explained, size = self.jacobian.by_velocity(x)
         sure = explained * self.count / ALIKE > SIGNIFICANT**2 * (1 - explained)
-        found = (slope < 0) & (explained > COMPENSATED) & sure & ~self.compensated
+        falls = (slope < 0) & (explained > COMPENSATED) & (size > VISIBLE * self.range)
+        found = falls & sure & ~self.compensated
         self.compensated = self.compensated | found
         return bool(found.any())
 

@@ -142,16 +142,17 @@ class TorqueJacobian:
             q = next(self.samples.blocks(1))[0]
             return self.samples.torque_deviation(self.model.input_matrix(q)[0], BLOCK)
 
-    def by_velocity(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Of the missing torque the slope by velocity (n,) [Nm s/rad, N s/m], and how much of its sum of squares this
-        line explains (n,).
+    def by_velocity(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Of the missing torque the slope by velocity (n,) [Nm s/rad, N s/m], how much of its sum of squares this line
+        explains (n,), and how large that is, as a root mean square (n,) [Nm, N].
         """
         weights = self._named(x)
         pairs = [(self._missing(weights, each).detach(), each.qd) for each in self._own_blocks()]
         sums = [torch.stack([tau * qd, qd * qd, tau * tau]).sum(dim=1) for tau, qd in pairs]
         both, speeds, squares = workers.total(torch.stack(sums).sum(dim=0))
         slope = both / speeds.clamp(min=1e-300)
-        return slope, slope * both / squares.clamp(min=1e-300)
+        size = (slope * both / self.samples.count).sqrt()
+        return slope, slope * both / squares.clamp(min=1e-300), size
 
     def free(self, adapt: Adaptation | None, compensated: torch.Tensor) -> torch.Tensor:
         """Which weights (K,) move: all, or those of an adaptation; compensation of the joints (n,) that have one."""

@@ -54,16 +54,19 @@ def torque_delay(arm: Arm, samples: DriveSamples, speeds: np.ndarray) -> tuple[f
     None: nothing that is sure. speeds: C, (n, n), of the motors.
     """
     problem = _Problem(arm, samples, speeds)
-    errors = np.stack([problem.errors(problem.rows, tau) for tau in samples.tau])  # (D, blocks, n)
-    total = errors.mean(axis=(1, 2))
-    best, now = int(total.argmin()), int(np.abs(DELAYS).argmin())
-    if not 0 < best < len(DELAYS) - 1 or not _sure(
-        errors[now].mean(axis=1), errors[best].mean(axis=1), CLEAR
-    ):
+    total = [problem.errors(problem.rows, tau).mean() for tau in samples.tau]
+    best, now = int(np.argmin(total)), int(np.abs(DELAYS).argmin())
+    if not 0 < best < len(DELAYS) - 1:
         return None
     before, at, after = total[best - 1 : best + 2]  # a parabola through them
     delay = DELAYS[best] + 0.5 * (before - after) / (before - 2 * at + after) * (DELAYS[1] - DELAYS[0])
-    return float(delay), float(at / total[now])
+    earlier = int(np.searchsorted(DELAYS, delay)) - 1  # torques are smooth from one of DELAYS to the next
+    part = (delay - DELAYS[earlier]) / (DELAYS[1] - DELAYS[0])
+    moved = (1 - part) * samples.tau[earlier] + part * samples.tau[earlier + 1]
+    errors = [problem.errors(problem.rows, tau).mean(axis=1) for tau in (samples.tau[now], moved)]
+    if not _sure(*errors, CLEAR):
+        return None
+    return float(delay), float(errors[1].mean() / errors[0].mean())
 
 
 def coupling(arm: Arm, samples: DriveSamples, speeds: np.ndarray) -> Coupling | None:

@@ -100,9 +100,10 @@ def _drives(arm: LoadedArm, log: DriveLog, mapping: LogMapping) -> list[Diagnost
     if late is None:
         return []
     delay, left = mapping.torque_delay + late[0], late[1]
+    when = "later" if late[0] > 0 else "earlier"
     message = (
-        f"torques are logged {late[0] * 1e3:.3g} ms later than they act: so moved, least squares misses {left:.0%} of "
-        f"what it missed (mean square); say 'torque_delay: {delay:.4g}' under 'logs' in the robot's YAML"
+        f"torques are logged {abs(late[0]) * 1e3:.3g} ms {when} than they act: so moved, least squares misses "
+        f"{left:.0%} of what it missed (mean square); say 'torque_delay: {delay:.4g}' under 'logs' in the robot's YAML"
     )
     return [Diagnostic("warning", "torque-delay", "logs", None, message)]
 

@@ -15,7 +15,7 @@ from typing import TypeVar
 import numpy as np
 import pyarrow as pa
 
-from spelgen.errors import LogError
+from spelgen.errors import LogError, shortened
 from spelgen.logs.bags import SUFFIXES as BAG_SUFFIXES
 from spelgen.logs.bags import is_bag
 from spelgen.logs.lerobot import is_dataset
@@ -23,6 +23,7 @@ from spelgen.logs.mapping import TIMES, LogMapping
 from spelgen.logs.trajectory import QUANTITIES
 
 SUFFIXES = (".parquet", ".csv", ".npz", *BAG_SUFFIXES)
+LISTED = 12  # columns, at most
 UNITS_KEY = b"units"  # in a Parquet file's metadata: the file declares its units
 UNITS = b"t s, q rad or m, qd rad/s or m/s, tau Nm or N"  # what spelgen itself declares
 
@@ -146,8 +147,8 @@ def missing_columns(
         *(getattr(columns, x).replace("{joint}", "<joint>") for x in wanted_quantities(mapping)),
     ]
     return LogError(
-        f"only the columns {', '.join(present)}", file=file,
-        element=f"missing column{'s' * (len(missing) > 1)} {', '.join(missing)}",
+        f"only the columns {shortened(list(present), LISTED)}", file=file,
+        element=f"missing column{'s' * (len(missing) > 1)} {shortened(missing, LISTED)}",
         expected=", ".join(expected), do=_advice(missing, present, mapping, joints),
     )  # fmt: skip
 
@@ -168,7 +169,7 @@ def _advice(
             return f"rename the column {close!r} to {missing[0]!r}?"
     return (
         "rename the columns, or say their names under 'logs' in the robot's YAML: "
-        "`spelgen logs --suggest FILE` drafts them"
+        "`spelgen logs LOGS --robot ROBOT.urdf --suggest FILE` drafts them"
     )
 
 
