@@ -63,10 +63,10 @@ def torque_delay(arm: Arm, samples: DriveSamples, speeds: np.ndarray) -> tuple[f
     earlier = int(np.searchsorted(DELAYS, delay)) - 1  # torques are smooth from one of DELAYS to the next
     part = (delay - DELAYS[earlier]) / (DELAYS[1] - DELAYS[0])
     moved = (1 - part) * samples.tau[earlier] + part * samples.tau[earlier + 1]
-    errors = [problem.errors(problem.rows, tau).mean(axis=1) for tau in (samples.tau[now], moved)]
-    if not _sure(*errors, CLEAR):
+    logged, mended = (problem.errors(problem.rows, tau).mean(axis=1) for tau in (samples.tau[now], moved))
+    if not _sure(logged, mended, CLEAR):
         return None
-    return float(delay), float(errors[1].mean() / errors[0].mean())
+    return float(delay), float(mended.mean() / logged.mean())
 
 
 def coupling(arm: Arm, samples: DriveSamples, speeds: np.ndarray) -> Coupling | None:
