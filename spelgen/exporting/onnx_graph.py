@@ -63,6 +63,12 @@ class OnnxGraph:
         found: list[str] = self.Split(x, np.array(sizes), axis=axis, outputs=len(sizes))
         return found
 
+    def waves(self, q: str, frequencies: Any) -> str:
+        """Cosines, then sines of frequencies, (waves, n), times q, (batch, n)."""
+        quarter = np.repeat([np.pi / 2, 0.0], len(frequencies))
+        found: str = self.Sin(self.Gemm(q, np.tile(frequencies, (2, 1)), quarter, transB=1))
+        return found
+
     def total(self, parts: Sequence[str]) -> str:
         """The sum of one or more."""
         found: str = parts[0] if len(parts) == 1 else self.Sum(*parts)
@@ -81,13 +87,16 @@ class OnnxGraph:
     def model(
         self, inputs: Mapping[str, Sequence[int]], output: str, name: str, shape: Sequence[int]
     ) -> bytes:
-        """The serialised model; shapes are without the batch. ``name``: of the output."""
+        """The serialised model; shapes are without the batch. ``name``: of the output.
+
+        The batch has no name: of known equal sizes ONNX Runtime would use buffers again, which takes it longer.
+        """
         self._nodes.append(helper.make_node("Identity", [output], [name]))
         described = [
-            helper.make_tensor_value_info(key, TensorProto.DOUBLE, ["batch", *size])
+            helper.make_tensor_value_info(key, TensorProto.DOUBLE, [None, *size])
             for key, size in inputs.items()
         ]
-        found = helper.make_tensor_value_info(name, TensorProto.DOUBLE, ["batch", *shape])
+        found = helper.make_tensor_value_info(name, TensorProto.DOUBLE, [None, *shape])
         graph = helper.make_graph(self._nodes, name, described, [found], self._tensors)
         model = helper.make_model(graph, opset_imports=_OPSETS, ir_version=_IR, functions=self._functions)
         onnx.checker.check_model(model)

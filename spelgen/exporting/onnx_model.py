@@ -8,7 +8,8 @@ import numpy as np
 
 from spelgen.exporting.description import TrainedModel
 from spelgen.exporting.onnx_graph import OnnxGraph
-from spelgen.exporting.onnx_residuals import OnnxResiduals
+from spelgen.exporting.onnx_joint_functions import OnnxJointFunctions
+from spelgen.exporting.onnx_residuals import SURELY_ONE, OnnxResiduals
 from spelgen.exporting.onnx_rigid import OnnxRigid
 
 ENTRIES: dict[str, tuple[tuple[str, ...], str]] = {
@@ -26,7 +27,7 @@ def onnx_model(model: TrainedModel, name: str) -> bytes:
     """The graph of an entry point, any batch size."""
     given, output = ENTRIES[name]
     inputs = {key: [model.memory if key == "z" else model.n] for key in given if key != "z" or model.memory}
-    made = _OnnxModel(model)
+    made = _OnnxModel(model, moving=name != "mass_matrix")
     shape = [model.n, model.n] if name == "mass_matrix" else [model.n]
     return made.g.model(inputs, getattr(made, name), output, shape)
 
@@ -34,56 +35,70 @@ def onnx_model(model: TrainedModel, name: str) -> bytes:
 class _OnnxModel:
     """Quantities by the names of the entry points; (batch, n)."""
 
-    def __init__(self, model: TrainedModel) -> None:
+    def __init__(self, model: TrainedModel, *, moving: bool) -> None:
         self.model, self.n, self.g = model, model.n, OnnxGraph()
         self._rigid = OnnxRigid(model, self.g, "q")
-        self._residuals = OnnxResiduals(model, self.g, "q")
+        self._residuals = OnnxResiduals(model, self.g, "q", moving=moving)
+        self._functions = OnnxJointFunctions(model, self.g, "q")
 
     @cached_property
     def mass_matrix(self) -> str:
         """(batch, n, n)."""
-        parts, constant = [self._rigid.mass], self.model.constant_mass
-        if constant.any():
-            parts.append(self.g.constant(constant))
-        return self.g.total([*parts, *([self._residuals.mass] if self._residuals.mass else [])])
+        return self.g.total([self._rigid.mass, *self._residuals.mass])
 
     @cached_property
     def gravity(self) -> str:
         """dV/dq."""
-        return self.g.total([self._rigid.gravity, *self._residuals.gravity])
+        return self.g.total([self._rigid_gravity, *self._residual_gravity])
+
+    @cached_property
+    def _rigid_gravity(self) -> str:
+        return self.g.reshaped(self._rigid.gravity, 0, self.n)
+
+    @cached_property
+    def _residual_gravity(self) -> list[str]:
+        return [*self._residuals.gravity, *self._functions.torque]
 
     @cached_property
     def bias(self) -> str:
         """Coriolis, centrifugal and gravity torque."""
-        return self.g.total([self._rigid.coriolis("qd"), self._rigid.gravity, *self._residuals.bias("qd")])
+        return self.g.total(self._bias)
+
+    @cached_property
+    def _bias(self) -> list[str]:
+        rising, held = self._rigid.coriolis("qd")
+        rows = self.g.total([rising, self._rigid.gravity, *self._residuals.coriolis("qd")])
+        return [self.g.reshaped(rows, 0, self.n), held, *self._residual_gravity]
 
     @cached_property
     def friction(self) -> str:
         """What friction takes."""
-        g, law, bristles = self.g, self.model.friction, self.model.bristles
-        speed, loads = self._turned("qd", self.model.motors.T), np.linalg.inv(self.model.motors)
+        g, law, speed = self.g, self.model.friction, self._turned("qd", self.model.motors.T)
+        zero = np.zeros(self.n)
         slow = g.Exp(g.Mul(g.Mul(speed, speed), -1 / law.stribeck_velocity**2))
-        sizes, laws = [slow], [law.stribeck]
-        if law.load_dependence.any():
-            sizes.append(g.Abs(self._turned(self._rigid.gravity, loads)))
-            laws.append(law.load_dependence)
-        dry = self._combined(sizes, laws, law.coulomb)
-        if bristles is None:
-            direction = g.Tanh(g.Mul(speed, 1 / law.coulomb_smoothing_velocity))
-        else:
-            share = np.kron(np.eye(self.n), np.ones((bristles.count, 1)))
-            direction = g.MatMul("z", (bristles.fractions / bristles.reach).reshape(-1, 1) * share)
         saturating = g.Tanh(g.Mul(speed, 1 / law.saturation_velocity))
-        found = self._combined([speed, saturating], [law.viscous, law.saturation], g.Mul(dry, direction))
-        if self._residuals.friction_factor is not None:
-            found = g.Mul(found, self._residuals.friction_factor)
+        # by each what is multiplied by a direction, and what is not
+        terms = [(slow, law.stribeck, zero), (speed, zero, law.viscous), (saturating, zero, law.saturation)]
+        if law.load_dependence.any():
+            load = self._turned(self._rigid_gravity, np.linalg.inv(self.model.motors))
+            terms.append((g.Abs(load), law.load_dependence, zero))
+        rows = np.concatenate([np.hstack([np.diag(each) for each in laws]) for _, *laws in terms])
+        sizes = g.Gemm(g.Concat(*(term for term, *_ in terms), axis=1), rows, np.append(law.coulomb, zero))
+        found = g.MatMul(g.Mul(sizes, self._directions(speed)), np.tile(np.eye(self.n), (2, 1)))
+        if self._functions.friction_factor is not None:
+            found = g.Mul(found, self._functions.friction_factor)
         return self._turned(found, self.model.motors)
 
-    def _combined(self, rows: list[str], factors: list[np.ndarray], rest: str | np.ndarray) -> str:
-        """Rows times factors, joint by joint, and the rest, as one product."""
-        whole = rows[0] if len(rows) == 1 else self.g.Concat(*rows, axis=1)
-        found: str = self.g.Gemm(whole, np.concatenate([np.diag(each) for each in factors]), rest)
-        return found
+    def _directions(self, speed: str) -> str:
+        """Of dry friction, and ones, (batch, 2 n)."""
+        g, n, law, bristles = self.g, self.n, self.model.friction, self.model.bristles
+        if bristles is None:
+            rows = np.diag(1 / law.coulomb_smoothing_velocity)
+            return g.Tanh(g.Gemm(speed, np.pad(rows, ((0, 0), (0, n))), np.repeat([0.0, SURELY_ONE], n)))
+        rows = (bristles.fractions / bristles.reach).reshape(-1, 1) * np.repeat(
+            np.eye(n), bristles.count, axis=0
+        )
+        return g.Gemm("z", np.pad(rows, ((0, 0), (0, n))), np.repeat([0.0, 1.0], n))
 
     def _turned(self, rows: str, by: np.ndarray) -> str:
         """Rows times a matrix that is mostly the identity."""
@@ -95,10 +110,7 @@ class _OnnxModel:
         """tau."""
         g, n, model = self.g, self.n, self.model
         moved = g.reshaped(g.MatMul(self.mass_matrix, g.reshaped("qdd", 0, n, 1)), 0, n)
-        force = g.Sum(moved, self.bias, self.friction)
-        if model.friction_compensation.any():
-            force = g.Sub(force, g.Mul("qd", model.friction_compensation))
-        inputs = model.inputs + np.diag(1 - model.actuated)
+        force, inputs = g.total([moved, *self._loads]), model.inputs + np.diag(1 - model.actuated)
         if not np.array_equal(inputs, np.eye(n)):
             force = g.MatMul(force, np.linalg.inv(inputs).T)
         found: str = g.Add(force, model.torque_offset) if model.torque_offset.any() else force
@@ -108,11 +120,15 @@ class _OnnxModel:
     def forward_dynamics(self) -> str:
         """qdd."""
         g, n, model = self.g, self.n, self.model
-        tau = g.Sub("tau", model.torque_offset) if model.torque_offset.any() else "tau"
-        if not np.array_equal(model.inputs, np.eye(n)):
-            tau = g.MatMul(tau, model.inputs.T)
-        if model.friction_compensation.any():
-            tau = g.Add(tau, g.Mul("qd", model.friction_compensation))
-        force = g.Sub(g.Sub(tau, self.bias), self.friction)
+        tau = self._turned("tau", model.inputs.T)
+        offset = [g.constant(model.inputs @ model.torque_offset)] if model.torque_offset.any() else []
+        force = g.Sub(tau, g.total([*self._loads, *offset]))
         inverse = g.inverse(self.mass_matrix, n)
         return g.reshaped(g.MatMul(inverse, g.reshaped(force, 0, n, 1)), 0, n)
+
+    @cached_property
+    def _loads(self) -> list[str]:
+        """Parts, (batch, n), of what drives hold up beside accelerations."""
+        compensation = self.model.friction_compensation
+        drives = [self.g.Mul("qd", -compensation)] if compensation.any() else []
+        return [*self._bias, self.friction, *drives]

@@ -29,20 +29,15 @@ class OnnxRigid:
         self._blocks = np.repeat(np.eye(self.b), 6, axis=1)  # (b, 6 b)
         self._parents = [body.parent for body in model.bodies]
 
-    def _by_bodies(self, joints: str) -> str:
-        """(..., n) to (..., b)."""
-        found: str = joints if self._single else self.g.MatMul(joints, self._chain["ratios"].T)
-        return found
-
     @cached_property
     def _frames(self) -> str:
         """What takes twists from the base's frame to the bodies', (batch, 6, 6 b)."""
-        g, value, table = self.g, self._by_bodies(self._q), self._chain["table"]
-        features = [g.Cos(value), g.Sin(value)]
+        g, table, ratios = self.g, self._chain["table"], self._chain["ratios"]
+        features = g.waves(self._q, ratios)
         if not self._turning:
-            features.append(value)
-        used = table[:, : self.b * len(features)]
-        whole = g.Gemm(g.Concat(*features, axis=1), used, self._chain["fixed"], transB=1)
+            features = g.Concat(features, g.MatMul(self._q, ratios.T), axis=1)
+        used = table[:, : self.b * (2 if self._turning else 3)]
+        whole = g.Gemm(features, used, self._chain["fixed"], transB=1)
         own = g.split(g.reshaped(whole, 0, 6 * self.b, 6), [6] * self.b, 1)
         placed: list[str] = []
         for k, parent in enumerate(self._parents):
@@ -52,19 +47,19 @@ class OnnxRigid:
 
     @cached_property
     def _axes(self) -> list[str]:
-        """The bodies' axes in the base's frame, (batch, 6, b), and what products take of them, (batch, 18, b)."""
+        """The bodies' axes in the base's frame, (batch, b, 6), and what products take of them, (batch, b, 18)."""
         g, swap = self.g, np.roll(np.eye(6), 3, axis=0)
         # the left factors are those of twists, which are sums of axes; of forces the axes feel the products
         table = np.concatenate([np.eye(6), _LEFT, _MOTION_RIGHT, _FORCE_SUMS.T]) @ swap
-        return g.split(g.MatMul(table, g.MatMul(self._frames, self._chain["reading"])), [6, 18, 18, 18], 1)
+        axes = g.MatMul(self._chain["reading"].T[None], g.Transpose(self._frames, perm=[0, 2, 1]))
+        return g.split(g.MatMul(axes, table.T), [6, 18, 18, 18], 2)
 
     @cached_property
     def _twists(self) -> str:
         """By joint velocity, (batch, n, 6 b)."""
         g = self.g
-        whole = g.MatMul(g.Transpose(self._axes[0], perm=[0, 2, 1]), self._frames)
-        bodies = g.Mul(whole, self._chain["carried"])
-        found: str = bodies if self._single else g.MatMul(self._chain["ratios"].T, bodies)
+        bodies = g.Mul(g.MatMul(self._axes[0], self._frames), self._chain["carried"])
+        found: str = bodies if self._single else g.MatMul(self._chain["ratios"].T[None], bodies)
         return found
 
     @cached_property
@@ -80,30 +75,32 @@ class OnnxRigid:
         return found
 
     def _felt(self, accelerations: str) -> str:
-        """The torques, (batch, n), of bodies with these accelerations, (batch, 1, 6 b)."""
-        back = self.g.Transpose(self._momenta, perm=[0, 2, 1])
-        return self.g.reshaped(self.g.MatMul(accelerations, back), 0, self.n)
+        """The torques, (batch, 1, n), of bodies with these accelerations, (batch, 1, 6 b)."""
+        found: str = self.g.MatMul(accelerations, self.g.Transpose(self._momenta, perm=[0, 2, 1]))
+        return found
 
     @cached_property
     def gravity(self) -> str:
-        """(batch, n)."""
+        """(batch, 1, n)."""
         return self._felt(self.g.MatMul(self._chain["base"][None, None], self._frames))
 
-    def coriolis(self, qd: str) -> str:
-        """(batch, n); qd: (batch, n)."""
-        g, carriers = self.g, self._chain["carriers"]
-        by_joints = g.reshaped(qd, 0, 1, self.n)
-        velocities, (_, lefts, rights, felt) = self._by_bodies(by_joints), self._axes
-        left = g.MatMul(g.Mul(lefts, velocities), carriers)
-        turning = g.MatMul(_MOTION_SUMS, g.Mul(left, rights))
-        steady = g.MatMul(g.Mul(turning, velocities), carriers)
-        whole = g.Mul(g.MatMul(g.Transpose(steady, perm=[0, 2, 1]), self._frames), self._blocks)
+    def coriolis(self, qd: str) -> tuple[str, str]:
+        """Its parts, (batch, 1, n) and (batch, n); qd: (batch, n)."""
+        g, ratios = self.g, self._chain["ratios"]
+        row, (_, lefts, rights, felt) = g.reshaped(qd, 0, 1, self.n), self._axes
+        by_bodies = row if self._single else g.MatMul(row, ratios.T)
+        summed = g.Mul(
+            by_bodies, self._chain["carriers"].T
+        )  # of all that carries a body, at their velocities
+        left = g.MatMul(summed, lefts)
+        steady = g.MatMul(summed, g.MatMul(g.Mul(left, rights), _MOTION_SUMS.T))
+        whole = g.Mul(g.MatMul(steady, self._frames), self._blocks)
         rising = self._felt(g.MatMul(np.ones((1, 1, self.b)), whole))
-        momenta = g.MatMul(g.Mul(self._frames, g.MatMul(by_joints, self._momenta)), self._blocks.T)
-        pushed = g.MatMul(g.Mul(left, g.MatMul(_FORCE_RIGHT, momenta)), carriers.T)
-        held = g.reshaped(g.MatMul(np.ones((1, 1, 18)), g.Mul(felt, pushed)), 0, self.b)
-        found: str = g.Add(rising, held if self._single else g.MatMul(held, self._chain["ratios"]))
-        return found
+        momenta = g.Transpose(g.Mul(self._frames, g.MatMul(row, self._momenta)), perm=[0, 2, 1])
+        pushed = g.Mul(left, g.MatMul(g.MatMul(self._blocks[None], momenta), _FORCE_RIGHT.T))
+        products = g.Mul(felt, g.MatMul(self._chain["carriers"][None], pushed))
+        held = g.ReduceSum(products, np.array([2]), keepdims=0)
+        return rising, held if self._single else g.MatMul(held, ratios)
 
 
 def _factors(components: tuple[int, ...], halves: tuple[int, int, int]) -> np.ndarray:
