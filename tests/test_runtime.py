@@ -109,8 +109,9 @@ def test_joint_functions_are_a_gradient_and_vanish_outside_the_range():
         weight.data = draw(*weight.shape, seed=weight.numel())
     q = draw(50, 3)
     gradient = vjp(lambda at: functions.energy(at).sum(), q)[1](torch.ones((), dtype=torch.float64))[0]
-    near(functions.torque(q, functions.splines(q)), gradient, 1e-10)
-    assert (functions.friction_factor(functions.splines(q)) > 0).all()
+    torque, factor = functions(q, functions.prepare())
+    near(torque, gradient, 1e-10)
+    assert (factor > 0).all()
     inside = torch.linspace(-3, 3, 20, dtype=torch.float64)[:, None] * torch.tensor([0.9, 0.075, 0.6])
     inside = inside + torch.tensor(JOINTS.center)
     near(functions.splines(inside).sum(dim=-1), torch.ones(20, 3).double(), 1e-12)

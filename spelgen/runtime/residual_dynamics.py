@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from spelgen.runtime.encoding import JointEncoding
-from spelgen.runtime.joint_functions import JointFunctions
+from spelgen.runtime.joint_functions import JointFunctions, JointFunctionWeights
 from spelgen.runtime.joints import Joints
 from spelgen.runtime.parts import DriveInput
 from spelgen.runtime.port_hamiltonian import applied
@@ -20,10 +20,11 @@ from spelgen.runtime.rigid_body_dynamics import Motion, RigidBodyDynamics, Rigid
 
 
 class ResidualPrepared(NamedTuple):
-    """What depends on the weights of the networks alone."""
+    """What depends on the weights alone."""
 
     mass: Any
     potential: Any
+    functions: JointFunctionWeights
 
 
 class ResidualMotion(NamedTuple):
@@ -31,7 +32,8 @@ class ResidualMotion(NamedTuple):
 
     q: Tensor
     encoded: Tensor
-    splines: Tensor  # (..., n, SPLINES)
+    torque: Tensor  # of the joints' own functions, (..., n) [Nm, N]
+    factor: Tensor  # on friction, (..., n)
 
 
 class ResidualDynamics(RigidBodyDynamics):
@@ -62,14 +64,15 @@ class ResidualDynamics(RigidBodyDynamics):
         prepared = super().prepare(definite)
         potential = None if self.residual_potential is None else self.residual_potential.prepare()
         mass = self.residual_mass.prepare(prepared.armature)
-        return prepared._replace(residual=ResidualPrepared(mass, potential))
+        functions = self.joint_functions.prepare()
+        return prepared._replace(residual=ResidualPrepared(mass, potential, functions))
 
     def configuration(self, q: Tensor, prepared: RigidPrepared) -> Motion:
         """How the bodies may move at q, and what residuals read of q."""
-        return super().configuration(q, prepared)._replace(residual=self._read(q))
+        return super().configuration(q, prepared)._replace(residual=self._read(q, prepared))
 
-    def _read(self, q: Tensor) -> ResidualMotion:
-        return ResidualMotion(q, self.encoding(q), self.joint_functions.splines(q))
+    def _read(self, q: Tensor, prepared: RigidPrepared) -> ResidualMotion:
+        return ResidualMotion(q, self.encoding(q), *self.joint_functions(q, prepared.residual.functions))
 
     def mass_at(self, at: Motion, prepared: RigidPrepared) -> tuple[Tensor, Any]:
         """M(q), (..., n, n), and what its derivatives need."""
@@ -102,18 +105,19 @@ class ResidualDynamics(RigidBodyDynamics):
 
     def residual_torque(self, q: Tensor, qd: Tensor, qdd: Tensor, prepared: RigidPrepared) -> Tensor:
         """What the residuals of M and V take, (..., n) [Nm, N]."""
-        read = self._read(q)
+        read = self._read(q, prepared)
         mass, residuals = self.residual_mass(read.encoded, prepared.residual.mass)
         return applied(mass, qdd) + self._nonlinear(read, qd, residuals, prepared)
 
     def friction_factor(self, q: Tensor) -> Tensor:
         """How much more friction the drives have at q than their laws say, (..., n)."""
-        factor: Tensor = self.joint_functions.friction_factor(self.joint_functions.splines(q))
+        factor: Tensor = self.joint_functions(q, self.joint_functions.prepare())[1]
         return factor
 
     def _varied(self, friction: Tensor, at: Motion) -> Tensor:
         """The laws' friction of the drives as it is at this position, (..., n)."""
-        return self.joint_functions.friction_factor(at.residual.splines) * friction
+        factor: Tensor = at.residual.factor
+        return factor * friction
 
     def _nonlinear(self, read: ResidualMotion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
         """dR/dt qd - d/dq of what the residuals add to 1/2 qd^T M(q) qd - V(q), (..., n)."""
@@ -126,4 +130,4 @@ class ResidualDynamics(RigidBodyDynamics):
         if self.residual_potential is not None:
             kinetic = kinetic - self.residual_potential.vjp(read.encoded, prepared.residual.potential)
         gradient: Tensor = self.encoding.vjp(read.encoded, kinetic)
-        return gradient - self.joint_functions.torque(read.q, read.splines)
+        return gradient - read.torque
