@@ -94,16 +94,21 @@ def main() -> None:
     if arm.settings.input != "position":
         parser.error(f"{asked.urdf.with_suffix('.yaml')} has to say 'input: position'")
     truths = {"kd": LAG, "armature": ARMATURE, "dry": DRY, "lost": DRY + asked.dead_zone}
+    truths |= {"dead_zone": asked.dead_zone} if asked.dead_zone else {}
     errors, held, left = {x: [] for x in truths}, {x: [] for x in truths}, {x: 0 for x in truths}
     for seed, logs in enumerate(recordings(arm, asked.seeds, asked.seconds, asked.dead_zone)):
         since = time.monotonic()
         found = spelgen.fit(spelgen.build(arm, asked.preset), logs).record["servo"]
         for what, truth in truths.items():
-            told = [joint[what] for joint in found["joints"] if joint[what]["determined"]]
+            told = [x[what] for x in found["joints"] if what in x and x[what]["determined"]]
             left[what] += len(found["joints"]) - len(told)
             errors[what] += [x["value"] / truth - 1 for x in told]
             held[what] += [x["low"] <= truth <= x["high"] for x in told]
-        row = ", ".join(f"{what} {100 * np.median(np.abs(x)):.2f} %" for what, x in errors.items() if x)
+        row = ", ".join(
+            f"{what} {100 * np.median(np.abs(x)):.2f} % ({sum(held[what])} of {len(x)} held)"
+            for what, x in errors.items()
+            if x
+        )
         print(f"seed {seed}: {time.monotonic() - since:.0f} s; median errors so far {row}", flush=True)
     print("           bias   90 % of errors below   intervals that hold the truth   left open")
     for what, x in ((what, x) for what, x in errors.items() if x):

@@ -44,11 +44,13 @@ def write_servo_arm(folder: Path, settings: str = "input: position\n") -> Path:
     return path
 
 
-def servo_logs(count: int, seconds: float, servos: Servos = Servos(), seed: int = 0) -> list[Trajectory]:
+def servo_logs(
+    count: int, seconds: float, servos: Servos = Servos(), seed: int = 0, swing: float = 1.0
+) -> list[Trajectory]:
     """Recordings at 50 Hz of commands that swing, hold and jump; positions come in steps of an encoder's 4096."""
     rng = np.random.default_rng(seed)
     t = np.arange(0.0, seconds, 0.02)
-    u = np.stack([_commands(rng, t) for _ in range(count)])
+    u = np.stack([_commands(rng, t, swing) for _ in range(count)])
     q = _simulated(t, u, servos)
     q = np.round(q * 4096 / (2 * np.pi)) * (2 * np.pi / 4096)
     nothing = np.zeros((len(t), 0))
@@ -58,7 +60,7 @@ def servo_logs(count: int, seconds: float, servos: Servos = Servos(), seed: int 
     ]
 
 
-def _commands(rng: np.random.Generator, t: np.ndarray) -> np.ndarray:
+def _commands(rng: np.random.Generator, t: np.ndarray, swing: float) -> np.ndarray:
     """(T, 2)"""
     waves = sum(
         rng.uniform(0.05, 0.3)
@@ -66,7 +68,7 @@ def _commands(rng: np.random.Generator, t: np.ndarray) -> np.ndarray:
         for _ in range(3)
     )
     levels = rng.uniform(-0.5, 0.5, (int(t[-1] / 2) + 1, 2))[(t / 2).astype(int)]
-    return np.asarray(waves + levels)
+    return np.asarray(swing * waves + levels)
 
 
 def _simulated(t: np.ndarray, u: np.ndarray, servos: Servos) -> np.ndarray:

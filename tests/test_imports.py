@@ -34,7 +34,7 @@ emission: bodies plan source docstring tailored bundle emit loading
 dynamics: arrays constraint pinocchio_dynamics pinocchio_arm pinocchio_urdf
 dynamics: regressor rigid_bodies regressor_dynamics tip
 logs: arm_mapping trajectory coverage bags lerobot tables npz readers values log_files suggest read checks filtering
-logs: preprocessing windows chunks epoch_windows commands
+logs: preprocessing windows chunks epoch_windows commands smoothing
 excitation: trajectory
 simulation: friction integration simulated_logs random_inputs servo_motions paths tracking
 identification: samples friction base_parameters least_squares method prior identification
@@ -43,8 +43,8 @@ fitting: run_schema address_lock run_folder run_lock
 fitting: gaussian_prior adaptive rollout calibration dataset streaming workers torque_samples torque_jacobian
 fitting: optimizers residual_fit torque_fit torque_report
 fitting: torque_networks urdf_regularizer stages compiled process progress validation loop
-fitting: run_record fitted servo_windows servo_start servo_weights servo_problem servo_descent servo_dead_zones
-fitting: servo_fit servo_intervals servo_report linear_servo servo_run
+fitting: run_record fitted servo_windows servo_start servo_weights servo_problem servo_descent servo_intervals
+fitting: servo_dead_zones servo_fit servo_report linear_servo servo_run
 fitting: fit train
 evaluation: names replay disturbance stiff baselines trust forecast torque rollout invariants examples
 evaluation: tables verdict results horizons torque_traces traces csv_file subject evaluate
@@ -64,7 +64,7 @@ exporting: c_statements c_tables c_networks c_joint_functions c_residual_calls c
 exporting: casadi_residuals casadi_export export
 render: charts plots picture page learned parameters reproduction shapes scene still arm_section
 render: run_facts curves report_page runs_page inspection_page identification_page
-logs: statistics gravity report check_logs
+logs: statistics gravity report following servo_report check_servo_logs check_logs
 fleet: ray_engine engine
 comparison: truth metrics known_urdf study runs formatting
 fleet: schema prepare jobs search units fleet ranking progress
@@ -88,7 +88,14 @@ SYMBOLIC = {"sympy", "flint", "spelgen.arm", "spelgen.structure"}
 PLAIN = {"spelgen.arm.actuation"}  # G by the files, without the exact arithmetic of its room
 ROOMS_THAT_DERIVE = ("urdf.", "arm.", "structure.", "emission.", "verify.", "explain.", "formulas.")
 DERIVES = [x for x in LAYERS if x.startswith(ROOMS_THAT_DERIVE) and x != "emission.loading"]
-BESIDE_A_ROBOT = {"logs.gravity", "logs.report", "logs.check_logs"}  # logs held against an arm's own facts
+# logs held against an arm's own facts
+BESIDE_A_ROBOT = {
+    "logs.gravity",
+    "logs.report",
+    "logs.servo_report",
+    "logs.check_servo_logs",
+    "logs.check_logs",
+}
 OF_A_RUN = {f"render.{name}" for name in ("charts", "plots", "picture", "page", "learned", "scene")}
 FITS = [x for x in LAYERS if x.startswith(("logs.", "fitting.", "evaluation.")) and x not in BESIDE_A_ROBOT]
 NEVER = {

@@ -88,14 +88,19 @@ def test_within_its_dead_zone_a_servo_gives_nothing(arm):
     assert float(servo.stored_energy(u, still)[1].detach()) == pytest.approx(0.5 * 12 * (0.03**2 + 0.1**2))
 
 
-def test_a_dead_zone_enters_where_windows_left_out_gain():
+def test_a_dead_zone_enters_where_windows_are_sure_of_it():
     rng = torch.Generator().manual_seed(0)
-    slopes = torch.randn(30, 50, 3, generator=rng).double()  # of an error by a weight and two dead zones
-    errors = torch.randn(30, 50, generator=rng).double() - slopes[..., 1] * 0.3
+    slopes = torch.randn(30, 50, 5, generator=rng).double()  # of an error by a weight and four dead zones
+    slopes[..., 3] = slopes[..., 0] + 1e-3 * slopes[..., 3]  # the weight could be this one
+    errors = torch.randn(30, 50, generator=rng).double() - slopes[..., [1, 3]].sum(dim=-1) * 0.3
     normal = Normal(slopes.mT @ slopes, (slopes.mT @ errors.unsqueeze(-1)).squeeze(-1))
-    nothing, places = torch.zeros(3).double(), torch.tensor([1, 2])
-    found = dead_zones(normal, nothing, torch.ones(3).double(), places)
-    assert found.tolist() == [pytest.approx(0.3, abs=0.06), 0.0]
+    nothing, places, widths = (
+        torch.zeros(5).double(),
+        torch.arange(1, 5),
+        torch.tensor([0, 0, 0, 0.1]).double(),
+    )
+    found = dead_zones(normal, nothing, torch.ones(5).double(), places, widths)
+    assert found.tolist() == [pytest.approx(0.3, abs=0.06), 0.0, 0.0, pytest.approx(0.1)]
 
 
 def test_intervals_count_errors_that_are_alike_once():
@@ -146,12 +151,17 @@ def test_commands_are_read_and_written(tmp_path, logs, arm):
 def test_what_is_told_covers_the_truth(fitted):
     told = fitted.record["servo"]["joints"]
     for k, joint in enumerate(told):
-        for what, truth in (("kd", TRUTH.kd), ("armature", TRUTH.armature), ("lost", TRUTH.coulomb)):
+        for what, truth in (
+            ("kd", TRUTH.kd),
+            ("armature", TRUTH.armature),
+            ("dry", TRUTH.coulomb),
+            ("lost", TRUTH.coulomb),
+        ):
             assert joint[what]["determined"]
             assert joint[what]["value"] == pytest.approx(truth[k] / TRUTH.kp[k], rel=0.03), what
             assert joint[what]["low"] < truth[k] / TRUTH.kp[k] < joint[what]["high"], what
-    left = "not determined by these logs: dry/kp of shoulder, dry/kp of elbow"  # a dead zone would look alike
-    assert left in " ".join(servo_text(fitted.record["servo"]).split())
+        assert "dead_zone" not in joint  # gravity tells that there is none
+    assert "all of these are determined" in servo_text(fitted.record["servo"])
 
 
 def test_simulated_commands_and_positions(tmp_path):
@@ -219,9 +229,8 @@ def test_what_does_not_belong_together_is_told(arm, logs, robots):
         spelgen.build(arm, "spel")
     with pytest.raises(OptionError, match="this arm has position servos"):
         spelgen.fit(spelgen.build(arm, "closed-form"), logs, spelgen.TorqueFit())
-    for asked in (spelgen.identify, lambda arm, logs: spelgen.check_logs(logs, arm)):
-        with pytest.raises(LogError, match="commanded positions and no torques"):
-            asked(arm, logs)
+    with pytest.raises(LogError, match="commanded positions and no torques"):
+        spelgen.identify(arm, logs)
     t = np.arange(9) * 0.1
     nothing = Trajectory(t, np.zeros((9, 2)), np.zeros((9, 2)), np.zeros((9, 2)))
     with pytest.raises(LogError, match="no commanded positions"):

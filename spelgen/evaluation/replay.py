@@ -13,8 +13,8 @@ from spelgen.dynamics.servo_rollout import STEP, replayed
 from spelgen.errors import Diagnostic
 from spelgen.evaluation.names import MODEL
 from spelgen.fitting.linear_servo import LinearServos
-from spelgen.fitting.servo_windows import velocities
 from spelgen.logs.commands import delayed_commands, steps_between
+from spelgen.logs.smoothing import velocities
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 
 LATE, LINEAR = "delayed command", "linear servo"

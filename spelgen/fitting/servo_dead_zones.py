@@ -1,7 +1,6 @@
-"""Which joints have a dead zone: those where it foretells windows that it was not fitted to.
+"""Which joints have a dead zone: those where windows tell one, beyond luck, with all dead zones fitted beside all else.
 
-By the cost's first two derivatives, window by window: without each one in turn all weights are fitted with a joint's
-dead zone and without, and both are judged there. A dead zone enters where windows as a whole gain, beyond luck.
+By the cost's first two derivatives. A dead zone that dry friction could be as well is unsure, and does not enter.
 """
 
 from __future__ import annotations
@@ -9,47 +8,32 @@ from __future__ import annotations
 import torch
 
 from spelgen.fitting.servo_descent import Normal
+from spelgen.fitting.servo_intervals import covariance
 
-SURE = 2.82  # standard errors of the mean gain of a window, as in `residual_fit`
-LEAST = 1e-3  # rad, m: to begin with, and no gain below
+SURE = 3.0  # standard deviations
+LEAST = 1e-3  # rad, m
 
 
 def dead_zones(
-    normal: Normal, away: torch.Tensor, precision: torch.Tensor, places: torch.Tensor
+    normal: Normal, away: torch.Tensor, precision: torch.Tensor, places: torch.Tensor, widths: torch.Tensor
 ) -> torch.Tensor:
-    """Half widths (n,) that windows ask for, 0 where they ask for none.
+    """Half widths (n,): those that have entered before, and those of which windows are sure; 0 where there is none.
 
     away: (k,) of the unknowns from the prior's centre; precision: (k,) of the prior, with dead zones; places: (n,) of
-    the dead zones among the unknowns.
+    the dead zones among the unknowns; widths: (n,) so far.
     """
-    others = torch.ones(len(precision), dtype=torch.bool)
-    others[places] = False
-    rest = torch.nonzero(others).squeeze(-1)
-    without = _left_out(normal, away, precision, rest)
-    found = torch.zeros(len(places)).double()
-    for joint, place in enumerate(places.tolist()):
-        both = torch.cat([rest, torch.tensor([place])])
-        width = _left_out(normal, away, precision, both)
-        gain = _cost(normal, without) - _cost(normal, width)
-        error = gain.std() / len(gain) ** 0.5
-        if gain.mean() > SURE * error and float(width[:, place].mean()) > LEAST:
-            found[joint] = width[:, place].mean()
-    return found
-
-
-def _left_out(
-    normal: Normal, away: torch.Tensor, precision: torch.Tensor, chosen: torch.Tensor
-) -> torch.Tensor:
-    """Steps (W, k) of the chosen unknowns to where the cost without a window is least."""
-    matrix, target = normal.matrix[:, chosen[:, None], chosen], normal.target[:, chosen]
-    whole = matrix.sum(dim=0) + torch.diag(precision[chosen])
-    slope = target.sum(dim=0) + (precision * away)[chosen]
-    steps = torch.zeros_like(normal.target)
-    steps[:, chosen] = -torch.linalg.solve(whole - matrix, (slope - target).unsqueeze(-1)).squeeze(-1)
-    return steps
-
-
-def _cost(normal: Normal, steps: torch.Tensor) -> torch.Tensor:
-    """What steps (W, k) add to the cost of their own window, (W,)."""
-    turned = (normal.matrix @ steps.unsqueeze(-1)).squeeze(-1)
-    return (steps * (turned + 2 * normal.target)).sum(dim=-1)
+    matrix = normal.matrix.sum(dim=0) + torch.diag(precision)
+    target = normal.target.sum(dim=0) + precision * away
+    free = torch.ones(len(precision), dtype=torch.bool)
+    while True:
+        step = torch.zeros_like(target)
+        step[free] = -torch.linalg.solve(matrix[free][:, free], target[free])
+        below = free[places] & (widths + step[places] < 0)
+        if not below.any():
+            break
+        free[places[below]] = False  # none is negative
+    found = widths + step[places]
+    unsure = covariance(normal, precision, torch.zeros_like(target)).diagonal()
+    deviation = torch.maximum(unsure, torch.linalg.inv(matrix).diagonal())[places].sqrt()
+    enters = (found > SURE * deviation) & (found > LEAST)
+    return torch.where(widths > 0, widths, torch.where(enters, found, torch.zeros_like(found)))

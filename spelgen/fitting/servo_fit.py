@@ -1,8 +1,8 @@
 """Fit position servos, friction and weight of an arm to logs of commanded positions: its most probable weights.
 
 First least squares on the command error (`servo_start`), then predicted windows (`servo_descent`), in rounds: each
-takes the bodies' load along what has been predicted, and the scale of errors, anew. Before the fine ones dead zones
-enter, where windows ask for them.
+takes the bodies' load along what has been predicted, and the scale of errors, anew. Before each of the fine ones dead
+zones enter, where windows are sure of them.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class ServoSolution:
     """How a fit ended. rms: (n,) root mean square errors of positions over windows [rad, m]. names: of the rows of
     weights of joints, (p, n), which with directions of bodies and the delay are the k unknowns of `Point.flat`.
     normal: of windows there; precision: (k,) of the prior, of all dead zones too; halved: (k,) what half as long steps
-    of the rollouts still changed at the end. gravity: (n,) mean size of its torque along the windows.
+    of the rollouts still changed at the end. qd, gravity: velocities and gravity's torques along the windows, (M, n).
     """
 
     names: tuple[tuple[str, int], ...]
@@ -46,6 +46,7 @@ class ServoSolution:
     normal: Normal
     precision: torch.Tensor
     halved: torch.Tensor
+    qd: torch.Tensor
     gravity: torch.Tensor
 
 
@@ -86,7 +87,7 @@ class ServoRounds:
 
     def _begin(self, point: Point) -> None:
         """The next round, from here."""
-        if len(self.begun) == ROUNDS - FINE:
+        if len(self.begun) >= ROUNDS - FINE:
             weights = self.problem.weights
             weights.dead_zones = point.joints[weights.row(DEAD_ZONE)] > 0
             self.problem.windows = self.windows
@@ -105,7 +106,7 @@ class ServoRounds:
             if len(self.begun) == ROUNDS:
                 return
             point = self.reached.point
-            if len(self.begun) == ROUNDS - FINE:
+            if len(self.begun) >= ROUNDS - FINE:
                 point = _with_dead_zones(descent, point)
             self._begin(point)
             self.reached = Reached(point, DAMPING[1], self.reached.taken)
@@ -131,17 +132,18 @@ class ServoRounds:
             normal=normal,
             precision=problem.weights.precision(len(point.bodies), every=True),
             halved=halved,
-            gravity=problem.load.gravity.abs().mean(dim=(0, 1)),
+            qd=self.windows.qd.flatten(0, 1),
+            gravity=problem.load.gravity.flatten(0, 1),
         )
 
 
 def _with_dead_zones(descent: Descent, point: Point) -> Point:
-    """The point, with those that windows ask for, which are fitted from now on."""
+    """The point, with those of which windows are sure, which are fitted from now on."""
     problem, weights = descent.problem, descent.problem.weights
     row, n = weights.row(DEAD_ZONE), problem.model.n
     precision = weights.precision(len(point.bodies), every=True)
     normal = descent.normal(point, problem.errors(point))
-    places = torch.arange(n) + row * n
-    joints = point.joints.clone()
-    joints[row] = dead_zones(normal, point.flat - descent.centre, precision, places)
+    places, joints = torch.arange(n) + row * n, point.joints.clone()
+    widths = torch.where(weights.dead_zones, joints[row].clamp(min=0.0), torch.zeros(n).double())
+    joints[row] = dead_zones(normal, point.flat - descent.centre, precision, places, widths)
     return replace(point, joints=joints)

@@ -11,7 +11,7 @@ from scipy.stats import t as student
 
 from spelgen.fitting.servo_fit import ServoSolution
 from spelgen.fitting.servo_intervals import covariance
-from spelgen.fitting.servo_weights import DEAD_ZONE, FRICTION
+from spelgen.fitting.servo_weights import DEAD_ZONE
 from spelgen.listing import Listing, number
 
 SURE = 0.975  # quantile of an interval of 95 %, of Student's t: windows are few
@@ -22,7 +22,6 @@ OPEN = 1.25  # what may be larger by such a factor within its interval is not de
 UNITS = {"kd": "s", "armature": "s^2", "dry": "rad, m", "lost": "rad, m"}
 """What is told in ratio to kp, and the ratio's unit; dry: friction of a joint that slides, under the usual load; lost:
 dry and half the dead zone, together."""
-FRICTION_PARTS = ("coulomb", "load_dependence")
 ABOUT = (
     "divided by kp, +- half an interval of 95 %: logs of positions tell no more. kp itself rests on the URDF's masses, "
     "where it is not known. kd stands for kd and viscous friction, which such logs cannot tell apart. dry: friction of "
@@ -35,18 +34,17 @@ def servo_record(model: Any, solution: ServoSolution) -> dict[str, Any]:
     """For config.json: delay [s], errors, and by joint kp, and the ratios to it with intervals of 95 %."""
     unsure = covariance(solution.normal, solution.precision, solution.halved)
     sure = float(student.ppf(SURE, max(1, len(solution.normal.matrix) - 1)))
-    joints = []
+    slid, joints = _dry(model, solution), []
     for joint, name in enumerate(model.facts.joints):
         about: dict[str, Any] = {"joint": name}
         known = not float(model.servo.trained[joint])
         about["kp"] = {"value": float(model.kp[joint].detach()), "known": known}
-        for what, (value, slopes) in _told(model, solution, joint).items():
+        for what, (value, slopes) in _told(model, slid, joint).items():
             direction = torch.zeros(len(unsure)).double()
             for weight, slope in slopes.items():
                 direction[solution.names.index((weight, 0)) * model.n + joint] = slope / value
             half = sure * math.hypot(LAWS, float((direction @ unsure @ direction).clamp(min=0).sqrt()))
             about[what] = {"unit": UNITS.get(what, "rad, m"), **_interval(value, half)}
-        about["dry"]["determined"] &= "dead_zone" in about  # where none was seen, a small one may still be
         joints.append(about)
     return {
         "delay": {"value": float(model.delay), "half": sure * float(unsure[-1, -1].sqrt())},
@@ -56,18 +54,15 @@ def servo_record(model: Any, solution: ServoSolution) -> dict[str, Any]:
     }
 
 
-def _told(model: Any, solution: ServoSolution, joint: int) -> dict[str, tuple[float, dict[str, float]]]:
+def _told(
+    model: Any, slid: tuple[torch.Tensor, dict[str, torch.Tensor]], joint: int
+) -> dict[str, tuple[float, dict[str, float]]]:
     """What is told of a joint: its value, and its slopes by weights, which but for dead zones are logarithms."""
-    with torch.no_grad():
-        laws = model.dynamics.friction.prepare()
-        kp, kd, armature, zone = (
-            float(x[joint]) for x in (model.kp, model.kd, model.armature, model.servo.dead_zone)
-        )
-        parts = (laws.coulomb, laws.load_dependence * solution.gravity)
-    sizes = [float(x[joint]) / kp for x in parts]
-    dry, by_kp = sum(sizes), -float(model.servo.trained[joint])
-    slopes = {FRICTION + name: x for name, x in zip(FRICTION_PARTS, sizes, strict=True)}
-    slopes |= {"servo.raw_kp": by_kp * dry}
+    kp, kd, armature, zone = (
+        float(x[joint].detach()) for x in (model.kp, model.kd, model.armature, model.servo.dead_zone)
+    )
+    dry, by_kp = float(slid[0][joint]) / kp, -float(model.servo.trained[joint])
+    slopes = {name: float(x[joint]) / kp for name, x in slid[1].items()} | {"servo.raw_kp": by_kp * dry}
     found = {
         "kd": (kd / kp, {"servo.raw_kd": kd / kp, "servo.raw_kp": by_kp * kd / kp}),
         "armature": (
@@ -78,6 +73,20 @@ def _told(model: Any, solution: ServoSolution, joint: int) -> dict[str, tuple[fl
         "lost": (dry + zone, slopes | {DEAD_ZONE: 1.0}),
     }
     return found | ({"dead_zone": (zone, {DEAD_ZONE: 1.0})} if zone else {})
+
+
+def _dry(model: Any, solution: ServoSolution) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    """Dry friction of each joint, (n,) [Nm, N], what it takes over what the joint went, and its slopes by weights."""
+    friction = model.dynamics.friction
+    raw = dict(friction.named_parameters())
+    way = solution.qd.abs()
+    with torch.enable_grad():
+        constants = friction.prepare()
+        dry = (friction.dry(solution.qd, solution.gravity, constants) * way).sum(dim=0) / way.sum(dim=0)
+        # of a joint the weights of that joint alone
+        slopes = torch.autograd.grad(dry.sum(), [*raw.values()], allow_unused=True)
+    found = {f"dynamics.friction.{name}": x for name, x in zip(raw, slopes, strict=True) if x is not None}
+    return dry.detach(), found
 
 
 def _interval(value: float, half: float) -> dict[str, Any]:

@@ -28,7 +28,7 @@ from spelgen.fitting.streaming import LargeLogs
 from spelgen.logs.checks import check
 from spelgen.logs.mapping import LogMapping
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.trajectory import Trajectory, require_joints
+from spelgen.logs.trajectory import Trajectory, require_commands, require_joints
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
@@ -118,11 +118,7 @@ def _commanded(model: EmittedModel, logs: Sequence[Trajectory] | LargeLogs) -> S
         )
     for each in logs:
         require_joints(each, model.facts.joints)
-        if each.u is None:
-            raise LogError(
-                "no commanded positions", file=each.file, element=f"trajectory {each.name}",
-                expected="u: this arm has position servos",
-            )  # fmt: skip
+        require_commands(each)
     return logs
 
 

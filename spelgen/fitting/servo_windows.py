@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from scipy.signal import savgol_filter
 
 from spelgen.dynamics.servo_rollout import STEP
 from spelgen.errors import LogError
 from spelgen.logs.commands import delayed_commands, steps_between
 from spelgen.logs.preprocessing import Preprocessing
+from spelgen.logs.smoothing import smoothed, velocities
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 
 LENGTH, SETTLING = (
@@ -25,7 +25,6 @@ LENGTH, SETTLING = (
     1.0,
 )  # s, of a window, and of its beginning, which is not judged: friction's memory forms there
 MOST = 200  # windows
-SMOOTHING = 0.18  # s over which derivatives are taken
 BLOCK = 2**13  # samples at a time
 
 
@@ -88,19 +87,6 @@ def servo_windows(logs: Sequence[Trajectory], preprocessing: Preprocessing, most
     dt = torch.from_numpy(np.stack([np.diff(x.t[a : a + length]) for x, a in starts]))
     steps = max(steps_between(x, STEP) for x, _ in starts)
     return ServoWindows(tuple(starts), q, qd, dt, settling, steps)
-
-
-def velocities(trajectory: Trajectory) -> np.ndarray:
-    """qd (T, n), smoothed."""
-    return smoothed(trajectory.q, trajectory.sample_rate)[0]
-
-
-def smoothed(q: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndarray]:
-    """First and second derivatives of (..., T, n), by cubic polynomials over `SMOOTHING` (Savitzky and Golay, 1964)."""
-    samples = q.shape[-2]
-    width = min(max(5, 2 * round(SMOOTHING * rate / 2) + 1), samples - 1 + samples % 2)
-    first, second = (savgol_filter(q, width, 3, deriv=order, delta=1 / rate, axis=-2) for order in (1, 2))
-    return first, second
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,10 +12,11 @@ from spelgen.arm.arm import Coordinate
 from spelgen.errors import Diagnostic, LogError, SpelgenError, SpelgenErrors, collect
 from spelgen.identification.drive_hints import Coupling, coupled_inputs, coupling, torque_delay
 from spelgen.identification.drive_samples import DriveLog
+from spelgen.logs.check_servo_logs import check_servo_logs
 from spelgen.logs.checks import Finding, findings, gap_diagnostics, summarised
 from spelgen.logs.gravity import GravityFit, StateSamples, fit_gravity, state_samples
 from spelgen.logs.report import SEEN, JointReport, LogReport
-from spelgen.logs.statistics import Statistics, statistics
+from spelgen.logs.statistics import Statistics, common_step, statistics
 from spelgen.logs.trajectory import QUANTITIES, Trajectory, require_joints, require_torques
 
 if TYPE_CHECKING:
@@ -37,8 +38,11 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping |
 
     What keeps logs from being trained on is among the report's `errors`. mapping: by which they were read, that of
     the arm's settings unless given; a unit that it says of torques is believed. Logged torques go through the arm's
-    input matrix to the joints'. Raises LogError without any trajectory, or with one of another number of joints.
+    input matrix to the joints'. Raises LogError without any trajectory, or with one of another number of joints, and
+    where an arm's settings say 'input: position', without commands.
     """
+    if arm.settings.input == "position":
+        return check_servo_logs(logs, arm)
     coordinates, inputs = arm.arm.coordinates, arm.actuation.matrix()
     joints, kinds = [c.name for c in coordinates], [c.kind for c in coordinates]
     drives = DriveLog(inputs)
@@ -145,7 +149,7 @@ def _joint(
         noise={name: float(np.median([each[name][index] for each in dense])) for name in QUANTITIES}
         if dense
         else None,
-        steps={name: _common_step([each.steps[name][index] for each in measured]) for name in QUANTITIES},
+        steps={name: common_step([each.steps[name][index] for each in measured]) for name in QUANTITIES},
         velocity_factor=agreement.factor(index) if agreement.xx[index] > 0 else None,
         velocity_correlation=agreement.correlation(index),
         gravity=gravity,
@@ -157,12 +161,6 @@ def _range_fraction(coordinate: Coordinate, low: float, high: float) -> float | 
         return None
     width = coordinate.upper - coordinate.lower
     return (high - low) / width if width > 0 else None
-
-
-def _common_step(steps: Sequence[float]) -> float | None:
-    """The step of most trajectories, where the signal is quantised in most of them."""
-    known = [step for step in steps if np.isfinite(step)]
-    return float(np.median(known)) if 2 * len(known) > len(steps) else None
 
 
 def _limits(coordinate: Coordinate, joint: JointReport) -> list[Diagnostic]:

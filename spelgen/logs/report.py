@@ -91,7 +91,7 @@ class LogReport:
 
     def listings(self, most: int | None = None) -> list[Listing]:
         """All tables; of trajectories at most `most`."""
-        return [_clocks(self, most), _ranges(self), _signals(self), _physics(self)]
+        return [clock_table(self, most), _ranges(self), _signals(self), _physics(self)]
 
     def text(self) -> str:
         """For a terminal, in 80 columns; the errors are not in it."""
@@ -114,7 +114,8 @@ class LogReport:
         return "".join(table.html() for table in (found, *self.listings(SHOWN)))
 
 
-def _clocks(found: LogReport, most: int | None) -> Listing:
+def clock_table(found: LogReport, most: int | None) -> Listing:
+    """When samples were taken; of trajectories at most `most`."""
     head = ("trajectory", "samples", "duration", "sample rate", "jitter", "gaps", "longest")
     rows = tuple(
         (

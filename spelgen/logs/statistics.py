@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,7 +59,7 @@ def statistics(trajectory: Trajectory) -> Statistics:
     signals = {name: getattr(trajectory, name) for name in QUANTITIES}
     dense = trajectory.sample_rate >= DENSE and len(trajectory.t) > 8
     return Statistics(
-        clock=_clock(trajectory),
+        clock=clock_of(trajectory),
         low={name: values.min(axis=0) for name, values in signals.items()},
         high={name: values.max(axis=0) for name, values in signals.items()},
         noise={name: noise_level(trajectory.t, values) for name, values in signals.items()}
@@ -72,7 +73,8 @@ def statistics(trajectory: Trajectory) -> Statistics:
     )
 
 
-def _clock(trajectory: Trajectory) -> Clock:
+def clock_of(trajectory: Trajectory) -> Clock:
+    """Of one trajectory."""
     steps = np.diff(trajectory.t)
     regular = steps[steps <= GAP * np.median(steps)] if steps.size else np.ones(1)
     gaps = steps[steps > GAP * np.median(steps)] if steps.size else steps
@@ -111,3 +113,9 @@ def quantisation_step(values: np.ndarray) -> float:
     near = apart[apart < NEAR * step] / step  # far apart, whole steps cannot be told from rounding
     whole = np.abs(near - np.round(near)) < WHOLE
     return step if len(near) >= FEWEST and whole.mean() > MOSTLY else float("nan")
+
+
+def common_step(steps: Sequence[float]) -> float | None:
+    """The step of most trajectories, where the signal is quantised in most of them."""
+    known = [step for step in steps if np.isfinite(step)]
+    return float(np.median(known)) if 2 * len(known) > len(steps) else None

@@ -124,6 +124,16 @@ def require_torques(trajectories: Sequence[Trajectory]) -> None:
             )  # fmt: skip
 
 
+def require_commands(trajectory: Trajectory) -> np.ndarray:
+    """Its commanded positions, (T, n). Raises LogError where none were logged."""
+    if trajectory.u is None:
+        raise LogError(
+            "no commanded positions", file=trajectory.file, element=f"trajectory {trajectory.name}",
+            expected="u: this arm has position servos",
+        )  # fmt: skip
+    return trajectory.u
+
+
 def trajectory_listing(trajectories: Sequence[Trajectory]) -> Listing:
     """Trajectories as a table: samples, duration, sample rate, joints."""
     head = ("trajectory", "samples", "duration", "sample rate", "joints")

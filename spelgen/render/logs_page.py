@@ -33,7 +33,9 @@ def page(found: LogReport, arm: Arm, inputs: np.ndarray) -> str:
 
 
 def charts(trajectory: Trajectory, arm: Arm, inputs: np.ndarray) -> list[Panel]:
-    """By joint: q; qd beside dq/dt; the joint's torque beside the URDF's gravity torque."""
+    """By joint: q; qd beside dq/dt; the joint's torque beside the URDF's gravity torque. Of servos: q beside u."""
+    if trajectory.u is not None:
+        return _following(trajectory, arm)
     stride = -(-len(trajectory.t) // DRAWN)
     pieces = [piece[::stride] for piece in split_at_gaps(trajectory)]
     t, q, qd, tau = (
@@ -60,6 +62,17 @@ def charts(trajectory: Trajectory, arm: Arm, inputs: np.ndarray) -> list[Panel]:
         name = coordinate.name
         charts = [_chart(what, unit, name, each, last=what == "torque") for what, unit, each in lines]
         drawn.append(Panel(name, tuple(charts)))
+    return drawn
+
+
+def _following(trajectory: Trajectory, arm: Arm) -> list[Panel]:
+    pieces = [piece[:: -(-len(trajectory) // DRAWN)] for piece in split_at_gaps(trajectory)]
+    t, q, u = (np.concatenate([getattr(piece, name) for piece in pieces]) for name in ("t", "q", "u"))
+    drawn = []
+    for k, coordinate in enumerate(arm.coordinates):
+        lines = [Line("logged", t, q[:, k], "truth"), Line("commanded", t, u[:, k], "predicted")]
+        chart = _chart("position", UNITS[coordinate.kind][0], coordinate.name, lines, last=True)
+        drawn.append(Panel(coordinate.name, (chart,)))
     return drawn
 
 

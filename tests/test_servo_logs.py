@@ -1,0 +1,118 @@
+"""What `spelgen logs` tells of logs of commanded positions."""
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from servo_arm import Servos, servo_logs, write_servo_arm
+from typer.testing import CliRunner
+
+import spelgen
+from spelgen.cli.main import app
+
+SETTINGS = "input: position\njoints: {shoulder: {kp: 14.0}}\n"
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory):
+    return spelgen.load_arm(write_servo_arm(tmp_path_factory.mktemp("servo"), SETTINGS))
+
+
+@pytest.fixture(scope="module")
+def logs():
+    return servo_logs(3, 12.0)
+
+
+def changed(logs, **columns):
+    """The logs, with columns that functions of a trajectory make anew."""
+    return [replace(x, **{name: made(x) for name, made in columns.items()}) for x in logs]
+
+
+def codes(report):
+    return {each.code for each in report.findings}
+
+
+def test_logs_of_a_servo_arm_are_told(arm, logs):
+    found = spelgen.check_logs(logs, arm)
+    assert not found.errors and not found.warnings
+    assert found.delay[0] - 1e-9 <= Servos().delay <= found.delay[1] + 1e-9 <= 0.04
+    shoulder, elbow = found.servos
+    assert shoulder.steps["q"] == pytest.approx(2 * np.pi / 4096, rel=1e-6)
+    assert shoulder.steps["u"] is None
+    assert shoulder.u == (min(x.u[:, 0].min() for x in logs), max(x.u[:, 0].max() for x in logs))
+    assert 0.05 < shoulder.behind < 0.15  # the delay, and kd/kp
+    assert shoulder.saturated < 0.02 and elbow.saturated is None
+    assert shoulder.still is None  # its command never rests
+    for text in ("Positions and commands [rad]", "Commands act after", "Nothing is odd."):
+        assert text in found.text()
+    told = json.loads(json.dumps(found.to_dict()))
+    assert told["joints"][1]["name"] == "elbow" and tuple(told["delay"]) == found.delay
+
+
+def test_the_command_tells_them_too(arm, logs, tmp_path):
+    path = spelgen.write_logs(tmp_path / "logs.csv", logs, arm)
+    command = ["logs", str(path), "--robot", str(arm.robot.path), "--html", str(tmp_path / "page.html")]
+    told = CliRunner().invoke(app, command)
+    assert told.exit_code == 0, told.output
+    assert "Following" in told.stdout
+    page = (tmp_path / "page.html").read_text()
+    assert "position of elbow" in page and "commanded" in page
+
+
+@pytest.mark.parametrize(
+    ("columns", "text"),
+    [
+        ({"u": lambda x: np.degrees(x.u)}, r"joint 'shoulder': got positions that move 0\.016\d* times as far as"),
+        ({"u": lambda x: -x.u}, r"joint 'elbow': got positions that move against commands \(correlation -1"),
+        ({"u": lambda x: x.u[:, ::-1]}, "joint 'shoulder': got a command that joint 'elbow' follows, and this one"),
+    ],
+)  # fmt: skip
+def test_commands_that_cannot_be_these_are_errors(arm, logs, columns, text):
+    found = spelgen.check_logs(changed(logs, **columns), arm)
+    assert any(re.search(text, str(each)) for each in found.errors)
+
+
+def only(column, values):
+    """A column of the commands in place of which others stand."""
+
+    def made(x):
+        u = x.u.copy()
+        u[:, column] = values(x)[:, column] if callable(values) else values
+        return u
+
+    return made
+
+
+@pytest.mark.parametrize(
+    ("columns", "code"),
+    [
+        ({"u": lambda x: x.q}, "commands-are-positions"),
+        ({"u": only(0, 0.3)}, "idle-command"),
+        ({"u": only(1, lambda x: np.roll(x.u, 500, axis=0))}, "not-following"),
+        ({"u": lambda x: np.concatenate([x.u[:1].repeat(10, axis=0), x.u[:-10]])}, "ahead-of-command"),
+        ({"u": lambda x: x.u + 3.0}, "beyond-position-limit"),
+    ],
+)
+def test_what_is_odd_about_commands_is_told(arm, logs, columns, code):
+    found = spelgen.check_logs(changed(logs, **columns), arm)
+    assert code in codes(found)
+
+
+def test_what_is_left_at_rest_is_told(arm):
+    shoulder, elbow = spelgen.check_logs(servo_logs(2, 12.0, swing=0.0), arm).servos
+    # dry friction and the links' weight hold that much, in ratio to kp
+    assert 0.3 * 0.15 / 14 < shoulder.still < (0.15 + 0.9) / 14
+    assert 0.3 * 0.08 / 9 < elbow.still < (0.08 + 0.16) / 9
+
+
+def test_servos_that_give_all_they_can_are_counted(arm):
+    far = [replace(x, u=x.u + np.array([6 / 14 + 0.2, 0.0])) for x in servo_logs(1, 8.0)]
+    shoulder = spelgen.check_logs(far, arm).servos[0]
+    assert 0.5 < shoulder.saturated <= 1.0
+
+
+def test_sparse_logs_are_told(arm, logs):
+    slow = [x[::4] for x in logs]
+    assert "sparse" in codes(spelgen.check_logs(slow, arm))
