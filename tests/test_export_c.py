@@ -112,6 +112,18 @@ def test_names_for_code():
     assert identifier("while") == "arm_while"
 
 
+@needs_gcc
+def test_the_longest_name_is_a_name(tmp_path):
+    """A function's first line may be too long by itself."""
+    described = Trained(moved_model("two_link", "closed-form"), arm_of("two_link")).described
+    model = replace(described, name=identifier("gen3" * 20))
+    source, entries = tmp_path / f"{model.name}.c", c_entries(model)
+    source.write_text(c_source(model, entries))
+    source.with_suffix(".h").write_text(c_header(model, entries, ""))
+    assert len(model.name) == 40
+    assert compile_object(source, "gcc").exists()
+
+
 def test_a_wrong_export_is_refused():
     trained = Trained(moved_model("two_link", "closed-form"), arm_of("two_link"))
     still = lambda name, inputs: {"tau": np.zeros_like(inputs["q"])}  # noqa: E731

@@ -134,9 +134,10 @@ def _comment(text: str) -> str:
 
 def _wrapped(signature: str) -> str:
     """A signature in lines that end after a parameter."""
-    lines = [""]
-    for part in signature.split(", "):
-        longer = f"{lines[-1]}, {part}" if lines[-1].strip() else lines[-1] + part
+    first, *rest = signature.split(", ")
+    lines = [first]
+    for part in rest:
+        longer = f"{lines[-1]}, {part}"
         if len(longer) < _WIDTH:
             lines[-1] = longer
         else:
