@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from spelgen.arm.actuation import Actuation
 from spelgen.arm.arm import Arm, Coordinate
+from spelgen.dynamics.servo_rank import servo_rank
 from spelgen.errors import Diagnostic
 from spelgen.explain.facts import Fact, facts
 from spelgen.labels import joint_ranges, joints_in_ranges, printable
@@ -21,10 +22,7 @@ if TYPE_CHECKING:  # SymPy is read in only for formulas
     from spelgen.formulas.formulas import Formulas
 
 SCHEMA = 1
-POSITION = (
-    "the springs of position servos: tau = clip(kp (u - q) - kd qd), which store 1/2 kp (q - u)^2; logs of positions "
-    "determine inertia, weight and friction in ratio to kp only, unless a mass, a load or one kp is known"
-)
+POSITION = "the springs of position servos: tau = clip(kp (u - q) - kd qd), which store 1/2 kp (q - u)^2"
 
 
 @dataclass(frozen=True, repr=False)
@@ -69,7 +67,7 @@ class Inspection:
                 "joints": self._names(structure.potential),
             },
             "input_matrix": {
-                **({} if self.input == "torque" else {"input": self.input}),
+                **({} if self.input == "torque" else self._position()),
                 "entries": [self._input(row, column) for row in range(n) for column in range(n)],
             },
             "base_parameters": structure.base_parameter_count,
@@ -106,6 +104,12 @@ class Inspection:
             "; ".join(f"{name}: {need}" for name, need in self.needs().items()),
         ).html()
 
+    def _position(self) -> dict[str, Any]:
+        found = servo_rank(self.arm)
+        groups = [self._names(group) for group in found.groups]
+        left = [f"{name} of {self.structure.joints[joint]}" for name, joint in found.open]
+        return {"input": "position", "kp_in_ratio": groups, "with_inertia_only": left}
+
     def _names(self, joints: tuple[int, ...]) -> list[str]:
         return [self.structure.joints[joint] for joint in joints]
 
@@ -122,10 +126,26 @@ class Inspection:
         kind, value = (found[0].kind, found[0].value) if found else ("zero", 0.0)
         return {"row": row + 1, "col": column + 1, "kind": kind, "value": value}
 
+    def _determined(self) -> str:
+        """What logs of positions tell, by the rank of their equations."""
+        found = servo_rank(self.arm)
+        told = "logs of positions determine inertia, weight and friction in ratio to kp only"
+        known = [joints_in_ranges(group) for group in found.groups]
+        if len(known) == 1:
+            told += ": one kp, mass or load that is known tells all"
+        else:
+            told += f": one kp, mass or load that is known tells those of {' or of '.join(known)}"
+        names: dict[str, list[int]] = {}
+        for name, joint in found.open:
+            names.setdefault(name, []).append(joint)
+        for name, joints in names.items():
+            told += f"; {name} of {joints_in_ranges(tuple(joints))} only together with the links' own inertia"
+        return told
+
     def _inputs(self) -> str:
         """What is to be said of G."""
         entries = self.actuation.entries
-        told = ["fixed" if self.input == "torque" else POSITION]
+        told = ["fixed" if self.input == "torque" else f"{POSITION}; {self._determined()}"]
         if not self.actuation.direct:
             told = ["motor torques"]
             for kind, what in (("fixed", "gear known"), ("gain", "gain trained"), ("coupled", "coupled")):

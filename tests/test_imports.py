@@ -32,7 +32,7 @@ dynamics: bristles
 dynamics: protocol runge_kutta residuals prepared servo_rollout
 emission: bodies plan source docstring tailored bundle emit loading
 dynamics: arrays constraint pinocchio_dynamics pinocchio_arm pinocchio_urdf
-dynamics: regressor rigid_bodies regressor_dynamics tip
+dynamics: regressor rigid_bodies regressor_dynamics tip servo_rank
 logs: arm_mapping trajectory coverage bags lerobot tables npz readers values log_files suggest read checks filtering
 logs: preprocessing windows chunks epoch_windows commands smoothing
 excitation: trajectory

@@ -56,6 +56,13 @@ class Descent:
     def _robust(self, errors: torch.Tensor) -> torch.Tensor:
         return 1 / (1 + (errors / self.scale).square() / 4)
 
+    def _weight(self, errors: torch.Tensor) -> torch.Tensor:
+        return self._robust(errors) / self.scale**2 / self.alike
+
+    def square(self, errors: torch.Tensor) -> float:
+        """Their weighted sum of squares."""
+        return float((self._weight(errors) * errors.square()).sum())
+
     def cost(self, point: Point, errors: torch.Tensor) -> float:
         """Infinite where a rollout left all bounds."""
         if not errors.isfinite().all():
@@ -69,7 +76,7 @@ class Descent:
     def normal(self, point: Point, errors: torch.Tensor) -> Normal:
         """Of the windows alone, without the prior."""
         own, shared = self.problem.slopes(point, errors)
-        weight = self._robust(errors) / self.scale**2 / self.alike
+        weight = self._weight(errors)
         p, (count, _, n), s = len(own), errors.shape, len(shared)
         matrix, target = (
             torch.zeros(count, p * n + s, p * n + s).double(),

@@ -29,6 +29,7 @@ GAIN = (
     1.0,
     0.05,
 )  # of the cost, in rounds before the fine ones, and in these: a step that gains less ends a round
+LEFT = 0.01  # of the cost, at least, where its second derivatives promise less
 DAMPING = (1e-2, 1e-5)  # to begin with, in the first round and in the others
 
 
@@ -116,6 +117,21 @@ class ServoRounds:
         reached = vars(self.reached) | {"point": vars(self.reached.point)}
         return {"start": self._start, "begun": [vars(x) for x in self.begun], "reached": reached}
 
+    def foreseen(self) -> ServoSolution:
+        """What windows will tell, by the slopes of their errors before the fit, were these errors as small as its first
+        step promises.
+        """
+        point = self.reached.point
+        errors = self.problem.errors(point)
+        descent = Descent(self.problem, self._noise, errors)
+        normal = descent.normal(point, errors)
+        target = normal.target.sum(dim=0)
+        gain = -float(target @ descent.step(normal, point))
+        left = max(1 - gain / descent.square(errors), LEFT)
+        return self._solution(
+            point, Normal(normal.matrix / left, normal.target), torch.zeros_like(point.flat)
+        )
+
     def solution(self) -> ServoSolution:
         """Give the model the most probable weights, after all rounds."""
         problem, point = self.problem, self.reached.point
@@ -125,6 +141,10 @@ class ServoRounds:
         halved = descent.step(normal, point)
         point = point.moved(halved)
         problem.write(point)
+        return self._solution(point, normal, halved)
+
+    def _solution(self, point: Point, normal: Normal, halved: torch.Tensor) -> ServoSolution:
+        problem = self.problem
         return ServoSolution(
             names=tuple(problem.weights.names),
             rms=problem.errors(point).square().mean(dim=(0, 1)).sqrt(),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -19,22 +19,41 @@ LAWS = (
     0.015  # relative deviation of ratios by what laws of friction are not, see benchmarks/servo_recovery.py
 )
 OPEN = 1.25  # what may be larger by such a factor within its interval is not determined
+INFLATION = (
+    50.0  # of a variance, from which on two things are one: of simulated SO-101s 4 to 30, or more than 90
+)
 UNITS = {"kd": "s", "armature": "s^2", "dry": "rad, m", "lost": "rad, m"}
-"""What is told in ratio to kp, and the ratio's unit; dry: friction of a joint that slides, under the usual load; lost:
+"""What is told in ratio to kp, and the ratio's unit; dry: friction of a joint that slides, over what it slid; lost:
 dry and half the dead zone, together."""
 ABOUT = (
     "divided by kp, +- half an interval of 95 %: logs of positions tell no more. kp itself rests on the URDF's masses, "
     "where it is not known. kd stands for kd and viscous friction, which such logs cannot tell apart. dry: friction of "
-    "a joint that slides under its usual load, open where no dead zone was seen beside it; lost: both together, dry/kp "
-    "and half the dead zone"
+    "a joint that slides, over what it slid, open where it and a dead zone look alike, as without gravity; lost: both "
+    "together, dry/kp and half the dead zone"
 )
 
 
 def servo_record(model: Any, solution: ServoSolution) -> dict[str, Any]:
     """For config.json: delay [s], errors, and by joint kp, and the ratios to it with intervals of 95 %."""
     unsure = covariance(solution.normal, solution.precision, solution.halved)
-    sure = float(student.ppf(SURE, max(1, len(solution.normal.matrix) - 1)))
-    slid, joints = _dry(model, solution), []
+    sure = _sure(solution)
+    return {
+        "delay": {"value": float(model.delay), "half": sure * float(unsure[-1, -1].sqrt())},
+        "rms": solution.rms.tolist(),
+        "steps": solution.steps,
+        "joints": _joints(model, solution, unsure),
+    }
+
+
+def _sure(solution: ServoSolution) -> float:
+    """How many standard deviations half an interval is."""
+    return float(student.ppf(SURE, max(1, len(solution.normal.matrix) - 1)))
+
+
+def _joints(model: Any, solution: ServoSolution, unsure: torch.Tensor) -> list[dict[str, Any]]:
+    """By joint, with the covariance of all unknowns (k, k)."""
+    sure = _sure(solution)
+    slid, apart, joints = _dry(model, solution), _told_apart(model, solution), []
     for joint, name in enumerate(model.facts.joints):
         about: dict[str, Any] = {"joint": name}
         known = not float(model.servo.trained[joint])
@@ -45,13 +64,10 @@ def servo_record(model: Any, solution: ServoSolution) -> dict[str, Any]:
                 direction[solution.names.index((weight, 0)) * model.n + joint] = slope / value
             half = sure * math.hypot(LAWS, float((direction @ unsure @ direction).clamp(min=0).sqrt()))
             about[what] = {"unit": UNITS.get(what, "rad, m"), **_interval(value, half)}
+        for what in {"dry", "dead_zone"} & about.keys():
+            about[what]["determined"] &= bool(apart[joint])
         joints.append(about)
-    return {
-        "delay": {"value": float(model.delay), "half": sure * float(unsure[-1, -1].sqrt())},
-        "rms": solution.rms.tolist(),
-        "steps": solution.steps,
-        "joints": joints,
-    }
+    return joints
 
 
 def _told(
@@ -89,6 +105,19 @@ def _dry(model: Any, solution: ServoSolution) -> tuple[torch.Tensor, dict[str, t
     return dry.detach(), found
 
 
+def _told_apart(model: Any, solution: ServoSolution) -> torch.Tensor:
+    """Whether windows tell a joint's dead zone from its dry friction and all else, (n,).
+
+    By the variance inflation factor of dead zones: of joints that gravity does not load the slopes of errors by either
+    are the same but for a factor, and what is linear in them says nothing of the one without the other.
+    """
+    matrix = solution.normal.matrix.sum(dim=0)
+    places = solution.names.index((DEAD_ZONE, 0)) * model.n + torch.arange(model.n)
+    inverse = torch.linalg.inv(matrix + torch.diag(solution.precision))
+    inflation: torch.Tensor = (matrix.diagonal() * inverse.diagonal())[places]
+    return inflation < INFLATION
+
+
 def _interval(value: float, half: float) -> dict[str, Any]:
     factor = math.exp(min(half, 50.0))
     return {"value": value, "low": value / factor, "high": value * factor, "determined": factor < OPEN}
@@ -114,6 +143,27 @@ def servo_text(record: Mapping[str, Any]) -> str:
     errors = ", ".join(number(1000 * x) for x in record["rms"])
     dead = f"half dead zones [rad, m]: {', '.join(zones)}\n" if zones else ""
     return f"{late}\nerrors on training windows, RMS by joint: {errors} mrad\n{table}\n{dead}{left}"
+
+
+def foreseen(model: Any, solution: ServoSolution) -> dict[str, list[str]]:
+    """Before a fit, by `ServoRounds.foreseen`: what logs will tell in ratio to kp, and what they leave open."""
+    whole = solution.normal.matrix.sum(dim=0) + torch.diag(solution.precision)
+    record = {"joints": _joints(model, solution, torch.linalg.inv(whole))}
+    left = undetermined(record)
+    every = [f"{_label(what)} of {each['joint']}" for each in record["joints"] for what in UNITS]
+    return {"determined": [x for x in every if x not in left], "open": left}
+
+
+def foreseen_text(model: Any, names: Mapping[str, Sequence[str]]) -> str:
+    """In a sentence."""
+    known = bool((model.servo.trained == 0).any())
+    found, left = (", ".join(names[x]) or "nothing" for x in ("determined", "open"))
+    scale = (
+        "kp is known of one joint at least, which tells masses"
+        if known
+        else "kp and masses are known in ratio alone, unless one kp, mass or load is: kp rests on the URDF's masses"
+    )
+    return f"by the rank of what they show, these logs determine {found}; they leave open {left}; {scale}"
 
 
 def undetermined(record: Mapping[str, Any]) -> list[str]:

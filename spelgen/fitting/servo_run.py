@@ -22,7 +22,7 @@ from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.run_lock import locked
 from spelgen.fitting.run_record import require_same
 from spelgen.fitting.servo_fit import ROUNDS, ServoRounds
-from spelgen.fitting.servo_report import servo_record
+from spelgen.fitting.servo_report import foreseen, foreseen_text, servo_record
 from spelgen.fitting.servo_windows import ServoWindows, servo_windows
 from spelgen.fitting.streaming import LargeLogs
 from spelgen.logs.checks import check
@@ -81,9 +81,15 @@ def fit_commands(
         if resume and folder is not None:
             require_same(folder, record)
             before, urdf = folder.load_checkpoint(), folder.urdf
+            record["foreseen"] = folder.read_config().get("foreseen")
         since = time.monotonic() - (before["seconds"] if before else 0.0)
         rounds = _rounds(model, windows, logs, before, folder)
         checkpoint = before or _checkpoint(rounds, since)
+        if before is None:
+            record["foreseen"] = foreseen(model, rounds.foreseen())
+            text = foreseen_text(model, record["foreseen"])
+            found.append(Diagnostic("info", "identifiability", "logs", None, text))
+            shown.note(found[-1])
         if run is not None and not resume:
             run.start(model.source, urdf, force=force)
             _save(run, checkpoint)
