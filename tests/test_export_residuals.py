@@ -108,6 +108,21 @@ def test_a_function_of_one_joint_stays_with_it():
     ]
 
 
+def test_onnx_of_functions_that_few_joints_have():
+    """Splines of one joint, friction of others, harmonics of some, and few of them."""
+    model = with_parts("scara", "springs", "ripple", "friction")
+    functions = model.dynamics.joint_functions
+    functions.raw_torque_splines[1:] = 0.0
+    functions.raw_friction_splines[:2] = 0.0
+    functions.raw_torque_ripple[0] = 0.0
+    functions.raw_torque_ripple[1, 5:66] = 0.0
+    trained = Trained(model, arm_of("scara"))
+    described = trained.described
+    assert described.residuals.torque.joints == (0,)
+    onnx = called_by_onnx({name: onnx_model(described, name) for name in ENTRIES})
+    check_parity(onnx, trained, list(ENTRIES), 1e-12, memory=described.memory, states=20)
+
+
 @needs_gcc
 def test_splines_at_their_ends_and_beyond(tmp_path):
     """On knots, where the range ends, far outside: by C and CasADi as by torch, and slopes as torch has them."""
