@@ -40,7 +40,7 @@ simulation: friction integration simulated_logs random_inputs servo_motions path
 identification: samples friction base_parameters least_squares method prior identification
 excitation: criterion excitation
 fitting: run_schema address_lock run_folder run_lock
-fitting: gaussian_prior adaptive rollout calibration dataset streaming workers torque_samples torque_jacobian
+fitting: gaussian_prior adaptive rollout calibration dataset streaming workers torque_samples body_steps torque_jacobian
 fitting: optimizers residual_fit torque_fit torque_report
 fitting: torque_networks urdf_regularizer stages compiled process progress validation loop
 fitting: run_record fitted servo_windows servo_start servo_weights servo_problem servo_descent servo_intervals

@@ -8,6 +8,7 @@ import pytest
 import torch
 from characters import TESTS, read_characters, write_arm
 from emitted import import_source
+from lxml import etree
 from motions import smooth_motion
 from scipy.optimize import minimize_scalar
 from typer.testing import CliRunner
@@ -17,6 +18,7 @@ from spelgen.cli.main import app
 from spelgen.emission.loading import load_module
 from spelgen.errors import LogError
 from spelgen.fitting import torque_fit, torque_jacobian
+from spelgen.fitting.body_steps import moved_bodies
 from spelgen.fitting.config import GaussianPrior, Rollout, TorqueFit
 from spelgen.fitting.fit import fit
 from spelgen.fitting.gaussian_prior import SIZES, covariance, kind_of, most_probable
@@ -32,6 +34,7 @@ from spelgen.logs import chunks
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.pipeline import generate
+from spelgen.runtime.rigid_body import pseudo_inertia
 from tests.test_closed_form import FOLLOWED, drawn
 
 ROBOTS = ("two_link", "rpr", "six_dof")
@@ -167,6 +170,42 @@ def test_a_urdf_that_is_wrong_is_given_up_and_that_is_said(emitted):
         f"the URDF's inertias are {how} to within a factor of {np.exp(2 * each.prior.bodies):.2g}"
         for how, each in (("hardly believed, only", wrong), ("believed", right))
     ]
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_bodies_that_are_placeholders_are_left_behind(emitted, robots, tmp_path, seed):
+    """Every link 1 kg and a small ball: 20 s of motion say all that there is to know."""
+    true = emitted["rpr"][0].Model()
+    tree = etree.parse(robots / "rpr.urdf")
+    for inertial in tree.iterfind(".//link/inertial"):
+        for child in list(inertial):
+            inertial.remove(child)
+        etree.SubElement(inertial, "mass", value="1")
+        moments = dict.fromkeys(("ixx", "iyy", "izz"), "0.004") | dict.fromkeys(("ixy", "ixz", "iyz"), "0")
+        etree.SubElement(inertial, "inertia", **moments)
+    tree.write(tmp_path / "rpr.urdf")
+    found = build(tmp_path / "rpr.urdf", "closed-form")
+    fit_torque(found, [recorded(true, 20.0, 0.02, seed)])
+    assert nmse(found, recorded(true, 20.0, 0.0, seed=9)) < 1e-4
+
+
+def test_steps_of_bodies_are_straight_in_their_parameters_and_stay_possible(emitted):
+    """Twice the step adds twice to the parameters; a step that no body could follow ends short of it."""
+    bodies = drawn(emitted["rpr"][0], seed=1, deviation=0.3).dynamics.inertial_parameters
+    raw = bodies.raw.detach().clone()
+    step = torch.randn(raw.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+
+    def parameters(size):
+        bodies.raw.data = moved_bodies(raw, size * step)
+        return bodies().detach()
+
+    small = parameters(0.01) - parameters(0.0)
+    torch.testing.assert_close(parameters(0.02) - parameters(0.0), 2 * small, rtol=1e-9, atol=1e-12)
+    slope = torch.func.jvp(
+        lambda x: torch.func.functional_call(bodies, {"raw": x}, ()), (raw,), (0.01 * step,)
+    )[1]
+    torch.testing.assert_close(small, slope, rtol=1e-9, atol=1e-12)
+    assert (torch.linalg.eigvalsh(pseudo_inertia(parameters(100.0))) > 0).all()
 
 
 def test_a_drive_that_compensates_friction_unseen_is_found_out(emitted):

@@ -35,7 +35,8 @@ DECIMATION = (
     2  # samples taken of so many: filtered at 8 Hz and sampled at 100 Hz they say all that is to be said
 )
 ALIKE = 20.0  # of those: so many in a row, 0.4 s, err alike and count once
-ROUNDS = 8  # of weighing joints by what is left of their torque, and the start by how far it was left
+ROUNDS = 8  # of weighing joints by what is left of their torque, and the start by how far it was left;
+LONGER, ENDED = 4, 0.98  # so many times as many while some joint's noise falls by more than that
 FIRST_ROUNDS = 3  # after which it is seen whether friction explains what is missed
 COMPENSATED = 0.1  # of what is missed: explained by a drive that adds torque with velocity,
 SIGNIFICANT = 4.0  # by so many standard deviations,
@@ -160,7 +161,8 @@ class _Problem:
         start = _Step(self.start, self.jacobian.squares(self.start), float("inf"), DAMPING[1])
         while True:
             self.believe(self.guess)
-            at, noise = self.solve(start, ALIKE**0.5 * FIRST_NOISE * self.range, FIRST_ROUNDS)
+            first = ALIKE**0.5 * FIRST_NOISE * self.range
+            at, noise = self.solve(start, first, FIRST_ROUNDS, most=first)
             if self.adapt is not None or not self.compensate(at.x):
                 return at, noise
             start = replace(start, steps=at.steps)
@@ -178,9 +180,15 @@ class _Problem:
         self.compensated = self.compensated | found
         return bool(found.any())
 
-    def solve(self, at: _Step, noise: torch.Tensor, rounds: int) -> tuple[_Step, torch.Tensor]:
-        """Steps down, and the noise (n,) after them; after each round it is found anew, as the prior is."""
-        for _ in range(rounds):
+    def solve(
+        self, at: _Step, noise: torch.Tensor, rounds: int, most: torch.Tensor | None = None
+    ) -> tuple[_Step, torch.Tensor]:
+        """Steps down, and the noise (n,) after them; after each round it is found anew, as the prior is.
+
+        There are more rounds while much is gained. most: of the noise, where the start may be far off: torques that are
+        not explained yet are no noise.
+        """
+        for number in range(LONGER * rounds):
             at = replace(at, cost=self.cost(at.x, at.squares, noise))
             for _ in range(STEPS):
                 curvature, target = self.normal_equations(at.x, noise)
@@ -190,11 +198,14 @@ class _Problem:
                 gained, at = at.cost - after.cost, after
                 if gained < GAIN * at.cost:
                     break
-            noise = self.noise(at.squares)
+            before, noise = noise, self.noise(at.squares)
+            noise = noise if most is None else torch.minimum(noise, most)
             self.covariance[self.free[:, None] & self.free] = torch.linalg.inv(curvature).flatten()
             if self.adapt != "load":
                 weights, variance = self.jacobian.weights, self.covariance.diagonal()
                 self.believe(most_probable(self.prior, self.guess, weights, at.x - self.start, variance))
+            if number + 1 >= rounds and (noise > ENDED * before).all():
+                break
         return at, noise
 
     def normal_equations(self, x: torch.Tensor, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -215,18 +226,18 @@ class _Problem:
     def step(
         self, at: _Step, curvature: torch.Tensor, target: torch.Tensor, noise: torch.Tensor
     ) -> _Step | None:
-        """A step that lowers the cost; None: there is none."""
+        """A step that lowers the cost, straight in the weights or in the bodies' parameters; None: there is none."""
         damping = at.damping
         while damping < DAMPING[2]:
             damped = curvature + damping * torch.diag(curvature.diagonal())
-            moved = at.x.clone()
             step = torch.linalg.solve(damped, target)
             if step @ (target - curvature @ step / 2) < NO_GAIN * at.cost:
                 return None
-            moved[self.free] += step
-            squares = self.jacobian.squares(moved)
-            lower = self.cost(moved, squares, noise)
-            if lower < at.cost:
-                return _Step(moved, squares, lower, max(damping / 10, DAMPING[0]), at.steps + 1)
+            whole = torch.zeros_like(at.x).masked_scatter(self.free, step)
+            ends = (at.x + whole, self.jacobian.moved(at.x, whole))
+            tried = [(x, self.jacobian.squares(x)) for x in ends]
+            cost, best = min((self.cost(x, squares, noise), k) for k, (x, squares) in enumerate(tried))
+            if cost < at.cost:
+                return _Step(*tried[best], cost, max(damping / 10, DAMPING[0]), at.steps + 1)
             damping *= 10
         return None

@@ -10,6 +10,7 @@ import torch
 from torch.func import functional_call, jacfwd, jvp, vmap
 
 from spelgen.fitting import workers
+from spelgen.fitting.body_steps import moved_bodies
 from spelgen.fitting.config import Adaptation
 from spelgen.fitting.torque_samples import Block, TorqueSamples
 
@@ -166,6 +167,12 @@ class TorqueJacobian:
         else:
             chosen[COMPENSATION] = compensated
         return torch.cat([x.flatten() for x in chosen.values()])
+
+    def moved(self, x: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
+        """The weights (K,) after a step, which goes straight in the bodies' inertial parameters."""
+        named, change = self._named(x), self._named(step)
+        parts = [moved_bodies(y, change[k]) if k == BODIES else y + change[k] for k, y in named.items()]
+        return torch.cat([part.flatten() for part in parts])
 
     def write(self, x: torch.Tensor) -> None:
         """Put the weights into the model."""
