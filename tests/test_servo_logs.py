@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 import spelgen
 from spelgen.cli.main import app
+from spelgen.logs.trajectory import Trajectory
 
 SETTINGS = "input: position\njoints: {shoulder: {kp: 14.0}}\n"
 
@@ -116,3 +117,12 @@ def test_servos_that_give_all_they_can_are_counted(arm):
 def test_sparse_logs_are_told(arm, logs):
     slow = [x[::4] for x in logs]
     assert "sparse" in codes(spelgen.check_logs(slow, arm))
+
+
+@pytest.mark.parametrize("samples", [1, 5, 13, 400])
+def test_any_logs_are_told(arm, samples):
+    t = np.arange(samples) * 0.02
+    ramp = np.stack([0.5 * t, np.full_like(t, 0.1)], axis=1)
+    for u in (ramp, 0 * ramp, 1e8 * ramp):
+        log = Trajectory(t, ramp, np.full_like(ramp, 0.5) * [1, 0], np.zeros((samples, 0)), u=u)
+        assert "Following" in spelgen.check_logs([log], arm).text()

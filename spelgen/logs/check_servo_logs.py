@@ -175,14 +175,15 @@ def _odd_command(
             message = f"positions come {-1000 * DELAYS[place]:.0f} ms before commands: are rows shifted?"
             yield odd("ahead-of-command", message)
     lower, upper = (None, None) if coordinate.continuous else (coordinate.lower, coordinate.upper)
-    for name, ends in (("q", (seen.low["q"], seen.high["q"])), ("u", (seen.low["u"], seen.high["u"]))):
-        if (lower is not None and ends[0] < lower - BEYOND) or (
-            upper is not None and ends[1] > upper + BEYOND
-        ):
-            message = (
-                f"{name} goes from {ends[0]:.4g} to {ends[1]:.4g}, the limits are {lower:g} and {upper:g}"
+    for name in ("q", "u"):
+        if lower is not None and seen.low[name] < lower - BEYOND:
+            yield odd(
+                "beyond-position-limit", f"{name} down to {seen.low[name]:.4g}, the limit is {lower:.4g}"
             )
-            yield odd("beyond-position-limit", message)
+        if upper is not None and seen.high[name] > upper + BEYOND:
+            yield odd(
+                "beyond-position-limit", f"{name} up to {seen.high[name]:.4g}, the limit is {upper:.4g}"
+            )
 
 
 def _sparse(clocks: Sequence[Clock]) -> Iterator[Diagnostic]:

@@ -124,7 +124,8 @@ class Following:
         matrix = columns[:3, :3] - np.outer(columns[:3, 3], columns[3, :3]) / count
         target = products[:3] - columns[:3, 3] * products[3] / count
         square = self._smooth_squares[k, joint] - products[3] ** 2 / count
-        factor = np.linalg.cholesky(matrix + np.diag(1e-9 * matrix.diagonal() + 1e-12))
+        # what a column's mean was taken from rounds
+        factor = np.linalg.cholesky(matrix + np.diag(1e-9 * columns.diagonal()[:3] + 1e-12))
         slopes, _ = nnls(factor.T, np.linalg.solve(factor, target))
         left = square - 2 * target @ slopes + slopes @ matrix @ slopes
         return max(float(left), 1e-12)
