@@ -29,6 +29,8 @@ def local(path: Path | str) -> Path:
     match = ADDRESS.match(str(path))
     if match is None or Path(path).exists():
         return Path(path)
+    if match[1] == "file":  # whose slashes `Path` has taken, too
+        return Path("/" + str(path)[match.end() :])
     address = f"{match[1]}://{str(path)[match.end() :]}".rstrip("/")
     if address not in _copies:
         _copies[address] = _fetched(address)

@@ -5,6 +5,7 @@ import os
 import socket
 import time
 import uuid
+from pathlib import Path
 
 import fsspec
 import pytest
@@ -67,6 +68,7 @@ def test_addresses_that_lead_nowhere(memory, tmp_path):
         local("nowhere://x/y")
     assert local(tmp_path / "a:" / "b") == tmp_path / "a:" / "b"
     assert local("C:/x").name == "x"
+    assert local(f"file://{tmp_path}/run") == tmp_path / "run" == local(Path(f"file://{tmp_path}/run"))
 
 
 # ---- one training at a time
