@@ -172,7 +172,7 @@ def test_a_urdf_that_is_wrong_is_given_up_and_that_is_said(emitted):
     ]
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_bodies_that_are_placeholders_are_left_behind(emitted, robots, tmp_path, seed):
     """Every link 1 kg and a small ball: 20 s of motion say all that there is to know."""
     true = emitted["rpr"][0].Model()

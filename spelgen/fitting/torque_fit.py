@@ -46,6 +46,7 @@ LARGE = 2**15  # samples; of more, FEW of them are fitted first
 FEW, LAST_ROUNDS = 2**14, 2
 TURNS = 3  # of rigid bodies and what stands beside them, where something does
 GAIN = 1e-4  # relative: a step that gains less ends a round
+KEPT = 0.5  # of what a step promises: one that keeps less is tried straight in the bodies' parameters, too
 NO_GAIN = 1e-10  # likewise: a step that promises less is not tried
 FIRST_NOISE = 0.1  # of a joint's torque range
 LEAST_NOISE = 1e-4  # likewise: noise-free samples are fitted to four digits of their torque's range
@@ -98,7 +99,7 @@ def fit_torque(
     few = samples.thinned(FEW) if large else samples
     prior = prior or (PRIORS[adapt] if adapt else GaussianPrior())
     problem = _Problem(TorqueJacobian(model, few), prior, adapt)
-    at, noise = problem.solve(*problem.near(), ROUNDS - FIRST_ROUNDS)
+    at, noise = problem.settled()
     residuals: list[Residual] = []
     if adapt is None and hasattr(model.dynamics, "joint_functions"):
         alike = max(1.0, ALIKE * few.count / samples.count)
@@ -154,17 +155,40 @@ class _Problem:
         """Which weights (K,) move."""
         return self.jacobian.free(self.adapt, self.compensated)
 
-    def near(self) -> tuple[_Step, torch.Tensor]:
+    def settled(self) -> tuple[_Step, torch.Tensor]:
+        """As `solve`, all rounds from the start; the more probable of two ways where the first leaves much.
+
+        Bodies that are far off leave much of the torque, which is taken for noise, and noise asks for no better bodies:
+        on the second way there is little noise until the fit is near.
+        """
+        little = ALIKE**0.5 * FIRST_NOISE * self.range
+        ways = []
+        for most in (None, little):
+            at, noise = self.solve(*self.near(little, most), ROUNDS - FIRST_ROUNDS)
+            ways.append((self.evidence(at.x, noise), at, noise, self.prior, self.covariance.clone()))
+            if (noise <= little).all():
+                break
+        _, at, noise, prior, self.covariance = max(ways, key=lambda way: way[0])
+        self.believe(prior)
+        return at, noise
+
+    def evidence(self, x: torch.Tensor, noise: torch.Tensor) -> float:
+        """The logarithm of the samples' marginal likelihood by Laplace's approximation, but for a constant."""
+        free, away = self.free, x - self.start
+        prior, posterior = self.precision[free][:, free], self.covariance[free][:, free]
+        missed = self.count / ALIKE * noise.log().sum() + away @ self.precision @ away / 2
+        return float((prior.logdet() + posterior.logdet()) / 2 - missed)
+
+    def near(self, noise: torch.Tensor, most: torch.Tensor | None) -> tuple[_Step, torch.Tensor]:
         """As `solve`, some rounds from the start; from there anew while further joints want a compensation, for what
         a fit made of their torque without one leads astray.
         """
         start = _Step(self.start, self.jacobian.squares(self.start), float("inf"), DAMPING[1])
         while True:
             self.believe(self.guess)
-            first = ALIKE**0.5 * FIRST_NOISE * self.range
-            at, noise = self.solve(start, first, FIRST_ROUNDS, most=first)
+            at, found = self.solve(start, noise, FIRST_ROUNDS, most)
             if self.adapt is not None or not self.compensate(at.x):
-                return at, noise
+                return at, found
             start = replace(start, steps=at.steps)
 
     def compensate(self, x: torch.Tensor) -> bool:
@@ -223,6 +247,10 @@ class _Problem:
         away = x - self.start
         return float(((squares / noise.square()).sum() + away @ self.precision @ away) / 2)
 
+    def after(self, x: torch.Tensor, noise: torch.Tensor, damping: float, steps: int) -> _Step:
+        squares = self.jacobian.squares(x)
+        return _Step(x, squares, self.cost(x, squares, noise), max(damping / 10, DAMPING[0]), steps)
+
     def step(
         self, at: _Step, curvature: torch.Tensor, target: torch.Tensor, noise: torch.Tensor
     ) -> _Step | None:
@@ -231,13 +259,15 @@ class _Problem:
         while damping < DAMPING[2]:
             damped = curvature + damping * torch.diag(curvature.diagonal())
             step = torch.linalg.solve(damped, target)
-            if step @ (target - curvature @ step / 2) < NO_GAIN * at.cost:
+            promised = float(step @ (target - curvature @ step / 2))
+            if promised < NO_GAIN * at.cost:
                 return None
             whole = torch.zeros_like(at.x).masked_scatter(self.free, step)
-            ends = (at.x + whole, self.jacobian.moved(at.x, whole))
-            tried = [(x, self.jacobian.squares(x)) for x in ends]
-            cost, best = min((self.cost(x, squares, noise), k) for k, (x, squares) in enumerate(tried))
-            if cost < at.cost:
-                return _Step(*tried[best], cost, max(damping / 10, DAMPING[0]), at.steps + 1)
+            after = self.after(at.x + whole, noise, damping, at.steps + 1)
+            if at.cost - after.cost < KEPT * promised:
+                straight = self.after(self.jacobian.moved(at.x, whole), noise, damping, at.steps + 1)
+                after = min(after, straight, key=lambda each: each.cost)
+            if after.cost < at.cost:
+                return after
             damping *= 10
         return None
