@@ -84,7 +84,7 @@ def row(
         np.median([mean(fitted([recorded(true, x, seed, NOISE)]), tests) for seed in range(DRAWS)])
         for x in SECONDS
     ]
-    print(f"{name:34}" + "".join(f"{x:12.5f}" for x in errors), flush=True)
+    print(f"{name:34}" + "".join(f"{x:12.1e}" for x in errors), flush=True)
 
 
 def truth(robot: Path) -> Any:

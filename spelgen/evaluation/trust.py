@@ -50,7 +50,7 @@ class Trust:
                 continue
             if error > CLEAR:
                 break
-            found = round(float(time), 3)
+            found = float(f"{time:.2g}")
         return found
 
     def reaches(self, seconds: float) -> bool:
