@@ -18,7 +18,7 @@ STEP = 3.4e-3  # s, at most: longer ones make armatures a few percent wrong
 IMPLICIT = 0.55  # theta: 0.5 adds no damping of its own, 1 damps what is too fast for a step
 
 
-class Drives(NamedTuple):
+class ServoDrives(NamedTuple):
     """What servos and friction do at joints: their constants, (..., n), and the laws that these belong to."""
 
     servo: Any
@@ -48,15 +48,15 @@ class Load(NamedTuple):
     coupled: bool
 
 
-def drives_of(model: Any) -> Drives:
+def servo_drives(model: Any) -> ServoDrives:
     """Of a model with servos."""
     dynamics = model.dynamics
-    return Drives(
+    return ServoDrives(
         model.servo.prepare(), dynamics.friction, dynamics.friction.prepare(), dynamics.torque_offset()
     )
 
 
-def balanced(drives: Drives, q: Tensor, qd: Tensor, u: Tensor, load: Load) -> ServoState:
+def balanced(drives: ServoDrives, q: Tensor, qd: Tensor, u: Tensor, load: Load) -> ServoState:
     """The state whose friction makes up, as far as it can, for what the servos' torque is not: at rest, or steady."""
     servo, laws = drives.servo, drives.laws
     torque = (servo.kp * beyond(u - q, servo.dead_zone) - servo.kd * qd).clamp(
@@ -67,7 +67,7 @@ def balanced(drives: Drives, q: Tensor, qd: Tensor, u: Tensor, load: Load) -> Se
     return ServoState(q, qd, direction.unsqueeze(-1) * laws.bristles.reach)
 
 
-def advanced(drives: Drives, state: ServoState, u: Tensor, load: Load, h: Tensor) -> ServoState:
+def advanced(drives: ServoDrives, state: ServoState, u: Tensor, load: Load, h: Tensor) -> ServoState:
     """The state one step ``h`` (..., 1) [s] later, under the delayed command u (..., n)."""
     (q, qd, z), servo, laws = state, drives.servo, drives.laws
     reach, fractions = laws.bristles.reach, drives.friction.bristle_fractions
@@ -99,7 +99,7 @@ def replayed(model: Any, q: Tensor, qd: Tensor, commands: Tensor, dt: Tensor) ->
     S: steps in an interval, over which what the bodies weigh and how inert they are is taken once.
     """
     with torch.no_grad():
-        drives, dynamics = drives_of(model), model.dynamics
+        drives, dynamics = servo_drives(model), model.dynamics
         prepared, found = dynamics.prepare(), []
         state, before = None, None
         for now, held in zip(commands.unbind(1), dt.unbind(1), strict=True):

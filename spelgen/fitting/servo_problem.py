@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch.func import functional_call
 
-from spelgen.dynamics.servo_rollout import Drives, Load, advanced, balanced, drives_of
+from spelgen.dynamics.servo_rollout import Load, ServoDrives, advanced, balanced, servo_drives
 from spelgen.fitting.servo_weights import BODIES, Point, ServoWeights, body_directions, inertial_slopes
 from spelgen.fitting.servo_windows import BodyLoad, Path, ServoWindows, body_load
 from spelgen.fitting.torque_jacobian import Asked
@@ -88,7 +88,7 @@ class ServoProblem:
             return self._integrated(drives, armature, added, commands)
 
     def _integrated(
-        self, drives: Drives, armature: torch.Tensor, added: torch.Tensor, commands: torch.Tensor
+        self, drives: ServoDrives, armature: torch.Tensor, added: torch.Tensor, commands: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         windows, load = self.windows, self.load
         h = windows.dt.unsqueeze(-1) / windows.steps
@@ -107,5 +107,5 @@ class ServoProblem:
         return torch.stack([x for x, _ in found], dim=2), torch.stack([x for _, x in found], dim=2)
 
 
-def _drives(model: Any) -> tuple[Drives, torch.Tensor]:
-    return drives_of(model), model.dynamics.armature()
+def _drives(model: Any) -> tuple[ServoDrives, torch.Tensor]:
+    return servo_drives(model), model.dynamics.armature()
