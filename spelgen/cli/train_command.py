@@ -211,10 +211,10 @@ def _outcome(found: Fit) -> tuple[str, str]:
         return f"{found.status}: {config.objective} fitted in {found.seconds:.0f} s", loss
     why = {
         "stopped early": f": no better validation loss since epoch {found.best_epoch}",
-        "out of time": f": {config.max_minutes or 0:g} minutes are over",
+        "out of time": f": --max-minutes {config.max_minutes or 0:g} is over",
         "finished": ": all epochs are run" if found.epochs >= config.epochs else ": no way further down",
     }.get(found.status or "", "")
-    ended = f"{found.status} after {found.epochs} epochs, {found.steps} steps, {found.seconds:.0f} s"
+    ended = f"{found.status} after {found.epochs} {'epoch' if found.epochs == 1 else 'epochs'}, {found.steps} steps, {found.seconds:.0f} s"
     return ended + why, f"best {loss}, at epoch {found.best_epoch}"
 
 

@@ -70,9 +70,9 @@ class TrainingProgress:
             self._bar.reset(self._task, description="training", total=self._epochs)
         state = f"validation {record['validation']:.3g}, best {record['best']:.3g}"
         self._bar.update(self._task, completed=record["epoch"], state=state)
-        rate = record["step"] / record["seconds"]
+        rate, epochs = record["step"] / record["seconds"], "epoch" if record["epoch"] == 1 else "epochs"
         self._said = (
-            f"training: {record['epoch']} epochs, loss {record['loss']:.3g}, {state}, {rate:.1f} steps/s"
+            f"training: {record['epoch']} {epochs}, loss {record['loss']:.3g}, {state}, {rate:.1f} steps/s"
         )
 
     def _end_stage(self) -> None:
