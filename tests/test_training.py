@@ -513,7 +513,7 @@ def test_progress_without_a_terminal_is_a_line_for_each_stage(show, capsys):
         progress.epoch({"epoch": 1, "step": 20, "seconds": 1.0, "loss": 0.5, "validation": 0.4, "best": 0.4})
     printed = capsys.readouterr()
     told = (
-        "momentum: 20 steps, loss 0.7\ntraining: 1 epochs, loss 0.5, validation 0.4, best 0.4, 20.0 steps/s\n"
+        "momentum: 20 steps, loss 0.7\ntraining: 1 epoch, loss 0.5, validation 0.4, best 0.4, 20.0 steps/s\n"
     )
     assert (printed.out, printed.err) == ("", told if show else "")
 

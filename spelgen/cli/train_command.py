@@ -214,7 +214,8 @@ def _outcome(found: Fit) -> tuple[str, str]:
         "out of time": f": --max-minutes {config.max_minutes or 0:g} is over",
         "finished": ": all epochs are run" if found.epochs >= config.epochs else ": no way further down",
     }.get(found.status or "", "")
-    ended = f"{found.status} after {found.epochs} {'epoch' if found.epochs == 1 else 'epochs'}, {found.steps} steps, {found.seconds:.0f} s"
+    epochs = f"{found.epochs} epoch" if found.epochs == 1 else f"{found.epochs} epochs"
+    ended = f"{found.status} after {epochs}, {found.steps} steps, {found.seconds:.0f} s"
     return ended + why, f"best {loss}, at epoch {found.best_epoch}"
 
 
