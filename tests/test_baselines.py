@@ -146,7 +146,7 @@ def test_least_squares_is_kept_with_a_run_and_stands_in_its_evaluation(robots, t
     arm = load_arm(robots / "rpr.urdf")
     bodies = RegressorDynamics(arm.arm, urdf_parameters(arm.arm), np.full(3, 0.1), lambda qd, _: 0.5 * qd)
     names = [coordinate.name for coordinate in arm.arm.coordinates]
-    t = np.arange(500) / 100
+    t = np.arange(300) / 100
     for role, seed in (("train", 0), ("test", 1)):
         phases = np.random.default_rng(seed).uniform(0, 6, (3, 3, 1))
         waves = [(k + 1) * t + phases[k] for k in range(3)]

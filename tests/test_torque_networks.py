@@ -34,7 +34,7 @@ def test_another_arms_torques_are_met(tmp_path):
         true.dynamics.mass.armature.raw += 0.5
         true.dynamics.friction.raw_viscous += 1.0
     start = missed(model, recorded(true, 7))
-    steps = fit_networks(model, [recorded(true, 5), recorded(true, 6)], 1e-6)
+    steps = fit_networks(model, [recorded(true, 5), recorded(true, 6)], 1e-6, evaluations=1500)
     assert steps % 20 == 0
     assert start > 1e-3
     assert missed(model, recorded(true, 7)) < 1e-6
