@@ -165,10 +165,12 @@ class _Problem:
         ways = []
         for most in (None, little):
             at, noise = self.solve(*self.near(little, most), ROUNDS - FIRST_ROUNDS)
-            ways.append((self.evidence(at.x, noise), at, noise, self.prior, self.covariance.clone()))
+            ways.append(
+                (self.evidence(at.x, noise), at, noise, self.prior, self.covariance.clone(), self.compensated)
+            )
             if (noise <= little).all():
                 break
-        _, at, noise, prior, self.covariance = max(ways, key=lambda way: way[0])
+        _, at, noise, prior, self.covariance, self.compensated = max(ways, key=lambda way: way[0])
         self.believe(prior)
         return at, noise
 
@@ -248,6 +250,7 @@ class _Problem:
         return float(((squares / noise.square()).sum() + away @ self.precision @ away) / 2)
 
     def after(self, x: torch.Tensor, noise: torch.Tensor, damping: float, steps: int) -> _Step:
+        """Where a step of this damping led to, and less damping for the next one."""
         squares = self.jacobian.squares(x)
         return _Step(x, squares, self.cost(x, squares, noise), max(damping / 10, DAMPING[0]), steps)
 
