@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from spelgen.dynamics.bristles import BristleReach
-from spelgen.errors import Diagnostic, LogError
+from spelgen.errors import Diagnostic, LogError, collect
 from spelgen.fitting.calibration import Source, calibration_windows
 from spelgen.fitting.dataset import LARGEST_VALIDATION, TrainingData, known_reach
 from spelgen.fitting.rollout import loss_scales
@@ -147,7 +147,8 @@ def _read_once(logs: LargeLogs) -> KnownLogs:
         gaps += gap_diagnostics(trajectory)
         for array in (trajectory.t, trajectory.q, trajectory.qd, trajectory.tau):
             numbers.update(np.ascontiguousarray(array).data)
-    notes = [*gaps[:1], *summarised(found, logs.joints, len(chunks))]
+    notes, errors = summarised(found, logs.joints, len(chunks))
+    collect(errors)
     # the last samples of a recording may be a chunk of their own, too short to tell a rate
     told = [each for each, length in zip(rates, lengths, strict=True) if length > max(lengths) / 10]
-    return KnownLogs(chunks, told, notes, numbers.hexdigest(), pieces)
+    return KnownLogs(chunks, told, [*gaps[:1], *notes], numbers.hexdigest(), pieces)

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from spelgen.arm.arm import Coordinate
-from spelgen.errors import Diagnostic, LogError, SpelgenError, SpelgenErrors, collect
+from spelgen.errors import Diagnostic, LogError, collect
 from spelgen.identification.drive_hints import Coupling, coupled_inputs, coupling, torque_delay
 from spelgen.identification.drive_samples import DriveLog
 from spelgen.logs.check_servo_logs import check_servo_logs
 from spelgen.logs.checks import Finding, findings, gap_diagnostics, summarised
 from spelgen.logs.gravity import GravityFit, StateSamples, fit_gravity, state_samples
 from spelgen.logs.report import SEEN, JointReport, LogReport
-from spelgen.logs.statistics import Statistics, common_step, statistics
+from spelgen.logs.statistics import Statistics, common_step, range_fraction, statistics
 from spelgen.logs.trajectory import QUANTITIES, Trajectory, require_joints, require_torques
 
 if TYPE_CHECKING:
@@ -63,13 +63,8 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping |
             examples.append(trajectory)
     if not measured:
         raise LogError("no trajectory", expected="at least one")
-    errors: tuple[SpelgenError, ...] = ()
-    try:
-        notes += summarised(odd, joints, len(measured))
-    except SpelgenErrors as several:
-        errors = several.errors
-    except SpelgenError as error:
-        errors = (error,)
+    about, errors = summarised(odd, joints, len(measured))
+    notes += about
     gravity = fit_gravity(arm.arm, samples)
     reports = [_joint(k, *each, measured) for k, each in enumerate(zip(coordinates, gravity, strict=True))]
     mapping = mapping or arm.settings.logs
@@ -77,7 +72,7 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping |
         largest = max(abs(report.low["tau"]), abs(report.high["tau"]))
         declared = mapping.unit("tau", coordinate.name) is not None
         wrong = torque_errors(coordinate, report.gravity, largest, declared=declared)
-        errors += tuple(wrong)
+        errors += wrong
         notes += [*_limits(coordinate, report), *([] if wrong else _gravity(report))]
     if not errors:
         notes += _drives(arm, drives, mapping)
@@ -87,7 +82,7 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping |
         trajectories=tuple(each.clock for each in measured),
         joints=tuple(reports),
         findings=tuple(notes),
-        errors=errors,
+        errors=tuple(errors),
         examples=tuple(examples),
     )
 
@@ -145,7 +140,7 @@ def _joint(
         kind=coordinate.kind,
         low=low,
         high=high,
-        range_fraction=_range_fraction(coordinate, low["q"], high["q"]),
+        range_fraction=range_fraction(coordinate, low["q"], high["q"]),
         noise={name: float(np.median([each[name][index] for each in dense])) for name in QUANTITIES}
         if dense
         else None,
@@ -154,13 +149,6 @@ def _joint(
         velocity_correlation=agreement.correlation(index),
         gravity=gravity,
     )
-
-
-def _range_fraction(coordinate: Coordinate, low: float, high: float) -> float | None:
-    if coordinate.continuous or coordinate.lower is None or coordinate.upper is None:
-        return None
-    width = coordinate.upper - coordinate.lower
-    return (high - low) / width if width > 0 else None
 
 
 def _limits(coordinate: Coordinate, joint: JointReport) -> list[Diagnostic]:

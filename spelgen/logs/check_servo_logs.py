@@ -8,11 +8,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from spelgen.arm.arm import Coordinate
-from spelgen.errors import Diagnostic, LogError, SpelgenError, SpelgenErrors
+from spelgen.errors import Diagnostic, LogError
 from spelgen.logs.checks import DEGREES, Finding, findings, gap_diagnostics, summarised
 from spelgen.logs.following import DELAYS, NOW, Following
 from spelgen.logs.servo_report import ServoJointReport, ServoLogReport
-from spelgen.logs.statistics import DENSE, Clock, clock_of, common_step, noise_level, quantisation_step
+from spelgen.logs.statistics import (
+    DENSE,
+    Clock,
+    clock_of,
+    common_step,
+    noise_level,
+    quantisation_step,
+    range_fraction,
+)
 from spelgen.logs.trajectory import Trajectory, require_commands, require_joints
 
 if TYPE_CHECKING:
@@ -47,13 +55,8 @@ def check_servo_logs(logs: Iterable[Trajectory], arm: LoadedArm) -> ServoLogRepo
             examples.append(trajectory)
     if not clocks:
         raise LogError("no trajectory", expected="at least one")
-    errors: list[SpelgenError] = []
-    try:
-        notes += summarised(odd, joints, len(clocks))
-    except SpelgenErrors as several:
-        errors += several.errors
-    except SpelgenError as error:
-        errors.append(error)
+    about, errors = summarised(odd, joints, len(clocks))
+    notes += about
     for k, coordinate in enumerate(coordinates):
         wrong = _wrong_command(k, joints, following)
         errors += [wrong] if wrong else []
@@ -104,7 +107,7 @@ def _joint(arm: LoadedArm, k: int, seen: _Signals, following: Following) -> Serv
         kind=coordinate.kind,
         q=(seen.low["q"], seen.high["q"]),
         u=(seen.low["u"], seen.high["u"]),
-        range_fraction=_range_fraction(coordinate, seen),
+        range_fraction=range_fraction(coordinate, seen.low["q"], seen.high["q"]),
         noise=float(np.median(seen.noise)) if seen.noise else None,
         steps={name: common_step(x) for name, x in seen.steps.items()},
         behind=float(DELAYS[place]) if moves else None,
@@ -118,13 +121,6 @@ def _reaches(arm: LoadedArm) -> np.ndarray:
     """Distances from the command (n,) at which servos give all they can; infinite where that is not known."""
     known = [(x.effort, arm.settings.joint(x.name).kp) for x in arm.arm.coordinates]
     return np.array([effort / kp if effort and kp else np.inf for effort, kp in known])
-
-
-def _range_fraction(coordinate: Coordinate, seen: _Signals) -> float | None:
-    if coordinate.continuous or coordinate.lower is None or coordinate.upper is None:
-        return None
-    width = coordinate.upper - coordinate.lower
-    return (seen.high["q"] - seen.low["q"]) / width if width > 0 else None
 
 
 def _wrong_command(k: int, joints: Sequence[str], following: Following) -> LogError | None:

@@ -84,7 +84,9 @@ def check(
         gaps += gap_diagnostics(trajectory)
         found += findings(trajectory, joints, joint_types)
         count += 1
-    return [*gaps, *summarised(found, joints, count)]
+    notes, errors = summarised(found, joints, count)
+    collect(errors)
+    return [*gaps, *notes]
 
 
 def gap_diagnostics(trajectory: Trajectory) -> list[Diagnostic]:
@@ -97,8 +99,10 @@ def gap_diagnostics(trajectory: Trajectory) -> list[Diagnostic]:
     return [Diagnostic("info", "gap", f"trajectory {trajectory.name}", None, message)]
 
 
-def summarised(found: Sequence[Finding], joints: Sequence[str], trajectories: int) -> list[Diagnostic]:
-    """Findings about that many trajectories, a sentence for each joint and kind. Raises as `check` does."""
+def summarised(
+    found: Sequence[Finding], joints: Sequence[str], trajectories: int
+) -> tuple[list[Diagnostic], list[SpelgenError]]:
+    """Findings about that many trajectories, a sentence for each joint and kind: notes, and what `check` raises."""
     by_kind: dict[tuple[str, Code], list[Finding]] = {(joint, code): [] for joint in joints for code in CODES}
     for each in found:
         by_kind[each.joint, each.code].append(each)
@@ -116,8 +120,7 @@ def summarised(found: Sequence[Finding], joints: Sequence[str], trajectories: in
         else:
             severity: Literal["info", "warning"] = "info" if code == "joint-at-rest" else "warning"
             notes.append(Diagnostic(severity, code, where, None, same[0].what + others))
-    collect(errors)
-    return notes
+    return notes, errors
 
 
 def findings(

@@ -6,10 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import nnls
-from scipy.signal import savgol_filter
 
 from spelgen.logs.commands import delayed_commands
-from spelgen.logs.smoothing import SMOOTHING
+from spelgen.logs.smoothing import derivative
 from spelgen.logs.trajectory import Trajectory, require_commands, split_at_gaps
 
 DELAYS = np.arange(-10, 41) / 100  # s that commands may come before positions
@@ -57,9 +56,10 @@ class Following:
         commands, q = require_commands(piece)[:-1], _between(piece.q)
         velocity = np.gradient(piece.q, piece.t, axis=0)
         # one filter over all of an equation changes nothing of what it says
-        smooth = _smooth(piece.q, piece.sample_rate)
+        rate = piece.sample_rate
+        smooth = derivative(piece.q, rate, 0)
         qd = np.gradient(smooth, piece.t, axis=0)
-        slopes = (qd, np.gradient(qd, piece.t, axis=0), _smooth(np.tanh(velocity / SLOW), piece.sample_rate))
+        slopes = (qd, np.gradient(qd, piece.t, axis=0), derivative(np.tanh(velocity / SLOW), rate, 0))
         columns = np.stack([*(_between(x) for x in slopes), np.ones_like(q)], axis=-1)  # (T, n, 4)
         self._columns += np.einsum("tni,tnj->nij", columns, columns)
         self.count += len(q)
@@ -70,7 +70,7 @@ class Following:
             self._uu[k] += np.square(u).sum(axis=0)
             self._uq[k] += u.T @ q
             self._squares[k] += np.square(u - q).sum(axis=0)
-            apart = _smooth(u - q, piece.sample_rate)
+            apart = derivative(u - q, rate, 0)
             self._smooth_squares[k] += np.square(apart).sum(axis=0)
             self._products[k] += np.einsum("tn,tni->ni", apart, columns)
         self.far += (np.abs(commands - q) > self._reaches).sum(axis=0)
@@ -135,9 +135,3 @@ def _between(x: np.ndarray) -> np.ndarray:
     """In the middle between samples, where delayed commands are."""
     middle: np.ndarray = (x[1:] + x[:-1]) / 2
     return middle
-
-
-def _smooth(x: np.ndarray, rate: float) -> np.ndarray:
-    width = min(max(5, 2 * round(SMOOTHING * rate / 2) + 1), len(x) - 1 + len(x) % 2)
-    found: np.ndarray = savgol_filter(x, width, 3, axis=0)
-    return found

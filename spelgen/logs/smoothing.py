@@ -17,7 +17,12 @@ def velocities(trajectory: Trajectory) -> np.ndarray:
 
 def smoothed(q: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndarray]:
     """First and second derivatives of (..., T, n), by cubic polynomials over `SMOOTHING` (Savitzky and Golay, 1964)."""
+    return derivative(q, rate, 1), derivative(q, rate, 2)
+
+
+def derivative(q: np.ndarray, rate: float, order: int) -> np.ndarray:
+    """That of (..., T, n) of this order, 0 for the smoothed values themselves; see `smoothed`."""
     samples = q.shape[-2]
     width = min(max(5, 2 * round(SMOOTHING * rate / 2) + 1), samples - 1 + samples % 2)
-    first, second = (savgol_filter(q, width, 3, deriv=order, delta=1 / rate, axis=-2) for order in (1, 2))
-    return first, second
+    found: np.ndarray = savgol_filter(q, width, 3, deriv=order, delta=1 / rate, axis=-2)
+    return found
