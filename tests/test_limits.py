@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-SECONDS, MEGABYTES = 20, 1000
+SECONDS, MEGABYTES = 10, 1000
 
 # The command, then its own largest memory: that of a child seen from here would hold ours too.
 PROGRAM = """
@@ -181,7 +181,7 @@ def run_in_bounds(*arguments: str, folder: Path) -> tuple[str, list[str]]:
         env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
         capture_output=True,
         text=True,
-        timeout=6 * SECONDS,  # by the clock, on a machine that may be busy
+        timeout=12 * SECONDS,  # by the clock, on a machine that may be busy
         check=False,
     )
     after = resource.getrusage(resource.RUSAGE_CHILDREN)

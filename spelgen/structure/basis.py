@@ -104,15 +104,16 @@ def _constants(
 
 def _readings(spans: Spans) -> Iterator[_Reading]:
     """Independent read-outs that together fix every change of M."""
-    chosen = field.Independent(len(spans.varying))
+    chosen, tried = field.Independent(len(spans.varying)), set[int]()
     for joints in _joint_sets(spans):
-        kernel = field.null_space(spans.outside(joints))
+        outside = field.row_basis(spans.outside(joints))
+        kernel = field.null_space(outside)
         missing = field.rank(np.concatenate([chosen.rows, kernel])) - len(chosen.rows) if len(kernel) else 0
-        candidates = _candidates(spans, joints)
+        candidates = _candidates(spans, joints, outside, tried)
         while missing:
             weights, values = next(candidates)
             support = np.flatnonzero(weights)
-            if chosen.add(field.product(spans.varying[:, support], weights[support, None])[:, 0]):
+            if chosen.add(field.combined(spans.varying[:, support], weights[support])):
                 missing -= 1
                 yield _Reading(tuple(sorted(joints)), weights, values)
 
@@ -129,21 +130,26 @@ def _joint_sets(spans: Spans) -> Iterator[frozenset[int]]:
         yield from (frozenset((first, *tail)) for tail in tails)
 
 
-def _candidates(spans: Spans, joints: frozenset[int]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Read-outs that depend on ``joints`` only: single entries of M, then the sparsest sums of entries."""
+def _candidates(
+    spans: Spans, joints: frozenset[int], outside: np.ndarray, tried: set[int]
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Read-outs that depend on ``joints`` only: single entries of M, then the sparsest sums of entries.
+
+    ``outside`` is the basis of the changes made by all other joints, in the basis of U. Entries that were ``tried``
+    for fewer joints are chosen or depend on those that are: they are left out, and those of now are put in.
+    """
     for index in reversed(range(len(spans.keys))):
-        if spans.entry_joints[index] and spans.entry_joints[index] <= joints:
+        if index not in tried and spans.entry_joints[index] and spans.entry_joints[index] <= joints:
+            tried.add(index)
             yield _single(spans, index)
-    outside = frozenset(range(spans.n)) - joints
-    # what depends on much is eliminated first, so that the sums keep to simple entries
-    order = sorted(range(len(spans.keys)), key=lambda index: (-len(spans.entry_joints[index]), index))
-    rows = field.row_basis(np.concatenate([spans.change_bases[k] for k in sorted(outside)])[:, order])
+    order = spans.order
+    rows = spans.changes_of(outside)[:, order]  # an echelon form, as those of both are
     bound = [order[pivot] for pivot in field.pivots(rows)]
     reduced = field.null_space(rows)
     kernel = np.zeros_like(reduced)
     kernel[:, order] = reduced
     free = [index for index in range(len(spans.keys)) if index not in set(bound)]
-    samples = spans.float_changes(outside)
+    samples = spans.float_changes(frozenset(range(spans.n)) - joints)
     coefficients = _solved(samples[:, bound], samples[:, free])
     for row in sorted(kernel, key=np.count_nonzero):
         (own,) = {int(index) for index in np.flatnonzero(row)} - set(bound)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from fractions import Fraction
 
 import numpy as np
-from flint import nmod_mat
+from flint import fmpz_mat, nmod_mat
 
 PRIME = 2**61 - 1
 _P = np.uint64(PRIME)
@@ -86,7 +86,7 @@ def row_basis(rows: np.ndarray) -> np.ndarray:
     if not rows.size:
         return rows[:0]
     reduced, rank = _matrix(rows).rref()
-    return _array(reduced)[:rank]
+    return _array(reduced, rank)
 
 
 def rank(rows: np.ndarray) -> int:
@@ -99,10 +99,11 @@ def pivots(basis: np.ndarray) -> list[int]:
     return [int(np.flatnonzero(row)[0]) for row in basis]
 
 
-def null_space(rows: np.ndarray) -> np.ndarray:
-    """Rows that span {x : rows x = 0}; each is 1 at one free column and elsewhere nonzero at pivots only."""
-    width = rows.shape[1]
-    basis = row_basis(rows)
+def null_space(basis: np.ndarray) -> np.ndarray:
+    """Rows that span {x : basis x = 0} of a ``row_basis``; each is 1 at one free column and elsewhere nonzero at
+    pivots only.
+    """
+    width = basis.shape[1]
     bound = pivots(basis)
     free = [column for column in range(width) if column not in set(bound)]
     kernel = np.zeros((len(free), width), dtype=np.uint64)
@@ -119,9 +120,14 @@ def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return _array(_matrix(a) * _matrix(b))
 
 
+def combined(columns: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """``columns`` (m, k) times ``weights`` (k,) in the field, for m and k that are small: faster than ``product``."""
+    return _summed(_product(columns, weights))
+
+
 class Independent:
-    """Independent vectors of length ``width``, gathered one by one; ``rows`` span them, reduced at their
-    pivots.
+    """Independent vectors of length ``width``, gathered one by one; ``rows`` span them, each 1 at a pivot of its own
+    where all others are 0.
     """
 
     def __init__(self, width: int):
@@ -130,16 +136,15 @@ class Independent:
 
     def add(self, vector: np.ndarray) -> bool:
         """Take ``vector`` in, unless it depends on those already there; whether it was."""
-        rest = vector
-        for row, pivot in zip(self.rows, self._pivots, strict=True):
-            if rest[pivot]:
-                rest = difference(rest, _product(row, rest[pivot]))
+        rest = difference(vector, combined(self.rows.T, vector[self._pivots]))
         support = np.flatnonzero(rest)
         if not len(support):
             return False
-        scale = np.uint64(pow(int(rest[support[0]]), -1, PRIME))
-        self.rows = np.concatenate([self.rows, _product(rest, scale)[None]])
-        self._pivots.append(int(support[0]))
+        pivot = int(support[0])
+        row = _product(rest, np.uint64(pow(int(rest[pivot]), -1, PRIME)))
+        others = difference(self.rows, _product(self.rows[:, pivot, None], row))
+        self.rows = np.concatenate([others, row[None]])
+        self._pivots.append(pivot)
         return True
 
 
@@ -149,11 +154,15 @@ def inverse(square: np.ndarray) -> np.ndarray:
 
 
 def _matrix(rows: np.ndarray) -> nmod_mat:
-    return nmod_mat(rows.shape[0], rows.shape[1], rows.ravel().tolist(), PRIME)
+    # faster than to make a residue of every number by itself
+    return nmod_mat(fmpz_mat(rows.shape[0], rows.shape[1], rows.ravel().tolist()), PRIME)
 
 
-def _array(matrix: nmod_mat) -> np.ndarray:
-    return np.array(list(map(int, matrix.entries())), dtype=np.uint64).reshape(matrix.nrows(), matrix.ncols())
+def _array(matrix: nmod_mat, rows: int | None = None) -> np.ndarray:
+    """The first ``rows`` of ``matrix``, all of them by default."""
+    height, width = matrix.nrows() if rows is None else rows, matrix.ncols()
+    entries = map(int, matrix.entries()[: height * width])
+    return np.fromiter(entries, dtype=np.uint64, count=height * width).reshape(height, width)
 
 
 def _values(other: Residues | int) -> np.ndarray | np.uint64:
@@ -163,6 +172,13 @@ def _values(other: Residues | int) -> np.ndarray | np.uint64:
 def _folded(values: np.ndarray) -> np.ndarray:
     """Numbers below 2^62 brought below the prime."""
     return np.where(values >= _P, values - _P, values)
+
+
+def _summed(values: np.ndarray) -> np.ndarray:
+    """Sums over the last axis modulo 2^61 - 1, of fewer than 2^30 numbers."""
+    low, high = (values & _LOW_31).sum(axis=-1), (values >> _BITS_31).sum(axis=-1)
+    total = (high >> _BITS_30) + ((high & _LOW_30) << _BITS_31) + low
+    return _folded((total & _P) + (total >> _BITS_61))
 
 
 def _product(a: np.ndarray, b: np.ndarray | np.uint64) -> np.ndarray:

@@ -134,13 +134,11 @@ def _least_eigenvalue(mass: np.ndarray, mean: np.ndarray, n: int) -> float:
 def _gravity_torque(arm: Arm, q: np.ndarray, inertias: list[list[float]]) -> np.ndarray:
     """Root mean square of dV/dq by coordinate."""
     step = 1e-4
-    squares = []
-    for index in range(q.shape[1]):
-        shift = np.zeros(q.shape[1])
-        shift[index] = step
-        ahead, behind = (float_energies(arm, q + sign * shift, inertias)[1] for sign in (1, -1))
-        squares.append((((ahead - behind) / (2 * step)) ** 2).mean())
-    return np.sqrt(squares)
+    shifts = step * np.eye(q.shape[1])[:, None]
+    ahead, behind = (_energies_of_each(arm, q + sign * shifts, inertias)[1] for sign in (1, -1))
+    return np.sqrt(
+        [(((after - before) / (2 * step)) ** 2).mean() for after, before in zip(ahead, behind, strict=True)]
+    )
 
 
 def _mass_changes(arm: Arm, q: np.ndarray, inertias: list[list[float]], typical: np.ndarray) -> np.ndarray:
@@ -148,12 +146,17 @@ def _mass_changes(arm: Arm, q: np.ndarray, inertias: list[list[float]], typical:
     elsewhere.
     """
     base, _ = float_energies(arm, q, inertias)
-    changes = []
+    moved = np.stack([q] * q.shape[1])
     for index in range(q.shape[1]):
-        moved = q.copy()
-        moved[:, index] = np.roll(moved[:, index], 1)
-        changes.append((((float_energies(arm, moved, inertias)[0] - base) / typical) ** 2).mean())
-    return np.sqrt(changes)
+        moved[index, :, index] = np.roll(q[:, index], 1)
+    elsewhere, _ = _energies_of_each(arm, moved, inertias)
+    return np.sqrt([(((mass - base) / typical) ** 2).mean() for mass in elsewhere])
+
+
+def _energies_of_each(arm: Arm, q: np.ndarray, inertias: list[list[float]]) -> tuple[np.ndarray, np.ndarray]:
+    """``float_energies`` of sets (n, points, n) of positions, (n, points, n(n+1)/2) and (n, points), in one call."""
+    mass, potential = float_energies(arm, q.reshape(-1, q.shape[-1]), inertias)
+    return mass.reshape(*q.shape[:2], -1), potential.reshape(q.shape[:2])
 
 
 def _sensitivities(sizes: np.ndarray) -> tuple[float, ...]:

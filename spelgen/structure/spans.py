@@ -48,9 +48,17 @@ class Spans:
         return [field.row_basis(change) for change in self.changes]
 
     @cached_property
+    def order(self) -> list[int]:
+        """Entries of M, those that depend on much first: in this order they are eliminated."""
+        return sorted(range(len(self.keys)), key=lambda index: (-len(self.entry_joints[index]), index))
+
+    @cached_property
     def varying(self) -> np.ndarray:
-        """Echelon basis of U, all that changes."""
-        return field.row_basis(np.concatenate(self.change_bases))
+        """Basis of U, all that changes: an echelon form of columns taken in ``order``."""
+        echelon = field.row_basis(np.concatenate(self.change_bases)[:, self.order])
+        basis = np.zeros_like(echelon)
+        basis[:, self.order] = echelon
+        return basis
 
     @cached_property
     def floats(self) -> Samples:
@@ -75,11 +83,22 @@ class Spans:
         between = [self._coordinates[k] for k in range(first, last) if k not in joints]
         return np.concatenate([self._before[first], *between, self._after[last]])
 
+    def changes_of(self, coordinates: np.ndarray) -> np.ndarray:
+        """Changes of M's entries, (m, entries), by their coordinates (m, dim U) in the basis of U."""
+        others = [index for index in range(len(self.keys)) if index not in set(self._pivots)]
+        changes = np.zeros((len(coordinates), len(self.keys)), dtype=np.uint64)
+        changes[:, self._pivots] = coordinates
+        changes[:, others] = field.product(coordinates, self.varying[:, others])
+        return changes
+
+    @cached_property
+    def _pivots(self) -> list[int]:
+        """Entries of M that are the coordinates in the basis of U: its columns there are those of the identity."""
+        return [self.order[pivot] for pivot in field.pivots(self.varying[:, self.order])]
+
     @cached_property
     def _coordinates(self) -> list[np.ndarray]:
-        # the basis of U is an echelon form, so an element of U is known by its values at the pivots
-        pivots = field.pivots(self.varying)
-        return [basis[:, pivots] for basis in self.change_bases]
+        return [basis[:, self._pivots] for basis in self.change_bases]
 
     @cached_property
     def _before(self) -> list[np.ndarray]:
