@@ -35,7 +35,7 @@ from spelgen.arm.arm import Arm
 from spelgen.building import build
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.dynamics.pinocchio_urdf import has_drives, urdf_dynamics
-from spelgen.evaluation.names import CONSTANT_VELOCITY, MODEL
+from spelgen.evaluation.names import CONSTANT_VELOCITY, EXTRAPOLATION, MODEL
 from spelgen.fitting.torque_fit import fit_torque
 from spelgen.identification.friction import FrictionModel
 from spelgen.identification.identify import least_squares
@@ -111,7 +111,7 @@ def table(cases: Iterator[Case]) -> None:
 
 def forecasts(folder: Path) -> None:
     """What `spelgen train` and `spelgen evaluate` say of each arm."""
-    head = [f"{preset} {ahead:g} s" for ahead in AHEAD for preset in ("still", *PRESETS)]
+    head = [f"{who} {ahead:g} s" for ahead in AHEAD for who in ("still", "goes on", *PRESETS)]
     print(f"{'':18}" + "".join(f"{x:>18}" for x in head))
     for name, urdf, training, tests in splits(folder):
         errors: dict[str, list[float]] = {}
@@ -120,8 +120,10 @@ def forecasts(folder: Path) -> None:
                 tests, seconds=AHEAD, steps=()
             )
             for horizon in found.horizons:
-                still, ours = (horizon.errors[x].mean_relative_rms for x in (CONSTANT_VELOCITY, MODEL))
-                errors.setdefault(horizon.name, [still]).append(ours)
+                still, on, ours = (
+                    horizon.errors[x].mean_relative_rms for x in (CONSTANT_VELOCITY, EXTRAPOLATION, MODEL)
+                )
+                errors.setdefault(horizon.name, [still, on]).append(ours)
         print(f"{name:18}" + "".join(f"{x:18.3f}" for row in errors.values() for x in row), flush=True)
 
 

@@ -14,11 +14,12 @@ from spelgen.errors import RunError
 from spelgen.evaluation.baselines import Predictor, of_dynamics
 from spelgen.evaluation.disturbance import after_past, without_compensation, without_past
 from spelgen.evaluation.evaluate import evaluate
+from spelgen.evaluation.extrapolation import extrapolation
 from spelgen.evaluation.forecast import forecast_of, past_steps, rolled
-from spelgen.evaluation.names import CONSTANT_VELOCITY, MODEL
+from spelgen.evaluation.names import CONSTANT_VELOCITY, EXTRAPOLATION, MODEL
 from spelgen.evaluation.rollout import rollout
 from spelgen.evaluation.tables import result_tables
-from spelgen.evaluation.trust import calibrated, relative_activity, weight
+from spelgen.evaluation.trust import calibrated
 from spelgen.fitting.calibration import calibration_windows, held_sources
 from spelgen.fitting.config import Rollout
 from spelgen.fitting.fit import fit
@@ -124,9 +125,13 @@ def test_evaluation_tells_forecasts_and_open_loop_of_the_same_windows(offset_fit
     for horizon in result.horizons:
         assert horizon.errors[MODEL].mean_relative_rms < 0.1 * horizon.open_loop[MODEL].mean_relative_rms
         assert horizon.errors[CONSTANT_VELOCITY] == horizon.open_loop[CONSTANT_VELOCITY]
+        extrapolated = horizon.errors[EXTRAPOLATION].mean_relative_rms
+        assert horizon.errors[MODEL].mean_relative_rms < 0.1 * extrapolated
+        assert extrapolated < horizon.errors[CONSTANT_VELOCITY].mean_relative_rms
+        assert EXTRAPOLATION not in horizon.open_loop
     assert result.forecasts[MODEL].good_for == 1.0
     text = " ".join(result.text().split())
-    assert "with the disturbance of the last 0.1 s held, trusted as far as training windows show" in text
+    assert "extrapolated motion, and dynamics as far as training windows trust them" in text
     assert "The same without that: open loop" in text
     assert "predictions up to 1 s ahead" in result._repr_html_()
     alone = evaluate(offset_fit, motions(seed=1, offset=OFFSET), steps=(), seconds=(0.5,), disturbance="none")
@@ -155,7 +160,7 @@ def test_the_true_model_is_trusted_and_nonsense_is_not(offset_fit):
 
     true = forecast_of(of_dynamics(MODEL, model, 2), calibration, kinds)
     several = [forecast_of(Predictor("nonsense", nonsense, form=model), calibration, kinds) for _ in range(5)]
-    assert true.trust.trust[2:].min() > 0.9  # from 0.05 s on
+    assert true.trust.trust[:, 2:].min() > 0.9  # from 0.05 s on
     assert true.trust.good_for == 1.0
     nothing = np.stack([none.trust.trust for none in several])
     assert np.mean(nothing != 0) < 0.1  # about what two standard errors let pass
@@ -167,15 +172,15 @@ def test_trust_is_one_for_what_is_measured_and_nothing_for_what_never_moves():
     generator = np.random.default_rng(0)
     measured = generator.normal(size=(2, 60, 3, 4))
     measured[:, :, :, 3] = 0.0
-    activity, blocks = np.ones((60, 4)), np.arange(60) // 6
+    blocks = np.arange(60) // 6
     times = np.array([0.1, 0.5, 1.0])
-    trust = calibrated(0 * measured, measured, measured, activity, blocks, times)
+    trust = calibrated(0 * measured, measured, measured, blocks, times)
     np.testing.assert_array_equal(trust.trust[..., :3], 1.0)
     np.testing.assert_array_equal(trust.held[..., :3], 1.0)
     np.testing.assert_array_equal(trust.trust[..., 3], 0.0)
-    other = calibrated(measured, generator.normal(size=measured.shape), measured, activity, blocks, times)
+    other = calibrated(measured, generator.normal(size=measured.shape), measured, blocks, times)
     assert (other.held[..., :3] == 0).all()
-    added = trust.added(0 * measured, measured, activity, np.array([0.1, 0.2, 2.0]))
+    added = trust.added(0 * measured, measured, np.array([0.1, 0.2, 2.0]))
     np.testing.assert_allclose(added[:, :, 0, :3], measured[:, :, 0, :3])
 
 
@@ -185,21 +190,62 @@ def test_windows_that_overlap_count_as_one():
     once = generator.normal(size=(2, 6, 1, 3))
     noise = 0.7 * generator.normal(size=once.shape)
     several, error = (np.repeat(x, 10, axis=1) for x in (once, noise))
-    activity, times = np.ones((60, 3)), np.array([1.0])
+    times = np.array([1.0])
     few, many = (
-        calibrated(several + error, several + error, several, activity, blocks, times).trust
+        calibrated(several + error, several + error, several, blocks, times).trust
         for blocks in (np.repeat(np.arange(6), 10), np.arange(60))
     )
     assert few.mean() < 0.9 * many.mean()
 
 
-def test_a_joint_that_moves_less_than_in_training_is_trusted_less():
-    assert weight(np.array(0.5), np.array(1.0)) == pytest.approx(0.5)
-    assert weight(np.array(0.5), np.array(0.01)) == pytest.approx(0.01 / 1.01)
-    assert weight(np.array(1.0), np.array(0.01)) == pytest.approx(1.0)
-    assert weight(np.array(0.0), np.array(9.0)) == 0.0
-    ones = np.ones((5, 2))
-    np.testing.assert_allclose(relative_activity(0.1 * ones, 0 * ones, ones, ones), 0.005)
+def waves(count=400, seed=0):
+    """qd, its change over 0.1 s, and how q and qd differ from a constant velocity's 0.1 and 0.5 s on: of sines."""
+    phases = 2 * np.pi * np.random.default_rng(seed).random((count, 2))
+    times = np.array([0.1, 0.5])
+
+    def motion(t):
+        return np.sin(phases + 3 * t), 3 * np.cos(phases + 3 * t)
+
+    (q, qd), (_, before) = motion(0.0), motion(-0.1)
+    ahead = np.stack([motion(t) for t in times], axis=2)  # (2, W, T, n)
+    still = np.stack([q[:, None] + qd[:, None] * times[:, None], qd[:, None] + 0 * times[:, None]])
+    return qd, qd - before, ahead - still, np.arange(count) // 25, times
+
+
+def test_motion_goes_on_as_in_training():
+    """A sine is told by its velocity and acceleration; a few jumps change little of what is found."""
+    qd, change, measured, blocks, times = waves()
+    found = extrapolation(qd, change, measured, blocks, times, 0.1)
+    added = found.added(qd, change, times)
+    np.testing.assert_allclose(added[0], measured[0], atol=0.005)
+    np.testing.assert_allclose(added[1], measured[1], atol=0.005)
+    jumping = measured.copy()
+    jumping[:, ::40] += 20.0
+    robust = extrapolation(qd, change, jumping, blocks, times, 0.1).added(qd, change, times)
+    columns = np.stack([qd[:, 0] * 0.1, change[:, 0] * 0.05], axis=1)
+    squares = columns @ np.linalg.lstsq(columns, jumping[0, :, 0, 0], rcond=None)[0]
+    error, plain = (np.abs(x - measured[0, :, 0, 0]).max() for x in (robust[0, :, 0, 0], squares))
+    assert error < 0.02 < 0.2 < plain
+    between = found.added(qd, change, np.array([0.3]))
+    assert np.abs(between[0, :, 0]).mean() < np.abs(measured[0, :, 1]).mean()
+
+
+def test_what_does_not_go_on_is_not_extrapolated():
+    """Noise that no stretch of time shares with others, and a joint at rest, are left at a constant velocity."""
+    generator = np.random.default_rng(2)
+    qd, change, measured = (generator.normal(size=x) for x in ((60, 3), (60, 3), (2, 60, 2, 3)))
+    measured[..., 2], qd[:, 2], change[:, 2] = 0.0, 0.0, 0.0
+    times, blocks = np.array([0.1, 0.5]), np.arange(60) // 6
+    parts = extrapolation(qd, change, measured, blocks, times, 0.1).parts
+    assert (parts[..., 2] == 0).all()
+    assert np.mean(parts[..., :2] == 0) > 0.5
+    many = [
+        extrapolation(
+            *(generator.normal(size=x) for x in (qd.shape, change.shape, measured.shape)), blocks, times, 0.1
+        )
+        for _ in range(10)
+    ]
+    assert np.mean([x.parts == 0 for x in many]) > 0.5
 
 
 def test_calibration_reads_no_test_windows(offset_fit):

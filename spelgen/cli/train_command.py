@@ -174,7 +174,7 @@ def train(
 
         reach = good_for(subject(found).model, found.calibration)
         place = "nowhere" if reach is None else f"up to {reach:g} s ahead"
-        say(f"forecasts clearly better than a constant velocity: {place}")
+        say(f"forecasts clearly better than extrapolated motion: {place}")
     say(f"run folder: {folder}")
     if found.status == "interrupted":
         note("the best model so far is in the run folder; --resume goes on")

@@ -1,4 +1,4 @@
-"""Forecasts: rollouts with the disturbance of the past held, followed as far as training windows show that it pays."""
+"""Forecasts: extrapolated motion, and rollouts with the past disturbance held as far as training trusts them."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ import torch
 
 from spelgen.evaluation.baselines import Predictor, constant_velocity, of_baseline, of_dynamics
 from spelgen.evaluation.disturbance import after_past
+from spelgen.evaluation.extrapolation import Extrapolation, extrapolation
 from spelgen.evaluation.names import MODEL
 from spelgen.evaluation.stiff import States
-from spelgen.evaluation.trust import LEAST_BLOCKS, TIMES, Trust, calibrated, relative_activity
+from spelgen.evaluation.trust import LEAST_BLOCKS, TIMES, Trust, calibrated
 from spelgen.fitting.calibration import PAST, CalibrationWindows
 from spelgen.fitting.rollout import choose_substeps, loss_scales, position_difference
 from spelgen.logs.windows import Windows, joined
@@ -37,28 +38,39 @@ class Rollouts:
     qd: np.ndarray
     change: np.ndarray
 
+    @property
+    def times(self) -> np.ndarray:
+        """Ahead (K-1,) [s]."""
+        elapsed: np.ndarray = self.ahead.dt.cumsum(dim=1).mean(dim=0).numpy()
+        return elapsed
+
 
 @dataclass(frozen=True, eq=False)
 class Forecast:
-    """What a predictor's rollouts are worth. qd, change: of the training windows, see `Rollouts`."""
+    """What a predictor's rollouts are worth beside motion that goes on."""
 
+    extrapolation: Extrapolation
     trust: Trust
-    qd: np.ndarray
-    change: np.ndarray
 
     def states(self, rollouts: Rollouts) -> States:
         """q and qd, (W, K-1, n), for what these rollouts predict."""
-        activity = relative_activity(rollouts.qd, rollouts.change, self.qd, self.change)
-        times = rollouts.ahead.dt.cumsum(dim=1).mean(dim=0).numpy()
-        still = rollouts.still
-        added = self.trust.added(rollouts.open_loop - still, rollouts.held - still, activity, times)
-        q, qd = torch.from_numpy(still + added)
+        on = self._going_on(rollouts)
+        added = self.trust.added(rollouts.open_loop - on, rollouts.held - on, rollouts.times)
+        q, qd = torch.from_numpy(on + added)
         return q, qd
+
+    def going_on(self, rollouts: Rollouts) -> States:
+        """The same without dynamics."""
+        q, qd = torch.from_numpy(self._going_on(rollouts))
+        return q, qd
+
+    def _going_on(self, rollouts: Rollouts) -> np.ndarray:
+        return rollouts.still + self.extrapolation.added(rollouts.qd, rollouts.change, rollouts.times)
 
 
 def good_for(model: Any, calibration: CalibrationWindows) -> float | None:
-    """The longest time [s] ahead up to which a model's forecasts of training windows are clearly better than a constant
-    velocity; None: there is none.
+    """The longest time [s] ahead up to which a model's forecasts of training windows are clearly better than
+    extrapolated motion; None: there is none.
     """
     forecast = forecast_of(
         for_windows(of_dynamics(MODEL, model, 1), calibration.probe), calibration, model.joint_types
@@ -123,16 +135,17 @@ def forecast_of(
     if calibration.blocks.max() + 1 < LEAST_BLOCKS:
         return None
     found = rolled(predictor, calibration.windows, calibration.past)
-    elapsed = found.ahead.dt.cumsum(dim=1).mean(dim=0).numpy()
+    elapsed = found.times
     wanted = [time for time in TIMES if time <= 1.02 * elapsed[-1]]
     chosen = np.unique([np.abs(elapsed - time).argmin() for time in wanted]) if wanted else np.array([0])
     start = found.ahead.q[:, :1]
     steps = position_difference(found.ahead.q[:, 1:], found.ahead.q[:, :-1], joint_types)
     q = start + steps.cumsum(dim=1)  # as rollouts go: on past a turn
     measured = np.stack([q.numpy(), found.ahead.qd[:, 1:].numpy()]) - found.still
-    activity = relative_activity(found.qd, found.change, found.qd, found.change)
+    times, past = elapsed[chosen], calibration.windows.dt[:, : calibration.past].sum(dim=1).mean().item()
+    on = extrapolation(found.qd, found.change, measured[:, :, chosen], calibration.blocks, times, past)
+    added = on.added(found.qd, found.change, times)
     open_loop, held, measured = (
-        x[:, :, chosen] for x in (found.open_loop - found.still, found.held - found.still, measured)
+        x[:, :, chosen] - added for x in (found.open_loop - found.still, found.held - found.still, measured)
     )
-    trust = calibrated(open_loop, held, measured, activity, calibration.blocks, elapsed[chosen])
-    return Forecast(trust, found.qd, found.change)
+    return Forecast(on, calibrated(open_loop, held, measured, calibration.blocks, times))

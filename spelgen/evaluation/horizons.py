@@ -12,6 +12,7 @@ from spelgen.errors import Diagnostic
 from spelgen.evaluation.baselines import Predictor
 from spelgen.evaluation.disturbance import without_past
 from spelgen.evaluation.forecast import Forecast, for_windows, past_steps, rolled
+from spelgen.evaluation.names import EXTRAPOLATION
 from spelgen.evaluation.results import Horizon, end_errors
 from spelgen.evaluation.stiff import States
 from spelgen.logs.preprocessing import Preprocessing
@@ -123,6 +124,7 @@ def predict(
             found = rolled(predictor, windows, past)
             q, qd = torch.from_numpy(found.open_loop)
             states[predictor.name], open_loop[predictor.name] = forecast.states(found), (q, qd)
+            states[EXTRAPOLATION] = forecast.going_on(found)  # the same beside all
         else:
             with torch.no_grad():
                 states[predictor.name] = predictor.states(ahead)

@@ -21,7 +21,7 @@ from spelgen.evaluation.verdict import verdict
 from spelgen.fitting.rollout import position_difference
 from spelgen.logs.windows import Windows
 
-SCHEMA = 4
+SCHEMA = 5
 
 
 @dataclass(frozen=True)
@@ -61,16 +61,16 @@ class Horizon:
 class ForecastSummary:
     """What training windows showed of a predictor's forecasts, see `trust.Trust`.
 
-    good_for: the longest time [s] up to which they are clearly better than a constant velocity, None: there is none.
-    times: [s]. relative_error: for each, of windows left out, relative to the constant velocity. trust, held: for each
-    time and joint.
+    good_for: the longest time [s] up to which they are clearly better than extrapolated motion, None: there is none.
+    times: [s]. relative_error: for each, of windows left out, relative to extrapolated motion. trust, held: of q and
+    qd, for each time and joint.
     """
 
     good_for: float | None
     times: tuple[float, ...]
     relative_error: tuple[float, ...]
-    trust: tuple[tuple[float, ...], ...]
-    held: tuple[tuple[float, ...], ...]
+    trust: tuple[tuple[tuple[float, ...], ...], ...]
+    held: tuple[tuple[tuple[float, ...], ...], ...]
 
 
 @dataclass(frozen=True)
@@ -190,5 +190,5 @@ def forecast_summary(trust: Trust) -> ForecastSummary:
         trust.good_for,
         tuple(trust.times.round(4).tolist()),
         tuple(trust.error.mean(axis=-1).round(3).tolist()),
-        *(tuple(map(tuple, x.round(3).tolist())) for x in (trust.trust, trust.held)),
+        *(tuple(tuple(map(tuple, y)) for y in x.round(3).tolist()) for x in (trust.trust, trust.held)),
     )

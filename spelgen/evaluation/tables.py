@@ -48,7 +48,7 @@ class Table:
         return Listing(self.title, head, rows, self.note)
 
 
-FORECAST = ", with the disturbance of the last 0.1 s held, trusted as far as training windows show"
+FORECAST = ": extrapolated motion, and dynamics as far as training windows trust them"
 OPEN_LOOP = ", open loop"
 WHY_OPEN_LOOP = (
     "open loop: a rollout with nothing held, as windows of the training logs are shorter, or the test"

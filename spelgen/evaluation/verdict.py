@@ -66,8 +66,8 @@ def verdict(
 def _told_reach(good_for: float | None) -> str:
     """How far ahead forecasts are good, [s], in a sentence."""
     if good_for is None:
-        return "On training windows its forecasts are nowhere clearly better than a constant velocity."
-    return f"On training windows its forecasts are clearly better than a constant velocity up to {good_for:g} s ahead."
+        return "On training windows its forecasts are nowhere clearly better than extrapolated motion."
+    return f"On training windows its forecasts are clearly better than extrapolated motion up to {good_for:g} s ahead."
 
 
 def _uses(evaluation: Mapping[str, Any]) -> tuple[list[str], list[str], list[str]]:

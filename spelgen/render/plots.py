@@ -11,6 +11,7 @@ from markupsafe import Markup
 
 from spelgen.evaluation.names import (
     CONSTANT_VELOCITY,
+    EXTRAPOLATION,
     LEAST_SQUARES,
     LEAST_SQUARES_WITH_MEMORY,
     MODEL,
@@ -31,6 +32,7 @@ STYLES = {
     LEAST_SQUARES: "squares",
     LEAST_SQUARES_WITH_MEMORY: "remembering",
     CONSTANT_VELOCITY: "hold",
+    EXTRAPOLATION: "going-on",
 }
 PARTS = {"inertia": "inertia", "Coriolis": "coriolis", "gravity": "gravity", "friction": "friction"}
 BARE = 84  # height of a chart that stands above another with the same times
