@@ -58,6 +58,13 @@ def address_of(path: Path) -> str | None:
     return None
 
 
+def with_addresses(text: str) -> str:
+    """What is said of local copies, said of their addresses."""
+    for address, copy in _copies.items():
+        text = text.replace(str(copy), address)
+    return text
+
+
 @contextmanager
 def reached(address: str) -> Iterator[tuple[Any, str]]:
     """The file system of an address, and the path there. Within it, whatever the file system raises names the address:

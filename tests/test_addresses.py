@@ -46,6 +46,10 @@ def test_a_run_and_its_logs_may_be_elsewhere(robots, tmp_path, memory):
     ):
         done = CliRunner().invoke(app, words)
         assert done.exit_code == 0, done.output
+    assert "run folder: memory://runs/first\n" in done.output
+    again = CliRunner().invoke(app, ["train", "memory://runs/first", "--data", "memory://data", "--resume"])
+    assert again.exit_code == 0, again.output
+    assert "finished after 2 epochs" in again.output
     assert {"config.json", "model.pt", "checkpoint.pt", "metrics.jsonl"} <= {
         path.rsplit("/", 1)[-1] for path in memory.find("/runs/first")
     }

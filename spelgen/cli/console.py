@@ -14,7 +14,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from spelgen.addresses import local
+from spelgen.addresses import local, with_addresses
 from spelgen.cli.command import readable
 from spelgen.errors import SpelgenError
 from spelgen.labels import printable
@@ -109,9 +109,9 @@ def counted(what: str) -> Iterator[Callable[[int, int], None]]:
 
 def say(text: str) -> None:
     """Print a result to stdout."""
-    print(printable(text, "\n"))
+    print(printable(with_addresses(text), "\n"))
 
 
 def note(text: str) -> None:
     """Print progress, a remark or an error to stderr."""
-    print(printable(text, "\n"), file=sys.stderr, flush=True)
+    print(printable(with_addresses(text), "\n"), file=sys.stderr, flush=True)

@@ -28,7 +28,11 @@ if TYPE_CHECKING:
 def train(
     module: Annotated[
         Path | None,
-        typer.Argument(metavar="MODULE.py", help="A module written by `spelgen build`.", show_default=False),
+        typer.Argument(
+            metavar="MODULE.py",
+            help="A module of `spelgen build`; with --resume, a run will do.",
+            show_default=False,
+        ),
     ] = None,
     more: MoreData = None,
     data: Data = None,
@@ -139,7 +143,7 @@ def train(
     if module is None:
         raise typer.BadParameter("name a module, or a run with --from", param_hint="'MODULE.py'")
     paths = options.logs(data, more)
-    folder = output or Path("runs") / module.stem
+    folder = output or (module if resume and module.is_dir() else Path("runs") / module.stem)
     urdf = None if resume else robot or _unchanged_urdf(module)
     chosen = Chosen(objective, flags, {"cutoff": filter, "decimation": decimation}, validation_fraction, seed,
                     fitted=source is not None)  # fmt: skip
