@@ -11,6 +11,7 @@ import hashlib
 import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -246,18 +247,23 @@ def read_source(path: str | Path) -> str:
 def parse_facts(source: str, file: Path | None = None) -> Facts:
     """The facts in a module's source text; nothing of it is executed. Raises ModuleError without them."""
     try:
-        record = json.loads(next(_texts(ast.parse(source), "FACTS")))
-        return Facts(
-            robot=record["robot"],
-            urdf=record["urdf"],
-            urdf_sha256=record["urdf_sha256"],
-            spec_sha256=record["spec_sha256"],
-            options=_options(_tupled(record["options"])),
-            joints=tuple(record["joints"]),
-            joint_types=tuple(record["joints"].values()),
-        )
+        return _facts(source)
     except _FOREIGN as problem:
         raise _no_facts(problem, file) from None
+
+
+@lru_cache(maxsize=8)  # a run reads one module again and again
+def _facts(source: str) -> Facts:
+    record = json.loads(next(_texts(ast.parse(source), "FACTS")))
+    return Facts(
+        robot=record["robot"],
+        urdf=record["urdf"],
+        urdf_sha256=record["urdf_sha256"],
+        spec_sha256=record["spec_sha256"],
+        options=_options(_tupled(record["options"])),
+        joints=tuple(record["joints"]),
+        joint_types=tuple(record["joints"].values()),
+    )
 
 
 def _no_facts(problem: Exception, file: Path | None) -> ModuleError:

@@ -1,17 +1,15 @@
 """Training with a compiled right-hand side: the same numbers as without, and one clear error where it cannot be."""
 
 import json
-import os
 import shutil
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 import torch
 from emitted import random_model
 from torch._dynamo.utils import counters
+from typer.testing import CliRunner
 
+from spelgen.cli.main import app
 from spelgen.fitting.compiled import compiled
 from spelgen.fitting.rollout import loss_scales, rollout_loss
 from spelgen.fitting.train import train
@@ -70,16 +68,20 @@ def _gradients_of_both(model, device="cpu"):
         assert found[1].cpu().numpy() == pytest.approx(found[0].cpu().numpy(), rel=1e-6, abs=1e-9)
 
 
-def test_without_a_compiler_one_error_says_what_to_do_and_nothing_is_written(tmp_path):
+def test_without_a_compiler_one_error_says_what_to_do_and_nothing_is_written(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr(
+        "torch._inductor.config.cpp.cxx", (None, "no-such-compiler")
+    )  # as CXX in the environment
+    torch._dynamo.reset()
     write_logs(tmp_path / "train.parquet", motions(), JOINTS)
-    done = subprocess.run(
-        [sys.executable, "-m", "spelgen", "train", str(STAND_IN), "--data", "train.parquet", "-o", "run",
+    done = CliRunner().invoke(
+        app,
+        ["train", str(STAND_IN), "--data", "train.parquet", "-o", "run",
          "--compile", "--epochs", "1", "--momentum-steps", "0", "--quiet"],
-        cwd=tmp_path, capture_output=True, text=True, check=False,
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[1]), "CXX": "no-such-compiler",
-             "TORCHINDUCTOR_CACHE_DIR": str(tmp_path / "cache")},
     )  # fmt: skip
-    assert done.returncode == 1
+    assert done.exit_code == 1
     (told,) = done.stderr.splitlines()
     assert told.startswith("a right-hand side that torch cannot compile (")
     assert "no-such-compiler" in told

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from fractions import Fraction
-from math import atan2, cos, pi, sin, tan
+from math import atan2, cos, lcm, pi, sin, tan
 
 import numpy as np
 
@@ -174,14 +174,18 @@ def _quaternion_ratios(r: np.ndarray) -> list[float]:
     return [0.0 if abs(ratio) < _NOISE else float(ratio) for ratio in ratios]
 
 
-def _rotation_of(w: Fraction, x: Fraction, y: Fraction, z: Fraction) -> Matrix:
+def _rotation_of(*quaternion: Fraction) -> Matrix:
+    # over one denominator, whole numbers do: fractions are costly
+    common = lcm(*(part.denominator for part in quaternion))
+    w, x, y, z = (part.numerator * (common // part.denominator) for part in quaternion)
     norm = w * w + x * x + y * y + z * z
-    s = 2 / norm
-    return (
-        (1 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y)),
-        (s * (x * y + w * z), 1 - s * (x * x + z * z), s * (y * z - w * x)),
-        (s * (x * z - w * y), s * (y * z + w * x), 1 - s * (x * x + y * y)),
+    rows = (
+        (norm - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), norm - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), norm - 2 * (x * x + y * y)),
     )
+    first, second, third = ((Fraction(a, norm), Fraction(b, norm), Fraction(c, norm)) for a, b, c in rows)
+    return first, second, third
 
 
 def transposed(a: Matrix) -> Matrix:

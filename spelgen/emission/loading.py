@@ -6,9 +6,10 @@ import ast
 import hashlib
 import linecache
 import sys
+from functools import lru_cache
 from html import escape
 from pathlib import Path
-from types import ModuleType
+from types import CodeType, ModuleType
 from typing import TYPE_CHECKING, Any, cast
 
 import torch
@@ -88,7 +89,7 @@ def load_module(module: str | Path, *, seed: int = 0) -> EmittedModel:
     path = f"<{name}>" if file is None else str(file)
     linecache.cache[path] = (len(source), None, source.splitlines(keepends=True), path)  # for tracebacks
     try:
-        exec(compile(source, path, "exec"), vars(code))
+        exec(_compiled(source, path), vars(code))
         model = code.Model(seed=seed)
     except Exception as error:
         told = f"import fails ({type(error).__name__}: {error})"
@@ -101,6 +102,11 @@ def load_module(module: str | Path, *, seed: int = 0) -> EmittedModel:
     emitted = cast("EmittedModel", model)
     emitted.source, emitted.facts = source, facts
     return emitted
+
+
+@lru_cache(maxsize=8)  # a run loads one module again and again
+def _compiled(source: str, path: str) -> CodeType:
+    return compile(source, path, "exec")
 
 
 def has_run(source: str) -> bool:

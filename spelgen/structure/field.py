@@ -96,7 +96,7 @@ def rank(rows: np.ndarray) -> int:
 
 def pivots(basis: np.ndarray) -> list[int]:
     """First nonzero column of each row of an echelon form."""
-    return [int(np.flatnonzero(row)[0]) for row in basis]
+    return (basis != 0).argmax(axis=1).tolist() if basis.size else []
 
 
 def null_space(basis: np.ndarray) -> np.ndarray:

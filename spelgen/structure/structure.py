@@ -85,7 +85,7 @@ def base_parameter_count(arm: Arm) -> int:
     """Rank of the inverse-dynamics regressor: how many combinations of inertial parameters move the arm
     differently.
     """
-    points = 4
+    points = 7  # enough for all but few arms of up to seven joints
     while True:
         rows = regressor_rows(arm, points + 2)
         found = field.rank(rows)
