@@ -54,9 +54,10 @@ formulas: terms printing angles shortening formulas text files
 inspection loaded_arm pipeline trust building
 simulation: simulate
 excitation: design
-identification: identify baseline drive_samples drive_hints
+identification: identify drive_samples drive_hints
 exporting: description tip_chain describe_residuals describe trained parity exported readme rigid_body_projection
 exporting: urdf_file urdf_export mjcf_file mjcf_export torch_programs torch_export
+identification: position_actuators baseline
 exporting: onnx_graph onnx_rigid onnx_joint_functions onnx_residuals onnx_model onnx_export
 exporting: rigid_expressions friction_expressions residual_expressions solved_expressions model_expressions
 exporting: tip_expressions entry_points

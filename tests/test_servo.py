@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 
 import numpy as np
 import pyarrow as pa
@@ -15,12 +16,15 @@ from servo_arm import COM, GRAVITY, MASS, Servos, servo_logs, write_servo_arm
 import spelgen
 from spelgen.dynamics.servo_rank import servo_rank
 from spelgen.errors import LogError, OptionError, SettingsError
+from spelgen.evaluation.names import POSITION_ACTUATORS
 from spelgen.evaluation.replay import LATE, LINEAR
 from spelgen.fitting import servo_descent, servo_fit
+from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.servo_dead_zones import dead_zones
 from spelgen.fitting.servo_descent import Normal
 from spelgen.fitting.servo_intervals import covariance
 from spelgen.fitting.servo_report import servo_text
+from spelgen.identification.baseline import read_baseline
 from spelgen.logs.commands import delayed_commands
 from spelgen.logs.trajectory import Trajectory
 
@@ -71,6 +75,29 @@ def test_replay_of_another_motion_beats_the_baselines(fitted, logs):
     assert "Commands replayed, whole log" in results.text()
     again = spelgen.evaluate(fitted.folder, logs[4:])
     assert again.to_dict() == results.to_dict()
+
+
+def test_actuators_of_mujoco_are_what_it_has_to_beat(fitted, logs, monkeypatch):
+    mujoco = pytest.importorskip("mujoco")
+    run = RunFolder(fitted.folder)
+    spelgen.keep_baseline(run.path, logs[:1])
+    (found,) = read_baseline(run).values()
+    simulated = mujoco.MjModel.from_xml_string(found.mjcf)
+    assert simulated.actuator_gainprm[:, 0] == pytest.approx(TRUTH.kp, rel=0.05)
+    assert -simulated.actuator_biasprm[:, 2] == pytest.approx(TRUTH.kd, rel=0.05)
+    # MuJoCo takes a servo's spring half a step late
+    assert simulated.dof_armature == pytest.approx(TRUTH.armature, rel=0.15)
+    assert simulated.dof_frictionloss == pytest.approx(TRUTH.coulomb, rel=0.1)
+    assert found.delay == pytest.approx(TRUTH.delay, abs=0.005)
+    results = spelgen.evaluate(run.path, logs[4][:400], baselines=read_baseline(run))
+    for replay in results.replays:
+        assert replay.errors[POSITION_ACTUATORS].mean < 0.4 * replay.errors[LINEAR].mean
+    (note,) = [x.message for x in results.diagnostics if x.code == "baseline"]
+    assert "by mujoco.minimize, the least squares of mujoco.sysid" in note
+    monkeypatch.setitem(sys.modules, "mujoco", None)  # as if it were not installed
+    assert read_baseline(run) == {}
+    alone = spelgen.evaluate(run.path, logs[4][:40], baselines=read_baseline(run))
+    assert "no-position-actuators" in {x.code for x in alone.diagnostics}
 
 
 def test_a_module_of_servos_stands_alone_and_says_so(arm, tmp_path):

@@ -166,7 +166,7 @@ def train(
         raise NotApplicable(f"--{error.option.replace('_', '-')}: {error.got}") from error
     if not first:
         return
-    if not resume and found.status != "interrupted" and found.config.objective != "servo":
+    if not resume and found.status != "interrupted":
         from spelgen.identification.baseline import keep_baseline
 
         keep_baseline(folder, paths)

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from spelgen.dynamics.protocol import RigidDynamics
 from spelgen.errors import Diagnostic, LogError
 from spelgen.evaluation.baselines import (
     Predictor,
@@ -19,7 +18,7 @@ from spelgen.evaluation.forecast import Disturbance, Forecast, for_windows, fore
 from spelgen.evaluation.horizons import PROBED, JudgedLogs, horizon_lengths, open_loop_note, predict
 from spelgen.evaluation.invariants import energy_drift
 from spelgen.evaluation.names import MODEL
-from spelgen.evaluation.replay import replays
+from spelgen.evaluation.replay import Replayed, replays
 from spelgen.evaluation.results import Results, forecast_summary, torque_summary
 from spelgen.evaluation.subject import Subject, subject
 from spelgen.evaluation.torque import torque_errors
@@ -40,7 +39,7 @@ def evaluate(
     logs: Trajectory | Sequence[Trajectory],
     *,
     arm: Any = None,
-    baselines: Mapping[str, RigidDynamics] | None = None,
+    baselines: Mapping[str, Any] | None = None,
     preprocessing: Preprocessing | None = None,
     steps: Sequence[int] = (1, 10),
     seconds: Sequence[float] = (1.0,),
@@ -50,11 +49,11 @@ def evaluate(
 
     model: an emitted one, a fit, or the folder of a run. arm: of ``load_arm``, or the path of a URDF; by default
     the fit's: it gives the URDF as a baseline, and errors of the tip. baselines: any dynamics to be judged beside
-    it, by name, e.g. ``{"least squares": identify(...).dynamics}``. preprocessing: of states and torques; by
-    default as the model was fitted. steps, seconds: horizons in samples and in time; those longer than every
-    trajectory are left out, and said. disturbance: "held" judges forecasts (see `forecast.py`) where the model comes
-    with windows of its training logs; "none" rollouts by themselves, open loop. The result depends on nothing else:
-    no random numbers. Raises LogError.
+    it, by name, e.g. ``{"least squares": identify(...).dynamics}``, or beside position servos a `Replayed`.
+    preprocessing: of states and torques; by default as the model was fitted. steps, seconds: horizons in samples and in
+    time; those longer than every trajectory are left out, and said. disturbance: "held" judges forecasts (see
+    `forecast.py`) where the model comes with windows of its training logs; "none" rollouts by themselves, open loop.
+    The result depends on nothing else: no random numbers. Raises LogError.
     """
     judged = subject(model, arm)
     joint_types, logs = judged.model.joint_types, [logs] if isinstance(logs, Trajectory) else list(logs)
@@ -63,7 +62,7 @@ def evaluate(
     notes = check(logs, judged.joints, joint_types)
     notes += _seen(logs, judged)
     if hasattr(judged.model, "servo"):
-        return _replayed(judged, logs, notes)
+        return _replayed(judged, logs, notes, baselines or {})
     require_torques(logs)
     used = _preprocessing(preprocessing, judged, logs)
     pieces = used.pieces(logs, shortest=2)
@@ -106,7 +105,12 @@ def evaluate(
     )  # fmt: skip
 
 
-def _replayed(judged: Subject, logs: Sequence[Trajectory], notes: list[Diagnostic]) -> Results:
+def _replayed(
+    judged: Subject,
+    logs: Sequence[Trajectory],
+    notes: list[Diagnostic],
+    baselines: Mapping[str, Replayed],
+) -> Results:
     """Of an arm under position servos: its commands are replayed."""
     if any(x.u is None for x in logs):
         raise LogError(
@@ -117,7 +121,7 @@ def _replayed(judged: Subject, logs: Sequence[Trajectory], notes: list[Diagnosti
     return Results(
         robot=judged.robot, joints=tuple(judged.joints), trajectories=tuple(x.name for x in logs), cutoff=None,
         substeps=1, parameters=sum(x.numel() for x in judged.model.parameters()), horizons=(), torque={},
-        energy_drift=None, replays=replays(judged.model, logs, judged.linear_servos, notes),
+        energy_drift=None, replays=replays(judged.model, logs, judged.linear_servos, notes, baselines),
         diagnostics=tuple(notes), joint_types=tuple(judged.model.joint_types),
     )  # fmt: skip
 

@@ -4,5 +4,6 @@ MODEL = "model"  # the trained model
 URDF, URDF_WITH_DRIVES = "URDF", "URDF and drives"
 LEAST_SQUARES = "least squares"
 LEAST_SQUARES_WITH_MEMORY = "least squares with memory"
+POSITION_ACTUATORS = "MuJoCo actuators"
 CONSTANT_VELOCITY = "velocity stays constant"
 EXTRAPOLATION = "extrapolated motion"

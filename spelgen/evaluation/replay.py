@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -40,10 +40,29 @@ class Replay:
     errors: dict[str, ReplayErrors]
 
 
+Part = tuple[Trajectory, slice]
+
+
+class Replayed(Protocol):
+    """A baseline that follows commands. about: what it is, and how it was fitted."""
+
+    @property
+    def about(self) -> str: ...
+
+    def positions(self, parts: Sequence[Part], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
+        """After each interval of each part of a log (K, n), from q and qd (parts, n), under the log's commands."""
+
+
 def replays(
-    model: Any, logs: Sequence[Trajectory], linear: LinearServos | None, notes: list[Diagnostic]
+    model: Any,
+    logs: Sequence[Trajectory],
+    linear: LinearServos | None,
+    notes: list[Diagnostic],
+    baselines: Mapping[str, Replayed],
 ) -> tuple[Replay, ...]:
-    """Of the model and, where they are known, linear servos: whole logs, and windows of `AHEAD`, one after another."""
+    """Of the model, baselines and, where they are known, linear servos: whole logs, and windows of `AHEAD`, one after
+    another.
+    """
     pieces = [x for log in logs for x in split_at_gaps(log) if len(x) > 2]
     whole = [(x, slice(0, len(x))) for x in pieces]
     windows = [
@@ -55,20 +74,33 @@ def replays(
     if linear is None:
         message = "no linear servos to compare with: they are fitted by `train`"
         notes.append(Diagnostic("info", "no-linear-servos", "logs", None, message))
-    found = [Replay("whole log", _errors(model, whole, linear, still=True))]
+    for name, each in baselines.items():
+        notes.append(Diagnostic("info", "baseline", "logs", None, f"{name}: {each.about}"))
+    if not baselines:
+        message = (
+            "no actuators of MuJoCo to compare with: `spelgen train` fits them where MuJoCo is installed"
+        )
+        notes.append(Diagnostic("info", "no-position-actuators", "logs", None, message))
+    found = [Replay("whole log", _errors(model, whole, linear, baselines, still=True))]
     if windows:
-        found.append(Replay(f"windows of {AHEAD:g} s", _errors(model, windows, linear, still=False)))
+        errors = _errors(model, windows, linear, baselines, still=False)
+        found.append(Replay(f"windows of {AHEAD:g} s", errors))
     return tuple(found)
 
 
-Part = tuple[Trajectory, slice]
-
-
 def _errors(
-    model: Any, parts: Sequence[Part], linear: LinearServos | None, *, still: bool
+    model: Any,
+    parts: Sequence[Part],
+    linear: LinearServos | None,
+    baselines: Mapping[str, Replayed],
+    *,
+    still: bool,
 ) -> dict[str, ReplayErrors]:
     """still: each part starts at rest, else with the velocity measured there."""
     wrong = {MODEL: _of_model(model, parts, still)}
+    for name, each in baselines.items():
+        found = each.positions(parts, *_starts(parts, still))
+        wrong[name] = [q - x.q[rows][1:] for q, (x, rows) in zip(found, parts, strict=True)]
     if linear is not None:
         wrong[LINEAR] = _of_linear(linear, parts, still)
         late = [delayed_commands(x, rows, linear.late, 1)[:, 0] for x, rows in parts]

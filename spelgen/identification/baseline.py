@@ -1,18 +1,21 @@
-"""Least squares on a run's own training logs, kept in its folder: what any model of the arm has to beat."""
+"""Least squares on a run's own training logs, kept in its folder: what any model of the arm has to beat. Of torques, or
+of an arm under position servos, of MuJoCo's actuators.
+"""
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from spelgen.dynamics.regressor_dynamics import RegressorDynamics
 from spelgen.errors import LogError, RunError
-from spelgen.evaluation.names import LEAST_SQUARES, LEAST_SQUARES_WITH_MEMORY
+from spelgen.evaluation.names import LEAST_SQUARES, LEAST_SQUARES_WITH_MEMORY, POSITION_ACTUATORS
 from spelgen.files import write_json
-from spelgen.fitting.run_folder import RunFolder
+from spelgen.fitting.run_folder import RunFolder, trained_model
+from spelgen.fitting.servo_windows import servo_windows
 from spelgen.fitting.streaming import LargeLogs
 from spelgen.fitting.train import open_logs
 from spelgen.identification.friction import FrictionModel
@@ -41,7 +44,8 @@ def keep_baseline(folder: Path | str, logs: Iterable[Path | str] | Sequence[Traj
     """Identify a run folder's arm from the logs, or log files, that it was trained on, those of validation included.
 
     What the logs cover is kept beside it. A run without URDF and logs larger than memory are left as they are; logs
-    that are too sparse for accelerations give no parameters.
+    that are too sparse for accelerations give no parameters. Of an arm under position servos MuJoCo's actuators are
+    fitted instead, where MuJoCo is installed.
     """
     run, given = RunFolder(Path(folder)), list(logs)
     record = run.read_config()
@@ -52,22 +56,49 @@ def keep_baseline(folder: Path | str, logs: Iterable[Path | str] | Sequence[Traj
     if isinstance(trajectories, LargeLogs) or not run.urdf.exists():
         return
     found: dict[str, Any] = {"coverage": coverage(trajectories)}
-    try:
-        arm, used = run_arm(run), Preprocessing(**record["preprocessing"])
-        fit = identify(arm, trajectories, preprocessing=used)
-        remembering = identify(arm, trajectories, LeastSquares(friction=REMEMBERING), preprocessing=used)
-    except (LogError, np.linalg.LinAlgError):
-        pass
+    arm, used = run_arm(run), Preprocessing(**record["preprocessing"])
+    if record["objective"] == "servo":
+        found |= _position_actuators(run, arm, trajectories, used)
     else:
-        found |= fit.to_dict() | {"parameters": fit.parameters.tolist()}
-        found |= {"parameters_with_memory": remembering.parameters.tolist()}
+        found |= _identified(arm, trajectories, used)
     write_json(run.baseline, found)
 
 
-def read_baseline(run: RunFolder) -> dict[str, RegressorDynamics]:
-    """The dynamics that ``keep_baseline`` found, by name; none where it found none."""
+def _identified(arm: LoadedArm, trajectories: Sequence[Trajectory], used: Preprocessing) -> dict[str, Any]:
+    try:
+        fit = identify(arm, trajectories, preprocessing=used)
+        remembering = identify(arm, trajectories, LeastSquares(friction=REMEMBERING), preprocessing=used)
+    except (LogError, np.linalg.LinAlgError):
+        return {}
+    found = fit.to_dict() | {"parameters": fit.parameters.tolist()}
+    return found | {"parameters_with_memory": remembering.parameters.tolist()}
+
+
+def _position_actuators(
+    run: RunFolder, arm: LoadedArm, trajectories: Sequence[Trajectory], used: Preprocessing
+) -> dict[str, Any]:
+    if not _has_mujoco():
+        return {}
+    from spelgen.identification.position_actuators import MOST, fit_position_actuators
+
+    found = fit_position_actuators(arm, servo_windows(trajectories, used, MOST), trained_model(run))
+    return {} if found is None else {"position_actuators": found.to_dict()}
+
+
+def _has_mujoco() -> bool:
+    return importlib.util.find_spec("mujoco") is not None
+
+
+def read_baseline(run: RunFolder) -> dict[str, Any]:
+    """What ``keep_baseline`` found, by name: `RegressorDynamics`, or `PositionActuators`, which follow commands. None
+    where it found none, and none in MuJoCo where that is not installed.
+    """
     path = run.baseline
     found = run.read_json(path) if path.exists() else {}
+    if "position_actuators" in found and _has_mujoco():
+        from spelgen.identification.position_actuators import PositionActuators
+
+        return {POSITION_ACTUATORS: PositionActuators.from_dict(found["position_actuators"])}
     if "parameters" not in found:
         return {}
     arm = run_arm(run)
