@@ -7,7 +7,9 @@ from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
-from torch.func import functional_call, jacfwd, jvp, vmap
+from torch.autograd import grad as gradient
+from torch.autograd.functional import jacobian
+from torch.func import functional_call
 
 from spelgen.fitting import workers
 from spelgen.fitting.body_steps import moved_bodies
@@ -274,18 +276,24 @@ class TorqueJacobian:
         return torch.cat([bodies if name == BODIES else next(rest) for name in weights], dim=-1)
 
     def _joint_slope(self, weights: Weights, samples: _Samples) -> torch.Tensor:
-        """By weights of which each joint has its own, which move its own torque alone: one of every joint at once."""
-        own = {name: x for name, x in weights.items() if name != BODIES}
+        """By weights of which each joint has its own, which move its own torque alone: one of every joint at once.
 
-        def missing(changed: Weights) -> torch.Tensor:
-            return self._logged({**weights, **changed}, samples)
-
-        def change(direction: Weights) -> torch.Tensor:
-            found: torch.Tensor = jvp(missing, (own,), (direction,))[1]
-            return found
-
-        changes = vmap(change)(self._directions).detach()  # (directions, T, n)
+        J d is the derivative of J^T v, which is linear in v, by v. That takes reverse passes alone: forward ones go
+        through constants too, as zeros whose shapes torch works out in Python, at several times the cost.
+        """
+        own = {name: x.requires_grad_() for name, x in self._apart(weights).items()}
+        with torch.enable_grad():
+            missing = self._logged({**weights, **own}, samples)
+            v = torch.zeros_like(missing, requires_grad=True)
+            pulled = gradient(missing, [*own.values()], v, create_graph=True, materialize_grads=True)
+        directions = [self._directions[name] for name in own]
+        # (directions, T, n)
+        changes = gradient(pulled, v, directions, is_grads_batched=True, materialize_grads=True)[0]
         return -(changes[self._direction] * self._moved[:, None]).permute(1, 2, 0)
+
+    def _apart(self, weights: Weights) -> dict[str, torch.Tensor]:
+        """Copies of all weights but the bodies'."""
+        return {name: x.detach().clone() for name, x in weights.items() if name != BODIES}
 
     def _body_slope(self, weights: Weights, samples: _Samples) -> torch.Tensor:
         """By the bodies' weights: through the torque and through the load that friction grows with."""
@@ -294,14 +302,12 @@ class TorqueJacobian:
             question = {**weights, BODIES: bodies}
             return self._ask(question, lambda model: model.dynamics.inertial_parameters().flatten())
 
-        change = jacfwd(ten)(weights[BODIES]).flatten(1).detach()  # (10 B, K)
+        change = jacobian(ten, weights[BODIES], vectorize=True).flatten(1)  # (10 B, K)
         constants = self._ask(weights, lambda model: model.dynamics.friction.prepare())
-        load = samples.load_regressor @ ten(weights[BODIES])
-        by_load = jvp(
-            lambda each: self.model.dynamics.friction(samples.speed, each, constants, samples.z),
-            (load,),
-            (torch.ones_like(load),),
-        )[1]
+        load = (samples.load_regressor @ ten(weights[BODIES])).detach().requires_grad_()
+        with torch.enable_grad():
+            friction = self.model.dynamics.friction(samples.speed, load, constants, samples.z)
+        (by_load,) = gradient(friction.sum(), load, materialize_grads=True)  # each drive's by its own load
         at_drives = (samples.factor * by_load).unsqueeze(-1) * samples.load_regressor
         loaded = samples.regressor + torch.einsum("mj,tmk->tjk", self.model.dynamics.motors, at_drives)
         return ((loaded @ change) * self._per_gain(weights)[:, None]).detach()
