@@ -198,6 +198,31 @@ def test_windows_that_overlap_count_as_one():
     assert few.mean() < 0.9 * many.mean()
 
 
+def test_a_past_that_lacks_far_more_than_in_training_is_trusted_less():
+    generator = np.random.default_rng(3)
+    measured, noise, disturbed = generator.normal(size=(3, 2, 60, 1, 2))
+    open_loop, times = measured + 0.5 * noise, np.array([0.5])
+    trust = calibrated(open_loop, open_loop + 0.1 * disturbed, measured, np.arange(60) // 6, times)
+    assert (trust.trust > 0.7).all() and (trust.trust < 0.9).all()
+    usual = trust.added(open_loop, open_loop + 0.1 * np.sign(disturbed), times)
+    plain = trust.trust[:, None] * (open_loop + 0.1 * trust.held[:, None] * np.sign(disturbed))
+    np.testing.assert_allclose(usual, plain)
+    added = trust.added(open_loop, open_loop + 10 * np.sign(disturbed), times)
+    assert np.abs(added).max() < 0.1 * np.abs(open_loop).max()
+    assert np.isfinite(trust.added(open_loop, np.full_like(open_loop, np.nan), times)).all()
+
+
+def test_few_stretches_bound_how_far_a_trusted_rollout_is_followed():
+    measured = np.random.default_rng(4).normal(size=(2, 60, 1, 1))
+    far, times = np.full((2, 1, 1, 1), 1e6), np.array([0.5])
+    reached = [
+        calibrated(measured, measured, measured, np.arange(60) // (60 // count), times).added(far, far, times)
+        for count in (3, 15)
+    ]
+    largest = np.abs(measured).max(axis=1)[:, None]
+    np.testing.assert_allclose(reached, [3 * largest, 15 * largest])
+
+
 def waves(count=400, seed=0):
     """qd, its change over 0.1 s, and how q and qd differ from a constant velocity's 0.1 and 0.5 s on: of sines."""
     phases = 2 * np.pi * np.random.default_rng(seed).random((count, 2))

@@ -4,6 +4,8 @@ A forecast is a combination of forecasts (Bates and Granger, Oper. Res. Q. 20:45
 part of what a rollout adds to it. The part is a coefficient of least squares by joint and time ahead, for positions
 and for velocities, less one standard error by the jackknife over stretches of time, since errors of windows that
 overlap are alike; it is 0 where windows that it was not fitted to are not predicted better by two standard errors.
+What a window's past lacks may do more than it did in training: with another load, on another day, or where few logs
+were fitted too well. What is missed then grows in proportion, and the part falls.
 """
 
 from __future__ import annotations
@@ -12,6 +14,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.stats import norm
+from scipy.stats import t as student
 
 from spelgen.evaluation.along_time import at_times
 
@@ -19,24 +23,26 @@ TIMES = (0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0)  # s
 SHORTEST = 0.05  # s: of the horizons that a model is said to be good for
 CLEAR = 0.9  # of extrapolated motion's error, what a forecast's is at most where the model is good
 LEAST_BLOCKS = 3
-CERTAIN = 2.0  # standard errors that a gain must be large
+CERTAIN = 2.0  # standard errors that a gain must be large; deviations within which disturbances are usual
 MIXTURES = np.linspace(0, 1, 9)  # parts of the rollout with the disturbance held; the rest is that without
-TINY = 1e-300
+TINY, FARTHEST = 1e-300, 1e6
 
 
 @dataclass(frozen=True, eq=False)
 class Trust:
     """Of one predictor, at times (T,) [s], for q and qd.
 
-    trust: (2, T, n) 0..1. held: (2, T, n) the part of the rollout with the disturbance held in what is trusted. limit:
-    (2, T, n) the farthest that a training window went from extrapolated motion [rad, rad/s; m, m/s]; a rollout that is
-    not trusted at all is not followed farther. error: (T, n) that of forecasts of windows that they were not fitted to,
+    trust: (2, T, n) 0..1. held: (2, T, n) the part of the rollout with the disturbance held in what is trusted. effect:
+    (2, T, n) mean square of what holding it changed in training windows. limit:
+    (2, T, n) how far rollouts are followed from extrapolated motion [rad, rad/s; m, m/s]: as far as a training window
+    went, farther where they are trusted. error: (T, n) that of forecasts of windows that they were not fitted to,
     relative to the extrapolation's.
     """
 
     times: np.ndarray
     trust: np.ndarray
     held: np.ndarray
+    effect: np.ndarray
     limit: np.ndarray
     error: np.ndarray
 
@@ -58,16 +64,23 @@ class Trust:
 
     def added(self, open_loop: np.ndarray, held: np.ndarray, times: np.ndarray) -> np.ndarray:
         """What to add to extrapolated motion, (2, W, K, n), of what rollouts add to it, at times (K,) [s]."""
-        trust, part, limit = (
-            at_times(x, self.times, times)[:, None] for x in (self.trust, self.held, self.limit)
-        )
-        limit = limit / np.maximum(1 - trust**2, 1e-9)  # what is trusted fully may go anywhere
-        return trust * ((1 - part) * bounded(open_loop, limit) + part * bounded(held, limit))
+        found = (self.trust, self.held, self.effect, self.limit)
+        trust, part, effect, limit = (at_times(x, self.times, times)[:, None] for x in found)
+        missed = (1 - trust) * unusual(held - open_loop, effect)
+        followed = np.divide(trust, trust + missed, out=np.zeros_like(missed), where=trust > 0)
+        return followed * ((1 - part) * bounded(open_loop, limit) + part * bounded(held, limit))
 
 
 def bounded(added: np.ndarray, limit: np.ndarray) -> np.ndarray:
     """Not farther from extrapolated motion than in training; 0 where it is no number."""
     return np.clip(np.nan_to_num(added, posinf=np.inf, neginf=-np.inf), -limit, limit)
+
+
+def unusual(changed: np.ndarray, usual: np.ndarray) -> np.ndarray:
+    """How much more, squared, than within `CERTAIN` deviations holding a disturbance changes; 1 where it does not."""
+    square = np.square(np.nan_to_num(changed, nan=np.inf))
+    usual = np.broadcast_to(CERTAIN**2 * usual, square.shape)
+    return np.maximum(1, np.divide(square, usual, out=np.ones_like(square), where=usual > 0))
 
 
 def calibrated(
@@ -78,6 +91,8 @@ def calibrated(
     blocks: (W,), see `CalibrationWindows`.
     """
     limit = np.abs(measured).max(axis=1)  # (2, T, n)
+    changed = np.nan_to_num(held - open_loop, nan=FARTHEST)
+    effect = np.square(np.clip(changed, -FARTHEST, FARTHEST)).mean(axis=1)
     rollouts = [bounded(x, limit[:, None]) for x in (open_loop, held)]
     alone = np.square(measured).sum(axis=1)
     trust, part, error = np.zeros_like(alone), np.zeros_like(alone), alone
@@ -87,7 +102,9 @@ def calibrated(
         trust, error = np.where(better, level, trust), np.where(better, squares, error)
         part = np.where(better, mixture, part)
     relative = np.divide(error, alone, out=np.ones_like(alone), where=alone > 0)
-    return Trust(times, trust, part, limit, np.sqrt(relative.mean(axis=0)))
+    # what is trusted more may go farther, but how sure is trust that few stretches tell?
+    farthest = limit / np.maximum(1 - trust**2, 1 / (blocks.max() + 1))
+    return Trust(times, trust, part, effect, farthest, np.sqrt(relative.mean(axis=0)))
 
 
 def _fitted(added: np.ndarray, measured: np.ndarray, blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -110,5 +127,6 @@ def _fitted(added: np.ndarray, measured: np.ndarray, blocks: np.ndarray) -> tupl
     total = np.maximum(alone.sum(axis=0), TINY)
     part = left.sum(axis=0) / total
     chance = np.sqrt(count / (count - 1) * np.square(left - part * alone).sum(axis=0)) / total
-    clear = part + CERTAIN * chance < 1
+    certain = student.isf(norm.sf(CERTAIN), count - 1)  # few stretches tell an error badly
+    clear = part + certain * chance < 1
     return np.where(clear, np.clip(level - error, 0, 1), 0), np.where(clear, left, alone).sum(axis=0)
