@@ -15,8 +15,8 @@ from spelgen.identification.drive_samples import DriveLog
 from spelgen.logs.check_servo_logs import check_servo_logs
 from spelgen.logs.checks import Finding, findings, gap_diagnostics, summarised
 from spelgen.logs.gravity import GravityFit, StateSamples, fit_gravity, state_samples
-from spelgen.logs.report import SEEN, JointReport, LogReport
-from spelgen.logs.statistics import Statistics, common_step, range_fraction, statistics
+from spelgen.logs.report import SEEN, JointReport, LogReport, range_fraction
+from spelgen.logs.statistics import Statistics, common_step, statistics
 from spelgen.logs.trajectory import QUANTITIES, Trajectory, require_joints, require_torques
 
 if TYPE_CHECKING:

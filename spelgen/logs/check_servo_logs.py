@@ -11,6 +11,7 @@ from spelgen.arm.arm import Coordinate
 from spelgen.errors import Diagnostic, LogError
 from spelgen.logs.checks import DEGREES, Finding, findings, gap_diagnostics, summarised
 from spelgen.logs.following import DELAYS, NOW, Following
+from spelgen.logs.report import range_fraction
 from spelgen.logs.servo_report import ServoJointReport, ServoLogReport
 from spelgen.logs.statistics import (
     DENSE,

@@ -6,6 +6,7 @@ import textwrap
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from spelgen.arm.arm import Coordinate
 from spelgen.errors import Diagnostic, SpelgenError
 from spelgen.listing import WIDTH, Listing, number
 from spelgen.logs.gravity import GravityFit
@@ -189,3 +190,11 @@ def _wrapped(finding: Diagnostic) -> str:
 
 def _counted(count: int, one: str, many: str) -> str:
     return f"{count} {one if count == 1 else many}"
+
+
+def range_fraction(coordinate: Coordinate, low: float, high: float) -> float | None:
+    """The part of a joint's range that lies between these positions; None where it has no range."""
+    if coordinate.continuous or coordinate.lower is None or coordinate.upper is None:
+        return None
+    width = coordinate.upper - coordinate.lower
+    return (high - low) / width if width > 0 else None

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from spelgen.arm.arm import Coordinate
 from spelgen.logs.checks import VelocityAgreement, velocity_agreement
 from spelgen.logs.trajectory import GAP, QUANTITIES, Trajectory
 
@@ -120,11 +119,3 @@ def common_step(steps: Sequence[float]) -> float | None:
     """The step of most trajectories, where the signal is quantised in most of them."""
     known = [step for step in steps if np.isfinite(step)]
     return float(np.median(known)) if 2 * len(known) > len(steps) else None
-
-
-def range_fraction(coordinate: Coordinate, low: float, high: float) -> float | None:
-    """The part of a joint's range that lies between these positions; None where it has no range."""
-    if coordinate.continuous or coordinate.lower is None or coordinate.upper is None:
-        return None
-    width = coordinate.upper - coordinate.lower
-    return (high - low) / width if width > 0 else None
