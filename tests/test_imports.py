@@ -46,7 +46,8 @@ fitting: torque_networks urdf_regularizer stages compiled process progress valid
 fitting: run_record fitted servo_windows servo_start servo_weights servo_problem servo_descent servo_intervals
 fitting: servo_dead_zones servo_fit servo_report linear_servo servo_run
 fitting: fit train
-evaluation: names replay disturbance stiff baselines along_time extrapolation trust forecast torque rollout invariants examples
+evaluation: names replay disturbance stiff baselines along_time extrapolation trust forecast torque rollout
+evaluation: invariants examples
 evaluation: tables verdict results horizons torque_traces traces csv_file subject evaluate
 verify: agreement urdf_cross_check numeric_samples verify
 explain: reasons facts

@@ -20,7 +20,6 @@ from spelgen.logs.statistics import (
     common_step,
     noise_level,
     quantisation_step,
-    range_fraction,
 )
 from spelgen.logs.trajectory import Trajectory, require_commands, require_joints
 
