@@ -106,10 +106,9 @@ def test_the_gradient_is_that_of_the_criterion(robots, robot):
     np.testing.assert_allclose(gradient, slopes, rtol=1e-3, atol=1e-4 * np.abs(gradient).max())
 
 
-def test_the_same_arguments_give_the_same_motion(loaded, found):
-    again = excite(loaded, **CHOICE, trials=40)
+def test_the_same_arguments_give_the_same_motion(loaded):
+    found, again, other = (excite(loaded, **CHOICE, trials=6, seed=seed) for seed in (0, 0, 1))
     np.testing.assert_array_equal(again.motion.q, found.motion.q)
-    other = excite(loaded, **CHOICE, trials=40, seed=1)
     assert not np.allclose(other.motion.q, found.motion.q)
 
 

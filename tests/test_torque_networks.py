@@ -11,7 +11,7 @@ from spelgen.fitting.torque_samples import TorqueSamples
 from spelgen.identification.samples import DynamicsSamples
 
 
-def recorded(model, seed, count=300):
+def recorded(model, seed, count=150):
     random = torch.Generator().manual_seed(seed)
     q, qd, qdd = torch.randn(3, count, model.n, dtype=torch.float64, generator=random)
     with torch.no_grad():
