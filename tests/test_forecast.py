@@ -1,5 +1,6 @@
 """Forecasts: what the past tells of forces that a model lacks, and how far training windows show it to be trusted."""
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -209,7 +210,12 @@ def test_a_past_that_lacks_far_more_than_in_training_is_trusted_less():
     np.testing.assert_allclose(usual, plain)
     added = trust.added(open_loop, open_loop + 10 * np.sign(disturbed), times)
     assert np.abs(added).max() < 0.1 * np.abs(open_loop).max()
-    assert np.isfinite(trust.added(open_loop, np.full_like(open_loop, np.nan), times)).all()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for wild in (np.nan, np.inf, 1e300):
+            assert np.isfinite(
+                trust.added(np.full_like(open_loop, wild), np.full_like(open_loop, -wild), times)
+            ).all()
 
 
 def test_few_stretches_bound_how_far_a_trusted_rollout_is_followed():

@@ -66,7 +66,7 @@ class Trust:
         """What to add to extrapolated motion, (2, W, K, n), of what rollouts add to it, at times (K,) [s]."""
         found = (self.trust, self.held, self.effect, self.limit)
         trust, part, effect, limit = (at_times(x, self.times, times)[:, None] for x in found)
-        missed = (1 - trust) * unusual(held - open_loop, effect)
+        missed = (1 - trust) * unusual(_changed(open_loop, held), effect)
         followed = np.divide(trust, trust + missed, out=np.zeros_like(missed), where=trust > 0)
         return followed * ((1 - part) * bounded(open_loop, limit) + part * bounded(held, limit))
 
@@ -78,9 +78,16 @@ def bounded(added: np.ndarray, limit: np.ndarray) -> np.ndarray:
 
 def unusual(changed: np.ndarray, usual: np.ndarray) -> np.ndarray:
     """How much more, squared, than within `CERTAIN` deviations holding a disturbance changes; 1 where it does not."""
-    square = np.square(np.nan_to_num(changed, nan=np.inf))
+    square = np.square(changed)
     usual = np.broadcast_to(CERTAIN**2 * usual, square.shape)
     return np.maximum(1, np.divide(square, usual, out=np.ones_like(square), where=usual > 0))
+
+
+def _changed(open_loop: np.ndarray, held: np.ndarray) -> np.ndarray:
+    """What holding the disturbance changes of rollouts, which may have left all bounds."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        changed = np.nan_to_num(held - open_loop, nan=FARTHEST)
+    return np.clip(changed, -FARTHEST, FARTHEST)
 
 
 def calibrated(
@@ -91,8 +98,7 @@ def calibrated(
     blocks: (W,), see `CalibrationWindows`.
     """
     limit = np.abs(measured).max(axis=1)  # (2, T, n)
-    changed = np.nan_to_num(held - open_loop, nan=FARTHEST)
-    effect = np.square(np.clip(changed, -FARTHEST, FARTHEST)).mean(axis=1)
+    effect = np.square(_changed(open_loop, held)).mean(axis=1)
     rollouts = [bounded(x, limit[:, None]) for x in (open_loop, held)]
     alone = np.square(measured).sum(axis=1)
     trust, part, error = np.zeros_like(alone), np.zeros_like(alone), alone
