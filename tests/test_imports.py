@@ -1,6 +1,7 @@
 """Imports run downward only; what derives knows no torch, what fits knows no symbolic algebra."""
 
 import ast
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -132,9 +133,10 @@ def test_never_imports(name):
     assert not forbidden
 
 
-def imported(name: str) -> set[str]:
+@cache
+def imported(name: str) -> frozenset[str]:
     """Every module that a file names in an import, those inside functions included."""
-    found = set()
+    found: set[str] = set()
     for node in ast.walk(ast.parse(_file(name).read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
@@ -142,7 +144,7 @@ def imported(name: str) -> set[str]:
             assert not node.level, f"{name}: relative import; name the module in full"
             members = {f"{node.module}.{alias.name}" for alias in node.names}
             found |= members & OURS or ({str(node.module)} - {"spelgen"})
-    return found
+    return frozenset(found)
 
 
 def reached(name: str) -> set[str]:

@@ -123,9 +123,10 @@ class TorqueJacobian:
         count = int(free.sum())
         curvature, target = torch.zeros(count, count).double(), torch.zeros(count).double()
         for block in self._own_blocks():
-            slope = (self._slope(weights, block) / noise[:, None]).flatten(0, 1)[:, free]
+            missing, slope = self._linearised(weights, block)
+            slope = (slope / noise[:, None]).flatten(0, 1)[:, free]
             curvature += slope.mT @ slope
-            target += slope.mT @ (self._logged(weights, block).detach() / noise).flatten()
+            target += slope.mT @ (missing / noise).flatten()
         return workers.total(curvature), workers.total(target)
 
     def left(self, x: torch.Tensor) -> Left:
@@ -268,20 +269,22 @@ class TorqueJacobian:
         """The missing torque in the units of what was logged, (T, n)."""
         return self._missing(weights, samples) * self._per_gain(weights)
 
-    def _slope(self, weights: Weights, samples: _Samples) -> torch.Tensor:
-        """Minus d(missing torque, as logged) / d(weights), (T, n, K)."""
-        bodies, joints = self._body_slope(weights, samples), self._joint_slope(weights, samples)
+    def _linearised(self, weights: Weights, samples: _Samples) -> tuple[torch.Tensor, torch.Tensor]:
+        """The missing torque as logged, (T, n), and minus its derivative by the weights, (T, n, K)."""
+        missing, joints = self._joint_slope(weights, samples)
+        bodies = self._body_slope(weights, samples)
         sizes = [x.numel() for name, x in weights.items() if name != BODIES]
         rest = iter(joints.split(sizes, dim=-1))
-        return torch.cat([bodies if name == BODIES else next(rest) for name in weights], dim=-1)
+        return missing, torch.cat([bodies if name == BODIES else next(rest) for name in weights], dim=-1)
 
-    def _joint_slope(self, weights: Weights, samples: _Samples) -> torch.Tensor:
-        """By weights of which each joint has its own, which move its own torque alone: one of every joint at once.
+    def _joint_slope(self, weights: Weights, samples: _Samples) -> tuple[torch.Tensor, torch.Tensor]:
+        """The missing torque, and minus its derivative by the weights of which each joint has its own, which move its
+        own torque alone: one of every joint at once.
 
         J d is the derivative of J^T v, which is linear in v, by v. That takes reverse passes alone: forward ones go
         through constants too, as zeros whose shapes torch works out in Python, at several times the cost.
         """
-        own = {name: x.requires_grad_() for name, x in self._apart(weights).items()}
+        own = {name: x.clone().requires_grad_() for name, x in weights.items() if name != BODIES}
         with torch.enable_grad():
             missing = self._logged({**weights, **own}, samples)
             v = torch.zeros_like(missing, requires_grad=True)
@@ -289,11 +292,7 @@ class TorqueJacobian:
         directions = [self._directions[name] for name in own]
         # (directions, T, n)
         changes = gradient(pulled, v, directions, is_grads_batched=True, materialize_grads=True)[0]
-        return -(changes[self._direction] * self._moved[:, None]).permute(1, 2, 0)
-
-    def _apart(self, weights: Weights) -> dict[str, torch.Tensor]:
-        """Copies of all weights but the bodies'."""
-        return {name: x.detach().clone() for name, x in weights.items() if name != BODIES}
+        return missing.detach(), -(changes[self._direction] * self._moved[:, None]).permute(1, 2, 0)
 
     def _body_slope(self, weights: Weights, samples: _Samples) -> torch.Tensor:
         """By the bodies' weights: through the torque and through the load that friction grows with."""

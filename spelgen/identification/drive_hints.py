@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import pairwise
 from typing import Literal, get_args
 
 import numpy as np
@@ -147,7 +148,8 @@ class _Problem:
         base = base_parameters(arm, SLOW, speeds)
         self.columns = base.columns
         self.rows = self._rows(speeds)
-        self.block = np.arange(len(samples.q)) * BLOCKS // len(samples.q)
+        edges = [-(-k * len(samples.q) // BLOCKS) for k in range(BLOCKS + 1)]
+        self.blocks = [slice(*each) for each in pairwise(edges)]
 
     def _rows(self, speeds: np.ndarray) -> np.ndarray:
         friction = SLOW.columns(self.samples.qd, self.samples.qdd, None, speeds)
@@ -160,8 +162,8 @@ class _Problem:
         a = rows / scale[:, None]
         b = tau / scale
         size = np.sqrt(np.square(a).sum(axis=(0, 1)))
-        a = a / np.where(size > 0, size, 1.0)
-        parts = [(a[self.block == k], b[self.block == k]) for k in range(BLOCKS)]
+        a /= np.where(size > 0, size, 1.0)
+        parts = [(a[block], b[block]) for block in self.blocks]
         flat = [(x.reshape(-1, x.shape[2]), y.reshape(-1)) for x, y in parts]
         normal = [(x.T @ x, x.T @ y) for x, y in flat]
         whole, right = (sum(each) for each in zip(*normal, strict=True))
