@@ -12,6 +12,8 @@ from spelgen.exporting.description import Servos
 from spelgen.exporting.rigid_body_projection import RigidBodyProjection
 from spelgen.exporting.urdf_file import about_center
 
+HARD = "0.9999 0.9999 0.001 0.5 2"  # as hard as MuJoCo has friction: its default lets a loaded joint creep at rest
+
 
 def mjcf_text(
     projection: RigidBodyProjection,
@@ -73,6 +75,7 @@ def _body(above: etree._Element, projection: RigidBodyProjection, index: int, bo
         joint["armature"] = _number(0 if place in _coupled(projection.motors) else projection.armature[place])
         joint["damping"] = _number(projection.viscous[place])
         joint["frictionloss"] = _number((projection.forward[place] - projection.backward[place]) / 2)
+        joint["solimpfriction"] = HARD
         if not own.continuous and own.lower is not None and own.upper is not None:
             joint["range"] = _numbers((own.lower, own.upper))
     etree.SubElement(found, "joint", joint)
