@@ -3,9 +3,9 @@
     python benchmarks/servo_recovery.py ARM.urdf [--seeds 40] [--seconds 16]
 
 For each seed three recordings at 50 Hz (other commands, the same arm: servos, armatures, dry friction, delay, encoders
-of twelve bits, a dead zone of the servos where --dead-zone says so) are fitted as `spelgen train` does, and the truth
-is held against the intervals of 95 %. The arm is integrated by itself: semi-implicit Euler in steps of a millisecond,
-dry friction as impulses; the bodies' M and bias are those of the URDF.
+of twelve bits, the URDF's effort limits, a dead zone of the servos where --dead-zone says so) are fitted as
+`spelgen train` does, and the truth is held against the intervals of 95 %. The arm is integrated by itself:
+semi-implicit Euler in steps of a millisecond, dry friction as impulses; the bodies' M and bias are those of the URDF.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ def commands(random: np.random.Generator, t: np.ndarray, n: int) -> np.ndarray:
     return np.asarray(sines + levels[(t / 2).astype(int)])
 
 
-def simulated(model: Any, u: torch.Tensor, dead_zone: float) -> torch.Tensor:
-    """Positions (B, T, n) under commands (B, T, n), from rest at the first ones."""
+def simulated(model: Any, u: torch.Tensor, dead_zone: float, limit: torch.Tensor) -> torch.Tensor:
+    """Positions (B, T, n) under commands (B, T, n), from rest at the first ones. limit: of torques, (n,) [Nm]."""
     size = torch.linspace(1.0, SMALLEST, u.shape[-1]).double() * KP
     rotors = torch.diag(size * ARMATURE - model.armature)
     damping, most = torch.diag(STEP / 2 * size * LAG), STEP * size * DRY
@@ -50,6 +50,7 @@ def simulated(model: Any, u: torch.Tensor, dead_zone: float) -> torch.Tensor:
             found.append(q)
         wrong = u[:, max(0, k - late) // per] - q
         pull = size * (wrong - wrong.clamp(-dead_zone, dead_zone)) - size * LAG * qd
+        pull = pull.clamp(-limit, limit)
         inverse = torch.linalg.inv(model.mass_matrix(q) + rotors + damping)
         qd = qd + STEP * (inverse @ (pull - model.nonlinear_effects(q, qd)).unsqueeze(-1)).squeeze(-1)
         impulse = torch.zeros_like(qd)
@@ -68,9 +69,10 @@ def recordings(
     """Of each seed, as encoders see them."""
     model = spelgen.build(arm, "closed-form")
     t = np.arange(0, seconds, 1 / RATE)
+    limit = torch.tensor([x.effort or float("inf") for x in arm.arm.coordinates]).double()
     u = [commands(np.random.default_rng((s, k)), t, model.n) for s in range(seeds) for k in range(RECORDINGS)]
     with torch.no_grad():
-        q = simulated(model, torch.from_numpy(np.stack(u)), dead_zone).numpy()
+        q = simulated(model, torch.from_numpy(np.stack(u)), dead_zone, limit).numpy()
     q, nothing = np.round(q / ENCODER) * ENCODER, np.zeros((len(t), 0))
     logs = [
         Trajectory(t, x, np.gradient(x, t, axis=0), nothing, f"motion {k}", u=each)
