@@ -11,11 +11,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import norm
+from scipy.stats import t as student
 
 from spelgen.evaluation.along_time import at_times
 
 FREEDOM = 3.0  # degrees of it that Student's distribution has
 ROUNDS = 20  # of weighing windows
+CERTAIN = 2.0  # standard errors that a gain must be large
 LEAST = 1e-12  # relative: columns that are smaller than rounding
 
 
@@ -48,8 +51,8 @@ def extrapolation(
     """As windows of the training logs show it.
 
     qd, change: (W, n). measured: (2, W, T, n) how q and qd differ from a constant velocity's at times (T,) [s].
-    blocks: (W,) stretches of time: a part is kept where it predicts those that it was not fitted to better than nothing
-    does. past: [s] over which the velocity changed.
+    blocks: (W,) stretches of time: parts are kept at times at which they predict those that they were not fitted to
+    better than none do, surely so over all joints, and at a joint by itself. past: [s] over which the velocity changed.
     """
     columns = _columns(qd, change / past, times)
     everywhere = np.ones((1, len(blocks)))
@@ -57,8 +60,21 @@ def extrapolation(
     (parts,), (weights,) = _regressed(columns, measured, everywhere)
     others, _ = _regressed(columns, measured, elsewhere)
     left = measured - np.einsum("wcskn,cswkn->swkn", others[blocks], columns)
-    better = (weights * (np.square(measured) - np.square(left))).sum(axis=1) > 0  # (2, T, n)
+    before, after = (
+        np.stack([(weights * np.square(x))[:, blocks == k].sum(axis=1) for k in range(len(elsewhere))])
+        for x in (measured, left)
+    )  # (B, 2, T, n)
+    alone = before.sum(axis=0)
+    gains = np.divide(before - after, alone, out=np.zeros_like(before), where=alone > 0)
+    together = gains.sum(axis=-1, keepdims=True)
+    chance = np.sqrt(len(together) * together.var(axis=0, ddof=1))
+    better = (gains.sum(axis=0) > 0) & (together.sum(axis=0) > certain(len(together)) * chance)
     return Extrapolation(times, np.where(better, parts, 0.0), past)
+
+
+def certain(stretches: int) -> float:
+    """`CERTAIN` standard errors, and more where few stretches of time tell them badly (Student)."""
+    return float(student.isf(norm.sf(CERTAIN), stretches - 1))
 
 
 def _columns(qd: np.ndarray, acceleration: np.ndarray, times: np.ndarray) -> np.ndarray:

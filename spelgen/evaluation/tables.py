@@ -141,11 +141,14 @@ def _by_joint(title: str, joints: Sequence[str], values: Mapping[str, Sequence[f
 def table(title: str, labels: Sequence[str], rows: Iterable[Mapping[str, float | None]]) -> Table:
     """Rows of numbers by column, the least of each marked."""
     rows = list(rows)
-    cells = [_cells(list(row.values())) for row in rows]
+    names = tuple(dict.fromkeys(name for row in rows for name in row))
+    cells = [_cells(row, names) for row in rows]
     laid = tuple(Row(label, each) for label, each in zip(labels, cells, strict=True))
-    return Table(title, tuple(rows[0]), laid)
+    return Table(title, names, laid)
 
 
-def _cells(values: Sequence[float | None]) -> tuple[Cell, ...]:
-    least = min((value for value in values if value is not None), default=None) if len(values) > 1 else None
-    return tuple(Cell(number(value), value is not None and value == least) for value in values)
+def _cells(row: Mapping[str, float | None], names: Sequence[str]) -> tuple[Cell, ...]:
+    known = [value for value in row.values() if value is not None]
+    least = min(known, default=None) if len(row) > 1 else None
+    cells = {name: Cell(number(value), value is not None and value == least) for name, value in row.items()}
+    return tuple(cells.get(name, Cell("")) for name in names)

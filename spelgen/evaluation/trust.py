@@ -14,16 +14,14 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.stats import norm
-from scipy.stats import t as student
 
 from spelgen.evaluation.along_time import at_times
+from spelgen.evaluation.extrapolation import CERTAIN, certain
 
 TIMES = (0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0)  # s
 SHORTEST = 0.05  # s: of the horizons that a model is said to be good for
 CLEAR = 0.9  # of extrapolated motion's error, what a forecast's is at most where the model is good
 LEAST_BLOCKS = 3
-CERTAIN = 2.0  # standard errors that a gain must be large; deviations within which disturbances are usual
 MIXTURES = np.linspace(0, 1, 9)  # parts of the rollout with the disturbance held; the rest is that without
 TINY, FARTHEST = 1e-300, 1e6
 
@@ -133,6 +131,5 @@ def _fitted(added: np.ndarray, measured: np.ndarray, blocks: np.ndarray) -> tupl
     total = np.maximum(alone.sum(axis=0), TINY)
     part = left.sum(axis=0) / total
     chance = np.sqrt(count / (count - 1) * np.square(left - part * alone).sum(axis=0)) / total
-    certain = student.isf(norm.sf(CERTAIN), count - 1)  # few stretches tell an error badly
-    clear = part + certain * chance < 1
+    clear = part + certain(count) * chance < 1
     return np.where(clear, np.clip(level - error, 0, 1), 0), np.where(clear, left, alone).sum(axis=0)

@@ -89,8 +89,8 @@ def _median(values: Sequence[float | None]) -> float | None:
 
 
 def _baselines(result: Result) -> dict[str, None]:
-    """Names of all predictors but the model."""
-    of_states = [name for errors in result["errors"].values() for name in errors]
+    """Names of all predictors but the model that are there at every horizon."""
+    of_states = _common([list(errors) for errors in result["errors"].values()] or [[]])
     return dict.fromkeys(name for name in [*of_states, *result["torque"]] if name != MODEL)
 
 
