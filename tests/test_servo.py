@@ -15,7 +15,7 @@ from servo_arm import COM, GRAVITY, MASS, Servos, servo_logs, write_servo_arm
 
 import spelgen
 from spelgen.dynamics.servo_rank import servo_rank
-from spelgen.errors import LogError, OptionError, SettingsError
+from spelgen.errors import LogError, OptionError, RunError, SettingsError
 from spelgen.evaluation.names import POSITION_ACTUATORS
 from spelgen.evaluation.replay import LATE, LINEAR
 from spelgen.fitting import servo_descent, servo_fit
@@ -98,6 +98,26 @@ def test_actuators_of_mujoco_are_what_it_has_to_beat(fitted, logs, monkeypatch):
     assert read_baseline(run) == {}
     alone = spelgen.evaluate(run.path, logs[4][:40], baselines=read_baseline(run))
     assert "no-position-actuators" in {x.code for x in alone.diagnostics}
+
+
+@pytest.mark.parametrize(
+    ("mjcf", "joints", "said"),
+    [
+        ("<mujoco><include file='/etc/passwd'/></mujoco>", ["a"], "names other files"),
+        ("<mujoco><worldbody/></mujoco>", [], "another number of joints"),
+        ("<mujoco", ["a"], "XMLSyntaxError"),
+        ("<mujoco><worldbody/></mujoco>", ["a"], "KeyError"),
+        (None, None, "TypeError"),
+    ],
+)
+def test_actuators_from_elsewhere_are_what_was_written_or_an_error(mjcf, joints, said, tmp_path):
+    record = {"mjcf": mjcf, "joints": joints, "offset": [0.0], "delay": 0.1}
+    (tmp_path / "least_squares.json").write_text(json.dumps({"position_actuators": record}))
+    with pytest.raises(
+        RunError, match=r"least_squares\.json: got actuators of MuJoCo that cannot be used"
+    ) as told:
+        read_baseline(RunFolder(tmp_path))
+    assert said in f"{told.value} {type(told.value).__name__}"
 
 
 def test_a_module_of_servos_stands_alone_and_says_so(arm, tmp_path):

@@ -98,7 +98,16 @@ def read_baseline(run: RunFolder) -> dict[str, Any]:
     if "position_actuators" in found and _has_mujoco():
         from spelgen.identification.position_actuators import PositionActuators
 
-        return {POSITION_ACTUATORS: PositionActuators.from_dict(found["position_actuators"])}
+        try:
+            return {POSITION_ACTUATORS: PositionActuators.from_dict(found["position_actuators"])}
+        except (KeyError, TypeError, ValueError, SyntaxError) as error:
+            told = " ".join(str(error).split())
+            raise RunError(
+                f"actuators of MuJoCo that cannot be used ({type(error).__name__}: {told})",
+                file=path,
+                expected="what `spelgen train` wrote",
+                do="train again, or remove the file",
+            ) from error
     if "parameters" not in found:
         return {}
     arm = run_arm(run)

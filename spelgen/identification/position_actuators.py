@@ -14,6 +14,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from lxml import etree
 from mujoco import minimize, rollout
 
 from spelgen.building import build
@@ -32,6 +33,7 @@ HARD = 0.9999  # impedance of frictionloss, the largest that MuJoCo takes: softe
 ITERATIONS, NUDGE = 8, 1e-4
 FARTHEST = 4.0  # of logarithms, from where the fit starts
 OFFSET, LATEST = 0.3, 0.4  # rad, m; s: at most
+ELSEWHERE = ("include", "asset", "extension", "plugin")  # what MuJoCo would read beside the text
 
 
 @dataclass(frozen=True)
@@ -60,9 +62,15 @@ class PositionActuators:
 
     @classmethod
     def from_dict(cls, record: Mapping[str, Any]) -> PositionActuators:
-        """What `to_dict` gave."""
-        joints, offset = (tuple(record[name]) for name in ("joints", "offset"))
-        return cls(record["mjcf"], joints, offset, record["delay"])
+        """What `to_dict` gave. Raises KeyError, TypeError or ValueError where it is something else, or names files."""
+        offset, joints = tuple(map(float, record["offset"])), tuple(map(str, record["joints"]))
+        found = cls(str(record["mjcf"]), joints, offset, float(record["delay"]))
+        root = etree.fromstring(found.mjcf.encode(), etree.XMLParser(resolve_entities=False, no_network=True))
+        if any(each.tag in ELSEWHERE for each in root.iter()):
+            raise ValueError("MJCF that names other files")
+        if not len(offset) == len(joints) == _Simulated(found.mjcf, joints).model.nq:
+            raise ValueError("another number of joints")
+        return found
 
     def positions(
         self, parts: Sequence[tuple[Trajectory, slice]], q: np.ndarray, qd: np.ndarray
