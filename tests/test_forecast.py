@@ -16,7 +16,7 @@ from spelgen.evaluation.baselines import Predictor, of_dynamics
 from spelgen.evaluation.disturbance import after_past, without_compensation, without_past
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.evaluation.extrapolation import extrapolation
-from spelgen.evaluation.forecast import forecast_of, past_steps, rolled
+from spelgen.evaluation.forecast import forecast_of, past_steps, rolled, training_motion
 from spelgen.evaluation.names import CONSTANT_VELOCITY, EXTRAPOLATION, MODEL
 from spelgen.evaluation.rollout import rollout
 from spelgen.evaluation.tables import result_tables
@@ -160,8 +160,9 @@ def test_the_true_model_is_trusted_and_nonsense_is_not(offset_fit):
         q, qd = (torch.randn(shape, generator=noise, dtype=torch.float64) for _ in "ab")
         return windows.q[:, :1] + q, windows.qd[:, :1] + qd
 
-    true = forecast_of(of_dynamics(MODEL, model, 2), calibration, kinds)
-    several = [forecast_of(Predictor("nonsense", nonsense, form=model), calibration, kinds) for _ in range(5)]
+    motion = training_motion(calibration, kinds)
+    true = forecast_of(of_dynamics(MODEL, model, 2), motion)
+    several = [forecast_of(Predictor("nonsense", nonsense, form=model), motion) for _ in range(5)]
     assert true.trust.trust[:, 2:].min() > 0.9  # from 0.05 s on
     assert true.trust.good_for == 1.0
     nothing = np.stack([none.trust.trust for none in several])
@@ -289,7 +290,7 @@ def test_calibration_reads_no_test_windows(offset_fit):
     assert results[0].forecasts == results[1].forecasts
     assert results[0].horizons[0].errors[MODEL] != results[1].horizons[0].errors[MODEL]
     predictor, past = of_dynamics(MODEL, offset_fit.model, 2), past_steps(RATE)
-    forecast = forecast_of(predictor, offset_fit.calibration, ("revolute", "revolute"))
+    forecast = forecast_of(predictor, training_motion(offset_fit.calibration, ("revolute", "revolute")))
     windows = cut_windows(motions(seed=3, count=1), past + 11, 40, measured=False)
     together = forecast.states(rolled(predictor, windows, past))
     alone = forecast.states(rolled(predictor, windows[:1], past))

@@ -1,9 +1,13 @@
-"""Numbers that were found at some times ahead, at others."""
+"""Numbers along time: at times between those at which they were found, and over stretches of it."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
+from scipy.stats import norm
+from scipy.stats import t as student
+
+CERTAIN = 2.0  # standard errors that a gain must be large; deviations within which disturbances are usual
 
 
 def at_times(values: np.ndarray, known: np.ndarray, times: np.ndarray) -> np.ndarray:
@@ -12,3 +16,15 @@ def at_times(values: np.ndarray, known: np.ndarray, times: np.ndarray) -> np.nda
         return np.repeat(values, len(times), axis=-2)
     found: np.ndarray = make_interp_spline(known, values, k=1, axis=-2)(np.clip(times, known[0], known[-1]))
     return found
+
+
+def by_stretch(values: np.ndarray, blocks: np.ndarray) -> np.ndarray:
+    """Sums over the windows of each stretch of time, (B, 2, T, n), of (2, W, T, n). blocks: (W,) their stretches."""
+    member = (blocks == np.arange(blocks.max() + 1)[:, None]).astype(float)
+    sums: np.ndarray = np.einsum("bw,swtn->bstn", member, values)
+    return sums
+
+
+def certain(stretches: int) -> float:
+    """`CERTAIN` standard errors, and more where few stretches of time tell them badly (Student)."""
+    return float(student.isf(norm.sf(CERTAIN), stretches - 1))

@@ -14,7 +14,7 @@ from spelgen.evaluation.baselines import (
     of_dynamics,
     of_urdf,
 )
-from spelgen.evaluation.forecast import Disturbance, Forecast, for_windows, forecast_of
+from spelgen.evaluation.forecast import Disturbance, Forecast, for_windows, forecast_of, training_motion
 from spelgen.evaluation.horizons import PROBED, JudgedLogs, horizon_lengths, open_loop_note, predict
 from spelgen.evaluation.invariants import energy_drift
 from spelgen.evaluation.names import MODEL
@@ -147,11 +147,9 @@ def _forecasts(
     """Of all that have dynamics, by the same training windows; none where these are not known."""
     calibration, types = judged.calibration, judged.model.joint_types
     dynamic = [x for x in predictors if x.form is not None]
-    if calibration is not None:
-        found = {x.name: forecast_of(for_windows(x, calibration.probe), calibration, types) for x in dynamic}
-        known = {name: each for name, each in found.items() if each is not None}
-        if known:
-            return known
+    motion = None if calibration is None else training_motion(calibration, types)
+    if calibration is not None and motion is not None:
+        return {x.name: forecast_of(for_windows(x, calibration.probe), motion) for x in dynamic}
     reason = (
         "no windows of its training logs are known" if calibration is None else "its training logs are short"
     )

@@ -11,14 +11,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import norm
-from scipy.stats import t as student
 
-from spelgen.evaluation.along_time import at_times
+from spelgen.evaluation.along_time import at_times, by_stretch, certain
 
 FREEDOM = 3.0  # degrees of it that Student's distribution has
 ROUNDS = 20  # of weighing windows
-CERTAIN = 2.0  # standard errors that a gain must be large
 LEAST = 1e-12  # relative: columns that are smaller than rounding
 
 
@@ -60,21 +57,13 @@ def extrapolation(
     (parts,), (weights,) = _regressed(columns, measured, everywhere)
     others, _ = _regressed(columns, measured, elsewhere)
     left = measured - np.einsum("wcskn,cswkn->swkn", others[blocks], columns)
-    before, after = (
-        np.stack([(weights * np.square(x))[:, blocks == k].sum(axis=1) for k in range(len(elsewhere))])
-        for x in (measured, left)
-    )  # (B, 2, T, n)
+    before, after = (by_stretch(weights * np.square(x), blocks) for x in (measured, left))
     alone = before.sum(axis=0)
     gains = np.divide(before - after, alone, out=np.zeros_like(before), where=alone > 0)
     together = gains.sum(axis=-1, keepdims=True)
     chance = np.sqrt(len(together) * together.var(axis=0, ddof=1))
     better = (gains.sum(axis=0) > 0) & (together.sum(axis=0) > certain(len(together)) * chance)
     return Extrapolation(times, np.where(better, parts, 0.0), past)
-
-
-def certain(stretches: int) -> float:
-    """`CERTAIN` standard errors, and more where few stretches of time tell them badly (Student)."""
-    return float(student.isf(norm.sf(CERTAIN), stretches - 1))
 
 
 def _columns(qd: np.ndarray, acceleration: np.ndarray, times: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from spelgen.evaluation.baselines import Predictor, constant_velocity, of_baseline, of_dynamics
-from spelgen.evaluation.disturbance import after_past
+from spelgen.evaluation.disturbance import after_past, without_past
 from spelgen.evaluation.extrapolation import Extrapolation, extrapolation
 from spelgen.evaluation.names import MODEL
 from spelgen.evaluation.stiff import States
@@ -41,8 +41,22 @@ class Rollouts:
     @property
     def times(self) -> np.ndarray:
         """Ahead (K-1,) [s]."""
-        elapsed: np.ndarray = self.ahead.dt.cumsum(dim=1).mean(dim=0).numpy()
-        return elapsed
+        return _elapsed(self.ahead)
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingMotion:
+    """How training windows went on, at times (T,) [s], which are samples `chosen` (T,) ahead.
+
+    going_on: (2, W, T, n) extrapolated q and qd. measured: (2, W, T, n) how measured ones differ from these.
+    """
+
+    calibration: CalibrationWindows
+    chosen: np.ndarray
+    times: np.ndarray
+    extrapolation: Extrapolation
+    going_on: np.ndarray
+    measured: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,10 +86,11 @@ def good_for(model: Any, calibration: CalibrationWindows) -> float | None:
     """The longest time [s] ahead up to which a model's forecasts of training windows are clearly better than
     extrapolated motion; None: there is none.
     """
-    forecast = forecast_of(
-        for_windows(of_dynamics(MODEL, model, 1), calibration.probe), calibration, model.joint_types
-    )
-    return None if forecast is None else forecast.trust.good_for
+    motion = training_motion(calibration, model.joint_types)
+    if motion is None:
+        return None
+    predictor = for_windows(of_dynamics(MODEL, model, 1), calibration.probe)
+    return forecast_of(predictor, motion).trust.good_for
 
 
 def for_windows(predictor: Predictor, probe: Windows) -> Predictor:
@@ -100,10 +115,8 @@ def rolled(predictor: Predictor, windows: Windows, past: int) -> Rollouts:
         ahead, disturbance = after_past(predictor.form, windows, past)
         both = joined([ahead, ahead])  # one rollout of twice the windows takes about as long as one
         predicted = _safe(predictor, both, torch.cat([torch.zeros_like(disturbance), disturbance]))
-        still = torch.stack(constant_velocity().states(ahead)).numpy()
     open_loop, held = np.split(torch.stack(predicted).numpy(), 2, axis=1)
-    qd = windows.qd[:, past]
-    return Rollouts(ahead, still, open_loop, held, qd.numpy(), (qd - windows.qd[:, 0]).numpy())
+    return Rollouts(ahead, _still(ahead), open_loop, held, *_velocities(windows, past))
 
 
 def _safe(predictor: Predictor, windows: Windows, disturbance: torch.Tensor) -> States:
@@ -128,24 +141,46 @@ def _whole_or_none(
     return q, qd
 
 
-def forecast_of(
-    predictor: Predictor, calibration: CalibrationWindows, joint_types: Sequence[str]
-) -> Forecast | None:
-    """The forecasts that training windows show to be worth it; None: these are of too few stretches of time."""
+def training_motion(calibration: CalibrationWindows, joint_types: Sequence[str]) -> TrainingMotion | None:
+    """How training windows went on; None: these are of too few stretches of time to tell."""
     if calibration.blocks.max() + 1 < LEAST_BLOCKS:
         return None
-    found = rolled(predictor, calibration.windows, calibration.past)
-    elapsed = found.times
+    windows, past = calibration.windows, calibration.past
+    ahead, (qd, change) = without_past(windows, past), _velocities(windows, past)
+    elapsed = _elapsed(ahead)
     wanted = [time for time in TIMES if time <= 1.02 * elapsed[-1]]
     chosen = np.unique([np.abs(elapsed - time).argmin() for time in wanted]) if wanted else np.array([0])
-    start = found.ahead.q[:, :1]
-    steps = position_difference(found.ahead.q[:, 1:], found.ahead.q[:, :-1], joint_types)
-    q = start + steps.cumsum(dim=1)  # as rollouts go: on past a turn
-    measured = np.stack([q.numpy(), found.ahead.qd[:, 1:].numpy()]) - found.still
-    times, past = elapsed[chosen], calibration.windows.dt[:, : calibration.past].sum(dim=1).mean().item()
-    on = extrapolation(found.qd, found.change, measured[:, :, chosen], calibration.blocks, times, past)
-    added = on.added(found.qd, found.change, times)
-    open_loop, held, measured = (
-        x[:, :, chosen] - added for x in (found.open_loop - found.still, found.held - found.still, measured)
-    )
-    return Forecast(on, calibrated(open_loop, held, measured, calibration.blocks, times))
+    steps = position_difference(ahead.q[:, 1:], ahead.q[:, :-1], joint_types)
+    q = ahead.q[:, :1] + steps.cumsum(dim=1)  # as rollouts go: on past a turn
+    still = _still(ahead)[:, :, chosen]
+    measured = np.stack([q.numpy(), ahead.qd[:, 1:].numpy()])[:, :, chosen] - still
+    times, seconds = elapsed[chosen], windows.dt[:, :past].sum(dim=1).mean().item()
+    on = extrapolation(qd, change, measured, calibration.blocks, times, seconds)
+    added = on.added(qd, change, times)
+    return TrainingMotion(calibration, chosen, times, on, still + added, measured - added)
+
+
+def forecast_of(predictor: Predictor, motion: TrainingMotion) -> Forecast:
+    """The forecasts that training windows show to be worth it."""
+    calibration = motion.calibration
+    found = rolled(predictor, calibration.windows, calibration.past)
+    open_loop, held = (x[:, :, motion.chosen] - motion.going_on for x in (found.open_loop, found.held))
+    trust = calibrated(open_loop, held, motion.measured, calibration.blocks, motion.times)
+    return Forecast(motion.extrapolation, trust)
+
+
+def _still(ahead: Windows) -> np.ndarray:
+    """q and qd at constant velocity, (2, W, K-1, n)."""
+    return torch.stack(constant_velocity().states(ahead)).numpy()
+
+
+def _elapsed(ahead: Windows) -> np.ndarray:
+    """Times ahead, (K-1,) [s]."""
+    elapsed: np.ndarray = ahead.dt.cumsum(dim=1).mean(dim=0).numpy()
+    return elapsed
+
+
+def _velocities(windows: Windows, past: int) -> tuple[np.ndarray, np.ndarray]:
+    """qd at the present sample, and its change over the past, (W, n) both."""
+    qd = windows.qd[:, past]
+    return qd.numpy(), (qd - windows.qd[:, 0]).numpy()

@@ -124,7 +124,8 @@ def predict(
             found = rolled(predictor, windows, past)
             q, qd = torch.from_numpy(found.open_loop)
             states[predictor.name], open_loop[predictor.name] = forecast.states(found), (q, qd)
-            states[EXTRAPOLATION] = forecast.going_on(found)  # the same beside all
+            if EXTRAPOLATION not in states:  # the same beside all
+                states[EXTRAPOLATION] = forecast.going_on(found)
         else:
             with torch.no_grad():
                 states[predictor.name] = predictor.states(ahead)

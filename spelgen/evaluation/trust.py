@@ -15,8 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
-from spelgen.evaluation.along_time import at_times
-from spelgen.evaluation.extrapolation import CERTAIN, certain
+from spelgen.evaluation.along_time import CERTAIN, at_times, by_stretch, certain
 
 TIMES = (0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0)  # s
 SHORTEST = 0.05  # s: of the horizons that a model is said to be good for
@@ -113,11 +112,8 @@ def calibrated(
 
 def _fitted(added: np.ndarray, measured: np.ndarray, blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Trust (2, T, n), and the squared errors of blocks that it was not fitted to."""
-    count = blocks.max() + 1
-    member = (blocks == np.arange(count)[:, None]).astype(float)  # (B, W)
-    size, product, alone = (
-        np.einsum("bw,swtn->bstn", member, x) for x in (added**2, added * measured, measured**2)
-    )
+    size, product, alone = (by_stretch(x, blocks) for x in (added**2, added * measured, measured**2))
+    count = len(alone)
     level, left_out = (
         np.clip(x / np.maximum(y, TINY), 0, 1)
         for x, y in (
