@@ -60,8 +60,7 @@ def folder(robots, tmp_path_factory):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    # forked, they need not import torch again
-    mp.start_processes(one_of_two, (found, port), nprocs=2, start_method="fork")
+    mp.spawn(one_of_two, (found, port), nprocs=2)
     return found
 
 

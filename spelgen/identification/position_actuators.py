@@ -1,8 +1,9 @@
 """What most people simulate such an arm with: MuJoCo's position actuators, with armature and frictionloss of each
 joint. Fitted to the logs that a model of position servos was trained on, they are what it has to beat.
 
-The bodies are the URDF's, as `spelgen export --to mjcf` writes them. Windows are rolled out by `mujoco.rollout` and
-fitted by `mujoco.minimize`, which is what `mujoco.sysid` fits with, and needs none of that package's extra.
+The bodies are the URDF's, and friction is as hard as MuJoCo takes it, as `spelgen export --to mjcf` writes both. Windows
+are rolled out by `mujoco.rollout` and fitted by `mujoco.minimize`, which is what `mujoco.sysid` fits with, and needs
+none of that package's extra.
 """
 
 from __future__ import annotations
@@ -29,7 +30,6 @@ from spelgen.logs.trajectory import Trajectory
 
 STEP = 5e-3  # s, at most
 MOST = 60  # windows
-HARD = 0.9999  # impedance of frictionloss, the largest that MuJoCo takes: softer friction lets arms creep at rest
 ITERATIONS, NUDGE = 8, 1e-4
 FARTHEST = 4.0  # of logarithms, from where the fit starts
 OFFSET, LATEST = 0.3, 0.4  # rad, m; s: at most
@@ -114,7 +114,6 @@ class _Simulated:
         self.model = mujoco.MjModel.from_xml_string(mjcf)
         self.model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         self.model.dof_solref[:, 0] = 2 * STEP
-        self.model.dof_solimp[:, :2] = HARD
         self._data = mujoco.MjData(self.model)
         self.places = [int(self.model.joint(name).dofadr[0]) for name in joints]
 
