@@ -48,6 +48,8 @@ class PinocchioDynamics:
         self._plain = not circles and model.nq == model.nv == len(lines)
         identity = np.array_equal(self.jacobian.T @ self.jacobian, np.eye(self.n))
         self._direct = model.nv == self.n and identity and not self.offset.any()
+        # coordinates are the model's joints in its order: products with the identity took longer than `aba` itself
+        self._same = self._direct and np.array_equal(self.jacobian, np.eye(self.n))
 
     @property
     def n(self) -> int:
@@ -80,6 +82,8 @@ class PinocchioDynamics:
 
     def configuration(self, q: np.ndarray) -> np.ndarray:
         """Pinocchio's configuration (..., nq) at q (..., n)."""
+        if self._same and self._plain:
+            return q
         positions = q @ self.jacobian.T + self.offset
         if self._plain:
             return positions
@@ -119,6 +123,8 @@ class PinocchioDynamics:
             force = force - self.friction(qd)
         if not self._direct:
             return _solved(self._mass(q), force - self._effects(q, qd))
+        if self._same:  # a copy, for Pinocchio writes over what it gave
+            return np.array(self._by_joint(pin.aba, self.configuration(q), qd, force))
         by_joint = (x @ self.jacobian.T for x in (qd, force))
         found: np.ndarray = self._by_joint(pin.aba, self.configuration(q), *by_joint) @ self.jacobian
         return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -33,10 +34,17 @@ class Friction:
         never drives: its product with qd is not negative.
         """
         s = np.tanh(qd / self.smoothing_velocity)
-        even, odd = self.forward + self.backward, self.forward - self.backward
-        return self.viscous * qd + 0.5 * s * (odd + s * even)
+        return self.viscous * qd + s * (self._odd + s * self._even)
 
-    @property
+    @cached_property
+    def _odd(self) -> np.ndarray:
+        return 0.5 * (self.forward - self.backward)
+
+    @cached_property
+    def _even(self) -> np.ndarray:
+        return 0.5 * (self.forward + self.backward)
+
+    @cached_property
     def widths(self) -> np.ndarray:
         """Velocity (n,) within which the friction of each joint jumps, infinite where it does not."""
         return np.where(self.forward > self.backward, self.smoothing_velocity, np.inf)
