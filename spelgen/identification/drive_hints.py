@@ -6,7 +6,7 @@ explained better, in blocks of time that the parameters were not fitted to?
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise
@@ -50,12 +50,12 @@ class Coupling:
     left: float
 
 
-def torque_delay(arm: Arm, samples: DriveSamples, speeds: np.ndarray) -> tuple[float, float] | None:
+def torque_delay(problem: DriveProblem) -> tuple[float, float] | None:
     """How much later torques are logged than they act [s], and what is left of the squared error if that is mended;
-    None: nothing that is sure. speeds: C, (n, n), of the motors.
+    None: nothing that is sure.
     """
-    problem = _Problem(arm, samples, speeds)
-    total = [problem.errors(problem.rows, tau).mean() for tau in samples.tau]
+    samples = problem.samples
+    total = [problem.errors(tau).mean() for tau in samples.tau]
     best, now = int(np.argmin(total)), int(np.abs(DELAYS).argmin())
     if not 0 < best < len(DELAYS) - 1:
         return None
@@ -64,20 +64,19 @@ def torque_delay(arm: Arm, samples: DriveSamples, speeds: np.ndarray) -> tuple[f
     earlier = int(np.searchsorted(DELAYS, delay)) - 1  # torques are smooth from one of DELAYS to the next
     part = (delay - DELAYS[earlier]) / (DELAYS[1] - DELAYS[0])
     moved = (1 - part) * samples.tau[earlier] + part * samples.tau[earlier + 1]
-    logged, mended = (problem.errors(problem.rows, tau).mean(axis=1) for tau in (samples.tau[now], moved))
+    logged, mended = (problem.errors(tau).mean(axis=1) for tau in (samples.tau[now], moved))
     if not _sure(logged, mended, CLEAR):
         return None
     return float(delay), float(mended.mean() / logged.mean())
 
 
-def coupling(arm: Arm, samples: DriveSamples, speeds: np.ndarray) -> Coupling | None:
+def coupling(problem: DriveProblem) -> Coupling | None:
     """The coupling between two joints' motors that explains torques best; None: none is sure.
 
-    speeds: C, (n, n), of the couplings that are known; joints that these join are left alone.
+    Joints that known couplings join are left alone.
     """
-    problem = _Problem(arm, samples, speeds)
-    tau = samples.tau[np.abs(DELAYS).argmin()]
-    plain = problem.errors(problem.rows, tau)
+    tau = problem.samples.tau[np.abs(DELAYS).argmin()]
+    plain = problem.errors(tau)
     found = []
     for joint, moved_by in problem.suspects(tau):
         before = plain[:, [joint, moved_by]].mean(axis=1)
@@ -92,22 +91,41 @@ def coupling(arm: Arm, samples: DriveSamples, speeds: np.ndarray) -> Coupling | 
 
 
 class _Pair:
-    """The torques of two joints, one of whose motors may turn with the other one, too."""
+    """The torques of two joints, one of whose motors may turn with the other one, too.
+
+    Only these two torques' rows, and of them the columns of that motor, change with the ratio.
+    """
 
     def __init__(
-        self, problem: _Problem, tau: np.ndarray, joint: int, moved_by: int, logged_at: LoggedAt
+        self, problem: DriveProblem, tau: np.ndarray, joint: int, moved_by: int, logged_at: LoggedAt
     ) -> None:
-        self.problem, self.tau, self.logged_at = problem, tau, logged_at
-        self.joint, self.moved_by = joint, moved_by
+        self.problem, self.logged_at, self.both = problem, logged_at, [joint, moved_by]
+        self.tau = (tau / problem.scale(tau))[:, self.both]
+        self.inverse_scale = 1 / problem.scale(tau)[self.both]
+        others = [k for k in range(tau.shape[1]) if k not in self.both]
+        self.others = problem.normal(tau, others)
         self.tried: dict[float, np.ndarray] = {}
 
     def errors(self, ratio: float) -> np.ndarray:
         """Mean of both joints by block that was not fitted, (B,)."""
         if ratio not in self.tried:
-            rows = self.problem.coupled(self.joint, self.moved_by, ratio, self.logged_at)
-            both = self.problem.errors(rows, self.tau)[:, [self.joint, self.moved_by]]
-            self.tried[ratio] = both.mean(axis=1)
+            rows = self.inverse_scale[:, None] * self.rows(ratio)  # (S, 2, K)
+            own = [x + y for x, y in zip(self.others, self.problem.sums(rows, self.tau), strict=True)]
+            missed = self.problem.missed(rows, self.tau, *own)
+            self.tried[ratio] = missed.mean(axis=1)
         return self.tried[ratio]
+
+    def rows(self, ratio: float) -> np.ndarray:
+        """Of both torques where the motor turns by ``ratio`` with the other joint, too, (S, 2, K)."""
+        joint, moved_by = self.both
+        qd, qdd = (x[:, joint] + ratio * x[:, moved_by] for x in self.problem.samples[1:3])
+        motor = self.problem.of_motor(joint)
+        rows = self.problem.rows[:, self.both]
+        rows[:, 0, motor] = SLOW.columns(qd[:, None], qdd[:, None])[:, 0, self.problem.effects(motor)]
+        rows[:, 1, motor] = ratio * rows[:, 0, motor]
+        if self.logged_at == "motors":
+            rows[:, 1] -= ratio * rows[:, 0]
+        return rows
 
     def best_ratio(self) -> float:
         """The ratio with the least error, one of small numbers where that costs little."""
@@ -139,39 +157,73 @@ def _varies(tau: np.ndarray) -> np.ndarray:
     return found
 
 
-class _Problem:
-    """Least squares of these samples; rows (S, n, K) of the regressor, of the parameters that the torques show."""
+class DriveProblem:
+    """Least squares of these samples; rows (S, n, K) of the regressor, of the parameters that the torques show.
+
+    speeds: C, (n, n), of the motors, by the couplings that are known.
+    """
 
     def __init__(self, arm: Arm, samples: DriveSamples, speeds: np.ndarray) -> None:
-        self.arm, self.samples, self.speeds = arm, samples, speeds
-        self.bodies = regressor(arm, samples.q, samples.qd, samples.qdd)
-        base = base_parameters(arm, SLOW, speeds)
-        self.columns = base.columns
-        self.rows = self._rows(speeds)
+        self.samples, self.speeds = samples, speeds
+        bodies = regressor(arm, samples.q, samples.qd, samples.qdd)
+        friction = SLOW.columns(samples.qd, samples.qdd, None, speeds)
+        columns = base_parameters(arm, SLOW, speeds).columns
+        self.rows: np.ndarray = np.concatenate([bodies, friction], axis=2)[..., columns]
+        self._of_drives = columns - bodies.shape[2]  # effect e of drive j is n e + j; below zero: of bodies
         edges = [-(-k * len(samples.q) // BLOCKS) for k in range(BLOCKS + 1)]
         self.blocks = [slice(*each) for each in pairwise(edges)]
+        self._squares = np.stack([self.sums(x[:, None])[0] for x in self.rows.swapaxes(0, 1)])  # (n, B, K, K)
 
-    def _rows(self, speeds: np.ndarray) -> np.ndarray:
-        friction = SLOW.columns(self.samples.qd, self.samples.qdd, None, speeds)
-        rows: np.ndarray = np.concatenate([self.bodies, friction], axis=2)[..., self.columns]
-        return rows
+    def scale(self, tau: np.ndarray) -> np.ndarray:
+        """The unit of each torque (S, n), (n,)."""
+        return np.where(_varies(tau), tau.std(axis=0), 1.0)
 
-    def errors(self, rows: np.ndarray, tau: np.ndarray) -> np.ndarray:
+    def of_motor(self, joint: int) -> np.ndarray:
+        """Whether a parameter is this motor's, (K,)."""
+        mine: np.ndarray = (self._of_drives >= 0) & (self._of_drives % len(self.speeds) == joint)
+        return mine
+
+    def effects(self, which: np.ndarray) -> np.ndarray:
+        """The effects of these parameters of drives."""
+        found: np.ndarray = self._of_drives[which] // len(self.speeds)
+        return found
+
+    def sums(self, rows: np.ndarray, tau: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """By block, of rows (S, J, K) and torques (S, J): their squares (B, K, K), and both together (B, K)."""
+        flat = [rows[block].reshape(-1, rows.shape[2]) for block in self.blocks]
+        squares = np.stack([x.T @ x for x in flat])
+        if tau is None:
+            return squares, squares[..., 0]
+        together = [x.T @ tau[block].ravel() for x, block in zip(flat, self.blocks, strict=True)]
+        return squares, np.stack(together)
+
+    def normal(self, tau: np.ndarray, joints: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+        """As `sums`, of the torques (S, n) of some joints, in their units."""
+        weights = self.scale(tau)[joints] ** -2
+        squares = np.tensordot(weights, self._squares[joints], axes=1)
+        together = [
+            np.einsum("sjk,sj->k", self.rows[b][:, joints], tau[b][:, joints] * weights) for b in self.blocks
+        ]
+        return squares, np.stack(together)
+
+    def errors(self, tau: np.ndarray) -> np.ndarray:
         """Squared errors by block that was not fitted, (B, n), by each torque's variance."""
-        scale = np.where(_varies(tau), tau.std(axis=0), 1.0)
-        a = rows / scale[:, None]
-        b = tau / scale
-        size = np.sqrt(np.square(a).sum(axis=(0, 1)))
-        a /= np.where(size > 0, size, 1.0)
-        parts = [(a[block], b[block]) for block in self.blocks]
-        flat = [(x.reshape(-1, x.shape[2]), y.reshape(-1)) for x, y in parts]
-        normal = [(x.T @ x, x.T @ y) for x, y in flat]
-        whole, right = (sum(each) for each in zip(*normal, strict=True))
-        found = []
-        for (x, y), (own, own_right) in zip(parts, normal, strict=True):
-            left_out = whole - own + NEGLIGIBLE * np.eye(len(whole))
-            found.append(np.square(x @ np.linalg.solve(left_out, right - own_right) - y).mean(axis=0))
-        return np.stack(found)
+        scale, everyone = self.scale(tau), range(tau.shape[1])
+        return self.missed(self.rows / scale[:, None], tau / scale, *self.normal(tau, everyone))
+
+    def missed(
+        self, rows: np.ndarray, tau: np.ndarray, squares: np.ndarray, together: np.ndarray
+    ) -> np.ndarray:
+        """Mean squares (B, J) of what rows (S, J, K) leave of torques (S, J), in each block with the parameters of all
+        others, by their `sums`.
+        """
+        size = np.sqrt(squares.sum(axis=0).diagonal())
+        size = np.where(size > 0, size, 1.0)
+        squares, together = squares / np.outer(size, size), together / size
+        left_out = squares.sum(axis=0) - squares + NEGLIGIBLE * np.eye(len(size))
+        found = np.linalg.solve(left_out, (together.sum(axis=0) - together)[..., None])[..., 0] / size
+        parts = zip(self.blocks, found, strict=True)
+        return np.stack([np.square(rows[block] @ x - tau[block]).mean(axis=0) for block, x in parts])
 
     def suspects(self, tau: np.ndarray) -> Iterator[tuple[int, int]]:
         """The pairs (joint, moved by) for whose coupling most speaks at first sight."""
@@ -200,15 +252,6 @@ class _Problem:
             _projected(missed[:, at], np.stack([*beside, qd[:, other], qdd[:, other], dry], axis=1))
             for at, other, beside in ((by, joint, [tau[:, joint]]), (joint, by, []))
         )
-
-    def coupled(self, joint: int, moved_by: int, ratio: float, logged_at: LoggedAt) -> np.ndarray:
-        """The rows where the motor of a joint turns by `ratio` with another one, too."""
-        speeds = self.speeds.copy()
-        speeds[joint] = speeds[joint] + ratio * speeds[moved_by]
-        rows = self._rows(speeds)
-        if logged_at == "motors":
-            rows[:, moved_by] -= ratio * rows[:, joint]
-        return rows
 
 
 def coupled_inputs(drives: Drives, found: Coupling) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 
 from spelgen.arm.arm import Coordinate
 from spelgen.errors import Diagnostic, LogError, collect
-from spelgen.identification.drive_hints import Coupling, coupled_inputs, coupling, torque_delay
+from spelgen.identification.drive_hints import Coupling, DriveProblem, coupled_inputs, coupling, torque_delay
 from spelgen.identification.drive_samples import DriveLog
 from spelgen.logs.check_servo_logs import check_servo_logs
 from spelgen.logs.checks import Finding, findings, gap_diagnostics, summarised
@@ -92,10 +92,11 @@ def _drives(arm: LoadedArm, log: DriveLog, mapping: LogMapping) -> list[Diagnost
     samples, speeds = log.samples(), arm.actuation.drives().speeds
     if samples is None:
         return []
-    found = coupling(arm.arm, samples, speeds)
+    problem = DriveProblem(arm.arm, samples, speeds)
+    found = coupling(problem)
     if found is not None:
         return [_coupled(arm, found)]
-    late = torque_delay(arm.arm, samples, speeds)
+    late = torque_delay(problem)
     if late is None:
         return []
     delay, left = mapping.torque_delay + late[0], late[1]
