@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
-from scipy.stats import norm
-from scipy.stats import t as student
+from scipy.special import ndtr, stdtrit
 
 CERTAIN = 2.0  # standard errors that a gain must be large; deviations within which disturbances are usual
 
@@ -27,4 +26,4 @@ def by_stretch(values: np.ndarray, blocks: np.ndarray) -> np.ndarray:
 
 def certain(stretches: int) -> float:
     """`CERTAIN` standard errors, and more where few stretches of time tell them badly (Student)."""
-    return float(student.isf(norm.sf(CERTAIN), stretches - 1))
+    return float(-stdtrit(stretches - 1, ndtr(-CERTAIN)))

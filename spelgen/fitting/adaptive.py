@@ -6,7 +6,6 @@ from functools import partial
 from typing import Any
 
 import torch
-from torchdiffeq import odeint, odeint_adjoint
 
 from spelgen.dynamics.protocol import memory_after, remembering, sliding_memory
 from spelgen.logs.windows import Windows
@@ -23,6 +22,8 @@ def roll_out_adaptive(model: Any, windows: Windows) -> tuple[torch.Tensor, torch
     adjoint equation (Chen et al., Neural Ordinary Differential Equations, NeurIPS 2018). Friction's memory follows the
     displacement since the last sample, as in `roll_out`; of it the adjoint equation knows nothing.
     """
+    from torchdiffeq import odeint, odeint_adjoint  # half a second, for those who ask for dopri5 alone
+
     long = windows.dt.shape[1] >= LONG and isinstance(model, torch.nn.Module) and torch.is_grad_enabled()
     adjoint = long and remembering(model) is None
     # the adjoint equation sees weights alone, so what is made of them cannot be prepared once for it

@@ -82,7 +82,7 @@ class ServoProblem:
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """q and qd (P, W, K, n) at all samples, of weights (P, p, n), (P, r) under commands (P, W, K-1, S, n)."""
         weights = {f"model.{name}": x.detach() for name, x in self.weights.named(joints).items()}
-        with torch.no_grad():
+        with torch.inference_mode():  # small operations, of which each takes a tenth less so
             drives, armature = functional_call(self._asked, weights, (_drives,))
             added = torch.einsum("wknr,pr->pwkn", self.load.weights, bodies - self._at)
             return self._integrated(drives, armature, added, commands)

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from spelgen.fitting.servo_fit import ServoSolution
 from spelgen.fitting.servo_intervals import covariance
@@ -47,7 +47,7 @@ def servo_record(model: Any, solution: ServoSolution) -> dict[str, Any]:
 
 def _sure(solution: ServoSolution) -> float:
     """How many standard deviations half an interval is."""
-    return float(student.ppf(SURE, max(1, len(solution.normal.matrix) - 1)))
+    return float(stdtrit(max(1, len(solution.normal.matrix) - 1), SURE))
 
 
 def _joints(model: Any, solution: ServoSolution, unsure: torch.Tensor) -> list[dict[str, Any]]:

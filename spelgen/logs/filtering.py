@@ -6,8 +6,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.signal import butter, sosfiltfilt
 
 from spelgen.errors import LogError, SpelgenError, collect
 from spelgen.logs.trajectory import GAP, QUANTITIES, Trajectory, split_at_gaps
@@ -45,6 +43,8 @@ def low_pass(trajectory: Trajectory, cutoff: float) -> Trajectory:
     rate, filtered and interpolated back, so that the result stands at the log's own times. All three go
     through the same filter, so that a linear system's filtered input still explains its filtered output.
     """
+    from scipy.interpolate import CubicSpline  # as in `low_pass_regular`
+
     t = trajectory.t
     mean_rate = (len(t) - 1) / (t[-1] - t[0])
     if cutoff >= mean_rate / 2:
@@ -62,6 +62,11 @@ def low_pass(trajectory: Trajectory, cutoff: float) -> Trajectory:
 
 def low_pass_regular(signals: np.ndarray, rate: float, cutoff: float) -> np.ndarray:
     """Signals (T, ...) at a regular rate [Hz] through that filter."""
+    from scipy.signal import (
+        butter,
+        sosfiltfilt,
+    )  # the better part of a second, which most commands can do without
+
     sections = butter(FILTER_ORDER, cutoff, fs=rate, output="sos")
     padding = min(len(signals) - 1, int(3 * rate / cutoff))  # three periods of the cutoff settle the ends
     filtered: np.ndarray = sosfiltfilt(sections, signals, axis=0, padlen=padding)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.signal import savgol_filter
 
 from spelgen.logs.trajectory import Trajectory
 
@@ -22,6 +21,8 @@ def smoothed(q: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndarray]:
 
 def derivative(q: np.ndarray, rate: float, order: int) -> np.ndarray:
     """That of (..., T, n) of this order, 0 for the smoothed values themselves; see `smoothed`."""
+    from scipy.signal import savgol_filter  # as in filtering.py
+
     samples = q.shape[-2]
     width = min(max(5, 2 * round(SMOOTHING * rate / 2) + 1), samples - 1 + samples % 2)
     found: np.ndarray = savgol_filter(q, width, 3, deriv=order, delta=1 / rate, axis=-2)

@@ -10,7 +10,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.signal import butter, sosfiltfilt
 
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
@@ -185,6 +184,8 @@ def record(
 
 def measured(recording: Recording, tracking: TrackingSettings, name: str) -> Trajectory:
     """Return what is logged of a motion: filtered positions, their differences, and the torques."""
+    from scipy.signal import butter, sosfiltfilt  # as in logs/filtering.py
+
     sample_rate = 1.0 / (recording.t[1] - recording.t[0])
     low_pass = butter(FILTER_ORDER, tracking.cutoff, fs=sample_rate, output="sos")
     padding = min(
