@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -25,6 +27,7 @@ from spelgen.structure.structure import derive
 from spelgen.urdf.read import read_urdf
 from spelgen.verify.numeric_samples import with_random_inertias
 
+ROOT = Path(__file__).parents[1]
 ROBOTS = ("two_link", "rpr", "scara", "six_dof", "ur10e")
 
 RUN_ALONE = """
@@ -42,13 +45,20 @@ print(json.dumps(found))
 """
 
 
+@cache
+def written(robot, assume="kinematics"):
+    """A robot with its structure and closed forms, all entries written out."""
+    arm = load_arm(ROOT / "robots" / f"{robot}.urdf").arm
+    structure = derive(arm, assume)
+    return arm, structure, formulas(arm, structure, longest=WRITABLE)
+
+
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_sympy_file_alone_equals_pinocchio(robots, robot, tmp_path):
     """The file is executed where this package cannot be imported; Pinocchio reads the URDF by itself."""
-    urdf = robots / f"{robot}.urdf"
-    arm = load_arm(urdf).arm
-    write_text(tmp_path / "closed_forms.py", sympy_source(formulas(arm, derive(arm), longest=WRITABLE)))
-    model = pin.buildModelFromUrdf(str(urdf))
+    arm, _, found = written(robot)
+    write_text(tmp_path / "closed_forms.py", sympy_source(found))
+    model = pin.buildModelFromUrdf(str(robots / f"{robot}.urdf"))
     model.gravity.linear = np.array(arm.gravity, dtype=float)
     points = np.random.default_rng(0).uniform(-2, 2, (3, model.nq))
     command = [sys.executable, "-I", "-c", RUN_ALONE, json.dumps(points.tolist())]
@@ -65,11 +75,9 @@ def test_sympy_file_alone_equals_pinocchio(robots, robot, tmp_path):
 
 @pytest.mark.parametrize("assume", ["kinematics", "inertials"])
 @pytest.mark.parametrize("robot", ROBOTS)
-def test_text_read_back_equals_pinocchio(robots, robot, assume):
+def test_text_read_back_equals_pinocchio(robot, assume):
     """By any inertial values under ``kinematics``, by the URDF's under ``inertials``."""
-    arm = load_arm(robots / f"{robot}.urdf").arm
-    structure = derive(arm, assume)
-    found = formulas(arm, structure, longest=WRITABLE)
+    arm, structure, found = written(robot, assume)
     assert not found.unwritten
     if assume == "kinematics":
         arm = with_random_inertias(arm, np.random.default_rng(1))
@@ -77,19 +85,17 @@ def test_text_read_back_equals_pinocchio(robots, robot, assume):
 
 
 @pytest.mark.parametrize("robot", ["two_link", "rpr", "scara", "six_dof"])
-def test_latex_read_back_equals_pinocchio(robots, robot):
-    arm = load_arm(robots / f"{robot}.urdf").arm
-    structure = derive(arm)
-    rows = without_latex(latex(formulas(arm, structure, longest=WRITABLE)))
+def test_latex_read_back_equals_pinocchio(robot):
+    arm, structure, found = written(robot)
+    rows = without_latex(latex(found))
     drawn = with_random_inertias(arm, np.random.default_rng(2))
     assert_equal_to_pinocchio(drawn, rows, structure.base_parameter_count)
 
 
 @pytest.mark.parametrize("robot", ["two_link", "rpr", "scara"])
-def test_sympy_proves_each_expression(robots, robot):
+def test_sympy_proves_each_expression(robot):
     """Exactly, and not by numbers: by sines and cosines of single angles each is its unshortened expansion."""
-    arm = load_arm(robots / f"{robot}.urdf").arm
-    found = formulas(arm, derive(arm))
+    arm, _, found = written(robot)
     expansion = Expansion(arm)
     generators = [function for q in found.q for function in (sympy.cos(q), sympy.sin(q), q)]
     circles = [sympy.cos(q) ** 2 + sympy.sin(q) ** 2 - 1 for q in found.q]

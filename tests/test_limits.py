@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import re
-import resource
 import subprocess
 import sys
 from collections.abc import Callable
@@ -18,19 +18,37 @@ import pytest
 ROOT = Path(__file__).parents[1]
 SECONDS, MEGABYTES = 10, 1000
 
-# The command, then its own largest memory: that of a child seen from here would hold ours too.
-PROGRAM = """
-import sys
+# One process imports what commands need, and forks one for each: its exit code and its own largest memory are the last
+# line of what it tells, its processor time is that of the fork and of the imports.
+SERVER = """
+import json, os, resource, signal, sys
+import spelgen.emission.emit
+import spelgen.pipeline
 from spelgen.cli.main import main
 
-sys.argv[0] = "spelgen"
-try:
-    main()
-except SystemExit as end:
-    code = end.code
-assert "torch" not in sys.modules
-status = open("/proc/self/status").read()
-print(code, status.partition("VmHWM:")[2].split()[0], file=sys.stderr)
+def run(folder, told, *arguments):
+    os.chdir(folder)
+    sys.stdout.flush()
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    os.dup2(os.open(told, os.O_WRONLY | os.O_CREAT), 2)
+    sys.argv = ["spelgen", *arguments]
+    try:
+        main()
+    except SystemExit as end:
+        code = end.code
+    assert "torch" not in sys.modules
+    status = open("/proc/self/status").read()
+    print(code, status.partition("VmHWM:")[2].split()[0], file=sys.stderr, flush=True)
+    os._exit(0)
+
+own = resource.getrusage(resource.RUSAGE_SELF)
+for line in sys.stdin:
+    child = os.fork()
+    if child == 0:
+        signal.alarm({alarm})
+        run(*json.loads(line))
+    _, status, used = os.wait4(child, 0)
+    print(status, sum(x.ru_utime + x.ru_stime for x in (own, used)), flush=True)
 """
 
 
@@ -155,16 +173,33 @@ CASES = {
 }
 
 
+@pytest.fixture(scope="module")
+def server():
+    """Runs commands."""
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    program = SERVER.replace("{alarm}", str(12 * SECONDS))  # by the clock, on a machine that may be busy
+    with subprocess.Popen(
+        [sys.executable, "-c", program],
+        env=environment,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as process:
+        yield process
+        process.stdin.close()
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is read from /proc")
 @pytest.mark.parametrize("name", CASES)
-def test_is_refused_or_built_in_bounds(tmp_path, name):
+def test_is_refused_or_built_in_bounds(server, tmp_path, name):
     case = CASES[name]
     text = case.make()
     path = tmp_path / "robot.urdf"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     inspect, build = ("inspect", "--format", "json", "-o", "structure.json"), ("build", "-o", "module.py")
     for command in (inspect, build) if case.refused is None else (build,):  # both refuse by the same reader
-        code, errors = run_in_bounds(command[0], path.name, *case.options, *command[1:], folder=tmp_path)
+        arguments = command[0], path.name, *case.options, *command[1:]
+        code, errors = run_in_bounds(server, *arguments, folder=tmp_path)
         assert code == ("0" if case.refused is None else "1")
         if case.refused is not None:
             assert_refusal(errors, case.refused)
@@ -172,23 +207,16 @@ def test_is_refused_or_built_in_bounds(tmp_path, name):
     assert made == ({"structure.json", "module.py"} if case.refused is None else set())
 
 
-def run_in_bounds(*arguments: str, folder: Path) -> tuple[str, list[str]]:
+def run_in_bounds(server: subprocess.Popen, *arguments: str, folder: Path) -> tuple[str, list[str]]:
     """Exit code and lines of stderr of a command, after its processor time and memory were looked at."""
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    run = subprocess.run(
-        [sys.executable, "-c", PROGRAM, *arguments],
-        cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        timeout=12 * SECONDS,  # by the clock, on a machine that may be busy
-        check=False,
-    )
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    assert run.returncode == 0, run.stderr[-2000:]
-    *lines, last = run.stderr.splitlines()
+    told = folder.parent / f"{folder.name}-{arguments[0]}.stderr"
+    print(json.dumps([str(folder), str(told), *arguments]), file=server.stdin, flush=True)
+    status, seconds = server.stdout.readline().split()
+    text = told.read_text()
+    assert status == "0", text[-2000:]
+    *lines, last = text.splitlines()
     code, kilobytes = last.split()
-    assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < SECONDS
+    assert float(seconds) < SECONDS
     assert int(kilobytes) < 1000 * MEGABYTES
     return code, lines
 

@@ -97,7 +97,7 @@ def test_least_squares_finds_friction_and_rotors_of_coupled_motors(wrist):
 def test_a_closed_form_model_is_fitted_to_a_coupled_wrist(wrist):
     module, arm = wrist
     strength, armature = np.array([5.0, 5.0, 4.0, 3.0, 2.0, 1.0]), np.full(6, 0.2)
-    motion = moved(module, 20.0)
+    motion = moved(module, 6.0)
     _, tau = on_motors(*motion, arm, strength, armature)
     model = module.Model()
     fit_torque(model, [DynamicsSamples("x", *motion, tau)])
@@ -159,7 +159,7 @@ def test_motors_may_be_coupled_where_joint_torques_are_logged(wrist, tmp_path):
     np.testing.assert_allclose(arm.actuation.drives().speeds, driven.actuation.drives().speeds)
     strength, armature = np.array([5.0, 5.0, 4.0, 3.0, 2.0, 1.0]), np.full(6, 0.2)
     module = import_source(generate(arm, preset="closed-form"), tmp_path / "joint_torques.py")
-    motion, fresh = moved(module, 20.0), moved(module, 10.0, seed=1)
+    motion, fresh = moved(module, 6.0), moved(module, 10.0, seed=1)
     (tau, _), (expected, _) = (on_motors(*x, driven, strength, armature) for x in (motion, fresh))
     samples = [DynamicsSamples("x", *motion, tau)]
     found = least_squares(arm.arm, samples, LeastSquares("range"), arm.actuation.drives())
