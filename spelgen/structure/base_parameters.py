@@ -11,6 +11,7 @@ from __future__ import annotations
 import random
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import lru_cache
 
 import numpy as np
 from flint import fmpq, fmpq_mat
@@ -46,6 +47,7 @@ def parameter_name(index: int) -> str:
     return f"{PARAMETERS[index % 10]}{index // 10 + 1}"
 
 
+@lru_cache(maxsize=16)  # of one arm they are asked for by least squares, logs and closed forms
 def base_parameters(arm: Arm, count: int) -> tuple[BaseParameter, ...]:
     """The ``count`` base parameters of ``arm``, by body from the root."""
     order = [10 * body + PARAMETERS.index(name) for body in range(len(arm.bodies)) for name in _PREFERRED]

@@ -11,6 +11,7 @@ or zeros of samples in a prime field (``field``): exact but for odds of about 1e
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 from spelgen.arm.arm import Arm
@@ -59,6 +60,7 @@ class Structure:
         return sum(not output.joints or min(output.joints) >= first for output in self.outputs)
 
 
+@lru_cache(maxsize=16)  # an arm is often loaded again, with other settings or logs
 def derive(arm: Arm, assume: Assume = "kinematics") -> Structure:
     """The structure of ``arm``. Raises ArmError without inertials under ``inertials``."""
     if assume == "inertials" and not arm.has_inertials:
@@ -81,6 +83,7 @@ def derive(arm: Arm, assume: Assume = "kinematics") -> Structure:
     )
 
 
+@lru_cache(maxsize=16)
 def base_parameter_count(arm: Arm) -> int:
     """Rank of the inverse-dynamics regressor: how many combinations of inertial parameters move the arm
     differently.
