@@ -83,5 +83,10 @@ def reference_arms(shared: Path, assume: str) -> Iterator[tuple[str, dict[str, A
 
 @cache
 def _reference(path: Path, joints: tuple[str, ...] | None, assume: str) -> tuple[Arm, Structure]:
-    arm = make_arm(read_urdf(path), joints=joints)
+    arm = _arm(path, joints)
     return arm, derive(arm, assume)
+
+
+@cache
+def _arm(path: Path, joints: tuple[str, ...] | None) -> Arm:
+    return make_arm(read_urdf(path), joints=joints)

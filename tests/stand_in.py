@@ -34,10 +34,14 @@ class Model(nn.Module):
         b, d = self.inertia[0], self.inertia[1].exp()
         return d + b**2 / d + self.inertia[2].exp(), b, d
 
-    def mass_matrix(self, q, prepared=None):
+    def _entries(self, q):
         a, b, d = self._coefficients()
-        c = q[..., 1].cos()
-        return torch.stack([a + 2 * b * c, d + b * c, d + b * c, d.expand(c.shape)], -1).unflatten(-1, (2, 2))
+        bc = b * q[..., 1].cos()
+        return a + 2 * bc, d + bc, d
+
+    def mass_matrix(self, q, prepared=None):
+        m11, m12, m22 = self._entries(q)
+        return torch.stack([m11, m12, m12, m22.expand(m12.shape)], -1).unflatten(-1, (2, 2))
 
     def potential_energy(self, q):
         return -(self.weight * q.cumsum(-1).cos()).sum(-1)
@@ -56,14 +60,17 @@ class Model(nn.Module):
         return (self.mass_matrix(q) @ qd.unsqueeze(-1)).squeeze(-1)
 
     def velocity(self, q, p, prepared=None):
-        return torch.linalg.solve(self.mass_matrix(q), p)
+        (m11, m12, m22), (p1, p2) = self._entries(q), p.unbind(-1)
+        scaled = torch.stack([m22 * p1 - m12 * p2, m11 * p2 - m12 * p1], -1)
+        return scaled / (m11 * m22 - m12**2).unsqueeze(-1)
 
     def hamiltonian(self, q, p, z=None):
         return 0.5 * (p * self.velocity(q, p)).sum(-1) + self.potential_energy(q)
 
     def _kinetic_slope(self, q, qd):
         """d(1/2 qd^T M qd)/dq (..., 2): only c2 varies."""
-        slope = -self.inertia[0] * q[..., 1].sin() * (qd[..., 0] ** 2 + qd[..., 0] * qd[..., 1])
+        first, second = qd.unbind(-1)
+        slope = -self.inertia[0] * q[..., 1].sin() * first * (first + second)
         return torch.stack([torch.zeros_like(slope), slope], -1)
 
     def _mass_rate(self, q, qd):

@@ -380,7 +380,7 @@ def test_interrupted_training_leaves_a_run(spelgen, trained, tmp_path):
     folder, _ = trained
     run = tmp_path / "run"
     command = [sys.executable, "-m", "spelgen", "train", "arm_spel.py", "--data", "logs", "-o", str(run)]
-    command += ["--optimizer", "adamw"]  # L-BFGS would have ended by itself
+    command += ["--optimizer", "adamw", "--momentum-steps", "0"]  # L-BFGS would have ended by itself
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     with subprocess.Popen(
         command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
