@@ -178,13 +178,14 @@ def test_trust_is_one_for_what_is_measured_and_nothing_for_what_never_moves():
     blocks = np.arange(60) // 6
     times = np.array([0.1, 0.5, 1.0])
     trust = calibrated(0 * measured, measured, measured, blocks, times)
-    np.testing.assert_array_equal(trust.trust[..., :3], 1.0)
-    np.testing.assert_array_equal(trust.held[..., :3], 1.0)
+    np.testing.assert_allclose(trust.trust[..., :3], 1.0)
+    np.testing.assert_allclose(trust.gains[0, 1], 0.0, atol=1e-7)
+    assert (trust.held[..., :3] > 0).all()
     np.testing.assert_array_equal(trust.trust[..., 3], 0.0)
     other = calibrated(measured, generator.normal(size=measured.shape), measured, blocks, times)
     assert (other.held[..., :3] == 0).all()
     added = trust.added(0 * measured, measured, np.array([0.1, 0.2, 2.0]))
-    np.testing.assert_allclose(added[:, :, 0, :3], measured[:, :, 0, :3])
+    np.testing.assert_allclose(added[:, :, 0, :3], measured[:, :, 0, :3], atol=1e-8)
 
 
 def test_windows_that_overlap_count_as_one():
@@ -208,7 +209,8 @@ def test_a_past_that_lacks_far_more_than_in_training_is_trusted_less():
     trust = calibrated(open_loop, open_loop + 0.1 * disturbed, measured, np.arange(60) // 6, times)
     assert (trust.trust > 0.7).all() and (trust.trust < 0.9).all()
     usual = trust.added(open_loop, open_loop + 0.1 * np.sign(disturbed), times)
-    plain = trust.trust[:, None] * (open_loop + 0.1 * trust.held[:, None] * np.sign(disturbed))
+    followed = [open_loop + 0.1 * each[None, None] * np.sign(disturbed) for each in trust.held]
+    plain = np.stack([(x * each[:, None]).sum(axis=0) for x, each in zip(followed, trust.gains, strict=True)])
     np.testing.assert_allclose(usual, plain)
     added = trust.added(open_loop, open_loop + 10 * np.sign(disturbed), times)
     assert np.abs(added).max() < 0.1 * np.abs(open_loop).max()
@@ -220,15 +222,29 @@ def test_a_past_that_lacks_far_more_than_in_training_is_trusted_less():
             ).all()
 
 
+def test_what_position_and_velocity_tell_together_is_followed():
+    """A missed force errs both alike: neither is worth much by itself, both together are."""
+    generator = np.random.default_rng(5)
+    measured = generator.normal(size=(2, 60, 1, 3))
+    force = 5 * generator.normal(size=(60, 1, 3))
+    open_loop, times = measured + np.stack([0.5 * force, force]), np.array([1.0])
+    trust = calibrated(open_loop, open_loop, measured, np.arange(60) // 6, times)
+    left = measured - trust.added(open_loop, open_loop, times)
+    best = [np.sqrt(1 / (1 + c**2)) for c in (0.5, 2.0)]  # what the direction of the force leaves unknown
+    for each, bound in zip(np.sqrt(np.square(left).mean(axis=(1, 2, 3))), best[::-1], strict=True):
+        assert 0.9 * bound < each < 1.15 * bound
+
+
 def test_few_stretches_bound_how_far_a_trusted_rollout_is_followed():
+    """As many times as far as in training as there are stretches, in the direction in which it goes."""
     measured = np.random.default_rng(4).normal(size=(2, 60, 1, 1))
-    far, times = np.full((2, 1, 1, 1), 1e6), np.array([0.5])
+    far, times = np.full((2, 1, 1, 1), 1e5), np.array([0.5])
     reached = [
         calibrated(measured, measured, measured, np.arange(60) // (60 // count), times).added(far, far, times)
         for count in (3, 15)
     ]
-    largest = np.abs(measured).max(axis=1)[:, None]
-    np.testing.assert_allclose(reached, [3 * largest, 15 * largest])
+    nearest = np.abs(measured).max(axis=1).min() * np.ones_like(far)
+    np.testing.assert_allclose(reached, [3 * nearest, 15 * nearest], rtol=1e-6)
 
 
 def waves(count=400, seed=0):

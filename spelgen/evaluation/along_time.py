@@ -18,9 +18,9 @@ def at_times(values: np.ndarray, known: np.ndarray, times: np.ndarray) -> np.nda
 
 
 def by_stretch(values: np.ndarray, blocks: np.ndarray) -> np.ndarray:
-    """Sums over the windows of each stretch of time, (B, 2, T, n), of (2, W, T, n). blocks: (W,) their stretches."""
+    """Sums over the windows of each stretch of time, (B, ..., T, n), of (..., W, T, n). blocks: (W,) the stretches."""
     member = (blocks == np.arange(blocks.max() + 1)[:, None]).astype(float)
-    sums: np.ndarray = np.einsum("bw,swtn->bstn", member, values)
+    sums: np.ndarray = np.einsum("bw,...wtn->b...tn", member, values)
     return sums
 
 

@@ -22,7 +22,7 @@ from spelgen.logs.windows import Windows, cut_windows, joined
 
 PAST, AHEAD = 0.1, 1.0  # s
 FASTEST = 100.0  # Hz
-MOST = 128  # windows
+MOST = 512  # windows
 MOST_BLOCKS = 16
 PROBED = 5  # samples
 WRITTEN = "a file of `spelgen train`"
