@@ -256,9 +256,8 @@ def test_slow_logs_are_told_to_say_little_of_inertia(emitted):
     true = drawn(module, seed=2, deviation=0.2)
     codes = {}
     for name, pace in (("quick", 1.0), ("slow", 0.02)):
-        motion = recorded(true, 8.0 / pace, 0.0, seed=1)
-        every = round(1 / pace)
-        q, qd, qdd = motion.q[::every], motion.qd[::every] * pace, motion.qdd[::every] * pace**2
+        motion = smooth_motion(6, 8.0 / pace, np.random.default_rng(1))
+        q, qd, qdd = (x[:: round(1 / pace)] * pace**order for order, x in enumerate(motion))
         with torch.no_grad():
             tau = true.inverse_dynamics(*(torch.from_numpy(x) for x in (q, qd, qdd))).numpy()
         tau = tau + 0.05 * tau.std(0) * np.random.default_rng(0).normal(size=tau.shape)
@@ -269,14 +268,20 @@ def test_slow_logs_are_told_to_say_little_of_inertia(emitted):
     assert codes["slow"] == {"urdf-believed", "inertia-undetermined", "acceleration-unseen"}
 
 
-@pytest.mark.parametrize("held", [True, False])
-@pytest.mark.parametrize("on_disk", [True, False])
-def test_blocks_give_what_all_at_once_gives(emitted, monkeypatch, held, on_disk):
-    """Of blocks that leave a rest, with regressors kept or computed anew, in memory or in a temporary file."""
+@pytest.fixture(scope="module")
+def at_once(emitted):
+    """Samples, the model that they were fitted to all at once, and how that ended."""
     module = emitted["rpr"][0]
     samples = [recorded(drawn(module, seed=2, deviation=0.3), 3.0, 0.05, seed=seed) for seed in range(3)]
-    whole, parts = module.Model(), module.Model()
-    expected = fit_torque(whole, samples)
+    whole = module.Model()
+    return samples, whole, fit_torque(whole, samples)
+
+
+@pytest.mark.parametrize("held", [True, False])
+@pytest.mark.parametrize("on_disk", [True, False])
+def test_blocks_give_what_all_at_once_gives(emitted, at_once, monkeypatch, held, on_disk):
+    """Of blocks that leave a rest, with regressors kept or computed anew, in memory or in a temporary file."""
+    (samples, whole, expected), parts = at_once, emitted["rpr"][0].Model()
     monkeypatch.setattr(torque_jacobian, "BLOCK", 64)
     monkeypatch.setattr(torque_jacobian, "HELD", 1e12 if held else 0)
     table = (

@@ -10,6 +10,7 @@ import shutil
 import signal
 import time
 import types
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -67,6 +68,11 @@ def truth():
 
 def motions(count=6, samples=21, seed=0, rate=20.0) -> list[Trajectory]:
     """Trajectories of the true arm under random held torques, at jittered times."""
+    return list(_motions(count, samples, seed, rate))
+
+
+@cache
+def _motions(count: int, samples: int, seed: int, rate: float) -> tuple[Trajectory, ...]:
     random = torch.Generator().manual_seed(seed)
     dt = (0.8 + 0.4 * torch.rand(count, samples - 1, generator=random, dtype=torch.float64)) / rate
     q = 4 * torch.rand(count, 1, 2, generator=random, dtype=torch.float64) - 2
@@ -77,7 +83,7 @@ def motions(count=6, samples=21, seed=0, rate=20.0) -> list[Trajectory]:
     positions = torch.cat([q, predicted_q], dim=1)
     velocities = torch.cat([torch.zeros(count, 1, 2), predicted_qd], dim=1)
     rows = zip(t.numpy(), positions.numpy(), velocities.numpy(), tau.numpy(), strict=True)
-    return [Trajectory(*row, name=f"motion_{k}") for k, row in enumerate(rows)]
+    return tuple(Trajectory(*row, name=f"motion_{k}") for k, row in enumerate(rows))
 
 
 @pytest.fixture(scope="module")
