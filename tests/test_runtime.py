@@ -121,6 +121,15 @@ def test_joint_functions_are_a_gradient_and_vanish_outside_the_range():
     near(functions.ripple(q)[:, 2, HARMONICS + 1], (202 * q[:, 2]).cos())
 
 
+def test_friction_stays_between_a_tenth_and_ten_times_for_all_weights():
+    functions, q = JointFunctions(JOINTS), draw(50, 3)
+    for size in (0.01, 1.0, 1e6):
+        functions.raw_friction_splines.data = size * draw(*functions.raw_friction_splines.shape)
+        factor = functions(q, functions.prepare())[1].detach()
+        assert (factor > 0.1 - 1e-12).all() and (factor < 10 + 1e-12).all()
+    assert factor.min() < 0.2 and factor.max() > 5
+
+
 def test_residual_of_m_never_takes_more_than_the_armature():
     def entries(f, c):
         return symmetric([f[0]], [f[0] - 2 * f[1], c[0]], [0, f[1], 3 * f[1]])

@@ -22,8 +22,10 @@ from spelgen.fitting.body_steps import moved_bodies
 from spelgen.fitting.config import GaussianPrior, Rollout, TorqueFit
 from spelgen.fitting.fit import fit
 from spelgen.fitting.gaussian_prior import SIZES, covariance, kind_of, most_probable
+from spelgen.fitting.residual_fit import FRICTION, enter
 from spelgen.fitting.stages import default_objective
 from spelgen.fitting.torque_fit import fit_torque
+from spelgen.fitting.torque_jacobian import Left
 from spelgen.fitting.torque_networks import adapt_networks
 from spelgen.fitting.torque_report import torque_notes
 from spelgen.fitting.torque_samples import TorqueSamples
@@ -537,3 +539,16 @@ def test_few_of_very_many_samples_come_near_first(emitted, monkeypatch):
     np.testing.assert_allclose(found.residual, expected.residual, rtol=1e-3)
     few = TorqueSamples.held(samples, 2).thinned(300)
     assert (few.count, len(next(few.blocks(1000))[0])) == (300, 300)
+
+
+def test_friction_that_is_nearly_nothing_does_not_vary(robots):
+    """What looks like friction that varies by 30 % is that, or far more than ten times a friction next to nothing."""
+    t = torch.linspace(0, 60, 1200).double()[:, None] * torch.tensor([1.1, 1.7])
+    noise = 0.01 * torch.randn(t.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    q, qd = t.sin(), t.cos()
+    missing = 0.3 * (3 * q).sin() * qd.sign() + noise
+    for friction, gain in ((1.0, 0.9), (1e-9, None)):
+        model = build(robots / "two_link.urdf", "minimal")
+        found = enter(model, Left(q, qd, 0 * q, missing, friction * qd.sign()), alike=5.0)
+        varied = [x.gain for x in found if x.name == FRICTION]
+        assert varied == [] if gain is None else min(varied) > gain and len(varied) == 2

@@ -32,7 +32,7 @@ def pinocchio_model(arm: Arm, settings: Settings) -> pin.Model:
     Reflected rotor inertia is the model's armature. Raises ArmError when a body has no inertial.
     """
     bare = [body.name for body in arm.bodies if body.inertia is None]
-    collect([ArmError("its link has no inertial", element=f"joint {name!r}") for name in bare])
+    collect([_without_inertial(name) for name in bare])
     model = pin.Model()
     model.name = arm.name
     model.gravity.linear = np.array(arm.gravity, dtype=float)
@@ -43,6 +43,12 @@ def pinocchio_model(arm: Arm, settings: Settings) -> pin.Model:
         model.appendBodyToJoint(index, _inertia(np.array(body.inertia, dtype=float)), pin.SE3.Identity())
     model.armature = np.array([_armature(arm, settings, body.name) for body in arm.bodies])
     return model
+
+
+def _without_inertial(name: str) -> ArmError:
+    what, wanted = "a link without <inertial>", "mass, centre of mass and inertia of all that moves"
+    do = "give them in the URDF: guesses do, a model that is trained on logs needs none"
+    return ArmError(what, element=f"joint {name!r}", expected=wanted, do=do)
 
 
 def _armature(arm: Arm, settings: Settings, joint_name: str) -> float:

@@ -40,7 +40,7 @@ def residuals(dynamics: Any, prepared: Any) -> Residuals:
         potential=_potential(prepared.residual.potential),
         torque=_splines(functions, scale * functions.raw_torque_splines),
         ripple=_ripple(functions, scale * functions.raw_torque_ripple),
-        friction=_splines(functions, functions.raw_friction_splines),
+        friction=_splines(functions, functions.friction_logarithms()),
     )
 
 

@@ -103,7 +103,8 @@ def relative(found: np.ndarray, expected: np.ndarray) -> float:
     if not expected.size:
         return 0.0
     size = np.abs(expected).max()
-    return float(np.abs(found - expected).max() / (size if size > 0 else 1.0))
+    with np.errstate(invalid="ignore"):
+        return float(np.abs(found - expected).max() / (size if size > 0 else 1.0))
 
 
 def reference(name: str, model: Any, arm: LoadedArm, inputs: Values) -> dict[str, np.ndarray]:

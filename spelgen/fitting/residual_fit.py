@@ -10,22 +10,25 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 
 from spelgen.fitting.optimizers import minimise
 from spelgen.fitting.torque_jacobian import Left
+from spelgen.runtime.joint_functions import LARGEST
 
 TENTHS = 10  # blocks of samples that are held out
 SURE = 2.82  # standard errors of the mean gain of a block: 1 % of luck, by Student's t of nine degrees of freedom
+LEAST_GAIN = 1e-3  # of the squares that are missed: what explains less is not worth a function
 ROUNDS = 30  # of the marginal likelihood's fixed point
 CONVERGED = 1e-3  # relative change of the noise
 NETWORK_SAMPLES = 2**12
 NETWORK_FOLDS = 2  # a network is fitted this often to be judged
 EVALUATIONS = 100  # of a network's loss
-FUNCTIONS = "dynamics.joint_functions."
+FRICTION = "raw_friction_splines"
+WIDEST = 0.99 * LARGEST  # weights of friction's logarithm: beyond, the model's own are infinite
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,7 @@ class _Candidate:
     """A function of one joint: its weights are a row of the model's parameter of that name, in units of ``scale``.
 
     features: (T, P). force: (n,) how its torque acts on the joints. groups: (P,) which weights have a scale in common.
+    friction: (T,) what the function varies, with weights of its logarithm, to which features are the linear answer.
     """
 
     parameter: str
@@ -50,6 +54,33 @@ class _Candidate:
     features: torch.Tensor
     force: torch.Tensor
     groups: torch.Tensor
+    friction: torch.Tensor | None
+
+    def weights(self, functions: Any) -> torch.Tensor:
+        """The model's, (P,)."""
+        if self.friction is not None:
+            return functions.friction_logarithms()[self.joint].detach()
+        return functions.get_parameter(self.parameter)[self.joint].detach() * self.scale
+
+    def write(self, functions: Any, weights: torch.Tensor) -> None:
+        """Make them the model's."""
+        if self.friction is not None:
+            weights = LARGEST * (weights.clamp(-WIDEST, WIDEST) / LARGEST).atanh()
+        with torch.no_grad():
+            functions.get_parameter(self.parameter)[self.joint] = weights / self.scale
+
+    def chunks(self) -> Iterator[_Candidate]:
+        """The same of each tenth of the samples."""
+        friction = [None] * TENTHS if self.friction is None else self.friction.chunk(TENTHS)
+        for features, each in zip(self.features.chunk(TENTHS), friction, strict=True):
+            yield replace(self, features=features, friction=each)
+
+    def torque(self, weights: torch.Tensor) -> torch.Tensor:
+        """What they add, (T,)."""
+        if self.friction is None:
+            return self.features @ weights
+        logarithm = (self.features @ weights.clamp(-WIDEST, WIDEST)) / self.friction
+        return self.friction * logarithm.nan_to_num().expm1()
 
     def target(self, missing: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
         """What of the missing torque (T, n) the function could be, (T,)."""
@@ -60,29 +91,29 @@ class _Candidate:
 def enter(model: Any, left: Left, alike: float) -> list[Residual]:
     """Give the model all parts that held-out samples ask for; what entered. alike: samples that err alike."""
     noise, missing, found = _noise(left.missing), left.missing, []
+    functions = model.dynamics.joint_functions
     for each in _candidates(model, left):
         target = each.target(missing, noise)
         gain = _held_out(each, target, alike)
         if gain is None:
             continue
         weights = _weights(each, target, alike)
-        _write(model, each, weights)
-        missing = missing - (each.features @ weights).unsqueeze(-1) * each.force
+        each.write(functions, weights)
+        missing = missing - each.torque(weights).unsqueeze(-1) * each.force
         found.append(Residual(each.parameter, each.joint, gain))
     return [*found, *_networks(model, left._replace(missing=missing), alike)]
 
 
 def refine(model: Any, left: Left, entered: Sequence[Residual], alike: float) -> None:
     """Fit the functions of single joints that have entered anew, beside what else has changed since."""
-    noise, missing = _noise(left.missing), left.missing
+    noise, missing, functions = _noise(left.missing), left.missing, model.dynamics.joint_functions
     chosen = {(each.name, each.joint) for each in entered}
     for each in _candidates(model, left):
         if (each.parameter, each.joint) not in chosen:
             continue
-        before = model.get_parameter(FUNCTIONS + each.parameter)[each.joint].detach() * each.scale
-        own = (each.features @ before).unsqueeze(-1) * each.force
+        own = (each.features @ each.weights(functions)).unsqueeze(-1) * each.force
         weights = _weights(each, each.target(missing + own, noise), alike)
-        _write(model, each, weights)
+        each.write(functions, weights)
         missing = missing + own - (each.features @ weights).unsqueeze(-1) * each.force
 
 
@@ -96,14 +127,15 @@ def _candidates(model: Any, left: Left) -> Iterator[_Candidate]:
     pairs = torch.arange(ripple.shape[-1] // 2).repeat(2)
     kinds = (
         ("raw_torque_splines", splines, functions.scale, own, together),
-        ("raw_friction_splines", splines * left.friction.unsqueeze(-1), torch.ones(len(motors)), motors, together),
+        (FRICTION, splines * left.friction.unsqueeze(-1), torch.ones(len(motors)), motors, together),
         ("raw_torque_ripple", ripple, functions.scale, own, pairs),
     )  # fmt: skip
     for parameter, features, scale, force, groups in kinds:
         for joint in range(len(motors)):
             if features[:, joint].any() and scale[joint] > 0:
+                varied = left.friction[:, joint] if parameter == FRICTION else None
                 yield _Candidate(
-                    parameter, joint, float(scale[joint]), features[:, joint], force[joint], groups
+                    parameter, joint, float(scale[joint]), features[:, joint], force[joint], groups, varied
                 )
 
 
@@ -112,16 +144,11 @@ def _noise(missing: torch.Tensor) -> torch.Tensor:
     return deviation.clamp(min=1e-12 * float(deviation.max()) + 1e-300)
 
 
-def _write(model: Any, candidate: _Candidate, weights: torch.Tensor) -> None:
-    with torch.no_grad():
-        model.get_parameter(FUNCTIONS + candidate.parameter)[candidate.joint] = weights / candidate.scale
-
-
 def _held_out(candidate: _Candidate, target: torch.Tensor, alike: float) -> float | None:
     """The part of the target's squares that is explained where it was not seen; None: no more than luck explains."""
-    blocks = [*zip(candidate.features.chunk(TENTHS), target.chunk(TENTHS), strict=True)]
-    grams = torch.stack([x.mT @ x for x, _ in blocks])
-    moments = torch.stack([x.mT @ y for x, y in blocks])
+    blocks = [*zip(candidate.chunks(), target.chunk(TENTHS), strict=True)]
+    grams = torch.stack([x.features.mT @ x.features for x, _ in blocks])
+    moments = torch.stack([x.features.mT @ y for x, y in blocks])
     squares = torch.stack([y @ y for _, y in blocks])
     left = []
     for index, (x, y) in enumerate(blocks):
@@ -133,16 +160,17 @@ def _held_out(candidate: _Candidate, target: torch.Tensor, alike: float) -> floa
             candidate.groups,
             alike,
         )
-        left.append((y - x @ weights).square().sum())
+        left.append((y - x.torque(weights)).square().sum())
     return _sure_gain(squares, torch.stack(left))
 
 
 def _sure_gain(before: torch.Tensor, after: torch.Tensor) -> float | None:
-    """The part by which sums of squares of blocks fell; None where luck could do that."""
+    """The part by which sums of squares of blocks fell; None where luck could do that, or it is next to nothing."""
     gains = before - after
     error = gains.std() / len(gains) ** 0.5
     sure = bool(gains.mean() > SURE * error) and bool(gains.isfinite().all())
-    return float(gains.sum() / before.sum()) if sure else None
+    part = float(gains.sum() / before.sum()) if sure else 0.0
+    return part if part > LEAST_GAIN else None
 
 
 def _weights(candidate: _Candidate, target: torch.Tensor, alike: float) -> torch.Tensor:

@@ -15,6 +15,7 @@ SPLINES = 34  # over the range of a joint
 HARMONICS = 64  # of a turn of the joint, and the first two of a turn of the motor: teeth and poles come again
 FINE = 5  # sines are dear: the k-th harmonic is made of the |b|-th, b from -FINE to FINE,
 COARSE = 6  # and of the (2 FINE + 1) a-th, a up to COARSE, where k = (2 FINE + 1) a + b
+LARGEST = math.log(10.0)  # logarithm of friction's factor: it stays between a tenth and ten times
 
 
 class JointFunctionWeights(NamedTuple):
@@ -57,9 +58,9 @@ class JointFunctions(nn.Module):
     """By joint a torque t(q) = dV/dq, its energy V(q), and a factor on friction, from q of that joint alone.
 
     t is a sum of cubic B-splines over the joint's range and, of a revolute joint, of harmonics of its
-    turns and of its motor's; the factor is the exponential of such a spline. Splines vanish where the
-    range ends, so that nothing is added where nothing was seen. Weights are zero at first; torques are
-    in units of usual friction.
+    turns and of its motor's; the factor is the exponential of such a spline, between a tenth and ten for
+    all weights. Splines vanish where the range ends, so that nothing is added where nothing was seen.
+    Weights are zero at first; torques are in units of usual friction.
     """
 
     scale: Tensor
@@ -95,7 +96,7 @@ class JointFunctions(nn.Module):
     def prepare(self) -> JointFunctionWeights:
         """All that depends on the weights alone."""
         scale = self.scale.unsqueeze(-1)
-        splines = torch.stack([scale * self.raw_torque_splines, self.raw_friction_splines], dim=-1) / 6
+        splines = torch.stack([scale * self.raw_torque_splines, self.friction_logarithms()], dim=-1) / 6
         cosines, sines = (scale * self.revolute * self.raw_torque_ripple).chunk(2, dim=1)
         return JointFunctionWeights(splines, _products(cosines, sines))
 
@@ -106,6 +107,10 @@ class JointFunctions(nn.Module):
         fine, coarse = waves.tensor_split((2 * FINE + 2,), dim=-1)
         ripple = (_by_joint(fine, weights.ripple) * coarse).sum(dim=-1)
         return smooth + ripple, friction.exp()
+
+    def friction_logarithms(self) -> Tensor:
+        """Weights of the splines whose sum is the logarithm of friction's factor, (n, SPLINES)."""
+        return LARGEST * (self.raw_friction_splines / LARGEST).tanh()
 
     def splines(self, q: Tensor) -> Tensor:
         """The cubic B-splines at q, (..., n, SPLINES), each 2/3 high."""
