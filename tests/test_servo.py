@@ -3,6 +3,7 @@
 import json
 import re
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
@@ -15,6 +16,7 @@ from servo_arm import COM, GRAVITY, MASS, Servos, servo_logs, write_servo_arm
 
 import spelgen
 from spelgen.dynamics.servo_rank import servo_rank
+from spelgen.dynamics.servo_rollout import replayed
 from spelgen.errors import LogError, OptionError, RunError, SettingsError
 from spelgen.evaluation.names import POSITION_ACTUATORS
 from spelgen.evaluation.replay import LATE, LINEAR
@@ -23,9 +25,12 @@ from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.servo_dead_zones import dead_zones
 from spelgen.fitting.servo_descent import Normal
 from spelgen.fitting.servo_intervals import covariance
+from spelgen.fitting.servo_problem import ServoProblem
 from spelgen.fitting.servo_report import servo_text
+from spelgen.fitting.servo_windows import servo_windows
 from spelgen.identification.baseline import read_baseline
 from spelgen.logs.commands import delayed_commands
+from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 
 TRUTH = Servos()
@@ -315,3 +320,28 @@ def test_what_does_not_belong_together_is_told(arm, logs, robots):
     nothing = Trajectory(t, np.zeros((9, 2)), np.zeros((9, 2)), np.zeros((9, 2)))
     with pytest.raises(LogError, match="no commanded positions"):
         spelgen.fit(spelgen.build(arm, "closed-form"), nothing)
+
+
+def moved(model, seconds, count=1):
+    """Logs of the whole arm in small steps, where the commands of both joints jump at once."""
+    with torch.no_grad():
+        model.dynamics.armature.raw.copy_((torch.tensor(TRUTH.armature) / model.armature).log())
+        model.servo.delay.fill_(TRUTH.delay)
+    t, every = np.arange(0.0, seconds, 0.0025), 8  # of which logs have one in so many
+    u = np.random.default_rng(0).uniform(-0.4, 0.4, (count, int(2 * seconds), 2)).repeat(200, axis=1)
+    nothing = np.zeros((len(t), 0))
+    logs = [Trajectory(t, x, np.zeros_like(x), nothing, u=x) for x in u]
+    commands = np.stack([delayed_commands(x, slice(None), TRUTH.delay, 2) for x in logs])
+    start, dt = torch.from_numpy(u[:, 0]), torch.full((count, len(t) - 1), 0.0025).double()
+    q = replayed(model, start, torch.zeros_like(start), torch.from_numpy(commands), dt).numpy()
+    return [replace(x, q=np.concatenate([x.u[:1], y]))[::every] for x, y in zip(logs, q, strict=True)]
+
+
+def test_joints_by_themselves_move_as_the_arm_does(arm):
+    model = spelgen.build(arm, "closed-form")
+    windows = replace(servo_windows(moved(model, 3.0), Preprocessing()), steps=24)
+    problem = ServoProblem(model, windows)
+    for _ in range(2):
+        problem.relinearise(problem.start, problem.path(problem.start))
+    errors = problem.errors(problem.start).square().mean(dim=(0, 1)).sqrt()
+    assert errors.max() < 6e-4

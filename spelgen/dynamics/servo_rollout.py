@@ -2,7 +2,9 @@
 
 Springs and dry friction are stiff, so both are taken implicitly, linearised at the start of a step (a Rosenbrock
 method, Hairer and Wanner, Solving ODEs II, IV.7, with the weights of the theta method): a few steps between samples are
-stable for any gain. Friction's memory follows the displacement exactly.
+stable for any gain. Theta is such that motion which fades does so as fast as it would, to third order (Liniger and
+Willoughby, SIAM J. Numerical Analysis 7:47, 1970): 1/2 for what is slow, which adds no damping of its own, and towards
+1 for what is too fast for a step. Friction's memory follows the displacement exactly.
 """
 
 from __future__ import annotations
@@ -15,7 +17,6 @@ from torch import Tensor
 from spelgen.runtime.position_servo import beyond
 
 STEP = 3.4e-3  # s, at most: longer ones make armatures a few percent wrong
-IMPLICIT = 0.55  # theta: 0.5 adds no damping of its own, 1 damps what is too fast for a step
 
 
 class ServoDrives(NamedTuple):
@@ -80,17 +81,20 @@ def advanced(drives: ServoDrives, state: ServoState, u: Tensor, load: Load, h: T
     stiff = free * servo.kp * (pull != 0)
     torque = torch.where(free > 0, pull, servo.limit * wanted.sign())
     force = torque - drives.offset - load.bias - dry * (fractions / reach * z).sum(dim=-1)
-    # at IMPLICIT of the step; bristles at its end: they are the stiffest
     damping = free * servo.kd + laws.viscosity(qd, drives.friction)
-    damping = IMPLICIT * h * (damping + h * (IMPLICIT * stiff + stiffness))
-    rest = IMPLICIT * h * force
+    inertia = load.inertia.diagonal(dim1=-2, dim2=-1) if load.coupled else load.inertia
+    fading = h * (damping + h * (stiff / 2 + stiffness)) / inertia
+    theta = (3 + fading) / (6 + fading)
+    # at theta of the step; bristles at its end: they are the stiffest
+    damping = theta * h * (damping + h * (theta * stiff + stiffness))
+    rest = theta * h * force
     if load.coupled:
         momentum = (load.inertia @ qd.unsqueeze(-1)).squeeze(-1)
         between = torch.linalg.solve(load.inertia + torch.diag_embed(damping), momentum + rest)
     else:
         between = (load.inertia * qd + rest) / (load.inertia + damping)
     moved = h * between
-    return ServoState(q + moved, qd + (between - qd) / IMPLICIT, laws.bristles.moved(z, moved))
+    return ServoState(q + moved, qd + (between - qd) / theta, laws.bristles.moved(z, moved))
 
 
 def replayed(model: Any, q: Tensor, qd: Tensor, commands: Tensor, dt: Tensor) -> Tensor:

@@ -1,6 +1,6 @@
 """Which joints have a dead zone: those where windows tell one, beyond luck, with all dead zones fitted beside all else.
 
-By the cost's first two derivatives. A dead zone that dry friction could be as well is unsure, and does not enter.
+By the cost's first two derivatives. A dead zone that dry friction could be as well does not enter.
 """
 
 from __future__ import annotations
@@ -12,6 +12,9 @@ from spelgen.fitting.servo_intervals import covariance
 
 SURE = 3.0  # standard deviations
 LEAST = 1e-3  # rad, m
+INFLATION = (
+    50.0  # of a variance, from which on two things are one: of simulated SO-101s 4 to 30, or more than 90
+)
 
 
 def dead_zones(
@@ -35,5 +38,17 @@ def dead_zones(
     found = widths + step[places]
     unsure = covariance(normal, precision, torch.zeros_like(target)).diagonal()
     deviation = torch.maximum(unsure, torch.linalg.inv(matrix).diagonal())[places].sqrt()
-    enters = (found > SURE * deviation) & (found > LEAST)
+    enters = (found > SURE * deviation) & (found > LEAST) & told_apart(normal, precision, places)
     return torch.where(widths > 0, widths, torch.where(enters, found, torch.zeros_like(found)))
+
+
+def told_apart(normal: Normal, precision: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
+    """Whether windows tell a joint's dead zone from its dry friction and all else, (n,).
+
+    By the variance inflation factor of dead zones: of joints that gravity does not load the slopes of errors by either
+    are the same but for a factor, and what is linear in them says nothing of the one without the other.
+    """
+    matrix = normal.matrix.sum(dim=0)
+    inverse = torch.linalg.inv(matrix + torch.diag(precision))
+    inflation: torch.Tensor = (matrix.diagonal() * inverse.diagonal())[places]
+    return inflation < INFLATION

@@ -30,6 +30,9 @@ GAIN = (
     0.05,
 )  # of the cost, in rounds before the fine ones, and in these: a step that gains less ends a round
 LEFT = 0.01  # of the cost, at least, where its second derivatives promise less
+LONG_NUDGE = (
+    1e-3  # of weights, for the last slopes: by shorter ones a joint that just slips looks like knowledge
+)
 DAMPING = (1e-2, 1e-5)  # to begin with, in the first round and in the others
 
 
@@ -137,10 +140,11 @@ class ServoRounds:
         problem, point = self.problem, self.reached.point
         descent = Descent(problem, self._noise, problem.errors(self.begun[-1]))
         problem.windows = replace(self.windows, steps=2 * self.windows.steps)
-        normal = descent.normal(point, problem.errors(point))
-        halved = descent.step(normal, point)
+        halved = descent.step(descent.normal(point, problem.errors(point)), point)
         point = point.moved(halved)
         problem.write(point)
+        problem.nudge = LONG_NUDGE
+        normal = descent.normal(point, problem.errors(point))
         return self._solution(point, normal, halved)
 
     def _solution(self, point: Point, normal: Normal, halved: torch.Tensor) -> ServoSolution:
@@ -152,7 +156,7 @@ class ServoRounds:
             normal=normal,
             precision=problem.weights.precision(len(point.bodies), every=True),
             halved=halved,
-            qd=self.windows.qd.flatten(0, 1),
+            qd=problem.along.qd.flatten(0, 1),
             gravity=problem.load.gravity.flatten(0, 1),
         )
 

@@ -16,7 +16,8 @@ from spelgen.fitting.servo_weights import BODIES, Point, ServoWeights, body_dire
 from spelgen.fitting.servo_windows import BodyLoad, Path, ServoWindows, body_load
 from spelgen.fitting.torque_jacobian import Asked
 
-NUDGE, DELAY_NUDGE = 1e-4, 2e-4  # s
+NUDGE = 1e-4  # of weights
+DELAY_NUDGE = 2e-4  # s
 GRAVITY_SAMPLES = 2000  # for the directions of the bodies
 
 
@@ -32,12 +33,13 @@ class ServoProblem:
         self._raw = model.get_parameter(BODIES).detach().clone()
         bodies = torch.zeros(self.directions.shape[1]).double()
         self.start = Point(self.weights.read(), bodies, float(model.servo.delay))
+        self.nudge = NUDGE
         self.relinearise(self.start, windows.path())
 
     def relinearise(self, point: Point, path: Path) -> None:
         """Take the bodies as they are at this point, moving along this path."""
         self.write(point)
-        self._at = point.bodies
+        self._at, self.along = point.bodies, path
         self.load: BodyLoad = body_load(self.model, path, inertial_slopes(self.model) @ self.directions)
 
     def write(self, point: Point) -> None:
@@ -61,12 +63,14 @@ class ServoProblem:
         """Of the errors (W, K', n), by the joints' weights (p, W, K', n), and by those that all share (r + 1, ...)."""
         p, r = len(point.joints), len(point.bodies)
         joints, bodies, commands = self._where(point)
-        own = torch.cat([joints + NUDGE * torch.eye(p).double().unsqueeze(-1), joints.expand(r + 1, -1, -1)])
-        shared = torch.cat([bodies.expand(p, -1), bodies + NUDGE * torch.eye(r).double(), bodies])
+        own = torch.cat(
+            [joints + self.nudge * torch.eye(p).double().unsqueeze(-1), joints.expand(r + 1, -1, -1)]
+        )
+        shared = torch.cat([bodies.expand(p, -1), bodies + self.nudge * torch.eye(r).double(), bodies])
         late = self.windows.commands(point.delay + DELAY_NUDGE).unsqueeze(0)
         every = torch.cat([commands.expand(p + r, -1, -1, -1, -1), late])
         found = self._errors(self._rolled(point, own, shared, every)[0]) - errors
-        return found[:p] / NUDGE, torch.cat([found[p:-1] / NUDGE, found[-1:] / DELAY_NUDGE])
+        return found[:p] / self.nudge, torch.cat([found[p:-1] / self.nudge, found[-1:] / DELAY_NUDGE])
 
     def _where(self, point: Point) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Weights of joints (1, p, n), of bodies (1, r), commands (1, W, K, S, n)."""
@@ -97,8 +101,7 @@ class ServoProblem:
         q, qd = windows.q[:, 0].expand(shape), windows.qd[:, 0].expand(shape)
         found, state = [(q, qd)], None
         for k in range(windows.q.shape[1] - 1):
-            between = (bias[:, :, k] + bias[:, :, k + 1]) / 2
-            now = Load(inertia[:, :, k], between, load.gravity[:, k], coupled=False)
+            now = Load(inertia[:, :, k], bias[:, :, k], load.gravity[:, k], coupled=False)
             if state is None:
                 state = balanced(drives, q, qd, commands[:, :, k, 0], now)
             for u in commands[:, :, k].unbind(2):

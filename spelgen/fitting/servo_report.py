@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from scipy.special import stdtrit
 
+from spelgen.fitting.servo_dead_zones import told_apart
 from spelgen.fitting.servo_fit import ServoSolution
 from spelgen.fitting.servo_intervals import covariance
 from spelgen.fitting.servo_weights import DEAD_ZONE
@@ -19,9 +20,6 @@ LAWS = (
     0.015  # relative deviation of ratios by what laws of friction are not, see benchmarks/servo_recovery.py
 )
 OPEN = 1.25  # what may be larger by such a factor within its interval is not determined
-INFLATION = (
-    50.0  # of a variance, from which on two things are one: of simulated SO-101s 4 to 30, or more than 90
-)
 UNITS = {"kd": "s", "armature": "s^2", "dry": "rad, m", "lost": "rad, m"}
 """What is told in ratio to kp, and the ratio's unit; dry: friction of a joint that slides, over what it slid; lost:
 dry and half the dead zone, together."""
@@ -53,7 +51,9 @@ def _sure(solution: ServoSolution) -> float:
 def _joints(model: Any, solution: ServoSolution, unsure: torch.Tensor) -> list[dict[str, Any]]:
     """By joint, with the covariance of all unknowns (k, k)."""
     sure = _sure(solution)
-    slid, apart, joints = _dry(model, solution), _told_apart(model, solution), []
+    slid, joints = _dry(model, solution), []
+    places = solution.names.index((DEAD_ZONE, 0)) * model.n + torch.arange(model.n)
+    apart = told_apart(solution.normal, solution.precision, places)
     for joint, name in enumerate(model.facts.joints):
         about: dict[str, Any] = {"joint": name}
         known = not float(model.servo.trained[joint])
@@ -103,19 +103,6 @@ def _dry(model: Any, solution: ServoSolution) -> tuple[torch.Tensor, dict[str, t
         slopes = torch.autograd.grad(dry.sum(), [*raw.values()], allow_unused=True)
     found = {f"dynamics.friction.{name}": x for name, x in zip(raw, slopes, strict=True) if x is not None}
     return dry.detach(), found
-
-
-def _told_apart(model: Any, solution: ServoSolution) -> torch.Tensor:
-    """Whether windows tell a joint's dead zone from its dry friction and all else, (n,).
-
-    By the variance inflation factor of dead zones: of joints that gravity does not load the slopes of errors by either
-    are the same but for a factor, and what is linear in them says nothing of the one without the other.
-    """
-    matrix = solution.normal.matrix.sum(dim=0)
-    places = solution.names.index((DEAD_ZONE, 0)) * model.n + torch.arange(model.n)
-    inverse = torch.linalg.inv(matrix + torch.diag(solution.precision))
-    inflation: torch.Tensor = (matrix.diagonal() * inverse.diagonal())[places]
-    return inflation < INFLATION
 
 
 def _interval(value: float, half: float) -> dict[str, Any]:

@@ -26,10 +26,10 @@ def start_servos(model: Any, windows: ServoWindows, load: BodyLoad, delay: float
     u = windows.commands(delay).mean(dim=2)
     z = np.stack([bristles_along(x.numpy(), bristle_reach(model)) for x in windows.q])
     direction = torch.from_numpy(z / dynamics.friction.bristles.reach.numpy()).mean(dim=-1)
-    rows = slice(windows.settling, -1)
+    rows = slice(windows.settling, None)
     error = (u - windows.q[:, :-1])[:, windows.settling :]
     path = windows.path()
-    columns = [x[:, rows] for x in (path.qd, path.qdd, direction, load.bias)]
+    columns = [x[:, rows] for x in (path.qd, path.qdd, direction[:, :-1], load.bias)]
     found = [
         _solved(torch.stack([*(x[..., k] for x in columns), torch.ones_like(error[..., k])]), error[..., k])
         for k in range(n)

@@ -29,7 +29,7 @@ BLOCK = 2**13  # samples at a time
 
 
 class Path(NamedTuple):
-    """A motion along windows: q, qd and qdd, (W, K, n)."""
+    """A motion along windows, between samples: means of q, qd and qdd, (W, K-1, n)."""
 
     q: torch.Tensor
     qd: torch.Tensor
@@ -54,13 +54,13 @@ class ServoWindows:
 
     def path(self, q: torch.Tensor | None = None, qd: torch.Tensor | None = None) -> Path:
         """The measured motion. q, qd: predicted, of which only what they miss is smoothed: so fast motion stays."""
-        if q is None or qd is None:
-            return Path(self.q, *(torch.from_numpy(x) for x in smoothed(self.q.numpy(), self.rate)))
-        missed = smoothed((self.q - q).numpy(), self.rate)
-        faster = np.gradient(qd.numpy(), 1 / self.rate, axis=1)
-        return Path(
-            self.q, *(torch.from_numpy(x + y) for x, y in zip((qd.numpy(), faster), missed, strict=True))
-        )
+        missed = self.q if q is None else self.q - q
+        slow, slower = (torch.from_numpy(x) for x in smoothed(missed.numpy(), self.rate))
+        path = Path(*(x[:, 1:] / 2 + x[:, :-1] / 2 for x in (self.q, slow, slower)))
+        if qd is None:
+            return path
+        faster = qd.diff(dim=1) / self.dt.unsqueeze(-1)
+        return Path(path.q, path.qd + qd[:, 1:] / 2 + qd[:, :-1] / 2, path.qdd + faster)
 
     def commands(self, delay: float) -> torch.Tensor:
         """Of ``delay`` [s] ago, over the steps between samples (W, K-1, S, n)."""
@@ -93,8 +93,8 @@ def servo_windows(logs: Sequence[Trajectory], preprocessing: Preprocessing, most
 class BodyLoad:
     """What the bodies are to the drives along windows.
 
-    inertia: (W, K, n) of each joint by itself, without the drives'. bias: the torque (W, K, n) that everything else
-    takes, gravity: its part of that. weights: what directions of the bodies' weights add to all of it, (W, K, n, r).
+    inertia: (W, K-1, n) of each joint by itself, without the drives'. bias: the torque (W, K-1, n) that everything else
+    takes, gravity: its part of that. weights: what directions of the bodies' weights add to all of it, (W, K-1, n, r).
     """
 
     inertia: torch.Tensor
