@@ -22,7 +22,7 @@ from spelgen.logs.windows import Windows, cut_windows, joined
 
 PAST, AHEAD = 0.1, 1.0  # s
 FASTEST = 100.0  # Hz
-MOST = 512  # windows
+FEW, MOST = 128, 512  # windows: between these, they begin no closer than a past is long
 MOST_BLOCKS = 16
 PROBED = 5  # samples
 WRITTEN = "a file of `spelgen train`"
@@ -118,7 +118,7 @@ def held_sources(trajectories: Iterable[Trajectory]) -> list[Source]:
 def calibration_windows(
     sources: Sequence[Source], preprocessing: Preprocessing, reach: BristleReach
 ) -> CalibrationWindows | None:
-    """About `MOST` windows, evenly spread over all samples; None: no recording is long enough.
+    """`FEW` to `MOST` windows, evenly spread over all samples; None: no recording is long enough.
 
     Samples are at most `FASTEST` apart [Hz]; windows are shorter where all recordings are. preprocessing: a resolved
     one. reach: see `cut_windows`. One source at a time is in memory.
@@ -129,7 +129,8 @@ def calibration_windows(
     if samples < past + 2:
         return None
     total = sum(x.samples for x in sources)
-    wanted = (np.arange(MOST) + 0.5) * total / MOST  # the windows' middles, counted over all samples
+    count = min(max(FEW, round(sum(x.samples / x.rate for x in sources) / PAST)), MOST)
+    wanted = (np.arange(count) + 0.5) * total / count  # the windows' middles, counted over all samples
     cut, blocks, start, block = [], [], 0, 0
     for source in sources:
         middles = wanted[(wanted >= start) & (wanted < start + source.samples)] - start
