@@ -12,9 +12,7 @@ from spelgen.fitting.servo_intervals import covariance
 
 SURE = 3.0  # standard deviations
 LEAST = 1e-3  # rad, m
-INFLATION = (
-    50.0  # of a variance, from which on two things are one: of simulated SO-101s 4 to 30, or more than 90
-)
+INFLATION = 50.0  # of a variance, from which on two things are one: of simulated SO-101s below 30 or above 90
 
 
 def dead_zones(

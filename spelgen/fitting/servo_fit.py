@@ -25,14 +25,9 @@ from spelgen.logs.trajectory import Trajectory
 
 ROUNDS = 5
 FINE = 2  # rounds at the end with all steps between samples, the others with half of them
-GAIN = (
-    1.0,
-    0.05,
-)  # of the cost, in rounds before the fine ones, and in these: a step that gains less ends a round
+GAIN = (1.0, 0.05)  # of the cost, in rounds before the fine ones and in these: less ends a round
 LEFT = 0.01  # of the cost, at least, where its second derivatives promise less
-LONG_NUDGE = (
-    1e-3  # of weights, for the last slopes: by shorter ones a joint that just slips looks like knowledge
-)
+LONG_NUDGE = 1e-3  # of weights, for the last slopes: by shorter ones a joint that just slips looks known
 DAMPING = (1e-2, 1e-5)  # to begin with, in the first round and in the others
 
 

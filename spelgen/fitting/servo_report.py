@@ -16,9 +16,7 @@ from spelgen.fitting.servo_weights import DEAD_ZONE
 from spelgen.listing import Listing, number
 
 SURE = 0.975  # quantile of an interval of 95 %, of Student's t: windows are few
-LAWS = (
-    0.015  # relative deviation of ratios by what laws of friction are not, see benchmarks/servo_recovery.py
-)
+LAWS = 0.015  # relative deviation of ratios by what friction's laws are not: benchmarks/servo_recovery.py
 OPEN = 1.25  # what may be larger by such a factor within its interval is not determined
 UNITS = {"kd": "s", "armature": "s^2", "dry": "rad, m", "lost": "rad, m"}
 """What is told in ratio to kp, and the ratio's unit; dry: friction of a joint that slides, over what it slid; lost:
