@@ -110,10 +110,12 @@ def calibrated(
     limit = FOLLOWED * np.abs(measured).max(axis=1)  # (2, T, n)
     effect = np.square(_changed(open_loop, held)).mean(axis=1)
     rollouts = [bounded(x, limit) for x in (open_loop, held)]
-    alone = by_stretch(np.square(measured), blocks).sum(axis=0)
+    squares_alone = by_stretch(np.square(measured), blocks)
+    alone = squares_alone.sum(axis=0)
     gains, part, error = np.zeros((2, *alone.shape)), np.zeros_like(alone), alone
     for mixture in MIXTURES:
-        found, squares = _fitted((1 - mixture) * rollouts[0] + mixture * rollouts[1], measured, blocks)
+        added = (1 - mixture) * rollouts[0] + mixture * rollouts[1]
+        found, squares = _fitted(added, measured, squares_alone, blocks)
         better = squares < error
         gains, error = np.where(better[:, None], found, gains), np.where(better, squares, error)
         part = np.where(better, mixture, part)
@@ -124,11 +126,15 @@ def calibrated(
     return Trust(times, gains, trust, part, effect, farther * limit, np.sqrt(relative.mean(axis=0)))
 
 
-def _fitted(added: np.ndarray, measured: np.ndarray, blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Gains (2, 2, T, n), and the squared errors (2, T, n) of blocks that they were not fitted to."""
+def _fitted(
+    added: np.ndarray, measured: np.ndarray, alone: np.ndarray, blocks: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Gains (2, 2, T, n), and the squared errors (2, T, n) of blocks that they were not fitted to.
+
+    alone: (B, 2, T, n) the squares of what was measured.
+    """
     products = by_stretch(added[:, None] * added[None], blocks)  # (B, 2, 2, T, n)
     with_measured = by_stretch(measured[:, None] * added[None], blocks)
-    alone = by_stretch(np.square(measured), blocks)
     left_out = _gains(products.sum(axis=0) - products, with_measured.sum(axis=0) - with_measured)
     size = np.einsum("bsctn,bsdtn,bcdtn->bstn", left_out, left_out, products)
     product = np.einsum("bsctn,bsctn->bstn", left_out, with_measured)

@@ -62,10 +62,8 @@ def low_pass(trajectory: Trajectory, cutoff: float) -> Trajectory:
 
 def low_pass_regular(signals: np.ndarray, rate: float, cutoff: float) -> np.ndarray:
     """Signals (T, ...) at a regular rate [Hz] through that filter."""
-    from scipy.signal import (
-        butter,
-        sosfiltfilt,
-    )  # the better part of a second, which most commands can do without
+    # the better part of a second, which most commands can do without
+    from scipy.signal import butter, sosfiltfilt
 
     sections = butter(FILTER_ORDER, cutoff, fs=rate, output="sos")
     padding = min(len(signals) - 1, int(3 * rate / cutoff))  # three periods of the cutoff settle the ends
