@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import cos, sin
+from math import cos, exp, sin
 from pathlib import Path
 
 import numpy as np
@@ -15,17 +15,21 @@ LINK = """<link name="{name}"><inertial><origin xyz="0 0 -{com}"/><mass value="{
 JOINT = """<joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{child}"/><axis xyz="0 1 0"/>
 <origin xyz="0 0 {z}"/><limit lower="-3" upper="3" effort="6" velocity="5"/></joint>"""
 LENGTH, COM, MASS, INERTIA = 0.2, np.array([0.1, 0.08]), np.array([0.3, 0.2]), np.array([1.2e-3, 6e-4])
-GRAVITY, STEP = 9.81, 5e-4
+GRAVITY, STEP, STRIBECK_VELOCITY = 9.81, 5e-4, 0.2
 
 
 @dataclass(frozen=True)
 class Servos:
-    """What is to be found: kp, kd, armature and dry friction of both joints, delay [s]."""
+    """What is to be found of both joints: kp, kd, armature, dry friction, what more of it there is at rest and falls as
+    exp(-qd^2 / STRIBECK_VELOCITY^2), half the dead zone; and the delay [s].
+    """
 
     kp: tuple[float, float] = (14.0, 9.0)
     kd: tuple[float, float] = (0.9, 0.5)
     armature: tuple[float, float] = (0.03, 0.012)
     coulomb: tuple[float, float] = (0.15, 0.08)
+    stribeck: tuple[float, float] = (0.0, 0.0)
+    dead_zone: tuple[float, float] = (0.0, 0.0)
     delay: float = 0.03
 
 
@@ -78,7 +82,7 @@ def _simulated(t: np.ndarray, u: np.ndarray, servos: Servos) -> np.ndarray:
     Number by number: for two joints that is faster than arrays.
     """
     (kp1, kp2), (kd1, kd2) = servos.kp, servos.kd
-    most1, most2 = (STEP * x for x in servos.coulomb)
+    (dry1, dry2), (slow1, slow2), (zone1, zone2) = servos.coulomb, servos.stribeck, servos.dead_zone
     own1, own2 = (INERTIA + MASS * COM**2).tolist()
     coupling = float(MASS[1] * LENGTH * COM[1])
     base1, base2 = own1 + own2 + float(MASS[1]) * LENGTH**2 + servos.armature[0], own2 + servos.armature[1]
@@ -91,8 +95,13 @@ def _simulated(t: np.ndarray, u: np.ndarray, servos: Servos) -> np.ndarray:
         u1, u2 = commands[max(0, k - late) // per]
         c, sway = coupling * cos(q2), coupling * sin(q2)
         both = weight2 * sin(q1 + q2)
-        force1 = kp1 * (u1 - q1) - kd1 * v1 - weight1 * sin(q1) - both + sway * (2 * v1 * v2 + v2 * v2)
-        force2 = kp2 * (u2 - q2) - kd2 * v2 - both - sway * v1 * v1
+        wrong1, wrong2 = u1 - q1, u2 - q2
+        wrong1 -= min(max(wrong1, -zone1), zone1)
+        wrong2 -= min(max(wrong2, -zone2), zone2)
+        most1 = STEP * (dry1 + slow1 * exp(-((v1 / STRIBECK_VELOCITY) ** 2)))
+        most2 = STEP * (dry2 + slow2 * exp(-((v2 / STRIBECK_VELOCITY) ** 2)))
+        force1 = kp1 * wrong1 - kd1 * v1 - weight1 * sin(q1) - both + sway * (2 * v1 * v2 + v2 * v2)
+        force2 = kp2 * wrong2 - kd2 * v2 - both - sway * v1 * v1
         # damping at a step's middle
         m11, m12, m22 = base1 + 2 * c + STEP / 2 * kd1, own2 + c, base2 + STEP / 2 * kd2
         determinant = m11 * m22 - m12 * m12

@@ -45,7 +45,7 @@ fitting: gaussian_prior adaptive rollout calibration dataset streaming workers t
 fitting: optimizers residual_fit torque_fit torque_report
 fitting: torque_networks urdf_regularizer stages compiled process progress validation loop
 fitting: run_record fitted servo_windows servo_start servo_weights servo_problem servo_descent servo_intervals
-fitting: servo_dead_zones servo_fit servo_report linear_servo servo_run
+fitting: servo_laws servo_fit servo_report linear_servo servo_run
 fitting: fit train
 evaluation: names replay disturbance stiff baselines along_time extrapolation trust forecast torque rollout
 evaluation: invariants examples

@@ -12,7 +12,7 @@ import pytest
 import torch
 import yaml
 from emitted import import_source
-from servo_arm import COM, GRAVITY, MASS, Servos, servo_logs, write_servo_arm
+from servo_arm import COM, GRAVITY, MASS, STRIBECK_VELOCITY, Servos, servo_logs, write_servo_arm
 
 import spelgen
 from spelgen.dynamics.servo_rank import servo_rank
@@ -22,7 +22,6 @@ from spelgen.evaluation.names import POSITION_ACTUATORS
 from spelgen.evaluation.replay import LATE, LINEAR
 from spelgen.fitting import servo_descent, servo_fit
 from spelgen.fitting.run_folder import RunFolder
-from spelgen.fitting.servo_dead_zones import dead_zones
 from spelgen.fitting.servo_descent import Normal
 from spelgen.fitting.servo_intervals import covariance
 from spelgen.fitting.servo_problem import ServoProblem
@@ -33,7 +32,7 @@ from spelgen.logs.commands import delayed_commands
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 
-TRUTH = Servos()
+TRUTH = Servos(stribeck=(0.0, 0.08), dead_zone=(0.006, 0.0))
 SLIDER = """<joint name="{0}" type="prismatic"><parent link="{1}"/><child link="{2}"/><axis xyz="{3}"/>
 <limit lower="-1" upper="1" effort="6" velocity="5"/></joint>"""
 LINK = """<link name="{0}"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>
@@ -49,7 +48,7 @@ def arm(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def logs():
-    return servo_logs(5, 16.0)
+    return servo_logs(5, 16.0, TRUTH)
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +91,10 @@ def test_actuators_of_mujoco_are_what_it_has_to_beat(fitted, logs, monkeypatch):
     assert -simulated.actuator_biasprm[:, 2] == pytest.approx(TRUTH.kd, rel=0.05)
     # MuJoCo takes a servo's spring half a step late
     assert simulated.dof_armature == pytest.approx(TRUTH.armature, rel=0.15)
-    assert simulated.dof_frictionloss == pytest.approx(TRUTH.coulomb, rel=0.1)
+    # it knows neither dead zones nor friction that falls with velocity: dry friction is all that holds a joint
+    rest = np.array(TRUTH.coulomb) + np.array(TRUTH.kp) * TRUTH.dead_zone
+    assert (simulated.dof_frictionloss > 0.9 * rest).all()
+    assert (simulated.dof_frictionloss < 1.1 * (rest + TRUTH.stribeck)).all()
     assert found.delay == pytest.approx(TRUTH.delay, abs=0.005)
     results = spelgen.evaluate(run.path, logs[4][:400], baselines=read_baseline(run))
     for replay in results.replays:
@@ -147,19 +149,15 @@ def test_within_its_dead_zone_a_servo_gives_nothing(arm):
     assert float(servo.stored_energy(u, still)[1].detach()) == pytest.approx(0.5 * 12 * (0.03**2 + 0.1**2))
 
 
-def test_a_dead_zone_enters_where_windows_are_sure_of_it():
-    rng = torch.Generator().manual_seed(0)
-    slopes = torch.randn(30, 50, 5, generator=rng).double()  # of an error by a weight and four dead zones
-    slopes[..., 3] = slopes[..., 0] + 1e-3 * slopes[..., 3]  # the weight could be this one
-    errors = torch.randn(30, 50, generator=rng).double() - slopes[..., [1, 3]].sum(dim=-1) * 0.3
-    normal = Normal(slopes.mT @ slopes, (slopes.mT @ errors.unsqueeze(-1)).squeeze(-1))
-    nothing, places, widths = (
-        torch.zeros(5).double(),
-        torch.arange(1, 5),
-        torch.tensor([0, 0, 0, 0.1]).double(),
-    )
-    found = dead_zones(normal, nothing, torch.ones(5).double(), places, widths)
-    assert found.tolist() == [pytest.approx(0.3, abs=0.06), 0.0, 0.0, pytest.approx(0.1)]
+def test_joints_get_the_laws_that_they_have(fitted):
+    shoulder, elbow = fitted.record["servo"]["joints"]
+    assert shoulder["dead_zone"]["value"] == pytest.approx(TRUTH.dead_zone[0], rel=0.03)
+    assert "dead_zone" not in elbow and not fitted.model.servo.dead_zone[1]
+    with torch.no_grad():
+        laws = fitted.model.dynamics.friction.prepare()
+    assert laws.stribeck[0] < 0.15 * TRUTH.coulomb[0]
+    assert float(laws.stribeck[1]) == pytest.approx(TRUTH.stribeck[1], rel=0.3)
+    assert float(laws.stribeck_velocity[1]) == pytest.approx(STRIBECK_VELOCITY, rel=0.1)
 
 
 def test_intervals_count_errors_that_are_alike_once():
@@ -211,14 +209,13 @@ def test_what_is_told_covers_the_truth(fitted):
     told = fitted.record["servo"]["joints"]
     for k, joint in enumerate(told):
         for what, truth in (
-            ("kd", TRUTH.kd),
-            ("armature", TRUTH.armature),
-            ("lost", TRUTH.coulomb),
+            ("kd", TRUTH.kd[k] / TRUTH.kp[k]),
+            ("armature", TRUTH.armature[k] / TRUTH.kp[k]),
+            ("lost", TRUTH.coulomb[k] / TRUTH.kp[k] + TRUTH.dead_zone[k]),
         ):
             assert joint[what]["determined"]
-            assert joint[what]["value"] == pytest.approx(truth[k] / TRUTH.kp[k], rel=0.03), what
-            assert joint[what]["low"] < truth[k] / TRUTH.kp[k] < joint[what]["high"], what
-        assert "dead_zone" not in joint
+            assert joint[what]["value"] == pytest.approx(truth, rel=0.03), what
+            assert joint[what]["low"] < truth < joint[what]["high"], what
     # the elbow's small weight does not tell dry friction from a dead zone
     assert told[0]["dry"]["determined"] and "dry/kp of elbow" in servo_text(fitted.record["servo"])
 
@@ -341,7 +338,10 @@ def test_joints_by_themselves_move_as_the_arm_does(arm):
     model = spelgen.build(arm, "closed-form")
     windows = replace(servo_windows(moved(model, 3.0), Preprocessing()), steps=24)
     problem = ServoProblem(model, windows)
+    start = replace(
+        problem.start, present=torch.ones_like(problem.start.present)
+    )  # all laws, as the logs have
     for _ in range(2):
-        problem.relinearise(problem.start, problem.path(problem.start))
-    errors = problem.errors(problem.start).square().mean(dim=(0, 1)).sqrt()
+        problem.relinearise(start, problem.path(start))
+    errors = problem.errors(start).square().mean(dim=(0, 1)).sqrt()
     assert errors.max() < 6e-4

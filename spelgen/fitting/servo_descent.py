@@ -20,6 +20,7 @@ from spelgen.fitting.servo_weights import Point
 
 ALIKE = 0.5  # s over which errors may be alike
 STEPS, TRIES = 12, 6
+HARDEST = 1.0  # damping, after which no step is tried
 LONGEST = 1.0  # of a step, in any weight: they are logarithms
 
 
@@ -49,7 +50,6 @@ class Descent:
 
     def __init__(self, problem: ServoProblem, noise: torch.Tensor, errors: torch.Tensor) -> None:
         self.problem, self.centre = problem, problem.start.flat
-        self.precision = problem.weights.precision(problem.directions.shape[1])
         self.scale = torch.maximum(1.4826 * errors.abs().flatten(0, 1).median(dim=0).values, noise)
         self.alike = _alike(errors * self._robust(errors), max(1, round(ALIKE * problem.windows.rate)))
 
@@ -63,15 +63,22 @@ class Descent:
         """Their weighted sum of squares."""
         return float((self._weight(errors) * errors.square()).sum())
 
+    def costs(self, point: Point, errors: torch.Tensor) -> torch.Tensor:
+        """By joint, (n,), without that of weights which all share."""
+        squares = (errors / self.scale).square()
+        away = self._away(point)[: point.joints.numel()].view_as(point.joints)
+        return (4 * torch.log1p(squares / 4) / self.alike).sum(dim=(0, 1)) + away.sum(dim=0)
+
     def cost(self, point: Point, errors: torch.Tensor) -> float:
         """Infinite where a rollout left all bounds."""
         if not errors.isfinite().all():
             return float("inf")
-        squares = (errors / self.scale).square()
-        away = point.flat - self.centre
-        return float(
-            (4 * torch.log1p(squares / 4) / self.alike).sum() + (self.precision * away.square()).sum()
-        )
+        shared = self._away(point)[point.joints.numel() :]
+        return float(self.costs(point, errors).sum() + shared.sum())
+
+    def _away(self, point: Point) -> torch.Tensor:
+        """The prior's part of the cost, (k,)."""
+        return self.problem.weights.precision(point) * (point.flat - self.centre).square()
 
     def normal(self, point: Point, errors: torch.Tensor) -> Normal:
         """Of the windows alone, without the prior."""
@@ -92,8 +99,9 @@ class Descent:
 
     def step(self, normal: Normal, point: Point, damping: float = 0.0) -> torch.Tensor:
         """To where the cost is least by its first two derivatives, (k,)."""
-        matrix = normal.matrix.sum(dim=0) + torch.diag(self.precision)
-        target = normal.target.sum(dim=0) + self.precision * (point.flat - self.centre)
+        precision = self.problem.weights.precision(point)
+        matrix = normal.matrix.sum(dim=0) + torch.diag(precision)
+        target = normal.target.sum(dim=0) + precision * (point.flat - self.centre)
         damped = matrix + damping * torch.diag(matrix.diagonal())
         return -torch.linalg.solve(damped, target).clamp(-LONGEST, LONGEST)
 
@@ -119,6 +127,40 @@ class Descent:
             rms = float(errors.square().mean().sqrt())
             reached = Reached(point, damping, reached.taken + 1, reached.steps + 1, over, rms)
             yield reached
+
+    def joint_by_joint(self, point: Point, damping: float, least: float) -> tuple[Point, torch.Tensor]:
+        """Where each joint's own weights are most probable, under what all share, and what that costs, (n,).
+
+        Each joint has its own steps, and ends with one that gains less than ``least``, or where none gains.
+        """
+        errors = self.problem.errors(point)
+        costs = self.costs(point, errors)
+        damped, going = torch.full_like(costs, damping), torch.ones_like(costs).bool()
+        for _ in range(STEPS):
+            tried = self._joints_moved(point, errors, damped)
+            found = self.problem.errors(tried)
+            new = self.costs(tried, found)
+            better = going & (new < costs)
+            going &= torch.where(better, costs - new >= least, damped < HARDEST)
+            point = replace(point, joints=torch.where(better, tried.joints, point.joints))
+            errors, costs = torch.where(better, found, errors), torch.where(better, new, costs)
+            damped = torch.where(better, (damped / 10).clamp(min=1e-7), damped * 5)
+            if not going.any():
+                break
+        return point, costs
+
+    def _joints_moved(self, point: Point, errors: torch.Tensor, damping: torch.Tensor) -> Point:
+        """A step of each joint by itself, with its own damping (n,)."""
+        slopes = self.problem.joint_slopes(point, errors).flatten(1, 2).permute(2, 0, 1)  # (n, p, M)
+        weight, (p, n) = self._weight(errors).flatten(0, 1).mT, point.joints.shape
+        own = slice(0, p * n)
+        precision = self.problem.weights.precision(point)[own].view(p, n).mT
+        away = (point.flat - self.centre)[own].view(p, n).mT
+        matrix = (slopes * weight.unsqueeze(1)) @ slopes.mT + torch.diag_embed(precision)
+        target = (slopes @ (weight * errors.flatten(0, 1).mT).unsqueeze(-1)).squeeze(-1) + precision * away
+        damped = matrix + damping[:, None, None] * torch.diag_embed(matrix.diagonal(dim1=-2, dim2=-1))
+        step = -torch.linalg.solve(damped, target).clamp(-LONGEST, LONGEST).mT
+        return replace(point, joints=point.joints + step * point.present)
 
 
 def _alike(errors: torch.Tensor, span: int) -> torch.Tensor:

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 
 from spelgen.dynamics.bristles import encoder_step
-from spelgen.fitting.servo_dead_zones import dead_zones
 from spelgen.fitting.servo_descent import Descent, Normal, Reached
+from spelgen.fitting.servo_laws import with_laws, without_faint
 from spelgen.fitting.servo_problem import ServoProblem
 from spelgen.fitting.servo_start import start_servos
 from spelgen.fitting.servo_weights import DEAD_ZONE, Point
@@ -87,8 +87,6 @@ class ServoRounds:
     def _begin(self, point: Point) -> None:
         """The next round, from here."""
         if len(self.begun) >= ROUNDS - FINE:
-            weights = self.problem.weights
-            weights.dead_zones = point.joints[weights.row(DEAD_ZONE)] > 0
             self.problem.windows = self.windows
         if self.begun:
             self.problem.relinearise(point, self.problem.path(point))
@@ -105,8 +103,10 @@ class ServoRounds:
             if len(self.begun) == ROUNDS:
                 return
             point = self.reached.point
-            if len(self.begun) >= ROUNDS - FINE:
-                point = _with_dead_zones(descent, point)
+            if len(self.begun) == ROUNDS - FINE:
+                point = with_laws(self.problem, self._noise, point)
+            elif len(self.begun) > ROUNDS - FINE:
+                point = without_faint(self.problem, point)
             self._begin(point)
             self.reached = Reached(point, DAMPING[1], self.reached.taken)
 
@@ -126,6 +126,7 @@ class ServoRounds:
         target = normal.target.sum(dim=0)
         gain = -float(target @ descent.step(normal, point))
         left = max(1 - gain / descent.square(errors), LEFT)
+        normal = self._with_dead_zones(descent, point)
         return self._solution(
             point, Normal(normal.matrix / left, normal.target), torch.zeros_like(point.flat)
         )
@@ -139,8 +140,14 @@ class ServoRounds:
         point = point.moved(halved)
         problem.write(point)
         problem.nudge = LONG_NUDGE
-        normal = descent.normal(point, problem.errors(point))
-        return self._solution(point, normal, halved)
+        return self._solution(point, self._with_dead_zones(descent, point), halved)
+
+    def _with_dead_zones(self, descent: Descent, point: Point) -> Normal:
+        """What windows tell, also of dead zones that no joint was given."""
+        every = self.problem.weights.with_all(point, DEAD_ZONE)
+        normal = descent.normal(every, self.problem.errors(every))
+        self.problem.write(point)
+        return normal
 
     def _solution(self, point: Point, normal: Normal, halved: torch.Tensor) -> ServoSolution:
         problem = self.problem
@@ -149,20 +156,8 @@ class ServoRounds:
             rms=problem.errors(point).square().mean(dim=(0, 1)).sqrt(),
             steps=self.reached.taken,
             normal=normal,
-            precision=problem.weights.precision(len(point.bodies), every=True),
+            precision=problem.weights.precision(problem.weights.with_all(point, DEAD_ZONE)),
             halved=halved,
             qd=problem.along.qd.flatten(0, 1),
             gravity=problem.load.gravity.flatten(0, 1),
         )
-
-
-def _with_dead_zones(descent: Descent, point: Point) -> Point:
-    """The point, with those of which windows are sure, which are fitted from now on."""
-    problem, weights = descent.problem, descent.problem.weights
-    row, n = weights.row(DEAD_ZONE), problem.model.n
-    precision = weights.precision(len(point.bodies), every=True)
-    normal = descent.normal(point, problem.errors(point))
-    places, joints = torch.arange(n) + row * n, point.joints.clone()
-    widths = torch.where(weights.dead_zones, joints[row].clamp(min=0.0), torch.zeros(n).double())
-    joints[row] = dead_zones(normal, point.flat - descent.centre, precision, places, widths)
-    return replace(point, joints=joints)

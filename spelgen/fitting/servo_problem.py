@@ -32,7 +32,7 @@ class ServoProblem:
         self.directions = body_directions(model, q[:: max(1, len(q) // GRAVITY_SAMPLES)])
         self._raw = model.get_parameter(BODIES).detach().clone()
         bodies = torch.zeros(self.directions.shape[1]).double()
-        self.start = Point(self.weights.read(), bodies, float(model.servo.delay))
+        self.start = Point(self.weights.read(), bodies, float(model.servo.delay), self.weights.present)
         self.nudge = NUDGE
         self.relinearise(self.start, windows.path())
 
@@ -44,7 +44,7 @@ class ServoProblem:
 
     def write(self, point: Point) -> None:
         """Put weights into the model."""
-        self.weights.write(point.joints)
+        self.weights.write(point)
         bodies = self._raw + (self.directions @ point.bodies).view_as(self._raw)
         with torch.no_grad():
             self.model.get_parameter(BODIES).copy_(bodies)
@@ -61,16 +61,33 @@ class ServoProblem:
 
     def slopes(self, point: Point, errors: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Of the errors (W, K', n), by the joints' weights (p, W, K', n), and by those that all share (r + 1, ...)."""
-        p, r = len(point.joints), len(point.bodies)
         joints, bodies, commands = self._where(point)
-        own = torch.cat(
-            [joints + self.nudge * torch.eye(p).double().unsqueeze(-1), joints.expand(r + 1, -1, -1)]
-        )
+        own, r = self._nudged(point), len(point.bodies)
+        p = len(own)
+        own = torch.cat([own, joints.expand(r + 1, -1, -1)])
         shared = torch.cat([bodies.expand(p, -1), bodies + self.nudge * torch.eye(r).double(), bodies])
         late = self.windows.commands(point.delay + DELAY_NUDGE).unsqueeze(0)
         every = torch.cat([commands.expand(p + r, -1, -1, -1, -1), late])
         found = self._errors(self._rolled(point, own, shared, every)[0]) - errors
-        return found[:p] / self.nudge, torch.cat([found[p:-1] / self.nudge, found[-1:] / DELAY_NUDGE])
+        return self._by_joint(point, found[:p]), torch.cat(
+            [found[p:-1] / self.nudge, found[-1:] / DELAY_NUDGE]
+        )
+
+    def joint_slopes(self, point: Point, errors: torch.Tensor) -> torch.Tensor:
+        """Of the errors (W, K', n), by the joints' weights alone, (p, W, K', n)."""
+        own, (_, bodies, commands) = self._nudged(point), self._where(point)
+        shape = (len(own), *commands.shape[1:])
+        q, _ = self._rolled(point, own, bodies.expand(len(own), -1), commands.expand(shape))
+        return self._by_joint(point, self._errors(q) - errors)
+
+    def _nudged(self, point: Point) -> torch.Tensor:
+        """Weights of joints, of which one after the other that any joint has is moved, (p', p, n)."""
+        return point.joints + self.nudge * torch.eye(len(point.joints)).double()[_rows(point)].unsqueeze(-1)
+
+    def _by_joint(self, point: Point, changes: torch.Tensor) -> torch.Tensor:
+        slopes = torch.zeros(len(point.joints), *changes.shape[1:]).double()
+        slopes[_rows(point)] = changes / self.nudge
+        return slopes
 
     def _where(self, point: Point) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Weights of joints (1, p, n), of bodies (1, r), commands (1, W, K, S, n)."""
@@ -85,7 +102,8 @@ class ServoProblem:
         self, point: Point, joints: torch.Tensor, bodies: torch.Tensor, commands: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """q and qd (P, W, K, n) at all samples, of weights (P, p, n), (P, r) under commands (P, W, K-1, S, n)."""
-        weights = {f"model.{name}": x.detach() for name, x in self.weights.named(joints).items()}
+        named = self.weights.named(joints, point.present)
+        weights = {f"model.{name}": x.detach() for name, x in named.items()}
         with torch.inference_mode():  # small operations, of which each takes a tenth less so
             drives, armature = functional_call(self._asked, weights, (_drives,))
             added = torch.einsum("wknr,pr->pwkn", self.load.weights, bodies - self._at)
@@ -112,3 +130,8 @@ class ServoProblem:
 
 def _drives(model: Any) -> tuple[ServoDrives, torch.Tensor]:
     return servo_drives(model), model.dynamics.armature()
+
+
+def _rows(point: Point) -> torch.Tensor:
+    """Of weights that any joint has."""
+    return point.present.any(dim=1).nonzero().squeeze(-1)

@@ -9,15 +9,14 @@ from typing import Any
 import torch
 from scipy.special import stdtrit
 
-from spelgen.fitting.servo_dead_zones import told_apart
 from spelgen.fitting.servo_fit import ServoSolution
 from spelgen.fitting.servo_intervals import covariance
+from spelgen.fitting.servo_laws import told_apart
 from spelgen.fitting.servo_weights import DEAD_ZONE
 from spelgen.listing import Listing, number
 
 SURE = 0.975  # quantile of an interval of 95 %, of Student's t: windows are few
 LAWS = 0.015  # relative deviation of ratios by what friction's laws are not: benchmarks/servo_recovery.py
-HIDDEN = 0.03  # the same of lost, where dry friction is fitted to what a dead zone may be
 OPEN = 1.25  # what may be larger by such a factor within its interval is not determined
 UNITS = {"kd": "s", "armature": "s^2", "dry": "rad, m", "lost": "rad, m"}
 """What is told in ratio to kp, and the ratio's unit; dry: friction of a joint that slides, over what it slid; lost:
@@ -61,10 +60,7 @@ def _joints(model: Any, solution: ServoSolution, unsure: torch.Tensor) -> list[d
             direction = torch.zeros(len(unsure)).double()
             for weight, slope in slopes.items():
                 direction[solution.names.index((weight, 0)) * model.n + joint] = slope / value
-            hidden = HIDDEN if what == "lost" and not apart[joint] else 0.0
-            half = sure * math.hypot(
-                LAWS, hidden, float((direction @ unsure @ direction).clamp(min=0).sqrt())
-            )
+            half = sure * math.hypot(LAWS, float((direction @ unsure @ direction).clamp(min=0).sqrt()))
             about[what] = {"unit": UNITS.get(what, "rad, m"), **_interval(value, half)}
         for what in {"dry", "dead_zone"} & about.keys():
             about[what]["determined"] &= bool(apart[joint])
