@@ -1,17 +1,19 @@
 """What a fit of servos finds of simulated arms of which it knows the URDF alone: ratios to kp beside the truth.
 
-    python benchmarks/servo_recovery.py ARM.urdf [--seeds 40] [--seconds 16]
+    python benchmarks/servo_recovery.py ARM.urdf [--seeds 40] [--seconds 16] [--mujoco [--backlash 0.0025]]
 
 For each seed three recordings at 50 Hz (other commands, the same arm: servos, armatures, dry friction, delay, encoders
 of twelve bits, the URDF's effort limits, a dead zone of the servos where --dead-zone says so) are fitted as
 `spelgen train` does, and the truth is held against the intervals of 95 %. The arm is integrated by itself:
 semi-implicit Euler in steps of a millisecond, dry friction as impulses; the bodies' M and bias are those of the URDF.
+With --mujoco it is MuJoCo that simulates, where gears may have backlash, with a mass of their own before it.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -63,22 +65,43 @@ def simulated(model: Any, u: torch.Tensor, dead_zone: float, limit: torch.Tensor
     return torch.stack(found, dim=1)
 
 
-def recordings(
-    arm: spelgen.LoadedArm, seeds: int, seconds: float, dead_zone: float
-) -> list[list[Trajectory]]:
+def recordings(arm: spelgen.LoadedArm, asked: argparse.Namespace) -> Iterator[list[Trajectory]]:
     """Of each seed, as encoders see them."""
     model = spelgen.build(arm, "closed-form")
-    t = np.arange(0, seconds, 1 / RATE)
+    t = np.arange(0, asked.seconds, 1 / RATE)
     limit = torch.tensor([x.effort or float("inf") for x in arm.arm.coordinates]).double()
-    u = [commands(np.random.default_rng((s, k)), t, model.n) for s in range(seeds) for k in range(RECORDINGS)]
-    with torch.no_grad():
-        q = simulated(model, torch.from_numpy(np.stack(u)), dead_zone, limit).numpy()
-    q, nothing = np.round(q / ENCODER) * ENCODER, np.zeros((len(t), 0))
-    logs = [
-        Trajectory(t, x, np.gradient(x, t, axis=0), nothing, f"motion {k}", u=each)
-        for k, (x, each) in enumerate(zip(q, u, strict=True))
+    every = [
+        [commands(np.random.default_rng((seed, k)), t, model.n) for k in range(RECORDINGS)]
+        for seed in range(asked.seeds)
     ]
-    return [logs[k : k + RECORDINGS] for k in range(0, len(logs), RECORDINGS)]
+    if asked.mujoco:
+        found = (in_mujoco(asked.urdf, arm, u, limit.numpy(), asked.backlash) for u in every)
+    else:
+        with torch.no_grad():
+            flat = torch.from_numpy(np.concatenate(every))
+            found = iter(
+                simulated(model, flat, asked.dead_zone, limit).unflatten(0, (-1, RECORDINGS)).numpy()
+            )
+    for u, q in zip(every, found, strict=True):
+        q, nothing = np.round(q / ENCODER) * ENCODER, np.zeros((len(t), 0))
+        yield [
+            Trajectory(t, x, np.gradient(x, t, axis=0), nothing, f"motion {k}", u=each)
+            for k, (x, each) in enumerate(zip(q, u, strict=True))
+        ]
+
+
+def in_mujoco(
+    urdf: Path, arm: spelgen.LoadedArm, u: list[np.ndarray], limit: np.ndarray, backlash: float
+) -> np.ndarray:
+    """Positions (B, T, n), as `simulated`."""
+    # MuJoCo is an extra
+    from servo_mujoco import arm_with_servos, positions
+
+    joints = [x.name for x in arm.arm.coordinates]
+    kp = np.linspace(1.0, SMALLEST, len(joints)) * KP
+    ratios = {"kd": LAG, "armature": ARMATURE, "dry": DRY}
+    model = arm_with_servos(urdf, joints, kp, ratios, limit, backlash)
+    return np.stack([positions(model, joints, each, 1 / RATE, DELAY) for each in u])
 
 
 def main() -> None:
@@ -90,15 +113,19 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=40)
     parser.add_argument("--seconds", type=float, default=16.0)
     parser.add_argument("--dead-zone", type=float, default=0.0, help="half its width [rad]")
+    parser.add_argument("--mujoco", action="store_true", help="MuJoCo simulates")
+    parser.add_argument("--backlash", type=float, default=0.0, help="of gears in MuJoCo, half of it [rad]")
     parser.add_argument("--preset", default="minimal")
     asked = parser.parse_args()
     arm = spelgen.load_arm(asked.urdf)
     if arm.settings.input != "position":
         parser.error(f"{asked.urdf.with_suffix('.yaml')} has to say 'input: position'")
+    if (asked.backlash and not asked.mujoco) or (asked.dead_zone and asked.mujoco):
+        parser.error("--backlash belongs to --mujoco, --dead-zone to the arm without")
     truths = {"kd": LAG, "armature": ARMATURE, "dry": DRY, "lost": DRY + asked.dead_zone}
     truths |= {"dead_zone": asked.dead_zone} if asked.dead_zone else {}
     errors, held, left = {x: [] for x in truths}, {x: [] for x in truths}, {x: 0 for x in truths}
-    for seed, logs in enumerate(recordings(arm, asked.seeds, asked.seconds, asked.dead_zone)):
+    for seed, logs in enumerate(recordings(arm, asked)):
         since = time.monotonic()
         found = spelgen.fit(spelgen.build(arm, asked.preset), logs).record["servo"]
         for what, truth in truths.items():
@@ -112,11 +139,12 @@ def main() -> None:
             if x
         )
         print(f"seed {seed}: {time.monotonic() - since:.0f} s; median errors so far {row}", flush=True)
-    print("           bias   90 % of errors below   intervals that hold the truth   left open")
-    for what, x in ((what, x) for what, x in errors.items() if x):
+    print("           bias   median   90 % below   within 3 %   intervals that hold the truth   left open")
+    for what, x in ((what, np.array(x)) for what, x in errors.items() if x):
         print(
-            f"{what:12}{100 * np.mean(x):5.2f} %{100 * np.quantile(np.abs(x), 0.9):14.2f} %"
-            f"{100 * np.mean(held[what]):22.0f} % of {len(held[what])}{left[what]:14}"
+            f"{what:10}{100 * x.mean():5.2f} %{100 * np.median(np.abs(x)):7.2f} %"
+            f"{100 * np.quantile(np.abs(x), 0.9):11.2f} %{100 * np.mean(np.abs(x) <= 0.03):11.1f} %"
+            f"{100 * np.mean(held[what]):21.1f} % of {len(x):4}{left[what]:10}"
         )
 
 

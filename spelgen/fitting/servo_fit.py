@@ -1,8 +1,8 @@
 """Fit position servos, friction and weight of an arm to logs of commanded positions: its most probable weights.
 
 First least squares on the command error (`servo_start`), then predicted windows (`servo_descent`), in rounds: each
-takes the bodies' load along what has been predicted, and the scale of errors, anew. Before each of the fine ones dead
-zones enter, where windows are sure of them.
+takes the bodies' load along what has been predicted, and the scale of errors, anew. Before the fine ones joints get the
+laws that they turn out to have (`servo_laws`).
 """
 
 from __future__ import annotations

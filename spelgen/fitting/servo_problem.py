@@ -18,6 +18,7 @@ from spelgen.fitting.torque_jacobian import Asked
 
 NUDGE = 1e-4  # of weights
 DELAY_NUDGE = 2e-4  # s
+STILL = 1e-9  # rad/s, m/s: so that there is friction of joints that never move
 GRAVITY_SAMPLES = 2000  # for the directions of the bodies
 
 
@@ -135,3 +136,11 @@ def _drives(model: Any) -> tuple[ServoDrives, torch.Tensor]:
 def _rows(point: Point) -> torch.Tensor:
     """Of weights that any joint has."""
     return point.present.any(dim=1).nonzero().squeeze(-1)
+
+
+def sliding_friction(friction: Any, qd: torch.Tensor, gravity: torch.Tensor) -> torch.Tensor:
+    """Dry friction of each joint, (n,) [Nm, N], over what it went; qd and gravity's torque: (..., n)."""
+    way = qd.abs() + STILL
+    dry = friction.dry(qd, gravity, friction.prepare()) * way
+    found: torch.Tensor = dry.flatten(0, -2).sum(dim=0) / way.flatten(0, -2).sum(dim=0)
+    return found

@@ -12,6 +12,7 @@ from scipy.special import stdtrit
 from spelgen.fitting.servo_fit import ServoSolution
 from spelgen.fitting.servo_intervals import covariance
 from spelgen.fitting.servo_laws import told_apart
+from spelgen.fitting.servo_problem import sliding_friction
 from spelgen.fitting.servo_weights import DEAD_ZONE
 from spelgen.listing import Listing, number
 
@@ -93,10 +94,8 @@ def _dry(model: Any, solution: ServoSolution) -> tuple[torch.Tensor, dict[str, t
     """Dry friction of each joint, (n,) [Nm, N], what it takes over what the joint went, and its slopes by weights."""
     friction = model.dynamics.friction
     raw = dict(friction.named_parameters())
-    way = solution.qd.abs()
     with torch.enable_grad():
-        constants = friction.prepare()
-        dry = (friction.dry(solution.qd, solution.gravity, constants) * way).sum(dim=0) / way.sum(dim=0)
+        dry = sliding_friction(friction, solution.qd, solution.gravity)
         # of a joint the weights of that joint alone
         slopes = torch.autograd.grad(dry.sum(), [*raw.values()], allow_unused=True)
     found = {f"dynamics.friction.{name}": x for name, x in zip(raw, slopes, strict=True) if x is not None}

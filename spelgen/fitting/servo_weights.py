@@ -12,6 +12,7 @@ from torch.func import functional_call, jacfwd
 
 DEAD_ZONE = "servo.dead_zone"
 FRICTION = "dynamics.friction.raw_"
+COULOMB = FRICTION + "coulomb"
 STRIBECK = FRICTION + "stribeck"
 STRIBECK_VELOCITY = FRICTION + "stribeck_velocity"
 BODIES = "dynamics.inertial_parameters.raw"
@@ -38,7 +39,7 @@ JOINT_WEIGHTS = (
     JointWeight("servo.raw_kd", 2.0),
     JointWeight("dynamics.armature.raw", 2.0),
     JointWeight("dynamics.raw_offset", 2.0),
-    JointWeight(FRICTION + "coulomb", 2.0),
+    JointWeight(COULOMB, 2.0),
     JointWeight(STRIBECK, 2.0, absent=-12.0),
     JointWeight(STRIBECK_VELOCITY, 1.0, absent=0.0),
     JointWeight(FRICTION + "load_dependence", 2.0),
@@ -123,10 +124,10 @@ class ServoWeights:
         shared = torch.tensor([1.0] * len(point.bodies) + [DELAY_DEVIATION]).double()
         return torch.cat([deviation.flatten(), shared]) ** -2
 
-    def with_all(self, point: Point, name: str) -> Point:
-        """The point, of which each joint has this weight."""
+    def with_all(self, point: Point, *names: str) -> Point:
+        """The point, of which each joint has these weights."""
         present = point.present.clone()
-        present[self.row(name)] = True
+        present[[self.row(x) for x in names]] = True
         return replace(point, present=present)
 
 
