@@ -48,3 +48,9 @@ def listed(parts: Sequence[str]) -> str:
 def printable(text: str, kept: str = "") -> str:
     """Text from a file, with what could steer a terminal made visible, but for the characters ``kept``."""
     return "".join(c if c.isprintable() or c in kept else c.encode("unicode_escape").decode() for c in text)
+
+
+def thousandths(joint_types: Sequence[str]) -> str:
+    """The unit of small distances of these joints: ``mrad``, ``mm`` or, of both kinds, ``mrad, mm``."""
+    slides = [kind == "prismatic" for kind in joint_types]
+    return "mrad, mm" if len({*slides}) != 1 else "mm" if slides[0] else "mrad"

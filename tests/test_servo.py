@@ -20,6 +20,7 @@ from spelgen.dynamics.servo_rollout import replayed
 from spelgen.errors import LogError, OptionError, RunError, SettingsError
 from spelgen.evaluation.names import POSITION_ACTUATORS
 from spelgen.evaluation.replay import LATE, LINEAR
+from spelgen.files import write_json
 from spelgen.fitting import servo_descent, servo_fit
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.servo_descent import Normal
@@ -28,9 +29,11 @@ from spelgen.fitting.servo_problem import ServoProblem
 from spelgen.fitting.servo_report import servo_text
 from spelgen.fitting.servo_windows import servo_windows
 from spelgen.identification.baseline import read_baseline
+from spelgen.listing import number
 from spelgen.logs.commands import delayed_commands
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
+from spelgen.render.report_page import render_report
 
 TRUTH = Servos(stribeck=(0.0, 0.08), dead_zone=(0.006, 0.0))
 SLIDER = """<joint name="{0}" type="prismatic"><parent link="{1}"/><child link="{2}"/><axis xyz="{3}"/>
@@ -195,6 +198,18 @@ def test_commands_are_held_and_late():
     ]
     late = delayed_commands(log, slice(1, 4), 0.025, 2)[..., 0]
     assert late == pytest.approx(np.array([[0.0, 0.0], [0.5, 1.0]]), abs=1e-9)
+
+
+def test_its_report_shows_servos_and_replays_and_no_torques(fitted, logs):
+    write_json(RunFolder(fitted.folder).evaluation, fitted.evaluate(logs[4:]).to_dict())
+    page = render_report(fitted.folder)
+    told = " ".join(page.split())
+    assert "Worst log replayed: motion 4" in page and told.count('class="line hold"') >= 2
+    kd = f"{number(TRUTH.kd[0] / TRUTH.kp[0])[:4]}"
+    assert '<h2 id="servos">Servos</h2>' in page and f"<td>{kd}" in page and "dry/kp of elbow" in told
+    assert "<td>command [rad]</td>" in page
+    for empty in ("to draw", "metrics.jsonl", 'id="torques"', "trained parameters"):
+        assert empty not in page, empty
 
 
 def test_commands_are_read_and_written(tmp_path, logs, arm):

@@ -22,7 +22,7 @@ from spelgen.evaluation.replay import Replayed, replays
 from spelgen.evaluation.results import Results, forecast_summary, torque_summary
 from spelgen.evaluation.subject import Subject, subject
 from spelgen.evaluation.torque import torque_errors
-from spelgen.evaluation.traces import traces
+from spelgen.evaluation.traces import replay_traces, traces
 from spelgen.fitting.rollout import choose_substeps, loss_scales
 from spelgen.identification.samples import dynamics_samples
 from spelgen.logs.checks import check
@@ -118,11 +118,12 @@ def _replayed(
             element=logs[0].name,
             expected="u: the model is one of position servos",
         )
+    found, missed = replays(judged.model, logs, judged.linear_servos, notes, baselines)
     return Results(
         robot=judged.robot, joints=tuple(judged.joints), trajectories=tuple(x.name for x in logs), cutoff=None,
         substeps=1, parameters=sum(x.numel() for x in judged.model.parameters()), horizons=(), torque={},
-        energy_drift=None, replays=replays(judged.model, logs, judged.linear_servos, notes, baselines),
-        diagnostics=tuple(notes), joint_types=tuple(judged.model.joint_types),
+        energy_drift=None, replays=found, traces=replay_traces(missed), diagnostics=tuple(notes),
+        joint_types=tuple(judged.model.joint_types),
     )  # fmt: skip
 
 

@@ -41,6 +41,8 @@ class Replay:
 
 
 Part = tuple[Trajectory, slice]
+Missed = tuple[Trajectory, np.ndarray]
+"""A log, and predicted less measured positions after each of its intervals, (K, n)."""
 
 
 class Replayed(Protocol):
@@ -59,9 +61,9 @@ def replays(
     linear: LinearServos | None,
     notes: list[Diagnostic],
     baselines: Mapping[str, Replayed],
-) -> tuple[Replay, ...]:
+) -> tuple[tuple[Replay, ...], list[Missed]]:
     """Of the model, baselines and, where they are known, linear servos: whole logs, and windows of `AHEAD`, one after
-    another.
+    another; and what the model misses of whole logs.
     """
     pieces = [x for log in logs for x in split_at_gaps(log) if len(x) > 2]
     whole = [(x, slice(0, len(x))) for x in pieces]
@@ -81,22 +83,23 @@ def replays(
             "no actuators of MuJoCo to compare with: `spelgen train` fits them where MuJoCo is installed"
         )
         notes.append(Diagnostic("info", "no-position-actuators", "logs", None, message))
-    found = [Replay("whole log", _errors(model, whole, linear, baselines, still=True))]
+    wrong = _wrong(model, whole, linear, baselines, still=True)
+    found = [Replay("whole log", _summaries(whole, wrong))]
     if windows:
-        errors = _errors(model, windows, linear, baselines, still=False)
+        errors = _summaries(windows, _wrong(model, windows, linear, baselines, still=False))
         found.append(Replay(f"windows of {AHEAD:g} s", errors))
-    return tuple(found)
+    return tuple(found), [*zip(pieces, wrong[MODEL], strict=True)]
 
 
-def _errors(
+def _wrong(
     model: Any,
     parts: Sequence[Part],
     linear: LinearServos | None,
     baselines: Mapping[str, Replayed],
     *,
     still: bool,
-) -> dict[str, ReplayErrors]:
-    """still: each part starts at rest, else with the velocity measured there."""
+) -> dict[str, list[np.ndarray]]:
+    """By predictor, of each part (K, n). still: each part starts at rest, else with the velocity measured there."""
     wrong = {MODEL: _of_model(model, parts, still)}
     for name, each in baselines.items():
         found = each.positions(parts, *_starts(parts, still))
@@ -105,6 +108,10 @@ def _errors(
         wrong[LINEAR] = _of_linear(linear, parts, still)
         late = [delayed_commands(x, rows, linear.late, 1)[:, 0] for x, rows in parts]
         wrong[LATE] = [u - x.q[rows][1:] for u, (x, rows) in zip(late, parts, strict=True)]
+    return wrong
+
+
+def _summaries(parts: Sequence[Part], wrong: Mapping[str, list[np.ndarray]]) -> dict[str, ReplayErrors]:
     names = [x.name for x, _ in parts]
     return {predictor: _summary(names, errors) for predictor, errors in wrong.items()}
 

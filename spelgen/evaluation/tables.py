@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from spelgen.labels import thousandths
 from spelgen.listing import Listing, number
 
 
@@ -62,8 +63,8 @@ def result_tables(evaluation: Mapping[str, Any], joint_types: Sequence[str] = ()
 
     joint_types: those of the evaluation by default; units are only those of joints that there are.
     """
-    tables, horizons = _replay_tables(evaluation), evaluation["horizons"]
     types = joint_types or evaluation.get("joint_types") or ()
+    tables, horizons = _replay_tables(evaluation, types), evaluation["horizons"]
     if horizons:
         title = "Error relative to the motion (0: none, 1: as if the arm had stood still)"
         forecast = [horizon for horizon in horizons if horizon.get("open_loop")]
@@ -96,18 +97,18 @@ def result_tables(evaluation: Mapping[str, Any], joint_types: Sequence[str] = ()
     return tables
 
 
-def _replay_tables(evaluation: Mapping[str, Any]) -> list[Table]:
+def _replay_tables(evaluation: Mapping[str, Any], types: Sequence[str]) -> list[Table]:
     """Of commands replayed: by trajectory and by joint."""
-    tables = []
+    tables, unit = [], thousandths(types)
     for replay in evaluation.get("replays", ()):
         errors = replay["errors"]
         names = list(next(iter(errors.values()))["trajectories"])
         rows = [{who: 1000 * each["trajectories"][name] for who, each in errors.items()} for name in names]
         rows.append({who: 1000 * each["mean"] for who, each in errors.items()})
-        title = f"Commands replayed, {replay['name']}: RMS of positions over all joints [mrad; mm]"
+        title = f"Commands replayed, {replay['name']}: RMS of positions over all joints [{unit}]"
         tables.append(table(title, [*names, "mean of these"], rows))
         by_joint = {who: [1000 * x for x in each["joints"]] for who, each in errors.items()}
-        title = "The same by joint, over all trajectories [mrad; mm]"
+        title = f"The same by joint, over all trajectories [{unit}]"
         tables.append(_by_joint(title, evaluation["joints"], by_joint))
     return tables
 

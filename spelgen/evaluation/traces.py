@@ -16,6 +16,7 @@ from spelgen.dynamics.protocol import RigidDynamics
 from spelgen.evaluation.baselines import Predictor
 from spelgen.evaluation.horizons import Predictions
 from spelgen.evaluation.names import MODEL
+from spelgen.evaluation.replay import Missed
 from spelgen.evaluation.torque_traces import plain, torque_trace
 from spelgen.fitting.rollout import loss_scales, position_difference
 from spelgen.logs.coverage import coverage
@@ -26,6 +27,7 @@ from spelgen.logs.windows import Windows
 TIMES = 24  # at which it is told
 QUANTILES = (0.1, 0.5, 0.9)
 SHOWN = 240  # samples of a predicted trajectory
+SHOWN_OF_LOG = 600  # of a whole log
 
 
 def traces(
@@ -52,6 +54,23 @@ def traces(
         found["mass"] = _masses(dynamics, found)
         found["friction"] = _friction(dynamics, pieces, found["torques"])
     return found
+
+
+def replay_traces(missed: Sequence[Missed]) -> dict[str, Any]:
+    """Of an arm under position servos: the logs of the middle and the largest error, positions measured, commanded
+    and predicted.
+    """
+    size = [float(np.sqrt(np.square(x).mean())) for _, x in missed]
+    order = np.argsort(size, kind="stable")
+    examples = []
+    for which, k in (("typical", order[len(order) // 2]), ("worst", order[-1])):
+        log, error = missed[k]
+        predicted = np.concatenate([log.q[:1], log.q[1:] + error])
+        columns = {"t": log.t - log.t[0], "q": log.q, "u": log.u, "predicted_q": predicted}
+        stride = -(-len(log) // SHOWN_OF_LOG)
+        told = {"which": which, "trajectory": log.name, "start": 0.0, "error": plain(size[k])}
+        examples.append(told | {name: plain(x[::stride]) for name, x in columns.items()})
+    return {"coverage": coverage([x for x, _ in missed]), "trajectories": examples}
 
 
 def _predictions(found: Predictions, joint_types: Sequence[str], tip: Any) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from spelgen.evaluation.names import MODEL
-from spelgen.labels import listed
+from spelgen.labels import listed, thousandths
 from spelgen.listing import number
 
 # part of the torque's variance that is explained -> what that is good for, and what not
@@ -105,7 +105,8 @@ def _uses(evaluation: Mapping[str, Any]) -> tuple[list[str], list[str], list[str
         good += ["simulation from commands"] if errors[MODEL] == min(errors.values()) else []
         bad += [] if good else ["simulation from commands"]
         proofs.append(
-            f"misses {1000 * errors[MODEL]:.3g} mrad of the positions that follow commands, {replay['name']}"
+            f"misses {1000 * errors[MODEL]:.3g} {thousandths(evaluation.get('joint_types', ()))} of the positions that "
+            f"follow commands, {replay['name']}"
         )
     elif horizons and not known:
         bad.append("simulation")

@@ -109,24 +109,36 @@ def _interval(value: float, half: float) -> dict[str, Any]:
 
 def servo_text(record: Mapping[str, Any]) -> str:
     """For a terminal: delay, ratios with intervals, and what the logs left open."""
-    rows = [
-        (each["joint"], number(each["kp"]["value"]), *(_shown(each[what]) for what in UNITS))
-        for each in record["joints"]
-    ]
-    head = ("joint", "kp [Nm/rad]", *(f"{_label(what)} [{unit}]" for what, unit in UNITS.items()))
-    table = Listing("Servos", head, tuple(rows), f"Ratios are {ABOUT}.").text()
-    open_ones = undetermined(record)
-    left = (
-        f"not determined by these logs: {', '.join(open_ones)}"
-        if open_ones
-        else "all of these are determined"
-    )
-    zones = [f"{x['joint']} {_shown(x['dead_zone'])}" for x in record["joints"] if "dead_zone" in x]
-    delay = record["delay"]
-    late = f"delay {1000 * delay['value']:.1f} ms, +- {1000 * delay['half']:.1f} ms"
     errors = ", ".join(number(1000 * x) for x in record["rms"])
-    dead = f"half dead zones [rad, m]: {', '.join(zones)}\n" if zones else ""
-    return f"{late}\nerrors on training windows, RMS by joint: {errors} mrad\n{table}\n{dead}{left}"
+    told = [f"delay {delay_text(record)}", f"errors on training windows, RMS by joint: {errors} mrad"]
+    zones = [f"{x['joint']} {_shown(x['dead_zone'])}" for x in record["joints"] if "dead_zone" in x]
+    dead = [f"half dead zones [rad, m]: {', '.join(zones)}"] if zones else []
+    return "\n".join([*told, servo_listing(record).text(), *dead, open_text(record)])
+
+
+def delay_text(record: Mapping[str, Any]) -> str:
+    """With its interval."""
+    delay = record["delay"]
+    return f"{1000 * delay['value']:.1f} ms, +- {1000 * delay['half']:.1f} ms"
+
+
+def servo_listing(record: Mapping[str, Any], *, zones: bool = False) -> Listing:
+    """By joint kp, and the ratios to it with intervals. zones: half dead zones too."""
+    rows = []
+    for each in record["joints"]:
+        row = [each["joint"], number(each["kp"]["value"]), *(_shown(each[what]) for what in UNITS)]
+        rows.append(
+            (*row, _shown(each["dead_zone"]) if "dead_zone" in each else "none") if zones else (*row,)
+        )
+    head = ["joint", "kp [Nm/rad]", *(f"{_label(what)} [{unit}]" for what, unit in UNITS.items())]
+    head += ["half dead zone [rad, m]"] if zones else []
+    return Listing("Servos", tuple(head), tuple(rows), f"Ratios are {ABOUT}.")
+
+
+def open_text(record: Mapping[str, Any]) -> str:
+    """What the logs leave open."""
+    left = undetermined(record)
+    return f"not determined by these logs: {', '.join(left)}" if left else "all of these are determined"
 
 
 def foreseen(model: Any, solution: ServoSolution) -> dict[str, list[str]]:

@@ -8,6 +8,7 @@ from typing import Any
 
 from markupsafe import Markup
 
+from spelgen.labels import thousandths
 from spelgen.listing import number
 from spelgen.render.picture import Picture
 from spelgen.render.plots import (
@@ -24,6 +25,7 @@ from spelgen.render.plots import (
 )
 from spelgen.spec import Facts
 
+BOTH = (("truth", "measured"), ("predicted", "predicted"))
 Limits = Sequence[tuple[float, float] | None]
 
 
@@ -62,7 +64,6 @@ def curves(traces: Mapping[str, Any], facts: Facts, picture: Picture) -> Curves:
     joints, types = facts.joints, facts.joint_types
     mass = traces.get("mass") or {}
     torques = traces.get("torques") or []
-    both = (("truth", "measured"), ("predicted", "predicted"))
     parts = (
         ("inertia", "inertia"),
         ("coriolis", "Coriolis"),
@@ -74,20 +75,12 @@ def curves(traces: Mapping[str, Any], facts: Facts, picture: Picture) -> Curves:
         torques=tuple(
             Drawn(
                 f"{x['which'].capitalize()} trajectory: {x['trajectory']}",
-                (*both, *parts),
+                (*BOTH, *parts),
                 tuple(torque_panels(x, joints, types)),
             )
             for x in torques
         ),
-        trajectories=tuple(
-            Drawn(
-                f"{x['which'].capitalize()} prediction: {x['trajectory']}, {x['start']:.3g} s into it, "
-                f"relative error {number(x['error'])}",
-                both,
-                tuple(trajectory_panels(x, joints, types)),
-            )
-            for x in traces.get("trajectories", [])
-        ),
+        trajectories=tuple(_predicted(x, joints, types) for x in traces.get("trajectories", [])),
         mass=tuple(mass_panels(mass, types, picture.rows)) if mass.get("by") else (),
         eigenvalues=eigenvalue_chart(mass) if mass.get("by") else None,
         along=str(mass.get("trajectory", "")),
@@ -96,6 +89,16 @@ def curves(traces: Mapping[str, Any], facts: Facts, picture: Picture) -> Curves:
         else (),
         energy=energy_chart(torques[0]) if torques else None,
     )
+
+
+def _predicted(example: Mapping[str, Any], joints: Sequence[str], types: Sequence[str]) -> Drawn:
+    which, name, error = (example[x] for x in ("which", "trajectory", "error"))
+    panels = tuple(trajectory_panels(example, joints, types))
+    if "u" in example:
+        title = f"{which.capitalize()} log replayed: {name}, {number(1000 * error)} {thousandths(types)} off"
+        return Drawn(title, (*BOTH, ("hold", "commanded")), panels)
+    title = f"{which.capitalize()} prediction: {name}, {example['start']:.3g} s into it, "
+    return Drawn(f"{title}relative error {number(error)}", BOTH, panels)
 
 
 def coverage(

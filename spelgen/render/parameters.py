@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from spelgen.dynamics.regressor import urdf_parameters
+from spelgen.fitting.servo_report import open_text, servo_listing
 from spelgen.identification.base_parameters import base_parameters
 from spelgen.identification.friction import FrictionModel
 from spelgen.loaded_arm import LoadedArm
@@ -17,12 +18,13 @@ from spelgen.render.plots import FORCE, INERTIA_UNITS, UNITS
 
 SURE_WORDS = ("firm", "fair")
 SURE = 2.0  # standard deviations of an interval: 95 %
+FAINT = 1e-4  # of dry friction: there is no such law
 FRICTION_UNITS = {
     "viscous": "{force} s/{length}",
     "saturation_velocity": "{speed}",
     "stribeck_velocity": "{speed}",
     "coulomb_smoothing_velocity": "{speed}",
-    "load_dependence": "1",
+    "load_dependence": "",
 }  # all others are a torque
 
 
@@ -36,6 +38,12 @@ class ParameterTable:
     note: str = ""
     more: tuple[tuple[str, ...], ...] = ()
     more_title: str = ""
+
+
+def servo_table(record: Mapping[str, Any]) -> ParameterTable:
+    """What a fit of position servos tells by joint; `record`: the run's, of servos."""
+    listing = servo_listing(record, zones=True)
+    return ParameterTable(listing.title, listing.head, listing.rows, f"{listing.note} {open_text(record)}.")
 
 
 def parameter_tables(
@@ -126,8 +134,8 @@ def _bodies(model: Any, arm: LoadedArm | None) -> Iterator[ParameterTable]:
         "Masses, centres of mass and inertias",
         ("moves with", "by", "m [kg]", "centre of mass x, y, z [m]", "principal moments about it [kg m²]"),
         tuple(rows),
-        "In the frame of the joint, z its axis. One of many sets that move alike: what motion shows are the base "
-        "parameters above; all sets shown belong to some real distribution of mass.",
+        "In the frame of the joint, z its axis. One of many sets that move alike: what motion shows are base "
+        "parameters; all sets shown belong to some real distribution of mass.",
     )
 
 
@@ -159,6 +167,7 @@ def _joints(model: Any, arm: LoadedArm | None) -> Iterator[ParameterTable]:
                 and values.shape == (len(types),)
                 and name != "offset"
                 and name != "smoothing"
+                and name not in _unused(model)
             ):
                 columns[name] = (values.tolist(), name)
         offset = getattr(getattr(model, "dynamics", None), "torque_offset", None)
@@ -173,12 +182,34 @@ def _joints(model: Any, arm: LoadedArm | None) -> Iterator[ParameterTable]:
     rows = []
     for k, kind in enumerate(types):
         name = arm.arm.coordinates[k].name if arm else f"joint {k + 1}"
-        row = [name, *(f"{values[k]:.3g} {_unit(what, kind)}" for values, what in columns.values())]
+        absent = _absent(named, k)
+        row = [
+            name,
+            *(
+                "none" if what in absent else f"{values[k]:.3g} {_unit(what, kind)}".strip()
+                for values, what in columns.values()
+            ),
+        ]
         if arm is not None:
             each = arm.arm.coordinates[k]
             row.append(f"{each.damping:.3g}, {each.friction:.3g}")
         rows.append(tuple(row))
     yield ParameterTable("Drives and friction", tuple(head), tuple(rows))
+
+
+def _absent(friction: Mapping[str, Any], joint: int) -> tuple[str, ...]:
+    """Constants of laws that a fit did not give to this joint."""
+    slow, dry = (friction.get(name) for name in ("stribeck", "coulomb"))
+    if slow is None or dry is None or slow[joint] > FAINT * dry[joint]:
+        return ()
+    return "stribeck", "stribeck_velocity"
+
+
+def _unused(model: Any) -> tuple[str, ...]:
+    """Constants of friction that this model's does not have: velocities of what remembers, and what kd stands for."""
+    smoothed = model.dynamics.friction.raw_coulomb_smoothing_velocity is not None
+    found = () if smoothed else ("coulomb_smoothing_velocity",)
+    return (*found, "viscous", "saturation", "saturation_velocity") if hasattr(model, "servo") else found
 
 
 def _unit(what: str, kind: str) -> str:

@@ -120,15 +120,20 @@ def torque_panels(trace: Mapping[str, Any], joints: Sequence[str], joint_types: 
 def trajectory_panels(
     example: Mapping[str, Any], joints: Sequence[str], joint_types: Sequence[str]
 ) -> list[Panel]:
-    """By joint: position and velocity, measured and predicted, each above what lies between the two."""
+    """By joint: position and, where it is known, velocity, measured, predicted and, of servos, commanded, each above
+    what lies between the first two.
+    """
     t, motion = example["t"], f"prediction {example['which']}"
+    shown = [x for x in QUANTITIES if x in example]
     panels = []
     for k, (name, kind) in enumerate(zip(joints, joint_types, strict=True)):
         charts = []
-        for (key, what), unit in zip(QUANTITIES.items(), UNITS[kind], strict=True):
+        for key, unit in zip(shown, UNITS[kind], strict=False):
+            what, last = QUANTITIES[key], key == shown[-1]
             true, found = numbers(example[key])[:, k], numbers(example[f"predicted_{key}"])[:, k]
-            last = key == "qd"
             lines = [Line("measured", t, true, "truth"), Line("predicted", t, found, "predicted")]
+            if "u" in example:
+                lines.insert(0, Line("commanded", t, numbers(example["u"])[:, k], "hold"))
             off = [Line("predicted less measured", t, found - true, "model")]
             charts += [
                 line_chart(lines, f"{what} of {name}", "", f"{what} [{unit}]", motion=motion, height=120),

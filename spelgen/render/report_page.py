@@ -21,7 +21,7 @@ from spelgen.render.arm_section import LETTERS, ArmSection, Cell, arm_section, m
 from spelgen.render.curves import Limits, coverage, curves, predictors
 from spelgen.render.learned import read_learned
 from spelgen.render.page import render_page
-from spelgen.render.parameters import ParameterTable, body_parameters, parameter_tables
+from spelgen.render.parameters import ParameterTable, body_parameters, parameter_tables, servo_table
 from spelgen.render.picture import Picture, read_picture
 from spelgen.render.plots import FORCE, UNITS
 from spelgen.render.reproduction import commands, files
@@ -112,6 +112,8 @@ def _rendered(run: RunFolder, robot: Path | str | None) -> str:
         curves=curves(traces, facts, picture),
         coverage=coverage(traces, identified, facts, limits),
         learned=learned,
+        under_servos=config is not None and config["objective"] == "servo",
+        servos=servo_table(config["servo"]) if config and "servo" in config else None,
         parameters=_parameters(trained, arm, identified),
         files=files(run.path),
         commands=commands(run, facts, config),

@@ -9,6 +9,8 @@ from typing import Any
 from markupsafe import Markup
 
 from spelgen.evaluation.names import MODEL
+from spelgen.fitting.servo_report import delay_text
+from spelgen.labels import thousandths
 from spelgen.listing import number
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.render.learned import Learned
@@ -57,7 +59,13 @@ def head_numbers(
             )
         if error["tip_mm"] is not None:
             found.append(Number(f"{number(error['tip_mm'])} mm", f"error of the tip after {last['name']}"))
-    if learned:
+    for replay in (evaluation or {}).get("replays", ()):
+        unit = thousandths((evaluation or {}).get("joint_types", ()))
+        error = f"{number(1000 * replay['errors'][MODEL]['mean'])} {unit}"
+        found.append(Number(error, f"off measured positions, commands replayed, {replay['name']}"))
+    if config and "servo" in config:
+        found.append(Number(delay_text(config["servo"]), "from commands to what they do"))
+    elif learned:
         found.append(Number(f"{learned.parameters:,}", "trained parameters"))
     if metrics:
         found.append(Number(_duration(metrics[-1]["seconds"]), f"of training, {metrics[-1]['step']:,} steps"))
