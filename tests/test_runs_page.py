@@ -38,6 +38,21 @@ def test_runs_stand_side_by_side_and_the_better_one_is_named(run, tmp_path):  # 
     assert result.exit_code == 0 and (tmp_path / "both.html").exists()
 
 
+def test_runs_of_servos_are_compared_by_what_they_replay(run, tmp_path):  # noqa: F811
+    better = tmp_path / "better"
+    shutil.copytree(run, better)
+    for folder, mean, logs in ((run, 0.008, {"a": 0.008, "b": 0.008}), (better, 0.006, {"b": 0.006})):
+        replay = {
+            "name": "whole log",
+            "errors": {"model": {"trajectories": logs, "mean": mean, "joints": []}},
+        }
+        changed = EVALUATION | {"horizons": [], "torque": {}, "replays": [replay]}
+        (folder / "evaluation.json").write_text(json.dumps(changed))
+    text = " ".join(" ".join(Page(render_runs([run, better])).text).split())
+    assert "better follows commands best, whole log (6 mrad" in text
+    assert "b 8 6 mean of all 8 6" in text and " a 8" not in text
+
+
 def test_a_run_without_evaluation_cannot_be_set_beside_others(run):  # noqa: F811
     (run / "evaluation.json").unlink()
     with pytest.raises(RunError, match=r"not evaluated.*spelgen evaluate"):

@@ -15,7 +15,7 @@ from spelgen.evaluation.tables import Table, table
 from spelgen.evaluation.verdict import verdict
 from spelgen.files import write_text
 from spelgen.fitting.run_folder import RunFolder
-from spelgen.labels import listed
+from spelgen.labels import listed, thousandths
 from spelgen.listing import number
 from spelgen.render.charts import Band, Line, line_chart
 from spelgen.render.page import render_page
@@ -99,6 +99,15 @@ def _best(runs: Sequence[RunShown]) -> str:
         )
     least = _least(runs, lambda run: (run.evaluation["torque"].get(MODEL) or {}).get("mean_nmse"))
     told += [f"{least[0]} has the least torque error (nMSE {number(least[1])})"] if least else []
+    replayed = _replayed(runs)
+    if replayed:
+        least = _least(runs, lambda run: 1000 * _replay(run, replayed[0])["mean"])
+        unit = thousandths(runs[0].facts.joint_types)
+        told += (
+            [f"{least[0]} follows commands best, {replayed[0]} ({number(least[1])} {unit} off)"]
+            if least
+            else []
+        )
     return f"{listed(told)}." if told else "These runs share nothing that was measured."
 
 
@@ -118,6 +127,30 @@ def _horizon(run: RunShown, name: str) -> Mapping[str, Any]:
         x["errors"][MODEL] for x in run.evaluation["horizons"] if x["name"] == name
     )
     return errors
+
+
+def _replayed(runs: Sequence[RunShown]) -> list[str]:
+    """How all runs have replayed commands."""
+    first, *rest = ([x["name"] for x in run.evaluation.get("replays", ())] for run in runs)
+    return [name for name in first if all(name in other for other in rest)]
+
+
+def _replay(run: RunShown, name: str) -> Mapping[str, Any]:
+    errors: Mapping[str, Any] = next(
+        x["errors"][MODEL] for x in run.evaluation["replays"] if x["name"] == name
+    )
+    return errors
+
+
+def _replay_table(runs: Sequence[RunShown], name: str) -> Table:
+    """Of logs that all runs have replayed, and the mean of each run's own."""
+    of_runs = {run.name: _replay(run, name) for run in runs}
+    first, *rest = (x["trajectories"] for x in of_runs.values())
+    logs = [log for log in first if all(log in other for other in rest)]
+    rows = [{k: 1000 * x["trajectories"][log] for k, x in of_runs.items()} for log in logs]
+    rows.append({k: 1000 * x["mean"] for k, x in of_runs.items()})
+    title = f"Commands replayed, {name}: RMS of positions [{thousandths(runs[0].facts.joint_types)}]"
+    return table(title, [*logs, "mean of all"], rows)
 
 
 def _tables(runs: Sequence[RunShown]) -> list[Table]:
@@ -141,7 +174,7 @@ def _tables(runs: Sequence[RunShown]) -> list[Table]:
             labels = [f"{joint} [{FORCE[kind]}]" for joint, kind in zip(names_of, types, strict=True)]
             rows = [{k: x["rmse"][j] for k, x in columns.items()} for j in range(len(labels))]
             found.append(table("Torque error by joint, RMSE", labels, rows))
-    return found
+    return [*found, *(_replay_table(runs, name) for name in _replayed(runs))]
 
 
 def _growth(runs: Sequence[RunShown]) -> list[Panel]:
