@@ -13,8 +13,10 @@ import torch
 import yaml
 from emitted import import_source
 from servo_arm import COM, GRAVITY, MASS, STRIBECK_VELOCITY, Servos, servo_logs, write_servo_arm
+from typer.testing import CliRunner
 
 import spelgen
+from spelgen.cli.main import app
 from spelgen.dynamics.servo_rank import servo_rank
 from spelgen.dynamics.servo_rollout import replayed
 from spelgen.errors import LogError, OptionError, RunError, SettingsError
@@ -347,6 +349,12 @@ def moved(model, seconds, count=1):
     start, dt = torch.from_numpy(u[:, 0]), torch.full((count, len(t) - 1), 0.0025).double()
     q = replayed(model, start, torch.zeros_like(start), torch.from_numpy(commands), dt).numpy()
     return [replace(x, q=np.concatenate([x.u[:1], y]))[::every] for x, y in zip(logs, q, strict=True)]
+
+
+def test_presets_are_not_compared_under_servos(tmp_path):
+    result = CliRunner().invoke(app, ["compare", str(write_servo_arm(tmp_path)), "-o", str(tmp_path / "out")])
+    assert result.exit_code == 1 and not (tmp_path / "out").exists()
+    assert "servo_arm.yaml: input: got position servos, expected torques" in " ".join(result.stderr.split())
 
 
 def test_joints_by_themselves_move_as_the_arm_does(arm):

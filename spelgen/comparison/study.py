@@ -19,7 +19,7 @@ import yaml
 from spelgen import pipeline
 from spelgen.comparison.known_urdf import with_wrong_inertials, without_inertials
 from spelgen.design import Design, Net, Preset, load_design
-from spelgen.errors import RunError
+from spelgen.errors import RunError, SettingsError
 from spelgen.files import write_json, write_text
 from spelgen.fitting.config import Rollout, fit_config
 from spelgen.fitting.loop import EPOCH_STEPS
@@ -134,10 +134,16 @@ def prepare_study(
 ) -> Study:
     """Simulate the logs and write the modules, or find them as an earlier call left them.
 
-    Raises RunError where the folder holds another comparison, or modules that spelgen does not write so, and what
-    `load_arm` and `simulate` raise.
+    Raises RunError where the folder holds another comparison, or modules that spelgen does not write so, SettingsError
+    where the arm has position servos, and what `load_arm` and `simulate` raise.
     """
     loaded = load_arm(robot)
+    if loaded.settings.input == "position":
+        raise SettingsError(
+            "position servos", file=robot.with_suffix(".yaml"), element="input",
+            expected="torques: by these presets are compared",
+            do="`spelgen train` fits what servos have to beat beside the model, `spelgen evaluate` compares them",
+        )  # fmt: skip
     chosen = {name: value for name, value in {"seeds": seeds, "steps": steps}.items() if value is not None}
     settings = loaded.settings.comparison.model_copy(update=chosen)
     ranges = [working_range(coordinate) for coordinate in loaded.arm.coordinates]
