@@ -68,7 +68,7 @@ def replay_traces(missed: Sequence[Missed]) -> dict[str, Any]:
         predicted = np.concatenate([log.q[:1], log.q[1:] + error])
         columns = {"t": log.t - log.t[0], "q": log.q, "u": log.u, "predicted_q": predicted}
         stride = -(-len(log) // SHOWN_OF_LOG)
-        told = {"which": which, "trajectory": log.name, "start": 0.0, "error": plain(size[k])}
+        told = {"which": which, "trajectory": log.name, "error": plain(size[k])}
         examples.append(told | {name: plain(x[::stride]) for name, x in columns.items()})
     return {"coverage": coverage([x for x, _ in missed]), "trajectories": examples}
 

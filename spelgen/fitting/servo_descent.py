@@ -102,8 +102,7 @@ class Descent:
         precision = self.problem.weights.precision(point)
         matrix = normal.matrix.sum(dim=0) + torch.diag(precision)
         target = normal.target.sum(dim=0) + precision * (point.flat - self.centre)
-        damped = matrix + damping * torch.diag(matrix.diagonal())
-        return -torch.linalg.solve(damped, target).clamp(-LONGEST, LONGEST)
+        return _damped_step(matrix, target, torch.tensor(damping, dtype=torch.float64))
 
     def steps(self, reached: Reached, least: float) -> Iterator[Reached]:
         """One after the other; the last is one that gains less than ``least``, or none where none gains."""
@@ -158,9 +157,13 @@ class Descent:
         away = (point.flat - self.centre)[own].view(p, n).mT
         matrix = (slopes * weight.unsqueeze(1)) @ slopes.mT + torch.diag_embed(precision)
         target = (slopes @ (weight * errors.flatten(0, 1).mT).unsqueeze(-1)).squeeze(-1) + precision * away
-        damped = matrix + damping[:, None, None] * torch.diag_embed(matrix.diagonal(dim1=-2, dim2=-1))
-        step = -torch.linalg.solve(damped, target).clamp(-LONGEST, LONGEST).mT
-        return replace(point, joints=point.joints + step * point.present)
+        return replace(point, joints=point.joints + _damped_step(matrix, target, damping).mT * point.present)
+
+
+def _damped_step(matrix: torch.Tensor, target: torch.Tensor, damping: torch.Tensor) -> torch.Tensor:
+    """By derivatives (..., k, k) and (..., k), each with its own damping (...), (..., k)."""
+    damped = matrix + damping[..., None, None] * torch.diag_embed(matrix.diagonal(dim1=-2, dim2=-1))
+    return -torch.linalg.solve(damped, target).clamp(-LONGEST, LONGEST)
 
 
 def _alike(errors: torch.Tensor, span: int) -> torch.Tensor:

@@ -122,11 +122,10 @@ class ServoRounds:
         point = self.reached.point
         errors = self.problem.errors(point)
         descent = Descent(self.problem, self._noise, errors)
-        normal = descent.normal(point, errors)
+        normal = self._with_dead_zones(descent, point)
         target = normal.target.sum(dim=0)
         gain = -float(target @ descent.step(normal, point))
         left = max(1 - gain / descent.square(errors), LEFT)
-        normal = self._with_dead_zones(descent, point)
         return self._solution(
             point, Normal(normal.matrix / left, normal.target), torch.zeros_like(point.flat)
         )

@@ -161,14 +161,9 @@ def _joints(model: Any, arm: LoadedArm | None) -> Iterator[ParameterTable]:
     with torch.no_grad():
         prepared: Any = friction.prepare() if hasattr(friction, "prepare") else None
         named = prepared._asdict() if hasattr(prepared, "_asdict") else {}
+        unused = {"offset", "smoothing", *_unused(model, friction)}
         for name, values in named.items():
-            if (
-                torch.is_tensor(values)
-                and values.shape == (len(types),)
-                and name != "offset"
-                and name != "smoothing"
-                and name not in _unused(model)
-            ):
+            if torch.is_tensor(values) and values.shape == (len(types),) and name not in unused:
                 columns[name] = (values.tolist(), name)
         offset = getattr(getattr(model, "dynamics", None), "torque_offset", None)
         if offset is not None:
@@ -205,9 +200,9 @@ def _absent(friction: Mapping[str, Any], joint: int) -> tuple[str, ...]:
     return "stribeck", "stribeck_velocity"
 
 
-def _unused(model: Any) -> tuple[str, ...]:
+def _unused(model: Any, friction: Any) -> tuple[str, ...]:
     """Constants of friction that this model's does not have: velocities of what remembers, and what kd stands for."""
-    smoothed = model.dynamics.friction.raw_coulomb_smoothing_velocity is not None
+    smoothed = getattr(friction, "raw_coulomb_smoothing_velocity", None) is not None
     found = () if smoothed else ("coulomb_smoothing_velocity",)
     return (*found, "viscous", "saturation", "saturation_velocity") if hasattr(model, "servo") else found
 

@@ -89,9 +89,9 @@ def _shown(folder: Path, name: str, index: int) -> RunShown:
 def _best(runs: Sequence[RunShown]) -> str:
     """Which run misses least over the longest horizon that all have, and which in torque."""
     told = []
-    common = _horizons(runs)
+    common, replayed = (_common(runs, what) for what in ("horizons", "replays"))
     if common:
-        least = _least(runs, lambda run: _horizon(run, common[-1])["mean_relative_rms"])
+        least = _least(runs, lambda run: _of_model(run, "horizons", common[-1])["mean_relative_rms"])
         told += (
             [f"{least[0]} predicts best over {common[-1]} ({number(least[1])} of the motion missed)"]
             if least
@@ -99,9 +99,8 @@ def _best(runs: Sequence[RunShown]) -> str:
         )
     least = _least(runs, lambda run: (run.evaluation["torque"].get(MODEL) or {}).get("mean_nmse"))
     told += [f"{least[0]} has the least torque error (nMSE {number(least[1])})"] if least else []
-    replayed = _replayed(runs)
     if replayed:
-        least = _least(runs, lambda run: 1000 * _replay(run, replayed[0])["mean"])
+        least = _least(runs, lambda run: 1000 * _of_model(run, "replays", replayed[0])["mean"])
         unit = thousandths(runs[0].facts.joint_types)
         told += (
             [f"{least[0]} follows commands best, {replayed[0]} ({number(least[1])} {unit} off)"]
@@ -116,35 +115,21 @@ def _least(runs: Sequence[RunShown], value: Callable[[RunShown], float | None]) 
     return (min(known)[1], min(known)[0]) if known else None
 
 
-def _horizons(runs: Sequence[RunShown]) -> list[str]:
-    """Those that all runs were judged over."""
-    first, *rest = ([x["name"] for x in run.evaluation["horizons"]] for run in runs)
+def _common(runs: Sequence[RunShown], what: str) -> list[str]:
+    """Names of the horizons, or of the replays, that all runs were judged over."""
+    first, *rest = ([x["name"] for x in run.evaluation.get(what, ())] for run in runs)
     return [name for name in first if all(name in other for other in rest)]
 
 
-def _horizon(run: RunShown, name: str) -> Mapping[str, Any]:
-    errors: Mapping[str, Any] = next(
-        x["errors"][MODEL] for x in run.evaluation["horizons"] if x["name"] == name
-    )
-    return errors
-
-
-def _replayed(runs: Sequence[RunShown]) -> list[str]:
-    """How all runs have replayed commands."""
-    first, *rest = ([x["name"] for x in run.evaluation.get("replays", ())] for run in runs)
-    return [name for name in first if all(name in other for other in rest)]
-
-
-def _replay(run: RunShown, name: str) -> Mapping[str, Any]:
-    errors: Mapping[str, Any] = next(
-        x["errors"][MODEL] for x in run.evaluation["replays"] if x["name"] == name
-    )
+def _of_model(run: RunShown, what: str, name: str) -> Mapping[str, Any]:
+    """The model's errors over one of these."""
+    errors: Mapping[str, Any] = next(x["errors"][MODEL] for x in run.evaluation[what] if x["name"] == name)
     return errors
 
 
 def _replay_table(runs: Sequence[RunShown], name: str) -> Table:
     """Of logs that all runs have replayed, and the mean of each run's own."""
-    of_runs = {run.name: _replay(run, name) for run in runs}
+    of_runs = {run.name: _of_model(run, "replays", name) for run in runs}
     first, *rest = (x["trajectories"] for x in of_runs.values())
     logs = [log for log in first if all(log in other for other in rest)]
     rows = [{k: 1000 * x["trajectories"][log] for k, x in of_runs.items()} for log in logs]
@@ -154,12 +139,12 @@ def _replay_table(runs: Sequence[RunShown], name: str) -> Table:
 
 
 def _tables(runs: Sequence[RunShown]) -> list[Table]:
-    names, found = _horizons(runs), []
+    names, found = _common(runs, "horizons"), []
     for what, title in (
         ("mean_relative_rms", "Error relative to the motion"),
         ("tip_mm", "Error of the tip's position [mm]"),
     ):
-        rows = [{run.name: _horizon(run, name)[what] for run in runs} for name in names]
+        rows = [{run.name: _of_model(run, "horizons", name)[what] for run in runs} for name in names]
         if any(x is not None for row in rows for x in row.values()):
             found.append(table(title, names, rows))
     torques = [run.evaluation["torque"].get(MODEL) for run in runs]
@@ -174,7 +159,7 @@ def _tables(runs: Sequence[RunShown]) -> list[Table]:
             labels = [f"{joint} [{FORCE[kind]}]" for joint, kind in zip(names_of, types, strict=True)]
             rows = [{k: x["rmse"][j] for k, x in columns.items()} for j in range(len(labels))]
             found.append(table("Torque error by joint, RMSE", labels, rows))
-    return [*found, *(_replay_table(runs, name) for name in _replayed(runs))]
+    return [*found, *(_replay_table(runs, name) for name in _common(runs, "replays"))]
 
 
 def _growth(runs: Sequence[RunShown]) -> list[Panel]:
