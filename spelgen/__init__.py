@@ -14,16 +14,16 @@ if TYPE_CHECKING:
     from spelgen.evaluation.rollout import rollout
     from spelgen.excitation.design import excite
     from spelgen.exporting.export import export
-    from spelgen.fitting.config import GaussianPrior, MomentumFit, Rollout, TorqueFit
+    from spelgen.settings.fits import GaussianPrior, MomentumFit, Rollout, TorqueFit
     from spelgen.fitting.fit import Fit, fit, load_run
-    from spelgen.identification.baseline import keep_baseline
+    from spelgen.baselines.keep import keep_baseline
     from spelgen.identification.friction import FrictionModel
     from spelgen.identification.identification import Identification
     from spelgen.identification.identify import identify
     from spelgen.identification.method import LeastSquares
     from spelgen.inspection import Inspection
     from spelgen.loaded_arm import LoadedArm, load_arm
-    from spelgen.logs.check_logs import check_logs
+    from spelgen.log_checks.check_logs import check_logs
     from spelgen.logs.preprocessing import Preprocessing
     from spelgen.logs.read import read_logs, write_logs
     from spelgen.logs.trajectory import Trajectory
@@ -45,22 +45,22 @@ _HOME = {
     "read_logs": "logs.read",
     "write_logs": "logs.read",
     "Trajectory": "logs.trajectory",
-    "check_logs": "logs.check_logs",
+    "check_logs": "log_checks.check_logs",
     "Preprocessing": "logs.preprocessing",
     "simulate": "simulation.simulate",
     "excite": "excitation.design",
     "identify": "identification.identify",
     "LeastSquares": "identification.method",
-    "keep_baseline": "identification.baseline",
+    "keep_baseline": "baselines.keep",
     "FrictionModel": "identification.friction",
     "Identification": "identification.identification",
     "fit": "fitting.fit",
     "Fit": "fitting.fitted",
     "load_run": "fitting.fitted",
-    "GaussianPrior": "fitting.config",
-    "TorqueFit": "fitting.config",
-    "MomentumFit": "fitting.config",
-    "Rollout": "fitting.config",
+    "GaussianPrior": "settings.fits",
+    "TorqueFit": "settings.fits",
+    "MomentumFit": "settings.fits",
+    "Rollout": "settings.fits",
     "rollout": "evaluation.rollout",
     "evaluate": "evaluation.evaluate",
     "Results": "evaluation.results",

@@ -6,7 +6,7 @@ import torch
 from emitted import ROBOTS
 
 from spelgen.building import build
-from spelgen.fitting.config import TorqueFit
+from spelgen.settings.fits import TorqueFit
 from spelgen.fitting.fitted import Fit
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.loaded_arm import load_arm

@@ -22,7 +22,7 @@ from spelgen.evaluation.invariants import energy_drift
 from spelgen.evaluation.rollout import rollout
 from spelgen.evaluation.subject import read_test_logs
 from spelgen.evaluation.torque import torque_errors
-from spelgen.fitting.config import Rollout
+from spelgen.settings.fits import Rollout
 from spelgen.fitting.train import train
 from spelgen.identification.samples import dynamics_samples
 from spelgen.loaded_arm import load_arm

@@ -10,7 +10,7 @@ from emitted import random_model
 import spelgen
 from spelgen.errors import LogError, RunError
 from spelgen.fitting.adaptive import LONG
-from spelgen.fitting.config import MomentumFit, Rollout, TorqueFit
+from spelgen.settings.fits import MomentumFit, Rollout, TorqueFit
 from spelgen.fitting.rollout import loss_scales, roll_out, rollout_loss
 from spelgen.fitting.train import train
 from spelgen.logs.preprocessing import Preprocessing

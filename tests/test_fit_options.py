@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from spelgen.cli.main import app
 from spelgen.errors import OptionError, SettingsError
-from spelgen.fitting.config import CONFIGS, OWNERS, MomentumFit, Rollout, TorqueFit, fit_config
+from spelgen.settings.fits import CONFIGS, OWNERS, MomentumFit, Rollout, TorqueFit, fit_config
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import write_logs
 from spelgen.pipeline import generate

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from spelgen.errors import RunError, SettingsError, SpelgenError
-from spelgen.fitting.config import GaussianPrior
+from spelgen.settings.fits import GaussianPrior
 from spelgen.fitting.fitted import load_run
 from spelgen.fleet import jobs
 from spelgen.fleet.engine import InProcess, engine

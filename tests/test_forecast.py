@@ -22,7 +22,7 @@ from spelgen.evaluation.rollout import rollout
 from spelgen.evaluation.tables import result_tables
 from spelgen.evaluation.trust import calibrated
 from spelgen.fitting.calibration import calibration_windows, held_sources
-from spelgen.fitting.config import Rollout
+from spelgen.settings.fits import Rollout
 from spelgen.fitting.fit import fit
 from spelgen.fitting.fitted import load_run
 from spelgen.logs.preprocessing import Preprocessing

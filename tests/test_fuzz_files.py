@@ -18,11 +18,11 @@ from test_fuzz import mutated
 from spelgen.building import build
 from spelgen.errors import SpelgenError
 from spelgen.evaluation.evaluate import evaluate
-from spelgen.fitting.config import TorqueFit
+from spelgen.settings.fits import TorqueFit
 from spelgen.fitting.fit import fit
 from spelgen.fitting.fitted import load_run
 from spelgen.loaded_arm import load_arm
-from spelgen.logs.check_logs import check_logs
+from spelgen.log_checks.check_logs import check_logs
 from spelgen.logs.chunks import scan
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory

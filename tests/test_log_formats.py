@@ -16,7 +16,7 @@ import pytest
 from spelgen.errors import LogError, SettingsError, SpelgenErrors
 from spelgen.loaded_arm import load_arm
 from spelgen.logs.chunks import scan
-from spelgen.logs.mapping import LogMapping
+from spelgen.settings.log_mapping import LogMapping
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory
 

@@ -21,8 +21,8 @@ from spelgen.identification.identify import identify, least_squares
 from spelgen.identification.method import LeastSquares
 from spelgen.identification.samples import DynamicsSamples, dynamics_samples
 from spelgen.loaded_arm import load_arm
-from spelgen.logs.check_logs import check_logs
-from spelgen.logs.mapping import LogMapping
+from spelgen.log_checks.check_logs import check_logs
+from spelgen.settings.log_mapping import LogMapping
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.pipeline import generate, inspect

@@ -12,7 +12,7 @@ from html_page import Page
 from spelgen import pipeline
 from spelgen.emission.loading import load_module
 from spelgen.errors import RunError
-from spelgen.fitting.config import Rollout
+from spelgen.settings.fits import Rollout
 from spelgen.render.report_page import render_report, write_report
 
 

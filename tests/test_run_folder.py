@@ -19,7 +19,7 @@ from spelgen.errors import LogError, RunError
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.exporting.export import export
 from spelgen.fitting import loop
-from spelgen.fitting.config import Rollout
+from spelgen.settings.fits import Rollout
 from spelgen.fitting.fitted import load_run
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.run_lock import locked

@@ -30,7 +30,7 @@ from spelgen.fitting.servo_intervals import covariance
 from spelgen.fitting.servo_problem import ServoProblem
 from spelgen.fitting.servo_report import servo_text
 from spelgen.fitting.servo_windows import servo_windows
-from spelgen.identification.baseline import read_baseline
+from spelgen.baselines.keep import read_baseline
 from spelgen.listing import number
 from spelgen.logs.commands import delayed_commands
 from spelgen.logs.preprocessing import Preprocessing

@@ -19,7 +19,7 @@ from spelgen.emission.loading import load_module
 from spelgen.errors import LogError
 from spelgen.fitting import torque_fit, torque_jacobian
 from spelgen.fitting.body_steps import moved_bodies
-from spelgen.fitting.config import GaussianPrior, Rollout, TorqueFit
+from spelgen.settings.fits import GaussianPrior, Rollout, TorqueFit
 from spelgen.fitting.fit import fit
 from spelgen.fitting.gaussian_prior import SIZES, covariance, kind_of, most_probable
 from spelgen.fitting.residual_fit import FRICTION, enter

@@ -22,7 +22,7 @@ from spelgen.emission.loading import load_module
 from spelgen.errors import LogError, ModuleError, RunError
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.evaluation.subject import read_test_logs
-from spelgen.fitting.config import MomentumFit, Rollout
+from spelgen.settings.fits import MomentumFit, Rollout
 from spelgen.fitting.dataset import prepare_data
 from spelgen.fitting.loop import TrainingLoop
 from spelgen.fitting.optimizers import LBFGS, MiniBatchAdamW
@@ -37,7 +37,7 @@ from spelgen.fitting.rollout import (
     rollout_loss,
 )
 from spelgen.fitting.train import train
-from spelgen.logs.mapping import LogMapping
+from spelgen.settings.log_mapping import LogMapping
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.windows import Windows, cut_windows

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from spelgen.errors import SpelgenError
-from spelgen.fitting.config import Rollout
+from spelgen.settings.fits import Rollout
 from spelgen.fitting.train import train
 from spelgen.loaded_arm import load_arm
 from spelgen.logs.read import write_logs

@@ -44,7 +44,7 @@ def evaluate(
     from spelgen.files import write_json
     from spelgen.fitting.fitted import load_run
     from spelgen.fitting.run_folder import RunFolder
-    from spelgen.identification.baseline import read_baseline
+    from spelgen.baselines.keep import read_baseline
     from spelgen.logs.preprocessing import Preprocessing
 
     torch.set_num_threads(1)

@@ -53,7 +53,7 @@ def identify(
     from spelgen.identification.method import LeastSquares
     from spelgen.loaded_arm import load_arm
     from spelgen.logs.arm_mapping import log_source
-    from spelgen.logs.check_logs import require_possible_torques
+    from spelgen.log_checks.check_logs import require_possible_torques
     from spelgen.logs.preprocessing import Preprocessing
     from spelgen.logs.read import read_logs
 

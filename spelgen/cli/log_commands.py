@@ -87,7 +87,7 @@ def logs(
     """
     from spelgen.loaded_arm import load_arm
     from spelgen.logs.arm_mapping import log_source
-    from spelgen.logs.check_logs import check_logs
+    from spelgen.log_checks.check_logs import check_logs
     from spelgen.logs.chunks import stream_logs
     from spelgen.render.logs_page import page
 

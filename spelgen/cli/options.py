@@ -14,7 +14,7 @@ from spelgen.errors import SpelgenError
 from spelgen.spec import Assume
 
 if TYPE_CHECKING:
-    from spelgen.logs.mapping import LogMapping
+    from spelgen.settings.log_mapping import LogMapping
 
 SUFFIXES = {".json": "json", ".csv": "csv", ".html": "html", ".tex": "latex", ".py": "sympy"}
 

@@ -15,13 +15,13 @@ from spelgen.cli.console import INTERRUPTED, note, say
 from spelgen.cli.options import Data, Filter, Force, Mapping, MoreData, RobotOption, Trust
 from spelgen.cli.train_start import Chosen, NotApplicable, begun, resumed
 from spelgen.errors import ModuleError, OptionError
-from spelgen.fitting.config import Adaptation, Objective, Optimizer, Solver
+from spelgen.settings.fits import Adaptation, Objective, Optimizer, Solver
 from spelgen.spec import read_facts
 
 if TYPE_CHECKING:
-    from spelgen.fitting.config import WindowConfig
+    from spelgen.settings.fits import WindowConfig
     from spelgen.fitting.fitted import Fit
-    from spelgen.logs.mapping import LogMapping
+    from spelgen.settings.log_mapping import LogMapping
     from spelgen.logs.trajectory import Trajectory
 
 
@@ -167,7 +167,7 @@ def train(
     if not first:
         return
     if not resume and found.status != "interrupted":
-        from spelgen.identification.baseline import keep_baseline
+        from spelgen.baselines.keep import keep_baseline
 
         keep_baseline(folder, paths)
     for line in _outcome(found):
@@ -190,7 +190,7 @@ def _torque_check(
 ) -> Callable[[Sequence[Trajectory]], None] | None:
     """What raises LogError for logs whose torques cannot be those of the module's arm; None: logs have no torques."""
     from spelgen.loaded_arm import load_arm
-    from spelgen.logs.check_logs import require_possible_torques
+    from spelgen.log_checks.check_logs import require_possible_torques
 
     options = read_facts(module).options
     arm = load_arm(urdf, options.joints, options.tip, options.angle_tolerance)

@@ -18,7 +18,7 @@ from spelgen.evaluation.examples import predict_examples
 from spelgen.evaluation.invariants import invariants
 from spelgen.evaluation.names import MODEL
 from spelgen.files import write_json
-from spelgen.fitting.config import BATCH, Rollout
+from spelgen.settings.fits import BATCH, Rollout
 from spelgen.fitting.rollout import LossScales, loss_scales
 from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.fitting.train import train

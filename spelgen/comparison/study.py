@@ -21,7 +21,7 @@ from spelgen.comparison.known_urdf import with_wrong_inertials, without_inertial
 from spelgen.design import Design, Net, Preset, load_design
 from spelgen.errors import RunError, SettingsError
 from spelgen.files import write_json, write_text
-from spelgen.fitting.config import Rollout, fit_config
+from spelgen.settings.fits import Rollout, fit_config
 from spelgen.fitting.loop import EPOCH_STEPS
 from spelgen.loaded_arm import LoadedArm, load_arm
 from spelgen.logs.preprocessing import Preprocessing

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from spelgen.dynamics.protocol import RigidDynamics, integrable
-from spelgen.fitting.config import Solver
+from spelgen.settings.fits import Solver
 from spelgen.fitting.rollout import roll_out
 from spelgen.logs.windows import Windows
 

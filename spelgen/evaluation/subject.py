@@ -16,7 +16,7 @@ from spelgen.fitting.fitted import Fit, load_run
 from spelgen.fitting.linear_servo import LinearServos
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.logs.arm_mapping import GivenMapping
-from spelgen.logs.mapping import LogMapping
+from spelgen.settings.log_mapping import LogMapping
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
@@ -26,7 +26,7 @@ from spelgen.urdf.read import read_urdf
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
-    from spelgen.fitting.config import WindowConfig
+    from spelgen.settings.fits import WindowConfig
 
 WINDOW = 5  # samples of the windows that say how many steps the integrator needs
 

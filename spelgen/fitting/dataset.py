@@ -20,7 +20,7 @@ from spelgen.logs.trajectory import Trajectory, gap_ends, require_joints, requir
 from spelgen.logs.windows import Split, Windows, split_validation, thinned
 
 if TYPE_CHECKING:
-    from spelgen.fitting.config import WindowConfig
+    from spelgen.settings.fits import WindowConfig
     from spelgen.logs.chunks import Chunk
 
 LARGEST_VALIDATION = 2048  # windows; validation is a measurement, it needs no more

@@ -15,7 +15,7 @@ from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.errors import Diagnostic, LogError, RunError
 from spelgen.files import write_json
 from spelgen.fitting.calibration import CalibrationWindows, read_calibration
-from spelgen.fitting.config import FitConfig
+from spelgen.settings.fits import FitConfig
 from spelgen.fitting.loop import Status
 from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.fitting.run_lock import locked

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 
 import torch
 
-from spelgen.fitting.config import Adaptation, GaussianPrior
+from spelgen.settings.fits import Adaptation, GaussianPrior
 
 # weights of a module's parts, by how their names end
 SIZES = ("raw_viscous", "raw_saturation", "raw_coulomb", "raw_stribeck")

@@ -13,7 +13,7 @@ import torch
 from spelgen.dynamics.residuals import idle_residuals
 from spelgen.errors import RunError
 from spelgen.fitting import workers
-from spelgen.fitting.config import BATCH, FEW_WINDOWS, LEARNING_RATE, WindowConfig
+from spelgen.settings.fits import BATCH, FEW_WINDOWS, LEARNING_RATE, WindowConfig
 from spelgen.fitting.dataset import TrainingData
 from spelgen.fitting.optimizers import LBFGS, MiniBatchAdamW, WindowOptimizer
 from spelgen.fitting.progress import TrainingProgress

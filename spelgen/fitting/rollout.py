@@ -13,7 +13,7 @@ import torch
 from spelgen.dynamics.protocol import PortHamiltonianDynamics, memory_after, memory_along, sliding_memory
 from spelgen.dynamics.runge_kutta import runge_kutta
 from spelgen.fitting.adaptive import roll_out_adaptive
-from spelgen.fitting.config import Solver
+from spelgen.settings.fits import Solver
 from spelgen.logs.windows import Windows
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from spelgen.errors import RunError, SpelgenError
-from spelgen.fitting.config import CONFIGS, Objective, Substeps, made
-from spelgen.logs.mapping import LogMapping
+from spelgen.settings.fits import CONFIGS, Objective, Substeps, made
+from spelgen.settings.log_mapping import LogMapping
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.settings.values import Count, NonNegative, Positive, Whole
 

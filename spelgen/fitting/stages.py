@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from spelgen.dynamics.bristles import bristle_reach
 from spelgen.errors import Diagnostic, LogError
-from spelgen.fitting.config import FitConfig, Rollout, TorqueFit, fit_config
+from spelgen.settings.fits import FitConfig, Rollout, TorqueFit, fit_config
 from spelgen.fitting.dataset import TrainingData
 from spelgen.fitting.torque_fit import DECIMATION, fit_torque
 from spelgen.fitting.torque_networks import adapt_networks, fit_networks

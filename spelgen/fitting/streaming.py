@@ -18,12 +18,12 @@ from spelgen.fitting.rollout import loss_scales
 from spelgen.logs.checks import Finding, findings, gap_diagnostics, summarised
 from spelgen.logs.chunks import Chunk, scan
 from spelgen.logs.epoch_windows import EpochWindows, WindowCutting
-from spelgen.logs.mapping import LogMapping
+from spelgen.settings.log_mapping import LogMapping
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import GAP, gap_ends
 
 if TYPE_CHECKING:
-    from spelgen.fitting.config import WindowConfig
+    from spelgen.settings.fits import WindowConfig
 
 SAMPLED = 2**16  # windows on which scales and substeps are chosen, and of the momentum steps
 SAMPLED_CHUNKS = 32  # that these windows come from

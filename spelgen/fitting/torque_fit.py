@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from spelgen.fitting.config import Adaptation, GaussianPrior
+from spelgen.settings.fits import Adaptation, GaussianPrior
 from spelgen.fitting.gaussian_prior import PRIORS, covariance, most_probable
 from spelgen.fitting.residual_fit import Residual, enter, refine
 from spelgen.fitting.torque_jacobian import COMPENSATION, TorqueJacobian

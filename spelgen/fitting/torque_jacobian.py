@@ -13,7 +13,7 @@ from torch.func import functional_call
 
 from spelgen.fitting import workers
 from spelgen.fitting.body_steps import moved_bodies
-from spelgen.fitting.config import Adaptation
+from spelgen.settings.fits import Adaptation
 from spelgen.fitting.torque_samples import Block, TorqueSamples
 
 if TYPE_CHECKING:

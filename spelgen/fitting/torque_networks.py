@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from spelgen.fitting.config import LBFGS_DECAY, Adaptation
+from spelgen.settings.fits import LBFGS_DECAY, Adaptation
 from spelgen.fitting.optimizers import minimise_sum
 from spelgen.fitting.torque_samples import Block, TorqueSamples
 from spelgen.identification.samples import DynamicsSamples

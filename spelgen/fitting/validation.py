@@ -12,7 +12,7 @@ from spelgen.fitting.rollout import INTEGRATION_FRACTION, choose_substeps, integ
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
-    from spelgen.fitting.config import WindowConfig
+    from spelgen.settings.fits import WindowConfig
 
 PROBE = 64  # windows on which the integration error is watched
 

@@ -17,7 +17,7 @@ from spelgen.fleet.schema import FleetRobot
 from spelgen.loaded_arm import LoadedArm, load_arm
 from spelgen.logs.chunks import large_files
 from spelgen.logs.log_files import log_files
-from spelgen.logs.mapping import LogMapping
+from spelgen.settings.log_mapping import LogMapping
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import split_validation

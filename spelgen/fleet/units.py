@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from spelgen.fitting.config import GaussianPrior
+from spelgen.settings.fits import GaussianPrior
 from spelgen.fitting.fitted import load_run
 from spelgen.fitting.gaussian_prior import KINDS
 from spelgen.fitting.run_folder import RunFolder

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from pydantic import ValidationError
 
 from spelgen.errors import LogError, collect
-from spelgen.logs.mapping import LogMapping
+from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.messages import explain
 from spelgen.settings.settings import load_mapping
 from spelgen.settings.yaml_document import Document

@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from spelgen.errors import LogError
-from spelgen.logs.mapping import PLAIN
+from spelgen.settings.log_mapping import PLAIN
 
 SUFFIXES = (".mcap", ".db3")
 MESSAGE = "sensor_msgs/msg/JointState"

@@ -17,7 +17,7 @@ import pyarrow.parquet
 from spelgen.errors import LogError, SpelgenError, collect
 from spelgen.logs.arm_mapping import GivenMapping, log_source
 from spelgen.logs.log_files import log_files
-from spelgen.logs.mapping import LogMapping
+from spelgen.settings.log_mapping import LogMapping
 from spelgen.logs.read import ROW_GROUP, read_logs
 from spelgen.logs.tables import Layout, opened, stored_columns, table_layout
 from spelgen.logs.trajectory import Trajectory

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from spelgen.errors import LogError
-from spelgen.logs.mapping import LogMapping
+from spelgen.settings.log_mapping import LogMapping
 
 INFO = "meta/info.json"
 STATE, ACTION = "observation.state", "action"

@@ -12,7 +12,7 @@ import pyarrow.parquet
 
 from spelgen.logs.bags import is_bag, read_bag
 from spelgen.logs.lerobot import dataset_files, dataset_mapping, is_dataset
-from spelgen.logs.mapping import PLAIN, LogMapping
+from spelgen.settings.log_mapping import PLAIN, LogMapping
 from spelgen.logs.npz import read_npz
 from spelgen.logs.tables import LogTable, made_layout, opened, stored_columns, table_layout, wanted_quantities
 

@@ -14,7 +14,7 @@ import pyarrow.compute
 import pyarrow.parquet
 
 from spelgen.errors import LogError
-from spelgen.logs.mapping import TIMES
+from spelgen.settings.log_mapping import TIMES
 from spelgen.logs.npz import npz_table
 from spelgen.logs.readers import read_csv
 from spelgen.logs.tables import opened

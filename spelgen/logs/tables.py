@@ -19,7 +19,7 @@ from spelgen.errors import LogError, shortened
 from spelgen.logs.bags import SUFFIXES as BAG_SUFFIXES
 from spelgen.logs.bags import is_bag
 from spelgen.logs.lerobot import is_dataset
-from spelgen.logs.mapping import TIMES, LogMapping
+from spelgen.settings.log_mapping import TIMES, LogMapping
 from spelgen.logs.trajectory import QUANTITIES
 
 SUFFIXES = (".parquet", ".csv", ".npz", *BAG_SUFFIXES)

@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.compute
 
 from spelgen.errors import LogError
-from spelgen.logs.mapping import TIMES
+from spelgen.settings.log_mapping import TIMES
 from spelgen.logs.tables import Layout, element, wanted_quantities
 from spelgen.logs.trajectory import LARGEST, Trajectory, gap_ends
 

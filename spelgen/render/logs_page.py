@@ -7,7 +7,7 @@ from markupsafe import Markup
 
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.regressor import regressor, urdf_parameters
-from spelgen.logs.report import LogReport
+from spelgen.log_checks.report import LogReport
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.render.charts import Line, line_chart
 from spelgen.render.page import render_page

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from spelgen.fitting.config import CONFIGS
+from spelgen.settings.fits import CONFIGS
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.spec import Facts, Options

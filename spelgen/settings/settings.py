@@ -12,7 +12,7 @@ from typing import Any, Literal, TypeVar
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from spelgen.errors import Diagnostic, SettingsError, collect
-from spelgen.logs.mapping import LogMapping
+from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.comparison import ComparisonSettings
 from spelgen.settings.joint import Coupling, JointSettings
 from spelgen.settings.messages import explain, unknown_name

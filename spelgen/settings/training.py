@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, ValidationInfo, field_validator
 
-from spelgen.fitting.config import OWNERS, GaussianPrior, Objective, Optimizer, Solver, Substeps, Window
+from spelgen.settings.fits import OWNERS, GaussianPrior, Objective, Optimizer, Solver, Substeps, Window
 from spelgen.settings.values import Count, Group, NonNegative, Number, Positive, Whole
 
 

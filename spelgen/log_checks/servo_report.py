@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from spelgen.listing import Listing, number
-from spelgen.logs.report import LogReport, clock_table
+from spelgen.log_checks.report import LogReport, clock_table
 
 _UNITS = {"revolute": "rad", "prismatic": "m"}
 

@@ -24,7 +24,7 @@ from spelgen.identification.identify import identify
 from spelgen.identification.method import LeastSquares
 from spelgen.loaded_arm import LoadedArm, load_arm
 from spelgen.logs.coverage import coverage
-from spelgen.logs.mapping import LogMapping
+from spelgen.settings.log_mapping import LogMapping
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 from spelgen.spec import read_facts
@@ -79,7 +79,7 @@ def _position_actuators(
 ) -> dict[str, Any]:
     if not _has_mujoco():
         return {}
-    from spelgen.identification.position_actuators import MOST, fit_position_actuators
+    from spelgen.baselines.position_actuators import MOST, fit_position_actuators
 
     found = fit_position_actuators(arm, servo_windows(trajectories, used, MOST), trained_model(run))
     return {} if found is None else {"position_actuators": found.to_dict()}
@@ -96,7 +96,7 @@ def read_baseline(run: RunFolder) -> dict[str, Any]:
     path = run.baseline
     found = run.read_json(path) if path.exists() else {}
     if "position_actuators" in found and _has_mujoco():
-        from spelgen.identification.position_actuators import PositionActuators
+        from spelgen.baselines.position_actuators import PositionActuators
 
         try:
             return {POSITION_ACTUATORS: PositionActuators.from_dict(found["position_actuators"])}

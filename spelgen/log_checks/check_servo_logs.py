@@ -10,10 +10,10 @@ import numpy as np
 from spelgen.arm.arm import Coordinate
 from spelgen.errors import Diagnostic, LogError
 from spelgen.logs.checks import DEGREES, Finding, findings, gap_diagnostics, summarised
-from spelgen.logs.following import DELAYS, NOW, Following
-from spelgen.logs.report import range_fraction
-from spelgen.logs.servo_report import ServoJointReport, ServoLogReport
-from spelgen.logs.statistics import (
+from spelgen.log_checks.following import DELAYS, NOW, Following
+from spelgen.log_checks.report import range_fraction
+from spelgen.log_checks.servo_report import ServoJointReport, ServoLogReport
+from spelgen.log_checks.statistics import (
     DENSE,
     Clock,
     clock_of,

@@ -9,8 +9,8 @@ from typing import Any
 from spelgen.arm.arm import Coordinate
 from spelgen.errors import Diagnostic, SpelgenError
 from spelgen.listing import WIDTH, Listing, number
-from spelgen.logs.gravity import GravityFit
-from spelgen.logs.statistics import Clock
+from spelgen.log_checks.gravity import GravityFit
+from spelgen.log_checks.statistics import Clock
 from spelgen.logs.trajectory import QUANTITIES, Trajectory
 
 SHOWN = 20  # trajectories that a terminal and a notebook show

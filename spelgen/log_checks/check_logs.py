@@ -12,16 +12,16 @@ from spelgen.arm.arm import Coordinate
 from spelgen.errors import Diagnostic, LogError, collect
 from spelgen.identification.drive_hints import Coupling, DriveProblem, coupled_inputs, coupling, torque_delay
 from spelgen.identification.drive_samples import DriveLog
-from spelgen.logs.check_servo_logs import check_servo_logs
+from spelgen.log_checks.check_servo_logs import check_servo_logs
 from spelgen.logs.checks import Finding, findings, gap_diagnostics, summarised
-from spelgen.logs.gravity import GravityFit, StateSamples, fit_gravity, state_samples
-from spelgen.logs.report import SEEN, JointReport, LogReport, range_fraction
-from spelgen.logs.statistics import Statistics, common_step, statistics
+from spelgen.log_checks.gravity import GravityFit, StateSamples, fit_gravity, state_samples
+from spelgen.log_checks.report import SEEN, JointReport, LogReport, range_fraction
+from spelgen.log_checks.statistics import Statistics, common_step, statistics
 from spelgen.logs.trajectory import QUANTITIES, Trajectory, require_joints, require_torques
 
 if TYPE_CHECKING:
     from spelgen.loaded_arm import LoadedArm
-    from spelgen.logs.mapping import LogMapping
+    from spelgen.settings.log_mapping import LogMapping
 
 EXAMPLES = 2  # trajectories that are drawn
 BEYOND = 1e-3  # [rad, m, of a limit] a limit overrun by less is rounding

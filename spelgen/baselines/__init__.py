@@ -1,0 +1,1 @@
+"""Predictors that a fitted model is compared with."""
