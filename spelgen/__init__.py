@@ -4,6 +4,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from spelgen.baselines.keep import keep_baseline
     from spelgen.building import build
     from spelgen.design import Design
     from spelgen.dynamics.tip import tip_kinematics
@@ -14,9 +15,7 @@ if TYPE_CHECKING:
     from spelgen.evaluation.rollout import rollout
     from spelgen.excitation.design import excite
     from spelgen.exporting.export import export
-    from spelgen.settings.fits import GaussianPrior, MomentumFit, Rollout, TorqueFit
     from spelgen.fitting.fit import Fit, fit, load_run
-    from spelgen.baselines.keep import keep_baseline
     from spelgen.identification.friction import FrictionModel
     from spelgen.identification.identification import Identification
     from spelgen.identification.identify import identify
@@ -28,6 +27,7 @@ if TYPE_CHECKING:
     from spelgen.logs.read import read_logs, write_logs
     from spelgen.logs.trajectory import Trajectory
     from spelgen.pipeline import check, generate, inspect
+    from spelgen.settings.fits import GaussianPrior, MomentumFit, Rollout, TorqueFit
     from spelgen.simulation.simulate import simulate
 
 __version__ = "0.1.0"

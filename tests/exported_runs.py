@@ -6,11 +6,11 @@ import torch
 from emitted import ROBOTS
 
 from spelgen.building import build
-from spelgen.settings.fits import TorqueFit
 from spelgen.fitting.fitted import Fit
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.loaded_arm import load_arm
 from spelgen.logs.preprocessing import Preprocessing
+from spelgen.settings.fits import TorqueFit
 
 COUPLED = """<robot name="2 fast; } int main( /* */"><link name="base"/>
 <link name="a"><inertial><origin xyz="0.1 0 0.2"/><mass value="2"/>

@@ -15,11 +15,11 @@ from spelgen.dynamics.regressor import regressor, urdf_parameters
 from spelgen.errors import LogError, SpelgenErrors
 from spelgen.loaded_arm import load_arm
 from spelgen.log_checks.check_logs import check_logs, require_possible_torques
-from spelgen.settings.log_mapping import LogMapping
-from spelgen.logs.read import write_logs
 from spelgen.log_checks.statistics import noise_level, quantisation_step, statistics
+from spelgen.logs.read import write_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.render.logs_page import page
+from spelgen.settings.log_mapping import LogMapping
 
 
 @pytest.fixture(scope="module")

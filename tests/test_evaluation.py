@@ -22,13 +22,13 @@ from spelgen.evaluation.invariants import energy_drift
 from spelgen.evaluation.rollout import rollout
 from spelgen.evaluation.subject import read_test_logs
 from spelgen.evaluation.torque import torque_errors
-from spelgen.settings.fits import Rollout
 from spelgen.fitting.train import train
 from spelgen.identification.samples import dynamics_samples
 from spelgen.loaded_arm import load_arm
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.windows import Windows, cut_windows
+from spelgen.settings.fits import Rollout
 
 STAND_IN = Path(__file__).with_name("stand_in.py")
 JOINTS = ("shoulder", "elbow")

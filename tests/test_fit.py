@@ -10,13 +10,13 @@ from emitted import random_model
 import spelgen
 from spelgen.errors import LogError, RunError
 from spelgen.fitting.adaptive import LONG
-from spelgen.settings.fits import MomentumFit, Rollout, TorqueFit
 from spelgen.fitting.rollout import loss_scales, roll_out, rollout_loss
 from spelgen.fitting.train import train
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import write_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
+from spelgen.settings.fits import MomentumFit, Rollout, TorqueFit
 from tests.test_closed_form import FOLLOWED
 from tests.test_training import (
     JOINTS,

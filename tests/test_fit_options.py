@@ -8,10 +8,10 @@ from typer.testing import CliRunner
 
 from spelgen.cli.main import app
 from spelgen.errors import OptionError, SettingsError
-from spelgen.settings.fits import CONFIGS, OWNERS, MomentumFit, Rollout, TorqueFit, fit_config
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import write_logs
 from spelgen.pipeline import generate
+from spelgen.settings.fits import CONFIGS, OWNERS, MomentumFit, Rollout, TorqueFit, fit_config
 from spelgen.settings.settings import load_settings
 from spelgen.settings.training import TrainingSettings
 from tests.test_training import JOINTS, STAND_IN, motions

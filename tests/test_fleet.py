@@ -13,7 +13,6 @@ import pytest
 import torch
 
 from spelgen.errors import RunError, SettingsError, SpelgenError
-from spelgen.settings.fits import GaussianPrior
 from spelgen.fitting.fitted import load_run
 from spelgen.fleet import jobs
 from spelgen.fleet.engine import InProcess, engine
@@ -27,6 +26,7 @@ from spelgen.fleet.units import LEAST, spread
 from spelgen.loaded_arm import load_arm
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.render.fleet_page import write_fleet
+from spelgen.settings.fits import GaussianPrior
 from spelgen.simulation.simulate import simulate
 
 QUICK = {"presets": ["spel"], "width": 4, "depth": 1, "training": {"epochs": 2, "momentum_steps": 0}}

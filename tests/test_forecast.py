@@ -22,12 +22,12 @@ from spelgen.evaluation.rollout import rollout
 from spelgen.evaluation.tables import result_tables
 from spelgen.evaluation.trust import calibrated
 from spelgen.fitting.calibration import calibration_windows, held_sources
-from spelgen.settings.fits import Rollout
 from spelgen.fitting.fit import fit
 from spelgen.fitting.fitted import load_run
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import cut_windows
+from spelgen.settings.fits import Rollout
 
 STAND_IN = Path(__file__).with_name("stand_in.py")
 RATE = 100.0

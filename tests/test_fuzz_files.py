@@ -18,7 +18,6 @@ from test_fuzz import mutated
 from spelgen.building import build
 from spelgen.errors import SpelgenError
 from spelgen.evaluation.evaluate import evaluate
-from spelgen.settings.fits import TorqueFit
 from spelgen.fitting.fit import fit
 from spelgen.fitting.fitted import load_run
 from spelgen.loaded_arm import load_arm
@@ -27,6 +26,7 @@ from spelgen.logs.chunks import scan
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.render.report_page import render_report
+from spelgen.settings.fits import TorqueFit
 from spelgen.settings.settings import OF_A_STEP
 from spelgen.simulation.friction import make_friction
 

@@ -17,18 +17,46 @@ RUNTIME = [
 CARRIED = {"__future__", "collections", "functools", "math", "torch", "typing"}
 
 # A folder (or a file at the top) may import only from itself and from what stands above it.
-ROOMS = """
-errors addresses files labels listing templates runtime
-settings urdf arm design spec
-structure dynamics
-explain formulas verify emission logs
-inspection loaded_arm pipeline building trust
-identification log_checks excitation
-fitting simulation
-evaluation exporting
-baselines fleet comparison render
-cli __init__ __main__
-""".split()
+ROOMS = [
+    "errors",
+    "addresses",
+    "files",
+    "labels",
+    "listing",
+    "templates",
+    "runtime",
+    "settings",
+    "urdf",
+    "arm",
+    "design",
+    "spec",
+    "structure",
+    "dynamics",
+    "explain",
+    "formulas",
+    "verify",
+    "emission",
+    "logs",
+    "inspection",
+    "loaded_arm",
+    "pipeline",
+    "building",
+    "trust",
+    "identification",
+    "log_checks",
+    "excitation",
+    "fitting",
+    "simulation",
+    "evaluation",
+    "exporting",
+    "baselines",
+    "fleet",
+    "comparison",
+    "render",
+    "cli",
+    "__init__",
+    "__main__",
+]
 
 FILES = [".".join(path.relative_to(PACKAGE).with_suffix("").parts) for path in sorted(PACKAGE.rglob("*.py"))]
 LAYERS = [name for name in FILES if not name.endswith(".__init__")]
@@ -40,7 +68,7 @@ PLAIN = {"spelgen.arm.actuation"}  # G by the files, without the exact arithmeti
 ROOMS_THAT_DERIVE = ("urdf.", "arm.", "structure.", "emission.", "verify.", "explain.", "formulas.")
 DERIVES = [x for x in LAYERS if x.startswith(ROOMS_THAT_DERIVE) and x != "emission.loading"]
 OF_A_RUN = {f"render.{name}" for name in ("charts", "plots", "picture", "page", "learned", "scene")}
-FITS = [x for x in LAYERS if x.startswith(("logs.", "fitting.", "evaluation.")) ]
+FITS = [x for x in LAYERS if x.startswith(("logs.", "fitting.", "evaluation."))]
 NEVER = {
     "spec": {"sympy", "flint", "torch"},
     "pipeline": {"torch"},
@@ -65,7 +93,9 @@ def test_runtime_needs_torch_alone():
 
 @pytest.mark.parametrize("name", [x for x in LAYERS if x not in RUNTIME])
 def test_imports_only_from_rooms_above(name):
-    own = {room(module.removeprefix("spelgen.")) for module in imported(name) if module.startswith("spelgen.")}
+    own = {
+        room(module.removeprefix("spelgen.")) for module in imported(name) if module.startswith("spelgen.")
+    }
     assert own <= set(ROOMS[: ROOMS.index(room(name)) + 1])
 
 

@@ -16,9 +16,9 @@ import pytest
 from spelgen.errors import LogError, SettingsError, SpelgenErrors
 from spelgen.loaded_arm import load_arm
 from spelgen.logs.chunks import scan
-from spelgen.settings.log_mapping import LogMapping
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory
+from spelgen.settings.log_mapping import LogMapping
 
 JOINTS = ("shoulder", "elbow")
 T = np.array([0.0, 0.01, 0.02, 0.03])

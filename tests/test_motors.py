@@ -22,11 +22,11 @@ from spelgen.identification.method import LeastSquares
 from spelgen.identification.samples import DynamicsSamples, dynamics_samples
 from spelgen.loaded_arm import load_arm
 from spelgen.log_checks.check_logs import check_logs
-from spelgen.settings.log_mapping import LogMapping
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.pipeline import generate, inspect
 from spelgen.runtime.actuation import motor_speeds as runtime_motor_speeds
+from spelgen.settings.log_mapping import LogMapping
 
 WRIST = np.array([[50.0, 50.0], [40.0, -40.0]])  # joint torques by motor torques of the last two joints
 SPEEDS = np.array([[1.0, 0.8], [1.0, -0.8]])  # of its motors, as of the fifth joint

@@ -12,8 +12,8 @@ from html_page import Page
 from spelgen import pipeline
 from spelgen.emission.loading import load_module
 from spelgen.errors import RunError
-from spelgen.settings.fits import Rollout
 from spelgen.render.report_page import render_report, write_report
+from spelgen.settings.fits import Rollout
 
 
 def errors(share, tip=None):

@@ -19,7 +19,6 @@ from spelgen.errors import LogError, RunError
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.exporting.export import export
 from spelgen.fitting import loop
-from spelgen.settings.fits import Rollout
 from spelgen.fitting.fitted import load_run
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.run_lock import locked
@@ -28,6 +27,7 @@ from spelgen.logs import chunks
 from spelgen.logs.read import write_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.pipeline import generate
+from spelgen.settings.fits import Rollout
 from spelgen.trust import require_own_module
 
 JOINTS = ("joint1", "joint2")

@@ -16,6 +16,7 @@ from servo_arm import COM, GRAVITY, MASS, STRIBECK_VELOCITY, Servos, servo_logs,
 from typer.testing import CliRunner
 
 import spelgen
+from spelgen.baselines.keep import read_baseline
 from spelgen.cli.main import app
 from spelgen.dynamics.servo_rank import servo_rank
 from spelgen.dynamics.servo_rollout import replayed
@@ -30,7 +31,6 @@ from spelgen.fitting.servo_intervals import covariance
 from spelgen.fitting.servo_problem import ServoProblem
 from spelgen.fitting.servo_report import servo_text
 from spelgen.fitting.servo_windows import servo_windows
-from spelgen.baselines.keep import read_baseline
 from spelgen.listing import number
 from spelgen.logs.commands import delayed_commands
 from spelgen.logs.preprocessing import Preprocessing

@@ -10,17 +10,17 @@ import pytest
 import torch
 
 from spelgen.errors import LogError
-from spelgen.settings.fits import Rollout
 from spelgen.fitting.dataset import prepare_data
 from spelgen.fitting.streaming import LargeLogs, prepare_streamed
 from spelgen.fitting.train import train
 from spelgen.logs import chunks, epoch_windows
 from spelgen.logs.chunks import large_files, scan
 from spelgen.logs.epoch_windows import EpochWindows, WindowCutting
-from spelgen.settings.log_mapping import LogMapping
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import QUANTITIES, Trajectory
+from spelgen.settings.fits import Rollout
+from spelgen.settings.log_mapping import LogMapping
 
 STAND_IN = Path(__file__).with_name("stand_in.py")
 JOINTS = ("shoulder", "elbow")

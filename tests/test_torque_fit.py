@@ -19,7 +19,6 @@ from spelgen.emission.loading import load_module
 from spelgen.errors import LogError
 from spelgen.fitting import torque_fit, torque_jacobian
 from spelgen.fitting.body_steps import moved_bodies
-from spelgen.settings.fits import GaussianPrior, Rollout, TorqueFit
 from spelgen.fitting.fit import fit
 from spelgen.fitting.gaussian_prior import SIZES, covariance, kind_of, most_probable
 from spelgen.fitting.residual_fit import FRICTION, enter
@@ -37,6 +36,7 @@ from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.pipeline import generate
 from spelgen.runtime.rigid_body import pseudo_inertia
+from spelgen.settings.fits import GaussianPrior, Rollout, TorqueFit
 from tests.test_closed_form import FOLLOWED, drawn
 
 ROBOTS = ("two_link", "rpr", "six_dof")

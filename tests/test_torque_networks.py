@@ -4,11 +4,11 @@ import torch
 from emitted import NETWORKS, built, import_source
 
 from spelgen.fitting import torque_networks
-from spelgen.settings.fits import MomentumFit, Rollout
 from spelgen.fitting.stages import default_objective, fit_torque_stage
 from spelgen.fitting.torque_networks import fit_networks
 from spelgen.fitting.torque_samples import TorqueSamples
 from spelgen.identification.samples import DynamicsSamples
+from spelgen.settings.fits import MomentumFit, Rollout
 
 
 def recorded(model, seed, count=150):

@@ -22,7 +22,6 @@ from spelgen.emission.loading import load_module
 from spelgen.errors import LogError, ModuleError, RunError
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.evaluation.subject import read_test_logs
-from spelgen.settings.fits import MomentumFit, Rollout
 from spelgen.fitting.dataset import prepare_data
 from spelgen.fitting.loop import TrainingLoop
 from spelgen.fitting.optimizers import LBFGS, MiniBatchAdamW
@@ -37,10 +36,11 @@ from spelgen.fitting.rollout import (
     rollout_loss,
 )
 from spelgen.fitting.train import train
-from spelgen.settings.log_mapping import LogMapping
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.windows import Windows, cut_windows
+from spelgen.settings.fits import MomentumFit, Rollout
+from spelgen.settings.log_mapping import LogMapping
 
 STAND_IN = Path(__file__).with_name("stand_in.py")
 JOINTS = ("shoulder", "elbow")

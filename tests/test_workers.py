@@ -12,11 +12,11 @@ import torch.multiprocessing as mp
 from spelgen.building import build
 from spelgen.emission.loading import load_module
 from spelgen.fitting import loop, workers
-from spelgen.settings.fits import Rollout, TorqueFit
 from spelgen.fitting.fit import fit
 from spelgen.loaded_arm import load_arm
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.windows import Windows
+from spelgen.settings.fits import Rollout, TorqueFit
 from spelgen.simulation.simulate import simulate
 
 JOINTS = ("joint1", "joint2")

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from spelgen.errors import SpelgenError
-from spelgen.settings.fits import Rollout
 from spelgen.fitting.train import train
 from spelgen.loaded_arm import load_arm
 from spelgen.logs.read import write_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.pipeline import check, generate
+from spelgen.settings.fits import Rollout
 from spelgen.trust import require_own_module
 from spelgen.urdf import xacro_input
 from spelgen.urdf.document import urdf_bytes

@@ -24,9 +24,9 @@ from spelgen.identification.identify import identify
 from spelgen.identification.method import LeastSquares
 from spelgen.loaded_arm import LoadedArm, load_arm
 from spelgen.logs.coverage import coverage
-from spelgen.settings.log_mapping import LogMapping
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
+from spelgen.settings.log_mapping import LogMapping
 from spelgen.spec import read_facts
 
 REMEMBERING = FrictionModel(memory=True)

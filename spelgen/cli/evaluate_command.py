@@ -39,12 +39,12 @@ def evaluate(
     paths = options.logs(data, more)
     import torch
 
+    from spelgen.baselines.keep import read_baseline
     from spelgen.evaluation.evaluate import evaluate as evaluated
     from spelgen.evaluation.subject import read_test_logs
     from spelgen.files import write_json
     from spelgen.fitting.fitted import load_run
     from spelgen.fitting.run_folder import RunFolder
-    from spelgen.baselines.keep import read_baseline
     from spelgen.logs.preprocessing import Preprocessing
 
     torch.set_num_threads(1)

@@ -52,8 +52,8 @@ def identify(
     from spelgen.identification.identify import identify as identified
     from spelgen.identification.method import LeastSquares
     from spelgen.loaded_arm import load_arm
-    from spelgen.logs.arm_mapping import log_source
     from spelgen.log_checks.check_logs import require_possible_torques
+    from spelgen.logs.arm_mapping import log_source
     from spelgen.logs.preprocessing import Preprocessing
     from spelgen.logs.read import read_logs
 

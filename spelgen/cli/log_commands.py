@@ -86,8 +86,8 @@ def logs(
     Nothing is changed. Exit code 1 where the logs cannot be trained on.
     """
     from spelgen.loaded_arm import load_arm
-    from spelgen.logs.arm_mapping import log_source
     from spelgen.log_checks.check_logs import check_logs
+    from spelgen.logs.arm_mapping import log_source
     from spelgen.logs.chunks import stream_logs
     from spelgen.render.logs_page import page
 

@@ -19,10 +19,10 @@ from spelgen.settings.fits import Adaptation, Objective, Optimizer, Solver
 from spelgen.spec import read_facts
 
 if TYPE_CHECKING:
-    from spelgen.settings.fits import WindowConfig
     from spelgen.fitting.fitted import Fit
-    from spelgen.settings.log_mapping import LogMapping
     from spelgen.logs.trajectory import Trajectory
+    from spelgen.settings.fits import WindowConfig
+    from spelgen.settings.log_mapping import LogMapping
 
 
 def train(

@@ -14,9 +14,9 @@ from spelgen.errors import RunError
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
+    from spelgen.logs.preprocessing import Preprocessing
     from spelgen.settings.fits import FitConfig
     from spelgen.settings.log_mapping import LogMapping
-    from spelgen.logs.preprocessing import Preprocessing
 
 
 LIMIT = "max_minutes"
@@ -56,9 +56,9 @@ class Start:
 
 def begun(module: Path, urdf: Path | None, chosen: Chosen) -> Start:
     """A new run: what the command line does not say, the robot's settings do."""
-    from spelgen.settings.fits import fit_config
     from spelgen.fitting.stages import default_config, has_rigid_bodies
     from spelgen.logs.preprocessing import Preprocessing
+    from spelgen.settings.fits import fit_config
     from spelgen.settings.settings import load_settings
     from spelgen.settings.training import TrainingSettings
 
@@ -94,12 +94,12 @@ def begun(module: Path, urdf: Path | None, chosen: Chosen) -> Start:
 
 def resumed(folder: Path, chosen: Chosen) -> Start:
     """A run that goes on: what the command line does not say, the run does."""
-    from spelgen.settings.fits import fit_config
     from spelgen.fitting.run_folder import RunFolder
     from spelgen.fitting.run_record import recorded_config
     from spelgen.fitting.stages import has_rigid_bodies
-    from spelgen.settings.log_mapping import LogMapping
     from spelgen.logs.preprocessing import Preprocessing
+    from spelgen.settings.fits import fit_config
+    from spelgen.settings.log_mapping import LogMapping
 
     run = RunFolder(folder)
     before = run.read_config()

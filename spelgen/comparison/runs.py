@@ -18,12 +18,12 @@ from spelgen.evaluation.examples import predict_examples
 from spelgen.evaluation.invariants import invariants
 from spelgen.evaluation.names import MODEL
 from spelgen.files import write_json
-from spelgen.settings.fits import BATCH, Rollout
 from spelgen.fitting.rollout import LossScales, loss_scales
 from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.fitting.train import train
 from spelgen.fleet.engine import Engine
 from spelgen.logs.read import read_logs
+from spelgen.settings.fits import BATCH, Rollout
 from spelgen.spec import read_facts
 
 if TYPE_CHECKING:

@@ -21,12 +21,12 @@ from spelgen.comparison.known_urdf import with_wrong_inertials, without_inertial
 from spelgen.design import Design, Net, Preset, load_design
 from spelgen.errors import RunError, SettingsError
 from spelgen.files import write_json, write_text
-from spelgen.settings.fits import Rollout, fit_config
 from spelgen.fitting.loop import EPOCH_STEPS
 from spelgen.loaded_arm import LoadedArm, load_arm
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import Trajectory, write_logs
 from spelgen.settings.comparison import ComparisonSettings
+from spelgen.settings.fits import Rollout, fit_config
 from spelgen.settings.settings import Settings
 from spelgen.structure.nominal import working_range
 from spelgen.trust import require_own_module

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from spelgen.dynamics.protocol import RigidDynamics, integrable
-from spelgen.settings.fits import Solver
 from spelgen.fitting.rollout import roll_out
 from spelgen.logs.windows import Windows
+from spelgen.settings.fits import Solver
 
 
 def rollout(

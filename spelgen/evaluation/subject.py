@@ -16,10 +16,10 @@ from spelgen.fitting.fitted import Fit, load_run
 from spelgen.fitting.linear_servo import LinearServos
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.logs.arm_mapping import GivenMapping
-from spelgen.settings.log_mapping import LogMapping
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
+from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.settings import load_mapping
 from spelgen.spec import logged_joints, read_facts
 from spelgen.urdf.read import read_urdf

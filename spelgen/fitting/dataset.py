@@ -20,8 +20,8 @@ from spelgen.logs.trajectory import Trajectory, gap_ends, require_joints, requir
 from spelgen.logs.windows import Split, Windows, split_validation, thinned
 
 if TYPE_CHECKING:
-    from spelgen.settings.fits import WindowConfig
     from spelgen.logs.chunks import Chunk
+    from spelgen.settings.fits import WindowConfig
 
 LARGEST_VALIDATION = 2048  # windows; validation is a measurement, it needs no more
 

@@ -12,7 +12,6 @@ from spelgen.errors import Diagnostic, RunError
 from spelgen.files import write_json
 from spelgen.fitting import workers
 from spelgen.fitting.compiled import compiled
-from spelgen.settings.fits import FitConfig, Rollout, ServoFit, WindowConfig
 from spelgen.fitting.dataset import TrainingData, prepare_data
 from spelgen.fitting.fitted import Fit, load_run
 from spelgen.fitting.loop import TrainingLoop
@@ -25,9 +24,10 @@ from spelgen.fitting.servo_run import fit_commands, require_input
 from spelgen.fitting.stages import default_config, fit_torque_stage, has_rigid_bodies
 from spelgen.fitting.streaming import LargeLogs, prepare_streamed
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer, urdf_regularizer
-from spelgen.settings.log_mapping import LogMapping
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
+from spelgen.settings.fits import FitConfig, Rollout, ServoFit, WindowConfig
+from spelgen.settings.log_mapping import LogMapping
 from spelgen.spec import logged_joints
 
 if TYPE_CHECKING:

@@ -15,7 +15,6 @@ from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.errors import Diagnostic, LogError, RunError
 from spelgen.files import write_json
 from spelgen.fitting.calibration import CalibrationWindows, read_calibration
-from spelgen.settings.fits import FitConfig
 from spelgen.fitting.loop import Status
 from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.fitting.run_lock import locked
@@ -25,6 +24,7 @@ from spelgen.listing import Listing
 from spelgen.logs.filtering import low_pass
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, gap_ends
+from spelgen.settings.fits import FitConfig
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel

@@ -13,7 +13,6 @@ import torch
 from spelgen.dynamics.residuals import idle_residuals
 from spelgen.errors import RunError
 from spelgen.fitting import workers
-from spelgen.settings.fits import BATCH, FEW_WINDOWS, LEARNING_RATE, WindowConfig
 from spelgen.fitting.dataset import TrainingData
 from spelgen.fitting.optimizers import LBFGS, MiniBatchAdamW, WindowOptimizer
 from spelgen.fitting.progress import TrainingProgress
@@ -22,6 +21,7 @@ from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer
 from spelgen.fitting.validation import Validation
 from spelgen.logs.windows import Windows
+from spelgen.settings.fits import BATCH, FEW_WINDOWS, LEARNING_RATE, WindowConfig
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel

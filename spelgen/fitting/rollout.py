@@ -13,8 +13,8 @@ import torch
 from spelgen.dynamics.protocol import PortHamiltonianDynamics, memory_after, memory_along, sliding_memory
 from spelgen.dynamics.runge_kutta import runge_kutta
 from spelgen.fitting.adaptive import roll_out_adaptive
-from spelgen.settings.fits import Solver
 from spelgen.logs.windows import Windows
+from spelgen.settings.fits import Solver
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel

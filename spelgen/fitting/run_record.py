@@ -7,12 +7,12 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from spelgen.errors import RunError
-from spelgen.settings.fits import CONFIGS, FitConfig, WindowConfig, made
 from spelgen.fitting.dataset import TrainingData
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.stages import has_rigid_bodies
-from spelgen.settings.log_mapping import LogMapping
 from spelgen.logs.trajectory import Trajectory
+from spelgen.settings.fits import CONFIGS, FitConfig, WindowConfig, made
+from spelgen.settings.log_mapping import LogMapping
 from spelgen.spec import logged_joints
 
 if TYPE_CHECKING:

@@ -8,9 +8,9 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from spelgen.errors import RunError, SpelgenError
+from spelgen.logs.preprocessing import Preprocessing
 from spelgen.settings.fits import CONFIGS, Objective, Substeps, made
 from spelgen.settings.log_mapping import LogMapping
-from spelgen.logs.preprocessing import Preprocessing
 from spelgen.settings.values import Count, NonNegative, Positive, Whole
 
 Schema = TypeVar("Schema", bound=BaseModel)

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 from spelgen.errors import Diagnostic, LogError, OptionError, RunError
 from spelgen.files import write_json
 from spelgen.fitting import workers
-from spelgen.settings.fits import FitConfig, ServoFit
 from spelgen.fitting.dataset import digest
 from spelgen.fitting.fitted import Fit
 from spelgen.fitting.linear_servo import fit_linear_servos
@@ -26,9 +25,10 @@ from spelgen.fitting.servo_report import foreseen, foreseen_text, servo_record
 from spelgen.fitting.servo_windows import ServoWindows, servo_windows
 from spelgen.fitting.streaming import LargeLogs
 from spelgen.logs.checks import check
-from spelgen.settings.log_mapping import LogMapping
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, require_commands, require_joints
+from spelgen.settings.fits import FitConfig, ServoFit
+from spelgen.settings.log_mapping import LogMapping
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel

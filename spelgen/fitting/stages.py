@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 from spelgen.dynamics.bristles import bristle_reach
 from spelgen.errors import Diagnostic, LogError
-from spelgen.settings.fits import FitConfig, Rollout, TorqueFit, fit_config
 from spelgen.fitting.dataset import TrainingData
 from spelgen.fitting.torque_fit import DECIMATION, fit_torque
 from spelgen.fitting.torque_networks import adapt_networks, fit_networks
@@ -15,6 +14,7 @@ from spelgen.fitting.torque_report import torque_notes
 from spelgen.fitting.torque_samples import TorqueSamples
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer
 from spelgen.identification.samples import DENSE, dynamics_samples
+from spelgen.settings.fits import FitConfig, Rollout, TorqueFit, fit_config
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel

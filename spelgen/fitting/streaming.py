@@ -18,9 +18,9 @@ from spelgen.fitting.rollout import loss_scales
 from spelgen.logs.checks import Finding, findings, gap_diagnostics, summarised
 from spelgen.logs.chunks import Chunk, scan
 from spelgen.logs.epoch_windows import EpochWindows, WindowCutting
-from spelgen.settings.log_mapping import LogMapping
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import GAP, gap_ends
+from spelgen.settings.log_mapping import LogMapping
 
 if TYPE_CHECKING:
     from spelgen.settings.fits import WindowConfig

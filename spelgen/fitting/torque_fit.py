@@ -21,12 +21,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from spelgen.settings.fits import Adaptation, GaussianPrior
 from spelgen.fitting.gaussian_prior import PRIORS, covariance, most_probable
 from spelgen.fitting.residual_fit import Residual, enter, refine
 from spelgen.fitting.torque_jacobian import COMPENSATION, TorqueJacobian
 from spelgen.fitting.torque_samples import TorqueSamples
 from spelgen.identification.samples import DynamicsSamples
+from spelgen.settings.fits import Adaptation, GaussianPrior
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel

@@ -13,8 +13,8 @@ from torch.func import functional_call
 
 from spelgen.fitting import workers
 from spelgen.fitting.body_steps import moved_bodies
-from spelgen.settings.fits import Adaptation
 from spelgen.fitting.torque_samples import Block, TorqueSamples
+from spelgen.settings.fits import Adaptation
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel

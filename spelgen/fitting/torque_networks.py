@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from spelgen.settings.fits import LBFGS_DECAY, Adaptation
 from spelgen.fitting.optimizers import minimise_sum
 from spelgen.fitting.torque_samples import Block, TorqueSamples
 from spelgen.identification.samples import DynamicsSamples
+from spelgen.settings.fits import LBFGS_DECAY, Adaptation
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel

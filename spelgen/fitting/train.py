@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING, Any
 
 from spelgen.emission.loading import load_module
 from spelgen.errors import Diagnostic, ModuleError, RunError
-from spelgen.settings.fits import FitConfig
 from spelgen.fitting.fit import AUTOMATIC, fit, sample_rates
 from spelgen.fitting.fitted import Fit
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.run_record import recorded_config
 from spelgen.fitting.streaming import LargeLogs
 from spelgen.logs.chunks import large_files
-from spelgen.settings.log_mapping import LogMapping
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
+from spelgen.settings.fits import FitConfig
+from spelgen.settings.log_mapping import LogMapping
 from spelgen.spec import Facts
 from spelgen.urdf.document import urdf_bytes
 

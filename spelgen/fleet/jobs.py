@@ -13,18 +13,18 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from spelgen import __version__, pipeline
+from spelgen.baselines.keep import keep_baseline
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.evaluation.subject import read_test_logs
 from spelgen.files import write_json, write_text
-from spelgen.settings.fits import FitConfig, GaussianPrior, fit_config
 from spelgen.fitting.fitted import load_run
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.stages import default_config, has_rigid_bodies
 from spelgen.fitting.train import train
-from spelgen.baselines.keep import keep_baseline
 from spelgen.loaded_arm import load_arm
-from spelgen.settings.log_mapping import LogMapping
 from spelgen.logs.preprocessing import Preprocessing
+from spelgen.settings.fits import FitConfig, GaussianPrior, fit_config
+from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.settings import load_settings
 from spelgen.settings.training import TrainingSettings
 

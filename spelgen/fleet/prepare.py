@@ -17,10 +17,10 @@ from spelgen.fleet.schema import FleetRobot
 from spelgen.loaded_arm import LoadedArm, load_arm
 from spelgen.logs.chunks import large_files
 from spelgen.logs.log_files import log_files
-from spelgen.settings.log_mapping import LogMapping
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import split_validation
+from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.settings import load_mapping
 
 HELD_OUT = 0.25  # of logs that do not say which are for the test

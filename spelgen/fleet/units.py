@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from spelgen.settings.fits import GaussianPrior
 from spelgen.fitting.fitted import load_run
 from spelgen.fitting.gaussian_prior import KINDS
 from spelgen.fitting.run_folder import RunFolder
@@ -23,6 +22,7 @@ from spelgen.fleet.jobs import Job
 from spelgen.fleet.prepare import Prepared
 from spelgen.fleet.schema import Fleet
 from spelgen.loaded_arm import load_arm
+from spelgen.settings.fits import GaussianPrior
 
 CLOSED_FORM = "closed-form"
 SHARED = "closed-form, units"  # how the runs are called that know the other units

@@ -13,10 +13,10 @@ from spelgen.errors import Diagnostic, LogError, collect
 from spelgen.identification.drive_hints import Coupling, DriveProblem, coupled_inputs, coupling, torque_delay
 from spelgen.identification.drive_samples import DriveLog
 from spelgen.log_checks.check_servo_logs import check_servo_logs
-from spelgen.logs.checks import Finding, findings, gap_diagnostics, summarised
 from spelgen.log_checks.gravity import GravityFit, StateSamples, fit_gravity, state_samples
 from spelgen.log_checks.report import SEEN, JointReport, LogReport, range_fraction
 from spelgen.log_checks.statistics import Statistics, common_step, statistics
+from spelgen.logs.checks import Finding, findings, gap_diagnostics, summarised
 from spelgen.logs.trajectory import QUANTITIES, Trajectory, require_joints, require_torques
 
 if TYPE_CHECKING:

@@ -9,7 +9,6 @@ import numpy as np
 
 from spelgen.arm.arm import Coordinate
 from spelgen.errors import Diagnostic, LogError
-from spelgen.logs.checks import DEGREES, Finding, findings, gap_diagnostics, summarised
 from spelgen.log_checks.following import DELAYS, NOW, Following
 from spelgen.log_checks.report import range_fraction
 from spelgen.log_checks.servo_report import ServoJointReport, ServoLogReport
@@ -21,6 +20,7 @@ from spelgen.log_checks.statistics import (
     noise_level,
     quantisation_step,
 )
+from spelgen.logs.checks import DEGREES, Finding, findings, gap_diagnostics, summarised
 from spelgen.logs.trajectory import Trajectory, require_commands, require_joints
 
 if TYPE_CHECKING:

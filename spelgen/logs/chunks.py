@@ -17,11 +17,11 @@ import pyarrow.parquet
 from spelgen.errors import LogError, SpelgenError, collect
 from spelgen.logs.arm_mapping import GivenMapping, log_source
 from spelgen.logs.log_files import log_files
-from spelgen.settings.log_mapping import LogMapping
 from spelgen.logs.read import ROW_GROUP, read_logs
 from spelgen.logs.tables import Layout, opened, stored_columns, table_layout
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.values import clock_start, made_trajectory, require_increasing_times, values_in_si
+from spelgen.settings.log_mapping import LogMapping
 
 IN_MEMORY = 100_000_000  # bytes of numbers up to which logs are held in memory; windows take five times that
 BUFFER = 2**16  # bytes read ahead of each column

@@ -10,8 +10,8 @@ import numpy as np
 import pyarrow as pa
 
 from spelgen.errors import LogError
-from spelgen.settings.log_mapping import LogMapping
 from spelgen.logs.tables import LogTable, element, made_layout, missing_columns, opened, wanted_quantities
+from spelgen.settings.log_mapping import LogMapping
 
 NAMES = "joints"  # the array of joint names, by the columns of the matrices
 ENDING = ".npy"

@@ -12,9 +12,9 @@ import pyarrow.parquet
 
 from spelgen.logs.bags import is_bag, read_bag
 from spelgen.logs.lerobot import dataset_files, dataset_mapping, is_dataset
-from spelgen.settings.log_mapping import PLAIN, LogMapping
 from spelgen.logs.npz import read_npz
 from spelgen.logs.tables import LogTable, made_layout, opened, stored_columns, table_layout, wanted_quantities
+from spelgen.settings.log_mapping import PLAIN, LogMapping
 
 HEAD = 2**16  # bytes of a CSV file that tell how it is written
 

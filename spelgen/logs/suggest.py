@@ -14,12 +14,12 @@ import pyarrow.compute
 import pyarrow.parquet
 
 from spelgen.errors import LogError
-from spelgen.settings.log_mapping import TIMES
 from spelgen.logs.npz import npz_table
 from spelgen.logs.readers import read_csv
 from spelgen.logs.tables import opened
 from spelgen.logs.trajectory import QUANTITIES
 from spelgen.logs.values import column_values
+from spelgen.settings.log_mapping import TIMES
 
 WORDS = {
     "t": {

@@ -19,8 +19,8 @@ from spelgen.errors import LogError, shortened
 from spelgen.logs.bags import SUFFIXES as BAG_SUFFIXES
 from spelgen.logs.bags import is_bag
 from spelgen.logs.lerobot import is_dataset
-from spelgen.settings.log_mapping import TIMES, LogMapping
 from spelgen.logs.trajectory import QUANTITIES
+from spelgen.settings.log_mapping import TIMES, LogMapping
 
 SUFFIXES = (".parquet", ".csv", ".npz", *BAG_SUFFIXES)
 LISTED = 12  # columns, at most

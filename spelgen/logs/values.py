@@ -12,9 +12,9 @@ import pyarrow as pa
 import pyarrow.compute
 
 from spelgen.errors import LogError
-from spelgen.settings.log_mapping import TIMES
 from spelgen.logs.tables import Layout, element, wanted_quantities
 from spelgen.logs.trajectory import LARGEST, Trajectory, gap_ends
+from spelgen.settings.log_mapping import TIMES
 
 EXACT = 2**53  # whole numbers up to here are exact as floating-point numbers
 CLOCKS: tuple[tuple[Callable[[pa.DataType], bool], pa.DataType], ...] = (

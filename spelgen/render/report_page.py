@@ -9,12 +9,12 @@ from typing import Any
 
 from jinja2 import TemplateError
 
+from spelgen.baselines.keep import run_arm
 from spelgen.errors import RunError, SpelgenError
 from spelgen.evaluation.tables import result_tables
 from spelgen.evaluation.verdict import verdict
 from spelgen.files import write_json, write_text
 from spelgen.fitting.run_folder import RunFolder, trained_model
-from spelgen.baselines.keep import run_arm
 from spelgen.labels import entry_name
 from spelgen.loaded_arm import LoadedArm
 from spelgen.render.arm_section import LETTERS, ArmSection, Cell, arm_section, matrix

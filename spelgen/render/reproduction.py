@@ -9,9 +9,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from spelgen.settings.fits import CONFIGS
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.logs.preprocessing import Preprocessing
+from spelgen.settings.fits import CONFIGS
 from spelgen.spec import Facts, Options
 
 FLAGS = {"cutoff": "filter"}  # options whose flag has another name

@@ -12,9 +12,9 @@ from typing import Any, Literal, TypeVar
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from spelgen.errors import Diagnostic, SettingsError, collect
-from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.comparison import ComparisonSettings
 from spelgen.settings.joint import Coupling, JointSettings
+from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.messages import explain, unknown_name
 from spelgen.settings.simulation import SimulationSettings, TrackingSettings
 from spelgen.settings.training import TrainingSettings
