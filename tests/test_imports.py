@@ -17,46 +17,19 @@ RUNTIME = [
 CARRIED = {"__future__", "collections", "functools", "math", "torch", "typing"}
 
 # A folder (or a file at the top) may import only from itself and from what stands above it.
-ROOMS = [
-    "errors",
-    "addresses",
-    "files",
-    "labels",
-    "listing",
-    "templates",
-    "runtime",
-    "settings",
-    "urdf",
-    "arm",
-    "design",
-    "spec",
-    "structure",
-    "dynamics",
-    "explain",
-    "formulas",
-    "verify",
-    "emission",
-    "logs",
-    "inspection",
-    "loaded_arm",
-    "pipeline",
-    "building",
-    "trust",
-    "identification",
-    "log_checks",
-    "excitation",
-    "fitting",
-    "simulation",
-    "evaluation",
-    "exporting",
-    "baselines",
-    "fleet",
-    "comparison",
-    "render",
-    "cli",
-    "__init__",
-    "__main__",
-]
+ROWS = """
+errors addresses files labels listing templates runtime
+settings urdf arm design spec
+structure dynamics
+explain formulas verify emission logs
+inspection loaded_arm pipeline building trust
+identification log_checks excitation
+fitting simulation
+evaluation exporting
+baselines fleet comparison render
+cli __init__ __main__
+"""
+ROOMS = ROWS.split()
 
 FILES = [".".join(path.relative_to(PACKAGE).with_suffix("").parts) for path in sorted(PACKAGE.rglob("*.py"))]
 LAYERS = [name for name in FILES if not name.endswith(".__init__")]

@@ -1,1 +1,1 @@
-"""Logs held against the arm they come from: gravity, following of commands, statistics, and the report of `spelgen logs`."""
+"""Logs are held against the arm that they come from, for `spelgen logs`."""
