@@ -49,7 +49,7 @@ Case = tuple[str, Path, list[DynamicsSamples], list[DynamicsSamples]]
 """Name, URDF, training samples, test samples."""
 Split = tuple[str, Path, list[Trajectory], list[Trajectory]]
 
-PRESETS = ("closed-form", "minimal")
+PRESETS = ("closed-form", "hybrid")
 AHEAD = (0.1, 0.5, 1.0)  # s
 SMOOTHING = 0.02  # rad/s, of the Deep Lagrangian network's Coulomb friction
 
@@ -84,7 +84,7 @@ def table(cases: Iterator[Case]) -> None:
         "+ network",
         "+ memory",
         "closed-form",
-        "minimal",
+        "hybrid",
     )
     print(f"{'':18}" + "".join(f"{x:>12}" for x in head) + "    fits [s]")
     for name, urdf, training, tests in cases:

@@ -3,7 +3,7 @@
     python benchmarks/deploy.py [--parity] [--latency]
 
 Needs the extras deploy and simulate and a C compiler. Models: the six arms of robots/, both presets that go to C, every
-weight moved by a normal number so that no part is idle; latencies also of minimal as fits mostly leave it, with nothing
+weight moved by a normal number so that no part is idle; latencies also of hybrid as fits mostly leave it, with nothing
 beside its bodies.
 """
 
@@ -40,7 +40,7 @@ from spelgen.loaded_arm import load_arm
 
 ROBOTS = Path(__file__).parents[1] / "robots"
 ARMS = ("two_link", "rpr", "scara", "six_dof", "ur10e", "panda")
-PRESETS = ("closed-form", "minimal")
+PRESETS = ("closed-form", "hybrid")
 RESIDUALS = ("dynamics.joint_functions.", "dynamics.residual_")
 STATES = 10_000
 CALLS = 50  # of which the clock sees the sum: it ticks in tens of nanoseconds
@@ -165,8 +165,8 @@ def latency(robot: str = "ur10e") -> None:
     print(f"{robot}, one call on one core; {compiler()} {' '.join(FLAGS)}{'':20s} median      p99  [us]")
     for preset, each in (
         ("closed-form", trained(robot, "closed-form")),
-        ("minimal", trained(robot, "minimal", residuals=False)),
-        ("minimal with all residuals", trained(robot, "minimal")),
+        ("hybrid", trained(robot, "hybrid", residuals=False)),
+        ("hybrid with all residuals", trained(robot, "hybrid")),
     ):
         model = each.described
         print(f"{preset}, C")

@@ -67,7 +67,7 @@ def curves(robot: Path) -> None:
         urdfs["true"].write_bytes(with_wrong_inertials(robot, 0.0))
         urdfs["30 % wrong"].write_bytes(with_wrong_inertials(robot, 0.3))
         urdfs["placeholders"].write_bytes(with_placeholders(robot))
-        for preset in ("closed-form", "minimal"):
+        for preset in ("closed-form", "hybrid"):
             for name, urdf in urdfs.items():
                 row(f"{preset}, URDF {name}", lambda x, u=urdf, p=preset: rigid(u, p, x), true, tests)
     plain, memory = LeastSquares("range"), LeastSquares("range", friction=FrictionModel(memory=True))

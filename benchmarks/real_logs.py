@@ -214,19 +214,19 @@ def panda(folder: Path, urdf: Path) -> None:
 
 def characters(folder: Path, scratch: Path) -> None:
     urdf = write_arm(scratch)
-    model, minimal = build(urdf, "closed-form"), build(urdf, "minimal")
+    model, hybrid = build(urdf, "closed-form"), build(urdf, "hybrid")
     samples, forces = read_characters(folder)
     training = [x for x in samples if x.name not in CHARACTERS]
     fit_torque(model, training)
-    fit_torque(minimal, training)
+    fit_torque(hybrid, training)
     tests = [i for i, x in enumerate(samples) if x.name in CHARACTERS]
     q, qd, qdd = (
         torch.from_numpy(np.concatenate([getattr(samples[i], k) for i in tests])) for k in ("q", "qd", "qdd")
     )
     tau, coriolis = (np.concatenate(x) for x in ([samples[i].tau for i in tests], [forces[i] for i in tests]))
     print("Characters (DeLaN's data): nMSE, total error by total variance\n")
-    print(f"{'':26}{'closed-form':>15}{'minimal':>15}")
-    found = [_torques(each, q, qd, qdd) for each in (model, minimal)]
+    print(f"{'':26}{'closed-form':>15}{'hybrid':>15}")
+    found = [_torques(each, q, qd, qdd) for each in (model, hybrid)]
     for name, true, columns in (
         ("torque", tau, [each[0] for each in found]),
         ("Coriolis torque", coriolis, [each[1] for each in found]),

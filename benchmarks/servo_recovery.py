@@ -115,7 +115,7 @@ def main() -> None:
     parser.add_argument("--dead-zone", type=float, default=0.0, help="half its width [rad]")
     parser.add_argument("--mujoco", action="store_true", help="MuJoCo simulates")
     parser.add_argument("--backlash", type=float, default=0.0, help="of gears in MuJoCo, half of it [rad]")
-    parser.add_argument("--preset", default="minimal")
+    parser.add_argument("--preset", default="hybrid")
     asked = parser.parse_args()
     arm = spelgen.load_arm(asked.urdf)
     if arm.settings.input != "position":

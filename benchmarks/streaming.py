@@ -2,7 +2,7 @@
 
     python benchmarks/streaming.py [--gigabytes 5] [--epochs 2] [--preset closed-form]
 
-A model of networks is fitted to windows, one of rigid bodies (closed-form, minimal) to torques.
+A model of networks is fitted to windows, one of rigid bodies (closed-form, hybrid) to torques.
 
 The log is synthetic: the Panda of robots/ under the torques of its own URDF, friction and noise, at 1 kHz. It is
 written to a temporary folder (TMPDIR) and removed in the end. `make bench` takes 0.2 GB.
@@ -50,7 +50,7 @@ def main() -> None:
         (folder / "module.py").write_text(source, encoding="utf-8")
         command = ["train", "module.py", "--data", "train.parquet", "-o", "run", "--quiet"]
         command += ["--robot", str(URDF)]
-        if chosen.preset not in ("closed-form", "minimal"):
+        if chosen.preset not in ("closed-form", "hybrid"):
             command += ["--epochs", str(chosen.epochs), "--momentum-steps", "200", "--urdf-weight", "0"]
         since = time.monotonic()
         subprocess.run([sys.executable, "-m", "spelgen", *command], cwd=folder, check=True)

@@ -46,8 +46,8 @@ PRESETS: dict[str, tuple[str | Design, Literal["mlp", "kan"] | None]] = {
     "spel": ("spel", "mlp"),
     "spel-kan": ("spel-kan", "kan"),
     "derived M, V": (NETWORKS, "mlp"),
-    "minimal": ("minimal", "mlp"),
-    "minimal-kan": ("minimal", "kan"),
+    "hybrid": ("hybrid", "mlp"),
+    "hybrid-kan": ("hybrid", "kan"),
     "closed-form": ("closed-form", None),
 }
 WIDTH, WINDOWS, SAMPLES, JOINTS, STEP = 64, 256, 5, 6, 0.02

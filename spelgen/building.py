@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def build(
     arm: LoadedArm | str | Path,
-    preset: str | Path | Design = "minimal",
+    preset: str | Path | Design = "hybrid",
     *,
     net: Net | None = None,
     width: int = 64,

@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args, get_type_hints
 from spelgen.errors import SettingsError, collect, suggestion
 from spelgen.settings.yaml_document import Document, read_document
 
-Preset = Literal["minimal", "spel", "spel-kan", "phnode", "closed-form"]
+Preset = Literal["hybrid", "closed-form", "minimal", "spel", "spel-kan", "phnode"]
 """Those that come with spelgen."""
 
 PRESET_NAMES: tuple[str, ...] = get_args(Preset)

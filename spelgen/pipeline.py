@@ -30,7 +30,7 @@ def inspect(
 
 def generate(
     arm: LoadedArm | str | Path,
-    preset: str | Path | Design = "minimal",
+    preset: str | Path | Design = "hybrid",
     *,
     net: Net | None = None,
     width: int = 64,

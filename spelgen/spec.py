@@ -36,7 +36,7 @@ _FOREIGN = (
 class Options:
     """What the user chose when building; enough to build the same module again from the same URDF."""
 
-    preset: str = "minimal"
+    preset: str = "hybrid"
     design: Design | None = None
     """None: that of the preset of this name, which comes with spelgen."""
     net: Net | None = None

@@ -55,7 +55,7 @@ def import_source(source: str, path: Path) -> ModuleType:
 def built(
     robot: str,
     assume: str = "kinematics",
-    preset: str = "minimal",
+    preset: str = "hybrid",
     net: str | None = None,
     design: Design | None = None,
 ) -> tuple[str, Structure]:
@@ -76,7 +76,7 @@ def random_model(
     *,
     seed: int,
     deviation: float | None = None,
-    preset: str = "minimal",
+    preset: str = "hybrid",
     net: str | None = None,
     design: Design | None = None,
 ) -> nn.Module:

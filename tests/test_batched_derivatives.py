@@ -11,7 +11,7 @@ def drawn(*shape: int) -> torch.Tensor:
     return torch.randn(*shape, dtype=torch.float64, generator=generator)
 
 
-@pytest.mark.parametrize("preset", ["closed-form", "minimal", "phnode"])
+@pytest.mark.parametrize("preset", ["closed-form", "hybrid", "phnode"])
 def test_each_states_jacobian_is_its_own(preset, tmp_path):
     model = random_model("rpr", tmp_path, seed=0, preset=preset).requires_grad_(False)
     states = tuple(0.3 * drawn(3, 4, 3))

@@ -31,7 +31,7 @@ from spelgen.logs.windows import cut_windows, joined
 from spelgen.render.comparison_page import write_comparison
 from spelgen.urdf.read import read_urdf
 
-CHOSEN = [variant for variant in VARIANTS if variant.name in ("phnode", "minimal")]
+CHOSEN = [variant for variant in VARIANTS if variant.name in ("phnode", "hybrid")]
 JOINTS = ("joint1", "joint2")
 
 
@@ -117,7 +117,7 @@ def test_the_ablation_changes_one_thing_at_a_time():
     ]
     assert changes[:3] == [{"dissipation"}, {"input"}, {"mass"}]
     assert changes[3] == {"potential", "encoding"}
-    assert designs[-1] == load_design("minimal")
+    assert designs[-1] == load_design("hybrid")
 
 
 def test_training_sees_the_beginning_only(study):
@@ -131,20 +131,20 @@ def test_training_sees_the_beginning_only(study):
 def test_every_run_is_noted_and_measured(study, notes):
     assert len(notes) == 2
     results = {result["variant"]: result for result in study.results()}
-    assert set(results) == {"phnode", "minimal"}
+    assert set(results) == {"phnode", "hybrid"}
     for result in results.values():
         parts = result["prediction"]
         assert parts["loss"] == pytest.approx(parts["position"] + parts["velocity"])
         assert result["invariants"]["least_eigenvalue"] > 0
         assert result["invariants"]["orthogonality"] < 1e-14
-    assert results["minimal"]["sizes"]["outputs"] == [1, 2, 0, 1]
+    assert results["hybrid"]["sizes"]["outputs"] == [1, 2, 0, 1]
     assert results["phnode"]["sizes"]["outputs"] == [21, 21, 6, 1]  # as in the paper
     assert results["phnode"]["sizes"]["inputs"] == 18
 
 
 def test_losses_are_of_the_logs_that_they_are_named_after(study):
     """Worked out again from the logs of each role: sums over joints, means over samples and windows."""
-    (result,) = (x for x in study.results() if x["variant"] == "minimal")
+    (result,) = (x for x in study.results() if x["variant"] == "hybrid")
     model = load_module(study.module(CHOSEN[1]))
     model.load_state_dict(torch.load(study.run(CHOSEN[1], 0) / "model.pt"))
     for key, role, samples in (("train", "train", 5), ("test", "test", 5), ("prediction", "test", 21)):
@@ -242,7 +242,7 @@ def test_the_page_shows_predictions_and_m_beside_the_truth(study):
     for name in ("M11", "M21", "M22"):
         assert f'aria-label="{name}"' in learned
     assert learned.count("<title>true</title>") == 3
-    (result,) = (x for x in study.results() if x["variant"] == "minimal")
+    (result,) = (x for x in study.results() if x["variant"] == "hybrid")
     q = example_positions(result["examples"][0])
     model = load_module(study.module(CHOSEN[1]))
     model.load_state_dict(torch.load(study.run(CHOSEN[1], 0) / "model.pt"))
@@ -250,9 +250,9 @@ def test_the_page_shows_predictions_and_m_beside_the_truth(study):
 
 
 def test_a_run_that_is_not_finite_counts_as_worst(study):
-    (result,) = (x for x in study.results() if x["variant"] == "minimal")
+    (result,) = (x for x in study.results() if x["variant"] == "hybrid")
     broken = result | {"seed": 1, "prediction": {"loss": None, "position": None, "velocity": None}}
-    table = comparison_tables([result, broken, broken], {"minimal": 1.0}, {})[1]
+    table = comparison_tables([result, broken, broken], {"hybrid": 1.0}, {})[1]
     assert {row.label: row.cells[0].text for row in table.rows}["prediction loss, 1 s"] == "-"
 
 

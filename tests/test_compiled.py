@@ -42,7 +42,7 @@ def test_a_compiled_run_says_so_and_repeats_the_plain_one(tmp_path, monkeypatch)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU to record graphs on")
-@pytest.mark.parametrize("preset", ["phnode", "minimal"])
+@pytest.mark.parametrize("preset", ["phnode", "hybrid"])
 def test_on_a_gpu_graphs_are_replayed_with_the_same_result(preset, tmp_path):
     counters.clear()
     _gradients_of_both(random_model("two_link", tmp_path, seed=0, preset=preset), "cuda")

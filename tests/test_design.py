@@ -98,7 +98,7 @@ def test_a_preset_of_your_own(rpr, robots, tmp_path, monkeypatch):
 )
 def test_a_wrong_preset_is_told_with_its_place(tmp_path, monkeypatch, change, message):
     monkeypatch.chdir(tmp_path)
-    values = asdict(load_design("minimal")) | change
+    values = asdict(load_design("hybrid")) | change
     text = "".join(f"{key}: {'null' if value is None else value}\n" for key, value in values.items())
     (tmp_path / "mine.yaml").write_text(text)
     with pytest.raises(SpelgenError) as error:
@@ -109,7 +109,7 @@ def test_a_wrong_preset_is_told_with_its_place(tmp_path, monkeypatch, change, me
 def test_no_preset_at_all():
     with pytest.raises(SettingsError) as error:
         load_design("minmal")
-    expected = "minimal, spel, spel-kan, phnode, closed-form, or a YAML file"
+    expected = "hybrid, spel, spel-kan, phnode, closed-form, or a YAML file"
     assert str(error.value) == f"got the preset 'minmal', expected one of {expected}"
     with pytest.raises(SettingsError, match="net: kan with encoding: none"):
         load_design("closed-form", "kan")

@@ -31,8 +31,8 @@ follow_imports_for_stubs = True
 follow_imports = normal
 """
 PRESETS = [
-    ("minimal", "mlp"),
-    ("minimal", "kan"),
+    ("hybrid", "mlp"),
+    ("hybrid", "kan"),
     ("spel", "mlp"),
     ("spel-kan", "kan"),
     ("phnode", "mlp"),
@@ -42,7 +42,7 @@ PRESETS = [
 
 
 @pytest.mark.parametrize(
-    ("robot", "preset"), [("two_link", "minimal"), *(("rpr", p) for p in get_args(Preset))]
+    ("robot", "preset"), [("two_link", "hybrid"), *(("rpr", p) for p in get_args(Preset))]
 )
 def test_golden_text(robot, preset, request):
     """``pytest --update`` writes the golden copies anew."""
@@ -73,7 +73,7 @@ def test_same_bytes_under_any_hash_seed_and_from_any_folder(tmp_path):
 
 def test_emitted_code_is_held_to_the_rules_of_written_code(tmp_path):
     # the runtime's parts are checked where they stand: here each preset once, and tailored parts of all sizes
-    for robot, preset, net in [*(("rpr", *each) for each in PRESETS), ("panda", "minimal", "mlp")]:
+    for robot, preset, net in [*(("rpr", *each) for each in PRESETS), ("panda", "hybrid", "mlp")]:
         text = built(robot, preset=preset, net=net)[0]
         (tmp_path / f"{robot}_{preset}_{net}.py".replace("-", "_")).write_text(text, encoding="utf-8")
     urdf = tmp_path / "gantry.urdf"

@@ -76,8 +76,8 @@ def test_friction_goes_back_as_the_urdf_can_say_it(tmp_path):
 
 
 def test_what_stands_beside_bodies_is_told(tmp_path):
-    """The bodies of minimal go back exactly; what else M, gravity and friction have is told as figures."""
-    run, model = run_of("two_link", tmp_path, "minimal", heavier)
+    """The bodies of hybrid go back exactly; what else M, gravity and friction have is told as figures."""
+    run, model = run_of("two_link", tmp_path, "hybrid", heavier)
     loaded, told = exported(run, tmp_path / "bodies.urdf")
     assert max(differences(model, loaded)) < 1e-8
     assert "bodies: the model's own" in told

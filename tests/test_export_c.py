@@ -29,7 +29,7 @@ from spelgen.loaded_arm import load_arm
 
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc on this machine")
 NAMES = [entry.name for entry in ENTRY_POINTS]
-BOTH = [("two_link", "closed-form"), ("rpr", "minimal")]
+BOTH = [("two_link", "closed-form"), ("rpr", "hybrid")]
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +67,7 @@ def test_c_gives_what_the_model_gives(case, program, flags, compiled):
 
 @needs_gcc
 def test_the_header_tells_sizes_and_the_readme_the_check(compiled):
-    _, folder, told = compiled["rpr", "minimal"]
+    _, folder, told = compiled["rpr", "hybrid"]
     header = (folder / "rpr.h").read_text()
     assert "bytes of code and constants, at most" in header
     assert "bytes of stack" in header
@@ -75,7 +75,7 @@ def test_the_header_tells_sizes_and_the_readme_the_check(compiled):
     assert max(map(len, header.splitlines())) < 130
 
 
-@pytest.mark.parametrize("preset", ["closed-form", "minimal"])
+@pytest.mark.parametrize("preset", ["closed-form", "hybrid"])
 @pytest.mark.parametrize("robot", ["rpr", "scara"])
 def test_casadi_gives_what_the_model_gives(robot, preset):
     found = export_casadi(Trained(moved_model(robot, preset), arm_of(robot)))
@@ -83,7 +83,7 @@ def test_casadi_gives_what_the_model_gives(robot, preset):
     assert len(found.files["README.md"].decode().splitlines()) == 5
 
 
-@pytest.mark.parametrize("preset", ["closed-form", "minimal"])
+@pytest.mark.parametrize("preset", ["closed-form", "hybrid"])
 def test_followers_motors_and_passive_joints_go_along(preset, tmp_path):
     """And text of the URDF becomes no code: the robot's name would."""
     urdf = tmp_path / "coupled.urdf"

@@ -64,7 +64,7 @@ def test_a_joint_that_friction_holds_does_not_creep():
 
 @pytest.mark.parametrize(
     ("preset", "which"),
-    [("minimal", "its own, without what it has beside them"), ("spel", "nearest to the model")],
+    [("hybrid", "its own, without what it has beside them"), ("spel", "nearest to the model")],
 )
 def test_what_mujoco_has_no_words_for_is_told(preset, which, tmp_path):
     run = run_folder("two_link", preset, tmp_path)

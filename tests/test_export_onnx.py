@@ -12,7 +12,7 @@ from spelgen.exporting.onnx_export import onnx_session
 from spelgen.loaded_arm import load_arm
 
 
-@pytest.mark.parametrize("preset", ["closed-form", "minimal"])
+@pytest.mark.parametrize("preset", ["closed-form", "hybrid"])
 @pytest.mark.parametrize("robot", ["rpr", "scara", "ur10e"])
 def test_onnx_gives_what_the_model_gives(robot, preset):
     """The check at export time compares every file with the model to 1e-10; here another batch size, by hand."""
@@ -25,7 +25,7 @@ def test_onnx_gives_what_the_model_gives(robot, preset):
     assert len(found.files["README.md"].decode().splitlines()) == 5
 
 
-@pytest.mark.parametrize("preset", ["closed-form", "minimal"])
+@pytest.mark.parametrize("preset", ["closed-form", "hybrid"])
 def test_followers_motors_and_passive_joints_go_along(preset, tmp_path):
     urdf = tmp_path / "coupled.urdf"
     urdf.write_text(COUPLED)

@@ -1,4 +1,4 @@
-"""What minimal has beside rigid bodies: exported where it is not zero, left out where it is."""
+"""What hybrid has beside rigid bodies: exported where it is not zero, left out where it is."""
 
 import shutil
 
@@ -32,8 +32,8 @@ RESIDUALS = ("joint_functions.", "residual_")
 
 
 def with_parts(robot, *parts, net=None):
-    """A minimal model whose bodies have moved, and of what stands beside them these parts alone."""
-    model, moved = build(arm_of(robot), "minimal", net=net), moved_model(robot, "minimal")
+    """A hybrid model whose bodies have moved, and of what stands beside them these parts alone."""
+    model, moved = build(arm_of(robot), "hybrid", net=net), moved_model(robot, "hybrid")
     names = tuple(PARTS[part] for part in parts)
     with torch.no_grad():
         for name, parameter in model.dynamics.named_parameters():

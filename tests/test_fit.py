@@ -240,7 +240,7 @@ def test_the_tour_on_an_arm_with_a_joint_that_follows(tmp_path):
     arm = spelgen.load_arm(tmp_path / "followed.urdf")
     logs = spelgen.simulate(arm, trajectories=4, duration=1.5)
     for preset, config in (
-        ("minimal", Rollout(epochs=1, momentum_steps=20)),
+        ("hybrid", Rollout(epochs=1, momentum_steps=20)),
         ("closed-form", Rollout(epochs=1, momentum_steps=0)),
     ):
         model = spelgen.build(arm, preset, width=8)

@@ -75,7 +75,7 @@ def test_forward_and_inverse_dynamics_undo_each_other(robot, tmp_path):
 @pytest.mark.parametrize(
     ("design", "deviation"),
     [(None, None), (NETWORKS, None), (NETWORKS, 1.0)],
-    ids=["minimal", "networks", "bounded networks"],
+    ids=["hybrid", "networks", "bounded networks"],
 )
 @pytest.mark.parametrize("robot", SIX)
 def test_written_out_derivatives_equal_autograd(robot, design, deviation, tmp_path):
@@ -279,7 +279,7 @@ def test_arm_with_a_constant_mass_matrix(tmp_path):
 
 def test_module_needs_torch_alone(tmp_path):
     """Each preset runs in a process that can import neither spelgen nor what spelgen needs."""
-    presets = {"minimal": None, "minimal_kan": "kan", "spel": None, "phnode": None}
+    presets = {"hybrid": None, "hybrid_kan": "kan", "spel": None, "phnode": None}
     for name, net in presets.items():
         source = built("panda", preset=name.removesuffix("_kan"), net=net)[0]
         (tmp_path / f"panda_{name}.py").write_text(source)

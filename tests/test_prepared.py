@@ -9,7 +9,7 @@ from spelgen.building import build
 from spelgen.dynamics.tip import tip_kinematics
 
 
-@pytest.fixture(scope="module", params=["closed-form", "minimal", "spel"])
+@pytest.fixture(scope="module", params=["closed-form", "hybrid", "spel"])
 def pair(request):
     model = moved_model("rpr", request.param)
     return model, model.prepared(tip_kinematics(arm_of("rpr")))
@@ -107,8 +107,8 @@ def test_kinematics_of_the_tip(pair):
 
 
 def test_what_is_zero_takes_no_time():
-    """Without residuals minimal is prepared as the bodies alone; with them it is not, and neither changes the model."""
-    model = build(arm_of("rpr"), "minimal").requires_grad_(False)
+    """Without residuals hybrid is prepared as the bodies alone; with them it is not, and neither changes the model."""
+    model = build(arm_of("rpr"), "hybrid").requires_grad_(False)
     q, qd, x = states(4)
     assert type(model.prepared()._dynamics).__name__ == "RigidBodyDynamics"
     torch.testing.assert_close(model.prepared().forward_dynamics(q, qd, x), model.forward_dynamics(q, qd, x))

@@ -29,7 +29,7 @@ from spelgen.pipeline import generate, make_spec
 from spelgen.spec import Options
 
 ROOT = Path(__file__).parents[1]
-PRESETS = [("phnode", "mlp"), ("phnode", "kan"), ("spel", "mlp"), ("spel-kan", "kan"), ("minimal", "kan")]
+PRESETS = [("phnode", "mlp"), ("phnode", "kan"), ("spel", "mlp"), ("spel-kan", "kan"), ("hybrid", "kan")]
 ROBOTS = ("two_link", "rpr", "six_dof")
 each = pytest.mark.parametrize(("preset", "net"), PRESETS)
 each_robot = pytest.mark.parametrize("robot", ROBOTS)
@@ -190,11 +190,11 @@ def test_networks_read_rotation_matrices(net, part, tmp_path):
     near(outputs_alone(model, network_inputs(owner, q)), layer)
 
 
-@pytest.mark.parametrize(("preset", "net"), [*PRESETS, ("minimal", "mlp")])
+@pytest.mark.parametrize(("preset", "net"), [*PRESETS, ("hybrid", "mlp")])
 @pytest.mark.parametrize("robot", ["rpr", "six_dof"])
 def test_reduced_model_is_the_port_hamiltonian_system_on_rotations(robot, preset, net, tmp_path):
     """Eq. 15 and 18 over three axes a joint, all derivatives automatic, against the n x n module."""
-    design = replace(NETWORKS, net=net) if preset == "minimal" else None
+    design = replace(NETWORKS, net=net) if preset == "hybrid" else None
     model = random_model(robot, tmp_path, seed=6, preset=preset, net=net, design=design)
     n = model.n
     q, p, _, tau = states(n)

@@ -78,7 +78,7 @@ def run(robots, tmp_path) -> Path:
     (folder / "module.py").write_text(pipeline.generate(robots / "rpr.urdf"), encoding="utf-8")
     torch.save(load_module(folder / "module.py").state_dict(), folder / "model.pt")
     config = {
-        "schema": 2, "robot": "rpr", "preset": "minimal", "joints": ["joint1", "joint2", "joint3"],
+        "schema": 2, "robot": "rpr", "preset": "hybrid", "joints": ["joint1", "joint2", "joint3"],
         "objective": "rollout", "config": Rollout(epochs=30).record(rigid_bodies=False), "data_digest": "d" * 64,
         "preprocessing": {"cutoff": 8.0, "decimation": 1}, "validation_fraction": 0.25, "seed": 7,
         "training": ["traj_01", "traj_03"],

@@ -28,8 +28,8 @@ from spelgen.runtime.symmetric import entry_basis, symmetric
 
 NUMBERS = Path(__file__).parent / "golden" / "numbers.json"
 PRESETS = (
-    ("minimal", "mlp"),
-    ("minimal", "kan"),
+    ("hybrid", "mlp"),
+    ("hybrid", "kan"),
     ("spel", "mlp"),
     ("spel-kan", "kan"),
     ("phnode", "mlp"),
@@ -261,7 +261,7 @@ def test_tailored_part_is_short_and_shows_the_entries():
 
 @pytest.mark.parametrize(
     ("robot", "preset", "net"),
-    [*(("rpr", *each) for each in PRESETS), ("six_dof", "minimal", "mlp"), ("six_dof", "closed-form", None)],
+    [*(("rpr", *each) for each in PRESETS), ("six_dof", "hybrid", "mlp"), ("six_dof", "closed-form", None)],
 )
 def test_transforms_work_for_every_preset(robot, preset, net, tmp_path):
     """Without a branch on data: torch.func."""

@@ -548,7 +548,7 @@ def test_friction_that_is_nearly_nothing_does_not_vary(robots):
     q, qd = t.sin(), t.cos()
     missing = 0.3 * (3 * q).sin() * qd.sign() + noise
     for friction, gain in ((1.0, 0.9), (1e-9, None)):
-        model = build(robots / "two_link.urdf", "minimal")
+        model = build(robots / "two_link.urdf", "hybrid")
         found = enter(model, Left(q, qd, 0 * q, missing, friction * qd.sign()), alike=5.0)
         varied = [x.gain for x in found if x.name == FRICTION]
         assert varied == [] if gain is None else min(varied) > gain and len(varied) == 2

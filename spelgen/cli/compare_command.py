@@ -24,7 +24,7 @@ def compare(
     seeds: Annotated[int | None, typer.Option(min=1, help="Runs of each preset.")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Training steps of each run.")] = None,
     ablation: Annotated[
-        bool, typer.Option("--ablation", help="From phnode to minimal, one change after the other.")
+        bool, typer.Option("--ablation", help="From phnode to hybrid, one change after the other.")
     ] = False,
     urdf_error: Annotated[
         float | None,

@@ -101,7 +101,7 @@ def build(
         typer.Option(
             metavar="NAME|FILE.yaml", help=f"How the model is made: {', '.join(PRESET_NAMES)}, or yours."
         ),
-    ] = "minimal",
+    ] = "hybrid",
     net: Annotated[Net | None, typer.Option(help="The kind of networks; default: the preset's own.")] = None,
     width: Annotated[int, typer.Option(min=1, max=4096, help="Units in a hidden layer.")] = 64,
     depth: Annotated[int, typer.Option(min=1, max=16, help="Hidden layers.")] = 2,

@@ -47,14 +47,14 @@ VARIANTS = (
     Variant("phnode", "phnode"),
     Variant("spel", "spel"),
     Variant("spel-kan", "spel-kan"),
-    Variant("minimal", "minimal"),
-    Variant("minimal-kan", "minimal", "kan"),
+    Variant("hybrid", "hybrid"),
+    Variant("hybrid-kan", "hybrid", "kan"),
     Variant("closed-form", "closed-form"),
 )
 
 
 def ablation_variants() -> tuple[Variant, ...]:
-    """From phnode to minimal, one change after the other."""
+    """From phnode to hybrid, one change after the other."""
     phnode = load_design("phnode")
     friction = replace(phnode, dissipation="per-joint")
     inputs = replace(friction, input="derived")
@@ -65,7 +65,7 @@ def ablation_variants() -> tuple[Variant, ...]:
         Variant("known-inputs", inputs),
         Variant("fewest-outputs", outputs),
         Variant("fewest-inputs", replace(outputs, potential="derived", encoding="joint")),
-        Variant("minimal", "minimal"),
+        Variant("hybrid", "hybrid"),
     )
 
 

@@ -18,7 +18,7 @@ def unsupported(what: str) -> RunError:
     """The error of a model that has no description."""
     return RunError(
         what,
-        expected="closed-form, or minimal with tanh networks",
+        expected="closed-form, or hybrid with tanh networks",
         do="--to torch, mjcf and urdf take every preset",
     )
 

@@ -80,7 +80,7 @@ class Fleet(Group):
     """
 
     robots: Annotated[dict[Name, FleetRobot], Field(min_length=1)]
-    presets: Annotated[tuple[str, ...], Field(min_length=1)] = ("closed-form", "minimal")
+    presets: Annotated[tuple[str, ...], Field(min_length=1)] = ("closed-form", "hybrid")
     seeds: Count = 1
     splits: Count = 1
     width: Count = 64

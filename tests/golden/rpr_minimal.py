@@ -1,7 +1,6 @@
 r"""Port-Hamiltonian model of an arm with 3 joints, written by `spelgen build`.
 
-3 rigid bodies with trained inertial parameters;
-networks for what they leave: 3 learned functions of q and 2 constants in M.
+3 learned functions of q and 2 constants make the mass matrix.
 The potential energy depends on joint 3.
 Sizes and starting values are the URDF's inertials.
 
@@ -20,7 +19,6 @@ Joints, in the order of q, qd and tau:
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple, Protocol
@@ -31,18 +29,17 @@ from torch import Tensor, nn
 
 FACTS = r"""{"robot": "rpr", "urdf": "rpr.urdf",
  "urdf_sha256": "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d",
- "spec_sha256": "dba7ec6cead031bb5bdd0f17b6dc9be521be22c26c61fb88eb3bab92198f365d",
+ "spec_sha256": "78e16dc7ad67f88500d19ab13a555f327d630ef495be053e71cb4ca2d0ce6f84",
  "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,
   "net": "mlp", "preset": "minimal", "tip": null, "width": 64},
  "joints": {"joint1": "revolute", "joint2": "prismatic", "joint3": "revolute"}}"""
 
 
 class Model(nn.Module):
-    """The arm's dynamics: 3 rigid bodies with trained inertial parameters, and networks for what they leave.
+    """The arm's dynamics: 3 learned functions of q and 2 constants make the mass matrix.
 
     q, qd, qdd, tau and p are (..., n), with any leading dimensions; rad and Nm, m and N if prismatic. For all
     weights M is positive definite, D positive semi-definite. ``prepared``: what ``prepare`` gave, for speed.
-    z, (..., n, 4), friction's memory, is how far its bristles are bent [rad, m]; None: they slide as qd goes.
     """
 
     n = 3
@@ -56,76 +53,52 @@ class Model(nn.Module):
             speed=(3.0, 1.0, 6.0), friction=(0.4, 0.4, 0.4), armature=(2.19, 0.782, 0.106),
             gear=(1.0, 1.0, 1.0), actuated=(True, True, True),
         )  # fmt: skip
-        bodies = Bodies(
-            parent=(-1, 0, 1), joint=(0, 1, 2), revolute=(True, False, True), ratio=(1.0, 1.0, 1.0),
-            offset=(0.0, 0.0, 0.0),
-            rotation=(
-                ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
-                ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
-                ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
-            ),
-            position=((0.0, 0.0, 0.0), (0.0, 0.0, 0.154), (0.0, -0.0203, 0.0)), mass=(5.01, 4.25, 1.08),
-            moment=((0.0, 0.0, -4.48896), (0.0, -0.086275, -27.4125), (0.0, 0.09936, -0.05832)),
-            inertia=(
-                (4.13010816, 4.12210816, 0.018), (179.3223764, 179.320625, 0.0077513825),
-                (0.0142904, 0.00425851, 0.0102504),
-            ),
-            products=((0.0, 0.0, 0.0), (0.0, 0.0, -0.55647375), (0.0, 0.0, 0.00536544)),
-        )  # fmt: skip
         generator = torch.Generator().manual_seed(seed)
-        functions = ((2,),) + ((1, 2),) * 2
+        encoding = JointEncoding(joints)
+        functions = (
+            MassFunction((2,), mean=-0.00167665, scale=1.36528),
+            MassFunction((1, 2), mean=-0.00154309, scale=0.0595527),
+            MassFunction((1, 2), mean=139.887, scale=12.6351),
+        )  # fmt: skip
+        constants = ((0.0101411, 0.0101411), (5.33, 5.33))
         network = MaskedMLP(
             joint_input(joints, (1, 2), (0.02, 1.0, 0.518)),
-            unit_joints(functions, width=64, depth=2, least=4), generator,
+            unit_joints([function.joints for function in functions], width=64, depth=2, least=4), generator,
         )  # fmt: skip
-        mass = ResidualMass(joints, self.mass_entries, 3, 2, network)
+        mass = DerivedMass(joints, self.mass_entries, functions, constants, network, 0.08)
         network = MaskedMLP(
             joint_input(joints, (2,), (0.02, 0.02, 1.0)), unit_joints(((2,),), width=32, depth=2), generator
         )
         potential = LearnedPotential(0.703291, network)
-        self.dynamics = ResidualDynamics(
-            joints, bodies, (0.0, 0.0, -9.81), DirectInput(joints), mass, potential,
-            reach=((0.0001, 0.001, 0.01, 0.1), (1e-05, 0.0001, 0.001, 0.01), (0.0001, 0.001, 0.01, 0.1)),
-        )  # fmt: skip
+        friction = JointFriction(joints, encoding, generator)
+        self.dynamics = NetworkDynamics(encoding, mass, potential, friction, DirectInput(joints))
         self.to(dtype)
 
     @staticmethod
     def mass_entries(f: Sequence[Tensor], c: Sequence[Tensor]) -> Tensor:
-        """R, what M has beside rigid bodies, (..., n, n), by its functions f(q) and its constants c."""
+        """M without armature, (..., n, n), by its functions f(q) and its constants c."""
         # f1(q3), f2(q2,3), f3(q2,3)
         f1, f2, f3 = f
         c1, c2 = c
         return symmetric([f3], [f1, c2], [f2, 0, c1])
 
     @property
-    def inertial_parameters(self) -> Tensor:
-        """By body (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) about its joint's frame, (bodies, 10)."""
-        return self.dynamics.inertial_parameters.forward()
-
-    @property
     def armature(self) -> Tensor:
         """What the drives add to M's diagonal, (n,) [kg m^2, kg]."""
-        return self.dynamics.armature.forward()
+        value: Tensor = self.dynamics.mass.armature.forward()
+        return value
 
     @property
     def rotor_inertia(self) -> Tensor:
         """The drives' inertia before the gear, (n,) [kg m^2, kg]."""
-        return self.dynamics.armature.rotor_inertia()
+        value: Tensor = self.dynamics.mass.armature.rotor_inertia()
+        return value
 
     @property
     def viscous(self) -> Tensor:
         """Friction torque by velocity, (n,) [Nm s/rad, N s/m]."""
-        return self.dynamics.friction.prepare().viscous
-
-    @property
-    def coulomb(self) -> Tensor:
-        """Dry friction, (n,) [Nm, N]."""
-        return self.dynamics.friction.prepare().coulomb
-
-    @property
-    def torque_offset(self) -> Tensor:
-        """What the measured torque shows without any, (n,) [Nm, N]."""
-        return self.dynamics.torque_offset()
+        value: Tensor = self.dynamics.friction.viscous()
+        return value
 
     def prepare(self, definite: bool = True) -> Any:
         """All that depends on the weights alone, until they change; M made ``definite``, or as learned."""
@@ -224,11 +197,6 @@ def vector(values: Iterable[float]) -> Tensor:
     return torch.tensor(list(values), dtype=torch.float64)
 
 
-def blocks(rows: Tensor, *shape: int) -> Tensor:
-    """(..., m) as (..., m / size, *shape), size the product of the shape."""
-    return rows.reshape(*rows.shape[:-1], rows.shape[-1] // math.prod(shape), *shape)
-
-
 class Network(Protocol):
     """Learned functions y of an encoding, each of its own joints, with derivatives written out."""
 
@@ -282,13 +250,6 @@ def applied(matrix: Tensor, vector: Tensor) -> Tensor:
     if vector.dim() == 1:  # fewer steps, which is what one state costs
         return matrix @ vector
     return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
-
-
-def combined(weights: Tensor, rows: Tensor) -> Tensor:
-    """The sum of weighted rows, weights^T rows, (..., m)."""
-    if weights.dim() == 1:
-        return weights @ rows
-    return (weights.unsqueeze(-2) @ rows).squeeze(-2)
 
 
 State = tuple[Tensor, Tensor]  # q and p, or how fast they change
@@ -460,35 +421,6 @@ class PortHamiltonian(nn.Module):
         return torch.cat([qd, force, moved, torch.zeros_like(tau)], dim=-1)
 
 
-class Bristles(nn.Module):
-    """K elements a joint, elastic up to their reach, sliding beyond; z is (..., n, K) [rad, m].
-
-    z' = qd - |qd| z / reach, whatever the speed: in displacement it is linear, and needs no small
-    steps (Dahl, A Solid Friction Model, 1968; several elements as in Lampaert, Al-Bender and
-    Swevers, A Generalized Maxwell-Slip Friction Model, 2003).
-    """
-
-    reach: Tensor  # (n, K)
-
-    def __init__(self, reach: Sequence[Sequence[float]]) -> None:
-        super().__init__()
-        self.register_buffer("reach", torch.tensor(reach, dtype=torch.float64))
-
-    def rate(self, qd: Tensor, z: Tensor) -> Tensor:
-        """z', (..., n, K)."""
-        return qd.unsqueeze(-1) - qd.abs().unsqueeze(-1) * z / self.reach
-
-    def moved(self, z: Tensor, displacement: Tensor) -> Tensor:
-        """z after joints went one way by (..., n), exactly."""
-        return moved_bristles(z, displacement, self.reach)
-
-
-def moved_bristles(z: Tensor, displacement: Tensor, reach: Tensor) -> Tensor:
-    """z, (..., n, K), after joints went one way by (..., n), exactly."""
-    end = displacement.sign().unsqueeze(-1) * reach
-    return end + (z - end) * (-displacement.abs().unsqueeze(-1) / reach).exp()
-
-
 Entries = Callable[[Sequence[Tensor], Sequence[Tensor]], Tensor]
 
 
@@ -510,6 +442,37 @@ def entry_basis(entries: Entries, functions: int, constants: int) -> tuple[Tenso
     by_function = entries(f.unbind(), f.new_zeros(constants, functions).unbind())
     by_constant = entries(c.new_zeros(functions, constants).unbind(), c.unbind())
     return by_function.flatten(1), by_constant.flatten(1)
+
+
+class PositiveDefiniteBound(nn.Module):
+    """Draws M towards a positive definite matrix C, as far as M needs it to be positive definite.
+
+    M' = C + t (M - C), with t = 1 wherever M - margin C is positive definite. Elsewhere t = 2^-k is
+    the first such power with t |M - C| <= 1 - margin, |.| being at least the norm relative to C:
+    then M' - margin C is positive definite. t is constant in pieces, so that derivatives of M' are
+    t times those of M. C has M's own zeros and linear relations, which therefore hold in M'.
+    """
+
+    center: Tensor  # C
+    least: Tensor  # margin C
+    unit: Tensor  # an entry's largest part in the norm relative to C, divided by 1 - margin
+
+    def __init__(self, center: Tensor, margin: float) -> None:
+        super().__init__()
+        scale = center.diagonal().rsqrt()
+        scaled = scale.unsqueeze(-1) * center * scale
+        least = torch.linalg.eigvalsh(scaled)[0]
+        self.register_buffer("center", center)
+        self.register_buffer("least", margin * center)
+        self.register_buffer("unit", scale.unsqueeze(-1) * scale / least / (1 - margin))
+
+    def forward(self, mass: Tensor) -> tuple[Tensor, Tensor]:
+        """M', (..., n, n), and t, (...)."""
+        fixed = mass.detach()
+        indefinite = torch.linalg.cholesky_ex(fixed - self.least).info != 0
+        size = torch.linalg.vector_norm(self.unit * (fixed - self.center), dim=(-2, -1))
+        part = torch.where(indefinite, torch.exp2(-torch.ceil(torch.log2(size)).clamp(min=1.0)), 1.0)
+        return torch.lerp(self.center, mass, part[..., None, None]), part
 
 
 def to_group(q: Tensor, joint_types: Sequence[str]) -> list[Tensor]:
@@ -535,6 +498,35 @@ def from_group(parts: Sequence[Tensor], joint_types: Sequence[str]) -> Tensor:
     return torch.stack(values, dim=-1)
 
 
+class Mass(Protocol):
+    """What gives M(q) and its derivatives."""
+
+    def prepare(self, definite: bool = True) -> Any:
+        """All that depends on the weights alone; ``definite``: keep M positive definite."""
+
+    def __call__(self, encoded: Tensor, prepared: Any) -> tuple[Tensor, Any]:
+        """M(q), (..., n, n), and what its derivatives need."""
+
+    def kinetic_vjp(self, encoded: Tensor, qd: Tensor, residuals: Any) -> Tensor:
+        """The derivative of 1/2 qd^T M(q) qd by the encoding."""
+
+    def jvp(self, rate: Tensor, residuals: Any) -> Tensor:
+        """dM/dt, (..., n, n), where the encoding changes at this rate."""
+
+
+class Friction(Protocol):
+    """What gives D(q, qd)."""
+
+    def prepare(self) -> Any:
+        """All that depends on the weights alone."""
+
+    def __call__(self, encoded: Tensor, qd: Tensor, prepared: Any) -> Tensor:
+        """D qd, (..., n) [Nm, N]."""
+
+    def dissipation(self, encoded: Tensor, qd: Tensor, prepared: Any) -> Tensor:
+        """D, (..., n, n)."""
+
+
 class Input(Protocol):
     """What gives G."""
 
@@ -549,13 +541,6 @@ class Input(Protocol):
 
     def solve(self, encoded: Tensor, force: Tensor, prepared: Any) -> Tensor:
         """The inputs, (..., n), that make this force."""
-
-
-class DriveInput(Input, Protocol):
-    """What gives a constant G, and how the drives turn."""
-
-    def motor_speeds(self) -> Tensor:
-        """C, (n, n): the drives' speeds are C qd."""
 
 
 class Armature(nn.Module):
@@ -637,302 +622,6 @@ def joint_input(joints: Joints, chosen: Iterable[int], sensitivity: Sequence[flo
     return NetworkInput(owners, vector(sensitivity[j] for j in owners), matrix, 0 * matrix.sum(dim=1))
 
 
-SPLINES = 34  # over the range of a joint
-
-
-HARMONICS = 64  # of a turn of the joint, and the first two of a turn of the motor: teeth and poles come again
-
-
-FINE = 5  # sines are dear: the k-th harmonic is made of the |b|-th, b from -FINE to FINE,
-
-
-COARSE = 6  # and of the (2 FINE + 1) a-th, a up to COARSE, where k = (2 FINE + 1) a + b
-
-
-LARGEST = math.log(10.0)  # logarithm of friction's factor: it stays between a tenth and ten times
-
-
-class JointFunctionWeights(NamedTuple):
-    """What depends on the weights alone."""
-
-    splines: Tensor  # of the torque [Nm, N] and of friction, by cubes, (n, SPLINES, 2)
-    ripple: Tensor  # of products of fine and coarse waves [Nm], (n, 2 FINE + 2, 2 COARSE + 6)
-
-
-def ripple_frequencies(joints: Joints) -> Tensor:
-    """How often in a turn of the joint a ripple may come again, (n, HARMONICS + 2)."""
-    few = tuple(range(1, HARMONICS + 3))
-    rows = [(*few[:-2], gear, 2 * gear) if gear > HARMONICS else few for gear in joints.gear]
-    return torch.tensor(rows, dtype=torch.float64)
-
-
-def _products(cosines: Tensor, sines: Tensor) -> Tensor:
-    """By which products of fine and coarse waves harmonics are made, (n, 2 FINE + 2, 2 COARSE + 6)."""
-    pads = FINE + 1, (2 * FINE + 1) * COARSE + FINE - HARMONICS
-    above, below, own = [], [], []
-    for harmonics in (cosines, sines):
-        regular, few = harmonics.tensor_split((HARMONICS,), dim=1)
-        rows = F.pad(regular, pads).reshape(-1, COARSE + 1, 2 * FINE + 1).mT  # (n, b + FINE, a)
-        above.append(rows[:, FINE:])
-        below.append(F.pad(rows[:, :FINE].flip(1), (0, 0, 1, 0)))
-        own.append(F.pad(few.unsqueeze(1), (0, 0, 0, FINE)))
-    by_cos = above[0] + below[0], own[0], above[1] + below[1], own[1]
-    by_sin = above[1] - below[1], 0 * own[0], below[0] - above[0], 0 * own[1]
-    return torch.cat([torch.cat(by_cos, dim=2), torch.cat(by_sin, dim=2)], dim=1)
-
-
-def _by_joint(rows: Tensor, matrices: Tensor) -> Tensor:
-    """Each joint's row, (..., n, k), times its own matrix, (n, k, m)."""
-    if rows.dim() == 2:  # fewer steps, which is what one state costs
-        return (rows.unsqueeze(-2) @ matrices).squeeze(-2)
-    return torch.einsum("...ik,ikm->...im", rows, matrices)
-
-
-class JointFunctions(nn.Module):
-    """By joint a torque t(q) = dV/dq, its energy V(q), and a factor on friction, from q of that joint alone.
-
-    t is a sum of cubic B-splines over the joint's range and, of a revolute joint, of harmonics of its
-    turns and of its motor's; the factor is the exponential of such a spline, between a tenth and ten for
-    all weights. Splines vanish where the range ends, so that nothing is added where nothing was seen.
-    Weights are zero at first; torques are in units of usual friction.
-    """
-
-    scale: Tensor
-    spacing: Tensor
-    middles: Tensor
-    revolute: Tensor
-    frequencies: Tensor
-    waves: Tensor  # how often fine ones, then coarse ones and the motor's, come again in a turn
-    quarter: Tensor  # by how much cosines are ahead of sines
-
-    def __init__(self, joints: Joints) -> None:
-        super().__init__()
-        n = joints.n
-        self.prismatic = not all(joints.revolute)
-        spacing = 2 * vector(joints.reach).unsqueeze(-1) / (SPLINES - 3)
-        knots = torch.arange(SPLINES).double() - (SPLINES - 1) / 2
-        self.register_buffer("scale", vector(joints.friction))
-        self.register_buffer("spacing", spacing)
-        self.register_buffer("middles", vector(joints.center).unsqueeze(-1) + spacing * knots)
-        self.register_buffer("revolute", vector(float(each) for each in joints.revolute).unsqueeze(-1))
-        frequencies = ripple_frequencies(joints)
-        fine, coarse = torch.arange(FINE + 1.0), (2 * FINE + 1) * torch.arange(COARSE + 1.0)
-        fine, coarse = fine.double().expand(n, -1), coarse.double().expand(n, -1)
-        coarse = torch.cat([coarse, frequencies[:, HARMONICS:]], dim=1)
-        self.register_buffer("frequencies", frequencies)
-        self.register_buffer("waves", torch.cat([fine, fine, coarse, coarse], dim=1))
-        ahead = [torch.full_like(half[0], x) for half in (fine, coarse) for x in (math.pi / 2, 0.0)]
-        self.register_buffer("quarter", torch.cat(ahead))
-        self.raw_torque_splines = nn.Parameter(torch.zeros(n, SPLINES, dtype=torch.float64))
-        self.raw_torque_ripple = nn.Parameter(torch.zeros(n, 2 * (HARMONICS + 2), dtype=torch.float64))
-        self.raw_friction_splines = nn.Parameter(torch.zeros(n, SPLINES, dtype=torch.float64))
-
-    def prepare(self) -> JointFunctionWeights:
-        """All that depends on the weights alone."""
-        scale = self.scale.unsqueeze(-1)
-        splines = torch.stack([scale * self.raw_torque_splines, self.friction_logarithms()], dim=-1) / 6
-        cosines, sines = (scale * self.revolute * self.raw_torque_ripple).chunk(2, dim=1)
-        return JointFunctionWeights(splines, _products(cosines, sines))
-
-    def forward(self, q: Tensor, weights: JointFunctionWeights) -> tuple[Tensor, Tensor]:
-        """dV/dq [Nm, N], and how much more friction there is than elsewhere, positive; (..., n) both."""
-        smooth, friction = _by_joint(self._cubes(q), weights.splines).unbind(-1)
-        waves = torch.addcmul(self.quarter, q.unsqueeze(-1), self.waves).sin()
-        fine, coarse = waves.tensor_split((2 * FINE + 2,), dim=-1)
-        ripple = (_by_joint(fine, weights.ripple) * coarse).sum(dim=-1)
-        return smooth + ripple, friction.exp()
-
-    def friction_logarithms(self) -> Tensor:
-        """Weights of the splines whose sum is the logarithm of friction's factor, (n, SPLINES)."""
-        return LARGEST * (self.raw_friction_splines / LARGEST).tanh()
-
-    def splines(self, q: Tensor) -> Tensor:
-        """The cubic B-splines at q, (..., n, SPLINES), each 2/3 high."""
-        return self._cubes(q) / 6
-
-    def ripple(self, q: Tensor) -> Tensor:
-        """Cosines, then sines of frequency times q, (..., n, 2 HARMONICS + 4); zero for a prismatic joint."""
-        phase = q.unsqueeze(-1) * self.frequencies
-        both = torch.cat([phase.cos(), phase.sin()], dim=-1)
-        return both * self.revolute if self.prismatic else both
-
-    def energy(self, q: Tensor) -> Tensor:
-        """V, (...) [J]; of what ends where the range does, half on either side."""
-        place = self._places(q)
-        away = place.abs()
-        part = 0.5 - (2 - away).relu() ** 4 / 24 + (1 - away).relu() ** 4 / 6
-        smooth = (self.spacing * place.sign() * part * self.raw_torque_splines).sum(dim=-1)
-        by_cos, by_sin = (self.ripple(q) / self.frequencies.repeat(1, 2)).chunk(2, dim=-1)
-        turned = torch.cat([by_sin, -by_cos], dim=-1)
-        return (self.scale * (smooth + (turned * self.raw_torque_ripple).sum(dim=-1))).sum(dim=-1)
-
-    def _cubes(self, q: Tensor) -> Tensor:
-        """Six times the splines."""
-        wide = (2 - self._places(q).abs()).relu()
-        return torch.sub(wide**3, (wide - 1).relu() ** 3, alpha=4)
-
-    def _places(self, q: Tensor) -> Tensor:
-        """How far q is from each spline's middle, in spacings, (..., n, SPLINES)."""
-        return (q / self.spacing.squeeze(-1)).unsqueeze(-1) - self.middles / self.spacing
-
-
-Row = tuple[float, float, float]
-
-
-class Bodies(NamedTuple):
-    """All that moves rigidly with a joint, an entry for each; a body turns about its frame's z, or
-    slides along it, by ratio * q + offset.
-    """
-
-    parent: tuple[int, ...]  # -1: the base
-    joint: tuple[int, ...]
-    revolute: tuple[bool, ...]
-    ratio: tuple[float, ...]
-    offset: tuple[float, ...]
-    rotation: tuple[tuple[Row, Row, Row], ...]  # of the joint's frame in its parent's
-    position: tuple[Row, ...]  # likewise [m]
-    mass: tuple[float, ...]  # nominal m [kg]
-    moment: tuple[Row, ...]  # nominal m c [kg m]
-    inertia: tuple[Row, ...]  # nominal Ixx, Iyy, Izz about the joint [kg m^2]
-    products: tuple[Row, ...]  # likewise Ixy, Ixz, Iyz
-
-
-def skew(a: Tensor) -> Tensor:
-    """[a]x, (..., 3, 3), with [a]x b = a x b."""
-    x, y, z = a.unbind(dim=-1)
-    zero = torch.zeros_like(x)
-    rows = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1)
-    return rows.reshape(*a.shape[:-1], 3, 3)
-
-
-def twist_map(rotation: Tensor, position: Tensor) -> Tensor:
-    """Takes twists (angular, linear) to a frame at ``position`` turned by ``rotation``^T, (6, 6)."""
-    top = torch.cat([rotation, torch.zeros_like(rotation)], dim=1)
-    return torch.cat([top, torch.cat([-rotation @ skew(position), rotation], dim=1)])
-
-
-def transform_table(bodies: Bodies, index: int) -> Tensor:
-    """A body's twist map from its parent's frame is table[0] + table[1] cos + table[2] sin, (3, 6, 6).
-
-    A prismatic one's is table[0] + displacement table[1].
-    """
-    rotation = torch.stack([vector(row) for row in bodies.rotation[index]]).mT
-    position = vector(bodies.position[index])
-    table = torch.zeros(3, 6, 6, dtype=torch.float64)
-    if bodies.revolute[index]:
-        about = torch.zeros(3, 3, 3, dtype=torch.float64)
-        about[0, 2, 2] = about[1, 0, 0] = about[1, 1, 1] = about[2, 0, 1] = 1
-        about[2, 1, 0] = -1
-        for term in range(3):
-            table[term] = twist_map(about[term] @ rotation, position)
-    else:
-        table[0] = twist_map(rotation, position)
-        table[1] = twist_map(rotation, position + rotation[2]) - table[0]
-    return table
-
-
-def motion_table(bodies: Bodies) -> tuple[Tensor, Tensor]:
-    """Takes cos, sin and value of all displacements to what takes rows of twists from parents' frames.
-
-    (36 bodies, 3 bodies), and what is added, (36 bodies,). Offsets of the displacements are in both.
-    """
-    count = len(bodies.parent)
-    by_term = torch.zeros(count, 6, 6, 3, count, dtype=torch.float64)
-    fixed = torch.zeros(count, 6, 6, dtype=torch.float64)
-    for index, (revolute, offset) in enumerate(zip(bodies.revolute, bodies.offset, strict=True)):
-        constant, first, second = transform_table(bodies, index).mT
-        if revolute:
-            cos, sin = math.cos(offset), math.sin(offset)
-            by_term[index, :, :, 0, index] = cos * first + sin * second
-            by_term[index, :, :, 1, index] = cos * second - sin * first
-            fixed[index] = constant
-        else:
-            by_term[index, :, :, 2, index] = first
-            fixed[index] = constant + offset * first
-    return by_term.reshape(36 * count, 3 * count), fixed.flatten()
-
-
-def crossed(twists: Tensor, others: Tensor) -> Tensor:
-    """How twists that are carried along by ``twists`` change; columns, (..., 6, k) each.
-
-    Featherstone's cross product of motion vectors (2008, eq. 2.31).
-    """
-    (w, u), (a, m) = twists.chunk(2, dim=-2), others.chunk(2, dim=-2)
-    linear = torch.linalg.cross(w, m, dim=-2) + torch.linalg.cross(u, a, dim=-2)
-    return torch.cat([torch.linalg.cross(w, a, dim=-2), linear], dim=-2)
-
-
-def pushed_along(twists: Tensor, momenta: Tensor) -> Tensor:
-    """How momenta that are carried along by ``twists`` change; columns, (..., 6, k) each.
-
-    Featherstone's cross product of force vectors (2008, eq. 2.32).
-    """
-    (w, u), (n, f) = twists.chunk(2, dim=-2), momenta.chunk(2, dim=-2)
-    angular = torch.linalg.cross(w, n, dim=-2) + torch.linalg.cross(u, f, dim=-2)
-    return torch.cat([angular, torch.linalg.cross(w, f, dim=-2)], dim=-2)
-
-
-def inertia_basis() -> Tensor:
-    """Spatial inertias of bodies with one parameter one and the others zero, (10, 6, 6)."""
-    basis = torch.zeros(10, 6, 6, dtype=torch.float64)
-    basis[0, 3:, 3:] = torch.eye(3)
-    for axis, unit in enumerate(torch.eye(3, dtype=torch.float64)):
-        basis[1 + axis, :3, 3:], basis[1 + axis, 3:, :3] = skew(unit), -skew(unit)
-    for place, (row, column) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))):
-        basis[4 + place, row, column] = basis[4 + place, column, row] = 1
-    return basis
-
-
-def pseudo_inertia(ten: Tensor) -> Tensor:
-    """[[tr(I)/2 - I, m c], [(m c)^T, m]], (..., 4, 4), of (m, m c, I), (..., 10).
-
-    It is positive definite exactly where some distribution of mass has these parameters (Wensing,
-    Kim and Slotine, IEEE RA-L 3:60, 2018).
-    """
-    m, x, y, z, xx, xy, xz, yy, yz, zz = ten.unbind(dim=-1)
-    half = (xx + yy + zz) / 2
-    rows = [half - xx, -xy, -xz, x, -xy, half - yy, -yz, y, -xz, -yz, half - zz, z, x, y, z, m]
-    return torch.stack(rows, dim=-1).reshape(*ten.shape[:-1], 4, 4)
-
-
-class InertialParameters(nn.Module):
-    """Trained inertial parameters of rigid bodies, possible ones for all weights; zero is nominal.
-
-    A body's pseudo-inertia is C T T^T C^T, with C of the nominal body and T lower triangular, its
-    diagonal exponentials (Rucker and Wensing, IEEE RA-L 7:4352, 2022).
-    """
-
-    factors: Tensor
-    triangle: Tensor
-
-    def __init__(self, bodies: Bodies) -> None:
-        super().__init__()
-        columns = zip(bodies.mass, bodies.moment, bodies.inertia, bodies.products, strict=True)
-        nominal = torch.stack(
-            [
-                vector((m, *moment, xx, xy, xz, yy, yz, zz))
-                for m, moment, (xx, yy, zz), (xy, xz, yz) in columns
-            ]
-        )
-        self.register_buffer("factors", torch.linalg.cholesky(pseudo_inertia(nominal)))
-        row, column = torch.tril_indices(4, 4)
-        self.register_buffer("triangle", torch.eye(16, dtype=torch.float64)[4 * row + column])
-        self.raw = nn.Parameter(torch.zeros(len(bodies.mass), 10, dtype=torch.float64))
-
-    def forward(self) -> Tensor:
-        """By body (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) about its joint's frame, (bodies, 10)."""
-        on_diagonal = self.triangle[:, ::5].sum(dim=1) > 0
-        lower = torch.where(on_diagonal, self.raw.exp(), self.raw) @ self.triangle
-        root = self.factors @ lower.reshape(-1, 4, 4)
-        pseudo = root @ root.mT
-        moments, tensor = pseudo[:, 3, :3], -pseudo[:, :3, :3]
-        trace = -tensor.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
-        xx, yy, zz = (trace.unsqueeze(-1) + tensor.diagonal(dim1=-2, dim2=-1)).unbind(dim=-1)
-        xy, xz, yz = tensor[:, 0, 1], tensor[:, 0, 2], tensor[:, 1, 2]
-        six = torch.stack([xx, xy, xz, yy, yz, zz], dim=-1)
-        return torch.cat([pseudo[:, 3, 3:], moments, six], dim=-1)
-
-
 def motor_speeds(gains: Tensor) -> Tensor:
     """C, (n, n): the motors' speeds are C qd, where the joints' torques are ``gains`` times the motors'.
 
@@ -1007,226 +696,193 @@ class LearnedPotential(nn.Module):
         return self.network.vjp(residuals, encoded.new_ones(1))
 
 
-# where the constants start, relative to a joint's usual friction and speed
-STRIBECK = 0.3  # dry friction that only slow motion has
+class MassFunction(NamedTuple):
+    """A learned function f of some joints: mean + scale * network."""
+
+    joints: tuple[int, ...]
+    mean: float  # over the workspace, with nominal inertias
+    scale: float
 
 
-STRIBECK_VELOCITY = 0.03  # where that has faded
-
-
-SMOOTHING_VELOCITY = 0.006  # over which dry friction turns around
-
-
-SATURATION_VELOCITY = 0.2  # where viscous friction begins to grow more slowly
-
-
-LOAD_DEPENDENCE = 0.03  # dry friction by gravity torque
-
-
-class FrictionConstants(NamedTuple):
-    """By joint, (n,), all positive."""
-
-    viscous: Tensor  # [Nm s/rad, N s/m]
-    saturation: Tensor  # viscous friction that stops growing [Nm, N]
-    saturation_velocity: Tensor  # [rad/s, m/s]
-    coulomb: Tensor  # [Nm, N]
-    stribeck: Tensor  # [Nm, N]
-    stribeck_velocity: Tensor  # [rad/s, m/s]
-    coulomb_smoothing_velocity: Tensor  # [rad/s, m/s]
-    load_dependence: Tensor  # dry friction by gravity torque
-    bristle_fractions: Tensor  # of dry friction, (n, K); a joint's add up to one
-
-
-class FrictionLaws(nn.Module):
-    """Friction which resists whatever the weights are: they are logarithms.
-
-    viscous qd + saturation tanh(qd / saturation_velocity)
-    + (coulomb + stribeck exp(-(qd / stribeck_velocity)^2) + load_dependence |gravity torque|) direction.
-
-    The direction, from -1 to 1, is that of the bristles, sum of fraction z / reach; without them, or
-    where nothing is known of the way here, tanh(qd / coulomb_smoothing_velocity).
-    """
-
-    nominal: Tensor
-    speed: Tensor
-    raw_coulomb_smoothing_velocity: nn.Parameter | None
-    raw_bristle_fractions: nn.Parameter | None
-
-    def __init__(self, joints: Joints, reach: Sequence[Sequence[float]] = ()) -> None:
-        super().__init__()
-        self.register_buffer("nominal", vector(joints.friction))
-        self.register_buffer("speed", vector(joints.speed))
-        self.bristles = Bristles(reach or [[]] * joints.n)
-        start = torch.zeros(joints.n, dtype=torch.float64)
-        self.raw_viscous = nn.Parameter(start.clone())
-        self.raw_saturation = nn.Parameter(start.clone())
-        self.raw_saturation_velocity = nn.Parameter(start.clone())
-        self.raw_coulomb = nn.Parameter(start.clone())
-        self.raw_stribeck = nn.Parameter(start.clone())
-        self.raw_stribeck_velocity = nn.Parameter(start.clone())
-        self.raw_load_dependence = nn.Parameter(start.clone())
-        # dry friction turns around by displacement or by velocity, never by both
-        smoothing = None if reach else nn.Parameter(start.clone())
-        self.register_parameter("raw_coulomb_smoothing_velocity", smoothing)
-        fractions = nn.Parameter(torch.zeros_like(self.bristles.reach)) if reach else None
-        self.register_parameter("raw_bristle_fractions", fractions)
-
-    def prepare(self) -> FrictionConstants:
-        """The constants, in their units."""
-        size, speed = self.nominal, self.speed
-        smoothing, fractions = self.raw_coulomb_smoothing_velocity, self.raw_bristle_fractions
-        return FrictionConstants(
-            viscous=size / speed * self.raw_viscous.exp(),
-            saturation=size * self.raw_saturation.exp(),
-            saturation_velocity=SATURATION_VELOCITY * speed * self.raw_saturation_velocity.exp(),
-            coulomb=size * self.raw_coulomb.exp(),
-            stribeck=STRIBECK * size * self.raw_stribeck.exp(),
-            stribeck_velocity=STRIBECK_VELOCITY * speed * self.raw_stribeck_velocity.exp(),
-            coulomb_smoothing_velocity=SMOOTHING_VELOCITY
-            * speed
-            * (1 if smoothing is None else smoothing.exp()),
-            load_dependence=LOAD_DEPENDENCE * size.sign() * self.raw_load_dependence.exp(),
-            bristle_fractions=self.bristles.reach if fractions is None else fractions.softmax(dim=-1),
-        )
-
-    def resistance(self, qd: Tensor, gravity: Tensor, constants: FrictionConstants) -> Tensor:
-        """The diagonal of D, (..., n): friction torque by velocity, of joints that slide."""
-        c = constants
-        slope = tanh_ratio(qd / c.coulomb_smoothing_velocity) / c.coulomb_smoothing_velocity
-        return self.viscosity(qd, c) + self.dry(qd, gravity, c) * slope
-
-    def forward(
-        self, qd: Tensor, gravity: Tensor, constants: FrictionConstants, z: Tensor | None = None
-    ) -> Tensor:
-        """The friction torque, (..., n) [Nm, N], under this gravity torque, of bristles at z, (..., n, K)."""
-        c = constants
-        if z is None:
-            direction = (qd / c.coulomb_smoothing_velocity).tanh()
-        else:
-            direction = (c.bristle_fractions / self.bristles.reach * z).sum(dim=-1)
-        saturating = c.saturation * (qd / c.saturation_velocity).tanh()
-        return c.viscous * qd + saturating + self.dry(qd, gravity, c) * direction
-
-    def sliding(self, qd: Tensor) -> Tensor:
-        """The bristles z, (..., n, K), of joints that have long gone this way."""
-        direction = (qd / self.prepare().coulomb_smoothing_velocity).tanh()
-        return direction.unsqueeze(-1) * self.bristles.reach
-
-    def stored_energy(self, z: Tensor, constants: FrictionConstants) -> Tensor:
-        """What the bristles of Coulomb friction give back, (...) [J]."""
-        stored = constants.bristle_fractions * z.square() / self.bristles.reach
-        return 0.5 * (constants.coulomb * stored.sum(dim=-1)).sum(dim=-1)
-
-    @staticmethod
-    def viscosity(qd: Tensor, c: FrictionConstants) -> Tensor:
-        """Torque by velocity, (..., n)."""
-        return c.viscous + c.saturation / c.saturation_velocity * tanh_ratio(qd / c.saturation_velocity)
-
-    @staticmethod
-    def dry(qd: Tensor, gravity: Tensor, c: FrictionConstants) -> Tensor:
-        """The size of dry friction, (..., n) [Nm, N]."""
-        slow = (-((qd / c.stribeck_velocity) ** 2)).exp()
-        return c.coulomb + c.stribeck * slow + c.load_dependence * gravity.abs()
-
-
-def tanh_ratio(x: Tensor) -> Tensor:
-    """tanh(x) / x."""
-    near = x.abs() < 1e-4
-    safe = torch.where(near, torch.ones_like(x), x)
-    return torch.where(near, 1 - x**2 / 3, safe.tanh() / safe)
-
-
-PART = 0.9  # of the drives' inertia, which the residual may take away at most
-
-
-NEVER = 1e30  # how large a function may be by an entry where it does not stand
-
-
-class ResidualMassPrepared(NamedTuple):
+class MassPrepared(NamedTuple):
     """What depends on the weights alone."""
 
     layers: Any  # of the network
-    functions: Tensor  # what each function adds to M at its largest, (functions, n n)
-    constant: Tensor  # what the constants add, (n n,)
+    definite: bool  # whether M is kept positive definite
 
 
-class ResidualMass(nn.Module):
-    """R(q), (..., n, n), with ``entries`` saying where functions and constants stand.
+class MassResiduals(NamedTuple):
+    """What M's derivatives need of the work done for M."""
 
-    Each is its bound times the tanh of a network's output, or of a weight: the bounds are such that
-    ``armature`` + R is positive definite for all q and all weights (see ``bounds``).
+    network: Any
+    part: Tensor  # of the functions' changes that M takes, see PositiveDefiniteBound
+
+
+class DerivedMass(nn.Module):
+    """M(q), (..., n, n), with ``entries`` saying where functions and constants stand.
+
+    A constant starts at the first of its two numbers, and is trained in units of the second. Where
+    M would not exceed margin * its nominal mean, it is drawn towards that mean (see
+    PositiveDefiniteBound): M is positive definite for all q and all weights.
     """
 
-    basis: Tensor  # (functions + constants, n, n)
-    inverse: Tensor  # one by |basis|, NEVER where that is zero
+    constant_scale: Tensor
+    constant_basis: Tensor  # (constants, n n)
+    function_mean: Tensor
+    function_scale: Tensor
+    function_basis: Tensor  # (functions, n n)
 
     def __init__(
-        self, joints: Joints, entries: Entries, functions: int, constants: int, network: Network | None
+        self,
+        joints: Joints,
+        entries: Entries,
+        functions: Sequence[MassFunction],
+        constants: Sequence[tuple[float, float]],
+        network: Network,
+        margin: float,
     ) -> None:
         super().__init__()
-        n = self.n = joints.n
-        basis = torch.cat(entry_basis(entries, functions, constants)).reshape(-1, n, n)
-        stands = basis != 0
-        self.register_buffer("basis", basis)
-        self.register_buffer("inverse", torch.where(stands, 1 / basis.abs(), NEVER))
-        self.part = PART / float(stands.sum(dim=(0, 2)).max())  # of all that meet in a row of M
-        self.functions, self.network = functions, network
-        self.raw_constants = nn.Parameter(torch.zeros(constants, dtype=torch.float64))
+        self.n = joints.n
+        start = vector(first for first, _ in constants)
+        by_function, by_constant = entry_basis(entries, len(functions), len(constants))
+        self.register_buffer("constant_scale", vector(unit for _, unit in constants))
+        self.register_buffer("constant_basis", by_constant)
+        self.register_buffer("function_mean", vector(each.mean for each in functions))
+        self.register_buffer("function_scale", vector(each.scale for each in functions))
+        self.register_buffer("function_basis", by_function)
+        mean = start @ self.constant_basis + self.function_mean @ self.function_basis
+        self.bound = PositiveDefiniteBound(self._square(mean), margin)
+        self.raw_constants = nn.Parameter(start / self.constant_scale)
+        self.network = network
+        self.armature = Armature(joints)
 
-    def bounds(self, armature: Tensor) -> Tensor:
-        """How large each function and constant may be, beside an armature matrix, (n, n).
+    def constants(self) -> Tensor:
+        """The constants of M, (constants,), in their units."""
+        return self.constant_scale * self.raw_constants
 
-        armature - diag(d) is positive semi-definite for d = 1 / (row sums of |armature^-1|), and so is
-        diag(d) - R where no row of |R| / sqrt(d d^T) adds up to more than one: by diagonal dominance both.
-        """
-        root = torch.linalg.inv(armature).abs().sum(dim=-1).rsqrt()
-        pairs = root.unsqueeze(-1) * root
-        smallest: Tensor = (pairs * self.inverse).amin(dim=(-2, -1))
-        return self.part * smallest
-
-    def prepare(self, armature: Tensor) -> ResidualMassPrepared:
-        """All that depends on the weights alone."""
-        rows = self.bounds(armature).unsqueeze(-1) * self.basis.flatten(1)
-        functions, constants = rows.tensor_split((self.functions,))
-        layers = None
-        if self.network is not None:
-            identity = torch.eye(self.functions, dtype=rows.dtype, device=rows.device)
-            layers = self.network.prepare(identity, rows.new_zeros(self.functions))
-        return ResidualMassPrepared(layers, functions, self.raw_constants.tanh() @ constants)
-
-    def forward(self, encoded: Tensor, prepared: ResidualMassPrepared) -> tuple[Tensor, Any]:
-        """R(q), and what its derivatives need."""
-        if self.network is None:
-            return self._square(prepared.constant).expand(*encoded.shape[:-1], -1, -1), None
-        y, residuals = self.network(encoded, prepared.layers)
-        height = y.tanh()
-        rows = F.linear(height, prepared.functions.mT, prepared.constant)
-        return self._square(rows), (residuals, 1 - height * height, prepared.functions)
+    def prepare(self, definite: bool = True) -> MassPrepared:
+        """All that depends on the weights alone; ``definite``: keep M positive definite."""
+        armature = torch.diag(self.armature())
+        constant = self.constants() @ self.constant_basis
+        constant = constant + self.function_mean @ self.function_basis + armature.flatten()
+        output_map = (self.function_scale.unsqueeze(-1) * self.function_basis).mT
+        return MassPrepared(self.network.prepare(output_map, constant), definite)
 
     def _square(self, rows: Tensor) -> Tensor:
         """(..., n n) as (..., n, n)."""
         return rows.reshape(*rows.shape[:-1], self.n, self.n)
 
-    def coriolis(self, rate: Tensor, qd: Tensor, residuals: Any) -> tuple[Tensor, Tensor]:
-        """dR/dt qd, (..., n), where the encoding changes at this rate, and what ``kinetic_vjp`` gives."""
-        if self.network is None:
-            return torch.zeros_like(qd), torch.zeros_like(rate)
-        network, slope, functions = residuals
-        moved = self._moved(qd, functions)
-        by_encoded = self.network.vjp(network, 0.5 * slope * applied(moved, qd))
-        return combined(slope * self.network.jvp(network, rate), moved), by_encoded
+    def forward(self, encoded: Tensor, prepared: MassPrepared) -> tuple[Tensor, MassResiduals]:
+        """M(q), and what its derivatives need."""
+        rows, residuals = self.network(encoded, prepared.layers)
+        mass = self._square(rows)
+        part = torch.ones_like(mass[..., 0, 0])
+        if prepared.definite:
+            mass, part = self.bound(mass)
+        return mass, MassResiduals(residuals, part)
 
-    def kinetic_vjp(self, encoded: Tensor, qd: Tensor, residuals: Any) -> Tensor:
-        """The derivative of 1/2 qd^T R(q) qd by the encoding."""
-        if self.network is None:
-            return torch.zeros_like(encoded)
-        network, slope, functions = residuals
-        by_encoded: Tensor = self.network.vjp(network, 0.5 * slope * applied(self._moved(qd, functions), qd))
-        return by_encoded
+    def kinetic_vjp(self, encoded: Tensor, qd: Tensor, residuals: MassResiduals) -> Tensor:
+        """The derivative of 1/2 qd^T M(q) qd by the encoding."""
+        half = 0.5 * residuals.part.unsqueeze(-1) * qd
+        weight = (half.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2)
+        return self.network.vjp(residuals.network, weight)
 
-    def _moved(self, qd: Tensor, functions: Tensor) -> Tensor:
-        """What each function adds to R qd at its largest, (..., functions, n)."""
-        return blocks(F.linear(qd, functions.reshape(-1, self.n)), self.n)
+    def jvp(self, rate: Tensor, residuals: MassResiduals) -> Tensor:
+        """dM/dt, (..., n, n), where the encoding changes at this rate."""
+        rows = self.network.jvp(residuals.network, rate)
+        return residuals.part[..., None, None] * self._square(rows)
+
+
+HIDDEN = 8  # units of a joint's network
+
+
+POSITION_SENSITIVITY = 0.1  # of friction's networks, relative to velocity
+
+
+SMOOTHING = 0.03  # below this fraction of its usual speed dry friction fades to zero, to start from
+
+
+LEAST_SMOOTHING = 0.001  # and at the least
+
+
+class FrictionLayers(NamedTuple):
+    """The weights made ready for many states, all joints' networks in one."""
+
+    weight: Tensor
+    bias: Tensor
+    out: Tensor
+    offset: Tensor
+    viscous: Tensor  # [Nm s/rad, N s/m]
+    smoothing: Tensor  # coulomb smoothing velocity squared [rad^2/s^2, m^2/s^2]
+
+
+class JointFriction(nn.Module):
+    """A diagonal D(q, qd), positive for all weights."""
+
+    matrix: Tensor  # where the inputs of a joint's network stand, (joints, inputs, encoded + 2 n)
+    speed: Tensor
+    nominal: Tensor
+
+    def __init__(self, joints: Joints, encoding: JointEncoding, generator: torch.Generator) -> None:
+        super().__init__()
+        n, inputs = joints.n, 4
+        matrix = torch.zeros(n, inputs, encoding.size + 2 * n, dtype=torch.float64)
+        for i, revolute in enumerate(joints.revolute):
+            cos, sin = (i, n + i) if revolute else (2 * n + i, 2 * n + i)
+            matrix[i, 0, cos] = matrix[i, 1, sin] = POSITION_SENSITIVITY
+            matrix[i, 2, i - 2 * n], matrix[i, 3, i - n] = 1 / joints.speed[i], 1.0
+        self.register_buffer("matrix", matrix)
+        self.register_buffer("speed", vector(joints.speed))
+        self.register_buffer("nominal", vector(joints.friction))
+        self.raw_smoothing = nn.Parameter(torch.zeros(n, dtype=torch.float64))
+        self.raw_viscous = nn.Parameter(torch.full((n,), -2.0, dtype=torch.float64))
+        shape = (n, inputs, HIDDEN)
+        weight = torch.randn(shape, dtype=torch.float64, generator=generator)
+        self.weight = nn.Parameter(weight / inputs**0.5)
+        self.bias = nn.Parameter(torch.zeros(n, HIDDEN, dtype=torch.float64))
+        self.out = nn.Parameter(torch.zeros(n, HIDDEN, dtype=torch.float64))
+        self.offset = nn.Parameter(torch.full((n,), -2.0, dtype=torch.float64))
+
+    def viscous(self) -> Tensor:
+        """Torque per velocity, (n,) [Nm s/rad, N s/m]."""
+        return self.nominal * F.softplus(self.raw_viscous) / self.speed
+
+    def coulomb_smoothing_velocity(self) -> Tensor:
+        """Where dry friction has turned around, (n,) [rad/s, m/s]."""
+        return self.speed * (LEAST_SMOOTHING**2 + (SMOOTHING * self.raw_smoothing.exp()) ** 2).sqrt()
+
+    def prepare(self) -> FrictionLayers:
+        """All joints' networks as one: block matrices are faster than a loop over joints.
+
+        Their tanh x is computed as 2 sigmoid(2 x) - 1, which takes a fraction of the time.
+        """
+        own = torch.eye(self.out.shape[0], dtype=self.out.dtype, device=self.out.device)
+        return FrictionLayers(
+            weight=2 * (self.weight.mT @ self.matrix).flatten(0, 1),
+            bias=2 * self.bias.flatten(),
+            out=2 * (own.unsqueeze(-1) * self.out).flatten(1),
+            offset=self.offset - self.out.sum(dim=1),
+            viscous=self.viscous(),
+            smoothing=self.coulomb_smoothing_velocity() ** 2,
+        )
+
+    def _dry(self, encoded: Tensor, qd: Tensor, direction: Tensor, layers: FrictionLayers) -> Tensor:
+        """Dry friction relative to its usual size, (..., n)."""
+        inputs = torch.cat([encoded, qd, direction], dim=-1)
+        hidden = torch.sigmoid(F.linear(inputs, layers.weight, layers.bias))
+        return F.softplus(F.linear(hidden, layers.out, layers.offset))
+
+    def forward(self, encoded: Tensor, qd: Tensor, layers: FrictionLayers) -> Tensor:
+        """The friction torque D qd, (..., n) [Nm, N]."""
+        direction = qd * torch.rsqrt(qd * qd + layers.smoothing)  # -1 or 1, smooth at standstill
+        dry = self._dry(encoded, qd, direction, layers)
+        return layers.viscous * qd + self.nominal * direction * dry
+
+    def dissipation(self, encoded: Tensor, qd: Tensor, layers: FrictionLayers) -> Tensor:
+        """D, (..., n, n) [Nm s/rad, N s/m], diagonal."""
+        smooth_speed = torch.sqrt(qd * qd + layers.smoothing)
+        dry = self._dry(encoded, qd, qd / smooth_speed, layers)
+        return torch.diag_embed(layers.viscous + self.nominal * dry / smooth_speed)
 
 
 class MLPLayers(NamedTuple):
@@ -1320,409 +976,110 @@ class MaskedMLP(nn.Module):
         return F.linear(tangent, layers.weights[-1])
 
 
-class Chain(NamedTuple):
-    """The bodies at a position; 6 numbers a body, side by side."""
-
-    frames: Tensor  # takes twists from the base's frame to the bodies', (..., 6, 6 bodies)
-    axes: Tensor  # twists that bodies have by their own displacements, in the base's frame, (..., 6, bodies)
-    twists: Tensor  # by joint velocity, in the bodies' frames, (..., n, 6 bodies)
-    weight: Tensor  # acceleration that stands for gravity, likewise, (..., 6 bodies)
-
-
-class BodyChain(nn.Module):
-    """Bodies that turn about or slide along axes, each carried by another or by the base.
-
-    Spatial vectors are (angular, linear), as in Featherstone, Rigid Body Dynamics Algorithms, 2008; they
-    are rows in the bodies' frames and columns in the base's. Only frames are followed body by body: sums
-    over all that carries a body, or that it carries, are products with a mask, so few operations are left.
-    """
-
-    table: (
-        Tensor  # takes cos, sin and value of the displacements to frames in parents', (36 bodies, 3 bodies)
-    )
-    fixed: Tensor  # what is added there, (36 bodies,)
-    reading: Tensor  # where axes stand in ``frames``, (6 bodies, bodies)
-    carriers: Tensor  # whether a body carries another, or is it, (bodies, bodies)
-    carried: Tensor  # likewise, six times each, (bodies, 6 bodies)
-    base: Tensor  # acceleration of the base that stands for gravity, (6,)
-    ratios: Tensor  # displacements by q, (bodies, n)
-
-    def __init__(self, n: int, bodies: Bodies, gravity: tuple[float, float, float]) -> None:
-        super().__init__()
-        self.parents, count = bodies.parent, len(bodies.parent)
-        reading = torch.zeros(count, 6, count, dtype=torch.float64)
-        carriers = torch.eye(count, dtype=torch.float64)
-        ratios = torch.zeros(count, n, dtype=torch.float64)
-        for index, parent in enumerate(bodies.parent):
-            ratios[index, bodies.joint[index]] = bodies.ratio[index]
-            # an inverse's rows are columns whose halves are swapped
-            reading[index, 5 if bodies.revolute[index] else 2, index] = 1
-            if parent >= 0:
-                carriers[:, index] += carriers[:, parent]
-        table, fixed = motion_table(bodies)
-        self.register_buffer("table", table)
-        self.register_buffer("fixed", fixed)
-        self.register_buffer("reading", reading.flatten(0, 1))
-        self.register_buffer("carriers", carriers)
-        self.register_buffer("carried", carriers.repeat_interleave(6, dim=1))
-        self.register_buffer("base", vector((0, 0, 0, *(-g for g in gravity))))
-        self.register_buffer("ratios", ratios)
-        self.single = torch.equal(ratios, torch.eye(n).double())  # no joint moves several bodies
-
-    def forward(self, q: Tensor) -> Chain:
-        """The bodies at q, (..., n)."""
-        value = self._by_bodies(q)
-        features = torch.cat([value.cos(), value.sin(), value], dim=-1)
-        own = blocks(F.linear(features, self.table, self.fixed), 6, 6).unbind(dim=-3)
-        placed: list[Tensor] = []
-        for index, parent in enumerate(self.parents):
-            placed.append(own[index] if parent < 0 else placed[parent] @ own[index])
-        frames = torch.cat(placed, dim=-1)
-        axes = (frames @ self.reading).roll(3, dims=-2)
-        twists = (axes.mT @ frames) * self.carried
-        twists = twists if self.single else self.ratios.mT @ twists
-        return Chain(frames, axes, twists, combined(self.base, frames))
-
-    def _by_bodies(self, joints: Tensor) -> Tensor:
-        """What is given by joint, (..., n), for the bodies that they move, (..., bodies)."""
-        return joints if self.single else joints @ self.ratios.mT
-
-    def turning(self, at: Chain, qd: Tensor) -> tuple[Tensor, Tensor]:
-        """The bodies' twists, and how these turn the bodies' axes; in the base's frame, (..., 6, bodies)."""
-        twists = (at.axes * self._by_bodies(qd).unsqueeze(-2)) @ self.carriers
-        return twists, crossed(twists, at.axes)
-
-    def accelerations(self, at: Chain, qd: Tensor, turning: Tensor) -> Tensor:
-        """The bodies' accelerations at steady qd, gravity taken as one, (..., 6 bodies)."""
-        steady = (turning * self._by_bodies(qd).unsqueeze(-2)) @ self.carriers
-        bodies = blocks(at.frames, 6) * steady.unsqueeze(-1)
-        return bodies.sum(dim=-3).flatten(-2) + at.weight
-
-    def at_base(self, at: Chain, momenta: Tensor) -> Tensor:
-        """Momenta of the bodies, (..., 6 bodies), in the base's frame, (..., 6, bodies)."""
-        return blocks(at.frames * momenta.unsqueeze(-2), 6).sum(dim=-1)
-
-    def by_joints(self, axes: Tensor, wrenches: Tensor) -> Tensor:
-        """What joints feel along ``axes`` of wrenches on all that they carry, (..., n)."""
-        felt = (axes * (wrenches @ self.carriers.mT)).sum(dim=-2)
-        return felt if self.single else felt @ self.ratios
-
-    def energy(self, at: Chain, inertia: Tensor) -> Tensor:
-        """The bodies' energy in gravity, (...) [J]; zero at the base's origin."""
-        # of all bodies together; the moment of mass stands in the inertia's upper right block
-        whole = at.frames @ inertia @ at.frames.mT
-        moment = torch.stack([whole[..., 2, 4], whole[..., 0, 5], whole[..., 1, 3]], dim=-1)
-        return applied(moment.unsqueeze(-2), self.base[3:]).squeeze(-1)
-
-    def regressor(self, q: Tensor, qd: Tensor, qdd: Tensor, basis: Tensor) -> Tensor:
-        """Y, (..., n, 10 bodies): Y @ inertial parameters is the bodies' torque.
-
-        basis: ``inertia_basis()``.
-        """
-        at = self(q)
-        rises = self.accelerations(at, qd, self.turning(at, qd)[1]) + combined(qdd, at.twists)
-        rises, twists = (blocks(rows, 6) for rows in (rises, combined(qd, at.twists)))
-        # by body and parameter: (..., bodies, 6, 10)
-        momenta = torch.tensordot(twists, basis, dims=([-1], [2])).mT
-        wrenches = torch.tensordot(rises, basis, dims=([-1], [2])).mT
-        wrenches = wrenches + pushed_along(twists.unsqueeze(-1), momenta)
-        columns = blocks(at.twists, 6).transpose(-3, -2)  # (..., bodies, n, 6)
-        rows: Tensor = (columns @ wrenches).transpose(-3, -2)
-        return rows.reshape(*q.shape, 10 * len(self.parents))
-
-
-def block_diagonal(blocks: Tensor) -> Tensor:
-    """The matrix, (k m, k m), with these blocks, (k, m, m), on its diagonal."""
-    k, m, _ = blocks.shape
-    own = torch.eye(k, dtype=blocks.dtype, device=blocks.device)
-    return (own[:, None, :, None] * blocks[:, :, None, :]).reshape(k * m, k * m)
-
-
-class RigidPrepared(NamedTuple):
-    """What depends on the weights alone, worked out once for many states."""
-
-    inertia: Tensor  # spatial inertias on the diagonal, (6 bodies, 6 bodies)
-    armature: Tensor  # what the rotors add to M, (n, n)
-    friction: FrictionConstants
-    input: Tensor
-    offset: Tensor  # what the measured torque shows without any, (n,)
-    compensation: Tensor  # what the drives add by velocity, unseen, (n,)
-    residual: Any = None  # of what a model has beside rigid bodies
-
-
-class Motion(NamedTuple):
-    """What is computed of a position alone."""
-
-    chain: Chain
-    momenta: Tensor  # of the chain's twists, by joint velocity, (..., n, 6 bodies)
-    gravity: Tensor  # dV/dq of the bodies, (..., n)
-    residual: Any = None  # of what a model has beside rigid bodies
-
-
-class RigidBodyDynamics(PortHamiltonian):
-    """Rigid bodies with trained inertial parameters, friction by laws, a trained torque offset."""
-
-    basis: Tensor
-    actuated: Tensor
-    motors: Tensor  # C: the drives' speeds are C qd, (n, n)
-    loads: Tensor  # its inverse
-    raw_friction_compensation: Tensor
-
-    def __init__(
-        self,
-        joints: Joints,
-        bodies: Bodies,
-        gravity: tuple[float, float, float],
-        input: DriveInput,
-        reach: Sequence[Sequence[float]] = (),
-    ) -> None:
-        super().__init__()
-        self.n, self.elements = joints.n, len(reach[0]) if reach else 0
-        self.chain = BodyChain(joints.n, bodies, gravity)
-        self.register_buffer("basis", inertia_basis())
-        self.register_buffer("actuated", vector(float(x) for x in joints.actuated))
-        self.inertial_parameters = InertialParameters(bodies)
-        self.armature = Armature(joints)
-        self.friction = FrictionLaws(joints, reach)
-        self.input = input
-        self.register_buffer("motors", self.input.motor_speeds())
-        self.register_buffer("loads", torch.linalg.inv(self.motors))
-        self.coupled = not torch.equal(self.motors, torch.eye(self.n).double())
-        # of the measured torque, in units of the joints' usual friction
-        self.raw_offset = nn.Parameter(torch.zeros(self.n, dtype=torch.float64))
-        # in units of usual friction at usual speed; no parameter: only a fit to torques may find one
-        self.register_buffer("raw_friction_compensation", torch.zeros(self.n, dtype=torch.float64))
-
-    def torque_offset(self) -> Tensor:
-        """What the measured torque shows without any, (n,) [Nm, N]."""
-        return self.raw_offset * self.friction.nominal * self.actuated
-
-    def friction_compensation(self) -> Tensor:
-        """What the drives add by velocity, unseen in the measured torque, (n,) [Nm s/rad, N s/m]."""
-        return self.raw_friction_compensation * self.friction.nominal / self.friction.speed * self.actuated
-
-    def prepare(self, definite: bool = True) -> RigidPrepared:
-        """All that depends on the weights alone; holds until they change."""
-        inertia = torch.tensordot(self.inertial_parameters(), self.basis, dims=1)
-        return RigidPrepared(
-            inertia=block_diagonal(inertia),
-            armature=self.motors.mT @ (self.armature().unsqueeze(-1) * self.motors),
-            friction=self.friction.prepare(),
-            input=self.input.prepare(),
-            offset=self.torque_offset(),
-            compensation=self.friction_compensation(),
-        )
-
-    def configuration(self, q: Tensor, prepared: RigidPrepared) -> Motion:
-        """How the bodies may move at q, and what they weigh there."""
-        chain: Chain = self.chain(q)
-        momenta = chain.twists @ prepared.inertia
-        return Motion(chain, momenta, applied(momenta, chain.weight))
-
-    def mass_at(self, at: Motion, prepared: RigidPrepared) -> tuple[Tensor, None]:
-        """M(q), (..., n, n)."""
-        return at.momenta @ at.chain.twists.mT + prepared.armature, None
-
-    def energy_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
-        """V(q), (...) [J]; zero for a mass at the base's origin."""
-        return self.chain.energy(at.chain, prepared.inertia)
-
-    def gravity_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
-        """dV/dq, (..., n) [Nm, N]."""
-        return at.gravity
-
-    def lagrangian_gradient(self, at: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
-        """d/dq of 1/2 qd^T M(q) qd - V(q), (..., n).
-
-        The kinetic part: the momentum of all that a joint carries, by what its displacement adds to
-        their twist.
-        """
-        momenta = self.chain.at_base(at.chain, combined(qd, at.momenta))
-        return self.chain.by_joints(self.chain.turning(at.chain, qd)[1], momenta) - at.gravity
-
-    def nonlinear_at(self, at: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
-        """The torque that holds qd steady without friction, (..., n), by Newton and Euler."""
-        chain = self.chain
-        twists, turning = chain.turning(at.chain, qd)
-        rising = applied(at.momenta, chain.accelerations(at.chain, qd, turning))
-        pushed = pushed_along(twists, chain.at_base(at.chain, combined(qd, at.momenta)))
-        return rising + chain.by_joints(at.chain.axes, pushed)
-
-    def regressor(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
-        """Y, (..., n, 10 bodies): Y @ inertial parameters is the bodies' torque."""
-        return self.chain.regressor(q, qd, qdd, self.basis)
-
-    def residual_torque(self, q: Tensor, qd: Tensor, qdd: Tensor, prepared: RigidPrepared) -> Tensor:
-        """What else than bodies, drives and friction takes torque, (..., n) [Nm, N]: nothing."""
-        return torch.zeros_like(q)
-
-    def friction_factor(self, q: Tensor) -> Tensor:
-        """How much more friction the drives have at q than their laws say, (..., n): nowhere any."""
-        return torch.ones_like(q)
-
-    def _varied(self, friction: Tensor, at: Motion) -> Tensor:
-        """The laws' friction of the drives as it is at this position, (..., n)."""
-        return friction
-
-    def _by_motors(self, joints: Tensor, matrix: Tensor) -> Tensor:
-        """Rows times a matrix that is the identity where each motor moves its own joint alone."""
-        return joints @ matrix if self.coupled else joints
-
-    def friction_at(self, at: Motion, qd: Tensor, prepared: RigidPrepared, z: Tensor | None = None) -> Tensor:
-        """The friction torque C^T f(C qd), (..., n) [Nm, N]."""
-        speeds, loads = self._by_motors(qd, self.motors.mT), self._by_motors(at.gravity, self.loads)
-        torque: Tensor = self.friction(speeds, loads, prepared.friction, z)
-        return self._by_motors(self._varied(torque, at), self.motors)
-
-    def stored_energy(self, z: Tensor, prepared: RigidPrepared) -> Tensor:
-        """What the bristles give back, (...) [J]."""
-        return self.friction.stored_energy(z, prepared.friction)
-
-    def memory(self, qd: Tensor) -> Tensor:
-        """z, (..., n, K), of drives that have long gone this way."""
-        return self.friction.sliding(qd @ self.motors.mT)
-
-    def memory_rate(self, qd: Tensor, z: Tensor) -> Tensor:
-        """z', (..., n, K)."""
-        return self.friction.bristles.rate(qd @ self.motors.mT, z)
-
-    def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
-        """z after joints went one way by (..., n), exactly."""
-        return self.friction.bristles.moved(z, displacement @ self.motors.mT)
-
-    def dissipation_at(self, at: Motion, qd: Tensor, prepared: RigidPrepared) -> Tensor:
-        """D(q, qd), (..., n, n), diagonal where each drive moves its own joint alone."""
-        speeds, loads = qd @ self.motors.mT, at.gravity @ self.loads
-        resistance = self.friction.resistance(speeds, loads, prepared.friction)
-        resistance = self._varied(resistance, at)
-        return self.motors.mT @ (resistance.unsqueeze(-1) * self.motors)
-
-    def input_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
-        """G, (..., n, n)."""
-        matrix: Tensor = self.input(at.gravity, prepared.input)
-        return matrix
-
-    def input_force(self, at: Motion, qd: Tensor, tau: Tensor, prepared: RigidPrepared) -> Tensor:
-        """G (tau - torque offset) + friction compensation qd, (..., n) [Nm, N]."""
-        force: Tensor = self.input.force(at.gravity, tau - prepared.offset, prepared.input)
-        return force + prepared.compensation * qd
-
-    def input_torque(self, at: Motion, qd: Tensor, force: Tensor, prepared: RigidPrepared) -> Tensor:
-        """The tau, (..., n), that is measured while the drives make this force."""
-        shown = force - prepared.compensation * qd
-        tau: Tensor = self.input.solve(at.gravity, shown, prepared.input)
-        return tau + prepared.offset
-
-
-class ResidualPrepared(NamedTuple):
-    """What depends on the weights alone."""
+class NetworkPrepared(NamedTuple):
+    """What depends on the weights alone, by part."""
 
     mass: Any
     potential: Any
-    functions: JointFunctionWeights
+    friction: Any
+    input: Any
 
 
-class ResidualMotion(NamedTuple):
-    """What residuals read of a position."""
+class NetworkDynamics(PortHamiltonian):
+    """The dynamics made of these parts; without a ``potential`` gravity does no work.
 
-    q: Tensor
-    encoded: Tensor
-    torque: Tensor  # of the joints' own functions, (..., n) [Nm, N]
-    factor: Tensor  # on friction, (..., n)
-
-
-class ResidualDynamics(RigidBodyDynamics):
-    """Rigid bodies with residuals in M, V and friction; with their weights zero they are bodies alone.
-
-    M = that of bodies and drives + R(q), positive definite for all weights (see ``ResidualMass``).
-    V = that of bodies + a network's + each joint's own. Friction is multiplied by a positive factor.
+    ``at``, all that is computed of q alone, is q as networks read it (see ``JointEncoding``).
     """
 
     def __init__(
         self,
-        joints: Joints,
-        bodies: Bodies,
-        gravity: tuple[float, float, float],
-        input: DriveInput,
-        mass: ResidualMass,
+        encoding: JointEncoding,
+        mass: Mass,
         potential: LearnedPotential | None,
-        reach: Sequence[Sequence[float]] = (),
+        friction: Friction,
+        input: Input,
     ) -> None:
-        super().__init__(joints, bodies, gravity, input, reach)
-        self.encoding = JointEncoding(joints)
-        self.joint_functions = JointFunctions(joints)
-        self.residual_mass = mass
-        self.residual_potential = potential
+        super().__init__()
+        self.n, self.elements = len(encoding.center), 0
+        self.encoding = encoding
+        # Any: what a part has beside its protocol is there to be asked for
+        self.mass: Any = mass
+        self.friction: Any = friction
+        self.input: Any = input
+        self.potential = potential
 
-    def prepare(self, definite: bool = True) -> RigidPrepared:
+    def prepare(self, definite: bool = True) -> NetworkPrepared:
         """All that depends on the weights alone; holds until they change."""
-        prepared = super().prepare(definite)
-        potential = None if self.residual_potential is None else self.residual_potential.prepare()
-        mass = self.residual_mass.prepare(prepared.armature)
-        functions = self.joint_functions.prepare()
-        return prepared._replace(residual=ResidualPrepared(mass, potential, functions))
+        return NetworkPrepared(
+            mass=self.mass.prepare(definite),
+            potential=None if self.potential is None else self.potential.prepare(),
+            friction=self.friction.prepare(),
+            input=self.input.prepare(),
+        )
 
-    def configuration(self, q: Tensor, prepared: RigidPrepared) -> Motion:
-        """How the bodies may move at q, and what residuals read of q."""
-        return super().configuration(q, prepared)._replace(residual=self._read(q, prepared))
+    def configuration(self, q: Tensor, prepared: NetworkPrepared) -> Tensor:
+        """What networks read of q."""
+        encoded: Tensor = self.encoding(q)
+        return encoded
 
-    def _read(self, q: Tensor, prepared: RigidPrepared) -> ResidualMotion:
-        return ResidualMotion(q, self.encoding(q), *self.joint_functions(q, prepared.residual.functions))
-
-    def mass_at(self, at: Motion, prepared: RigidPrepared) -> tuple[Tensor, Any]:
+    def mass_at(self, at: Tensor, prepared: NetworkPrepared) -> tuple[Tensor, Any]:
         """M(q), (..., n, n), and what its derivatives need."""
-        more, residuals = self.residual_mass(at.residual.encoded, prepared.residual.mass)
-        return super().mass_at(at, prepared)[0] + more, residuals
+        found: tuple[Tensor, Any] = self.mass(at, prepared.mass)
+        return found
 
-    def energy_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
+    def energy_at(self, at: Tensor, prepared: NetworkPrepared) -> Tensor:
         """V(q), (...) [J]."""
-        energy = super().energy_at(at, prepared) + self.joint_functions.energy(at.residual.q)
-        if self.residual_potential is None:
-            return energy
-        more: Tensor = self.residual_potential(at.residual.encoded, prepared.residual.potential)
-        return energy + more
+        if self.potential is None:
+            return at.new_zeros(at.shape[:-1])
+        energy: Tensor = self.potential(at, prepared.potential)
+        return energy
 
-    def gravity_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
+    def gravity_at(self, at: Tensor, prepared: NetworkPrepared) -> Tensor:
         """dV/dq, (..., n) [Nm, N]."""
-        kinetic = torch.zeros_like(at.residual.encoded)
-        return at.gravity - self._gradient(at.residual, kinetic, prepared)
+        if self.potential is None:
+            return torch.zeros_like(at[..., : self.n])
+        gradient: Tensor = self.encoding.vjp(at, self.potential.vjp(at, prepared.potential))
+        return gradient
 
-    def lagrangian_gradient(self, at: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
+    def lagrangian_gradient(
+        self, at: Tensor, qd: Tensor, residuals: Any, prepared: NetworkPrepared
+    ) -> Tensor:
         """d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
-        kinetic = self.residual_mass.kinetic_vjp(at.residual.encoded, qd, residuals)
-        own = self._gradient(at.residual, kinetic, prepared)
-        return super().lagrangian_gradient(at, qd, None, prepared) + own
+        by_encoded = self.mass.kinetic_vjp(at, qd, residuals)
+        if self.potential is not None:
+            by_encoded = by_encoded - self.potential.vjp(at, prepared.potential)
+        gradient: Tensor = self.encoding.vjp(at, by_encoded)
+        return gradient
 
-    def nonlinear_at(self, at: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
-        """The torque that holds qd steady without friction, (..., n)."""
-        own = self._nonlinear(at.residual, qd, residuals, prepared)
-        return super().nonlinear_at(at, qd, None, prepared) + own
+    def nonlinear_at(self, at: Tensor, qd: Tensor, residuals: Any, prepared: NetworkPrepared) -> Tensor:
+        """dM/dt qd - d/dq (1/2 qd^T M qd) + dV/dq, (..., n)."""
+        gradient = self.lagrangian_gradient(at, qd, residuals, prepared)
+        mass_rate: Tensor = self.mass.jvp(self.encoding.jvp(at, qd), residuals)
+        return applied(mass_rate, qd) - gradient
 
-    def residual_torque(self, q: Tensor, qd: Tensor, qdd: Tensor, prepared: RigidPrepared) -> Tensor:
-        """What the residuals of M and V take, (..., n) [Nm, N]."""
-        read = self._read(q, prepared)
-        mass, residuals = self.residual_mass(read.encoded, prepared.residual.mass)
-        return applied(mass, qdd) + self._nonlinear(read, qd, residuals, prepared)
+    def friction_at(
+        self, at: Tensor, qd: Tensor, prepared: NetworkPrepared, z: Tensor | None = None
+    ) -> Tensor:
+        """D(q, qd) qd, (..., n) [Nm, N]; this friction has no memory."""
+        torque: Tensor = self.friction(at, qd, prepared.friction)
+        return torque
 
-    def friction_factor(self, q: Tensor) -> Tensor:
-        """How much more friction the drives have at q than their laws say, (..., n)."""
-        factor: Tensor = self.joint_functions(q, self.joint_functions.prepare())[1]
-        return factor
+    def dissipation_at(self, at: Tensor, qd: Tensor, prepared: NetworkPrepared) -> Tensor:
+        """D(q, qd), (..., n, n)."""
+        matrix: Tensor = self.friction.dissipation(at, qd, prepared.friction)
+        return matrix
 
-    def _varied(self, friction: Tensor, at: Motion) -> Tensor:
-        """The laws' friction of the drives as it is at this position, (..., n)."""
-        factor: Tensor = at.residual.factor
-        return factor * friction
+    def input_at(self, at: Tensor, prepared: NetworkPrepared) -> Tensor:
+        """G(q), (..., n, n)."""
+        matrix: Tensor = self.input(at, prepared.input)
+        return matrix
 
-    def _nonlinear(self, read: ResidualMotion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
-        """dR/dt qd - d/dq of what the residuals add to 1/2 qd^T M(q) qd - V(q), (..., n)."""
-        rate = self.encoding.jvp(read.encoded, qd)
-        moved, kinetic = self.residual_mass.coriolis(rate, qd, residuals)
-        return moved - self._gradient(read, kinetic, prepared)
+    def input_force(self, at: Tensor, qd: Tensor, tau: Tensor, prepared: NetworkPrepared) -> Tensor:
+        """G tau, (..., n) [Nm, N]."""
+        force: Tensor = self.input.force(at, tau, prepared.input)
+        return force
 
-    def _gradient(self, read: ResidualMotion, kinetic: Tensor, prepared: RigidPrepared) -> Tensor:
-        """d/dq of what the residuals add to 1/2 qd^T M(q) qd - V(q), (..., n); kinetic: by the encoding."""
-        if self.residual_potential is not None:
-            kinetic = kinetic - self.residual_potential.vjp(read.encoded, prepared.residual.potential)
-        gradient: Tensor = self.encoding.vjp(read.encoded, kinetic)
-        return gradient - read.torque
+    def input_torque(self, at: Tensor, qd: Tensor, force: Tensor, prepared: NetworkPrepared) -> Tensor:
+        """The tau, (..., n), that makes this force."""
+        tau: Tensor = self.input.solve(at, force, prepared.input)
+        return tau

@@ -1,19 +1,21 @@
-r"""Port-Hamiltonian model of an arm with 2 joints, written by `spelgen build`.
+r"""Port-Hamiltonian model of an arm with 3 joints, written by `spelgen build`.
 
-2 rigid bodies with trained inertial parameters;
-networks for what they leave: 1 learned function of q and 2 constants in M.
-The potential energy depends on joints 1,2.
+3 rigid bodies with trained inertial parameters;
+networks for what they leave: 3 learned functions of q and 2 constants in M.
+The potential energy depends on joint 3.
 Sizes and starting values are the URDF's inertials.
 
 Mass matrix: the joints each entry depends on, C where it is constant, . where it is always zero.
 
-    2
-    2   C
+    2,3
+    3    C
+    2,3  .    C
 
 Joints, in the order of q, qd and tau:
 
-    1  "joint1"  revolute   rad, Nm  -3.14159 .. 3.14159
-    2  "joint2"  revolute   rad, Nm  -3.14159 .. 3.14159
+    1  "joint1"  revolute   rad, Nm  -2.96706 .. 2.96706
+    2  "joint2"  prismatic  m, N     0.305 .. 1.27
+    3  "joint3"  revolute   rad, Nm  -2.96706 .. 2.96706
 """
 
 from __future__ import annotations
@@ -27,67 +29,73 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-FACTS = r"""{"robot": "two_link", "urdf": "two_link.urdf",
- "urdf_sha256": "d5393c842e189b72219c5ce02e115de571a94cd406b48898ea64b5431a395232",
- "spec_sha256": "b4138f8bb8b1a04fcfacd45e8d2ed91fd58f4226734d6128db1122af41cc1705",
+FACTS = r"""{"robot": "rpr", "urdf": "rpr.urdf",
+ "urdf_sha256": "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d",
+ "spec_sha256": "765da56814f8b95376bd87633bc5dfaec8f5161fa9db5448b6d7d871c48b3080",
  "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,
-  "net": "mlp", "preset": "minimal", "tip": null, "width": 64},
- "joints": {"joint1": "revolute", "joint2": "revolute"}}"""
+  "net": "mlp", "preset": "hybrid", "tip": null, "width": 64},
+ "joints": {"joint1": "revolute", "joint2": "prismatic", "joint3": "revolute"}}"""
 
 
 class Model(nn.Module):
-    """The arm's dynamics: 2 rigid bodies with trained inertial parameters, and networks for what they leave.
+    """The arm's dynamics: 3 rigid bodies with trained inertial parameters, and networks for what they leave.
 
     q, qd, qdd, tau and p are (..., n), with any leading dimensions; rad and Nm, m and N if prismatic. For all
     weights M is positive definite, D positive semi-definite. ``prepared``: what ``prepare`` gave, for speed.
     z, (..., n, 4), friction's memory, is how far its bristles are bent [rad, m]; None: they slide as qd goes.
     """
 
-    n = 2
-    joint_names = ("joint1", "joint2")
-    joint_types = ("revolute", "revolute")
+    n = 3
+    joint_names = ("joint1", "joint2", "joint3")
+    joint_types = ("revolute", "prismatic", "revolute")
 
     def __init__(self, seed: int = 0, dtype: torch.dtype = torch.float64) -> None:
         super().__init__()
         joints = Joints(
-            revolute=(True, True), center=(0.0, 0.0), reach=(3.14159, 3.14159), speed=(10.0, 10.0),
-            friction=(1.0, 1.0), armature=(0.1, 0.1), gear=(1.0, 1.0), actuated=(True, True),
+            revolute=(True, False, True), center=(0.0, 0.7875, 0.0), reach=(2.96706, 0.4825, 2.96706),
+            speed=(3.0, 1.0, 6.0), friction=(0.4, 0.4, 0.4), armature=(2.19, 0.782, 0.106),
+            gear=(1.0, 1.0, 1.0), actuated=(True, True, True),
         )  # fmt: skip
         bodies = Bodies(
-            parent=(-1, 0), joint=(0, 1), revolute=(True, True), ratio=(1.0, 1.0), offset=(0.0, 0.0),
+            parent=(-1, 0, 1), joint=(0, 1, 2), revolute=(True, False, True), ratio=(1.0, 1.0, 1.0),
+            offset=(0.0, 0.0, 0.0),
             rotation=(
                 ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
-                ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+                ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
+                ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
             ),
-            position=((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), mass=(1.0, 1.0),
-            moment=((0.5, 0.0, 0.0), (0.5, 0.0, 0.0)), inertia=((0.6, 0.85, 1.25), (0.6, 0.85, 1.25)),
-            products=((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+            position=((0.0, 0.0, 0.0), (0.0, 0.0, 0.154), (0.0, -0.0203, 0.0)), mass=(5.01, 4.25, 1.08),
+            moment=((0.0, 0.0, -4.48896), (0.0, -0.086275, -27.4125), (0.0, 0.09936, -0.05832)),
+            inertia=(
+                (4.13010816, 4.12210816, 0.018), (179.3223764, 179.320625, 0.0077513825),
+                (0.0142904, 0.00425851, 0.0102504),
+            ),
+            products=((0.0, 0.0, 0.0), (0.0, 0.0, -0.55647375), (0.0, 0.0, 0.00536544)),
         )  # fmt: skip
         generator = torch.Generator().manual_seed(seed)
-        functions = ((1,),)
+        functions = ((2,),) + ((1, 2),) * 2
         network = MaskedMLP(
-            joint_input(joints, (1,), (0.02, 1.0)), unit_joints(functions, width=64, depth=2, least=4),
-            generator,
+            joint_input(joints, (1, 2), (0.02, 1.0, 0.518)),
+            unit_joints(functions, width=64, depth=2, least=4), generator,
         )  # fmt: skip
-        mass = ResidualMass(joints, self.mass_entries, 1, 2, network)
+        mass = ResidualMass(joints, self.mass_entries, 3, 2, network)
         network = MaskedMLP(
-            joint_input(joints, (0, 1), (1.0, 0.307)), unit_joints(((0, 1),), width=32, depth=2), generator
+            joint_input(joints, (2,), (0.02, 0.02, 1.0)), unit_joints(((2,),), width=32, depth=2), generator
         )
-        potential = LearnedPotential(10.8194, network)
+        potential = LearnedPotential(0.703291, network)
         self.dynamics = ResidualDynamics(
-            joints, bodies, (0.0, -9.81, 0.0), DirectInput(joints), mass, potential,
-            reach=((0.0001, 0.001, 0.01, 0.1), (0.0001, 0.001, 0.01, 0.1)),
+            joints, bodies, (0.0, 0.0, -9.81), DirectInput(joints), mass, potential,
+            reach=((0.0001, 0.001, 0.01, 0.1), (1e-05, 0.0001, 0.001, 0.01), (0.0001, 0.001, 0.01, 0.1)),
         )  # fmt: skip
         self.to(dtype)
 
     @staticmethod
     def mass_entries(f: Sequence[Tensor], c: Sequence[Tensor]) -> Tensor:
         """R, what M has beside rigid bodies, (..., n, n), by its functions f(q) and its constants c."""
-        # f1(q2)
-        (f1,) = f
+        # f1(q3), f2(q2,3), f3(q2,3)
+        f1, f2, f3 = f
         c1, c2 = c
-        m11 = 2 * f1 + c2
-        return symmetric([m11], [f1, c1])
+        return symmetric([f3], [f1, c2], [f2, 0, c1])
 
     @property
     def inertial_parameters(self) -> Tensor:
