@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from spelgen.baselines.keep import keep_baseline
     from spelgen.building import build
+    from spelgen.certificate.inspection import Inspection
     from spelgen.design import Design
     from spelgen.dynamics.tip import tip_kinematics
     from spelgen.emission.loading import load_module
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from spelgen.identification.identification import Identification
     from spelgen.identification.identify import identify
     from spelgen.identification.method import LeastSquares
-    from spelgen.inspection import Inspection
     from spelgen.loaded_arm import LoadedArm, load_arm
     from spelgen.log_checks.check_logs import check_logs
     from spelgen.logs.preprocessing import Preprocessing

@@ -10,18 +10,18 @@ from typing import TYPE_CHECKING
 
 from spelgen.arm.actuation import Actuation, derive_actuation
 from spelgen.arm.arm import Arm, make_arm
+from spelgen.certificate.inspection import Inspection
+from spelgen.certificate.verification import Verification
 from spelgen.errors import Diagnostic
-from spelgen.inspection import Inspection
 from spelgen.settings.settings import Settings, load_settings
 from spelgen.spec import Assume
 from spelgen.structure.base_parameters import BaseParameter, base_parameters
 from spelgen.structure.structure import Structure, derive
 from spelgen.urdf.read import read_urdf
 from spelgen.urdf.robot import Robot
-from spelgen.verify.agreement import Verification
 
 if TYPE_CHECKING:  # SymPy is read in only for formulas
-    from spelgen.formulas.formulas import Entry, Formulas
+    from spelgen.certificate.formulas import Entry, Formulas
 
 
 @dataclass(frozen=True, repr=False)
@@ -71,7 +71,7 @@ class LoadedArm:
 
     def verify(self, assume: Assume = "kinematics") -> Verification:
         """The structure once more, by numbers and by other programs. Raises SpelgenError without Pinocchio."""
-        from spelgen.verify.verify import verify
+        from spelgen.certificate.verify import verify
 
         return verify(self.robot, self.arm, self.structure_for(assume))
 
@@ -83,7 +83,7 @@ class LoadedArm:
 
         ``longest``: terms of what is still written out; None: as many as a person reads.
         """
-        from spelgen.formulas.formulas import formulas
+        from spelgen.certificate.formulas import formulas
 
         return formulas(self.arm, self.structure_for(assume), entry=entry, longest=longest)
 

@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from spelgen.certificate.inspection import Inspection
+from spelgen.certificate.verification import Verification
 from spelgen.design import PRESET_NAMES, Design, Net, load_design
 from spelgen.emission.emit import emit
 from spelgen.emission.plan import plan_model
 from spelgen.errors import ModuleError
-from spelgen.inspection import Inspection
 from spelgen.loaded_arm import LoadedArm, load_arm
 from spelgen.spec import Assume, Facts, ModelSpec, Options, read_facts
-from spelgen.verify.agreement import Verification
 
 
 def inspect(

@@ -14,6 +14,7 @@ from types import ModuleType
 import numpy as np
 import torch
 from flint import fmpq_mpoly
+from polynomials import polynomials
 from torch import nn
 
 from spelgen.design import Design
@@ -22,7 +23,6 @@ from spelgen.loaded_arm import LoadedArm, load_arm
 from spelgen.pipeline import make_spec
 from spelgen.spec import Options
 from spelgen.structure.structure import Structure
-from spelgen.structure.symbolic import polynomials
 
 ROBOTS = Path(__file__).parents[1] / "robots"
 GANTRY = """<robot name="gantry"><link name="base"/><link name="bridge"/><link name="trolley"/>

@@ -15,11 +15,11 @@ from formulas_read import assert_equal_to_pinocchio, read_back
 from typer.testing import CliRunner
 
 from spelgen.arm.arm import make_arm
+from spelgen.certificate.formula_files import sympy_source
+from spelgen.certificate.formula_text import text, to_dict
+from spelgen.certificate.formulas import formulas
 from spelgen.cli.main import app
 from spelgen.errors import SpelgenError
-from spelgen.formulas.files import sympy_source
-from spelgen.formulas.formulas import formulas
-from spelgen.formulas.text import text, to_dict
 from spelgen.loaded_arm import load_arm
 from spelgen.pipeline import inspect
 from spelgen.structure.structure import derive

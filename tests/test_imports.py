@@ -21,8 +21,8 @@ ROWS = """
 errors addresses files labels listing templates runtime
 settings urdf arm design spec
 structure dynamics
-explain formulas verify emission logs
-inspection loaded_arm pipeline building trust
+certificate emission logs
+loaded_arm pipeline building trust
 identification log_checks excitation
 fitting simulation
 evaluation exporting
@@ -38,7 +38,7 @@ OURS = {f"spelgen.{name}" for name in LAYERS}
 # What a file may not import, neither itself nor through others.
 SYMBOLIC = {"sympy", "flint", "spelgen.arm", "spelgen.structure"}
 PLAIN = {"spelgen.arm.actuation"}  # G by the files, without the exact arithmetic of its room
-ROOMS_THAT_DERIVE = ("urdf.", "arm.", "structure.", "emission.", "verify.", "explain.", "formulas.")
+ROOMS_THAT_DERIVE = ("urdf.", "arm.", "structure.", "emission.", "certificate.")
 DERIVES = [x for x in LAYERS if x.startswith(ROOMS_THAT_DERIVE) and x != "emission.loading"]
 OF_A_RUN = {f"render.{name}" for name in ("charts", "plots", "picture", "page", "learned", "scene")}
 FITS = [x for x in LAYERS if x.startswith(("logs.", "fitting.", "evaluation."))]

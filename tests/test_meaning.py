@@ -12,13 +12,13 @@ from arms import STRAIGHT, chain, reference_arms
 from seen_arm import NOTHING, Seen
 
 from spelgen.arm.arm import Arm, make_arm
-from spelgen.arm.axes import is_plain
-from spelgen.explain.facts import Fact, facts
+from spelgen.certificate.axes import is_plain
+from spelgen.certificate.facts import Fact, facts
+from spelgen.certificate.numeric_samples import draw
 from spelgen.pipeline import inspect
 from spelgen.structure.recursion import triangle
 from spelgen.structure.structure import Structure, derive
 from spelgen.urdf.read import read_urdf
-from spelgen.verify.numeric_samples import draw
 
 LAST = (
     "M{n}{n} is constant: joint {n} is the last, so the inertia about its axis stays the same. "

@@ -6,10 +6,10 @@ import re
 import pytest
 
 from spelgen.arm.arm import make_arm
+from spelgen.certificate.verify import verify
 from spelgen.errors import SpelgenError
 from spelgen.structure.structure import derive
 from spelgen.urdf.read import read_urdf
-from spelgen.verify.verify import verify
 
 # file -> a part of every line of the refusal
 REFUSED = {

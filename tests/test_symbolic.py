@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from arms import planar, random_arm
 from flint import fmpq_mat
+from polynomials import Polynomials, polynomials
 
 from spelgen.loaded_arm import load_arm
 from spelgen.structure.recursion import triangle
 from spelgen.structure.structure import derive
-from spelgen.structure.symbolic import Polynomials, polynomials
 
 ROBOTS = ["two_link", "rpr", "scara", "six_dof", "ur10e", "panda"]
 

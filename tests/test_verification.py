@@ -5,9 +5,9 @@ from fractions import Fraction
 
 import pytest
 
+from spelgen.certificate.verify import verify
 from spelgen.loaded_arm import load_arm
 from spelgen.structure.structure import Entry, derive
-from spelgen.verify.verify import verify
 
 ROBOTS = ("two_link", "rpr", "six_dof", "scara", "panda", "ur10e")
 

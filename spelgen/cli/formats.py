@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Literal
 from spelgen.cli.console import note
 
 if TYPE_CHECKING:
-    from spelgen.formulas.formulas import Entry, Formulas
-    from spelgen.inspection import Inspection
-    from spelgen.verify.agreement import Verification
+    from spelgen.certificate.formulas import Entry, Formulas
+    from spelgen.certificate.inspection import Inspection
+    from spelgen.certificate.verification import Verification
 
 Format = Literal["text", "json", "html", "latex", "sympy"]
 
@@ -31,22 +31,22 @@ def rendered(
     """
     closed = None
     if formulas or entry is not None or format in ("latex", "sympy"):
-        from spelgen.formulas import files, text
-        from spelgen.formulas.formulas import WRITABLE
+        from spelgen.certificate import formula_files, formula_text
+        from spelgen.certificate.formulas import WRITABLE
 
         longest = WRITABLE if format in ("json", "sympy") else None
         closed = found.closed_forms(entry, longest=longest)
     if closed and format in ("latex", "sympy"):
         _tell(closed, proof)
-        return files.latex(closed) if format == "latex" else files.sympy_source(closed)
+        return formula_files.latex(closed) if format == "latex" else formula_files.sympy_source(closed)
     if format == "html":
         from spelgen.render.inspection_page import page
 
         return page(found, closed, proof, urdf)
     if format == "text":
-        told = found.text() if closed is None else text.text(closed)
+        told = found.text() if closed is None else formula_text.text(closed)
         return told + (f"\n\n{proof.text()}" if proof else "") + "\n"
-    data = found.to_dict() | ({"formulas": text.to_dict(closed)} if closed else {})
+    data = found.to_dict() | ({"formulas": formula_text.to_dict(closed)} if closed else {})
     return json.dumps(data | ({"verification": proof.to_dict()} if proof else {}), indent=2) + "\n"
 
 

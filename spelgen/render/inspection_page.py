@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from spelgen.inspection import Inspection, reach
+from spelgen.certificate.inspection import Inspection, reach
+from spelgen.certificate.verification import Verification
 from spelgen.render.arm_section import arm_section, matrix
 from spelgen.render.page import render_page
-from spelgen.verify.agreement import Verification
 
 if TYPE_CHECKING:
-    from spelgen.formulas.formulas import Formulas
+    from spelgen.certificate.formulas import Formulas
 
 _WIDTH = 100  # of the closed forms
 
@@ -28,7 +28,7 @@ def page(
     """
     text = None
     if closed:  # SymPy is read in only for formulas
-        from spelgen.formulas.text import text as written
+        from spelgen.certificate.formula_text import text as written
 
         text = written(closed, _WIDTH)
     return render_page(

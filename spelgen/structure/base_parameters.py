@@ -18,9 +18,8 @@ from flint import fmpq, fmpq_mat
 
 from spelgen.arm.arm import Arm
 from spelgen.structure import field
-from spelgen.structure.recursion import energies, triangle
+from spelgen.structure.recursion import PARAMETERS, energies, triangle
 from spelgen.structure.sampling import Position, motions
-from spelgen.structure.symbolic import PARAMETERS
 
 # Parameters that stand for a group if they can; Iyy, hz and m of a turning body can always be regrouped.
 _PREFERRED = ("Izz", "Ixx", "Ixy", "Ixz", "Iyz", "hx", "hy", "m", "Iyy", "hz")

@@ -70,7 +70,7 @@ class Budget:
 
 
 class Expansion:
-    """The recursion of ``arm``, written down over c1, s1, q1, c2, ... as in ``symbolic``."""
+    """The recursion of ``arm``, written down over c1, s1, q1, c2, ... three variables a coordinate."""
 
     def __init__(self, arm: Arm):
         n = len(arm.coordinates)

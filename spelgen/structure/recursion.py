@@ -2,7 +2,7 @@
 
 The composite-inertia recursion (Featherstone, *Rigid Body Dynamics Algorithms*, 2008, ch. 6) only adds,
 negates and multiplies, so the same lines serve floating-point numbers (nominal values), a prime field
-(``structure``) and polynomials (``symbolic``). Each body carries ten inertial parameters (m, h = m c, I
+(``structure``) and polynomials (``expansion``). Each body carries ten inertial parameters (m, h = m c, I
 about its joint's origin), in which M and V are linear. A body turns about or slides along the z axis of
 its own joint frame.
 """
@@ -21,6 +21,9 @@ Element = Any
 
 Vector = tuple[Element, Element, Element]
 Terms = tuple[tuple[int, Element], ...]
+
+PARAMETERS = ("m", "hx", "hy", "hz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
+"""Names of a body's ten inertial parameters, in their order."""
 
 TENSOR = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """Order of the six tensor components of a ten-vector: Ixx, Ixy, Ixz, Iyy, Iyz, Izz."""

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from spelgen.arm.axes import Axes
 from spelgen.arm.rational import ZERO
+from spelgen.certificate.axes import Axes
 from spelgen.labels import axes_told, entry_name, joints_told
 from spelgen.structure.structure import Entry, Structure
 

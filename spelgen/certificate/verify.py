@@ -14,17 +14,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from spelgen.arm.arm import Arm
+from spelgen.certificate.urdf_cross_check import urdf_cross_check
+from spelgen.certificate.verification import Check, Verdict, Verification, size_told
 from spelgen.errors import SpelgenError
 from spelgen.labels import entry_name, joints_in_ranges
 from spelgen.structure.basis import Weights
 from spelgen.structure.recursion import triangle
 from spelgen.structure.structure import Structure
 from spelgen.urdf.robot import Robot
-from spelgen.verify.agreement import Check, Verdict, Verification, size_told
-from spelgen.verify.urdf_cross_check import urdf_cross_check
 
 if TYPE_CHECKING:
-    from spelgen.verify.numeric_samples import NumericSamples
+    from spelgen.certificate.numeric_samples import NumericSamples
 
 ROUNDING = 1e-12
 """Fraction of its scale below which a number is taken for rounding; what is found is told beside it."""
@@ -81,7 +81,7 @@ def verify(robot: Robot, arm: Arm, structure: Structure, *, samples: int = 0, se
     ``samples`` is how many; never fewer than show the ranks. Raises SpelgenError without Pinocchio.
     """
     try:
-        from spelgen.verify import numeric_samples
+        from spelgen.certificate import numeric_samples
     except ModuleNotFoundError as missing:
         if (missing.name or "").split(".")[0] != "pinocchio":
             raise

@@ -10,8 +10,8 @@ from dataclasses import asdict, dataclass
 from fractions import Fraction
 
 from spelgen.arm.arm import Arm
-from spelgen.arm.axes import Axes, is_plain
-from spelgen.explain import reasons
+from spelgen.certificate import reasons
+from spelgen.certificate.axes import Axes, is_plain
 from spelgen.labels import axes_told, entry_name, joints_told, listed
 from spelgen.structure.basis import Constant, Output
 from spelgen.structure.structure import Entry, Structure

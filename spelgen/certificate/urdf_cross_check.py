@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from spelgen.arm.arm import Arm
+from spelgen.certificate.verification import Check, Verdict, size_told
 from spelgen.urdf.robot import Joint, Link, Robot
-from spelgen.verify.agreement import Check, Verdict, size_told
 
 _ROUNDING = 1e-9
 """What composed rotations (1e-11 each) and dropped offsets (below 1e-9 m) may add up to, per joint."""

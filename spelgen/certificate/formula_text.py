@@ -5,8 +5,8 @@ from __future__ import annotations
 import textwrap
 from typing import Any
 
-from spelgen.formulas.formulas import WRITABLE, Formulas
-from spelgen.formulas.printing import Text
+from spelgen.certificate.formulas import WRITABLE, Formulas
+from spelgen.certificate.printing import Text
 from spelgen.labels import printable
 
 _LONGEST_NAME = 36

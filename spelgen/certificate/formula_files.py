@@ -11,8 +11,8 @@ from collections.abc import Iterable
 
 from sympy import Expr, Symbol
 
-from spelgen.formulas.formulas import Formulas
-from spelgen.formulas.printing import Latex, Python
+from spelgen.certificate.formulas import Formulas
+from spelgen.certificate.printing import Latex, Python
 
 _LATEX_WIDTH = 140
 _PYTHON_WIDTH = 100

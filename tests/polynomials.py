@@ -16,10 +16,8 @@ from flint import Ordering, fmpq, fmpq_mpoly, fmpq_mpoly_ctx
 
 from spelgen.arm.arm import Arm
 from spelgen.structure.basis import Weights
-from spelgen.structure.recursion import energies
+from spelgen.structure.recursion import PARAMETERS, energies
 from spelgen.structure.sampling import Position, motions
-
-PARAMETERS = ("m", "hx", "hy", "hz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
 
 
 @dataclass(frozen=True)

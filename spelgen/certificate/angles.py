@@ -10,8 +10,8 @@ from flint import fmpq, fmpz_poly
 from sympy import Add, Expr, cos, sin
 
 from spelgen.arm.arm import Arm
-from spelgen.arm.axes import Axes, is_plain
-from spelgen.formulas.terms import Factors
+from spelgen.certificate.axes import Axes, is_plain
+from spelgen.certificate.terms import Factors
 
 
 def parallel_runs(arm: Arm) -> list[dict[int, int]]:

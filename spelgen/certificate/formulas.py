@@ -16,10 +16,10 @@ from flint import fmpq, fmpq_mpoly, fmpq_mpoly_ctx
 from sympy import Expr, Matrix, Rational, Symbol
 
 from spelgen.arm.arm import Arm
+from spelgen.certificate.printing import Latex
+from spelgen.certificate.shortening import Shortener
+from spelgen.certificate.terms import coordinate, expression, grouped, parameter
 from spelgen.errors import SpelgenError
-from spelgen.formulas.printing import Latex
-from spelgen.formulas.shortening import Shortener
-from spelgen.formulas.terms import coordinate, expression, grouped, parameter
 from spelgen.labels import entry_name
 from spelgen.listing import Listing
 from spelgen.structure.base_parameters import BaseParameter, base_parameters, parameter_name

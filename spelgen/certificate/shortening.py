@@ -16,8 +16,17 @@ from flint import fmpq, fmpq_mpoly, fmpq_mpoly_ctx
 from sympy import Add, Expr, Pow, Rational, cos, sin
 
 from spelgen.arm.arm import Arm
-from spelgen.formulas.angles import multiple_angles, parallel_runs
-from spelgen.formulas.terms import Factors, Terms, collected, coordinate, expression, length, ordered, times
+from spelgen.certificate.angles import multiple_angles, parallel_runs
+from spelgen.certificate.terms import (
+    Factors,
+    Terms,
+    collected,
+    coordinate,
+    expression,
+    length,
+    ordered,
+    times,
+)
 from spelgen.structure.sampling import base_denominators
 
 _MOST_TERMS = 60

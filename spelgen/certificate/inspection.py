@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from spelgen.arm.actuation import Actuation
 from spelgen.arm.arm import Arm, Coordinate
+from spelgen.certificate.facts import Fact, facts
 from spelgen.dynamics.servo_rank import servo_rank
 from spelgen.errors import Diagnostic
-from spelgen.explain.facts import Fact, facts
 from spelgen.labels import joint_ranges, joints_in_ranges, printable
 from spelgen.listing import Listing
 from spelgen.structure.structure import Entry, Structure
 
 if TYPE_CHECKING:  # SymPy is read in only for formulas
-    from spelgen.formulas.formulas import Entry as PlaceOfEntry
-    from spelgen.formulas.formulas import Formulas
+    from spelgen.certificate.formulas import Entry as PlaceOfEntry
+    from spelgen.certificate.formulas import Formulas
 
 SCHEMA = 1
 POSITION = "the springs of position servos: tau = clip(kp (u - q) - kd qd), which store 1/2 kp (q - u)^2"
@@ -42,7 +42,7 @@ class Inspection:
 
     def closed_forms(self, entry: PlaceOfEntry | None = None, *, longest: int | None = None) -> Formulas:
         """M and V, or one entry, as expressions; arguments and errors as for ``formulas.formulas.formulas``."""
-        from spelgen.formulas.formulas import formulas
+        from spelgen.certificate.formulas import formulas
 
         return formulas(self.arm, self.structure, entry=entry, longest=longest)
 

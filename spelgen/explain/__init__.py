@@ -1,1 +1,0 @@
-"""The structure said in words: facts, and the reasons for them."""

@@ -1,1 +1,0 @@
-"""The structure derived a second time, by other means."""
