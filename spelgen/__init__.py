@@ -36,7 +36,7 @@ _HOME = {
     "load_arm": "loaded_arm",
     "LoadedArm": "loaded_arm",
     "inspect": "pipeline",
-    "Inspection": "inspection",
+    "Inspection": "certificate.inspection",
     "generate": "pipeline",
     "Design": "design",
     "build": "building",
