@@ -29,7 +29,7 @@ from spelgen.pipeline import generate
 from spelgen.simulation.simulate import simulate
 
 URDF = Path(__file__).parents[1] / "robots" / "rpr.urdf"
-ADAMW = ["--optimizer", "adamw", "--batch", "8", "--momentum-steps", "0"]
+ADAMW = ["--set", "optimizer=adamw", "--set", "batch=8", "--set", "momentum_steps=0"]
 LONGEST, SHORTER = 6.0, 2.0  # [s] from the first write of a process to its death; of servos, which end sooner
 
 
@@ -52,7 +52,7 @@ def main() -> None:
         (folder / "module.py").write_text(source)
         options = ["--quiet", "--robot", str(urdf)] + ([] if asked.servos else ADAMW)
         epochs = str(20 + 16 * kills)  # of some 0.2 s: more than are done before the last kill
-        always = [] if asked.servos else ["--epochs", epochs, "--patience", epochs]
+        always = [] if asked.servos else ["--set", f"epochs={epochs}", "--set", f"patience={epochs}"]
 
         def command(run: Path, *, resume: bool) -> list[str]:
             said = ["--resume"] if resume else options

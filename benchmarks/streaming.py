@@ -51,7 +51,14 @@ def main() -> None:
         command = ["train", "module.py", "--data", "train.parquet", "-o", "run", "--quiet"]
         command += ["--robot", str(URDF)]
         if chosen.preset not in ("closed-form", "hybrid"):
-            command += ["--epochs", str(chosen.epochs), "--momentum-steps", "200", "--urdf-weight", "0"]
+            command += [
+                "--set",
+                f"epochs={chosen.epochs}",
+                "--set",
+                "momentum_steps=200",
+                "--set",
+                "urdf_weight=0",
+            ]
         since = time.monotonic()
         subprocess.run([sys.executable, "-m", "spelgen", *command], cwd=folder, check=True)
         peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024 / 1e9

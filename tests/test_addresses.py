@@ -39,7 +39,15 @@ def test_a_run_and_its_logs_may_be_elsewhere(robots, tmp_path, memory):
     write_logs(local("memory://data/train.parquet"), logs.train, JOINTS)
     assert memory.exists("/data/train.parquet")
     module = tmp_path / "module.py"
-    options = ["--epochs", "2", "--momentum-steps", "0", "--quiet", "--robot", str(robots / "two_link.urdf")]
+    options = [
+        "--set",
+        "epochs=2",
+        "--set",
+        "momentum_steps=0",
+        "--quiet",
+        "--robot",
+        str(robots / "two_link.urdf"),
+    ]
     for words in (
         ["build", str(robots / "two_link.urdf"), "--preset", "spel", "--width", "4", "-o", str(module)],
         ["train", str(module), "--data", "memory://data", "-o", "memory://runs/first", *options],

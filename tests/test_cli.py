@@ -274,7 +274,7 @@ def test_names_cannot_steer_the_terminal(spelgen, tmp_path):
         ["build", "a.urdf", "--preset", "magic"],
         ["simulate", "a.urdf"],
         ["train", "m.py"],
-        ["train", "m.py", "--data", "x", "--epochs", "0"],
+        ["train", "m.py", "--data", "x", "--set", "epochs=0"],
         ["evaluate", "run"],
     ],
     ids=" ".join,
@@ -335,7 +335,7 @@ def trained(robots, tmp_path_factory):
     steps = {
         "build": ["build", "arm.urdf"],
         "simulate": ["simulate", "arm.urdf", "-o", "logs"],
-        "train": ["train", "arm_spel.py", "--data", "logs", "-o", "run", "--epochs", "2"],
+        "train": ["train", "arm_spel.py", "--data", "logs", "-o", "run", "--set", "epochs=2"],
         "evaluate": ["evaluate", "run", "--data", "logs"],
         "report": ["report", "run"],
     }
@@ -371,7 +371,7 @@ def test_a_second_run_needs_force_or_resume(trained, monkeypatch):
     again = CliRunner().invoke(app, command)
     assert again.exit_code == 1
     assert again.stderr.startswith("run: ") and "--resume" in again.stderr
-    more = CliRunner().invoke(app, [*command, "--resume", "--epochs", "3"])
+    more = CliRunner().invoke(app, [*command, "--resume", "--set", "epochs=3"])
     assert more.exit_code == 0, more.stderr
     assert "after 3 epochs" in more.stdout
 
@@ -380,7 +380,7 @@ def test_interrupted_training_leaves_a_run(spelgen, trained, tmp_path):
     folder, _ = trained
     run = tmp_path / "run"
     command = [sys.executable, "-m", "spelgen", "train", "arm_spel.py", "--data", "logs", "-o", str(run)]
-    command += ["--optimizer", "adamw", "--momentum-steps", "0"]  # L-BFGS would have ended by itself
+    command += ["--set", "optimizer=adamw", "--set", "momentum_steps=0"]  # L-BFGS would have ended by itself
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     with subprocess.Popen(
         command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
@@ -408,6 +408,13 @@ def test_bare_command_shows_the_help(spelgen):
     [
         (["trian"], "No such command 'trian'. Did you mean 'train'?"),
         (["train", "--objectve", "rollout"], "No such option: --objectve. Did you mean --objective?"),
+        (["train", "m.py", "--set", "epoch=3"], "--set: unknown key 'epoch'; did you mean 'epochs'?"),
+        (["train", "m.py", "--set", "epochs"], "--set: got 'epochs', expected KEY=VALUE"),
+        (["train", "m.py", "--set", "solver=rk5"], "--set solver: got 'rk5', expected 'rk4' or 'dopri5'"),
+        (
+            ["train", "m.py", "--set", "prior.body=1"],
+            "--set prior: unknown key 'body'; did you mean 'bodies'?",
+        ),
         (["build", "x.urdf", "--net", "mpl"], "'mpl' is none of mlp, kan. Did you mean 'mlp'?"),
         (["logs", "x", "--robot", "y", "--format", "xml"], "'xml' is none of text, json."),
     ],

@@ -79,11 +79,11 @@ def test_without_a_compiler_one_error_says_what_to_do_and_nothing_is_written(tmp
     done = CliRunner().invoke(
         app,
         ["train", str(STAND_IN), "--data", "train.parquet", "-o", "run",
-         "--compile", "--epochs", "1", "--momentum-steps", "0", "--quiet"],
+         "--set", "compile=true", "--set", "epochs=1", "--set", "momentum_steps=0", "--quiet"],
     )  # fmt: skip
     assert done.exit_code == 1
     (told,) = done.stderr.splitlines()
     assert told.startswith("a right-hand side that torch cannot compile (")
     assert "no-such-compiler" in told
-    assert told.endswith("; install a C++ compiler (g++), or train without --compile")
+    assert told.endswith("; install a C++ compiler (g++), or train without compile=true")
     assert not (tmp_path / "run").exists()

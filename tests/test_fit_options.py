@@ -131,35 +131,45 @@ def test_the_command_line_names_the_flag(robots, tmp_path):
     write_logs(logs, motions(), JOINTS)
     module.write_text(generate(robots / "rpr.urdf", preset="closed-form"))
     data = ("--data", logs, "-o", tmp_path / "run", "--quiet")
-    told = refused(module, *data, "--objective", "torque", "--learning-rate", "0.1")
-    assert told == "Error: --learning-rate: belongs to the objectives momentum and rollout, this fits torque"
-    told = refused(module, *data, "--objective", "torque", "--urdf-weight", "0")
-    assert told == "Error: --urdf-weight: with the objective torque belongs to models of networks alone"
+    told = refused(module, *data, "--objective", "torque", "--set", "learning_rate=0.1")
+    assert (
+        told == "Error: --set learning_rate: belongs to the objectives momentum and rollout, this fits torque"
+    )
+    told = refused(module, *data, "--objective", "torque", "--set", "urdf_weight=0")
+    assert told == "Error: --set urdf_weight: with the objective torque belongs to models of networks alone"
     told = refused(module, *data, "--objective", "momentum")
     assert (
         told
         == "Error: --objective: momentum belongs to models of networks alone, this is one of rigid bodies"
     )
-    told = refused(STAND_IN, *data, "--evaluations", "40")
-    assert told == "Error: --evaluations: belongs to the objective torque, this fits rollout"
-    told = refused(STAND_IN, *data, "--no-torque-first")
-    assert told == "Error: --torque-first: with the objective rollout belongs to models of rigid bodies"
-    told = refused(STAND_IN, *data, "--optimizer", "lbfgs", "--batch", "4")
-    assert told == "Error: --batch: belongs to the optimizer adamw, this is lbfgs"
+    told = refused(STAND_IN, *data, "--set", "evaluations=40")
+    assert told == "Error: --set evaluations: belongs to the objective torque, this fits rollout"
+    told = refused(STAND_IN, *data, "--set", "torque_first=false")
+    assert told == "Error: --set torque_first: with the objective rollout belongs to models of rigid bodies"
+    told = refused(STAND_IN, *data, "--set", "optimizer=lbfgs", "--set", "batch=4")
+    assert told == "Error: --set batch: belongs to the optimizer adamw, this is lbfgs"
     assert not (tmp_path / "run").exists()
 
 
 def test_a_run_goes_on_with_its_own_options(tmp_path):
     logs, run = tmp_path / "train.parquet", tmp_path / "run"
     write_logs(logs, motions(), JOINTS)
-    begin = ["train", str(STAND_IN), "--data", str(logs), "-o", str(run), "--quiet", "--momentum-steps", "20"]
-    assert CliRunner().invoke(app, [*begin, "--epochs", "1", "--window", "6"]).exit_code == 0
+    begin = [
+        "train",
+        str(STAND_IN),
+        "--data",
+        str(logs),
+        "-o",
+        str(run),
+        "--quiet",
+        "--set",
+        "momentum_steps=20",
+    ]
+    assert CliRunner().invoke(app, [*begin, "--set", "epochs=1", "--set", "window=6"]).exit_code == 0
     again = ["train", str(STAND_IN), "--data", str(logs), "-o", str(run), "--quiet", "--resume"]
-    assert CliRunner().invoke(app, [*again, "--epochs", "2"]).output.startswith("finished after 2 epochs")
-    assert refused(*again[1:], "--evaluations", "40").startswith(
-        "Error: --evaluations: belongs to the objective t"
-    )
-    done = CliRunner().invoke(app, [*again, "--window", "7"])
+    assert CliRunner().invoke(app, [*again, "--set", "epochs=2"]).output.startswith("finished after 2 epochs")
+    assert refused(*again[1:], "--set", "evaluations=40").startswith("Error: --set evaluations: belongs to")
+    done = CliRunner().invoke(app, [*again, "--set", "window=7"])
     assert done.exit_code == 1
     assert "got window 7 instead of 6, expected the settings the run was started with" in done.stderr
     done = CliRunner().invoke(app, [*again, "--objective", "momentum"])

@@ -125,7 +125,7 @@ def test_numbers_are_those_of_the_run(run):
     assert "But URDF is better after 1 step." in text
     assert "34 to train, 17 held out" in text
     assert "8.0e-10" in text
-    assert "--objective rollout --seed 7 --epochs 30 --filter 8.0 --decimation 1" in text
+    assert "--objective rollout --set seed=7 --set epochs=30 --set cutoff=8.0 --set decimation=1" in text
     assert "2,000 steps on the momentum" in text
 
 

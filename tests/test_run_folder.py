@@ -183,7 +183,7 @@ def test_a_full_disk_is_told_with_the_file(start, tmp_path):
     """No file may grow beyond 2000 bytes: it fails as a full disk does, while it is written."""
     run = trained(start, tmp_path / "run")
     before = weights(run)
-    command = ["train", start / "module.py", "--data", start, "-o", run, "--resume", "--epochs", "9"]
+    command = ["train", start / "module.py", "--data", start, "-o", run, "--resume", "--set", "epochs=9"]
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (2000, limits[1]))
     try:

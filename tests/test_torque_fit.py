@@ -414,8 +414,8 @@ def test_a_run_is_adapted_to_another_day_or_unit(run, emitted, tmp_path, adapt):
         str(folder / "run"),
         "--data",
         str(tmp_path / "other.parquet"),
-        "--adapt",
-        adapt,
+        "--set",
+        f"adapt={adapt}",
     ]
     done = CliRunner().invoke(app, [*command, "-o", str(tmp_path / "adapted"), "--quiet"])
     assert done.exit_code == 0, done.output
@@ -454,19 +454,19 @@ def test_a_part_of_a_model_of_networks_is_adapted(robots, run, emitted):
 def test_adapt_belongs_to_a_run_and_to_torques(run, tmp_path):
     folder, _, fitting = run
     for command, message in (
-        ([*fitting, "--adapt", "unit"], "--adapt: belongs to --from"),
+        ([*fitting, "--set", "adapt=unit"], "--set adapt: belongs to --from"),
         (
             [
                 "train",
                 "--from",
                 str(folder / "run"),
                 *fitting[2:4],
-                "--adapt",
-                "unit",
+                "--set",
+                "adapt=unit",
                 "--objective",
                 "rollout",
             ],
-            "--adapt: belongs to the objective torque, this fits rollout",
+            "--set adapt: belongs to the objective torque, this fits rollout",
         ),
     ):
         done = CliRunner().invoke(app, command)

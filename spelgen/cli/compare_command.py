@@ -9,7 +9,7 @@ import typer
 
 from spelgen.cli.console import counted, note, say
 from spelgen.cli.options import Address, Force, Robot
-from spelgen.cli.train_start import NotApplicable
+from spelgen.cli.train_settings import UsageError
 from spelgen.errors import SpelgenError, suggestion
 
 
@@ -52,7 +52,7 @@ def compare(
     from spelgen.render.comparison_page import write_comparison
 
     if urdf_error is not None and steps is not None:
-        raise NotApplicable(
+        raise UsageError(
             "--steps: belongs to models that know kinematics alone, these are trained by defaults"
         )
     known = {variant.name: variant for variant in (ablation_variants() if ablation else VARIANTS)}

@@ -6,16 +6,24 @@ import hashlib
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import INTERRUPTED, note, say
-from spelgen.cli.options import Data, Filter, Force, Mapping, MoreData, RobotOption, Trust
-from spelgen.cli.train_start import Chosen, NotApplicable, begun, resumed
+from spelgen.cli.options import Data, Force, Mapping, MoreData, RobotOption, Trust
+from spelgen.cli.train_settings import (
+    TIME_LIMIT,
+    Machine,
+    Request,
+    UsageError,
+    new_run,
+    read_assignments,
+    resumed_run,
+)
 from spelgen.errors import ModuleError, OptionError
-from spelgen.settings.fits import Adaptation, Objective, Optimizer, Solver
+from spelgen.settings.fits import Objective
 from spelgen.spec import read_facts
 
 if TYPE_CHECKING:
@@ -46,194 +54,182 @@ def train(
     trust: Trust = False,
     source: Annotated[
         Path | None,
-        typer.Option(
-            "--from", metavar="RUN", help="Begin from a run; no MODULE. Torques adapt it, see --adapt."
-        ),
-    ] = None,
-    adapt: Annotated[
-        Adaptation | None,
-        typer.Option(
-            help="[torque] What differs from the run of --from: a load at the tip (the default), the friction of "
-            "another day, or all of another unit."
-        ),
+        typer.Option("--from", metavar="RUN", help="Begin from a run; no MODULE. Torques adapt it."),
     ] = None,
     objective: Annotated[
         Objective | None,
         typer.Option(help="Default: of rigid bodies torque, else rollout, after momentum steps."),
     ] = None,
-    window: Annotated[
-        int | None, typer.Option(min=2, help="[momentum, rollout] Samples in a window.")
+    assignments: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="Set an option of the fit: epochs=50, seed=1, device=cuda; once for each.",
+        ),
     ] = None,
-    stride: Annotated[
-        int | None, typer.Option(min=1, help="[momentum, rollout] Samples from window to window.")
-    ] = None,
-    momentum_steps: Annotated[
-        int | None,
-        typer.Option(min=0, help="[momentum, rollout] On the weak form, before windows are predicted."),
-    ] = None,
-    torque_first: Annotated[
-        bool | None, typer.Option(help="[rollout] Fit torques first; of rigid bodies.")
-    ] = None,
-    epochs: Annotated[int | None, typer.Option(min=1, help="[rollout] At most so many.")] = None,
-    patience: Annotated[
-        int | None, typer.Option(min=1, help="[rollout] Epochs without gain before the end.")
-    ] = None,
-    solver: Annotated[
-        Solver | None, typer.Option(help="[rollout] rk4 of fixed steps, or torchdiffeq's dopri5.")
-    ] = None,
-    substeps: Annotated[
-        int | None, typer.Option(min=1, help="[rollout] Steps of rk4 between samples.")
-    ] = None,
-    compile: Annotated[
-        bool | None, typer.Option(help="[rollout] The right-hand side by torch; needs a C++ compiler.")
-    ] = None,
-    optimizer: Annotated[
-        Optimizer | None,
-        typer.Option(help="[momentum, rollout] On batches, or on all windows at once: default where few."),
-    ] = None,
-    batch: Annotated[int | None, typer.Option(min=1, help="[adamw] Windows in a step.")] = None,
-    learning_rate: Annotated[float | None, typer.Option(min=0.0, help="[adamw] At its largest.")] = None,
     max_minutes: Annotated[
-        float | None, typer.Option(min=0.0, help="[momentum, rollout] At most so long.")
+        float | None, typer.Option(min=0.0, help="End the fit to windows after so long.")
     ] = None,
-    evaluations: Annotated[
-        int | None, typer.Option(min=1, help="[torque] Of the loss of networks, at most.")
-    ] = None,
-    weight_decay: Annotated[
-        float | None, typer.Option(min=0.0, help="Of AdamW; or of the penalty of L-BFGS.")
-    ] = None,
-    urdf_weight: Annotated[
-        float | None, typer.Option(min=0.0, help="Of staying near the URDF's own M and gravity; 0: none.")
-    ] = None,
-    validation_fraction: Annotated[
-        float | None, typer.Option(min=0.01, max=0.9, help="Part of the trajectories.")
-    ] = None,
-    filter: Filter = None,
-    decimation: Annotated[
-        int | None, typer.Option(min=1, help="In windows, take one sample of so many.")
-    ] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Of split, order and batches.")] = None,
-    device: Annotated[str, typer.Option(help="cpu, cuda, ...")] = "cpu",
-    threads: Annotated[int, typer.Option(min=1, help="Of torch.")] = 1,
     quiet: Annotated[bool, typer.Option("--quiet", help="Show no progress.")] = False,
 ) -> None:
     """Fit a module to logs.
 
-    What is not given here comes from the settings beside the robot. [torque], [momentum], [rollout]: the objectives
-    that an option belongs to; it is an error beside another one.
+    What is not given here comes from `training` in the settings beside the robot, whose keys --set takes, too.
+    docs/cli.md lists them. It is an error to set one that does not apply to the objective.
     """
-    since = time.monotonic()
-    flags: dict[str, Any] = {
-        "window": window, "stride": stride, "momentum_steps": momentum_steps, "torque_first": torque_first,
-        "epochs": epochs, "patience": patience, "solver": solver, "substeps": substeps, "compile": compile,
-        "optimizer": optimizer, "batch": batch, "learning_rate": learning_rate, "max_minutes": max_minutes,
-        "evaluations": evaluations, "weight_decay": weight_decay, "urdf_weight": urdf_weight,
-    }  # fmt: skip
-    flags = {name: value for name, value in flags.items() if value is not None}
+    start_time = time.monotonic()
+    values = read_assignments(assignments or [])
+    if max_minutes is not None:
+        values[TIME_LIMIT] = max_minutes
+    request = Request(objective, values)
     if source is not None:
-        more = [*([module] if module else []), *(more or [])]  # all that stands there is logs
-        module, robot = _of_run(source, robot)
-        objective = objective or "torque"
-        if objective == "torque":
-            flags["adapt"] = adapt or "load"
-        elif adapt is not None:
-            raise NotApplicable(f"--adapt: belongs to the objective torque, this fits {objective}")
-    elif adapt is not None:
-        raise NotApplicable("--adapt: belongs to --from")
+        if module is not None:
+            more = [module, *(more or [])]  # with --from, all that stands there is logs
+        module, robot = _module_of_run(source, robot)
+        request = _warm_start(request)
+    elif "adapt" in values:
+        raise UsageError("--set adapt: belongs to --from")
     if module is None:
         raise typer.BadParameter("name a module, or a run with --from", param_hint="'MODULE.py'")
     paths = options.logs(data, more)
-    folder = output or (module if resume and module.is_dir() else Path("runs") / module.stem)
-    urdf = None if resume else robot or _unchanged_urdf(module)
-    chosen = Chosen(objective, flags, {"cutoff": filter, "decimation": decimation}, validation_fraction, seed,
-                    fitted=source is not None)  # fmt: skip
-    start = resumed(folder, chosen) if resume else begun(module, urdf, chosen)
-    given = options.mapping(mapping, urdf, read_facts(start.module).joints)
-    check = None if urdf is None else _torque_check(urdf, start.module, given or start.mapping)
-    from spelgen.fitting import workers
+    folder = output or _default_folder(module, resume)
+    urdf = None
+    if resume:
+        start = resumed_run(folder, request)
+    else:
+        urdf = robot or _unchanged_urdf(module)
+        start = new_run(module, urdf, request)
+    log_mapping = options.mapping(mapping, urdf, read_facts(start.module).joints) or start.mapping
+    machine = Machine.model_validate({name: values[name] for name in Machine.model_fields if name in values})
     from spelgen.fitting.train import train as train_files
 
     try:
-        with workers.group(device) as own:
-            found = train_files(
-                start.module, paths, folder, start.config, urdf=urdf, source=source, mapping=given or start.mapping,
-                preprocessing=start.preprocessing, validation=start.validation, seed=start.seed, resume=resume,
-                force=force, trust=trust, device=own, threads=threads, progress=not quiet,
-                since=since, require=check,
-            )  # fmt: skip
-            first = workers.rank() == 0
+        fit = train_files(
+            start.module,
+            paths,
+            folder,
+            start.config,
+            urdf=urdf,
+            source=source,
+            mapping=log_mapping,
+            preprocessing=start.preprocessing,
+            validation=start.validation,
+            seed=start.seed,
+            resume=resume,
+            force=force,
+            trust=trust,
+            device=machine.device,
+            threads=machine.threads,
+            progress=not quiet,
+            since=start_time,
+            require=_torque_check(urdf, start.module, log_mapping),
+        )
     except OptionError as error:
-        raise NotApplicable(f"--{error.option.replace('_', '-')}: {error.got}") from error
-    if not first:
-        return
-    if not resume and found.status != "interrupted":
+        raise UsageError(f"{_spelled(error.option)}: {error.got}") from error
+    _tell(fit, folder, paths, resume=resume)
+
+
+def _tell(fit: Fit, folder: Path, paths: Sequence[Path], *, resume: bool) -> None:
+    """Print how the fit ended, and keep the baselines of a new run; leave with 130 where it was interrupted."""
+    interrupted = fit.status == "interrupted"
+    if not resume and not interrupted:
         from spelgen.baselines.keep import keep_baseline
 
         keep_baseline(folder, paths)
-    for line in _outcome(found):
+    for line in _outcome(fit):
         say(line)
-    if found.calibration is not None and found.status != "interrupted":
+    if fit.calibration is not None and not interrupted:
         from spelgen.evaluation.forecast import good_for
         from spelgen.evaluation.subject import subject
 
-        reach = good_for(subject(found).model, found.calibration)
+        reach = good_for(subject(fit).model, fit.calibration)
         place = "nowhere" if reach is None else f"up to {reach:g} s ahead"
         say(f"forecasts clearly better than extrapolated motion: {place}")
     say(f"run folder: {folder}")
-    if found.status == "interrupted":
+    if interrupted:
         note("the best model so far is in the run folder; --resume goes on")
         raise typer.Exit(INTERRUPTED)
 
 
+def _outcome(fit: Fit) -> tuple[str, str]:
+    """Return how a fit ended, with the reason where its status does not say it, and what it came to."""
+    if fit.config.objective == "servo":
+        from spelgen.fitting.servo_report import servo_text
+
+        result = f"{fit.steps} steps were taken"
+        if "servo" in fit.record:
+            result = servo_text(fit.record["servo"])
+        return f"{fit.status}: servos fitted in {fit.seconds:.0f} s", result
+    config, loss = cast("WindowConfig", fit.config), f"validation loss {fit.best_validation:.3g}"
+    if not config.epochs:  # windows only judge
+        return f"{fit.status}: {config.objective} fitted in {fit.seconds:.0f} s", loss
+    reason = ""
+    if fit.status == "stopped early":
+        reason = f": no better validation loss since epoch {fit.best_epoch}"
+    elif fit.status == "out of time":
+        reason = f": --max-minutes {config.max_minutes or 0:g} is over"
+    elif fit.status == "finished" and fit.epochs >= config.epochs:
+        reason = ": all epochs are run"
+    elif fit.status == "finished":
+        reason = ": no way further down"
+    epochs = f"{fit.epochs} epoch{'s' * (fit.epochs != 1)}"
+    end = f"{fit.status} after {epochs}, {fit.steps} steps, {fit.seconds:.0f} s{reason}"
+    return end, f"best {loss}, at epoch {fit.best_epoch}"
+
+
+def _warm_start(request: Request) -> Request:
+    """Return the request for a model that was fitted before: by default its load is fitted to torques."""
+    objective, values = request.objective or "torque", dict(request.values)
+    if objective == "torque":
+        values.setdefault("adapt", "load")
+    elif "adapt" in values:
+        raise UsageError(f"--set adapt: belongs to the objective torque, this fits {objective}")
+    return Request(objective, values, warm_start=True)
+
+
+def _spelled(option: str) -> str:
+    """Return an option of a fit as the command line has it."""
+    if option in ("objective", TIME_LIMIT):
+        return f"--{option.replace('_', '-')}"
+    return f"--set {option}"
+
+
+def _default_folder(module: Path, resume: bool) -> Path:
+    if resume and module.is_dir():
+        return module
+    return Path("runs") / module.stem
+
+
 def _torque_check(
-    urdf: Path, module: Path, mapping: LogMapping | None
+    urdf: Path | None, module: Path, mapping: LogMapping | None
 ) -> Callable[[Sequence[Trajectory]], None] | None:
-    """What raises LogError for logs whose torques cannot be those of the module's arm; None: logs have no torques."""
+    """Return what raises LogError for logs whose torques cannot be those of the arm; None: nothing to check."""
+    if urdf is None:
+        return None
     from spelgen.loaded_arm import load_arm
     from spelgen.log_checks.check_logs import require_possible_torques
 
-    options = read_facts(module).options
-    arm = load_arm(urdf, options.joints, options.tip, options.angle_tolerance)
+    facts = read_facts(module).options
+    arm = load_arm(urdf, facts.joints, facts.tip, facts.angle_tolerance)
     if arm.settings.input == "position":
         return None
     return lambda logs: require_possible_torques(logs, arm, mapping)
 
 
-def _outcome(found: Fit) -> tuple[str, str]:
-    """How a fit ended, and why where its status does not say so; what it came to."""
-    if found.config.objective == "servo":
-        from spelgen.fitting.servo_report import servo_text
-
-        told = (
-            servo_text(found.record["servo"])
-            if "servo" in found.record
-            else f"{found.steps} steps were taken"
-        )
-        return f"{found.status}: servos fitted in {found.seconds:.0f} s", told
-    config, loss = cast("WindowConfig", found.config), f"validation loss {found.best_validation:.3g}"
-    if not config.epochs:  # windows only judge
-        return f"{found.status}: {config.objective} fitted in {found.seconds:.0f} s", loss
-    why = {
-        "stopped early": f": no better validation loss since epoch {found.best_epoch}",
-        "out of time": f": --max-minutes {config.max_minutes or 0:g} is over",
-        "finished": ": all epochs are run" if found.epochs >= config.epochs else ": no way further down",
-    }.get(found.status or "", "")
-    epochs = f"{found.epochs} epoch" if found.epochs == 1 else f"{found.epochs} epochs"
-    ended = f"{found.status} after {epochs}, {found.steps} steps, {found.seconds:.0f} s"
-    return ended + why, f"best {loss}, at epoch {found.best_epoch}"
-
-
-def _of_run(source: Path, robot: Path | None) -> tuple[Path, Path | None]:
-    """The module and the URDF of a run."""
+def _module_of_run(source: Path, robot: Path | None) -> tuple[Path, Path | None]:
+    """Return the module of a run, and its URDF where none is named."""
     from spelgen.fitting.run_folder import RunFolder
 
     run = RunFolder(source)
     run.read_config()  # where there is no run, this says so
-    return run.module, robot or (run.urdf if run.urdf.exists() else None)
+    if robot is None and run.urdf.exists():
+        robot = run.urdf
+    return run.module, robot
 
 
 def _unchanged_urdf(module: Path) -> Path | None:
-    """The URDF of the module's name near it, when it is still the one the module was built from."""
+    """Return the URDF of the module's name near it, where it is still the one the module was built from."""
     from spelgen.pipeline import find_urdf
     from spelgen.urdf.document import urdf_bytes
 
@@ -242,4 +238,6 @@ def _unchanged_urdf(module: Path) -> Path | None:
         path = find_urdf(module, facts.urdf)
     except ModuleError:
         return None
-    return path if hashlib.sha256(urdf_bytes(path)).hexdigest() == facts.urdf_sha256 else None
+    if hashlib.sha256(urdf_bytes(path)).hexdigest() != facts.urdf_sha256:
+        return None
+    return path

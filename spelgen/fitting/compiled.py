@@ -25,7 +25,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     # recorded once and replayed: to launch such small kernels one by one takes longer than to run them
     "cuda": {"triton.cudagraphs": True},
 }
-CURE = "install a C++ compiler (g++), or train without --compile"
+CURE = "install a C++ compiler (g++), or train without compile=true"
 
 
 class Compiled:

@@ -19,7 +19,7 @@ def require_device(device: str) -> None:
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0]
         raise RunError(
-            f"a device {device!r} that torch cannot use ({reason})", do="use --device cpu"
+            f"a device {device!r} that torch cannot use ({reason})", do="use the device cpu"
         ) from error
 
 

@@ -14,8 +14,6 @@ from spelgen.logs.preprocessing import Preprocessing
 from spelgen.settings.fits import CONFIGS
 from spelgen.spec import Facts, Options
 
-FLAGS = {"cutoff": "filter"}  # options whose flag has another name
-
 
 @dataclass(frozen=True)
 class File:
@@ -48,24 +46,34 @@ def commands(run: RunFolder, facts: Facts, record: Mapping[str, Any] | None) -> 
     found.append(f"spelgen build {urdf}{built} -o module.py")
     if record:
         usual = CONFIGS[record["objective"]]().model_dump(mode="json") | asdict(Preprocessing())
-        usual |= {"validation_fraction": 0.25, "seed": 0, "objective": None}
-        chosen = {name: record[name] for name in ("objective", "validation_fraction", "seed")}
-        chosen |= record["config"] | record["preprocessing"]
-        found.append(f"spelgen train module.py --robot {urdf} --data LOGS -o RUN2{_flags(chosen, usual)}")
+        usual |= {"validation_fraction": 0.25, "seed": 0}
+        options = {name: record[name] for name in ("validation_fraction", "seed")}
+        options |= record["config"] | record["preprocessing"]
+        command = (
+            f"spelgen train module.py --robot {urdf} --data LOGS -o RUN2 --objective {record['objective']}"
+        )
+        for key, value in _changed(options, usual).items():
+            command += f" --set {shlex.quote(f'{key}={value}')}"
+        found.append(command)
     return [*found, "spelgen evaluate RUN2 --data LOGS", "spelgen report RUN2"]
 
 
 def _flags(chosen: Mapping[str, Any], usual: Mapping[str, Any]) -> str:
     """The command-line flags of what differs from the default."""
     text = ""
-    for key, value in chosen.items():
-        if value is None or value == usual.get(key) or isinstance(value, Mapping):
-            continue
-        text += f" --{'no-' if value is False else ''}{FLAGS.get(key, key).replace('_', '-')}"
-        if not isinstance(value, bool):
-            words = ",".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
-            text += f" {shlex.quote(words)}"
+    for key, value in _changed(chosen, usual).items():
+        words = ",".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
+        text += f" --{key.replace('_', '-')} {shlex.quote(words)}"
     return text
+
+
+def _changed(options: Mapping[str, Any], usual: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options that are set to something else than usual."""
+    changed = {}
+    for key, value in options.items():
+        if value is not None and value != usual.get(key) and not isinstance(value, Mapping):
+            changed[key] = value
+    return changed
 
 
 def _size(count: int) -> str:

@@ -1,4 +1,4 @@
-"""What is wrong in a settings file, told with file, line and key."""
+"""Say what is wrong in a settings file, with file, line and key."""
 
 from __future__ import annotations
 
@@ -8,62 +8,79 @@ from typing import Any, get_args
 from pydantic import BaseModel
 
 from spelgen.errors import SettingsError, suggestion
-from spelgen.settings.yaml_document import Document
+from spelgen.settings.yaml_document import Document, Location
+
+LONGEST_VALUE = 60  # characters of a value that a message repeats
+EXPECTED = {
+    "missing": "a value",
+    "model_type": "keys with values",
+    "dict_type": "keys with values",
+}
 
 
-def explain(detail: Mapping[str, Any], document: Document, group: type[BaseModel]) -> SettingsError:
-    """What pydantic found wrong (one of `ValidationError.errors`), with its line and what was expected there."""
+def explain(detail: Mapping[str, Any], document: Document | None, group: type[BaseModel]) -> SettingsError:
+    """Return one of pydantic's `ValidationError.errors` as an error with its line and what was expected there.
+
+    document: None for values of the command line, which have no lines.
+    """
     location, kind = tuple(detail["loc"]), detail["type"]
     if kind == "extra_forbidden":
-        known = list(_group_at(group, location[:-1]).model_fields)
+        known = _group_at(group, location[:-1]).model_fields
         return unknown_name(location, "key", str(location[-1]), known, document)
+    expected = EXPECTED.get(kind) or expected_text(detail["msg"])
     if location[-1:] == ("[key]",):
-        location, kind = location[:-1], "name" if kind == "string_pattern_mismatch" else "key"
-    expected = {
-        "key": "a name; write it in quotes",
-        "name": "a name of letters, digits, '.', '_' and '-'",
-        "missing": "a value",
-        "model_type": "keys with values",
-        "dict_type": "keys with values",
-    }.get(kind, detail["msg"].removeprefix("Input should be ").removeprefix("Value error, "))
-    got = repr(detail["input"]) if location or kind != "value_error" else "these settings"
+        location, expected = location[:-1], "a name; write it in quotes"
+        if kind == "string_pattern_mismatch":
+            expected = "a name of letters, digits, '.', '_' and '-'"
+    got = repr(detail["input"])
     if kind == "missing" and isinstance(detail["input"], Mapping):
         got = "nothing"
-    return SettingsError(
-        got if len(got) <= 60 else got[:57] + "...",
-        file=document.path,
-        line=document.line(location),
-        element=_dotted(location),
-        expected=expected,
-    )
-
-
-def _group_at(group: type[BaseModel], location: tuple[Any, ...]) -> type[BaseModel]:
-    """The group of keys at a place in a file; keys of a dict and numbers of a list lead into the next one."""
-    for part in location:
-        field = group.model_fields.get(str(part))
-        group = next(iter(_groups_in(field.annotation)), group) if field else group
-    return group
-
-
-def _groups_in(annotation: Any) -> list[type[BaseModel]]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [annotation]
-    return [found for each in get_args(annotation) for found in _groups_in(each)]
+    elif kind == "value_error" and not location:
+        got = "these settings"
+    if len(got) > LONGEST_VALUE:
+        got = got[: LONGEST_VALUE - 3] + "..."
+    return SettingsError(got, expected=expected, **_place(location, document))
 
 
 def unknown_name(
-    location: tuple[Any, ...], kind: str, name: str, known: Iterable[str], document: Document
+    location: Location, kind: str, name: str, known: Iterable[str], document: Document | None
 ) -> SettingsError:
-    """A name that a file speaks of and nothing has, with the known name that is closest."""
-    return SettingsError(
-        f"unknown {kind} {name!r}",
-        file=document.path,
-        line=document.line(location),
-        element=_dotted(location[:-1]),
-        do=suggestion(name, known),
-    )
+    """Return the error for a name that a file speaks of and nothing has, with the known name that is closest."""
+    place = _place(location, document)
+    place["element"] = dotted(location[:-1])
+    return SettingsError(f"unknown {kind} {name!r}", do=suggestion(name, known), **place)
 
 
-def _dotted(location: tuple[Any, ...]) -> str | None:
+def expected_text(message: str) -> str:
+    """Return what pydantic expected, without the words before it."""
+    return message.removeprefix("Input should be ").removeprefix("Value error, ")
+
+
+def dotted(location: Location) -> str | None:
+    """Return the place in a file as `joints.joint1.gear`; None for the whole file."""
     return ".".join(map(str, location)) or None
+
+
+def _place(location: Location, document: Document | None) -> dict[str, Any]:
+    if document is None:
+        return {"element": dotted(location)}
+    return {"file": document.path, "line": document.line(location), "element": dotted(location)}
+
+
+def _group_at(group: type[BaseModel], location: Location) -> type[BaseModel]:
+    """Return the group of keys at a place in a file; keys of a dict and numbers of a list lead into the next one."""
+    for key in location:
+        field = group.model_fields.get(str(key))
+        if field is not None:
+            group = _first_group(field.annotation) or group
+    return group
+
+
+def _first_group(annotation: object) -> type[BaseModel] | None:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    for argument in get_args(annotation):
+        group = _first_group(argument)
+        if group is not None:
+            return group
+    return None

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import yaml
 from yaml.composer import ComposerError
 
 from spelgen.errors import SettingsError
+
+Location: TypeAlias = tuple[int | str, ...]
+"""Keys and numbers of list items that lead to a place in a file."""
 
 MAX_BYTES = 256 * 1024  # 300 joints, each with every key, take 60 kB
 MAX_DEPTH = 16
@@ -29,24 +32,33 @@ class Document:
         try:
             return yaml.SafeLoader("").construct_document(self.root)
         except yaml.YAMLError as error:
-            raise _told(error, self.path) from error
+            raise _yaml_error(error, self.path) from error
         except ValueError as error:  # e.g. the date 2025-99-99
             raise SettingsError(f"not plain YAML: {error}", file=self.path) from error
 
-    def line(self, location: tuple[Any, ...]) -> int | None:
+    def line(self, location: Location) -> int | None:
         """Return the line of a key or list item, or of the nearest thing around it that is there."""
-        node, line = self.root, None if self.root is None else self.root.start_mark.line + 1
-        for part in location:
-            if isinstance(node, yaml.MappingNode):
-                found = [(key, value) for key, value in node.value if key.value == str(part)]
-            elif isinstance(node, yaml.SequenceNode) and isinstance(part, int) and part < len(node.value):
-                found = [(node.value[part], node.value[part])]
-            else:
+        if self.root is None:
+            return None
+        node, line = self.root, self.root.start_mark.line + 1
+        for key in location:
+            entry = _entry(node, key)
+            if entry is None:
                 break
-            if not found:
-                break
-            line, node = found[0][0].start_mark.line + 1, found[0][1]
+            name, node = entry
+            line = name.start_mark.line + 1
         return line
+
+
+def _entry(node: yaml.Node, key: int | str) -> tuple[yaml.Node, yaml.Node] | None:
+    """Return the nodes of a key and of its value, of a list item twice the same; None where there is none."""
+    if isinstance(node, yaml.MappingNode):
+        for name, value in node.value:
+            if name.value == str(key):
+                return name, value
+    elif isinstance(node, yaml.SequenceNode) and isinstance(key, int) and key < len(node.value):
+        return node.value[key], node.value[key]
+    return None
 
 
 class _Loader(yaml.SafeLoader):
@@ -54,7 +66,7 @@ class _Loader(yaml.SafeLoader):
 
     depth = 0
 
-    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node:
+    def compose_node(self, parent: yaml.Node | None, index: object) -> yaml.Node:
         event = self.peek_event()
         mark = event.start_mark
         if self.check_event(yaml.AliasEvent):
@@ -68,7 +80,7 @@ class _Loader(yaml.SafeLoader):
         self.depth -= 1
         return node
 
-    def compose_mapping_node(self, anchor: Any) -> yaml.Node:
+    def compose_mapping_node(self, anchor: str | None) -> yaml.Node:
         node = super().compose_mapping_node(anchor)
         seen: set[str] = set()
         for key, _ in node.value:
@@ -93,10 +105,10 @@ def read_document(path: Path) -> Document:
     except UnicodeDecodeError as error:
         raise SettingsError("bytes that are not UTF-8", file=path, expected="YAML text") from error
     except yaml.YAMLError as error:
-        raise _told(error, path) from error
+        raise _yaml_error(error, path) from error
 
 
-def _told(error: yaml.YAMLError, path: Path) -> SettingsError:
+def _yaml_error(error: yaml.YAMLError, path: Path) -> SettingsError:
     mark = getattr(error, "problem_mark", None)
     problem = getattr(error, "problem", None) or "characters that YAML does not allow"
     problem = problem.removeprefix("but ")  # of a sentence whose first half PyYAML keeps apart

@@ -1,0 +1,198 @@
+"""Decide what the command `train` fits: the command line first, then the robot's settings or the run that goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+from pydantic import ValidationError
+
+from spelgen.cli.console import note
+from spelgen.errors import RunError, suggestion
+from spelgen.settings.fits import CONFIGS, FitConfig
+from spelgen.settings.messages import explain
+from spelgen.settings.training import TrainingSettings
+from spelgen.settings.values import Count, Group
+
+if TYPE_CHECKING:
+    from spelgen.emission.loading import EmittedModel
+    from spelgen.logs.preprocessing import Preprocessing
+    from spelgen.settings.log_mapping import LogMapping
+
+TIME_LIMIT = "max_minutes"
+PREPROCESSING = ("cutoff", "decimation", "gap")
+FIELD_SEPARATOR = "."
+
+
+class UsageError(typer.BadParameter):
+    """An option that does not apply to what is fitted; the message names the option itself."""
+
+    def format_message(self) -> str:
+        """Return the message without the name of a parameter before it."""
+        return self.message
+
+
+class Machine(Group):
+    """Where a fit runs: a device of torch, and how many threads it uses."""
+
+    device: str = "cpu"
+    threads: Count = 1
+
+
+def _groups_by_key() -> dict[str, type[Group]]:
+    """Return every key of `--set` with the group of settings that checks its value."""
+    keys: dict[str, type[Group]] = {}
+    for group in (*CONFIGS.values(), TrainingSettings, Machine):
+        for name in group.model_fields:
+            keys.setdefault(name, group)
+    del keys["objective"]  # an option of its own
+    return keys
+
+
+KEYS = _groups_by_key()
+
+
+@dataclass(frozen=True)
+class Request:
+    """Hold what the command line asks for. values: of `--set`, by key. warm_start: the model was fitted before."""
+
+    objective: str | None
+    values: Mapping[str, object]
+    warm_start: bool = False
+
+    @property
+    def options(self) -> dict[str, object]:
+        """Return the values that belong to the configuration of an objective."""
+        return {name: value for name, value in self.values.items() if issubclass(KEYS[name], FitConfig)}
+
+    @property
+    def preprocessing(self) -> dict[str, object]:
+        """Return the values that say how logs are prepared."""
+        return {name: value for name, value in self.values.items() if name in PREPROCESSING}
+
+
+@dataclass(frozen=True)
+class Start:
+    """Hold what is fitted and how. config: makes the configuration once the logs' sample rates [Hz] are known."""
+
+    module: Path
+    config: Callable[[EmittedModel, Sequence[float] | None], FitConfig | None]
+    preprocessing: Preprocessing
+    validation: float
+    seed: int
+    mapping: LogMapping | None
+
+
+def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
+    """Return the checked values of `KEY=VALUE`; `prior.bodies=0.1` sets one field of a group.
+
+    Raises a usage error for an unknown key, with the nearest known one, and for a value that cannot be.
+    """
+    texts: dict[str, object] = {}
+    for assignment in assignments:
+        key, equals, text = assignment.partition("=")
+        name, _, field = key.strip().replace("-", "_").partition(FIELD_SEPARATOR)
+        if not equals:
+            raise UsageError(f"--set: got {assignment!r}, expected KEY=VALUE")
+        if name not in KEYS:
+            raise UsageError(f"--set: unknown key {name!r}; {suggestion(name, KEYS)}")
+        if not field:
+            texts[name] = text
+            continue
+        fields = texts.setdefault(name, {})
+        if isinstance(fields, dict):
+            fields[field] = text
+    return {name: _checked(name, text) for name, text in texts.items()}
+
+
+def _checked(name: str, text: object) -> object:
+    try:
+        return getattr(KEYS[name].model_validate({name: text}), name)
+    except ValidationError as error:
+        wrong = explain(error.errors(include_url=False)[0], None, KEYS[name])
+        raise UsageError(f"--set {wrong}") from error
+
+
+def new_run(module: Path, urdf: Path | None, request: Request) -> Start:
+    """Return the start of a new run: what the command line does not say, the robot's settings do."""
+    from spelgen.logs.preprocessing import Preprocessing
+    from spelgen.settings.settings import load_settings
+
+    settings = TrainingSettings()
+    if urdf is not None:
+        settings = load_settings(urdf).training
+    return Start(
+        module,
+        lambda model, rates: _new_config(settings, request, model, rates),
+        Preprocessing(**(settings.preprocessing | request.preprocessing)),
+        **_split(request, settings.model_dump(include={"validation_fraction", "seed"})),
+        mapping=None,
+    )
+
+
+def _new_config(
+    settings: TrainingSettings, request: Request, model: EmittedModel, rates: Sequence[float] | None
+) -> FitConfig | None:
+    """Return the configuration for a model; None where the logs' rates decide and are not known yet."""
+    from spelgen.fitting.stages import default_config, has_rigid_bodies
+    from spelgen.settings.fits import fit_config
+
+    rigid_bodies, options, defaults = has_rigid_bodies(model), request.options, dict(settings.options)
+    objective = request.objective or settings.objective
+    if objective is not None:
+        if request.warm_start and objective == "rollout" and rigid_bodies:
+            defaults["torque_first"] = False  # it would start the bodies anew
+        return fit_config(objective, rigid_bodies=rigid_bodies, options=options, defaults=defaults)
+    if rates is None and rigid_bodies:
+        return None
+    if TIME_LIMIT in options:  # whoever sets it cannot know which objective the logs will lead to
+        defaults[TIME_LIMIT] = options.pop(TIME_LIMIT)
+    config = default_config(model, rates or [], options, defaults)
+    if TIME_LIMIT in request.values and TIME_LIMIT not in type(config).model_fields:
+        note(f"info: --max-minutes limits fits to windows; these logs are fitted by {config.objective}")
+    return config
+
+
+def resumed_run(folder: Path, request: Request) -> Start:
+    """Return the start of a run that goes on: what the command line does not say, the run does."""
+    from spelgen.fitting.run_folder import RunFolder
+    from spelgen.fitting.run_record import recorded_config
+    from spelgen.fitting.stages import has_rigid_bodies
+    from spelgen.logs.preprocessing import Preprocessing
+    from spelgen.settings.fits import fit_config
+    from spelgen.settings.log_mapping import LogMapping
+
+    run = RunFolder(folder)
+    record = run.read_config()
+    if record["validation_fraction"] is None and record["objective"] != "servo":  # which needs none
+        raise RunError(
+            "a run with validation logs that were given in memory",
+            file=folder,
+            do="go on with spelgen.fit(..., folder=..., resume=True)",
+        )
+
+    def config(model: EmittedModel, rates: Sequence[float] | None) -> FitConfig:
+        rigid_bodies = has_rigid_bodies(model)
+        if request.objective not in (None, record["objective"]):
+            return fit_config(request.objective, rigid_bodies=rigid_bodies, options=request.options)
+        same = recorded_config(record, **request.options)
+        same.require(rigid_bodies=rigid_bodies)
+        return same
+
+    return Start(
+        run.module,
+        config,
+        Preprocessing(**(record["preprocessing"] | request.preprocessing)),
+        **_split(request, record),
+        mapping=LogMapping(**record["mapping"]),
+    )
+
+
+def _split(request: Request, defaults: Mapping[str, float]) -> dict[str, float]:
+    return {
+        "validation": request.values.get("validation_fraction", defaults["validation_fraction"]),
+        "seed": request.values.get("seed", defaults["seed"]),
+    }
