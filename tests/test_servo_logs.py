@@ -43,9 +43,9 @@ def test_logs_of_a_servo_arm_are_told(arm, logs):
     assert shoulder.steps["q"] == pytest.approx(2 * np.pi / 4096, rel=1e-6)
     assert shoulder.steps["u"] is None
     assert shoulder.u == (min(x.u[:, 0].min() for x in logs), max(x.u[:, 0].max() for x in logs))
-    assert 0.05 < shoulder.behind < 0.15  # the delay, and kd/kp
+    assert 0.05 < shoulder.lag < 0.15  # the delay, and kd/kp
     assert shoulder.saturated < 0.02 and elbow.saturated is None
-    assert shoulder.still is None  # its command never rests
+    assert shoulder.steady_state_error is None  # its command never rests
     for text in ("Positions and commands [rad]", "Commands act after", "Nothing is odd."):
         assert text in found.text()
     told = json.loads(json.dumps(found.to_dict()))
@@ -104,8 +104,8 @@ def test_what_is_odd_about_commands_is_told(arm, logs, columns, code):
 def test_what_is_left_at_rest_is_told(arm):
     shoulder, elbow = spelgen.check_logs(servo_logs(2, 12.0, swing=0.0), arm).servos
     # dry friction and the links' weight hold that much, in ratio to kp
-    assert 0.3 * 0.15 / 14 < shoulder.still < (0.15 + 0.9) / 14
-    assert 0.3 * 0.08 / 9 < elbow.still < (0.08 + 0.16) / 9
+    assert 0.3 * 0.15 / 14 < shoulder.steady_state_error < (0.15 + 0.9) / 14
+    assert 0.3 * 0.08 / 9 < elbow.steady_state_error < (0.08 + 0.16) / 9
 
 
 def test_servos_that_give_all_they_can_are_counted(arm):

@@ -1,4 +1,4 @@
-"""Logs of commanded positions beside a robot: what they hold, how joints follow, and what is odd about it."""
+"""Check logs of commanded positions beside a robot: what they hold, how joints follow, and what is odd about it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from spelgen.arm.arm import Coordinate
 from spelgen.errors import Diagnostic, LogError
-from spelgen.log_checks.following import DELAYS, NOW, Following
+from spelgen.log_checks.following import DELAYS, NO_DELAY, TUNING, Following, measure_following
 from spelgen.log_checks.report import range_fraction
 from spelgen.log_checks.servo_report import ServoJointReport, ServoLogReport
 from spelgen.log_checks.statistics import (
@@ -27,163 +27,173 @@ if TYPE_CHECKING:
     from spelgen.loaded_arm import LoadedArm
 
 EXAMPLES = 2  # trajectories that are drawn
-ALIKE, UNLIKE = 0.9, 0.5  # correlations of a command with the position that is, or is not, that of its joint
-SPARSE = 20.0  # Hz, below which delays and friction are not seen
-BEYOND = 1e-3  # rad, m that rounding overruns a limit by
-USUAL = 0.9  # quantile
+ROUNDING = 1e-3  # rad, m by which rounding overruns a limit
 
 
 def check_servo_logs(logs: Iterable[Trajectory], arm: LoadedArm) -> ServoLogReport:
-    """All about logs of commanded positions, read once; nothing is repaired or raised but what `check_logs` raises."""
+    """Report all about logs of commanded positions; nothing is repaired or raised but what `check_logs` raises."""
     coordinates = arm.arm.coordinates
     joints, kinds = [c.name for c in coordinates], [c.kind for c in coordinates]
-    seen = [_Signals(k) for k in range(len(joints))]
-    following, clocks = Following(_reaches(arm)), []
-    examples: list[Trajectory] = []
+    logs = list(logs)
+    if not logs:
+        raise LogError("no trajectory", expected="at least one")
     notes: list[Diagnostic] = []
     odd: list[Finding] = []
-    for trajectory in logs:
-        require_joints(trajectory, joints)
-        require_commands(trajectory)
-        clocks.append(clock_of(trajectory))
-        following.add(trajectory)
-        for each in seen:
-            each.add(trajectory)
-        odd += findings(trajectory, joints, kinds)
-        notes += gap_diagnostics(trajectory)
-        if len(examples) < EXAMPLES:
-            examples.append(trajectory)
-    if not clocks:
-        raise LogError("no trajectory", expected="at least one")
-    about, errors = summarised(odd, joints, len(clocks))
-    notes += about
+    for log in logs:
+        require_joints(log, joints)
+        require_commands(log)
+        odd += findings(log, joints, kinds)
+        notes += gap_diagnostics(log)
+    summaries, errors = summarised(odd, joints, len(logs))
+    notes += summaries
+    following = measure_following(logs, _saturation(arm))
+    clocks = [clock_of(log) for log in logs]
+    reports = []
     for k, coordinate in enumerate(coordinates):
+        report = _joint(arm, k, logs, following)
+        reports.append(report)
         wrong = _wrong_command(k, joints, following)
-        errors += [wrong] if wrong else []
-        notes += [] if wrong else _odd_command(k, coordinate, seen[k], following)
+        if wrong is None:
+            copied = all(np.array_equal(log.q[:, k], require_commands(log)[:, k]) for log in logs)
+            notes += [*_odd_command(k, report, following, copied=copied), *_beyond_limits(coordinate, report)]
+        else:
+            errors.append(wrong)
     notes += _sparse(clocks)
     return ServoLogReport(
         robot=arm.arm.name,
-        files=len({each.file for each in clocks} - {None}),
+        files=len({clock.file for clock in clocks} - {None}),
         trajectories=tuple(clocks),
         joints=(),
         findings=tuple(notes),
         errors=tuple(errors),
-        examples=tuple(examples),
-        servos=tuple(_joint(arm, k, seen[k], following) for k in range(len(joints))),
-        delay=following.delay(),
+        examples=tuple(logs[:EXAMPLES]),
+        servos=tuple(reports),
+        delay=following.delay,
     )
 
 
-class _Signals:
-    """Ends, noise and steps of one joint's signals over recordings."""
-
-    def __init__(self, joint: int) -> None:
-        self._joint = joint
-        self.low, self.high = {"q": np.inf, "u": np.inf}, {"q": -np.inf, "u": -np.inf}
-        self.noise: list[float] = []
-        self.steps: dict[str, list[float]] = {"q": [], "u": []}
-        self.same = True  # as if the positions had been logged twice
-
-    def add(self, trajectory: Trajectory) -> None:
-        q, u = (x[:, self._joint] for x in (trajectory.q, require_commands(trajectory)))
-        for name, values in (("q", q), ("u", u)):
-            self.low[name] = min(self.low[name], float(values.min()))
-            self.high[name] = max(self.high[name], float(values.max()))
-            self.steps[name].append(quantisation_step(values))
-        self.same &= bool(np.array_equal(q, u))
-        if trajectory.sample_rate >= DENSE and len(q) > 8:
-            self.noise.append(float(noise_level(trajectory.t, q[:, None])[0]))
+def _saturation(arm: LoadedArm) -> np.ndarray:
+    """Return distances from the command (n,) at which servos give all they can; infinite where that is not known."""
+    distances = np.full(len(arm.arm.coordinates), np.inf)
+    for k, coordinate in enumerate(arm.arm.coordinates):
+        kp = arm.settings.joint(coordinate.name).kp
+        if coordinate.effort and kp:
+            distances[k] = coordinate.effort / kp
+    return distances
 
 
-def _joint(arm: LoadedArm, k: int, seen: _Signals, following: Following) -> ServoJointReport:
-    coordinate, moves = arm.arm.coordinates[k], bool(following.moves()[k])
-    apart = following.apart(k)
-    place = following.likeness(k, k).place if moves else NOW
-    rest = np.abs(np.concatenate([np.zeros(0), *following.rest[k]]))
-    kp = arm.settings.joint(coordinate.name).kp
+def _joint(arm: LoadedArm, k: int, logs: Sequence[Trajectory], following: Following) -> ServoJointReport:
+    coordinate = arm.arm.coordinates[k]
+    positions = [log.q[:, k] for log in logs]
+    commands = [require_commands(log)[:, k] for log in logs]
+    delay, lag = NO_DELAY, None
+    if following.moves[k]:
+        delay = following.best_delay(k, k)
+        lag = float(DELAYS[delay])
+    steady_state_error, saturated = None, None
+    if len(following.steady_state_errors[k]):
+        steady_state_error = float(np.quantile(np.abs(following.steady_state_errors[k]), 0.9))
+    if arm.settings.joint(coordinate.name).kp is not None:
+        saturated = float(following.saturated[k])
+    q, u = _ends(positions), _ends(commands)
     return ServoJointReport(
         name=coordinate.name,
         kind=coordinate.kind,
-        q=(seen.low["q"], seen.high["q"]),
-        u=(seen.low["u"], seen.high["u"]),
-        range_fraction=range_fraction(coordinate, seen.low["q"], seen.high["q"]),
-        noise=float(np.median(seen.noise)) if seen.noise else None,
-        steps={name: common_step(x) for name, x in seen.steps.items()},
-        behind=float(DELAYS[place]) if moves else None,
-        apart=float(apart[place]),
-        still=float(np.quantile(rest, USUAL)) if len(rest) else None,
-        saturated=None if kp is None else float(following.far[k] / max(following.count, 1)),
+        q=q,
+        u=u,
+        range_fraction=range_fraction(coordinate, *q),
+        noise=_noise(logs, k),
+        steps={
+            "q": common_step(list(map(quantisation_step, positions))),
+            "u": common_step(list(map(quantisation_step, commands))),
+        },
+        lag=lag,
+        tracking_rms=float(following.tracking_rms[delay, k]),
+        steady_state_error=steady_state_error,
+        saturated=saturated,
     )
 
 
-def _reaches(arm: LoadedArm) -> np.ndarray:
-    """Distances from the command (n,) at which servos give all they can; infinite where that is not known."""
-    known = [(x.effort, arm.settings.joint(x.name).kp) for x in arm.arm.coordinates]
-    return np.array([effort / kp if effort and kp else np.inf for effort, kp in known])
+def _ends(signals: Sequence[np.ndarray]) -> tuple[float, float]:
+    joined = np.concatenate(signals)
+    return float(joined.min()), float(joined.max())
+
+
+def _noise(logs: Sequence[Trajectory], k: int) -> float | None:
+    """Return the standard deviation of the position's noise, None where logs are too sparse to tell."""
+    levels = []
+    for log in logs:
+        if log.sample_rate >= DENSE and len(log) > 8:
+            levels.append(noise_level(log.t, log.q[:, [k]]))
+    if not levels:
+        return None
+    return float(np.median(levels))
 
 
 def _wrong_command(k: int, joints: Sequence[str], following: Following) -> LogError | None:
-    """Why a command cannot be that of its joint."""
-    if not following.moves()[k]:
+    """Return why a command cannot be that of its joint, None where it can."""
+    if not following.moves[k]:
         return None
-    where, (_, alike, factor) = f"joint {joints[k]!r}", following.likeness(k, k)
-    if alike > ALIKE and (0.8 < factor * DEGREES < 1.25 or 0.8 < factor / DEGREES < 1.25):
-        got = f"positions that move {factor:.3g} times as far as commands (180/pi is 57.3)"
-        return LogError(
-            got,
-            element=where,
-            expected="both in radians",
-            do="say 'units' of q and u under 'logs' in the robot's YAML",
-        )
-    if alike < -ALIKE:
-        got = f"positions that move against commands (correlation {alike:.2g})"
+    where, delay = f"joint {joints[k]!r}", following.best_delay(k, k)
+    correlation, gain = float(following.correlation[delay, k, k]), float(following.gain[delay, k, k])
+    in_degrees = 0.8 < gain * DEGREES < 1.25 or 0.8 < gain / DEGREES < 1.25
+    if correlation > TUNING.follows and in_degrees:
+        got = f"positions that move {gain:.3g} times as far as commands (180/pi is 57.3)"
+        do = "say 'units' of q and u under 'logs' in the robot's YAML"
+        return LogError(got, element=where, expected="both in radians", do=do)
+    if correlation < -TUNING.follows:
+        got = f"positions that move against commands (correlation {correlation:.2g})"
         return LogError(got, element=where, expected="one sense", do="check the signs of q and u")
-    if alike < UNLIKE:
+    if correlation < TUNING.ignores:
         for other, name in enumerate(joints):
-            if other != k and following.likeness(k, other).correlation > ALIKE:
+            delay = following.best_delay(k, other)
+            if other != k and following.correlation[delay, k, other] > TUNING.follows:
                 got = f"a command that joint {name!r} follows, and this one does not"
-                return LogError(
-                    got, element=where, expected="its own command", do="check the names of the columns"
-                )
+                do = "check the names of the columns"
+                return LogError(got, element=where, expected="its own command", do=do)
     return None
 
 
 def _odd_command(
-    k: int, coordinate: Coordinate, seen: _Signals, following: Following
+    k: int, report: ServoJointReport, following: Following, *, copied: bool
 ) -> Iterator[Diagnostic]:
-    """What is odd about a joint's command."""
-    where = f"joint {coordinate.name!r}"
+    """Yield what is odd about a joint's command; copied: it is the position itself."""
+    delay = following.best_delay(k, k)
+    correlation = following.correlation[delay, k, k]
+    if copied:
+        message = "u is q, to the last bit: are the commands those that were sent?"
+        yield _warning("commands-are-positions", report.name, message)
+    elif not following.moves[k]:
+        message = f"its command moves by {report.u[1] - report.u[0]:.3g} alone: what its servo is stays open"
+        yield _warning("idle-command", report.name, message)
+    elif correlation < TUNING.ignores:
+        message = f"it does not follow its command (correlation {correlation:.2g})"
+        yield _warning("not-following", report.name, message)
+    elif DELAYS[delay] < 0:
+        message = f"positions come {-1000 * DELAYS[delay]:.0f} ms before commands: are rows shifted?"
+        yield _warning("ahead-of-command", report.name, message)
 
-    def odd(code: str, message: str) -> Diagnostic:
-        return Diagnostic("warning", code, where, None, message)
 
-    if seen.same:
-        yield odd("commands-are-positions", "u is q, to the last bit: are the commands those that were sent?")
-    elif not following.moves()[k]:
-        span = seen.high["u"] - seen.low["u"]
-        yield odd("idle-command", f"its command moves by {span:.3g} alone: what its servo is stays open")
-    else:
-        place, alike, _ = following.likeness(k, k)
-        if alike < UNLIKE:
-            yield odd("not-following", f"it does not follow its command (correlation {alike:.2g})")
-        elif DELAYS[place] < 0:
-            message = f"positions come {-1000 * DELAYS[place]:.0f} ms before commands: are rows shifted?"
-            yield odd("ahead-of-command", message)
-    lower, upper = (None, None) if coordinate.continuous else (coordinate.lower, coordinate.upper)
-    for name in ("q", "u"):
-        if lower is not None and seen.low[name] < lower - BEYOND:
-            yield odd(
-                "beyond-position-limit", f"{name} down to {seen.low[name]:.4g}, the limit is {lower:.4g}"
-            )
-        if upper is not None and seen.high[name] > upper + BEYOND:
-            yield odd(
-                "beyond-position-limit", f"{name} up to {seen.high[name]:.4g}, the limit is {upper:.4g}"
-            )
+def _beyond_limits(coordinate: Coordinate, report: ServoJointReport) -> Iterator[Diagnostic]:
+    """Yield where positions and commands go beyond the URDF's limits."""
+    if coordinate.continuous:
+        return
+    for name, (low, high) in (("q", report.q), ("u", report.u)):
+        if coordinate.lower is not None and low < coordinate.lower - ROUNDING:
+            message = f"{name} down to {low:.4g}, the limit is {coordinate.lower:.4g}"
+            yield _warning("beyond-position-limit", report.name, message)
+        if coordinate.upper is not None and high > coordinate.upper + ROUNDING:
+            message = f"{name} up to {high:.4g}, the limit is {coordinate.upper:.4g}"
+            yield _warning("beyond-position-limit", report.name, message)
 
 
 def _sparse(clocks: Sequence[Clock]) -> Iterator[Diagnostic]:
-    slow = [x for x in clocks if x.sample_rate < SPARSE]
-    if slow:
-        message = f"{slow[0].sample_rate:.3g} Hz: below {SPARSE:g} Hz delays and friction are hardly seen"
-        yield Diagnostic("warning", "sparse", f"trajectory {slow[0].name}", None, message)
+    for clock in clocks:
+        if clock.sample_rate < TUNING.sparse_rate:
+            message = f"{clock.sample_rate:.3g} Hz: below {TUNING.sparse_rate:g} Hz delays and friction are hardly seen"
+            yield Diagnostic("warning", "sparse", f"trajectory {clock.name}", None, message)
+            return
+
+
+def _warning(code: str, joint: str, message: str) -> Diagnostic:
+    return Diagnostic("warning", code, f"joint {joint!r}", None, message)

@@ -1,8 +1,9 @@
-"""How joints follow commanded positions: sums over recordings, from which delays and distances come."""
+"""Measure how joints follow commanded positions: correlations, delays, and distances between the two."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import nnls
@@ -10,128 +11,143 @@ from scipy.optimize import nnls
 from spelgen.logs.commands import delayed_commands
 from spelgen.logs.smoothing import derivative
 from spelgen.logs.trajectory import Trajectory, require_commands, split_at_gaps
+from spelgen.settings.tuning.servo import ServoLogTuning
 
-DELAYS = np.arange(-10, 41) / 100  # s that commands may come before positions
-NOW = int(np.argmin(np.abs(DELAYS)))
-SHORTEST = 12  # samples of a piece
-STILL = 0.25  # s that a command rests before a joint under it is taken to rest
-SLOW = 0.02  # rad/s, m/s: below it a joint rests
-CLEAR = 0.1  # of the mean square error that a delay leaves, in logarithms
-MOVES = 1e-2  # rad, m: commands that move less tell nothing of delays
-
-
-class Likeness(NamedTuple):
-    """place: among `DELAYS`, where the correlation is largest; factor: how far the position moves by the command."""
-
-    place: int
-    correlation: float
-    factor: float
+TUNING = ServoLogTuning()
+DELAYS = (
+    np.arange(TUNING.earliest_delay, TUNING.latest_delay + 1e-9, TUNING.delay_step).round(9) + 0.0
+)  # no -0
+NO_DELAY = int(np.argmin(np.abs(DELAYS)))
+FILTER_SAMPLES = 12  # the shortest piece that the derivative's polynomial has room in
 
 
+@dataclass(frozen=True, eq=False)
 class Following:
-    """Sums over recordings of n joints. count: of samples; far: of those that far from the command, (n,); rest: of
-    each joint, distances u - q while both rest.
+    """Hold how n joints follow their commands at each of the D `DELAYS`.
+
+    moves: (n,) whether the command moves. correlation, gain: (D, n, n) of the command of one joint with the position of
+    another, and how far that moves by the command. tracking_rms: (D, n) root mean square of u - q [rad, m].
+    delay: the ends [s] between which commands act, None where no command moves. steady_state_errors: of each joint, the
+    distances u - q while command and joint rest. saturated: (n,) fraction of the samples at its torque limit.
     """
 
-    def __init__(self, reaches: np.ndarray) -> None:
-        """reaches: (n,) distances that are far."""
-        delays, n = len(DELAYS), len(reaches)
-        self._reaches, self.count, self.far = reaches, 0, np.zeros(n)
-        self.rest: list[list[np.ndarray]] = [[] for _ in range(n)]
-        # of commands at each delay, of positions, and of both
-        self._u, self._uu, self._uq = np.zeros((delays, n)), np.zeros((delays, n)), np.zeros((delays, n, n))
-        self._q, self._qq = np.zeros(n), np.zeros(n)
-        # of what is between them, and of velocity, acceleration, the sense of motion and 1
-        self._squares, self._smooth_squares = np.zeros((2, delays, n))
-        self._products = np.zeros((delays, n, 4))
-        self._columns = np.zeros((n, 4, 4))
+    moves: np.ndarray
+    correlation: np.ndarray
+    gain: np.ndarray
+    tracking_rms: np.ndarray
+    delay: tuple[float, float] | None
+    steady_state_errors: list[np.ndarray]
+    saturated: np.ndarray
 
-    def add(self, trajectory: Trajectory) -> None:
-        """One more recording, piece by piece."""
-        for piece in split_at_gaps(trajectory):
-            if len(piece) >= SHORTEST:
-                self._add(piece)
+    def best_delay(self, command: int, position: int) -> int:
+        """Return the index among `DELAYS` at which the command of one joint is most like the position of another."""
+        return int(np.argmax(np.abs(self.correlation[:, command, position])))
 
-    def _add(self, piece: Trajectory) -> None:
-        commands, q = require_commands(piece)[:-1], _between(piece.q)
-        velocity = np.gradient(piece.q, piece.t, axis=0)
+
+def measure_following(logs: Sequence[Trajectory], saturation: np.ndarray) -> Following:
+    """Measure n joints over recordings; saturation: (n,) distances from the command at which torque is at its limit."""
+    pieces = []
+    for log in logs:
+        pieces += [piece for piece in split_at_gaps(log) if len(piece) >= FILTER_SAMPLES]
+    n = len(saturation)
+    q = _joined([_midpoints(piece.q) for piece in pieces], n)
+    q_centred = q - _mean(q)
+    q_std = np.sqrt(_mean(q_centred**2))
+    correlation, gain = np.zeros((2, len(DELAYS), n, n))
+    tracking_rms = np.zeros((len(DELAYS), n))
+    for k, delay in enumerate(DELAYS.tolist()):
+        u = _joined([_commands(piece, delay) for piece in pieces], n)
+        u_centred = u - _mean(u)
+        u_std = np.sqrt(_mean(u_centred**2))
+        covariance = u_centred.T @ q_centred / max(len(u), 1)
+        correlation[k] = covariance / np.maximum(np.outer(u_std, q_std), 1e-6)
+        gain[k] = covariance / np.maximum(u_std**2, 1e-12)[:, None]
+        tracking_rms[k] = np.sqrt(_mean((u - q) ** 2))
+        if k == NO_DELAY:
+            moves = u_std > TUNING.idle_command
+    commands = _joined([require_commands(piece)[:-1] for piece in pieces], n)
+    return Following(
+        moves=moves,
+        correlation=correlation,
+        gain=gain,
+        tracking_rms=tracking_rms,
+        delay=_delay(pieces, moves),
+        steady_state_errors=_resting_errors(pieces, n),
+        saturated=_mean(np.abs(commands - q) > saturation),
+    )
+
+
+def _delay(pieces: Sequence[Trajectory], moves: np.ndarray) -> tuple[float, float] | None:
+    """Find between which delays [s] commands act, None where no command moves.
+
+    Velocity, acceleration and dry friction only hold a joint back, so u - q is a sum of them with coefficients that are
+    not negative; delays are alike where this sum leaves the same, but for `equal_delays`.
+    """
+    moving = np.flatnonzero(moves)
+    if not len(moving):
+        return None
+    columns = np.concatenate([_retarding_motion(piece) for piece in pieces])  # (T, n, 3)
+    columns = columns - columns.mean(axis=0)
+    delays = DELAYS[DELAYS > -1e-9]
+    log_residuals = np.zeros((len(delays), len(moving)))
+    for k, delay in enumerate(delays.tolist()):
         # one filter over all of an equation changes nothing of what it says
-        rate = piece.sample_rate
-        smooth = derivative(piece.q, rate, 0)
-        qd = np.gradient(smooth, piece.t, axis=0)
-        slopes = (qd, np.gradient(qd, piece.t, axis=0), derivative(np.tanh(velocity / SLOW), rate, 0))
-        columns = np.stack([*(_between(x) for x in slopes), np.ones_like(q)], axis=-1)  # (T, n, 4)
-        self._columns += np.einsum("tni,tnj->nij", columns, columns)
-        self.count += len(q)
-        self._q, self._qq = self._q + q.sum(axis=0), self._qq + np.square(q).sum(axis=0)
-        for k, delay in enumerate(DELAYS):
-            u = delayed_commands(piece, slice(0, len(piece)), delay, 1)[:, 0]
-            self._u[k] += u.sum(axis=0)
-            self._uu[k] += np.square(u).sum(axis=0)
-            self._uq[k] += u.T @ q
-            self._squares[k] += np.square(u - q).sum(axis=0)
-            apart = derivative(u - q, rate, 0)
-            self._smooth_squares[k] += np.square(apart).sum(axis=0)
-            self._products[k] += np.einsum("tn,tni->ni", apart, columns)
-        self.far += (np.abs(commands - q) > self._reaches).sum(axis=0)
-        span = max(1, round(STILL * piece.sample_rate))
-        moved = np.abs(commands - np.roll(commands, span, axis=0)) > 0
-        moved[:span] = True
-        for joint, rest in enumerate(self.rest):
-            rests = ~moved[:, joint] & (np.abs(qd[1:, joint]) < SLOW)
-            rest.append((commands - q)[rests, joint])
-
-    def moves(self) -> np.ndarray:
-        """Whether a joint's command moves, (n,)."""
-        count = max(self.count, 1)
-        variance = self._uu[NOW] / count - np.square(self._u[NOW] / count)
-        moves: np.ndarray = variance > MOVES**2
-        return moves
-
-    def apart(self, joint: int) -> np.ndarray:
-        """Root mean square of u - q at each delay, (D,)."""
-        apart: np.ndarray = np.sqrt(self._squares[:, joint] / max(self.count, 1))
-        return apart
-
-    def likeness(self, joint: int, other: int) -> Likeness:
-        """Of the command of one joint with the position of another, maybe itself."""
-        count = max(self.count, 1)
-        together = self._uq[:, joint, other] - self._u[:, joint] * self._q[other] / count  # (D,)
-        own = self._uu[:, joint] - np.square(self._u[:, joint]) / count
-        its = self._qq[other] - self._q[other] ** 2 / count
-        alike = together / np.sqrt(np.maximum(own * its, 1e-12))
-        place = int(np.argmax(np.abs(alike)))
-        return Likeness(place, float(alike[place]), float(together[place] / max(own[place], 1e-12)))
-
-    def delay(self) -> tuple[float, float] | None:
-        """Between which delays [s] commands act: those where velocity, acceleration and dry friction, none of which
-        pushes, explain u - q as well as at the best one, but for `CLEAR`. None where no command moves.
-        """
-        moving = np.flatnonzero(self.moves()).tolist()
-        if not moving:
-            return None
-        late = np.flatnonzero(DELAYS > -1e-9)
-        cost = np.array(
-            [np.mean([np.log(self._unexplained(k, joint)) for joint in moving]) for k in late.tolist()]
-        )
-        good = DELAYS[late[cost < cost.min() + CLEAR]]
-        return max(0.0, float(good.min())), float(good.max())
-
-    def _unexplained(self, k: int, joint: int) -> float:
-        """The sum of squares of u - q that is left at a delay."""
-        columns, products = self._columns[joint], self._products[k, joint]
-        count = columns[3, 3]  # of ones: the mean is taken out
-        matrix = columns[:3, :3] - np.outer(columns[:3, 3], columns[3, :3]) / count
-        target = products[:3] - columns[:3, 3] * products[3] / count
-        square = self._smooth_squares[k, joint] - products[3] ** 2 / count
-        # what a column's mean was taken from rounds
-        factor = np.linalg.cholesky(matrix + np.diag(1e-9 * columns.diagonal()[:3] + 1e-12))
-        slopes, _ = nnls(factor.T, np.linalg.solve(factor, target))
-        left = square - 2 * target @ slopes + slopes @ matrix @ slopes
-        return max(float(left), 1e-12)
+        errors = [
+            derivative(_commands(piece, delay) - _midpoints(piece.q), piece.sample_rate, 0)
+            for piece in pieces
+        ]
+        command_error = np.concatenate(errors)
+        command_error = command_error - command_error.mean(axis=0)
+        for place, joint in enumerate(moving.tolist()):
+            _, residual = nnls(columns[:, joint], command_error[:, joint])
+            log_residuals[k, place] = np.log(max(residual**2, 1e-12))
+    cost = log_residuals.mean(axis=1)
+    alike = delays[cost < cost.min() + TUNING.equal_delays]
+    return float(alike.min()), float(alike.max())
 
 
-def _between(x: np.ndarray) -> np.ndarray:
-    """In the middle between samples, where delayed commands are."""
+def _retarding_motion(piece: Trajectory) -> np.ndarray:
+    """Return velocity, acceleration and the sense of motion between samples, (T - 1, n, 3), all smoothed alike."""
+    rate = piece.sample_rate
+    velocity = np.gradient(derivative(piece.q, rate, 0), piece.t, axis=0)
+    acceleration = np.gradient(velocity, piece.t, axis=0)
+    direction = np.tanh(np.gradient(piece.q, piece.t, axis=0) / TUNING.rest_velocity)
+    columns = np.stack([velocity, acceleration, derivative(direction, rate, 0)], axis=-1)
+    return _midpoints(columns)
+
+
+def _resting_errors(pieces: Sequence[Trajectory], n: int) -> list[np.ndarray]:
+    """Return the distances u - q of each joint while it and its command rest."""
+    errors = [[np.zeros(0)] for _ in range(n)]
+    for piece in pieces:
+        u = require_commands(piece)[:-1]
+        velocity = np.gradient(derivative(piece.q, piece.sample_rate, 0), piece.t, axis=0)[1:]
+        span = max(1, round(TUNING.rest_time * piece.sample_rate))
+        rests = (u == np.roll(u, span, axis=0)) & (np.abs(velocity) < TUNING.rest_velocity)
+        rests[:span] = False
+        command_error = u - _midpoints(piece.q)
+        for joint in range(n):
+            errors[joint].append(command_error[rests[:, joint], joint])
+    return [np.concatenate(joint_errors) for joint_errors in errors]
+
+
+def _commands(piece: Trajectory, delay: float) -> np.ndarray:
+    """Return the mean delayed commands between samples, (T - 1, n)."""
+    return delayed_commands(piece, slice(0, len(piece)), delay, 1)[:, 0]
+
+
+def _midpoints(x: np.ndarray) -> np.ndarray:
+    """Return values in the middle between samples, where delayed commands are."""
     middle: np.ndarray = (x[1:] + x[:-1]) / 2
     return middle
+
+
+def _joined(arrays: list[np.ndarray], n: int) -> np.ndarray:
+    """Concatenate arrays of n columns, of which there may be none."""
+    return np.concatenate([np.zeros((0, n)), *arrays])
+
+
+def _mean(x: np.ndarray) -> np.ndarray:
+    """Return the mean of (T, n) over time, 0 where there are no samples."""
+    mean: np.ndarray = x.sum(axis=0) / max(len(x), 1)
+    return mean

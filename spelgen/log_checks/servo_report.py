@@ -1,9 +1,8 @@
-"""What `check_logs` found of logs of commanded positions: tables of commands, and of how joints follow them."""
+"""Report what logs of commanded positions hold: tables of commands, and of how joints follow them."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any
 
 from spelgen.listing import Listing, number
 from spelgen.log_checks.report import LogReport, clock_table
@@ -13,13 +12,13 @@ _UNITS = {"revolute": "rad", "prismatic": "m"}
 
 @dataclass(frozen=True)
 class ServoJointReport:
-    """One joint over all trajectories [rad, m]; None where it cannot be told.
+    """Describe one joint over all trajectories [rad, m]; None where it cannot be said.
 
     q, u: the lowest and the highest. range_fraction: of the joint's range that was visited. noise: of q, standard
-    deviation of what changes from sample to sample. steps: of q and u where they are quantised. behind: by which
-    positions come after commands [s], with all that makes them late. apart: root mean square of u, so much later, less
-    q. still: what is left between them where both rest, nine tenths are nearer. saturated: part of the time that
-    kp (u - q) is beyond the effort limit, where the settings tell kp.
+    deviation of what changes from sample to sample. steps: of q and u where they are quantised. lag: by which
+    positions come after commands [s]. tracking_rms: root mean square of u, delayed by the lag, less q.
+    steady_state_error: nine tenths of the distances u - q are smaller while both rest. saturated: fraction of the time
+    that kp (u - q) is beyond the effort limit, where the settings say kp.
     """
 
     name: str
@@ -29,64 +28,71 @@ class ServoJointReport:
     range_fraction: float | None
     noise: float | None
     steps: dict[str, float | None]
-    behind: float | None
-    apart: float
-    still: float | None
+    lag: float | None
+    tracking_rms: float
+    steady_state_error: float | None
     saturated: float | None
+
+    def signals(self) -> tuple[str, ...]:
+        """Return the joint's row among positions and commands."""
+        visited = _format(self.range_fraction, 1, ".0%")
+        steps = (number(self.steps["q"]), number(self.steps["u"]))
+        return (self.name, _span(self.q), visited, _span(self.u), number(self.noise), *steps)
+
+    def following(self) -> tuple[str, ...]:
+        """Return the joint's row among lags and distances."""
+        return (
+            self.name,
+            _format(self.lag, 1000, ".0f", " ms"),
+            _format(self.tracking_rms, 1000, ".3g"),
+            _format(self.steady_state_error, 1000, ".3g"),
+            _format(self.saturated, 1, ".1%"),
+        )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ServoLogReport(LogReport):
-    """delay: between which ends commands act [s], by least squares on the command error; None where nothing moves."""
+    """Report logs of commanded positions. delay: the ends between which commands act [s], None where none moves."""
 
     servos: tuple[ServoJointReport, ...] = ()
     delay: tuple[float, float] | None = None
 
-    def to_dict(self) -> dict[str, Any]:
-        """JSON form, as of logs of torques but for the joints."""
-        return super().to_dict() | {"delay": self.delay, "joints": [asdict(each) for each in self.servos]}
+    def to_dict(self) -> dict[str, object]:
+        """Return the JSON form, as of logs of torques but for the joints."""
+        return super().to_dict() | {"delay": self.delay, "joints": [asdict(joint) for joint in self.servos]}
 
     def listings(self, most: int | None = None) -> list[Listing]:
-        """All tables; of trajectories at most `most`."""
+        """Return all tables; of trajectories at most `most`."""
         return [clock_table(self, most), self._commands(), self._following()]
 
     def _commands(self) -> Listing:
         head = ("joint", "q", "range", "u", "noise", "q step", "u step")
-        rows = tuple(
-            (
-                x.name, _span(x.q), "-" if x.range_fraction is None else f"{x.range_fraction:.0%}", _span(x.u),
-                number(x.noise), number(x.steps["q"]), number(x.steps["u"]),
-            )
-            for x in self.servos
-        )  # fmt: skip
-        units = "; ".join(unit for kind, unit in _UNITS.items() if kind in {x.kind for x in self.servos})
+        kinds = {joint.kind for joint in self.servos}
+        units = "; ".join(unit for kind, unit in _UNITS.items() if kind in kinds)
         note = (
             "range: how much of the joint's was visited; u: commanded positions; noise: of q, standard deviation of "
             "what changes from sample to sample, from 50 Hz on; step: between the levels of a quantised signal."
         )
+        rows = tuple(joint.signals() for joint in self.servos)
         return Listing(f"Positions and commands [{units}]", head, rows, note)
 
     def _following(self) -> Listing:
-        head = ("joint", "behind", "apart", "left at rest", "saturated")
-        rows = tuple(
-            (
-                x.name, "-" if x.behind is None else f"{1000 * x.behind:.0f} ms", f"{1000 * x.apart:.3g}",
-                "-" if x.still is None else f"{1000 * x.still:.3g}",
-                "-" if x.saturated is None else f"{x.saturated:.1%}",
-            )
-            for x in self.servos
-        )  # fmt: skip
-        late = ""
-        if self.delay is not None:
-            ends = " to ".join(dict.fromkeys(f"{1000 * x:.0f}" for x in self.delay))
-            late = f"Commands act after {ends} ms. "
+        head = ("joint", "lag", "tracking RMS", "steady-state error", "saturated")
         note = (
-            f"{late}behind: by how much positions come after commands; apart: what then is left between them, RMS; "
-            "left at rest: what dry friction, dead zone and weight leave between them, nine tenths are nearer [mrad, "
-            "mm]; "
-            "saturated: part of the time that kp (u - q) is beyond the effort limit, where the settings tell kp."
+            "lag: by how much positions come after commands; tracking RMS: of the delayed command less the position; "
+            "steady-state error: distance from the command at rest, nine tenths are smaller [mrad, mm]; saturated: "
+            "fraction of the time that kp (u - q) is beyond the effort limit, where the settings say kp."
         )
-        return Listing("Following", head, rows, note)
+        if self.delay is not None:
+            ends = dict.fromkeys(f"{1000 * end:.0f}" for end in self.delay)
+            note = f"Commands act after {' to '.join(ends)} ms. {note}"
+        return Listing("Following", head, tuple(joint.following() for joint in self.servos), note)
+
+
+def _format(value: float | None, factor: float, form: str, unit: str = "") -> str:
+    if value is None:
+        return "-"
+    return f"{factor * value:{form}}{unit}"
 
 
 def _span(ends: tuple[float, float]) -> str:
