@@ -16,8 +16,6 @@ from torch import Tensor
 
 from spelgen.runtime.position_servo import beyond
 
-STEP = 3.4e-3  # s, at most: longer ones make armatures a few percent wrong
-
 
 class ServoDrives(NamedTuple):
     """What servos and friction do at joints: their constants, (..., n), and the laws that these belong to."""

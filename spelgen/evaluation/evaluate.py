@@ -18,7 +18,7 @@ from spelgen.evaluation.forecast import Disturbance, Forecast, for_windows, fore
 from spelgen.evaluation.horizons import PROBED, JudgedLogs, horizon_lengths, open_loop_note, predict
 from spelgen.evaluation.invariants import energy_drift
 from spelgen.evaluation.names import MODEL
-from spelgen.evaluation.replay import Replayed, replays
+from spelgen.evaluation.replay import CommandFollower, replays
 from spelgen.evaluation.results import Results, forecast_summary, torque_summary
 from spelgen.evaluation.subject import Subject, subject
 from spelgen.evaluation.torque import torque_errors
@@ -49,7 +49,7 @@ def evaluate(
 
     model: an emitted one, a fit, or the folder of a run. arm: of ``load_arm``, or the path of a URDF; by default
     the fit's: it gives the URDF as a baseline, and errors of the tip. baselines: any dynamics to be judged beside
-    it, by name, e.g. ``{"least squares": identify(...).dynamics}``, or beside position servos a `Replayed`.
+    it, by name, e.g. ``{"least squares": identify(...).dynamics}``, or beside position servos a `CommandFollower`.
     preprocessing: of states and torques; by default as the model was fitted. steps, seconds: horizons in samples and in
     time; those longer than every trajectory are left out, and said. disturbance: "held" judges forecasts (see
     `forecast.py`) where the model comes with windows of its training logs; "none" rollouts by themselves, open loop.
@@ -109,7 +109,7 @@ def _replayed(
     judged: Subject,
     logs: Sequence[Trajectory],
     notes: list[Diagnostic],
-    baselines: Mapping[str, Replayed],
+    baselines: Mapping[str, CommandFollower],
 ) -> Results:
     """Of an arm under position servos: its commands are replayed."""
     if any(x.u is None for x in logs):
@@ -118,7 +118,7 @@ def _replayed(
             element=logs[0].name,
             expected="u: the model is one of position servos",
         )
-    found, missed = replays(judged.model, logs, judged.linear_servos, notes, baselines)
+    found, missed = replays(judged.model, logs, {**baselines, **judged.command_followers}, notes)
     return Results(
         robot=judged.robot, joints=tuple(judged.joints), trajectories=tuple(x.name for x in logs), cutoff=None,
         substeps=1, parameters=sum(x.numel() for x in judged.model.parameters()), horizons=(), torque={},

@@ -1,30 +1,38 @@
-"""Arms that position servos move, judged by replaying commands: whole logs from their start, and windows."""
+"""Judge arms that position servos move by replaying commands: whole logs from their start, and windows."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import torch
 
-from spelgen.dynamics.servo_rollout import STEP, replayed
+from spelgen.dynamics.servo_rollout import replayed
 from spelgen.errors import Diagnostic
-from spelgen.evaluation.names import MODEL
-from spelgen.fitting.linear_servo import LinearServos
-from spelgen.logs.commands import delayed_commands, steps_between
+from spelgen.evaluation.names import LINEAR_SERVOS, MODEL, POSITION_ACTUATORS
+from spelgen.logs.commands import LogRows, delayed_commands, steps_between
 from spelgen.logs.smoothing import velocities
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 
-LATE, LINEAR = "delayed command", "linear servo"
-AHEAD = 1.0  # s, of a window
+if TYPE_CHECKING:
+    from spelgen.emission.loading import EmittedModel
+
+WINDOW = 1.0  # s, of the replays that start anew again and again
+MISSING = {
+    LINEAR_SERVOS: ("no-linear-servos", "no linear servos to compare with: they are fitted by `train`"),
+    POSITION_ACTUATORS: (
+        "no-position-actuators",
+        "no actuators of MuJoCo to compare with: `spelgen train` fits them where MuJoCo is installed",
+    ),
+}
 
 
 @dataclass(frozen=True)
 class ReplayErrors:
-    """Of one predictor, root mean squares over time [rad, m]: by trajectory (over joints too), the mean of these, by
-    joint over all trajectories.
+    """Hold root mean squares over time of one predictor [rad, m]: by trajectory (over joints too), the mean of these,
+    by joint over all trajectories.
     """
 
     trajectories: dict[str, float]
@@ -34,131 +42,113 @@ class ReplayErrors:
 
 @dataclass(frozen=True)
 class Replay:
-    """What was replayed, and how wrong each predictor was."""
+    """Hold what was replayed, and how wrong each predictor was."""
 
     name: str
     errors: dict[str, ReplayErrors]
 
 
-Part = tuple[Trajectory, slice]
 Missed = tuple[Trajectory, np.ndarray]
 """A log, and predicted less measured positions after each of its intervals, (K, n)."""
 
 
-class Replayed(Protocol):
-    """A baseline that follows commands. about: what it is, and how it was fitted."""
+class CommandFollower(Protocol):
+    """Predict the positions of an arm under commands. about: what it is, and how it was fitted."""
 
     @property
     def about(self) -> str: ...
 
-    def positions(self, parts: Sequence[Part], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
-        """After each interval of each part of a log (K, n), from q and qd (parts, n), under the log's commands."""
+    def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
+        """Return positions (K, n) after each interval of each part of a log, from q and qd (parts, n)."""
+
+
+class ServoModel:
+    """Roll out a model of position servos under logged commands."""
+
+    about = "the model"
+
+    def __init__(self, model: EmittedModel) -> None:
+        self._model = model
+
+    def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
+        """Return positions (K, n) of each part; all run beside each other, the shorter ones on and on."""
+        steps = max(steps_between(log) for log, _ in parts)
+        lengths = [rows.stop - rows.start - 1 for _, rows in parts]
+        commands, intervals = [], []
+        for (log, rows), length in zip(parts, lengths, strict=True):
+            padding = (0, max(lengths) - length)
+            delayed = delayed_commands(log, rows, float(self._model.servo.delay), steps)
+            commands.append(np.pad(delayed, (padding, (0, 0), (0, 0)), mode="edge"))
+            intervals.append(np.pad(np.diff(log.t[rows]), padding, mode="edge"))
+        arrays = (q, qd, np.stack(commands), np.stack(intervals))
+        predicted = replayed(self._model, *map(torch.from_numpy, arrays)).numpy()
+        return [positions[:length] for positions, length in zip(predicted, lengths, strict=True)]
 
 
 def replays(
-    model: Any,
+    model: EmittedModel,
     logs: Sequence[Trajectory],
-    linear: LinearServos | None,
+    baselines: Mapping[str, CommandFollower],
     notes: list[Diagnostic],
-    baselines: Mapping[str, Replayed],
 ) -> tuple[tuple[Replay, ...], list[Missed]]:
-    """Of the model, baselines and, where they are known, linear servos: whole logs, and windows of `AHEAD`, one after
-    another; and what the model misses of whole logs.
+    """Replay whole logs, and windows of `WINDOW` one after another, by the model and the baselines.
+
+    Returns these, and what the model misses of whole logs. Notes say what the baselines are, or that there are none.
     """
-    pieces = [x for log in logs for x in split_at_gaps(log) if len(x) > 2]
-    whole = [(x, slice(0, len(x))) for x in pieces]
-    windows = [
-        (x, slice(a, a + span))
-        for x in pieces
-        for span in [round(AHEAD * x.sample_rate) + 1]
-        for a in range(0, len(x) - span + 1, span - 1)
-    ]
-    if linear is None:
-        message = "no linear servos to compare with: they are fitted by `train`"
-        notes.append(Diagnostic("info", "no-linear-servos", "logs", None, message))
-    for name, each in baselines.items():
-        notes.append(Diagnostic("info", "baseline", "logs", None, f"{name}: {each.about}"))
-    if not baselines:
-        message = (
-            "no actuators of MuJoCo to compare with: `spelgen train` fits them where MuJoCo is installed"
-        )
-        notes.append(Diagnostic("info", "no-position-actuators", "logs", None, message))
-    wrong = _wrong(model, whole, linear, baselines, still=True)
-    found = [Replay("whole log", _summaries(whole, wrong))]
+    pieces: list[Trajectory] = []
+    for log in logs:
+        pieces += [piece for piece in split_at_gaps(log) if len(piece) > 2]
+    windows: list[LogRows] = []
+    for piece in pieces:
+        length = round(WINDOW * piece.sample_rate) + 1
+        starts = range(0, len(piece) - length + 1, length - 1)
+        windows += [(piece, slice(start, start + length)) for start in starts]
+    for name, (code, message) in MISSING.items():
+        if name in baselines:
+            code, message = "baseline", f"{name}: {baselines[name].about}"
+        notes.append(Diagnostic("info", code, "logs", None, message))
+    predictors = {MODEL: ServoModel(model), **baselines}
+    logs_from_rest = [(piece, slice(0, len(piece))) for piece in pieces]
+    q = np.stack([piece.q[0] for piece in pieces])
+    errors = _errors(predictors, logs_from_rest, q, np.zeros_like(q))
+    results = [Replay("whole log", _summaries(logs_from_rest, errors))]
     if windows:
-        errors = _summaries(windows, _wrong(model, windows, linear, baselines, still=False))
-        found.append(Replay(f"windows of {AHEAD:g} s", errors))
-    return tuple(found), [*zip(pieces, wrong[MODEL], strict=True)]
+        smooth_velocities = {id(piece): velocities(piece) for piece in pieces}
+        q = np.stack([log.q[rows.start] for log, rows in windows])
+        qd = np.stack([smooth_velocities[id(log)][rows.start] for log, rows in windows])
+        summaries = _summaries(windows, _errors(predictors, windows, q, qd))
+        results.append(Replay(f"windows of {WINDOW:g} s", summaries))
+    return tuple(results), list(zip(pieces, errors[MODEL], strict=True))
 
 
-def _wrong(
-    model: Any,
-    parts: Sequence[Part],
-    linear: LinearServos | None,
-    baselines: Mapping[str, Replayed],
-    *,
-    still: bool,
-) -> dict[str, list[np.ndarray]]:
-    """By predictor, of each part (K, n). still: each part starts at rest, else with the velocity measured there."""
-    wrong = {MODEL: _of_model(model, parts, still)}
-    for name, each in baselines.items():
-        found = each.positions(parts, *_starts(parts, still))
-        wrong[name] = [q - x.q[rows][1:] for q, (x, rows) in zip(found, parts, strict=True)]
-    if linear is not None:
-        wrong[LINEAR] = _of_linear(linear, parts, still)
-        late = [delayed_commands(x, rows, linear.late, 1)[:, 0] for x, rows in parts]
-        wrong[LATE] = [u - x.q[rows][1:] for u, (x, rows) in zip(late, parts, strict=True)]
-    return wrong
+Errors = dict[str, list[np.ndarray]]
+"""By predictor, predicted less measured positions of each part, (K, n)."""
 
 
-def _summaries(parts: Sequence[Part], wrong: Mapping[str, list[np.ndarray]]) -> dict[str, ReplayErrors]:
-    names = [x.name for x, _ in parts]
-    return {predictor: _summary(names, errors) for predictor, errors in wrong.items()}
+def _errors(
+    predictors: Mapping[str, CommandFollower], parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray
+) -> Errors:
+    measured = [log.q[rows][1:] for log, rows in parts]
+    errors: Errors = {}
+    for name, predictor in predictors.items():
+        predicted = predictor.positions(parts, q, qd)
+        errors[name] = [x - y for x, y in zip(predicted, measured, strict=True)]
+    return errors
+
+
+def _summaries(parts: Sequence[LogRows], errors: Errors) -> dict[str, ReplayErrors]:
+    names = [log.name for log, _ in parts]
+    return {predictor: _summary(names, part_errors) for predictor, part_errors in errors.items()}
 
 
 def _summary(names: Sequence[str], errors: Sequence[np.ndarray]) -> ReplayErrors:
-    joined = {
-        name: np.concatenate([x for each, x in zip(names, errors, strict=True) if each == name])
-        for name in dict.fromkeys(names)
-    }
-    by_name = {name: float(np.sqrt(np.square(x).mean())) for name, x in joined.items()}
-    joints = np.sqrt(np.square(np.concatenate([*joined.values()])).mean(axis=0))
-    return ReplayErrors(by_name, float(np.mean([*by_name.values()])), tuple(joints.tolist()))
+    by_name: dict[str, list[np.ndarray]] = {name: [] for name in names}
+    for name, error in zip(names, errors, strict=True):
+        by_name[name].append(error)
+    trajectories = {name: float(_rms(np.concatenate(parts), None)) for name, parts in by_name.items()}
+    joints = _rms(np.concatenate(errors), 0)
+    return ReplayErrors(trajectories, float(np.mean(list(trajectories.values()))), tuple(joints.tolist()))
 
 
-def _starts(parts: Sequence[Part], still: bool) -> tuple[np.ndarray, np.ndarray]:
-    q = np.stack([x.q[rows.start] for x, rows in parts])
-    if still:
-        return q, np.zeros_like(q)
-    measured = {id(x): velocities(x) for x, _ in parts}
-    return q, np.stack([measured[id(x)][rows.start] for x, rows in parts])
-
-
-def _of_model(model: Any, parts: Sequence[Part], still: bool) -> list[np.ndarray]:
-    """Errors (K, n) of each part; all run beside each other, the shorter ones on and on."""
-    q, qd = _starts(parts, still)
-    steps = max(steps_between(x, STEP) for x, _ in parts)
-    delay, longest = float(model.servo.delay), max(rows.stop - rows.start for _, rows in parts) - 1
-    commands = [delayed_commands(x, rows, delay, steps) for x, rows in parts]
-    held = [np.pad(u, ((0, longest - len(u)), (0, 0), (0, 0)), mode="edge") for u in commands]
-    times = [
-        np.pad(dt, (0, longest - len(dt)), mode="edge") for dt in (np.diff(x.t[rows]) for x, rows in parts)
-    ]
-    arrays = (q, qd, np.stack(held), np.stack(times))
-    found = replayed(model, *(torch.from_numpy(x) for x in arrays)).numpy()
-    return [each[: len(u)] - x.q[rows][1:] for each, u, (x, rows) in zip(found, commands, parts, strict=True)]
-
-
-def _of_linear(linear: LinearServos, parts: Sequence[Part], still: bool) -> list[np.ndarray]:
-    q, qd = _starts(parts, still)
-    found = []
-    for k, (x, rows) in enumerate(parts):
-        predicted = [
-            linear.positions(
-                joint, q[k : k + 1, joint], qd[k : k + 1, joint],
-                delayed_commands(x, rows, delay, 1)[None, :, 0, joint], float(np.diff(x.t[rows]).mean()),
-            )[0]
-            for joint, delay in enumerate(linear.delay)
-        ]  # fmt: skip
-        found.append(np.stack(predicted, axis=1) - x.q[rows][1:])
-    return found
+def _rms(x: np.ndarray, axis: int | None) -> np.ndarray:
+    return np.sqrt(np.square(x).mean(axis=axis))

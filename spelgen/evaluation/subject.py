@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import torch
 
 from spelgen.dynamics.bristles import NO_BRISTLES, BristleReach, bristle_reach, reach_of
+from spelgen.evaluation.names import DELAYED_COMMAND, LINEAR_SERVOS
+from spelgen.evaluation.replay import CommandFollower
 from spelgen.fitting.calibration import CalibrationWindows
 from spelgen.fitting.fitted import Fit, load_run
-from spelgen.fitting.linear_servo import LinearServos
 from spelgen.fitting.run_folder import RunFolder
+from spelgen.fitting.servo.linear_servos import DelayedCommand, LinearServos
 from spelgen.logs.arm_mapping import GivenMapping
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs
@@ -38,7 +40,7 @@ class Subject:
     urdf: its robot's, where known; tip: the link there, None for the last. preprocessing, window, substeps:
     those of its fit. reach: (n, K) of the bristles that friction remembers with, its own or the usual ones.
     trained_on: names of the trajectories that it has seen; calibration: windows of them, None where they are not known.
-    linear_servos: fitted to them, what a model of position servos is compared with.
+    command_followers: fitted to them, what a model of position servos is compared with, by name.
     """
 
     model: EmittedModel
@@ -52,7 +54,7 @@ class Subject:
     reach: BristleReach = NO_BRISTLES
     trained_on: frozenset[str] = frozenset()
     calibration: CalibrationWindows | None = None
-    linear_servos: LinearServos | None = None
+    command_followers: Mapping[str, CommandFollower] = field(default_factory=dict)
 
     @property
     def substeps_per_sample(self) -> int:
@@ -76,10 +78,16 @@ def subject(judged: Any, arm: Any = None) -> Subject:
         substeps=judged.substeps,
         trained_on=seen,
         calibration=judged.calibration,
-        linear_servos=LinearServos.from_dict(judged.record["servo"]["linear"])
-        if "servo" in judged.record
-        else None,
+        command_followers=_command_followers(judged.record),
     )
+
+
+def _command_followers(record: Mapping[str, Any]) -> dict[str, CommandFollower]:
+    """Return the baselines that a fit of position servos leaves in its record."""
+    if "servo" not in record:
+        return {}
+    servos = LinearServos.from_dict(record["servo"]["linear"])
+    return {LINEAR_SERVOS: servos, DELAYED_COMMAND: DelayedCommand(servos.late)}
 
 
 def _of_model(model: EmittedModel, urdf: Path | str | None) -> Subject:

@@ -13,13 +13,13 @@ from spelgen.files import write_json
 from spelgen.fitting import workers
 from spelgen.fitting.dataset import digest
 from spelgen.fitting.fitted import Fit
-from spelgen.fitting.linear_servo import fit_linear_servos
 from spelgen.fitting.loop import Status
 from spelgen.fitting.process import termination_as_interrupt, threads_of_torch
 from spelgen.fitting.progress import TrainingProgress
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.run_lock import locked
 from spelgen.fitting.run_record import require_same
+from spelgen.fitting.servo.linear_servos import fit_linear_servos
 from spelgen.fitting.servo_fit import ROUNDS, ServoRounds
 from spelgen.fitting.servo_report import foreseen, foreseen_text, servo_record
 from spelgen.fitting.servo_windows import ServoWindows, servo_windows

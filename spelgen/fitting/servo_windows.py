@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from spelgen.dynamics.servo_rollout import STEP
 from spelgen.errors import LogError
 from spelgen.logs.commands import delayed_commands, steps_between
 from spelgen.logs.preprocessing import Preprocessing
@@ -85,7 +84,7 @@ def servo_windows(logs: Sequence[Trajectory], preprocessing: Preprocessing, most
         for source in (lambda x: x.q, lambda x: smooth[id(x)])
     )
     dt = torch.from_numpy(np.stack([np.diff(x.t[a : a + length]) for x, a in starts]))
-    steps = max(steps_between(x, STEP) for x, _ in starts)
+    steps = max(steps_between(x) for x, _ in starts)
     return ServoWindows(tuple(starts), q, qd, dt, settling, steps)
 
 

@@ -1,0 +1,1 @@
+"""Fit arms under position servos to logs of commanded positions."""

@@ -1,0 +1,109 @@
+"""Fit what any model of an arm under position servos has to beat: commands that come late, and linear servos."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from scipy.linalg import expm
+from scipy.optimize import least_squares, minimize_scalar
+
+from spelgen.fitting.servo_windows import ServoWindows
+from spelgen.logs.commands import LogRows, delayed_commands
+
+LATEST = 0.4  # s, of delays
+START = (20.0, 1.0, 0.02, 0.0)  # frequency [rad/s], damping ratio, delay [s], offset [rad, m]
+BOUNDS = ((1.0, 0.05, 0.0, -1.0), (200.0, 20.0, LATEST, 1.0))
+SCALE = (10.0, 1.0, 0.02, 0.02)  # of steps
+
+
+@dataclass(frozen=True)
+class DelayedCommand:
+    """Predict that positions are the commands of ``delay`` [s] ago."""
+
+    delay: float
+    about = "the commands themselves, after the delay by which they are nearest to the positions of the training logs"
+
+    def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
+        """Return positions (K, n) after each interval of each part of a log."""
+        return [delayed_commands(log, rows, self.delay, 1)[:, 0] for log, rows in parts]
+
+
+@dataclass(frozen=True)
+class LinearServos:
+    """Predict each joint by itself: qdd = w^2 (u + offset - q) - 2 damping w qd, u commanded ``delay`` [s] ago.
+
+    late: the one delay [s] by which commands themselves are nearest to positions.
+    """
+
+    frequency: tuple[float, ...]
+    damping: tuple[float, ...]
+    delay: tuple[float, ...]
+    offset: tuple[float, ...]
+    late: float
+    about = "a linear second-order servo at each joint, fitted to windows of the training logs"
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the JSON form."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, record: Mapping[str, list[float] | float]) -> LinearServos:
+        """Read what `to_dict` gave."""
+        names = ("frequency", "damping", "delay", "offset")
+        return cls(*(tuple(np.atleast_1d(record[name]).tolist()) for name in names), float(record["late"]))
+
+    def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
+        """Return positions (K, n) after each interval of each part of a log, from q and qd (parts, n)."""
+        result = []
+        for k, (log, rows) in enumerate(parts):
+            dt = float(np.diff(log.t[rows]).mean())
+            predicted = np.zeros((rows.stop - rows.start - 1, q.shape[1]))
+            for joint, delay in enumerate(self.delay):
+                u = delayed_commands(log, rows, delay, 1)[:, 0, joint] + self.offset[joint]
+                start = q[[k], joint], qd[[k], joint]
+                predicted[:, joint] = _rollout(
+                    *start, u[None], dt, self.frequency[joint], self.damping[joint]
+                )
+            result.append(predicted)
+        return result
+
+
+def fit_linear_servos(windows: ServoWindows) -> LinearServos:
+    """Fit commands to all samples of windows, and linear servos to what follows each window's settling."""
+    q, qd = windows.q.numpy(), windows.qd.numpy()
+    measured, dt = q[:, 1:], float(windows.dt.mean())
+
+    def commands(delay: float) -> np.ndarray:
+        return windows.commands(delay).mean(dim=2).numpy()
+
+    def delayed_error(delay: float) -> float:
+        return float(np.square(commands(delay) - measured).mean())
+
+    late = minimize_scalar(delayed_error, bounds=(0, LATEST), method="bounded").x
+    fits = []
+    for joint in range(q.shape[2]):
+
+        def residuals(x: np.ndarray, joint: int = joint) -> np.ndarray:
+            frequency, damping, delay, offset = x.tolist()
+            u = commands(delay)[..., joint] + offset
+            predicted = _rollout(q[:, 0, joint], qd[:, 0, joint], u, dt, frequency, damping)
+            return (predicted - measured[..., joint])[:, windows.settling :].ravel()
+
+        fit = least_squares(residuals, START, bounds=BOUNDS, x_scale=SCALE, diff_step=1e-4, max_nfev=30)
+        fits.append(fit.x.tolist())
+    return LinearServos(*zip(*fits, strict=True), float(late))
+
+
+def _rollout(
+    q: np.ndarray, qd: np.ndarray, u: np.ndarray, dt: float, frequency: float, damping: float
+) -> np.ndarray:
+    """Return positions (W, K) from q and qd (W,) under u (W, K): exactly, where a command is held over each step."""
+    system = np.array([[0, 1, 0], [-(frequency**2), -2 * damping * frequency, frequency**2], [0, 0, 0]])
+    step = expm(system * dt)[:2]
+    state, positions = np.stack([q, qd]), np.empty_like(u)
+    for k in range(u.shape[1]):
+        state = step[:, :2] @ state + step[:, 2:] * u[:, k]
+        positions[:, k] = state[0]
+    return positions
