@@ -87,10 +87,10 @@ class Unbounded(nn.Module):
 
 def unbounded(model: EmittedModel) -> EmittedModel | None:
     """The model with M as it comes; None where nothing is done to it."""
-    if not hasattr(getattr(model.dynamics, "mass", None), "bound"):
+    if not hasattr(getattr(model, "mass", None), "bound"):
         return None
     plain = copy.deepcopy(model)
-    plain.dynamics.mass.bound = Unbounded()
+    plain.mass.bound = Unbounded()
     return plain
 
 
@@ -113,7 +113,7 @@ def training_step(model: EmittedModel, data: Data) -> None:
 def networks_alone(model: EmittedModel, data: Data) -> None:
     """The floor: each network forward and backward once for every evaluation in the step, and nothing else."""
     model.zero_grad()
-    dynamics, q, qd = model.dynamics, data.q[:, 0], data.qd[:, 0]
+    dynamics, q, qd = model, data.q[:, 0], data.qd[:, 0]
     prepared = dynamics.prepare()
     total = torch.zeros((), dtype=torch.float64)
     for _ in range(4 * (SAMPLES - 1)):
@@ -158,9 +158,9 @@ def seconds(work: Callable[[], None]) -> float:
 
 def sizes(model: EmittedModel) -> str:
     """Outputs of the networks of M, D, G and V, and inputs of that of M."""
-    if not hasattr(model.dynamics, "mass"):
+    if not hasattr(model, "mass"):
         return ""
-    parts = (model.dynamics.mass, model.dynamics.friction, model.dynamics.input, model.dynamics.potential)
+    parts = (model.mass, model.friction, model.input, model.potential)
     mass, friction, given, potential = (getattr(part, "network", None) for part in parts)
     outputs = (
         len(mass.biases[-1]),
@@ -189,7 +189,7 @@ def main() -> None:
             steps[name].append(seconds(lambda model=model: training_step(model, data)))
             if (free := plain[name]) is not None:
                 bare[name].append(seconds(lambda model=free: training_step(model, data)))
-            if hasattr(model.dynamics, "mass"):
+            if hasattr(model, "mass"):
                 floors[name].append(seconds(lambda model=model: networks_alone(model, data)))
     rivals = {"published": Published(JOINTS, WIDTH, WIDTH // 2), "with jvp": ByJvp(JOINTS, WIDTH, WIDTH // 2)}
     slow = {

@@ -25,6 +25,8 @@ Kind = Literal["zero", "constant", "varying"]
 Entries = tuple[tuple[int, int, float], ...]
 """A sparse symmetric matrix by its lower triangle: (row, column, value), 0-based."""
 
+MODULE_FORMAT = 2
+"""Of emitted modules: it changes when a module, or weights of one, written before cannot be used any more."""
 _FACTS_WIDTH = 100
 _FOREIGN = (
     SyntaxError, ValueError, KeyError, TypeError, StopIteration, AttributeError, RecursionError, MemoryError,
@@ -201,7 +203,8 @@ class Facts:
 
 def facts_json(spec: ModelSpec) -> str:
     """What the module made from ``spec`` says of itself, as JSON for people and programs."""
-    facts: dict[str, str | dict[str, Any]] = {
+    facts: dict[str, str | int | dict[str, Any]] = {
+        "format": MODULE_FORMAT,
         "robot": spec.robot,
         "urdf": spec.urdf,
         "urdf_sha256": spec.urdf_sha256,
@@ -210,12 +213,12 @@ def facts_json(spec: ModelSpec) -> str:
         "joints": {joint.name: joint.kind for joint in spec.joints},
     }
     items = [f"{json.dumps(key)}: {_filled(value)}" for key, value in facts.items()]
-    return "{" + ", ".join(items[:2]) + ",\n " + ",\n ".join(items[2:]) + "}"
+    return "{" + ", ".join(items[:3]) + ",\n " + ",\n ".join(items[3:]) + "}"
 
 
-def _filled(value: str | dict[str, Any]) -> str:
-    """JSON of a text, or of a group on as many lines as it takes, with items kept whole."""
-    if isinstance(value, str):
+def _filled(value: str | int | dict[str, Any]) -> str:
+    """JSON of a value, or of a group on as many lines as it takes, with items kept whole."""
+    if not isinstance(value, dict):
         return json.dumps(value)
     lines = [""]
     for key, item in value.items():
@@ -247,14 +250,27 @@ def read_source(path: str | Path) -> str:
 def parse_facts(source: str, file: Path | None = None) -> Facts:
     """The facts in a module's source text; nothing of it is executed. Raises ModuleError without them."""
     try:
-        return _facts(source)
+        record = _record(source)
+        if record.get("format") == MODULE_FORMAT:
+            return _facts(source)
     except _FOREIGN as problem:
         raise _no_facts(problem, file) from None
+    raise ModuleError(
+        "a module of another version of spelgen",
+        file=file,
+        expected="a module written by this version of `spelgen build`",
+        do=f"build it again from {record.get('urdf')} with `spelgen build`, and train it again",
+    )
 
 
 @lru_cache(maxsize=8)  # a run reads one module again and again
+def _record(source: str) -> dict[str, Any]:
+    record: dict[str, Any] = json.loads(next(_texts(ast.parse(source), "FACTS")))
+    return record
+
+
 def _facts(source: str) -> Facts:
-    record = json.loads(next(_texts(ast.parse(source), "FACTS")))
+    record = _record(source)
     return Facts(
         robot=record["robot"],
         urdf=record["urdf"],

@@ -92,7 +92,7 @@ def randomise(model: nn.Module, seed: int, deviation: float | None = None) -> No
     generator = torch.Generator().manual_seed(seed)
     for name, parameter in model.named_parameters():
         draw = torch.randn(parameter.shape, dtype=parameter.dtype, generator=generator)
-        if name.endswith("armature.raw"):
+        if name.endswith("rotors.raw"):
             parameter.data = draw
         elif deviation is not None:
             parameter.data = deviation * draw
@@ -106,7 +106,7 @@ def randomise(model: nn.Module, seed: int, deviation: float | None = None) -> No
 
 def network_inputs(model: nn.Module, q: torch.Tensor) -> torch.Tensor:
     """What the networks of a model read of q, (..., encoded)."""
-    encoded: torch.Tensor = model.dynamics.encoding(q)
+    encoded: torch.Tensor = model.encoding(q)
     return encoded
 
 
@@ -121,14 +121,14 @@ def outputs_alone(network: nn.Module, encoded: torch.Tensor) -> torch.Tensor:
 def bounded(model: nn.Module, q: torch.Tensor) -> torch.Tensor:
     """Where, (...), M would not be positive definite by itself."""
     prepared = model.prepare()
-    residuals = model.dynamics.mass_at(model.dynamics.configuration(q, prepared), prepared)[1]
+    residuals = model.mass_at(model.configuration(q, prepared), prepared)[1]
     part: torch.Tensor = residuals.part
     return part < 1
 
 
 def frictionless(model: nn.Module) -> nn.Module:
     """The model without dissipation."""
-    model.dynamics.friction.nominal.zero_()
+    model.friction.nominal.zero_()
     return model
 
 
@@ -180,18 +180,16 @@ def exact_model(robot: str, folder: Path) -> nn.Module:
     source, structure = built(robot, design=NETWORKS)
     module = import_source(source, folder / f"{robot}_exact.py")
     model = frictionless(module.Model())
-    mass, potential = model.dynamics.mass, model.dynamics.potential
-    mass.armature.nominal.zero_()
+    mass, potential = model.mass, model.potential
+    mass.rotors.nominal.zero_()
     true = polynomials(_loaded(robot).arm, inertials=True)
     if structure.outputs:
         functions = [true.combination(output.reads) for output in structure.outputs]
-        encoding = model.dynamics.encoding
+        encoding = model.encoding
         mass.network = ExactFunctions(functions, mass.function_mean, mass.function_scale, encoding)
     if structure.potential:
         scale = potential.scale[0]
-        potential.network = ExactFunctions(
-            [true.potential], torch.zeros_like(scale), scale, model.dynamics.encoding
-        )
+        potential.network = ExactFunctions([true.potential], torch.zeros_like(scale), scale, model.encoding)
     constants = [true.combination(constant.reads) for constant in structure.constants]
     assert all(sum(c.degrees()) == 0 for c in constants), "a constant depends on q"
     values = torch.tensor([_float(c.leading_coefficient()) for c in constants], dtype=torch.float64)

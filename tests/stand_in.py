@@ -4,6 +4,7 @@ import torch
 from torch import nn
 
 FACTS = """{
+  "format": 2,
   "robot": "stand_in",
   "urdf": "stand_in.urdf",
   "urdf_sha256": "none",

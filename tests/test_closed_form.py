@@ -58,8 +58,8 @@ def drawn(module, seed, deviation=0.5):
 def rigid(module):
     """The untrained model without friction and armature."""
     model = module.Model()
-    model.dynamics.armature.nominal.zero_()
-    model.dynamics.friction.nominal.zero_()
+    model.rotors.nominal.zero_()
+    model.friction.nominal.zero_()
     return model.requires_grad_(False)
 
 
@@ -92,7 +92,7 @@ def test_untrained_it_is_the_urdfs_rigid_arm(emitted, robots, robot):
     each = list(zip(q.numpy(), qd.numpy(), qdd.numpy(), strict=True))
     tau = torch.from_numpy(np.array([pin.rnea(other, data, *x) for x in each]))
     near(model.inverse_dynamics(q, qd, qdd), tau, 1e-8)
-    near(model.dynamics.regressor(q, qd, qdd) @ model.inertial_parameters.flatten(), tau, 1e-8)
+    near(model.regressor(q, qd, qdd) @ model.inertial_parameters.flatten(), tau, 1e-8)
     height = torch.from_numpy(np.array([pin.computePotentialEnergy(other, data, x) for x in q.numpy()]))
     near(model.potential_energy(q) - model.potential_energy(q[:1]), height - height[0], 1e-8)
 
@@ -153,7 +153,7 @@ def test_any_batch_shape(emitted, batch):
         assert value.shape == (*batch, 3)
     for value in (model.mass_matrix(q), model.dissipation(q, qd), model.input_matrix(q)):
         assert value.shape == (*batch, 3, 3)
-    assert model.dynamics.regressor(q, qd, tau).shape == (*batch, 3, 30)
+    assert model.regressor(q, qd, tau).shape == (*batch, 3, 30)
     assert model.potential_energy(q).shape == batch
     assert model(torch.zeros(()), torch.cat([q, qd, tau], dim=-1)).shape == (*batch, 9)
 
@@ -161,7 +161,7 @@ def test_any_batch_shape(emitted, batch):
 def test_backpropagation_reaches_every_weight(emitted):
     model = drawn(emitted["rpr"][0], seed=0, deviation=0.3)
     q, qd, _, tau = states(3)
-    z = 0.3 * model.dynamics.memory(qd)  # on their way from one side to the other
+    z = 0.3 * model.memory(qd)  # on their way from one side to the other
     model.forward_dynamics(q, qd, tau, z * torch.rand_like(z)).square().sum().backward()
     for name, parameter in model.named_parameters():
         assert parameter.grad.abs().max() > 0, name
@@ -170,12 +170,12 @@ def test_backpropagation_reaches_every_weight(emitted):
 def test_friction_at_a_standstill_has_its_slope(emitted):
     model = drawn(emitted["ur10e"][0], seed=0)
     q = states(6)[0]
-    constants = model.dynamics.friction.prepare()
+    constants = model.friction.prepare()
     still = torch.zeros_like(q).requires_grad_()
-    (slope,) = torch.autograd.grad(model.dynamics.friction(still, model.gravity(q), constants).sum(), still)
+    (slope,) = torch.autograd.grad(model.friction(still, model.gravity(q), constants).sum(), still)
     near(slope, model.dissipation(q, still).diagonal(dim1=-2, dim2=-1))
     away = torch.full_like(q, 1e-3)  # where the formula is another branch
-    torque = model.dynamics.friction(away, model.gravity(q), constants)
+    torque = model.friction(away, model.gravity(q), constants)
     dry = constants.coulomb + constants.load_dependence * model.gravity(q).abs()
     dry = dry + constants.stribeck * (-((away / constants.stribeck_velocity) ** 2)).exp()
     saturating = constants.saturation * (away / constants.saturation_velocity).tanh()

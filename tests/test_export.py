@@ -35,9 +35,9 @@ def exported(run, path):
 
 def heavier(model):
     random = torch.Generator().manual_seed(0)
-    for parameter in (model.dynamics.inertial_parameters.raw, model.dynamics.armature.raw):
+    for parameter in (model.bodies.raw, model.rotors.raw):
         parameter += 0.2 * torch.randn(parameter.shape, dtype=torch.float64, generator=random)
-    model.dynamics.friction.raw_coulomb += 0.5
+    model.friction.raw_coulomb += 0.5
 
 
 def differences(model, loaded):
@@ -82,9 +82,9 @@ def test_what_stands_beside_bodies_is_told(tmp_path):
     assert max(differences(model, loaded)) < 1e-8
     assert "bodies: the model's own" in told
     assert "position_factor" not in (tmp_path / "bodies.friction.yaml").read_text().split("joints:")[1]
-    functions = model.dynamics.joint_functions
+    functions = model.joint_functions
     with torch.no_grad():
-        model.dynamics.residual_mass.raw_constants += 0.5
+        model.residual_mass.raw_constants += 0.5
         functions.raw_torque_ripple[0, 5] = 3.0
         functions.raw_friction_splines += 0.3 * torch.linspace(-1, 1, 34)
     found = export(model, arm=load_arm(ROBOTS / "two_link.urdf"))

@@ -94,7 +94,7 @@ def test_followers_motors_and_passive_joints_go_along(preset, tmp_path):
     with torch.no_grad():
         for parameter in model.parameters():
             parameter += 0.1
-        model.dynamics.raw_friction_compensation += 0.3
+        model.raw_friction_compensation += 0.3
     trained = Trained(model, arm)
     assert export_casadi(trained).summary
     assert trained.described.name == "arm_2_fast_int_main"

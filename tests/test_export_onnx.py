@@ -35,7 +35,7 @@ def test_followers_motors_and_passive_joints_go_along(preset, tmp_path):
     with torch.no_grad():
         for parameter in model.parameters():
             parameter += 0.1
-        model.dynamics.raw_friction_compensation += 0.3
+        model.raw_friction_compensation += 0.3
     assert "from the torch module" in export(model, "onnx", arm=arm).summary[0]
 
 

@@ -36,9 +36,9 @@ def with_parts(robot, *parts, net=None):
     model, moved = build(arm_of(robot), "hybrid", net=net), moved_model(robot, "hybrid")
     names = tuple(PARTS[part] for part in parts)
     with torch.no_grad():
-        for name, parameter in model.dynamics.named_parameters():
+        for name, parameter in model.named_parameters():
             if name.startswith(names) or not name.startswith(RESIDUALS):
-                parameter.copy_(moved.dynamics.get_parameter(name))
+                parameter.copy_(moved.get_parameter(name))
     return model.requires_grad_(False)
 
 
@@ -96,7 +96,7 @@ def test_each_part_goes_alone(parts, tmp_path):
 
 def test_a_function_of_one_joint_stays_with_it():
     model = with_parts("scara")
-    functions = model.dynamics.joint_functions
+    functions = model.joint_functions
     functions.raw_torque_splines[1, 20] = 1.0
     functions.raw_torque_ripple[0, [2, 65]] = torch.tensor([1.0, 2.0], dtype=torch.float64)  # twice the gear
     functions.raw_torque_ripple[2, 3] = 1.0  # of a prismatic joint: no turns, no ripple
@@ -111,7 +111,7 @@ def test_a_function_of_one_joint_stays_with_it():
 def test_onnx_of_functions_that_few_joints_have():
     """Splines of one joint, friction of others, harmonics of some, and few of them."""
     model = with_parts("scara", "springs", "ripple", "friction")
-    functions = model.dynamics.joint_functions
+    functions = model.joint_functions
     functions.raw_torque_splines[1:] = 0.0
     functions.raw_friction_splines[:2] = 0.0
     functions.raw_torque_ripple[0] = 0.0
@@ -127,7 +127,7 @@ def test_onnx_of_functions_that_few_joints_have():
 def test_splines_at_their_ends_and_beyond(tmp_path):
     """On knots, where the range ends, far outside: by C and CasADi as by torch, and slopes as torch has them."""
     model = with_parts("two_link", "springs", "friction")
-    described, functions = describe(model, arm_of("two_link")), model.dynamics.joint_functions
+    described, functions = describe(model, arm_of("two_link")), model.joint_functions
     center, spacing = functions.middles.mean(dim=1), functions.spacing.flatten()
     knots = center + spacing * torch.arange(-19.5, 20, 0.5, dtype=torch.float64)[:, None]
     q = torch.cat([knots, torch.tensor([[50.0, -50.0], [1e6, -1e6]], dtype=torch.float64)]).contiguous()
@@ -154,7 +154,7 @@ def test_splines_at_their_ends_and_beyond(tmp_path):
 def test_kolmogorov_arnold_networks_are_refused_unless_zero():
     model = with_parts("two_link", net="kan")
     assert not describe(model, arm_of("two_link")).residuals
-    model.dynamics.residual_mass.network.weights[-1].add_(0.1)
+    model.residual_mass.network.weights[-1].add_(0.1)
     with pytest.raises(
         RunError, match="Kolmogorov-Arnold networks beside rigid bodies, expected closed-form"
     ):

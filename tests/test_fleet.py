@@ -181,11 +181,8 @@ def test_a_search_finds_what_is_best_and_proposes_the_same_when_it_goes_on(tmp_p
 
 
 def test_the_spread_of_units_is_the_prior_about_what_they_share():
-    common = {"dynamics.armature.raw": torch.zeros(2), "dynamics.inertial_parameters.raw": torch.ones(3)}
-    units = [
-        {"dynamics.armature.raw": torch.full((2,), away), "dynamics.inertial_parameters.raw": torch.ones(3)}
-        for away in (0.1, -0.3, 5.0)
-    ]
+    common = {"rotors.raw": torch.zeros(2), "bodies.raw": torch.ones(3)}
+    units = [{"rotors.raw": torch.full((2,), away), "bodies.raw": torch.ones(3)} for away in (0.1, -0.3, 5.0)]
     prior = spread(units, common)
     assert prior.armature == pytest.approx(0.3)  # the middle one: one odd unit does not count
     assert prior.bodies == LEAST

@@ -85,11 +85,11 @@ def test_what_drives_add_by_velocity_is_held_with_the_rest_and_blows_nothing_up(
     windows = cut_windows(offset_logs, past + 101, 20, measured=False)
     plain = rolled(of_dynamics(MODEL, model, 2), windows, past)
     speed = windows.qd[:, past // 2]
-    model.get_buffer("dynamics.raw_friction_compensation").fill_(300.0)
+    model.get_buffer("raw_friction_compensation").fill_(300.0)
     _, before = after_past(without_compensation(model), windows, past)
     _, disturbance = after_past(model, windows, past)
     torch.testing.assert_close(disturbance, before)
-    assert (model.dynamics.friction_compensation() * speed).abs().max() > 50
+    assert (model.friction_compensation * speed).abs().max() > 50
     found = rolled(of_dynamics(MODEL, model, 2), windows, past)
     np.testing.assert_allclose(found.held, plain.held)
     with torch.no_grad(), np.errstate(all="ignore"):

@@ -85,8 +85,8 @@ def test_energy_of_an_arm_left_to_itself_never_rises(tmp_path):
     """H and what the bristles store, of a closed-form rpr, along its own motion."""
     model = import_source(built("rpr", preset="closed-form")[0], tmp_path / "rpr.py").Model(seed=1)
     with torch.no_grad():
-        model.dynamics.friction.raw_stribeck -= 100.0
-        model.dynamics.friction.raw_load_dependence -= 100.0
+        model.friction.raw_stribeck -= 100.0
+        model.friction.raw_load_dependence -= 100.0
         q, qd = torch.tensor([[0.3, 0.1, -0.4]]).double(), torch.tensor([[1.0, 0.2, -1.5]]).double()
         steps = torch.full((1, 2000), 5e-4).double()
         still = Windows(
@@ -154,7 +154,7 @@ def test_least_squares_finds_the_strengths_of_bristles():
 def test_the_weak_form_counts_all_that_the_drives_do():
     """An offset of the measured torque and friction that drives make up for are no fault of the rigid bodies."""
     model = load_module(built("rpr", preset="closed-form")[0])
-    dynamics = model.dynamics
+    dynamics = model
     with torch.no_grad():
         dynamics.raw_offset += 2.0
         dynamics.raw_friction_compensation += 1.0

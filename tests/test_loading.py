@@ -70,3 +70,17 @@ def test_a_model_is_shown_in_a_line_and_as_its_structure():
     assert repr(build(ROBOTS / "rpr.urdf", preset="closed-form")).startswith(
         "<Model of 'rpr' (closed-form): "
     )
+
+
+def test_a_module_written_before_says_what_to_rebuild(tmp_path):
+    path = tmp_path / "module.py"
+    text = STAND_IN.read_text(encoding="utf-8")
+    line = '  "format": 2,\n'
+    assert line in text
+    path.write_text(text.replace(line, ""), encoding="utf-8")
+    with pytest.raises(ModuleError) as caught:
+        load_module(path)
+    assert str(caught.value) == (
+        f"{path}: got a module of another version of spelgen, expected a module written by this version of"
+        " `spelgen build`; build it again from stand_in.urdf with `spelgen build`, and train it again"
+    )

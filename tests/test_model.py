@@ -116,7 +116,7 @@ def test_mass_matrix_is_positive_definite_for_any_weights(robot, tmp_path):
             randomise(model, seed=draw, deviation=30.0)
             q = 8 * torch.rand(10_000, model.n, dtype=torch.float64, generator=generator) - 4
             prepared = model.prepare()
-            mass, residuals = model.dynamics.mass_at(model.dynamics.configuration(q, prepared), prepared)
+            mass, residuals = model.mass_at(model.configuration(q, prepared), prepared)
             assert torch.linalg.eigvalsh(mass)[:, 0].min() > 0
             needed += (residuals.part < 1).any().item()
     assert needed > 50, "the draws were to need the bound"
@@ -127,8 +127,8 @@ def test_bound_keeps_zeros_and_relations_and_is_nothing_at_nominal_values(robot,
     model = random_model(robot, tmp_path, seed=1, deviation=3.0, design=NETWORKS)
     structure = built(robot)[1]
     q = states(model.n, 200)[0]
-    part = model.dynamics.mass
-    part.armature.nominal.zero_()
+    part = model.mass
+    part.rotors.nominal.zero_()
     mass = model.mass_matrix(q).detach()
     for entry in structure.entries:
         if entry.kind == "zero":
@@ -145,7 +145,7 @@ def test_outputs_read_their_own_joints_only(robot, tmp_path):
     """Moving any other joint leaves an output's bits unchanged, and its own joints move it."""
     model = random_model(robot, tmp_path, seed=2)
     q = states(model.n, 50)[0]
-    network = model.dynamics.residual_mass.network
+    network = model.residual_mass.network
     before = outputs_alone(network, network_inputs(model, q))
     for joint in range(model.n):
         moved = q.clone()
@@ -159,7 +159,7 @@ def test_outputs_read_their_own_joints_only(robot, tmp_path):
 def test_energy_stays_without_input_and_dissipation(robot, tmp_path):
     """Random weights, Runge-Kutta with 2.5 ms over 2 s: relative drift of H below 1e-8."""
     model = frictionless(random_model(robot, tmp_path, seed=0))
-    for weight in model.dynamics.joint_functions.parameters():
+    for weight in model.joint_functions.parameters():
         weight.data.zero_()  # ripple of 66 waves in a turn takes shorter steps
     at, qd, _, _ = (0.25 * x for x in states(model.n, 4))
     with torch.no_grad():
@@ -238,7 +238,7 @@ def test_held_input_moves_the_momentum(tmp_path):
 def test_backpropagation_reaches_every_parameter(dtype, tmp_path):
     model = random_model("rpr", tmp_path, seed=0, deviation=0.5).to(dtype)
     q, qd, _, tau = (x.to(dtype) for x in states(3, 10))
-    z = 0.3 * model.dynamics.memory(qd)
+    z = 0.3 * model.memory(qd)
     loss = model.forward_dynamics(q, qd, tau, z).pow(2).sum() + model.hamiltonian(q, qd, z).pow(2).sum()
     loss.backward()
     for name, parameter in model.named_parameters():

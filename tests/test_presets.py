@@ -78,7 +78,7 @@ def test_written_out_derivatives_equal_autograd(robot, preset, net, tmp_path):
 def test_forward_and_inverse_dynamics_undo_each_other(robot, preset, net, tmp_path):
     model = random_model(robot, tmp_path, seed=3, preset=preset, net=net)
     if preset == "phnode":  # random gains may be next to zero
-        torch.nn.init.zeros_(model.dynamics.input.network.weights[-1])
+        torch.nn.init.zeros_(model.input.network.weights[-1])
     q, qd, _, tau = states(model.n)
     near(model.inverse_dynamics(q, qd, model.forward_dynamics(q, qd, tau)), tau, 1e-8)
 
@@ -116,7 +116,7 @@ def test_any_batch_shape(preset, net, batch, tmp_path):
 def test_backpropagation_reaches_every_weight(preset, net, tmp_path):
     model = random_model("rpr", tmp_path, seed=0, deviation=0.3, preset=preset, net=net)
     q, qd, _, tau = states(3)
-    z = 0.3 * model.dynamics.memory(qd)
+    z = 0.3 * model.memory(qd)
     model.forward_dynamics(q, qd, tau, z).square().sum().backward()
     for name, parameter in model.named_parameters():
         # V's own level moves nothing
@@ -141,7 +141,7 @@ def test_kan_outputs_read_their_own_joints_only(robot, tmp_path):
     model = random_model(robot, tmp_path, seed=2, net="kan")
     outputs = built(robot, net="kan")[1].outputs
     q = states(model.n)[0]
-    network = model.dynamics.residual_mass.network
+    network = model.residual_mass.network
     before = outputs_alone(network, network_inputs(model, q))
     for joint in range(model.n):
         moved = q.clone()
@@ -155,7 +155,7 @@ def test_kan_outputs_read_their_own_joints_only(robot, tmp_path):
 def test_spel_keeps_zeros_constants_and_relations(robot, preset, tmp_path):
     """Its networks see all joints, as the paper's do; what the structure fixes stays fixed."""
     model = random_model(robot, tmp_path, seed=1, preset=preset)
-    for weight in model.dynamics.mass.network.parameters():
+    for weight in model.mass.network.parameters():
         weight.data *= 0.5
     q = states(model.n, 100)[0] / 5
     assert not bounded(model, q).any(), "M was to be positive definite by itself"
@@ -172,7 +172,7 @@ def test_spel_keeps_zeros_constants_and_relations(robot, preset, tmp_path):
 def test_networks_read_rotation_matrices(net, part, tmp_path):
     """Layer by layer as the papers write them, on the 9 numbers of R and the 3 of r."""
     owner = random_model("rpr", tmp_path, seed=5, preset="phnode", net=net)
-    model, encoding = getattr(owner.dynamics, part).network, owner.dynamics.encoding
+    model, encoding = getattr(owner, part).network, owner.encoding
     q = states(3)[0]
     parts = owner.to_group(q)
     parts[1] = (parts[1] - encoding.center[1] * torch.tensor([0, 0, 1.0], dtype=q.dtype)) / encoding.reach[1]
@@ -221,7 +221,7 @@ def test_phnode_is_its_three_axis_model_held_by_bearings(net, tmp_path):
 
     def inverse_mass(at: torch.Tensor) -> torch.Tensor:
         prepared = model.prepare()
-        return model.dynamics.mass.inverse(model.dynamics.configuration(at, prepared), prepared.mass)
+        return model.mass.inverse(model.configuration(at, prepared), prepared.mass)
 
     inverse = inverse_mass(q).detach()
     assert torch.linalg.eigvalsh(inverse)[:, 0].min() > 0

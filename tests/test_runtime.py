@@ -275,7 +275,7 @@ def test_transforms_work_for_every_preset(robot, preset, net, tmp_path):
     near(forward, reverse, 1e-8)
     curvature = hessian(model.hamiltonian, argnums=1)(q[0], model.momentum(q[0], qd[0]))
     near(curvature, torch.linalg.inv(model.mass_matrix(q[0])), 1e-8)
-    z = model.dynamics.memory(qd)
+    z = model.memory(qd)
     near(vmap(model.forward_dynamics)(q, qd, tau, z), model.forward_dynamics(q, qd, tau, z), 1e-9)
 
 
@@ -284,7 +284,7 @@ def test_every_preset_is_one_graph(preset, net, tmp_path):
     """Strict export with a batch of any size, and all that torch.compile traces."""
     model = random_model("rpr", tmp_path, seed=1, preset=preset, net=net).requires_grad_(False)
     q, qd, tau = draw(5, 3), draw(5, 3, seed=1), draw(5, 3, seed=2)
-    state = torch.cat([q, qd, model.dynamics.memory(qd).flatten(-2), tau], dim=-1)
+    state = torch.cat([q, qd, model.memory(qd).flatten(-2), tau], dim=-1)
     batch = {"t": None, "state": {0: torch.export.Dim("batch")}}
     program = torch.export.export(model, (torch.zeros(()), state), dynamic_shapes=batch, strict=True)
     more = torch.cat([state, state])
@@ -312,8 +312,8 @@ def test_values_are_in_units(tmp_path):
     model = import_source(built("six_dof")[0], tmp_path / "six.py").Model()
     near(model.armature, torch.tensor([0.306, 0.306, 0.204, 0.0816, 0.0816, 0.0816], dtype=torch.float64))
     closed = import_source(built("rpr", preset="closed-form")[0], tmp_path / "closed.py").Model()
-    closed.dynamics.friction.raw_coulomb.data[:] = math.log(2)
-    near(closed.coulomb, 2 * closed.dynamics.friction.nominal)
+    closed.friction.raw_coulomb.data[:] = math.log(2)
+    near(closed.coulomb, 2 * closed.friction.nominal)
     assert closed.inertial_parameters.shape == (3, 10)
     near(model.rotor_inertia, model.armature / 101.0**2)
 

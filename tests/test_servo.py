@@ -158,7 +158,7 @@ def test_joints_get_the_laws_that_they_have(fitted):
     assert shoulder["dead_zone"]["value"] == pytest.approx(TRUTH.dead_zone[0], rel=0.03)
     assert "dead_zone" not in elbow and not fitted.model.servo.dead_zone[1]
     with torch.no_grad():
-        laws = fitted.model.dynamics.friction.prepare()
+        laws = fitted.model.friction.prepare()
     assert laws.stribeck[0] < 0.15 * TRUTH.coulomb[0]
     assert float(laws.stribeck[1]) == pytest.approx(TRUTH.stribeck[1], rel=0.3)
     assert float(laws.stribeck_velocity[1]) == pytest.approx(STRIBECK_VELOCITY, rel=0.1)
@@ -338,7 +338,7 @@ def test_what_does_not_belong_together_is_told(arm, logs, robots):
 def moved(model, seconds, count=1):
     """Logs of the whole arm in small steps, where the commands of both joints jump at once."""
     with torch.no_grad():
-        model.dynamics.armature.raw.copy_((torch.tensor(TRUTH.armature) / model.armature).log())
+        model.rotors.raw.copy_((torch.tensor(TRUTH.armature) / model.armature).log())
         model.servo.delay.fill_(TRUTH.delay)
     t, every = np.arange(0.0, seconds, 0.0025), 8  # of which logs have one in so many
     u = np.random.default_rng(0).uniform(-0.4, 0.4, (count, int(2 * seconds), 2)).repeat(200, axis=1)

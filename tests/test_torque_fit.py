@@ -40,7 +40,7 @@ from spelgen.settings.fits import GaussianPrior, Rollout, TorqueFit
 from tests.test_closed_form import FOLLOWED, drawn
 
 ROBOTS = ("two_link", "rpr", "six_dof")
-BODIES = "dynamics.inertial_parameters.raw"
+BODIES = "bodies.raw"
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +108,7 @@ def test_only_the_named_bodies_move(emitted):
 
 
 def test_the_prior_shares_what_joints_share():
-    weights = {"armature.raw": torch.zeros(2), **{f"friction.{name}": torch.zeros(2) for name in SIZES}}
+    weights = {"rotors.raw": torch.zeros(2), **{f"friction.{name}": torch.zeros(2) for name in SIZES}}
     prior = GaussianPrior(armature=0.5, shared_armature=2.0, sizes=0.3, shared_sizes=1.0, shared_friction=3.0)
     found = covariance(prior, weights)
     assert found[0, 0] == 0.25 + 4.0
@@ -127,7 +127,7 @@ def test_the_prior_knows_every_weight(emitted):
     assert kinds == {"bodies", "offset", "armature", "sizes", "velocities", "fractions"}
     assert kind_of(torque_jacobian.COMPENSATION) == "friction_compensation"
     with pytest.raises(StopIteration):
-        kind_of("dynamics.unheard_of")
+        kind_of("unheard_of")
 
 
 def test_deviations_are_those_of_the_largest_marginal_likelihood():
@@ -141,7 +141,7 @@ def test_deviations_are_those_of_the_largest_marginal_likelihood():
         return float(np.linalg.slogdet(total)[1] + y @ np.linalg.solve(total, y)) / 2
 
     best = np.exp(minimize_scalar(minus_log_likelihood, bounds=(-4, 3), method="bounded").x)
-    weights = {"inertial_parameters.raw": torch.zeros(2, 10), "raw_offset": torch.zeros(2)}
+    weights = {"bodies.raw": torch.zeros(2, 10), "raw_offset": torch.zeros(2)}
     guess = prior = GaussianPrior(bodies=0.1, offset=0.1, degrees_of_freedom=1e-9)
     for _ in range(200):
         posterior = np.linalg.inv(rows.T @ rows / noise**2 + np.eye(20) / prior.bodies**2)
@@ -193,7 +193,7 @@ def test_bodies_that_are_placeholders_are_left_behind(emitted, robots, tmp_path,
 
 def test_steps_of_bodies_are_straight_in_their_parameters_and_stay_possible(emitted):
     """Twice the step adds twice to the parameters; a step that no body could follow ends short of it."""
-    bodies = drawn(emitted["rpr"][0], seed=1, deviation=0.3).dynamics.inertial_parameters
+    bodies = drawn(emitted["rpr"][0], seed=1, deviation=0.3).bodies
     raw = bodies.raw.detach().clone()
     step = torch.randn(raw.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
 
@@ -213,11 +213,11 @@ def test_steps_of_bodies_are_straight_in_their_parameters_and_stay_possible(emit
 def test_a_drive_that_compensates_friction_unseen_is_found_out(emitted):
     module = emitted["six_dof"][0]
     true, found = drawn(module, seed=2, deviation=0.2), module.Model()
-    true.dynamics.raw_friction_compensation[4] = 40.0
+    true.raw_friction_compensation[4] = 40.0
     logs = [recorded(true, 6.0, 0.05, seed=1)]
     fit = fit_torque(found, logs)
     assert fit.compensated.tolist() == [False] * 4 + [True, False]
-    value, known = (x.dynamics.friction_compensation() for x in (found, true))
+    value, known = (x.friction_compensation for x in (found, true))
     assert value[4].item() == pytest.approx(known[4].item(), rel=0.15)
     assert value[[0, 1, 2, 3, 5]].abs().max() == 0
     assert nmse(found, recorded(true, 10.0, 0.0, seed=9)) < 5e-3
@@ -230,8 +230,8 @@ def test_a_torque_that_falls_with_velocity_by_little_is_no_compensation(emitted)
     module = emitted["six_dof"][0]
     true = module.Model()
     with torch.no_grad():
-        true.dynamics.friction.raw_coulomb -= 20.0
-        true.dynamics.friction.raw_viscous -= 20.0
+        true.friction.raw_coulomb -= 20.0
+        true.friction.raw_viscous -= 20.0
     plain = recorded(true, 40.0, 0.0, seed=1)
     falling = 0.03 * plain.tau.std(axis=0) / plain.qd.std(axis=0) * plain.qd
     log = replace(plain, tau=plain.tau - falling)
@@ -243,8 +243,8 @@ def test_compensation_belongs_to_the_input(emitted):
     model = drawn(emitted["six_dof"][0], seed=2)
     q, qd, qdd = (torch.rand(5, 6, dtype=torch.float64) for _ in range(3))
     tau, friction = model.inverse_dynamics(q, qd, qdd), model.friction_torque(q, qd)
-    model.dynamics.raw_friction_compensation += 3.0
-    added = 3.0 * model.dynamics.friction.nominal / model.dynamics.friction.speed * qd
+    model.raw_friction_compensation += 3.0
+    added = 3.0 * model.friction.nominal / model.friction.speed * qd
     torch.testing.assert_close(model.inverse_dynamics(q, qd, qdd), tau - added)
     torch.testing.assert_close(model.forward_dynamics(q, qd, tau - added), qdd)
     torch.testing.assert_close(model.friction_torque(q, qd), friction)
@@ -402,9 +402,9 @@ def test_a_run_is_adapted_to_another_day_or_unit(run, emitted, tmp_path, adapt):
     module, arm = emitted["two_link"]
     other = module.Model()
     other.load_state_dict(true.state_dict())
-    other.get_parameter("dynamics.friction.raw_coulomb").data += 0.4
-    other.get_parameter("dynamics.friction.raw_viscous").data -= 0.3
-    other.get_parameter("dynamics.raw_offset").data += torch.tensor([0.2, -0.1]).double()
+    other.get_parameter("friction.raw_coulomb").data += 0.4
+    other.get_parameter("friction.raw_viscous").data -= 0.3
+    other.get_parameter("raw_offset").data += torch.tensor([0.2, -0.1]).double()
     if adapt == "unit":
         other.get_parameter(BODIES).data[:, 9] += 0.1
     write(tmp_path / "other.parquet", [recorded(other, 15.0, 0.01, seed=3)], arm)
@@ -423,7 +423,7 @@ def test_a_run_is_adapted_to_another_day_or_unit(run, emitted, tmp_path, adapt):
         torch.load(x / "model.pt", weights_only=True) for x in (folder / "run", tmp_path / "adapted")
     )
     moved = {name for name in before if not torch.equal(before[name], after[name])}
-    of_friction = ("dynamics.friction.", "dynamics.raw_offset")
+    of_friction = ("friction.", "raw_offset")
     assert moved and (adapt == "unit" or all(name.startswith(of_friction) for name in moved))
     assert (BODIES in moved) == (adapt == "unit")
     errors = []
@@ -438,8 +438,8 @@ def test_a_part_of_a_model_of_networks_is_adapted(robots, run, emitted):
     _, true, _ = run
     samples = [recorded(true, 2.0, 0.01, seed=3)]
     for adapt, part in (
-        ("friction", "dynamics.friction."),
-        ("load", ("dynamics.mass.", "dynamics.potential.")),
+        ("friction", "friction."),
+        ("load", ("mass.", "potential.")),
     ):
         model = build(robots / "two_link.urdf", "spel", width=8)
         before = {name: x.clone() for name, x in model.state_dict().items()}

@@ -30,9 +30,9 @@ def test_another_arms_torques_are_met(tmp_path):
     module = import_source(built("two_link", design=NETWORKS)[0], tmp_path / "two_link_spel.py")
     true, model = module.Model(seed=0), module.Model(seed=1)
     with torch.no_grad():
-        true.dynamics.mass.raw_constants *= 1.5
-        true.dynamics.mass.armature.raw += 0.5
-        true.dynamics.friction.raw_viscous += 1.0
+        true.mass.raw_constants *= 1.5
+        true.mass.rotors.raw += 0.5
+        true.friction.raw_viscous += 1.0
     start = missed(model, recorded(true, 7))
     steps = fit_networks(model, [recorded(true, 5), recorded(true, 6)], 1e-6, evaluations=1500)
     assert steps % 20 == 0
@@ -44,9 +44,9 @@ def test_what_is_penalised_stays(tmp_path):
     """A penalty against the torques leaves an error that nothing else would."""
     module = import_source(built("two_link", design=NETWORKS)[0], tmp_path / "two_link_spel.py")
     true, model = module.Model(seed=0), module.Model(seed=0)
-    constants = model.dynamics.mass.raw_constants
+    constants = model.mass.raw_constants
     with torch.no_grad():
-        true.dynamics.mass.raw_constants *= 1.5
+        true.mass.raw_constants *= 1.5
     fit_networks(model, [recorded(true, 5)], 1e-6, lambda: 1e3 * (constants - 1).square().sum())
     assert (constants - 1).abs().max() < 0.01
 
@@ -57,7 +57,7 @@ def test_blocks_give_what_all_at_once_gives(tmp_path, monkeypatch):
     true = module.Model(seed=0)
     samples = [recorded(true, 5), recorded(true, 6)]
     whole, parts = module.Model(seed=1), module.Model(seed=1)
-    penalty = lambda model: lambda: 1e-3 * model.dynamics.mass.raw_constants.square().sum()  # noqa: E731
+    penalty = lambda model: lambda: 1e-3 * model.mass.raw_constants.square().sum()  # noqa: E731
     fit_networks(whole, samples, 1e-6, penalty(whole), evaluations=20)
     monkeypatch.setattr(torque_networks, "BLOCK", 128)
     fit_networks(parts, TorqueSamples.spooled(samples, 2), 1e-6, penalty(parts), evaluations=20)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from spelgen.dynamics.protocol import has_residuals
 from spelgen.fitting.rollout import LossScales, position_difference, roll_out, rollout_loss
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
@@ -64,11 +65,10 @@ def predict(model: EmittedModel, windows: Windows, substeps: int) -> Prediction:
 
 def sizes(model: EmittedModel) -> Sizes:
     """How many numbers the model's networks give and read, and how many are trained."""
-    dynamics = model.dynamics
-    beside = "residual_" if hasattr(dynamics, "residual_mass") else ""  # rigid bodies
+    beside = "residual_" if has_residuals(model) else ""  # rigid bodies
     names = (f"{beside}mass", "friction", "input", f"{beside}potential")
     mass, friction, input, potential = (
-        getattr(getattr(dynamics, name, None), "network", None) for name in names
+        getattr(getattr(model, name, None), "network", None) for name in names
     )
     outputs = [
         0 if network is None else len(network.biases[-1]) for network in (mass, friction, input, potential)

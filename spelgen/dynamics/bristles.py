@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from spelgen.design import BRISTLE_REACH
+from spelgen.dynamics.protocol import has_friction_state
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,10 +39,9 @@ def reach_of(kinds: Sequence[str], motors: np.ndarray | None = None) -> BristleR
 
 def bristle_reach(model: Any) -> BristleReach:
     """Of a model."""
-    friction = getattr(getattr(model, "dynamics", None), "friction", None)
-    if friction is None or not hasattr(friction, "bristles"):
+    if not has_friction_state(model):
         return BristleReach(np.zeros((model.n, 0)))
-    reach, motors = (x.cpu().double().numpy() for x in (friction.bristles.reach, model.dynamics.motors))
+    reach, motors = (x.cpu().double().numpy() for x in (model.friction.bristles.reach, model.motors))
     return BristleReach(reach, motors)
 
 

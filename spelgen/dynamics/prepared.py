@@ -31,12 +31,11 @@ class PreparedModel:
     """
 
     def __init__(self, model: Any, tip: Any = None, *, dtype: torch.dtype = torch.float64) -> None:
-        model = copy.deepcopy(model).to(dtype=dtype).requires_grad_(False)
         # networks that give nothing would take most of the time
-        model.dynamics = without_idle_residuals(model.dynamics)
+        model = without_idle_residuals(model).to(dtype=dtype).requires_grad_(False)
         self.n: int = model.n
-        self._dynamics, self._weights, self._tip = model.dynamics, model.prepare(), tip
-        self.elements: int = model.dynamics.elements
+        self._dynamics, self._weights, self._tip = model, model.prepare(), tip
+        self.elements: int = model.elements
 
     def mass_matrix(self, q: Tensor) -> Tensor:
         """M(q), (..., n, n) [kg m^2, kg m, kg]."""

@@ -60,24 +60,45 @@ class PortHamiltonianDynamics(RigidDynamics, Protocol):
         """q' and p', (..., n), under the inputs tau; without, of the arm left to itself."""
 
 
-def remembering(dynamics: Any) -> Any:
-    """What knows of friction's memory z, which all that depends on friction then takes last; None: nothing does."""
-    owner = getattr(dynamics, "dynamics", dynamics)  # an emitted model's, or of least squares
-    return owner if getattr(owner, "elements", 0) else None
+def has_rigid_bodies(model: object) -> bool:
+    """Return whether a model is made of rigid bodies, with inertial parameters and friction by laws."""
+    return hasattr(model, "inertial_parameters")
+
+
+def has_residuals(model: object) -> bool:
+    """Return whether a model has functions of joints and networks beside its rigid bodies."""
+    return getattr(model, "residual_mass", None) is not None
+
+
+def has_friction_state(model: object) -> bool:
+    """Return whether the model's friction depends on the state z of bristles, which all calls then take last."""
+    return getattr(model, "elements", 0) > 0
+
+
+def has_servos(model: object) -> bool:
+    """Return whether position servos stand between a model's inputs, which are commands, and its joints."""
+    return hasattr(model, "servo")
+
+
+def has_momentum(dynamics: object) -> bool:
+    """Return whether momenta can be its state (see ``PortHamiltonianDynamics``)."""
+    return hasattr(dynamics, "momentum")
 
 
 def sliding_memory(dynamics: Any, qd: Tensor) -> Tensor:
     """z, (..., n, K), of joints that have long gone the way of qd."""
-    owner = remembering(dynamics)
-    found: Tensor = qd.unsqueeze(-1)[..., :0] if owner is None else owner.memory(qd)
-    return found
+    if not has_friction_state(dynamics):
+        return qd.unsqueeze(-1)[..., :0]
+    z: Tensor = dynamics.memory(qd)
+    return z
 
 
 def memory_after(dynamics: Any, z: Tensor, displacement: Tensor) -> Tensor:
     """z after joints went one way by (..., n)."""
-    owner = remembering(dynamics) if z.shape[-1] else None  # asked four times a step
-    found: Tensor = z if owner is None else owner.memory_after(z, displacement)
-    return found
+    if not z.shape[-1] or not has_friction_state(dynamics):
+        return z
+    moved: Tensor = dynamics.memory_after(z, displacement)
+    return moved
 
 
 def memory_along(dynamics: Any, q: Tensor, qd: Tensor, z: Tensor | None = None) -> Tensor:
@@ -93,7 +114,7 @@ def memory_along(dynamics: Any, q: Tensor, qd: Tensor, z: Tensor | None = None) 
 
 def known_past(dynamics: Any, z: Tensor | None) -> tuple[Tensor, ...]:
     """z as what to give to these dynamics last, where they have a use for it."""
-    return () if z is None or remembering(dynamics) is None else (z,)
+    return (z,) if z is not None and has_friction_state(dynamics) else ()
 
 
 class VelocityState:
@@ -101,6 +122,17 @@ class VelocityState:
 
     def __init__(self, dynamics: RigidDynamics) -> None:
         self.dynamics: Any = dynamics
+        self.elements = getattr(dynamics, "elements", 0)
+
+    def memory(self, qd: Tensor) -> Tensor:
+        """z, (..., n, K), of joints that have long gone the way of qd."""
+        z: Tensor = self.dynamics.memory(qd)
+        return z
+
+    def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
+        """z after joints went one way by (..., n)."""
+        z = self.dynamics.memory_after(z, displacement)
+        return z
 
     def prepare(self, definite: bool = True) -> None:
         """Nothing."""
@@ -123,4 +155,4 @@ class VelocityState:
 
 def integrable(dynamics: RigidDynamics) -> Any:
     """What a rollout integrates: the dynamics in momenta where they have these, else in velocities."""
-    return dynamics if hasattr(dynamics, "momentum") else VelocityState(dynamics)
+    return dynamics if has_momentum(dynamics) else VelocityState(dynamics)

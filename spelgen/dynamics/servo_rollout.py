@@ -49,9 +49,9 @@ class Load(NamedTuple):
 
 def servo_drives(model: Any) -> ServoDrives:
     """Of a model with servos."""
-    dynamics = model.dynamics
+    dynamics = model
     return ServoDrives(
-        model.servo.prepare(), dynamics.friction, dynamics.friction.prepare(), dynamics.torque_offset()
+        model.servo.prepare(), dynamics.friction, dynamics.friction.prepare(), dynamics.torque_offset
     )
 
 
@@ -101,7 +101,7 @@ def replayed(model: Any, q: Tensor, qd: Tensor, commands: Tensor, dt: Tensor) ->
     S: steps in an interval, over which what the bodies weigh and how inert they are is taken once.
     """
     with torch.no_grad():
-        drives, dynamics = servo_drives(model), model.dynamics
+        drives, dynamics = servo_drives(model), model
         prepared, found = dynamics.prepare(), []
         state, before = None, None
         for now, held in zip(commands.unbind(1), dt.unbind(1), strict=True):

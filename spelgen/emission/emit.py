@@ -24,12 +24,12 @@ def emit(spec: ModelSpec) -> str:
         names=tailored.names("joint_names", [joint.identifier for joint in spec.joints]),
         types=tailored.names("joint_types", [joint.kind for joint in spec.joints]),
         class_summary=docstring.class_summary(spec),
+        base=tailored.base(spec),
         elements=len(BRISTLE_REACH["revolute"]) if spec.design.memory == "bristles" else 0,
         setup=tailored.setup(spec),
         mass_entries=tailored.mass_entries(spec),
         mass_about=docstring.mass_entries(spec),
         values=_values(spec),
-        typed=bool(spec.bodies),
     )
     imports, runtime = bundle(model)
     return render(
@@ -40,37 +40,20 @@ def emit(spec: ModelSpec) -> str:
         joint_table=docstring.joint_table(spec),
         imports=imports,
         facts=facts_json(spec),
-        model=model,
+        model=model.rstrip(),
         runtime=runtime,
     )
 
 
 def _values(spec: ModelSpec) -> list[Value]:
-    """What was trained, in units, as properties of the model."""
-    dynamics = "self.dynamics"
-    if spec.bodies:
-        friction = [
-            (name, f"{what}, (n,) {units}.", f"{dynamics}.friction.prepare().{name}")
-            for name, what, units in _FRICTION
-        ]
-        ten = "By body (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) about its joint's frame, (bodies, 10)."
-        return [
-            ("inertial_parameters", ten, f"{dynamics}.inertial_parameters.forward()"),
-            *_armature(dynamics),
-            *friction,
-            (
-                "torque_offset",
-                "What the measured torque shows without any, (n,) [Nm, N].",
-                f"{dynamics}.torque_offset()",
-            ),
-            *(_SERVO if spec.servos else ()),
-        ]
+    """Properties of the model beside those of its base: what was trained, in units."""
+    if spec.servos:
+        return list(_SERVO)
     values: list[Value] = []
     if spec.design.mass == "derived":
-        values += _armature(f"{dynamics}.mass")
+        values += _ARMATURE
     if spec.design.dissipation == "per-joint":
-        viscous = "Friction torque by velocity, (n,) [Nm s/rad, N s/m]."
-        values.append(("viscous", viscous, f"{dynamics}.friction.viscous()"))
+        values.append(_VISCOUS)
     return values
 
 
@@ -79,24 +62,16 @@ _SERVO: tuple[Value, ...] = (
     ("kd", "Of the servos, torque by velocity, (n,) [Nm s/rad, N s/m].", "self.servo.kd()"),
     ("delay", "Of the commands [s].", "self.servo.delay"),
 )
-
-
-def _armature(owner: str) -> list[Value]:
-    return [
-        (
-            "armature",
-            "What the drives add to M's diagonal, (n,) [kg m^2, kg].",
-            f"{owner}.armature.forward()",
-        ),
-        (
-            "rotor_inertia",
-            "The drives' inertia before the gear, (n,) [kg m^2, kg].",
-            f"{owner}.armature.rotor_inertia()",
-        ),
-    ]
-
-
-_FRICTION = (
-    ("viscous", "Friction torque by velocity", "[Nm s/rad, N s/m]"),
-    ("coulomb", "Dry friction", "[Nm, N]"),
+_ARMATURE: tuple[Value, ...] = (
+    ("armature", "What the drives add to M's diagonal, (n,) [kg m^2, kg].", "self.mass.rotors.forward()"),
+    (
+        "rotor_inertia",
+        "The drives' inertia before the gear, (n,) [kg m^2, kg].",
+        "self.mass.rotors.rotor_inertia()",
+    ),
+)
+_VISCOUS: Value = (
+    "viscous",
+    "Friction torque by velocity, (n,) [Nm s/rad, N s/m].",
+    "self.friction.viscous()",
 )

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
         n: int
         joint_names: tuple[str, ...]
         joint_types: tuple[str, ...]
-        dynamics: Any
+        elements: int
         source: str
         """The module's text, as it was loaded."""
         facts: Facts

@@ -24,8 +24,15 @@ _SEED = Code("generator")
 _INDENT = 8
 
 
+def base(spec: ModelSpec) -> str:
+    """The class of the runtime that the model is."""
+    if not spec.bodies:
+        return "NetworkDynamics"
+    return "RigidBodyDynamics" if spec.design.net == "none" else "ResidualDynamics"
+
+
 def setup(spec: ModelSpec) -> str:
-    """The statements of the model's ``__init__`` that make its dynamics."""
+    """The statements of the model's ``__init__`` that make its parts, and itself of them."""
     lines = [assignment("joints", _joints(spec), _INDENT)]
     lines += _rigid_bodies(spec) if spec.bodies else _networks(spec)
     return "\n".join(lines)
@@ -141,17 +148,16 @@ def _rigid_bodies(spec: ModelSpec) -> list[str]:
     )
     made: list[tuple[str, object]] = [("bodies", bodies)]
     parts: list[object] = [Code("joints"), Code("bodies"), spec.gravity, _input(spec)]
-    kind = "RigidBodyDynamics"
     if spec.design.net != "none":
-        kind = "ResidualDynamics"
         made += _residuals(spec)
         parts += [Code("mass"), Code("potential") if spec.potential else None]
     reach = tuple(BRISTLE_REACH[x.kind] for x in spec.joints)
     remembers = {"reach": reach} if spec.design.memory == "bristles" else {}
-    made.append(("self.dynamics", call(kind, *parts, **remembers)))
+    lines = [assignment(name, value, _INDENT) for name, value in made]
+    lines.append(_base_setup(call("super().__init__", *parts, **remembers)))
     if spec.servos:
-        made.append(("self.servo", _servo(spec)))
-    return [assignment(name, value, _INDENT) for name, value in made]
+        lines.append(assignment("self.servo", _servo(spec), _INDENT))
+    return lines
 
 
 def _residuals(spec: ModelSpec) -> list[tuple[str, object]]:
@@ -209,8 +215,12 @@ def _networks(spec: ModelSpec) -> list[str]:
     if not spec.potential:
         parts[2] = None
     parts.append(_input(spec))
-    made.append(("self.dynamics", call("NetworkDynamics", *parts)))
-    return [assignment(name, value, _INDENT) for name, value in made]
+    lines = [assignment(name, value, _INDENT) for name, value in made]
+    return [*lines, _base_setup(call("super().__init__", *parts))]
+
+
+def _base_setup(value: Call) -> str:
+    return " " * _INDENT + laid_out("", value, _INDENT)
 
 
 def _mass(spec: ModelSpec) -> list[tuple[str, object]]:

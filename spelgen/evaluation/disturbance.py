@@ -39,8 +39,8 @@ class WithoutCompensation:
 
 def without_compensation(model: Any) -> Any:
     """The same model but for what its drives add by velocity."""
-    own = getattr(getattr(model, "dynamics", None), "friction_compensation", None)
-    return model if own is None or not own().any() else WithoutCompensation(model)
+    own = getattr(model, "friction_compensation", None)
+    return model if own is None or not own.any() else WithoutCompensation(model)
 
 
 class Disturbed:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from spelgen.dynamics.protocol import has_servos
 from spelgen.errors import Diagnostic, LogError
 from spelgen.evaluation.baselines import (
     Predictor,
@@ -61,7 +62,7 @@ def evaluate(
         require_joints(trajectory, judged.joints)
     notes = check(logs, judged.joints, joint_types)
     notes += _seen(logs, judged)
-    if hasattr(judged.model, "servo"):
+    if has_servos(judged.model):
         return _replayed(judged, logs, notes, baselines or {})
     require_torques(logs)
     used = _preprocessing(preprocessing, judged, logs)

@@ -92,10 +92,10 @@ def energy_drift(model: EmittedModel, windows: Windows) -> float | None:
         if calls > DRIFT_CALLS:
             raise _TooStiff
         q, p = state.chunk(2, dim=-1)
-        at = model.dynamics.configuration(q, prepared)
-        mass, residuals = model.dynamics.mass_at(at, prepared)
+        at = model.configuration(q, prepared)
+        mass, residuals = model.mass_at(at, prepared)
         qd = torch.linalg.solve(mass, p)
-        return torch.cat([qd, model.dynamics.lagrangian_gradient(at, qd, residuals, prepared)], dim=-1)
+        return torch.cat([qd, model.lagrangian_gradient(at, qd, residuals, prepared)], dim=-1)
 
     times = torch.linspace(0.0, DRIFT_SECONDS, DRIFT_TIMES, dtype=q.dtype)
     with torch.no_grad(), warnings.catch_warnings():

@@ -18,10 +18,10 @@ import torch
 from spelgen.dynamics.protocol import (
     RigidDynamics,
     VelocityState,
+    has_friction_state,
     integrable,
     known_past,
     memory_after,
-    remembering,
     sliding_memory,
 )
 from spelgen.evaluation.disturbance import Disturbed
@@ -125,7 +125,7 @@ def _step(
     width = VELOCITY * qd.abs().amax(dim=0).clamp(min=1e-3)
     damping = ((friction(qd + width) - friction(qd - width)) / (2 * width)).clamp(min=0)
     stiffness = torch.zeros_like(damping)  # (W, n), as damping: a joint's friction goes by its own motion
-    if remembering(dynamics) is not None:
+    if has_friction_state(dynamics):
         way = DISPLACEMENT * torch.where(qd < 0, -1.0, 1.0).to(q)
         stiffness = ((friction(qd, way) - friction(qd)) / way).clamp(min=0)
     h = GAMMA * step

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from spelgen.dynamics.protocol import has_rigid_bodies, has_servos
 from spelgen.exporting.describe_residuals import array, constant_residual, residuals, unsupported
 from spelgen.exporting.description import Bristles, FrictionLaw, Servos, TrainedModel
 from spelgen.exporting.tip_chain import tip_chain
-from spelgen.fitting.stages import has_rigid_bodies
 from spelgen.loaded_arm import LoadedArm
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
     """The numbers of a trained model of this arm. Raises RunError for a preset that has no such description."""
     exact: Any = copy.deepcopy(model).double().cpu().requires_grad_(False)
-    dynamics, preset = exact.dynamics, model.facts.options.preset
+    dynamics, preset = exact, model.facts.options.preset
     if not has_rigid_bodies(exact):
         raise unsupported(f"the preset {preset}, which is not of rigid bodies")
     with torch.no_grad():
@@ -47,7 +47,7 @@ def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
             inputs=np.diag(gains) if gains.ndim == 1 else gains,
             actuated=array(dynamics.input.actuated),
             torque_offset=array(exact.torque_offset),
-            friction_compensation=array(dynamics.friction_compensation()),
+            friction_compensation=array(dynamics.friction_compensation),
             tip_link=tip_link,
             tip=tip,
             tip_end=end,
@@ -75,7 +75,7 @@ def _bristles(dynamics: Any, prepared: Any) -> Bristles | None:
 
 def servos_of(model: Any) -> Servos | None:
     """The position servos of a model, None where it has none."""
-    if not hasattr(model, "servo"):
+    if not has_servos(model):
         return None
     kp, kd, limit, dead_zone = (array(x) for x in model.servo.prepare())
     return Servos(kp, kd, limit, dead_zone, float(model.servo.delay))

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from spelgen.dynamics.protocol import has_residuals
 from spelgen.errors import RunError
 from spelgen.exporting.description import Encoding, Harmonics, Network, Residuals, Splines
 
@@ -21,11 +22,6 @@ def unsupported(what: str) -> RunError:
         expected="closed-form, or hybrid with tanh networks",
         do="--to torch, mjcf and urdf take every preset",
     )
-
-
-def has_residuals(dynamics: Any) -> bool:
-    """Whether the dynamics may have something beside rigid bodies."""
-    return hasattr(dynamics, "residual_mass")
 
 
 def residuals(dynamics: Any, prepared: Any) -> Residuals:

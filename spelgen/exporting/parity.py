@@ -122,9 +122,9 @@ def reference(name: str, model: Any, arm: LoadedArm, inputs: Values) -> dict[str
             kinetic = 0.5 * (model.momentum(q, qd) * qd).sum(dim=-1)
             found = {"energy": torch.stack([kinetic, model.potential_energy(q)], dim=-1)}
         elif name == "friction_step":
-            found = {"z_next": q[:, :0] if z is None else model.dynamics.memory_after(z, dq).flatten(-2)}
+            found = {"z_next": q[:, :0] if z is None else model.memory_after(z, dq).flatten(-2)}
         elif name == "friction_memory":
-            found = {"z_start": q[:, :0] if z is None else model.dynamics.memory(qd).flatten(-2)}
+            found = {"z_start": q[:, :0] if z is None else model.memory(qd).flatten(-2)}
         elif name.endswith("derivatives"):
             found = _derivatives(name, model, q, qd, qdd if name.startswith("inverse") else tau, *kept)
         else:

@@ -13,9 +13,9 @@ from scipy.optimize import nnls
 
 from spelgen.arm.arm import Arm
 from spelgen.building import build
+from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.dynamics.residuals import without_residuals
 from spelgen.fitting.optimizers import minimise
-from spelgen.fitting.stages import has_rigid_bodies
 from spelgen.loaded_arm import LoadedArm
 from spelgen.structure.nominal import working_range
 
@@ -76,7 +76,7 @@ def rigid_body_projection(model: EmittedModel, arm: LoadedArm) -> RigidBodyProje
         arm=arm,
         inertias=bodies.inertial_parameters.numpy(),
         armature=bodies.armature.numpy(),
-        motors=bodies.dynamics.motors.numpy(),
+        motors=bodies.motors.numpy(),
         viscous=viscous,
         forward=forward,
         backward=backward,
@@ -97,8 +97,7 @@ def sampled_positions(arm: Arm) -> torch.Tensor:
 
 def _own(model: EmittedModel) -> EmittedModel:
     """The model without what it has beside rigid bodies."""
-    alone = copy.deepcopy(model)
-    alone.dynamics = without_residuals(alone.dynamics)
+    alone: EmittedModel = without_residuals(model)
     return alone
 
 

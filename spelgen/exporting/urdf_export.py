@@ -8,6 +8,7 @@ from typing import Any
 import torch
 import yaml
 
+from spelgen.dynamics.protocol import has_friction_state
 from spelgen.exporting.describe import servos_of
 from spelgen.exporting.exported import Exported
 from spelgen.exporting.readme import UNITS, readme
@@ -89,14 +90,14 @@ def projection_summary(found: RigidBodyProjection) -> tuple[str, str]:
 
 def friction_text(trained: Trained, projection: RigidBodyProjection) -> str:
     """YAML: viscous and Coulomb friction of each joint, and the constants of the model's own law where it has one."""
-    friction = trained.model.dynamics.friction
+    friction = trained.model.friction
     law = friction.prepare()
     constants = law._asdict() if hasattr(law, "coulomb") else {}
     if projection.own:
-        factor = trained.model.dynamics.friction_factor(sampled_positions(projection.arm.arm))
+        factor = trained.model.friction_factor(sampled_positions(projection.arm.arm))
         if (factor != 1).any():
             constants["position_factor"] = torch.stack([factor.amin(dim=0), factor.amax(dim=0)], dim=-1)
-    if hasattr(friction, "bristles"):
+    if has_friction_state(trained.model):
         constants["bristle_reach"] = friction.bristles.reach
     joints: dict[str, Any] = {}
     servos = servos_of(trained.model)

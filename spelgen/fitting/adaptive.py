@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from spelgen.dynamics.protocol import memory_after, remembering, sliding_memory
+from spelgen.dynamics.protocol import has_friction_state, memory_after, sliding_memory
 from spelgen.logs.windows import Windows
 
 RELATIVE, ABSOLUTE = 1e-7, 1e-9  # tolerances of a step
@@ -25,7 +25,7 @@ def roll_out_adaptive(model: Any, windows: Windows) -> tuple[torch.Tensor, torch
     from torchdiffeq import odeint, odeint_adjoint  # half a second, for those who ask for dopri5 alone
 
     long = windows.dt.shape[1] >= LONG and isinstance(model, torch.nn.Module) and torch.is_grad_enabled()
-    adjoint = long and remembering(model) is None
+    adjoint = long and not has_friction_state(model)
     # the adjoint equation sees weights alone, so what is made of them cannot be prepared once for it
     prepared = None if adjoint else model.prepare()
     q = windows.q[:, 0]

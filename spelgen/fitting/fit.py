@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from spelgen.dynamics.bristles import bristle_reach
+from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.errors import Diagnostic, RunError
 from spelgen.files import write_json
 from spelgen.fitting import workers
@@ -21,7 +22,7 @@ from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.run_lock import locked
 from spelgen.fitting.run_record import describe, require_same
 from spelgen.fitting.servo_run import fit_commands, require_input
-from spelgen.fitting.stages import default_config, fit_torque_stage, has_rigid_bodies
+from spelgen.fitting.stages import default_config, fit_torque_stage
 from spelgen.fitting.streaming import LargeLogs, prepare_streamed
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer, urdf_regularizer
 from spelgen.logs.preprocessing import Preprocessing

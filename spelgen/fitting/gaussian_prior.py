@@ -16,11 +16,11 @@ from spelgen.settings.fits import Adaptation, GaussianPrior
 # weights of a module's parts, by how their names end
 SIZES = ("raw_viscous", "raw_saturation", "raw_coulomb", "raw_stribeck")
 KINDS = {
-    "inertial_parameters.raw": "bodies",
+    "bodies.raw": "bodies",
     "raw_offset": "offset",
     "raw_friction_compensation": "friction_compensation",
     "raw_gains": "gains",
-    "armature.raw": "armature",
+    "rotors.raw": "armature",
     "_velocity": "velocities",
     "raw_load_dependence": "sizes",
     "raw_bristle_fractions": "fractions",

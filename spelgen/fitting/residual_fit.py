@@ -91,7 +91,7 @@ class _Candidate:
 def enter(model: Any, left: Left, alike: float) -> list[Residual]:
     """Give the model all parts that held-out samples ask for; what entered. alike: samples that err alike."""
     noise, missing, found = _noise(left.missing), left.missing, []
-    functions = model.dynamics.joint_functions
+    functions = model.joint_functions
     for each in _candidates(model, left):
         target = each.target(missing, noise)
         gain = _held_out(each, target, alike)
@@ -106,7 +106,7 @@ def enter(model: Any, left: Left, alike: float) -> list[Residual]:
 
 def refine(model: Any, left: Left, entered: Sequence[Residual], alike: float) -> None:
     """Fit the functions of single joints that have entered anew, beside what else has changed since."""
-    noise, missing, functions = _noise(left.missing), left.missing, model.dynamics.joint_functions
+    noise, missing, functions = _noise(left.missing), left.missing, model.joint_functions
     chosen = {(each.name, each.joint) for each in entered}
     for each in _candidates(model, left):
         if (each.parameter, each.joint) not in chosen:
@@ -119,7 +119,7 @@ def refine(model: Any, left: Left, entered: Sequence[Residual], alike: float) ->
 
 def _candidates(model: Any, left: Left) -> Iterator[_Candidate]:
     """What could enter: smooth torques first, then friction that varies, then ripple."""
-    functions, motors = model.dynamics.joint_functions, model.dynamics.motors
+    functions, motors = model.joint_functions, model.motors
     with torch.no_grad():
         splines, ripple = functions.splines(left.q), functions.ripple(left.q)
     own = torch.eye(len(motors)).to(motors)
@@ -210,7 +210,7 @@ def _probable(
 
 def _networks(model: Any, left: Left, alike: float) -> Iterator[Residual]:
     """The networks that enter: the potential's, then the mass matrix's."""
-    dynamics = model.dynamics
+    dynamics = model
     every = -(-len(left.q) // NETWORK_SAMPLES)
     few = Left(*(x[::every] for x in left))
     for name in ("residual_potential", "residual_mass"):

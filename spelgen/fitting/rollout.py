@@ -146,7 +146,7 @@ def momentum_loss(
     torque would count less.) everywhere: from a mean over these windows that over those of all processes.
     """
     q, qd, tau = windows.q, windows.qd, windows.tau  # (W, K, n), (W, K, n), (W, K-1, n)
-    dynamics, dt = model.dynamics, windows.dt.unsqueeze(-1)
+    dynamics, dt = model, windows.dt.unsqueeze(-1)
     # velocities are measured, so M need not be positive definite on the way; kept so, descent stops where it is not
     prepared = model.prepare(definite=False)
     at = dynamics.configuration(q, prepared)

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
+from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.errors import RunError
 from spelgen.fitting.dataset import TrainingData
 from spelgen.fitting.run_folder import RunFolder
-from spelgen.fitting.stages import has_rigid_bodies
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.fits import CONFIGS, FitConfig, WindowConfig, made
 from spelgen.settings.log_mapping import LogMapping

@@ -83,7 +83,7 @@ def _shared_out(problem: ServoProblem, point: Point, share: float) -> Point:
     problem.write(point)
     model, row = problem.model, problem.weights.row
     with torch.no_grad():
-        torques = sliding_friction(model.dynamics.friction, problem.along.qd, problem.load.gravity)
+        torques = sliding_friction(model.friction, problem.along.qd, problem.load.gravity)
         dry = torques / model.kp
     joints, present = point.joints.clone(), point.present.clone()
     lost = dry + joints[row(DEAD_ZONE)].clamp(min=0.0)

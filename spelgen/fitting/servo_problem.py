@@ -130,7 +130,7 @@ class ServoProblem:
 
 
 def _drives(model: Any) -> tuple[ServoDrives, torch.Tensor]:
-    return servo_drives(model), model.dynamics.armature()
+    return servo_drives(model), model.armature
 
 
 def _rows(point: Point) -> torch.Tensor:

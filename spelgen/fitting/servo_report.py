@@ -82,7 +82,7 @@ def _told(
         "kd": (kd / kp, {"servo.raw_kd": kd / kp, "servo.raw_kp": by_kp * kd / kp}),
         "armature": (
             armature / kp,
-            {"dynamics.armature.raw": armature / kp, "servo.raw_kp": by_kp * armature / kp},
+            {"rotors.raw": armature / kp, "servo.raw_kp": by_kp * armature / kp},
         ),
         "dry": (dry, slopes),
         "lost": (dry + zone, slopes | {DEAD_ZONE: 1.0}),
@@ -92,13 +92,13 @@ def _told(
 
 def _dry(model: Any, solution: ServoSolution) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
     """Dry friction of each joint, (n,) [Nm, N], what it takes over what the joint went, and its slopes by weights."""
-    friction = model.dynamics.friction
+    friction = model.friction
     raw = dict(friction.named_parameters())
     with torch.enable_grad():
         dry = sliding_friction(friction, solution.qd, solution.gravity)
         # of a joint the weights of that joint alone
         slopes = torch.autograd.grad(dry.sum(), [*raw.values()], allow_unused=True)
-    found = {f"dynamics.friction.{name}": x for name, x in zip(raw, slopes, strict=True) if x is not None}
+    found = {f"friction.{name}": x for name, x in zip(raw, slopes, strict=True) if x is not None}
     return dry.detach(), found
 
 

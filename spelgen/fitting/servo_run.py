@@ -8,6 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from spelgen.dynamics.protocol import has_servos
 from spelgen.errors import Diagnostic, LogError, OptionError, RunError
 from spelgen.files import write_json
 from spelgen.fitting import workers
@@ -36,11 +37,11 @@ if TYPE_CHECKING:
 
 def require_input(model: EmittedModel, config: FitConfig) -> None:
     """Raise OptionError for an objective that does not belong to what commands the arm."""
-    if hasattr(model, "servo") and not isinstance(config, ServoFit):
+    if has_servos(model) and not isinstance(config, ServoFit):
         raise OptionError(
             "objective", f"{config.objective} belongs to logs of torques, this arm has position servos"
         )
-    if isinstance(config, ServoFit) and not hasattr(model, "servo"):
+    if isinstance(config, ServoFit) and not has_servos(model):
         raise OptionError("objective", "servo belongs to arms with 'input: position' in their settings")
 
 

@@ -21,7 +21,7 @@ LEAST = 0.05  # of a usual size, so that its logarithm is one
 
 def start_servos(model: Any, windows: ServoWindows, load: BodyLoad, delay: float) -> None:
     """Give kp, kd, armature, friction and offset of the model the values that explain the command error best."""
-    dynamics, servo = model.dynamics, model.servo
+    dynamics, servo = model, model.servo
     n = model.n
     u = windows.commands(delay).mean(dim=2)
     z = np.stack([bristles_along(x.numpy(), bristle_reach(model)) for x in windows.q])
@@ -45,7 +45,7 @@ def start_servos(model: Any, windows: ServoWindows, load: BodyLoad, delay: float
         servo.raw_kp.copy_(torch.where(known, torch.zeros_like(kp), (kp / nominal).log()))
         servo.raw_kd.copy_((torch.maximum(kp * slopes[:, 0], LEAST**2 * kp) / servo.nominal_kd).log())
         armature = torch.maximum(kp * slopes[:, 1] - own, LEAST**3 * kp)
-        dynamics.armature.raw.copy_((armature / dynamics.armature.nominal).log())
+        dynamics.rotors.raw.copy_((armature / dynamics.rotors.nominal).log())
         friction = dynamics.friction
         friction.raw_coulomb.copy_((torch.maximum(kp * slopes[:, 2], LEAST * size) / size).log())
         # a drive's viscous friction and kd are one number: kd has it all

@@ -11,11 +11,11 @@ import torch
 from torch.func import functional_call, jacfwd
 
 DEAD_ZONE = "servo.dead_zone"
-FRICTION = "dynamics.friction.raw_"
+FRICTION = "friction.raw_"
 COULOMB = FRICTION + "coulomb"
 STRIBECK = FRICTION + "stribeck"
 STRIBECK_VELOCITY = FRICTION + "stribeck_velocity"
-BODIES = "dynamics.inertial_parameters.raw"
+BODIES = "bodies.raw"
 BODY_DEVIATION = 0.3  # of the bodies' weights, which is some 60 % in mass
 DIRECTIONS = 6  # of the bodies' weights, those that move gravity most
 FAINT = 1e-3  # of the strongest direction: weaker ones are left as they are
@@ -37,8 +37,8 @@ class JointWeight:
 JOINT_WEIGHTS = (
     JointWeight("servo.raw_kp", 3.0),
     JointWeight("servo.raw_kd", 2.0),
-    JointWeight("dynamics.armature.raw", 2.0),
-    JointWeight("dynamics.raw_offset", 2.0),
+    JointWeight("rotors.raw", 2.0),
+    JointWeight("raw_offset", 2.0),
     JointWeight(COULOMB, 2.0),
     JointWeight(STRIBECK, 2.0, absent=-12.0),
     JointWeight(STRIBECK_VELOCITY, 1.0, absent=0.0),
@@ -135,7 +135,7 @@ def body_directions(model: Any, q: torch.Tensor) -> torch.Tensor:
     """Directions of the bodies' weights that move gravity at q (M, n) most, (10 B, r), a standard deviation long."""
     still = torch.zeros_like(q)
     with torch.no_grad():
-        gravity = model.dynamics.regressor(q, still, still) @ inertial_slopes(model)
+        gravity = model.regressor(q, still, still) @ inertial_slopes(model)
     _, sizes, turned = torch.linalg.svd(gravity.flatten(0, 1), full_matrices=False)
     felt = int((sizes > FAINT * sizes[0].clamp(min=1e-12)).sum()) if len(sizes) else 0
     return BODY_DEVIATION * turned[: min(felt, DIRECTIONS)].mT
@@ -143,7 +143,7 @@ def body_directions(model: Any, q: torch.Tensor) -> torch.Tensor:
 
 def inertial_slopes(model: Any) -> torch.Tensor:
     """Of the ten parameters of all bodies by their weights, (10 B, 10 B)."""
-    bodies, raw = model.dynamics.inertial_parameters, model.get_parameter(BODIES).detach()
+    bodies, raw = model.bodies, model.get_parameter(BODIES).detach()
 
     def ten(flat: torch.Tensor) -> torch.Tensor:
         found: torch.Tensor = functional_call(bodies, {"raw": flat.view_as(raw)}, ()).flatten()

@@ -104,11 +104,11 @@ class BodyLoad:
 
 def body_load(model: Any, path: Path, directions: torch.Tensor) -> BodyLoad:
     """Of the model as it is; directions: of the ten parameters of all bodies, (10 bodies, r)."""
-    dynamics = model.dynamics
+    dynamics = model
     flat = [x.flatten(0, 1) for x in path]
     found: list[tuple[torch.Tensor, ...]] = []
     with torch.no_grad():
-        prepared, armature = dynamics.prepare(), dynamics.armature()
+        prepared, armature = dynamics.prepare(), dynamics.armature
         for q, qd, qdd in zip(*(x.split(BLOCK) for x in flat), strict=True):
             at = dynamics.configuration(q, prepared)
             mass, residuals = dynamics.mass_at(at, prepared)

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from spelgen.dynamics.bristles import bristle_reach
+from spelgen.dynamics.protocol import has_rigid_bodies, has_servos
 from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.dataset import TrainingData
 from spelgen.fitting.torque_fit import DECIMATION, fit_torque
@@ -26,16 +27,11 @@ MOVED = {
 }
 
 
-def has_rigid_bodies(model: Any) -> bool:
-    """Whether the model is of rigid bodies and friction laws, whatever stands beside them."""
-    return hasattr(model, "inertial_parameters")
-
-
 def default_objective(model: EmittedModel, rates: Sequence[float]) -> str:
     """What is fitted where nobody says: to an arm under position servos what follows its commands; torque to a
     model of rigid bodies, where logs are sampled densely enough for accelerations (rates [Hz]); else windows.
     """
-    if hasattr(model, "servo"):
+    if has_servos(model):
         return "servo"
     return "torque" if has_rigid_bodies(model) and any(rate >= DENSE for rate in rates) else "rollout"
 

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from spelgen.dynamics.protocol import has_residuals
 from spelgen.fitting.gaussian_prior import PRIORS, covariance, most_probable
 from spelgen.fitting.residual_fit import Residual, enter, refine
 from spelgen.fitting.torque_jacobian import COMPENSATION, TorqueJacobian
@@ -101,7 +102,7 @@ def fit_torque(
     problem = _Problem(TorqueJacobian(model, few), prior, adapt)
     at, noise = problem.settled()
     residuals: list[Residual] = []
-    if adapt is None and hasattr(model.dynamics, "joint_functions"):
+    if adapt is None and has_residuals(model):
         alike = max(1.0, ALIKE * few.count / samples.count)
         problem.jacobian.write(at.x)
         residuals = enter(model, problem.jacobian.left(at.x), alike)

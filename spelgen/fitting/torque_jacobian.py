@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 
 BLOCK = 2**13  # samples at a time: of seven joints some 100 MB with their derivatives
 HELD = 2e8  # bytes of regressors up to which they are kept from pass to pass
-BODIES = "dynamics.inertial_parameters.raw"
-COMPENSATION = "dynamics.raw_friction_compensation"
+BODIES = "bodies.raw"
+COMPENSATION = "raw_friction_compensation"
 GAINS = "raw_gains"  # logarithms of gains between logged and joint torques
-FRICTION = ("dynamics.friction.", "dynamics.raw_offset")  # what changes from day to day
-RESIDUALS = ("dynamics.joint_functions.", "dynamics.residual_")  # what stands beside rigid bodies
+FRICTION = ("friction.", "raw_offset")  # what changes from day to day
+RESIDUALS = ("joint_functions.", "residual_")  # what stands beside rigid bodies
 
 Weights = Mapping[str, torch.Tensor]
 
@@ -113,7 +113,7 @@ class TorqueJacobian:
         if not trained:
             return found
         change = weights[trained[0]] - self.weights[trained[0]]
-        return found.index_put((self.model.dynamics.input.rows,), (-change).exp())
+        return found.index_put((self.model.input.rows,), (-change).exp())
 
     def normal_equations(
         self, x: torch.Tensor, noise: torch.Tensor, free: torch.Tensor
@@ -132,10 +132,10 @@ class TorqueJacobian:
     def left(self, x: torch.Tensor) -> Left:
         """What these weights leave, of all samples."""
         weights, parts = self._named(x), []
-        dynamics = self.model.dynamics
+        dynamics = self.model
         for each, (q, *_) in zip(self._blocks(), self.samples.blocks(BLOCK), strict=True):
-            ten = self._ask(weights, lambda model: model.dynamics.inertial_parameters().flatten())
-            constants = self._ask(weights, lambda model: model.dynamics.friction.prepare())
+            ten = self._ask(weights, lambda model: model.inertial_parameters.flatten())
+            constants = self._ask(weights, lambda model: model.friction.prepare())
             friction = dynamics.friction(each.speed, each.load_regressor @ ten, constants, each.z)
             parts.append(Left(q, each.qd, each.qdd, self._missing(weights, each), each.factor * friction))
         return Left(*(torch.cat(column).detach() for column in zip(*parts, strict=True)))
@@ -202,7 +202,7 @@ class TorqueJacobian:
         q, qd, qdd, tau, z = block
         still = torch.zeros_like(q)
         with torch.no_grad():
-            dynamics = self.model.dynamics
+            dynamics = self.model
             past = z if z.shape[-1] else None
             load = torch.einsum("jm,tjk->tmk", dynamics.loads, dynamics.regressor(q, still, still))
             speed = qd @ dynamics.motors.mT
@@ -216,7 +216,7 @@ class TorqueJacobian:
         (K - 10 B, n).
         """
         own = {name: x for name, x in self.weights.items() if name != BODIES}
-        moves = (self.model.dynamics.motors != 0).double()
+        moves = (self.model.motors != 0).double()
         turn: list[int] = []  # of a joint, among those that have torques in common
         for coupled in moves @ moves.mT > 0:
             taken = {turn[k] for k in range(len(turn)) if coupled[k]}
@@ -227,7 +227,7 @@ class TorqueJacobian:
         for name, x in own.items():
             size = x[0].numel()
             row, weight = torch.arange(len(x)).repeat_interleave(size), torch.arange(size).repeat(len(x))
-            joint = self.model.dynamics.input.rows[row] if name.endswith(GAINS) else row
+            joint = self.model.input.rows[row] if name.endswith(GAINS) else row
             direction = count + turns * weight + torch.tensor(turn)[joint]
             each = torch.zeros(total, len(x), size).double()
             each[direction, row, weight] = 1.0
@@ -251,13 +251,13 @@ class TorqueJacobian:
         """The torque that the model does not explain, (T, n)."""
 
         def missing(model: Any) -> torch.Tensor:
-            dynamics = model.dynamics
-            prepared, ten = dynamics.prepare(), dynamics.inertial_parameters().flatten()
+            dynamics = model
+            prepared, ten = dynamics.prepare(), dynamics.inertial_parameters.flatten()
             load = samples.load_regressor @ ten
             friction = samples.factor * dynamics.friction(samples.speed, load, prepared.friction, samples.z)
-            tau = samples.tau - dynamics.torque_offset()
+            tau = samples.tau - dynamics.torque_offset
             given = dynamics.input.force(load, tau, prepared.input)
-            given = given + dynamics.friction_compensation() * samples.qd
+            given = given + dynamics.friction_compensation * samples.qd
             missing: torch.Tensor = (
                 given - samples.regressor @ ten - samples.qdd @ prepared.armature - samples.residual
             )
@@ -299,14 +299,14 @@ class TorqueJacobian:
 
         def ten(bodies: torch.Tensor) -> torch.Tensor:
             question = {**weights, BODIES: bodies}
-            return self._ask(question, lambda model: model.dynamics.inertial_parameters().flatten())
+            return self._ask(question, lambda model: model.inertial_parameters.flatten())
 
         change = jacobian(ten, weights[BODIES], vectorize=True).flatten(1)  # (10 B, K)
-        constants = self._ask(weights, lambda model: model.dynamics.friction.prepare())
+        constants = self._ask(weights, lambda model: model.friction.prepare())
         load = (samples.load_regressor @ ten(weights[BODIES])).detach().requires_grad_()
         with torch.enable_grad():
-            friction = self.model.dynamics.friction(samples.speed, load, constants, samples.z)
+            friction = self.model.friction(samples.speed, load, constants, samples.z)
         (by_load,) = gradient(friction.sum(), load, materialize_grads=True)  # each drive's by its own load
         at_drives = (samples.factor * by_load).unsqueeze(-1) * samples.load_regressor
-        loaded = samples.regressor + torch.einsum("mj,tmk->tjk", self.model.dynamics.motors, at_drives)
+        loaded = samples.regressor + torch.einsum("mj,tmk->tjk", self.model.motors, at_drives)
         return ((loaded @ change) * self._per_gain(weights)[:, None]).detach()

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
 PARTS: dict[Adaptation, tuple[str, ...]] = {
-    "load": ("dynamics.mass", "dynamics.potential"),
-    "friction": ("dynamics.friction",),
+    "load": ("mass", "potential"),
+    "friction": ("friction",),
     "unit": ("",),
 }
 """How the names of the weights begin that an adaptation moves."""

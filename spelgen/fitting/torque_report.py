@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch.func import functional_call, jacrev
 
+from spelgen.dynamics.protocol import has_residuals
 from spelgen.errors import Diagnostic
 from spelgen.fitting.torque_fit import TorqueSolution
 from spelgen.fitting.torque_jacobian import BLOCK, Asked, rigid_weights
@@ -32,14 +33,14 @@ def torque_notes(model: EmittedModel, samples: TorqueSamples, found: TorqueSolut
     message = f"the URDF's inertias are {how} to within a factor of {factor:.2g}"
     yield Diagnostic("info", "urdf-believed", "bodies", None, message)
     if found.compensated.any():
-        value = model.dynamics.friction_compensation().detach().numpy()
+        value = model.friction_compensation.detach().numpy()
         each = ", ".join(f"{names[k]} {value[k]:.3g}" for k in np.flatnonzero(found.compensated))
         message = (
             "the measured torque falls as velocity grows, as of a drive that compensates friction unseen: "
             f"{each} Nm s/rad (N s/m) are added; check the torques' signs and what the controller subtracts"
         )
         yield Diagnostic("warning", "friction-compensated", "logs", None, message)
-    if hasattr(model.dynamics, "joint_functions"):
+    if has_residuals(model):
         yield Diagnostic("info", "residuals", "model", None, _entered(found, names))
     q, _, qdd, *_ = (x[:: max(1, len(x) // POSITIONS)] for x in next(samples.blocks(BLOCK)))
     inertia, deviation = _inertia(model, q, found.covariance)

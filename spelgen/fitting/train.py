@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from spelgen.dynamics.protocol import has_servos
 from spelgen.emission.loading import load_module
 from spelgen.errors import Diagnostic, ModuleError, RunError
 from spelgen.fitting.fit import AUTOMATIC, fit, sample_rates
@@ -97,7 +98,7 @@ def start_from(model: EmittedModel, source: Path | str) -> None:
 def mapping_of(model: Any, mapping: LogMapping | None) -> LogMapping:
     """The mapping, by default as spelgen writes logs, for what this model is commanded."""
     mapping = mapping or LogMapping()
-    return mapping.model_copy(update={"input": "position"}) if hasattr(model, "servo") else mapping
+    return mapping.model_copy(update={"input": "position"}) if has_servos(model) else mapping
 
 
 def open_logs(

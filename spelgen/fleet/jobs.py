@@ -14,12 +14,13 @@ import torch
 
 from spelgen import __version__, pipeline
 from spelgen.baselines.keep import keep_baseline
+from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.evaluation.subject import read_test_logs
 from spelgen.files import write_json, write_text
 from spelgen.fitting.fitted import load_run
 from spelgen.fitting.run_folder import RunFolder
-from spelgen.fitting.stages import default_config, has_rigid_bodies
+from spelgen.fitting.stages import default_config
 from spelgen.fitting.train import train
 from spelgen.loaded_arm import load_arm
 from spelgen.logs.preprocessing import Preprocessing

@@ -41,15 +41,15 @@ def read_learned(run: RunFolder) -> Learned:
     before: Any = run.load_module()
     after: Any = trained_model(run)
     found = []
-    if hasattr(after.dynamics, "mass") and hasattr(after.dynamics.mass, "constants"):
-        basis = after.dynamics.mass.constant_basis.reshape(-1, after.n, after.n)
+    if hasattr(after, "mass") and hasattr(after.mass, "constants"):
+        basis = after.mass.constant_basis.reshape(-1, after.n, after.n)
         values = zip(basis, _constants(before), _constants(after), strict=True)
         found += [_constant(*each, after.joint_types) for each in values]
     return Learned(sum(parameter.numel() for parameter in after.parameters()), tuple(found))
 
 
 def _constants(model: EmittedModel) -> list[float]:
-    dynamics: Any = model.dynamics
+    dynamics: Any = model
     return list(dynamics.mass.constants().tolist())
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from spelgen.dynamics.protocol import has_rigid_bodies, has_servos
 from spelgen.dynamics.regressor import urdf_parameters
 from spelgen.fitting.servo_report import open_text, servo_listing
 from spelgen.identification.base_parameters import base_parameters
@@ -58,11 +59,10 @@ def parameter_tables(
 
 def body_parameters(model: Any) -> np.ndarray | None:
     """(bodies, 10) of a closed-form model, as ``Body.inertia`` has them; None of another."""
-    own = getattr(getattr(model, "dynamics", None), "inertial_parameters", None)
-    if own is None:
+    if not has_rigid_bodies(model):
         return None
     with torch.no_grad():
-        values: np.ndarray = own().numpy()
+        values: np.ndarray = model.inertial_parameters.numpy()
     return values
 
 
@@ -157,7 +157,7 @@ def _joints(model: Any, arm: LoadedArm | None) -> Iterator[ParameterTable]:
     columns: dict[str, tuple[list[float], str]] = {}
     if hasattr(model, "armature"):
         columns["armature"] = ([float(x) for x in model.armature.tolist()], "armature")
-    friction: Any = getattr(getattr(model, "dynamics", None), "friction", None)
+    friction: Any = getattr(model, "friction", None)
     with torch.no_grad():
         prepared: Any = friction.prepare() if hasattr(friction, "prepare") else None
         named = prepared._asdict() if hasattr(prepared, "_asdict") else {}
@@ -165,9 +165,8 @@ def _joints(model: Any, arm: LoadedArm | None) -> Iterator[ParameterTable]:
         for name, values in named.items():
             if torch.is_tensor(values) and values.shape == (len(types),) and name not in unused:
                 columns[name] = (values.tolist(), name)
-        offset = getattr(getattr(model, "dynamics", None), "torque_offset", None)
-        if offset is not None:
-            columns["torque offset"] = (offset().tolist(), "offset")
+        if has_rigid_bodies(model):
+            columns["torque offset"] = (model.torque_offset.tolist(), "offset")
     if not columns:
         return
     head = ["joint", *(name.replace("_", " ") for name in columns)]
@@ -204,7 +203,7 @@ def _unused(model: Any, friction: Any) -> tuple[str, ...]:
     """Constants of friction that this model's does not have: velocities of what remembers, and what kd stands for."""
     smoothed = getattr(friction, "raw_coulomb_smoothing_velocity", None) is not None
     found = () if smoothed else ("coulomb_smoothing_velocity",)
-    return (*found, "viscous", "saturation", "saturation_velocity") if hasattr(model, "servo") else found
+    return (*found, "viscous", "saturation", "saturation_velocity") if has_servos(model) else found
 
 
 def _unit(what: str, kind: str) -> str:

@@ -29,7 +29,7 @@ class ConstantMass(nn.Module):
         self.register_buffer("constant_scale", vector(unit for _, unit in constants))
         self.register_buffer("constant_basis", entry_basis(entries, 0, len(constants))[1])
         self.raw_constants = nn.Parameter(start / self.constant_scale)
-        self.armature = Armature(joints)
+        self.rotors = Armature(joints)
 
     def constants(self) -> Tensor:
         """The constants of M, (constants,), in their units."""
@@ -38,7 +38,7 @@ class ConstantMass(nn.Module):
     def prepare(self, definite: bool = True) -> Tensor:
         """M, (n, n)."""
         rows = self.constants() @ self.constant_basis
-        return rows.reshape(self.n, self.n) + torch.diag(self.armature())
+        return rows.reshape(self.n, self.n) + torch.diag(self.rotors())
 
     def forward(self, encoded: Tensor, prepared: Tensor) -> tuple[Tensor, None]:
         """M, for each state."""

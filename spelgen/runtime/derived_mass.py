@@ -73,7 +73,7 @@ class DerivedMass(nn.Module):
         self.bound = PositiveDefiniteBound(self._square(mean), margin)
         self.raw_constants = nn.Parameter(start / self.constant_scale)
         self.network = network
-        self.armature = Armature(joints)
+        self.rotors = Armature(joints)
 
     def constants(self) -> Tensor:
         """The constants of M, (constants,), in their units."""
@@ -81,7 +81,7 @@ class DerivedMass(nn.Module):
 
     def prepare(self, definite: bool = True) -> MassPrepared:
         """All that depends on the weights alone; ``definite``: keep M positive definite."""
-        armature = torch.diag(self.armature())
+        armature = torch.diag(self.rotors())
         constant = self.constants() @ self.constant_basis
         constant = constant + self.function_mean @ self.function_basis + armature.flatten()
         output_map = (self.function_scale.unsqueeze(-1) * self.function_basis).mT

@@ -37,7 +37,6 @@ class NetworkDynamics(PortHamiltonian):
         input: Input,
     ) -> None:
         super().__init__()
-        self.n, self.elements = len(encoding.center), 0
         self.encoding = encoding
         # Any: what a part has beside its protocol is there to be asked for
         self.mass: Any = mass

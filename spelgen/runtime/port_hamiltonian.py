@@ -7,6 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from spelgen.runtime.lie_group import from_group, to_group
+
 
 def solved(matrix: Tensor, right: Tensor) -> Tensor:
     """matrix^-1 right, (..., n)."""
@@ -43,7 +45,9 @@ class PortHamiltonian(nn.Module):
     """
 
     n: int
-    elements: int  # K, of friction's memory at a joint
+    joint_names: tuple[str, ...]
+    joint_types: tuple[str, ...]  # "revolute" or "prismatic"
+    elements = 0  # K, of friction's memory at a joint
 
     def prepare(self, definite: bool = True) -> Any:
         """All that depends on the weights alone; holds until they change.
@@ -113,7 +117,7 @@ class PortHamiltonian(nn.Module):
         raise NotImplementedError
 
     def mass_matrix(self, q: Tensor, prepared: Any = None) -> Tensor:
-        """M(q), (..., n, n)."""
+        """M(q), (..., n, n) [kg m^2, kg m, kg]."""
         prepared = self.prepare() if prepared is None else prepared
         return self.mass_at(self.configuration(q, prepared), prepared)[0]
 
@@ -147,6 +151,14 @@ class PortHamiltonian(nn.Module):
         """G(q), (..., n, n)."""
         prepared = self.prepare()
         return self.input_at(self.configuration(q, prepared), prepared)
+
+    def momentum(self, q: Tensor, qd: Tensor, prepared: Any = None) -> Tensor:
+        """p = M(q) qd, (..., n)."""
+        return applied(self.mass_matrix(q, prepared), qd)
+
+    def velocity(self, q: Tensor, p: Tensor, prepared: Any = None) -> Tensor:
+        """qd = M(q)^-1 p, (..., n)."""
+        return solved(self.mass_matrix(q, prepared), p)
 
     def hamiltonian(self, q: Tensor, p: Tensor, z: Tensor | None = None) -> Tensor:
         """H, (...) [J]."""
@@ -184,7 +196,7 @@ class PortHamiltonian(nn.Module):
         force = force - self.friction_at(at, qd, prepared, z)
         return qd, force if tau is None else force + self.input_force(at, qd, tau, prepared)
 
-    def state_rate(self, state: Tensor) -> Tensor:
+    def forward(self, t: Tensor, state: Tensor) -> Tensor:
         """The rate of (q, p, z), (..., 2 n + n K), or of (q, p, z, tau), where tau is held.
 
         A state that is too short for z has none: friction is then that of joints which slide.
@@ -196,3 +208,11 @@ class PortHamiltonian(nn.Module):
         qd, force = self.port_hamiltonian_rhs(q, p, tau if tau.shape[-1] else None, self.prepare(), z)
         moved = flat if z is None else self.memory_rate(qd, z).flatten(-2)
         return torch.cat([qd, force, moved, torch.zeros_like(tau)], dim=-1)
+
+    def to_group(self, q: Tensor) -> list[Tensor]:
+        """By joint, R in SO(3), (..., 3, 3), or r in R^3, (..., 3), if prismatic; z is its axis."""
+        return to_group(q, self.joint_types)
+
+    def from_group(self, parts: list[Tensor]) -> Tensor:
+        """q, (..., n), with angles in [-pi, pi]; the inverse of ``to_group``."""
+        return from_group(parts, self.joint_types)

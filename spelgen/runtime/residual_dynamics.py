@@ -41,7 +41,12 @@ class ResidualDynamics(RigidBodyDynamics):
 
     M = that of bodies and drives + R(q), positive definite for all weights (see ``ResidualMass``).
     V = that of bodies + a network's + each joint's own. Friction is multiplied by a positive factor.
+    Where ``residual_mass`` is None there are no residuals: for a model that is asked often, and has none.
     """
+
+    joint_functions: JointFunctions
+    residual_mass: ResidualMass | None
+    residual_potential: LearnedPotential | None
 
     def __init__(
         self,
@@ -62,6 +67,8 @@ class ResidualDynamics(RigidBodyDynamics):
     def prepare(self, definite: bool = True) -> RigidPrepared:
         """All that depends on the weights alone; holds until they change."""
         prepared = super().prepare(definite)
+        if self.residual_mass is None:
+            return prepared
         potential = None if self.residual_potential is None else self.residual_potential.prepare()
         mass = self.residual_mass.prepare(prepared.armature)
         functions = self.joint_functions.prepare()
@@ -69,19 +76,26 @@ class ResidualDynamics(RigidBodyDynamics):
 
     def configuration(self, q: Tensor, prepared: RigidPrepared) -> Motion:
         """How the bodies may move at q, and what residuals read of q."""
-        return super().configuration(q, prepared)._replace(residual=self._read(q, prepared))
+        at = super().configuration(q, prepared)
+        return at if self.residual_mass is None else at._replace(residual=self._read(q, prepared))
 
     def _read(self, q: Tensor, prepared: RigidPrepared) -> ResidualMotion:
         return ResidualMotion(q, self.encoding(q), *self.joint_functions(q, prepared.residual.functions))
 
     def mass_at(self, at: Motion, prepared: RigidPrepared) -> tuple[Tensor, Any]:
         """M(q), (..., n, n), and what its derivatives need."""
+        mass = super().mass_at(at, prepared)[0]
+        if self.residual_mass is None:
+            return mass, None
         more, residuals = self.residual_mass(at.residual.encoded, prepared.residual.mass)
-        return super().mass_at(at, prepared)[0] + more, residuals
+        return mass + more, residuals
 
     def energy_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
         """V(q), (...) [J]."""
-        energy = super().energy_at(at, prepared) + self.joint_functions.energy(at.residual.q)
+        energy = super().energy_at(at, prepared)
+        if self.residual_mass is None:
+            return energy
+        energy = energy + self.joint_functions.energy(at.residual.q)
         if self.residual_potential is None:
             return energy
         more: Tensor = self.residual_potential(at.residual.encoded, prepared.residual.potential)
@@ -89,39 +103,52 @@ class ResidualDynamics(RigidBodyDynamics):
 
     def gravity_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
         """dV/dq, (..., n) [Nm, N]."""
+        if self.residual_mass is None:
+            return at.gravity
         kinetic = torch.zeros_like(at.residual.encoded)
         return at.gravity - self._gradient(at.residual, kinetic, prepared)
 
     def lagrangian_gradient(self, at: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
         """d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
+        gradient = super().lagrangian_gradient(at, qd, None, prepared)
+        if self.residual_mass is None:
+            return gradient
         kinetic = self.residual_mass.kinetic_vjp(at.residual.encoded, qd, residuals)
-        own = self._gradient(at.residual, kinetic, prepared)
-        return super().lagrangian_gradient(at, qd, None, prepared) + own
+        return gradient + self._gradient(at.residual, kinetic, prepared)
 
     def nonlinear_at(self, at: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
         """The torque that holds qd steady without friction, (..., n)."""
-        own = self._nonlinear(at.residual, qd, residuals, prepared)
-        return super().nonlinear_at(at, qd, None, prepared) + own
+        torque = super().nonlinear_at(at, qd, None, prepared)
+        if self.residual_mass is None:
+            return torque
+        return torque + self._nonlinear(at.residual, qd, residuals, prepared)
 
     def residual_torque(self, q: Tensor, qd: Tensor, qdd: Tensor, prepared: RigidPrepared) -> Tensor:
         """What the residuals of M and V take, (..., n) [Nm, N]."""
+        if self.residual_mass is None:
+            return torch.zeros_like(q)
         read = self._read(q, prepared)
         mass, residuals = self.residual_mass(read.encoded, prepared.residual.mass)
         return applied(mass, qdd) + self._nonlinear(read, qd, residuals, prepared)
 
     def friction_factor(self, q: Tensor) -> Tensor:
         """How much more friction the drives have at q than their laws say, (..., n)."""
+        if self.residual_mass is None:
+            return torch.ones_like(q)
         factor: Tensor = self.joint_functions(q, self.joint_functions.prepare())[1]
         return factor
 
     def _varied(self, friction: Tensor, at: Motion) -> Tensor:
         """The laws' friction of the drives as it is at this position, (..., n)."""
+        if self.residual_mass is None:
+            return friction
         factor: Tensor = at.residual.factor
         return factor * friction
 
     def _nonlinear(self, read: ResidualMotion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
         """dR/dt qd - d/dq of what the residuals add to 1/2 qd^T M(q) qd - V(q), (..., n)."""
         rate = self.encoding.jvp(read.encoded, qd)
+        assert self.residual_mass is not None
         moved, kinetic = self.residual_mass.coriolis(rate, qd, residuals)
         return moved - self._gradient(read, kinetic, prepared)
 

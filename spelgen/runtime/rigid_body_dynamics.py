@@ -63,12 +63,12 @@ class RigidBodyDynamics(PortHamiltonian):
         reach: Sequence[Sequence[float]] = (),
     ) -> None:
         super().__init__()
-        self.n, self.elements = joints.n, len(reach[0]) if reach else 0
+        self.elements = len(reach[0]) if reach else 0
         self.chain = BodyChain(joints.n, bodies, gravity)
         self.register_buffer("basis", inertia_basis())
         self.register_buffer("actuated", vector(float(x) for x in joints.actuated))
-        self.inertial_parameters = InertialParameters(bodies)
-        self.armature = Armature(joints)
+        self.bodies = InertialParameters(bodies)
+        self.rotors = Armature(joints)
         self.friction = FrictionLaws(joints, reach)
         self.input = input
         self.register_buffer("motors", self.input.motor_speeds())
@@ -79,24 +79,51 @@ class RigidBodyDynamics(PortHamiltonian):
         # in units of usual friction at usual speed; no parameter: only a fit to torques may find one
         self.register_buffer("raw_friction_compensation", torch.zeros(self.n, dtype=torch.float64))
 
+    @property
+    def inertial_parameters(self) -> Tensor:
+        """By body (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) about its joint's frame, (bodies, 10)."""
+        return self.bodies.forward()
+
+    @property
+    def armature(self) -> Tensor:
+        """What the drives add to M's diagonal, (n,) [kg m^2, kg]."""
+        return self.rotors.forward()
+
+    @property
+    def rotor_inertia(self) -> Tensor:
+        """The drives' inertia before the gear, (n,) [kg m^2, kg]."""
+        return self.rotors.rotor_inertia()
+
+    @property
+    def viscous(self) -> Tensor:
+        """Friction torque by velocity, (n,) [Nm s/rad, N s/m]."""
+        return self.friction.prepare().viscous
+
+    @property
+    def coulomb(self) -> Tensor:
+        """Dry friction, (n,) [Nm, N]."""
+        return self.friction.prepare().coulomb
+
+    @property
     def torque_offset(self) -> Tensor:
         """What the measured torque shows without any, (n,) [Nm, N]."""
         return self.raw_offset * self.friction.nominal * self.actuated
 
+    @property
     def friction_compensation(self) -> Tensor:
         """What the drives add by velocity, unseen in the measured torque, (n,) [Nm s/rad, N s/m]."""
         return self.raw_friction_compensation * self.friction.nominal / self.friction.speed * self.actuated
 
     def prepare(self, definite: bool = True) -> RigidPrepared:
         """All that depends on the weights alone; holds until they change."""
-        inertia = torch.tensordot(self.inertial_parameters(), self.basis, dims=1)
+        inertia = torch.tensordot(self.inertial_parameters, self.basis, dims=1)
         return RigidPrepared(
             inertia=block_diagonal(inertia),
-            armature=self.motors.mT @ (self.armature().unsqueeze(-1) * self.motors),
+            armature=self.motors.mT @ (self.armature.unsqueeze(-1) * self.motors),
             friction=self.friction.prepare(),
             input=self.input.prepare(),
-            offset=self.torque_offset(),
-            compensation=self.friction_compensation(),
+            offset=self.torque_offset,
+            compensation=self.friction_compensation,
         )
 
     def configuration(self, q: Tensor, prepared: RigidPrepared) -> Motion:
