@@ -137,7 +137,8 @@ def _new_config(
     settings: TrainingSettings, request: Request, model: EmittedModel, rates: Sequence[float] | None
 ) -> FitConfig | None:
     """Return the configuration for a model; None where the logs' rates decide and are not known yet."""
-    from spelgen.fitting.stages import default_config, has_rigid_bodies
+    from spelgen.dynamics.protocol import has_rigid_bodies
+    from spelgen.fitting.stages import default_config
     from spelgen.settings.fits import fit_config
 
     rigid_bodies, options, defaults = has_rigid_bodies(model), request.options, dict(settings.options)
@@ -158,9 +159,9 @@ def _new_config(
 
 def resumed_run(folder: Path, request: Request) -> Start:
     """Return the start of a run that goes on: what the command line does not say, the run does."""
+    from spelgen.dynamics.protocol import has_rigid_bodies
     from spelgen.fitting.run_folder import RunFolder
     from spelgen.fitting.run_record import recorded_config
-    from spelgen.fitting.stages import has_rigid_bodies
     from spelgen.logs.preprocessing import Preprocessing
     from spelgen.settings.fits import fit_config
     from spelgen.settings.log_mapping import LogMapping
