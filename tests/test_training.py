@@ -217,7 +217,6 @@ def test_the_run_folder_tells_what_was_done(logs, tmp_path):
         "metrics.jsonl",
         "checkpoint.pt",
         "model.pt",
-        "calibration.npz",
     }
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     assert config["joints"] == list(JOINTS)

@@ -24,12 +24,6 @@ def evaluate(
     filter: Filter = None,
     format: Annotated[Format | None, options.result_format()] = None,
     output: Output = None,
-    disturbance: Annotated[
-        Literal["held", "none"],
-        typer.Option(
-            help="held: forecasts that hold what the model missed before; none: rollouts alone, open loop."
-        ),
-    ] = "held",
     trust: Trust = False,
 ) -> None:
     """Judge a trained run on test logs, beside its baselines.
@@ -50,9 +44,7 @@ def evaluate(
     torch.set_num_threads(1)
     used = None if filter is None else Preprocessing(cutoff=filter)
     logs, baselines = read_test_logs(run, paths, mapping), read_baseline(RunFolder(run))
-    found = evaluated(
-        load_run(run, trust=trust), logs, baselines=baselines, preprocessing=used, disturbance=disturbance
-    )
+    found = evaluated(load_run(run, trust=trust), logs, baselines=baselines, preprocessing=used)
     write_json(RunFolder(run).evaluation, found.to_dict())
     for each in found.diagnostics:
         note(f"{each.severity}: {each.where}: {each.message}")

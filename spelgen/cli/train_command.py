@@ -139,13 +139,6 @@ def _tell(fit: Fit, folder: Path, paths: Sequence[Path], *, resume: bool) -> Non
         keep_baseline(folder, paths)
     for line in _outcome(fit):
         say(line)
-    if fit.calibration is not None and not interrupted:
-        from spelgen.evaluation.forecast import good_for
-        from spelgen.evaluation.subject import subject
-
-        reach = good_for(subject(fit).model, fit.calibration)
-        place = "nowhere" if reach is None else f"up to {reach:g} s ahead"
-        say(f"forecasts clearly better than extrapolated motion: {place}")
     say(f"run folder: {folder}")
     if interrupted:
         note("the best model so far is in the run folder; --resume goes on")

@@ -45,8 +45,6 @@ def _states(evaluation: Mapping[str, Any]) -> Iterator[Row]:
     joints = list(zip(evaluation["joints"], evaluation["joint_types"], strict=True))
     for horizon in evaluation["horizons"]:
         seconds = horizon["seconds"]
-        for name, errors in horizon.get("open_loop", {}).items():
-            yield "relative RMS, open loop", "1", seconds, "", "", name, errors["mean_relative_rms"]
         for name, errors in horizon["errors"].items():
             yield "relative RMS", "1", seconds, "", "", name, errors["mean_relative_rms"]
             yield "tip RMS", "mm", seconds, "", "", name, errors["tip_mm"]

@@ -15,12 +15,11 @@ from spelgen.evaluation.baselines import (
     of_dynamics,
     of_urdf,
 )
-from spelgen.evaluation.forecast import Disturbance, Forecast, for_windows, forecast_of, training_motion
-from spelgen.evaluation.horizons import PROBED, JudgedLogs, horizon_lengths, open_loop_note, predict
+from spelgen.evaluation.horizons import PROBED, JudgedLogs, horizon_lengths, predict
 from spelgen.evaluation.invariants import energy_drift
 from spelgen.evaluation.names import MODEL
 from spelgen.evaluation.replay import CommandFollower, replays
-from spelgen.evaluation.results import Results, forecast_summary, torque_summary
+from spelgen.evaluation.results import Results, torque_summary
 from spelgen.evaluation.subject import Subject, subject
 from spelgen.evaluation.torque import torque_errors
 from spelgen.evaluation.traces import replay_traces, traces
@@ -44,7 +43,6 @@ def evaluate(
     preprocessing: Preprocessing | None = None,
     steps: Sequence[int] = (1, 10),
     seconds: Sequence[float] = (1.0,),
-    disturbance: Disturbance = "held",
 ) -> Results:
     """Predict the states and torques of test logs and measure the errors.
 
@@ -52,9 +50,9 @@ def evaluate(
     the fit's: it gives the URDF as a baseline, and errors of the tip. baselines: any dynamics to be judged beside
     it, by name, e.g. ``{"least squares": identify(...).dynamics}``, or beside position servos a `CommandFollower`.
     preprocessing: of states and torques; by default as the model was fitted. steps, seconds: horizons in samples and in
-    time; those longer than every trajectory are left out, and said. disturbance: "held" judges forecasts (see
-    `forecast.py`) where the model comes with windows of its training logs; "none" rollouts by themselves, open loop.
-    The result depends on nothing else: no random numbers. Raises LogError.
+    time; those longer than every trajectory are left out, and said. All
+    that has dynamics is judged open loop, and with the disturbance held that a momentum observer finds before a
+    prediction starts (see `momentum_observer.py`). No random numbers enter. Raises LogError.
     """
     judged = subject(model, arm)
     joint_types, logs = judged.model.joint_types, [logs] if isinstance(logs, Trajectory) else list(logs)
@@ -75,11 +73,10 @@ def evaluate(
     predictors = [of_dynamics(MODEL, judged.model, substeps), constant_velocity()]
     predictors += _urdf_baseline(judged, probe, notes)
     predictors += [of_baseline(name, each, probe) for name, each in (baselines or {}).items()]
-    forecasts = _forecasts(predictors, judged, notes) if disturbance == "held" else {}
     tip = _tip(judged, notes)
     position = None if tip is None else tip.position
     predicted = [
-        predict(name, k, tests, predictors, forecasts, joint_types, position, judged.window, notes)
+        predict(name, k, tests, predictors, joint_types, position, judged.window, notes)
         for name, k in lengths.items()
     ]
     longest = max(predicted, key=lambda x: x[0].steps)[1] if predicted else None
@@ -99,7 +96,6 @@ def evaluate(
             if x.torque and samples
         },
         energy_drift=energy_drift(judged.model, probe),
-        forecasts={name: forecast_summary(x.trust) for name, x in forecasts.items()},
         traces=traces(predictors, pieces, longest, joint_types, used=used, reach=judged.reach, tip=position),
         diagnostics=tuple(notes),
         joint_types=tuple(joint_types),
@@ -141,22 +137,6 @@ def _seen(logs: Sequence[Trajectory], judged: Subject) -> list[Diagnostic]:
         return []
     message = f"names also used in training: {', '.join(seen)}; errors on training data prove nothing"
     return [Diagnostic("warning", "tested-on-training-data", "logs", None, message)]
-
-
-def _forecasts(
-    predictors: Sequence[Predictor], judged: Subject, notes: list[Diagnostic]
-) -> dict[str, Forecast]:
-    """Of all that have dynamics, by the same training windows; none where these are not known."""
-    calibration, types = judged.calibration, judged.model.joint_types
-    dynamic = [x for x in predictors if x.form is not None]
-    motion = None if calibration is None else training_motion(calibration, types)
-    if calibration is not None and motion is not None:
-        return {x.name: forecast_of(for_windows(x, calibration.probe), motion) for x in dynamic}
-    reason = (
-        "no windows of its training logs are known" if calibration is None else "its training logs are short"
-    )
-    notes.append(open_loop_note(f"no forecasts, rollouts are open loop: {reason}"))
-    return {}
 
 
 def _urdf_baseline(judged: Subject, probe: Windows, notes: list[Diagnostic]) -> list[Predictor]:

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 
 from spelgen.dynamics.bristles import BristleReach
 from spelgen.errors import Diagnostic
-from spelgen.evaluation.baselines import Predictor
-from spelgen.evaluation.disturbance import without_past
-from spelgen.evaluation.forecast import Forecast, for_windows, past_steps, rolled
-from spelgen.evaluation.names import EXTRAPOLATION
+from spelgen.evaluation.baselines import Predictor, of_baseline, of_dynamics
+from spelgen.evaluation.momentum_observer import observe, past_steps, without_past
+from spelgen.evaluation.names import MODEL, observed
 from spelgen.evaluation.results import Horizon, end_errors
 from spelgen.evaluation.stiff import States
+from spelgen.fitting.rollout import choose_substeps, loss_scales
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
@@ -83,61 +84,56 @@ def horizon_lengths(
     return {name: k for name, k in wanted.items() if 0 < k <= logs.longest}
 
 
-def open_loop_note(message: str) -> Diagnostic:
-    """That forecasts are not to be had."""
-    return Diagnostic("info", "open-loop", "logs", None, message)
-
-
 def predict(
     name: str,
     steps: int,
     logs: JudgedLogs,
     predictors: Sequence[Predictor],
-    forecasts: Mapping[str, Forecast],
     joint_types: Sequence[str],
     tip: Callable[[torch.Tensor], torch.Tensor] | None,
     probed: int,
     notes: list[Diagnostic],
 ) -> tuple[Horizon, Predictions]:
-    """Errors over so many samples, of forecasts where these reach that far and pieces are long enough for a past.
+    """Judge rollouts over so many samples: open loop, and with what a momentum observer finds before they start.
 
     tip: its position [m] by q. probed: samples of the windows that say how many steps integrators need.
     """
     decimation = _decimation(steps, logs.rate)
     if decimation > 1:
         probe = logs.windows(probed, PROBED, decimation)
-        predictors = [for_windows(x, probe) for x in predictors]
+        predictors = [_in_steps_for(x, probe, joint_types) for x in predictors]
     most, past = max(min(MOST_WINDOWS, PREDICTED_STEPS // steps), 1), past_steps(logs.rate / decimation)
-    reached = all(x.trust.reaches(steps / logs.rate) for x in forecasts.values())
-    if not forecasts or not reached or past * decimation + steps >= logs.longest + 1:
+    if past * decimation + steps > logs.longest:
+        message = f"no observer over {name}: the longest trajectory has {logs.longest} steps"
+        notes.append(Diagnostic("info", "no-observer", "logs", None, message))
         past = 0
-    if forecasts and not past:
-        reason = "these trajectories have no past" if reached else "windows of its training logs are shorter"
-        notes.append(open_loop_note(f"no forecasts over {name}, rollouts are open loop: {reason}"))
     samples = past + steps // decimation + 1
     windows = logs.windows(samples, most, decimation)
     ahead = without_past(windows, past)
-    states, open_loop = {}, {}
+    states = {}
     for predictor in predictors:
-        forecast = forecasts.get(predictor.name)
-        if past and forecast is not None:
-            found = rolled(predictor, windows, past)
-            q, qd = torch.from_numpy(found.open_loop)
-            states[predictor.name], open_loop[predictor.name] = forecast.states(found), (q, qd)
-            if EXTRAPOLATION not in states:  # the same beside all
-                states[EXTRAPOLATION] = forecast.going_on(found)
-        else:
-            with torch.no_grad():
-                states[predictor.name] = predictor.states(ahead)
-            if past:
-                open_loop[predictor.name] = states[predictor.name]
-    errors, alone = (
-        {name: end_errors(each, ahead, joint_types, tip) for name, each in found.items()}
-        for found in (states, open_loop)
-    )
+        if not past or predictor.form is None:
+            states[predictor.name] = predictor.states(ahead)
+            continue
+        with torch.no_grad():
+            started, disturbance = observe(predictor.form, windows, past)
+        states[predictor.name] = predictor.states(started)
+        states[observed(predictor.name)] = predictor.states(started, disturbance)
+    errors = {name: end_errors(state, ahead, joint_types, tip) for name, state in states.items()}
     seconds = ahead.dt.sum(dim=1).mean().item()
     starts = [(piece, k + past * decimation) for piece, k in logs.starts(samples, most, decimation)[0]]
-    return Horizon(name, steps, seconds, len(ahead), errors, alone), Predictions(ahead, starts, states)
+    return Horizon(name, steps, seconds, len(ahead), errors), Predictions(ahead, starts, states)
+
+
+def _in_steps_for(predictor: Predictor, probe: Windows, joint_types: Sequence[str]) -> Predictor:
+    """Return the same dynamics, in the steps that they need on windows whose samples lie farther apart."""
+    dynamics = predictor.dynamics
+    if dynamics is None:
+        return predictor
+    if predictor.name != MODEL:
+        return of_baseline(predictor.name, dynamics, probe)
+    model: Any = dynamics
+    return of_dynamics(MODEL, model, choose_substeps(model, probe, loss_scales(probe, joint_types)))
 
 
 def _decimation(steps: int, rate: float) -> int:

@@ -7,4 +7,8 @@ LEAST_SQUARES_WITH_MEMORY = "least squares with memory"
 POSITION_ACTUATORS = "MuJoCo actuators"
 LINEAR_SERVOS, DELAYED_COMMAND = "linear servo", "delayed command"
 CONSTANT_VELOCITY = "velocity stays constant"
-EXTRAPOLATION = "extrapolated motion"
+
+
+def observed(predictor: str) -> str:
+    """Return the name of the same predictor where it holds the disturbance that an observer finds."""
+    return f"{predictor} + observer"

@@ -16,12 +16,11 @@ from spelgen.evaluation.replay import Replay
 from spelgen.evaluation.stiff import States
 from spelgen.evaluation.tables import result_tables
 from spelgen.evaluation.torque import TorqueErrors
-from spelgen.evaluation.trust import Trust
 from spelgen.evaluation.verdict import verdict
 from spelgen.fitting.rollout import position_difference
 from spelgen.logs.windows import Windows
 
-SCHEMA = 5
+SCHEMA = 6
 
 
 @dataclass(frozen=True)
@@ -45,8 +44,7 @@ class StateErrors:
 class Horizon:
     """How far ahead: a number of samples, in the mean `seconds`; from `windows` starting points.
 
-    errors: by predictor, of its forecasts; open_loop: of its rollouts by themselves, from the same starting points.
-    This is empty, and the errors are those of rollouts, where there are no forecasts.
+    errors: by predictor, open loop, and as `observed(predictor)` where it holds what a momentum observer finds.
     """
 
     name: str
@@ -54,23 +52,6 @@ class Horizon:
     seconds: float
     windows: int
     errors: dict[str, StateErrors]
-    open_loop: dict[str, StateErrors]
-
-
-@dataclass(frozen=True)
-class ForecastSummary:
-    """What training windows showed of a predictor's forecasts, see `trust.Trust`.
-
-    good_for: the longest time [s] up to which they are clearly better than extrapolated motion, None: there is none.
-    times: [s]. relative_error: for each, of windows left out, relative to extrapolated motion. trust, held: of q and
-    qd, for each time and joint.
-    """
-
-    good_for: float | None
-    times: tuple[float, ...]
-    relative_error: tuple[float, ...]
-    trust: tuple[tuple[tuple[float, ...], ...], ...]
-    held: tuple[tuple[tuple[float, ...], ...], ...]
 
 
 @dataclass(frozen=True)
@@ -93,7 +74,7 @@ class Results:
     cutoff: of the filter on the test logs [Hz], None without. substeps: of rk4 between samples. parameters: trained
     numbers of the model. torque: by predictor, empty where the logs are too sparse. energy_drift: of the model
     without input and dissipation over 1 s, integrated to thirteen digits, relative to its kinetic energy; None where
-    the logs never move. forecasts: by predictor, empty where there are none. traces: the curves behind the figures;
+    the logs never move. traces: the curves behind the figures;
     those of predictions are the longest horizon's, see `traces.py`. replays: of commands, of an arm under
     position servos.
     """
@@ -108,7 +89,6 @@ class Results:
     torque: dict[str, TorqueSummary]
     energy_drift: float | None
     diagnostics: tuple[Diagnostic, ...]
-    forecasts: dict[str, ForecastSummary] = field(default_factory=dict)
     traces: dict[str, Any] = field(default_factory=dict)
     joint_types: tuple[str, ...] = ()
     replays: tuple[Replay, ...] = ()
@@ -181,14 +161,4 @@ def torque_summary(errors: TorqueErrors) -> TorqueSummary:
         nmse=dict(zip(errors.trajectories, _finite(by_trajectory), strict=True)),
         mean_nmse=_finite(by_trajectory.mean().unsqueeze(0))[0],
         rmse=_finite(torch.from_numpy(errors.rmse).mean(dim=0)),
-    )
-
-
-def forecast_summary(trust: Trust) -> ForecastSummary:
-    """What is told of a trust, to three digits."""
-    return ForecastSummary(
-        trust.good_for,
-        tuple(trust.times.round(4).tolist()),
-        tuple(trust.error.mean(axis=-1).round(3).tolist()),
-        *(tuple(tuple(map(tuple, y)) for y in x.round(3).tolist()) for x in (trust.trust, trust.held)),
     )

@@ -24,7 +24,7 @@ from spelgen.dynamics.protocol import (
     memory_after,
     sliding_memory,
 )
-from spelgen.evaluation.disturbance import Disturbed
+from spelgen.evaluation.momentum_observer import Disturbed
 from spelgen.fitting.rollout import roll_out
 from spelgen.logs.windows import Windows
 
@@ -42,14 +42,30 @@ States = tuple[torch.Tensor, torch.Tensor]
 
 @dataclass(frozen=True)
 class Solver:
-    """Predicts windows. form: what is integrated, see `integrable`. method: `roll_out` or `roll_out_stiff`."""
+    """Predict windows. form: what is integrated, see `integrable`. method: `roll_out` or `roll_out_stiff`."""
 
     form: Any
     method: Callable[[Any, Windows, int], States]
     substeps: int
 
     def __call__(self, windows: Windows, disturbance: torch.Tensor | None = None) -> States:
-        """q and qd, (W, K-1, n); under a disturbance (W, n) that is added to p'. Leaving all bounds is no error."""
+        """Return q and qd, (W, K-1, n); under a disturbance (W, n) that is added to p'.
+
+        Leaving all bounds is no error: a window whose numbers blow up is NaN.
+        """
+        try:
+            return self._rolled_out(windows, disturbance)
+        except torch.linalg.LinAlgError:
+            if len(windows) == 1:
+                nowhere = torch.full_like(windows.q[:, 1:], torch.nan)
+                return nowhere, nowhere
+        halves = []
+        for rows in torch.arange(len(windows)).tensor_split(2):
+            halves.append(self(windows[rows], None if disturbance is None else disturbance[rows]))
+        (q, qd), (other_q, other_qd) = halves
+        return torch.cat([q, other_q]), torch.cat([qd, other_qd])
+
+    def _rolled_out(self, windows: Windows, disturbance: torch.Tensor | None) -> States:
         form = self.form if disturbance is None else Disturbed(self.form, disturbance)
         with torch.no_grad(), np.errstate(over="ignore", invalid="ignore"):
             return self.method(form, windows, self.substeps)

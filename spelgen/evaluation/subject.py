@@ -13,7 +13,6 @@ import torch
 from spelgen.dynamics.bristles import NO_BRISTLES, BristleReach, bristle_reach, reach_of
 from spelgen.evaluation.names import DELAYED_COMMAND, LINEAR_SERVOS
 from spelgen.evaluation.replay import CommandFollower
-from spelgen.fitting.calibration import CalibrationWindows
 from spelgen.fitting.fitted import Fit, load_run
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.servo.linear_servos import DelayedCommand, LinearServos
@@ -39,7 +38,7 @@ class Subject:
 
     urdf: its robot's, where known; tip: the link there, None for the last. preprocessing, window, substeps:
     those of its fit. reach: (n, K) of the bristles that friction remembers with, its own or the usual ones.
-    trained_on: names of the trajectories that it has seen; calibration: windows of them, None where they are not known.
+    trained_on: names of the trajectories that it has seen.
     command_followers: fitted to them, what a model of position servos is compared with, by name.
     """
 
@@ -53,7 +52,6 @@ class Subject:
     substeps: int = 1
     reach: BristleReach = NO_BRISTLES
     trained_on: frozenset[str] = frozenset()
-    calibration: CalibrationWindows | None = None
     command_followers: Mapping[str, CommandFollower] = field(default_factory=dict)
 
     @property
@@ -77,7 +75,6 @@ def subject(judged: Any, arm: Any = None) -> Subject:
         window=cast("WindowConfig", judged.config).window,
         substeps=judged.substeps,
         trained_on=seen,
-        calibration=judged.calibration,
         command_followers=_command_followers(judged.record),
     )
 

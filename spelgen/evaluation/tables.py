@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from spelgen.evaluation.names import observed
 from spelgen.labels import thousandths
 from spelgen.listing import Listing, number
 
@@ -49,12 +50,7 @@ class Table:
         return Listing(self.title, head, rows, self.note)
 
 
-FORECAST = ": extrapolated motion, and dynamics as far as training windows trust them"
-OPEN_LOOP = ", open loop"
-WHY_OPEN_LOOP = (
-    "open loop: a rollout with nothing held, as windows of the training logs are shorter, or the test"
-    " trajectories have no past"
-)
+OBSERVER = "+ observer: holds the disturbance that a momentum observer finds in the 0.1 s before; all else is open loop"
 UNITS = {"revolute": ("rad", "rad/s", "Nm"), "prismatic": ("m", "m/s", "N")}
 
 
@@ -67,20 +63,10 @@ def result_tables(evaluation: Mapping[str, Any], joint_types: Sequence[str] = ()
     tables, horizons = _replay_tables(evaluation, types), evaluation["horizons"]
     if horizons:
         title = "Error relative to the motion (0: none, 1: as if the arm had stood still)"
-        forecast = [horizon for horizon in horizons if horizon.get("open_loop")]
-        heads, note = [_ahead(horizon) for horizon in horizons], ""
-        if forecast:
-            title += FORECAST
-            heads = [
-                name if horizon in forecast else name + OPEN_LOOP
-                for name, horizon in zip(heads, horizons, strict=True)
-            ]
-            note = WHY_OPEN_LOOP if len(forecast) < len(horizons) else ""
+        heads = [_ahead(horizon) for horizon in horizons]
+        holds = any(observed(name) in horizon["errors"] for horizon in horizons for name in horizon["errors"])
         rows = [_of(horizon, "mean_relative_rms") for horizon in horizons]
-        tables.append(replace(table(title, heads, rows), note=note))
-        if forecast:
-            rows = [_of(horizon, "mean_relative_rms", "open_loop") for horizon in forecast]
-            tables.append(table("The same without that: open loop", [_ahead(x) for x in forecast], rows))
+        tables.append(replace(table(title, heads, rows), note=OBSERVER if holds else ""))
         tips = [_of(horizon, "tip_mm") for horizon in horizons]
         if any(value is not None for tip in tips for value in tip.values()):
             tables.append(table("Error of the tip's position [mm]", heads, tips))
@@ -129,8 +115,8 @@ def _ahead(horizon: Mapping[str, Any]) -> str:
     return name if name.endswith(" s") else f"{name} ({horizon['seconds']:.3g} s)"
 
 
-def _of(horizon: Mapping[str, Any], what: str, which: str = "errors") -> dict[str, Any]:
-    return {predictor: errors[what] for predictor, errors in horizon[which].items()}
+def _of(horizon: Mapping[str, Any], what: str) -> dict[str, Any]:
+    return {predictor: errors[what] for predictor, errors in horizon["errors"].items()}
 
 
 def _by_joint(title: str, joints: Sequence[str], values: Mapping[str, Sequence[float | None]]) -> Table:

@@ -57,17 +57,8 @@ def verdict(
     told += f"; worst at {place}" if place else ""
     wishes = _wishes(evaluation, identified, limits, place)
     told += f"; next, record {wishes[0][0]}" if wishes else ""
-    forecast = (evaluation.get("forecasts") or {}).get(MODEL)
-    reach = _told_reach(forecast["good_for"]) if forecast else ""
-    because = [f"It {listed(proofs)}.", reach, worst, _beaten(evaluation), *(f"{x[1]}." for x in wishes)]
+    because = [f"It {listed(proofs)}.", worst, _beaten(evaluation), *(f"{x[1]}." for x in wishes)]
     return Verdict(f"{told}.", " ".join(x for x in because if x))
-
-
-def _told_reach(good_for: float | None) -> str:
-    """How far ahead forecasts are good, [s], in a sentence."""
-    if good_for is None:
-        return "On training windows its forecasts are nowhere clearly better than extrapolated motion."
-    return f"On training windows its forecasts are clearly better than extrapolated motion up to {good_for:g} s ahead."
 
 
 def _uses(evaluation: Mapping[str, Any]) -> tuple[list[str], list[str], list[str]]:
@@ -81,10 +72,7 @@ def _uses(evaluation: Mapping[str, Any]) -> tuple[list[str], list[str], list[str
         part = 1 - nmse
         amount = "none" if part <= 0 else f"{_percent(part)}"
         proofs.append(f"explains {amount} of the variance of the torques")
-    forecast = (evaluation.get("forecasts") or {}).get(MODEL)
-    if forecast and forecast["good_for"]:
-        good.append(f"predictions up to {forecast['good_for']:g} s ahead")
-    simulated = [(x["name"], (x.get("open_loop") or x["errors"])[MODEL]) for x in evaluation["horizons"]]
+    simulated = [(x["name"], x["errors"][MODEL]) for x in evaluation["horizons"]]
     horizons = [(name, errors["mean_relative_rms"], errors["tip_mm"]) for name, errors in simulated]
     known = [x for x in horizons if x[1] is not None]
     if known:

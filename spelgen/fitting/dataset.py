@@ -11,7 +11,6 @@ import numpy as np
 
 from spelgen.dynamics.bristles import BristleReach, reach_of
 from spelgen.errors import Diagnostic, LogError
-from spelgen.fitting.calibration import CalibrationWindows, calibration_windows, held_sources
 from spelgen.fitting.rollout import LossScales, loss_scales
 from spelgen.logs.checks import check
 from spelgen.logs.epoch_windows import EpochWindows, WindowCutting
@@ -32,8 +31,8 @@ class TrainingData:
 
     training: all of them, or where the logs are larger than memory an even sample, and `stream` draws those
     that are fitted. preprocessing: as it was resolved. digest: of every number, to resume on the same data only.
-    recordings: what all was cut from, validation included; of logs larger than memory chunks. calibration: of all of
-    these, None where they are too short. counts: training windows of each trajectory; none of logs larger than memory.
+    recordings: what all was cut from, validation included; of logs larger than memory chunks. counts: training windows
+    of each trajectory; none of logs larger than memory.
     """
 
     training: Windows
@@ -47,7 +46,6 @@ class TrainingData:
     recordings: tuple[Trajectory, ...] = ()
     chunks: tuple[Chunk, ...] = ()
     stream: EpochWindows | None = None
-    calibration: CalibrationWindows | None = None
     counts: tuple[int, ...] = ()
 
     @property
@@ -92,7 +90,6 @@ def prepare_data(
         diagnostics=(*notes, *resolved.diagnostics, split.note),
         digest=digest(everything),
         recordings=tuple(everything),
-        calibration=calibration_windows(held_sources(everything), resolved, known_reach(reach, joint_types)),
         counts=tuple(
             sum(map(cutting.count, np.diff(gap_ends(x.t, resolved.gap)).tolist())) for x in split.training
         ),

@@ -109,8 +109,6 @@ def fit(
             found += fit_torque_stage(model, data, chosen, regularizer)
             if run is not None:
                 run.start(model.source, urdf, force=force)
-                if data.calibration is not None:
-                    data.calibration.save(run.calibration)
         loop = TrainingLoop(
             model,
             data,
@@ -147,7 +145,6 @@ def fit(
         checkpoint=loop.state(),
         urdf=urdf,
         folder=None if known is None else known.path,
-        calibration=data.calibration,
     )
 
 

@@ -14,7 +14,6 @@ import torch
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.errors import Diagnostic, LogError, RunError
 from spelgen.files import write_json
-from spelgen.fitting.calibration import CalibrationWindows, read_calibration
 from spelgen.fitting.loop import Status
 from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.fitting.run_lock import locked
@@ -36,8 +35,7 @@ class Fit:
 
     config, preprocessing: as they were resolved. history: a record for each epoch. status: how the fit ended; None:
     not known, of a run that was loaded. record: what config.json holds. checkpoint: what checkpoint.pt holds.
-    urdf: of the robot, where it is known. folder: of the run, where there is one. calibration: windows of
-    the training logs, where these are long enough.
+    urdf: of the robot, where it is known. folder: of the run, where there is one.
     """
 
     model: EmittedModel
@@ -50,7 +48,6 @@ class Fit:
     checkpoint: dict[str, Any]
     urdf: Path | None = None
     folder: Path | None = None
-    calibration: CalibrationWindows | None = None
 
     @property
     def epochs(self) -> int:
@@ -153,8 +150,6 @@ class Fit:
         with locked(run.path):
             run.start(self.model.source, self.urdf, force=force)
             run.write_metrics(self.history)
-            if self.calibration is not None:
-                self.calibration.save(run.calibration)
             run.save(self.model.state_dict(), self.checkpoint)
             write_json(run.config, self.record)
         if logs is not None:
@@ -210,5 +205,4 @@ def load_run(folder: Path | str, *, trust: bool = False) -> Fit:
         checkpoint=run.load_checkpoint(),
         urdf=run.urdf if run.urdf.exists() else None,
         folder=run.path,
-        calibration=read_calibration(run.calibration, len(record["joints"])),
     )

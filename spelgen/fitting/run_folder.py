@@ -31,7 +31,7 @@ class RunFolder:
 
     module.py: the trained module's source. robot.urdf, robot.yaml: its robot, where known. config.json: how
     it was trained. metrics.jsonl: a line per epoch. checkpoint.pt: everything needed to go on. model.pt:
-    the best state_dict so far. calibration.npz: windows of the training logs, where these are long enough.
+    the best state_dict so far.
     evaluation.json: what `evaluate` found. least_squares.json: what least squares found.
     """
 
@@ -69,10 +69,6 @@ class RunFolder:
         return self.path / "model.pt"
 
     @property
-    def calibration(self) -> Path:
-        return self.path / "calibration.npz"
-
-    @property
     def evaluation(self) -> Path:
         return self.path / "evaluation.json"
 
@@ -102,7 +98,6 @@ class RunFolder:
             self.metrics,
             self.checkpoint,
             self.weights,
-            self.calibration,
             self.evaluation,
             self.baseline,
         )

@@ -12,8 +12,7 @@ import numpy as np
 
 from spelgen.dynamics.bristles import BristleReach
 from spelgen.errors import Diagnostic, LogError, collect
-from spelgen.fitting.calibration import Source, calibration_windows
-from spelgen.fitting.dataset import LARGEST_VALIDATION, TrainingData, known_reach
+from spelgen.fitting.dataset import LARGEST_VALIDATION, TrainingData
 from spelgen.fitting.rollout import loss_scales
 from spelgen.logs.checks import Finding, findings, gap_diagnostics, summarised
 from spelgen.logs.chunks import Chunk, scan
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
 SAMPLED = 2**16  # windows on which scales and substeps are chosen, and of the momentum steps
 SAMPLED_CHUNKS = 32  # that these windows come from
 VALIDATED_CHUNKS = 16
-CALIBRATED_CHUNKS = 16
 
 
 @dataclass(frozen=True)
@@ -98,15 +96,7 @@ def prepare_streamed(
         digest=known.digest,
         chunks=tuple(known.chunks),
         stream=training,
-        calibration=calibration_windows(_sources(known), resolved, known_reach(reach, logs.joint_types)),
     )
-
-
-def _sources(known: KnownLogs) -> list[Source]:
-    """Some of the chunks, evenly spread."""
-    rate = float(np.median(known.rates))
-    chosen = known.chunks[:: -(-len(known.chunks) // CALIBRATED_CHUNKS)]
-    return [Source(x.stop - x.first, rate, x.load) for x in chosen]
 
 
 def _split(

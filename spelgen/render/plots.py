@@ -11,12 +11,12 @@ from markupsafe import Markup
 
 from spelgen.evaluation.names import (
     CONSTANT_VELOCITY,
-    EXTRAPOLATION,
     LEAST_SQUARES,
     LEAST_SQUARES_WITH_MEMORY,
     MODEL,
     URDF,
     URDF_WITH_DRIVES,
+    observed,
 )
 from spelgen.labels import entry_name
 from spelgen.render.charts import Band, Dots, Line, line_chart
@@ -32,7 +32,7 @@ STYLES = {
     LEAST_SQUARES: "squares",
     LEAST_SQUARES_WITH_MEMORY: "remembering",
     CONSTANT_VELOCITY: "hold",
-    EXTRAPOLATION: "going-on",
+    observed(MODEL): "going-on",
 }
 PARTS = {"inertia": "inertia", "Coriolis": "coriolis", "gravity": "gravity", "friction": "friction"}
 BARE = 84  # height of a chart that stands above another with the same times
