@@ -25,7 +25,7 @@ from spelgen.evaluation import invariants
 from spelgen.evaluation.baselines import constant_velocity
 from spelgen.evaluation.examples import predict_examples
 from spelgen.fitting.rollout import roll_out
-from spelgen.fleet.engine import InProcess
+from spelgen.fleet.tasks import run_here
 from spelgen.logs.read import Trajectory, read_logs
 from spelgen.logs.windows import cut_windows, joined
 from spelgen.render.comparison_page import write_comparison
@@ -64,7 +64,7 @@ def notes():
 @pytest.fixture(scope="module")
 def study(robot, quick, notes, tmp_path_factory):
     found = prepare_study(robot, tmp_path_factory.mktemp("study"), variants=CHOSEN)
-    run_study(found, InProcess(), note=notes.append)
+    run_study(found, run_here, note=notes.append)
     return found
 
 
@@ -104,7 +104,7 @@ def test_with_a_wrong_urdf_models_are_trained_by_defaults(robot, quick, tmp_path
 
         patch.setattr(runs, "train", train)
         with pytest.raises(KeyboardInterrupt):
-            run_study(found, InProcess(), note=print)
+            run_study(found, run_here, note=print)
     assert seen == [None]
     with pytest.raises(RunError, match="a comparison with other settings"):
         prepare_study(robot, tmp_path, variants=CHOSEN[1:], urdf_error=1.0)
@@ -170,7 +170,7 @@ def test_a_comparison_goes_on_where_it_stopped(study, robot, quick):
     lost.unlink()
     notes = []
     again = prepare_study(robot, study.folder, variants=CHOSEN)
-    run_study(again, InProcess(), note=notes.append)
+    run_study(again, run_here, note=notes.append)
     assert notes[0] == "1 of 2 runs are done already"
     assert kept.stat().st_mtime_ns == before[1]
     first, second = (json.loads(x) for x in (before[0], lost.read_text()))

@@ -15,14 +15,13 @@ import torch
 from spelgen.errors import RunError, SettingsError, SpelgenError
 from spelgen.fitting.fitted import load_run
 from spelgen.fleet import jobs
-from spelgen.fleet.engine import InProcess, engine
-from spelgen.fleet.fleet import run_fleet
+from spelgen.fleet.fleet import run_fleet, search_options
 from spelgen.fleet.jobs import Job
 from spelgen.fleet.prepare import Preparation, prepare
 from spelgen.fleet.ranking import fleet_listings, winners
 from spelgen.fleet.schema import FleetRobot, Search, load_fleet
-from spelgen.fleet.search import searched
-from spelgen.fleet.units import LEAST, spread
+from spelgen.fleet.tasks import run_here, workers
+from spelgen.fleet.units import LEAST_DEVIATION, spread
 from spelgen.loaded_arm import load_arm
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.render.fleet_page import write_fleet
@@ -35,14 +34,8 @@ QUICK = {"presets": ["spel"], "width": 4, "depth": 1, "training": {"epochs": 2, 
 pytestmark = pytest.mark.usefixtures("short_epochs")
 
 
-class Unseen:
+def silent(text):
     """Nobody watches."""
-
-    def phase(self, name, jobs):
-        pass
-
-    def ended(self, job, outcome):
-        pass
 
 
 @pytest.fixture(scope="module")
@@ -93,8 +86,8 @@ def test_ray_runs_again_what_died_and_every_result_is_there_once(fleet, tmp_path
     chosen = fleet(training={"epochs": 12, "patience": 12, "momentum_steps": 0})
     killer = threading.Thread(target=kill_two, args=(folder, killed))
     killer.start()
-    with engine(2) as runs:
-        found = run_fleet(chosen, folder, runs, Unseen())
+    with workers(2) as runs:
+        found = run_fleet(chosen, folder, runs, silent)
     killer.join()
     assert len(set(killed)) == 2
     assert sorted(x["robot"] for x in found.results) == ["a", "b"]
@@ -106,15 +99,15 @@ def test_ray_runs_again_what_died_and_every_result_is_there_once(fleet, tmp_path
 
 def test_what_is_done_is_not_done_again_and_what_changed_is(fleet, tmp_path):
     folder = tmp_path / "out"
-    first = run_fleet(fleet("a"), folder, InProcess(), Unseen())
+    first = run_fleet(fleet("a"), folder, run_here, silent)
     files = {x: x.stat().st_mtime_ns for x in folder.glob("runs/*/*/result.json")}
-    again = run_fleet(fleet("a"), folder, InProcess(), Unseen())
+    again = run_fleet(fleet("a"), folder, run_here, silent)
     assert again.results == first.results == json.loads((folder / "fleet.json").read_text())["results"]
     assert files == {x: x.stat().st_mtime_ns for x in folder.glob("runs/*/*/result.json")}
-    more = run_fleet(fleet("a", seeds=2), folder, InProcess(), Unseen())
+    more = run_fleet(fleet("a", seeds=2), folder, run_here, silent)
     assert [x["seed"] for x in more.results] == [0, 1]
     assert all(files[x] == x.stat().st_mtime_ns for x in files)
-    other = run_fleet(fleet("a", width=5), folder, InProcess(), Unseen())
+    other = run_fleet(fleet("a", width=5), folder, run_here, silent)
     assert {x["parameters"] for x in other.results} != {x["parameters"] for x in first.results}
     (ranked,) = fleet_listings(other)
     assert ranked.rows[-1][0] == "(velocity stays constant)"
@@ -129,7 +122,7 @@ def test_an_arm_that_fails_is_told_and_the_others_run(fleet, tmp_path):
     broken = tmp_path / "broken.urdf"
     broken.write_text("<robot")
     robots = {"broken": FleetRobot(urdf=broken), "a": chosen.robots["a"]}
-    found = run_fleet(chosen.model_copy(update={"robots": robots}), tmp_path / "out", InProcess(), Unseen())
+    found = run_fleet(chosen.model_copy(update={"robots": robots}), tmp_path / "out", run_here, silent)
     assert [x["robot"] for x in found.results] == ["a"]
     assert str(broken) in found.failures["broken"]
     assert "unexpected" not in found.failures["broken"]
@@ -137,8 +130,8 @@ def test_an_arm_that_fails_is_told_and_the_others_run(fleet, tmp_path):
         run_fleet(
             chosen.model_copy(update={"robots": {"broken": robots["broken"]}}),
             tmp_path / "none",
-            InProcess(),
-            Unseen(),
+            run_here,
+            silent,
         )
 
 
@@ -161,7 +154,10 @@ def test_a_search_finds_what_is_best_and_proposes_the_same_when_it_goes_on(tmp_p
     search = Search(
         over={"learning_rate": {"low": 1e-5, "high": 1.0, "log": True}, "width": [8, 16]}, trials=24
     )
-    start = Job("a", "spel", 0, 0, tmp_path / "spel", tmp_path, (), (), "")
+    start = Job(
+        robot="a", preset="spel", seed=0, split=0, folder=tmp_path / "spel", urdf=tmp_path, train=(), test=(),
+        data="", design="spel",
+    )  # fmt: skip
     asked: list[list[Job]] = []
 
     def run_all(jobs):
@@ -170,12 +166,12 @@ def test_a_search_finds_what_is_best_and_proposes_the_same_when_it_goes_on(tmp_p
             loss = abs(np.log10(job.training.learning_rate) + 2) + (job.width != 16)
             yield job, RunError("not finite") if loss > 3 else {"validation": loss}
 
-    best = searched(search, [start], run_all)["a", "spel"]
+    (best,) = search_options(search, [start], run_all)
     assert best.options["width"] == 16
-    assert best.loss < 0.3
+    assert best.validation < 0.3
     assert best.trials == 24
     once, asked = asked, []
-    assert searched(search, [start], run_all)["a", "spel"] == best
+    assert search_options(search, [start], run_all) == (best,)
     assert [[x.key for x in each] for each in asked] == [[x.key for x in each] for each in once]
     assert len({x.folder for each in once for x in each}) == 24
 
@@ -185,7 +181,7 @@ def test_the_spread_of_units_is_the_prior_about_what_they_share():
     units = [{"rotors.raw": torch.full((2,), away), "bodies.raw": torch.ones(3)} for away in (0.1, -0.3, 5.0)]
     prior = spread(units, common)
     assert prior.armature == pytest.approx(0.3)  # the middle one: one odd unit does not count
-    assert prior.bodies == LEAST
+    assert prior.bodies == LEAST_DEVIATION
     assert prior.shared_armature == prior.shared_friction == 0.0
     assert prior.velocities == GaussianPrior().velocities  # of which there are no weights
 
@@ -217,7 +213,7 @@ def test_units_of_an_arm_share_what_they_know(robots, tmp_path, monkeypatch):
         "training": {"objective": "torque"},
     }
     (tmp_path / "fleet.yaml").write_text(json.dumps(content))
-    found = run_fleet(load_fleet(tmp_path / "fleet.yaml"), tmp_path / "out", InProcess(), Unseen())
+    found = run_fleet(load_fleet(tmp_path / "fleet.yaml"), tmp_path / "out", run_here, silent)
     assert not found.failures
     assert len(found.results) == 7
     (units,) = found.units

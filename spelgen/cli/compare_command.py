@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from spelgen.cli.console import counted, note, say
+from spelgen.cli.console import note, progress_bar, say
 from spelgen.cli.options import Address, Force, Robot
 from spelgen.cli.train_settings import UsageError
 from spelgen.errors import SpelgenError, suggestion
@@ -48,40 +48,46 @@ def compare(
     from spelgen.comparison.formatting import comparison_tables
     from spelgen.comparison.runs import run_study, time_steps
     from spelgen.comparison.study import VARIANTS, ablation_variants, prepare_study
-    from spelgen.fleet.engine import engine
+    from spelgen.fleet.tasks import workers
     from spelgen.render.comparison_page import write_comparison
 
     if urdf_error is not None and steps is not None:
         raise UsageError(
             "--steps: belongs to models that know kinematics alone, these are trained by defaults"
         )
-    known = {variant.name: variant for variant in (ablation_variants() if ablation else VARIANTS)}
-    chosen = list(known) if presets is None else [name.strip() for name in presets.split(",")]
+    variants = {variant.name: variant for variant in (ablation_variants() if ablation else VARIANTS)}
+    chosen = list(variants)
+    if presets is not None:
+        chosen = [name.strip() for name in presets.split(",")]
     for name in chosen:
-        if name not in known:
+        if name not in variants:
             raise SpelgenError(
-                f"unknown preset {name!r}", expected=", ".join(known), do=suggestion(name, known)
+                f"unknown preset {name!r}", expected=", ".join(variants), do=suggestion(name, variants)
             )
-    about = [
-        robot.stem,
-        *(["ablation"] if ablation else []),
-        *([f"urdf-{urdf_error:g}"] if urdf_error is not None else []),
-    ]
-    folder = output or Path("comparisons") / "-".join(about)
-    with counted("simulating") as progress:
+    folder = output or _default_folder(robot, ablation, urdf_error)
+    with progress_bar("simulating") as progress:
         study = prepare_study(
             robot,
             folder,
-            variants=[known[name] for name in chosen],
+            variants=[variants[name] for name in chosen],
             seeds=seeds,
             steps=steps,
             urdf_error=urdf_error,
             force=force,
             progress=progress,
         )
-    with engine(jobs, address) as runs:
-        run_study(study, runs, note=note)
+    with workers(jobs, address) as run_tasks:
+        run_study(study, run_tasks, note=note)
     tables = comparison_tables(list(study.results()), time_steps(study), study.settings.published)
     for table in tables:
         say(table.text() + "\n")
     say(f"wrote {write_comparison(study, tables)}")
+
+
+def _default_folder(robot: Path, ablation: bool, urdf_error: float | None) -> Path:
+    name = robot.stem
+    if ablation:
+        name += "-ablation"
+    if urdf_error is not None:
+        name += f"-urdf-{urdf_error:g}"
+    return Path("comparisons") / name

@@ -10,39 +10,45 @@ import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, NoReturn
 
 import typer
 
 from spelgen.addresses import local, with_addresses
-from spelgen.cli.command import readable
-from spelgen.errors import SpelgenError
+from spelgen.cli.command import name_values
+from spelgen.errors import Diagnostic, SpelgenError
+from spelgen.files import write_text
 from spelgen.labels import printable
 
 FAILED = 1
 INTERRUPTED = 130  # 128 + SIGINT, as shells count
 BROKEN_PIPE = 141  # 128 + SIGPIPE
 
+# top-level module that only an extra brings -> the extra
 EXTRAS = {
     "pinocchio": "simulate",
     "casadi": "deploy",
+    "mujoco": "deploy",
+    "onnx": "deploy",
+    "onnxruntime": "deploy",
+    "safetensors": "deploy",
     "optuna": "fleet",
-    **dict.fromkeys(("mujoco", "onnx", "onnxruntime", "safetensors"), "deploy"),
-}  # top-level module that only an extra brings -> the extra
+    "ray": "fleet",
+}
 
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
 
 
-def told(command: Callable[..., None]) -> Callable[..., None]:
-    """Wrap a command: it gains the option --debug, and its exceptions end as `fail` tells them.
+def handle_errors(command: Callable[..., None]) -> Callable[..., None]:
+    """Wrap a command: it gains the option --debug, and its exceptions end as `fail` reports them.
 
-    Usage errors (exit 2) are found by typer before the command runs and pass through.
+    Typer finds usage errors (exit 2) before the command runs; they pass through.
     """
 
     @functools.wraps(command)
-    def run(*args: Any, debug: bool = False, **kwargs: Any) -> None:
+    def run(*arguments: object, debug: bool = False, **options: object) -> None:
         try:
-            command(*args, **{name: _local(value) for name, value in kwargs.items()})
+            command(*arguments, **{name: _local(value) for name, value in options.items()})
             sys.stdout.flush()  # a closed pipe shows here, where it is handled, and not at exit
         except (typer.Exit, typer.Abort, typer.BadParameter):
             raise
@@ -50,25 +56,27 @@ def told(command: Callable[..., None]) -> Callable[..., None]:
             fail(error, debug=debug)
 
     signature = inspect.signature(command, eval_str=True)
-    for each in signature.parameters.values():
-        readable(each.annotation)
+    for parameter in signature.parameters.values():
+        name_values(parameter.annotation)
     option = inspect.Parameter("debug", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Debug)
-    run.__signature__ = signature.replace(parameters=[*signature.parameters.values(), option])  # type: ignore[attr-defined]
-    run.__annotations__ = {
-        name: each.annotation for name, each in [*signature.parameters.items(), ("debug", option)]
-    }
+    parameters = [*signature.parameters.values(), option]
+    # typer reads the options from these two
+    vars(run)["__signature__"] = signature.replace(parameters=parameters)
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return run
 
 
-def _local(value: Any) -> Any:
-    """Paths that are addresses become their local copies."""
+def _local(value: object) -> object:
+    """Return paths that are addresses as their local copies, all else as it is."""
     if isinstance(value, list):
-        return [_local(each) for each in value]
-    return local(value) if isinstance(value, Path) else value
+        return [_local(element) for element in value]
+    if isinstance(value, Path):
+        return local(value)
+    return value
 
 
 def fail(error: BaseException, *, debug: bool = False) -> NoReturn:
-    """Tell an exception on stderr and leave with its exit code; with `debug`, its traceback first."""
+    """Report an exception on stderr and leave with its exit code; with `debug`, its traceback first."""
     if isinstance(error, BrokenPipeError):
         # Nobody listens any more: let the interpreter's last flush go nowhere, and say nothing.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -78,32 +86,35 @@ def fail(error: BaseException, *, debug: bool = False) -> NoReturn:
     if isinstance(error, KeyboardInterrupt):
         note("interrupted")
         raise typer.Exit(INTERRUPTED)
-    note(_told(error, debug))
+    note(_message(error, debug))
     raise typer.Exit(FAILED)
 
 
-def _told(error: BaseException, debug: bool) -> str:
+def _message(error: BaseException, debug: bool) -> str:
     if isinstance(error, SpelgenError):
         return str(error)
-    if isinstance(error, ModuleNotFoundError) and (error.name or "").split(".")[0] in EXTRAS:
-        extra = EXTRAS[(error.name or "").split(".")[0]]
-        return f"this needs the package {error.name}, which is not installed; pip install 'spelgen[{extra}]'"
+    if isinstance(error, ModuleNotFoundError):
+        extra = EXTRAS.get((error.name or "").split(".")[0])
+        if extra is not None:
+            return (
+                f"this needs the package {error.name}, which is not installed; pip install 'spelgen[{extra}]'"
+            )
     if isinstance(error, OSError) and error.filename is not None:
         return f"{os.fsdecode(error.filename)}: {(error.strerror or type(error).__name__).lower()}"
     if isinstance(error, OSError) and error.strerror:
         return error.strerror.lower()
-    where = "" if debug else "; --debug shows where"
-    return f"spelgen: unexpected {type(error).__name__}: {' '.join(str(error).split())}{where}"
+    hint = "" if debug else "; --debug shows where"
+    return f"spelgen: unexpected {type(error).__name__}: {' '.join(str(error).split())}{hint}"
 
 
 @contextmanager
-def counted(what: str) -> Iterator[Callable[[int, int], None]]:
-    """A bar on stderr, where that is a terminal; gives a function to call with (done, all)."""
+def progress_bar(title: str) -> Iterator[Callable[[int, int], None]]:
+    """Show a bar on stderr, where that is a terminal; give a function to call with (done, all)."""
     from rich.console import Console
     from rich.progress import Progress
 
     with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty(), transient=True) as bar:
-        task = bar.add_task(what, total=None)
+        task = bar.add_task(title, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
@@ -115,3 +126,23 @@ def say(text: str) -> None:
 def note(text: str) -> None:
     """Print progress, a remark or an error to stderr."""
     print(printable(with_addresses(text), "\n"), file=sys.stderr, flush=True)
+
+
+def note_diagnostic(diagnostic: Diagnostic) -> None:
+    """Print a warning or a remark of an analysis to stderr."""
+    note(f"{diagnostic.severity}: {diagnostic.where}: {diagnostic.message}")
+
+
+def deliver(text: str, output: Path | None) -> None:
+    """Print a result without its last line end, or write it to a file and say so."""
+    if output is None:
+        say(text.removesuffix("\n"))
+    else:
+        say(f"wrote {write_text(output, text)}")
+
+
+def refuse_warnings(subject: str, count: int) -> None:
+    """Leave with 1 where there are warnings and --strict allows none."""
+    if count:
+        note(f"{subject}{count} warning{'s' * (count > 1)}, and --strict allows none")
+        raise typer.Exit(FAILED)

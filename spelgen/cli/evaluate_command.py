@@ -9,9 +9,8 @@ from typing import Annotated, Literal
 import typer
 
 from spelgen.cli import options
-from spelgen.cli.console import note, say
+from spelgen.cli.console import deliver, note_diagnostic, say
 from spelgen.cli.options import Data, Filter, Mapping, MoreData, Output, Run, Trust
-from spelgen.files import write_text
 
 Format = Literal["text", "json", "csv"]
 
@@ -28,13 +27,13 @@ def evaluate(
 ) -> None:
     """Judge a trained run on test logs, beside its baselines.
 
-    What it finds is kept in the run folder, as evaluation.json.
+    The result is kept in the run folder, as evaluation.json.
     """
     paths = options.logs(data, more)
     import torch
 
     from spelgen.baselines.keep import read_baseline
-    from spelgen.evaluation.evaluate import evaluate as evaluated
+    from spelgen.evaluation.evaluate import evaluate as evaluate_model
     from spelgen.evaluation.subject import read_test_logs
     from spelgen.files import write_json
     from spelgen.fitting.fitted import load_run
@@ -42,20 +41,25 @@ def evaluate(
     from spelgen.logs.preprocessing import Preprocessing
 
     torch.set_num_threads(1)
-    used = None if filter is None else Preprocessing(cutoff=filter)
+    preprocessing = None
+    if filter is not None:
+        preprocessing = Preprocessing(cutoff=filter)
     logs, baselines = read_test_logs(run, paths, mapping), read_baseline(RunFolder(run))
-    found = evaluated(load_run(run, trust=trust), logs, baselines=baselines, preprocessing=used)
-    write_json(RunFolder(run).evaluation, found.to_dict())
-    for each in found.diagnostics:
-        note(f"{each.severity}: {each.where}: {each.message}")
-    wanted = options.chosen(format, output, Format)
-    if wanted == "csv":
+    model = load_run(run, trust=trust)
+    results = evaluate_model(model, logs, baselines=baselines, preprocessing=preprocessing)
+    record = results.to_dict()
+    write_json(RunFolder(run).evaluation, record)
+    for diagnostic in results.diagnostics:
+        note_diagnostic(diagnostic)
+    chosen = options.choose_format(format, output, Format)
+    if chosen == "csv":
         from spelgen.evaluation.csv_file import csv_text
 
-        text = csv_text(found.to_dict()).removesuffix("\n")
+        deliver(csv_text(record), output)
+    elif chosen == "json":
+        deliver(json.dumps(record) + "\n", output)
     else:
-        text = found.text() if wanted == "text" else json.dumps(found.to_dict())
-    say(text if output is None else f"wrote {write_text(output, text + chr(10))}")
+        deliver(results.text() + "\n", output)
 
 
 def report(
@@ -82,7 +86,7 @@ def report(
 
     if trust:
         for run in runs:
-            RunFolder(run).load_module(trust=True)  # what ran once may run again
+            RunFolder(run).load_module(trust=True)  # a module that ran once may run again
     if robot is not None and len(runs) > 1:
         raise typer.BadParameter("belongs to the page of one run", param_hint="'--robot'")
     if len(runs) == 1:

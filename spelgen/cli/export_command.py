@@ -28,14 +28,14 @@ def export(
     mjcf: such bodies, drives and friction for MuJoCo. c: a C99 header and source without dependencies. ros2: a colcon
     package around these. casadi, onnx, torch: a file for each function.
     """
-    from spelgen.exporting.export import export as exported
+    from spelgen.exporting.export import export as export_run
     from spelgen.exporting.exported import require_fitting
     from spelgen.fitting.fitted import load_run
 
     require_fitting(to, output)
     options.require_free(output, force=force)
-    found = exported(load_run(run, trust=trust), to)
-    for path in found.write(output, force=force):
+    result = export_run(load_run(run, trust=trust), to)
+    for path in result.write(output, force=force):
         say(f"wrote {path}")
-    for line in found.summary:
+    for line in result.summary:
         say(line)

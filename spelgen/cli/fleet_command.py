@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from spelgen.cli.console import FAILED, say
+from spelgen.cli.console import FAILED, note, say
 from spelgen.cli.options import Address
 
 
@@ -29,21 +29,20 @@ def fleet(
     """
     from spelgen.fitting.process import termination_as_interrupt
     from spelgen.fitting.run_lock import locked
-    from spelgen.fleet.engine import engine
     from spelgen.fleet.fleet import run_fleet
-    from spelgen.fleet.progress import FleetProgress
     from spelgen.fleet.ranking import fleet_listings
     from spelgen.fleet.schema import load_fleet
+    from spelgen.fleet.tasks import workers
     from spelgen.render.fleet_page import write_fleet
 
-    chosen = load_fleet(file)
+    settings = load_fleet(file)
     folder = (output or Path("fleets") / file.stem).absolute()
-    workers = engine(jobs or len(os.sched_getaffinity(0)), address, chosen.gpus)
-    with locked(folder), termination_as_interrupt(), workers as runs, FleetProgress() as progress:
-        found = run_fleet(chosen, folder, runs, progress)
-    listings = fleet_listings(found)
-    for each in listings:
-        say(each.text() + "\n")
-    say(f"wrote {write_fleet(found, listings, folder / 'fleet.html')}")
-    if found.failures:
+    count = jobs or len(os.sched_getaffinity(0))
+    with locked(folder), termination_as_interrupt(), workers(count, address, settings.gpus) as run_tasks:
+        results = run_fleet(settings, folder, run_tasks, note)
+    listings = fleet_listings(results)
+    for listing in listings:
+        say(listing.text() + "\n")
+    say(f"wrote {write_fleet(results, listings, folder / 'fleet.html')}")
+    if results.failures:
         raise typer.Exit(FAILED)

@@ -8,12 +8,12 @@ from typing import Annotated, Literal
 import typer
 
 from spelgen.cli import options
-from spelgen.cli.console import note, say
+from spelgen.cli.console import deliver, note_diagnostic
 from spelgen.cli.options import AngleTolerance, Data, Filter, Joints, Mapping, MoreData, Output, Robot, Tip
 from spelgen.errors import OptionError
-from spelgen.files import write_text
 
 Format = Literal["text", "json", "html"]
+EFFECTS = ("stribeck", "polynomial", "memory")
 
 
 def identify(
@@ -35,21 +35,21 @@ def identify(
     prior: Annotated[
         float | None, typer.Option(min=1e-6, help="Stay near the URDF's inertials; 0.5 suits few data.")
     ] = None,
-    stribeck: Annotated[bool, typer.Option("--stribeck", help="Dry friction of slow motion.")] = False,
-    polynomial: Annotated[bool, typer.Option("--polynomial", help="Friction in qd |qd| and qd^3.")] = False,
-    memory: Annotated[
-        bool, typer.Option("--memory", help="Dry friction by the way the joint came (bristles).")
-    ] = False,
-    coulomb_smoothing_velocity: Annotated[
-        float, typer.Option(min=1e-6, help="Width of Coulomb friction's jump [rad/s, m/s].")
-    ] = 0.01,
+    friction: Annotated[
+        str | None,
+        typer.Option(
+            metavar="stribeck,polynomial,memory",
+            help="Beside viscous and Coulomb friction, one or several of: more of it in slow motion; qd |qd| and "
+            "qd^3; bristles, by the way the joint came.",
+        ),
+    ] = None,
     format: Annotated[Format | None, options.result_format()] = None,
     output: Output = None,
 ) -> None:
     """Identify an arm's base parameters, friction and armature from logs by least squares."""
     paths = options.logs(data, more)
     from spelgen.identification.friction import FrictionModel
-    from spelgen.identification.identify import identify as identified
+    from spelgen.identification.identify import identify as identify_arm
     from spelgen.identification.method import LeastSquares
     from spelgen.loaded_arm import load_arm
     from spelgen.log_checks.check_logs import require_possible_torques
@@ -57,25 +57,26 @@ def identify(
     from spelgen.logs.preprocessing import Preprocessing
     from spelgen.logs.read import read_logs
 
-    friction = FrictionModel(coulomb_smoothing_velocity, stribeck, polynomial, memory)
+    effects = options.names(friction) or []
+    for name in effects:
+        if name not in EFFECTS:
+            raise typer.BadParameter(f"{name!r} is none of {', '.join(EFFECTS)}", param_hint="'--friction'")
     try:
-        method = LeastSquares(weights, ridge, prior, friction)
+        method = LeastSquares(weights, ridge, prior, FrictionModel(**dict.fromkeys(effects, True)))
     except OptionError as error:
         raise typer.BadParameter(error.got, param_hint=f"'--{error.element}'") from None
     arm = load_arm(robot, options.names(joints), tip, angle_tolerance)
     logs = read_logs(paths, arm, mapping, role="train")
     require_possible_torques(logs, arm, log_source(arm, mapping).mapping)
-    found = identified(arm, logs, method, preprocessing=Preprocessing(cutoff=filter))
-    for each in found.diagnostics:
-        note(f"{each.severity}: {each.where}: {each.message}")
-    wanted = options.chosen(format, output, Format)
-    if wanted == "html":
+    result = identify_arm(arm, logs, method, preprocessing=Preprocessing(cutoff=filter))
+    for diagnostic in result.diagnostics:
+        note_diagnostic(diagnostic)
+    chosen = options.choose_format(format, output, Format)
+    if chosen == "html":
         from spelgen.render.identification_page import page
 
-        result = page(found, arm)
+        deliver(page(result, arm) + "\n", output)
+    elif chosen == "json":
+        deliver(json.dumps(result.to_dict(), indent=2) + "\n", output)
     else:
-        result = found.text() if wanted == "text" else json.dumps(found.to_dict(), indent=2)
-    if output is None:
-        say(result)
-    else:
-        say(f"wrote {write_text(output, result + chr(10))}")
+        deliver(result.text() + "\n", output)

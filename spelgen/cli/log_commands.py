@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from spelgen.cli import options
-from spelgen.cli.console import FAILED, counted, note, say
-from spelgen.cli.options import AngleTolerance, Force, Joints, Mapping, Robot, Tip
+from spelgen.cli.console import FAILED, note, progress_bar, refuse_warnings, say
+from spelgen.cli.options import AngleTolerance, Force, Joints, Mapping, Robot, Strict, Tip
 from spelgen.errors import SpelgenError, SpelgenErrors
 from spelgen.files import write_text
 
@@ -45,13 +45,13 @@ def excite(
 
     Collisions are not checked.
     """
-    from spelgen.excitation.design import excite as excited
+    from spelgen.excitation.design import excite as design_motion
     from spelgen.loaded_arm import load_arm
 
     options.require_free(output, force=force)
     arm = load_arm(robot, options.names(joints), tip, angle_tolerance)
-    with counted("searching") as progress:
-        found = excited(
+    with progress_bar("searching") as progress:
+        motion = design_motion(
             arm,
             duration=duration,
             sample_rate=sample_rate,
@@ -62,8 +62,8 @@ def excite(
             seed=seed,
             progress=progress,
         )
-    say(found.text())
-    say(f"wrote {write_text(output, found.csv())}")
+    say(motion.text())
+    say(f"wrote {write_text(output, motion.csv())}")
 
 
 def logs(
@@ -79,7 +79,7 @@ def logs(
         Path | None, typer.Option(help="Write the mapping that names and numbers of the first log suggest.")
     ] = None,
     force: Force = False,
-    strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 if there is any warning.")] = False,
+    strict: Strict = False,
 ) -> None:
     """Check logs: what they hold, and what is odd about them.
 
@@ -95,21 +95,23 @@ def logs(
     if suggest is not None:
         options.require_free(suggest, force=force)
         mapping = _suggested(paths, arm, suggest)
-    found = check_logs(stream_logs(paths, arm, mapping), arm, log_source(arm, mapping).mapping)
-    say(found.text() if format == "text" else json.dumps(found.to_dict(), indent=2))
+    result = check_logs(stream_logs(paths, arm, mapping), arm, log_source(arm, mapping).mapping)
+    if format == "text":
+        say(result.text())
+    else:
+        say(json.dumps(result.to_dict(), indent=2))
     if html is not None:
-        note(f"wrote {write_text(html, page(found, arm.arm, arm.actuation.matrix()))}")
-    if found.errors:
-        note(str(SpelgenErrors(found.errors)))
-    warnings = len(found.warnings)
-    if strict and warnings:
-        note(f"{warnings} warning{'s' * (warnings > 1)}, and --strict allows none")
-    if found.errors or (strict and warnings):
+        note(f"wrote {write_text(html, page(result, arm.arm, arm.actuation.matrix()))}")
+    if result.errors:
+        note(str(SpelgenErrors(result.errors)))
+    if strict:
+        refuse_warnings("", len(result.warnings))
+    if result.errors:
         raise typer.Exit(FAILED)
 
 
 def _suggested(paths: list[Path], arm: LoadedArm, file: Path) -> Path:
-    """The mapping that the first log suggests, written to a file; ends the command where it lacks columns."""
+    """Write the mapping that the first log suggests, and return its file; leave with 1 where the log lacks columns."""
     from spelgen.errors import collect
     from spelgen.logs.log_files import log_files
     from spelgen.logs.suggest import suggest_mapping
@@ -118,9 +120,9 @@ def _suggested(paths: list[Path], arm: LoadedArm, file: Path) -> Path:
     logs = log_files(paths, None, errors)
     collect(errors)
     coordinates = arm.arm.coordinates
-    found = suggest_mapping(logs[0], [x.name for x in coordinates], [x.kind for x in coordinates])
-    say(f"wrote {write_text(file, found.text)}: to be read, then used by --mapping")
-    if found.missing:
-        note(f"no column was found for {', '.join(found.missing)}; say their names in {file}")
+    suggestion = suggest_mapping(logs[0], [x.name for x in coordinates], [x.kind for x in coordinates])
+    say(f"wrote {write_text(file, suggestion.text)}: to be read, then used by --mapping")
+    if suggestion.missing:
+        note(f"no column was found for {', '.join(suggestion.missing)}; say their names in {file}")
         raise typer.Exit(FAILED)
     return file

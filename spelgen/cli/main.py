@@ -18,13 +18,14 @@ from spelgen.cli import (
     export_command,
     fleet_command,
     identify_command,
+    inspect_command,
     log_commands,
     model_commands,
     simulate_command,
     train_command,
 )
 from spelgen.cli.command import Command, Group
-from spelgen.cli.console import say, told
+from spelgen.cli.console import handle_errors, say
 
 CONTEXT = {"max_content_width": 80, "help_option_names": ["-h", "--help"]}
 
@@ -36,7 +37,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 for command in (
-    model_commands.inspect,
+    inspect_command.inspect,
     model_commands.init,
     model_commands.build,
     simulate_command.simulate,
@@ -51,11 +52,11 @@ for command in (
     fleet_command.fleet,
     model_commands.check,
 ):
-    app.command(cls=Command, context_settings=CONTEXT)(told(command))
+    app.command(cls=Command, context_settings=CONTEXT)(handle_errors(command))
 
 
-def _version(asked: bool) -> None:
-    if asked:
+def _version(requested: bool) -> None:
+    if requested:
         say(f"spelgen {__version__}")
         raise typer.Exit
 

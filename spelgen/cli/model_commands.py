@@ -1,4 +1,4 @@
-"""Commands about the model itself: `inspect`, `build`, `check`."""
+"""Commands about the model itself: `init`, `build`, `check`."""
 
 from __future__ import annotations
 
@@ -9,64 +9,9 @@ import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import FAILED, note, say
-from spelgen.cli.formats import Format, rendered
-from spelgen.cli.options import (
-    AngleTolerance,
-    Assumption,
-    Entry,
-    Force,
-    Joints,
-    Module,
-    Output,
-    Robot,
-    RobotOption,
-    Tip,
-)
+from spelgen.cli.options import AngleTolerance, Assumption, Force, Joints, Module, Robot, RobotOption, Tip
 from spelgen.design import PRESET_NAMES, Net
 from spelgen.files import write_text
-
-
-def inspect(
-    robot: Robot,
-    joints: Joints = None,
-    tip: Tip = None,
-    assume: Assumption = "kinematics",
-    angle_tolerance: AngleTolerance = 2e-3,
-    formulas: Annotated[
-        bool, typer.Option("--formulas", help="Write M and V as expressions in q and base parameters.")
-    ] = False,
-    entry: Entry = None,
-    format: Annotated[Format | None, options.result_format()] = None,
-    output: Output = None,
-    strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 if there is any warning.")] = False,
-    verify: Annotated[bool, typer.Option("--verify", help="Prove it again by other programs.")] = False,
-) -> None:
-    """Show the exact structure of an arm's dynamics."""
-    from spelgen.loaded_arm import load_arm
-
-    wanted = options.entry(entry)
-    arm = load_arm(robot, options.names(joints), tip, angle_tolerance)
-    found = arm.inspect(assume)
-    proof = arm.verify(assume) if verify else None
-    text = rendered(
-        found,
-        options.chosen(format, output, Format),
-        formulas=formulas,
-        entry=wanted,
-        proof=proof,
-        urdf=arm.robot.path,
-    )
-    if output is None:
-        say(text.removesuffix("\n"))
-    else:
-        say(f"wrote {write_text(output, text)}")
-    warnings = sum(diagnostic.severity == "warning" for diagnostic in found.diagnostics)
-    if strict and warnings:
-        note(f"{robot}: {warnings} warning{'s' * (warnings > 1)}, and --strict allows none")
-        raise typer.Exit(FAILED)
-    if proof and not proof.agrees:
-        note(f"{robot}: the proof contradicts the derivation; please report this file")
-        raise typer.Exit(FAILED)
 
 
 def init(
@@ -113,8 +58,8 @@ def build(
 ) -> None:
     """Write the PyTorch module tailored to an arm."""
     if preset not in PRESET_NAMES and Path(preset).suffix not in (".yaml", ".yml"):
-        told = f"{preset!r} is none of {', '.join(PRESET_NAMES)}, nor a YAML file"
-        raise typer.BadParameter(told, param_hint="'--preset'")
+        message = f"{preset!r} is none of {', '.join(PRESET_NAMES)}, nor a YAML file"
+        raise typer.BadParameter(message, param_hint="'--preset'")
     if net is not None and preset == "closed-form":
         raise typer.BadParameter("closed-form has no networks", param_hint="'--net'")
     from spelgen.loaded_arm import load_arm
@@ -140,5 +85,5 @@ def check(module: Module, robot: RobotOption = None) -> None:
     if not result.fresh:
         note(f"{module}: build it again from {result.urdf}")
         raise typer.Exit(FAILED)
-    proved = f"{len(result.proof.checks)} facts proved by {result.proof.means}"
-    say(f"{module} is up to date with {result.urdf}; {proved}")
+    proof = f"{len(result.proof.checks)} facts proved by {result.proof.means}"
+    say(f"{module} is up to date with {result.urdf}; {proof}")

@@ -1,4 +1,4 @@
-"""What commands have in common: their arguments and options, and what these turn into."""
+"""Arguments and options that several commands have, and what these turn into."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ import csv
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 import typer
+from typer.models import OptionInfo
 
 from spelgen.errors import SpelgenError
 from spelgen.spec import Assume
@@ -84,31 +85,38 @@ Address = Annotated[
     str | None,
     typer.Option(metavar="HOST:PORT", help="A Ray cluster that runs already; default: one on this machine."),
 ]
+Strict = Annotated[bool, typer.Option("--strict", help="Exit with 1 if there is any warning.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace an output that exists.")]
 
 
-def result_format() -> Any:
-    """The option `--format`; one for each command, whose formats are its own."""
-    return typer.Option(help="Of the result; without it, by the suffix of -o, else text.", show_default=False)
+def result_format() -> OptionInfo:
+    """Return the option `--format`; one for each command, whose formats are its own."""
+    option: OptionInfo = typer.Option(
+        help="Of the result; without it, by the suffix of -o, else text.", show_default=False
+    )
+    return option
 
 
-def chosen(format: str | None, output: Path | None, formats: Any) -> str:
-    """The format named, else the one of these (a Literal) that the output's suffix means, else text."""
-    meant = SUFFIXES.get(output.suffix.lower() if output else "")
-    return format or (meant if meant in get_args(formats) else None) or "text"
+def choose_format(format: str | None, output: Path | None, formats: object) -> str:
+    """Return the format named, else the one of these (a Literal) that the output's suffix means, else text."""
+    if format is not None:
+        return format
+    meant = SUFFIXES.get(output.suffix.lower()) if output else None
+    if meant in get_args(formats):
+        return str(meant)
+    return "text"
 
 
 def names(text: str | None) -> list[str] | None:
-    """`a, b, "c, d"` -> the three names; None stays None."""
-    return (
-        None
-        if text is None
-        else [name.strip() for name in next(csv.reader([text], skipinitialspace=True), [])]
-    )
+    """Return `a, b, "c, d"` as three names; None stays None."""
+    if text is None:
+        return None
+    cells: list[str] = next(csv.reader([text], skipinitialspace=True), [])
+    return [name.strip() for name in cells]
 
 
 def entry(text: str | None) -> tuple[int, int] | Literal["V"] | None:
-    """`3,2` -> (3, 2), `V` -> "V"; None stays None. A usage error for anything else."""
+    """Return `3,2` as (3, 2), `V` as "V"; None stays None. A usage error for anything else."""
     if text is None:
         return None
     if text == "V":
@@ -120,24 +128,28 @@ def entry(text: str | None) -> tuple[int, int] | Literal["V"] | None:
 
 
 def logs(data: list[Path] | None, more: list[Path] | None) -> list[Path]:
-    """The paths after --data, however often it stands there; a usage error without any."""
+    """Return the paths after --data, however often it stands there; a usage error without any."""
     if not data:
         raise typer.BadParameter("name at least one file or folder", param_hint="'--data'")
     return [*data, *(more or [])]
 
 
 def mapping(file: Path | None, urdf: Path | None, joints: Sequence[str]) -> LogMapping | None:
-    """What a mapping file says, else the settings beside the URDF; None without either.
+    """Return what a mapping file says, else the settings beside the URDF; None without either.
 
     The file may speak of all joints of the URDF, or of `joints` where there is none.
     """
     from spelgen.settings.settings import load_mapping, load_settings
     from spelgen.urdf.read import read_urdf
 
-    there = urdf is not None and urdf.is_file()
+    has_urdf = urdf is not None and urdf.is_file()
     if file is not None:
-        return load_mapping(file, [x.name for x in read_urdf(urdf).joints] if urdf and there else joints)
-    return load_settings(urdf).logs if urdf and there else None
+        if urdf is not None and has_urdf:
+            joints = [joint.name for joint in read_urdf(urdf).joints]
+        return load_mapping(file, joints)
+    if urdf is not None and has_urdf:
+        return load_settings(urdf).logs
+    return None
 
 
 def require_free(path: Path, *, force: bool) -> None:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from spelgen.cli import options
-from spelgen.cli.console import counted, note, say
+from spelgen.cli.console import note, progress_bar, say
 from spelgen.cli.options import AngleTolerance, Force, Joints, Robot, Tip
 
 
@@ -26,14 +26,14 @@ def simulate(
     """Make training and test logs with Pinocchio."""
     from spelgen.loaded_arm import load_arm
     from spelgen.logs.read import write_logs
-    from spelgen.simulation.simulate import simulate as simulated
+    from spelgen.simulation.simulate import simulate as simulate_arm
 
     arm = load_arm(robot, options.names(joints), tip, angle_tolerance)
     paths = {role: output / f"{role}.parquet" for role in ("train", "test")}
     for path in paths.values():
         options.require_free(path, force=force)
-    with counted("simulating") as progress:
-        logs = simulated(arm, seed=seed, progress=progress)
+    with progress_bar("simulating") as progress:
+        logs = simulate_arm(arm, seed=seed, progress=progress)
     names = [coordinate.name for coordinate in arm.arm.coordinates]
     for path, trajectories in zip(paths.values(), (logs.train, logs.test), strict=True):
         if trajectories:

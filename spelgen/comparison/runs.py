@@ -21,7 +21,7 @@ from spelgen.files import write_json
 from spelgen.fitting.rollout import LossScales, loss_scales
 from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.fitting.train import train
-from spelgen.fleet.engine import Engine
+from spelgen.fleet.tasks import RunTasks
 from spelgen.logs.read import read_logs
 from spelgen.settings.fits import BATCH, Rollout
 from spelgen.spec import read_facts
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 HORIZON = 1.0  # s, over which trajectories are predicted
 
 
-def run_study(study: Study, engine: Engine, *, note: Callable[[str], None]) -> None:
+def run_study(study: Study, run_tasks: RunTasks, *, note: Callable[[str], None]) -> None:
     """Train and measure what is not yet done; `note` hears of each run that ends. What a run raises ends all."""
     waiting = [
         (variant, seed)
@@ -44,7 +44,7 @@ def run_study(study: Study, engine: Engine, *, note: Callable[[str], None]) -> N
     done = count - len(waiting)
     if done:
         note(f"{done} of {count} runs are done already")
-    for (variant, seed), result in engine.results(partial(_run, study), waiting):
+    for (variant, seed), result in run_tasks(partial(_run, study), waiting):
         if isinstance(result, Exception):
             raise result
         done += 1

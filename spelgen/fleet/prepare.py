@@ -1,4 +1,4 @@
-"""An arm's logs for its runs: simulated or as given, in one form, split into what is trained on and what tests."""
+"""Prepare an arm's logs for its runs: simulated or as given, in one form, split into training and test."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -24,11 +23,13 @@ from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.settings import load_mapping
 
 HELD_OUT = 0.25  # of logs that do not say which are for the test
+Split = tuple[Sequence[Trajectory], Sequence[Trajectory]]
+"""Training and test trajectories."""
 
 
 @dataclass(frozen=True)
 class Preparation:
-    """What is to be done for one arm: its logs go to ``folder``."""
+    """Name an arm whose logs go to ``folder``, in so many splits."""
 
     name: str
     robot: FleetRobot
@@ -37,8 +38,8 @@ class Preparation:
 
 
 @dataclass(frozen=True)
-class Prepared:
-    """An arm whose logs are ready. key: of all that they were made from. group: of its URDF and choice of joints: equal
+class PreparedArm:
+    """Hold an arm's logs. key: digest of all that they were made from. group: of its URDF and choice of joints, equal
     for units of the same arm. data: for each split the paths of training and of test logs, which `mapping` reads.
     """
 
@@ -49,91 +50,77 @@ class Prepared:
     mapping: LogMapping
 
 
-def prepare(preparation: Preparation) -> Prepared:
+def prepare(preparation: Preparation) -> PreparedArm:
     """Write the logs of every split, unless they are there already. Raises what reading and simulating raise."""
-    robot, folder = preparation.robot, preparation.folder
+    robot, folder, splits = preparation.robot, preparation.folder, preparation.splits
     arm = load_arm(robot.urdf, robot.joints, robot.tip)
-    mapping = _mapping(robot, arm)
+    mapping = arm.settings.logs
+    if robot.mapping is not None:
+        mapping = load_mapping(robot.mapping, [joint.name for joint in arm.robot.joints])
     group = _digest(arm.robot.digest, robot.joints, robot.tip)
-    key = _digest(
-        group,
-        arm.settings.model_dump_json(exclude_unset=True),
-        mapping.model_dump_json(exclude_unset=True),
-        _stamps(robot),
-        preparation.splits,
-    )
+    settings = arm.settings.model_dump_json(exclude_unset=True)
+    key = _digest(group, settings, mapping.model_dump_json(exclude_unset=True), _stamps(robot), splits)
     names = [coordinate.name for coordinate in arm.arm.coordinates]
+    element = f"robots.{preparation.name}.data"
     if robot.data and large_files(robot.data, names):
-        if preparation.splits > 1:
-            raise LogError(
-                "logs larger than memory",
-                element=f"robots.{preparation.name}.data",
-                expected="splits: 1 of them",
-            )
-        return Prepared(preparation.name, key, group, ((robot.data, robot.data),), mapping)
-    places = [folder / f"split{k}" for k in range(preparation.splits)]
-    done = folder / "prepared.json"
-    if not done.exists() or json.loads(done.read_text(encoding="utf-8")) != {"key": key}:
-        done.unlink(missing_ok=True)
-        train, test = _logs(robot, arm, mapping)
-        parts = [(train, test)] if preparation.splits == 1 and test else _folds([*train, *test], preparation)
-        for place, (training, testing) in zip(places, parts, strict=True):
-            write_logs(place / "train.parquet", training, names)
-            write_logs(place / "test.parquet", testing, names)
-        write_json(done, {"key": key})
-    data = tuple(((place / "train.parquet",), (place / "test.parquet",)) for place in places)
-    return Prepared(preparation.name, key, group, data, LogMapping())
+        if splits > 1:
+            raise LogError("logs larger than memory", element=element, expected="splits: 1 of them")
+        return PreparedArm(preparation.name, key, group, ((robot.data, robot.data),), mapping)
+    paths = [
+        (folder / f"split{k}" / "train.parquet", folder / f"split{k}" / "test.parquet") for k in range(splits)
+    ]
+    record = folder / "prepared.json"
+    if not record.exists() or json.loads(record.read_text(encoding="utf-8")) != {"key": key}:
+        record.unlink(missing_ok=True)
+        for split_paths, split in zip(paths, _splits(robot, arm, mapping, splits, element), strict=True):
+            for path, trajectories in zip(split_paths, split, strict=True):
+                write_logs(path, trajectories, names)
+        write_json(record, {"key": key})
+    data = tuple(((train,), (test,)) for train, test in paths)
+    return PreparedArm(preparation.name, key, group, data, LogMapping())
 
 
-def _mapping(robot: FleetRobot, arm: LoadedArm) -> LogMapping:
-    if robot.mapping is None:
-        return arm.settings.logs
-    return load_mapping(robot.mapping, [joint.name for joint in arm.robot.joints])
+def _splits(robot: FleetRobot, arm: LoadedArm, mapping: LogMapping, count: int, element: str) -> list[Split]:
+    """Return the trajectories of each split; whole ones are drawn by a fixed seed where the logs do not say."""
+    train, test = _roles(robot, arm, mapping)
+    if count == 1 and test:
+        return [(train, test)]
+    logs = [*train, *test]
+    if count == 1:
+        split = split_validation(logs, HELD_OUT, 0)
+        return [(split.training, split.validation)]
+    if len(logs) < count:
+        expected = f"{count} or more, for as many splits"
+        raise LogError(f"{len(logs)} trajectories", element=element, expected=expected)
+    splits: list[Split] = []
+    for fold in np.array_split(np.random.default_rng(0).permutation(len(logs)), count):
+        tested = set(fold.tolist())
+        training = [log for k, log in enumerate(logs) if k not in tested]
+        splits.append((training, [logs[k] for k in sorted(tested)]))
+    return splits
 
 
-def _logs(
-    robot: FleetRobot, arm: LoadedArm, mapping: LogMapping
-) -> tuple[Sequence[Trajectory], Sequence[Trajectory]]:
-    """Training and test trajectories; none of the latter where the logs do not tell."""
+def _roles(robot: FleetRobot, arm: LoadedArm, mapping: LogMapping) -> Split:
+    """Return training and test trajectories; none of the latter where the logs do not say which they are."""
     if not robot.data:
         from spelgen.simulation.simulate import simulate
 
         simulated = simulate(arm)
         return simulated.train, simulated.test
-    train, every = (read_logs(robot.data, arm, mapping, role) for role in ("train", None))
-    files = {x.file for x in train}
-    if {x.file for x in every} == files:
+    train = read_logs(robot.data, arm, mapping, "train")
+    everything = read_logs(robot.data, arm, mapping, None)
+    if {log.file for log in everything} == {log.file for log in train}:
         return train, []
     return train, read_logs(robot.data, arm, mapping, "test")
 
 
-def _folds(
-    logs: Sequence[Trajectory], preparation: Preparation
-) -> list[tuple[Sequence[Trajectory], Sequence[Trajectory]]]:
-    """Training and test logs of each split, whole trajectories drawn by a fixed seed."""
-    if preparation.splits == 1:
-        split = split_validation(logs, HELD_OUT, 0)
-        return [(split.training, split.validation)]
-    if len(logs) < preparation.splits:
-        raise LogError(
-            f"{len(logs)} trajectories", element=f"robots.{preparation.name}.data",
-            expected=f"{preparation.splits} or more, for as many splits",
-        )  # fmt: skip
-    folds = np.array_split(np.random.default_rng(0).permutation(len(logs)), preparation.splits)
-    tests = [set(fold.tolist()) for fold in folds]
-    return [
-        ([x for k, x in enumerate(logs) if k not in test], [x for k, x in enumerate(logs) if k in test])
-        for test in tests
-    ]
-
-
-def _stamps(robot: FleetRobot) -> list[Any]:
-    """Of each log file its path, size and last change."""
+def _stamps(robot: FleetRobot) -> list[tuple[str, int, int]]:
+    """Return path, size and time of the last change of each log file."""
     errors: list[SpelgenError] = []
     files = log_files(robot.data, None, errors)
     collect(errors)
-    return [(str(x), x.stat().st_size, x.stat().st_mtime_ns) for x in files]
+    return [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
 
 
-def _digest(*parts: Any) -> str:
-    return hashlib.sha256(json.dumps(parts, default=str).encode()).hexdigest()[:16]
+def _digest(*values: object) -> str:
+    return hashlib.sha256(json.dumps(values, default=str).encode()).hexdigest()[:16]

@@ -1,64 +1,64 @@
-"""What a fleet found, as tables: models ranked for each arm, what a search chose, how units differ."""
+"""Lay a fleet's results out in tables: models ranked for each arm, what a search chose, how units differ."""
 
 from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from spelgen.evaluation.names import MODEL
-from spelgen.fleet.fleet import FleetResults
+from spelgen.fleet.fleet import FleetResults, SearchResult
 from spelgen.fleet.units import Quantity, Units
 from spelgen.listing import Listing, number
 
-Result = Mapping[str, Any]
-BETTER = "relative RMS after each time (0: no error, 1: as if the arm had stood still), nMSE of torques"
+RunResult = Mapping[str, Any]
+MEASURE = "relative RMS after each time (0: no error, 1: as if the arm had stood still), nMSE of torques"
 
 
-def fleet_listings(found: FleetResults) -> list[Listing]:
-    """All tables of a fleet's report."""
-    robots = dict.fromkeys(result["robot"] for result in found.results)
-    tables = [ranking(robot, [x for x in found.results if x["robot"] == robot]) for robot in robots]
-    tables += [_searches(found)] if found.found else []
-    tables += [_unit_listing(units, each) for units in found.units for each in units.quantities]
-    tables += [_failures(found)] if found.failures else []
+def fleet_listings(fleet: FleetResults) -> list[Listing]:
+    """Return all tables of a fleet's report."""
+    tables = [ranking(robot, runs) for robot, runs in _by_robot(fleet).items()]
+    if fleet.search:
+        tables.append(_search_listing(fleet.search))
+    for units in fleet.units:
+        tables += [_unit_listing(units, quantity) for quantity in units.quantities]
+    if fleet.failures:
+        rows = tuple((f"{name}: {reason}",) for name, reason in fleet.failures.items())
+        tables.append(Listing("What failed; started again, it is tried again", ("",), rows))
     return tables
 
 
-def ranking(robot: str, results: Sequence[Result]) -> Listing:
-    """One arm's models, the one that predicts best over the longest horizon first, and the baselines among them;
+def winners(fleet: FleetResults) -> dict[str, int]:
+    """Return of how many arms each model is the best, the one that wins most first."""
+    wins: dict[str, int] = {}
+    for robot, runs in _by_robot(fleet).items():
+        names = [row[0] for row in ranking(robot, runs).rows if not row[0].startswith("(")]
+        wins[names[0]] = wins.get(names[0], 0) + 1
+    return dict(sorted(wins.items(), key=lambda item: -item[1]))
+
+
+def ranking(robot: str, runs: Sequence[RunResult]) -> Listing:
+    """Return one arm's models, the one that predicts best over the longest horizon first, and the baselines among them;
     medians over seeds and splits.
     """
-    presets: dict[str, list[Result]] = {}
-    for result in results:
-        presets.setdefault(result["preset"], []).append(result)
-    horizons = _common([list(result["errors"]) for result in results])
-    baselines = _common([list(_baselines(result)) for result in results])
-    lines = [_line(name, runs, MODEL, horizons) for name, runs in presets.items()]
-    lines += [_line(f"({name})", results, name, horizons) for name in baselines]
-    rows = tuple(
-        (x.name, *map(_text, (*x.errors, x.torque, x.parameters, x.runs, x.seconds)))
-        for x in sorted(lines, key=lambda line: line.order)
-    )
+    presets: dict[str, list[RunResult]] = {}
+    for run in runs:
+        presets.setdefault(run["preset"], []).append(run)
+    horizons = _common(run["errors"] for run in runs)
+    lines = [_model_line(name, of_preset, horizons) for name, of_preset in presets.items()]
+    for name in _common(_predictors(run) for run in runs):
+        if name != MODEL:
+            lines.append(_line(f"({name})", runs, name, horizons))
+    lines.sort(key=lambda line: line.order)
     head = ("", *horizons, "nMSE", "parameters", "runs", "time [s]")
-    return Listing(f"{robot}, best first: {BETTER}; medians of all runs", head, rows)
-
-
-def winners(found: FleetResults) -> dict[str, int]:
-    """Of how many arms each model is the best."""
-    wins: dict[str, int] = {}
-    for robot in dict.fromkeys(result["robot"] for result in found.results):
-        rows = ranking(robot, [x for x in found.results if x["robot"] == robot]).rows
-        best = next(name for name, *_ in rows if not name.startswith("("))
-        wins[best] = wins.get(best, 0) + 1
-    return dict(sorted(wins.items(), key=lambda each: -each[1]))
+    return Listing(f"{robot}, best first: {MEASURE}; medians of all runs", head, tuple(x.row for x in lines))
 
 
 @dataclass(frozen=True)
 class _Line:
-    """A model or a baseline: errors by horizon, nMSE of torques; parameters, runs and their seconds of models alone."""
+    """A model or a baseline: errors by horizon, nMSE of torques; of models parameters, runs and seconds a run."""
 
     name: str
     errors: tuple[float | None, ...]
@@ -69,75 +69,78 @@ class _Line:
 
     @property
     def order(self) -> list[float]:
-        """By the error over the longest horizon, then by shorter ones, then by torque."""
-        return [math.inf if x is None else x for x in (*reversed(self.errors), self.torque)]
+        """Return what lines are sorted by: errors, of the longest horizon first, then of torque."""
+        values = (*reversed(self.errors), self.torque)
+        return [math.inf if value is None else value for value in values]
+
+    @property
+    def row(self) -> tuple[str, ...]:
+        """Return the line as text."""
+        values = (*self.errors, self.torque, self.parameters, self.runs, self.seconds)
+        return (self.name, *(_text(value) for value in values))
 
 
-def _line(name: str, runs: Sequence[Result], predictor: str, horizons: Sequence[str]) -> _Line:
-    errors = tuple(_median([run["errors"][horizon].get(predictor) for run in runs]) for horizon in horizons)
-    torque = _median([run["torque"].get(predictor) for run in runs])
-    if predictor != MODEL:
-        return _Line(name, errors, torque)
+def _model_line(name: str, runs: Sequence[RunResult], horizons: Sequence[str]) -> _Line:
+    line = _line(name, runs, MODEL, horizons)
     seconds = _median([run["seconds"] for run in runs])
-    return _Line(name, errors, torque, runs[0]["parameters"], len(runs), seconds)
+    return _Line(name, line.errors, line.torque, runs[0]["parameters"], len(runs), seconds)
+
+
+def _line(name: str, runs: Sequence[RunResult], predictor: str, horizons: Sequence[str]) -> _Line:
+    errors = []
+    for horizon in horizons:
+        errors.append(_median([run["errors"][horizon].get(predictor) for run in runs]))
+    return _Line(name, tuple(errors), _median([run["torque"].get(predictor) for run in runs]))
 
 
 def _median(values: Sequence[float | None]) -> float | None:
-    """What is not finite counts as infinitely bad; None where that is the median."""
-    middle = statistics.median(math.inf if x is None else x for x in values)
-    return middle if math.isfinite(middle) else None
+    """Return the median, None where it is not finite; an error that is not finite counts as infinitely bad."""
+    median = statistics.median(math.inf if value is None else value for value in values)
+    return median if math.isfinite(median) else None
 
 
-def _baselines(result: Result) -> dict[str, None]:
-    """Names of all predictors but the model that are there at every horizon."""
-    of_states = _common([list(errors) for errors in result["errors"].values()] or [[]])
-    return dict.fromkeys(name for name in [*of_states, *result["torque"]] if name != MODEL)
+def _predictors(run: RunResult) -> list[str]:
+    """Return the names of all predictors that are judged at every horizon, or by torque."""
+    return [*_common(run["errors"].values()), *run["torque"]]
 
 
-def _common(lists: Sequence[Sequence[str]]) -> list[str]:
-    first, *rest = lists
-    return [name for name in first if all(name in other for other in rest)]
+def _common(lists: Iterable[Iterable[str]]) -> list[str]:
+    """Return the names that are in all lists, once, in the order of the first."""
+    first, *others = [list(names) for names in lists] or [[]]
+    return [name for name in dict.fromkeys(first) if all(name in names for names in others)]
 
 
-def _text(value: float | None) -> str:
-    if isinstance(value, int):
-        return f"{value:,}"
-    return number(value)
+def _by_robot(fleet: FleetResults) -> dict[str, list[RunResult]]:
+    robots: dict[str, list[RunResult]] = {}
+    for run in fleet.results:
+        robots.setdefault(run["robot"], []).append(run)
+    return robots
 
 
-def _searches(found: FleetResults) -> Listing:
-    rows = tuple(
-        (
-            f"{robot}, {preset}",
-            ", ".join(f"{k} {_text(x)}" for k, x in each.options.items()),
-            number(each.loss),
-            str(each.trials),
-        )
-        for (robot, preset), each in found.found.items()
-    )
-    return Listing(
-        "What the search chose, by validation loss", ("", "options", "loss", "trials"), rows, left=(0, 1)
-    )
+def _search_listing(search: Sequence[SearchResult]) -> Listing:
+    rows = []
+    for result in search:
+        options = ", ".join(f"{name} {_text(value)}" for name, value in result.options.items())
+        name = f"{result.robot}, {result.preset}"
+        rows.append((name, options, number(result.validation), str(result.trials)))
+    title = "What the search chose, by validation loss"
+    return Listing(title, ("", "options", "loss", "trials"), tuple(rows), left=(0, 1))
 
 
 def _unit_listing(units: Units, quantity: Quantity) -> Listing:
-    """A row for each joint or parameter; a column for each unit, in order of their days."""
-    titles = [
-        name if day is None else f"{name} {day}" for name, day in zip(units.names, units.days, strict=True)
-    ]
-    rows = tuple(
-        (
-            label,
-            *(number(unit[k]) for unit in quantity.values),
-            number(quantity.common[k]),
-            number(quantity.spread[k]),
-        )
-        for k, label in enumerate(quantity.labels)
-    )
+    """Return a row for each joint or parameter; a column for each unit, in order of their days."""
+    columns = [*quantity.values, quantity.common, quantity.spread]
+    rows = []
+    for k, label in enumerate(quantity.labels):
+        rows.append((label, *(number(column[k]) for column in columns)))
+    names = [f"{name} {day or ''}".rstrip() for name, day in zip(units.names, units.days, strict=True)]
     title = f"{units.arm}: {quantity.name} [{quantity.unit}] of {len(units.names)} units or days"
-    return Listing(title, ("", *titles, "all", "spread"), rows)
+    return Listing(title, ("", *names, "all", "spread"), tuple(rows))
 
 
-def _failures(found: FleetResults) -> Listing:
-    rows = tuple((f"{name}: {why}",) for name, why in found.failures.items())
-    return Listing("What failed; started again, it is tried again", ("",), rows)
+def _text(value: float | str | None) -> str:
+    if isinstance(value, str):
+        return value
+    if isinstance(value, int):
+        return f"{value:,}"
+    return number(value)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from datetime import date
 from pathlib import Path
 from typing import Annotated, Any
@@ -9,23 +10,22 @@ from typing import Annotated, Any
 from pydantic import Field, StringConstraints, ValidationError, model_validator
 
 from spelgen.design import PRESET_NAMES
-from spelgen.errors import SettingsError, SpelgenError, collect, suggestion
-from spelgen.settings.messages import explain
+from spelgen.errors import SettingsError, collect, suggestion
+from spelgen.settings.messages import dotted, expected_text, explain
 from spelgen.settings.training import TrainingSettings
 from spelgen.settings.values import Count, Group, NonNegative, Number, Whole
-from spelgen.settings.yaml_document import Document, read_document
+from spelgen.settings.yaml_document import Document, Location, read_document
 
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,60}$")]
+SIZES = ("width", "depth")  # options of a module, beside those of its training
+NOT_SEARCHED = ("prior", "seed", "objective")
 
 
-class _Searched(TrainingSettings):
-    """What a search may vary."""
+class SearchedOptions(TrainingSettings):
+    """Options that a search may vary."""
 
     width: Count = 64
     depth: Count = 2
-
-
-SEARCHED = tuple(x for x in _Searched.model_fields if x not in ("prior", "seed", "objective"))
 
 
 class FleetRobot(Group):
@@ -72,11 +72,11 @@ class Search(Group):
 
 
 class Fleet(Group):
-    """What is run: every arm with every preset, seed and split.
+    """Every arm with every preset, seed and split.
 
     splits: 1 takes train.* and test.* of the logs, or a quarter of the trajectories for the test where there are none;
     k: k-fold cross-validation over whole trajectories. training: options as in a robot's settings, for all. shared:
-    arms of the same URDF are units of one: see `shared.py`. gpus: what each run needs of one, 0: none.
+    arms of the same URDF are units of one: see `units.py`. gpus: what each run needs of one, 0: none.
     """
 
     robots: Annotated[dict[Name, FleetRobot], Field(min_length=1)]
@@ -92,64 +92,71 @@ class Fleet(Group):
 
 
 def load_fleet(path: Path) -> Fleet:
-    """The fleet that a file describes; its paths are relative to its folder. Raises SettingsError, or SpelgenErrors."""
+    """Return the fleet that a file describes; its paths are relative to its folder. Raises SettingsError, SpelgenErrors."""
     document = read_document(path)
     content = document.value()
     try:
         fleet = Fleet.model_validate({} if content is None else content)
     except ValidationError as error:
-        collect([explain(each, document, Fleet) for each in error.errors(include_url=False)])
+        collect([explain(detail, document, Fleet) for detail in error.errors(include_url=False)])
         raise
-    collect([*_unknown(fleet, document)])
+    collect(
+        [*_preset_errors(fleet, document), *_search_errors(fleet, document), *_path_errors(fleet, document)]
+    )
     folder = path.parent
-    robots = {name: _within(robot, folder) for name, robot in fleet.robots.items()}
-    presets = tuple(x if x in PRESET_NAMES else str(folder / x) for x in fleet.presets)
+    presets = tuple(name if name in PRESET_NAMES else str(folder / name) for name in fleet.presets)
+    robots = {name: _resolved(robot, folder) for name, robot in fleet.robots.items()}
     return fleet.model_copy(update={"robots": robots, "presets": presets})
 
 
-def _within(robot: FleetRobot, folder: Path) -> FleetRobot:
-    return robot.model_copy(
-        update={
-            "urdf": folder / robot.urdf,
-            "data": tuple(folder / each for each in robot.data),
-            "mapping": None if robot.mapping is None else folder / robot.mapping,
-        }
-    )
+def _resolved(robot: FleetRobot, folder: Path) -> FleetRobot:
+    paths: dict[str, object] = {
+        "urdf": folder / robot.urdf,
+        "data": tuple(folder / path for path in robot.data),
+    }
+    if robot.mapping is not None:
+        paths["mapping"] = folder / robot.mapping
+    return robot.model_copy(update=paths)
 
 
-def _unknown(fleet: Fleet, document: Document) -> list[SpelgenError]:
-    """Names that the file speaks of and nothing has."""
-    errors: list[SpelgenError] = []
-
-    def wrong(location: tuple[Any, ...], got: str, known: tuple[str, ...], do: str | None = None) -> None:
-        errors.append(
-            SettingsError(
-                got, file=document.path, line=document.line(location), element=".".join(map(str, location)),
-                do=do or suggestion(str(location[-1]), known),
-            )
-        )  # fmt: skip
-
+def _preset_errors(fleet: Fleet, document: Document) -> Iterator[SettingsError]:
     for number, preset in enumerate(fleet.presets):
         if preset not in PRESET_NAMES and Path(preset).suffix not in (".yaml", ".yml"):
-            wrong(
-                ("presets", number),
-                f"unknown preset {preset!r}",
-                PRESET_NAMES,
-                suggestion(preset, PRESET_NAMES),
+            yield _error(
+                document, ("presets", number), f"unknown preset {preset!r}", suggestion(preset, PRESET_NAMES)
             )
-    for name, among in () if fleet.search is None else fleet.search.over.items():
-        if name not in SEARCHED:
-            wrong(("search", "over", name), f"unknown option {name!r}", SEARCHED)
+
+
+def _search_errors(fleet: Fleet, document: Document) -> Iterator[SettingsError]:
+    if fleet.search is None:
+        return
+    known = [name for name in SearchedOptions.model_fields if name not in NOT_SEARCHED]
+    for name, candidates in fleet.search.over.items():
+        location = ("search", "over", name)
+        if name not in known:
+            yield _error(document, location, f"unknown option {name!r}", suggestion(name, known))
             continue
-        for value in (among.low, among.high) if isinstance(among, Range) else among:
+        if isinstance(candidates, Range):
+            candidates = (candidates.low, candidates.high)
+        for value in candidates:
             try:
-                _Searched.model_validate({name: value})
+                SearchedOptions.model_validate({name: value})
             except ValidationError as error:
-                expected = error.errors()[0]["msg"].removeprefix("Input should be ")
-                wrong(("search", "over", name), repr(value), (), f"expected {expected}")
+                expected = expected_text(error.errors()[0]["msg"])
+                yield _error(document, location, repr(value), f"expected {expected}")
+
+
+def _path_errors(fleet: Fleet, document: Document) -> Iterator[SettingsError]:
     for name, robot in fleet.robots.items():
-        for key, paths in (("urdf", [robot.urdf]), ("data", robot.data), ("mapping", [robot.mapping])):
-            for each in paths:
-                if each is not None and not (document.path.parent / each).exists():
-                    wrong(("robots", name, key), f"no such file: {each}", (), "check the path")
-    return errors
+        paths = [("urdf", robot.urdf), *(("data", path) for path in robot.data)]
+        if robot.mapping is not None:
+            paths.append(("mapping", robot.mapping))
+        for key, path in paths:
+            if not (document.path.parent / path).exists():
+                yield _error(document, ("robots", name, key), f"no such file: {path}", "check the path")
+
+
+def _error(document: Document, location: Location, got: str, do: str) -> SettingsError:
+    return SettingsError(
+        got, file=document.path, line=document.line(location), element=dotted(location), do=do
+    )

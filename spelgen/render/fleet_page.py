@@ -13,17 +13,17 @@ from spelgen.listing import Listing
 from spelgen.render.page import render_page
 
 
-def write_fleet(found: FleetResults, listings: Sequence[Listing], path: Path) -> Path:
+def write_fleet(fleet: FleetResults, listings: Sequence[Listing], path: Path) -> Path:
     """Write the page; return its path."""
-    arms = len({result["robot"] for result in found.results})
-    wins = [f"{name} of {count}" for name, count in winners(found).items()]
+    arms = len({result["robot"] for result in fleet.results})
+    wins = [f"{name} of {count}" for name, count in winners(fleet).items()]
     text = render_page(
         "fleet.html.jinja",
         verdict=f"Predicts best of {arms} arm{'s' * (arms > 1)}: {listed(wins)}."
         if wins
         else "No run has ended.",
-        runs=len(found.results),
-        failures=len(found.failures),
+        runs=len(fleet.results),
+        failures=len(fleet.failures),
         listings=listings,
     )
     return write_text(path, text)
