@@ -92,7 +92,10 @@ class Fleet(Group):
 
 
 def load_fleet(path: Path) -> Fleet:
-    """Return the fleet that a file describes; its paths are relative to its folder. Raises SettingsError, SpelgenErrors."""
+    """Return the fleet that a file describes; its paths are relative to its folder.
+
+    Raises SettingsError, or SpelgenErrors with all that is wrong.
+    """
     document = read_document(path)
     content = document.value()
     try:
