@@ -9,10 +9,13 @@ from pathlib import Path
 import pytest
 import torch
 from emitted import SIX, built, import_source, random_model
+from exported_runs import arm_of
 from torch import Tensor
 from torch.func import hessian, jacfwd, jacrev, jvp, vjp, vmap
 
-from spelgen.design import load_design
+from spelgen.building import build
+from spelgen.design import PRESET_NAMES, load_design
+from spelgen.dynamics.parameters import parameter_table, parameters_of_kind
 from spelgen.emission.bundle import bundle, load_runtime, names_in
 from spelgen.runtime.encoding import JointEncoding, joint_input, lie_group_input
 from spelgen.runtime.friction_laws import FrictionLaws, tanh_ratio
@@ -338,3 +341,19 @@ def test_numbers_are_those_of_the_first_stage(case, tmp_path):
         }
     for name, expected in json.loads(NUMBERS.read_text())[case].items():
         near(found[name], torch.tensor(expected, dtype=torch.float64), 1e-12)
+
+
+def test_every_weight_says_what_it_stands_for():
+    """Fits, exports and reports find weights by kind: a part that declares nothing would pass for a network."""
+    networks = ("network.", "friction.weight", "friction.bias", "friction.out", "friction.offset")
+    for preset in PRESET_NAMES:
+        model = build(arm_of("rpr"), preset)
+        table = parameter_table(model)
+        assert list(table)[: len(list(model.parameters()))] == [name for name, _ in model.named_parameters()]
+        for name, info in table.items():
+            assert (info.kind == "network") == any(part in name for part in networks), name
+    assert parameters_of_kind(build(arm_of("rpr"), "hybrid"), "bodies", "friction_compensation") == (
+        "bodies.raw",
+        "raw_friction_compensation",
+    )
+    assert table["friction.network.weights.0"].kind == "network"

@@ -73,6 +73,8 @@ class MotorGain(NamedTuple):
 class MotorInput(nn.Module):
     """G, (n, n), of gears and couplings between motors and joints, some of them trained."""
 
+    kinds = (("raw_gains", "gains", "1"),)
+
     actuated: Tensor
     known: Tensor
     trained: Tensor

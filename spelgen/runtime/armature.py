@@ -11,6 +11,8 @@ from spelgen.runtime.joints import Joints, vector
 class Armature(nn.Module):
     """Rotor inertia times gear squared of each joint, never negative; the weights are logarithms."""
 
+    kinds = (("raw", "armature", "kg m^2, kg"),)
+
     nominal: Tensor
     gear: Tensor
 

@@ -19,6 +19,8 @@ class ConstantMass(nn.Module):
     enter by their sizes, so that M stays positive definite.
     """
 
+    kinds = (("raw_constants", "mass_constants", "kg m^2, kg m, kg"),)
+
     constant_scale: Tensor
     constant_basis: Tensor
 

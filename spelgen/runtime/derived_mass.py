@@ -45,6 +45,8 @@ class DerivedMass(nn.Module):
     PositiveDefiniteBound): M is positive definite for all q and all weights.
     """
 
+    kinds = (("raw_constants", "mass_constants", "kg m^2, kg m, kg"),)
+
     constant_scale: Tensor
     constant_basis: Tensor  # (constants, n n)
     function_mean: Tensor

@@ -43,6 +43,18 @@ class FrictionLaws(nn.Module):
     where nothing is known of the way here, tanh(qd / coulomb_smoothing_velocity).
     """
 
+    kinds = (
+        ("raw_viscous", "sizes", "Nm s/rad, N s/m"),
+        ("raw_saturation", "sizes", "Nm, N"),
+        ("raw_saturation_velocity", "velocities", "rad/s, m/s"),
+        ("raw_coulomb", "sizes", "Nm, N"),
+        ("raw_stribeck", "sizes", "Nm, N"),
+        ("raw_stribeck_velocity", "velocities", "rad/s, m/s"),
+        ("raw_coulomb_smoothing_velocity", "velocities", "rad/s, m/s"),
+        ("raw_load_dependence", "load_dependence", "1"),
+        ("raw_bristle_fractions", "fractions", "1"),
+    )
+
     nominal: Tensor
     speed: Tensor
     raw_coulomb_smoothing_velocity: nn.Parameter | None

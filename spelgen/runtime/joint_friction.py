@@ -31,6 +31,11 @@ class FrictionLayers(NamedTuple):
 class JointFriction(nn.Module):
     """A diagonal D(q, qd), positive for all weights."""
 
+    kinds = (
+        ("raw_viscous", "sizes", "Nm s/rad, N s/m"),
+        ("raw_smoothing", "velocities", "rad/s, m/s"),
+    )
+
     matrix: Tensor  # where the inputs of a joint's network stand, (joints, inputs, encoded + 2 n)
     speed: Tensor
     nominal: Tensor

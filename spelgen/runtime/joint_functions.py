@@ -63,6 +63,12 @@ class JointFunctions(nn.Module):
     Weights are zero at first; torques are in units of usual friction.
     """
 
+    kinds = (
+        ("raw_torque_splines", "torque_splines", "Nm, N"),
+        ("raw_torque_ripple", "torque_ripple", "Nm"),
+        ("raw_friction_splines", "friction_splines", "1"),
+    )
+
     scale: Tensor
     spacing: Tensor
     middles: Tensor

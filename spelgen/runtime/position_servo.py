@@ -29,6 +29,13 @@ class PositionServo(nn.Module):
     port-Hamiltonian too, with u as its input. The weights are logarithms.
     """
 
+    kinds = (
+        ("raw_kp", "stiffness", "Nm/rad, N/m"),
+        ("raw_kd", "damping", "Nm s/rad, N s/m"),
+        ("dead_zone", "dead_zone", "rad, m"),
+        ("delay", "delay", "s"),
+    )
+
     nominal_kp: Tensor
     nominal_kd: Tensor
     trained: Tensor

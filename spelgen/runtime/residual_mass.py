@@ -32,6 +32,8 @@ class ResidualMass(nn.Module):
     ``armature`` + R is positive definite for all q and all weights (see ``bounds``).
     """
 
+    kinds = (("raw_constants", "mass_residuals", "kg m^2, kg m, kg"),)
+
     basis: Tensor  # (functions + constants, n, n)
     inverse: Tensor  # one by |basis|, NEVER where that is zero
 

@@ -136,6 +136,8 @@ class InertialParameters(nn.Module):
     diagonal exponentials (Rucker and Wensing, IEEE RA-L 7:4352, 2022).
     """
 
+    kinds = (("raw", "bodies", "kg, kg m, kg m^2"),)
+
     factors: Tensor
     triangle: Tensor
 

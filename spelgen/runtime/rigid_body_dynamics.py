@@ -48,6 +48,11 @@ class Motion(NamedTuple):
 class RigidBodyDynamics(PortHamiltonian):
     """Rigid bodies with trained inertial parameters, friction by laws, a trained torque offset."""
 
+    kinds = (
+        ("raw_offset", "offset", "Nm, N"),
+        ("raw_friction_compensation", "friction_compensation", "Nm s/rad, N s/m"),
+    )
+
     basis: Tensor
     actuated: Tensor
     motors: Tensor  # C: the drives' speeds are C qd, (n, n)

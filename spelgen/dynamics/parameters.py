@@ -1,0 +1,43 @@
+"""What each trained number of a model stands for, as the parts of the runtime declare it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import nn
+
+
+@dataclass(frozen=True)
+class ParameterInfo:
+    """A parameter by what it stands for, whichever part of a model holds it.
+
+    kind: bodies, armature, gains, offset, friction_compensation, sizes, velocities, load_dependence, fractions (of
+    bristles), torque_splines, torque_ripple, friction_splines, mass_constants, mass_residuals, stiffness, damping,
+    dead_zone, delay, or network. unit: of the quantity that the parameter makes, of revolute and of prismatic joints;
+    most parameters are logarithms of it, relative to a nominal value.
+    """
+
+    kind: str
+    unit: str
+
+
+NETWORK = ParameterInfo("network", "1")
+"""Of all parameters that no part declares: weights and biases."""
+
+
+def parameter_table(model: nn.Module) -> dict[str, ParameterInfo]:
+    """Return, by name, what a model's parameters stand for, and the buffers that a fit may set.
+
+    Buffers are those that a part declares: what only some logs can tell, such as a friction compensation.
+    """
+    table = {name: NETWORK for name, _ in model.named_parameters()}
+    for path, part in model.named_modules():
+        for name, kind, unit in getattr(part, "kinds", ()):
+            if getattr(part, name) is not None:  # a part may do without
+                table[f"{path}.{name}" if path else name] = ParameterInfo(kind, unit)
+    return table
+
+
+def parameters_of_kind(model: nn.Module, *kinds: str) -> tuple[str, ...]:
+    """Return the names of a model's parameters of these kinds, in its own order."""
+    return tuple(name for name, info in parameter_table(model).items() if info.kind in kinds)
