@@ -1,6 +1,6 @@
-"""Files at addresses that fsspec knows, `s3://bucket/logs` say: copied here to be read, and sent there once written.
+"""Copy files from addresses that fsspec knows, such as `s3://bucket/logs`, and send there what is written.
 
-All else in spelgen works on local paths. What is fetched lies in a temporary folder for as long as the process lives.
+All else in spelgen works on local paths. A copy lies in a temporary folder for as long as the process lives.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Protocol
 
 from spelgen.errors import SpelgenError
 
@@ -22,9 +22,23 @@ ADDRESS = re.compile(r"^([a-z][a-z0-9+.-]+):/+(?=[^/])")
 _copies: dict[str, Path] = {}  # address -> its local copy
 
 
+class FileSystem(Protocol):
+    """What is used of a file system of fsspec, which has no types."""
+
+    def isdir(self, path: str) -> bool: ...
+    def exists(self, path: str) -> bool: ...
+    def find(self, path: str) -> list[str]: ...
+    def get_file(self, remote: str, local: str) -> None: ...
+    def put_file(self, local: str, remote: str) -> None: ...
+    def rm_file(self, path: str) -> None: ...
+    def makedirs(self, path: str, exist_ok: bool) -> None: ...
+
+
 def local(path: Path | str) -> Path:
-    """A local path as it is; of an address the copy of what lies there, a file or a folder: what is written to it, and
-    into it, is sent to the address (see `sent`). Raises SpelgenError where the address cannot be reached.
+    """Return a local path as it is, and of an address the copy of the file or folder there.
+
+    What is written to the copy, and into it, is sent to the address (see `sent`). Raises SpelgenError where the
+    address cannot be reached, or names files outside itself.
     """
     match = ADDRESS.match(str(path))
     if match is None or Path(path).exists():
@@ -33,42 +47,45 @@ def local(path: Path | str) -> Path:
         return Path("/" + str(path)[match.end() :])
     address = f"{match[1]}://{str(path)[match.end() :]}".rstrip("/")
     if address not in _copies:
-        _copies[address] = _fetched(address)
+        _copies[address] = _fetch(address)
     return _copies[address]
 
 
 def sent(path: Path) -> None:
-    """Send a file that was written, or tell of one that was removed, to the address that it is of, if it is of one."""
+    """Send a file that was written to its address, or remove it there if it was removed here."""
     target = address_of(path)
     if target is None:
         return
-    with reached(target) as (system, place):
+    with reached(target) as (system, remote):
         if path.exists():
-            system.makedirs(system._parent(place), exist_ok=True)
-            system.put_file(str(path), place)
-        elif system.exists(place):
-            system.rm_file(place)
+            system.makedirs(remote.rpartition("/")[0], exist_ok=True)
+            system.put_file(str(path), remote)
+        elif system.exists(remote):
+            system.rm_file(remote)
 
 
 def address_of(path: Path) -> str | None:
-    """The address of which a path is the copy, or stands in it; None: it is a local one."""
+    """Return the address that a path is copied from; None of a local path."""
     for address, copy in _copies.items():
-        if path == copy or copy in path.parents:
-            return address if path == copy else f"{address}/{path.relative_to(copy).as_posix()}"
+        if path == copy:
+            return address
+        if copy in path.parents:
+            return f"{address}/{path.relative_to(copy).as_posix()}"
     return None
 
 
 def with_addresses(text: str) -> str:
-    """What is said of local copies, said of their addresses."""
+    """Return a text with addresses in place of their local copies."""
     for address, copy in _copies.items():
         text = text.replace(str(copy), address)
     return text
 
 
 @contextmanager
-def reached(address: str) -> Iterator[tuple[Any, str]]:
-    """The file system of an address, and the path there. Within it, whatever the file system raises names the address:
-    each has kinds of its own.
+def reached(address: str) -> Iterator[tuple[FileSystem, str]]:
+    """Yield the file system of an address, and the path there.
+
+    Within it every exception becomes a SpelgenError that names the address: each file system raises kinds of its own.
     """
     try:
         import fsspec
@@ -85,17 +102,29 @@ def reached(address: str) -> Iterator[tuple[Any, str]]:
         raise SpelgenError(f"cannot be reached ({reason})", file=address) from error
 
 
-def _fetched(address: str) -> Path:
+def _fetch(address: str) -> Path:
+    """Copy the file or folder at an address into a new temporary folder; return where it then lies."""
     folder = Path(tempfile.mkdtemp(prefix="spelgen-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    copy = folder / address.rsplit("/", 1)[-1]
-    with reached(address) as (system, place):
-        if system.isdir(place):
+    copy = _inside(folder, address.rpartition("/")[2], address)
+    with reached(address) as (system, remote):
+        if system.isdir(remote):
             copy.mkdir()
-            for each in system.find(place):
-                target = copy / each[len(place.rstrip("/")) :].lstrip("/")
+            for key in system.find(remote):
+                target = _inside(copy, key.removeprefix(remote.rstrip("/")).lstrip("/"), address)
                 target.parent.mkdir(parents=True, exist_ok=True)
-                system.get_file(each, str(target))
-        elif system.exists(place):
-            system.get_file(place, str(copy))
+                system.get_file(key, str(target))
+        elif system.exists(remote):
+            system.get_file(remote, str(copy))
     return copy
+
+
+def _inside(folder: Path, name: str, address: str) -> Path:
+    """Return where a name lies in a folder. Raises SpelgenError where it leads out of it.
+
+    Archives and object stores take any text for a key, `../../.bashrc` too.
+    """
+    path = folder / name
+    if folder.resolve() not in path.resolve().parents:
+        raise SpelgenError(f"the key {name!r}", file=address, expected="keys inside the address alone")
+    return path

@@ -17,6 +17,7 @@ from typing import Any, Literal
 
 from spelgen.design import Design, Net
 from spelgen.errors import ModuleError
+from spelgen.files import require_regular_file
 
 Assume = Literal["kinematics", "inertials"]
 """Which values of the URDF are trusted: the kinematics alone, or the inertials' zeros and symmetries too."""
@@ -239,8 +240,7 @@ def read_source(path: str | Path) -> str:
     path = Path(path)
     if not path.exists():
         raise ModuleError("no such file", file=path, do="build it with `spelgen build`")
-    if not path.is_file():  # a pipe might never end
-        raise ModuleError("no regular file", file=path, expected="a module written by `spelgen build`")
+    require_regular_file(path, ModuleError, "a module written by `spelgen build`")
     try:
         return path.read_text(encoding="utf-8")
     except (OSError, ValueError) as problem:

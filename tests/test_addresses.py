@@ -5,6 +5,7 @@ import os
 import socket
 import time
 import uuid
+import zipfile
 from pathlib import Path
 
 import fsspec
@@ -81,6 +82,23 @@ def test_addresses_that_lead_nowhere(memory, tmp_path):
     assert local(tmp_path / "a:" / "b") == tmp_path / "a:" / "b"
     assert local("C:/x").name == "x"
     assert local(f"file://{tmp_path}/run") == tmp_path / "run" == local(Path(f"file://{tmp_path}/run"))
+
+
+def test_keys_that_lead_out_of_an_address_are_refused(tmp_path, memory):
+    with zipfile.ZipFile(tmp_path / "evil.zip", "w") as archive:
+        archive.writestr("logs/train.csv", "t")
+        archive.writestr("logs/../../../../../../../tmp/spelgen_was_here", "x")
+    with pytest.raises(
+        SpelgenError, match=r"^zip://logs::.*evil\.zip: got the key '.*was_here', expected keys in"
+    ):
+        local(f"zip://logs::{tmp_path}/evil.zip")
+    memory.pipe("/bucket/logs/../../x.csv", b"t")
+    memory.store["/bucket/logs/a/../../../y.csv"] = memory.store.popitem()[1]
+    with pytest.raises(SpelgenError, match=r"^memory://bucket: got the key '.*y\.csv', expected keys inside"):
+        local("memory://bucket")
+    with pytest.raises(SpelgenError, match=r"^memory://data/\.\.: got the key '\.\.', expected keys inside"):
+        local("memory://data/..")
+    assert not Path("/tmp/spelgen_was_here").exists()
 
 
 # ---- one training at a time

@@ -16,6 +16,7 @@ from spelgen.errors import LogError, SpelgenErrors
 from spelgen.loaded_arm import load_arm
 from spelgen.log_checks.check_logs import check_logs, require_possible_torques
 from spelgen.log_checks.statistics import noise_level, quantisation_step, statistics
+from spelgen.logs import chunks
 from spelgen.logs.read import write_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.render.logs_page import page
@@ -242,8 +243,7 @@ def test_logs_larger_than_memory_are_told_by_parts(spelgen, robots, arm, log, tm
     write_logs(tmp_path / "logs.parquet", [log], names)
     command = ["logs", "logs.parquet", "--robot", robots / "rpr.urdf", "--format", "json"]
     whole = json.loads(spelgen(*command).stdout)
-    monkeypatch.setattr("spelgen.logs.chunks.IN_MEMORY", 1000)
-    monkeypatch.setattr("spelgen.logs.chunks.LONGEST", 600)
+    monkeypatch.setattr(chunks, "TUNING", replace(chunks.TUNING, in_memory=1000, chunk_samples=600))
     told = json.loads(spelgen(*command).stdout)
     assert [x["name"] for x in told["trajectories"]] == [f"motion [{k}]" for k in range(1, 5)]
     assert [x["low"] for x in told["joints"]] == [x["low"] for x in whole["joints"]]

@@ -6,6 +6,7 @@ import sys
 import textwrap
 import tracemalloc
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,12 @@ import pytest
 
 from spelgen.errors import LogError, SettingsError, SpelgenErrors
 from spelgen.loaded_arm import load_arm
+from spelgen.logs import formats, npz
 from spelgen.logs.chunks import scan
+from spelgen.logs.formats import FORMATS
 from spelgen.logs.read import read_logs, write_logs
+from spelgen.logs.suggest import suggest_mapping
+from spelgen.logs.tables import LogFormat, LogTable, table_layout
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.log_mapping import LogMapping
 
@@ -309,6 +314,49 @@ def test_arrays_that_are_not_asked_for_are_not_looked_at(tmp_path):
     tracemalloc.stop()
 
 
+def test_arrays_that_unpack_to_more_than_memory_are_refused(tmp_path, monkeypatch):
+    np.savez_compressed(tmp_path / "x.npz", **columns(q_elbow=np.zeros(2_000_000)))
+    assert (tmp_path / "x.npz").stat().st_size < 50_000
+    monkeypatch.setattr(npz, "TUNING", replace(npz.TUNING, npz_bytes=1_000_000))
+    tracemalloc.start()
+    with pytest.raises(LogError) as caught:
+        read_logs(tmp_path / "x.npz", JOINTS)
+    assert tracemalloc.get_traced_memory()[1] < 1e6
+    tracemalloc.stop()
+    assert str(caught.value) == (
+        f"{tmp_path}/x.npz: array q_elbow.npy: got 0.016 GB of arrays, expected at most 0.001 GB; "
+        "write larger logs as Parquet"
+    )
+
+
+def test_arrays_that_promise_more_than_they_hold_are_refused(tmp_path):
+    head = b"\x93NUMPY\x01\x00v\x00{'descr': '<f8', 'fortran_order': False, 'shape': (100000000000000,), }"
+    with zipfile.ZipFile(tmp_path / "x.npz", "w") as archive:
+        archive.writestr("t.npy", head.ljust(127) + b"\n" + bytes(80))
+    with pytest.raises(LogError, match=r"x\.npz: an unreadable npz file"):
+        read_logs(tmp_path / "x.npz", JOINTS)
+
+
+def test_a_new_format_is_a_reader_and_its_name_among_the_formats(tmp_path, monkeypatch):
+    """As docs/extending.md says: reading, folders, messages and suggestions follow."""
+
+    def as_table(file):
+        rows = [[float(x) for x in line.split()] for line in file.read_text().splitlines()]
+        return pa.table(dict(zip(columns(), np.transpose(rows), strict=True)))
+
+    def read(file, joints, mapping):
+        table = as_table(file)
+        return [LogTable(None, table, table_layout(table.schema, joints, mapping, file))]
+
+    monkeypatch.setattr(formats, "FORMATS", [*FORMATS, LogFormat(read, suffixes=(".txt",), columns=as_table)])
+    np.savetxt(tmp_path / "x.txt", np.stack(list(columns().values()), axis=1), fmt="%.17g")
+    check(read_logs(tmp_path, JOINTS)[0], "x")
+    assert "q_shoulder" in suggest_mapping(tmp_path / "x.txt", JOINTS, ["revolute"] * 2).text
+    with pytest.raises(LogError, match=r"got a file of kind '\.odd', expected .*\.db3, \.txt, the folder"):
+        (tmp_path / "y.odd").touch()
+        read_logs(tmp_path / "y.odd", JOINTS)
+
+
 def test_a_trajectory_named_twice_in_a_column_is_one_text(tmp_path):
     arrays = {f"{k}/t_{k}": T for k in ("a", "b")} | {"a/t_b": T, "/t_": T}
     for k in ("a", "b"):
@@ -332,7 +380,7 @@ def test_pipes_among_logs_are_not_waited_for(tmp_path, suffix):
     with pytest.raises(LogError) as caught:
         read_logs(tmp_path / f"live{suffix}", JOINTS)
     kinds = ".parquet, .csv, .npz, .mcap, .db3, the folder of a ROS 2 bag or of a LeRobot data set"
-    assert str(caught.value) == f"{tmp_path}/live{suffix}: got a pipe or a device, expected a file: {kinds}"
+    assert str(caught.value) == f"{tmp_path}/live{suffix}: got no regular file, expected a file: {kinds}"
     parquet(tmp_path / "x.parquet", columns())
     check(read_logs(tmp_path, JOINTS)[0], "x")
 
@@ -429,7 +477,7 @@ def test_a_pipe_in_a_bag_is_not_waited_for(bag):
     with pytest.raises(LogError) as caught:
         read_logs([folder], JOINTS)
     assert str(caught.value) == (
-        f"{folder}/live: got a pipe or a device, expected files in the folder of a ROS 2 bag"
+        f"{folder}/live: got no regular file, expected files in the folder of a ROS 2 bag"
     )
 
 

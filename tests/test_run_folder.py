@@ -5,6 +5,7 @@ import json
 import os
 import re
 import resource
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -258,8 +259,7 @@ def test_a_checkpoint_that_lost_a_number_is_told(plain, tmp_path):
 
 
 def test_a_log_that_changes_under_training_is_told(start, tmp_path, monkeypatch):
-    monkeypatch.setattr(chunks, "IN_MEMORY", 100)
-    monkeypatch.setattr(chunks, "LONGEST", 25)
+    monkeypatch.setattr(chunks, "TUNING", replace(chunks.TUNING, in_memory=100, chunk_samples=25))
     path = tmp_path / "train.parquet"
     write_logs(path, motions(), JOINTS)
     (chunk, _), *_ = chunks.scan([path], JOINTS)

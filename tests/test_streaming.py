@@ -1,6 +1,7 @@
 """Logs larger than memory: the same samples and windows as in memory, drawn part by part, the same when resumed."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -49,7 +50,7 @@ def same(first: Trajectory, second: Trajectory) -> bool:
 @pytest.fixture(params=[37, 1000, 10_000])
 def log(request, tmp_path, monkeypatch) -> Path:
     """A file of row groups of this size that is read as one larger than memory."""
-    monkeypatch.setattr(chunks, "IN_MEMORY", 1000)
+    monkeypatch.setattr(chunks, "TUNING", replace(chunks.TUNING, in_memory=1000))
     write_logs(tmp_path / "log.parquet", recordings(), JOINTS)
     table = pa.parquet.read_table(tmp_path / "log.parquet")
     pa.parquet.write_table(table, tmp_path / "train.parquet", row_group_size=request.param)
@@ -67,7 +68,7 @@ def test_parts_hold_the_samples_of_the_recordings(log):
 
 
 def test_long_recordings_are_several_parts(log, monkeypatch):
-    monkeypatch.setattr(chunks, "LONGEST", 150)
+    monkeypatch.setattr(chunks, "TUNING", replace(chunks.TUNING, chunk_samples=150))
     found = dict((part.name, part) for part, _ in scan([log], JOINTS, LogMapping()))
     assert list(found)[:4] == ["r0 [1]", "r0 [2]", "r0 [3]", "r1 [1]"]
     for whole in read_logs([log], JOINTS):
@@ -138,7 +139,7 @@ def test_preparation_finds_what_it_finds_in_memory(log):
 
 
 def test_a_last_sample_alone_changes_nothing(log, monkeypatch):
-    monkeypatch.setattr(chunks, "LONGEST", 399)
+    monkeypatch.setattr(chunks, "TUNING", replace(chunks.TUNING, chunk_samples=399))
     found = prepare_streamed(LargeLogs((log,), JOINTS, KINDS), CONFIG, AUTOMATIC)
     plain = prepare_data(read_logs([log], JOINTS), JOINTS, KINDS, CONFIG, AUTOMATIC)
     assert found.preprocessing.cutoff == plain.preprocessing.cutoff == 8.0
@@ -174,7 +175,7 @@ def test_training_streams_and_resumes_with_the_same_numbers(log, tmp_path, monke
 
 @pytest.mark.parametrize("group", [4096, 1_600_000])
 def test_a_log_is_never_in_memory_as_a_whole(tmp_path, monkeypatch, group):
-    monkeypatch.setattr(chunks, "LONGEST", 4096)
+    monkeypatch.setattr(chunks, "TUNING", replace(chunks.TUNING, chunk_samples=4096))
     monkeypatch.setattr(chunks, "ROW_GROUP", 4096)
     random = np.random.default_rng(0)
     columns = {name: random.standard_normal(1_600_000) for name in ("q_a", "qd_a", "tau_a")}
@@ -199,7 +200,7 @@ def test_only_large_parquet_is_streamed(log, tmp_path, monkeypatch):
         LogError, match=r"more\.csv: got a log beside others too large for memory, expected Parq"
     ):
         large_files([log, tmp_path / "more.csv"], JOINTS)
-    monkeypatch.setattr(chunks, "IN_MEMORY", 10**6)
+    monkeypatch.setattr(chunks, "TUNING", replace(chunks.TUNING, in_memory=10**6))
     assert large_files([log, tmp_path / "more.csv"], JOINTS) == []
 
 
@@ -221,9 +222,8 @@ BROKEN = {
 @pytest.mark.parametrize("case", BROKEN)
 def test_errors_tell_the_row_of_the_file(log, monkeypatch, case):
     row, column, value, message = BROKEN[case]
-    monkeypatch.setattr(
-        chunks, "LONGEST", 50
-    )  # row 450 begins a part: its time is compared with the last one's
+    # row 450 begins a chunk: its time is compared with the last one's
+    monkeypatch.setattr(chunks, "TUNING", replace(chunks.TUNING, chunk_samples=50))
     with pytest.raises(LogError, match=message):
         list(scan([broken(log, row, column, value)], JOINTS, LogMapping()))
 

@@ -516,7 +516,7 @@ def test_a_log_larger_than_memory_is_fitted_to_torques(emitted, robots, tmp_path
     write(tmp_path / "train.parquet", logs, arm)
     (tmp_path / "arm.py").write_text(generate(robots / "two_link.urdf", preset="closed-form"))
     plain = train(tmp_path / "arm.py", [tmp_path / "train.parquet"], tmp_path / "plain", progress=False)
-    monkeypatch.setattr(chunks, "IN_MEMORY", 1000)
+    monkeypatch.setattr(chunks, "TUNING", replace(chunks.TUNING, in_memory=1000))
     monkeypatch.setattr(torque_jacobian, "BLOCK", 100)
     large = train(tmp_path / "arm.py", [tmp_path / "train.parquet"], tmp_path / "large", progress=False)
     assert {"streamed", "torque-fit"} <= {note.code for note in large.diagnostics}

@@ -15,7 +15,7 @@ import torch
 from spelgen.addresses import address_of, local, sent
 from spelgen.emission.loading import has_run, load_module
 from spelgen.errors import RunError
-from spelgen.files import naming, remove, write_bytes
+from spelgen.files import naming, remove, require_regular_file, write_bytes
 from spelgen.fitting.address_lock import refresh
 from spelgen.fitting.run_schema import require_checkpoint, require_epoch, require_record
 from spelgen.spec import read_source
@@ -198,8 +198,7 @@ class RunFolder:
 
 def _text(path: Path, errors: str = "strict") -> str:
     """The text of a file; RunError for a pipe, which might never end."""
-    if not path.is_file():
-        raise RunError("no regular file", file=path)
+    require_regular_file(path, RunError)
     return path.read_text(encoding="utf-8", errors=errors)
 
 

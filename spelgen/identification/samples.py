@@ -1,4 +1,4 @@
-"""Logs -> samples on which accelerations can be had: filtered, at one rate, where the arm moves."""
+"""Take samples from logs on which accelerations can be had: filtered, at one rate, where the arm moves."""
 
 from __future__ import annotations
 
@@ -9,23 +9,24 @@ from itertools import pairwise
 import numpy as np
 
 from spelgen.dynamics.bristles import BristleReach, bristles_along
-from spelgen.logs.filtering import AUTOMATIC_CUTOFF, low_pass, low_pass_regular, resample
+from spelgen.logs.filtering import low_pass, low_pass_regular, resample
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
+from spelgen.settings.tuning.identification import IdentificationTuning
+from spelgen.settings.tuning.logs import LogTuning
 
-FREQUENCY = 100.0  # [Hz] of the common grid
-MOVING = 0.02  # [rad/s, m/s] samples at which every joint is slower say nothing of dynamics
-DENSE = 50.0  # [Hz] below this rate accelerations cannot be had from a log
-SHORTEST = 1.0  # [s] pieces below this are all filter transient
-HOLE = 0.25 / AUTOMATIC_CUTOFF  # [s] a shorter one loses nothing that the filter lets through
+TUNING = IdentificationTuning()
+FREQUENCY = TUNING.sample_rate
+DENSE = LogTuning().dense_rate
+HOLE = 0.25 / LogTuning().automatic_cutoff  # [s] a shorter one loses nothing that the filter lets through
 AUTOMATIC = Preprocessing()
 
 
 @dataclass(frozen=True, eq=False)
 class DynamicsSamples:
-    """Samples (T, n) of one trajectory: q, qd, qdd [rad, s; m, s] and tau [Nm, N] as logged.
+    """Hold samples (T, n) of one trajectory: q, qd, qdd [rad, s; m, s] and tau [Nm, N] as logged.
 
-    z: (T, n, K) [rad, m], friction's memory of the way there; None: not known.
+    z: (T, n, K) [rad, m], states of friction's bristles from the motion before; None: not known.
     """
 
     name: str
@@ -43,7 +44,7 @@ def dynamics_samples(
     preprocessing: Preprocessing = AUTOMATIC,
     reach: BristleReach | None = None,
 ) -> list[DynamicsSamples]:
-    """The moving samples of each dense enough trajectory.
+    """Return the moving samples of each dense enough trajectory.
 
     At 100 Hz, through the zero-phase low-pass of ``preprocessing``, by default of 8 Hz, on q, qd and tau (before the
     change of rate where the log is denser, after it where not), qdd by central differences of the filtered qd, only
@@ -51,51 +52,56 @@ def dynamics_samples(
     moves to the last, standstill between them included. ``reach``: of the bristles whose states z are
     wanted, through the same filter; see ``bristles_along``.
     """
-    return [
-        _samples(x, pauses, preprocessing, reach)
-        for x in trajectories
-        if x.sample_rate >= DENSE and any(map(_long, _pieces(x, preprocessing.gap)))
-    ]
+    samples = []
+    for trajectory in trajectories:
+        if trajectory.sample_rate < DENSE:
+            continue
+        pieces = _long_pieces(trajectory, preprocessing.gap)
+        if not pieces:
+            continue
+        columns = [_columns(piece, pauses, preprocessing, reach) for piece in pieces]
+        joined = [np.concatenate(arrays) for arrays in zip(*columns, strict=True)]
+        samples.append(DynamicsSamples(trajectory.name, *joined))
+    return samples
 
 
-def _pieces(trajectory: Trajectory, gap: float) -> list[Trajectory]:
+def _long_pieces(trajectory: Trajectory, gap: float) -> list[Trajectory]:
+    """Return the pieces between holes of which a filter leaves something."""
     steps = np.diff(trajectory.t)
     if not steps.size:
-        return [trajectory]
-    holes = steps > max(gap * np.median(steps), HOLE)
-    ends = [0, *(np.flatnonzero(holes) + 1), len(trajectory.t)]
-    return [trajectory[start:stop] for start, stop in pairwise(ends)]
+        return []
+    holes = np.flatnonzero(steps > max(gap * np.median(steps), HOLE)) + 1
+    pieces = []
+    for start, stop in pairwise([0, *holes, len(trajectory)]):
+        piece = trajectory[start:stop]
+        if piece.duration >= TUNING.shortest_piece:
+            pieces.append(piece)
+    return pieces
 
 
-def _long(piece: Trajectory) -> bool:
-    return bool(piece.t[-1] - piece.t[0] >= SHORTEST)
-
-
-def _samples(
-    trajectory: Trajectory, pauses: bool, preprocessing: Preprocessing, reach: BristleReach | None
-) -> DynamicsSamples:
-    parts = []
-    for piece in filter(_long, _pieces(trajectory, preprocessing.gap)):
-        smooth = _at_common_rate(piece, preprocessing.acceleration_cutoff)
-        qdd = np.gradient(smooth.qd, smooth.t, axis=0)
-        taken = (np.abs(smooth.qd) > MOVING).any(axis=1)
-        if pauses and taken.any():
-            first, *_, last = np.flatnonzero(taken)
-            taken[first:last] = True
-        columns = [smooth.q, smooth.qd, qdd, smooth.tau]
-        if reach is not None and reach.elements:
-            z, cutoff = bristles_along(smooth.q, reach), preprocessing.acceleration_cutoff
-            # the torque's steps where joints turn around went through the filter, so must these
-            columns.append(z if cutoff is None else low_pass_regular(z, FREQUENCY, cutoff))
-        parts.append([x[taken] for x in columns])
-    return DynamicsSamples(
-        trajectory.name, *(np.concatenate(columns) for columns in zip(*parts, strict=True))
-    )
+def _columns(
+    piece: Trajectory, pauses: bool, preprocessing: Preprocessing, reach: BristleReach | None
+) -> list[np.ndarray]:
+    """Return q, qd, qdd, tau, and z where a reach is given, of the selected samples of a piece."""
+    cutoff = preprocessing.acceleration_cutoff
+    smooth = _at_common_rate(piece, cutoff)
+    qdd = np.gradient(smooth.qd, smooth.t, axis=0)
+    selected = (np.abs(smooth.qd) > TUNING.moving).any(axis=1)
+    if pauses and selected.any():
+        moving = np.flatnonzero(selected)
+        selected[moving[0] : moving[-1]] = True
+    columns = [smooth.q, smooth.qd, qdd, smooth.tau]
+    if reach is not None and reach.elements:
+        z = bristles_along(smooth.q, reach)
+        # the torque's steps where joints turn around went through the filter, so must these
+        columns.append(z if cutoff is None else low_pass_regular(z, FREQUENCY, cutoff))
+    return [x[selected] for x in columns]
 
 
 def _at_common_rate(piece: Trajectory, cutoff: float | None) -> Trajectory:
     if cutoff is None:
         return resample(piece, FREQUENCY)
+    # filtered at the higher of the two rates: what the lower one would fold back is gone by then
     if piece.sample_rate > 1.5 * FREQUENCY:
         return resample(low_pass(piece, cutoff), FREQUENCY)
     return low_pass(resample(piece, FREQUENCY), cutoff)

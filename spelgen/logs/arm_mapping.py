@@ -1,42 +1,96 @@
-"""Whose logs are read, and how these are named: from an arm, a model or names to joints, types and a mapping."""
+"""Find out whose logs are read, and how they are named: from an arm, a model or names of joints."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 from pydantic import ValidationError
 
 from spelgen.errors import LogError, collect
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.messages import explain
-from spelgen.settings.settings import load_mapping
+from spelgen.settings.settings import Settings, load_mapping
 from spelgen.settings.yaml_document import Document
 from spelgen.spec import logged_joints
 
-GivenMapping = LogMapping | Mapping[str, Any] | Path | str | None
+GivenMapping = LogMapping | Mapping[str, object] | Path | str | None
+
+
+class NamedJoint(Protocol):
+    """Hold a joint as a URDF or an arm has it."""
+
+    @property
+    def name(self) -> str: ...
+
+
+class Coordinate(NamedJoint, Protocol):
+    """Hold a joint that moves. kind: "revolute" or "prismatic"."""
+
+    @property
+    def kind(self) -> str: ...
+
+
+class Coordinates(Protocol):
+    """Hold the joints that move, as an arm does."""
+
+    @property
+    def coordinates(self) -> Sequence[Coordinate]: ...
+
+
+class Joints(Protocol):
+    """Hold all joints, as a robot of a URDF does."""
+
+    @property
+    def joints(self) -> Sequence[NamedJoint]: ...
+
+
+@runtime_checkable
+class DescribedArm(Protocol):
+    """Hold what of a loaded arm says how its logs are named."""
+
+    @property
+    def arm(self) -> Coordinates: ...
+    @property
+    def robot(self) -> Joints: ...
+    @property
+    def settings(self) -> Settings: ...
+
+
+@runtime_checkable
+class JointNames(Protocol):
+    """Hold what of a module says whose logs it takes."""
+
+    @property
+    def joint_names(self) -> Sequence[str]: ...
+    @property
+    def joint_types(self) -> Sequence[str]: ...
+
+
+LoggedArm = DescribedArm | JointNames | Sequence[str]
 
 
 class LogSource(NamedTuple):
-    """joint_types: "revolute" or "prismatic", None where they are not known."""
+    """Say whose logs they are. joint_types: "revolute" or "prismatic", None where they are not known."""
 
     joints: tuple[str, ...]
     joint_types: tuple[str, ...] | None
     mapping: LogMapping
 
 
-def log_source(arm: Any, mapping: GivenMapping = None) -> LogSource:
-    """What `read_logs` was given. Raises LogError for what is no arm, SettingsError for a wrong mapping."""
-    if hasattr(arm, "arm") and hasattr(arm, "settings"):
+def log_source(arm: LoggedArm, mapping: GivenMapping = None) -> LogSource:
+    """Return what `read_logs` was given. Raises LogError for what is no arm, SettingsError for a wrong mapping."""
+    if isinstance(arm, DescribedArm):
         coordinates = arm.arm.coordinates
-        given = arm.settings.logs if mapping is None else mapping
-        known = [joint.name for joint in arm.robot.joints]
-        names, kinds = tuple(c.name for c in coordinates), tuple(c.kind for c in coordinates)
-        return LogSource(names, kinds, _mapping(given, known))
-    if hasattr(arm, "joint_names"):
-        names = logged_joints(arm)
-        return LogSource(names, tuple(arm.joint_types), _mapping(mapping, names))
+        if mapping is None:
+            mapping = arm.settings.logs
+        joints = tuple(x.name for x in coordinates)
+        joint_types = tuple(x.kind for x in coordinates)
+        return LogSource(joints, joint_types, _mapping(mapping, [x.name for x in arm.robot.joints]))
+    if isinstance(arm, JointNames):
+        joints = logged_joints(arm)
+        return LogSource(joints, tuple(arm.joint_types), _mapping(mapping, joints))
     if isinstance(arm, Sequence) and not isinstance(arm, str) and all(isinstance(x, str) for x in arm):
         return LogSource(tuple(arm), None, _mapping(mapping, arm))
     raise LogError(
@@ -44,13 +98,16 @@ def log_source(arm: Any, mapping: GivenMapping = None) -> LogSource:
     )
 
 
-def _mapping(given: Any, joints: Sequence[str]) -> LogMapping:
-    if isinstance(given, Mapping):
-        try:
-            return LogMapping.model_validate(dict(given))
-        except ValidationError as error:
-            keys = Document(Path("mapping"), None)
-            collect([explain(each, keys, LogMapping) for each in error.errors(include_url=False)])
-    if isinstance(given, str | Path):
-        return load_mapping(given, joints)
-    return LogMapping() if given is None else given
+def _mapping(mapping: GivenMapping, joints: Sequence[str]) -> LogMapping:
+    if mapping is None:
+        return LogMapping()
+    if isinstance(mapping, LogMapping):
+        return mapping
+    if isinstance(mapping, str | Path):
+        return load_mapping(mapping, joints)
+    try:
+        return LogMapping.model_validate(dict(mapping))
+    except ValidationError as error:
+        keys = Document(Path("mapping"), None)
+        collect([explain(x, keys, LogMapping) for x in error.errors(include_url=False)])
+        raise

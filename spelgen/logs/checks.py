@@ -19,6 +19,7 @@ SPAN = 10  # steps over which q and the integral of qd are compared: quantisatio
 DRIFT = 0.05  # [rad, m] that qd must say a joint moved, before a q that never changes is called frozen
 AGREEMENT, DEVIATION = 0.9, 0.1  # least correlation of q with the integral of qd, largest |factor - 1|
 DEGREES = 180.0 / np.pi
+TURNS = 4 * np.pi  # [rad] no revolute joint turns further, so what does is in degrees
 
 Code = Literal["degrees", "frozen", "velocity-is-no-derivative", "constant-torque", "joint-at-rest"]
 CODES: tuple[Code, ...] = (

@@ -1,29 +1,29 @@
-"""Where logs have been: ranges of positions and velocities, and how often each part of them occurs."""
+"""Measure where logs have been: ranges of positions and velocities, and how often each part of them occurs."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 from spelgen.logs.trajectory import Trajectory
 
-BINS = 24
+BINS = 24  # bars of a chart
 
 
-def coverage(logs: Sequence[Trajectory]) -> dict[str, Any]:
-    """`seconds` of all logs; by joint `q` and `qd`: their range, and how many samples fall into equal bins of it."""
-    found: dict[str, Any] = {"seconds": _told(sum(log.duration for log in logs))}
+def coverage(logs: Sequence[Trajectory]) -> dict[str, object]:
+    """Return `seconds` of all logs; by joint `q` and `qd`: their range, and the samples in equal bins of it."""
+    result: dict[str, object] = {"seconds": _rounded(sum(log.duration for log in logs))}
     for name in ("q", "qd"):
-        values = np.concatenate([getattr(log, name) for log in logs]).T
-        found[name] = [
-            {"low": _told(x.min()), "high": _told(x.max()), "counts": np.histogram(x, BINS)[0].tolist()}
-            for x in values
-        ]
-    return found
+        values = np.concatenate([getattr(log, name) for log in logs])
+        joints = []
+        for column in values.T:
+            counts = np.histogram(column, BINS)[0].tolist()
+            joints.append({"low": _rounded(column.min()), "high": _rounded(column.max()), "counts": counts})
+        result[name] = joints
+    return result
 
 
-def _told(value: float) -> float:
-    """To five digits."""
+def _rounded(value: float) -> float:
+    """Return a value to five significant digits."""
     return float(f"{value:.5g}")

@@ -1,66 +1,79 @@
-"""Data sets of LeRobot 3 (a folder with meta/info.json, and Parquet under data/) -> where an arm stands in them."""
+"""Read data sets of LeRobot 3: Parquet files of episodes, and their own names of joints."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from spelgen.errors import LogError
-from spelgen.settings.log_mapping import LogMapping
+from spelgen.files import require_regular_file
+from spelgen.logs.parquet_files import read_parquet
+from spelgen.logs.tables import LogFormat, LogTable
+from spelgen.settings.log_mapping import JointLog, LogMapping
 
 INFO = "meta/info.json"
 STATE, ACTION = "observation.state", "action"
 ENDING = ".pos"
 
 
-def is_dataset(path: Path) -> bool:
-    """Whether this is such a folder."""
-    return (path / INFO).is_file()
+def is_dataset(folder: Path) -> bool:
+    """Whether a folder is a data set."""
+    return (folder / INFO).is_file()
 
 
-def dataset_files(path: Path) -> list[Path]:
-    """Its files of episodes, in order. Raises LogError where there are none."""
-    found = sorted((path / "data").rglob("*.parquet"))
-    if not found:
+def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
+    """Return the tables of all files. Raises LogError where there are none, or a joint is not among the motors."""
+    mapping = dataset_mapping(folder, joints, mapping)
+    tables: list[LogTable] = []
+    for file in sorted((folder / "data").rglob("*.parquet")):
+        require_regular_file(file, LogError, "files of episodes")
+        tables += read_parquet(file, joints, mapping)
+    if not tables:
         raise LogError(
-            "a data set without Parquet files", file=path, expected="data/chunk-000/file-000.parquet"
+            "a data set without Parquet files", file=folder, expected="data/chunk-000/file-000.parquet"
         )
-    return found
+    return tables
 
 
-def dataset_mapping(path: Path, joints: Sequence[str], mapping: LogMapping) -> LogMapping:
-    """The mapping, with the columns that the data set's own names of motors say: positions, commands, episodes.
+def dataset_mapping(folder: Path, joints: Sequence[str], mapping: LogMapping) -> LogMapping:
+    """Return the mapping with the columns that the data set's names of motors say: positions, commands, episodes.
 
     Units stay the mapping's. Raises LogError where a joint is not among these names.
     """
-    state, action = (_names(path, feature) for feature in (STATE, ACTION))
-    places: dict[str, Any] = {}
+    states, actions = _motor_names(folder, STATE), _motor_names(folder, ACTION)
+    logged: dict[str, JointLog] = {}
     for joint in joints:
-        named = mapping.log_name(joint)
-        for names in (state, action):
-            if named not in names:
+        name = mapping.log_name(joint)
+        for names in (states, actions):
+            if name not in names:
                 raise LogError(
-                    f"the motors {', '.join(names) or 'without names'}", file=path / INFO, element=f"joint {joint}",
-                    expected=f"{named} among them", do="say its name under 'logs', 'joints' in the robot's YAML",
+                    f"the motors {', '.join(names) or 'without names'}", file=folder / INFO, element=f"joint {joint}",
+                    expected=f"{name} among them", do="say its name under 'logs', 'joints' in the robot's YAML",
                 )  # fmt: skip
-        columns = {"q": f"{STATE}[{state.index(named)}]", "u": f"{ACTION}[{action.index(named)}]"}
-        own = mapping.joint(joint)
-        places[joint] = own.model_copy(update={"columns": own.columns.model_copy(update=columns)})
-    columns = {"t": "timestamp", "trajectory": "episode_index"}
-    whole = mapping.columns.model_copy(update=columns)
-    return mapping.model_copy(update={"columns": whole, "joints": places})
+        columns = {"q": f"{STATE}[{states.index(name)}]", "u": f"{ACTION}[{actions.index(name)}]"}
+        joint_log = mapping.joint(joint)
+        logged[joint] = joint_log.model_copy(update={"columns": joint_log.columns.model_copy(update=columns)})
+    common = mapping.columns.model_copy(update={"t": "timestamp", "trajectory": "episode_index"})
+    return mapping.model_copy(update={"columns": common, "joints": logged})
 
 
-def _names(path: Path, feature: str) -> list[str]:
-    """Of the motors of a feature, without LeRobot's ending; they stand in a list, or in a group of lists."""
+def _motor_names(folder: Path, feature: str) -> list[str]:
+    """Return the motors' names of a feature, without LeRobot's ending."""
     try:
-        found = json.loads((path / INFO).read_text(encoding="utf-8"))["features"][feature]["names"]
-        several = list(found.values()) if isinstance(found, dict) else [found or []]
-        return [str(name).removesuffix(ENDING) for names in several for name in names]
+        info = json.loads((folder / INFO).read_text(encoding="utf-8"))
+        groups = info["features"][feature]["names"]
+        if not isinstance(groups, dict):
+            groups = {"motors": groups or []}  # LeRobot writes a list, or a group of lists
+        motors: list[str] = []
+        for names in groups.values():
+            motors += [str(name).removesuffix(ENDING) for name in names]
+        return motors
     except (ValueError, KeyError, TypeError, AttributeError, OSError, RecursionError) as error:
         raise LogError(
-            f"no names of {feature} ({type(error).__name__})", file=path / INFO,
+            f"no names of {feature} ({type(error).__name__})", file=folder / INFO,
             expected='"features", with the motors\' "names", as LeRobot 3 writes them',
         ) from error  # fmt: skip
+
+
+LEROBOT = LogFormat(read_dataset, is_folder=is_dataset, folder="a LeRobot data set")

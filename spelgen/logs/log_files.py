@@ -1,4 +1,4 @@
-"""Paths -> the log files that they name."""
+"""Find the log files that paths name."""
 
 from __future__ import annotations
 
@@ -7,42 +7,48 @@ from pathlib import Path
 
 from spelgen.addresses import local
 from spelgen.errors import LogError, SpelgenError
-from spelgen.logs.tables import SUFFIXES, is_log
-
-KINDS = f"{', '.join(SUFFIXES)}, the folder of a ROS 2 bag or of a LeRobot data set"
+from spelgen.files import require_regular_file
+from spelgen.logs.formats import describe_formats, format_of
 
 
 def log_files(
     paths: Path | str | Iterable[Path | str], role: str | None, errors: list[SpelgenError]
 ) -> list[Path]:
-    """The files and bags that these paths name, each once; what cannot be one is added to the errors."""
+    """Return the logs that these paths name, each once; what cannot be one is added to the errors.
+
+    role: "train" or "test": of a folder that holds train.* or test.* files, only those with this stem.
+    """
     files: dict[Path, None] = {}
     for given in [paths] if isinstance(paths, str | Path) else paths:
         path = local(given)
-        if is_log(path):
-            files[path] = None
-        elif path.is_dir():
-            found = _folder_files(path, role)
-            if not found:
-                several = any(map(is_log, path.iterdir()))  # that are those of another role
-                got = f"a folder without {role}.* among its logs" if several else "a folder without logs"
-                errors.append(
-                    LogError(got, file=path, expected=f"{role}.*, or files by name" if several else KINDS)
-                )
-            files |= dict.fromkeys(found)
-        elif not path.exists():
-            errors.append(
-                LogError("no such file or folder", file=given, expected="a log", do="check the path")
-            )
-        elif not path.is_file():
-            errors.append(LogError("a pipe or a device", file=path, expected=f"a file: {KINDS}"))
-        else:
-            errors.append(LogError(f"a file of kind {path.suffix!r}", file=path, expected=KINDS))
+        try:
+            if not path.exists():
+                raise LogError("no such file or folder", file=given, expected="a log", do="check the path")
+            files |= dict.fromkeys(_logs_at(path, role))
+        except LogError as error:
+            errors.append(error)
     return list(files)
 
 
-def _folder_files(folder: Path, role: str | None) -> list[Path]:
-    found = sorted(filter(is_log, folder.iterdir()))
-    if role and any(path.stem in ("train", "test") for path in found):
-        return [path for path in found if path.stem == role]
-    return found
+def _logs_at(path: Path, role: str | None) -> list[Path]:
+    if format_of(path) is not None:
+        return [path]
+    if path.is_dir():
+        return _folder_logs(path, role)
+    require_regular_file(path, LogError, f"a file: {describe_formats()}")
+    raise LogError(f"a file of kind {path.suffix!r}", file=path, expected=describe_formats())
+
+
+def _folder_logs(folder: Path, role: str | None) -> list[Path]:
+    logs = sorted(path for path in folder.iterdir() if format_of(path) is not None)
+    if not logs:
+        raise LogError("a folder without logs", file=folder, expected=describe_formats())
+    has_roles = any(path.stem in ("train", "test") for path in logs)
+    if role is None or not has_roles:
+        return logs
+    selected = [path for path in logs if path.stem == role]
+    if not selected:
+        raise LogError(
+            f"a folder without {role}.* among its logs", file=folder, expected=f"{role}.*, or files by name"
+        )
+    return selected

@@ -1,13 +1,17 @@
-"""What is done to logs before anything is computed from them: the same in training, identification and evaluation."""
+"""Decide what is done to logs before anything is computed from them, in training, identification and evaluation."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from math import isfinite
 
 from spelgen.errors import Diagnostic, SettingsError
-from spelgen.logs.filtering import AUTOMATIC_CUTOFF, automatic_cutoff, automatic_decimation, prepare
+from spelgen.logs.filtering import automatic_cutoff, automatic_decimation, prepare
 from spelgen.logs.trajectory import GAP, Trajectory
+from spelgen.settings.tuning.logs import LogTuning
+
+TUNING = LogTuning()
 
 
 @dataclass(frozen=True)
@@ -26,7 +30,7 @@ class Preprocessing:
     gap: float = GAP
 
     def __post_init__(self) -> None:
-        if self.cutoff is not None and not 0 <= self.cutoff < float("inf"):
+        if self.cutoff is not None and not (isfinite(self.cutoff) and self.cutoff >= 0):
             raise SettingsError(
                 f"{self.cutoff!r}", element="cutoff", expected="a frequency [Hz], or 0 for none"
             )
@@ -36,20 +40,21 @@ class Preprocessing:
             raise SettingsError(f"{self.gap!r}", element="gap", expected="more than 1 median step")
 
     def resolved(self, rates: Iterable[float]) -> Preprocessing:
-        """The same with all decided for windows of logs with these sample rates [Hz], as it is kept with a run.
+        """Return the same with all decided for windows of logs with these sample rates [Hz], as it is kept with a run.
 
         A cutoff that stays None is that of logs too slow to be filtered unasked.
         """
         rates = list(rates)
         cutoff = automatic_cutoff(rates) if self.cutoff is None else self.cutoff
-        return replace(
-            self, cutoff=cutoff, decimation=self.decimation or automatic_decimation(rates, cutoff or None)
-        )
+        decimation = self.decimation or automatic_decimation(rates, cutoff or None)
+        return replace(self, cutoff=cutoff, decimation=decimation)
 
     @property
     def acceleration_cutoff(self) -> float | None:
         """The filter [Hz] before accelerations are taken; None: no filter."""
-        return AUTOMATIC_CUTOFF if self.cutoff is None else self.cutoff or None
+        if self.cutoff is None:
+            return TUNING.automatic_cutoff
+        return self.cutoff or None
 
     @property
     def filtered(self) -> bool:
@@ -59,9 +64,11 @@ class Preprocessing:
     @property
     def diagnostics(self) -> list[Diagnostic]:
         """That the logs are filtered, if they are; of a ``resolved`` one."""
-        message = f"q, qd and tau filtered at {self.cutoff:g} Hz, zero phase" if self.cutoff else ""
-        return [Diagnostic("info", "filter", "logs", None, message)] if message else []
+        if not self.cutoff:
+            return []
+        message = f"q, qd and tau filtered at {self.cutoff:g} Hz, zero phase"
+        return [Diagnostic("info", "filter", "logs", None, message)]
 
     def pieces(self, trajectories: Sequence[Trajectory], *, shortest: int) -> list[Trajectory]:
-        """Gap-free pieces of at least so many samples, filtered; of a ``resolved`` one. Raises LogError."""
+        """Return gap-free pieces of at least so many samples, filtered; of a ``resolved`` one. Raises LogError."""
         return prepare(trajectories, shortest=shortest, cutoff=self.cutoff or None, gap=self.gap)

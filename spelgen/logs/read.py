@@ -1,12 +1,10 @@
-"""Log files <-> trajectories, in SI units and the URDF's senses: no filtering, no resampling, no repair."""
+"""Read and write log files, in SI units and the URDF's senses: no filter, no resampling, no repair."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -15,28 +13,25 @@ import pyarrow.parquet
 
 from spelgen.errors import LogError, SpelgenError, collect
 from spelgen.files import replacing
-from spelgen.logs.arm_mapping import GivenMapping, log_source
+from spelgen.logs.arm_mapping import GivenMapping, LoggedArm, log_source
+from spelgen.logs.formats import read_tables
 from spelgen.logs.log_files import log_files
-from spelgen.logs.readers import read_tables
 from spelgen.logs.tables import UNITS, UNITS_KEY, LogTable
 from spelgen.logs.trajectory import Trajectory, require_joints
-from spelgen.logs.values import clock_start, made_trajectory, require_increasing_times, values_in_si
+from spelgen.logs.values import clock_start, make_trajectory, require_increasing_times, values_in_si
 
-ROW_GROUP = 2**16  # rows that are written together: a log too large for memory is read by them
-
-Named = tuple[tuple[str, str, str], Trajectory]
-"""A trajectory and its possible names, from the shortest to the surely unique one."""
+ROW_GROUP = 2**16  # rows written together: logs larger than memory are read by row groups
 
 
 def read_logs(
     paths: Path | str | Iterable[Path | str],
-    arm: Any,
+    arm: LoggedArm,
     mapping: GivenMapping = None,
     role: str | None = None,
     *,
     joint_types: Sequence[str] | None = None,
 ) -> list[Trajectory]:
-    """All trajectories of the given files and folders, in sorted order of their files.
+    """Return all trajectories of the given files and folders, in sorted order of their files.
 
     arm: one loaded from a URDF, a model, or the names of joints as the URDF has them; without a mapping, joint j
     has the columns `q_<j>`, `qd_<j>`, `tau_<j>`, beside the time `t` [s]. A column `trajectory` splits one file
@@ -47,84 +42,89 @@ def read_logs(
     Raises LogError (or one error that holds several) naming file, row and column, and SettingsError where
     the mapping does not fit the joints.
     """
-    joints, kinds, how = log_source(arm, mapping)
-    collect(how.misfits(joints, kinds or joint_types))
+    source = log_source(arm, mapping)
+    collect(source.mapping.misfits(source.joints, source.joint_types or joint_types))
     errors: list[SpelgenError] = []
-    labelled: list[Named] = []
+    trajectories: list[Trajectory] = []
     for file in log_files(paths, role, errors):
         try:
-            for each in read_tables(file, joints, how):
-                labelled += _trajectories(each, file)
+            for table in read_tables(file, source.joints, source.mapping):
+                trajectories += _trajectories(table, file)
         except LogError as error:
             errors.append(error)
     collect(errors)
-    return _with_unique_names(labelled)
+    return _with_unique_names(trajectories)
 
 
-def write_logs(path: Path | str, trajectories: Sequence[Trajectory], arm: Any) -> Path:
+def write_logs(path: Path | str, trajectories: Sequence[Trajectory], arm: LoggedArm) -> Path:
     """Write one Parquet or CSV file (by suffix) with a `trajectory` column, all or nothing; return the path.
 
     arm: as for `read_logs`, which gives the same numbers back from either. Parquet files declare their units.
     Raises LogError for another suffix, without trajectories, and for those of another number of joints.
     """
     path, joints = Path(path), log_source(arm).joints
-    write = _writer(path)
+    if path.suffix not in (".parquet", ".csv"):
+        raise LogError(f"a log named {path.name!r}", expected=".parquet or .csv")
     if not trajectories:
         raise LogError("no trajectory", file=path, expected="at least one")
+    names: list[str] = []
     for trajectory in trajectories:
         require_joints(trajectory, joints)
+        names += [trajectory.name] * len(trajectory)
     columns: dict[str, np.ndarray | list[str]] = {
-        "trajectory": [x.name for x in trajectories for _ in x.t],
+        "trajectory": names,
         "t": np.concatenate([x.t for x in trajectories]),
     }
     for quantity in trajectories[0].quantities:
         values = np.concatenate([getattr(x, quantity) for x in trajectories])
-        columns |= {f"{quantity}_{joint}": values[:, i] for i, joint in enumerate(joints)}
+        for index, joint in enumerate(joints):
+            columns[f"{quantity}_{joint}"] = values[:, index]
     table = pa.table(columns).replace_schema_metadata({UNITS_KEY: UNITS})
     with replacing(path) as unfinished:
-        write(table, unfinished)
+        if path.suffix == ".csv":
+            pa.csv.write_csv(table, unfinished)
+        else:
+            pa.parquet.write_table(table, unfinished, row_group_size=ROW_GROUP)
     return path
 
 
-def _writer(path: Path) -> Callable[[pa.Table, Path], None]:
-    writers: dict[str, Callable[[pa.Table, Path], None]] = {
-        ".parquet": partial(pa.parquet.write_table, row_group_size=ROW_GROUP),
-        ".csv": pa.csv.write_csv,
-    }
-    if path.suffix not in writers:
-        raise LogError(f"a log named {path.name!r}", expected=" or ".join(writers))
-    return writers[path.suffix]
-
-
-def _trajectories(part: LogTable, file: Path) -> list[Named]:
-    """The trajectories of one table."""
-    if not part.table.num_rows:
+def _trajectories(log: LogTable, file: Path) -> list[Trajectory]:
+    """Return the trajectories of one table."""
+    if not log.table.num_rows:
         raise LogError("no rows", file=file, expected="at least one window of samples")
-    times = part.layout.columns[0]
-    data = values_in_si(part.table, part.layout, file, clock_start(part.table[times]))
-    found = []
-    for name, rows in _recordings(part, file.stem):
+    times = log.layout.columns[0]
+    data = values_in_si(log.table, log.layout, file, clock_start(log.table[times]))
+    trajectories = []
+    for name, rows in _recordings(log, file.stem):
         require_increasing_times(data[rows, 0], rows, file, times)
-        trajectory = made_trajectory(data[rows], part.layout, name=name, file=file)
-        found.append(((name, f"{file.stem}/{name}", f"{file}/{name}"), trajectory))
-    return found
+        trajectories.append(make_trajectory(data[rows], log.layout, name, file))
+    return trajectories
 
 
-def _recordings(part: LogTable, stem: str) -> list[tuple[str, np.ndarray]]:
-    """Name and rows of each recording of a table, in order of their first rows."""
-    if part.layout.labels is None:
-        return [(part.recording or stem, np.arange(part.table.num_rows))]
-    places: dict[str, int] = {}
-    codes = [
-        places.setdefault(str(label), len(places)) for label in part.table[part.layout.labels].to_pylist()
-    ]
-    order = np.argsort(codes, kind="stable")
-    return list(zip(places, np.split(order, np.cumsum(np.bincount(codes))[:-1]), strict=True))
+def _recordings(log: LogTable, stem: str) -> list[tuple[str, np.ndarray]]:
+    """Return name and rows of each recording of a table, in order of their first rows."""
+    if log.layout.labels is None:
+        return [(log.recording or stem, np.arange(log.table.num_rows))]
+    codes: dict[str, int] = {}
+    code_of_row = []
+    for label in log.table[log.layout.labels].to_pylist():
+        code_of_row.append(codes.setdefault(str(label), len(codes)))
+    # sorting keeps time and memory in proportion to the rows, however many recordings there are
+    rows = np.argsort(code_of_row, kind="stable")
+    ends = np.cumsum(np.bincount(code_of_row))
+    return list(zip(codes, np.split(rows, ends[:-1]), strict=True))
 
 
-def _with_unique_names(labelled: Sequence[Named]) -> list[Trajectory]:
-    for level in range(3):
-        names = [labels[level] for labels, _ in labelled]
-        if len(set(names)) == len(names):
-            break
-    return [replace(x, name=name) for name, (_, x) in zip(names, labelled, strict=True)]
+def _with_unique_names(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
+    """Return the trajectories under the shortest names that tell all of them apart."""
+    short, with_stem, with_path = [], [], []
+    for trajectory in trajectories:
+        assert trajectory.file is not None
+        short.append(trajectory.name)
+        with_stem.append(f"{trajectory.file.stem}/{trajectory.name}")
+        with_path.append(f"{trajectory.file}/{trajectory.name}")
+    names = with_path
+    for candidates in (with_stem, short):
+        if len(set(candidates)) == len(candidates):
+            names = candidates
+    return [replace(x, name=name) for x, name in zip(trajectories, names, strict=True)]

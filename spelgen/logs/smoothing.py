@@ -1,29 +1,36 @@
-"""Velocities and accelerations of recordings that hold positions alone."""
+"""Differentiate recordings that hold positions alone."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from spelgen.logs.trajectory import Trajectory
+from spelgen.settings.tuning.logs import LogTuning
 
-SMOOTHING = 0.18  # s over which derivatives are taken
+TUNING = LogTuning()
 
 
 def velocities(trajectory: Trajectory) -> np.ndarray:
-    """qd (T, n), smoothed."""
-    return smoothed(trajectory.q, trajectory.sample_rate)[0]
+    """Return qd (T, n), smoothed."""
+    return derivative(trajectory.q, trajectory.sample_rate, 1)
 
 
 def smoothed(q: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndarray]:
-    """First and second derivatives of (..., T, n), by cubic polynomials over `SMOOTHING` (Savitzky and Golay, 1964)."""
+    """Return first and second derivatives of (..., T, n); see `derivative`."""
     return derivative(q, rate, 1), derivative(q, rate, 2)
 
 
 def derivative(q: np.ndarray, rate: float, order: int) -> np.ndarray:
-    """That of (..., T, n) of this order, 0 for the smoothed values themselves; see `smoothed`."""
-    from scipy.signal import savgol_filter  # as in filtering.py
+    """Return the derivative of (..., T, n) at a rate [Hz], of order 0 the smoothed values themselves.
+
+    By cubic polynomials over `derivative_span` (Savitzky and Golay, Anal. Chem. 36, 1964).
+    """
+    from scipy.signal import savgol_filter  # takes long to import, as in filtering.py
 
     samples = q.shape[-2]
-    width = min(max(5, 2 * round(SMOOTHING * rate / 2) + 1), samples - 1 + samples % 2)
-    found: np.ndarray = savgol_filter(q, width, 3, deriv=order, delta=1 / rate, axis=-2)
-    return found
+    width = 2 * round(TUNING.derivative_span * rate / 2) + 1
+    # the filter takes odd widths alone: above a cubic's four samples, and no more than there are
+    longest = samples - 1 + samples % 2
+    width = min(max(5, width), longest)
+    derivatives: np.ndarray = savgol_filter(q, width, 3, deriv=order, delta=1 / rate, axis=-2)
+    return derivatives

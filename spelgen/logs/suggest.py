@@ -1,68 +1,48 @@
-"""Columns of a log without known names -> the mapping by which it is read, as far as names and numbers tell."""
+"""Draft the mapping of a log that nobody has described, as far as its names and numbers tell."""
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute
-import pyarrow.parquet
 
 from spelgen.errors import LogError
-from spelgen.logs.npz import npz_table
-from spelgen.logs.readers import read_csv
-from spelgen.logs.tables import opened
+from spelgen.logs.checks import TURNS
+from spelgen.logs.formats import FORMATS, format_of
+from spelgen.logs.tables import names_joint
 from spelgen.logs.trajectory import QUANTITIES
 from spelgen.logs.values import column_values
 from spelgen.settings.log_mapping import TIMES
 
 WORDS = {
-    "t": {
-        "t",
-        "time",
-        "times",
-        "timestamp",
-        "stamp",
-        "clock",
-        "ms",
-        "us",
-        "ns",
-        "sec",
-        "secs",
-        "seconds",
-        "millis",
-    },
+    "t": {"t", "time", "times", "timestamp", "stamp", "clock", "ms", "us", "ns", "sec", "secs", "seconds", "millis"},
     "q": {"q", "pos", "position", "positions", "angle", "angles", "theta"},
     "qd": {"qd", "dq", "vel", "velocity", "velocities", "speed", "speeds", "omega"},
     "tau": {"tau", "torque", "torques", "effort", "efforts", "current", "currents", "amps", "curr", "moment"},
-}
+}  # fmt: skip
 NOT_MEASURED = {"target", "desired", "command", "cmd", "reference", "ref", "setpoint", "goal", "error", "std"}
-NAMES = ("name", "names", "joint_names", "joints")
+JOINT_NAMES = ("name", "names", "joint_names", "joints")
 UNITS = {
     "t": {"ms": "ms", "millis": "ms", "us": "us", "ns": "ns"},
     "q": {"deg": "deg", "degree": "deg", "degrees": "deg", "mm": "mm"},
     "qd": {"deg": "deg/s", "degrees": "deg/s", "dps": "deg/s", "rpm": "rpm", "mm": "mm/s"},
     "tau": {
         "mnm": "mNm",
-        "amps": "A",
-        "ampere": "A",
-        "current": "A",
-        "currents": "A",
-        "curr": "A",
         "ma": "mA",
+        **dict.fromkeys(("amps", "ampere", "current", "currents", "curr"), "A"),
     },
 }
-TURNS = 4 * np.pi  # no revolute joint turns further, so what does is in degrees
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column, or a place of a column of lists. quantity: t, q, qd or tau. number: the last one in its name."""
+    """Describe a column, or one element of a column of lists. number: its place, or the last number in its name."""
 
     name: str
     quantity: str
@@ -72,165 +52,230 @@ class Column:
 
 @dataclass(frozen=True)
 class Suggestion:
-    """A mapping as YAML text, with comments on what was assumed. missing: what no column was found for."""
+    """Hold a mapping as YAML text, with comments on what was assumed. missing: what no column was found for."""
 
     text: str
     missing: tuple[str, ...]
 
 
+@dataclass
+class Draft:
+    """Collect what is known of a log. columns: by quantity and joint; units: of all joints; angles: of turning ones."""
+
+    clock: str
+    columns: dict[str, dict[str, Column]]
+    units: dict[str, str]
+    angles: dict[str, str]
+    in_urdf_order: bool = False
+    missing: list[str] = field(default_factory=list)
+
+
 def suggest_mapping(file: Path, joints: Sequence[str], joint_types: Sequence[str]) -> Suggestion:
-    """How a file may be read. Raises LogError where it cannot be opened, or has no column of times."""
+    """Return how a file may be read. Raises LogError where it cannot be opened, or has no column of times."""
     table = _table(file)
-    columns, listed = _columns(table, file)
-    times = [each for each in columns if each.quantity == "t"]
+    columns = _measured_columns(table)
+    order = _joint_order(table, file)
+    times = [column for column in columns if column.quantity == "t"]
     if not times:
         names = ", ".join(table.column_names)
         raise LogError(f"only the columns {names}", file=file, expected="one of times, called t or time")
-    clock = min(times, key=lambda each: len(each.words))
-    found = {what: _by_joint(columns, what, joints, listed) for what in QUANTITIES}
-    units = {"t": _time_unit(clock, table)}
+    clock = min(times, key=lambda column: len(column.words))
+    by_joint = {quantity: _by_joint(columns, quantity, joints, order) for quantity in QUANTITIES}
     turning = [joint for joint, kind in zip(joints, joint_types, strict=True) if kind == "revolute"]
-    angles = _angle_units(found, turning, table, file, clock, units["t"])
+    units = {"t": _time_unit(clock, table)}
+    angles = _angle_units(by_joint, turning, _Values(table, file, clock.name, TIMES[units["t"]]))
     if len(turning) == len(joints):
         units |= angles
-    torque = _said_unit("tau", found["tau"].values())
-    units |= {"tau": torque} if torque else {}
-    missing = [f"{what} of {joint}" for what in ("q", "tau") for joint in joints if joint not in found[what]]
-    differentiated = len(found["qd"]) < len(joints)
-    lines = [
-        "# Read off the names and numbers of " + json.dumps(file.name) + ": check it before you rely on it."
-    ]
-    if not listed and not any(_speaks_of(each, joint) for each in found["q"].values() for joint in joints):
+    torque = _unit_in_names("tau", by_joint["tau"].values())
+    if torque is not None:
+        units["tau"] = torque
+    draft = Draft(clock.name, by_joint, units, angles if len(turning) < len(joints) else {})
+    named = any(names_joint(column.name, joint) for column in by_joint["q"].values() for joint in joints)
+    draft.in_urdf_order = not order and not named
+    for quantity in ("q", "tau"):
+        draft.missing += [f"{quantity} of {joint}" for joint in joints if joint not in by_joint[quantity]]
+    return Suggestion(_yaml(draft, file, joints, turning), tuple(draft.missing))
+
+
+def _yaml(draft: Draft, file: Path, joints: Sequence[str], turning: Collection[str]) -> str:
+    differentiated = len(draft.columns["qd"]) < len(joints)
+    lines = [f"# Read off the names and numbers of {json.dumps(file.name)}: check it before you rely on it."]
+    if draft.in_urdf_order:
         lines.append("# Joints are taken in the URDF's order: the log does not name them.")
-    lines += [f"columns: {{t: {json.dumps(clock.name)}}}", f"units: {json.dumps(units)}"]
-    lines += ["velocity: differentiated"] if differentiated else []
+    lines += [f"columns: {{t: {json.dumps(draft.clock)}}}", f"units: {json.dumps(draft.units)}"]
+    if differentiated:
+        lines.append("velocity: differentiated")
     lines.append("joints:")
+    quantities = ("q", "tau") if differentiated else QUANTITIES
     for joint in joints:
-        own = {what: found[what][joint].name for what in QUANTITIES if joint in found[what]}
-        if differentiated:
-            own.pop("qd", None)
-        lines += [f"  {json.dumps(joint)}:", f"    columns: {json.dumps(own)}"]
-        if angles and joint in turning and len(turning) < len(joints):
-            lines.append(f"    units: {json.dumps(angles)}")
-        if units.get("tau") in ("A", "mA"):
-            lines.append(
-                f"    gain: 1.0 # Nm per {units['tau']} at the joint, the gear included: say what it is"
-            )
-    lines += [f"# no column was found for {each}" for each in missing]
-    return Suggestion("\n".join(lines) + "\n", tuple(missing))
+        names = {x: draft.columns[x][joint].name for x in quantities if joint in draft.columns[x]}
+        lines += [f"  {json.dumps(joint)}:", f"    columns: {json.dumps(names)}"]
+        if draft.angles and joint in turning:
+            lines.append(f"    units: {json.dumps(draft.angles)}")
+        torque = draft.units.get("tau")
+        if torque in ("A", "mA"):
+            lines.append(f"    gain: 1.0 # Nm per {torque} at the joint, the gear included: say what it is")
+    lines += [f"# no column was found for {missing}" for missing in draft.missing]
+    return "\n".join(lines) + "\n"
 
 
 def _table(file: Path) -> pa.Table:
-    if file.suffix == ".parquet":
-        return opened(file, lambda: pa.parquet.read_table(file))
-    if file.suffix == ".npz":
-        return npz_table(file)
-    if file.suffix == ".csv":
-        return opened(file, lambda: read_csv(file))
-    raise LogError(f"a file of kind {file.suffix!r}", file=file, expected=".csv, .parquet or .npz")
+    log_format = format_of(file)
+    if log_format is None or log_format.columns is None:
+        suffixes = [x.suffixes[0] for x in FORMATS if x.columns is not None]
+        raise LogError(f"a file of kind {file.suffix!r}", file=file, expected=" or ".join(suffixes))
+    return log_format.columns(file)
 
 
-def _columns(table: pa.Table, file: Path) -> tuple[list[Column], list[str]]:
-    """What may be meant by the columns, and the names of the joints in the order of lists, where lists are named."""
-    found: list[Column] = []
+def _measured_columns(table: pa.Table) -> list[Column]:
+    """Return the columns, and elements of columns of lists, whose names speak of a measured quantity."""
+    columns: list[Column] = []
     for name in table.column_names:
         words = _words(name)
-        quantity = next((what for what, known in WORDS.items() if known & set(words)), None)
-        if quantity is None or NOT_MEASURED & set(words):
+        quantity = _quantity(words)
+        if quantity is None:
             continue
-        places = _places(table[name])
-        numbers = re.findall(r"\d+", name)
-        if places is None:
-            found.append(Column(name, quantity, words, int(numbers[-1]) if numbers else None))
-        else:
-            found += [Column(f"{name}[{k}]", quantity, words, k) for k in range(places)]
-    named = next((name for name in table.column_names if name.strip("/").lower() in NAMES), None)
-    if named is None or _places(table[named]) is None:
-        return found, []
-    texts = pa.compute.unique(table[named].cast(pa.string()) if _is_text(table[named]) else table[named])
-    if len(texts) > 1:
-        raise LogError(
-            f"{len(texts)} orders of joints", file=file, element=f"column {named}",
-            expected="the same names in each row", do="sort each message's joints before it is written",
-        )  # fmt: skip
-    first = texts[0].as_py()
-    return found, re.findall(r"[^\[\](),;'\"\s]+", first) if isinstance(first, str) else list(map(str, first))
+        length = _list_length(table[name])
+        if length is None:
+            numbers = re.findall(r"\d+", name)
+            columns.append(Column(name, quantity, words, int(numbers[-1]) if numbers else None))
+        for index in range(length or 0):
+            columns.append(Column(f"{name}[{index}]", quantity, words, index))
+    return columns
+
+
+def _quantity(words: Collection[str]) -> str | None:
+    if not NOT_MEASURED.isdisjoint(words):
+        return None
+    for quantity, spoken in WORDS.items():
+        if not spoken.isdisjoint(words):
+            return quantity
+    return None
+
+
+def _joint_order(table: pa.Table, file: Path) -> list[str]:
+    """Return the names of the joints in the order of lists; empty where the log does not name them.
+
+    Raises LogError where the order changes from row to row.
+    """
+    for column in table.column_names:
+        names = table[column]
+        if column.strip("/").lower() not in JOINT_NAMES or _list_length(names) is None:
+            continue
+        orders = pa.compute.unique(names.cast(pa.string()) if _is_text(names) else names)
+        if len(orders) > 1:
+            raise LogError(
+                f"{len(orders)} orders of joints", file=file, element=f"column {column}",
+                expected="the same names in each row", do="sort each message's joints before it is written",
+            )  # fmt: skip
+        first = orders[0].as_py()
+        if isinstance(first, str):
+            return re.findall(r"[^\[\](),;'\"\s]+", first)
+        return [str(name) for name in first]
+    return []
 
 
 def _words(name: str) -> tuple[str, ...]:
     """``field.jointPos0`` -> field, joint, pos."""
-    apart = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name)
-    return tuple(word.lower() for word in re.findall(r"[A-Za-z]+", apart))
+    separated = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name)
+    return tuple(word.lower() for word in re.findall(r"[A-Za-z]+", separated))
 
 
 def _is_text(values: pa.ChunkedArray) -> bool:
     return pa.types.is_string(values.type) or pa.types.is_large_string(values.type)
 
 
-def _places(values: pa.ChunkedArray) -> int | None:
-    """How many places the lists of a column have; None for plain values."""
-    first = next((each.as_py() for each in values if each.is_valid), None)
+def _list_length(values: pa.ChunkedArray) -> int | None:
+    """Return how many elements the lists of a column have, written as text maybe; None for plain values."""
+    valid = values.drop_null()
+    first = valid[0].as_py() if len(valid) else None
     if isinstance(first, list):
         return len(first)
     if isinstance(first, str) and re.match(r"\s*(array\()?[^\[(]*[\[(]", first):
-        return len(re.findall(r"[^\s,;]+", re.sub(r"^.*[\[(]|[\])].*$", "", first)))
+        inside = re.sub(r"^.*[\[(]|[\])].*$", "", first)
+        return len(re.findall(r"[^\s,;]+", inside))
     return None
 
 
-def _speaks_of(column: Column, joint: str) -> bool:
-    return re.search(rf"(?<![0-9a-z]){re.escape(joint)}(?![0-9a-z])", column.name, re.IGNORECASE) is not None
-
-
 def _by_joint(
-    columns: Sequence[Column], quantity: str, joints: Sequence[str], listed: Sequence[str]
+    columns: Sequence[Column], quantity: str, joints: Sequence[str], order: Sequence[str]
 ) -> dict[str, Column]:
-    """The column of each joint: by its name, else by the order of lists, else by numbers in the URDF's order."""
-    of_it = [each for each in columns if each.quantity == quantity]
-    found = {joint: each for joint in joints for each in of_it if _speaks_of(each, joint)}
-    if found:
-        return found
-    numbered = sorted((each for each in of_it if each.number is not None), key=lambda each: each.number or 0)
-    if listed:
-        places = {name: k for k, name in enumerate(listed)}
-        return {joint: x for joint in joints for x in numbered if x.number == places.get(joint)}
-    return dict(zip(joints, numbered, strict=False)) if len(numbered) >= len(joints) else {}
+    """Return the column of each joint: by its name, else by the order of lists, else by numbers in the URDF's order."""
+    candidates = [column for column in columns if column.quantity == quantity]
+    named: dict[str, Column] = {}
+    for joint in joints:
+        for column in candidates:
+            if names_joint(column.name, joint):
+                named[joint] = column
+    if named:
+        return named
+    numbered = {column.number: column for column in candidates if column.number is not None}
+    if order:
+        listed = [joint for joint in joints if joint in order and order.index(joint) in numbered]
+        return {joint: numbered[order.index(joint)] for joint in listed}
+    if len(numbered) < len(joints):
+        return {}
+    return dict(zip(joints, [numbered[number] for number in sorted(numbered)], strict=False))
 
 
 def _time_unit(clock: Column, table: pa.Table) -> str:
-    said = next((UNITS["t"][word] for word in clock.words if word in UNITS["t"]), None)
-    if said:
-        return said
+    """Return the unit of times that their name says, else that in which steps between samples are usual."""
+    unit = _unit_in_names("t", [clock])
+    if unit is not None:
+        return unit
     try:
         steps = np.diff(table[clock.name].cast(pa.float64()).to_numpy())
     except (pa.ArrowException, KeyError):
         return "s"
     step = float(np.median(steps)) if len(steps) else 0.0
-    return "s" if step < 0.5 else "ms" if step < 500 else "us" if step < 5e5 else "ns"
+    for unit, largest in (("s", 0.5), ("ms", 500), ("us", 5e5)):  # no arm is sampled more slowly than at 2 Hz
+        if step < largest:
+            return unit
+    return "ns"
 
 
-def _said_unit(quantity: str, columns: Iterable[Column]) -> str | None:
-    """The unit that the columns' names say."""
-    words = {word for each in columns for word in each.words}
-    return next((unit for word, unit in UNITS[quantity].items() if word in words), None)
+def _unit_in_names(quantity: str, columns: Iterable[Column]) -> str | None:
+    """Return the unit that the columns' names say."""
+    words = {word for column in columns for word in column.words}
+    for word, unit in UNITS[quantity].items():
+        if word in words:
+            return unit
+    return None
+
+
+@dataclass(frozen=True)
+class _Values:
+    """Give the numbers of a table's columns. time_scale: from times as logged to seconds."""
+
+    table: pa.Table
+    file: Path
+    clock: str
+    time_scale: float
+
+    def of(self, column: Column) -> np.ndarray:
+        return column_values(self.table, column.name, self.file)
+
+    def time_steps(self) -> np.ndarray:
+        return np.diff(column_values(self.table, self.clock, self.file)) * self.time_scale
 
 
 def _angle_units(
-    found: Mapping[str, Mapping[str, Column]],
-    turning: Sequence[str],
-    table: pa.Table,
-    file: Path,
-    clock: Column,
-    time_unit: str,
+    columns: dict[str, dict[str, Column]], turning: Collection[str], values: _Values
 ) -> dict[str, str]:
-    """Degrees, where positions of turning joints are no radians: of q, and of qd where that is its derivative."""
-    places, speeds = ({k: x for k, x in found[what].items() if k in turning} for what in ("q", "qd"))
-    values = {joint: column_values(table, each.name, file) for joint, each in places.items()}
-    said, speed = _said_unit("q", places.values()), _said_unit("qd", speeds.values())
-    degrees = said == "deg" or (said is None and any(np.ptp(x) > TURNS for x in values.values()))
-    if speed is None and degrees and speeds.keys() == places.keys():
-        dt = np.diff(column_values(table, clock.name, file)) * TIMES[time_unit]
-        moved = sum(np.abs(np.diff(x)).sum() for x in values.values())
-        meant = sum(np.abs(column_values(table, x.name, file)[1:] * dt).sum() for x in speeds.values())
-        speed = "deg/s" if moved < 8 * meant else None  # between 1 and 180 / pi
-    units = {"q": "deg" if degrees else said, "qd": speed}
-    return {what: unit for what, unit in units.items() if unit}
+    """Return degrees where positions of turning joints are no radians: of q, and of qd where that is its derivative."""
+    positions = {joint: x for joint, x in columns["q"].items() if joint in turning}
+    speeds = {joint: x for joint, x in columns["qd"].items() if joint in turning}
+    unit = _unit_in_names("q", positions.values())
+    speed_unit = _unit_in_names("qd", speeds.values())
+    q = [values.of(x) for x in positions.values()]
+    if unit is None and any(np.ptp(x) > TURNS for x in q):
+        unit = "deg"
+    if unit == "deg" and speed_unit is None and speeds.keys() == positions.keys():
+        dt = values.time_steps()
+        distance = sum(np.abs(np.diff(x)).sum() for x in q)
+        integral = sum(np.abs(values.of(x)[1:] * dt).sum() for x in speeds.values())
+        # 1 if speeds are in degrees as positions are, 57 if in radians: halfway between the two
+        if distance < 8 * integral:
+            speed_unit = "deg/s"
+    units = {"q": unit, "qd": speed_unit}
+    return {quantity: unit for quantity, unit in units.items() if unit}

@@ -1,4 +1,4 @@
-"""What every reader of log files gives: a table, and where in it an arm's quantities stand; or one clear sentence."""
+"""Describe what every reader of logs gives: a table, and where in it an arm's quantities stand."""
 
 from __future__ import annotations
 
@@ -6,35 +6,32 @@ import difflib
 import re
 import zipfile
 import zlib
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 import pyarrow as pa
 
 from spelgen.errors import LogError, shortened
-from spelgen.logs.bags import SUFFIXES as BAG_SUFFIXES
-from spelgen.logs.bags import is_bag
-from spelgen.logs.lerobot import is_dataset
 from spelgen.logs.trajectory import QUANTITIES
 from spelgen.settings.log_mapping import TIMES, LogMapping
 
-SUFFIXES = (".parquet", ".csv", ".npz", *BAG_SUFFIXES)
-LISTED = 12  # columns, at most
+LISTED = 12  # columns that a message names
 UNITS_KEY = b"units"  # in a Parquet file's metadata: the file declares its units
 UNITS = b"t s, q rad or m, qd rad/s or m/s, tau Nm or N"  # what spelgen itself declares
 
-UNREADABLE = (pa.ArrowException, OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error)
-
-Content = TypeVar("Content")
+# Arrow, NumPy and zipfile raise all of these for damaged files
+UNREADABLE = (
+    pa.ArrowException, OSError, ValueError, EOFError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the quantities of an arm stand in a log, and how they are measured.
+    """Say where the quantities of an arm stand in a log, and how they are measured.
 
     columns: of t, then of q, qd and tau by joint; without qd where velocities are to be differentiated. labels: the
     column that splits the log into recordings, None without. declares_units: the file or the mapping says units.
@@ -48,52 +45,69 @@ class Layout:
 
     @cached_property
     def units(self) -> tuple[np.ndarray, np.ndarray]:
-        """Factors and offsets (C,) of the columns: a logged value in SI units is factor * value + offset."""
-        pairs = [(what, joint) for what in wanted_quantities(self.mapping) for joint in self.joints]
-        factors = [TIMES[self.mapping.units.t], *(self.mapping.scale(*each) for each in pairs)]
-        return np.array(factors), np.array([0.0, *(self.mapping.offset(*each) for each in pairs)])
+        """Return factors and offsets (C,) of the columns: a value in SI units is factor * logged value + offset."""
+        factors, offsets = [TIMES[self.mapping.units.t]], [0.0]
+        for quantity in wanted_quantities(self.mapping):
+            for joint in self.joints:
+                factors.append(self.mapping.scale(quantity, joint))
+                offsets.append(self.mapping.offset(quantity, joint))
+        return np.array(factors), np.array(offsets)
 
 
 @dataclass(frozen=True, eq=False)
 class LogTable:
-    """Part of a log file. recording: its name, where the kind of file keeps recordings apart."""
+    """Hold one table of a log file. recording: its name, where the format keeps recordings apart."""
 
     recording: str | None
     table: pa.Table
     layout: Layout
 
 
-def is_log(path: Path) -> bool:
-    """Whether there is a reader for this file or folder; what is neither, a pipe or a device, might never end."""
-    return is_bag(path) or is_dataset(path) if path.is_dir() else path.suffix in SUFFIXES and path.is_file()
+@dataclass(frozen=True)
+class LogFormat:
+    """Describe one format of logs: what belongs to it, and how that is read.
+
+    read: from a path, the joints and the mapping to tables; raises LogError. suffixes: of its files. columns: from a
+    file to all its columns, of which `suggest` drafts a mapping; None where the format itself says what they are.
+    is_folder: whether a folder is a log of this format; folder: what such a folder is called.
+    """
+
+    read: Callable[[Path, Sequence[str], LogMapping], list[LogTable]]
+    suffixes: tuple[str, ...] = ()
+    columns: Callable[[Path], pa.Table] | None = None
+    is_folder: Callable[[Path], bool] | None = None
+    folder: str = ""
 
 
 def wanted_quantities(mapping: LogMapping) -> tuple[str, ...]:
-    """The quantities that a log must hold."""
+    """Return the quantities that a log must hold."""
     if mapping.input == "position":
         return ("q", "u")
-    return tuple(x for x in QUANTITIES if x != "qd" or mapping.velocity == "logged")
+    if mapping.velocity == "differentiated":
+        return ("q", "tau")
+    return QUANTITIES
 
 
 def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, file: Path) -> Layout:
-    """Where a table's columns are. Raises LogError where one is missing, or there twice.
+    """Return where a table's columns are. Raises LogError where one is missing, or there twice.
 
     What spelgen itself wrote is read as such, whatever the mapping says.
     """
     metadata = schema.metadata or {}
     if metadata.get(UNITS_KEY) == UNITS:
         mapping = LogMapping(input=mapping.input)
-    quantities = wanted_quantities(mapping)
-    columns = (mapping.columns.t, *(mapping.column(what, joint) for what in quantities for joint in joints))
+    columns = [mapping.columns.t]
+    for quantity in wanted_quantities(mapping):
+        columns += [mapping.column(quantity, joint) for joint in joints]
     _require_columns(schema.names, columns, file, mapping, joints)
     labels = mapping.columns.trajectory if mapping.columns.trajectory in schema.names else None
     if labels and pa.types.is_nested(schema.field(labels).type):
         kind = schema.field(labels).type
         raise LogError(f"values of type {kind}", file=file, element=f"column {labels}", expected="names")
-    return made_layout(columns, labels, joints, mapping, declared=UNITS_KEY in metadata)
+    return make_layout(columns, labels, joints, mapping, declared=UNITS_KEY in metadata)
 
 
-def made_layout(
+def make_layout(
     columns: Sequence[str],
     labels: str | None,
     joints: Sequence[str],
@@ -101,25 +115,33 @@ def made_layout(
     *,
     declared: bool = False,
 ) -> Layout:
-    """A layout; declared: the file itself says what its units are."""
-    said = declared or all(mapping.unit("q", joint) for joint in joints)
-    return Layout(tuple(columns), labels, tuple(joints), mapping, said)
+    """Return a layout. declared: the file itself says what its units are."""
+    if not declared:
+        declared = all(mapping.unit("q", joint) for joint in joints)
+    return Layout(tuple(columns), labels, tuple(joints), mapping, declared)
 
 
-def element(name: str, present: Collection[str]) -> tuple[str, int] | None:
-    """The column of lists and the place in them that a name like `position[2]` speaks of; None for other names."""
+def list_element(name: str, columns: Collection[str]) -> tuple[str, int] | None:
+    """Return the column of lists and the index that a name like `position[2]` means; None for other names."""
     match = re.fullmatch(r"(.+)\[(\d{1,3})\]", name)
-    return (match[1], int(match[2])) if match and name not in present and match[1] in present else None
+    if match is None or name in columns or match[1] not in columns:
+        return None
+    return match[1], int(match[2])
 
 
-def stored_columns(layout: Layout, present: Collection[str]) -> list[str]:
-    """The columns of a file that hold a layout's, each once."""
-    names = [x for x in (*layout.columns, layout.labels) if x]
-    return list(dict.fromkeys(found[0] if (found := element(x, present)) else x for x in names))
+def stored_columns(layout: Layout, columns: Collection[str]) -> list[str]:
+    """Return the columns of a file that hold a layout's, each once."""
+    stored: dict[str, None] = {}
+    for name in layout.columns:
+        element = list_element(name, columns)
+        stored[name if element is None else element[0]] = None
+    if layout.labels:
+        stored[layout.labels] = None
+    return list(stored)
 
 
 def _require_columns(
-    present: Sequence[str], wanted: Sequence[str], file: Path, mapping: LogMapping, joints: Sequence[str]
+    columns: Sequence[str], wanted: Sequence[str], file: Path, mapping: LogMapping, joints: Sequence[str]
 ) -> None:
     shared = sorted({name for name in wanted if wanted.count(name) > 1})
     if shared:
@@ -127,45 +149,47 @@ def _require_columns(
             "one column for several joints", file=file, element=f"column {', '.join(shared)}",
             expected="'{joint}' in its name under 'logs'",
         )  # fmt: skip
-    repeated = sorted({name for name in wanted if present.count(name) > 1})
+    repeated = sorted({name for name in wanted if columns.count(name) > 1})
     if repeated:
         raise LogError(
             "the same column twice", file=file, element=f"column {', '.join(repeated)}", expected="it once"
         )
-    missing = [name for name in wanted if name not in present and not element(name, present)]
+    missing = [name for name in wanted if name not in columns and not list_element(name, columns)]
     if missing:
-        raise missing_columns(missing, present, file, mapping, joints)
+        raise missing_columns(missing, columns, file, mapping, joints)
 
 
 def missing_columns(
-    missing: Sequence[str], present: Collection[str], file: Path, mapping: LogMapping, joints: Sequence[str]
+    missing: Sequence[str], columns: Collection[str], file: Path, mapping: LogMapping, joints: Sequence[str]
 ) -> LogError:
-    """What is told of columns that are not there."""
-    columns = mapping.columns
-    expected = [
-        columns.t,
-        *(getattr(columns, x).replace("{joint}", "<joint>") for x in wanted_quantities(mapping)),
-    ]
+    """Return the error about columns that are not there."""
+    expected = [mapping.columns.t]
+    for quantity in wanted_quantities(mapping):
+        expected.append(getattr(mapping.columns, quantity).replace("{joint}", "<joint>"))
     return LogError(
-        f"only the columns {shortened(list(present), LISTED)}", file=file,
+        f"only the columns {shortened(list(columns), LISTED)}", file=file,
         element=f"missing column{'s' * (len(missing) > 1)} {shortened(missing, LISTED)}",
-        expected=", ".join(expected), do=_advice(missing, present, mapping, joints),
+        expected=", ".join(expected), do=_advice(missing, columns, mapping, joints),
     )  # fmt: skip
 
 
 def _advice(
-    missing: Sequence[str], present: Collection[str], mapping: LogMapping, joints: Sequence[str]
+    missing: Sequence[str], columns: Collection[str], mapping: LogMapping, joints: Sequence[str]
 ) -> str:
-    """What to do; a column is offered only where it names the same joint and is not another quantity's."""
-    owner = {
-        mapping.column(what, joint): (what, joint) for what in wanted_quantities(mapping) for joint in joints
-    }
-    if all(owner.get(name, ("", ""))[0] == "qd" for name in missing):
+    """Say what to do about missing columns: offer one that names the same joint and is no other quantity's."""
+    owners: dict[str, tuple[str, str]] = {}
+    for quantity in wanted_quantities(mapping):
+        for joint in joints:
+            owners[mapping.column(quantity, joint)] = (quantity, joint)
+    quantities = {owners.get(name, ("", ""))[0] for name in missing}
+    if quantities == {"qd"}:
         return "say 'velocity: differentiated' under 'logs' in the robot's YAML where none were logged"
-    joint = mapping.log_name(owner[missing[0]][1]) if missing[0] in owner else ""
-    named = re.compile(rf"(?<![0-9a-z]){re.escape(joint)}(?![0-9a-z])", re.IGNORECASE)
-    for close in difflib.get_close_matches(missing[0], [x for x in present if x not in owner], n=5):
-        if named.search(close):
+    joint = ""
+    if missing[0] in owners:
+        joint = mapping.log_name(owners[missing[0]][1])
+    unused = [name for name in columns if name not in owners]
+    for close in difflib.get_close_matches(missing[0], unused, n=5):
+        if names_joint(close, joint):
             return f"rename the column {close!r} to {missing[0]!r}?"
     return (
         "rename the columns, or say their names under 'logs' in the robot's YAML: "
@@ -173,10 +197,16 @@ def _advice(
     )
 
 
-def opened(file: Path, read: Callable[[], Content]) -> Content:
-    """What `read` gives; LogError where the file is not of its kind."""
+def names_joint(column: str, joint: str) -> bool:
+    """Whether a column's name holds a joint's as a word of its own: `q_1` holds 1, `q_12` does not."""
+    return re.search(rf"(?<![0-9a-z]){re.escape(joint)}(?![0-9a-z])", column, re.IGNORECASE) is not None
+
+
+@contextmanager
+def reading(file: Path) -> Iterator[None]:
+    """Turn what libraries raise for a damaged file into a LogError that names it."""
     try:
-        return read()
+        yield
     except UNREADABLE as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
-        raise LogError(f"an unreadable {file.suffix[1:]} file ({reason})", file=file) from error
+        lines = str(error).splitlines() or [type(error).__name__]
+        raise LogError(f"an unreadable {file.suffix[1:]} file ({lines[0].rstrip('.')})", file=file) from error

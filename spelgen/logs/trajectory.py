@@ -1,4 +1,4 @@
-"""What every step of the way from log files to training windows works on."""
+"""Hold one recording of an arm: what every step from log files to training samples works on."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from spelgen.errors import LogError
 from spelgen.listing import Listing
+from spelgen.settings.tuning.logs import LogTuning
 
+TUNING = LogTuning()
 QUANTITIES = ("q", "qd", "tau")
-LARGEST = 1e9  # [rad, rad/s, Nm; m, m/s, N] no arm has more
-GAP = 4.0  # a step longer than this many median steps is a hole in the recording, not jitter
+GAP = TUNING.gap
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -30,7 +30,7 @@ class Trajectory:
     name: unique among the trajectories that are used together.
     file: where it was read from, None if it was not.
     declares_units: the file itself, or the mapping it was read by, says in what units its columns are.
-    Raises LogError where shapes do not fit, a number is not finite or beyond any arm (LARGEST), or times do not
+    Raises LogError where shapes do not fit, a number is not finite or larger than any arm has, or times do not
     increase.
     """
 
@@ -45,42 +45,29 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         for column in ("t", *self.quantities):
-            object.__setattr__(self, column, self._numbers(column))
-        if self.t.ndim != 1 or not self.t.size:
-            raise self._error("t", f"an array of shape {self.t.shape}", "(T,), a time for each sample")
-        samples, joints = len(self.t), self.q.shape[1] if self.q.ndim == 2 else "n"
+            object.__setattr__(self, column, self._as_array(column))
+        self._require_shapes()
+        self._require_possible("t", np.isfinite(self.t))
         for column in self.quantities:
-            shape = getattr(self, column).shape
-            if len(shape) != 2 or shape != (samples, joints):
-                wanted = f"({samples}, {joints}), a row for each time and a column for each joint"
-                raise self._error(column, f"an array of shape {shape}", wanted)
-        for column in ("t", *self.quantities):
-            values = getattr(self, column)
-            bad = ~np.isfinite(values) if column == "t" else ~(np.abs(values) < LARGEST)
-            if bad.any():
-                row = int(np.argwhere(bad)[0, 0])
-                possible = (
-                    f"numbers below {LARGEST:g}" if np.isfinite(values[row]).all() else "finite numbers"
-                )
-                raise self._error(column, f"{values[row].tolist()} at sample {row}", possible)
-        back = np.flatnonzero(np.diff(self.t) <= 0)
-        if back.size:
-            before, after = self.t[back[0]], self.t[back[0] + 1]
+            self._require_possible(column, np.abs(getattr(self, column)) < TUNING.largest_value)
+        backward = np.flatnonzero(np.diff(self.t) <= 0)
+        if backward.size:
+            before, after = self.t[backward[0]], self.t[backward[0] + 1]
             raise self._error("t", f"{after:g} s after {before:g} s", "increasing times")
 
     def __len__(self) -> int:
-        """Samples."""
+        """Return the number of samples."""
         return len(self.t)
 
     def __getitem__(self, rows: slice) -> Trajectory:
-        """The same recording, only these rows."""
-        cut = {name: getattr(self, name)[rows] for name in ("t", "tau", *self.quantities)}
-        return replace(self, **cut)
+        """Return the same recording, only these rows."""
+        u = None if self.u is None else self.u[rows]
+        return replace(self, t=self.t[rows], q=self.q[rows], qd=self.qd[rows], tau=self.tau[rows], u=u)
 
     @property
     def quantities(self) -> tuple[str, ...]:
         """What it holds beside times: q, qd, and tau or u."""
-        return QUANTITIES if self.u is None else (*QUANTITIES[:2], "u")
+        return QUANTITIES if self.u is None else ("q", "qd", "u")
 
     @property
     def duration(self) -> float:
@@ -91,7 +78,9 @@ class Trajectory:
     def sample_rate(self) -> float:
         """Samples per second outside gaps [Hz], from the mean step: the median of jittered steps is biased."""
         steps = np.diff(self.t)
-        return float(1.0 / steps[steps <= GAP * np.median(steps)].mean()) if steps.size else 0.0
+        if not steps.size:
+            return 0.0
+        return float(1.0 / steps[steps <= GAP * np.median(steps)].mean())
 
     def __repr__(self) -> str:
         joints = self.q.shape[1]
@@ -101,14 +90,37 @@ class Trajectory:
     def _repr_html_(self) -> str:
         return trajectory_listing([self]).html()
 
-    def _numbers(self, column: str) -> np.ndarray:
-        given: Any = getattr(self, column)
+    def _as_array(self, column: str) -> np.ndarray:
+        values: object = getattr(self, column)
         try:
-            if hasattr(given, "detach"):  # a tensor, wherever it is and whatever gradient it has
-                given = given.detach().cpu()
-            return np.asarray(given, dtype=float)
+            if hasattr(values, "detach"):  # a tensor, wherever it is and whatever gradient it has
+                values = values.detach().cpu()
+            return np.asarray(values, dtype=float)
         except (TypeError, ValueError) as error:
-            raise self._error(column, f"{type(given).__name__} ({error})", "an array of numbers") from error
+            got = f"{type(values).__name__} ({error})"
+            raise self._error(column, got, "an array of numbers") from error
+
+    def _require_shapes(self) -> None:
+        if self.t.ndim != 1 or not self.t.size:
+            raise self._error("t", f"an array of shape {self.t.shape}", "(T,), a time for each sample")
+        samples = len(self.t)
+        joints = self.q.shape[1] if self.q.ndim == 2 else "n"
+        for column in self.quantities:
+            shape = getattr(self, column).shape
+            if len(shape) != 2 or shape != (samples, joints):
+                expected = f"({samples}, {joints}), a row for each time and a column for each joint"
+                raise self._error(column, f"an array of shape {shape}", expected)
+
+    def _require_possible(self, column: str, possible: np.ndarray) -> None:
+        """Raise LogError where a column holds a value that is not possible, both of one shape."""
+        if possible.all():
+            return
+        row = int(np.argwhere(~possible)[0, 0])
+        value = getattr(self, column)[row]
+        expected = "finite numbers"
+        if np.isfinite(value).all():
+            expected = f"numbers below {TUNING.largest_value:g}"
+        raise self._error(column, f"{value.tolist()} at sample {row}", expected)
 
     def _error(self, column: str, got: str, expected: str) -> LogError:
         return LogError(got, file=self.file, element=f"trajectory {self.name}: {column}", expected=expected)
@@ -116,16 +128,16 @@ class Trajectory:
 
 def require_torques(trajectories: Sequence[Trajectory]) -> None:
     """Raise LogError where no torques were logged."""
-    for each in trajectories:
-        if each.u is not None:
+    for trajectory in trajectories:
+        if trajectory.u is not None:
             raise LogError(
-                "commanded positions and no torques", file=each.file, element=f"trajectory {each.name}",
+                "commanded positions and no torques", file=trajectory.file, element=f"trajectory {trajectory.name}",
                 expected="torques", do="arms under position servos are fitted and judged by `train` and `evaluate`",
             )  # fmt: skip
 
 
 def require_commands(trajectory: Trajectory) -> np.ndarray:
-    """Its commanded positions, (T, n). Raises LogError where none were logged."""
+    """Return its commanded positions, (T, n). Raises LogError where none were logged."""
     if trajectory.u is None:
         raise LogError(
             "no commanded positions", file=trajectory.file, element=f"trajectory {trajectory.name}",
@@ -135,27 +147,27 @@ def require_commands(trajectory: Trajectory) -> np.ndarray:
 
 
 def trajectory_listing(trajectories: Sequence[Trajectory]) -> Listing:
-    """Trajectories as a table: samples, duration, sample rate, joints."""
+    """Return trajectories as a table: samples, duration, sample rate, joints."""
     head = ("trajectory", "samples", "duration", "sample rate", "joints")
-    rows = tuple(
-        (x.name, str(len(x)), f"{x.duration:.4g} s", f"{x.sample_rate:.4g} Hz", str(x.q.shape[1]))
-        for x in trajectories
-    )
-    return Listing("Trajectories", head, rows)
+    rows = []
+    for x in trajectories:
+        rate, joints = f"{x.sample_rate:.4g} Hz", str(x.q.shape[1])
+        rows.append((x.name, str(len(x)), f"{x.duration:.4g} s", rate, joints))
+    return Listing("Trajectories", head, tuple(rows))
 
 
 def require_joints(trajectory: Trajectory, joints: Sequence[str]) -> None:
     """Raise LogError unless the trajectory has a column for each of these joints."""
-    found = trajectory.q.shape[1]
-    if found != len(joints):
+    count = trajectory.q.shape[1]
+    if count != len(joints):
         raise LogError(
-            f"{found} joints", file=trajectory.file, element=f"trajectory {trajectory.name}",
+            f"{count} joints", file=trajectory.file, element=f"trajectory {trajectory.name}",
             expected=f"{len(joints)}: {', '.join(joints)}",
         )  # fmt: skip
 
 
 def gap_ends(t: np.ndarray, gap: float = GAP) -> list[int]:
-    """Where the gap-free pieces of these times (T,) begin, and T. gap: in median steps."""
+    """Return where the gap-free pieces of these times (T,) begin, and T. gap: in median steps."""
     steps = np.diff(t)
     if not steps.size:
         return [0, len(t)]
@@ -163,6 +175,8 @@ def gap_ends(t: np.ndarray, gap: float = GAP) -> list[int]:
 
 
 def split_at_gaps(trajectory: Trajectory, gap: float = GAP) -> list[Trajectory]:
-    """The gap-free pieces, in order, all under the trajectory's name."""
+    """Return the gap-free pieces, in order, all under the trajectory's name."""
     ends = gap_ends(trajectory.t, gap)
-    return [trajectory] if len(ends) == 2 else [trajectory[a:b] for a, b in pairwise(ends)]
+    if len(ends) == 2:
+        return [trajectory]
+    return [trajectory[start:stop] for start, stop in pairwise(ends)]

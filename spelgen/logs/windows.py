@@ -1,8 +1,8 @@
-"""Gap-free trajectories -> batched windows of a few samples, and the split into training and validation."""
+"""Cut gap-free trajectories into batched windows of a few samples, and split them into training and validation."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from spelgen.dynamics.bristles import BristleReach, bristles_along
 from spelgen.errors import Diagnostic, LogError
-from spelgen.logs.read import Trajectory
+from spelgen.logs.trajectory import Trajectory
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,7 +21,7 @@ class Windows:
     dt: (W, K-1) steps between the samples [s].
     q, qd: (W, K, n) measured positions and velocities.
     tau: (W, K-1, n) the input held over each step.
-    z: (W, n, B) [rad, m] friction's memory at the first sample, of the way there; None: not known.
+    z: (W, n, B) [rad, m] states of friction's bristles at the first sample, from the motion before; None: not known.
     """
 
     dt: torch.Tensor
@@ -34,37 +34,35 @@ class Windows:
         return self.dt.shape[0]
 
     def __getitem__(self, rows: torch.Tensor | slice) -> Windows:
-        return self._each(lambda x: x[rows])
+        return Windows(*(x[rows] for x in self.columns()))
 
     def split(self, size: int) -> list[Windows]:
-        """Consecutive parts of at most `size` windows."""
+        """Return consecutive parts of at most `size` windows."""
         return [self[start : start + size] for start in range(0, len(self), size)]
 
     def to(self, device: str | torch.device) -> Windows:
-        """The same windows on another device."""
-        return self._each(lambda x: x.to(device))
+        """Return the same windows on another device."""
+        return Windows(*(x.to(device) for x in self.columns()))
 
     def columns(self) -> list[torch.Tensor]:
-        """All that is known."""
+        """Return the tensors that are known."""
         columns = [self.dt, self.q, self.qd, self.tau]
         return columns if self.z is None else [*columns, self.z]
 
-    def _each(self, change: Callable[[torch.Tensor], torch.Tensor]) -> Windows:
-        return Windows(*map(change, self.columns()))
-
 
 def thinned(windows: Windows, most: int) -> Windows:
-    """At most that many windows, evenly spread."""
+    """Return at most that many windows, evenly spread."""
     return windows[:: -(-len(windows) // most)]
 
 
-def joined(parts: Sequence[Windows]) -> Windows:
-    """One batch of all windows, in order."""
-    return Windows(*(torch.cat(each) for each in zip(*(x.columns() for x in parts), strict=True)))
+def joined(batches: Sequence[Windows]) -> Windows:
+    """Return one batch of all windows, in order."""
+    columns = zip(*(x.columns() for x in batches), strict=True)
+    return Windows(*map(torch.cat, columns))
 
 
 def window_count(samples: int, window: int, stride: int, decimation: int) -> int:
-    """How many windows `cut_windows` cuts from a piece of so many samples."""
+    """Return how many windows `cut_windows` cuts from a piece of so many samples."""
     starts = samples - (window - 1) * decimation
     return max(0, -(-starts // stride))
 
@@ -78,38 +76,42 @@ def cut_windows(
     measured: bool,
     reach: BristleReach | None = None,
 ) -> Windows:
-    """All windows of `window` samples, `decimation` apart, that start at every `stride`-th sample of a piece.
+    """Return all windows of `window` samples, `decimation` apart, that start at every `stride`-th sample of a piece.
 
     Between samples the input is held at its mean over time. measured: False reads tau[k] as held from t[k]
     to t[k+1], as a simulator with zero-order hold applied it. True reads it as measured at t[k] and takes
     the mean of both ends for a step; holding tau[k] would be half a sample late. reach: (n, B) of the bristles
     whose states z are wanted, which begin straight with each piece. Raises LogError when there is no window.
     """
-    cut = [
-        _cut(piece, window, stride, decimation, measured, reach)
-        for piece in pieces
-        if len(piece.t) > (window - 1) * decimation
-    ]
-    if not cut:
-        raise LogError(f"no trajectory of {(window - 1) * decimation + 1} samples", expected="one window")
-    return Windows(*(torch.from_numpy(np.concatenate(parts)) for parts in zip(*cut, strict=True)))
+    span = (window - 1) * decimation
+    batches: list[list[np.ndarray]] = []
+    for piece in pieces:
+        if len(piece) > span:
+            batches.append(_cut(piece, window, stride, decimation, measured, reach))
+    if not batches:
+        raise LogError(f"no trajectory of {span + 1} samples", expected="one window")
+    columns = [np.concatenate(arrays) for arrays in zip(*batches, strict=True)]
+    return Windows(*map(torch.from_numpy, columns))
 
 
 def _cut(
     piece: Trajectory, window: int, stride: int, decimation: int, measured: bool, reach: BristleReach | None
-) -> tuple[np.ndarray, ...]:
+) -> list[np.ndarray]:
+    """Return dt, q, qd, tau, and z where a reach is given, of the windows of one piece."""
     held = (piece.tau[:-1] + piece.tau[1:]) / 2 if measured else piece.tau[:-1]
-    impulse = sliding_window_view(held * np.diff(piece.t)[:, None], decimation, axis=0).sum(
-        axis=-1
-    )  # (T - decimation, n)
+    impulses = held * np.diff(piece.t)[:, None]
+    impulse = sliding_window_view(impulses, decimation, axis=0).sum(axis=-1)  # (T - decimation, n)
     dt = (piece.t[decimation:] - piece.t[:-decimation])[:, None]
-    steps = [_slide(x, window - 1, stride, decimation) for x in (dt, impulse / dt)]
-    states = [_slide(x, window, stride, decimation) for x in (piece.q, piece.qd)]
-    columns = (steps[0][..., 0], *states, steps[1])
-    if reach is None or not reach.elements:
-        return columns
-    starts = len(piece.t) - (window - 1) * decimation
-    return *columns, bristles_along(piece.q, reach)[:starts:stride]
+    columns = [
+        _slide(dt, window - 1, stride, decimation)[..., 0],
+        _slide(piece.q, window, stride, decimation),
+        _slide(piece.qd, window, stride, decimation),
+        _slide(impulse / dt, window - 1, stride, decimation),
+    ]
+    if reach is not None and reach.elements:
+        starts = len(piece) - (window - 1) * decimation
+        columns.append(bristles_along(piece.q, reach)[:starts:stride])
+    return columns
 
 
 def _slide(values: np.ndarray, window: int, stride: int, decimation: int) -> np.ndarray:
@@ -120,7 +122,7 @@ def _slide(values: np.ndarray, window: int, stride: int, decimation: int) -> np.
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Training and validation pieces, which share no sample, and how they were chosen."""
+    """Hold training and validation pieces, which share no sample, and how they were chosen."""
 
     training: tuple[Trajectory, ...]
     validation: tuple[Trajectory, ...]
@@ -132,27 +134,29 @@ def split_validation(trajectories: Sequence[Trajectory], fraction: float, seed: 
 
     A single trajectory is cut once in time, its last part validates.
     """
-    if len(trajectories) == 1:
+    total = len(trajectories)
+    if total == 1:
         return _split_in_time(trajectories[0], fraction)
-    count = min(max(1, round(fraction * len(trajectories))), len(trajectories) - 1)
-    chosen = set(np.random.default_rng(seed).permutation(len(trajectories))[:count].tolist())
-    training = tuple(x for i, x in enumerate(trajectories) if i not in chosen)
-    validation = tuple(x for i, x in enumerate(trajectories) if i in chosen)
-    names = (
-        ", ".join(x.name for x in validation)
-        if count <= 3
-        else f"{count} of {len(trajectories)} trajectories"
-    )
+    count = min(max(1, round(fraction * total)), total - 1)
+    chosen = set(np.random.default_rng(seed).permutation(total)[:count].tolist())
+    training: list[Trajectory] = []
+    validation: list[Trajectory] = []
+    for index, trajectory in enumerate(trajectories):
+        (validation if index in chosen else training).append(trajectory)
+    names = f"{count} of {total} trajectories"
+    if count <= 3:
+        names = ", ".join(x.name for x in validation)
     note = Diagnostic("info", "validation-split", "logs", None, f"validation on whole trajectories: {names}")
-    return Split(training, validation, note)
+    return Split(tuple(training), tuple(validation), note)
 
 
 def _split_in_time(trajectory: Trajectory, fraction: float) -> Split:
     t = trajectory.t
     cut = int(np.searchsorted(t, t[-1] - fraction * (t[-1] - t[0])))
-    parts = trajectory[:cut], replace(trajectory[cut:], name=f"{trajectory.name} (last part)")
-    before, after = t[cut - 1] - t[0], t[-1] - t[cut]
+    first, last = trajectory[:cut], replace(trajectory[cut:], name=f"{trajectory.name} (last part)")
     message = (
-        f"only one trajectory: training on its first {before:.3g} s, validation on the last {after:.3g} s"
+        f"only one trajectory: training on its first {t[cut - 1] - t[0]:.3g} s, "
+        f"validation on the last {t[-1] - t[cut]:.3g} s"
     )
-    return Split(parts[:1], parts[1:], Diagnostic("warning", "validation-split", "logs", None, message))
+    note = Diagnostic("warning", "validation-split", "logs", None, message)
+    return Split((first,), (last,), note)

@@ -10,6 +10,7 @@ import yaml
 from yaml.composer import ComposerError
 
 from spelgen.errors import SettingsError
+from spelgen.files import require_regular_file
 
 Location: TypeAlias = tuple[int | str, ...]
 """Keys and numbers of list items that lead to a place in a file."""
@@ -95,8 +96,7 @@ class _Loader(yaml.SafeLoader):
 def read_document(path: Path) -> Document:
     """Return a small YAML file of one document; raises SettingsError where it is no such thing."""
     try:
-        if not path.is_file():
-            raise SettingsError("no regular file", file=path, expected="a YAML file")
+        require_regular_file(path, SettingsError, "a YAML file")
         if path.stat().st_size > MAX_BYTES:
             raise SettingsError("a large file", file=path, expected=f"at most {MAX_BYTES} bytes")
         return Document(path, _Loader(path.read_bytes().decode("utf-8")).get_single_node())
