@@ -33,10 +33,10 @@ from torch.func import grad, jvp
 
 import spelgen
 from spelgen.arm.arm import Arm
+from spelgen.baselines.names import CONSTANT_VELOCITY, MODEL, observed
 from spelgen.building import build
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.dynamics.pinocchio_urdf import has_drives, urdf_dynamics
-from spelgen.evaluation.names import CONSTANT_VELOCITY, MODEL, observed
 from spelgen.fitting.torque_fit import fit_torque
 from spelgen.identification.friction import FrictionModel
 from spelgen.identification.identify import least_squares

@@ -25,9 +25,9 @@ from characters import TESTS as CHARACTERS
 from characters import read_characters, write_arm
 
 from spelgen.arm.arm import Arm
+from spelgen.baselines.predictor import of_dynamics
 from spelgen.building import build
 from spelgen.dynamics.bristles import BristleReach, reach_of
-from spelgen.evaluation.baselines import of_dynamics
 from spelgen.evaluation.results import end_errors
 from spelgen.fitting.torque_fit import fit_torque
 from spelgen.identification.friction import FrictionModel
@@ -191,7 +191,7 @@ def tested(logs: Sequence[Trajectory], steps: int) -> Windows:
 def relative_error(dynamics: Any, windows: Windows) -> float:
     predictor = of_dynamics("", dynamics, SUBSTEPS)
     with torch.no_grad():
-        predicted = predictor.states(windows)
+        predicted = predictor.solver(windows)
     found = end_errors(predicted, windows, ("revolute",) * windows.q.shape[-1], None)
     return found.mean_relative_rms or np.nan
 

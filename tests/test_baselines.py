@@ -8,14 +8,16 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
+from spelgen.baselines.baseline import JudgedArm
+from spelgen.baselines.names import URDF, URDF_WITH_DRIVES
+from spelgen.baselines.rosenbrock import roll_out_stiff
+from spelgen.baselines.solver import accurate_solver
+from spelgen.baselines.urdf import UrdfValues
 from spelgen.cli.main import app
 from spelgen.dynamics.protocol import VelocityState
 from spelgen.dynamics.regressor import regressor, urdf_parameters
 from spelgen.dynamics.regressor_dynamics import RegressorDynamics
 from spelgen.dynamics.rigid_bodies import RigidBodies
-from spelgen.evaluation.baselines import of_urdf
-from spelgen.evaluation.names import URDF, URDF_WITH_DRIVES
-from spelgen.evaluation.stiff import accurate_solver, roll_out_stiff
 from spelgen.fitting.fitted import load_run
 from spelgen.loaded_arm import load_arm
 from spelgen.logs.read import Trajectory, read_logs, write_logs
@@ -124,7 +126,7 @@ def test_the_urdf_stands_once_as_it_is_and_once_with_its_drives(robots):
     names = [coordinate.name for coordinate in arm.arm.coordinates]
     q = torch.zeros(1, 4, 3, dtype=torch.float64)
     probe = Windows(torch.full((1, 3), 0.05, dtype=torch.float64), q, q, q[:, :3])
-    plain, driven = of_urdf(arm.robot.path, names, probe)
+    plain, driven = UrdfValues().predictors(JudgedArm(names, arm.robot.path, None, probe, []))
     assert (plain.name, driven.name) == (URDF, URDF_WITH_DRIVES)
     at = torch.full((1, 3), 0.3, dtype=torch.float64)
     rotors = [arm.settings.joint(name) for name in names]

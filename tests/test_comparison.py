@@ -12,6 +12,8 @@ import pytest
 import torch
 import yaml
 
+from spelgen.baselines.constant_velocity import hold_velocity
+from spelgen.baselines.predictor import Predictor
 from spelgen.comparison import metrics, runs
 from spelgen.comparison.formatting import comparison_tables
 from spelgen.comparison.known_urdf import with_wrong_inertials
@@ -22,7 +24,6 @@ from spelgen.design import load_design
 from spelgen.emission.loading import load_module
 from spelgen.errors import RunError
 from spelgen.evaluation import invariants
-from spelgen.evaluation.baselines import constant_velocity
 from spelgen.evaluation.examples import predict_examples
 from spelgen.fitting.rollout import roll_out
 from spelgen.fleet.tasks import run_here
@@ -264,7 +265,9 @@ def test_windows_and_examples_of_every_fourth_sample_begin_with_a_fourth_one():
     windows = metrics.thinned([log], 5, 4)
     assert not (windows.q % 4).any()
     assert torch.equal(windows.tau, windows.q[:, :-1] / 4)
-    (example,) = predict_examples(constant_velocity(), [log], 10, ["joint1"], decimation=4, measured=False)
+    (example,) = predict_examples(
+        Predictor("", hold_velocity), [log], 10, ["joint1"], decimation=4, measured=False
+    )
     assert [x % 4 for x in example.joints[0].q_true] == [0] * 11
     np.testing.assert_allclose(example.t, 0.008 * np.arange(11), atol=1e-12)
 

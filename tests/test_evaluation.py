@@ -10,16 +10,16 @@ import torch
 import typer
 from typer.testing import CliRunner
 
+from spelgen.baselines.constant_velocity import hold_velocity
+from spelgen.baselines.names import observed
 from spelgen.building import build
 from spelgen.cli import evaluate_command
 from spelgen.dynamics.pinocchio_urdf import urdf_dynamics
 from spelgen.dynamics.tip import tip_kinematics
 from spelgen.emission.loading import load_module
 from spelgen.errors import LogError, RunError
-from spelgen.evaluation.baselines import constant_velocity
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.evaluation.invariants import energy_drift
-from spelgen.evaluation.names import observed
 from spelgen.evaluation.rollout import rollout
 from spelgen.evaluation.subject import read_test_logs
 from spelgen.evaluation.torque import torque_errors
@@ -121,7 +121,7 @@ def test_a_constant_velocity_is_exact_where_nothing_accelerates():
     qd = draw(4, 1, 2)
     t = torch.cat([torch.zeros(4, 1), dt.cumsum(dim=1)], dim=1)
     windows = Windows(dt, t.unsqueeze(-1) * qd, qd.expand(-1, 4, -1), draw(4, 3, 2))
-    q, velocity = constant_velocity().states(windows)
+    q, velocity = hold_velocity(windows)
     torch.testing.assert_close(q, windows.q[:, 1:])
     torch.testing.assert_close(velocity, windows.qd[:, 1:])
 
@@ -333,14 +333,20 @@ def moving(samples=600, rate=100.0, still=0) -> Trajectory:
     return Trajectory(t, q, qd, tau, "moving")
 
 
+class Torques:
+    """Dynamics that have torques alone."""
+
+    def __init__(self, inverse_dynamics):
+        self.inverse_dynamics = inverse_dynamics
+
+
 def test_torque_errors_by_the_protocol():
     (samples,) = dynamics_samples([moving()])
-    exact = torque_errors(lambda q, qd, qdd: torch.stack([qdd[:, 0], 0 * qdd[:, 1]], -1), [samples])
+    exact = torque_errors(Torques(lambda q, qd, qdd: torch.stack([qdd[:, 0], 0 * qdd[:, 1]], -1)), [samples])
     assert exact.nmse[0, 0] < 1e-3  # the ends of the filter remain
     assert math.isnan(exact.nmse[0, 1])  # a torque that never varies has nothing to explain
-    offset = torque_errors(
-        lambda q, qd, qdd: torch.from_numpy(samples.tau) + torch.tensor([1.0, 2.0]), [samples]
-    )
+    tau = torch.from_numpy(samples.tau)
+    offset = torque_errors(Torques(lambda q, qd, qdd: tau + torch.tensor([1.0, 2.0])), [samples])
     np.testing.assert_allclose(offset.rmse, [[1.0, 2.0]], rtol=1e-12)
     np.testing.assert_allclose(offset.nmse[0, 0], 1 / samples.tau[:, 0].var(), rtol=1e-12)
 
@@ -364,8 +370,8 @@ def test_the_ur10e_urdf_has_its_known_torque_error(shared):
     ]
     samples = dynamics_samples(read_logs(sorted(paths), UR10E))
     assert len(samples) == 9
-    torque = urdf_dynamics(folder / "ur10e.urdf", UR10E).inverse_dynamics
-    assert torque_errors(torque, samples).nmse.mean() == pytest.approx(0.67, abs=0.005)
+    dynamics = urdf_dynamics(folder / "ur10e.urdf", UR10E)
+    assert torque_errors(dynamics, samples).nmse.mean() == pytest.approx(0.67, abs=0.005)
 
 
 def test_logs_that_never_move_have_no_torque_errors(robots):

@@ -25,8 +25,10 @@ certificate emission logs
 loaded_arm pipeline building trust
 identification log_checks excitation
 fitting simulation
-evaluation exporting
-baselines fleet comparison render
+exporting
+baselines
+evaluation
+fleet comparison render
 cli __init__ __main__
 """
 ROOMS = ROWS.split()
@@ -41,7 +43,7 @@ PLAIN = {"spelgen.arm.actuation"}  # G by the files, without the exact arithmeti
 ROOMS_THAT_DERIVE = ("urdf.", "arm.", "structure.", "emission.", "certificate.")
 DERIVES = [x for x in LAYERS if x.startswith(ROOMS_THAT_DERIVE) and x != "emission.loading"]
 OF_A_RUN = {f"render.{name}" for name in ("charts", "plots", "picture", "page", "learned", "scene")}
-FITS = [x for x in LAYERS if x.startswith(("logs.", "fitting.", "evaluation."))]
+FITS = [x for x in LAYERS if x.startswith(("logs.", "fitting."))]  # evaluation has least squares beside it
 NEVER = {
     "spec": {"sympy", "flint", "torch"},
     "pipeline": {"torch"},

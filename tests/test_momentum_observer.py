@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 import torch
 
+from spelgen.baselines.names import CONSTANT_VELOCITY, MODEL, observed
+from spelgen.baselines.predictor import of_dynamics
+from spelgen.baselines.solver import Solver
 from spelgen.dynamics.protocol import VelocityState
 from spelgen.emission.loading import load_module
 from spelgen.evaluation import momentum_observer
-from spelgen.evaluation.baselines import of_dynamics
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.evaluation.momentum_observer import observe, past_steps, without_past
-from spelgen.evaluation.names import CONSTANT_VELOCITY, MODEL, observed
 from spelgen.evaluation.rollout import rollout
-from spelgen.evaluation.stiff import Solver
 from spelgen.fitting.rollout import roll_out
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
@@ -105,7 +105,7 @@ def test_rollouts_that_hold_it_stand_beside_open_loop():
 def test_a_window_whose_numbers_blow_up_spoils_no_other():
     model = load_module(STAND_IN)
     windows = cut_windows(motions(), 11, 60, measured=False)
-    sound = of_dynamics(MODEL, model, 1).states(windows)
+    sound = of_dynamics(MODEL, model, 1).solver(windows)
 
     def fragile(form, some, substeps):
         if (some.q[:, 0] == windows.q[3, 0]).all(dim=-1).any():

@@ -16,12 +16,12 @@ from servo_arm import COM, GRAVITY, MASS, STRIBECK_VELOCITY, Servos, servo_logs,
 from typer.testing import CliRunner
 
 import spelgen
-from spelgen.baselines.keep import read_baseline
+from spelgen.baselines.keep import read_followers
+from spelgen.baselines.names import DELAYED_COMMAND, LINEAR_SERVOS, POSITION_ACTUATORS
 from spelgen.cli.main import app
 from spelgen.dynamics.servo_rank import servo_rank
 from spelgen.dynamics.servo_rollout import replayed
 from spelgen.errors import LogError, OptionError, RunError, SettingsError
-from spelgen.evaluation.names import DELAYED_COMMAND, LINEAR_SERVOS, POSITION_ACTUATORS
 from spelgen.files import write_json
 from spelgen.fitting import servo_descent, servo_fit
 from spelgen.fitting.run_folder import RunFolder
@@ -89,7 +89,7 @@ def test_actuators_of_mujoco_are_what_it_has_to_beat(fitted, logs, monkeypatch):
     mujoco = pytest.importorskip("mujoco")
     run = RunFolder(fitted.folder)
     spelgen.keep_baseline(run.path, logs[:1])
-    (found,) = read_baseline(run).values()
+    (found,) = read_followers(run).values()
     simulated = mujoco.MjModel.from_xml_string(found.mjcf)
     assert simulated.actuator_gainprm[:, 0] == pytest.approx(TRUTH.kp, rel=0.05)
     assert -simulated.actuator_biasprm[:, 2] == pytest.approx(TRUTH.kd, rel=0.05)
@@ -100,14 +100,14 @@ def test_actuators_of_mujoco_are_what_it_has_to_beat(fitted, logs, monkeypatch):
     assert (simulated.dof_frictionloss > 0.9 * rest).all()
     assert (simulated.dof_frictionloss < 1.1 * (rest + TRUTH.stribeck)).all()
     assert found.delay == pytest.approx(TRUTH.delay, abs=0.005)
-    results = spelgen.evaluate(run.path, logs[4][:400], baselines=read_baseline(run))
+    results = spelgen.evaluate(run.path, logs[4][:400])
     for replay in results.replays:
         assert replay.errors[POSITION_ACTUATORS].mean < 0.4 * replay.errors[LINEAR_SERVOS].mean
     notes = " ".join(x.message for x in results.diagnostics if x.code == "baseline")
     assert "by mujoco.minimize, the least squares of mujoco.sysid" in notes
     monkeypatch.setitem(sys.modules, "mujoco", None)  # as if it were not installed
-    assert read_baseline(run) == {}
-    alone = spelgen.evaluate(run.path, logs[4][:40], baselines=read_baseline(run))
+    assert read_followers(run) == {}
+    alone = spelgen.evaluate(run.path, logs[4][:40])
     assert "no-position-actuators" in {x.code for x in alone.diagnostics}
 
 
@@ -127,7 +127,7 @@ def test_actuators_from_elsewhere_are_what_was_written_or_an_error(mjcf, joints,
     with pytest.raises(
         RunError, match=r"least_squares\.json: got actuators of MuJoCo that cannot be used"
     ) as told:
-        read_baseline(RunFolder(tmp_path))
+        read_followers(RunFolder(tmp_path))
     assert said in f"{told.value} {type(told.value).__name__}"
 
 

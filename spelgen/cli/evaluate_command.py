@@ -32,7 +32,6 @@ def evaluate(
     paths = options.logs(data, more)
     import torch
 
-    from spelgen.baselines.keep import read_baseline
     from spelgen.evaluation.evaluate import evaluate as evaluate_model
     from spelgen.evaluation.subject import read_test_logs
     from spelgen.files import write_json
@@ -44,9 +43,9 @@ def evaluate(
     preprocessing = None
     if filter is not None:
         preprocessing = Preprocessing(cutoff=filter)
-    logs, baselines = read_test_logs(run, paths, mapping), read_baseline(RunFolder(run))
+    logs = read_test_logs(run, paths, mapping)
     model = load_run(run, trust=trust)
-    results = evaluate_model(model, logs, baselines=baselines, preprocessing=preprocessing)
+    results = evaluate_model(model, logs, preprocessing=preprocessing)
     record = results.to_dict()
     write_json(RunFolder(run).evaluation, record)
     for diagnostic in results.diagnostics:

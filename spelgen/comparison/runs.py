@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from spelgen.baselines.names import MODEL
+from spelgen.baselines.predictor import of_dynamics
 from spelgen.comparison.metrics import predict, sizes, step_seconds, thinned
 from spelgen.comparison.study import Study, Variant
 from spelgen.comparison.truth import example_positions, mass_error, true_mass
 from spelgen.emission.loading import load_module
-from spelgen.evaluation.baselines import of_dynamics
 from spelgen.evaluation.examples import predict_examples
 from spelgen.evaluation.invariants import invariants
-from spelgen.evaluation.names import MODEL
 from spelgen.files import write_json
 from spelgen.fitting.rollout import LossScales, loss_scales
 from spelgen.fitting.run_folder import RunFolder, trained_model

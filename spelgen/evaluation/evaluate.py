@@ -6,19 +6,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from spelgen.baselines.baseline import JudgedArm
+from spelgen.baselines.names import MODEL
+from spelgen.baselines.predictor import of_accurate_dynamics, of_dynamics
+from spelgen.baselines.registry import BASELINES
 from spelgen.dynamics.protocol import has_servos
 from spelgen.errors import Diagnostic, LogError
-from spelgen.evaluation.baselines import (
-    Predictor,
-    constant_velocity,
-    of_baseline,
-    of_dynamics,
-    of_urdf,
-)
 from spelgen.evaluation.horizons import PROBED, JudgedLogs, horizon_lengths, predict
 from spelgen.evaluation.invariants import energy_drift
-from spelgen.evaluation.names import MODEL
-from spelgen.evaluation.replay import CommandFollower, replays
+from spelgen.evaluation.replay import replays
 from spelgen.evaluation.results import Results, torque_summary
 from spelgen.evaluation.subject import Subject, subject
 from spelgen.evaluation.torque import torque_errors
@@ -28,9 +24,9 @@ from spelgen.identification.samples import dynamics_samples
 from spelgen.logs.checks import check
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, require_joints, require_torques
-from spelgen.logs.windows import Windows
 
 if TYPE_CHECKING:
+    from spelgen.dynamics.protocol import RigidDynamics
     from spelgen.dynamics.tip import TipKinematics
 
 
@@ -39,7 +35,7 @@ def evaluate(
     logs: Trajectory | Sequence[Trajectory],
     *,
     arm: Any = None,
-    baselines: Mapping[str, Any] | None = None,
+    baselines: Mapping[str, RigidDynamics] | None = None,
     preprocessing: Preprocessing | None = None,
     steps: Sequence[int] = (1, 10),
     seconds: Sequence[float] = (1.0,),
@@ -47,11 +43,11 @@ def evaluate(
     """Predict the states and torques of test logs and measure the errors.
 
     model: an emitted one, a fit, or the folder of a run. arm: of ``load_arm``, or the path of a URDF; by default
-    the fit's: it gives the URDF as a baseline, and errors of the tip. baselines: any dynamics to be judged beside
-    it, by name, e.g. ``{"least squares": identify(...).dynamics}``, or beside position servos a `CommandFollower`.
+    the fit's: it gives the URDF as a baseline, and errors of the tip. baselines: other dynamics to be judged beside
+    those of `baselines.registry` and what the fit's folder keeps, by name, e.g. ``{"truth": identify(...).dynamics}``.
     preprocessing: of states and torques; by default as the model was fitted. steps, seconds: horizons in samples and in
-    time; those longer than every trajectory are left out, and said. All
-    that has dynamics is judged open loop, and with the disturbance held that a momentum observer finds before a
+    time; those longer than every trajectory are left out, and said.
+    All that has dynamics is judged open loop, and with the disturbance held that a momentum observer finds before a
     prediction starts (see `momentum_observer.py`). No random numbers enter. Raises LogError.
     """
     judged = subject(model, arm)
@@ -61,7 +57,7 @@ def evaluate(
     notes = check(logs, judged.joints, joint_types)
     notes += _seen(logs, judged)
     if has_servos(judged.model):
-        return _replayed(judged, logs, notes, baselines or {})
+        return _replayed(judged, logs, notes)
     require_torques(logs)
     used = _preprocessing(preprocessing, judged, logs)
     pieces = used.pieces(logs, shortest=2)
@@ -70,9 +66,12 @@ def evaluate(
     probe = tests.windows(judged.window, PROBED)
     scales = loss_scales(probe, joint_types)
     substeps = choose_substeps(judged.model, probe, scales, start=judged.substeps_per_sample)
-    predictors = [of_dynamics(MODEL, judged.model, substeps), constant_velocity()]
-    predictors += _urdf_baseline(judged, probe, notes)
-    predictors += [of_baseline(name, each, probe) for name, each in (baselines or {}).items()]
+    predictors = [of_dynamics(MODEL, judged.model, substeps)]
+    arm_of_model = JudgedArm(judged.joints, judged.urdf, judged.run, probe, notes)
+    for baseline in BASELINES:
+        predictors += baseline.predictors(arm_of_model)
+    for name, dynamics in (baselines or {}).items():
+        predictors.append(of_accurate_dynamics(name, dynamics, probe))
     tip = _tip(judged, notes)
     position = None if tip is None else tip.position
     predicted = [
@@ -91,9 +90,9 @@ def evaluate(
         parameters=sum(parameter.numel() for parameter in judged.model.parameters()),
         horizons=tuple(horizon for horizon, _ in predicted),
         torque={
-            x.name: torque_summary(torque_errors(x.torque, samples))
+            x.name: torque_summary(torque_errors(x.dynamics, samples))
             for x in predictors
-            if x.torque and samples
+            if x.dynamics is not None and samples
         },
         energy_drift=energy_drift(judged.model, probe),
         traces=traces(predictors, pieces, longest, joint_types, used=used, reach=judged.reach, tip=position),
@@ -106,7 +105,6 @@ def _replayed(
     judged: Subject,
     logs: Sequence[Trajectory],
     notes: list[Diagnostic],
-    baselines: Mapping[str, CommandFollower],
 ) -> Results:
     """Of an arm under position servos: its commands are replayed."""
     if any(x.u is None for x in logs):
@@ -115,7 +113,7 @@ def _replayed(
             element=logs[0].name,
             expected="u: the model is one of position servos",
         )
-    found, missed = replays(judged.model, logs, {**baselines, **judged.command_followers}, notes)
+    found, missed = replays(judged.model, logs, judged.command_followers, notes)
     return Results(
         robot=judged.robot, joints=tuple(judged.joints), trajectories=tuple(x.name for x in logs), cutoff=None,
         substeps=1, parameters=sum(x.numel() for x in judged.model.parameters()), horizons=(), torque={},
@@ -137,20 +135,6 @@ def _seen(logs: Sequence[Trajectory], judged: Subject) -> list[Diagnostic]:
         return []
     message = f"names also used in training: {', '.join(seen)}; errors on training data prove nothing"
     return [Diagnostic("warning", "tested-on-training-data", "logs", None, message)]
-
-
-def _urdf_baseline(judged: Subject, probe: Windows, notes: list[Diagnostic]) -> list[Predictor]:
-    """The URDF's own values as a baseline, where they can be had."""
-    if judged.urdf is None:
-        reason = "no arm is known"
-    else:
-        try:
-            return of_urdf(judged.urdf, judged.joints, probe)
-        except Exception as error:  # Pinocchio and its parser raise many kinds; the evaluation stands without
-            reason = _told(error)
-    message = f"no comparison with the URDF: {reason}"
-    notes.append(Diagnostic("info", "no-urdf-baseline", _where(judged.urdf), None, message))
-    return []
 
 
 def _tip(judged: Subject, notes: list[Diagnostic]) -> TipKinematics | None:

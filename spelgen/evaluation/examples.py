@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import torch
 
-from spelgen.evaluation.baselines import Predictor
+from spelgen.baselines.predictor import Predictor
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import cut_windows
 
@@ -65,7 +65,7 @@ def _example(
     window = cut_windows([part], steps + 1, decimation=decimation, measured=measured)
     part = part[::decimation]
     with torch.no_grad():
-        predicted = predictor.states(window)  # each (1, steps, n)
+        predicted = predictor.solver(window)  # each (1, steps, n)
     q, qd = (
         torch.cat([first[:, :1], rest], dim=1)[0]
         for first, rest in zip((window.q, window.qd), predicted, strict=True)

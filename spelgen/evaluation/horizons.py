@@ -8,13 +8,13 @@ from typing import Any
 
 import torch
 
+from spelgen.baselines.names import MODEL, observed
+from spelgen.baselines.predictor import Predictor, of_accurate_dynamics, of_dynamics
+from spelgen.baselines.solver import Solver, States
 from spelgen.dynamics.bristles import BristleReach
 from spelgen.errors import Diagnostic
-from spelgen.evaluation.baselines import Predictor, of_baseline, of_dynamics
 from spelgen.evaluation.momentum_observer import observe, past_steps, without_past
-from spelgen.evaluation.names import MODEL, observed
 from spelgen.evaluation.results import Horizon, end_errors
-from spelgen.evaluation.stiff import States
 from spelgen.fitting.rollout import choose_substeps, loss_scales
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
@@ -112,13 +112,13 @@ def predict(
     ahead = without_past(windows, past)
     states = {}
     for predictor in predictors:
-        if not past or predictor.form is None:
-            states[predictor.name] = predictor.states(ahead)
+        if not past or not isinstance(predictor.solver, Solver):
+            states[predictor.name] = predictor.solver(ahead)
             continue
         with torch.no_grad():
-            started, disturbance = observe(predictor.form, windows, past)
-        states[predictor.name] = predictor.states(started)
-        states[observed(predictor.name)] = predictor.states(started, disturbance)
+            started, disturbance = observe(predictor.solver.form, windows, past)
+        states[predictor.name] = predictor.solver(started)
+        states[observed(predictor.name)] = predictor.solver(started, disturbance)
     errors = {name: end_errors(state, ahead, joint_types, tip) for name, state in states.items()}
     seconds = ahead.dt.sum(dim=1).mean().item()
     starts = [(piece, k + past * decimation) for piece, k in logs.starts(samples, most, decimation)[0]]
@@ -131,7 +131,7 @@ def _in_steps_for(predictor: Predictor, probe: Windows, joint_types: Sequence[st
     if dynamics is None:
         return predictor
     if predictor.name != MODEL:
-        return of_baseline(predictor.name, dynamics, probe)
+        return of_accurate_dynamics(predictor.name, dynamics, probe)
     model: Any = dynamics
     return of_dynamics(MODEL, model, choose_substeps(model, probe, loss_scales(probe, joint_types)))
 

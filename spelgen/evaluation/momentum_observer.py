@@ -58,20 +58,3 @@ def without_past(windows: Windows, past: int) -> Windows:
     return Windows(
         windows.dt[:, past:], windows.q[:, past:], windows.qd[:, past:], windows.tau[:, past:], windows.z
     )
-
-
-class Disturbed:
-    """Add a disturbance (W, n) to the p' of what a rollout integrates; all else is as it was."""
-
-    def __init__(self, form: Any, disturbance: Tensor) -> None:
-        self.form, self.disturbance = form, disturbance
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.form, name)
-
-    def port_hamiltonian_rhs(
-        self, q: Tensor, p: Tensor, tau: Tensor, prepared: Any, z: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Return q' and p', (W, n)."""
-        qd, force = self.form.port_hamiltonian_rhs(q, p, tau, prepared, z)
-        return qd, force + self.disturbance

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
+from spelgen.baselines.baseline import CommandFollower
+from spelgen.baselines.names import LINEAR_SERVOS, MODEL, POSITION_ACTUATORS
 from spelgen.dynamics.servo_rollout import replayed
 from spelgen.errors import Diagnostic
-from spelgen.evaluation.names import LINEAR_SERVOS, MODEL, POSITION_ACTUATORS
 from spelgen.logs.commands import LogRows, delayed_commands, steps_between
 from spelgen.logs.smoothing import velocities
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
@@ -50,16 +51,6 @@ class Replay:
 
 Missed = tuple[Trajectory, np.ndarray]
 """A log, and predicted less measured positions after each of its intervals, (K, n)."""
-
-
-class CommandFollower(Protocol):
-    """Predict the positions of an arm under commands. about: what it is, and how it was fitted."""
-
-    @property
-    def about(self) -> str: ...
-
-    def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
-        """Return positions (K, n) after each interval of each part of a log, from q and qd (parts, n)."""
 
 
 class ServoModel:

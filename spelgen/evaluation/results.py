@@ -10,10 +10,10 @@ from typing import Any
 
 import torch
 
+from spelgen.baselines.names import MODEL
+from spelgen.baselines.solver import States
 from spelgen.errors import Diagnostic
-from spelgen.evaluation.names import MODEL
 from spelgen.evaluation.replay import Replay
-from spelgen.evaluation.stiff import States
 from spelgen.evaluation.tables import result_tables
 from spelgen.evaluation.torque import TorqueErrors
 from spelgen.evaluation.verdict import verdict

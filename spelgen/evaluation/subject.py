@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any, cast
 
 import torch
 
+from spelgen.baselines.baseline import CommandFollower
+from spelgen.baselines.keep import read_followers
+from spelgen.baselines.names import DELAYED_COMMAND, LINEAR_SERVOS
 from spelgen.dynamics.bristles import NO_BRISTLES, BristleReach, bristle_reach, reach_of
-from spelgen.evaluation.names import DELAYED_COMMAND, LINEAR_SERVOS
-from spelgen.evaluation.replay import CommandFollower
 from spelgen.fitting.fitted import Fit, load_run
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.servo.linear_servos import DelayedCommand, LinearServos
@@ -38,7 +39,7 @@ class Subject:
 
     urdf: its robot's, where known; tip: the link there, None for the last. preprocessing, window, substeps:
     those of its fit. reach: (n, K) of the bristles that friction remembers with, its own or the usual ones.
-    trained_on: names of the trajectories that it has seen.
+    trained_on: names of the trajectories that it has seen. run: the folder, where there is one.
     command_followers: fitted to them, what a model of position servos is compared with, by name.
     """
 
@@ -52,6 +53,7 @@ class Subject:
     substeps: int = 1
     reach: BristleReach = NO_BRISTLES
     trained_on: frozenset[str] = frozenset()
+    run: RunFolder | None = None
     command_followers: Mapping[str, CommandFollower] = field(default_factory=dict)
 
     @property
@@ -75,16 +77,18 @@ def subject(judged: Any, arm: Any = None) -> Subject:
         window=cast("WindowConfig", judged.config).window,
         substeps=judged.substeps,
         trained_on=seen,
-        command_followers=_command_followers(judged.record),
+        run=None if judged.folder is None else RunFolder(judged.folder),
+        command_followers=_command_followers(judged),
     )
 
 
-def _command_followers(record: Mapping[str, Any]) -> dict[str, CommandFollower]:
-    """Return the baselines that a fit of position servos leaves in its record."""
-    if "servo" not in record:
+def _command_followers(fit: Fit) -> dict[str, CommandFollower]:
+    """Return the baselines that a fit of position servos leaves in its record and its folder."""
+    if "servo" not in fit.record:
         return {}
-    servos = LinearServos.from_dict(record["servo"]["linear"])
-    return {LINEAR_SERVOS: servos, DELAYED_COMMAND: DelayedCommand(servos.late)}
+    kept = {} if fit.folder is None else read_followers(RunFolder(fit.folder))
+    servos = LinearServos.from_dict(fit.record["servo"]["linear"])
+    return {**kept, LINEAR_SERVOS: servos, DELAYED_COMMAND: DelayedCommand(servos.late)}
 
 
 def _of_model(model: EmittedModel, urdf: Path | str | None) -> Subject:

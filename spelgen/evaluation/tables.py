@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from spelgen.evaluation.names import observed
+from spelgen.baselines.names import observed
 from spelgen.labels import thousandths
 from spelgen.listing import Listing, number
 

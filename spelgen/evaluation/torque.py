@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 
+from spelgen.dynamics.protocol import known_past
 from spelgen.identification.samples import DynamicsSamples
 
 
@@ -23,17 +25,15 @@ class TorqueErrors:
     rmse: np.ndarray
 
 
-def torque_errors(
-    torque: Callable[..., torch.Tensor],
-    samples: Sequence[DynamicsSamples],
-) -> TorqueErrors:
-    """Errors of an inverse dynamics on these samples; it is given q, qd, qdd and, where known, z."""
+def torque_errors(dynamics: Any, samples: Sequence[DynamicsSamples]) -> TorqueErrors:
+    """Return the errors of an inverse dynamics on these samples."""
     nmse, rmse = [], []
     for sample in samples:
+        q, qd, qdd, tau = map(torch.from_numpy, (sample.q, sample.qd, sample.qdd, sample.tau))
+        z = None if sample.z is None else torch.from_numpy(sample.z)
         with torch.no_grad():
-            known = (x for x in (sample.q, sample.qd, sample.qdd, sample.z) if x is not None)
-            found = torque(*map(torch.from_numpy, known))
-            squares = (found - torch.from_numpy(sample.tau)).square().mean(dim=0).numpy()
+            predicted = dynamics.inverse_dynamics(q, qd, qdd, *known_past(dynamics, z))
+        squares = (predicted - tau).square().mean(dim=0).numpy()
         variance = sample.tau.var(axis=0)
         nmse.append(np.divide(squares, variance, out=np.full_like(squares, np.nan), where=variance > 0))
         rmse.append(np.sqrt(squares))

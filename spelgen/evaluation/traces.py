@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from spelgen.baselines.names import MODEL
+from spelgen.baselines.predictor import Predictor
 from spelgen.dynamics.bristles import BristleReach
 from spelgen.dynamics.protocol import RigidDynamics
-from spelgen.evaluation.baselines import Predictor
 from spelgen.evaluation.horizons import Predictions
-from spelgen.evaluation.names import MODEL
 from spelgen.evaluation.replay import Missed
 from spelgen.evaluation.torque_traces import plain, torque_trace
 from spelgen.fitting.rollout import loss_scales, position_difference

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from spelgen.evaluation.names import MODEL
+from spelgen.baselines.names import MODEL
 from spelgen.labels import listed, thousandths
 from spelgen.listing import number
 

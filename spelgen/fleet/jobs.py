@@ -191,11 +191,12 @@ class _ConfigChoice:
 def _judged(job: Job, run: RunFolder) -> RunResult:
     """Return errors on the test logs, of the model and the URDF; evaluation.json has all of them.
 
-    Least squares is left out: its stiff rollouts take ten times as long as all else, for every run anew.
+    Least squares is left out, for it is kept only afterwards: its stiff rollouts take ten times as long as all else,
+    for every run anew.
     """
-    keep_baseline(run.path, job.train)
     logs = read_test_logs(job.folder, job.test, job.mapping)
     results = evaluate(load_run(job.folder), logs).to_dict()
+    keep_baseline(run.path, job.train)
     write_json(run.evaluation, results)
     errors = {}
     for horizon in results["horizons"]:

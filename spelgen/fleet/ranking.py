@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from spelgen.evaluation.names import MODEL
+from spelgen.baselines.names import MODEL
 from spelgen.fleet.fleet import FleetResults, SearchResult
 from spelgen.fleet.units import Quantity, Units
 from spelgen.listing import Listing, number

@@ -12,10 +12,10 @@ import numpy as np
 from markupsafe import Markup
 
 from spelgen.arm.arm import Arm
+from spelgen.baselines.names import MODEL
 from spelgen.certificate.facts import facts
 from spelgen.certificate.formula_text import to_dict
 from spelgen.certificate.formulas import Formulas, formulas
-from spelgen.evaluation.names import MODEL
 from spelgen.labels import entry_name, joint_ranges, joints_in_ranges
 from spelgen.render.page import json_data
 from spelgen.render.scene import Scene, scene

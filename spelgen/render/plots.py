@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from spelgen.evaluation.names import (
+from spelgen.baselines.names import (
     CONSTANT_VELOCITY,
     LEAST_SQUARES,
     LEAST_SQUARES_WITH_MEMORY,

@@ -9,7 +9,7 @@ from typing import Any
 
 from jinja2 import TemplateError
 
-from spelgen.baselines.keep import run_arm
+from spelgen.baselines.run_arm import run_arm
 from spelgen.errors import RunError, SpelgenError
 from spelgen.evaluation.tables import result_tables
 from spelgen.evaluation.verdict import verdict

@@ -8,7 +8,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from spelgen.evaluation.names import MODEL
+from spelgen.baselines.names import MODEL
 from spelgen.fitting.servo_report import delay_text
 from spelgen.labels import thousandths
 from spelgen.listing import number

@@ -9,8 +9,8 @@ from typing import Any
 
 from markupsafe import Markup
 
+from spelgen.baselines.names import MODEL
 from spelgen.errors import RunError
-from spelgen.evaluation.names import MODEL
 from spelgen.evaluation.tables import Table, table
 from spelgen.evaluation.verdict import verdict
 from spelgen.files import write_text

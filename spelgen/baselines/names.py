@@ -1,12 +1,12 @@
-"""How predictors are called, in results and wherever these are shown."""
+"""The names of predictors, in results and wherever these are shown."""
 
 MODEL = "model"  # the trained model
+CONSTANT_VELOCITY = "velocity stays constant"
 URDF, URDF_WITH_DRIVES = "URDF", "URDF and drives"
 LEAST_SQUARES = "least squares"
 LEAST_SQUARES_WITH_MEMORY = "least squares with memory"
 POSITION_ACTUATORS = "MuJoCo actuators"
 LINEAR_SERVOS, DELAYED_COMMAND = "linear servo", "delayed command"
-CONSTANT_VELOCITY = "velocity stays constant"
 
 
 def observed(predictor: str) -> str:

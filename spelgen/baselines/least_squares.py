@@ -1,0 +1,58 @@
+"""Least squares on the very training logs of a run, with friction of two kinds: a jump, and bristles with memory."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from spelgen.baselines.baseline import Baseline, JudgedArm
+from spelgen.baselines.names import LEAST_SQUARES, LEAST_SQUARES_WITH_MEMORY
+from spelgen.baselines.predictor import Predictor, of_accurate_dynamics
+from spelgen.baselines.run_arm import run_arm
+from spelgen.errors import LogError
+from spelgen.fitting.run_folder import RunFolder
+from spelgen.identification.friction import FrictionModel
+from spelgen.identification.identification import identified_dynamics
+from spelgen.identification.identify import identify
+from spelgen.identification.method import LeastSquares
+from spelgen.logs.preprocessing import Preprocessing
+from spelgen.logs.trajectory import Trajectory
+
+FRICTION = {
+    LEAST_SQUARES: ("parameters", FrictionModel()),
+    LEAST_SQUARES_WITH_MEMORY: ("parameters_with_memory", FrictionModel(memory=True)),
+}
+"""By name, under which key parameters are kept, and the friction that they are of."""
+
+
+class IdentifiedArm(Baseline):
+    """Take an arm for what least squares makes of the training logs."""
+
+    def fit(
+        self, run: RunFolder, logs: Sequence[Trajectory], preprocessing: Preprocessing
+    ) -> dict[str, object]:
+        """Return the parameters with what is known of them; {} where logs are too sparse for accelerations."""
+        arm = run_arm(run)
+        fits = {}
+        try:
+            for key, friction in FRICTION.values():
+                fits[key] = identify(arm, logs, LeastSquares(friction=friction), preprocessing=preprocessing)
+        except (LogError, np.linalg.LinAlgError):
+            return {}
+        parameters = {key: fit.parameters.tolist() for key, fit in fits.items()}
+        return {**fits["parameters"].to_dict(), **parameters}
+
+    def predictors(self, judged: JudgedArm) -> list[Predictor]:
+        """Return a predictor for each kind of friction."""
+        if judged.run is None or not judged.run.baseline.exists():
+            return []
+        record = judged.run.read_json(judged.run.baseline)
+        if "parameters" not in record:
+            return []
+        arm = run_arm(judged.run)
+        predictors = []
+        for name, (key, friction) in FRICTION.items():
+            dynamics = identified_dynamics(arm.arm, friction, np.array(record[key]), arm.actuation.drives())
+            predictors.append(of_accurate_dynamics(name, dynamics, judged.probe))
+        return predictors

@@ -1,0 +1,8 @@
+"""All baselines of arms under torques, in the order in which tables show them."""
+
+from spelgen.baselines.baseline import Baseline
+from spelgen.baselines.constant_velocity import ConstantVelocity
+from spelgen.baselines.least_squares import IdentifiedArm
+from spelgen.baselines.urdf import UrdfValues
+
+BASELINES: tuple[Baseline, ...] = (ConstantVelocity(), UrdfValues(), IdentifiedArm())
