@@ -38,7 +38,9 @@ def shared() -> Path:
 @pytest.fixture
 def short_epochs(monkeypatch: pytest.MonkeyPatch) -> None:
     """Epochs of few windows take four steps: for tests of what stands around a fit."""
-    monkeypatch.setattr("spelgen.fitting.loop.EPOCH_STEPS", 4)
+    from spelgen.settings.tuning.fitting import WindowTuning
+
+    monkeypatch.setattr("spelgen.fitting.window_problem.TUNING", WindowTuning(epoch_steps=4))
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

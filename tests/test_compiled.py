@@ -30,9 +30,7 @@ def test_a_compiled_run_says_so_and_repeats_the_plain_one(tmp_path, monkeypatch)
     losses = {}
     for compile in (False, True):
         config = quick(epochs=2, momentum_steps=0, compile=compile)
-        result = train(
-            STAND_IN, [tmp_path / "train.parquet"], tmp_path / f"{compile}", config, progress=False
-        )
+        result = train(STAND_IN, [tmp_path / "train.parquet"], tmp_path / f"{compile}", config)
         metrics = (result.folder / "metrics.jsonl").read_text().splitlines()
         losses[compile] = [json.loads(line)["validation"] for line in metrics]
         assert compile == any(note.code == "compiled" for note in result.diagnostics)

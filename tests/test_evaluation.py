@@ -147,7 +147,7 @@ def run(tmp_path_factory) -> Path:
     for role, seed in (("train", 0), ("test", 1)):
         write_logs(folder / "logs" / f"{role}.parquet", motions(model, seed=seed), JOINTS)
     config = Rollout(epochs=1, optimizer="adamw", batch=32, learning_rate=1e-12, momentum_steps=0)
-    train(STAND_IN, [folder / "logs"], folder / "run", config, progress=False)
+    train(STAND_IN, [folder / "logs"], folder / "run", config)
     return folder / "run"
 
 
@@ -256,7 +256,7 @@ def test_a_urdf_run_is_compared_in_torque_and_at_the_tip(cart):
         write_logs(cart.parent / "logs" / f"{role}.parquet", logs, names)
     config, unfiltered = Rollout(epochs=1, momentum_steps=0), Preprocessing(cutoff=0.0)
     logs = [cart.parent / "logs"]
-    train(module, logs, cart.parent / "run", config, preprocessing=unfiltered, progress=False)
+    train(module, logs, cart.parent / "run", config, preprocessing=unfiltered)
     result = evaluated(cart.parent / "run", logs[0])
     for horizon in result.horizons:
         assert horizon.errors["URDF"].mean_relative_rms < 1e-4

@@ -10,6 +10,7 @@ from emitted import random_model
 import spelgen
 from spelgen.errors import LogError, RunError
 from spelgen.fitting.adaptive import LONG
+from spelgen.fitting.fit import RunOptions
 from spelgen.fitting.rollout import loss_scales, roll_out, rollout_loss
 from spelgen.fitting.train import train
 from spelgen.logs.preprocessing import Preprocessing
@@ -39,7 +40,7 @@ def same(first: torch.nn.Module, second: torch.nn.Module) -> bool:
 @pytest.mark.usefixtures("short_epochs")
 def test_a_fit_in_memory_is_that_of_files(tmp_path):
     write_logs(tmp_path / "train.parquet", motions(), JOINTS)
-    filed = train(STAND_IN, [tmp_path / "train.parquet"], tmp_path / "filed", QUICK, progress=False)
+    filed = train(STAND_IN, [tmp_path / "train.parquet"], tmp_path / "filed", QUICK)
     model = spelgen.load_module(STAND_IN)
     found = spelgen.fit(model, motions(), QUICK)
     assert found.model is model
@@ -56,8 +57,7 @@ def test_a_fit_in_memory_is_that_of_files(tmp_path):
         [tmp_path / "train.parquet"],
         tmp_path / "saved",
         quick(epochs=7),
-        resume=True,
-        progress=False,
+        options=RunOptions(resume=True),
     )
     assert again.epochs == 7
 

@@ -19,7 +19,8 @@ from spelgen.cli.main import app
 from spelgen.errors import LogError, RunError
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.exporting.export import export
-from spelgen.fitting import loop
+from spelgen.fitting import loop, window_problem
+from spelgen.fitting.fit import RunOptions
 from spelgen.fitting.fitted import load_run
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.run_lock import locked
@@ -29,6 +30,7 @@ from spelgen.logs.read import write_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.pipeline import generate
 from spelgen.settings.fits import Rollout
+from spelgen.settings.tuning.fitting import WindowTuning
 from spelgen.trust import require_own_module
 
 JOINTS = ("joint1", "joint2")
@@ -50,7 +52,7 @@ def motions(count: int = 4, samples: int = 25) -> list[Trajectory]:
 def short_epochs():
     """Two steps an epoch: what is written, and when, is the same after twenty."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(loop, "EPOCH_STEPS", 2)
+        patch.setattr(window_problem, "TUNING", WindowTuning(epoch_steps=2))
         yield
 
 
@@ -65,7 +67,7 @@ def start(robots, tmp_path_factory) -> Path:
 
 
 def trained(start: Path, folder: Path, **options) -> Path:
-    train(start / "module.py", [start / "train.parquet"], folder, QUICK, progress=False, **options)
+    train(start / "module.py", [start / "train.parquet"], folder, QUICK, **options)
     return folder
 
 
@@ -87,7 +89,7 @@ def foreign(start, tmp_path_factory) -> Path:
         lambda run, log: load_run(run),
         lambda run, log: evaluate(run, motions()),
         lambda run, log: export(run),
-        lambda run, log: train("", [log], run, resume=True, progress=False),
+        lambda run, log: train("", [log], run, options=RunOptions(resume=True)),
         lambda run, log: train(run / "module.py", [log], run.parent / "more", QUICK, source=run),
     ],
 )
@@ -162,7 +164,9 @@ def test_killed_between_any_two_writes_nothing_is_lost(start, tmp_path):
     while True:
         there = (run / "config.json").exists()
         resumed.add(there)
-        training = functools.partial(trained, start, run, urdf=start / "arm.urdf", resume=there)
+        training = functools.partial(
+            trained, start, run, urdf=start / "arm.urdf", options=RunOptions(resume=there)
+        )
         if not killed(training, write, before=bool(write % 2)):
             break
         kills, write = kills + 1, write + 1
@@ -174,7 +178,7 @@ def test_killed_between_any_two_writes_nothing_is_lost(start, tmp_path):
 
 def test_an_interruption_before_the_first_checkpoint_leaves_no_run(start, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr(loop.TrainingLoop, "_measure", lambda loop: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(loop, "measure", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             trained(start, tmp_path / "run")
     trained(start, tmp_path / "run")
@@ -194,7 +198,7 @@ def test_a_full_disk_is_told_with_the_file(start, tmp_path):
     assert told.exit_code == 1
     assert told.stderr.splitlines()[-1] == f"{run}/model.pt: file too large"
     assert all(torch.equal(before[name], x) for name, x in weights(run).items())
-    assert trained(start, run, resume=True)
+    assert trained(start, run, options=RunOptions(resume=True))
 
 
 # ---- what lies in it may be anything

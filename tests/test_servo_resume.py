@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 import spelgen
 from spelgen.cli.main import app
 from spelgen.errors import RunError
-from spelgen.fitting import servo_run
+from spelgen.fitting.fit import RunOptions
+from spelgen.fitting.progress import TrainingProgress
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.train import train
 
@@ -29,8 +30,8 @@ def start(tmp_path_factory) -> Path:
 
 
 def trained(start: Path, folder: Path, **options) -> Path:
-    urdf = None if "resume" in options else start / "servo_arm.urdf"
-    train(start / "module.py", [start / "train.parquet"], folder, urdf=urdf, progress=False, **options)
+    urdf = None if "options" in options else start / "servo_arm.urdf"
+    train(start / "module.py", [start / "train.parquet"], folder, urdf=urdf, **options)
     return folder
 
 
@@ -43,7 +44,7 @@ def whole(start, tmp_path_factory) -> Path:
 def test_killed_between_writes_it_ends_as_if_it_never_was(start, whole, tmp_path):
     run, kills, write = tmp_path / "run", 0, 3
     while True:
-        options = {"resume": True} if (run / "config.json").exists() else {}
+        options = {"options": RunOptions(resume=True)} if (run / "config.json").exists() else {}
         training = functools.partial(trained, start, run, **options)
         if not killed(training, write, before=bool(write % 2)):
             break
@@ -54,16 +55,16 @@ def test_killed_between_writes_it_ends_as_if_it_never_was(start, whole, tmp_path
 
 
 def test_an_interrupted_one_is_usable_and_goes_on(start, whole, tmp_path, monkeypatch):
-    run, shown = tmp_path / "run", servo_run.TrainingProgress.round
+    run, shown = tmp_path / "run", TrainingProgress.round
 
-    def interrupt(progress, number, steps, rms):
-        shown(progress, number, steps, rms)
+    def interrupt(progress, number, rounds, steps, rms):
+        shown(progress, number, rounds, steps, rms)
         if number == 3:
             raise KeyboardInterrupt
 
     command = ["train", start / "module.py", "--data", start, "-o", run]
     with monkeypatch.context() as patch:
-        patch.setattr(servo_run.TrainingProgress, "round", interrupt)
+        patch.setattr(TrainingProgress, "round", interrupt)
         told = CliRunner().invoke(app, list(map(str, command)))
     assert told.exit_code == 130, told.stderr
     assert "the best model so far is in the run folder; --resume goes on" in told.stderr
@@ -79,10 +80,10 @@ def test_it_goes_on_with_what_it_was_started_with(start, whole, tmp_path):
         trained(start, whole)
     spelgen.write_logs(tmp_path / "train.parquet", servo_logs(2, 1.0, seed=1), ("shoulder", "elbow"))
     with pytest.raises(RunError, match="other logs than the run was started with"):
-        train("", [tmp_path / "train.parquet"], whole, resume=True, progress=False)
+        train("", [tmp_path / "train.parquet"], whole, options=RunOptions(resume=True))
     checkpoint, run = RunFolder(whole).load_checkpoint(), RunFolder(tmp_path / "run")
     run.start((whole / "module.py").read_text(), start / "servo_arm.urdf", force=False)
     run.config.write_bytes((whole / "config.json").read_bytes())
     torch.save(checkpoint | {"servo": {}}, run.checkpoint)
     with pytest.raises(RunError, match="a checkpoint of another model"):
-        trained(start, run.path, resume=True)
+        trained(start, run.path, options=RunOptions(resume=True))

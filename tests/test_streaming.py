@@ -1,6 +1,5 @@
-"""Logs larger than memory: the same samples and windows as in memory, drawn part by part, the same when resumed."""
+"""Logs larger than memory: the same samples and windows as in memory, for torque fits alone."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,15 +7,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 import pytest
-import torch
 
 from spelgen.errors import LogError
-from spelgen.fitting.dataset import prepare_data
+from spelgen.fitting.dataset import WindowChoice, prepare_data
 from spelgen.fitting.streaming import LargeLogs, prepare_streamed
 from spelgen.fitting.train import train
-from spelgen.logs import chunks, epoch_windows
+from spelgen.logs import chunks
 from spelgen.logs.chunks import large_files, scan
-from spelgen.logs.epoch_windows import EpochWindows, WindowCutting
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import QUANTITIES, Trajectory
@@ -26,7 +23,6 @@ from spelgen.settings.log_mapping import LogMapping
 STAND_IN = Path(__file__).with_name("stand_in.py")
 JOINTS = ("shoulder", "elbow")
 KINDS = ("revolute", "revolute")
-CONFIG = Rollout(epochs=4, batch=32, momentum_steps=5, optimizer="adamw")
 EVERY_OTHER, AUTOMATIC = Preprocessing(decimation=2), Preprocessing()
 
 
@@ -95,36 +91,9 @@ def test_a_mapping_holds_for_parts_too(tmp_path):
     np.testing.assert_allclose(expected.q[:, 0], -np.sin(phase), rtol=1e-12)
 
 
-def streamed(log, cutting, **changed) -> EpochWindows:
-    found = [part for part, _ in scan([log], JOINTS, LogMapping())]
-    counts = tuple(len(cutting.windows([part.load()])) for part in found)
-    return EpochWindows(tuple(found), counts, cutting, seed=0)
-
-
-@pytest.mark.parametrize("cutoff", [None, 8.0])
-def test_a_pass_over_all_shares_gives_every_window_once(log, monkeypatch, cutoff):
-    monkeypatch.setattr(epoch_windows, "EPOCH", 900)
-    cutting = WindowCutting(5, 3, Preprocessing(cutoff, 2))
-    expected = cutting.windows(read_logs([log], JOINTS))
-    found = streamed(log, cutting)
-    assert (len(found), found.epochs_per_pass) == (len(expected), -(-len(expected) // 900))
-    for turn in range(2):
-        shares = [
-            found.windows(found.drawn(turn * found.epochs_per_pass + k)) for k in range(found.epochs_per_pass)
-        ]
-        drawn = torch.cat([share.q for share in shares])
-        order, expected_order = drawn[:, 0, 0].argsort(), expected.q[:, 0, 0].argsort()
-        for name in ("dt", "q", "qd", "tau"):
-            values = torch.cat([getattr(share, name) for share in shares])
-            assert torch.equal(values[order], getattr(expected, name)[expected_order])
-    first = [found.windows(found.drawn(k)).q[0, 0, 0].item() for k in range(2 * found.epochs_per_pass)]
-    assert first[: found.epochs_per_pass] != first[found.epochs_per_pass :]
-    assert found.drawn(3) == streamed(log, cutting).drawn(3)
-
-
 def test_preparation_finds_what_it_finds_in_memory(log):
-    plain = prepare_data(read_logs([log], JOINTS), JOINTS, KINDS, CONFIG, AUTOMATIC)
-    found = prepare_streamed(LargeLogs((log,), JOINTS, KINDS), CONFIG, AUTOMATIC)
+    plain = prepare_data(read_logs([log], JOINTS), JOINTS, KINDS, AUTOMATIC)
+    found = prepare_streamed(LargeLogs((log,), JOINTS, KINDS), AUTOMATIC)
     assert (found.preprocessing, found.digest) == (plain.preprocessing, plain.digest)
     assert len(found.validation_names) == len(plain.validation_names)
     assert found.training.dt.mean().item() == pytest.approx(plain.training.dt.mean().item(), rel=0.01)
@@ -133,44 +102,27 @@ def test_preparation_finds_what_it_finds_in_memory(log):
     codes = {each.code for each in found.diagnostics}
     assert codes == {"gap", "filter", "streamed"}
     starts = {round(x, 12) for x in found.validation.q[:, 0, 0].tolist()}
-    for number in range(found.stream.epochs_per_pass):
-        drawn = found.stream.windows(found.stream.drawn(number))
-        assert starts.isdisjoint(round(x, 12) for x in drawn.q[:, 0, 0].tolist())
+    assert starts.isdisjoint(round(x, 12) for x in found.training.q[:, 0, 0].tolist())
 
 
 def test_a_last_sample_alone_changes_nothing(log, monkeypatch):
     monkeypatch.setattr(chunks, "TUNING", replace(chunks.TUNING, chunk_samples=399))
-    found = prepare_streamed(LargeLogs((log,), JOINTS, KINDS), CONFIG, AUTOMATIC)
-    plain = prepare_data(read_logs([log], JOINTS), JOINTS, KINDS, CONFIG, AUTOMATIC)
+    found = prepare_streamed(LargeLogs((log,), JOINTS, KINDS), AUTOMATIC)
+    plain = prepare_data(read_logs([log], JOINTS), JOINTS, KINDS, AUTOMATIC)
     assert found.preprocessing.cutoff == plain.preprocessing.cutoff == 8.0
     assert found.training.dt.mean().item() == pytest.approx(plain.training.dt.mean().item(), rel=0.01)
     assert "validation on 2 chunks, 8 hold no window" in found.diagnostics[-1].message
 
 
-def lines(run: Path) -> list[dict]:
-    records = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    return [{key: value for key, value in record.items() if key != "seconds"} for record in records]
-
-
 @pytest.mark.parametrize("log", [1000], indirect=True)
-def test_training_streams_and_resumes_with_the_same_numbers(log, tmp_path, monkeypatch):
-    monkeypatch.setattr(epoch_windows, "EPOCH", 400)
-    drawn, share = [], EpochWindows.drawn
-
-    def drawing(self, number):
-        drawn.append(number)
-        if len(drawn) == 7:  # in the third epoch of the second run
-            raise KeyboardInterrupt
-        return share(self, number)
-
-    monkeypatch.setattr(EpochWindows, "drawn", drawing)
-    whole = train(STAND_IN, [log], tmp_path / "whole", CONFIG, preprocessing=EVERY_OTHER, progress=False)
-    half = train(STAND_IN, [log], tmp_path / "half", CONFIG, preprocessing=EVERY_OTHER, progress=False)
-    assert (whole.status, half.status, half.epochs) == ("finished", "interrupted", 2)
-    train(STAND_IN, [log], tmp_path / "half", CONFIG, preprocessing=EVERY_OTHER, resume=True, progress=False)
-    assert drawn == [0, 1, 2, 3, 0, 1, 2, 2, 3]
-    assert lines(tmp_path / "half") == lines(tmp_path / "whole")
-    assert json.loads((tmp_path / "whole" / "config.json").read_text())["training_windows"] > 4 * 400
+def test_windows_are_not_streamed(log, tmp_path):
+    with pytest.raises(LogError) as caught:
+        train(STAND_IN, [log], tmp_path / "run", Rollout(epochs=1))
+    assert str(caught.value) == (
+        "got logs larger than memory, expected some hours of them: every tenth file, say; "
+        "or fit torques, which read them in chunks: the objective torque"
+    )
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("group", [4096, 1_600_000])
@@ -242,4 +194,4 @@ def test_the_rows_of_a_recording_must_lie_together(log):
 
 def test_two_parts_are_needed(log):
     with pytest.raises(LogError, match="no two chunks with 799 samples without a gap"):
-        prepare_streamed(LargeLogs((log,), JOINTS, KINDS), Rollout(window=400), EVERY_OTHER)
+        prepare_streamed(LargeLogs((log,), JOINTS, KINDS), EVERY_OTHER, WindowChoice(window=400))

@@ -21,8 +21,8 @@ from spelgen.fitting import torque_fit, torque_jacobian
 from spelgen.fitting.body_steps import moved_bodies
 from spelgen.fitting.fit import fit
 from spelgen.fitting.gaussian_prior import SIZES, covariance, kind_of, most_probable
+from spelgen.fitting.objectives import default_objective
 from spelgen.fitting.residual_fit import FRICTION, enter
-from spelgen.fitting.stages import default_objective
 from spelgen.fitting.torque_fit import fit_torque
 from spelgen.fitting.torque_jacobian import Left
 from spelgen.fitting.torque_networks import adapt_networks
@@ -515,10 +515,10 @@ def test_a_log_larger_than_memory_is_fitted_to_torques(emitted, robots, tmp_path
     logs = [recorded(drawn(module, seed=3, deviation=0.3), 4.0, 0.01, seed=seed) for seed in range(4)]
     write(tmp_path / "train.parquet", logs, arm)
     (tmp_path / "arm.py").write_text(generate(robots / "two_link.urdf", preset="closed-form"))
-    plain = train(tmp_path / "arm.py", [tmp_path / "train.parquet"], tmp_path / "plain", progress=False)
+    plain = train(tmp_path / "arm.py", [tmp_path / "train.parquet"], tmp_path / "plain")
     monkeypatch.setattr(chunks, "TUNING", replace(chunks.TUNING, in_memory=1000))
     monkeypatch.setattr(torque_jacobian, "BLOCK", 100)
-    large = train(tmp_path / "arm.py", [tmp_path / "train.parquet"], tmp_path / "large", progress=False)
+    large = train(tmp_path / "arm.py", [tmp_path / "train.parquet"], tmp_path / "large")
     assert {"streamed", "torque-fit"} <= {note.code for note in large.diagnostics}
     assert plain.config.objective == large.config.objective == "torque"
     for name, value in plain.model.state_dict().items():

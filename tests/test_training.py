@@ -22,7 +22,8 @@ from spelgen.emission.loading import load_module
 from spelgen.errors import LogError, ModuleError, RunError
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.evaluation.subject import read_test_logs
-from spelgen.fitting.dataset import prepare_data
+from spelgen.fitting.dataset import TrainingData, prepare_data
+from spelgen.fitting.fit import RunOptions
 from spelgen.fitting.loop import TrainingLoop
 from spelgen.fitting.optimizers import LBFGS, MiniBatchAdamW
 from spelgen.fitting.progress import TrainingProgress
@@ -36,11 +37,14 @@ from spelgen.fitting.rollout import (
     rollout_loss,
 )
 from spelgen.fitting.train import train
+from spelgen.fitting.validation import Validation
+from spelgen.fitting.window_problem import WindowProblem
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.windows import Windows, cut_windows
 from spelgen.settings.fits import MomentumFit, Rollout
 from spelgen.settings.log_mapping import LogMapping
+from spelgen.settings.tuning.fitting import WindowTuning
 
 STAND_IN = Path(__file__).with_name("stand_in.py")
 JOINTS = ("shoulder", "elbow")
@@ -199,7 +203,7 @@ def test_stiff_friction_gets_more_substeps():
 
 def test_training_finds_the_true_parameters(logs, tmp_path):
     config = quick(epochs=15, momentum_steps=200)
-    result = train(STAND_IN, [logs], tmp_path / "run", config, progress=False)
+    result = train(STAND_IN, [logs], tmp_path / "run", config)
     model = load_module(tmp_path / "run" / "module.py")
     model.load_state_dict(torch.load(tmp_path / "run" / "model.pt", weights_only=True))
     assert result.status == "finished"
@@ -209,7 +213,7 @@ def test_training_finds_the_true_parameters(logs, tmp_path):
 
 
 def test_the_run_folder_tells_what_was_done(logs, tmp_path):
-    result = train(STAND_IN, [logs], tmp_path / "run", quick(epochs=2), progress=False)
+    result = train(STAND_IN, [logs], tmp_path / "run", quick(epochs=2))
     names = {path.name for path in (tmp_path / "run").iterdir()}
     assert names == {
         "module.py",
@@ -231,22 +235,22 @@ def test_the_run_folder_tells_what_was_done(logs, tmp_path):
 class Interrupted(TrainingProgress):
     """Presses Ctrl-C after three epochs."""
 
-    def epoch(self, record):
+    def epoch(self, record, epochs):
         if record["epoch"] == 3:
             raise KeyboardInterrupt
 
 
 @pytest.mark.parametrize(("optimizer", "steps"), [("adamw", 20), ("lbfgs", 3)])
 def test_resuming_repeats_what_would_have_been(logs, tmp_path, monkeypatch, optimizer, steps):
-    monkeypatch.setattr("spelgen.fitting.loop.EPOCH_STEPS", steps)
+    monkeypatch.setattr("spelgen.fitting.window_problem.TUNING", WindowTuning(epoch_steps=steps))
     config = quick(optimizer=optimizer, momentum_steps=20 if optimizer == "adamw" else 0)
     straight, broken = tmp_path / "straight", tmp_path / "broken"
-    train(STAND_IN, [logs], straight, config, progress=False)
+    train(STAND_IN, [logs], straight, config)
     with monkeypatch.context() as patch:
         patch.setattr("spelgen.fitting.fit.TrainingProgress", Interrupted)
-        assert train(STAND_IN, [logs], broken, config, progress=False).status == "interrupted"
+        assert train(STAND_IN, [logs], broken, config).status == "interrupted"
     assert len(lines(broken)) == 3
-    result = train(STAND_IN, [logs], broken, config, resume=True, progress=False)
+    result = train(STAND_IN, [logs], broken, config, options=RunOptions(resume=True))
     assert result.status == "finished"
     assert len(lines(straight)) > 3
     assert lines(broken) == lines(straight)
@@ -269,10 +273,10 @@ def equal(first, second) -> bool:
 
 @pytest.mark.usefixtures("short_epochs")
 def test_resuming_drops_epochs_after_the_checkpoint(logs, tmp_path):
-    train(STAND_IN, [logs], tmp_path / "run", QUICK, progress=False)
+    train(STAND_IN, [logs], tmp_path / "run", QUICK)
     with (tmp_path / "run" / "metrics.jsonl").open("a") as file:
         file.write('{"epoch": 7, "step')  # killed while writing
-    train(STAND_IN, [logs], tmp_path / "run", QUICK, resume=True, progress=False)
+    train(STAND_IN, [logs], tmp_path / "run", QUICK, options=RunOptions(resume=True))
     assert [record["epoch"] for record in lines(tmp_path / "run")] == [1, 2, 3, 4, 5, 6]
 
 
@@ -285,7 +289,7 @@ def test_numbers_that_blow_up_are_rolled_back_at_half_the_rate(logs, tmp_path, m
         return loss * math.nan if sum(calls) == 25 and calls[-1] else loss
 
     monkeypatch.setattr("spelgen.fitting.loop.rollout_loss", blown_up_once)
-    result = train(STAND_IN, [logs], tmp_path / "run", QUICK, progress=False)
+    result = train(STAND_IN, [logs], tmp_path / "run", QUICK)
     records = lines(tmp_path / "run")
     assert result.status == "finished"
     assert [record["rollbacks"] for record in records] == [0, 1, 1, 1, 1, 1]
@@ -302,7 +306,7 @@ def test_numbers_that_never_recover_end_the_run(logs, tmp_path, monkeypatch, opt
 
     monkeypatch.setattr("spelgen.fitting.loop.rollout_loss", blown_up)
     with pytest.raises(RunError) as caught:
-        train(STAND_IN, [logs], tmp_path / "run", quick(optimizer=optimizer), progress=False)
+        train(STAND_IN, [logs], tmp_path / "run", quick(optimizer=optimizer))
     assert str(caught.value) == (
         f"{tmp_path}/run: losses that are not finite, after 8 attempts at half the learning rate each; "
         "check units and signs of the logs; the best model so far is kept in model.pt"
@@ -311,7 +315,7 @@ def test_numbers_that_never_recover_end_the_run(logs, tmp_path, monkeypatch, opt
 
 @pytest.mark.usefixtures("short_epochs")
 def test_mapped_logs_train_as_plain_ones_do(logs, tmp_path):
-    plain = train(STAND_IN, [logs], tmp_path / "plain", QUICK, progress=False)
+    plain = train(STAND_IN, [logs], tmp_path / "plain", QUICK)
     names = {"t": "ms", "trajectory": "run", "q": "pos {joint}", "qd": "vel {joint}", "tau": "cur {joint}"}
     text = {
         "columns": names,
@@ -327,7 +331,7 @@ def test_mapped_logs_train_as_plain_ones_do(logs, tmp_path):
     np.savez(tmp_path / "train.npz", **columns)
     mapping = LogMapping.model_validate(text)
     mapped = train(
-        STAND_IN, [tmp_path / "train.npz"], tmp_path / "run", QUICK, mapping=mapping, progress=False
+        STAND_IN, [tmp_path / "train.npz"], tmp_path / "run", QUICK, options=RunOptions(mapping=mapping)
     )
     assert mapped.best_validation == pytest.approx(plain.best_validation, rel=1e-6)
     again = train(
@@ -335,8 +339,7 @@ def test_mapped_logs_train_as_plain_ones_do(logs, tmp_path):
         [tmp_path / "train.npz"],
         tmp_path / "run",
         quick(epochs=7),
-        resume=True,
-        progress=False,
+        options=RunOptions(resume=True),
     )
     assert again.epochs == 7
     assert (
@@ -347,11 +350,11 @@ def test_mapped_logs_train_as_plain_ones_do(logs, tmp_path):
 
 def test_early_stop_and_time_limit(logs, tmp_path):
     stuck = quick(learning_rate=1e-30, patience=2, momentum_steps=0)
-    result = train(STAND_IN, [logs], tmp_path / "stuck", stuck, progress=False)
+    result = train(STAND_IN, [logs], tmp_path / "stuck", stuck)
     assert (result.status, result.epochs) == ("stopped early", 2)
     for momentum_steps in (0, 1000):
         hurried = quick(max_minutes=1e-6, momentum_steps=momentum_steps)
-        result = train(STAND_IN, [logs], tmp_path / f"late{momentum_steps}", hurried, progress=False)
+        result = train(STAND_IN, [logs], tmp_path / f"late{momentum_steps}", hurried)
         assert (result.status, result.epochs) == ("out of time", 0)
 
 
@@ -382,40 +385,42 @@ def test_a_signal_leaves_a_usable_run(logs, tmp_path, number):
     load_module(folder / "module.py").load_state_dict(torch.load(folder / "model.pt", weights_only=True))
     epoch = torch.load(folder / "checkpoint.pt", weights_only=True)["epoch"]
     config = Rollout(epochs=epoch + 1, batch=32, patience=100000, momentum_steps=0, optimizer="adamw")
-    assert train(STAND_IN, [logs], folder, config, resume=True, progress=False).epochs == epoch + 1
+    assert train(STAND_IN, [logs], folder, config, options=RunOptions(resume=True)).epochs == epoch + 1
     assert not list(folder.glob(".*"))  # no half-written file is left
 
 
 def test_a_run_is_not_overwritten_unasked(logs, tmp_path):
     config = quick(epochs=1)
-    train(STAND_IN, [logs], tmp_path / "run", config, progress=False)
+    train(STAND_IN, [logs], tmp_path / "run", config)
     before = (tmp_path / "run" / "model.pt").read_bytes()
     with pytest.raises(RunError) as caught:
-        train(STAND_IN, [logs], tmp_path / "run", config, progress=False)
+        train(STAND_IN, [logs], tmp_path / "run", config)
     assert str(caught.value) == (
         f"{tmp_path}/run: there is a run in this folder; --resume it, --force to replace it, or -o another"
     )
     assert (tmp_path / "run" / "model.pt").read_bytes() == before
-    train(STAND_IN, [logs], tmp_path / "run", config, seed=5, force=True, progress=False)
+    train(STAND_IN, [logs], tmp_path / "run", config, seed=5, options=RunOptions(force=True))
     assert json.loads((tmp_path / "run" / "config.json").read_text())["seed"] == 5
 
 
 def test_a_run_is_resumed_only_as_it_was_started(logs, tmp_path):
-    train(STAND_IN, [logs], tmp_path / "run", quick(epochs=1), progress=False)
+    train(STAND_IN, [logs], tmp_path / "run", quick(epochs=1))
     with pytest.raises(RunError) as caught:
-        train(STAND_IN, [logs], tmp_path / "run", quick(batch=16), seed=1, resume=True, progress=False)
+        train(STAND_IN, [logs], tmp_path / "run", quick(batch=16), seed=1, options=RunOptions(resume=True))
     assert str(caught.value) == (
         f"{tmp_path}/run: got batch 16 instead of 32, seed 1 instead of 0, "
         "expected the settings the run was started with; or start a new run"
     )
     write_logs(tmp_path / "other.parquet", motions(seed=1), JOINTS)
     with pytest.raises(RunError) as caught:
-        train(STAND_IN, [tmp_path / "other.parquet"], tmp_path / "run", QUICK, resume=True, progress=False)
+        train(
+            STAND_IN, [tmp_path / "other.parquet"], tmp_path / "run", QUICK, options=RunOptions(resume=True)
+        )
     assert str(caught.value) == (
         f"{tmp_path}/run: other logs than the run was started with; give the same --data or start a new run"
     )
     with pytest.raises(RunError) as caught:
-        train(STAND_IN, [logs], tmp_path / "none", QUICK, resume=True, progress=False)
+        train(STAND_IN, [logs], tmp_path / "none", QUICK, options=RunOptions(resume=True))
     assert str(caught.value) == (
         f"{tmp_path}/none: got no such run, expected a folder with config.json; spelgen train"
     )
@@ -424,35 +429,44 @@ def test_a_run_is_resumed_only_as_it_was_started(logs, tmp_path):
 def test_nothing_is_written_when_the_logs_are_bad(tmp_path):
     (tmp_path / "bad.csv").write_text("t,q_shoulder\n0,0\n")
     with pytest.raises(LogError):
-        train(STAND_IN, [tmp_path / "bad.csv"], tmp_path / "run", QUICK, progress=False)
+        train(STAND_IN, [tmp_path / "bad.csv"], tmp_path / "run", QUICK)
     assert not (tmp_path / "run").exists()
 
 
 def test_a_changed_urdf_stays_out_of_the_run(logs, tmp_path):
     module = Path(shutil.copy(STAND_IN, tmp_path / "module.py"))
     (tmp_path / "stand_in.urdf").write_text("<robot/>")
-    result = train(module, [logs], tmp_path / "run", quick(epochs=1), progress=False)
+    result = train(module, [logs], tmp_path / "run", quick(epochs=1))
     assert "changed-urdf" in [note.code for note in result.diagnostics]
     assert not (tmp_path / "run" / "robot.urdf").exists()
     with pytest.raises(
         ModuleError, match="another URDF than the module was built from; build the module again"
     ):
-        train(module, [logs], tmp_path / "new", QUICK, urdf=tmp_path / "stand_in.urdf", progress=False)
+        train(module, [logs], tmp_path / "new", QUICK, urdf=tmp_path / "stand_in.urdf")
     assert not (tmp_path / "new").exists()
 
 
+def prepared(logs: Path) -> TrainingData:
+    return prepare_data(read_logs([logs], JOINTS), JOINTS, ("revolute", "revolute"), Preprocessing())
+
+
+def loop_of(logs: Path, config: Rollout, **options) -> TrainingLoop:
+    model, data = load_module(STAND_IN), prepared(logs)
+    problem = WindowProblem(model, data, config)
+    return TrainingLoop(problem, Validation(model, data, batch=problem.batch), config, **options)
+
+
 def test_validation_windows_come_from_other_trajectories(logs):
-    data = prepare_data(read_logs([logs], JOINTS), JOINTS, ("revolute", "revolute"), QUICK, Preprocessing())
+    data = prepared(logs)
     seen = {tuple(row) for row in data.training.q.flatten(0, 1).tolist()}
     assert not any(tuple(row) in seen for row in data.validation.q.flatten(0, 1).tolist())
     assert len(data.training) + len(data.validation) == 6 * 17
 
 
 def test_the_learning_rate_rises_and_falls(logs, tmp_path):
-    data = prepare_data(read_logs([logs], JOINTS), JOINTS, ("revolute", "revolute"), QUICK, Preprocessing())
-    loop = TrainingLoop(load_module(STAND_IN), data, QUICK)
+    loop = loop_of(logs, QUICK)
     rates = []
-    for step in range(QUICK.epochs * loop.epoch_steps):
+    for step in range(QUICK.epochs * loop.problem.epoch_steps):
         loop.step = step
         rates.append(loop._rate())
     peak = int(np.argmax(rates))
@@ -477,7 +491,6 @@ def test_few_windows_are_taken_all_at_once(logs, tmp_path):
             [logs],
             tmp_path / optimizer,
             quick(momentum_steps=0, optimizer=optimizer),
-            progress=False,
         )
         losses[optimizer] = lines(tmp_path / optimizer)[-1]["best"]
     assert losses["lbfgs"] < 0.5 * losses["adamw"]
@@ -503,8 +516,7 @@ def test_the_line_search_turns_back_from_numbers_that_blow_up():
 
 def test_the_objective_momentum_predicts_no_windows(logs, tmp_path):
     result, start = (
-        train(STAND_IN, [logs], tmp_path / f"{k}", MomentumFit(momentum_steps=k, **ADAMW), progress=False)
-        for k in (200, 1)
+        train(STAND_IN, [logs], tmp_path / f"{k}", MomentumFit(momentum_steps=k, **ADAMW)) for k in (200, 1)
     )
     assert (result.status, result.epochs, result.steps) == ("finished", 0, 0)
     assert result.best_validation < 0.5 * start.best_validation
@@ -512,10 +524,12 @@ def test_the_objective_momentum_predicts_no_windows(logs, tmp_path):
 
 @pytest.mark.parametrize("show", [False, True])
 def test_progress_without_a_terminal_is_a_line_for_each_stage(show, capsys):
-    with TrainingProgress(2, show=show) as progress:
+    with TrainingProgress(show=show) as progress:
         for step in (10, 20):
             progress.momentum(step, 20, 0.7)
-        progress.epoch({"epoch": 1, "step": 20, "seconds": 1.0, "loss": 0.5, "validation": 0.4, "best": 0.4})
+        progress.epoch(
+            {"epoch": 1, "step": 20, "seconds": 1.0, "loss": 0.5, "validation": 0.4, "best": 0.4}, 2
+        )
     printed = capsys.readouterr()
     told = (
         "momentum: 20 steps, loss 0.7\ntraining: 1 epoch, loss 0.5, validation 0.4, best 0.4, 20.0 steps/s\n"
@@ -527,10 +541,10 @@ def test_progress_on_a_terminal_is_one_line_of_80_columns(monkeypatch):
     screen = io.StringIO()
     console = Console(file=screen, width=80, force_terminal=True, legacy_windows=False)
     monkeypatch.setattr("spelgen.fitting.progress.Console", lambda **options: console)
-    with TrainingProgress(400, show=True) as progress:
+    with TrainingProgress(show=True) as progress:
         progress.momentum(1900, 2000, 1.234e-5)
         losses = {"loss": 1.234e-5, "validation": 1.234e-5, "best": 1.234e-5}
-        progress.epoch({"epoch": 399, "step": 8000, "seconds": 1.0, **losses})
+        progress.epoch({"epoch": 399, "step": 8000, "seconds": 1.0, **losses}, 400)
         progress._bar.refresh()
     shown = [
         line
@@ -546,7 +560,9 @@ def test_progress_on_a_terminal_is_one_line_of_80_columns(monkeypatch):
 def test_the_allowed_time_is_kept_within_an_epoch(logs, monkeypatch):
     """An epoch of a million steps of 20 ms would take hours: by a clock that only steps move."""
     now = [100.0]
-    monkeypatch.setattr("spelgen.fitting.loop.time", types.SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(
+        "spelgen.fitting.window_problem.time", types.SimpleNamespace(monotonic=lambda: now[0])
+    )
     run = MiniBatchAdamW.run
 
     def slow(self, loss, windows, steps, rate):
@@ -555,10 +571,9 @@ def test_the_allowed_time_is_kept_within_an_epoch(logs, monkeypatch):
 
     monkeypatch.setattr(MiniBatchAdamW, "run", slow)
     config = quick(epochs=10**6, patience=10**6, max_minutes=1.0, momentum_steps=0)
-    data = prepare_data(read_logs([logs], JOINTS), JOINTS, ("revolute", "revolute"), config, Preprocessing())
-    loop = TrainingLoop(load_module(STAND_IN), data, config, seconds=12.0)
-    loop.epoch_steps = 10**6
-    with TrainingProgress(1, show=False) as progress:
-        assert loop.run(progress) == "out of time"
+    loop = loop_of(logs, config, seconds=12.0)
+    loop.problem.epoch_steps = 10**6
+    with TrainingProgress(show=False) as progress:
+        assert loop.run(progress, lambda: None) == "out of time"
     assert 0.95 * 60 < now[0] - 100.0 + 12.0 <= 1.05 * 60
     assert loop.epoch < 10

@@ -205,9 +205,7 @@ def test_a_module_built_from_xacro_trains_with_its_robot(arm, tmp_path):
     log = Trajectory(t, q, np.gradient(q, t, axis=0), q)
     write_logs(tmp_path / "log.parquet", [log], ["joint1", "joint2"])
     config = Rollout(epochs=1, momentum_steps=0)
-    fit = train(
-        tmp_path / "module.py", [tmp_path / "log.parquet"], tmp_path / "run", config, urdf=arm, progress=False
-    )
+    fit = train(tmp_path / "module.py", [tmp_path / "log.parquet"], tmp_path / "run", config, urdf=arm)
     assert not [x for x in fit.diagnostics if x.code in ("no-urdf", "changed-urdf", "no-regularizer")]
     assert read_urdf(tmp_path / "run" / "robot.urdf").digest == fit.model.facts.urdf_sha256
     require_own_module(tmp_path / "run" / "module.py", tmp_path / "run" / "robot.urdf")

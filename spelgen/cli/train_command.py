@@ -6,7 +6,7 @@ import hashlib
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -23,13 +23,12 @@ from spelgen.cli.train_settings import (
     resumed_run,
 )
 from spelgen.errors import ModuleError, OptionError
-from spelgen.settings.fits import Objective
+from spelgen.settings.fits import Objective, Rollout
 from spelgen.spec import read_facts
 
 if TYPE_CHECKING:
     from spelgen.fitting.fitted import Fit
     from spelgen.logs.trajectory import Trajectory
-    from spelgen.settings.fits import WindowConfig
     from spelgen.settings.log_mapping import LogMapping
 
 
@@ -102,8 +101,18 @@ def train(
         start = new_run(module, urdf, request)
     log_mapping = options.mapping(mapping, urdf, read_facts(start.module).joints) or start.mapping
     machine = Machine.model_validate({name: values[name] for name in Machine.model_fields if name in values})
+    from spelgen.fitting.fit import RunOptions
     from spelgen.fitting.train import train as train_files
 
+    run_options = RunOptions(
+        device=machine.device,
+        threads=machine.threads,
+        resume=resume,
+        force=force,
+        progress=not quiet,
+        mapping=log_mapping,
+        began=start_time,
+    )
     try:
         fit = train_files(
             start.module,
@@ -112,18 +121,12 @@ def train(
             start.config,
             urdf=urdf,
             source=source,
-            mapping=log_mapping,
             preprocessing=start.preprocessing,
             validation=start.validation,
             seed=start.seed,
-            resume=resume,
-            force=force,
             trust=trust,
-            device=machine.device,
-            threads=machine.threads,
-            progress=not quiet,
-            since=start_time,
             require=_torque_check(urdf, start.module, log_mapping),
+            options=run_options,
         )
     except OptionError as error:
         raise UsageError(f"{_spelled(error.option)}: {error.got}") from error
@@ -154,8 +157,8 @@ def _outcome(fit: Fit) -> tuple[str, str]:
         if "servo" in fit.record:
             result = servo_text(fit.record["servo"])
         return f"{fit.status}: servos fitted in {fit.seconds:.0f} s", result
-    config, loss = cast("WindowConfig", fit.config), f"validation loss {fit.best_validation:.3g}"
-    if not config.epochs:  # windows only judge
+    config, loss = fit.config, f"validation loss {fit.best_validation:.3g}"
+    if not isinstance(config, Rollout):  # windows only judge
         return f"{fit.status}: {config.objective} fitted in {fit.seconds:.0f} s", loss
     reason = ""
     if fit.status == "stopped early":

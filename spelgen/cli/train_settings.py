@@ -138,7 +138,7 @@ def _new_config(
 ) -> FitConfig | None:
     """Return the configuration for a model; None where the logs' rates decide and are not known yet."""
     from spelgen.dynamics.protocol import has_rigid_bodies
-    from spelgen.fitting.stages import default_config
+    from spelgen.fitting.objectives import default_config
     from spelgen.settings.fits import fit_config
 
     rigid_bodies, options, defaults = has_rigid_bodies(model), request.options, dict(settings.options)

@@ -18,6 +18,7 @@ from spelgen.emission.loading import load_module
 from spelgen.evaluation.examples import predict_examples
 from spelgen.evaluation.invariants import invariants
 from spelgen.files import write_json
+from spelgen.fitting.fit import RunOptions
 from spelgen.fitting.rollout import LossScales, loss_scales
 from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.fitting.train import train
@@ -59,10 +60,11 @@ def _run(study: Study, chosen: tuple[Variant, int]) -> dict[str, Any]:
     variant, seed = chosen
     folder = study.run(variant, seed)
     run = RunFolder(folder)
+    resume = run.checkpoint.exists()
     ended = train(
         study.module(variant), [study.logs], folder, study.training, preprocessing=study.preprocessing,
         validation=study.validation_fraction, seed=seed, urdf=study.urdf,
-        resume=run.checkpoint.exists(), force=not run.checkpoint.exists(), progress=False,
+        options=RunOptions(resume=resume, force=not resume),
     )  # fmt: skip
     if ended.status == "interrupted":
         raise KeyboardInterrupt

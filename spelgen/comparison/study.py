@@ -21,7 +21,7 @@ from spelgen.comparison.known_urdf import with_wrong_inertials, without_inertial
 from spelgen.design import Design, Net, Preset, load_design
 from spelgen.errors import RunError, SettingsError
 from spelgen.files import write_json, write_text
-from spelgen.fitting.loop import EPOCH_STEPS
+from spelgen.fitting.window_problem import TUNING
 from spelgen.loaded_arm import LoadedArm, load_arm
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import Trajectory, write_logs
@@ -181,7 +181,7 @@ def prepare_study(
 
 def _training(settings: Settings, comparison: ComparisonSettings) -> Rollout:
     """How every variant is trained: without the URDF's regularizer, which would tell the answer."""
-    epochs = -(-comparison.steps // EPOCH_STEPS)
+    epochs = -(-comparison.steps // TUNING.epoch_steps)
     options: dict[str, Any] = {"urdf_weight": 0.0, "epochs": epochs, "patience": epochs}
     options["momentum_steps"] = comparison.momentum_steps
     if comparison.weight_decay is not None:

@@ -6,7 +6,7 @@ import copy
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -28,7 +28,6 @@ from spelgen.urdf.read import read_urdf
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
-    from spelgen.settings.fits import WindowConfig
 
 WINDOW = 5  # samples of the windows that say how many steps the integrator needs
 
@@ -74,7 +73,7 @@ def subject(judged: Any, arm: Any = None) -> Subject:
     return replace(
         _of_model(judged.model, urdf or judged.urdf),
         preprocessing=judged.preprocessing,
-        window=cast("WindowConfig", judged.config).window,
+        window=getattr(judged.config, "window", WINDOW),
         substeps=judged.substeps,
         trained_on=seen,
         run=None if judged.folder is None else RunFolder(judged.folder),

@@ -5,38 +5,66 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from spelgen.dynamics.bristles import BristleReach, reach_of
+from spelgen.dynamics.bristles import BristleReach
 from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.rollout import LossScales, loss_scales
 from spelgen.logs.checks import check
-from spelgen.logs.epoch_windows import EpochWindows, WindowCutting
+from spelgen.logs.chunks import Chunk
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.trajectory import Trajectory, gap_ends, require_joints, require_torques
-from spelgen.logs.windows import Split, Windows, split_validation, thinned
+from spelgen.logs.trajectory import Trajectory, require_joints, require_torques
+from spelgen.logs.windows import Split, Windows, cut_windows, split_validation, thinned, window_count
+from spelgen.settings.tuning.fitting import ValidationTuning
 
-if TYPE_CHECKING:
-    from spelgen.logs.chunks import Chunk
-    from spelgen.settings.fits import WindowConfig
+TUNING = ValidationTuning()
 
-LARGEST_VALIDATION = 2048  # windows; validation is a measurement, it needs no more
+
+@dataclass(frozen=True, eq=False)
+class WindowCutting:
+    """How windows are cut: see `cut_windows`. preprocessing: a resolved one."""
+
+    window: int
+    stride: int
+    preprocessing: Preprocessing
+    reach: BristleReach | None = None
+
+    @property
+    def decimation(self) -> int:
+        """Samples from one sample of a window to the next."""
+        return self.preprocessing.decimation or 1
+
+    @property
+    def shortest(self) -> int:
+        """Samples of one window."""
+        return (self.window - 1) * self.decimation + 1
+
+    def count(self, samples: int) -> int:
+        """Return how many windows a gap-free piece of so many samples has."""
+        return window_count(samples, self.window, self.stride, self.decimation)
+
+    def windows(self, trajectories: Sequence[Trajectory]) -> Windows:
+        """Return all windows of these trajectories, filtered piece by piece."""
+        pieces = self.preprocessing.pieces(trajectories, shortest=self.shortest)
+        filtered = self.preprocessing.filtered
+        return cut_windows(
+            pieces, self.window, self.stride, self.decimation, measured=filtered, reach=self.reach
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class TrainingData:
     """Windows of the logs, ready to fit.
 
-    training: all of them, or where the logs are larger than memory an even sample, and `stream` draws those
-    that are fitted. preprocessing: as it was resolved. digest: of every number, to resume on the same data only.
-    recordings: what all was cut from, validation included; of logs larger than memory chunks. counts: training windows
-    of each trajectory; none of logs larger than memory.
+    training: all of them, or of logs larger than memory an even sample. size: windows of all training logs.
+    preprocessing: as it was resolved. digest: of every number, to resume on the same data only.
+    recordings: what all was cut from, validation included; of logs larger than memory chunks.
     """
 
     training: Windows
     validation: Windows
+    size: int
     scales: LossScales
     preprocessing: Preprocessing
     training_names: tuple[str, ...]
@@ -45,44 +73,51 @@ class TrainingData:
     digest: str
     recordings: tuple[Trajectory, ...] = ()
     chunks: tuple[Chunk, ...] = ()
-    stream: EpochWindows | None = None
-    counts: tuple[int, ...] = ()
 
-    @property
-    def size(self) -> int:
-        """Windows there are to fit."""
-        return len(self.training if self.stream is None else self.stream)
+
+@dataclass(frozen=True)
+class WindowChoice:
+    """Which windows are cut, and which are set aside.
+
+    validation: trajectories, or the fraction of the logs that is set aside, whole trajectories drawn by the seed
+    before anything is cut, so that no sample is in both parts. window, stride, reach: see `cut_windows`.
+    """
+
+    window: int = 5
+    stride: int = 1
+    validation: float | Sequence[Trajectory] = 0.25
+    seed: int = 0
+    reach: BristleReach | None = None
+
+
+DEFAULT_CHOICE = WindowChoice()
 
 
 def prepare_data(
     trajectories: Sequence[Trajectory],
     joints: Sequence[str],
     joint_types: Sequence[str],
-    config: WindowConfig,
     preprocessing: Preprocessing,
-    validation: float | Sequence[Trajectory] = 0.25,
-    seed: int = 0,
-    reach: BristleReach | None = None,
+    choice: WindowChoice = DEFAULT_CHOICE,
 ) -> TrainingData:
-    """Check the logs and make windows of them.
-
-    validation: trajectories, or the fraction of the logs that is set aside, whole trajectories drawn by the seed
-    before anything is cut, so that no sample is in both parts. reach: see `cut_windows`. Raises LogError.
-    """
+    """Check the logs and make windows of them. Raises LogError."""
     if not trajectories:
         raise LogError("no logs", expected="a trajectory or more")
-    split = _split(trajectories, validation, seed)
-    everything = [*trajectories] if isinstance(validation, float) else [*trajectories, *validation]
+    split = _split(trajectories, choice)
+    everything = list(trajectories)
+    if not isinstance(choice.validation, float):
+        everything += choice.validation
     for trajectory in everything:
         require_joints(trajectory, joints)
     require_torques(everything)
     notes = check(everything, joints, joint_types)
     resolved = preprocessing.resolved([x.sample_rate for x in everything])
-    cutting = WindowCutting(config.window, config.stride, resolved, reach)
+    cutting = WindowCutting(choice.window, choice.stride, resolved, choice.reach)
     windows = cutting.windows(split.training)
     return TrainingData(
         training=windows,
-        validation=thinned(cutting.windows(split.validation), LARGEST_VALIDATION),
+        validation=thinned(cutting.windows(split.validation), TUNING.windows),
+        size=len(windows),
         scales=loss_scales(windows, joint_types),
         preprocessing=resolved,
         training_names=tuple(x.name for x in split.training),
@@ -90,27 +125,19 @@ def prepare_data(
         diagnostics=(*notes, *resolved.diagnostics, split.note),
         digest=digest(everything),
         recordings=tuple(everything),
-        counts=tuple(
-            sum(map(cutting.count, np.diff(gap_ends(x.t, resolved.gap)).tolist())) for x in split.training
-        ),
     )
 
 
-def known_reach(reach: BristleReach | None, joint_types: Sequence[str]) -> BristleReach:
-    """That of a model's bristles (n, K) [rad, m]; the usual ones where it has none, for what it is compared with."""
-    return reach if reach is not None and reach.elements else reach_of(joint_types)
-
-
-def _split(trajectories: Sequence[Trajectory], validation: float | Sequence[Trajectory], seed: int) -> Split:
-    if isinstance(validation, float):
-        return split_validation(trajectories, validation, seed)
-    message = f"validation on {len(validation)} trajectories that were given"
+def _split(trajectories: Sequence[Trajectory], choice: WindowChoice) -> Split:
+    if isinstance(choice.validation, float):
+        return split_validation(trajectories, choice.validation, choice.seed)
+    message = f"validation on {len(choice.validation)} trajectories that were given"
     note = Diagnostic("info", "validation-split", "logs", None, message)
-    return Split(tuple(trajectories), tuple(validation), note)
+    return Split(tuple(trajectories), tuple(choice.validation), note)
 
 
 def digest(trajectories: Iterable[Trajectory]) -> str:
-    """A fingerprint of every number."""
+    """Return a fingerprint of every number."""
     numbers = hashlib.sha256()
     for trajectory in trajectories:
         for array in (trajectory.t, trajectory.q, trajectory.qd, trajectory.tau):

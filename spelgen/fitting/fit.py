@@ -3,41 +3,64 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Protocol
 
-from spelgen.dynamics.bristles import bristle_reach
 from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.errors import Diagnostic, RunError
 from spelgen.files import write_json
-from spelgen.fitting import workers
-from spelgen.fitting.compiled import compiled
-from spelgen.fitting.dataset import TrainingData, prepare_data
 from spelgen.fitting.fitted import Fit, load_run
-from spelgen.fitting.loop import TrainingLoop
+from spelgen.fitting.objective import FitRequest, Logs, Objective, Status, record_of
+from spelgen.fitting.objectives import default_config, objective_of
 from spelgen.fitting.process import require_device, termination_as_interrupt, threads_of_torch
 from spelgen.fitting.progress import TrainingProgress
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.run_lock import locked
-from spelgen.fitting.run_record import describe, require_same
-from spelgen.fitting.servo_run import fit_commands, require_input
-from spelgen.fitting.stages import default_config, fit_torque_stage
-from spelgen.fitting.streaming import LargeLogs, prepare_streamed
-from spelgen.fitting.urdf_regularizer import UrdfRegularizer, urdf_regularizer
+from spelgen.fitting.run_record import require_same
+from spelgen.fitting.streaming import LargeLogs
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
-from spelgen.settings.fits import FitConfig, Rollout, ServoFit, WindowConfig
+from spelgen.settings.fits import FitConfig
 from spelgen.settings.log_mapping import LogMapping
-from spelgen.spec import logged_joints
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
+    from spelgen.urdf.robot import Robot
 
-__all__ = ["Fit", "fit", "load_run"]
+__all__ = ["Fit", "RunOptions", "fit", "load_run"]
 
-Logs = Sequence[Trajectory] | LargeLogs
 AUTOMATIC = Preprocessing()
+
+
+class ArmOfFile(Protocol):
+    """An arm that was loaded from a file, as `spelgen.load_arm` gives it."""
+
+    @property
+    def robot(self) -> Robot: ...
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """How a fit runs, whatever it fits.
+
+    device, threads: of torch. resume: go on from the folder's checkpoint, exactly as if there had been no interruption.
+    force: replace a run. progress: show it on stderr. mapping: how the logs were read, kept with the run. notes: found
+    before, to be told with the rest. began: from when the allowed time counts (`time.monotonic`); None: from now.
+    """
+
+    device: str = "cpu"
+    threads: int = 1
+    resume: bool = False
+    force: bool = False
+    progress: bool = False
+    mapping: LogMapping | None = None
+    notes: Sequence[Diagnostic] = ()
+    began: float | None = None
+
+
+QUIET = RunOptions()
 
 
 def fit(
@@ -48,168 +71,125 @@ def fit(
     preprocessing: Preprocessing = AUTOMATIC,
     validation: float | Sequence[Trajectory] = 0.25,
     seed: int = 0,
-    arm: Any = None,
-    device: str = "cpu",
-    threads: int = 1,
+    arm: ArmOfFile | Path | str | None = None,
     folder: Path | str | None = None,
-    resume: bool = False,
-    force: bool = False,
-    mapping: LogMapping | None = None,
-    progress: bool = False,
-    notes: Sequence[Diagnostic] = (),
-    since: float | None = None,
+    options: RunOptions = QUIET,
 ) -> Fit:
     """Fit ``model`` to ``logs``; it then has the best weights that were found.
 
     config: a `TorqueFit`, `MomentumFit` or `Rollout`, or of an arm under position servos a `ServoFit`, all that it
-    takes, which needs no validation; by default torque for rigid bodies, where logs are
-    dense enough for accelerations, and rollout for networks. validation: the fraction of the logs that is set aside,
-    whole trajectories drawn by ``seed``, or trajectories. arm: the arm or the URDF that the model was made from,
-    for the regularizer towards it and for the run folder.
-    folder: where checkpoints go after every epoch (see `RunFolder`); without one, `Fit.save` writes all that.
-    resume: go on from the folder's checkpoint, exactly as if there had been no interruption. force: replace a run.
-    mapping: how the logs were read, kept with the run. notes: what was found before, to be told with the rest.
-    since: from where the allowed time counts (`time.monotonic`); None: from now.
-    In processes that `torchrun` started, each of which calls this, all fit together (see `workers.py`).
+    takes, which needs no validation; by default torque for rigid bodies, where logs are dense enough for accelerations,
+    and rollout for networks. validation: the fraction of the logs that is set aside, whole trajectories drawn by
+    ``seed``, or trajectories. arm: the arm or the URDF that the model was made from, for the regularizer towards it and
+    for the run folder. folder: where checkpoints go after every epoch (see `RunFolder`); without one, `Fit.save`
+    writes all that.
     Ctrl-C or SIGTERM end the fit with status "interrupted".
     Raises OptionError for an option that does not apply to this model, LogError, and RunError when the folder holds a
     run or cannot be resumed with this.
     """
-    began = time.monotonic()
+    began = options.began or time.monotonic()
+    run = None if folder is None else RunFolder(Path(folder))
     logs = [logs] if isinstance(logs, Trajectory) else logs
-    rigid_bodies = has_rigid_bodies(model)
     if config is None:
         config = default_config(model, sample_rates(logs))
-    config.require(rigid_bodies=rigid_bodies)
-    require_input(model, config)
-    known = None if folder is None else RunFolder(Path(folder))
-    if isinstance(config, ServoFit):
-        return fit_commands(
-            model, logs, config, preprocessing, seed=seed, urdf=_urdf(arm), folder=known, resume=resume, force=force,
-            mapping=mapping, notes=notes, threads=threads, progress=progress and workers.rank() == 0,
-        )  # fmt: skip
-    run = known if workers.rank() == 0 else None  # of several processes one writes
-    if run is not None and not resume:
-        run.require_free(force=force)
-    with threads_of_torch(threads), locked(run.path if run else None) as told:
-        require_device(device)
-        data = _prepared(model, logs, cast("WindowConfig", config), preprocessing, validation, seed)
-        chosen = cast("WindowConfig", config.resolved(data.size))
-        found = [*data.diagnostics, *notes, *told]
-        stepped = _compiled(model, data, chosen, device, found)
-        record = describe(model, chosen, data, seed=seed, validation=validation, mapping=mapping) | {
-            "device": device,
-            "threads": threads,
-        }
-        urdf = known.urdf if resume and known is not None else _urdf(arm)
-        if resume and known is not None:
-            require_same(known, record)
-        regularizer = _regularizer(urdf, model, chosen, data, found)
-        if not resume:
-            found += fit_torque_stage(model, data, chosen, regularizer)
-            if run is not None:
-                run.start(model.source, urdf, force=force)
-        loop = TrainingLoop(
-            model,
-            data,
-            chosen,
-            seed=seed,
-            device=device,
-            regularizer=regularizer,
-            stepped=stepped,
-            folder=run,
-            seconds=workers.agreed(time.monotonic() - (since or began)),
-        )
-        if resume and known is not None:
-            loop.restore(known)
-        elif run is not None:
-            loop.save()
-            write_json(run.config, record)  # now there is a run, and it can be resumed
-        with (
-            TrainingProgress(chosen.epochs, show=progress and workers.rank() == 0) as shown,
-            termination_as_interrupt(),
-        ):
-            for note in found:
-                shown.note(note)
-            status = loop.run(shown)
-    model.load_state_dict(loop.best_weights)
+    config.require(rigid_bodies=has_rigid_bodies(model))
+    urdf = run.urdf if run is not None and options.resume else _urdf(arm)
+    request = FitRequest(
+        model, logs, config, preprocessing, validation, seed, urdf, options.mapping, options.device,
+        options.threads, began, None if run is None else run.path,
+    )  # fmt: skip
+    objective = objective_of(request)
+    if run is not None and not options.resume:
+        run.require_free(force=options.force)
+    with (
+        threads_of_torch(options.threads),
+        termination_as_interrupt(),
+        locked(None if run is None else run.path) as lock_notes,
+    ):
+        require_device(options.device)
+        prepared = objective.prepare()
+        notes = [*prepared.notes, *options.notes, *lock_notes]
+        record = record_of(request, prepared, rigid_bodies=has_rigid_bodies(model))
+        if run is not None and options.resume:
+            require_same(run, record)
+            _resume(objective, run)
+        else:
+            notes += objective.begin()
+        before = record | objective.results()
+        save = _writer(objective, run)
+        if run is not None and not options.resume:
+            run.start(model.source, urdf, force=options.force)
+            save()
+            write_json(run.config, before)  # now there is a run, and it can be resumed
+        status = _run(objective, save, notes, show=options.progress)
+        record |= objective.results()
+        if run is not None and record != before:
+            write_json(run.config, record)
+    checkpoint = objective.checkpoint()
+    model.load_state_dict(checkpoint["best_weights"])
     model.requires_grad_(True)  # of what rested, too
     return Fit(
         model=model,
-        config=chosen,
-        preprocessing=data.preprocessing,
-        history=loop.history,
-        diagnostics=tuple(found),
+        config=prepared.config,
+        preprocessing=prepared.preprocessing,
+        history=objective.history,
+        diagnostics=tuple(notes),
         status=status,
         record=record,
-        checkpoint=loop.state(),
+        checkpoint=checkpoint,
         urdf=urdf,
-        folder=None if known is None else known.path,
+        folder=None if run is None else run.path,
     )
 
 
 def sample_rates(logs: Logs) -> list[float]:
-    """Of all logs [Hz]."""
-    return logs.rates if isinstance(logs, LargeLogs) else [x.sample_rate for x in logs]
+    """Return those of all logs [Hz]."""
+    if isinstance(logs, LargeLogs):
+        return logs.rates
+    return [log.sample_rate for log in logs]
 
 
-def _prepared(
-    model: EmittedModel,
-    logs: Logs,
-    config: WindowConfig,
-    preprocessing: Preprocessing,
-    validation: float | Sequence[Trajectory],
-    seed: int,
-) -> TrainingData:
-    if not isinstance(logs, LargeLogs):
-        joints, kinds = logged_joints(model), model.joint_types
-        return prepare_data(
-            logs, joints, kinds, config, preprocessing, validation, seed, bristle_reach(model)
-        )
-    if not isinstance(validation, float):
-        raise RunError(
-            "trajectories to validate logs larger than memory on", expected="a fraction of these logs"
-        )
-    return prepare_streamed(logs, config, preprocessing, validation, seed, bristle_reach(model))
-
-
-def _urdf(arm: Any) -> Path | None:
-    """The file of an arm that was loaded, or of a path; None: neither."""
-    if arm is None or isinstance(arm, str | Path):
-        return None if arm is None else Path(arm)
-    return Path(arm.robot.path)
-
-
-def _regularizer(
-    urdf: Path | None,
-    model: EmittedModel,
-    config: WindowConfig,
-    data: TrainingData,
-    notes: list[Diagnostic],
-) -> UrdfRegularizer | None:
-    """Where it is wanted and can be had; the torques of rigid bodies have a prior of their own."""
-    wanted = isinstance(config, Rollout) or not has_rigid_bodies(model)
-    if not wanted or not config.urdf_weight or urdf is None or not urdf.exists():
+def _urdf(arm: ArmOfFile | Path | str | None) -> Path | None:
+    """Return the file of an arm that was loaded, or of a path."""
+    if arm is None:
         return None
+    return Path(arm) if isinstance(arm, str | Path) else Path(arm.robot.path)
+
+
+def _resume(objective: Objective, run: RunFolder) -> None:
+    checkpoint = run.load_checkpoint()
     try:
-        return urdf_regularizer(urdf, logged_joints(model), model, data.training)
-    except Exception as error:  # Pinocchio and its parser raise many kinds; the fit goes on without
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
-        message = f"fitted without the URDF's regularizer: {reason}"
-        notes.append(Diagnostic("info", "no-regularizer", urdf.name, None, message))
-        return None
+        objective.resume(checkpoint, run.read_metrics(), run.read_config())
+    except (KeyError, RuntimeError, ValueError, TypeError, AttributeError) as error:
+        raise RunError("a checkpoint of another model", file=run.checkpoint, do="start a new run") from error
+    run.keep_metrics(len(objective.history))
 
 
-def _compiled(
-    model: EmittedModel, data: TrainingData, config: WindowConfig, device: str, notes: list[Diagnostic]
-) -> EmittedModel:
-    """The model as steps on windows use it, compiled where that is asked for."""
-    if not config.compile:
-        return model
-    since = time.monotonic()
-    batch = getattr(config, "batch", None)
-    windows = data.training if batch is None else data.training[:batch]  # as steps take them
-    ready = compiled(model.to(device), windows.to(device), data.scales.to(device))
-    message = f"right-hand side compiled in {time.monotonic() - since:.0f} s"
-    notes.append(Diagnostic("info", "compiled", "training", None, message))
-    return ready
+def _writer(objective: Objective, run: RunFolder | None) -> Callable[[], None]:
+    """Return what writes new lines of the history and the checkpoint."""
+    written = len(objective.history)
+
+    def save() -> None:
+        nonlocal written
+        if run is None:
+            return
+        for epoch in objective.history[written:]:
+            run.append_metrics(epoch)
+        written = len(objective.history)
+        checkpoint = objective.checkpoint()
+        run.save(checkpoint["best_weights"], checkpoint)
+
+    return save
+
+
+def _run(
+    objective: Objective, save: Callable[[], None], notes: Sequence[Diagnostic], *, show: bool
+) -> Status:
+    """Tell the notes, and go on until an end is reached, of which an interruption is one."""
+    with TrainingProgress(show=show) as progress:
+        for note in notes:
+            progress.note(note)
+        try:
+            return objective.run(progress, save)
+        except KeyboardInterrupt:
+            return "interrupted"

@@ -14,7 +14,7 @@ import torch
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.errors import Diagnostic, LogError, RunError
 from spelgen.files import write_json
-from spelgen.fitting.loop import Status
+from spelgen.fitting.objective import Status
 from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.fitting.run_lock import locked
 from spelgen.fitting.run_record import recorded_config

@@ -16,8 +16,7 @@ class TrainingProgress:
     nothing at all when `show` is False.
     """
 
-    def __init__(self, epochs: int, *, show: bool) -> None:
-        self._epochs = epochs
+    def __init__(self, *, show: bool) -> None:
         self._show = show
         self._console = Console(stderr=True, highlight=False, soft_wrap=True)
         columns = (
@@ -27,7 +26,7 @@ class TrainingProgress:
             TimeRemainingColumn(),
         )
         self._bar = Progress(*columns, TextColumn("{task.fields[state]}"), console=self._console)
-        self._task = self._bar.add_task("training", total=epochs, state="")
+        self._task = self._bar.add_task("training", total=None, state="")
         self._said = ""  # of the stage that goes on, where there is no terminal
 
     def __enter__(self) -> TrainingProgress:
@@ -57,17 +56,17 @@ class TrainingProgress:
         if step == steps:
             self._end_stage()
 
-    def round(self, number: int, steps: int, rms: float) -> None:
-        """Show how far a fit of servos is: the round, steps in all, errors [rad, m]."""
+    def round(self, number: int, rounds: int, steps: int, rms: float) -> None:
+        """Show how far a fit of servos is: the round of so many, steps in all, errors [rad, m]."""
         state = f"{steps} steps, errors {1000 * rms:.3g} mrad"
-        self._bar.update(self._task, description="servos", completed=number, state=state)
+        self._bar.update(self._task, description="servos", completed=number, total=rounds, state=state)
         self._said = f"servos: {state}"
 
-    def epoch(self, record: dict[str, Any]) -> None:
-        """Show one line of metrics.jsonl."""
+    def epoch(self, record: dict[str, Any], epochs: int) -> None:
+        """Show one line of metrics.jsonl, of so many epochs at most."""
         if not self._said.startswith("training"):
             self._end_stage()
-            self._bar.reset(self._task, description="training", total=self._epochs)
+            self._bar.reset(self._task, description="training", total=epochs)
         state = f"validation {record['validation']:.3g}, best {record['best']:.3g}"
         self._bar.update(self._task, completed=record["epoch"], state=state)
         rate, epochs = record["step"] / record["seconds"], "epoch" if record["epoch"] == 1 else "epochs"

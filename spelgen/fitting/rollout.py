@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -18,8 +18,6 @@ from spelgen.settings.fits import Solver
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
-
-Mean = Callable[[torch.Tensor], torch.Tensor]
 
 SUBSTEPS = (1, 2, 4, 8, 16, 32)  # rk4 steps between samples
 INTEGRATION_FRACTION = 0.03  # of the model's own error, what the integrator may add
@@ -134,16 +132,14 @@ def rollout_loss(
     return rollout_errors(model, windows, scales, substeps, solver).square().mean()
 
 
-def momentum_loss(
-    model: EmittedModel, windows: Windows, scales: LossScales, everywhere: Mean | None = None
-) -> torch.Tensor:
+def momentum_loss(model: EmittedModel, windows: Windows, scales: LossScales) -> torch.Tensor:
     """The weak form of the equations: p(t) - p(0) against the impulse of all forces along the measured
     samples.
 
     Forces between samples are the mean of their values at both ends (trapezium rule): no ODE is solved and no
     acceleration needed. What is missing is told as mean torque, in units of its standard deviation at the
     joint. (Told as a velocity, M(q)^-1 times it, it would reward an M that is too large: errors of the measured
-    torque would count less.) everywhere: from a mean over these windows that over those of all processes.
+    torque would count less.)
     """
     q, qd, tau = windows.q, windows.qd, windows.tau  # (W, K, n), (W, K, n), (W, K-1, n)
     dynamics, dt = model, windows.dt.unsqueeze(-1)
@@ -163,7 +159,6 @@ def momentum_loss(
     with torch.no_grad():
         inputs = dynamics.input_at(at, prepared).abs()
     unit = (inputs @ scales.tau).mean(dim=(0, 1))  # gears may stand between motor and joint
-    unit = unit if everywhere is None else everywhere(unit)
     return (missing / torch.maximum(unit, 1e-2 * unit.amax())).square().mean()
 
 

@@ -39,12 +39,13 @@ class Counters(BaseModel):
     step: Whole
     best_epoch: Whole
     best_loss: float
-    rollbacks: Whole
-    learning_rate_factor: Positive
     seconds: NonNegative
     substeps: Substeps
-    momentum_done: bool
     best_weights: dict[str, Any]
+    # of fits to windows alone
+    rollbacks: Whole = 0
+    learning_rate_factor: Positive = 1.0
+    momentum_done: bool = True
 
 
 class Epoch(BaseModel):

@@ -1,32 +1,30 @@
-"""Logs larger than memory: one pass to know them, samples to measure on, a stream of windows to fit."""
+"""Logs larger than memory, for torque fits: one pass to know them, then chunk by chunk, and windows to validate on."""
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from spelgen.dynamics.bristles import BristleReach
 from spelgen.errors import Diagnostic, LogError, collect
-from spelgen.fitting.dataset import LARGEST_VALIDATION, TrainingData
+from spelgen.fitting.dataset import (
+    DEFAULT_CHOICE,
+    TUNING,
+    TrainingData,
+    WindowChoice,
+    WindowCutting,
+)
 from spelgen.fitting.rollout import loss_scales
 from spelgen.logs.checks import Finding, findings, gap_diagnostics, summarised
 from spelgen.logs.chunks import Chunk, scan
-from spelgen.logs.epoch_windows import EpochWindows, WindowCutting
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import GAP, gap_ends
+from spelgen.logs.windows import Windows, joined, thinned
 from spelgen.settings.log_mapping import LogMapping
-
-if TYPE_CHECKING:
-    from spelgen.settings.fits import WindowConfig
-
-SAMPLED = 2**16  # windows on which scales and substeps are chosen, and of the momentum steps
-SAMPLED_CHUNKS = 32  # that these windows come from
-VALIDATED_CHUNKS = 16
 
 
 @dataclass(frozen=True)
@@ -40,19 +38,19 @@ class LargeLogs:
     gap: float = GAP
 
     @cached_property
-    def known(self) -> KnownLogs:
+    def contents(self) -> LogContents:
         """What a pass over the files tells. Raises LogError, and SettingsError where the mapping does not fit."""
         return _read_once(self)
 
     @property
     def rates(self) -> list[float]:
         """Sample rates [Hz]."""
-        return self.known.rates
+        return self.contents.rates
 
 
 @dataclass(frozen=True, eq=False)
-class KnownLogs:
-    """What one pass tells. pieces: lengths of the gap-free pieces of each chunk. rates: of chunks that are long
+class LogContents:
+    """Hold what one pass tells. pieces: lengths of the gap-free pieces of each chunk. rates: of chunks that are long
     enough [Hz].
     """
 
@@ -64,81 +62,80 @@ class KnownLogs:
 
 
 def prepare_streamed(
-    logs: LargeLogs,
-    config: WindowConfig,
-    preprocessing: Preprocessing,
-    validation: float = 0.25,
-    seed: int = 0,
-    reach: BristleReach | None = None,
+    logs: LargeLogs, preprocessing: Preprocessing, choice: WindowChoice = DEFAULT_CHOICE
 ) -> TrainingData:
-    """As `prepare_data`; whole chunks (see `scan`) are set aside for validation."""
+    """As `prepare_data`; whole chunks (see `scan`) are set aside for validation, and windows are only a sample."""
     if logs.gap != preprocessing.gap:
         logs = replace(logs, gap=preprocessing.gap)
-    known = logs.known
-    resolved = preprocessing.resolved(known.rates)
-    cutting = WindowCutting(config.window, config.stride, resolved, reach)
-    training, validating = _split(known, cutting, validation, seed)
-    sample = training.sample(SAMPLED_CHUNKS, SAMPLED)
-    unused = len(known.chunks) - len(training.chunks) - len(validating.chunks)
+    contents = logs.contents
+    resolved = preprocessing.resolved(contents.rates)
+    cutting = WindowCutting(choice.window, choice.stride, resolved, choice.reach)
+    counts = [sum(map(cutting.count, pieces)) for pieces in contents.pieces]
+    usable = [index for index, count in enumerate(counts) if count]
+    training, validating = _split(usable, cutting, choice)
+    windows = _sample([contents.chunks[k] for k in training], cutting)
     message = (
-        f"larger than memory: read in {len(known.chunks)} chunks, {training.epochs_per_pass} epochs pass over all; "
-        f"validation on {len(validating.chunks)} chunks, {unused} hold no window"
+        f"larger than memory: read in {len(contents.chunks)} chunks; validation on {len(validating)} chunks, "
+        f"{len(contents.chunks) - len(usable)} hold no window"
     )
-    note = Diagnostic("info", "streamed", "logs", None, message)
     return TrainingData(
-        training=sample,
-        validation=validating.sample(VALIDATED_CHUNKS, LARGEST_VALIDATION),
-        scales=loss_scales(sample, logs.joint_types),
+        training=windows,
+        validation=_sample([contents.chunks[k] for k in validating], cutting),
+        size=sum(counts[k] for k in training),
+        scales=loss_scales(windows, logs.joint_types),
         preprocessing=resolved,
-        training_names=tuple(chunk.name for chunk in training.chunks),
-        validation_names=tuple(chunk.name for chunk in validating.chunks),
-        diagnostics=(*known.notes, *resolved.diagnostics, note),
-        digest=known.digest,
-        chunks=tuple(known.chunks),
-        stream=training,
+        training_names=tuple(contents.chunks[k].name for k in training),
+        validation_names=tuple(contents.chunks[k].name for k in validating),
+        diagnostics=(
+            *contents.notes,
+            *resolved.diagnostics,
+            Diagnostic("info", "streamed", "logs", None, message),
+        ),
+        digest=contents.digest,
+        chunks=tuple(contents.chunks),
     )
 
 
 def _split(
-    known: KnownLogs, cutting: WindowCutting, fraction: float, seed: int
-) -> tuple[EpochWindows, EpochWindows]:
-    """Training and validation, which share no chunk; chunks without a window are left out."""
-    counts = [sum(map(cutting.count, pieces)) for pieces in known.pieces]
-    usable = [index for index, count in enumerate(counts) if count]
+    usable: Sequence[int], cutting: WindowCutting, choice: WindowChoice
+) -> tuple[list[int], list[int]]:
+    """Return which chunks are for training and which for validation; chunks without a window are left out."""
     if len(usable) < 2:
         raise LogError(f"no two chunks with {cutting.shortest} samples without a gap", expected="several")
-    size = min(max(1, round(fraction * len(usable))), len(usable) - 1)
-    validated = set(np.random.default_rng(seed).permutation(usable)[:size].tolist())
-
-    def stream(chosen: list[int]) -> EpochWindows:
-        chunks = tuple(known.chunks[index] for index in chosen)
-        return EpochWindows(chunks, tuple(counts[index] for index in chosen), cutting, seed)
-
-    return (
-        stream([index for index in usable if index not in validated]),
-        stream([index for index in usable if index in validated]),
-    )
+    assert isinstance(choice.validation, float)
+    size = min(max(1, round(choice.validation * len(usable))), len(usable) - 1)
+    validated = set(np.random.default_rng(choice.seed).permutation(usable)[:size].tolist())
+    return [k for k in usable if k not in validated], sorted(validated)
 
 
-def _read_once(logs: LargeLogs) -> KnownLogs:
+def _sample(chunks: Sequence[Chunk], cutting: WindowCutting) -> Windows:
+    """Return some windows, evenly spread over some chunks, which are evenly spread themselves."""
+    chosen = chunks[:: -(-len(chunks) // TUNING.chunks)]
+    samples = []
+    for chunk in chosen:
+        windows = thinned(cutting.windows([chunk.load()]), max(1, TUNING.windows // len(chosen)))
+        samples.append(joined([windows]))  # a copy: a slice would keep all windows of its chunk
+    return joined(samples)
+
+
+def _read_once(logs: LargeLogs) -> LogContents:
     chunks: list[Chunk] = []
     pieces: list[list[int]] = []
     rates: list[float] = []
-    lengths: list[int] = []
-    found: list[Finding] = []
+    problems: list[Finding] = []
     gaps: list[Diagnostic] = []
     numbers = hashlib.sha256()
     for chunk, trajectory in scan(logs.files, logs.joints, logs.mapping, logs.joint_types):
         chunks.append(chunk)
         pieces.append(np.diff(gap_ends(trajectory.t, logs.gap)).tolist())
-        lengths.append(len(trajectory.t))
         rates.append(trajectory.sample_rate)
-        found += findings(trajectory, logs.joints, logs.joint_types)
+        problems += findings(trajectory, logs.joints, logs.joint_types)
         gaps += gap_diagnostics(trajectory)
         for array in (trajectory.t, trajectory.q, trajectory.qd, trajectory.tau):
             numbers.update(np.ascontiguousarray(array).data)
-    notes, errors = summarised(found, logs.joints, len(chunks))
+    notes, errors = summarised(problems, logs.joints, len(chunks))
     collect(errors)
     # the last samples of a recording may be a chunk of their own, too short to tell a rate
-    told = [each for each, length in zip(rates, lengths, strict=True) if length > max(lengths) / 10]
-    return KnownLogs(chunks, told, [*gaps[:1], *notes], numbers.hexdigest(), pieces)
+    lengths = [sum(lengths) for lengths in pieces]
+    reliable = [rate for rate, length in zip(rates, lengths, strict=True) if length > max(lengths) / 10]
+    return LogContents(chunks, reliable, [*gaps[:1], *notes], numbers.hexdigest(), pieces)

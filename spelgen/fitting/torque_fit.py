@@ -14,7 +14,7 @@ fitted to what these leave, where it pays (see ``residual_fit``), and then both 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -23,6 +23,8 @@ import torch
 
 from spelgen.dynamics.protocol import has_residuals
 from spelgen.fitting.gaussian_prior import PRIORS, covariance, most_probable
+from spelgen.fitting.levenberg_marquardt import TUNING as DAMPING
+from spelgen.fitting.levenberg_marquardt import NormalEquations, SolverState, levenberg_marquardt
 from spelgen.fitting.residual_fit import Residual, enter, refine
 from spelgen.fitting.torque_jacobian import COMPENSATION, TorqueJacobian
 from spelgen.fitting.torque_samples import TorqueSamples
@@ -47,11 +49,8 @@ LARGE = 2**15  # samples; of more, FEW of them are fitted first
 FEW, LAST_ROUNDS = 2**14, 2
 TURNS = 3  # of rigid bodies and what stands beside them, where something does
 GAIN = 1e-4  # relative: a step that gains less ends a round
-KEPT = 0.5  # of what a step promises: one that keeps less is tried straight in the bodies' parameters, too
-NO_GAIN = 1e-10  # likewise: a step that promises less is not tried
 FIRST_NOISE = 0.1  # of a joint's torque range
 LEAST_NOISE = 1e-4  # likewise: noise-free samples are fitted to four digits of their torque's range
-DAMPING = (1e-9, 1e-3, 1e6)  # of the steps, relative to the curvature: least, first, most
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,15 +71,7 @@ class TorqueSolution:
     residuals: tuple[Residual, ...]
 
 
-@dataclass(frozen=True, eq=False)
-class _Step:
-    """Weights, the sums of squares of the torque that they miss (n,), their cost; damping of the next step; steps."""
-
-    x: torch.Tensor
-    squares: torch.Tensor
-    cost: float
-    damping: float
-    steps: int = 0
+_State = SolverState[torch.Tensor]  # its residuals: sums of squares of the torque that is missed (n,)
 
 
 def fit_torque(
@@ -108,7 +99,7 @@ def fit_torque(
         residuals = enter(model, problem.jacobian.left(at.x), alike)
         for _ in range(TURNS if residuals else 0):
             at = problem.again(at, TorqueJacobian(model, few))
-            at, noise = problem.solve(at, problem.noise(at.squares), LAST_ROUNDS)
+            at, noise = problem.solve(at, problem.noise(at.residuals), LAST_ROUNDS)
             problem.jacobian.write(at.x)
             refine(model, problem.jacobian.left(at.x), residuals, alike)
         if residuals:  # seen with what was refined last
@@ -117,7 +108,7 @@ def fit_torque(
         at, _ = problem.solve(problem.again(at, TorqueJacobian(model, samples)), noise, LAST_ROUNDS)
     problem.jacobian.write(at.x)
     return TorqueSolution(
-        residual=((at.squares / samples.count).sqrt() / problem.jacobian.per_gain(at.x)).numpy(),
+        residual=((at.residuals / samples.count).sqrt() / problem.jacobian.per_gain(at.x)).numpy(),
         steps=at.steps,
         cost=at.cost,
         prior=problem.prior,
@@ -141,10 +132,10 @@ class _Problem:
         deviation = jacobian.torque_deviation()
         self.range = torch.maximum(deviation, 1e-3 * deviation.max())
 
-    def again(self, at: _Step, jacobian: TorqueJacobian) -> _Step:
+    def again(self, at: _State, jacobian: TorqueJacobian) -> _State:
         """Go on from these weights with these samples."""
         self.take(jacobian)
-        return replace(at, squares=jacobian.squares(at.x))
+        return replace(at, residuals=jacobian.squares(at.x))
 
     def believe(self, prior: GaussianPrior) -> None:
         """Go on with this prior."""
@@ -156,7 +147,7 @@ class _Problem:
         """Which weights (K,) move."""
         return self.jacobian.free(self.adapt, self.compensated)
 
-    def settled(self) -> tuple[_Step, torch.Tensor]:
+    def settled(self) -> tuple[_State, torch.Tensor]:
         """As `solve`, all rounds from the start; the more probable of two ways where the first leaves much.
 
         Bodies that are far off leave much of the torque, which is taken for noise, and noise asks for no better bodies:
@@ -182,11 +173,11 @@ class _Problem:
         missed = self.count / ALIKE * noise.log().sum() + away @ self.precision @ away / 2
         return float((prior.logdet() + posterior.logdet()) / 2 - missed)
 
-    def near(self, noise: torch.Tensor, most: torch.Tensor | None) -> tuple[_Step, torch.Tensor]:
+    def near(self, noise: torch.Tensor, most: torch.Tensor | None) -> tuple[_State, torch.Tensor]:
         """As `solve`, some rounds from the start; from there anew while further joints want a compensation, for what
         a fit made of their torque without one leads astray.
         """
-        start = _Step(self.start, self.jacobian.squares(self.start), float("inf"), DAMPING[1])
+        start = _State(self.start, self.jacobian.squares(self.start), float("inf"), DAMPING.first)
         while True:
             self.believe(self.guess)
             at, found = self.solve(start, noise, FIRST_ROUNDS, most)
@@ -208,26 +199,20 @@ class _Problem:
         return bool(found.any())
 
     def solve(
-        self, at: _Step, noise: torch.Tensor, rounds: int, most: torch.Tensor | None = None
-    ) -> tuple[_Step, torch.Tensor]:
+        self, at: _State, noise: torch.Tensor, rounds: int, most: torch.Tensor | None = None
+    ) -> tuple[_State, torch.Tensor]:
         """Steps down, and the noise (n,) after them; after each round it is found anew, as the prior is.
 
         There are more rounds while much is gained. most: of the noise, where the start may be far off: torques that are
         not explained yet are no noise.
         """
         for number in range(LONGER * rounds):
-            at = replace(at, cost=self.cost(at.x, at.squares, noise))
-            for _ in range(STEPS):
-                curvature, target = self.normal_equations(at.x, noise)
-                after = self.step(at, curvature, target, noise)
-                if after is None:
-                    break
-                gained, at = at.cost - after.cost, after
-                if gained < GAIN * at.cost:
-                    break
-            before, noise = noise, self.noise(at.squares)
+            self.weights = 1 / noise.square()
+            at = replace(at, cost=self.cost(at.x, at.residuals), converged=False)
+            *_, at = at, *levenberg_marquardt(self, at, max_steps=STEPS, relative_gain=GAIN)
+            before, noise = noise, self.noise(at.residuals)
             noise = noise if most is None else torch.minimum(noise, most)
-            self.covariance[self.free[:, None] & self.free] = torch.linalg.inv(curvature).flatten()
+            self.covariance[self.free[:, None] & self.free] = torch.linalg.inv(self.curvature).flatten()
             if self.adapt != "load":
                 weights, variance = self.jacobian.weights, self.covariance.diagonal()
                 self.believe(most_probable(self.prior, self.guess, weights, at.x - self.start, variance))
@@ -235,43 +220,29 @@ class _Problem:
                 break
         return at, noise
 
-    def normal_equations(self, x: torch.Tensor, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """The cost's second derivative by the weights that move, and minus its first."""
+    def residuals(self, x: torch.Tensor) -> torch.Tensor:
+        """Sums of squares of the torque that is missed (n,)."""
+        return self.jacobian.squares(x)
+
+    def cost(self, x: torch.Tensor, residuals: torch.Tensor) -> float:
+        """See the top of this file."""
+        away = x - self.start
+        return float(((residuals * self.weights).sum() + away @ self.precision @ away) / 2)
+
+    def normal_equations(self, x: torch.Tensor, residuals: torch.Tensor) -> NormalEquations:
+        """By the weights that move."""
         free = self.free
-        curvature, target = self.jacobian.normal_equations(x, noise, free)
+        curvature, descent = self.jacobian.normal_equations(x, self.weights.rsqrt(), free)
         away = self.precision @ (x - self.start)
-        return curvature + self.precision[free][:, free], target - away[free]
+        self.curvature = curvature + self.precision[free][:, free]
+        return NormalEquations(self.curvature, descent - away[free])
+
+    def moved(self, x: torch.Tensor, step: torch.Tensor) -> Iterator[torch.Tensor]:
+        """Straight in the weights, or in the bodies' parameters."""
+        change = torch.zeros_like(x).masked_scatter(self.free, step)
+        yield x + change
+        yield self.jacobian.moved(x, change)
 
     def noise(self, squares: torch.Tensor) -> torch.Tensor:
         """Standard deviations (n,) of errors as if they were independent from sample to sample."""
         return ALIKE**0.5 * torch.maximum((squares / self.count).sqrt(), LEAST_NOISE * self.range)
-
-    def cost(self, x: torch.Tensor, squares: torch.Tensor, noise: torch.Tensor) -> float:
-        away = x - self.start
-        return float(((squares / noise.square()).sum() + away @ self.precision @ away) / 2)
-
-    def after(self, x: torch.Tensor, noise: torch.Tensor, damping: float, steps: int) -> _Step:
-        """Where a step of this damping led to, and less damping for the next one."""
-        squares = self.jacobian.squares(x)
-        return _Step(x, squares, self.cost(x, squares, noise), max(damping / 10, DAMPING[0]), steps)
-
-    def step(
-        self, at: _Step, curvature: torch.Tensor, target: torch.Tensor, noise: torch.Tensor
-    ) -> _Step | None:
-        """A step that lowers the cost, straight in the weights or in the bodies' parameters; None: there is none."""
-        damping = at.damping
-        while damping < DAMPING[2]:
-            damped = curvature + damping * torch.diag(curvature.diagonal())
-            step = torch.linalg.solve(damped, target)
-            promised = float(step @ (target - curvature @ step / 2))
-            if promised < NO_GAIN * at.cost:
-                return None
-            whole = torch.zeros_like(at.x).masked_scatter(self.free, step)
-            after = self.after(at.x + whole, noise, damping, at.steps + 1)
-            if at.cost - after.cost < KEPT * promised:
-                straight = self.after(self.jacobian.moved(at.x, whole), noise, damping, at.steps + 1)
-                after = min(after, straight, key=lambda each: each.cost)
-            if after.cost < at.cost:
-                return after
-            damping *= 10
-        return None

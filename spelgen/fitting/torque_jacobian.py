@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -11,7 +11,6 @@ from torch.autograd import grad as gradient
 from torch.autograd.functional import jacobian
 from torch.func import functional_call
 
-from spelgen.fitting import workers
 from spelgen.fitting.body_steps import moved_bodies
 from spelgen.fitting.torque_samples import Block, TorqueSamples
 from spelgen.settings.fits import Adaptation
@@ -45,12 +44,6 @@ class _Samples:
     load_regressor: torch.Tensor
     residual: torch.Tensor
     factor: torch.Tensor
-
-    def own(self) -> _Samples:
-        """Those of this process."""
-        columns: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(self)}
-        mine: dict[str, Any] = {name: x if x is None else workers.own(x) for name, x in columns.items()}
-        return _Samples(**mine)
 
 
 class Left(NamedTuple):
@@ -100,8 +93,8 @@ class TorqueJacobian:
     def squares(self, x: torch.Tensor) -> torch.Tensor:
         """Sums of squares (n,) of the missing torque [Nm^2, N^2], as logged where gains are trained."""
         weights = self._named(x)
-        parts = [self._logged(weights, each).detach().square().sum(dim=0) for each in self._own_blocks()]
-        return workers.total(torch.stack(parts).sum(dim=0))
+        parts = [self._logged(weights, each).detach().square().sum(dim=0) for each in self._blocks()]
+        return torch.stack(parts).sum(dim=0)
 
     def per_gain(self, x: torch.Tensor) -> torch.Tensor:
         """What of a joint torque is logged (n,), relative to the start: 1, but where gains are trained."""
@@ -122,12 +115,12 @@ class TorqueJacobian:
         weights = self._named(x)
         count = int(free.sum())
         curvature, target = torch.zeros(count, count).double(), torch.zeros(count).double()
-        for block in self._own_blocks():
+        for block in self._blocks():
             missing, slope = self._linearised(weights, block)
             slope = (slope / noise[:, None]).flatten(0, 1)[:, free]
             curvature += slope.mT @ slope
             target += slope.mT @ (missing / noise).flatten()
-        return workers.total(curvature), workers.total(target)
+        return curvature, target
 
     def left(self, x: torch.Tensor) -> Left:
         """What these weights leave, of all samples."""
@@ -151,9 +144,9 @@ class TorqueJacobian:
         explains (n,), and how large that is, as a root mean square (n,) [Nm, N].
         """
         weights = self._named(x)
-        pairs = [(self._missing(weights, each).detach(), each.qd) for each in self._own_blocks()]
+        pairs = [(self._missing(weights, each).detach(), each.qd) for each in self._blocks()]
         sums = [torch.stack([tau * qd, qd * qd, tau * tau]).sum(dim=1) for tau, qd in pairs]
-        both, speeds, squares = workers.total(torch.stack(sums).sum(dim=0))
+        both, speeds, squares = torch.stack(sums).sum(dim=0)
         slope = both / speeds.clamp(min=1e-300)
         size = (slope * both / self.samples.count).sqrt()
         return slope, slope * both / squares.clamp(min=1e-300), size
@@ -187,13 +180,6 @@ class TorqueJacobian:
 
     def _blocks(self) -> Iterator[_Samples]:
         yield from self._computed() if self._held is None else self._held
-
-    def _own_blocks(self) -> Iterator[_Samples]:
-        """As `_blocks`, of each what is this process's (see `workers.py`): sums over all are made of theirs."""
-        if self._held is None:
-            own: Any = (tuple(map(workers.own, block)) for block in self.samples.blocks(BLOCK))
-            return map(self._with_regressors, own)
-        return (block.own() for block in self._held)
 
     def _computed(self) -> Iterator[_Samples]:
         return map(self._with_regressors, self.samples.blocks(BLOCK))

@@ -28,7 +28,7 @@ def fit_networks(
     model: EmittedModel,
     samples: TorqueSamples | Sequence[DynamicsSamples],
     weight_decay: float = LBFGS_DECAY,
-    penalty: Callable[[], torch.Tensor | float] = lambda: 0.0,
+    penalty: Callable[[], torch.Tensor | float] | None = None,
     evaluations: int = 2000,
 ) -> int:
     """Set the weights of ``model`` to what meets the samples' torques best; return the evaluations it took.
@@ -46,7 +46,9 @@ def fit_networks(
         number, (q, qd, qdd, tau, z) = block
         error = ((model.inverse_dynamics(q, qd, qdd, z if z.shape[-1] else None) - tau) / scale).square()
         part = error.mean() if count <= BLOCK else error.sum() / (count * joints)
-        return part if number else part + penalty()
+        if number or penalty is None:
+            return part
+        return part + penalty()
 
     return minimise_sum(model, missed, lambda: enumerate(samples.blocks(BLOCK)), evaluations, weight_decay)
 

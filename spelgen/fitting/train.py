@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from spelgen.dynamics.protocol import has_servos
 from spelgen.emission.loading import load_module
 from spelgen.errors import Diagnostic, ModuleError, RunError
-from spelgen.fitting.fit import AUTOMATIC, fit, sample_rates
+from spelgen.fitting.fit import AUTOMATIC, QUIET, RunOptions, fit, sample_rates
 from spelgen.fitting.fitted import Fit
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.run_record import recorded_config
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
 
 Choice = Callable[[Any, Sequence[float] | None], FitConfig | None]
 """From the model and, where it asks for these by None, the logs' sample rates [Hz]."""
-RECORDED = {"seed": "seed", "validation": "validation_fraction"}
 
 
 def train(
@@ -41,58 +41,56 @@ def train(
     *,
     urdf: Path | str | None = None,
     source: Path | str | None = None,
-    mapping: LogMapping | None = None,
     preprocessing: Preprocessing = AUTOMATIC,
-    resume: bool = False,
+    validation: float | None = None,
+    seed: int | None = None,
     trust: bool = False,
-    progress: bool = True,
     require: Callable[[Sequence[Trajectory]], None] | None = None,
-    **options: Any,
+    options: RunOptions = QUIET,
 ) -> Fit:
-    """Fit the emitted module to the logs and leave a run folder (see `RunFolder`); ``options`` are those of `fit`.
+    """Fit the emitted module to the logs and leave a run folder (see `RunFolder`); see `fit`.
 
     urdf: the robot the module was built from, for the regularizer and the baselines of `evaluate`; by default the file
     of that name beside the module. source: a run whose module and weights are where the fit starts. trust: the module
-    of a run folder is run whatever it is (see `RunFolder.load_module`). mapping: how the logs are named and measured;
-    by default as spelgen writes them. config: may also be a function that chooses. require: raises where it finds
-    logs wrong, before anything is fitted; logs larger than memory are not shown to it. What is not said of a run that
-    is resumed is as before.
+    of a run folder is run whatever it is (see `RunFolder.load_module`). config: may also be a function that chooses.
+    require: raises where it finds logs wrong, before anything is fitted; logs larger than memory are not shown to it.
+    validation: 0.25 by default, seed: 0. What is not said of a run that is resumed is as before, and logs are read as
+    spelgen writes them where ``options`` has no mapping.
     Raises ModuleError, LogError, and RunError when the folder holds a run or cannot be resumed with this.
     """
-    run = RunFolder(Path(folder))
-    module = Path(module)
-    if resume:
-        before = run.read_config()  # a missing run is told before anything is read
-        mapping = mapping or LogMapping(**before["mapping"])
-        config = config or recorded_config(before)
-        options = {name: before[x] for name, x in RECORDED.items()} | options
-        preprocessing = (
-            Preprocessing(**before["preprocessing"]) if preprocessing is AUTOMATIC else preprocessing
-        )
-        module = run.module
-    if resume or source is not None:
-        model = (run if resume else RunFolder(Path(source or ""))).load_module(trust=trust)
+    run, module = RunFolder(Path(folder)), Path(module)
+    robot, notes = None, []
+    if options.resume:
+        record = run.read_config()  # a missing run is told before anything is read
+        config = config or recorded_config(record)
+        seed = record["seed"] if seed is None else seed
+        validation = validation or record["validation_fraction"]
+        if preprocessing is AUTOMATIC:
+            preprocessing = Preprocessing(**record["preprocessing"])
+        options = replace(options, mapping=options.mapping or LogMapping(**record["mapping"]))
+        model = run.load_module(trust=trust)
     else:
-        model = load_module(module)
-    if source is not None and not resume:
-        start_from(model, source)
+        model = _new_model(module, source, trust=trust)
+        robot, notes = robot_of(module, urdf, model.facts)
     chosen = config(model, None) if callable(config) else config  # before logs, which may take long to read
-    logs = open_logs(model, data, mapping, preprocessing)
+    logs = open_logs(model, data, options.mapping, preprocessing)
     if require is not None and not isinstance(logs, LargeLogs):
         require(logs)
     if chosen is None and callable(config):
         chosen = config(model, sample_rates(logs))
-    robot, notes = (None, []) if resume else robot_of(module, urdf, model.facts)
     return fit(
-        model, logs, chosen, preprocessing=preprocessing, arm=robot, folder=folder, resume=resume, mapping=mapping,
-        progress=progress, notes=notes, **options,
+        model, logs, chosen, preprocessing=preprocessing, validation=validation or 0.25, seed=seed or 0, arm=robot,
+        folder=folder, options=replace(options, notes=[*options.notes, *notes]),
     )  # fmt: skip
 
 
-def start_from(model: EmittedModel, source: Path | str) -> None:
-    """Give a model the best weights of a run."""
+def _new_model(module: Path, source: Path | str | None, *, trust: bool) -> EmittedModel:
+    if source is None:
+        return load_module(module)
     run = RunFolder(Path(source))
+    model = run.load_module(trust=trust)
     model.load_state_dict(run.load_state(run.weights))
+    return model
 
 
 def mapping_of(model: Any, mapping: LogMapping | None) -> LogMapping:

@@ -9,47 +9,58 @@ import torch
 
 from spelgen.fitting.dataset import TrainingData
 from spelgen.fitting.rollout import INTEGRATION_FRACTION, choose_substeps, integration_error, rollout_loss
+from spelgen.settings.fits import BATCH, Solver
+from spelgen.settings.tuning.fitting import ValidationTuning
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
-    from spelgen.settings.fits import WindowConfig
 
-PROBE = 64  # windows on which the integration error is watched
+TUNING = ValidationTuning()
 
 
 class Validation:
-    """Validation windows, and a probe of the training windows; ``batch``: windows predicted together, a quarter."""
+    """Validation windows, and a probe of the training windows for the integrator's steps.
+
+    substeps: of rk4 between samples, where they are prescribed. batch: a fourth of the windows predicted together.
+    """
 
     def __init__(
-        self, model: EmittedModel, data: TrainingData, config: WindowConfig, batch: int, device: str
+        self,
+        model: EmittedModel,
+        data: TrainingData,
+        device: str = "cpu",
+        *,
+        batch: int = BATCH,
+        solver: Solver = "rk4",
+        substeps: int | None = None,
     ) -> None:
-        self.model, self.config = model, config
+        self.model = model.to(device)
+        self.solver, self.prescribed = solver, substeps
         self.size = len(data.validation)
         self.scales = data.scales.to(device)
-        self.parts = data.validation.to(device).split(4 * batch)
-        self.probe = data.training[:: -(-len(data.training) // PROBE)].to(device)
+        self.batches = data.validation.to(device).split(4 * batch)
+        self.probe = data.training[:: -(-len(data.training) // TUNING.probe)].to(device)
 
     def loss(self, substeps: int) -> float:
-        """`rollout_loss` of the validation windows; infinite where numbers blow up."""
-        solver = self.config.solver
+        """Return `rollout_loss` of the validation windows; infinite where numbers blow up."""
+        total = 0.0
         try:
             with torch.no_grad():
-                losses = [
-                    rollout_loss(self.model, x, self.scales, substeps, solver).item() * len(x)
-                    for x in self.parts
-                ]
+                for windows in self.batches:
+                    loss = rollout_loss(self.model, windows, self.scales, substeps, self.solver)
+                    total += loss.item() * len(windows)
         except torch.linalg.LinAlgError:
             return math.inf
-        return sum(losses) / self.size
+        return total / self.size
 
     def substeps(self, present: int | None = None) -> int:
-        """Integrator steps per sample interval: those asked for, or as many as the model now needs; never fewer than
-        the present ones.
+        """Return the integrator's steps per sample interval: those prescribed, or as many as the model now needs;
+        never fewer than the present ones.
         """
-        if self.config.solver != "rk4":
+        if self.solver != "rk4":
             return 1
-        if self.config.substeps is not None:
-            return self.config.substeps
+        if self.prescribed is not None:
+            return self.prescribed
         if present is None:
             return choose_substeps(self.model, self.probe, self.scales)
         if integration_error(self.model, self.probe, self.scales, present) <= INTEGRATION_FRACTION:

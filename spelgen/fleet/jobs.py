@@ -17,9 +17,10 @@ from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.evaluation.subject import read_test_logs
 from spelgen.files import write_json, write_text
+from spelgen.fitting.fit import RunOptions
 from spelgen.fitting.fitted import load_run
+from spelgen.fitting.objectives import default_config
 from spelgen.fitting.run_folder import RunFolder
-from spelgen.fitting.stages import default_config
 from spelgen.fitting.train import train
 from spelgen.fleet.schema import SIZES
 from spelgen.loaded_arm import load_arm
@@ -114,21 +115,19 @@ def run_job(job: Job) -> RunResult:
     start, run = time.monotonic(), RunFolder(job.folder)
     _remove_foreign_run(job, run)
     training = _training(job)
-    preprocessing = Preprocessing(**training.preprocessing)
+    resume = run.config.exists()
     common: dict[str, Any] = {
         "source": job.source,
-        "mapping": job.mapping,
-        "preprocessing": preprocessing,
+        "preprocessing": Preprocessing(**training.preprocessing),
         "validation": training.validation_fraction,
         "seed": job.seed,
-        "device": job.device,
-        "progress": False,
+        "options": RunOptions(device=job.device, mapping=job.mapping, resume=resume, force=not resume),
     }
-    if run.config.exists():
-        fit = train(run.module, job.train, job.folder, resume=True, **common)
+    if resume:
+        fit = train(run.module, job.train, job.folder, **common)
     else:
         config = _ConfigChoice(training, job.prior)
-        fit = train(_module(job), job.train, job.folder, config, urdf=job.urdf, force=True, **common)
+        fit = train(_module(job), job.train, job.folder, config, urdf=job.urdf, **common)
     if fit.status == "interrupted":
         raise KeyboardInterrupt
     result = {

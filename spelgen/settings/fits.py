@@ -112,16 +112,6 @@ class TorqueFit(FitConfig):
     objective: ClassVar[Objective] = "torque"
     of_rigid_bodies: ClassVar[tuple[str, ...]] = ("prior",)
     of_networks: ClassVar[tuple[str, ...]] = ("evaluations", "weight_decay", "urdf_weight")
-    # windows are not fitted, only judged by
-    window: ClassVar[int] = 5
-    stride: ClassVar[int] = 1
-    momentum_steps: ClassVar[int] = 0
-    epochs: ClassVar[int] = 0
-    patience: ClassVar[int] = 1
-    substeps: ClassVar[int | None] = None
-    solver: ClassVar[Solver] = "rk4"
-    max_minutes: ClassVar[float | None] = None
-    compile: ClassVar[bool] = False
 
     prior: GaussianPrior | None = None
     adapt: Adaptation | None = None
@@ -173,11 +163,6 @@ class MomentumFit(OnWindows):
     """
 
     objective: ClassVar[Objective] = "momentum"
-    epochs: ClassVar[int] = 0
-    patience: ClassVar[int] = 1
-    substeps: ClassVar[int | None] = None
-    solver: ClassVar[Solver] = "rk4"
-    compile: ClassVar[bool] = False
 
 
 class Rollout(OnWindows):
@@ -205,11 +190,9 @@ class ServoFit(FitConfig):
     """Fit position servos, friction and weight of an arm to what follows its commands (see `fit_servos`)."""
 
     objective: ClassVar[Objective] = "servo"
-    epochs: ClassVar[int] = 0
-    window: ClassVar[int] = 5
 
 
-WindowConfig = TorqueFit | MomentumFit | Rollout
+WindowConfig = MomentumFit | Rollout
 CONFIGS: dict[str, type[FitConfig]] = {x.objective: x for x in (TorqueFit, MomentumFit, Rollout, ServoFit)}
 OWNERS: dict[str, list[str]] = {
     name: [objective for objective, config in CONFIGS.items() if name in config.model_fields]

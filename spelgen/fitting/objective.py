@@ -1,0 +1,130 @@
+"""What a fit is: the protocol of an objective, and what every objective is given."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol
+
+from spelgen.errors import Diagnostic
+from spelgen.fitting.streaming import LargeLogs
+from spelgen.logs.preprocessing import Preprocessing
+from spelgen.logs.trajectory import Trajectory
+from spelgen.settings.fits import FitConfig
+from spelgen.settings.log_mapping import LogMapping
+from spelgen.spec import logged_joints
+
+if TYPE_CHECKING:
+    from spelgen.emission.loading import EmittedModel
+    from spelgen.fitting.progress import TrainingProgress
+
+Logs = Sequence[Trajectory] | LargeLogs
+Status = Literal["finished", "stopped early", "out of time", "interrupted"]
+
+
+@dataclass(frozen=True)
+class FitRequest:
+    """What is fitted to what, and how: the same for each objective.
+
+    validation: the fraction of the logs that is set aside, or trajectories. urdf: the robot's, where it is known.
+    mapping: how the logs were read. began: from when the allowed time counts (`time.monotonic`). folder: of the run.
+    """
+
+    model: EmittedModel
+    logs: Logs
+    config: FitConfig
+    preprocessing: Preprocessing
+    validation: float | Sequence[Trajectory]
+    seed: int
+    urdf: Path | None
+    mapping: LogMapping | None
+    device: str
+    threads: int
+    began: float
+    folder: Path | None
+
+
+@dataclass(frozen=True)
+class PreparedLogs:
+    """Hold what `Objective.prepare` tells of the logs, for config.json and for people.
+
+    config, preprocessing: with all that depends on the logs decided. digest: of every number.
+    training, validation: names of trajectories. training_windows, validation_windows: how many there are.
+    further: what else the record says of this objective.
+    """
+
+    config: FitConfig
+    preprocessing: Preprocessing
+    digest: str
+    training: tuple[str, ...]
+    validation: tuple[str, ...]
+    training_windows: int
+    validation_windows: int
+    mapping: LogMapping
+    notes: tuple[Diagnostic, ...]
+    further: dict[str, object] = field(default_factory=dict)
+
+
+class Objective(Protocol):
+    """One way to fit a model: what it needs of logs, how it starts, goes on and is resumed.
+
+    `fit` calls `prepare` first, then `begin` for a new fit or `resume`, then `run`. It owns the run folder: what an
+    objective wants kept it says by `save`, and in `checkpoint`, `history` and `results`.
+    """
+
+    name: ClassVar[str]
+    history: list[dict[str, Any]]  # lines of metrics.jsonl
+
+    def __init__(self, request: FitRequest) -> None:
+        """Raise OptionError for a config or a model that this objective is not for."""
+
+    def prepare(self) -> PreparedLogs:
+        """Check the logs and read what is fitted. Raises LogError and RunError."""
+
+    def begin(self) -> list[Diagnostic]:
+        """Do what comes before the first checkpoint of a new fit; return what there is to tell."""
+
+    def resume(
+        self, checkpoint: dict[str, Any], history: list[dict[str, Any]], record: dict[str, Any]
+    ) -> None:
+        """Go on from what the run folder holds. Raises KeyError, RuntimeError, TypeError, ValueError or AttributeError
+        where that is of another model.
+        """
+
+    def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
+        """Fit until an end is reached; call ``save`` where `checkpoint` is worth keeping. KeyboardInterrupt may end it
+        anywhere.
+        """
+
+    def checkpoint(self) -> dict[str, Any]:
+        """Return what a resumed fit needs, with "best_weights", and the numbers of `run_schema.Counters`."""
+
+    def results(self) -> dict[str, object]:
+        """Return what config.json says of how it went, beside what `prepare` told."""
+
+
+def record_of(request: FitRequest, prepared: PreparedLogs, *, rigid_bodies: bool) -> dict[str, Any]:
+    """Return what goes into config.json: options that were used, resolved, and nothing that does not apply."""
+    model, facts = request.model, getattr(request.model, "facts", None)
+    fraction = request.validation if prepared.validation and isinstance(request.validation, float) else None
+    return {
+        "schema": 2,
+        "robot": facts.robot if facts else type(model).__name__,
+        "preset": facts.options.preset if facts else None,
+        "joints": list(logged_joints(model)),
+        "objective": prepared.config.objective,
+        "config": prepared.config.record(rigid_bodies=rigid_bodies),
+        "preprocessing": asdict(prepared.preprocessing),
+        "validation_fraction": fraction,
+        "seed": request.seed,
+        "data_digest": prepared.digest,
+        "training": list(prepared.training),
+        "validation": list(prepared.validation),
+        "training_windows": prepared.training_windows,
+        "validation_windows": prepared.validation_windows,
+        **prepared.further,
+        "mapping": prepared.mapping.model_dump(exclude_defaults=True),
+        "device": request.device,
+        "threads": request.threads,
+    }

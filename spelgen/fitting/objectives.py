@@ -1,0 +1,51 @@
+"""The registry of objectives, and which one is fitted where nobody says."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from spelgen.dynamics.protocol import has_rigid_bodies, has_servos
+from spelgen.fitting.objective import FitRequest, Objective
+from spelgen.fitting.servo_objective import ServoObjective
+from spelgen.fitting.torque_objective import TorqueObjective
+from spelgen.fitting.window_objectives import MomentumObjective, RolloutObjective
+from spelgen.identification.samples import DENSE
+from spelgen.settings.fits import FitConfig, fit_config
+
+if TYPE_CHECKING:
+    from spelgen.emission.loading import EmittedModel
+
+OBJECTIVES: dict[str, type[Objective]] = {
+    objective.name: objective
+    for objective in (TorqueObjective, MomentumObjective, RolloutObjective, ServoObjective)
+}
+
+
+def objective_of(request: FitRequest) -> Objective:
+    """Return the objective of a request. Raises OptionError where it is not for this model."""
+    return OBJECTIVES[request.config.objective](request)
+
+
+def default_objective(model: EmittedModel, rates: Sequence[float]) -> str:
+    """Return what is fitted where nobody says: to an arm under position servos what follows its commands; torque to a
+    model of rigid bodies, where logs are sampled densely enough for accelerations (rates [Hz]); else windows.
+    """
+    if has_servos(model):
+        return "servo"
+    if has_rigid_bodies(model) and any(rate >= DENSE for rate in rates):
+        return "torque"
+    return "rollout"
+
+
+def default_config(
+    model: EmittedModel,
+    rates: Sequence[float],
+    options: Mapping[str, object] | None = None,
+    defaults: Mapping[str, object] | None = None,
+) -> FitConfig:
+    """Return the configuration of `default_objective`; options and defaults as for `fit_config`."""
+    objective, rigid_bodies = default_objective(model, rates), has_rigid_bodies(model)
+    if rigid_bodies and objective == "rollout":  # bodies need no regularizer where nobody asks for one
+        defaults = {"urdf_weight": 0.0, **(defaults or {})}
+    return fit_config(objective, rigid_bodies=rigid_bodies, options=options, defaults=defaults)

@@ -1,0 +1,141 @@
+"""The objective torque: fit inverse dynamics to the torques of all logs, then measure the model on windows."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from spelgen.dynamics.bristles import bristle_reach
+from spelgen.dynamics.protocol import has_rigid_bodies
+from spelgen.errors import Diagnostic, LogError
+from spelgen.fitting.dataset import TrainingData
+from spelgen.fitting.objective import FitRequest, PreparedLogs, Status
+from spelgen.fitting.torque_fit import DECIMATION, fit_torque
+from spelgen.fitting.torque_logs import prepare_windows, prepared_logs, regularizer_of, require_torque_input
+from spelgen.fitting.torque_networks import adapt_networks, fit_networks
+from spelgen.fitting.torque_report import torque_notes
+from spelgen.fitting.torque_samples import TorqueSamples
+from spelgen.fitting.urdf_regularizer import UrdfRegularizer
+from spelgen.fitting.validation import Validation
+from spelgen.fitting.window_problem import measure
+from spelgen.identification.samples import DENSE, DynamicsSamples, dynamics_samples
+from spelgen.settings.fits import TorqueFit
+
+if TYPE_CHECKING:
+    from spelgen.emission.loading import EmittedModel
+    from spelgen.fitting.progress import TrainingProgress
+
+MOVED = {
+    "load": "a load at the tip alone fitted",
+    "friction": "friction and torque offsets alone fitted",
+    "unit": "what sets this unit apart fitted",
+}
+
+
+class TorqueObjective:
+    """All is done in `begin`, before there is a run folder: a fit to torques takes seconds to minutes."""
+
+    name: ClassVar[str] = "torque"
+
+    def __init__(self, request: FitRequest) -> None:
+        require_torque_input(request.model, request.config)
+        assert isinstance(request.config, TorqueFit)
+        self.request, self.config = request, request.config
+        self.history: list[dict[str, Any]] = []
+        self._checkpoint: dict[str, Any] = {}
+
+    def prepare(self) -> PreparedLogs:
+        """See `Objective`."""
+        self.data = prepare_windows(self.request)
+        return prepared_logs(self.request, self.data, self.config)
+
+    def begin(self) -> list[Diagnostic]:
+        """Fit the model. Raises LogError where no log is sampled densely enough for accelerations."""
+        model, notes = self.request.model, []
+        samples = torque_samples(model, self.data)
+        if samples is None:
+            what = "to adapt to" if self.config.adapt else "to fit torques to"
+            raise LogError(
+                f"no motion {what}",
+                expected=f"samples at {DENSE:g} Hz or more that move",
+                do="fit windows: the objective rollout",
+            )
+        regularizer = None
+        if not has_rigid_bodies(model):  # the torques of rigid bodies have a prior of their own
+            regularizer = regularizer_of(self.request, self.data, self.config.urdf_weight, notes)
+        notes += fit_torques(model, samples, self.config, regularizer)
+        measured = measure(model, Validation(model, self.data, self.request.device))
+        self._checkpoint = {
+            "epoch": 0,
+            "step": 0,
+            "best_epoch": 0,
+            "best_loss": measured.loss,
+            "best_weights": measured.weights,
+            "seconds": time.monotonic() - self.request.began,
+            "substeps": measured.substeps,
+        }
+        return notes
+
+    def resume(
+        self, checkpoint: dict[str, Any], history: list[dict[str, Any]], record: dict[str, Any]
+    ) -> None:
+        """Take the model as it was fitted."""
+        self.request.model.load_state_dict(checkpoint["best_weights"])
+        self._checkpoint = checkpoint
+
+    def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
+        """Do nothing more."""
+        return "finished"
+
+    def checkpoint(self) -> dict[str, Any]:
+        """See `Objective`."""
+        return self._checkpoint
+
+    def results(self) -> dict[str, object]:
+        """Return nothing: notes tell how it went."""
+        return {}
+
+
+def torque_samples(model: EmittedModel, data: TrainingData) -> TorqueSamples | None:
+    """Return the samples of all logs, those of validation included; None: no log has samples that move, and densely.
+
+    Of logs larger than memory they lie in a temporary file.
+    """
+    decimation, reach = 1, bristle_reach(model)
+    if has_rigid_bodies(model):
+        decimation = DECIMATION
+    if not data.chunks:
+        samples = dynamics_samples(data.recordings, preprocessing=data.preprocessing, reach=reach)
+        return TorqueSamples.held(samples, decimation) if any(len(x.q) for x in samples) else None
+
+    def stream() -> Iterator[DynamicsSamples]:
+        for chunk in data.chunks:
+            yield from dynamics_samples([chunk.load()], preprocessing=data.preprocessing, reach=reach)
+
+    spooled = TorqueSamples.spooled(stream(), model.n, reach.elements, decimation)
+    return spooled if spooled.count else None
+
+
+def fit_torques(
+    model: EmittedModel, samples: TorqueSamples, config: TorqueFit, regularizer: UrdfRegularizer | None = None
+) -> list[Diagnostic]:
+    """Fit the model to samples; return what there is to tell."""
+    notes: list[Diagnostic] = []
+    if has_rigid_bodies(model):
+        solution = fit_torque(model, samples, config.prior, config.adapt)
+        steps = solution.steps
+        if not config.adapt:
+            notes += torque_notes(model, samples, solution)
+    elif config.adapt:
+        steps = adapt_networks(model, samples, config.adapt, config.weight_decay, config.evaluations)
+    else:
+        penalty = None
+        if regularizer is not None:
+            penalty = lambda: config.urdf_weight * regularizer.loss(model)  # noqa: E731
+        steps = fit_networks(model, samples, config.weight_decay, penalty, config.evaluations)
+    message = (
+        f"{MOVED.get(config.adapt or '', 'fitted')} to the torques of {samples.seen} samples, those of validation "
+        f"included, in {steps} steps"
+    )
+    return [Diagnostic("info", "torque-fit", "logs", None, message), *notes]

@@ -1,0 +1,196 @@
+"""The objectives momentum and rollout: fit windows of the logs."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from spelgen.dynamics.protocol import has_rigid_bodies
+from spelgen.errors import Diagnostic, LogError
+from spelgen.fitting.compiled import compiled
+from spelgen.fitting.dataset import TrainingData
+from spelgen.fitting.loop import TrainingLoop
+from spelgen.fitting.momentum import momentum_stage
+from spelgen.fitting.objective import FitRequest, PreparedLogs, Status
+from spelgen.fitting.streaming import LargeLogs
+from spelgen.fitting.torque_logs import prepare_windows, prepared_logs, regularizer_of, require_torque_input
+from spelgen.fitting.torque_objective import fit_torques, torque_samples
+from spelgen.fitting.validation import Validation
+from spelgen.fitting.window_problem import Clock, Measured, WindowProblem, measure
+from spelgen.identification.samples import DENSE
+from spelgen.settings.fits import MomentumFit, Rollout, TorqueFit, WindowConfig
+
+if TYPE_CHECKING:
+    from spelgen.emission.loading import EmittedModel
+    from spelgen.fitting.progress import TrainingProgress
+
+
+def _prepare(request: FitRequest, config: WindowConfig) -> TrainingData:
+    if isinstance(request.logs, LargeLogs):
+        raise LogError(
+            "logs larger than memory",
+            expected="some hours of them: every tenth file, say",
+            do="or fit torques, which read them in chunks: the objective torque",
+        )
+    return prepare_windows(request, config.window, config.stride)
+
+
+class MomentumObjective:
+    """Steps on the weak form alone, kept where they predict validation windows better."""
+
+    name: ClassVar[str] = "momentum"
+
+    def __init__(self, request: FitRequest) -> None:
+        require_torque_input(request.model, request.config)
+        assert isinstance(request.config, MomentumFit)
+        self.request, self.config = request, request.config
+        self.history: list[dict[str, Any]] = []
+
+    def prepare(self) -> PreparedLogs:
+        """See `Objective`."""
+        self.data = _prepare(self.request, self.config)
+        self.config = self.config.resolved(self.data.size)
+        return prepared_logs(self.request, self.data, self.config)
+
+    def begin(self) -> list[Diagnostic]:
+        """Measure the model as it is."""
+        request, notes = self.request, []
+        regularizer = regularizer_of(request, self.data, self.config.urdf_weight, notes)
+        self.problem = WindowProblem(request.model, self.data, self.config, request.device, regularizer)
+        self.validation = Validation(request.model, self.data, request.device, batch=self.problem.batch)
+        self.best = measure(request.model, self.validation)
+        self.seconds = time.monotonic() - request.began
+        self.done = False
+        return notes
+
+    def resume(
+        self, checkpoint: dict[str, Any], history: list[dict[str, Any]], record: dict[str, Any]
+    ) -> None:
+        """Go on from the weights so far; steps that were not all taken start again."""
+        self.begin()
+        self.request.model.load_state_dict(checkpoint["best_weights"])
+        self.best = Measured(checkpoint["substeps"], checkpoint["best_loss"], checkpoint["best_weights"])
+        self.seconds, self.done = checkpoint["seconds"], checkpoint["momentum_done"]
+
+    def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
+        """See `Objective`."""
+        if not self.done and self.config.momentum_steps:
+            clock = Clock(self.config.max_minutes, self.seconds)
+            seed = self.request.seed
+            self.best = momentum_stage(self.problem, self.validation, self.best, clock, progress, seed)
+            self.seconds = clock.seconds
+        self.done = True
+        save()
+        return "finished"
+
+    def checkpoint(self) -> dict[str, Any]:
+        """See `Objective`."""
+        return {
+            "epoch": 0,
+            "step": 0,
+            "best_epoch": 0,
+            "best_loss": self.best.loss,
+            "best_weights": self.best.weights,
+            "seconds": self.seconds,
+            "substeps": self.best.substeps,
+            "momentum_done": self.done,
+        }
+
+    def results(self) -> dict[str, object]:
+        """Return nothing more."""
+        return {}
+
+
+class RolloutObjective:
+    """Torques first, of rigid bodies; then momentum; then predicted windows, epoch by epoch."""
+
+    name: ClassVar[str] = "rollout"
+
+    def __init__(self, request: FitRequest) -> None:
+        require_torque_input(request.model, request.config)
+        assert isinstance(request.config, Rollout)
+        self.request, self.config = request, request.config
+
+    @property
+    def history(self) -> list[dict[str, Any]]:
+        """A record for each epoch."""
+        return self.loop.history
+
+    def prepare(self) -> PreparedLogs:
+        """See `Objective`."""
+        self.data = _prepare(self.request, self.config)
+        self.config = self.config.resolved(self.data.size)
+        return prepared_logs(self.request, self.data, self.config)
+
+    def begin(self) -> list[Diagnostic]:
+        """Fit torques, and measure the model then."""
+        return self._start(torque_first=self.config.torque_first and has_rigid_bodies(self.request.model))
+
+    def resume(
+        self, checkpoint: dict[str, Any], history: list[dict[str, Any]], record: dict[str, Any]
+    ) -> None:
+        """Go on from the last whole epoch."""
+        self._start(torque_first=False)
+        self.loop.restore(checkpoint, history)
+
+    def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
+        """See `Objective`."""
+        return self.loop.run(progress, save)
+
+    def checkpoint(self) -> dict[str, Any]:
+        """See `Objective`."""
+        return self.loop.state()
+
+    def results(self) -> dict[str, object]:
+        """Return nothing more: the history tells."""
+        return {}
+
+    def _start(self, *, torque_first: bool) -> list[Diagnostic]:
+        """Make the loop; return what there is to tell."""
+        request, config, notes = self.request, self.config, []
+        model = request.model
+        stepped = self._compiled(notes)
+        # towards the URDF as the model has it before any fit, in a resumed run too
+        regularizer = regularizer_of(request, self.data, config.urdf_weight, notes)
+        if torque_first:
+            notes += self._torque_stage()
+        problem = WindowProblem(model, self.data, config, request.device, regularizer)
+        validation = Validation(
+            model,
+            self.data,
+            request.device,
+            batch=problem.batch,
+            solver=config.solver,
+            substeps=config.substeps,
+        )
+        self.loop = TrainingLoop(
+            problem,
+            validation,
+            config,
+            seed=request.seed,
+            stepped=stepped,
+            seconds=time.monotonic() - request.began,
+            folder=request.folder,
+        )
+        return notes
+
+    def _torque_stage(self) -> list[Diagnostic]:
+        samples = torque_samples(self.request.model, self.data)
+        if samples is not None:
+            return fit_torques(self.request.model, samples, TorqueFit())
+        message = f"no torque fit: these logs are sampled below {DENSE:g} Hz; windows alone are fitted"
+        return [Diagnostic("warning", "no-torque-fit", "logs", None, message)]
+
+    def _compiled(self, notes: list[Diagnostic]) -> EmittedModel:
+        """Return the model as steps on windows use it, compiled where that is asked for."""
+        if not self.config.compile:
+            return self.request.model
+        start, device = time.monotonic(), self.request.device
+        windows = self.data.training  # as steps take them, so that shapes are compiled for once
+        if self.config.batch is not None:
+            windows = windows[: self.config.batch]
+        model = compiled(self.request.model.to(device), windows.to(device), self.data.scales.to(device))
+        message = f"right-hand side compiled in {time.monotonic() - start:.0f} s"
+        notes.append(Diagnostic("info", "compiled", "training", None, message))
+        return model
