@@ -28,7 +28,7 @@ from spelgen.arm.arm import Arm
 from spelgen.baselines.predictor import of_dynamics
 from spelgen.building import build
 from spelgen.dynamics.bristles import BristleReach, reach_of
-from spelgen.evaluation.results import end_errors
+from spelgen.evaluation.state_errors import end_errors
 from spelgen.fitting.torque_fit import fit_torque
 from spelgen.identification.friction import FrictionModel
 from spelgen.identification.identification import Identification

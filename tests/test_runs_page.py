@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 from spelgen.cli.main import app
 from spelgen.errors import RunError
 from spelgen.evaluation.csv_file import HEAD, csv_text
+from spelgen.evaluation.results import Results
 from spelgen.identification.identify import identify
 from spelgen.loaded_arm import load_arm
 from spelgen.logs.trajectory import Trajectory
@@ -44,7 +45,7 @@ def test_runs_of_servos_are_compared_by_what_they_replay(run, tmp_path):  # noqa
     for folder, mean, logs in ((run, 0.008, {"a": 0.008, "b": 0.008}), (better, 0.006, {"b": 0.006})):
         replay = {
             "name": "whole log",
-            "errors": {"model": {"trajectories": logs, "mean": mean, "joints": []}},
+            "errors": {"model": {"trajectories": logs, "mean": mean, "joints": [mean] * 3}},
         }
         changed = EVALUATION | {"horizons": [], "torque": {}, "replays": [replay]}
         (folder / "evaluation.json").write_text(json.dumps(changed))
@@ -60,8 +61,7 @@ def test_a_run_without_evaluation_cannot_be_set_beside_others(run):  # noqa: F81
 
 
 def test_the_table_holds_every_figure_once_with_its_unit():
-    evaluation = EVALUATION | {"joint_types": ["revolute", "prismatic", "revolute"]}
-    head, *rows = csv.reader(io.StringIO(csv_text(evaluation)))
+    head, *rows = csv.reader(io.StringIO(csv_text(Results.from_dict(EVALUATION))))
     assert tuple(head) == HEAD
     found = {tuple(row[:-1]): row[-1] for row in rows}
     assert len(found) == len(rows)

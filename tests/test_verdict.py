@@ -2,21 +2,43 @@
 
 import pytest
 
+from spelgen.evaluation.results import Results
 from spelgen.evaluation.verdict import verdict
 
 JOINTS = ["a", "b"]
 
 
 def errors(relative, tip=None):
-    return {"q_relative_rms": [relative, relative], "mean_relative_rms": relative, "tip_mm": tip}
+    each = [relative, relative]
+    return {"q": each, "qd": each, "q_relative_rms": each, "qd_relative_rms": each, "mean_relative_rms": relative,
+            "tip_mm": tip}  # fmt: skip
 
 
-def evaluation(relative=0.05, nmse=0.004, **others):
-    horizons = [
-        {"name": name, "errors": {"model": errors(relative * factor)} | {k: errors(v) for k, v in others.items()}}
-        for name, factor in (("1 step", 0.5), ("1 s", 1.0))
-    ]  # fmt: skip
-    return {"joints": JOINTS, "horizons": horizons, "torque": {"model": {"mean_nmse": nmse}}}
+def evaluation(relative=0.05, nmse=0.004, traces=None, seen=False, **others):
+    """Return an evaluation with two horizons; others: errors of other predictors at both."""
+    horizons = []
+    for k, (name, factor) in enumerate((("1 step", 0.5), ("1 s", 1.0))):
+        by_predictor = {"model": errors(relative * factor)} | {who: errors(x) for who, x in others.items()}
+        horizons.append({"name": name, "steps": k + 1, "seconds": 1.0, "windows": 9, "errors": by_predictor})
+    torque = {"model": {"nmse": {}, "mean_nmse": nmse, "rmse": [1.0, 1.0]}}
+    return results(horizons, torque, traces, seen)
+
+
+def results(horizons, torque, traces=None, seen=False):
+    note = {
+        "severity": "warning",
+        "code": "tested-on-training-data",
+        "where": "logs",
+        "line": None,
+        "message": "",
+    }
+    return Results.from_dict(
+        {
+            "robot": "arm", "joints": JOINTS, "joint_types": ["revolute"] * 2, "trajectories": ["x"], "cutoff": None,
+            "substeps": 1, "parameters": 1, "horizons": horizons, "torque": torque, "energy_drift": None,
+            "diagnostics": [note] * seen, "traces": {"coverage": {}} | (traces or {}),
+        }
+    )  # fmt: skip
 
 
 def torques(slow, fast):
@@ -25,7 +47,9 @@ def torques(slow, fast):
     residual = [[0.0, slow if abs(x) < 0.01 else fast] for _, x in qd]
     measured = [[float(k % 7), 10 * x[1] + r[1]] for k, (x, r) in enumerate(zip(qd, residual, strict=True))]
     predicted = [[m[0], m[1] - r[1]] for m, r in zip(measured, residual, strict=True)]
-    return {"torques": [{"measured": measured, "predicted": {"model": predicted}, "qd": qd}]}
+    trace = {"which": "typical", "trajectory": "x", "t": [], "q": [], "qd": qd, "measured": measured,
+             "without_friction": [], "predicted": {"model": predicted}, "parts": {}, "energy": {}}  # fmt: skip
+    return {"torques": [trace]}
 
 
 @pytest.mark.parametrize("relative, nmse, said", [
@@ -52,18 +76,18 @@ def test_figures_and_better_baselines_are_told():
     (0.2, 0.2, "worst at b."),
 ])  # fmt: skip
 def test_where_it_fails_follows_the_residuals(slow, fast, place):
-    assert verdict(evaluation() | {"traces": torques(slow, fast)}).sentence.endswith(place)
+    assert verdict(evaluation(traces=torques(slow, fast))).sentence.endswith(place)
 
 
 def test_what_to_record_follows_what_the_logs_cover():
     def ranges(high):
         return {"q": [{"low": 0.0, "high": x} for x in (1.0, high)], "qd": [{"low": -1.0, "high": 1.0}] * 2}
 
-    tested = evaluation() | {"traces": {"coverage": ranges(2.0)}}
+    tested = evaluation(traces={"coverage": ranges(2.0)})
     assert (
         "next, record motion with the positions of b" in verdict(tested, {"coverage": ranges(1.0)}).sentence
     )
-    inside = evaluation() | {"traces": {"coverage": ranges(1.0)}}
+    inside = evaluation(traces={"coverage": ranges(1.0)})
     narrow = verdict(inside, {"coverage": ranges(1.0)}, [(0.0, 1.2), (0.0, 4.0)])
     assert (
         narrow.sentence.endswith("next, record wider motion of b.") and "25 % of its range" in narrow.because
@@ -72,8 +96,17 @@ def test_what_to_record_follows_what_the_logs_cover():
 
 
 def test_a_test_on_training_logs_is_no_proof():
-    told = verdict(evaluation() | {"diagnostics": [{"code": "tested-on-training-data"}]}).sentence
+    told = verdict(evaluation(seen=True)).sentence
     assert told.startswith("Judged on logs that it was trained on, which proves little: good enough for")
+
+
+def test_where_a_constant_velocity_is_better_the_model_is_for_torques():
+    still = "velocity stays constant"
+    better = "A constant velocity predicts better 1 s ahead: there the model is for torques, not for motion."
+    assert better in verdict(evaluation(0.9, 0.004, **{still: 0.6})).because
+    held = evaluation(0.9, 0.004, **{still: 0.6, "model + observer": 0.2})
+    assert "A constant velocity" not in verdict(held).because
+    assert "prediction 1 s ahead with a momentum observer" in verdict(held).sentence
 
 
 def test_errors_beyond_the_motion_are_told_as_such():
@@ -81,5 +114,4 @@ def test_errors_beyond_the_motion_are_told_as_such():
 
 
 def test_nothing_to_judge_by_is_said():
-    empty = {"joints": JOINTS, "horizons": [], "torque": {}}
-    assert verdict(empty).sentence == "Nothing to judge by: no horizon and no torque was evaluated."
+    assert verdict(results([], {})).sentence == "Nothing to judge by: no horizon and no torque was evaluated."

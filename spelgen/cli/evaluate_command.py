@@ -54,7 +54,7 @@ def evaluate(
     if chosen == "csv":
         from spelgen.evaluation.csv_file import csv_text
 
-        deliver(csv_text(record), output)
+        deliver(csv_text(results), output)
     elif chosen == "json":
         deliver(json.dumps(record) + "\n", output)
     else:

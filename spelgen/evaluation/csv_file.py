@@ -1,76 +1,79 @@
-"""evaluation.json as one long CSV table: a row for each number that is shown as a figure or drawn by horizon."""
+"""An evaluation as one long CSV table: a row for each number that is shown as a figure or drawn by horizon."""
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
+from spelgen.evaluation.results import Results
+from spelgen.evaluation.tables import POSITION, TORQUE, UNITS, VELOCITY
+
 HEAD = ("quantity", "unit", "horizon_s", "joint", "trajectory", "predictor", "value")
-UNITS = {
-    "revolute": {"q": "rad", "qd": "rad/s", "tau": "Nm"},
-    "prismatic": {"q": "m", "qd": "m/s", "tau": "N"},
-}
-Row = tuple[str, str, float | str, str, str, str, float | None]
 
 
-def csv_text(evaluation: Mapping[str, Any]) -> str:
-    """The table, with its head; nothing stands where a number is not known."""
+def csv_text(results: Results) -> str:
+    """Return the table, with its head; nothing stands where a number is not known."""
     file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(HEAD)
-    for *row, value in (
-        *_replays(evaluation),
-        *_states(evaluation),
-        *_torques(evaluation),
-        *_growth(evaluation),
-    ):
-        writer.writerow([*row, "" if value is None else value])
+    writer = csv.DictWriter(file, HEAD, restval="", lineterminator="\n")
+    writer.writeheader()
+    for rows in (_replays, _states, _torques, _growth):
+        writer.writerows(rows(results))
     return file.getvalue()
 
 
-def _replays(evaluation: Mapping[str, Any]) -> Iterator[Row]:
-    joints = list(zip(evaluation["joints"], evaluation["joint_types"], strict=True))
-    for replay in evaluation.get("replays", ()):
-        quantity = f"q RMS of commands replayed, {replay['name']}"
-        for name, errors in replay["errors"].items():
-            for trajectory, value in errors["trajectories"].items():
-                yield quantity, "rad; m", "", "", trajectory, name, value
-            for (joint, kind), value in zip(joints, errors["joints"], strict=True):
-                yield quantity, UNITS[kind]["q"], "", joint, "", name, value
+Row = dict[str, Any]  # numbers and text by column
 
 
-def _states(evaluation: Mapping[str, Any]) -> Iterator[Row]:
-    joints = list(zip(evaluation["joints"], evaluation["joint_types"], strict=True))
-    for horizon in evaluation["horizons"]:
-        seconds = horizon["seconds"]
-        for name, errors in horizon["errors"].items():
-            yield "relative RMS", "1", seconds, "", "", name, errors["mean_relative_rms"]
-            yield "tip RMS", "mm", seconds, "", "", name, errors["tip_mm"]
-            for what in ("q", "qd"):
-                columns = zip(joints, errors[what], errors[f"{what}_relative_rms"], strict=True)
-                for (joint, kind), absolute, relative in columns:
-                    yield f"{what} RMS", UNITS[kind][what], seconds, joint, "", name, absolute
-                    yield f"{what} relative RMS", "1", seconds, joint, "", name, relative
+def _by_joint(results: Results, row: Row, unit: int, values: tuple[float | None, ...]) -> Iterator[Row]:
+    for joint, kind, value in zip(results.joints, results.joint_types, values, strict=True):
+        yield row | {"unit": UNITS[kind][unit], "joint": joint, "value": value}
 
 
-def _torques(evaluation: Mapping[str, Any]) -> Iterator[Row]:
-    for name, errors in evaluation["torque"].items():
-        yield "torque nMSE", "1", "", "", "", name, errors["mean_nmse"]
-        for trajectory, value in errors["nmse"].items():
-            yield "torque nMSE", "1", "", "", trajectory, name, value
-        columns = zip(evaluation["joints"], evaluation["joint_types"], errors["rmse"], strict=True)
-        for joint, kind, value in columns:
-            yield "torque RMSE", UNITS[kind]["tau"], "", joint, "", name, value
+def _replays(results: Results) -> Iterator[Row]:
+    for replay in results.replays:
+        for name, errors in replay.errors.items():
+            row: Row = {"quantity": f"q RMS of commands replayed, {replay.name}", "predictor": name}
+            for trajectory, value in errors.trajectories.items():
+                yield row | {"unit": "rad; m", "trajectory": trajectory, "value": value}
+            yield from _by_joint(results, row, POSITION, errors.joints)
 
 
-def _growth(evaluation: Mapping[str, Any]) -> Iterator[Row]:
-    growth = evaluation["traces"].get("growth")
-    if not growth:
+def _states(results: Results) -> Iterator[Row]:
+    for horizon in results.horizons:
+        for name, errors in horizon.errors.items():
+            row: Row = {"horizon_s": horizon.seconds, "predictor": name}
+            yield row | {"quantity": "relative RMS", "unit": "1", "value": errors.mean_relative_rms}
+            yield row | {"quantity": "tip RMS", "unit": "mm", "value": errors.tip_mm}
+            yield from _by_joint(results, row | {"quantity": "q RMS"}, POSITION, errors.q)
+            yield from _by_joint(results, row | {"quantity": "qd RMS"}, VELOCITY, errors.qd)
+            relative = {"q": errors.q_relative_rms, "qd": errors.qd_relative_rms}
+            for what, values in relative.items():
+                for joint, value in zip(results.joints, values, strict=True):
+                    quantity = {"quantity": f"{what} relative RMS", "unit": "1"}
+                    yield row | quantity | {"joint": joint, "value": value}
+
+
+def _torques(results: Results) -> Iterator[Row]:
+    for name, errors in results.torque.items():
+        row: Row = {"quantity": "torque nMSE", "unit": "1", "predictor": name}
+        yield row | {"value": errors.mean_nmse}
+        for trajectory, value in errors.nmse.items():
+            yield row | {"trajectory": trajectory, "value": value}
+        yield from _by_joint(results, row | {"quantity": "torque RMSE"}, TORQUE, errors.rmse)
+
+
+def _growth(results: Results) -> Iterator[Row]:
+    growth = results.traces.growth
+    if growth is None:
         return
-    for key, quantity, unit in (("relative", "relative error", "1"), ("tip_mm", "tip error", "mm")):
-        for name, curves in growth[key].items():
-            for level, part in (("low", "10 %"), ("median", "50 %"), ("high", "90 %")):
-                for seconds, value in zip(growth["seconds"], curves[level], strict=True):
-                    yield f"{quantity}, {part} of the starts", unit, seconds, "", "", name, value
+    for quantity, unit, curves in (
+        ("relative error", "1", growth.relative),
+        ("tip error", "mm", growth.tip_mm),
+    ):
+        for name, curve in curves.items():
+            for part, values in (("10 %", curve.low), ("50 %", curve.median), ("90 %", curve.high)):
+                row: Row = {"quantity": f"{quantity}, {part} of the starts", "unit": unit, "predictor": name}
+                for seconds, value in zip(growth.seconds, values, strict=True):
+                    yield row | {"horizon_s": seconds, "value": value}

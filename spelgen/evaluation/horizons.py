@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, cast
 
 import torch
 
@@ -14,26 +14,41 @@ from spelgen.baselines.solver import Solver, States
 from spelgen.dynamics.bristles import BristleReach
 from spelgen.errors import Diagnostic
 from spelgen.evaluation.momentum_observer import observe, past_steps, without_past
-from spelgen.evaluation.results import Horizon, end_errors
+from spelgen.evaluation.state_errors import StateErrors, TipPosition, end_errors
 from spelgen.fitting.rollout import choose_substeps, loss_scales
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
+from spelgen.settings.tuning.evaluation import EvaluationTuning
 
-PREDICTED_STEPS = 40_000  # per horizon and predictor: windows are thinned evenly to about this many
-MOST_WINDOWS = 2000
-PROBED = 64  # windows that say how many steps the integrator needs
-DENSEST = 200.0  # [Hz] inputs of denser logs are averaged where a horizon
-LEAST_STEPS = 100  # has still as many steps then
+if TYPE_CHECKING:
+    from spelgen.emission.loading import EmittedModel
+
+TUNING = EvaluationTuning()
+
+
+@dataclass(frozen=True)
+class Horizon:
+    """How far ahead: a number of samples, in the mean `seconds`; from `windows` starting points.
+
+    errors: by predictor, open loop, and as `observed(predictor)` where it holds what a momentum observer finds.
+    """
+
+    name: str
+    steps: int
+    seconds: float
+    windows: int
+    errors: dict[str, StateErrors]
 
 
 @dataclass(frozen=True, eq=False)
 class JudgedLogs:
-    """Pieces of test logs, gap-free and filtered, of which windows are cut. reach: of what friction remembers with."""
+    """Pieces of test logs, gap-free and filtered, of which windows are cut. reach: of the bristles of friction."""
 
     pieces: Sequence[Trajectory]
     used: Preprocessing
     reach: BristleReach
+    joint_types: Sequence[str]
 
     @property
     def rate(self) -> float:
@@ -45,26 +60,33 @@ class JudgedLogs:
         """Steps of the longest piece."""
         return max(map(len, self.pieces)) - 1
 
-    def starts(
-        self, samples: int, most: int, decimation: int = 1
-    ) -> tuple[list[tuple[Trajectory, int]], int]:
-        """Where about `most` windows begin, or all, evenly spread; and how many samples lie between them."""
-        span = (samples - 1) * decimation
-        stride = -(-sum(max(0, len(x) - span) for x in self.pieces) // most)
-        return [(x, k) for x in self.pieces for k in range(0, len(x) - span, stride)], stride
+    def stride(self, span: int, most: int) -> int:
+        """Return how many samples lie between the starts of about `most` windows of so many steps."""
+        return -(-sum(max(0, len(piece) - span) for piece in self.pieces) // most)
+
+    def starts(self, span: int, most: int) -> list[tuple[Trajectory, int]]:
+        """Return the pieces and first samples of these windows."""
+        stride = self.stride(span, most)
+        starts: list[tuple[Trajectory, int]] = []
+        for piece in self.pieces:
+            starts += [(piece, first) for first in range(0, len(piece) - span, stride)]
+        return starts
 
     def windows(self, samples: int, most: int, decimation: int = 1) -> Windows:
-        """The windows of so many samples that begin there, shorter ones where all pieces are."""
+        """Return the windows of so many samples that begin there, shorter ones where all pieces are."""
         samples = min(samples, self.longest // decimation + 1)
-        stride = self.starts(samples, most, decimation)[1]
-        return cut_windows(
-            self.pieces, samples, stride, decimation, measured=self.used.filtered, reach=self.reach
-        )
+        stride = self.stride((samples - 1) * decimation, most)
+        measured = self.used.filtered
+        return cut_windows(self.pieces, samples, stride, decimation, measured=measured, reach=self.reach)
+
+    def probe(self, samples: int, decimation: int = 1) -> Windows:
+        """Return few windows, that say how many steps integrators need."""
+        return self.windows(samples, TUNING.probed_model_windows, decimation)
 
 
 @dataclass(frozen=True, eq=False)
 class Predictions:
-    """What was predicted of these windows, q and qd (W, K-1, n), by predictor. starts: the first sample of each."""
+    """Predicted q and qd (W, K-1, n) of windows by predictor. starts: the piece and first sample of each."""
 
     windows: Windows
     starts: list[tuple[Trajectory, int]]
@@ -74,14 +96,22 @@ class Predictions:
 def horizon_lengths(
     logs: JudgedLogs, steps: Sequence[int], seconds: Sequence[float], notes: list[Diagnostic]
 ) -> dict[str, int]:
-    """Horizon name -> number of samples ahead; those longer than every trajectory are left out, and said."""
-    wanted = {f"{k} step{'s' if k > 1 else ''}": k for k in steps}
-    wanted |= {f"{duration:g} s": round(duration * logs.rate) for duration in seconds}
-    for name, k in wanted.items():
-        if not 0 < k <= logs.longest:
-            message = f"no prediction over {name}: the longest trajectory has {logs.longest} steps"
-            notes.append(Diagnostic("info", "horizon-too-long", "logs", None, message))
-    return {name: k for name, k in wanted.items() if 0 < k <= logs.longest}
+    """Return the number of samples of each horizon by name; those longer than every trajectory are left out, and
+    noted.
+    """
+    lengths = {}
+    for k in steps:
+        lengths["1 step" if k == 1 else f"{k} steps"] = k
+    for duration in seconds:
+        lengths[f"{duration:g} s"] = round(duration * logs.rate)
+    possible = {}
+    for name, k in lengths.items():
+        if 0 < k <= logs.longest:
+            possible[name] = k
+            continue
+        message = f"no prediction over {name}: the longest trajectory has {logs.longest} steps"
+        notes.append(Diagnostic("info", "horizon-too-long", "logs", None, message))
+    return possible
 
 
 def predict(
@@ -89,26 +119,26 @@ def predict(
     steps: int,
     logs: JudgedLogs,
     predictors: Sequence[Predictor],
-    joint_types: Sequence[str],
-    tip: Callable[[torch.Tensor], torch.Tensor] | None,
+    tip: TipPosition | None,
     probed: int,
     notes: list[Diagnostic],
 ) -> tuple[Horizon, Predictions]:
     """Judge rollouts over so many samples: open loop, and with what a momentum observer finds before they start.
 
-    tip: its position [m] by q. probed: samples of the windows that say how many steps integrators need.
+    probed: samples of the windows that say how many steps integrators need.
     """
     decimation = _decimation(steps, logs.rate)
     if decimation > 1:
-        probe = logs.windows(probed, PROBED, decimation)
-        predictors = [_in_steps_for(x, probe, joint_types) for x in predictors]
-    most, past = max(min(MOST_WINDOWS, PREDICTED_STEPS // steps), 1), past_steps(logs.rate / decimation)
+        probe = logs.probe(probed, decimation)
+        predictors = [_in_steps_for(predictor, probe, logs.joint_types) for predictor in predictors]
+    past = past_steps(logs.rate / decimation)
     if past * decimation + steps > logs.longest:
         message = f"no observer over {name}: the longest trajectory has {logs.longest} steps"
         notes.append(Diagnostic("info", "no-observer", "logs", None, message))
         past = 0
-    samples = past + steps // decimation + 1
-    windows = logs.windows(samples, most, decimation)
+    most = max(1, min(TUNING.most_windows, TUNING.most_predicted_steps // steps))
+    span = past * decimation + steps
+    windows = logs.windows(span // decimation + 1, most, decimation)
     ahead = without_past(windows, past)
     states = {}
     for predictor in predictors:
@@ -119,9 +149,9 @@ def predict(
             started, disturbance = observe(predictor.solver.form, windows, past)
         states[predictor.name] = predictor.solver(started)
         states[observed(predictor.name)] = predictor.solver(started, disturbance)
-    errors = {name: end_errors(state, ahead, joint_types, tip) for name, state in states.items()}
+    errors = {who: end_errors(state, ahead, logs.joint_types, tip) for who, state in states.items()}
     seconds = ahead.dt.sum(dim=1).mean().item()
-    starts = [(piece, k + past * decimation) for piece, k in logs.starts(samples, most, decimation)[0]]
+    starts = [(piece, first + past * decimation) for piece, first in logs.starts(span, most)]
     return Horizon(name, steps, seconds, len(ahead), errors), Predictions(ahead, starts, states)
 
 
@@ -132,11 +162,14 @@ def _in_steps_for(predictor: Predictor, probe: Windows, joint_types: Sequence[st
         return predictor
     if predictor.name != MODEL:
         return of_accurate_dynamics(predictor.name, dynamics, probe)
-    model: Any = dynamics
-    return of_dynamics(MODEL, model, choose_substeps(model, probe, loss_scales(probe, joint_types)))
+    model = cast("EmittedModel", dynamics)
+    return of_dynamics(MODEL, dynamics, choose_substeps(model, probe, loss_scales(probe, joint_types)))
 
 
 def _decimation(steps: int, rate: float) -> int:
-    """The largest whole part of the steps that leaves enough of them, and samples dense enough."""
-    largest = max(1, min(int(rate / DENSEST), steps // LEAST_STEPS))
+    """Return the largest divisor of the steps that leaves enough of them, and samples dense enough.
+
+    Inputs of the samples between are averaged.
+    """
+    largest = max(1, min(int(rate / TUNING.densest_rate), steps // TUNING.fewest_steps))
     return max(k for k in range(1, largest + 1) if steps % k == 0)

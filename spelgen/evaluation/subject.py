@@ -6,7 +6,7 @@ import copy
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 
@@ -28,6 +28,7 @@ from spelgen.urdf.read import read_urdf
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
+    from spelgen.loaded_arm import LoadedArm
 
 WINDOW = 5  # samples of the windows that say how many steps the integrator needs
 
@@ -56,26 +57,36 @@ class Subject:
     command_followers: Mapping[str, CommandFollower] = field(default_factory=dict)
 
     @property
+    def parameters(self) -> int:
+        """How many numbers of the model are trained."""
+        return sum(parameter.numel() for parameter in self.model.parameters())
+
+    @property
     def substeps_per_sample(self) -> int:
-        """Of the logs as they were recorded: samples of the fit's windows may lie farther apart."""
-        decimation = self.preprocessing.decimation if self.preprocessing else None
-        return -(-self.substeps // (decimation or 1))
+        """Steps of rk4 in a step of the logs as recorded: samples of the fit's windows may lie farther apart."""
+        decimation = 1
+        if self.preprocessing is not None and self.preprocessing.decimation:
+            decimation = self.preprocessing.decimation
+        return -(-self.substeps // decimation)
 
 
-def subject(judged: Any, arm: Any = None) -> Subject:
-    """A model, a fit or the folder of a run, on an arm of ``load_arm`` or the URDF of this path."""
+def subject(judged: EmittedModel | Fit | Path | str, arm: LoadedArm | Path | str | None = None) -> Subject:
+    """Return what is judged: a model, a fit or the folder of a run, on an arm or the URDF of this path."""
     if isinstance(judged, str | Path):
         judged = load_run(judged)
-    urdf = arm if arm is None or isinstance(arm, str | Path) else arm.robot.path
+    urdf: Path | str | None = None
+    if isinstance(arm, str | Path):
+        urdf = arm
+    elif arm is not None:
+        urdf = arm.robot.path
     if not isinstance(judged, Fit):
         return _of_model(judged, urdf)
-    seen = frozenset(judged.record["training"]) | frozenset(judged.record["validation"])
     return replace(
         _of_model(judged.model, urdf or judged.urdf),
         preprocessing=judged.preprocessing,
         window=getattr(judged.config, "window", WINDOW),
         substeps=judged.substeps,
-        trained_on=seen,
+        trained_on=frozenset([*judged.record["training"], *judged.record["validation"]]),
         run=None if judged.folder is None else RunFolder(judged.folder),
         command_followers=_command_followers(judged),
     )
@@ -94,22 +105,20 @@ def _of_model(model: EmittedModel, urdf: Path | str | None) -> Subject:
     weights = next(model.parameters(), None)
     if weights is not None and (weights.dtype != torch.float64 or not weights.is_cpu):  # as logs are
         model = copy.deepcopy(model).double().cpu()
-    own = bristle_reach(model)
-    facts = getattr(model, "facts", None)  # none where it is what else has an arm's dynamics
-    return Subject(
-        model,
-        facts.robot if facts else type(model).__name__,
-        logged_joints(model),
-        None if urdf is None else Path(urdf),
-        facts.options.tip if facts else None,
-        reach=own if own.elements else reach_of(model.joint_types),
-    )
+    reach = bristle_reach(model)
+    if not reach.elements:
+        reach = reach_of(model.joint_types)
+    robot, tip = type(model).__name__, None
+    if hasattr(model, "facts"):  # else something that has an arm's dynamics in another way
+        robot, tip = model.facts.robot, model.facts.options.tip
+    path = None if urdf is None else Path(urdf)
+    return Subject(model, robot, logged_joints(model), path, tip, reach=reach)
 
 
 def read_test_logs(
     folder: Path | str, paths: Iterable[Path | str], mapping: GivenMapping = None
 ) -> list[Trajectory]:
-    """Logs of a run's arm (a folder's test.* where there are such), mapped as those that it was trained on."""
+    """Return logs of a run's arm (a folder's test.* where there are such), mapped as those that it was trained on."""
     run = RunFolder(Path(folder))
     record, facts = run.read_config(), read_facts(run.module)
     if mapping is None:

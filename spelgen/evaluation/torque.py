@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from spelgen.dynamics.protocol import known_past
+from spelgen.evaluation.plain import finite
 from spelgen.identification.samples import DynamicsSamples
 
 
@@ -24,6 +25,26 @@ class TorqueErrors:
     nmse: np.ndarray
     rmse: np.ndarray
 
+    def summary(self) -> TorqueSummary:
+        """Return means over joints and trajectories."""
+        by_trajectory = np.nanmean(self.nmse, axis=1)
+        nmse = dict(zip(self.trajectories, finite(by_trajectory), strict=True))
+        (mean,) = finite(by_trajectory.mean(keepdims=True))
+        return TorqueSummary(nmse, mean, finite(self.rmse.mean(axis=0)))
+
+
+@dataclass(frozen=True)
+class TorqueSummary:
+    """Errors of the inverse dynamics of one predictor by the protocol of `dynamics_samples`.
+
+    nmse: per trajectory, mean over joints. mean_nmse: mean over trajectories. rmse: per joint [Nm, N], mean
+    over trajectories.
+    """
+
+    nmse: dict[str, float | None]
+    mean_nmse: float | None
+    rmse: tuple[float | None, ...]
+
 
 def torque_errors(dynamics: Any, samples: Sequence[DynamicsSamples]) -> TorqueErrors:
     """Return the errors of an inverse dynamics on these samples."""
@@ -37,4 +58,4 @@ def torque_errors(dynamics: Any, samples: Sequence[DynamicsSamples]) -> TorqueEr
         variance = sample.tau.var(axis=0)
         nmse.append(np.divide(squares, variance, out=np.full_like(squares, np.nan), where=variance > 0))
         rmse.append(np.sqrt(squares))
-    return TorqueErrors(tuple(x.name for x in samples), np.array(nmse), np.array(rmse))
+    return TorqueErrors(tuple(sample.name for sample in samples), np.array(nmse), np.array(rmse))

@@ -1,193 +1,283 @@
 """The curves behind the figures of an evaluation: for pages, and for programs as `traces` of evaluation.json.
 
-Everything is plain lists and numbers [rad, m, s, Nm, N, kg m^2, J], rounded to five digits; None where not finite.
+All are plain lists and numbers [rad, m, s, Nm, N, kg m^2, J], rounded to five digits; None where not finite.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from spelgen.baselines.names import MODEL
 from spelgen.baselines.predictor import Predictor
-from spelgen.dynamics.bristles import BristleReach
-from spelgen.dynamics.protocol import RigidDynamics
-from spelgen.evaluation.horizons import Predictions
+from spelgen.evaluation.horizons import JudgedLogs, Predictions
+from spelgen.evaluation.plain import Rows, Series, number, rows, series
 from spelgen.evaluation.replay import Missed
-from spelgen.evaluation.torque_traces import plain, torque_trace
-from spelgen.fitting.rollout import loss_scales, position_difference
+from spelgen.evaluation.state_errors import TipPosition
+from spelgen.evaluation.torque_traces import TorqueTrace, torque_traces
+from spelgen.fitting.rollout import LossScales, loss_scales, position_difference
 from spelgen.logs.coverage import coverage
-from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows
 
-TIMES = 24  # at which it is told
-QUANTILES = (0.1, 0.5, 0.9)
+if TYPE_CHECKING:
+    from spelgen.dynamics.protocol import RigidDynamics
+
+TIMES = 24  # of an error's growth
 SHOWN = 240  # samples of a predicted trajectory
 SHOWN_OF_LOG = 600  # of a whole log
 
 
-def traces(
+@dataclass(frozen=True)
+class Quantiles:
+    """10, 50 and 90 % of the starts have at most these errors, by time."""
+
+    low: Series
+    median: Series
+    high: Series
+
+
+@dataclass(frozen=True)
+class Growth:
+    """How errors grow with time [s], by predictor: relative to the motion, and of the tip [mm] where it is known."""
+
+    seconds: Series
+    windows: int
+    relative: dict[str, Quantiles]
+    tip_mm: dict[str, Quantiles]
+
+
+@dataclass(frozen=True)
+class PredictedExample:
+    """A prediction of the model, of middle ("typical") or largest ("worst") error, and what was measured; (T, n)."""
+
+    which: str
+    trajectory: str
+    start: float | None
+    error: float | None
+    t: Series
+    q: Rows
+    qd: Rows
+    predicted_q: Rows
+    predicted_qd: Rows
+
+
+@dataclass(frozen=True)
+class ReplayedExample:
+    """A log replayed by a model of position servos: measured, commanded and predicted positions, (T, n)."""
+
+    which: str
+    trajectory: str
+    error: float | None
+    t: Series
+    q: Rows
+    u: Rows
+    predicted_q: Rows
+
+
+@dataclass(frozen=True)
+class MassCurves:
+    """The lower triangle of M, row by row, and its eigenvalues along a trajectory; (entries, T) and (n, T)."""
+
+    entries: Rows
+    eigenvalues: Rows
+
+
+@dataclass(frozen=True)
+class MassTrace:
+    """M along a trajectory by predictor."""
+
+    trajectory: str
+    t: Series
+    by: dict[str, MassCurves]
+
+
+@dataclass(frozen=True)
+class FrictionSamples:
+    """What the model's rigid bodies leave of a joint's torque, at its velocity."""
+
+    qd: Series
+    torque: Series
+
+
+@dataclass(frozen=True)
+class FrictionTrace:
+    """Friction by velocity: (n, T) by predictor, each joint alone at the mean position; and what was measured."""
+
+    qd: Rows
+    by: dict[str, Rows]
+    measured: list[FrictionSamples]
+
+
+@dataclass(frozen=True)
+class Traces:
+    """All curves; coverage: of the test logs, see `logs.coverage`."""
+
+    coverage: dict[str, object]
+    growth: Growth | None = None
+    trajectories: tuple[PredictedExample | ReplayedExample, ...] = ()
+    torques: tuple[TorqueTrace, ...] = ()
+    mass: MassTrace | None = None
+    friction: FrictionTrace | None = None
+
+
+def motion_traces(
     predictors: Sequence[Predictor],
-    pieces: Sequence[Trajectory],
-    predicted: Predictions | None,
-    joint_types: Sequence[str],
-    *,
-    used: Preprocessing,
-    reach: BristleReach,
-    tip: Any = None,
-) -> dict[str, Any]:
-    """All curves. pieces: gap-free and filtered. predicted: of the longest horizon. tip: its position [m] by q.
-
-    reach: of the bristles that friction remembers with.
-    """
+    logs: JudgedLogs,
+    predictions: Predictions | None,
+    tip: TipPosition | None,
+) -> Traces:
+    """Return all curves of an arm under torques. predictions: over the longest horizon."""
     dynamics = {x.name: x.dynamics for x in predictors if x.dynamics is not None}
-    found: dict[str, Any] = {"coverage": coverage(pieces)}
-    if predicted is not None:
-        found |= _predictions(predicted, joint_types, tip)
-    model = next((x for x in predictors if x.name == MODEL and x.dynamics is not None), None)
-    if model is not None and model.dynamics is not None:
-        found["torques"] = torque_trace(model.dynamics, dynamics, pieces, used, reach)
-        found["mass"] = _masses(dynamics, found)
-        found["friction"] = _friction(dynamics, pieces, found["torques"])
-    return found
+    growth: Growth | None = None
+    examples: tuple[PredictedExample, ...] = ()
+    if predictions is not None:
+        growth = _growth(predictions, logs.joint_types, tip)
+        examples = _examples(predictions, logs.joint_types)
+    torques = torque_traces(dynamics, logs)
+    return Traces(
+        coverage=coverage(logs.pieces),
+        growth=growth,
+        trajectories=examples,
+        torques=torques,
+        mass=_mass_trace(dynamics, (*torques, *examples)),
+        friction=_friction_trace(dynamics, logs.pieces, torques),
+    )
 
 
-def replay_traces(missed: Sequence[Missed]) -> dict[str, Any]:
-    """Of an arm under position servos: the logs of the middle and the largest error, positions measured, commanded
-    and predicted.
-    """
-    size = [float(np.sqrt(np.square(x).mean())) for _, x in missed]
-    order = np.argsort(size, kind="stable")
+def replay_traces(missed: Sequence[Missed]) -> Traces:
+    """Return the logs of middle and of largest error of an arm under position servos."""
+    errors = [float(np.sqrt(np.square(error).mean())) for _, error in missed]
     examples = []
-    for which, k in (("typical", order[len(order) // 2]), ("worst", order[-1])):
+    for which, k in _typical_and_worst(torch.tensor(errors)).items():
         log, error = missed[k]
-        predicted = np.concatenate([log.q[:1], log.q[1:] + error])
-        columns = {"t": log.t - log.t[0], "q": log.q, "u": log.u, "predicted_q": predicted}
         stride = -(-len(log) // SHOWN_OF_LOG)
-        told = {"which": which, "trajectory": log.name, "error": plain(size[k])}
-        examples.append(told | {name: plain(x[::stride]) for name, x in columns.items()})
-    return {"coverage": coverage([x for x, _ in missed]), "trajectories": examples}
+        predicted = np.concatenate([log.q[:1], log.q[1:] + error])
+        examples.append(
+            ReplayedExample(
+                which,
+                log.name,
+                number(errors[k]),
+                series((log.t - log.t[0])[::stride]),
+                rows(log.q[::stride]),
+                rows(log.u[::stride]),
+                rows(predicted[::stride]),
+            )
+        )
+    return Traces(coverage([log for log, _ in missed]), trajectories=tuple(examples))
 
 
-def _predictions(found: Predictions, joint_types: Sequence[str], tip: Any) -> dict[str, Any]:
-    """How errors grow with the horizon, and the predictions of the middle and the largest error."""
-    windows = found.windows
+def _typical_and_worst(errors: Tensor) -> dict[str, int]:
+    """Return which of these (N,) is in the middle, and which the largest."""
+    order = errors.nan_to_num(nan=torch.inf).argsort(stable=True)
+    return {"typical": int(order[len(order) // 2]), "worst": int(order[-1])}
+
+
+def _growth(predictions: Predictions, joint_types: Sequence[str], tip: TipPosition | None) -> Growth:
+    windows = predictions.windows
     steps = windows.dt.shape[1]
     times = np.unique(np.geomspace(1, steps, TIMES).round().astype(int)) - 1
     scales = loss_scales(windows, joint_types)
-    grown: dict[str, Any] = {}
-    tips: dict[str, Any] = {}
-    examples: list[dict[str, Any]] = []
-    for name, (q, qd) in found.states.items():
-        away = position_difference(q, windows.q[:, 1:], joint_types)
-        error = torch.cat([away / scales.q, (qd - windows.qd[:, 1:]) / scales.qd], dim=-1)
-        size = error.square().mean(dim=-1).sqrt()  # (W, steps)
-        grown[name] = _quantiles(size[:, times])
+    relative, tips = {}, {}
+    for name, states in predictions.states.items():
+        errors = _relative_errors(states, windows, scales, joint_types)
+        relative[name] = _quantiles(errors[:, times])
         if tip is not None:
-            distance = 1000 * (tip(q[:, times]) - tip(windows.q[:, 1:][:, times])).norm(dim=-1)
-            tips[name] = _quantiles(distance)
-        if name == MODEL:
-            order = size[:, -1].nan_to_num(nan=torch.inf).argsort()
-            chosen = {"typical": int(order[len(order) // 2]), "worst": int(order[-1])}
-            examples = [
-                _example(which, found.starts[k], windows[k : k + 1], q[k], qd[k], size[k, -1].item())
-                for which, k in chosen.items()
-            ]
+            measured = tip(windows.q[:, 1:][:, times])
+            tips[name] = _quantiles(1000 * (tip(states[0][:, times]) - measured).norm(dim=-1))
     seconds = windows.dt.cumsum(dim=1).mean(dim=0)[times]
-    return {
-        "growth": {"seconds": plain(seconds), "windows": len(windows), "relative": grown, "tip_mm": tips},
-        "trajectories": examples,
-    }
+    return Growth(series(seconds), len(windows), relative, tips)
 
 
-def _quantiles(values: torch.Tensor) -> dict[str, Any]:
-    """Over windows (W, times): not finite counts as infinite."""
+def _relative_errors(
+    states: tuple[Tensor, Tensor], windows: Windows, scales: LossScales, joint_types: Sequence[str]
+) -> Tensor:
+    """Return the root mean square over joints of errors in units of the motion, (W, K-1)."""
+    q, qd = states
+    position = position_difference(q, windows.q[:, 1:], joint_types) / scales.q
+    velocity = (qd - windows.qd[:, 1:]) / scales.qd
+    return torch.cat([position, velocity], dim=-1).square().mean(dim=-1).sqrt()
+
+
+def _quantiles(values: Tensor) -> Quantiles:
+    """Return those over windows of (W, T); what is not finite counts as infinite."""
     ordered = values.nan_to_num(nan=torch.inf).sort(dim=0).values
-    rows = [ordered[round(part * (len(ordered) - 1))] for part in QUANTILES]
-    return dict(zip(("low", "median", "high"), map(plain, rows), strict=True))
+    last = len(ordered) - 1
+    return Quantiles(*(series(ordered[round(part * last)]) for part in (0.1, 0.5, 0.9)))
 
 
-def _example(
-    which: str,
-    start: tuple[Trajectory, int],
-    window: Windows,
-    q: torch.Tensor,
-    qd: torch.Tensor,
-    error: float,
-) -> dict[str, Any]:
-    piece, first = start
-    stride = -(-len(q) // SHOWN)
-    t = torch.cat([window.dt.new_zeros(1), window.dt[0].cumsum(dim=0)])
-    predicted = (torch.cat([x[0, :1], y]) for x, y in ((window.q, q), (window.qd, qd)))
-    columns = dict(
-        zip(
-            ("t", "q", "qd", "predicted_q", "predicted_qd"),
-            (t, window.q[0], window.qd[0], *predicted),
-            strict=True,
+def _examples(predictions: Predictions, joint_types: Sequence[str]) -> tuple[PredictedExample, ...]:
+    windows, (q, qd) = predictions.windows, predictions.states[MODEL]
+    scales = loss_scales(windows, joint_types)
+    errors = _relative_errors((q, qd), windows, scales, joint_types)[:, -1]
+    stride = -(-q.shape[1] // SHOWN)
+    examples = []
+    for which, k in _typical_and_worst(errors).items():
+        piece, first = predictions.starts[k]
+        t = torch.cat([windows.dt.new_zeros(1), windows.dt[k].cumsum(dim=0)])
+        examples.append(
+            PredictedExample(
+                which,
+                piece.name,
+                number(piece.t[first] - piece.t[0]),
+                number(errors[k].item()),
+                series(t[::stride]),
+                rows(windows.q[k][::stride]),
+                rows(windows.qd[k][::stride]),
+                rows(torch.cat([windows.q[k, :1], q[k]])[::stride]),
+                rows(torch.cat([windows.qd[k, :1], qd[k]])[::stride]),
+            )
         )
-    )
-    told = {name: plain(x[::stride]) for name, x in columns.items()}
-    return {
-        "which": which,
-        "trajectory": piece.name,
-        "start": plain(piece.t[first] - piece.t[0]),
-        "error": plain(error),
-    } | told
+    return tuple(examples)
 
 
-def _masses(dynamics: Mapping[str, RigidDynamics], found: Mapping[str, Any]) -> dict[str, Any]:
-    """M along the first trajectory that is drawn: its lower triangle, row by row, and its eigenvalues."""
-    along = [*found["torques"], *found.get("trajectories", [])]
-    if not along:
-        return {}
-    stride = -(-len(along[0]["t"]) // SHOWN)
-    q = torch.tensor(along[0]["q"], dtype=torch.float64)[::stride]
-    shown: dict[str, Any] = {}
-    for name, each in dynamics.items():
+def _mass_trace(
+    dynamics: Mapping[str, RigidDynamics], trajectories: Sequence[TorqueTrace | PredictedExample]
+) -> MassTrace | None:
+    """Return M along the first trajectory that is drawn."""
+    if not trajectories:
+        return None
+    along = trajectories[0]
+    stride = -(-len(along.t) // SHOWN)
+    q = torch.tensor(along.q, dtype=torch.float64)[::stride]
+    row, column = torch.tril_indices(q.shape[-1], q.shape[-1])
+    curves = {}
+    for name, predictor in dynamics.items():
         with torch.no_grad():
-            mass = torch.as_tensor(each.mass_matrix(q))
+            mass = torch.as_tensor(predictor.mass_matrix(q))
         if mass.isfinite().all():
-            rows, columns = torch.tril_indices(mass.shape[-1], mass.shape[-1])
-            shown[name] = {
-                "entries": plain(mass[:, rows, columns].mT),
-                "eigenvalues": plain(torch.linalg.eigvalsh(mass).mT),
-            }
-    return {"trajectory": along[0]["trajectory"], "t": along[0]["t"][::stride], "by": shown}
+            eigenvalues = torch.linalg.eigvalsh(mass)
+            curves[name] = MassCurves(rows(mass[:, row, column].mT), rows(eigenvalues.mT))
+    return MassTrace(along.trajectory, along.t[::stride], curves)
 
 
-def _friction(
-    dynamics: Mapping[str, RigidDynamics], pieces: Sequence[Trajectory], torques: Sequence[Mapping[str, Any]]
-) -> dict[str, Any]:
-    """Friction by velocity, each joint alone at the mean position; and what the rigid bodies leave of the torque."""
+def _friction_trace(
+    dynamics: Mapping[str, RigidDynamics], pieces: Sequence[Trajectory], torques: Sequence[TorqueTrace]
+) -> FrictionTrace:
     q = np.concatenate([piece.q for piece in pieces])
     fast = np.quantile(np.abs(np.concatenate([piece.qd for piece in pieces])), 0.995, axis=0)
     middle = torch.from_numpy(q.mean(axis=0))
     n = len(middle)
     grid = np.sinh(np.linspace(-4, 4, 81)) / np.sinh(4)  # dense where friction turns around
     speeds = torch.from_numpy(grid[:, None] * fast)  # (81, n)
-    curves: dict[str, Any] = {}
-    for name, each in dynamics.items():
+    curves = {}
+    for name, predictor in dynamics.items():
         with torch.no_grad():
-            moved = torch.diag_embed(speeds)  # one joint at a time
-            torque = each.friction_torque(middle.expand(len(speeds), n, n), moved)
-        curves[name] = plain(torch.diagonal(torch.as_tensor(torque), dim1=-2, dim2=-1).mT)
-    left = [
-        {
-            "qd": [row[k] for trace in torques for row in trace["qd"]],
-            "torque": [
-                None if a is None or b is None else a - b
-                for trace in torques
-                for a, b in zip(
-                    (row[k] for row in trace["measured"]),
-                    (row[k] for row in trace["without_friction"]),
-                    strict=True,
-                )
-            ],
-        }
-        for k in range(n)
-    ]
-    return {"qd": plain(speeds.mT), "by": curves, "measured": left}
+            alone = torch.diag_embed(speeds)  # one joint at a time
+            torque = torch.as_tensor(predictor.friction_torque(middle.expand(len(speeds), n, n), alone))
+        curves[name] = rows(torch.diagonal(torque, dim1=-2, dim2=-1).mT)
+    return FrictionTrace(rows(speeds.mT), curves, [_friction_samples(torques, joint) for joint in range(n)])
+
+
+def _friction_samples(torques: Sequence[TorqueTrace], joint: int) -> FrictionSamples:
+    velocity, friction = [], []
+    for trace in torques:
+        measured, without = np.array(trace.measured, float), np.array(trace.without_friction, float)
+        velocity += series(np.array(trace.qd, float)[:, joint])
+        friction += series((measured - without)[:, joint])
+    return FrictionSamples(velocity, friction)

@@ -1,31 +1,29 @@
-"""What an evaluation comes to in words: good enough for what, where it fails, and what to record next."""
+"""An evaluation in words: good enough for what, where it fails, and what to record next."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from spelgen.baselines.names import MODEL
+from spelgen.baselines.names import CONSTANT_VELOCITY, MODEL, observed
+from spelgen.errors import shortened
 from spelgen.labels import listed, thousandths
 from spelgen.listing import number
+from spelgen.settings.tuning.evaluation import EvaluationTuning
 
-# part of the torque's variance that is explained -> what that is good for, and what not
-CONTROL = (
-    (0.99, "feed-forward control, telling contacts from its own error", ""),
-    (0.95, "feed-forward control", "telling contacts from its own error"),
-    (0.8, "gravity compensation", "feed-forward control"),
-    (-math.inf, "", "control"),
-)
-CLOSE, ROUGH = 0.1, 0.3  # relative RMS up to which a prediction is close, or rough
+if TYPE_CHECKING:
+    from spelgen.evaluation.results import Results
+    from spelgen.evaluation.state_errors import StateErrors
+
+TUNING = EvaluationTuning()
 SEEN = "tested-on-training-data"
 STANDSTILL = "near standstill"
-SLOW = 0.1  # of a joint's largest velocity
-UNEVEN = 1.4  # ratio of errors that is worth a word
-NARROW = 0.5  # part of a joint's range below which its logs are narrow
+EXCITE = "(as spelgen excite proposes)"
+Limits = Sequence[tuple[float, float] | None]
 
 
 @dataclass(frozen=True)
@@ -36,185 +34,255 @@ class Verdict:
     because: str
 
 
-def verdict(
-    evaluation: Mapping[str, Any],
-    identified: Mapping[str, Any] | None = None,
-    limits: Sequence[tuple[float, float] | None] = (),
-) -> Verdict:
-    """Of evaluation.json, beside what least squares found of the training logs; limits: of the joints."""
-    good, bad, proofs = _uses(evaluation)
-    if not proofs:
+@dataclass
+class _Uses:
+    """What a model is good enough for, what not, and the figures that say so."""
+
+    good: list[str] = field(default_factory=list)
+    bad: list[str] = field(default_factory=list)
+    proofs: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class _Failure:
+    """Where a model fails most: a joint, when it does, and the figure that says so."""
+
+    joint: str = ""
+    when: str = ""
+    proof: str = ""
+
+
+@dataclass(frozen=True)
+class _Recommendation:
+    """What to record next, and why."""
+
+    motion: str
+    reason: str
+
+
+def verdict(results: Results, identified: Mapping[str, Any] | None = None, limits: Limits = ()) -> Verdict:
+    """Judge an evaluation. identified: least_squares.json, of the training logs. limits: of the joints."""
+    uses = _Uses()
+    _judge_torques(results, uses)
+    _judge_motion(results, uses)
+    _judge_replays(results, uses)
+    if not uses.proofs:
         return Verdict("Nothing to judge by: no horizon and no torque was evaluated.", "")
-    place, worst = _worst(evaluation)
-    known = any(x.get("code") == SEEN for x in evaluation.get("diagnostics", ()))
-    told = f"Good enough for {listed(good)}" if good else "Not good enough yet to rely on"
-    told = (
-        f"Judged on logs that it was trained on, which proves little: {told[0].lower()}{told[1:]}"
-        if known
-        else told
-    )
-    told += f", not for {listed(bad)}" if bad and good else ""
-    told += f"; worst at {place}" if place else ""
-    wishes = _wishes(evaluation, identified, limits, place)
-    told += f"; next, record {wishes[0][0]}" if wishes else ""
-    because = [f"It {listed(proofs)}.", worst, _beaten(evaluation), *(f"{x[1]}." for x in wishes)]
-    return Verdict(f"{told}.", " ".join(x for x in because if x))
-
-
-def _uses(evaluation: Mapping[str, Any]) -> tuple[list[str], list[str], list[str]]:
-    good, bad, proofs = [], [], []
-    torque = evaluation["torque"].get(MODEL)
-    nmse = torque["mean_nmse"] if torque else None
-    if nmse is not None:
-        _, use, missing = next(row for row in CONTROL if 1 - nmse >= row[0])
-        good += use.split(", ") if use else []
-        bad += [missing] if missing else []
-        part = 1 - nmse
-        amount = "none" if part <= 0 else f"{_percent(part)}"
-        proofs.append(f"explains {amount} of the variance of the torques")
-    simulated = [(x["name"], x["errors"][MODEL]) for x in evaluation["horizons"]]
-    horizons = [(name, errors["mean_relative_rms"], errors["tip_mm"]) for name, errors in simulated]
-    known = [x for x in horizons if x[1] is not None]
-    if known:
-        name, error, tip = known[-1]
-        if error <= ROUGH:
-            good.append(f"{'simulation' if error <= CLOSE else 'rough simulation'} {name} ahead")
-        else:
-            bad.append(f"simulation {name} ahead")
-        away = "" if tip is None else f", {number(tip)} mm at the tip"
-        proofs.append(
-            f"misses {_percent(error)} of the motion after {name}{away}"
-            if error <= 1
-            else f"is off by {error:.3g} times the motion after {name}{away}"
-        )
-    replay = next(iter(evaluation.get("replays") or ()), None)
-    if replay:
-        errors = {name: each["mean"] for name, each in replay["errors"].items()}
-        good += ["simulation from commands"] if errors[MODEL] == min(errors.values()) else []
-        bad += [] if good else ["simulation from commands"]
-        proofs.append(
-            f"misses {1000 * errors[MODEL]:.3g} {thousandths(evaluation.get('joint_types', ()))} of the positions that "
-            f"follow commands, {replay['name']}"
-        )
-    elif horizons and not known:
-        bad.append("simulation")
-        proofs.append("predicts nothing that stays finite")
-    return good, bad, proofs
-
-
-def _worst(evaluation: Mapping[str, Any]) -> tuple[str, str]:
-    """The joint that fails most, slowly or fast, and the figure that tells."""
-    joints, traces = evaluation["joints"], evaluation.get("traces") or {}
-    left = _residuals(traces)
-    if left:
-        ratios = [float(np.sqrt(np.nanmean(r**2)) / (np.nanstd(m) or math.inf)) for r, m, _ in left]
-        k = int(np.nanargmax(ratios))
-        residual, _, qd = left[k]
-        slow = np.abs(qd) < SLOW * np.nanmax(np.abs(qd))
-        when = ""
-        if 5 < slow.sum() < len(slow) - 5:
-            size = [float(np.sqrt(np.nanmean(residual[x] ** 2))) for x in (slow, ~slow)]
-            when = f" {STANDSTILL}" if size[0] > UNEVEN * size[1] else ""
-            when = " at speed" if size[1] > UNEVEN * size[0] else when
-        return (
-            f"{joints[k]}{when}",
-            f"At {joints[k]} {_percent(ratios[k])} of the torque's variation is left.",
-        )
-    horizon = next(reversed(evaluation["horizons"]), None)
-    sizes = horizon["errors"][MODEL]["q_relative_rms"] if horizon else []
-    if horizon is None or not sizes or None in sizes:
-        return "", ""
-    k = int(np.argmax(sizes))
-    return joints[k], f"At {joints[k]} it misses {_percent(sizes[k])} of the motion after {horizon['name']}."
-
-
-def _beaten(evaluation: Mapping[str, Any]) -> str:
-    """Which baselines are better, at what."""
-    lost: dict[str, list[str]] = {}
-    for horizon in evaluation["horizons"]:
-        errors = {name: x["mean_relative_rms"] for name, x in horizon["errors"].items()}
-        _note_better(errors, f"after {horizon['name']}", lost)
-    torque = {name: x["mean_nmse"] for name, x in evaluation["torque"].items()}
-    _note_better(torque, "in torque", lost)
-    told = [f"{name} is better {listed(where)}" for name, where in lost.items()]
-    return f"But {listed(told)}." if told else ""
-
-
-def _note_better(errors: Mapping[str, float | None], where: str, lost: dict[str, list[str]]) -> None:
-    known = {name: x for name, x in errors.items() if x is not None}
-    best = min(known, key=known.__getitem__, default=MODEL)
-    if best != MODEL and MODEL in errors:
-        lost.setdefault(best, []).append(where)
-
-
-def _wishes(
-    evaluation: Mapping[str, Any],
-    identified: Mapping[str, Any] | None,
-    limits: Sequence[tuple[float, float] | None],
-    worst: str,
-) -> list[tuple[str, str]]:
-    """What to record, the most useful first, and why."""
-    joints, found = evaluation["joints"], []
-    seen = (identified or {}).get("coverage") or {}
-    outside = _outside(seen, (evaluation.get("traces") or {}).get("coverage") or {}, joints)
-    if identified and identified.get("unseen_directions"):
-        why = f"The training logs say nothing in {identified['unseen_directions']} directions of the base parameters"
-        found.append(("a richer motion (as spelgen excite proposes)", why))
-    if outside:
-        why = f"The test logs go where the training logs do not: {_shortened(outside)}"
-        found.append((f"motion with the {outside[0]} that the test logs have", why))
-    if worst.endswith(STANDSTILL):
-        joint = worst.removesuffix(f" {STANDSTILL}")
-        found.append((f"slow reversals of {joint}", "Dry friction is learned from slow reversals"))
-    narrow = _narrow(seen, joints, limits)
-    if narrow:
-        found.append((f"wider motion of {narrow[0]}", f"{narrow[0]} has moved over {narrow[1]} of its range"))
-    base = (identified or {}).get("base_parameters", ())
-    open_ = [each["name"] for each in base if each["determined"] in ("weak", "may be zero")]
-    if open_:
-        why = f"{len(open_)} of {len(base)} base parameters can hardly be told from zero by these logs"
-        found.append(("faster motion of all joints together (as spelgen excite proposes)", why))
-    return found
-
-
-def _narrow(
-    seen: Mapping[str, Any], joints: Sequence[str], limits: Sequence[tuple[float, float] | None]
-) -> tuple[str, str] | None:
-    """The joint that uses least of its range, where that is little, and how much."""
-    parts = {}
-    for name, found, bound in zip(joints, seen.get("q", ()), limits, strict=False):
-        if bound is not None and bound[1] > bound[0]:
-            parts[name] = (found["high"] - found["low"]) / min(bound[1] - bound[0], 2 * math.pi)
-    least = min(parts, key=parts.__getitem__, default="")
-    return (least, _percent(parts[least])) if least and parts[least] < NARROW else None
-
-
-def _outside(seen: Mapping[str, Any], tested: Mapping[str, Any], joints: Sequence[str]) -> list[str]:
-    found = []
-    for what, word in (("q", "positions"), ("qd", "velocities")):
-        for name, own, other in zip(joints, seen.get(what, ()), tested.get(what, ()), strict=False):
-            room = 0.1 * (own["high"] - own["low"])
-            if other["low"] < own["low"] - room or other["high"] > own["high"] + room:
-                found.append(f"{word} of {name}")
-    return found
-
-
-def _residuals(traces: Mapping[str, Any]) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """By joint: residual torque, measured torque and velocity, of all traces."""
-    torques = traces.get("torques") or []
-    if not torques:
-        return []
-    columns = [
-        np.concatenate([np.array(row(trace), dtype=float) for trace in torques])
-        for row in (lambda x: x["measured"], lambda x: x["predicted"][MODEL], lambda x: x["qd"])
+    worst = _worst_joint(results)
+    recommendations = _recommendations(results, identified or {}, limits, worst)
+    sentence = "Not good enough yet to rely on"
+    if uses.good:
+        sentence = f"Good enough for {listed(uses.good)}"
+    if any(diagnostic.code == SEEN for diagnostic in results.diagnostics):
+        sentence = sentence[0].lower() + sentence[1:]
+        sentence = f"Judged on logs that it was trained on, which proves little: {sentence}"
+    if uses.good and uses.bad:
+        sentence += f", not for {listed(uses.bad)}"
+    if worst.joint:
+        sentence += f"; worst at {worst.joint}{worst.when}"
+    if recommendations:
+        sentence += f"; next, record {recommendations[0].motion}"
+    because = [
+        f"It {listed(uses.proofs)}.",
+        _constant_velocity(results),
+        worst.proof,
+        _better_baselines(results),
     ]
-    return [(a - b, a, qd) for a, b, qd in zip(*(x.T for x in columns), strict=True)]
+    because += [f"{recommendation.reason}." for recommendation in recommendations]
+    return Verdict(f"{sentence}.", " ".join(part for part in because if part))
 
 
-def _shortened(names: Iterable[str]) -> str:
-    names = list(names)
-    return listed(names) if len(names) <= 4 else f"{', '.join(names[:3])} and {len(names) - 3} more"
+def _judge_torques(results: Results, uses: _Uses) -> None:
+    summary = results.torque.get(MODEL)
+    if summary is None or summary.mean_nmse is None:
+        return
+    explained = 1 - summary.mean_nmse
+    if explained >= TUNING.explained_for_contacts:
+        uses.good += ["feed-forward control", "telling contacts from its own error"]
+    elif explained >= TUNING.explained_for_feed_forward:
+        uses.good.append("feed-forward control")
+        uses.bad.append("telling contacts from its own error")
+    elif explained >= TUNING.explained_for_gravity:
+        uses.good.append("gravity compensation")
+        uses.bad.append("feed-forward control")
+    else:
+        uses.bad.append("control")
+    amount = _percent(explained) if explained > 0 else "none"
+    uses.proofs.append(f"explains {amount} of the variance of the torques")
 
 
-def _percent(part: float) -> str:
-    return f"{100 * part:.3g} %" if part < 0.99 or part >= 1 else f"{100 * part:.4g} %"
+def _judge_motion(results: Results, uses: _Uses) -> None:
+    finite = [x for x in results.horizons if x.errors[MODEL].mean_relative_rms is not None]
+    if not finite:
+        if results.horizons:
+            uses.bad.append("simulation")
+            uses.proofs.append("predicts nothing that stays finite")
+        return
+    last = finite[-1]
+    error = _relative(last.errors[MODEL])
+    holding = _relative(last.errors.get(observed(MODEL)))
+    if error <= TUNING.close_prediction:
+        uses.good.append(f"simulation {last.name} ahead")
+    elif error <= TUNING.rough_prediction:
+        uses.good.append(f"rough simulation {last.name} ahead")
+    else:
+        uses.bad.append(f"simulation {last.name} ahead")
+        if holding <= TUNING.rough_prediction:
+            uses.good.append(f"prediction {last.name} ahead with a momentum observer")
+    away = ""
+    tip = last.errors[MODEL].tip_mm
+    if tip is not None:
+        away = f", {number(tip)} mm at the tip"
+    if error <= 1:
+        uses.proofs.append(f"misses {_percent(error)} of the motion after {last.name}{away}")
+    else:
+        uses.proofs.append(f"is off by {error:.3g} times the motion after {last.name}{away}")
+
+
+def _judge_replays(results: Results, uses: _Uses) -> None:
+    if not results.replays:
+        return
+    replay = results.replays[0]
+    own = replay.errors[MODEL].mean
+    if own == min(errors.mean for errors in replay.errors.values()):
+        uses.good.append("simulation from commands")
+    else:
+        uses.bad.append("simulation from commands")
+    unit = thousandths(results.joint_types)
+    uses.proofs.append(f"misses {1000 * own:.3g} {unit} of the positions that follow commands, {replay.name}")
+
+
+def _relative(errors: StateErrors | None) -> float:
+    """Return the mean error relative to the motion; infinite where it is not known."""
+    if errors is None or errors.mean_relative_rms is None:
+        return math.inf
+    return errors.mean_relative_rms
+
+
+def _constant_velocity(results: Results) -> str:
+    """Say at which times ahead a constant velocity is better than the model, with an observer and without."""
+    times = []
+    for horizon in results.horizons:
+        own = min(_relative(horizon.errors.get(name)) for name in (MODEL, observed(MODEL)))
+        if _relative(horizon.errors.get(CONSTANT_VELOCITY)) < own:
+            times.append(horizon.name)
+    if not times:
+        return ""
+    return f"A constant velocity predicts better {listed(times)} ahead: there the model is for torques, not for motion."
+
+
+def _better_baselines(results: Results) -> str:
+    """Say which other baselines are better, at what."""
+    better: dict[str, list[str]] = {}
+    for horizon in results.horizons:
+        errors = {name: _relative(x) for name, x in horizon.errors.items() if name != CONSTANT_VELOCITY}
+        best = min(errors, key=errors.__getitem__)
+        if errors[best] < min(errors[MODEL], errors.get(observed(MODEL), math.inf)):
+            better.setdefault(best, []).append(f"after {horizon.name}")
+    torque = {name: x.mean_nmse for name, x in results.torque.items() if x.mean_nmse is not None}
+    if MODEL in torque:
+        best = min(torque, key=torque.__getitem__)
+        if best != MODEL:
+            better.setdefault(best, []).append("in torque")
+    if not better:
+        return ""
+    return f"But {listed([f'{name} is better {listed(where)}' for name, where in better.items()])}."
+
+
+def _worst_joint(results: Results) -> _Failure:
+    """Return the joint whose torque is explained least, else the one whose motion is."""
+    if results.traces.torques:
+        return _worst_torque(results)
+    if not results.horizons:
+        return _Failure()
+    last = results.horizons[-1]
+    errors = last.errors[MODEL].q_relative_rms
+    if not errors or None in errors:
+        return _Failure()
+    k = int(np.argmax(np.array(errors, dtype=float)))
+    amount = _percent(float(errors[k] or 0))
+    joint = results.joints[k]
+    return _Failure(joint, "", f"At {joint} it misses {amount} of the motion after {last.name}.")
+
+
+def _worst_torque(results: Results) -> _Failure:
+    traces = results.traces.torques
+    measured = np.concatenate([np.array(trace.measured, dtype=float) for trace in traces])  # (T, n)
+    predicted = np.concatenate([np.array(trace.predicted[MODEL], dtype=float) for trace in traces])
+    qd = np.concatenate([np.array(trace.qd, dtype=float) for trace in traces])
+    residual = measured - predicted
+    deviation = np.nanstd(measured, axis=0)
+    ratios = np.sqrt(np.nanmean(residual**2, axis=0)) / np.where(deviation > 0, deviation, math.inf)
+    k = int(np.nanargmax(ratios))
+    joint, when = results.joints[k], ""
+    slow = np.abs(qd[:, k]) < TUNING.slow * np.nanmax(np.abs(qd[:, k]))
+    if 5 < slow.sum() < len(slow) - 5:
+        size_slow, size_fast = (np.sqrt(np.nanmean(residual[x, k] ** 2)) for x in (slow, ~slow))
+        if size_slow > TUNING.uneven * size_fast:
+            when = f" {STANDSTILL}"
+        elif size_fast > TUNING.uneven * size_slow:
+            when = " at speed"
+    amount = _percent(float(ratios[k]))
+    return _Failure(joint, when, f"At {joint} {amount} of the torque's variation is left.")
+
+
+def _recommendations(
+    results: Results, identified: Mapping[str, Any], limits: Limits, worst: _Failure
+) -> list[_Recommendation]:
+    """Return what to record, the most useful first."""
+    recommendations = []
+
+    def recommend(motion: str, reason: str) -> None:
+        recommendations.append(_Recommendation(motion, reason))
+
+    trained = identified.get("coverage") or {}
+    unseen = identified.get("unseen_directions")
+    if unseen:
+        reason = f"The training logs say nothing in {unseen} directions of the base parameters"
+        recommend(f"a richer motion {EXCITE}", reason)
+    outside = _outside(trained, results.traces.coverage, results.joints)
+    if outside:
+        reason = f"The test logs go where the training logs do not: {shortened(outside, 3)}"
+        recommend(f"motion with the {outside[0]} that the test logs have", reason)
+    if worst.when.endswith(STANDSTILL):
+        recommend(f"slow reversals of {worst.joint}", "Dry friction is learned from slow reversals")
+    fractions = _range_fractions(trained, results.joints, limits)
+    if fractions:
+        joint = min(fractions, key=fractions.__getitem__)
+        if fractions[joint] < TUNING.narrow_range:
+            reason = f"{joint} has moved over {_percent(fractions[joint])} of its range"
+            recommend(f"wider motion of {joint}", reason)
+    base = identified.get("base_parameters", ())
+    weak = [parameter for parameter in base if parameter["determined"] in ("weak", "may be zero")]
+    if weak:
+        reason = f"{len(weak)} of {len(base)} base parameters can hardly be told from zero by these logs"
+        recommend(f"faster motion of all joints together {EXCITE}", reason)
+    return recommendations
+
+
+def _range_fractions(trained: Mapping[str, Any], joints: Sequence[str], limits: Limits) -> dict[str, float]:
+    """Return the fraction of its range that each joint has moved over, a turn at most."""
+    fractions = {}
+    for name, covered, bound in zip(joints, trained.get("q", ()), limits, strict=False):
+        if bound is not None and bound[1] > bound[0]:
+            room = min(bound[1] - bound[0], 2 * math.pi)
+            fractions[name] = (covered["high"] - covered["low"]) / room
+    return fractions
+
+
+def _outside(trained: Mapping[str, Any], tested: Mapping[str, Any], joints: Sequence[str]) -> list[str]:
+    """Return where the test logs go beyond the training logs by a tenth of these."""
+    places = []
+    for quantity, word in (("q", "positions"), ("qd", "velocities")):
+        ranges = zip(joints, trained.get(quantity, ()), tested.get(quantity, ()), strict=False)
+        for name, inner, outer in ranges:
+            room = 0.1 * (inner["high"] - inner["low"])
+            if outer["low"] < inner["low"] - room or outer["high"] > inner["high"] + room:
+                places.append(f"{word} of {name}")
+    return places
+
+
+def _percent(fraction: float) -> str:
+    """Return three digits, and four of what is nearly all."""
+    digits = 4 if 0.99 <= fraction < 1 else 3
+    return f"{100 * fraction:.{digits}g} %"

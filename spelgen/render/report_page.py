@@ -11,6 +11,7 @@ from jinja2 import TemplateError
 
 from spelgen.baselines.run_arm import run_arm
 from spelgen.errors import RunError, SpelgenError
+from spelgen.evaluation.results import Results
 from spelgen.evaluation.tables import result_tables
 from spelgen.evaluation.verdict import verdict
 from spelgen.files import write_json, write_text
@@ -58,7 +59,7 @@ def report_data(folder: Path | str) -> dict[str, Any]:
     bodies = None if trained is None else body_parameters(trained)
     return {
         "schema": SCHEMA,
-        "verdict": asdict(verdict(evaluation, identified, limits)) if evaluation else None,
+        "verdict": asdict(verdict(Results.from_dict(evaluation), identified, limits)) if evaluation else None,
         "evaluation": evaluation,
         "least_squares": identified,
         "bodies": None if bodies is None else bodies.tolist(),
@@ -88,6 +89,7 @@ def _rendered(run: RunFolder, robot: Path | str | None) -> str:
     evaluation, identified = (
         run.read_json(path) if path.is_file() else None for path in (run.evaluation, run.baseline)
     )
+    results = Results.from_dict(evaluation) if evaluation else None
     metrics = run.read_metrics()
     arm = _arm(run)
     trained = trained_model(run) if run.weights.is_file() else None
@@ -103,12 +105,12 @@ def _rendered(run: RunFolder, robot: Path | str | None) -> str:
         units=UNITS,
         force=FORCE,
         numbers=head_numbers(learned, config, metrics, evaluation),
-        verdict=verdict(evaluation, identified, limits) if evaluation else None,
+        verdict=verdict(results, identified, limits) if results else None,
         config=config,
         training=training_facts(config, metrics, identified) if config else None,
         evaluation=evaluation,
         predictors=predictors(evaluation),
-        tables=result_tables(evaluation, facts.joint_types) if evaluation else [],
+        tables=result_tables(results) if results else [],
         curves=curves(traces, facts, picture),
         coverage=coverage(traces, identified, facts, limits),
         learned=learned,

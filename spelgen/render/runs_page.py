@@ -11,6 +11,7 @@ from markupsafe import Markup
 
 from spelgen.baselines.names import MODEL
 from spelgen.errors import RunError
+from spelgen.evaluation.results import Results
 from spelgen.evaluation.tables import Table, table
 from spelgen.evaluation.verdict import verdict
 from spelgen.files import write_text
@@ -81,7 +82,7 @@ def _shown(folder: Path, name: str, index: int) -> RunShown:
         facts=read_facts(run.module),
         objective=config["objective"],
         parameters=f"{evaluation['parameters']:,}",
-        verdict=verdict(evaluation, identified).sentence,
+        verdict=verdict(Results.from_dict(evaluation), identified).sentence,
         evaluation=evaluation,
     )
 

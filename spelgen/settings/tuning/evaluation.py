@@ -24,3 +24,31 @@ class EvaluationTuning:
     """[] the same of the Rosenbrock method, which has order two."""
     probed_windows: int = 16
     """[] that say in which steps a baseline is integrated."""
+
+    most_windows: int = 2000
+    """[] that a horizon is judged on, evenly spread."""
+    most_predicted_steps: int = 40_000
+    """[] of a predictor over a horizon: fewer windows where they are long."""
+    probed_model_windows: int = 64
+    """[] that say in which steps the model is integrated."""
+    densest_rate: float = 200.0
+    """[Hz] inputs of denser logs are averaged over horizons that still have as many steps as the next says."""
+    fewest_steps: int = 100
+    """[] of a horizon after that."""
+
+    explained_for_contacts: float = 0.99
+    """[] of the torque's variance; convention of this package, as the next two."""
+    explained_for_feed_forward: float = 0.95
+    """[] likewise."""
+    explained_for_gravity: float = 0.8
+    """[] likewise: what gravity and friction alone come to on most logs."""
+    close_prediction: float = 0.1
+    """[] of the motion: errors up to it are called a simulation."""
+    rough_prediction: float = 0.3
+    """[] of the motion: errors up to it are called a rough simulation."""
+    slow: float = 0.1
+    """[] of a joint's largest velocity: below is called near standstill."""
+    uneven: float = 1.4
+    """[] ratio of slow and fast errors that is worth a word."""
+    narrow_range: float = 0.5
+    """[] of a joint's range: logs that cover less are called narrow."""
