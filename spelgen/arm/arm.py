@@ -19,12 +19,14 @@ Kind = Literal["revolute", "prismatic"]
 
 MOST_JOINTS = 16
 """Longest arm that is taken: what comes after grows with about the fifth power of it."""
+
 MOST_FOLLOWERS = 48
+"""Most joints that follow others by <mimic>: each is a body of its own in all that comes after."""
 
 
 @dataclass(frozen=True)
 class Coordinate:
-    """One degree of freedom; limits as in the file (rad or m, N m or N, per second), None where absent."""
+    """Hold one degree of freedom; limits as in the file (rad or m, N m or N, per second), None where absent."""
 
     name: str
     kind: Kind
@@ -40,7 +42,7 @@ class Coordinate:
 
 @dataclass(frozen=True)
 class Body:
-    """A joint and all that moves rigidly with it.
+    """Hold a joint and all that moves rigidly with it.
 
     ``rotation`` and ``translation`` [m] are the pose of the joint's own frame in the parent body's (the root
     link's for parent -1) at zero position; the joint turns about, or slides along, the +z of its own frame by
@@ -62,7 +64,7 @@ class Body:
 
 @dataclass(frozen=True)
 class Arm:
-    """A serial arm with n coordinates, root first; ``bodies`` hold the chain in its order, parents first.
+    """Hold a serial arm with n coordinates, root first; ``bodies`` hold the chain in its order, parents first.
 
     ``gravity`` [m/s2] is in the root link's frame; ``locked`` names the joints held still; ``diagnostics``
     holds what this step did, the robot's own stay with the robot.
@@ -102,16 +104,17 @@ def make_arm(
     chain = choose_chain(robot, joints, tip)
     _require_small(robot, chain)
     lumped = lump_links(robot, chain, angle_tolerance)
+    # all bodies of one coordinate move with it, so bodies are found by their leader
     indices = {joint.name: index for index, joint in enumerate(chain.joints)}
-    held = {joint.name for joint in lumped.held if joint.type != "fixed"}
+    locked = {joint.name for joint in lumped.held if joint.type != "fixed"}
     x, y, z = (exact(float(value)) for value in gravity)
     return Arm(
         name=robot.name,
         coordinates=tuple(_coordinate(joint) for joint in chain.joints),
-        bodies=tuple(_body(each, indices[each.followed.leader.name]) for each in lumped.moved),
+        bodies=tuple(_body(moved, indices[moved.followed.leader.name]) for moved in lumped.moved),
         gravity=(x, y, z),
         diagnostics=lumped.diagnostics,
-        locked=tuple(joint.name for joint in robot.joints if joint.name in held),
+        locked=tuple(joint.name for joint in robot.joints if joint.name in locked),
     )
 
 
@@ -122,7 +125,8 @@ def _require_small(robot: Robot, chain: Chain) -> None:
         do = "choose fewer with --joints or --tip"
         raise ArmError(f"{moving} joints", file=robot.told_as, expected=f"at most {MOST_JOINTS}", do=do)
     leaders = {joint.name for joint in chain.joints}
-    following = sum(each.leader.name in leaders for each in follows(robot).values()) - moving
+    followed = [follow.leader.name for follow in follows(robot).values()]
+    following = sum(name in leaders for name in followed) - moving
     if following > MOST_FOLLOWERS:
         got = f"{following} joints that follow others by <mimic>"
         raise ArmError(got, file=robot.told_as, expected=f"at most {MOST_FOLLOWERS}", do="fix some of them")
@@ -158,4 +162,6 @@ def _coordinate(joint: Joint) -> Coordinate:
 
 
 def _kind(joint: Joint) -> Kind:
-    return "prismatic" if joint.type == "prismatic" else "revolute"
+    if joint.type == "prismatic":
+        return "prismatic"
+    return "revolute"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -11,13 +11,14 @@ from spelgen.arm.rational import bounded, exact
 from spelgen.errors import ArmError, Diagnostic, Severity, suggestion
 from spelgen.urdf.robot import Joint, Robot
 
+# names of vendors' grippers: what is behind such a joint is no part of the arm
 _GRIPPER = re.compile(r"gripper|finger|thumb|knuckle|(?:^|[^a-z])jaws?(?:[^a-z]|$)", re.IGNORECASE)
 _CHOOSE = "choose one with --tip LINK or --joints A,B,..."
 
 
 @dataclass(frozen=True)
 class Chain:
-    """The chosen joints, root first, and what to tell about the choice."""
+    """Hold the chosen joints, root first, and what to tell about the choice."""
 
     joints: tuple[Joint, ...]
     diagnostics: tuple[Diagnostic, ...] = ()
@@ -25,7 +26,7 @@ class Chain:
 
 @dataclass(frozen=True)
 class Follow:
-    """q = multiplier * q_leader + offset, with a leader that follows nothing."""
+    """Say that q = multiplier * q_leader + offset, with a leader that follows nothing."""
 
     leader: Joint
     multiplier: Fraction
@@ -47,32 +48,37 @@ def choose_chain(robot: Robot, joints: Sequence[str] | None, tip: str | None) ->
     else:
         chain = _longest(robot)
     if not chain.joints:
-        raise ArmError(
-            "no joint that moves by itself", file=robot.told_as, expected="a serial chain of joints"
-        )
+        expected = "a serial chain of joints"
+        raise ArmError("no joint that moves by itself", file=robot.told_as, expected=expected)
     _refuse_free_joints(robot, chain.joints[-1])
     return chain
 
 
 def follows(robot: Robot) -> dict[str, Follow]:
     """Return what each joint follows, through any number of mimic joints; itself where it follows none."""
-    found: dict[str, Follow] = {}
+    result: dict[str, Follow] = {}
     for joint in robot.joints:
-        waiting = []
-        while joint.name not in found and joint.mimic is not None:
-            waiting.append((joint.name, joint.mimic))
-            joint = robot.joint[joint.mimic.joint]
-        followed = found.setdefault(joint.name, Follow(joint, Fraction(1), Fraction(0)))
-        for name, mimic in reversed(waiting):
+        followers = []
+        leader = joint
+        while leader.name not in result and leader.mimic is not None:
+            followers.append((leader.name, leader.mimic))
+            leader = robot.joint[leader.mimic.joint]
+        follow = result.setdefault(leader.name, Follow(leader, Fraction(1), Fraction(0)))
+        # nearest to the leader first: each follows the one before it
+        for name, mimic in reversed(followers):
             multiplier = exact(mimic.multiplier)
-            offset = multiplier * followed.offset + exact(mimic.offset)
-            followed = Follow(followed.leader, bounded(multiplier * followed.multiplier), bounded(offset))
-            found[name] = followed
-    return found
+            offset = multiplier * follow.offset + exact(mimic.offset)
+            follow = Follow(follow.leader, bounded(multiplier * follow.multiplier), bounded(offset))
+            result[name] = follow
+    return result
 
 
-def _is_free(joint: Joint) -> bool:
+def _moves_by_itself(joint: Joint) -> bool:
     return joint.moves and joint.mimic is None
+
+
+def _independent(joints: Iterable[Joint]) -> tuple[Joint, ...]:
+    return tuple(joint for joint in joints if _moves_by_itself(joint))
 
 
 def _refuse_free_joints(robot: Robot, last: Joint) -> None:
@@ -89,15 +95,15 @@ def _refuse_free_joints(robot: Robot, last: Joint) -> None:
 
 
 def _named(robot: Robot, names: Sequence[str]) -> tuple[Joint, ...]:
+    """Return the joints of these names, which must be in their order on one path."""
     chosen = [_usable(robot, name) for name in names]
-    repeated = [name for name in names if list(names).count(name) > 1]
-    if repeated:
-        raise ArmError(f"the joint {repeated[0]!r} twice", file=robot.told_as, expected="each joint once")
+    for name in names:
+        if list(names).count(name) > 1:
+            raise ArmError(f"the joint {name!r} twice", file=robot.told_as, expected="each joint once")
     if not chosen:
         return ()
-    paths = {joint.name: robot.path_to(joint.child) for joint in chosen}
-    deepest = max(chosen, key=lambda joint: len(paths[joint.name]))
-    ordered = tuple(joint for joint in paths[deepest.name] if joint.name in paths)
+    deepest = max(chosen, key=lambda joint: len(robot.path_to(joint.child)))
+    ordered = tuple(joint for joint in robot.path_to(deepest.child) if joint in chosen)
     for joint in chosen:
         if joint not in ordered:
             raise ArmError(
@@ -107,68 +113,73 @@ def _named(robot: Robot, names: Sequence[str]) -> tuple[Joint, ...]:
                 expected="joints on one path from the root",
             )
     if list(ordered) != chosen:
-        told = ",".join(joint.name for joint in ordered)
-        got = f"the joints in the order {','.join(names)}"
         raise ArmError(
-            got, file=robot.told_as, expected="the order from the root to the tip", do=f"use {told}"
+            f"the joints in the order {','.join(names)}",
+            file=robot.told_as,
+            expected="the order from the root to the tip",
+            do=f"use {','.join(joint.name for joint in ordered)}",
         )
     return ordered
 
 
 def _usable(robot: Robot, name: str) -> Joint:
+    """Return the joint of this name, which must move by itself."""
     joint = robot.joint.get(name)
     if joint is None:
-        names = [each.name for each in robot.joints if _is_free(each)]
+        names = [joint.name for joint in _independent(robot.joints)]
         raise ArmError(f"no joint is named {name!r}", file=robot.told_as, do=suggestion(name, names))
-    where = f"joint {name!r}"
-    if not joint.moves:
-        got = f"a {joint.type} joint"
-        expected = "a revolute, continuous or prismatic joint"
-        raise ArmError(got, file=robot.told_as, line=joint.line, element=where, expected=expected)
-    if joint.mimic is not None:
+    if _moves_by_itself(joint):
+        return joint
+    got = f"a {joint.type} joint"
+    expected = "a revolute, continuous or prismatic joint"
+    do = None
+    if joint.moves:
+        got = "a mimic joint"
+        expected = "its leader"
         do = f"name {follows(robot)[name].leader.name!r} instead: what follows it moves with it"
-        raise ArmError(
-            "a mimic joint", file=robot.told_as, line=joint.line, element=where, expected="its leader", do=do
-        )
-    return joint
+    element = f"joint {name!r}"
+    raise ArmError(got, file=robot.told_as, line=joint.line, element=element, expected=expected, do=do)
 
 
 def _up_to(robot: Robot, tip: str) -> tuple[Joint, ...]:
     if tip not in robot.link:
         raise ArmError(f"no link is named {tip!r}", file=robot.told_as, do=suggestion(tip, robot.link))
-    return tuple(joint for joint in robot.path_to(tip) if _is_free(joint))
+    return _independent(robot.path_to(tip))
 
 
 def _longest(robot: Robot) -> Chain:
-    """The longest chain; several of one length are told apart by what is certain, or are an error."""
+    """Return the longest chain; of several of one length, the one that something certain speaks for."""
     chains = _chains(robot)
     length = max((len(chain) for chain in chains), default=0)
     longest = [chain for chain in chains if len(chain) == length]
-    if len(longest) < 2:
-        return Chain(longest[0] if longest else ())
+    if not longest:
+        return Chain(())
+    if len(longest) == 1:
+        return Chain(longest[0])
     if _is_parallel_gripper(longest):
         jaws = ", ".join(repr(chain[-1].name) for chain in longest)
         message = f"{jaws} slide side by side at the end of the chain: taken as a gripper's and locked"
-        return Chain(longest[0][:-1], (_told(longest[0][-1], "info", message),))
+        return Chain(longest[0][:-1], (_remark(longest[0][-1], "info", message),))
     driven = [chain for chain in longest if all(joint.effort != 0 for joint in chain)]
     if len(driven) == 1:
         message = (
             f"{len(longest)} chains of {length} joints: the only one without a joint of effort 0 is taken"
         )
-        return Chain(driven[0], (_told(driven[0][-1], "warning", message),))
+        return Chain(driven[0], (_remark(driven[0][-1], "warning", message),))
     raise _ambiguous(robot, longest)
 
 
-def _told(joint: Joint, severity: Severity, message: str) -> Diagnostic:
+def _remark(joint: Joint, severity: Severity, message: str) -> Diagnostic:
     return Diagnostic(severity, "ambiguous-chain", f"joint {joint.name!r}", joint.line, message)
 
 
 def _chains(robot: Robot) -> list[tuple[Joint, ...]]:
-    """The distinct chains from the root to a tip, without what belongs to a gripper by its name."""
+    """Return the distinct chains from the root to a tip, without what belongs to a gripper by its name."""
     chains: dict[tuple[str, ...], tuple[Joint, ...]] = {}
     for link in robot.links:
         if not robot.joints_below[link.name]:
-            chain = _without_gripper(tuple(joint for joint in robot.path_to(link.name) if _is_free(joint)))
+            chain = _without_gripper(_independent(robot.path_to(link.name)))
+            # fingers fixed side by side end the same chain
             chains.setdefault(tuple(joint.name for joint in chain), chain)
     return list(chains.values())
 
@@ -178,20 +189,24 @@ def _without_gripper(chain: tuple[Joint, ...]) -> tuple[Joint, ...]:
     while end and _GRIPPER.search(chain[end - 1].name):
         end -= 1
     # a chain of nothing but fingers is a finger robot, and the finger is the arm
-    return chain[:end] if end else chain
+    return chain[:end] or chain
 
 
 def _is_parallel_gripper(chains: Sequence[tuple[Joint, ...]]) -> bool:
-    """Chains that differ in a last sliding joint only, all from one link."""
-    lasts = [chain[-1] for chain in chains]
-    same_start = all(chain[:-1] == chains[0][:-1] for chain in chains) and len(chains[0]) > 1
-    return same_start and all(last.type == "prismatic" and last.parent == lasts[0].parent for last in lasts)
+    """Whether chains differ in a last sliding joint only, all from one link."""
+    *arm, jaw = chains[0]
+    for chain in chains:
+        last = chain[-1]
+        if list(chain[:-1]) != arm or last.type != "prismatic" or last.parent != jaw.parent:
+            return False
+    return bool(arm)
 
 
 def _ambiguous(robot: Robot, chains: Sequence[tuple[Joint, ...]]) -> ArmError:
-    listed = " and ".join(
-        f"one to the link {chain[-1].child!r} ({chain[0].name} ... {chain[-1].name})" for chain in chains[:4]
-    )
-    more = f" and {len(chains) - 4} more" if len(chains) > 4 else ""
-    got = f"{len(chains)} chains of {len(chains[0])} joints: {listed}{more}"
+    listed = []
+    for chain in chains[:4]:
+        listed.append(f"one to the link {chain[-1].child!r} ({chain[0].name} ... {chain[-1].name})")
+    if len(chains) > 4:
+        listed.append(f"{len(chains) - 4} more")
+    got = f"{len(chains)} chains of {len(chains[0])} joints: {' and '.join(listed)}"
     return ArmError(got, file=robot.told_as, expected="one longest chain", do=_CHOOSE)

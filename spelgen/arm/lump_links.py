@@ -12,15 +12,15 @@ from spelgen.arm.chain import Chain, Follow, follows
 from spelgen.arm.placement import Placement, Pose, TenVector
 from spelgen.arm.rational import bounded, rotation_from_rpy
 from spelgen.errors import Diagnostic
+from spelgen.settings.tuning.structure import GeometryTuning
 from spelgen.urdf.robot import Joint, Link, Robot
 
-# sine of the angle below which two axes are meant to be parallel, whatever rounding made of them
-_PARALLEL = 1e-2
+TUNING = GeometryTuning()
 
 
 @dataclass(frozen=True)
 class Moved:
-    """A joint that moves, what it follows, where it is, and the ``links`` it carries with their inertia."""
+    """Hold a joint that moves, what it follows, where it is, and the ``links`` it carries with their inertia."""
 
     joint: Joint
     followed: Follow
@@ -31,7 +31,7 @@ class Moved:
 
 @dataclass(frozen=True)
 class LumpedLinks:
-    """All joints: those that move, the chain's first, and those held still, fixed ones included."""
+    """Hold all joints: those that move, the chain's first, and those held still, fixed ones included."""
 
     moved: tuple[Moved, ...]
     held: tuple[Joint, ...]
@@ -53,30 +53,30 @@ def lump_links(robot: Robot, chain: Chain, angle_tolerance: float) -> LumpedLink
         else:
             held.append(joint)
             placement.hold(joint, float(followed.offset) if joint.moves else 0.0)
-    moved = tuple(
-        Moved(joint, following[joint.name], pose, tuple(links), _total(placement, links))
-        for (joint, pose), links in zip(poses, _lumps(robot, placement, len(poses)), strict=True)
-    )
-    told = [
+    moved = []
+    for (joint, pose), links in zip(poses, _lumps(robot, placement, len(poses)), strict=True):
+        moved.append(Moved(joint, following[joint.name], pose, tuple(links), _total(placement, links)))
+    diagnostics = [
         *chain.diagnostics,
         *rounding.diagnostics,
-        *_tell_folded(moved),
-        *_tell_lumped(moved),
-        *_tell_locked(following, held),
-        *_tell_dependent(placement, moved, held),
+        *_folded_remarks(moved),
+        *_lumped_remarks(moved),
+        *_locked_remarks(following, held),
+        *_dependent_remarks(placement, moved, held),
     ]
-    return LumpedLinks(moved, tuple(held), tuple(sorted(told, key=lambda each: each.line or 0)))
+    diagnostics.sort(key=lambda diagnostic: diagnostic.line or 0)
+    return LumpedLinks(tuple(moved), tuple(held), tuple(diagnostics))
 
 
 def _chain_first(robot: Robot, chain: Chain) -> list[Joint]:
-    """All joints, parents first, those on the way to the chain's tip before all others."""
+    """Return all joints, parents first, those on the way to the chain's tip before all others."""
     path = robot.path_to(chain.joints[-1].child)
-    names = {joint.name for joint in path}
-    return [*path, *(joint for joint in robot.joints_from_root if joint.name not in names)]
+    # bodies are numbered in this order, so the chain's come first and followers after them
+    return list(dict.fromkeys([*path, *robot.joints_from_root]))
 
 
 def _lumps(robot: Robot, placement: Placement, count: int) -> list[list[Link]]:
-    """The links with an inertial that each body carries; what the root carries never moves."""
+    """Return the links with an inertial that each body carries; what the root carries never moves."""
     lumps: list[list[Link]] = [[] for _ in range(count)]
     for link in robot.links:
         body = placement.frames[link.name].body
@@ -86,7 +86,7 @@ def _lumps(robot: Robot, placement: Placement, count: int) -> list[list[Link]]:
 
 
 def _total(placement: Placement, links: Sequence[Link]) -> TenVector | None:
-    """The sum of the links' inertias about their body's origin."""
+    """Return the sum of the links' inertias about their body's origin."""
     total: TenVector | None = None
     for link in links:
         if link.inertial is not None:
@@ -99,27 +99,30 @@ def _info(code: str, joint: Joint, message: str) -> Diagnostic:
     return Diagnostic("info", code, f"joint {joint.name!r}", joint.line, message)
 
 
-def _tell_folded(moved: Sequence[Moved]) -> Iterator[Diagnostic]:
-    for each in moved:
-        joint, followed = each.joint, each.followed
-        if joint.mimic is not None:
-            offset = f" plus {float(followed.offset):g}" if followed.offset else ""
-            message = f"moves at {float(followed.multiplier):g} times {followed.leader.name!r}{offset}"
-            yield _info("mimic-folded", joint, message)
+def _folded_remarks(moved: Sequence[Moved]) -> Iterator[Diagnostic]:
+    for body in moved:
+        if body.joint.mimic is not None:
+            followed = body.followed
+            message = f"moves at {float(followed.multiplier):g} times {followed.leader.name!r}"
+            if followed.offset:
+                message += f" plus {float(followed.offset):g}"
+            yield _info("mimic-folded", body.joint, message)
 
 
-def _tell_lumped(moved: Sequence[Moved]) -> Iterator[Diagnostic]:
-    for each in moved:
-        joint = each.joint
-        others = [link for link in each.links if link.name != joint.child]
-        if others:
-            mass = sum(link.inertial.mass for link in others if link.inertial is not None)
-            listed = ", ".join(repr(link.name) for link in others)
-            message = f"also carries {listed} ({mass:.4g} kg) by fixed or locked joints"
-            yield _info("lumped", joint, message)
+def _lumped_remarks(moved: Sequence[Moved]) -> Iterator[Diagnostic]:
+    for body in moved:
+        names = []
+        mass = 0.0
+        for link in body.links:
+            if link.name != body.joint.child and link.inertial is not None:
+                names.append(repr(link.name))
+                mass += link.inertial.mass
+        if names:
+            message = f"also carries {', '.join(names)} ({mass:.4g} kg) by fixed or locked joints"
+            yield _info("lumped", body.joint, message)
 
 
-def _tell_locked(following: Mapping[str, Follow], held: Sequence[Joint]) -> Iterator[Diagnostic]:
+def _locked_remarks(following: Mapping[str, Follow], held: Sequence[Joint]) -> Iterator[Diagnostic]:
     for joint in held:
         if joint.type == "fixed":
             continue
@@ -133,15 +136,20 @@ def _tell_locked(following: Mapping[str, Follow], held: Sequence[Joint]) -> Iter
         yield _info("locked-joint", joint, message)
 
 
-def _tell_dependent(
+def _dependent_remarks(
     placement: Placement, moved: Sequence[Moved], held: Sequence[Joint]
 ) -> Iterator[Diagnostic]:
-    """A locked joint beside a joint of the chain and parallel to it smells of an opened parallelogram."""
+    """Say which locked joints are parallel to one of the chain beside them.
+
+    A locked joint beside a joint of the chain and parallel to it is the mark of an opened parallelogram.
+    """
     behind: set[str] = set()
     for joint in held:
         if joint.moves or joint.parent in behind:
             behind.add(joint.child)
-        if joint.parent in behind or joint.type not in ("revolute", "continuous") or joint.mimic is not None:
+        turns = joint.type in ("revolute", "continuous") and joint.mimic is None
+        # behind a locked joint the arm's own geometry says nothing any more
+        if joint.parent in behind or not turns:
             continue
         beside = _parallel_beside(placement, moved, joint)
         if beside is not None:
@@ -153,13 +161,14 @@ def _tell_dependent(
 
 
 def _parallel_beside(placement: Placement, moved: Sequence[Moved], joint: Joint) -> Joint | None:
-    """The revolute joint that starts from the same moving body as ``joint``, with a parallel axis."""
+    """Return the revolute joint that starts from the same moving body as ``joint``, with a parallel axis."""
     frame = placement.frames[joint.parent]
-    axis = np.array(joint.axis) / np.linalg.norm(joint.axis)
-    axis = np.array(frame.rotation, dtype=float) @ rotation_from_rpy(joint.rpy) @ axis
-    for each in moved:
-        if each.pose.parent == frame.body >= 0 and each.joint.type != "prismatic":
-            other = np.array([float(row[2]) for row in each.pose.rotation])
-            if np.linalg.norm(np.cross(axis, other)) < _PARALLEL:
-                return each.joint
+    rotation = np.array(frame.rotation, dtype=float) @ rotation_from_rpy(joint.rpy)
+    axis = rotation @ np.array(joint.axis) / np.linalg.norm(joint.axis)
+    for body in moved:
+        if body.pose.parent == frame.body >= 0 and body.joint.type != "prismatic":
+            # a body turns about the +z of its own frame
+            beside = np.array(body.pose.rotation, dtype=float)[:, 2]
+            if np.linalg.norm(np.cross(axis, beside)) < TUNING.parallel:
+                return body.joint
     return None

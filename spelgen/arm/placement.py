@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from fractions import Fraction
-from math import inf
 
 import numpy as np
 
@@ -27,6 +26,7 @@ from spelgen.arm.rational import (
     rotated,
     rotated_tensor,
     rotation_about,
+    scaled,
     summed,
     transposed,
 )
@@ -37,7 +37,7 @@ TenVector = tuple[Fraction, ...]
 
 @dataclass(frozen=True)
 class Frame:
-    """A link's frame at zero position, in the frame of the body it moves with (-1: the root link).
+    """Hold a link's frame at zero position, in the frame of the body it moves with (-1: the root link).
 
     ``composed`` (3, 3) is its float64 rotation in the frame of the last revolute body on the way,
     ``rotation`` the exact one in the body's own frame; they differ where prismatic bodies lie between.
@@ -50,19 +50,19 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class _Turned:
-    """A frame's rotation in the frame of the last revolute body before it, (3, 3) float64 and rational."""
+class _StretchFrame:
+    """Hold a frame's rotation in the frame of the last revolute body before it, (3, 3) float64 and rational."""
 
     composed: np.ndarray
     exact: Matrix
 
 
-_STRAIGHT = _Turned(np.eye(3), IDENTITY)
+_STRAIGHT = _StretchFrame(np.eye(3), IDENTITY)
 
 
 @dataclass(frozen=True)
 class Pose:
-    """A joint's own frame, with +z along its axis, in the frame of the body ``parent``."""
+    """Hold a joint's own frame, with +z along its axis, in the frame of the body ``parent``."""
 
     parent: int
     rotation: Matrix
@@ -70,99 +70,110 @@ class Pose:
 
 
 class Placement:
-    """From the root outwards: every joint is either held, or starts a body of its own."""
+    """Place links from the root outwards: every joint is either held, or starts a body of its own."""
 
     def __init__(self, root: str, rounding: AngleRounding) -> None:
         self.frames = {root: Frame(-1, np.eye(3), IDENTITY, ZERO)}
         self._rounding = rounding
         # by body, the frames from the last revolute body above it, or itself, to its own
-        self._stretches: list[tuple[_Turned, ...]] = [(_STRAIGHT,)]
+        self._stretches: list[tuple[_StretchFrame, ...]] = [(_STRAIGHT,)]
 
     def hold(self, joint: Joint, value: float) -> None:
         """Place the child of a joint that stays at ``value`` [rad or m]."""
-        at = self._joint_origin(joint)
+        frame = self._joint_origin(joint)
         if value and joint.type == "prismatic":
-            axis = self._rounding.axis(joint)
-            x, y, z = (exact(float(component)) * exact(value) for component in axis)
-            shifted = self._rounding.position(summed(at.position, rotated(at.rotation, (x, y, z))))
-            at = Frame(at.body, at.composed, at.rotation, shifted)
+            frame = self._slid(frame, self._rounding.axis(joint), value)
         elif value:
             turn = rotation_about(self._rounding.axis(joint), self._rounding.angle(value))
-            composed = at.composed @ turn
-            at = Frame(at.body, composed, self._in_body(at.body, composed), at.position)
-        self.frames[joint.child] = at
+            frame = self._turned(frame, frame.position, turn)
+        self.frames[joint.child] = frame
 
     def move(self, joint: Joint) -> Pose:
         """Place a moving joint and its child, which start a body; bodies are numbered by order of calls."""
-        at = self._joint_origin(joint)
-        turned = alignment(self._rounding.axis(joint))
-        along = at.composed @ turned
-        rotation = self._in_body(at.body, along)
-        slides = joint.type == "prismatic"
-        stretch = self._stretches[at.body + 1]
-        own = _Turned(along, product(stretch[-1].exact, rotation))
+        frame = self._joint_origin(joint)
+        aligning = alignment(self._rounding.axis(joint))
+        aligned = frame.composed @ aligning
+        rotation = self._in_body(frame.body, aligned)
         body = len(self._stretches) - 1
-        composed = at.composed if slides else turned.T
-        self._stretches.append((*stretch, own) if slides else (_STRAIGHT,))
+        if joint.type == "prismatic":
+            # a slide turns nothing, so angles before and after it still add up
+            stretch = self._stretches[frame.body + 1]
+            self._stretches.append((*stretch, _StretchFrame(aligned, product(stretch[-1].exact, rotation))))
+            composed = frame.composed
+        else:
+            self._stretches.append((_STRAIGHT,))
+            composed = aligning.T
         self.frames[joint.child] = Frame(body, composed, self._in_body(body, composed), ZERO)
-        return Pose(at.body, rotation, self._seen_from_both(rotation, at.position))
+        return Pose(frame.body, rotation, self._seen_from_both(rotation, frame.position))
 
     def inertia(self, link: Link, inertial: Inertial) -> TenVector:
-        """The link's (m, m c, I) about its body's origin, in the body's frame (parallel-axis theorem)."""
-        frame = self.frames[link.name]
+        """Return the link's (m, m c, I) about its body's origin, in the body's frame (parallel-axis theorem)."""
         offset, turn = self._rounding.inertial_origin(link, inertial)
-        rotation = frame.rotation if turn is None else self._in_body(frame.body, frame.composed @ turn)
-        x, y, z = self._rounding.position(summed(frame.position, rotated(frame.rotation, offset)))
+        frame = self._turned(self.frames[link.name], self._offset(self.frames[link.name], offset), turn)
         mass = exact(inertial.mass)
-        xx, xy, xz, yy, yz, zz = rotated_tensor(rotation, self._rounding.tensor(link, inertial))
+        x, y, z = frame.position
+        hx, hy, hz = scaled(mass, frame.position)
+        xx, xy, xz, yy, yz, zz = rotated_tensor(frame.rotation, self._rounding.tensor(link, inertial))
         return (
-            mass,
-            mass * x,
-            mass * y,
-            mass * z,
-            xx + mass * (y * y + z * z),
-            xy - mass * x * y,
-            xz - mass * x * z,
-            yy + mass * (x * x + z * z),
-            yz - mass * y * z,
-            zz + mass * (x * x + y * y),
+            *(mass, hx, hy, hz),
+            *(xx + hy * y + hz * z, xy - hx * y, xz - hx * z),
+            *(yy + hx * x + hz * z, yz - hy * z, zz + hx * x + hy * y),
         )
 
     def _joint_origin(self, joint: Joint) -> Frame:
         frame = self.frames[joint.parent]
         offset, turn = self._rounding.joint_origin(joint)
-        position = self._rounding.position(summed(frame.position, rotated(frame.rotation, offset)))
+        return self._turned(frame, self._offset(frame, offset), turn)
+
+    def _offset(self, frame: Frame, offset: Vector) -> Vector:
+        return self._rounding.position(summed(frame.position, rotated(frame.rotation, offset)))
+
+    def _slid(self, frame: Frame, axis: np.ndarray, value: float) -> Frame:
+        x, y, z = map(exact, axis.tolist())
+        position = self._offset(frame, scaled(exact(value), (x, y, z)))
+        return Frame(frame.body, frame.composed, frame.rotation, position)
+
+    def _turned(self, frame: Frame, position: Vector, turn: np.ndarray | None) -> Frame:
+        """Return ``frame`` turned by ``turn`` (3, 3), None for not at all, and at ``position``."""
         if turn is None:
             return Frame(frame.body, frame.composed, frame.rotation, position)
         composed = frame.composed @ turn
         return Frame(frame.body, composed, self._in_body(frame.body, composed), position)
 
     def _seen_from_both(self, rotation: Matrix, position: Vector) -> Vector:
-        """The position of a joint, without noise in its parent's frame nor, where both can be, in its own.
+        """Return the position of a joint without noise in its parent's frame nor, where both can be, in its own.
 
         An offset of (0.1, 0.1, 0) goes exactly along an axis of 45 degrees, but not along a rational one.
         """
-        own = self._rounding.position(rotated(transposed(rotation), position))
-        moved = self._rounding.position(rotated(rotation, own))
-        return moved if rotated(transposed(rotation), moved) == own else position
+        in_own_frame = self._rounding.position(rotated(transposed(rotation), position))
+        moved = self._rounding.position(rotated(rotation, in_own_frame))
+        if rotated(transposed(rotation), moved) == in_own_frame:
+            return moved
+        return position
 
     def _in_body(self, body: int, composed: np.ndarray) -> Matrix:
-        """The exact rotation in the body's frame of what is turned by ``composed`` in its stretch's.
+        """Return the exact rotation in the body's frame of what is turned by ``composed`` in its stretch's.
 
-        It is made rational in the frame, of those on the way, in which it then keeps most zeros seen from
-        all of them: an axis of 45 degrees, no rational one, may be square to several.
+        It is made rational in that frame of the stretch in which it then keeps most zeros seen from all of them: an
+        axis of 45 degrees, no rational one, may be square to several.
         """
         stretch = self._stretches[body + 1]
-        seen = [frame.composed.T @ composed for frame in stretch]
-        best, fewest = IDENTITY, inf
-        for frame, turned in zip(stretch, seen, strict=True):
-            candidate = product(frame.exact, exact_rotation(turned))
-            lost = sum(
-                lost_zeros(product(transposed(other.exact), candidate), view)
-                for other, view in zip(stretch, seen, strict=True)
-            )
-            if lost < fewest:
+        best = IDENTITY
+        fewest: int | None = None
+        for frame in stretch:
+            candidate = product(frame.exact, exact_rotation(frame.composed.T @ composed))
+            lost = _zeros_lost(stretch, composed, candidate)
+            if fewest is None or lost < fewest:
                 best, fewest = candidate, lost
             if not lost:
                 break
         return product(transposed(stretch[-1].exact), best)
+
+
+def _zeros_lost(stretch: tuple[_StretchFrame, ...], composed: np.ndarray, candidate: Matrix) -> int:
+    """Count the zeros, seen from the frames of a stretch, that a rational rotation has lost."""
+    lost = 0
+    for frame in stretch:
+        seen = product(transposed(frame.exact), candidate)
+        lost += lost_zeros(seen, frame.composed.T @ composed)
+    return lost

@@ -91,6 +91,11 @@ class Transmission:
     line: int
     errors: tuple[UrdfError, ...] = ()
 
+    @property
+    def joint_names(self) -> list[str]:
+        """Names of the joints that it drives."""
+        return [name for name, _, _ in self.joints]
+
 
 @dataclass(frozen=True)
 class Robot:
