@@ -1,4 +1,4 @@
-"""How joints and entries are named in pictures and sentences about a structure."""
+"""Name joints and entries in pictures and sentences about a structure."""
 
 from __future__ import annotations
 
@@ -6,51 +6,75 @@ from collections.abc import Sequence
 
 
 def joint_ranges(joints: tuple[int, ...]) -> str:
-    """The joints' numbers, from 1, with runs of three and more shortened: ``2-6`` or ``2,4``."""
+    """Return the joints' numbers, from 1, with runs of three and more shortened: ``2-6`` or ``2,4``."""
     runs: list[list[int]] = []
     for joint in joints:
         if runs and joint == runs[-1][-1] + 1:
             runs[-1].append(joint)
         else:
             runs.append([joint])
-    return ",".join(
-        f"{run[0] + 1}-{run[-1] + 1}" if len(run) > 2 else ",".join(str(joint + 1) for joint in run)
-        for run in runs
-    )
+    texts = []
+    for run in runs:
+        if len(run) > 2:
+            texts.append(f"{run[0] + 1}-{run[-1] + 1}")
+        else:
+            texts += [str(joint + 1) for joint in run]
+    return ",".join(texts)
 
 
 def joints_in_ranges(joints: tuple[int, ...]) -> str:
-    """``joint 2``, or ``joints 2-4,6``."""
-    return f"joint{'s' * (len(joints) > 1)} {joint_ranges(joints)}"
+    """Return ``joint 2``, or ``joints 2-4,6``."""
+    return f"{_plural('joint', joints)} {joint_ranges(joints)}"
 
 
 def entry_name(row: int, column: int) -> str:
-    """How an entry of M is called, from its 0-based place: M21, or M12,1 from ten joints on."""
-    separator = "," if max(row, column) >= 9 else ""
-    return f"M{row + 1}{separator}{column + 1}"
+    """Return how an entry of M is called, from its 0-based place: M21, or M12,1 from ten joints on."""
+    if max(row, column) >= 9:
+        return f"M{row + 1},{column + 1}"
+    return f"M{row + 1}{column + 1}"
 
 
 def joints_told(joints: Sequence[int]) -> str:
-    """``joint 2``, or ``joints 2, 3 and 5``."""
-    return f"joint{'s' * (len(joints) > 1)} {listed([str(joint + 1) for joint in sorted(joints)])}"
+    """Return ``joint 2``, or ``joints 2, 3 and 5``."""
+    return f"{_plural('joint', joints)} {listed([str(joint + 1) for joint in sorted(joints)])}"
 
 
 def axes_told(joints: Sequence[int]) -> str:
-    """``the axis of joint 2``, or ``the axes of joints 2 and 3``."""
-    return f"the {'axis' if len(joints) == 1 else 'axes'} of {joints_told(joints)}"
+    """Return ``the axis of joint 2``, or ``the axes of joints 2 and 3``."""
+    if len(joints) == 1:
+        return f"the axis of {joints_told(joints)}"
+    return f"the axes of {joints_told(joints)}"
 
 
-def listed(parts: Sequence[str]) -> str:
-    """``a``, or ``a, b and c``."""
-    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
+def listed(names: Sequence[str]) -> str:
+    """Return ``a``, or ``a, b and c``."""
+    *others, last = names
+    if not others:
+        return last
+    return f"{', '.join(others)} and {last}"
 
 
-def printable(text: str, kept: str = "") -> str:
-    """Text from a file, with what could steer a terminal made visible, but for the characters ``kept``."""
-    return "".join(c if c.isprintable() or c in kept else c.encode("unicode_escape").decode() for c in text)
+def printable(text: str, allowed: str = "") -> str:
+    """Return text from a file, with what could steer a terminal made visible, but for the characters ``allowed``."""
+    characters = []
+    for character in text:
+        if not character.isprintable() and character not in allowed:
+            character = character.encode("unicode_escape").decode()
+        characters.append(character)
+    return "".join(characters)
 
 
 def thousandths(joint_types: Sequence[str]) -> str:
-    """The unit of small distances of these joints: ``mrad``, ``mm`` or, of both kinds, ``mrad, mm``."""
-    slides = [kind == "prismatic" for kind in joint_types]
-    return "mrad, mm" if len({*slides}) != 1 else "mm" if slides[0] else "mrad"
+    """Return the unit of small distances of these joints: ``mrad``, ``mm`` or, of both kinds, ``mrad, mm``."""
+    kinds = {kind == "prismatic" for kind in joint_types}
+    if kinds == {True}:
+        return "mm"
+    if kinds == {False}:
+        return "mrad"
+    return "mrad, mm"
+
+
+def _plural(noun: str, items: Sequence[int]) -> str:
+    if len(items) > 1:
+        return f"{noun}s"
+    return noun

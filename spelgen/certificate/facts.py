@@ -1,4 +1,4 @@
-"""Structure -> plain words: which entries are zero, constant or equal, which joints do not matter, and why.
+"""Say a structure in plain words: which entries are zero, constant or equal, which joints do not matter, and why.
 
 A reason is given only where the arm's exact geometry proves it (``reasons``).
 """
@@ -13,7 +13,6 @@ from spelgen.arm.arm import Arm
 from spelgen.certificate import reasons
 from spelgen.certificate.axes import Axes, is_plain
 from spelgen.labels import axes_told, entry_name, joints_told, listed
-from spelgen.structure.basis import Constant, Output
 from spelgen.structure.structure import Entry, Structure
 
 Reason = str | None
@@ -21,7 +20,7 @@ Reason = str | None
 
 @dataclass(frozen=True)
 class Fact:
-    """Something that always holds, what it means for the model, and why it holds.
+    """Hold something that always holds, what it means for the model, and why it holds.
 
     ``reason`` is None where geometry gives no simple one, and where bodies share a coordinate: there the
     exact ranks tell the fact and nothing more.
@@ -32,132 +31,174 @@ class Fact:
     reason: Reason
 
     def to_dict(self) -> dict[str, Reason]:
-        """The three fields as a JSON object."""
+        """Return the three fields as a JSON object."""
         return asdict(self)
 
     def __str__(self) -> str:
-        because = f": {self.reason}" if self.reason else ""
-        return f"{self.statement}{because}. {self.means}."
+        if self.reason:
+            return f"{self.statement}: {self.reason}. {self.means}."
+        return f"{self.statement}. {self.means}."
 
 
 def facts(arm: Arm, structure: Structure) -> tuple[Fact, ...]:
-    """What holds of M and V at all configurations, with the reason where geometry gives a simple one."""
-    axes = Axes(arm) if is_plain(arm) else None
+    """Return what holds of M and V at all configurations, with the reason where geometry gives a simple one."""
+    axes = None
+    if is_plain(arm):
+        axes = Axes(arm)
+    words = _Words(structure, axes)
     return (
-        *_zeros(axes, structure),
-        *_constants(axes, structure),
-        *_equalities(axes, structure),
-        *_idle_joints(axes, structure),
-        *_potential(axes, structure),
+        *words.zeros(),
+        *words.constants(),
+        *words.equalities(),
+        *words.idle_joints(),
+        *words.potential(),
     )
 
 
-def _zeros(axes: Axes | None, structure: Structure) -> Iterator[Fact]:
-    """Zeros along an axis by the joint that slides, right angles by a joint many have, then the others."""
-    along: dict[int, list[Entry]] = {}
-    across, left = [], []
-    for entry in structure.entries:
-        a, b = entry.row, entry.column
-        if entry.kind != "zero":
-            continue
-        if axes is not None and axes.slides[a] != axes.slides[b] and axes.parallel(a, b):
-            along.setdefault(a if axes.slides[a] else b, []).append(entry)
-        elif axes is not None and axes.slides[a] and axes.slides[b] and axes.perpendicular(a, b):
-            across.append(entry)
-        else:
-            left.append(entry)
-    for slider, group in sorted(along.items()):
-        which = f"joint {slider + 1} slides along {axes_told(_others(group, slider))}"
-        yield _zero(group, f"{which}, and what turns about an axis never moves along it")
-    while across:
-        places = [joint for entry in across for joint in (entry.row, entry.column)]
-        most = max(sorted(set(places)), key=places.count)
-        group = [entry for entry in across if most in (entry.row, entry.column)]
-        across = [entry for entry in across if entry not in group]
-        yield _zero(group, f"joint {most + 1} slides at right angles to {joints_told(_others(group, most))}")
-    for reason, group in _by_reason(axes, structure, left, reasons.balance_reason):
-        yield _zero(group, reason)
+@dataclass(frozen=True)
+class _Words:
+    """Say what holds of a structure; ``axes`` is None where bodies share coordinates, and no reason is sought."""
+
+    structure: Structure
+    axes: Axes | None
+
+    def _reason(self, why: Callable[..., Reason], *subject: object) -> Reason:
+        if self.axes is None:
+            return None
+        return why(self.axes, self.structure, *subject)
+
+    def zeros(self) -> Iterator[Fact]:
+        """Yield zeros along an axis by the joint that slides, right angles by a joint many have, then the others."""
+        along: dict[int, list[Entry]] = {}
+        across: list[Entry] = []
+        others: list[Entry] = []
+        for entry in self.structure.entries:
+            if entry.kind != "zero":
+                continue
+            slider = self._slides_along(entry)
+            if slider is not None:
+                along.setdefault(slider, []).append(entry)
+            elif self._slide_across(entry):
+                across.append(entry)
+            else:
+                others.append(entry)
+        for slider, group in sorted(along.items()):
+            axes = axes_told(_other_joints(group, slider))
+            yield _zero(
+                group,
+                f"joint {slider + 1} slides along {axes}, and what turns about an axis never moves along it",
+            )
+        while across:
+            # one sentence for the joint in most entries that are left; of several, the nearest to the root
+            joints = [joint for entry in across for joint in (entry.row, entry.column)]
+            common = max(sorted(set(joints)), key=joints.count)
+            group = [entry for entry in across if common in (entry.row, entry.column)]
+            across = [entry for entry in across if entry not in group]
+            which = joints_told(_other_joints(group, common))
+            yield _zero(group, f"joint {common + 1} slides at right angles to {which}")
+        for reason, group in self._by_reason(others, reasons.balance_reason):
+            yield _zero(group, reason)
+
+    def _slides_along(self, entry: Entry) -> int | None:
+        """Return the joint of the two that slides along the axis about which the other one turns."""
+        axes, a, b = self.axes, entry.row, entry.column
+        if axes is None or axes.slides[a] == axes.slides[b] or not axes.parallel(a, b):
+            return None
+        if axes.slides[a]:
+            return a
+        return b
+
+    def _slide_across(self, entry: Entry) -> bool:
+        axes, a, b = self.axes, entry.row, entry.column
+        return axes is not None and axes.slides[a] and axes.slides[b] and axes.perpendicular(a, b)
+
+    def constants(self) -> Iterator[Fact]:
+        entries = [entry for entry in self.structure.entries if entry.kind == "constant"]
+        for reason, group in self._by_reason(entries, reasons.constant_reason):
+            means = "They need numbers, no network"
+            if len(group) == 1:
+                means = "It needs a number, no network"
+            yield Fact(f"{_names_are(group)} constant", means, reason)
+
+    def _by_reason(
+        self, entries: Sequence[Entry], why: Callable[[Axes, Structure, Entry], Reason]
+    ) -> Iterator[tuple[Reason, list[Entry]]]:
+        """Yield the entries grouped by their reasons, those without one last."""
+        groups: dict[Reason, list[Entry]] = {}
+        for entry in entries:
+            groups.setdefault(self._reason(why, entry), []).append(entry)
+        for reason, group in sorted(groups.items(), key=lambda item: item[0] is None):
+            if reason is not None:
+                reason = reason.format(axes=axes_told(sorted({entry.column for entry in group})))
+            yield reason, group
+
+    def equalities(self) -> Iterator[Fact]:
+        """Yield entries that are equal, or opposite, at every configuration: the smallest form writes them alike."""
+        terms: dict[tuple[int, int], dict[int, Fraction]] = {}
+        for number, term in enumerate((*self.structure.outputs, *self.structure.constants)):
+            for row, column, factor in term.basis:
+                terms.setdefault((row, column), {})[number] = factor
+        groups: dict[tuple[tuple[int, Fraction], ...], dict[tuple[int, int], bool]] = {}
+        for entry, factors in sorted(terms.items()):
+            # entries are opposite where all factors are: so the first one's sign is taken out
+            positive = factors[min(factors)] > 0
+            if not positive:
+                factors = {number: -factor for number, factor in factors.items()}
+            groups.setdefault(tuple(sorted(factors.items())), {})[entry] = positive
+        for group in groups.values():
+            if len(group) > 1:
+                entries = list(group)
+                names = []
+                for entry in entries:
+                    sign = "" if group[entry] == group[entries[0]] else "-"
+                    names.append(sign + entry_name(*entry))
+                reason = self._reason(reasons.equality_reason, entries)
+                yield Fact(f"{' = '.join(names)} always", "One of them is learned", reason)
+
+    def idle_joints(self) -> Iterator[Fact]:
+        """Yield joints that no entry of M depends on."""
+        read: set[int] = set()
+        for entry in self.structure.entries:
+            read.update(entry.joints)
+        if not read:
+            return  # every entry is zero or constant, which has been said
+        for joint in range(len(self.structure.joints)):
+            if joint not in read:
+                reason = self._reason(reasons.idle_reason, joint)
+                yield Fact(f"M does not depend on joint {joint + 1}", "No network of M reads it", reason)
+
+    def potential(self) -> Iterator[Fact]:
+        if not self.structure.potential:
+            yield Fact("V is zero", "It needs no network", self._reason(reasons.potential_reason))
+            return
+        groups: dict[Reason, list[int]] = {}
+        for joint in range(len(self.structure.joints)):
+            if joint not in self.structure.potential:
+                groups.setdefault(self._reason(reasons.weightless_reason, joint), []).append(joint)
+        for reason, group in groups.items():
+            means = f"The network of V does not read {_pronoun(group)}"
+            yield Fact(f"V does not depend on {joints_told(group)}", means, reason)
 
 
 def _zero(group: Sequence[Entry], reason: Reason) -> Fact:
-    return Fact(f"{_are(group)} always zero", f"Nothing is learned for {_it(group)}", reason)
+    return Fact(f"{_names_are(group)} always zero", f"Nothing is learned for {_pronoun(group)}", reason)
 
 
-def _constants(axes: Axes | None, structure: Structure) -> Iterator[Fact]:
-    entries = [entry for entry in structure.entries if entry.kind == "constant"]
-    for reason, group in _by_reason(axes, structure, entries, reasons.constant_reason):
-        means = "It needs a number" if len(group) == 1 else "They need numbers"
-        yield Fact(f"{_are(group)} constant", f"{means}, no network", reason)
-
-
-def _by_reason(
-    axes: Axes | None,
-    structure: Structure,
-    entries: Sequence[Entry],
-    why: Callable[[Axes, Structure, Entry], Reason],
-) -> Iterator[tuple[Reason, list[Entry]]]:
-    """The entries grouped by their reasons, those without one last."""
-    groups: dict[Reason, list[Entry]] = {}
+def _other_joints(entries: Sequence[Entry], joint: int) -> list[int]:
+    joints: set[int] = set()
     for entry in entries:
-        groups.setdefault(None if axes is None else why(axes, structure, entry), []).append(entry)
-    for reason, group in sorted(groups.items(), key=lambda item: item[0] is None):
-        axes_of_columns = axes_told(sorted({entry.column for entry in group}))
-        yield reason and reason.format(axes=axes_of_columns), group
+        joints.update((entry.row, entry.column))
+    return sorted(joints - {joint})
 
 
-def _equalities(axes: Axes | None, structure: Structure) -> Iterator[Fact]:
-    """Entries that are equal, or opposite, at every configuration: the smallest form writes them alike."""
-    terms: tuple[Output | Constant, ...] = (*structure.outputs, *structure.constants)
-    factors: dict[tuple[int, int], dict[int, Fraction]] = {}
-    for number, term in enumerate(terms):
-        for row, column, factor in term.basis:
-            factors.setdefault((row, column), {})[number] = factor
-    groups: dict[tuple[tuple[int, Fraction], ...], list[tuple[Fraction, tuple[int, int]]]] = {}
-    for place, of_entry in sorted(factors.items()):
-        sign = Fraction(1 if of_entry[min(of_entry)] > 0 else -1)
-        groups.setdefault(tuple(sorted((k, sign * x) for k, x in of_entry.items())), []).append((sign, place))
-    for group in groups.values():
-        if len(group) > 1:
-            first = group[0][0]
-            names = [("" if sign == first else "-") + entry_name(*place) for sign, place in group]
-            places = [place for _, place in group]
-            reason = None if axes is None else reasons.equality_reason(axes, structure, places)
-            yield Fact(f"{' = '.join(names)} always", "One of them is learned", reason)
-
-
-def _idle_joints(axes: Axes | None, structure: Structure) -> Iterator[Fact]:
-    """Joints that no entry of M depends on."""
-    matter = {joint for entry in structure.entries for joint in entry.joints}
-    if matter:  # else every entry is zero or constant, which has been told
-        for joint in range(len(structure.joints)):
-            if joint not in matter:
-                reason = None if axes is None else reasons.idle_reason(axes, structure, joint)
-                yield Fact(f"M does not depend on joint {joint + 1}", "No network of M reads it", reason)
-
-
-def _potential(axes: Axes | None, structure: Structure) -> Iterator[Fact]:
-    if not structure.potential:
-        reason = None if axes is None else reasons.potential_reason(axes)
-        yield Fact("V is zero", "It needs no network", reason)
-        return
-    groups: dict[Reason, list[int]] = {}
-    for joint in range(len(structure.joints)):
-        if joint not in structure.potential:
-            reason = None if axes is None else reasons.weightless_reason(axes, structure, joint)
-            groups.setdefault(reason, []).append(joint)
-    for reason, group in groups.items():
-        means = f"The network of V does not read {'it' if len(group) == 1 else 'them'}"
-        yield Fact(f"V does not depend on {joints_told(group)}", means, reason)
-
-
-def _others(entries: Sequence[Entry], joint: int) -> list[int]:
-    return sorted({each for entry in entries for each in (entry.row, entry.column)} - {joint})
-
-
-def _are(entries: Sequence[Entry]) -> str:
+def _names_are(entries: Sequence[Entry]) -> str:
     names = [entry_name(entry.row, entry.column) for entry in entries]
-    return f"{listed(names)} {'is' if len(names) == 1 else 'are'}"
+    if len(names) == 1:
+        return f"{names[0]} is"
+    return f"{listed(names)} are"
 
 
-def _it(entries: Sequence[Entry]) -> str:
-    return "it" if len(entries) == 1 else "them"
+def _pronoun(things: Sequence[object]) -> str:
+    if len(things) == 1:
+        return "it"
+    return "them"

@@ -1,4 +1,4 @@
-"""Closed forms as files: LaTeX to be read in from a document that loads amsmath, and Python that needs SymPy alone.
+"""Write closed forms as files: LaTeX for a document that loads amsmath, and Python that needs SymPy alone.
 
 Every name in a formula is made from numbers; the URDF's names stand in comments only, as JSON strings, which
 have neither line ends nor control characters.
@@ -7,7 +7,7 @@ have neither line ends nor control characters.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 from sympy import Expr, Symbol
 
@@ -29,15 +29,21 @@ values: what the URDF gives them, where it has inertials.
 '''
 
 
-def latex(found: Formulas) -> str:
-    """The formulas and the definitions of their parameters in two ``align*`` environments."""
-    rows = [(Symbol(each.name), each.expression) for each in found.rows if each.expression is not None]
-    definitions = [each for each in found.base_parameters.items() if not each[1].is_Symbol]
+def latex(formulas: Formulas) -> str:
+    """Return the formulas and the definitions of their parameters in two ``align*`` environments."""
+    rows = []
+    for row in formulas.rows:
+        if row.expression is not None:
+            rows.append((Symbol(row.name), row.expression))
+    definitions = []
+    for name, definition in formulas.base_parameters.items():
+        if not definition.is_Symbol:
+            definitions.append((name, definition))
     lines = ["% Closed forms of a serial arm's mass matrix and potential energy, by spelgen; needs amsmath."]
-    lines += [f"% {line}" for line in _comments(found)]
-    for each in (rows, definitions):
-        if each:
-            lines += [r"\begin{align*}", " \\\\\n".join(_aligned(each)), r"\end{align*}"]
+    lines += [f"% {line}" for line in _comments(formulas)]
+    for equations in (rows, definitions):
+        if equations:
+            lines += [r"\begin{align*}", " \\\\\n".join(_aligned(equations)), r"\end{align*}"]
     return "\n".join(lines) + "\n"
 
 
@@ -45,53 +51,60 @@ def _aligned(rows: Iterable[tuple[Symbol, Expr]]) -> Iterable[str]:
     printer = Latex()
     for name, expression in rows:
         first, *others = printer.lines(expression, f"{printer.whole(name)} &= ", _LATEX_WIDTH)
-        yield from [first, *(rf"    &\quad {line.strip()}" for line in others)]
+        yield first
+        for line in others:
+            yield rf"    &\quad {line.strip()}"
 
 
-def sympy_source(found: Formulas) -> str:
-    """The text of the file for SymPy."""
-    n = len(found.q)
-    body = _table("entries", {str(place): entry for place, entry in found.entries.items()})
-    if len(found.entries) == n * (n + 1) // 2:
+def sympy_source(formulas: Formulas) -> str:
+    """Return the text of the file for SymPy."""
+    n = len(formulas.q)
+    body = _table("entries", {str(place): entry for place, entry in formulas.entries.items()})
+    if formulas.mass_matrix is not None:
         body.append(f"M = Matrix({n}, {n}, lambda i, j: entries[max(i, j) + 1, min(i, j) + 1])")
     body.append("")
-    if found.potential is not None:
-        body += ["V = (", *Python().lines(found.potential, "    ", _PYTHON_WIDTH), ")", ""]
-    body += _table("base_parameters", found.base_parameters)
-    body += _table("values", found.values)
-    return "\n".join([_HEAD, *_beginning(found, "\n".join(body)), *body]) + "\n"
+    if formulas.potential is not None:
+        body += ["V = (", *Python().lines(formulas.potential, "    ", _PYTHON_WIDTH), ")", ""]
+    body += _table("base_parameters", formulas.base_parameters)
+    body += _table("values", formulas.values)
+    return "\n".join([_HEAD, *_beginning(formulas, "\n".join(body)), *body]) + "\n"
 
 
-def _table(name: str, rows: dict[str, Expr] | dict[Symbol, Expr]) -> list[str]:
-    printer = Python()
-    lines = [
-        printer.lines(expression, f"    {key}: ", _PYTHON_WIDTH, end=",") for key, expression in rows.items()
-    ]
-    return [f"{name} = {{", *(line for each in lines for line in each), "}"]
+def _table(name: str, rows: Mapping[str, Expr] | Mapping[Symbol, Expr]) -> list[str]:
+    lines = [f"{name} = {{"]
+    for key, expression in rows.items():
+        lines += Python().lines(expression, f"    {key}: ", _PYTHON_WIDTH, end=",")
+    return [*lines, "}"]
 
 
-def _beginning(found: Formulas, body: str) -> list[str]:
-    """Comments, imports of what ``body`` uses, and the symbols."""
-    called = ("Add", "Float", "Matrix", "Rational", "cos", "sin")
-    imported = [*(name for name in called if f"{name}(" in body), "Symbol"]
-    parts = {symbol for each in found.base_parameters.values() for symbol in each.free_symbols}
-    positions = [symbol.name for symbol in found.q]
-    names = dict.fromkeys([*sorted(symbol.name for symbol in parts), *(each.name for each in found.base)])
-    return [
-        *(f"# {line}" for line in _comments(found)),
-        "",
-        f"from sympy import {', '.join(sorted(imported))}",
-        "",
-        *(f'{name} = Symbol("{name}", real=True)' for name in (*positions, *names)),
-        f"q = ({', '.join(positions)}{',' * (len(positions) == 1)})",
-        "",
-    ]
+def _beginning(formulas: Formulas, body: str) -> list[str]:
+    """Return comments, imports of what ``body`` uses, and the symbols."""
+    imported = ["Symbol"]
+    for name in ("Add", "Float", "Matrix", "Rational", "cos", "sin"):
+        if f"{name}(" in body:
+            imported.append(name)
+    inertial: set[str] = set()
+    for definition in formulas.base_parameters.values():
+        inertial.update(symbol.name for symbol in definition.free_symbols)
+    positions = [symbol.name for symbol in formulas.q]
+    bases = [base.name for base in formulas.base]
+    lines = [f"# {line}" for line in _comments(formulas)]
+    lines += ["", f"from sympy import {', '.join(sorted(imported))}", ""]
+    for name in dict.fromkeys([*positions, *sorted(inertial), *bases]):
+        lines.append(f'{name} = Symbol("{name}", real=True)')
+    # the last comma makes a tuple of one position too
+    return [*lines, f"q = ({', '.join(positions)}{',' * (len(positions) == 1)})", ""]
 
 
-def _comments(found: Formulas) -> list[str]:
-    """Which robot, joints and bodies the numbers in the names stand for."""
-    lines = [f"Robot {json.dumps(found.arm.name)}, for {found.trusted}."]
-    lines += [f"q{k + 1}: {json.dumps(each.name)}" for k, each in enumerate(found.arm.coordinates)]
-    if [each.name for each in found.arm.bodies] != [each.name for each in found.arm.coordinates]:
-        lines += [f"body {k + 1}: {json.dumps(each.name)}" for k, each in enumerate(found.arm.bodies)]
-    return lines + [f"{each.name}: {each.omission}" for each in found.unwritten]
+def _comments(formulas: Formulas) -> list[str]:
+    """Return which robot, joints and bodies the numbers in the names stand for."""
+    arm = formulas.arm
+    lines = [f"Robot {json.dumps(arm.name)}, for {formulas.trusted}."]
+    for number, coordinate in enumerate(arm.coordinates, start=1):
+        lines.append(f"q{number}: {json.dumps(coordinate.name)}")
+    if [body.name for body in arm.bodies] != [coordinate.name for coordinate in arm.coordinates]:
+        for number, body in enumerate(arm.bodies, start=1):
+            lines.append(f"body {number}: {json.dumps(body.name)}")
+    for row in formulas.unwritten:
+        lines.append(f"{row.name}: {row.omission}")
+    return lines

@@ -1,4 +1,4 @@
-"""Closed forms of M(q) and V(q), linear in the base inertial parameters, as SymPy expressions.
+"""Derive closed forms of M(q) and V(q), linear in the base inertial parameters, as SymPy expressions.
 
 Each entry is expanded exactly (``expansion``), its terms are collected by base parameter (``base_parameters``) and
 written the shortest of several ways (``shortening``). What is too long is counted, not written.
@@ -12,7 +12,7 @@ from fractions import Fraction
 from functools import cached_property
 from typing import Literal
 
-from flint import fmpq, fmpq_mpoly, fmpq_mpoly_ctx
+from flint import fmpq, fmpq_mpoly
 from sympy import Expr, Matrix, Rational, Symbol
 
 from spelgen.arm.arm import Arm
@@ -22,28 +22,25 @@ from spelgen.certificate.terms import coordinate, expression, grouped, parameter
 from spelgen.errors import SpelgenError
 from spelgen.labels import entry_name
 from spelgen.listing import Listing
+from spelgen.settings.tuning.structure import CertificateTuning
 from spelgen.structure.base_parameters import BaseParameter, base_parameters, parameter_name
 from spelgen.structure.expansion import Budget, Expansion, TooLarge
 from spelgen.structure.recursion import triangle
 from spelgen.structure.structure import Structure
 
-READABLE = 40
-"""Terms of an entry that a person reads among others."""
-WRITABLE = 3000
-"""Terms of an entry that a program reads, or a person who asks for it alone."""
-_BUDGET = 300_000  # multiplications of terms for an entry, about 0.3 s
-_WHOLE_BUDGET = 2_000_000
+TUNING = CertificateTuning()
+READABLE = TUNING.readable_terms
+WRITABLE = TUNING.writable_terms
 
 Place = tuple[int, int] | None
 """An entry of M, 0-based with row >= column; None stands for V."""
 Entry = tuple[int, int] | Literal["V"]
 """An entry as users name it: (row, column) from 1, or V."""
-_Polynomials = list[tuple[BaseParameter, fmpq_mpoly]]
 
 
 @dataclass(frozen=True)
 class Formula:
-    """One entry of M, or V: its number of terms, and how it is written.
+    """Hold one entry of M, or V: its number of terms, and how it is written.
 
     ``terms`` counts products of a base parameter and a monomial in cosines, sines and distances, before
     they are shortened; None where they were too many to be expanded. ``expression`` is None where it is too
@@ -57,17 +54,21 @@ class Formula:
     @property
     def name(self) -> str:
         """``M21`` or ``V``."""
-        return "V" if self.place is None else entry_name(*self.place)
+        if self.place is None:
+            return "V"
+        return entry_name(*self.place)
 
     @property
     def omission(self) -> str:
         """Why it is not written out."""
-        return f"{self.terms} terms, not written out" if self.terms else "too many terms to be expanded"
+        if self.terms is None:
+            return "too many terms to be expanded"
+        return f"{self.terms} terms, not written out"
 
 
 @dataclass(frozen=True, repr=False)
 class Formulas:
-    """Closed forms of ``arm`` in the base parameters ``base``; V up to a constant.
+    """Hold closed forms of ``arm`` in the base parameters ``base``; V up to a constant.
 
     Sums and products stand as they were chosen: SymPy did not evaluate them, and what it makes of them (a
     derivative, a substitution) it does. Under ``inertials`` terms that vanish for the URDF's values are left out.
@@ -86,11 +87,11 @@ class Formulas:
     @cached_property
     def entries(self) -> dict[tuple[int, int], Expr]:
         """(row, column) -> entry of M that is not too long; the lower triangle, counted from 1."""
-        return {
-            (each.place[0] + 1, each.place[1] + 1): each.expression
-            for each in self.rows
-            if each.place and each.expression is not None
-        }
+        entries = {}
+        for row in self.rows:
+            if row.place is not None and row.expression is not None:
+                entries[row.place[0] + 1, row.place[1] + 1] = row.expression
+        return entries
 
     @property
     def mass_matrix(self) -> Matrix | None:
@@ -103,46 +104,50 @@ class Formulas:
     @property
     def potential(self) -> Expr | None:
         """V(q) [J], None where it is missing."""
-        return next((each.expression for each in self.rows if each.place is None), None)
+        return next((row.expression for row in self.rows if row.place is None), None)
 
     @property
     def base_parameters(self) -> dict[Symbol, Expr]:
         """What each parameter in the expressions is the sum of, by body: m a mass [kg], h = m c a first moment
         [kg m] and I a tensor [kg m2] about the joint's origin, in a frame whose z is the joint's axis.
         """
-        return {
-            parameter(each.name): expression(
-                {(parameter(parameter_name(index)),): _rational(share) for index, share in each.weights}
-            )
-            for each in self.base
-        }
+        definitions = {}
+        for base in self.base:
+            terms = {}
+            for index, coefficient in base.weights:
+                terms[parameter(parameter_name(index)),] = _rational(coefficient)
+            definitions[parameter(base.name)] = expression(terms)
+        return definitions
 
     @property
     def values(self) -> dict[Symbol, Rational]:
         """The base parameters' exact values by the URDF, where it has inertials."""
-        return {parameter(each.name): Rational(each.value) for each in self.base if each.value is not None}
+        return {parameter(base.name): Rational(base.value) for base in self.base if base.value is not None}
 
     @property
     def trusted(self) -> str:
         """For which inertial values the formulas hold."""
-        own = self.assume == "inertials"
-        return "the URDF's inertial zeros and symmetries" if own else "any inertial values"
+        if self.assume == "inertials":
+            return "the URDF's inertial zeros and symmetries"
+        return "any inertial values"
 
     @property
     def unwritten(self) -> tuple[Formula, ...]:
         """The entries that were too long."""
-        return tuple(each for each in self.rows if each.expression is None)
+        return tuple(row for row in self.rows if row.expression is None)
 
     def __repr__(self) -> str:
-        written = sum(each.expression is not None for each in self.rows)
+        written = len(self.rows) - len(self.unwritten)
         return f"<Formulas of {self.arm.name!r}: {written} written, in {len(self.base)} base parameters>"
 
     def _repr_html_(self) -> str:
         """A table of LaTeX, for a notebook."""
-        rows = [
-            (each.name, each.omission if each.expression is None else f"${Latex().whole(each.expression)}$")
-            for each in self.rows
-        ]
+        rows = []
+        for row in self.rows:
+            text = row.omission
+            if row.expression is not None:
+                text = f"${Latex().whole(row.expression)}$"
+            rows.append((row.name, text))
         return Listing(f"{self.arm.name}: closed forms", ("", ""), tuple(rows), left=(0, 1)).html()
 
 
@@ -155,37 +160,25 @@ def formulas(
     written. Raises SpelgenError for an entry that M does not have.
     """
     n = len(arm.coordinates)
-    order: list[Place] = [*triangle(n), None] if entry is None else [_place(n, entry)]
+    places: list[Place] = [*triangle(n), None]
+    budget = TUNING.entry_budget
+    if entry is not None:
+        places = [_place(n, entry)]
+        budget = TUNING.budget
     if longest is None:
         longest = READABLE if entry is None else WRITABLE
-    base = base_parameters(arm, structure.base_parameter_count)
-    if structure.assume == "inertials":
-        base = tuple(each for each in base if each.value)
-    expansion = Expansion(arm)
-    shortener = Shortener(arm, expansion.context)
-    left, found = _WHOLE_BUDGET, dict[Place, Formula]()
-    for place in reversed(order):  # from the tip on, so that what is cheap is not left out for what is dear
-        budget = Budget(left if entry else min(left, _BUDGET))
-        before = budget.left
-        try:
-            polynomials = _polynomials(expansion, shortener, base, place, budget)
-        except TooLarge:
-            found[place] = Formula(place, None, None)
-        else:
-            if structure.assume == "inertials":
-                polynomials = _at_urdf_values(expansion.context, polynomials)
-            found[place] = _formula(shortener, place, polynomials, longest)
-        left -= before - budget.left
-    rows = tuple(found[place] for place in order)
-    if entry:
-        told = {
-            symbol.name
-            for each in rows
-            if each.expression is not None
-            for symbol in each.expression.free_symbols
-        }
-        base = tuple(each for each in base if each.name in told)
-    return Formulas(arm, structure.assume, base, rows)
+    writer = _Writer(arm, structure)
+    total = TUNING.budget
+    rows: list[Formula] = []
+    for place in reversed(places):  # from the tip on, so that what is cheap is not left out for what is dear
+        allowance = Budget(min(total, budget))
+        total -= allowance.left
+        rows.insert(0, writer.formula(place, longest, allowance))
+        total += allowance.left
+    base = writer.base
+    if entry is not None:
+        base = _named_in(rows, base)
+    return Formulas(arm, structure.assume, base, tuple(rows))
 
 
 def _place(n: int, entry: Entry) -> Place:
@@ -193,45 +186,73 @@ def _place(n: int, entry: Entry) -> Place:
         return None
     row, column = max(entry), min(entry)
     if column < 1 or row > n:
-        raise SpelgenError(
-            f"the entry {entry[0]},{entry[1]} of M", expected=f"a row and a column from 1 to {n}, or V"
-        )
+        expected = f"a row and a column from 1 to {n}, or V"
+        raise SpelgenError(f"the entry {entry[0]},{entry[1]} of M", expected=expected)
     return row - 1, column - 1
 
 
-def _polynomials(
-    expansion: Expansion, shortener: Shortener, base: Sequence[BaseParameter], place: Place, budget: Budget
-) -> _Polynomials:
-    """What each base parameter is multiplied by, without the constant part of V. Raises TooLarge."""
-    element = expansion.written.potential if place is None else expansion.written.mass[place]
-    found = []
-    for each in base:
-        # the parameters regrouped into this one have their part in its first one's polynomial
-        polynomial = shortener.reduced(expansion.polynomial(element, each.index, budget))
-        constant = polynomial[(0,) * len(expansion.context.gens())]
-        found.append((each, polynomial if place else polynomial - constant))
-    return found
+def _named_in(rows: Sequence[Formula], base: Sequence[BaseParameter]) -> tuple[BaseParameter, ...]:
+    """Return the base parameters that stand in the expressions of ``rows``."""
+    names: set[str] = set()
+    for row in rows:
+        if row.expression is not None:
+            names.update(symbol.name for symbol in row.expression.free_symbols)
+    return tuple(parameter for parameter in base if parameter.name in names)
 
 
-def _at_urdf_values(context: fmpq_mpoly_ctx, polynomials: _Polynomials) -> _Polynomials:
-    """Without the monomials whose coefficient is zero for the URDF's values."""
-    scaled = (_rational(each.value or Fraction(0)) * polynomial for each, polynomial in polynomials)
-    total = sum(scaled, context.from_dict({}))
-    kept = []
-    for each, polynomial in polynomials:
-        left = {monomial: share for monomial, share in polynomial.terms() if total[monomial] != 0}
-        kept.append((each, context.from_dict(left)))
-    return kept
+class _Writer:
+    """Write the entries of one arm."""
 
+    def __init__(self, arm: Arm, structure: Structure):
+        self._at_urdf_values = structure.assume == "inertials"
+        self.base = base_parameters(arm, structure.base_parameter_count)
+        if self._at_urdf_values:
+            self.base = tuple(base for base in self.base if base.value)
+        self._expansion = Expansion(arm)
+        self._shortener = Shortener(arm, self._expansion.context)
 
-def _formula(shortener: Shortener, place: Place, polynomials: _Polynomials, longest: int) -> Formula:
-    terms = sum(len(polynomial) for _, polynomial in polynomials)
-    if terms > longest:
-        return Formula(place, terms, None)
-    functions = [
-        (parameter(x.name), shortener.shortest(function)) for x, function in polynomials if function != 0
-    ]
-    return Formula(place, terms, grouped(functions))
+    def formula(self, place: Place, longest: int, budget: Budget) -> Formula:
+        """Return one entry, counted only where it has more than ``longest`` terms or needs more than ``budget``."""
+        try:
+            polynomials = self._polynomials(place, budget)
+        except TooLarge:
+            return Formula(place, None, None)
+        if self._at_urdf_values:
+            polynomials = self._without_vanishing(polynomials)
+        terms = sum(len(polynomial) for polynomial in polynomials)
+        if terms > longest:
+            return Formula(place, terms, None)
+        functions = []
+        for base, polynomial in zip(self.base, polynomials, strict=True):
+            if polynomial != 0:
+                functions.append((parameter(base.name), self._shortener.shortest(polynomial)))
+        return Formula(place, terms, grouped(functions))
+
+    def _polynomials(self, place: Place, budget: Budget) -> list[fmpq_mpoly]:
+        """Return what each base parameter is multiplied by, without the constant part of V. Raises TooLarge."""
+        element = self._expansion.written.potential
+        if place is not None:
+            element = self._expansion.written.mass[place]
+        polynomials = []
+        for base in self.base:
+            # the parameters regrouped into this one have their part in its first one's polynomial
+            polynomial = self._shortener.reduced(self._expansion.polynomial(element, base.index, budget))
+            if place is None:
+                polynomial -= polynomial[(0,) * self._expansion.context.nvars()]
+            polynomials.append(polynomial)
+        return polynomials
+
+    def _without_vanishing(self, polynomials: Sequence[fmpq_mpoly]) -> list[fmpq_mpoly]:
+        """Leave out the monomials whose coefficient is zero for the URDF's values."""
+        context = self._expansion.context
+        total = context.from_dict({})
+        for base, polynomial in zip(self.base, polynomials, strict=True):
+            total += _rational(base.value or Fraction(0)) * polynomial
+        result = []
+        for polynomial in polynomials:
+            terms = {monomial: value for monomial, value in polynomial.terms() if total[monomial] != 0}
+            result.append(context.from_dict(terms))
+        return result
 
 
 def _rational(number: Fraction) -> fmpq:

@@ -1,4 +1,4 @@
-"""SymPy's printers, kept from rearranging what was chosen, and lines of one width.
+"""Keep SymPy's printers from rearranging what was chosen, and lines of one width.
 
 Blanks that must not end a line are no-break spaces until the lines are made.
 """
@@ -15,30 +15,36 @@ from sympy.printing.precedence import PRECEDENCE
 from sympy.printing.printer import Printer
 from sympy.printing.str import StrPrinter
 
+# textwrap breaks lines at blanks alone, so a no-break space holds a line together
 _FIXED = "\N{NO-BREAK SPACE}"
 _LONG_SUM = 20
-_DOUBLE = 10**17
+_DOUBLE = 10**17  # more digits than a double holds
 
 
 class _AsBuilt(Printer):
-    """Sums and products in the order they were put together, numbers as decimals."""
+    """Print sums and products in the order they were put together, numbers as decimals."""
 
     times = "*"
 
     def whole(self, expression: Expr) -> str:
-        """The expression in one line."""
+        """Return the expression in one line."""
         return str(self.doprint(expression)).replace(_FIXED, " ")
 
     def lines(self, expression: Expr, start: str, width: int, end: str = "") -> list[str]:
-        """The expression between ``start`` and ``end``, broken where lines get longer than ``width``: before
+        """Return the expression between ``start`` and ``end``, broken where lines get longer than ``width``: before
         terms, and inside of those that are longer than a line.
         """
         indent = " " * (len(start) - len(start.lstrip()) + 4)
         pieces: list[str] = []
         for term in Add.make_args(expression):
-            text = self._signed(self.doprint(term)) if pieces else self.doprint(term)
-            room = width - len(indent if pieces else start)
-            pieces.append(text if len(text) > room else text.replace(" ", _FIXED))
+            text = str(self.doprint(term))
+            room = width - len(start)
+            if pieces:
+                text = self._signed(text)
+                room = width - len(indent)
+            if len(text) <= room:
+                text = text.replace(" ", _FIXED)
+            pieces.append(text)
         lines = textwrap.wrap(
             " ".join(pieces) + end, width, initial_indent=start, subsequent_indent=indent,
             break_long_words=False, break_on_hyphens=False,
@@ -46,7 +52,9 @@ class _AsBuilt(Printer):
         return [line.replace(_FIXED, " ") for line in lines]
 
     def _signed(self, text: str) -> str:
-        return f"-{_FIXED}{text[1:]}" if text.startswith("-") else f"+{_FIXED}{text}"
+        if text.startswith("-"):
+            return f"-{_FIXED}{text[1:]}"
+        return f"+{_FIXED}{text}"
 
     def _print_Add(self, expression: Add, order: str | None = None) -> str:
         first, *others = [self._print(term) for term in expression.args]
@@ -57,23 +65,23 @@ class _AsBuilt(Printer):
         written = [self.parenthesize(factor, PRECEDENCE["Mul"]) for factor in factors]
         if abs(number) != 1:
             written.insert(0, self._print(abs(number)))
-        return ("-" if number < 0 else "") + self.times.join(written)
+        return _sign(number) + self.times.join(written)
 
     def _print_Function(self, expression: Function, **power: str) -> str:
         return super()._print_Function(expression, **power).replace(" ", _FIXED)
 
     def _print_Rational(self, number: Rational) -> str:
-        return ("-" if number < 0 else "") + decimal(abs(number))
+        return _sign(number) + decimal(abs(number))
 
     _print_Integer = _print_Rational
 
 
 class Text(_AsBuilt, StrPrinter):
-    """As one types it: numbers as short decimals, else with twelve digits."""
+    """Print as one types: numbers as short decimals, else with twelve digits."""
 
 
 class Latex(_AsBuilt, LatexPrinter):
-    r"""For a formula of LaTeX's, with brackets that unlike \left( may stand on different lines."""
+    r"""Print a formula of LaTeX's, with brackets that unlike \left( may stand on different lines."""
 
     times = rf"{_FIXED}\,{_FIXED}"
 
@@ -81,23 +89,29 @@ class Latex(_AsBuilt, LatexPrinter):
         return rf"\bigl({text}\bigr)"
 
     def _print_Symbol(self, symbol: Symbol, style: str = "plain") -> str:
-        """``Izz1R`` as I with the index zz,1R."""
+        """Return ``Izz1R`` as I with the index zz,1R."""
         letter, axes, place = re.findall(r"(.)([a-z]*)(.*)", symbol.name)[0]
-        return f"{letter}_{{{axes}{',' if axes else ''}{place}}}" if place else letter
+        if not place:
+            return str(letter)
+        if axes:
+            return f"{letter}_{{{axes},{place}}}"
+        return f"{letter}_{{{place}}}"
 
     def _print_Rational(self, number: Rational) -> str:
         mantissa, _, exponent = super()._print_Rational(number).partition("e")
         mantissa = re.sub(r"(\d+)/(\d+)", r"\\tfrac{\1}{\2}", mantissa)
-        return rf"{mantissa} \cdot 10^{{{int(exponent)}}}" if exponent else mantissa
+        if exponent:
+            return rf"{mantissa} \cdot 10^{{{int(exponent)}}}"
+        return mantissa
 
     _print_Integer = _print_Rational
 
 
 class Python(_AsBuilt, StrPrinter):
-    """Python that SymPy evaluates exactly: fractions as they are, unless they have more digits than a double."""
+    """Print Python that SymPy evaluates exactly: fractions as they are, unless they have more digits than a double."""
 
     def _print_Add(self, expression: Add, order: str | None = None) -> str:
-        """A long sum in one call, since Python cannot nest thousands of additions."""
+        """Print a long sum in one call, since Python cannot nest thousands of additions."""
         if len(expression.args) <= _LONG_SUM:
             return super()._print_Add(expression)
         return f"Add({', '.join(map(self._print, expression.args))})"
@@ -105,14 +119,23 @@ class Python(_AsBuilt, StrPrinter):
     def _print_Rational(self, number: Rational) -> str:
         if number.q == 1:
             return str(number.p)
-        short = max(abs(number.p), number.q) < _DOUBLE
-        return f"Rational({number.p}, {number.q})" if short else f"Float({float(number)!r})"
+        if max(abs(number.p), number.q) < _DOUBLE:
+            return f"Rational({number.p}, {number.q})"
+        return f"Float({float(number)!r})"
 
     _print_Integer = _print_Rational
 
 
 @cache
 def decimal(value: Rational) -> str:
-    """A positive number: an exact decimal or a small fraction where it is one, else twelve digits."""
+    """Return a positive number as an exact decimal or a small fraction where it is one, else with twelve digits."""
     short = f"{float(value):.12g}"
-    return short if Rational(short) == value or value.q > 16 else f"{value.p}/{value.q}"
+    if Rational(short) == value or value.q > 16:
+        return short
+    return f"{value.p}/{value.q}"
+
+
+def _sign(number: Rational) -> str:
+    if number < 0:
+        return "-"
+    return ""

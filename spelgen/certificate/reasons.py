@@ -1,4 +1,4 @@
-"""Why an entry is constant, or equal to another, and why a joint does not matter: the arm's geometry.
+"""Give the reason why an entry is constant, or equal to another, and why a joint does not matter: the arm's geometry.
 
 M couples joints a and b by the integral of v_a . v_b over the mass that both move, v being the velocity field
 of a unit rate: that integral is what the reasons speak of. Each function gives None where it finds none.
@@ -16,7 +16,7 @@ from spelgen.structure.structure import Entry, Structure
 
 
 def constant_reason(axes: Axes, structure: Structure, entry: Entry) -> str | None:
-    """Why ``entry`` is constant."""
+    """Return why ``entry`` is constant."""
     later, earlier = entry.row, entry.column
     if later == earlier:
         return _diagonal_reason(axes, structure, later)
@@ -29,10 +29,10 @@ def constant_reason(axes: Axes, structure: Structure, entry: Entry) -> str | Non
         )
     turn = not axes.slides[later] and not axes.slides[earlier]
     if turn and axes.same_line(later, earlier) and _diagonal_reason(axes, structure, later):
-        sign = "-" if axes.opposed(later, earlier) else ""
-        return (
-            f"{joints_told([earlier, later])} turn about one line, so it is {sign}{entry_name(later, later)}"
-        )
+        same = entry_name(later, later)
+        if axes.opposed(later, earlier):
+            same = f"-{same}"
+        return f"{joints_told([earlier, later])} turn about one line, so it is {same}"
     return balance_reason(axes, structure, entry)
 
 
@@ -50,10 +50,11 @@ def _diagonal_reason(axes: Axes, structure: Structure, joint: int) -> str | None
 
 
 def balance_reason(axes: Axes, structure: Structure, entry: Entry) -> str | None:
-    """Why an entry of a balanced last body is what it is: it is Izz times the cosine between the axes."""
+    """Return why an entry of a balanced last body is what it is: it is Izz times the cosine between the axes."""
     last, other = len(structure.joints) - 1, entry.column
     if structure.assume != "inertials" or not axes.balanced or entry.row != last:
         return None
+    # its velocity field about its own axis is a pure spin: only axes along it feel that
     balanced = f"what joint {last + 1} carries is balanced about its axis"
     if axes.without_inertia:
         return f"{balanced} and has no moment of inertia about it"
@@ -66,16 +67,17 @@ def balance_reason(axes: Axes, structure: Structure, entry: Entry) -> str | None
     return None
 
 
-def equality_reason(axes: Axes, structure: Structure, places: Sequence[tuple[int, int]]) -> str | None:
-    """Why entries of one row are equal: their columns' joints move alike what the row's joint carries."""
-    columns = sorted(column for _, column in places)
-    if len({row for row, _ in places}) > 1:
+def equality_reason(axes: Axes, structure: Structure, entries: Sequence[tuple[int, int]]) -> str | None:
+    """Return why entries of one row are equal: their columns' joints move alike what the row's joint carries."""
+    if len({row for row, _ in entries}) > 1:
         return None
-    slides = axes.slides[columns[0]]
+    columns = sorted(column for _, column in entries)
     if all(axes.move_alike(columns[0], column) for column in columns[1:]):
-        return f"{joints_told(columns)} {'slide along one direction' if slides else 'turn about one line'}"
+        if axes.slides[columns[0]]:
+            return f"{joints_told(columns)} slide along one direction"
+        return f"{joints_told(columns)} turn about one line"
     last = len(structure.joints) - 1
-    if places[0][0] == last and structure.assume == "inertials" and axes.balanced:
+    if entries[0][0] == last and structure.assume == "inertials" and axes.balanced:
         turn = not any(axes.slides[column] for column in columns)
         if turn and all(axes.parallel(columns[0], column) for column in columns[1:]):
             balanced = f"what joint {last + 1} carries is balanced about its axis"
@@ -84,32 +86,33 @@ def equality_reason(axes: Axes, structure: Structure, places: Sequence[tuple[int
 
 
 def idle_reason(axes: Axes, structure: Structure, joint: int) -> str | None:
-    """Why M does not depend on ``joint``."""
+    """Return why M does not depend on ``joint``."""
     if joint == 0:
         return "it moves the whole arm as one piece"
-    before = list(range(joint))
-    if all(axes.commute(joint, other) for other in before):
-        return f"it leaves {axes_told(before)} in place, as if it moved the whole arm"
+    nearer = list(range(joint))
+    if all(axes.commute(joint, other) for other in nearer):
+        return f"it leaves {axes_told(nearer)} in place, as if it moved the whole arm"
     if joint == len(axes.slides) - 1 and structure.assume == "inertials" and axes.symmetric:
         return "what it carries is symmetric about its axis"
     return None
 
 
 def weightless_reason(axes: Axes, structure: Structure, joint: int) -> str | None:
-    """Why V does not depend on ``joint``."""
+    """Return why V does not depend on ``joint``."""
     if axes.lifts_nothing(joint):
-        slides = axes.slides[joint]
-        return "sliding level lifts nothing" if slides else "turning about the vertical lifts nothing"
+        if axes.slides[joint]:
+            return "sliding level lifts nothing"
+        return "turning about the vertical lifts nothing"
     last = joint == len(axes.slides) - 1
     if last and structure.assume == "inertials" and axes.centred:
         return "the centre of the mass that it carries lies on its axis"
     return None
 
 
-def potential_reason(axes: Axes) -> str | None:
-    """Why V is zero."""
+def potential_reason(axes: Axes, structure: Structure) -> str | None:
+    """Return why V is zero."""
     if axes.arm.gravity == ZERO:
         return "so is gravity"
-    if all(axes.lifts_nothing(joint) for joint in range(len(axes.slides))):
+    if all(axes.lifts_nothing(joint) for joint in range(len(structure.joints))):
         return "every joint turns about gravity's direction or slides across it, which lifts nothing"
     return None

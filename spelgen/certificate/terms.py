@@ -1,4 +1,4 @@
-"""Sums of products on their way to a short form: how long they are to read, and the SymPy expression they become.
+"""Handle sums of products on their way to a short form: their length to read, and the SymPy expression they become.
 
 SymPy evaluated would undo what is chosen here, as it makes 2*(a + b) into 2*a + 2*b; so nothing is evaluated.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence, Set
 from functools import cache, lru_cache
+from math import inf
 
 from flint import fmpq
 from sympy import Add, Expr, Mul, Rational, Symbol
@@ -19,117 +20,142 @@ Terms = dict[Factors, fmpq]
 
 @cache
 def coordinate(joint: int) -> Symbol:
-    """The position of a joint, counted from 0."""
+    """Return the position of a joint, counted from 0."""
     return Symbol(f"q{joint + 1}", real=True)
 
 
 def parameter(name: str) -> Symbol:
-    """A base parameter, or an inertial parameter of a body."""
+    """Return a base parameter, or an inertial parameter of a body."""
     return Symbol(name, real=True)
 
 
 def expression(terms: Terms) -> Expr:
-    """The sum as it stands."""
+    """Return the sum as it stands."""
     products = []
     for factors, value in terms.items():
-        before = [] if value == 1 and factors else [Rational(int(value.p), int(value.q))]
-        products.append(Mul(*before, *factors, evaluate=False))
+        if value == 1 and factors:
+            products.append(Mul(*factors, evaluate=False))
+        else:
+            products.append(Mul(Rational(int(value.p), int(value.q)), *factors, evaluate=False))
     return Add(*products, evaluate=False)
 
 
 def length(terms: Terms) -> float:
-    """How long a sum is to read, about one for every symbol."""
-    return sum(
-        (0.3 if abs(value) == 1 and factors else 1.0) + sum(map(_length, factors))
-        for factors, value in terms.items()
-    )
+    """Return how long a sum is to read, about one for every symbol."""
+    total = 0.0
+    for factors, value in terms.items():
+        total += 1.0
+        if abs(value) == 1 and factors:
+            total -= 0.7  # no number is written, only the sign
+        for factor in factors:
+            total += _length(factor)
+    return total
 
 
 @lru_cache(4096)
 def _length(part: Expr) -> float:
-    if part.is_Number or part.is_Symbol:
-        return 0.7 if part.is_Number else 1.0
+    """Return the length of a number, symbol, power, bracket, or function of a sum of angles.
+
+    Signs, powers and brackets count as a third of a symbol, a cosine's letters and each of its angles as half.
+    """
+    if part.is_Number:
+        return 0.7
+    if part.is_Symbol:
+        return 1.0
     if part.is_Pow:
         return 0.3 + _length(part.base)
     if part.is_Add:
         return 0.3 + sum(0.3 + _length(term) for term in part.args)
     if part.is_Mul:
         return sum(_length(factor) for factor in part.args if factor != -1)
-    multiples = [
-        term.as_coeff_Mul()[0] for term in Add.make_args(part.args[0])
-    ]  # of a cosine's or sine's angle
-    return 0.5 + sum(0.5 if abs(multiple) == 1 else 0.75 for multiple in multiples)
+    total = 0.5
+    for angle in Add.make_args(part.args[0]):
+        total += 0.5
+        if abs(angle.as_coeff_Mul()[0]) != 1:
+            total += 0.25
+    return total
 
 
 @lru_cache(4096)
 def joints(factor: Expr) -> frozenset[int]:
-    """The joints that a distance, a cosine or a sine depends on; none of a base parameter or a sum."""
+    """Return the joints that a distance, a cosine or a sine depends on; none of a base parameter or a sum."""
     if factor.is_Add or (factor.is_Pow and factor.base.is_Add):
         return frozenset()
-    return frozenset(int(each.name[1:]) - 1 for each in factor.free_symbols if each.name.startswith("q"))
+    names = [symbol.name for symbol in factor.free_symbols]
+    return frozenset(int(name[1:]) - 1 for name in names if name.startswith("q"))
 
 
 def ordered(factors: Iterable[Expr]) -> Factors:
-    """The factors as they are written: distances and angles by joint, then sums."""
-    return tuple(sorted(factors, key=lambda factor: min(joints(factor), default=1_000)))
+    """Return the factors as they are written: distances and angles by joint, then sums."""
+    return tuple(sorted(factors, key=lambda factor: min(joints(factor), default=inf)))
 
 
 def times(terms: Terms, value: fmpq) -> Terms:
-    """The sum with every term times ``value``."""
-    return {factors: value * own for factors, own in terms.items()}
+    """Return the sum with every term times ``value``."""
+    return {factors: value * coefficient for factors, coefficient in terms.items()}
 
 
 def bracketed(terms: Terms) -> tuple[fmpq, Terms]:
-    """A number and a sum, of which ``terms`` is the product.
+    """Return a number and a sum, of which ``terms`` is the product.
 
     A size stands before the brackets only where it leaves none inside, else no more than a sign.
     """
     if len(terms) < 2:
         return fmpq(1), terms
-    sizes = {abs(value) for value in terms.values()}
-    size = sizes.pop() if len(sizes) == 1 else fmpq(1)
-    before = size if next(iter(terms.values())) > 0 else -size
-    return before, times(terms, 1 / before)
+    first, *others = terms.values()
+    outside = fmpq(1)
+    if all(abs(value) == abs(first) for value in others):
+        outside = abs(first)
+    if first < 0:
+        outside = -outside
+    return outside, times(terms, 1 / outside)
 
 
 def collected(terms: Terms, inner: Set[int]) -> Terms:
-    """The terms with the same factors of other joints as one: these factors times a sum over ``inner``."""
+    """Return the terms with the same factors of other joints as one: these factors times a sum over ``inner``."""
     groups: dict[Factors, Terms] = {}
     for factors, value in terms.items():
-        inside = tuple(each for each in factors if joints(each) <= inner)
-        outside = tuple(each for each in factors if each not in inside)
+        inside = tuple(factor for factor in factors if joints(factor) <= inner)
+        outside = tuple(factor for factor in factors if factor not in inside)
         groups.setdefault(outside, {})[inside] = value
-    found: Terms = {}
+    result: Terms = {}
     for outside, group in groups.items():
         if len(group) == 1 or not outside:
-            found |= {ordered((*inside, *outside)): value for inside, value in group.items()}
+            for inside, value in group.items():
+                result[ordered((*inside, *outside))] = value
         else:
-            before, within = bracketed(group)
-            found[*outside, expression(within)] = before
-    return found
+            number, bracket = bracketed(group)
+            result[*outside, expression(bracket)] = number
+    return result
 
 
 def grouped(functions: Sequence[tuple[Symbol, Terms]]) -> Expr:
-    """The sum of parameters times functions; parameters with the same function, up to a factor, together."""
+    """Return the sum of parameters times functions; parameters with one function, up to a factor, together."""
     groups: dict[tuple[tuple[Factors, fmpq], ...], Terms] = {}
     for symbol, function in functions:
         leading = next(iter(function.values()))
-        groups.setdefault(tuple(times(function, 1 / leading).items()), {})[symbol,] = leading
-    whole: Terms = {}
-    for unit, members in sorted(groups.items(), key=lambda group: group[0] != (((), 1),)):  # constants first
-        whole |= _group(dict(unit), members)
-    size = abs(bracketed(whole)[0])
-    return expression(whole if size == 1 else {(expression(times(whole, 1 / size)),): size})
+        unit = tuple(times(function, 1 / leading).items())
+        groups.setdefault(unit, {})[symbol,] = leading
+    total: Terms = {}
+    constant = (((), fmpq(1)),)
+    for unit, members in sorted(groups.items(), key=lambda group: group[0] != constant):  # constants first
+        total |= _group(dict(unit), members)
+    size = abs(bracketed(total)[0])
+    if size == 1:
+        return expression(total)
+    return expression({(expression(times(total, 1 / size)),): size})
 
 
 def _group(unit: Terms, members: Terms) -> Terms:
-    """The terms of parameters times multiples of one function, given with 1 as its first coefficient."""
-    before, factors = fmpq(1), next(iter(unit))
+    """Return the terms of parameters times multiples of one function, given with 1 as its first coefficient."""
+    number = fmpq(1)
+    factors = next(iter(unit))
     if len(unit) > 1:
         first = abs(next(iter(members.values())))
-        before, inside = bracketed(times(unit, first))
-        factors, members = (expression(inside),), times(members, 1 / first)
+        number, bracket = bracketed(times(unit, first))
+        factors = (expression(bracket),)
+        members = times(members, 1 / first)
     if len(members) > 1 and factors:
-        size, together = bracketed(members)
-        return {(expression(together), *factors): before * size}
-    return {(*symbol, *factors): before * value for symbol, value in members.items()}
+        size, parameters = bracketed(members)
+        return {(expression(parameters), *factors): number * size}
+    return {(*symbol, *factors): number * value for symbol, value in members.items()}

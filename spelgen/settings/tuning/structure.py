@@ -9,15 +9,37 @@ from dataclasses import dataclass
 class GeometryTuning:
     """Hold what decides which exact number a rounded one of a URDF stands for."""
 
-    fine_tolerance: float = 2e-5  # [rad] from pi/12, pi/8, pi/5: 0.26, 0.39, 0.63 are as often meant as they are
+    fine_tolerance: float = (
+        2e-5  # [rad] from pi/12, pi/8, pi/5: 0.26, 0.39, 0.63 are as often meant as they are
+    )
     fine_divisors: tuple[int, ...] = (12, 8, 5)  # of pi: the special angles on CAD drawings of the 189 arms
     offset_noise: float = 1e-9  # [m] below it an offset is 0: what composed rotations leave
     axis_noise: float = 1e-3  # of a unit axis: a component below it is 0, as CAD exporters print three digits
-    tensor_noise: float = 1e-12  # of the largest moment: a smaller product of inertia is rounding of a program
+    tensor_noise: float = (
+        1e-12  # of the largest moment: a smaller product of inertia is rounding of a program
+    )
     notable: float = 1e-9  # [rad, 1] a smaller change of an angle or axis is not worth a remark
     zero_noise: float = 1e-12  # of a rotation's element: smaller is rounding of float64, and stands for 0
     rotation_error: float = 1e-11  # [rad] of a rational rotation: thousands of times below any calibration
     denominators: tuple[int, ...] = (10**7, 10**10, 10**13)  # tried in turn, the shortest fractions first
     eighth: float = 0.7  # [rad] just below pi/4: at an edge of an eighth no usual angle lies
     most_bits: int = 4096  # of a denominator: exact arithmetic on longer ones takes hours (a hostile file)
-    parallel: float = 1e-2  # [rad] between two axes that are meant to be parallel, whatever rounding made of them
+    parallel: float = (
+        1e-2  # [rad] between two axes that are meant to be parallel, whatever rounding made of them
+    )
+
+
+@dataclass(frozen=True)
+class CertificateTuning:
+    """Hold how much of closed forms is written, and what numbers of a check count as rounding."""
+
+    readable_terms: int = 40  # of an entry that a person reads among others: three lines of a terminal
+    writable_terms: int = 3000  # of an entry that a program reads, or a person who asks for it alone
+    entry_budget: int = 300_000  # multiplications of terms for one entry, about 0.3 s
+    budget: int = 2_000_000  # multiplications of terms for all entries of an arm, about 2 s
+    most_terms_shortened: int = 60  # of a function; shortening longer ones takes seconds and they stay long
+    ways_collected: int = 3  # the shortest ways to write a function, of which common factors are taken out
+    rounding: float = 1e-12  # of its scale: a smaller number of a check is rounding; what is measured is told
+    form_rounding: float = 1e-6  # the same for the smallest form, whose long fractions are doubles
+    fine: float = 1e-3  # an arm with smaller nonzero numbers may have products that vanish in rounding
+    frame_rounding: float = 1e-9  # [rad, m] per joint: dropped offsets, and composed rotations of 1e-11 each
