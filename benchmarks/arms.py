@@ -118,7 +118,7 @@ def states_ahead(folder: Path) -> None:
         for preset in PRESETS:
             fit = spelgen.fit(build(urdf, preset), training, arm=urdf)
             row = []
-            for horizon in fit.evaluate(tests, seconds=AHEAD, steps=()).horizons:
+            for horizon in spelgen.evaluate(fit, tests, seconds=AHEAD, steps=()).horizons:
                 row += [horizon.errors[x].mean_relative_rms or np.inf for x in predictors]
             print(f"{f'{name}, {preset}':30}" + "".join(f"{x:30.3f}" for x in row), flush=True)
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from spelgen.evaluation.rollout import rollout
     from spelgen.excitation.design import excite
     from spelgen.exporting.export import export
-    from spelgen.fitting.fit import Fit, fit, load_run
+    from spelgen.fitting.fit import Fit, RunOptions, fit, load_run
     from spelgen.identification.friction import FrictionModel
     from spelgen.identification.identification import Identification
     from spelgen.identification.identify import identify
@@ -56,6 +56,7 @@ _HOME = {
     "Identification": "identification.identification",
     "fit": "fitting.fit",
     "Fit": "fitting.fitted",
+    "RunOptions": "fitting.fit",
     "load_run": "fitting.fitted",
     "GaussianPrior": "settings.fits",
     "TorqueFit": "settings.fits",
@@ -83,6 +84,7 @@ __all__ = [
     "Preprocessing",
     "Results",
     "Rollout",
+    "RunOptions",
     "SpelgenError",
     "TorqueFit",
     "Trajectory",

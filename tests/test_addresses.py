@@ -1,10 +1,6 @@
 """Logs and runs at addresses that fsspec knows are as those on the disk."""
 
 import json
-import os
-import socket
-import time
-import uuid
 import zipfile
 from pathlib import Path
 
@@ -14,11 +10,8 @@ from typer.testing import CliRunner
 
 from spelgen.addresses import local
 from spelgen.cli.main import app
-from spelgen.errors import LogError, RunError, SpelgenError
-from spelgen.fitting import address_lock
-from spelgen.fitting.address_lock import AddressLock
+from spelgen.errors import LogError, SpelgenError
 from spelgen.fitting.run_folder import RunFolder
-from spelgen.fitting.run_lock import locked
 from spelgen.loaded_arm import load_arm
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.simulation.simulate import simulate
@@ -99,65 +92,3 @@ def test_keys_that_lead_out_of_an_address_are_refused(tmp_path, memory):
     with pytest.raises(SpelgenError, match=r"^memory://data/\.\.: got the key '\.\.', expected keys inside"):
         local("memory://data/..")
     assert not Path("/tmp/spelgen_was_here").exists()
-
-
-# ---- one training at a time
-
-
-def holder(**changed) -> bytes:
-    """What the lock of another process says, on a machine that is not this one."""
-    record = {"process": 7, "host": "elsewhere", "machine": 1, "since": "2026-01-01 00:00:00", "token": "x"}
-    return json.dumps(record | {"refreshed": time.time()} | changed).encode()
-
-
-def test_a_run_elsewhere_belongs_to_one_training(memory):
-    folder = local("memory://runs/held")
-    with locked(folder):
-        told = json.loads(memory.cat("/runs/held/.lock"))
-        assert (told["process"], told["host"]) == (os.getpid(), socket.gethostname())
-        with pytest.raises(RunError) as caught:
-            AddressLock("memory://runs/held")
-        assert str(caught.value) == (
-            f"memory://runs/held: process {os.getpid()} on {socket.gethostname()}, since {told['since']}, trains in "
-            "this folder; wait for it, or -o another; where it is gone, remove .lock there"
-        )
-    assert not memory.exists("/runs/held/.lock")
-
-
-@pytest.mark.parametrize(
-    ("changed", "gone"),
-    [
-        ({}, False),
-        ({"refreshed": 0.0}, True),
-        ({"host": socket.gethostname(), "machine": uuid.getnode(), "process": 2**22 + 1}, True),
-        ({"host": socket.gethostname(), "machine": uuid.getnode(), "process": os.getppid()}, False),
-    ],
-)
-def test_a_lock_is_taken_over_once_its_holder_is_gone(memory, changed, gone):
-    memory.pipe("/runs/other/.lock", holder(**changed))
-    if gone:
-        with locked(local("memory://runs/other")) as notes:
-            assert notes[0].message.endswith("since 2026-01-01 00:00:00, which is gone, is taken over")
-    else:
-        with (
-            pytest.raises(RunError, match=r"process .* since 2026-01-01 00:00:00, trains in this folder"),
-            locked(local("memory://runs/other")),
-        ):
-            pass
-    assert memory.exists("/runs/other/.lock") != gone
-
-
-def test_whose_lock_was_taken_over_writes_no_more(memory, monkeypatch):
-    run = RunFolder("memory://runs/lost")
-    with locked(run.path):
-        run.save({}, {})
-        before = json.loads(memory.cat("/runs/lost/.lock"))["refreshed"]
-        monkeypatch.setattr(address_lock, "REFRESH", 0.0)
-        run.save({}, {})
-        assert json.loads(memory.cat("/runs/lost/.lock"))["refreshed"] > before
-        memory.pipe("/runs/lost/.lock", holder())
-        memory.rm("/runs/lost/model.pt")
-        with pytest.raises(RunError, match="process 7 on elsewhere, since"):
-            run.save({}, {})
-        assert not memory.exists("/runs/lost/model.pt")
-    assert json.loads(memory.cat("/runs/lost/.lock"))["host"] == "elsewhere"  # left to whose it is

@@ -157,7 +157,7 @@ def test_torques_are_fitted_predicted_and_scored():
     assert tau.shape == test.tau.shape
     inner = slice(100, -100)  # away from the ends, where the filter settles
     assert np.abs(tau - test.tau)[inner].max() < 0.02 * test.tau.std()
-    result = found.evaluate([test])
+    result = spelgen.evaluate(found, [test])
     assert result.torque["model"].mean_nmse == pytest.approx(1 - found.score([test]), rel=1e-6)
     constant = Trajectory(test.t, test.q, test.qd, np.ones_like(test.tau), "constant")
     assert found.predict(constant).shape == test.tau.shape

@@ -75,7 +75,7 @@ def test_ratios_to_kp_are_found(fitted):
 
 
 def test_replay_of_another_motion_beats_the_baselines(fitted, logs):
-    results = fitted.evaluate(logs[4:])
+    results = spelgen.evaluate(fitted, logs[4:])
     for replay in results.replays:
         errors = {name: each.mean for name, each in replay.errors.items()}
         assert errors["model"] < 0.4 * min(errors[LINEAR_SERVOS], errors[DELAYED_COMMAND])
@@ -202,7 +202,7 @@ def test_commands_are_held_and_late():
 
 
 def test_its_report_shows_servos_and_replays_and_no_torques(fitted, logs):
-    write_json(RunFolder(fitted.folder).evaluation, fitted.evaluate(logs[4:]).to_dict())
+    write_json(RunFolder(fitted.folder).evaluation, spelgen.evaluate(fitted, logs[4:]).to_dict())
     page = render_report(fitted.folder)
     told = " ".join(page.split())
     assert "Worst log replayed: motion 4" in page and told.count('class="line hold"') >= 2
@@ -274,15 +274,17 @@ def test_simulated_commands_and_positions(tmp_path):
 
 def test_exports_hold_the_servos(fitted, arm, tmp_path, monkeypatch):
     kp, kd = (x.detach().numpy() for x in fitted.model.servo.prepare()[:2])
-    xml = fitted.export("mjcf").files[".xml"].decode()
+    xml = spelgen.export(fitted, to="mjcf").files[".xml"].decode()
     found = re.findall(r'<position name="\w+" joint="\w+" kp="([^"]+)" kv="([^"]+)" forcerange="-6 6"', xml)
     assert np.array(found, dtype=float) == pytest.approx(np.stack([kp, kd], axis=1))
-    held = yaml.safe_load(fitted.export("urdf").files[".friction.yaml"])
+    held = yaml.safe_load(spelgen.export(fitted, to="urdf").files[".friction.yaml"])
     assert held["delay"] == pytest.approx(float(fitted.model.delay))
     assert held["joints"]["elbow"]["servo"]["kp"] == pytest.approx(kp[1])
     monkeypatch.setattr(fitted.model.servo, "dead_zone", torch.tensor([0.01, 0.0]).double())
-    assert "dead zones are left out" in fitted.export("mjcf").files[".README.md"].decode()
-    files = fitted.export("c").files  # checked against the module when exported, where there is a compiler
+    assert "dead zones are left out" in spelgen.export(fitted, to="mjcf").files[".README.md"].decode()
+    files = spelgen.export(
+        fitted, to="c"
+    ).files  # checked against the module when exported, where there is a compiler
     assert b"servo_arm_servo_torque(const servo_arm_real u[SERVO_ARM_N]" in files["servo_arm.h"]
 
 

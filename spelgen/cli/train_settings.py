@@ -172,7 +172,7 @@ def resumed_run(folder: Path, request: Request) -> Start:
         raise RunError(
             "a run with validation logs that were given in memory",
             file=folder,
-            do="go on with spelgen.fit(..., folder=..., resume=True)",
+            do="go on with spelgen.fit(..., folder=..., options=spelgen.RunOptions(resume=True))",
         )
 
     def config(model: EmittedModel, rates: Sequence[float] | None) -> FitConfig:

@@ -104,14 +104,14 @@ def fit(
     with (
         threads_of_torch(options.threads),
         termination_as_interrupt(),
-        locked(None if run is None else run.path) as lock_notes,
+        locked(None if run is None else run.path),
     ):
         require_device(options.device)
         prepared = objective.prepare()
-        notes = [*prepared.notes, *options.notes, *lock_notes]
+        notes = [*prepared.notes, *options.notes]
         record = record_of(request, prepared, rigid_bodies=has_rigid_bodies(model))
         if run is not None and options.resume:
-            require_same(run, record)
+            require_same(run.read_config(), record, run.path)
             _resume(objective, run)
         else:
             notes += objective.begin()

@@ -105,8 +105,9 @@ class Fit:
         where no log is sampled densely enough for accelerations.
         """
         logs = [logs] if isinstance(logs, Trajectory) else logs
-        found = dynamics_samples(logs, preprocessing=self.preprocessing, reach=bristle_reach(self.model))
-        samples = [x for x in found if len(x.q)]
+        reach = bristle_reach(self.model)
+        samples = dynamics_samples(logs, preprocessing=self.preprocessing, reach=reach)
+        samples = [x for x in samples if len(x.q)]
         if not samples:
             raise LogError(
                 "no motion to judge torques on", expected=f"samples at {DENSE:g} Hz or more that move"
@@ -119,30 +120,11 @@ class Fit:
             scores.append(1 - (squares[varies] / variance[varies]).mean())
         return float(np.mean(scores))
 
-    def evaluate(self, logs: Any, **options: Any) -> Any:
-        """What `spelgen.evaluate` finds of this fit on test logs."""
-        import spelgen
-
-        return spelgen.evaluate(self, logs, **options)
-
-    def export(self, to: str, path: Path | str | None = None, **options: Any) -> Any:
-        """What `spelgen.export` makes of this fit."""
-        import spelgen
-
-        return spelgen.export(self, to=to, path=path, **options)
-
-    def save(
-        self,
-        folder: Path | str,
-        *,
-        logs: Trajectory | Sequence[Trajectory] | None = None,
-        force: bool = False,
-    ) -> Path:
+    def save(self, folder: Path | str, *, force: bool = False) -> Path:
         """Write the run folder that `spelgen train` writes; return its path. Raises RunError where a run lies, unless
         forced.
 
-        logs: those of the fit; least squares on them and what they cover then stand in `evaluate` and `report` too,
-        where the fit was given its arm.
+        `spelgen.keep_baseline(folder, logs)` adds what least squares find, for `evaluate` and `report`.
         """
         if not hasattr(self.model, "source"):
             raise RunError("a model without a module", expected="one of spelgen.build or spelgen.load_module")
@@ -152,10 +134,6 @@ class Fit:
             run.write_metrics(self.history)
             run.save(self.model.state_dict(), self.checkpoint)
             write_json(run.config, self.record)
-        if logs is not None:
-            import spelgen
-
-            spelgen.keep_baseline(run.path, [logs] if isinstance(logs, Trajectory) else logs)
         return run.path
 
     def _filtered(self, piece: Trajectory) -> Trajectory:
@@ -163,16 +141,19 @@ class Fit:
         return low_pass(piece, cutoff) if cutoff and len(piece.t) > 3 else piece
 
     def _torque(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, z: np.ndarray | None) -> np.ndarray:
-        some = next(self.model.parameters())
-        known = (x for x in (q, qd, qdd, z) if x is not None)
-        inputs = (torch.as_tensor(np.ascontiguousarray(x)).to(some) for x in known)
+        like = next(self.model.parameters())
+        arrays = [q, qd, qdd]
+        if z is not None:
+            arrays.append(z)
+        inputs = [torch.as_tensor(np.ascontiguousarray(array)).to(like) for array in arrays]
         with torch.no_grad():
             return self.model.inverse_dynamics(*inputs).cpu().double().numpy()
 
     def __repr__(self) -> str:
-        ended = f"{self.status} after " if self.status else ""
-        told = f"{ended}{self.epochs} epochs, validation loss {self.best_validation:.3g}"
-        return f"<Fit of {self.record['robot']!r} to {self.config.objective}: {told}>"
+        end = f"{self.epochs} epochs, validation loss {self.best_validation:.3g}"
+        if self.status:
+            end = f"{self.status} after {end}"
+        return f"<Fit of {self.record['robot']!r} to {self.config.objective}: {end}>"
 
     def _repr_html_(self) -> str:
         rows = [

@@ -98,7 +98,7 @@ class Objective(Protocol):
         """
 
     def checkpoint(self) -> dict[str, Any]:
-        """Return what a resumed fit needs, with "best_weights", and the numbers of `run_schema.Counters`."""
+        """Return what a resumed fit needs, with "best_weights", and the numbers of `run_record.Checkpoint`."""
 
     def results(self) -> dict[str, object]:
         """Return what config.json says of how it went, beside what `prepare` told."""

@@ -12,12 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from spelgen.addresses import address_of, local, sent
+from spelgen.addresses import local, sent
 from spelgen.emission.loading import has_run, load_module
 from spelgen.errors import RunError
 from spelgen.files import naming, remove, require_regular_file, write_bytes
-from spelgen.fitting.address_lock import refresh
-from spelgen.fitting.run_schema import require_checkpoint, require_epoch, require_record
+from spelgen.fitting.run_record import Checkpoint, Epoch, require, require_record
 from spelgen.spec import read_source
 from spelgen.urdf.document import urdf_bytes
 
@@ -114,10 +113,7 @@ class RunFolder:
         return robot + ([(self.settings, settings.read_bytes())] if settings.is_file() else [])
 
     def save(self, weights: dict[str, Any], checkpoint: dict[str, Any]) -> None:
-        """Write model.pt and checkpoint.pt. Raises RunError where another process has taken over (see
-        `address_lock`).
-        """
-        refresh(address_of(self.path))
+        """Write model.pt and checkpoint.pt."""
         write_state(self.weights, weights)
         write_state(self.checkpoint, checkpoint)
 
@@ -144,7 +140,9 @@ class RunFolder:
         records = []
         for count, line in enumerate(lines, start=1):
             try:
-                records.append(require_epoch(json.loads(line), self.metrics, count))
+                record = json.loads(line)
+                require(Epoch, record, self.metrics, count)
+                records.append(record)
             except (ValueError, RecursionError) as error:
                 if count < len(lines):
                     raise RunError(f"broken JSON ({error})", file=self.metrics, line=count) from error
@@ -170,7 +168,9 @@ class RunFolder:
 
     def load_checkpoint(self) -> dict[str, Any]:
         """checkpoint.pt, with the numbers that every one has. Raises RunError."""
-        return require_checkpoint(self.load_state(self.checkpoint), self.checkpoint)
+        checkpoint = self.load_state(self.checkpoint)
+        require(Checkpoint, checkpoint, self.checkpoint)
+        return checkpoint
 
     def load_state(self, path: Path) -> dict[str, Any]:
         """checkpoint.pt or model.pt, on the CPU; nothing but tensors and plain values is ever unpickled."""

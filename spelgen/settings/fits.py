@@ -219,12 +219,12 @@ def fit_config(
             usual.pop(name, None)
         elif name in options and other not in options and usual.get(other) == against:
             usual.pop(other)
-    found = made(kind, usual | options)
+    found = make_config(kind, usual | options)
     found.require(rigid_bodies=rigid_bodies)
     return found
 
 
-def made(kind: type[FitConfig], options: Mapping[str, Any]) -> FitConfig:
+def make_config(kind: type[FitConfig], options: Mapping[str, Any]) -> FitConfig:
     """The configuration with these options. Raises SettingsError for values that cannot be."""
     try:
         return kind(**options)
