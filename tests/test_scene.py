@@ -10,9 +10,8 @@ from spelgen.dynamics.tip import tip_kinematics
 from spelgen.loaded_arm import load_arm
 from spelgen.render.arm_section import arm_section, matrix
 from spelgen.render.page import json_data
-from spelgen.render.scene import scene
-from spelgen.render.shapes import tube
-from spelgen.render.still import camera
+from spelgen.render.scene import CAMERA, scene
+from spelgen.render.shapes import joined, tube
 
 
 @pytest.mark.parametrize("robot", ["rpr", "scara", "panda", "ur10e"])
@@ -40,14 +39,14 @@ def test_the_shapes_of_the_file_are_drawn_where_all_are_there(tmp_path):
     path = tmp_path / "r.urdf"
     path.write_text(text.replace("BOX", box))
     found = scene(path, ["j"])
-    assert found.found and [len(link.shape.faces) for link in found.links] == [12, 12]
+    assert found.has_meshes and [len(link.shape.faces) for link in found.links] == [12, 12]
     np.testing.assert_allclose(np.ptp(found.links[1].shape.vertices, axis=0), [0.1, 0.2, 0.3], atol=1e-3)
     path.write_text(text.replace("BOX", mesh))
-    assert not scene(path, ["j"]).found  # tubes: an arm with holes is worse
+    assert not scene(path, ["j"]).has_meshes  # tubes: an arm with holes is worse
 
 
 def test_tubes_are_closed_and_look_outward():
-    shape = tube(np.zeros(3), np.array([0.0, 0.0, 2.0]), 0.5)
+    shape = joined(tube(np.zeros(3), np.array([0.0, 0.0, 2.0]), 0.5))
     volume = 0.0
     for face in shape.faces:
         first, *rest = shape.vertices[list(face)]
@@ -56,15 +55,18 @@ def test_tubes_are_closed_and_look_outward():
 
 
 def test_the_camera_is_no_mirror():
-    assert np.linalg.det(camera()) == pytest.approx(1.0)
+    assert np.linalg.det(CAMERA.axes()) == pytest.approx(1.0)
 
 
 def test_every_cell_tells_what_it_is_and_why(robots):
     arm = load_arm(robots / "rpr.urdf")
     cells = matrix(arm.arm, arm.structure)
-    assert cells[1][1].told.startswith("M22 is constant.") and "the mass that it carries" in cells[1][1].told
-    assert cells[1][2].told.startswith("M32 is always zero.") and cells[1][2] == cells[2][1]
-    assert "M22 = m2R" in cells[1][1].told
+    assert (
+        cells[1][1].explanation.startswith("M22 is constant.")
+        and "the mass that it carries" in cells[1][1].explanation
+    )
+    assert cells[1][2].explanation.startswith("M32 is always zero.") and cells[1][2] == cells[2][1]
+    assert "M22 = m2R" in cells[1][1].explanation
     assert cells[0][0].joints == (1, 2)
 
 

@@ -72,11 +72,11 @@ class _Readable:
         return context
 
 
-class Command(_Readable, TyperCommand):
+class Command(_Readable, TyperCommand):  # type: ignore[misc]  # typer's own types do not agree with click's
     """A command."""
 
 
-class Group(_Readable, TyperGroup):
+class Group(_Readable, TyperGroup):  # type: ignore[misc]
     """All commands."""
 
 

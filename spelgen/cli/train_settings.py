@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 from pydantic import ValidationError
@@ -45,7 +45,8 @@ class Machine(Group):
 def _groups_by_key() -> dict[str, type[Group]]:
     """Return every key of `--set` with the group of settings that checks its value."""
     keys: dict[str, type[Group]] = {}
-    for group in (*CONFIGS.values(), TrainingSettings, Machine):
+    groups: list[type[Group]] = [*CONFIGS.values(), TrainingSettings, Machine]
+    for group in groups:
         for name in group.model_fields:
             keys.setdefault(name, group)
     del keys["objective"]  # an option of its own
@@ -60,7 +61,7 @@ class Request:
     """Hold what the command line asks for. values: of `--set`, by key. warm_start: the model was fitted before."""
 
     objective: str | None
-    values: Mapping[str, object]
+    values: Mapping[str, Any]
     warm_start: bool = False
 
     @property
@@ -128,7 +129,8 @@ def new_run(module: Path, urdf: Path | None, request: Request) -> Start:
         module,
         lambda model, rates: _new_config(settings, request, model, rates),
         Preprocessing(**(settings.preprocessing | request.preprocessing)),
-        **_split(request, settings.model_dump(include={"validation_fraction", "seed"})),
+        request.values.get("validation_fraction", settings.validation_fraction),
+        request.values.get("seed", settings.seed),
         mapping=None,
     )
 
@@ -187,13 +189,7 @@ def resumed_run(folder: Path, request: Request) -> Start:
         run.module,
         config,
         Preprocessing(**(record["preprocessing"] | request.preprocessing)),
-        **_split(request, record),
+        request.values.get("validation_fraction", record["validation_fraction"]),
+        request.values.get("seed", record["seed"]),
         mapping=LogMapping(**record["mapping"]),
     )
-
-
-def _split(request: Request, defaults: Mapping[str, float]) -> dict[str, float]:
-    return {
-        "validation": request.values.get("validation_fraction", defaults["validation_fraction"]),
-        "seed": request.values.get("seed", defaults["seed"]),
-    }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,200 +11,176 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Arm, Coordinate
 from spelgen.baselines.names import MODEL
 from spelgen.certificate.facts import facts
 from spelgen.certificate.formula_text import to_dict
-from spelgen.certificate.formulas import Formulas, formulas
+from spelgen.certificate.formulas import formulas
 from spelgen.labels import entry_name, joint_ranges, joints_in_ranges
 from spelgen.render.page import json_data
+from spelgen.render.plots import Record, numbers
 from spelgen.render.scene import Scene, scene
-from spelgen.render.still import PITCH, YAW, still, view
+from spelgen.settings.tuning.render import TUNING
 from spelgen.structure.structure import Structure
 
-GHOSTS = 3
 LETTERS = {"zero": "0", "constant": "C"}
-WORST = 0.5  # relative error that is drawn as the worst colour
+KINDS = {"zero": "is always zero", "constant": "is constant"}
 IDENTIFIED = {"alone": 1.0, "in combination": 0.5, "never": 0.0}
+ENTRY = re.compile(r"M\d+(?:,\d+)?")
 
 
 @dataclass(frozen=True)
 class Cell:
-    """An entry of M: kind, what stands in it, the joints it depends on (0-based), and all that is to be told."""
+    """An entry of M: kind, what stands in it, the joints it depends on (0-based), and why."""
 
     kind: str
     text: str
     joints: tuple[int, ...]
-    told: str
+    explanation: str
 
 
 @dataclass(frozen=True)
 class ArmSection:
-    """data: for the script. motions: their names. coloured: what the links can be coloured by."""
+    """data: for the script. motions: their names. colours: what the links can be coloured by."""
 
     picture: Markup
     data: Markup
     motions: tuple[str, ...]
-    coloured: tuple[str, ...]
-    found: bool
+    colours: tuple[str, ...]
+    has_meshes: bool
 
 
 def matrix(arm: Arm, structure: Structure) -> list[list[Cell]]:
-    """M, whole: of each entry what it depends on, why, and its formula where that is short."""
-    told = _told(arm, structure, formulas(arm, structure))
-    n = len(structure.joints)
-    cells = {(x.row, x.column): x for x in structure.entries}
-    return [
-        [
-            Cell(x.kind, LETTERS.get(x.kind, joint_ranges(x.joints)), tuple(x.joints), told[x.row, x.column])
-            for x in (cells[max(i, j), min(i, j)] for j in range(n))
-        ]
-        for i in range(n)
-    ]  # fmt: skip
+    """Return M, both triangles: of each entry what it depends on, why, and its formula where that is short."""
+    explanations = _explanations(arm, structure)
+    cells = {}
+    for entry in structure.entries:
+        text = LETTERS.get(entry.kind, joint_ranges(entry.joints))
+        name = entry_name(entry.row, entry.column)
+        cell = Cell(entry.kind, text, tuple(entry.joints), explanations[name])
+        cells[entry.row, entry.column] = cells[entry.column, entry.row] = cell
+    joints = range(len(structure.joints))
+    return [[cells[row, column] for column in joints] for row in joints]
 
 
-def _told(arm: Arm, structure: Structure, closed: Formulas) -> dict[tuple[int, int], str]:
-    """By entry: what it is, the facts that name it, and its formula."""
-    every = facts(arm, structure)
-    written = {(x["row"], x["col"]): x for x in to_dict(closed)["entries"] if x["row"]}
-    found = {}
+def _explanations(arm: Arm, structure: Structure) -> dict[str, str]:
+    """Return by the name of an entry what it is, the facts that name it, and its formula."""
+    every_fact = facts(arm, structure)
+    closed = {entry["name"]: entry for entry in to_dict(formulas(arm, structure))["entries"]}
+    explanations = {}
     for entry in structure.entries:
         name = entry_name(entry.row, entry.column)
-        what = {"zero": "is always zero", "constant": "is constant"}.get(entry.kind) or (
-            f"depends on {joints_in_ranges(entry.joints)} only"
-        )
-        lines = [f"{name} {what}."]
-        lines += [str(fact) for fact in every if name in re.findall(r"M\d+(?:,\d+)?", fact.statement)]
-        idle = [fact for fact in every if fact.statement.startswith("M does not depend")]
-        lines += [str(fact) for fact in idle if entry.kind == "varying"]
-        formula = written[entry.row + 1, entry.column + 1]
+        default = f"depends on {joints_in_ranges(entry.joints)} only"
+        lines = [f"{name} {KINDS.get(entry.kind, default)}."]
+        lines += [str(fact) for fact in every_fact if name in ENTRY.findall(fact.statement)]
+        if entry.kind == "varying":
+            lines += [str(x) for x in every_fact if x.statement.startswith("M does not depend")]
+        formula = closed[name]
         if formula["expression"]:
             lines.append(f"{name} = {formula['expression']}")
         elif entry.kind != "zero":
-            lines.append(
-                f"Its formula has {formula['terms'] or 'too many'} terms: `spelgen inspect --entry` writes it."
-            )
-        found[entry.row, entry.column] = "\n".join(lines)
-    return found
+            terms = formula["terms"] or "too many"
+            lines.append(f"Its formula has {terms} terms: `spelgen inspect --entry` writes it.")
+        explanations[name] = "\n".join(lines)
+    return explanations
 
 
 def arm_section(
-    arm: Arm,
-    urdf: Path,
-    traces: Mapping[str, Any] | None = None,
-    identified: Mapping[str, Any] | None = None,
+    arm: Arm, urdf: Path, traces: Record | None = None, identified: Record | None = None
 ) -> ArmSection:
-    """The arm with the motions of an evaluation's traces, or, without, one through its ranges."""
-    names = [coordinate.name for coordinate in arm.coordinates]
-    drawn = scene(urdf, names)
+    """Return the arm with the motions of an evaluation's traces, or, without, one through its ranges."""
+    drawn = scene(urdf, [coordinate.name for coordinate in arm.coordinates])
     motions = _motions(traces or {}) or [_sweep(arm)]
     for motion in motions:
-        poses = motion["q"][:: max(1, len(motion["q"]) // 12)]
-        seen = view(drawn, poses)
-        motion["middle"] = [round(1000 * x, 1) for x in seen.middle]
-        motion["scale"] = round(seen.scale, 2)
-        motion["ground"] = round(1000 * _lowest(drawn, poses), 1)
-    own = motions[0]["q"]
-    ghosts = [own[round(k * (len(own) - 1) / GHOSTS)] for k in range(1, GHOSTS + 1)]
-    colours = _identifiability(arm, identified or {})
-    data = drawn.to_dict() | {
-        "motions": motions,
-        "identifiability": colours,
-        "yaw": YAW,
-        "pitch": PITCH,
-    }
+        motion |= _view(drawn, motion["q"])
+    first = motions[0]["q"]
+    poses = [first[round(k * (len(first) - 1) / TUNING.ghosts)] for k in range(TUNING.ghosts + 1)]
+    unseen = _unseen(arm, identified or {})
+    data = drawn.to_dict() | {"motions": motions, "identifiability": unseen}
+    colours = []
+    if "error" in motions[0]:
+        colours.append("error")
+    if unseen is not None:
+        colours.append("known")
     return ArmSection(
-        picture=still(
-            drawn, view(drawn, [own[0], *ghosts]), own[0], ghosts, f"{arm.name} in {GHOSTS + 1} positions"
-        ),
+        picture=drawn.still(drawn.view(poses), poses, f"{arm.name} in {len(poses)} positions"),
         data=json_data(data),
         motions=tuple(motion["told"] for motion in motions),
-        coloured=tuple(
-            told
-            for told, there in (("error", "error" in motions[0]), ("known", colours is not None))
-            if there
-        ),
-        found=drawn.found,
+        colours=tuple(colours),
+        has_meshes=drawn.has_meshes,
     )
 
 
-def _motions(traces: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Predictions, coloured by the error of their positions; then torques, coloured by what is not explained."""
-    found = []
-    for x in traces.get("trajectories", ()):
-        q, predicted = _numbers(x["q"]), _numbers(x["predicted_q"])
-        moved = np.ptp(q, axis=0)
-        off = np.abs(predicted - q) / np.maximum(moved, 1e-2 * moved.max() + 1e-9) / WORST
-        found.append(
-            {
-                "name": f"prediction {x['which']}",
-                "told": f"{x['which']} prediction beside what was measured ({x['trajectory']})",
-                "t": x["t"],
-                "q": x["q"],
-                "predicted": x["predicted_q"],
-                "error": _rounded(off),
-            }
-        )
-    for x in traces.get("torques", ()):
-        measured, predicted = _numbers(x["measured"]), _numbers(x["predicted"][MODEL])
-        scale = np.maximum(measured.std(axis=0), 1e-9)
-        found.append(
-            {
-                "name": f"torque {x['which']}",
-                "told": f"residual torque, {x['which']} trajectory ({x['trajectory']})",
-                "t": x["t"],
-                "q": x["q"],
-                "error": _rounded(np.abs(measured - predicted) / scale / WORST),
-            }
-        )
-    return found
-
-
-def _sweep(arm: Arm) -> dict[str, Any]:
-    """Every joint through part of its range, at its own pace."""
-    t = np.linspace(0, 12, 121)
-    columns = []
-    for k, each in enumerate(arm.coordinates):
-        low, high = _range(each)
-        middle, reach = (low + high) / 2, 0.4 * (high - low)
-        columns.append(middle + reach * np.sin(2 * np.pi * t / 12 * (1 + k % 3) + k))
+def _view(drawn: Scene, q: Sequence[Sequence[float]]) -> dict[str, object]:
+    """Return the view of a motion for the script [mm]; the ground lies below all links, at the root where they stay
+    above it.
+    """
+    poses = q[:: max(1, len(q) // 12)]
+    view = drawn.view(poses)
+    lowest = min(float(position[2]) for pose in poses for _, position in drawn.frames(pose))
     return {
-        "name": "sweep",
-        "told": "a motion through the joints' ranges",
-        "t": [round(x, 3) for x in t.tolist()],
-        "q": np.round(np.array(columns).T, 4).tolist(),
+        "middle": (1000 * view.middle).round(1).tolist(),
+        "scale": round(view.scale, 2),
+        "ground": round(1000 * min(0.0, lowest), 1),
     }
 
 
-def _range(each: Any) -> tuple[float, float]:
-    usual = 1.2 if each.kind == "revolute" else 0.3
-    low = -usual if each.lower is None or each.continuous else max(each.lower, -2 * usual)
-    high = usual if each.upper is None or each.continuous else min(each.upper, 2 * usual)
-    return (low, high) if low < high else (each.lower or 0.0, each.upper or 0.0)
+def _motions(traces: Record) -> list[dict[str, Any]]:
+    """Return predictions, coloured by the error of their positions; then torques, coloured by their residual."""
+    motions = []
+    for example in traces.get("trajectories", ()):
+        q, predicted = numbers(example["q"]), numbers(example["predicted_q"])
+        moved = np.ptp(q, axis=0)
+        error = np.abs(predicted - q) / np.maximum(moved, 1e-2 * moved.max() + 1e-9)
+        label = f"{example['which']} prediction beside what was measured ({example['trajectory']})"
+        motions.append(_motion(f"prediction {example['which']}", label, example, error))
+        motions[-1]["predicted"] = example["predicted_q"]
+    for trace in traces.get("torques", ()):
+        measured, predicted = numbers(trace["measured"]), numbers(trace["predicted"][MODEL])
+        error = np.abs(measured - predicted) / np.maximum(measured.std(axis=0), 1e-9)
+        label = f"residual torque, {trace['which']} trajectory ({trace['trajectory']})"
+        motions.append(_motion(f"torque {trace['which']}", label, trace, error))
+    return motions
 
 
-def _identifiability(arm: Arm, identified: Mapping[str, Any]) -> list[float] | None:
-    """By joint, 0..1 from known to unknown: which part of its body's ten parameters motion cannot show."""
-    how = identified.get("identifiability")
-    if not how:
+def _motion(name: str, label: str, trace: Record, error: np.ndarray) -> dict[str, Any]:
+    """Return a motion for the script; error: (T, n), relative to the motion or to the torque."""
+    rows = (error / TUNING.worst_error).round(3).astype(object)
+    rows[~np.isfinite(error)] = None  # JSON has no NaN
+    return {"name": name, "told": label, "t": trace["t"], "q": trace["q"], "error": rows.tolist()}
+
+
+def _sweep(arm: Arm) -> dict[str, Any]:
+    """Return a motion of every joint through part of its range, at its own pace."""
+    t = np.linspace(0, 12, 121)
+    q = np.zeros((len(t), len(arm.coordinates)))
+    for k, coordinate in enumerate(arm.coordinates):
+        low, high = _range(coordinate)
+        q[:, k] = (low + high) / 2 + 0.4 * (high - low) * np.sin(2 * np.pi * t / 12 * (1 + k % 3) + k)
+    label = "a motion through the joints' ranges"
+    return {"name": "sweep", "told": label, "t": t.round(3).tolist(), "q": q.round(4).tolist()}
+
+
+def _range(coordinate: Coordinate) -> tuple[float, float]:
+    """Return the range that is shown: that of the URDF, or a usual one where it has none or a very wide one."""
+    usual = 1.2 if coordinate.kind == "revolute" else 0.3
+    low, high = -usual, usual
+    if not coordinate.continuous and coordinate.lower is not None:
+        low = max(coordinate.lower, -2 * usual)
+    if not coordinate.continuous and coordinate.upper is not None:
+        high = min(coordinate.upper, 2 * usual)
+    if low < high:
+        return low, high
+    return coordinate.lower or 0.0, coordinate.upper or 0.0
+
+
+def _unseen(arm: Arm, identified: Record) -> list[float] | None:
+    """Return by joint, 0..1, which part of its bodies' ten parameters motion cannot show; the worst body counts."""
+    identifiability = identified.get("identifiability")
+    if not identifiability:
         return None
-    values = list(how.values())[: 10 * len(arm.bodies)]
+    shown = [IDENTIFIED.get(x, 0.0) for x in list(identifiability.values())[: 10 * len(arm.bodies)]]
+    unseen = 1 - np.array(shown).reshape(-1, 10).mean(axis=1)
     worst = np.zeros(len(arm.coordinates))
-    for k, body in enumerate(arm.bodies):
-        seen = np.mean([IDENTIFIED.get(x, 0.0) for x in values[10 * k : 10 * k + 10]])
-        worst[body.coordinate] = max(worst[body.coordinate], 1 - seen)
-    return [round(float(x), 3) for x in worst]
-
-
-def _lowest(drawn: Scene, poses: Sequence[Sequence[float]]) -> float:
-    """Where the ground is drawn: below all links, at the root where they stay above it."""
-    heights = [float(position[2]) for q in poses for _, position in drawn.frames(q)]
-    return min([0.0, *heights])
-
-
-def _rounded(values: np.ndarray) -> list[Any]:
-    return [[round(x, 3) if np.isfinite(x) else None for x in row] for row in values.tolist()]
-
-
-def _numbers(values: Any) -> np.ndarray:
-    return np.array(values, dtype=float)
+    np.maximum.at(worst, [body.coordinate for body in arm.bodies], unseen)
+    return list(worst.round(3).tolist())

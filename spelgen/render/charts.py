@@ -7,17 +7,29 @@ tell values from pixels stands in `data-` attributes.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from markupsafe import Markup
 
-MARGIN_LEFT, MARGIN_RIGHT, MARGIN_TOP, MARGIN_BOTTOM = 62, 14, 10, 36
-BARE_BOTTOM = 8  # without labels of x
-MAX_POINTS = 300  # per line: more cannot be seen at this size and only makes the file heavy
-WIDTH, HEIGHT = 400, 190
-MAX_DECADES = 8  # of a logarithmic axis, counted from the largest value
+from spelgen.settings.tuning.render import TUNING
+
+Values = Sequence[float] | np.ndarray
+
+
+@dataclass(frozen=True)
+class Margins:
+    """Room around the curves [pixels]. bare: below a chart whose x axis has no numbers."""
+
+    left: int = 62
+    right: int = 14
+    top: int = 10
+    bottom: int = 36
+    bare: int = 8
+
+
+MARGINS = Margins()
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,33 +37,28 @@ class Line:
     """One curve: x and y of equal length, broken where a value is not finite. `style` is its CSS class."""
 
     label: str
-    x: Sequence[float] | np.ndarray
-    y: Sequence[float] | np.ndarray
+    x: Values
+    y: Values
     style: str
+
+
+@dataclass(frozen=True, eq=False)
+class Dots(Line):
+    """Points that nothing connects."""
 
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """What lies between two curves over x."""
+    """The area between two curves over x."""
 
     label: str
-    x: Sequence[float] | np.ndarray
-    low: Sequence[float] | np.ndarray
-    high: Sequence[float] | np.ndarray
+    x: Values
+    low: Values
+    high: Values
     style: str
 
 
-@dataclass(frozen=True, eq=False)
-class Dots:
-    """Points that nothing connects."""
-
-    label: str
-    x: Sequence[float] | np.ndarray
-    y: Sequence[float] | np.ndarray
-    style: str
-
-
-Mark = Line | Band | Dots
+Mark = Line | Band
 
 
 @dataclass(frozen=True)
@@ -64,207 +71,222 @@ class Axis:
     end: float
     log: bool = False
 
-    def pixel(self, value: float) -> float:
-        """Where a value lies; a value below the axis lies on its edge."""
-        low, high = self._scale(self.low), self._scale(self.high)
-        fraction = (self._scale(max(value, self.low)) - low) / (high - low)
-        return self.start + fraction * (self.end - self.start)
-
-    def ticks(self) -> list[float]:
-        """Round values within the axis, about five."""
+    def pixels(self, values: np.ndarray) -> np.ndarray:
+        """Return where values lie; a value outside the axis lies on its edge."""
+        clipped = np.clip(values, self.low, self.high)
         if self.log:
-            first, last = math.ceil(math.log10(self.low) - 1e-9), math.floor(math.log10(self.high) + 1e-9)
-            decades = [10.0**k for k in range(first, last + 1, max(1, math.ceil((last - first + 1) / 5)))]
-            if len(decades) >= 3:
-                return decades
-            fine = [m * 10.0**k for k in range(first - 1, last + 1) for m in (1, 2, 5)]
-            within = [value for value in fine if self.low * (1 - 1e-9) <= value <= self.high * (1 + 1e-9)]
-            if len(within) >= 3:
-                return within
-        step = _round_step((self.high - self.low) / 5)
-        return [
-            k * step
-            for k in range(math.ceil(self.low / step - 1e-9), math.floor(self.high / step + 1e-9) + 1)
-        ]
+            fraction = np.log(clipped / self.low) / math.log(self.high / self.low)
+        else:
+            fraction = (clipped - self.low) / (self.high - self.low)
+        pixels: np.ndarray = self.start + fraction * (self.end - self.start)
+        return pixels
 
-    def _scale(self, value: float) -> float:
-        return math.log10(value) if self.log else value
+    def ticks(self) -> list[tuple[float, str]]:
+        """Return about five round values within the axis, as pixel and label."""
+        if self.log:
+            values = _decades(self.low, self.high)
+            labels = _log_labels(values)
+        else:
+            values, labels = _steps(self.low, self.high)
+        return list(zip(self.pixels(np.array(values)).tolist(), labels, strict=True))
+
+    def data(self) -> str:
+        """Return first and last pixel, their values and whether it is logarithmic, for a script."""
+        return f"{self.start:g} {self.end:g} {self.low:.6g} {self.high:.6g} {int(self.log)}"
 
 
 def line_chart(
-    shown: Sequence[Mark],
+    marks: Sequence[Mark],
     title: str,
     x_label: str,
     y_label: str,
     *,
     log: bool = False,
     log_x: bool = False,
-    marks: Sequence[tuple[float, str]] = (),
+    verticals: Sequence[tuple[float, str]] = (),
     motion: str = "",
     limits: tuple[float, float] | None = None,
-    width: int = WIDTH,
-    height: int = HEIGHT,
+    width: int = 400,
+    height: int = 190,
 ) -> Markup:
-    """One SVG element with lines, bands and dots, axes, grid and `marks` (vertical lines: x, text).
+    """Return one SVG element with lines, bands and dots, axes, grid and vertical lines (x, text).
 
     log, log_x: logarithmic axes. motion: name of the motion whose time x is, which a script may follow. limits: of y,
     in place of its values'. Without an x_label the x axis has no numbers: those of the chart below are its own. The
     legend is the page's business (`style`, `label`). Without a finite value the chart says so.
     """
-    x_values, y_values = _numbers(shown, ("x",)), _numbers(shown, ("y", "low", "high"))
+    x_values, y_values = _finite([mark.x for mark in marks], log_x), _finite(_heights(marks), log)
     if limits is not None:
         y_values = np.array(limits)
-    x_values, y_values = (
-        values[values > 0] if positive else values
-        for values, positive in ((x_values, log_x), (y_values, log))
-    )
-    opening = Markup('<svg class="chart" viewBox="0 0 {} {}" role="img" aria-label="{}"').format(
-        width, height, title
-    )
+    attributes = {"class": "chart", "viewBox": f"0 0 {width} {height}", "role": "img", "aria-label": title}
     if not x_values.size or not y_values.size:
-        empty = Markup('><text x="{}" y="{}" text-anchor="middle">no finite values to show</text></svg>')
-        return opening + empty.format(width / 2, height / 2)
-    bottom = height - (MARGIN_BOTTOM if x_label else BARE_BOTTOM)
-    y_axis = _axis(y_values, bottom, MARGIN_TOP, pad=0.0 if limits else 0.06, log=log)
-    x_axis = _axis(x_values, MARGIN_LEFT, width - MARGIN_RIGHT, pad=0.0, log=log_x)
-    scales = Markup(' data-x="{}" data-y="{}"').format(_told(x_axis), _told(y_axis))
-    moved = Markup(' data-motion="{}"').format(motion) if motion else Markup("")
-    parts = [opening, scales, moved, Markup(">"), _frame(x_axis, y_axis, x_label, y_label)]
-    parts += [_mark(x, text, x_axis, y_axis) for x, text in marks if x_axis.low <= x <= x_axis.high]
-    parts += [_drawn(each, x_axis, y_axis) for each in sorted(shown, key=lambda x: isinstance(x, Line))]
-    return Markup("").join([*parts, Markup("</svg>")])
+        empty = {"x": width / 2, "y": height / 2, "text-anchor": "middle"}
+        return element("svg", attributes, element("text", empty, "no finite values to show"))
+    bottom = height - (MARGINS.bottom if x_label else MARGINS.bare)
+    x_axis = _axis(x_values, MARGINS.left, width - MARGINS.right, pad=0.0, log=log_x)
+    y_axis = _axis(y_values, bottom, MARGINS.top, pad=0.0 if limits else 0.06, log=log)
+    attributes |= {"data-x": x_axis.data(), "data-y": y_axis.data()}
+    if motion:
+        attributes["data-motion"] = motion
+    parts = [_frame(x_axis, y_axis, x_label, y_label)]
+    for x, text in verticals:
+        if x_axis.low <= x <= x_axis.high:
+            parts.append(_vertical(float(x_axis.pixels(np.array(x))), text, x_axis, y_axis))
+    # lines are drawn last, above all bands and dots
+    for mark in sorted(marks, key=lambda mark: type(mark) is Line):
+        parts.append(_drawn(mark, x_axis, y_axis))
+    return element("svg", attributes, Markup("").join(parts))
 
 
-def _numbers(shown: Sequence[Mark], names: Sequence[str]) -> np.ndarray:
-    columns = [
-        np.asarray(getattr(each, name), dtype=float)
-        for each in shown
-        for name in names
-        if hasattr(each, name)
-    ]
-    values = np.concatenate(columns or [np.zeros(0)])
-    return values[np.isfinite(values)]
+def element(tag: str, attributes: Mapping[str, object], content: str = "") -> Markup:
+    """Return an XML element; attributes, and content that is no markup, are escaped."""
+    words = Markup("").join(Markup(' {}="{}"').format(*item) for item in attributes.items())
+    return Markup("<{0}{1}>{2}</{0}>").format(tag, words, content)
 
 
-def _told(axis: Axis) -> str:
-    """For a script: first and last pixel, their values, and whether it is logarithmic."""
-    return f"{axis.start:g} {axis.end:g} {axis.low:.6g} {axis.high:.6g} {int(axis.log)}"
+def _heights(marks: Sequence[Mark]) -> list[Values]:
+    heights: list[Values] = []
+    for mark in marks:
+        if isinstance(mark, Band):
+            heights += [mark.low, mark.high]
+        else:
+            heights.append(mark.y)
+    return heights
 
 
-def _axis(values: np.ndarray, start: float, end: float, *, pad: float, log: bool = False) -> Axis:
+def _finite(columns: Sequence[Values], positive: bool) -> np.ndarray:
+    values: np.ndarray = np.concatenate(
+        [np.zeros(0), *(np.asarray(column, dtype=float) for column in columns)]
+    )
+    values = values[np.isfinite(values)]
+    if positive:
+        values = values[values > 0]
+    return values
+
+
+def _axis(values: np.ndarray, start: float, end: float, *, pad: float, log: bool) -> Axis:
+    """Return an axis that holds the values, and `pad` of their range on both sides."""
     low, high = float(values.min()), float(values.max())
     if log:
-        low = max(low, high * 10.0**-MAX_DECADES)
-        low, high = (
-            (low / 2, high * 2) if low == high else (low / (high / low) ** pad, high * (high / low) ** pad)
-        )
-    elif high - low <= 1e-9 * max(abs(low), abs(high)):
+        low = max(low, high * 10.0**-TUNING.decades)
+        factor = (high / low) ** pad if high > low else 2.0
+        return Axis(low / factor, high * factor, start, end, log=True)
+    room = pad * (high - low)
+    if high - low <= 1e-9 * max(abs(low), abs(high)):
         room = 0.5 * abs(high) or 1.0  # a flat line lies in the middle
-        low, high = low - room, high + room
-    else:
-        low, high = low - pad * (high - low), high + pad * (high - low)
-    return Axis(low, high, start, end, log)
+    return Axis(low - room, high + room, start, end)
 
 
-def _round_step(step: float) -> float:
-    """The least of 1, 2, 5 times a power of ten that is not below `step`."""
-    power = 10.0 ** math.floor(math.log10(step))
-    return next(m * power for m in (1, 2, 5, 10) if m * power >= step * (1 - 1e-9))
+def _decades(low: float, high: float) -> list[float]:
+    """Return powers of ten, or 1, 2 and 5 times these where there are fewer than three."""
+    first, last = math.ceil(math.log10(low) - 1e-9), math.floor(math.log10(high) + 1e-9)
+    powers = [10.0**k for k in range(first, last + 1, max(1, math.ceil((last - first + 1) / 5)))]
+    if len(powers) >= 3:
+        return powers
+    fine = np.outer(10.0 ** np.arange(first - 1, last + 1), [1, 2, 5]).ravel()
+    fine = fine[(fine >= low) & (fine <= high)]
+    if len(fine) >= 3:
+        return list(fine)
+    return list(np.geomspace(low, high, 4))
+
+
+def _log_labels(values: Sequence[float]) -> list[str]:
+    """Return 10 with an exponent where all values are powers of ten."""
+    powers = np.log10(values)
+    if not np.allclose(powers, powers.round(), atol=1e-9):
+        return [f"{value:.3g}" for value in values]
+    exponent = {"dy": "-5", "class": "power"}
+    return ["10" + element("tspan", exponent, str(round(power))) for power in powers]
+
+
+def _steps(low: float, high: float) -> tuple[list[float], list[str]]:
+    """Return multiples of 1, 2 or 5 times a power of ten, with as many decimals as they need."""
+    rough = (high - low) / 5
+    power = math.floor(math.log10(rough))
+    step = next(m * 10.0**power for m in (1, 2, 5, 10) if m * 10.0**power >= rough * (1 - 1e-9))
+    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
+    values = [k * step for k in range(first, last + 1)]
+    decimals = max(0, -math.floor(math.log10(step) + 1e-9))
+    if decimals > 4 or max(abs(low), abs(high)) >= 1e5:
+        return values, [f"{value:.2g}" for value in values]
+    return values, [f"{value:.{decimals}f}" for value in values]
 
 
 def _frame(x_axis: Axis, y_axis: Axis, x_label: str, y_label: str) -> Markup:
-    bottom, left = y_axis.start, x_axis.start
-    grid, text = (
-        Markup('<path class="grid" d="M{:.1f} {:.1f}H{:.1f}"/>'),
-        Markup('<text x="{:.1f}" y="{:.1f}" {}>{}</text>'),
-    )
-    end, middle = Markup('text-anchor="end"'), Markup('text-anchor="middle"')
+    """Return grid, axes and their labels."""
+    left, right, bottom = x_axis.start, x_axis.end, y_axis.start
     parts = []
-    for value, label in _labelled(y_axis):
-        y = y_axis.pixel(value)
-        parts += [grid.format(left, y, x_axis.end), text.format(left - 7, y + 4, end, label)]
-    parts.append(Markup('<path class="axis" d="M{:.1f} {:.1f}H{:.1f}"/>').format(left, bottom, x_axis.end))
+    for y, label in y_axis.ticks():
+        parts.append(element("path", {"class": "grid", "d": f"M{left:.1f} {y:.1f}H{right:.1f}"}))
+        parts.append(_text(left - 7, y + 4, "end", label))
+    parts.append(element("path", {"class": "axis", "d": f"M{left:.1f} {bottom:.1f}H{right:.1f}"}))
     if x_label:
-        for value, label in _labelled(x_axis):
-            parts.append(text.format(x_axis.pixel(value), bottom + 16, middle, label))
-        place = Markup('text-anchor="middle" class="label"')
-        parts.append(text.format((left + x_axis.end) / 2, bottom + 31, place, x_label))
+        for x, label in x_axis.ticks():
+            parts.append(_text(x, bottom + 16, "middle", label))
+        parts.append(_text((left + right) / 2, bottom + 31, "middle", x_label, {"class": "label"}))
     y = (bottom + y_axis.end) / 2
-    turned = Markup('text-anchor="middle" class="label" transform="rotate(-90 12 {:.1f})"').format(y)
-    return Markup("").join([*parts, text.format(12, y, turned, y_label)])
+    turned = {"class": "label", "transform": f"rotate(-90 12 {y:.1f})"}
+    parts.append(_text(12, y, "middle", y_label, turned))
+    return Markup("").join(parts)
 
 
-def _labelled(axis: Axis) -> list[tuple[float, str | Markup]]:
-    ticks = axis.ticks()
-    powers = [math.log10(tick) for tick in ticks] if axis.log else []
-    if powers and all(math.isclose(power, round(power), abs_tol=1e-9) for power in powers):
-        text = Markup('10<tspan dy="-5" class="power">{}</tspan>')
-        return [(tick, text.format(round(power))) for tick, power in zip(ticks, powers, strict=True)]
-    if axis.log:
-        return [(tick, f"{tick:g}") for tick in ticks]
-    decimals = max((_decimals(tick) for tick in ticks), default=0)
-    plain = decimals <= 4 and max(map(abs, ticks), default=0.0) < 1e5
-    return [(tick, f"{tick:.{decimals}f}" if plain else f"{tick:.2g}") for tick in ticks]
+def _text(x: float, y: float, anchor: str, text: str, attributes: Mapping[str, str] | None = None) -> Markup:
+    place = {"x": f"{x:.1f}", "y": f"{y:.1f}", "text-anchor": anchor}
+    return element("text", {**place, **(attributes or {})}, text)
 
 
-def _decimals(value: float) -> int:
-    return len(f"{abs(value):.9f}".rstrip("0").split(".")[1])
+def _vertical(x: float, text: str, x_axis: Axis, y_axis: Axis) -> Markup:
+    line = element("path", {"class": "mark", "d": f"M{x:.1f} {y_axis.start:.1f}V{y_axis.end:.1f}"})
+    if x > (x_axis.start + x_axis.end) / 2:
+        return line + _text(x - 5, y_axis.end + 10, "end", text)
+    return line + _text(x + 5, y_axis.end + 10, "start", text)
 
 
-def _mark(x: float, text: str, x_axis: Axis, y_axis: Axis) -> Markup:
-    pixel, top = x_axis.pixel(x), y_axis.end
-    side, anchor = (-5, "end") if pixel > (x_axis.start + x_axis.end) / 2 else (5, "start")
-    line = Markup('<path class="mark" d="M{:.1f} {:.1f}V{:.1f}"/>').format(pixel, y_axis.start, top)
-    return line + Markup('<text x="{:.1f}" y="{:.1f}" text-anchor="{}">{}</text>').format(
-        pixel + side, top + 10, anchor, text
-    )
+def _drawn(mark: Mark, x_axis: Axis, y_axis: Axis) -> Markup:
+    title = element("title", {}, mark.label)
+    if isinstance(mark, Band):
+        return element(
+            "polygon", {"class": f"band {mark.style}", "points": _outline(mark, x_axis, y_axis)}, title
+        )
+    x, y = np.asarray(mark.x, dtype=float), np.asarray(mark.y, dtype=float)
+    if isinstance(mark, Dots):
+        inside = (x >= x_axis.low) & (x <= x_axis.high) & (y >= y_axis.low) & (y <= y_axis.high)
+        places = zip(x_axis.pixels(x[inside]), y_axis.pixels(y[inside]), strict=True)
+        # lines without length, whose round ends are the dots
+        path = "".join(f"M{a:.1f} {b:.1f}h0" for a, b in places)
+        return element("path", {"class": f"dots {mark.style}", "d": path}, title)
+    return element("path", {"class": f"line {mark.style}", "d": _path(x, y, x_axis, y_axis)}, title)
 
 
-def _drawn(each: Mark, x_axis: Axis, y_axis: Axis) -> Markup:
-    if isinstance(each, Dots):
-        return _dots(each, x_axis, y_axis)
-    return _band(each, x_axis, y_axis) if isinstance(each, Band) else _path(each, x_axis, y_axis)
-
-
-def _path(line: Line, x_axis: Axis, y_axis: Axis) -> Markup:
-    x, y = np.asarray(line.x, dtype=float), np.asarray(line.y, dtype=float)
-    stride = max(1, math.ceil(len(x) / MAX_POINTS))
-    steps, at = [], None
-    for k in sorted({*range(0, len(x), stride), len(x) - 1} - {-1}):
-        if not (math.isfinite(x[k]) and math.isfinite(y[k]) and (y[k] > 0 or not y_axis.log)):
-            at = None
+def _path(x: np.ndarray, y: np.ndarray, x_axis: Axis, y_axis: Axis) -> str:
+    """Return a path in tenths of a pixel, relative steps being shorter; broken where a value cannot be drawn."""
+    stride = max(1, math.ceil(len(x) / TUNING.points))
+    rows = np.unique([*range(0, len(x), stride), max(len(x) - 1, 0)])[: len(x)]
+    x, y = x[rows], y[rows]
+    drawable = np.isfinite(x) & np.isfinite(y)
+    if y_axis.log:
+        drawable &= y > 0
+    columns, heights = np.round(10 * x_axis.pixels(x)), np.round(10 * y_axis.pixels(y))
+    steps, pen = [], None
+    for column, height, visible in zip(columns, heights, drawable, strict=True):
+        if not visible:
+            pen = None
             continue
-        there = round(10 * x_axis.pixel(x[k])), round(10 * y_axis.pixel(y[k]))  # in tenths of a pixel
-        letter, base = ("M", (0, 0)) if at is None else ("l", at)
-        steps.append(f"{letter}{(there[0] - base[0]) / 10:g} {(there[1] - base[1]) / 10:g}")
-        at = there
-    return Markup('<path class="line {}" d="{}"><title>{}</title></path>').format(
-        line.style, "".join(steps), line.label
-    )
+        if pen is None:
+            steps.append(f"M{column / 10:g} {height / 10:g}")
+        else:
+            steps.append(f"l{(column - pen[0]) / 10:g} {(height - pen[1]) / 10:g}")
+        pen = column, height
+    return "".join(steps)
 
 
-def _band(band: Band, x_axis: Axis, y_axis: Axis) -> Markup:
-    """Up to the first value that is not finite; what exceeds the axis ends at its edge."""
-    columns = (np.asarray(values, dtype=float) for values in (band.x, band.low, band.high))
-    rows = []
-    for x, low, high in zip(*columns, strict=True):
-        if not (math.isfinite(x) and math.isfinite(low)):
-            break
-        top = high if math.isfinite(high) else y_axis.high
-        rows.append((x_axis.pixel(x), y_axis.pixel(low), y_axis.pixel(min(top, y_axis.high))))
-    outline = [(x, low) for x, low, _ in rows] + [(x, high) for x, _, high in reversed(rows)]
-    return Markup('<polygon class="band {}" points="{}"><title>{}</title></polygon>').format(
-        band.style, " ".join(f"{x:.1f},{y:.1f}" for x, y in outline), band.label
-    )
-
-
-def _dots(dots: Dots, x_axis: Axis, y_axis: Axis) -> Markup:
-    """One path of lines without length, whose round ends are the dots."""
-    x, y = np.asarray(dots.x, dtype=float), np.asarray(dots.y, dtype=float)
-    inside = np.isfinite(x) & np.isfinite(y) & (x >= x_axis.low) & (x <= x_axis.high)
-    inside &= (y >= y_axis.low) & (y <= y_axis.high)
-    places = zip(x[inside], y[inside], strict=True)
-    path = "".join(f"M{x_axis.pixel(a):.1f} {y_axis.pixel(b):.1f}h0" for a, b in places)
-    return Markup('<path class="dots {}" d="{}"><title>{}</title></path>').format(
-        dots.style, path, dots.label
-    )
+def _outline(band: Band, x_axis: Axis, y_axis: Axis) -> str:
+    """Return the corners up to the first value that is not finite; what exceeds the axis ends at its edge."""
+    x, low, high = (np.asarray(values, dtype=float) for values in (band.x, band.low, band.high))
+    finite = np.isfinite(x) & np.isfinite(low)
+    count = len(x) if finite.all() else int(np.argmin(finite))
+    columns = x_axis.pixels(x[:count])
+    bottom = y_axis.pixels(low[:count])
+    top = y_axis.pixels(np.nan_to_num(high[:count], nan=y_axis.high, posinf=y_axis.high))
+    corners = [*zip(columns, bottom, strict=True), *zip(columns[::-1], top[::-1], strict=True)]
+    return " ".join(f"{a:.1f},{b:.1f}" for a, b in corners)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from markupsafe import Markup
 
@@ -14,10 +14,9 @@ from spelgen.emission.loading import load_module
 from spelgen.evaluation.tables import Table
 from spelgen.files import write_text
 from spelgen.fitting.run_folder import RunFolder
-from spelgen.labels import entry_name
 from spelgen.render.charts import Line, line_chart
 from spelgen.render.page import render_page
-from spelgen.render.plots import QUANTITIES, UNITS, Panel, inertia_unit
+from spelgen.render.plots import QUANTITIES, UNITS, Panel, Record, mass_panels
 
 STYLES = ("c1", "c2", "c3", "c4", "c5", "c6")
 
@@ -25,9 +24,13 @@ STYLES = ("c1", "c2", "c3", "c4", "c5", "c6")
 def write_comparison(study: Study, tables: Sequence[Table]) -> Path:
     """Write comparison.html into the study's folder; return its path."""
     results = [result for result in study.results() if result["seed"] == 0]
-    names = [result["variant"] for result in results]
-    styles = dict(zip(names, STYLES, strict=False))
+    styles = dict(zip([result["variant"] for result in results], STYLES, strict=False))
     joint_types = load_module(study.module(study.variants[0])).joint_types
+    with_examples = [result for result in results if result["examples"]]
+    panels, entries = [], []
+    if with_examples:
+        panels = _prediction_panels(with_examples, styles, joint_types)
+        entries = _mass_panels(study, with_examples, styles, joint_types)
     text = render_page(
         "comparison.html.jinja",
         study=study,
@@ -35,87 +38,69 @@ def write_comparison(study: Study, tables: Sequence[Table]) -> Path:
         key=[(style, name) for name, style in styles.items()],
         verdict=_verdict(tables),
         losses=_losses(study, styles),
-        panels=_panels(results, styles, joint_types),
-        entries=_entries(study, results, styles, joint_types),
+        panels=panels,
+        entries=entries,
     )
     return write_text(study.folder / "comparison.html", text)
 
 
 def _verdict(tables: Sequence[Table]) -> str:
-    """Which model is best in most rows of the tables."""
-    wins: dict[str, int] = {}
+    """Say which model is best in most rows of the tables."""
+    wins: Counter[str] = Counter()
     rows = 0
     for table in tables:
         for row in table.rows:
             best = [name for name, cell in zip(table.columns, row.cells, strict=True) if cell.best]
+            wins.update(best)
             rows += bool(best)
-            for name in best:
-                wins[name] = wins.get(name, 0) + 1
     if not wins:
         return "Nothing was compared."
-    most = max(wins, key=wins.__getitem__)
-    return f"{most} is the best in {wins[most]} of {rows} rows."
+    ((name, count),) = wins.most_common(1)
+    return f"{name} is the best in {count} of {rows} rows."
 
 
 def _losses(study: Study, styles: Mapping[str, str]) -> Markup:
-    """Validation loss of the first seed's runs by training step."""
+    """Return the validation loss of the first seed's runs by training step."""
     lines = []
     for variant in study.variants:
         records = RunFolder(study.run(variant, 0)).read_metrics()
-        if variant.name not in styles or not records:
-            continue
-        steps = [record["step"] for record in records]
-        lines.append(Line(variant.name, steps, [record["best"] for record in records], styles[variant.name]))
-    return line_chart(
-        lines, "Best validation loss by step", "training step", "loss", log=True, width=560, height=250
-    )
+        if variant.name in styles and records:
+            steps, losses = [record["step"] for record in records], [record["best"] for record in records]
+            lines.append(Line(variant.name, steps, losses, styles[variant.name]))
+    title = "Best validation loss by step"
+    return line_chart(lines, title, "training step", "loss", log=True, width=560, height=250)
 
 
-def _entries(
-    study: Study,
-    results: Sequence[Mapping[str, Any]],
-    styles: Mapping[str, str],
-    joint_types: Sequence[str],
+def _mass_panels(
+    study: Study, results: Sequence[Record], styles: Mapping[str, str], joint_types: Sequence[str]
 ) -> list[Panel]:
-    """M's lower triangle along the first example: the true robot's, and what every variant learned."""
-    shown = [result for result in results if result["examples"]]
-    if not shown:
-        return []
-    example = shown[0]["examples"][0]
-    true = true_mass(study.source, example_positions(example)).tolist()
-    panels = []
-    for i, j in [(row, column) for row in range(len(joint_types)) for column in range(row + 1)]:
-        lines = [Line("true", example["t"], [each[i][j] for each in true], "truth")]
-        for result in shown:
-            learned = [each[i][j] for each in result["mass"]["along"]]
-            lines.append(Line(result["variant"], example["t"], learned, styles[result["variant"]]))
-        name = entry_name(i, j)
-        unit = inertia_unit(joint_types[i], joint_types[j])
-        chart = line_chart(lines, name, "t [s]", f"{name} [{unit}]", height=170)
-        panels.append(Panel(name, (chart,)))
-    return panels
+    """Return M's lower triangle along the first example: the true robot's, and what every variant learned."""
+    example = results[0]["examples"][0]
+    along = {"true": true_mass(study.source, example_positions(example)).tolist()}
+    for result in results:
+        along[result["variant"]] = result["mass"]["along"]
+    entries = {}
+    for i in range(len(joint_types)):
+        for j in range(i + 1):
+            entries[i, j] = {name: [mass[i][j] for mass in masses] for name, masses in along.items()}
+    return mass_panels(example["t"], entries, {"true": "truth", **styles}, joint_types, width=400)
 
 
-def _panels(
-    results: Sequence[Mapping[str, Any]], styles: Mapping[str, str], joint_types: Sequence[str]
+def _prediction_panels(
+    results: Sequence[Record], styles: Mapping[str, str], joint_types: Sequence[str]
 ) -> list[Panel]:
-    """The first test trajectory of the results: what was measured, and what every variant predicts."""
-    examples = {result["variant"]: result["examples"][0] for result in results if result["examples"]}
-    if not examples:
-        return []
-    t = next(iter(examples.values()))["t"]
-    joints = next(iter(examples.values()))["joints"]
+    """Return the first test trajectory of the results: what was measured, and what every variant predicts."""
+    examples = {result["variant"]: result["examples"][0] for result in results}
+    first = results[0]["examples"][0]
     panels = []
-    for k, (joint, kind) in enumerate(zip(joints, joint_types, strict=True)):
+    for k, (joint, kind) in enumerate(zip(first["joints"], joint_types, strict=True)):
         charts = []
-        for what, unit in zip(QUANTITIES, UNITS[kind], strict=True):
-            lines = [Line("measured", t, joint[f"{what}_true"], "truth")]
-            lines += [
-                Line(name, t, example["joints"][k][f"{what}_pred"], styles[name])
-                for name, example in examples.items()
-            ]
-            name = QUANTITIES[what]
-            title = f"{name} of {joint['name']}"
-            charts.append(line_chart(lines, title, "t [s]", f"{name} [{unit}]", height=170))
+        for (key, quantity), unit in zip(QUANTITIES.items(), UNITS[kind], strict=True):
+            lines = [Line("measured", first["t"], joint[f"{key}_true"], "truth")]
+            for name, example in examples.items():
+                predicted = example["joints"][k][f"{key}_pred"]
+                lines.append(Line(name, first["t"], predicted, styles[name]))
+            title = f"{quantity} of {joint['name']}"
+            charts.append(line_chart(lines, title, "t [s]", f"{quantity} [{unit}]", height=170))
         panels.append(Panel(joint["name"], tuple(charts)))
     return panels

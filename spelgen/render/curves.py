@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from markupsafe import Markup
 
@@ -12,99 +11,99 @@ from spelgen.labels import thousandths
 from spelgen.listing import number
 from spelgen.render.picture import Picture
 from spelgen.render.plots import (
+    COMPONENTS,
+    Limits,
     Panel,
+    Record,
     coverage_panels,
     eigenvalue_chart,
     energy_chart,
     friction_panels,
     growth_charts,
-    mass_panels,
     style,
     torque_panels,
+    trace_mass_panels,
     trajectory_panels,
 )
 from spelgen.spec import Facts
 
-BOTH = (("truth", "measured"), ("predicted", "predicted"))
-Limits = Sequence[tuple[float, float] | None]
+Legend = tuple[tuple[str, str], ...]
+"""Style and label of each line."""
+BOTH: Legend = (("truth", "measured"), ("predicted", "predicted"))
 
 
 @dataclass(frozen=True)
-class Drawn:
-    """A part of the page: a heading, its legend (style, label) and panels."""
+class Section:
+    """A part of the page: a heading, its legend and panels."""
 
     title: str
-    key: tuple[tuple[str, str], ...]
-    panels: tuple[Panel, ...]
+    key: Legend
+    panels: list[Panel]
 
 
-@dataclass(frozen=True)
+@dataclass
 class Curves:
     """All that is drawn of an evaluation's traces; None or empty where there is nothing."""
 
-    growth: tuple[Panel, ...] = ()
-    torques: tuple[Drawn, ...] = ()
-    trajectories: tuple[Drawn, ...] = ()
-    mass: tuple[Panel, ...] = ()
+    growth: Sequence[Panel] = ()
+    torques: Sequence[Section] = ()
+    trajectories: Sequence[Section] = ()
+    mass: Sequence[Panel] = ()
     eigenvalues: Markup | None = None
     along: str = ""
-    friction: tuple[Panel, ...] = ()
+    friction: Sequence[Panel] = ()
     energy: Markup | None = None
 
 
-def predictors(evaluation: Mapping[str, Any] | None) -> list[tuple[str, str]]:
-    """Legend of all that predicts: style and name."""
-    horizons = (evaluation or {}).get("horizons") or []
-    names = list(horizons[0]["errors"]) if horizons else list((evaluation or {}).get("torque") or {})
+def predictors(evaluation: Record) -> list[tuple[str, str]]:
+    """Return the legend of all that predicts: style and name."""
+    names = evaluation.get("torque", {})
+    if evaluation.get("horizons"):
+        names = evaluation["horizons"][0]["errors"]
     return [(style(name), name) for name in names]
 
 
-def curves(traces: Mapping[str, Any], facts: Facts, picture: Picture) -> Curves:
-    """All that can be drawn of these traces."""
+def curves(traces: Record, facts: Facts, picture: Picture) -> Curves:
+    """Return all that can be drawn of these traces."""
     joints, types = facts.joints, facts.joint_types
-    mass = traces.get("mass") or {}
+    drawn = Curves()
+    if traces.get("growth"):
+        drawn.growth = growth_charts(traces["growth"])
     torques = traces.get("torques") or []
-    parts = (
-        ("inertia", "inertia"),
-        ("coriolis", "Coriolis"),
-        ("gravity", "gravity"),
-        ("friction", "friction"),
-    )
-    return Curves(
-        growth=tuple(growth_charts(traces["growth"])) if traces.get("growth") else (),
-        torques=tuple(
-            Drawn(
-                f"{x['which'].capitalize()} trajectory: {x['trajectory']}",
-                (*BOTH, *parts),
-                tuple(torque_panels(x, joints, types)),
-            )
-            for x in torques
-        ),
-        trajectories=tuple(_predicted(x, joints, types) for x in traces.get("trajectories", [])),
-        mass=tuple(mass_panels(mass, types, picture.rows)) if mass.get("by") else (),
-        eigenvalues=eigenvalue_chart(mass) if mass.get("by") else None,
-        along=str(mass.get("trajectory", "")),
-        friction=tuple(friction_panels(traces["friction"], torques, joints, types))
-        if traces.get("friction")
-        else (),
-        energy=energy_chart(torques[0]) if torques else None,
-    )
+    if torques:
+        drawn.torques = [_torques(trace, facts) for trace in torques]
+        drawn.energy = energy_chart(torques[0])
+    drawn.trajectories = [_prediction(example, facts) for example in traces.get("trajectories", [])]
+    mass = traces.get("mass") or {}
+    if mass.get("by"):
+        kinds = [[cell.kind for cell in row] for row in picture.rows]
+        drawn.mass, drawn.eigenvalues = trace_mass_panels(mass, kinds, types), eigenvalue_chart(mass)
+        drawn.along = str(mass["trajectory"])
+    if traces.get("friction"):
+        drawn.friction = friction_panels(traces["friction"], torques, joints, types)
+    return drawn
 
 
-def _predicted(example: Mapping[str, Any], joints: Sequence[str], types: Sequence[str]) -> Drawn:
-    which, name, error = (example[x] for x in ("which", "trajectory", "error"))
-    panels = tuple(trajectory_panels(example, joints, types))
+def _torques(trace: Record, facts: Facts) -> Section:
+    title = f"{trace['which'].capitalize()} trajectory: {trace['trajectory']}"
+    key = (*BOTH, *((name.lower(), name) for name in COMPONENTS))
+    return Section(title, key, torque_panels(trace, facts.joints, facts.joint_types))
+
+
+def _prediction(example: Record, facts: Facts) -> Section:
+    kind, name, error = example["which"].capitalize(), example["trajectory"], example["error"]
+    panels = trajectory_panels(example, facts.joints, facts.joint_types)
     if "u" in example:
-        title = f"{which.capitalize()} log replayed: {name}, {number(1000 * error)} {thousandths(types)} off"
-        return Drawn(title, (*BOTH, ("hold", "commanded")), panels)
-    title = f"{which.capitalize()} prediction: {name}, {example['start']:.3g} s into it, "
-    return Drawn(f"{title}relative error {number(error)}", BOTH, panels)
+        title = f"{kind} log replayed: {name}, {number(1000 * error)} {thousandths(facts.joint_types)} off"
+        return Section(title, (*BOTH, ("hold", "commanded")), panels)
+    title = f"{kind} prediction: {name}, {example['start']:.3g} s into it, relative error {number(error)}"
+    return Section(title, BOTH, panels)
 
 
-def coverage(
-    traces: Mapping[str, Any], identified: Mapping[str, Any] | None, facts: Facts, limits: Limits
-) -> list[Panel]:
-    """Where training and test logs have been."""
-    known = {"training": (identified or {}).get("coverage"), "test": traces.get("coverage")}
-    logs = {name: x for name, x in known.items() if x}
-    return coverage_panels(logs, facts.joints, facts.joint_types, limits) if logs else []
+def coverage(traces: Record, identified: Record | None, facts: Facts, limits: Limits) -> list[Panel]:
+    """Return where training and test logs have been."""
+    logs = {"training": (identified or {}).get("coverage"), "test": traces.get("coverage")}
+    known = {name: covered for name, covered in logs.items() if covered}
+    if not known:
+        return []
+    return coverage_panels(known, facts.joints, facts.joint_types, limits)

@@ -17,12 +17,12 @@ _WIDTH = 100  # of the closed forms
 
 
 def page(
-    found: Inspection,
+    inspection: Inspection,
     closed: Formulas | None = None,
     proof: Verification | None = None,
     urdf: Path | None = None,
 ) -> str:
-    """The page about ``found``, with the closed forms, the proof and the arm of the URDF where they are given.
+    """The page about the inspection, with the closed forms, the proof and the arm of the URDF where they are given.
 
     It needs no other file, and all that comes from the URDF is escaped.
     """
@@ -33,10 +33,10 @@ def page(
         text = written(closed, _WIDTH)
     return render_page(
         "inspection.html.jinja",
-        found=found,
-        cells=matrix(found.arm, found.structure),
-        arm=None if urdf is None else arm_section(found.arm, urdf),
-        joints=[(each.name, each.kind, reach(each)) for each in found.arm.coordinates],
+        found=inspection,
+        cells=matrix(inspection.arm, inspection.structure),
+        arm=None if urdf is None else arm_section(inspection.arm, urdf),
+        joints=[(joint.name, joint.kind, reach(joint)) for joint in inspection.arm.coordinates],
         closed=text,
         proof=proof,
     )

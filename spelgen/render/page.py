@@ -6,7 +6,6 @@ import base64
 import hashlib
 import json
 from functools import cache
-from typing import Any
 
 from markupsafe import Markup
 
@@ -16,7 +15,7 @@ from spelgen.templates import read, render
 SCRIPTS = ("page.js", "arm.js")
 
 
-def render_page(template: str, **context: Any) -> str:
+def render_page(template: str, **context: object) -> str:
     """One self-contained page. Its Content-Security-Policy admits the style and the scripts in it by their digests,
     and nothing else: no file or address can be loaded, and no text that came through can run.
     """
@@ -27,12 +26,12 @@ def render_page(template: str, **context: Any) -> str:
         style=style,
         style_hash=Markup(_digest(style)),
         scripts=scripts,
-        script_hashes=Markup(" ").join(Markup("'{}'").format(_digest(each)) for each in scripts),
+        script_hashes=Markup(" ").join(Markup("'{}'").format(_digest(script)) for script in scripts),
         **context,
     )
 
 
-def json_data(data: Any) -> Markup:
+def json_data(data: object) -> Markup:
     """JSON that may stand in a <script> element: none of its text can end the element."""
     text = json.dumps(data, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
     return Markup(text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e"))

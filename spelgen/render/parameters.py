@@ -1,32 +1,37 @@
-"""What a model has learned that is a number: inertial parameters, drives and friction, beside the URDF's."""
+"""Tables of what a model has learned that is a number: inertial parameters, drives, friction and constants of M."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
 from spelgen.dynamics.protocol import has_rigid_bodies, has_servos
 from spelgen.dynamics.regressor import urdf_parameters
+from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.fitting.servo_report import open_text, servo_listing
 from spelgen.identification.base_parameters import base_parameters
 from spelgen.identification.friction import FrictionModel
 from spelgen.loaded_arm import LoadedArm
-from spelgen.render.plots import FORCE, INERTIA_UNITS, UNITS
+from spelgen.render.plots import FORCE, UNITS, Record, inertia_unit
+from spelgen.settings.tuning.render import TUNING
 
-SURE_WORDS = ("firm", "fair")
-SURE = 2.0  # standard deviations of an interval: 95 %
-FAINT = 1e-4  # of dry friction: there is no such law
+if TYPE_CHECKING:
+    from spelgen.emission.loading import EmittedModel
+
+Rows = tuple[tuple[str, ...], ...]
+DETERMINED = ("firm", "fair")
+# of all others the unit is that of a torque
 FRICTION_UNITS = {
     "viscous": "{force} s/{length}",
     "saturation_velocity": "{speed}",
     "stribeck_velocity": "{speed}",
     "coulomb_smoothing_velocity": "{speed}",
     "load_dependence": "",
-}  # all others are a torque
+}
 
 
 @dataclass(frozen=True)
@@ -35,102 +40,121 @@ class ParameterTable:
 
     title: str
     head: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
+    rows: Rows
     note: str = ""
-    more: tuple[tuple[str, ...], ...] = ()
+    more: Rows = ()
     more_title: str = ""
 
 
-def servo_table(record: Mapping[str, Any]) -> ParameterTable:
-    """What a fit of position servos tells by joint; `record`: the run's, of servos."""
+@dataclass(frozen=True)
+class Constant:
+    """A trained constant of M: where it enters, its value before training and after, in that entry's unit."""
+
+    where: str
+    start: float
+    learned: float
+    unit: str
+
+
+def servo_table(record: Record) -> ParameterTable:
+    """Return what a fit of position servos found by joint; `record`: the run's, of servos."""
     listing = servo_listing(record, zones=True)
     return ParameterTable(listing.title, listing.head, listing.rows, f"{listing.note} {open_text(record)}.")
 
 
 def parameter_tables(
-    model: Any | None, arm: LoadedArm | None, identified: Mapping[str, Any] | None
+    model: EmittedModel | None, arm: LoadedArm | None, identified: Record | None
 ) -> list[ParameterTable]:
-    """All that is known of a run's parameters; `identified`: what least squares found of the same logs."""
-    found = [] if model is None else [*_bodies(model, arm), *_joints(model, arm)]
+    """Return all that is known of a run's parameters; `identified`: by least squares on the same logs."""
+    tables = []
     if arm is not None and identified and "base_parameters" in identified:
-        found.insert(0, base_table(model, arm, identified))
-    return found
+        tables.append(base_table(model, arm, identified))
+    if model is None:
+        return tables
+    bodies = body_parameters(model)
+    if bodies is not None:
+        tables.append(_body_table(bodies, arm))
+    columns = _joint_columns(model)
+    if columns:
+        tables.append(_joint_table(model, columns, arm))
+    return tables
 
 
-def body_parameters(model: Any) -> np.ndarray | None:
-    """(bodies, 10) of a closed-form model, as ``Body.inertia`` has them; None of another."""
+def body_parameters(model: EmittedModel) -> np.ndarray | None:
+    """Return (bodies, 10) of a model of rigid bodies, as ``Body.inertia`` has them; None of another."""
     if not has_rigid_bodies(model):
         return None
-    with torch.no_grad():
-        values: np.ndarray = model.inertial_parameters.numpy()
+    values: np.ndarray = model.inertial_parameters.detach().numpy()
     return values
 
 
-def base_table(model: Any | None, arm: LoadedArm, identified: Mapping[str, Any]) -> ParameterTable:
-    """What least squares found, beside the URDF and, where there is one, a closed-form model."""
+def base_table(model: EmittedModel | None, arm: LoadedArm, identified: Record) -> ParameterTable:
+    """Return what least squares found, beside the URDF and, where there is one, a model of rigid bodies."""
     effects = identified["method"]["effects"]
     friction = FrictionModel(stribeck="stribeck" in effects, polynomial="cubic" in effects)
     base = base_parameters(arm.arm, friction, arm.actuation.drives().speeds)
-    drives = len(base.parameters) - 10 * len(arm.arm.bodies)
-    nominal = base.combination @ np.concatenate([urdf_parameters(arm.arm), np.zeros(drives)])
+    nominal = np.zeros(base.combination.shape[1])
+    nominal[: 10 * len(arm.arm.bodies)] = urdf_parameters(arm.arm)
+    nominal = base.combination @ nominal
     learned = _learned(model, base.combination)
-    rows: dict[bool, list[tuple[str, ...]]] = {True: [], False: []}
-    for k, each in enumerate(identified["base_parameters"]):
-        of_bodies, of_drives = k < base.bodies, each["name"].startswith("armature")
-        away = each["deviation"]
-        own = [] if learned is None else [f"{learned[k]:.4g}" if of_bodies or of_drives else ""]
-        rows[each["determined"] in SURE_WORDS].append(
-            (
-                each["name"],
-                f"{nominal[k]:.4g}" if of_bodies and arm.arm.has_inertials else "",
-                *own,
-                f"{each['value']:.4g}" + ("" if away is None else f" ± {SURE * away:.2g}"),
-                each["determined"],
-                "" if each["formula"] == each["name"] else each["formula"],
-            )
-        )
-    model_head = () if learned is None else ("model",)
-    told = "The intervals are those of least squares on the training logs [kg, m, s]"
+    sure: list[tuple[str, ...]] = []
+    unsure: list[tuple[str, ...]] = []
+    for k, parameter in enumerate(identified["base_parameters"]):
+        of_bodies, value = k < base.bodies, f"{parameter['value']:.4g}"
+        if parameter["deviation"] is not None:
+            value += f" ± {TUNING.interval * parameter['deviation']:.2g}"
+        row = [parameter["name"], f"{nominal[k]:.4g}" if of_bodies and arm.arm.has_inertials else ""]
+        if learned is not None:
+            known = of_bodies or parameter["name"].startswith("armature")
+            row.append(f"{learned[k]:.4g}" if known else "")
+        row += [value, parameter["determined"], parameter["formula"].replace(parameter["name"], "", 1)]
+        if parameter["formula"] != parameter["name"]:
+            row[-1] = parameter["formula"]
+        rows = sure if parameter["determined"] in DETERMINED else unsure
+        rows.append(tuple(row))
+    head = ["parameter", "URDF", "least squares, 95 %", "determined", "made of"]
+    note = "The intervals are those of least squares on the training logs [kg, m, s]"
     if learned is not None:
-        told += (
+        head.insert(2, "model")
+        note += (
             "; a value of the model outside its interval is either drawn there by the URDF, or tells of an effect "
             "that least squares has no column for"
         )
     return ParameterTable(
         "Base parameters: the only combinations that motion shows",
-        ("parameter", "URDF", *model_head, "least squares, 95 %", "determined", "made of"),
-        tuple(rows[True]),
-        f"{told}.",
-        tuple(rows[False]),
-        f"{len(rows[False])} more that these logs hardly tell from zero",
+        tuple(head),
+        tuple(sure),
+        f"{note}.",
+        tuple(unsure),
+        f"{len(unsure)} more that these logs hardly tell from zero",
     )
 
 
-def _learned(model: Any, combination: np.ndarray) -> np.ndarray | None:
-    """Base parameters of a closed-form model; those of friction are of other laws, and stay zero."""
-    own = body_parameters(model)
-    if own is None:
+def _learned(model: EmittedModel | None, combination: np.ndarray) -> np.ndarray | None:
+    """Return base parameters of a model of rigid bodies; those of friction follow other laws, and stay zero."""
+    bodies = None if model is None else body_parameters(model)
+    if model is None or bodies is None:
         return None
     parameters = np.zeros(combination.shape[1])
-    parameters[: own.size] = own.ravel()
-    if hasattr(model, "armature"):
-        parameters[own.size : own.size + model.n] = model.armature.detach().numpy()
-    found: np.ndarray = combination @ parameters
-    return found
+    parameters[: bodies.size] = bodies.ravel()
+    parameters[bodies.size : bodies.size + model.n] = model.armature.detach().numpy()
+    learned: np.ndarray = combination @ parameters
+    return learned
 
 
-def _bodies(model: Any, arm: LoadedArm | None) -> Iterator[ParameterTable]:
-    values = body_parameters(model)
-    if values is None:
-        return
-    nominal = urdf_parameters(arm.arm).reshape(-1, 10) if arm and arm.arm.has_inertials else None
-    names = [body.name for body in arm.arm.bodies] if arm else [f"body {k + 1}" for k in range(len(values))]
+def _body_table(values: np.ndarray, arm: LoadedArm | None) -> ParameterTable:
+    names = [f"body {k + 1}" for k in range(len(values))]
+    nominal = None
+    if arm is not None:
+        names = [body.name for body in arm.arm.bodies]
+        if arm.arm.has_inertials:
+            nominal = urdf_parameters(arm.arm).reshape(-1, 10)
     rows = []
     for k, name in enumerate(names):
         rows.append((name, "model", *_about_centre(values[k])))
         if nominal is not None:
             rows.append(("", "URDF", *_about_centre(nominal[k])))
-    yield ParameterTable(
+    return ParameterTable(
         "Masses, centres of mass and inertias",
         ("moves with", "by", "m [kg]", "centre of mass x, y, z [m]", "principal moments about it [kg m²]"),
         tuple(rows),
@@ -139,75 +163,113 @@ def _bodies(model: Any, arm: LoadedArm | None) -> Iterator[ParameterTable]:
     )
 
 
-def _about_centre(ten: np.ndarray) -> tuple[str, str, str]:
-    mass = ten[0]
+def _about_centre(body: np.ndarray) -> tuple[str, str, str]:
+    """Return mass, centre of mass and principal moments about it, of ten parameters."""
+    mass = body[0]
     if mass <= 0:
         return f"{mass:.4g}", "", ""
-    c = ten[1:4] / mass
-    xx, xy, xz, yy, yz, zz = ten[4:]
-    tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    moments = np.linalg.eigvalsh(tensor - mass * (c @ c * np.eye(3) - np.outer(c, c)))
-    place, about = (", ".join(f"{x:.3g}" for x in values) for values in (c, moments))
-    return f"{mass:.4g}", place, about
+    centre = body[1:4] / mass
+    tensor = np.zeros((3, 3))
+    tensor[np.triu_indices(3)] = body[4:]
+    tensor = np.triu(tensor) + np.triu(tensor, 1).T
+    # Steiner: the parameters are about the joint's frame
+    about = tensor - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+    return f"{mass:.4g}", _listed(centre), _listed(np.linalg.eigvalsh(about))
 
 
-def _joints(model: Any, arm: LoadedArm | None) -> Iterator[ParameterTable]:
-    """Armature and friction of each joint: whatever constants with one number a joint the model has."""
-    types = tuple(model.joint_types)
-    columns: dict[str, tuple[list[float], str]] = {}
+def _listed(values: np.ndarray) -> str:
+    return ", ".join(f"{value:.3g}" for value in values)
+
+
+def _joint_columns(model: EmittedModel) -> dict[str, list[float]]:
+    """Return the constants with one number a joint: armature, friction laws and torque offset."""
+    columns = {}
     if hasattr(model, "armature"):
-        columns["armature"] = ([float(x) for x in model.armature.tolist()], "armature")
-    friction: Any = getattr(model, "friction", None)
+        columns["armature"] = model.armature.tolist()
+    if not has_rigid_bodies(model):
+        return columns
     with torch.no_grad():
-        prepared: Any = friction.prepare() if hasattr(friction, "prepare") else None
-        named = prepared._asdict() if hasattr(prepared, "_asdict") else {}
-        unused = {"offset", "smoothing", *_unused(model, friction)}
-        for name, values in named.items():
-            if torch.is_tensor(values) and values.shape == (len(types),) and name not in unused:
-                columns[name] = (values.tolist(), name)
-        if has_rigid_bodies(model):
-            columns["torque offset"] = (model.torque_offset.tolist(), "offset")
-    if not columns:
-        return
+        constants = model.friction.prepare()._asdict()
+    for name, values in constants.items():
+        if torch.is_tensor(values) and values.shape == (model.n,) and name not in _unused(model):
+            columns[name] = values.tolist()
+    columns["torque offset"] = model.torque_offset.tolist()
+    return columns
+
+
+def _unused(model: EmittedModel) -> set[str]:
+    """Return constants of friction that this model does not have, or that kd of its servos stands for."""
+    unused = {"offset", "smoothing"}
+    if getattr(model.friction, "raw_coulomb_smoothing_velocity", None) is None:
+        unused.add("coulomb_smoothing_velocity")
+    if has_servos(model):
+        unused |= {"viscous", "saturation", "saturation_velocity"}
+    return unused
+
+
+def _joint_table(
+    model: EmittedModel, columns: Mapping[str, Sequence[float]], arm: LoadedArm | None
+) -> ParameterTable:
     head = ["joint", *(name.replace("_", " ") for name in columns)]
-    known = arm is not None
-    if known:
-        head += ["URDF: viscous, Coulomb"]
+    if arm is not None:
+        head.append("URDF: viscous, Coulomb")
     rows = []
-    for k, kind in enumerate(types):
-        name = arm.arm.coordinates[k].name if arm else f"joint {k + 1}"
-        absent = _absent(named, k)
-        row = [
-            name,
-            *(
-                "none" if what in absent else f"{values[k]:.3g} {_unit(what, kind)}".strip()
-                for values, what in columns.values()
-            ),
-        ]
+    for k, kind in enumerate(model.joint_types):
+        name = f"joint {k + 1}" if arm is None else arm.arm.coordinates[k].name
+        row = [name]
+        for column, values in columns.items():
+            text = f"{values[k]:.3g} {_unit(column, kind)}".strip()
+            row.append("none" if _is_absent(column, columns, k) else text)
         if arm is not None:
-            each = arm.arm.coordinates[k]
-            row.append(f"{each.damping:.3g}, {each.friction:.3g}")
+            joint = arm.arm.coordinates[k]
+            row.append(f"{joint.damping:.3g}, {joint.friction:.3g}")
         rows.append(tuple(row))
-    yield ParameterTable("Drives and friction", tuple(head), tuple(rows))
+    return ParameterTable("Drives and friction", tuple(head), tuple(rows))
 
 
-def _absent(friction: Mapping[str, Any], joint: int) -> tuple[str, ...]:
-    """Constants of laws that a fit did not give to this joint."""
-    slow, dry = (friction.get(name) for name in ("stribeck", "coulomb"))
-    if slow is None or dry is None or slow[joint] > FAINT * dry[joint]:
-        return ()
-    return "stribeck", "stribeck_velocity"
+def _is_absent(column: str, columns: Mapping[str, Sequence[float]], joint: int) -> bool:
+    """Return whether the column belongs to a law that a fit did not give to this joint."""
+    if column not in ("stribeck", "stribeck_velocity") or "coulomb" not in columns:
+        return False
+    return columns["stribeck"][joint] <= TUNING.no_law * columns["coulomb"][joint]
 
 
-def _unused(model: Any, friction: Any) -> tuple[str, ...]:
-    """Constants of friction that this model's does not have: velocities of what remembers, and what kd stands for."""
-    smoothed = getattr(friction, "raw_coulomb_smoothing_velocity", None) is not None
-    found = () if smoothed else ("coulomb_smoothing_velocity",)
-    return (*found, "viscous", "saturation", "saturation_velocity") if has_servos(model) else found
-
-
-def _unit(what: str, kind: str) -> str:
-    if what == "armature":
-        return INERTIA_UNITS[f"{kind} {kind}"]
+def _unit(column: str, kind: str) -> str:
+    if column == "armature":
+        return inertia_unit(kind, kind)
     length, speed = UNITS[kind]
-    return FRICTION_UNITS.get(what, "{force}").format(force=FORCE[kind], length=length, speed=speed)
+    return FRICTION_UNITS.get(column, "{force}").format(force=FORCE[kind], length=length, speed=speed)
+
+
+def mass_constants(run: RunFolder) -> list[Constant]:
+    """Return the constants of M that the best model of a run has learned; none where its preset has none.
+
+    Raises ModuleError or RunError when the run cannot be read.
+    """
+    before, after = run.load_module(), trained_model(run)
+    mass: Any = getattr(after, "mass", None)
+    if not hasattr(mass, "constants"):
+        return []
+    constants = []
+    bases = mass.constant_basis.reshape(-1, after.n, after.n)
+    start: Any = before.mass
+    for basis, old, new in zip(bases, start.constants().tolist(), mass.constants().tolist(), strict=True):
+        entries = [(row, column) for row, column in basis.tril().nonzero().tolist()]
+        terms = []
+        for row, column in entries:
+            sign = "-" if basis[row, column] < 0 else "+"
+            size = abs(basis[row, column].item())
+            factor = "" if size == 1 else f"{size:.4g} "
+            terms.append(f"{sign} {factor}M{_index(row, column)}")
+        row, column = entries[0]
+        unit = inertia_unit(after.joint_types[row], after.joint_types[column])
+        where = " ".join(terms).removeprefix("+ ").replace("- ", "-", terms[0].startswith("-"))
+        constants.append(Constant(where, old, new, unit))
+    return constants
+
+
+def _index(row: int, column: int) -> str:
+    """Return `21` for row 1, column 0: the name of an entry of a matrix."""
+    if row < 9:
+        return f"{row + 1}{column + 1}"
+    return f"({row + 1},{column + 1})"

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import ast
-import re
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
-from typing import Literal
 
 from spelgen.errors import ModuleError
 
-_HEADING = "Mass matrix: "
+HEADING = "Mass matrix: "
+KINDS = {"C": "constant", ".": "zero"}
 
 
 @dataclass(frozen=True)
 class PictureCell:
-    """An entry of M: its kind, and the joints it depends on as the module writes them (`2-4,6`, from 1)."""
+    """An entry of M: zero, constant or varying, and the joints it depends on as the module has them (`2-4,6`)."""
 
-    kind: Literal["zero", "constant", "varying"]
+    kind: str
     joints: str
 
 
@@ -26,26 +26,31 @@ class Picture:
     """summary: sentences about the model. rows: the full symmetric matrix."""
 
     summary: str
-    rows: tuple[tuple[PictureCell, ...], ...]
+    rows: list[list[PictureCell]]
+
+    @property
+    def kinds(self) -> list[list[str]]:
+        """Return the kind of each entry."""
+        return [[cell.kind for cell in row] for row in self.rows]
 
 
 def read_picture(module: Path) -> Picture:
-    """The picture in the docstring of the emitted module. Raises ModuleError when there is none."""
+    """Return the picture in the docstring of the emitted module. Raises ModuleError when there is none."""
     paragraphs = (ast.get_docstring(ast.parse(module.read_bytes())) or "").split("\n\n")
-    place = next((k for k, text in enumerate(paragraphs) if text.startswith(_HEADING)), None)
-    lower = (
-        []
-        if place is None
-        else [re.split(r" +", line.strip()) for line in paragraphs[place + 1].splitlines()]
-    )
-    if place is None or [len(row) for row in lower] != list(range(1, len(lower) + 1)):
+    lower: list[list[str]] = []
+    for heading, text in pairwise(paragraphs):
+        if heading.startswith(HEADING):
+            lower = [line.split() for line in text.splitlines()]
+            break
+    if not lower or [len(row) for row in lower] != list(range(1, len(lower) + 1)):
         raise ModuleError("no picture of the mass matrix in the docstring", file=module, do="build it again")
-    cells = {(i, j): _cell(text) for i, row in enumerate(lower) for j, text in enumerate(row)}
-    rows = tuple(tuple(cells[max(i, j), min(i, j)] for j in range(len(lower))) for i in range(len(lower)))
+    rows = []
+    for i in range(len(lower)):
+        rows.append([_cell(lower[max(i, j)][min(i, j)]) for j in range(len(lower))])
     return Picture(" ".join(paragraphs[1].split()), rows)
 
 
 def _cell(text: str) -> PictureCell:
-    if text == "C":
-        return PictureCell("constant", "")
-    return PictureCell("zero", "") if text == "." else PictureCell("varying", text)
+    if text in KINDS:
+        return PictureCell(KINDS[text], "")
+    return PictureCell("varying", text)

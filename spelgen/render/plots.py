@@ -1,4 +1,4 @@
-"""What pages draw of a run: curves of evaluation.json's `traces`, and the loss by epoch."""
+"""Panels of charts that pages draw of a run, from evaluation.json's `traces` and metrics.jsonl."""
 
 from __future__ import annotations
 
@@ -19,7 +19,13 @@ from spelgen.baselines.names import (
     observed,
 )
 from spelgen.labels import entry_name
-from spelgen.render.charts import Band, Dots, Line, line_chart
+from spelgen.render.charts import Band, Dots, Line, Mark, line_chart
+from spelgen.settings.tuning.render import TUNING
+
+Record = Mapping[str, Any]
+"""A part of evaluation.json or of a trace in it."""
+Limits = Sequence[tuple[float, float] | None]
+"""Lowest and highest position of each joint; None: it has no limits."""
 
 UNITS = {"revolute": ("rad", "rad/s"), "prismatic": ("m", "m/s")}
 FORCE = {"revolute": "Nm", "prismatic": "N"}
@@ -34,9 +40,11 @@ STYLES = {
     CONSTANT_VELOCITY: "hold",
     observed(MODEL): "going-on",
 }
-PARTS = {"inertia": "inertia", "Coriolis": "coriolis", "gravity": "gravity", "friction": "friction"}
-BARE = 84  # height of a chart that stands above another with the same times
-FAR = 3.0  # a baseline farther away than this many ranges of the others is cut off: else they would be flat
+COMPONENTS = ("inertia", "Coriolis", "gravity", "friction")
+ERRORS = {
+    "relative": ("Relative to the motion", "error / motion"),
+    "tip_mm": ("Of the tip", "error of the tip [mm]"),
+}
 
 
 @dataclass(frozen=True)
@@ -48,242 +56,272 @@ class Panel:
 
 
 def style(predictor: str) -> str:
-    """The CSS class of a predictor's lines."""
+    """Return the CSS class of a predictor's lines."""
     return STYLES.get(predictor, "c6")
 
 
 def inertia_unit(a: str, b: str) -> str:
-    """Of the entry of M between joints of these types."""
+    """Return the unit of the entry of M between joints of these types."""
     return INERTIA_UNITS.get(f"{a} {b}", "kg m")
 
 
-def loss_chart(metrics: Sequence[Mapping[str, Any]], best_epoch: int) -> Markup:
-    """Training and validation loss by epoch, with the epoch of the model that was kept."""
+def numbers(values: object) -> np.ndarray:
+    """Return nested lists, None where not finite, as an array."""
+    return np.array(values, dtype=float)
+
+
+def loss_chart(metrics: Sequence[Record], best_epoch: int) -> Markup:
+    """Return training and validation loss by epoch, with the epoch of the model that was kept."""
     epochs = [record["epoch"] for record in metrics]
     lines = [
         Line("training loss", epochs, [record["loss"] for record in metrics], "train"),
         Line("validation loss", epochs, [record["validation"] for record in metrics], "model"),
     ]
     best = [(best_epoch, "best")]
-    return line_chart(lines, "Loss by epoch", "epoch", "loss", log=True, marks=best, width=560, height=240)
+    return line_chart(
+        lines, "Loss by epoch", "epoch", "loss", log=True, verticals=best, width=560, height=240
+    )
 
 
-def growth_charts(growth: Mapping[str, Any]) -> list[Panel]:
-    """Error against the horizon: the middle half of the windows as lines, 10 to 90 % as bands."""
-    seconds = growth["seconds"]
+def growth_panels(
+    curves: Mapping[str, Mapping[str, tuple[Sequence[float], Record]]],
+    styles: Mapping[str, str],
+    banded: Sequence[str],
+) -> list[Panel]:
+    """Return errors against the horizon [s], relative and of the tip: medians, and of the banded names 10 to 90 %.
+
+    curves: by measure and name the horizons, and low, median and high error at each.
+    """
     panels = []
-    for what, label in (("relative", "error / motion"), ("tip_mm", "error of the tip [mm]")):
-        shown: list[Line | Band] = []
-        for name, x in growth[what].items():
-            shown.append(Line(f"{name}, median", seconds, numbers(x["median"]), style(name)))
-            if name in (MODEL, LEAST_SQUARES):
-                shown.append(
-                    Band(f"{name}, 10 to 90 %", seconds, numbers(x["low"]), numbers(x["high"]), style(name))
-                )
-        if shown:
-            title = "Relative to the motion" if what == "relative" else "Of the tip"
-            limits = _limits([growth[what]], positive=True)
+    for measure, (title, label) in ERRORS.items():
+        marks: list[Mark] = []
+        for name, (seconds, error) in curves.get(measure, {}).items():
+            marks.append(Line(f"{name}, median", seconds, numbers(error["median"]), styles[name]))
+            if name in banded:
+                low, high = numbers(error["low"]), numbers(error["high"])
+                marks.append(Band(f"{name}, 10 to 90 %", seconds, low, high, styles[name]))
+        if marks:
             chart = line_chart(
-                shown, f"{title}: error by horizon", "horizon [s]", label, log=True, log_x=True, limits=limits,
-                width=520, height=260,
-            )  # fmt: skip
+                marks,
+                f"{title}: error by horizon",
+                "horizon [s]",
+                label,
+                log=True,
+                log_x=True,
+                limits=_error_limits(curves[measure]),
+                width=520,
+                height=260,
+            )
             panels.append(Panel(title, (chart,)))
     return panels
 
 
-def torque_panels(trace: Mapping[str, Any], joints: Sequence[str], joint_types: Sequence[str]) -> list[Panel]:
-    """By joint: measured and predicted torque, what is left, and what the prediction is made of."""
-    t, measured = trace["t"], numbers(trace["measured"])
+def growth_charts(growth: Record) -> list[Panel]:
+    """Return how the errors of all predictors grow with the horizon, with bands of the model and of least squares."""
+    curves = {}
+    for measure in ERRORS:
+        curves[measure] = {name: (growth["seconds"], error) for name, error in growth[measure].items()}
+    styles = {name: style(name) for of_measure in curves.values() for name in of_measure}
+    return growth_panels(curves, styles, (MODEL, LEAST_SQUARES))
+
+
+def _error_limits(errors: Mapping[str, tuple[Sequence[float], Record]]) -> tuple[float, float] | None:
+    """Return limits of medians and the model's band, baselines that are hopeless cut off; None without a model."""
+    if MODEL not in errors:
+        return None
+    own = _positive([errors[MODEL][1][key] for key in ("low", "high")])
+    medians = _positive([error["median"] for _, error in errors.values()])
+    if not own.size or not medians.size:
+        return None
+    high = max(own.max(), medians[medians < TUNING.outlier * own.max()].max(initial=0.0))
+    return float(min(own.min(), medians.min())) / 1.3, 1.3 * float(high)
+
+
+def _positive(columns: Sequence[object]) -> np.ndarray:
+    values = np.concatenate([numbers(column) for column in columns])
+    positive: np.ndarray = values[values > 0]
+    return positive
+
+
+def torque_panels(trace: Record, joints: Sequence[str], joint_types: Sequence[str]) -> list[Panel]:
+    """Return by joint measured and predicted torque, the residual, and the components of the prediction."""
+    t, measured, motion = trace["t"], numbers(trace["measured"]), f"torque {trace['which']}"
     predicted = numbers(trace["predicted"][MODEL])
+    components = {name: numbers(trace["parts"][name]) for name in COMPONENTS}
     panels = []
-    for k, (name, kind) in enumerate(zip(joints, joint_types, strict=True)):
-        unit, motion = FORCE[kind], f"torque {trace['which']}"
+    for k, (joint, kind) in enumerate(zip(joints, joint_types, strict=True)):
+        unit = FORCE[kind]
         both = [
             Line("measured", t, measured[:, k], "truth"),
             Line("predicted", t, predicted[:, k], "predicted"),
         ]
-        left = [Line("measured less predicted", t, measured[:, k] - predicted[:, k], "model")]
-        parts = [Line(part, t, numbers(trace["parts"][part])[:, k], style) for part, style in PARTS.items()]
-        panels.append(
-            Panel(
-                name,
-                (
-                    line_chart(both, f"Torque of {name}", "", f"torque [{unit}]", motion=motion, height=150),
-                    line_chart(left, f"Residual of {name}", "", f"residual [{unit}]", motion=motion, height=BARE),
-                    line_chart(parts, f"Parts of the torque of {name}", "t [s]", f"parts [{unit}]", motion=motion),
-                ),
-            )
-        )  # fmt: skip
+        residual = [Line("measured less predicted", t, measured[:, k] - predicted[:, k], "model")]
+        lines = [Line(name, t, torque[:, k], name.lower()) for name, torque in components.items()]
+        charts = (
+            line_chart(both, f"Torque of {joint}", "", f"torque [{unit}]", motion=motion, height=150),
+            line_chart(residual, f"Residual of {joint}", "", f"residual [{unit}]", motion=motion, height=84),
+            line_chart(lines, f"Parts of the torque of {joint}", "t [s]", f"parts [{unit}]", motion=motion),
+        )
+        panels.append(Panel(joint, charts))
     return panels
 
 
-def trajectory_panels(
-    example: Mapping[str, Any], joints: Sequence[str], joint_types: Sequence[str]
-) -> list[Panel]:
-    """By joint: position and, where it is known, velocity, measured, predicted and, of servos, commanded, each above
-    what lies between the first two.
+def trajectory_panels(example: Record, joints: Sequence[str], joint_types: Sequence[str]) -> list[Panel]:
+    """Return by joint position and, where it is known, velocity: measured, predicted and, of servos, commanded, each
+    above the difference of the first two.
     """
     t, motion = example["t"], f"prediction {example['which']}"
-    shown = [x for x in QUANTITIES if x in example]
+    keys = [key for key in QUANTITIES if key in example]
     panels = []
-    for k, (name, kind) in enumerate(zip(joints, joint_types, strict=True)):
+    for k, (joint, kind) in enumerate(zip(joints, joint_types, strict=True)):
         charts = []
-        for key, unit in zip(shown, UNITS[kind], strict=False):
-            what, last = QUANTITIES[key], key == shown[-1]
-            true, found = numbers(example[key])[:, k], numbers(example[f"predicted_{key}"])[:, k]
-            lines = [Line("measured", t, true, "truth"), Line("predicted", t, found, "predicted")]
+        for key, unit in zip(keys, UNITS[kind], strict=False):
+            quantity = QUANTITIES[key]
+            measured, predicted = numbers(example[key])[:, k], numbers(example[f"predicted_{key}"])[:, k]
+            lines = [Line("measured", t, measured, "truth"), Line("predicted", t, predicted, "predicted")]
             if "u" in example:
                 lines.insert(0, Line("commanded", t, numbers(example["u"])[:, k], "hold"))
-            off = [Line("predicted less measured", t, found - true, "model")]
-            charts += [
-                line_chart(lines, f"{what} of {name}", "", f"{what} [{unit}]", motion=motion, height=120),
+            error = [Line("predicted less measured", t, predicted - measured, "model")]
+            title, label, height = f"{quantity} of {joint}", "", 84
+            if key == keys[-1]:  # the time stands below the last chart alone
+                label, height = "t [s]", 112
+            charts.append(line_chart(lines, title, "", f"{quantity} [{unit}]", motion=motion, height=120))
+            charts.append(
                 line_chart(
-                    off, f"Error of the {what} of {name}", "t [s]" if last else "", f"error [{unit}]", motion=motion,
-                    height=BARE + 28 * last,
-                ),
-            ]  # fmt: skip
-        panels.append(Panel(name, tuple(charts)))
+                    error, f"Error of the {title}", label, f"error [{unit}]", motion=motion, height=height
+                )
+            )
+        panels.append(Panel(joint, tuple(charts)))
     return panels
 
 
 def mass_panels(
-    mass: Mapping[str, Any], joint_types: Sequence[str], picture: Sequence[Sequence[Any]]
+    t: Sequence[float],
+    entries: Mapping[tuple[int, int], Mapping[str, Sequence[float]]],
+    styles: Mapping[str, str],
+    joint_types: Sequence[str],
+    width: int = 330,
 ) -> list[Panel]:
-    """The entries of M that are not always zero, by the model and its baselines, along a trajectory."""
+    """Return entries of M, by row and column, along a trajectory: a line for each name, as the style of that name."""
     panels = []
-    places = [(i, j) for i in range(len(joint_types)) for j in range(i + 1)]
-    for place, (i, j) in enumerate(places):
-        if picture[i][j].kind == "zero":
-            continue
-        lines = [
-            Line(name, mass["t"], numbers(x["entries"][place]), style(name)) for name, x in mass["by"].items()
-        ]
-        unit, name = inertia_unit(joint_types[i], joint_types[j]), entry_name(i, j)
-        chart = line_chart(lines, f"{name} along the trajectory", "t [s]", f"{name} [{unit}]", width=330)
-        panels.append(Panel(name, (chart,)))
+    for (i, j), by_name in entries.items():
+        name = entry_name(i, j)
+        lines = [Line(label, t, numbers(values), styles[label]) for label, values in by_name.items()]
+        unit = f"{name} [{inertia_unit(joint_types[i], joint_types[j])}]"
+        panels.append(Panel(name, (line_chart(lines, name, "t [s]", unit, width=width),)))
     return panels
 
 
-def eigenvalue_chart(mass: Mapping[str, Any]) -> Markup:
-    """The least and the largest eigenvalue of M along a trajectory; what is not positive is not drawn."""
-    lines = [
-        Line(f"{name}, {which}", mass["t"], numbers(x["eigenvalues"][row]), style(name))
-        for name, x in mass["by"].items()
-        for row, which in ((0, "least"), (-1, "largest"))
-    ]
+def trace_mass_panels(
+    mass: Record, kinds: Sequence[Sequence[str]], joint_types: Sequence[str]
+) -> list[Panel]:
+    """Return the entries of M that are not always zero, by the model and its baselines. kinds: of each entry."""
+    entries = {}
+    places = [(i, j) for i in range(len(joint_types)) for j in range(i + 1)]
+    for number, (i, j) in enumerate(places):
+        if kinds[i][j] != "zero":
+            entries[i, j] = {name: x["entries"][number] for name, x in mass["by"].items()}
+    styles = {name: style(name) for name in mass["by"]}
+    return mass_panels(mass["t"], entries, styles, joint_types)
+
+
+def eigenvalue_chart(mass: Record) -> Markup:
+    """Return the smallest and the largest eigenvalue of M along a trajectory; what is not positive is not drawn."""
+    lines = []
+    for name, trace in mass["by"].items():
+        for row, label in ((0, "least"), (-1, "largest")):
+            eigenvalues = numbers(trace["eigenvalues"][row])
+            lines.append(Line(f"{name}, {label}", mass["t"], eigenvalues, style(name)))
     return line_chart(lines, "Eigenvalues of M", "t [s]", "eigenvalue of M", log=True, width=520, height=230)
 
 
 def friction_panels(
-    friction: Mapping[str, Any],
-    torques: Sequence[Mapping[str, Any]],
-    joints: Sequence[str],
-    joint_types: Sequence[str],
+    friction: Record, torques: Sequence[Record], joints: Sequence[str], joint_types: Sequence[str]
 ) -> list[Panel]:
-    """By joint: friction by velocity, and the loops that measured motion makes of it, measured and by the model.
+    """Return by joint friction by velocity, and the loops that measured motion makes of it, measured and by the model.
 
-    What is measured is the torque less that of the model's rigid bodies. A model without memory of friction makes no
+    Measured friction is the torque less that of the model's rigid bodies. A model whose friction has no state makes no
     loop but for load.
     """
     panels = []
-    for k, (name, kind) in enumerate(zip(joints, joint_types, strict=True)):
-        curves = {label: numbers(x[k]) for label, x in friction["by"].items()}
-        loops: list[Line | Dots] = []
+    for k, (joint, kind) in enumerate(zip(joints, joint_types, strict=True)):
+        dots = friction["measured"][k]
+        marks: list[Mark] = [Dots("measured", numbers(dots["qd"]), numbers(dots["torque"]), "truth")]
         for trace in torques[:1]:
             qd = numbers(trace["qd"])[:, k]
-            left = numbers(trace["measured"])[:, k] - numbers(trace["without_friction"])[:, k]
-            loops.append(Line("measured, in the order of time", qd, left, "loop"))
-            loops.append(Line("model along it", qd, numbers(trace["parts"]["friction"])[:, k], "loop model"))
-        left = friction["measured"][k]
-        dots = Dots("measured", numbers(left["qd"]), numbers(left["torque"]), "truth")
-        limits = _robust_limits(dots.y, curves.get(MODEL, np.zeros(1)))
-        lines = (Line(label, friction["qd"][k], y, style(label)) for label, y in curves.items())
+            measured = numbers(trace["measured"])[:, k] - numbers(trace["without_friction"])[:, k]
+            modelled = numbers(trace["parts"]["friction"])[:, k]
+            marks.append(Line("measured, in the order of time", qd, measured, "loop"))
+            marks.append(Line("model along it", qd, modelled, "loop model"))
+        for name, curves in friction["by"].items():
+            marks.append(Line(name, friction["qd"][k], numbers(curves[k]), style(name)))
+        model = friction["by"].get(MODEL)
         chart = line_chart(
-            [dots, *loops, *lines], f"Friction of {name}", f"velocity [{UNITS[kind][1]}]",
-            f"friction [{FORCE[kind]}]", limits=limits, height=220,
-        )  # fmt: skip
-        panels.append(Panel(name, (chart,)))
+            marks,
+            f"Friction of {joint}",
+            f"velocity [{UNITS[kind][1]}]",
+            f"friction [{FORCE[kind]}]",
+            limits=_friction_limits(numbers(dots["torque"]), numbers(model[k]) if model else np.zeros(1)),
+            height=220,
+        )
+        panels.append(Panel(joint, (chart,)))
     return panels
 
 
-def coverage_panels(
-    by_logs: Mapping[str, Mapping[str, Any]],
-    joints: Sequence[str],
-    joint_types: Sequence[str],
-    limits: Sequence[tuple[float, float] | None],
-) -> list[Panel]:
-    """By joint: how often positions and velocities occur, of the logs named; marks: the joint's limits."""
-    panels = []
-    for k, (name, kind) in enumerate(zip(joints, joint_types, strict=True)):
-        charts = []
-        for what, unit in zip(QUANTITIES, UNITS[kind], strict=True):
-            bands = [_histogram(label, logs[what][k]) for label, logs in by_logs.items()]
-            bound = limits[k] if what == "q" else None
-            marks = [(bound[0], "limit"), (bound[1], "limit")] if bound else []
-            edge = [Line("limits", bound, (0, 0), "edge")] if bound else []
-            label = f"{QUANTITIES[what]} [{unit}]"
-            charts.append(
-                line_chart(
-                    [*bands, *edge],
-                    f"{QUANTITIES[what]} of {name}",
-                    label,
-                    "share",
-                    marks=marks,
-                    width=300,
-                    height=130,
-                )
-            )
-        panels.append(Panel(name, tuple(charts)))
-    return panels
-
-
-def energy_chart(trace: Mapping[str, Any]) -> Markup:
-    """Where the drives' work went."""
-    styles = ("truth", "urdf", "friction", "model")
-    lines = [
-        Line(name, trace["t"], numbers(x), style)
-        for (name, x), style in zip(trace["energy"].items(), styles, strict=True)
-    ]
-    return line_chart(
-        lines, "Energy", "t [s]", "energy [J]", motion=f"torque {trace['which']}", width=560, height=250
-    )
-
-
-def _histogram(label: str, found: Mapping[str, Any]) -> Band:
-    counts = np.array(found["counts"], dtype=float)
-    edges = np.linspace(found["low"], found["high"], len(counts) + 1)
-    heights = np.repeat(counts / max(counts.sum(), 1.0), 2)
-    return Band(
-        label,
-        np.repeat(edges, 2)[1:-1],
-        np.zeros_like(heights),
-        heights,
-        "train" if label == "training" else "model",
-    )
-
-
-def _limits(groups: Sequence[Mapping[str, Any]], *, positive: bool) -> tuple[float, float] | None:
-    """Of the medians and the model's band, baselines that are hopeless cut off."""
-    own = [x for group in groups for key in ("low", "high") for x in group.get(MODEL, {}).get(key, ())]
-    all_ = [x for group in groups for each in group.values() for x in each["median"]]
-    good = [x for x in own if x is not None and x > 0]
-    rest = [x for x in all_ if x is not None and x > 0]
-    if not good or not rest:
-        return None
-    high = max([*good, *(x for x in rest if x < 100 * max(good))])
-    return min([*good, *rest]) / 1.3, high * 1.3
-
-
-def _robust_limits(dots: Any, curve: np.ndarray) -> tuple[float, float] | None:
-    values = np.concatenate([np.asarray(dots, dtype=float), np.asarray(curve, dtype=float)])
+def _friction_limits(measured: np.ndarray, curve: np.ndarray) -> tuple[float, float] | None:
+    """Return limits that hold the model's curve and all but the outliers of what was measured."""
+    values = np.concatenate([measured, curve])
     values = values[np.isfinite(values)]
     if not values.size:
         return None
-    low, high = np.quantile(values, [0.005, 0.995])
+    low, high = np.quantile(values, [1 - TUNING.bulk, TUNING.bulk])
     room = 0.15 * (high - low) or 1.0
     return float(min(low, np.nanmin(curve)) - room), float(max(high, np.nanmax(curve)) + room)
 
 
-def numbers(values: Any) -> np.ndarray:
-    """Nested lists, None where not finite, as an array."""
-    return np.array(values, dtype=float)
+def coverage_panels(
+    by_logs: Mapping[str, Record], joints: Sequence[str], joint_types: Sequence[str], limits: Limits
+) -> list[Panel]:
+    """Return by joint how often positions and velocities occur in the logs named; the joint's limits are marked."""
+    panels = []
+    for k, (joint, kind) in enumerate(zip(joints, joint_types, strict=True)):
+        charts = []
+        for (key, quantity), unit in zip(QUANTITIES.items(), UNITS[kind], strict=True):
+            marks: list[Mark] = [_histogram(name, logs[key][k]) for name, logs in by_logs.items()]
+            verticals = []
+            bounds = limits[k]
+            if key == "q" and bounds is not None:
+                verticals = [(bound, "limit") for bound in bounds]
+                marks.append(Line("limits", bounds, (0, 0), "edge"))
+            charts.append(
+                line_chart(
+                    marks,
+                    f"{quantity} of {joint}",
+                    f"{quantity} [{unit}]",
+                    "share",
+                    verticals=verticals,
+                    width=300,
+                    height=130,
+                )
+            )
+        panels.append(Panel(joint, tuple(charts)))
+    return panels
+
+
+def _histogram(name: str, histogram: Record) -> Band:
+    """Return the outline of a histogram's bars; heights sum to one."""
+    counts = numbers(histogram["counts"])
+    edges = np.linspace(histogram["low"], histogram["high"], len(counts) + 1)
+    heights = np.repeat(counts / max(counts.sum(), 1.0), 2)
+    style = "train" if name == "training" else "model"
+    return Band(name, np.repeat(edges, 2)[1:-1], np.zeros_like(heights), heights, style)
+
+
+def energy_chart(trace: Record) -> Markup:
+    """Return where the drives' work went along a trajectory."""
+    styles = ("truth", "urdf", "friction", "model")
+    lines = []
+    for (name, energy), color in zip(trace["energy"].items(), styles, strict=True):
+        lines.append(Line(name, trace["t"], numbers(energy), color))
+    motion = f"torque {trace['which']}"
+    return line_chart(lines, "Energy", "t [s]", "energy [J]", motion=motion, width=560, height=250)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jinja2 import TemplateError
 
@@ -13,23 +13,59 @@ from spelgen.baselines.run_arm import run_arm
 from spelgen.errors import RunError, SpelgenError
 from spelgen.evaluation.results import Results
 from spelgen.evaluation.tables import result_tables
-from spelgen.evaluation.verdict import verdict
+from spelgen.evaluation.verdict import Verdict, verdict
 from spelgen.files import write_json, write_text
 from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.labels import entry_name
 from spelgen.loaded_arm import LoadedArm
-from spelgen.render.arm_section import LETTERS, ArmSection, Cell, arm_section, matrix
-from spelgen.render.curves import Limits, coverage, curves, predictors
-from spelgen.render.learned import read_learned
+from spelgen.render.arm_section import LETTERS, Cell, arm_section, matrix
+from spelgen.render.curves import coverage, curves, predictors
 from spelgen.render.page import render_page
-from spelgen.render.parameters import ParameterTable, body_parameters, parameter_tables, servo_table
+from spelgen.render.parameters import body_parameters, mass_constants, parameter_tables, servo_table
 from spelgen.render.picture import Picture, read_picture
-from spelgen.render.plots import FORCE, UNITS
+from spelgen.render.plots import FORCE, UNITS, Limits, Record
 from spelgen.render.reproduction import commands, files
 from spelgen.render.run_facts import head_numbers, training_facts
 from spelgen.spec import Facts, read_facts
 
+if TYPE_CHECKING:
+    from spelgen.emission.loading import EmittedModel
+
 SCHEMA = 1  # of the page as data
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a run folder holds; None for what it lacks. arm: None also where its URDF can no longer be read."""
+
+    folder: RunFolder
+    facts: Facts
+    config: Mapping[str, Any] | None
+    metrics: list[dict[str, Any]]
+    evaluation: Record | None
+    identified: Record | None
+    arm: LoadedArm | None
+    model: EmittedModel | None
+
+    @property
+    def limits(self) -> Limits:
+        """Return the joints' limits, None of a joint without."""
+        limits: list[tuple[float, float] | None] = [None] * len(self.facts.joints)
+        if self.arm is not None:
+            for k, joint in enumerate(self.arm.arm.coordinates):
+                if not joint.continuous and joint.lower is not None and joint.upper is not None:
+                    limits[k] = joint.lower, joint.upper
+        return limits
+
+    @property
+    def results(self) -> Results | None:
+        """Return the evaluation; None before there is one."""
+        return None if self.evaluation is None else Results.from_dict(self.evaluation)
+
+    @property
+    def verdict(self) -> Verdict | None:
+        """Return what the model is good for; None before it is evaluated."""
+        return None if self.results is None else verdict(self.results, self.identified, self.limits)
 
 
 def write_report(
@@ -49,123 +85,102 @@ def write_report(
 
 
 def report_data(folder: Path | str) -> dict[str, Any]:
-    """All that the page shows, for programs: the verdict, the evaluation, least squares, the model's parameters."""
-    run = RunFolder(Path(folder))
-    evaluation, identified = (
-        run.read_json(path) if path.is_file() else None for path in (run.evaluation, run.baseline)
-    )
-    arm, trained = _arm(run), trained_model(run) if run.weights.is_file() else None
-    limits = _limits(arm, len(read_facts(run.module).joints))
-    bodies = None if trained is None else body_parameters(trained)
+    """Return all that the page shows, for programs: the verdict, the evaluation, least squares, the parameters."""
+    run = _read(RunFolder(Path(folder)))
+    bodies = None if run.model is None else body_parameters(run.model)
     return {
         "schema": SCHEMA,
-        "verdict": asdict(verdict(Results.from_dict(evaluation), identified, limits)) if evaluation else None,
-        "evaluation": evaluation,
-        "least_squares": identified,
+        "verdict": None if run.verdict is None else asdict(run.verdict),
+        "evaluation": run.evaluation,
+        "least_squares": run.identified,
         "bodies": None if bodies is None else bodies.tolist(),
-        "tables": [asdict(table) for table in _parameters(trained, arm, identified)],
+        "tables": [asdict(table) for table in parameter_tables(run.model, run.arm, run.identified)],
     }
 
 
 def render_report(folder: Path | str, robot: Path | str | None = None) -> str:
-    """The page about a run as HTML; the same folder gives the same text. robot: see ``write_report``."""
+    """Return the page about a run as HTML; the same folder gives the same text. robot: see ``write_report``."""
     run = RunFolder(Path(folder))
     if not run.module.is_file():
         raise RunError(
             "no run", file=run.path, expected="a folder with module.py", do="make one with `spelgen train`"
         )
     try:
-        return _rendered(run, robot)
+        return _rendered(_read(run), robot)
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, TemplateError) as error:
         raise RunError(
-            f"files that do not hold what a report needs ({type(error).__name__}: {error})", file=run.path,
+            f"files that do not hold what a report needs ({type(error).__name__}: {error})",
+            file=run.path,
             do="run `spelgen evaluate` again",
-        ) from error  # fmt: skip
+        ) from error
 
 
-def _rendered(run: RunFolder, robot: Path | str | None) -> str:
-    facts, picture = read_facts(run.module), read_picture(run.module)
-    config = run.read_config() if run.config.is_file() else None
-    evaluation, identified = (
-        run.read_json(path) if path.is_file() else None for path in (run.evaluation, run.baseline)
+def _read(folder: RunFolder) -> Run:
+    try:
+        arm = run_arm(folder)
+    except SpelgenError:
+        arm = None
+    return Run(
+        folder,
+        read_facts(folder.module),
+        config=folder.read_config() if folder.config.is_file() else None,
+        metrics=folder.read_metrics(),
+        evaluation=_json(folder, folder.evaluation),
+        identified=_json(folder, folder.baseline),
+        arm=arm,
+        model=trained_model(folder) if folder.weights.is_file() else None,
     )
-    results = Results.from_dict(evaluation) if evaluation else None
-    metrics = run.read_metrics()
-    arm = _arm(run)
-    trained = trained_model(run) if run.weights.is_file() else None
-    traces = (evaluation or {}).get("traces") or {}
-    limits = _limits(arm, len(facts.joints))
-    learned = read_learned(run) if trained is not None else None
+
+
+def _json(folder: RunFolder, path: Path) -> Record | None:
+    return folder.read_json(path) if path.is_file() else None
+
+
+def _rendered(run: Run, robot: Path | str | None) -> str:
+    facts, config, evaluation = run.facts, run.config or {}, run.evaluation or {}
+    picture, traces = read_picture(run.folder.module), evaluation.get("traces") or {}
+    arm, servos = None, None
+    if run.arm is not None:
+        arm = arm_section(run.arm.arm, Path(robot or run.arm.robot.path), traces, run.identified)
+    if "servo" in config:
+        servos = servo_table(config["servo"])
     return render_page(
         "report.html.jinja",
         facts=facts,
         picture=picture,
-        cells=_cells(arm, facts, picture),
-        arm=_section(arm, traces, identified, robot),
+        cells=_cells(run.arm, facts, picture),
+        arm=arm,
         units=UNITS,
         force=FORCE,
-        numbers=head_numbers(learned, config, metrics, evaluation),
-        verdict=verdict(results, identified, limits) if results else None,
-        config=config,
-        training=training_facts(config, metrics, identified) if config else None,
-        evaluation=evaluation,
+        numbers=head_numbers(run.model, config, run.metrics, evaluation),
+        verdict=run.verdict,
+        config=run.config,
+        training=training_facts(config, run.metrics, run.identified) if config else None,
+        evaluation=run.evaluation,
         predictors=predictors(evaluation),
-        tables=result_tables(results) if results else [],
+        tables=[] if run.results is None else result_tables(run.results),
         curves=curves(traces, facts, picture),
-        coverage=coverage(traces, identified, facts, limits),
-        learned=learned,
-        under_servos=config is not None and config["objective"] == "servo",
-        servos=servo_table(config["servo"]) if config and "servo" in config else None,
-        parameters=_parameters(trained, arm, identified),
-        files=files(run.path),
-        commands=commands(run, facts, config),
+        coverage=coverage(traces, run.identified, facts, run.limits),
+        trained=run.model is not None,
+        constants=mass_constants(run.folder) if run.model is not None else [],
+        under_servos=config.get("objective") == "servo",
+        servos=servos,
+        parameters=parameter_tables(run.model, run.arm, run.identified),
+        files=files(run.folder.path),
+        commands=commands(run.folder, facts, run.config),
     )
 
 
-def _arm(run: RunFolder) -> LoadedArm | None:
-    """The run's arm, where its folder has the URDF and that can still be read."""
-    try:
-        return run_arm(run)
-    except SpelgenError:
-        return None
-
-
-def _section(
-    arm: LoadedArm | None,
-    traces: Mapping[str, Any],
-    identified: Mapping[str, Any] | None,
-    robot: Path | str | None,
-) -> ArmSection | None:
-    if arm is None:
-        return None
-    return arm_section(arm.arm, Path(robot) if robot else arm.robot.path, traces, identified)
-
-
-def _parameters(
-    model: Any | None, arm: LoadedArm | None, identified: Mapping[str, Any] | None
-) -> list[ParameterTable]:
-    return parameter_tables(model, arm, identified)
-
-
 def _cells(arm: LoadedArm | None, facts: Facts, picture: Picture) -> list[list[Cell]]:
-    """M with reasons where the model's structure is the arm's own, else as the module's docstring pictures it."""
+    """Return M with reasons where the model's structure is the arm's own, else as the module's docstring has it."""
     if arm is not None:
         derived = matrix(arm.arm, arm.structure_for(facts.options.assume))
-        if [[x.kind for x in row] for row in derived] == [[x.kind for x in row] for row in picture.rows]:
+        if [[cell.kind for cell in row] for row in derived] == picture.kinds:
             return derived
-    return [
-        [
-            Cell(x.kind, LETTERS.get(x.kind, x.joints), (), f"{entry_name(max(i, j), min(i, j))}: {x.kind}")
-            for j, x in enumerate(row)
-        ]
-        for i, row in enumerate(picture.rows)
-    ]
-
-
-def _limits(arm: LoadedArm | None, count: int) -> Limits:
-    if arm is None:
-        return [None] * count
-    return [
-        None if x.continuous or x.lower is None or x.upper is None else (x.lower, x.upper)
-        for x in arm.arm.coordinates
-    ]
+    cells = []
+    for i, row in enumerate(picture.rows):
+        cells.append([])
+        for j, entry in enumerate(row):
+            name, text = entry_name(max(i, j), min(i, j)), LETTERS.get(entry.kind, entry.joints)
+            cells[-1].append(Cell(entry.kind, text, (), f"{name}: {entry.kind}"))
+    return cells

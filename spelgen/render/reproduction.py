@@ -7,11 +7,12 @@ import shlex
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.logs.preprocessing import Preprocessing
+from spelgen.render.plots import Record
 from spelgen.settings.fits import CONFIGS
+from spelgen.settings.training import TrainingSettings
 from spelgen.spec import Facts, Options
 
 
@@ -25,58 +26,55 @@ class File:
 
 
 def files(folder: Path) -> list[File]:
-    """Every file of the folder but pages and what is being written."""
-    paths = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
-    return [
-        File(path.name, _size(path.stat().st_size), hashlib.sha256(path.read_bytes()).hexdigest())
-        for path in paths
-        if path.suffix != ".html"
-    ]
+    """Return every file of the folder but pages and what is being written."""
+    entries = []
+    for path in sorted(folder.iterdir()):
+        if path.is_file() and not path.name.startswith(".") and path.suffix != ".html":
+            content = path.read_bytes()
+            entries.append(File(path.name, _size(len(content)), hashlib.sha256(content).hexdigest()))
+    return entries
 
 
-def commands(run: RunFolder, facts: Facts, record: Mapping[str, Any] | None) -> list[str]:
-    """What makes a run again, from its config.json; the logs' place is not known to the run."""
-    built = _flags(asdict(facts.options), asdict(Options()))
-    urdf, found = shlex.quote(facts.urdf), []
+def commands(run: RunFolder, facts: Facts, record: Record | None) -> list[str]:
+    """Return what makes a run again, from its config.json; the logs' place is not known to the run."""
+    urdf = shlex.quote(facts.urdf)
+    lines = []
     if run.urdf.exists():  # under the name that the module knows it by
-        copies = [(run.urdf.name, facts.urdf)]
+        lines.append(f"cp RUN/{run.urdf.name} {urdf}")
         if run.settings.exists():
-            copies.append((run.settings.name, str(Path(facts.urdf).with_suffix(".yaml"))))
-        found += [f"cp RUN/{before} {shlex.quote(after)}" for before, after in copies]
-    found.append(f"spelgen build {urdf}{built} -o module.py")
+            lines.append(
+                f"cp RUN/{run.settings.name} {shlex.quote(str(Path(facts.urdf).with_suffix('.yaml')))}"
+            )
+    build = f"spelgen build {urdf}"
+    for key, value in _changed(asdict(facts.options), asdict(Options())).items():
+        words = ",".join(value) if isinstance(value, (list, tuple)) else str(value)
+        build += f" --{key.replace('_', '-')} {shlex.quote(words)}"
+    lines.append(f"{build} -o module.py")
     if record:
-        usual = CONFIGS[record["objective"]]().model_dump(mode="json") | asdict(Preprocessing())
-        usual |= {"validation_fraction": 0.25, "seed": 0}
-        options = {name: record[name] for name in ("validation_fraction", "seed")}
-        options |= record["config"] | record["preprocessing"]
-        command = (
+        defaults = CONFIGS[record["objective"]]().model_dump(mode="json") | asdict(Preprocessing())
+        defaults |= TrainingSettings().model_dump(include={"validation_fraction", "seed"})
+        options = {"validation_fraction": record["validation_fraction"], "seed": record["seed"]}
+        train = (
             f"spelgen train module.py --robot {urdf} --data LOGS -o RUN2 --objective {record['objective']}"
         )
-        for key, value in _changed(options, usual).items():
-            command += f" --set {shlex.quote(f'{key}={value}')}"
-        found.append(command)
-    return [*found, "spelgen evaluate RUN2 --data LOGS", "spelgen report RUN2"]
+        for key, value in _changed(options | record["config"] | record["preprocessing"], defaults).items():
+            train += f" --set {shlex.quote(f'{key}={value}')}"
+        lines.append(train)
+    return [*lines, "spelgen evaluate RUN2 --data LOGS", "spelgen report RUN2"]
 
 
-def _flags(chosen: Mapping[str, Any], usual: Mapping[str, Any]) -> str:
-    """The command-line flags of what differs from the default."""
-    text = ""
-    for key, value in _changed(chosen, usual).items():
-        words = ",".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
-        text += f" --{key.replace('_', '-')} {shlex.quote(words)}"
-    return text
-
-
-def _changed(options: Mapping[str, Any], usual: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options that are set to something else than usual."""
+def _changed(options: Mapping[str, object], defaults: Mapping[str, object]) -> dict[str, object]:
+    """Return the options that are set to something else than by default."""
     changed = {}
     for key, value in options.items():
-        if value is not None and value != usual.get(key) and not isinstance(value, Mapping):
+        if value is not None and value != defaults.get(key) and not isinstance(value, Mapping):
             changed[key] = value
     return changed
 
 
 def _size(count: int) -> str:
-    return (
-        f"{count} B" if count < 1000 else f"{count / 1000:.1f} kB" if count < 1e6 else f"{count / 1e6:.1f} MB"
-    )
+    if count < 1000:
+        return f"{count} B"
+    if count < 1e6:
+        return f"{count / 1000:.1f} kB"
+    return f"{count / 1e6:.1f} MB"

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-from markupsafe import Markup
 
 from spelgen.baselines.names import MODEL
 from spelgen.errors import RunError
@@ -18,16 +15,15 @@ from spelgen.files import write_text
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.labels import listed, thousandths
 from spelgen.listing import number
-from spelgen.render.charts import Band, Line, line_chart
 from spelgen.render.page import render_page
-from spelgen.render.plots import FORCE, Panel, numbers
+from spelgen.render.plots import ERRORS, FORCE, Panel, Record, growth_panels
 from spelgen.spec import Facts, read_facts
 
 STYLES = ("model", "train", "gravity", "coriolis", "friction", "hold")
 
 
 @dataclass(frozen=True)
-class RunShown:
+class EvaluatedRun:
     """A run as the page tells of it; style: of its lines."""
 
     name: str
@@ -36,7 +32,21 @@ class RunShown:
     objective: str
     parameters: str
     verdict: str
-    evaluation: Mapping[str, Any]
+    evaluation: Record
+
+    def errors(self, kind: str, name: str) -> Record:
+        """Return the model's errors over a horizon or a replay of this name."""
+        record: Record = next(x["errors"][MODEL] for x in self.evaluation[kind] if x["name"] == name)
+        return record
+
+    def torque(self) -> Record | None:
+        """Return the model's errors of torque; None where the logs tell none."""
+        record: Record | None = self.evaluation["torque"].get(MODEL)
+        return record
+
+    def replay_error(self, name: str) -> float:
+        """Return the mean error of positions under the commands of these logs [mrad; mm]."""
+        return 1000 * float(self.errors("replays", name)["mean"])
 
 
 def write_runs(folders: Sequence[Path], output: Path) -> Path:
@@ -45,14 +55,14 @@ def write_runs(folders: Sequence[Path], output: Path) -> Path:
 
 
 def render_runs(folders: Sequence[Path]) -> str:
-    """The page as HTML."""
-    runs = [
-        _shown(folder, name, k) for k, (folder, name) in enumerate(zip(folders, _names(folders), strict=True))
-    ]
+    """Return the page as HTML."""
+    runs = []
+    for folder, name, style in zip(folders, _names(folders), STYLES * len(folders), strict=False):
+        runs.append(_read(folder, name, style))
     return render_page(
         "runs.html.jinja",
         runs=runs,
-        verdict=_best(runs),
+        verdict=_verdict(runs),
         robots=sorted({run.facts.robot for run in runs}),
         key=[(run.style, run.name) for run in runs],
         tables=_tables(runs),
@@ -61,24 +71,22 @@ def render_runs(folders: Sequence[Path]) -> str:
 
 
 def _names(folders: Sequence[Path]) -> list[str]:
-    """The folders' own names, with their parents' where two are the same."""
-    short = [folder.resolve().name for folder in folders]
-    return [
-        name if short.count(name) == 1 else "/".join(folder.resolve().parts[-2:])
-        for folder, name in zip(folders, short, strict=True)
-    ]
+    """Return the folders' own names, with their parents' where two are the same."""
+    paths = [folder.resolve() for folder in folders]
+    short = [path.name for path in paths]
+    return [path.name if short.count(path.name) == 1 else "/".join(path.parts[-2:]) for path in paths]
 
 
-def _shown(folder: Path, name: str, index: int) -> RunShown:
+def _read(folder: Path, name: str, style: str) -> EvaluatedRun:
     run = RunFolder(folder)
     config = run.read_config()
     if not run.evaluation.is_file():
         raise RunError("a run that is not evaluated", file=folder, do="spelgen evaluate")
     evaluation = run.read_json(run.evaluation)
     identified = run.read_json(run.baseline) if run.baseline.is_file() else None
-    return RunShown(
+    return EvaluatedRun(
         name=name,
-        style=STYLES[index % len(STYLES)],
+        style=style,
         facts=read_facts(run.module),
         objective=config["objective"],
         parameters=f"{evaluation['parameters']:,}",
@@ -87,114 +95,91 @@ def _shown(folder: Path, name: str, index: int) -> RunShown:
     )
 
 
-def _best(runs: Sequence[RunShown]) -> str:
-    """Which run misses least over the longest horizon that all have, and which in torque."""
-    told = []
-    common, replayed = (_common(runs, what) for what in ("horizons", "replays"))
-    if common:
-        least = _least(runs, lambda run: _of_model(run, "horizons", common[-1])["mean_relative_rms"])
-        told += (
-            [f"{least[0]} predicts best over {common[-1]} ({number(least[1])} of the motion missed)"]
-            if least
-            else []
-        )
-    least = _least(runs, lambda run: (run.evaluation["torque"].get(MODEL) or {}).get("mean_nmse"))
-    told += [f"{least[0]} has the least torque error (nMSE {number(least[1])})"] if least else []
-    if replayed:
-        least = _least(runs, lambda run: 1000 * _of_model(run, "replays", replayed[0])["mean"])
-        unit = thousandths(runs[0].facts.joint_types)
-        told += (
-            [f"{least[0]} follows commands best, {replayed[0]} ({number(least[1])} {unit} off)"]
-            if least
-            else []
-        )
-    return f"{listed(told)}." if told else "These runs share nothing that was measured."
+def _verdict(runs: Sequence[EvaluatedRun]) -> str:
+    """Say which run misses least over the longest horizon that all have, which in torque, which under commands."""
+    sentences = []
+    for horizon in _common(runs, "horizons")[-1:]:
+        best = _best({run.name: run.errors("horizons", horizon)["mean_relative_rms"] for run in runs})
+        if best:
+            sentences.append(
+                f"{best[1]} predicts best over {horizon} ({number(best[0])} of the motion missed)"
+            )
+    best = _best({run.name: (run.torque() or {}).get("mean_nmse") for run in runs})
+    if best:
+        sentences.append(f"{best[1]} has the least torque error (nMSE {number(best[0])})")
+    for replay in _common(runs, "replays")[:1]:
+        best = _best({run.name: run.replay_error(replay) for run in runs})
+        if best:
+            unit = thousandths(runs[0].facts.joint_types)
+            sentences.append(f"{best[1]} follows commands best, {replay} ({number(best[0])} {unit} off)")
+    if not sentences:
+        return "These runs share nothing that was measured."
+    return f"{listed(sentences)}."
 
 
-def _least(runs: Sequence[RunShown], value: Callable[[RunShown], float | None]) -> tuple[str, float] | None:
-    known = [(x, run.name) for run in runs if (x := value(run)) is not None]
-    return (min(known)[1], min(known)[0]) if known else None
+def _best(errors: Mapping[str, float | None]) -> tuple[float, str] | None:
+    """Return the smallest error and the name of its run; None where no run has one."""
+    known = [(error, name) for name, error in errors.items() if error is not None]
+    return min(known, default=None)
 
 
-def _common(runs: Sequence[RunShown], what: str) -> list[str]:
-    """Names of the horizons, or of the replays, that all runs were judged over."""
-    first, *rest = ([x["name"] for x in run.evaluation.get(what, ())] for run in runs)
-    return [name for name in first if all(name in other for other in rest)]
+def _common(runs: Sequence[EvaluatedRun], kind: str) -> list[str]:
+    """Return the names of the horizons, or of the replays, that all runs were judged over."""
+    first, *others = [[x["name"] for x in run.evaluation.get(kind, ())] for run in runs]
+    return [name for name in first if all(name in names for names in others)]
 
 
-def _of_model(run: RunShown, what: str, name: str) -> Mapping[str, Any]:
-    """The model's errors over one of these."""
-    errors: Mapping[str, Any] = next(x["errors"][MODEL] for x in run.evaluation[what] if x["name"] == name)
-    return errors
-
-
-def _replay_table(runs: Sequence[RunShown], name: str) -> Table:
-    """Of logs that all runs have replayed, and the mean of each run's own."""
-    of_runs = {run.name: _of_model(run, "replays", name) for run in runs}
-    first, *rest = (x["trajectories"] for x in of_runs.values())
-    logs = [log for log in first if all(log in other for other in rest)]
-    rows = [{k: 1000 * x["trajectories"][log] for k, x in of_runs.items()} for log in logs]
-    rows.append({k: 1000 * x["mean"] for k, x in of_runs.items()})
-    title = f"Commands replayed, {name}: RMS of positions [{thousandths(runs[0].facts.joint_types)}]"
-    return table(title, [*logs, "mean of all"], rows)
-
-
-def _tables(runs: Sequence[RunShown]) -> list[Table]:
-    names, found = _common(runs, "horizons"), []
-    for what, title in (
+def _tables(runs: Sequence[EvaluatedRun]) -> list[Table]:
+    tables = []
+    horizons = _common(runs, "horizons")
+    for measure, title in (
         ("mean_relative_rms", "Error relative to the motion"),
         ("tip_mm", "Error of the tip's position [mm]"),
     ):
-        rows = [{run.name: _of_model(run, "horizons", name)[what] for run in runs} for name in names]
-        if any(x is not None for row in rows for x in row.values()):
-            found.append(table(title, names, rows))
-    torques = [run.evaluation["torque"].get(MODEL) for run in runs]
-    if all(torques):
-        columns = dict(zip((run.name for run in runs), torques, strict=True))
-        found.append(
-            table("Torque error, nMSE", ["mean of all"], [{k: x["mean_nmse"] for k, x in columns.items()}])
-        )
-        joints = {run.facts.joints: run.facts.joint_types for run in runs}
-        if len(joints) == 1:
-            ((names_of, types),) = joints.items()
-            labels = [f"{joint} [{FORCE[kind]}]" for joint, kind in zip(names_of, types, strict=True)]
-            rows = [{k: x["rmse"][j] for k, x in columns.items()} for j in range(len(labels))]
-            found.append(table("Torque error by joint, RMSE", labels, rows))
-    return [*found, *(_replay_table(runs, name) for name in _common(runs, "replays"))]
+        rows = [{run.name: run.errors("horizons", name)[measure] for run in runs} for name in horizons]
+        if any(value is not None for row in rows for value in row.values()):
+            tables.append(table(title, horizons, rows))
+    tables += _torque_tables(runs)
+    tables += [_replay_table(runs, name) for name in _common(runs, "replays")]
+    return tables
 
 
-def _growth(runs: Sequence[RunShown]) -> list[Panel]:
-    panels = []
-    for what, title, label in (
-        ("relative", "Relative to the motion", "error / motion"),
-        ("tip_mm", "Of the tip", "error of the tip [mm]"),
-    ):
-        shown: list[Line | Band] = []
-        for run in runs:
-            growth = (run.evaluation.get("traces") or {}).get("growth") or {}
-            curves = growth.get(what, {}).get(MODEL)
-            if curves:
-                seconds = growth["seconds"]
-                shown.append(Line(f"{run.name}, median", seconds, numbers(curves["median"]), run.style))
-                shown.append(
-                    Band(
-                        f"{run.name}, 10 to 90 %",
-                        seconds,
-                        numbers(curves["low"]),
-                        numbers(curves["high"]),
-                        run.style,
-                    )
-                )
-        if shown:
-            chart: Markup = line_chart(
-                shown,
-                f"{title}: error by horizon",
-                "horizon [s]",
-                label,
-                log=True,
-                log_x=True,
-                width=520,
-                height=260,
-            )
-            panels.append(Panel(title, (chart,)))
-    return panels
+def _torque_tables(runs: Sequence[EvaluatedRun]) -> list[Table]:
+    errors = {}
+    for run in runs:
+        torque = run.torque()
+        if torque is None:
+            return []
+        errors[run.name] = torque
+    means = {name: error["mean_nmse"] for name, error in errors.items()}
+    tables = [table("Torque error, nMSE", ["mean of all"], [means])]
+    facts = runs[0].facts
+    if all(run.facts.joints == facts.joints for run in runs):
+        labels, rows = [], []
+        for k, (joint, kind) in enumerate(zip(facts.joints, facts.joint_types, strict=True)):
+            labels.append(f"{joint} [{FORCE[kind]}]")
+            rows.append({name: error["rmse"][k] for name, error in errors.items()})
+        tables.append(table("Torque error by joint, RMSE", labels, rows))
+    return tables
+
+
+def _replay_table(runs: Sequence[EvaluatedRun], name: str) -> Table:
+    """Return errors of the logs that all runs have replayed, and the mean of each run's own."""
+    by_run = {run.name: run.errors("replays", name)["trajectories"] for run in runs}
+    first, *others = by_run.values()
+    logs = [log for log in first if all(log in errors for errors in others)]
+    rows = [{run: 1000 * errors[log] for run, errors in by_run.items()} for log in logs]
+    rows.append({run.name: run.replay_error(name) for run in runs})
+    unit = thousandths(runs[0].facts.joint_types)
+    return table(f"Commands replayed, {name}: RMS of positions [{unit}]", [*logs, "mean of all"], rows)
+
+
+def _growth(runs: Sequence[EvaluatedRun]) -> list[Panel]:
+    curves: dict[str, dict[str, tuple[Sequence[float], Record]]] = {measure: {} for measure in ERRORS}
+    for run in runs:
+        growth = (run.evaluation.get("traces") or {}).get("growth") or {}
+        for measure, by_run in curves.items():
+            error = growth.get(measure, {}).get(MODEL)
+            if error:
+                by_run[run.name] = growth["seconds"], error
+    return growth_panels(curves, {run.name: run.style for run in runs}, [run.name for run in runs])

@@ -1,6 +1,6 @@
-"""A URDF -> the arm as a page draws it: links that hang on one another, each with its faces.
+"""A URDF -> the arm as a page draws it: links that hang on one another, each with its triangles, and a still picture.
 
-The faces are those of the file's visual shapes where yourdfpy finds them, simplified to fit a page; else tubes from
+The triangles are those of the file's visual shapes where these are found, simplified to fit a page; else tubes from
 joint to joint, with a drum about the axis of each that turns.
 """
 
@@ -9,17 +9,38 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from markupsafe import Markup
+from scipy.spatial.transform import Rotation
 
-from spelgen.dynamics.constraint import mimic_constraint
+from spelgen.dynamics.constraint import Constraint, mimic_constraint
+from spelgen.render.charts import element
 from spelgen.render.shapes import Shape, drum, joined, slide, tube, visual_shapes
+from spelgen.settings.tuning.render import TUNING
 from spelgen.urdf.read import read_urdf
 from spelgen.urdf.robot import Joint, Robot
 
-FACES = 2600  # of all links together
-THIN = 0.028  # radius of a tube, of the arm's reach
+
+@dataclass(frozen=True)
+class Camera:
+    """Direction of the camera [rad], size of the picture and room for the arm in it. light: points to the light."""
+
+    yaw: float = 2.3
+    pitch: float = 0.36
+    width: int = 640
+    height: int = 420
+    fill: float = 0.86
+    light: tuple[float, float, float] = (-0.352, 0.624, 0.704)
+    shades: int = 8
+
+    def axes(self) -> np.ndarray:
+        """Return what takes the root's axes to right, up and towards the eye, (3, 3)."""
+        c, s, cp, sp = np.cos(self.yaw), np.sin(self.yaw), np.cos(self.pitch), np.sin(self.pitch)
+        return np.array([[-c, s, 0], [-s * sp, -c * sp, cp], [s * cp, c * cp, sp]])
+
+
+CAMERA = Camera()
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,143 +60,194 @@ class SceneLink:
     offset: float
     shape: Shape
 
-
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """Links, parents first, and how far the arm reaches [m]. found: whether the shapes are the file's own."""
-
-    links: tuple[SceneLink, ...]
-    reach: float
-    found: bool
-
-    def frames(self, q: Sequence[float]) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Where the links stand at q: rotation and position of each."""
-        placed: list[tuple[np.ndarray, np.ndarray]] = []
-        for link in self.links:
-            above = placed[link.parent] if link.parent >= 0 else (np.eye(3), np.zeros(3))
-            rotation, position = above[0] @ link.rotation, above[1] + above[0] @ link.position
-            value = link.offset + (link.ratio * q[link.joint] if link.joint >= 0 else 0.0)
-            if link.slides:
-                position = position + rotation @ link.axis * value
-            else:
-                rotation = rotation @ _turn(link.axis, value)
-            placed.append((rotation, position))
-        return placed
-
-    def to_dict(self) -> dict[str, Any]:
-        """For a script, in millimetres and short names."""
+    def to_dict(self) -> dict[str, object]:
+        """Return the link for a script, in millimetres and short names."""
         return {
-            "reach": round(1000 * self.reach),
-            "links": [
-                {
-                    "parent": link.parent,
-                    "R": [round(x, 6) for x in link.rotation.ravel().tolist()],
-                    "p": _mm(link.position),
-                    "axis": [round(x, 6) for x in link.axis.tolist()],
-                    "slides": link.slides,
-                    "joint": link.joint,
-                    "ratio": link.ratio,
-                    "offset": link.offset,
-                    "v": [_mm(x) for x in link.shape.vertices],
-                    "f": [list(face) for face in link.shape.faces],
-                }
-                for link in self.links
-            ],
+            "parent": self.parent,
+            "R": self.rotation.ravel().round(6).tolist(),
+            "p": _mm(self.position),
+            "axis": self.axis.round(6).tolist(),
+            "slides": self.slides,
+            "joint": self.joint,
+            "ratio": self.ratio,
+            "offset": self.offset,
+            "v": _mm(self.shape.vertices),
+            "f": self.shape.faces.tolist(),
         }
 
 
+@dataclass(frozen=True)
+class View:
+    """What the camera looks at: the middle [m], and pixels per metre."""
+
+    middle: np.ndarray
+    scale: float
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Links, parents first, and how far the arm reaches [m]. has_meshes: whether the shapes are the file's own."""
+
+    links: tuple[SceneLink, ...]
+    reach: float
+    has_meshes: bool
+
+    def frames(self, q: Sequence[float]) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return where the links stand at q: rotation (3, 3) and position (3,) of each."""
+        frames: list[tuple[np.ndarray, np.ndarray]] = []
+        for link in self.links:
+            rotation, position = np.eye(3), np.zeros(3)
+            if link.parent >= 0:
+                rotation, position = frames[link.parent]
+            position = position + rotation @ link.position
+            rotation = rotation @ link.rotation
+            value = link.offset
+            if link.joint >= 0:
+                value += link.ratio * q[link.joint]
+            if link.slides:
+                position = position + rotation @ link.axis * value
+            else:
+                rotation = rotation @ Rotation.from_rotvec(value * link.axis).as_matrix()
+            frames.append((rotation, position))
+        return frames
+
+    def triangles(self, q: Sequence[float]) -> np.ndarray:
+        """Return the corners of all triangles at q, (F, 3, 3) [m]."""
+        placed = [np.zeros((0, 3, 3))]
+        for link, (rotation, position) in zip(self.links, self.frames(q), strict=True):
+            vertices = link.shape.vertices @ rotation.T + position
+            placed.append(vertices[link.shape.faces])
+        return np.concatenate(placed)
+
+    def view(self, poses: Sequence[Sequence[float]]) -> View:
+        """Return the view that holds the arm at all these positions."""
+        points = np.concatenate([np.zeros((1, 3)), *(self.triangles(q).reshape(-1, 3) for q in poses)])
+        middle = (points.min(axis=0) + points.max(axis=0)) / 2
+        across, up, _ = np.maximum(np.abs((points - middle) @ CAMERA.axes().T).max(axis=0), 1e-6)
+        return View(middle, CAMERA.fill * min(CAMERA.width / 2 / across, CAMERA.height / 2 / up))
+
+    def still(self, view: View, poses: Sequence[Sequence[float]], title: str) -> Markup:
+        """Return a picture of the arm at the first of these positions, and pale at the others: what a page shows
+        without a script, and on paper.
+        """
+        ghosts = [element("g", {"class": "ghost"}, self._polygons(view, q, shaded=False)) for q in poses[1:]]
+        picture = Markup("").join([*ghosts, self._polygons(view, poses[0], shaded=True)])
+        size = f"0 0 {CAMERA.width} {CAMERA.height}"
+        attributes = {"class": "still", "viewBox": size, "role": "img", "aria-label": title}
+        return element("svg", attributes, picture)
+
+    def _polygons(self, view: View, q: Sequence[float], *, shaded: bool) -> Markup:
+        """Return triangles from the farthest to the nearest (painter's algorithm), those that look away left out."""
+        corners = (self.triangles(q) - view.middle) @ CAMERA.axes().T
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 1])
+        facing = normals[:, 2] > 0
+        corners, normals = corners[facing], normals[facing]
+        cosines = normals @ np.array(CAMERA.light) / np.linalg.norm(normals, axis=1)
+        shades = np.round((CAMERA.shades - 1) * np.maximum(0.0, cosines)).astype(int)
+        flat = np.array([CAMERA.width, CAMERA.height]) / 2 + view.scale * corners[..., :2] * [1, -1]
+        polygons = []
+        for k in np.argsort(corners[..., 2].mean(axis=1), kind="stable"):
+            attributes = {"points": " ".join(f"{x:.0f},{y:.0f}" for x, y in flat[k])}
+            if shaded:
+                attributes = {"class": f"s{shades[k]}", **attributes}
+            polygons.append(element("polygon", attributes))
+        return Markup("").join(polygons)
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the scene for a script, in millimetres and short names."""
+        links = [link.to_dict() for link in self.links]
+        return {"reach": round(1000 * self.reach), "yaw": CAMERA.yaw, "pitch": CAMERA.pitch, "links": links}
+
+
 def scene(urdf: Path, joints: Sequence[str]) -> Scene:
-    """The arm of these joints. Raises what reading the URDF raises."""
+    """Return the arm of these joints. Raises what reading the URDF raises."""
     robot = read_urdf(urdf)
     constraint = mimic_constraint(robot, joints)
-    links = _links(robot, joints)
-    shapes = visual_shapes(urdf, links, FACES)
-    known = sum(len(shape.faces) for shape in shapes.values()) > 0
-    places = {name: k for k, name in enumerate(links)}
-    far = _reach(robot, links)
-    built = []
-    for name in links:
-        joint = robot.joint_above.get(name)
-        below = [each for each in robot.joints_below[name] if each.child in places]
-        row = constraint.names.index(joint.name) if joint is not None and joint.moves else None
-        ratios = np.zeros(1) if row is None else constraint.jacobian[row]
-        driven = int(np.flatnonzero(ratios)[0]) if ratios.any() else -1
-        axis = np.array(joint.axis if joint is not None else (0, 0, 1), dtype=float)
-        axis = axis / (np.linalg.norm(axis) or 1.0)
-        shape = shapes.get(name, Shape()) if known else _tubes(robot, name, joint, below, THIN * far, axis)
-        built.append(
-            SceneLink(
-                name=name,
-                parent=-1 if joint is None else places.get(joint.parent, -1),
-                rotation=_rotation(joint.rpy) if joint is not None else np.eye(3),
-                position=np.array(joint.xyz if joint is not None else (0, 0, 0), dtype=float),
-                axis=axis,
-                slides=joint is not None and joint.type == "prismatic",
-                joint=driven,
-                ratio=float(ratios[driven]) if driven >= 0 else 0.0,
-                offset=0.0 if row is None else float(constraint.offset[row]),
-                shape=shape,
-            )
-        )
-    return Scene(tuple(built), far, known)
+    names = _links(robot, joints)
+    shapes = visual_shapes(urdf, names)
+    lengths = [
+        float(np.linalg.norm(robot.joint_above[name].xyz)) for name in names if name in robot.joint_above
+    ]
+    reach = max(sum(lengths), 1e-3)
+    links = []
+    for name in names:
+        if shapes:
+            shape = shapes.get(name, joined([]))
+        else:
+            shape = _tubes(robot, name, names, TUNING.tube_radius * reach)
+        links.append(_link(robot, name, names, constraint, shape))
+    return Scene(tuple(links), reach, bool(shapes))
+
+
+def _link(robot: Robot, name: str, names: Sequence[str], constraint: Constraint, shape: Shape) -> SceneLink:
+    joint = robot.joint_above.get(name)
+    if joint is None:
+        root = np.zeros(3)
+        return SceneLink(name, -1, np.eye(3), root, np.array([0.0, 0.0, 1.0]), False, -1, 0.0, 0.0, shape)
+    driver, ratio, offset = -1, 0.0, 0.0
+    if joint.moves:
+        row = constraint.names.index(joint.name)
+        offset = float(constraint.offset[row])
+        drivers = np.flatnonzero(constraint.jacobian[row])
+        if len(drivers):
+            driver = int(drivers[0])
+            ratio = float(constraint.jacobian[row, driver])
+    return SceneLink(
+        name=name,
+        parent=names.index(joint.parent) if joint.parent in names else -1,
+        rotation=_rotation(joint),
+        position=np.array(joint.xyz, dtype=float),
+        axis=_axis(joint),
+        slides=joint.type == "prismatic",
+        joint=driver,
+        ratio=ratio,
+        offset=offset,
+        shape=shape,
+    )
 
 
 def _links(robot: Robot, joints: Sequence[str]) -> list[str]:
-    """From the root to the last joint, and all that the joints carry; parents first."""
-    on_path = {each.parent for name in joints for each in robot.path_to(robot.joint[name].child)}
-    carried: set[str] = {robot.joint[name].child for name in joints}
+    """Return the links from the root to the last joint, and all that the joints carry; parents first."""
+    shown = {robot.joint[name].child for name in joints}
     for joint in robot.joints_from_root:
-        if joint.parent in carried:
-            carried.add(joint.child)
-    return [robot.root, *(x.child for x in robot.joints_from_root if x.child in on_path | carried)]
+        if joint.parent in shown:
+            shown.add(joint.child)
+    for name in joints:
+        shown |= {joint.parent for joint in robot.path_to(robot.joint[name].child)}
+    return [robot.root, *(joint.child for joint in robot.joints_from_root if joint.child in shown)]
 
 
-def _reach(robot: Robot, links: Sequence[str]) -> float:
-    lengths = [
-        float(np.linalg.norm(robot.joint_above[name].xyz)) for name in links if name in robot.joint_above
-    ]
-    return max(sum(lengths), 1e-3)
-
-
-def _tubes(
-    robot: Robot, name: str, joint: Joint | None, below: Sequence[Joint], radius: float, axis: np.ndarray
-) -> Shape:
-    """From the link's origin to the joints that it carries; the last one ends at its centre of mass."""
-    ends = [np.array(each.xyz, dtype=float) for each in below]
-    inertial = robot.link[name].inertial
-    if not ends and inertial is not None:
-        ends = [np.array(inertial.com, dtype=float)]
-    parts = [
-        tube(np.zeros(3), end, radius if below else 0.7 * radius)
-        for end in ends
-        if np.linalg.norm(end) > radius / 2
-    ]
-    for each in below:
-        if each.type == "prismatic":  # its rail
-            along = _rotation(each.rpy) @ np.array(each.axis, dtype=float)
-            length = max((abs(x) for x in (each.lower, each.upper) if x is not None), default=0.0)
-            if length > radius / 2:
-                parts.append(tube(np.array(each.xyz), np.array(each.xyz) + length * along, 0.4 * radius, 6))
+def _tubes(robot: Robot, name: str, names: Sequence[str], radius: float) -> Shape:
+    """Return tubes from the link's origin to the joints that it carries; the last link ends at its centre of mass."""
+    joint, inertial = robot.joint_above.get(name), robot.link[name].inertial
+    below = [joint for joint in robot.joints_below[name] if joint.child in names]
+    parts = []
+    for carried in below:
+        end = np.array(carried.xyz, dtype=float)
+        parts += tube(np.zeros(3), end, radius)
+        if carried.type == "prismatic":  # its rail
+            travel = max(abs(carried.lower or 0.0), abs(carried.upper or 0.0))
+            parts += tube(end, end + travel * _rotation(carried) @ _axis(carried), 0.4 * radius)
+    if not below and inertial is not None:
+        parts += tube(np.zeros(3), np.array(inertial.com, dtype=float), 0.7 * radius)
     if joint is not None and joint.moves:
         shape = slide if joint.type == "prismatic" else drum
-        parts.append(shape(axis, 1.5 * radius))
+        parts += shape(_axis(joint), 1.5 * radius)
     return joined(parts)
 
 
-def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
-    """Rodrigues' rotation about a unit axis."""
-    x, y, z = axis
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    found: np.ndarray = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-    return found
+def _axis(joint: Joint) -> np.ndarray:
+    axis = np.array(joint.axis, dtype=float)
+    unit: np.ndarray = axis / (np.linalg.norm(axis) or 1.0)
+    return unit
 
 
-def _rotation(rpy: Sequence[float]) -> np.ndarray:
-    """Roll, pitch, yaw of a URDF."""
-    roll, pitch, yaw = rpy
-    x, y, z = np.eye(3)
-    return _turn(z, yaw) @ _turn(y, pitch) @ _turn(x, roll)
+def _rotation(joint: Joint) -> np.ndarray:
+    """Return the rotation of roll, pitch and yaw, about fixed axes."""
+    matrix: np.ndarray = Rotation.from_euler("xyz", joint.rpy).as_matrix()
+    return matrix
 
 
-def _mm(vector: np.ndarray) -> list[float]:
-    return [round(1000 * x, 1) for x in vector.tolist()]
+def _mm(vectors: np.ndarray) -> list[float]:
+    rounded: list[float] = (1000 * vectors).round(1).tolist()
+    return rounded

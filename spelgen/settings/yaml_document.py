@@ -41,13 +41,13 @@ class Document:
         """Return the line of a key or list item, or of the nearest thing around it that is there."""
         if self.root is None:
             return None
-        node, line = self.root, self.root.start_mark.line + 1
+        node, line = self.root, int(self.root.start_mark.line) + 1
         for key in location:
             entry = _entry(node, key)
             if entry is None:
                 break
             name, node = entry
-            line = name.start_mark.line + 1
+            line = int(name.start_mark.line) + 1
         return line
 
 
@@ -62,7 +62,7 @@ def _entry(node: yaml.Node, key: int | str) -> tuple[yaml.Node, yaml.Node] | Non
     return None
 
 
-class _Loader(yaml.SafeLoader):
+class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
     """The safe loader, without tags, aliases (a small file could grow huge), deep nesting and repeated keys."""
 
     depth = 0
