@@ -38,6 +38,11 @@ if TYPE_CHECKING:
         source: str
         """The module's text, as it was loaded."""
         facts: Facts
+        # of models that have them: see `dynamics.protocol`
+        armature: torch.Tensor
+        inertial_parameters: torch.Tensor
+        torque_offset: torch.Tensor
+        friction: Any
 
         def mass_matrix(self, q: torch.Tensor, prepared: Any = None) -> torch.Tensor: ...
         def potential_energy(self, q: torch.Tensor) -> torch.Tensor: ...

@@ -177,7 +177,7 @@ def _cells(arm: LoadedArm | None, facts: Facts, picture: Picture) -> list[list[C
         derived = matrix(arm.arm, arm.structure_for(facts.options.assume))
         if [[cell.kind for cell in row] for row in derived] == picture.kinds:
             return derived
-    cells = []
+    cells: list[list[Cell]] = []
     for i, row in enumerate(picture.rows):
         cells.append([])
         for j, entry in enumerate(row):

@@ -100,7 +100,8 @@ def _mesh(geometry: yourdfpy.Geometry, model: yourdfpy.URDF) -> Trimesh:
     if geometry.cylinder is not None:
         return trimesh.creation.cylinder(geometry.cylinder.radius, geometry.cylinder.length, sections=12)
     if geometry.sphere is not None:
-        return trimesh.creation.uv_sphere(geometry.sphere.radius, count=[8, 10])
+        sphere: Trimesh = trimesh.creation.uv_sphere(geometry.sphere.radius, count=[8, 10])
+        return sphere
     path = Path(model._filename_handler(geometry.mesh.filename))
     if path.stat().st_size > TUNING.mesh_bytes:
         raise ValueError("a mesh too large for a page")
