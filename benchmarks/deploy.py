@@ -24,17 +24,18 @@ import torch
 
 from spelgen.building import build
 from spelgen.dynamics.pinocchio_arm import pinocchio_model
-from spelgen.exporting.c_code import c_entries, c_header, c_source
-from spelgen.exporting.c_library import CLibrary, compile_object, compiler, link_library
+from spelgen.exporting.c_library import CLibrary, compile_object, compiler, link_library, write_c
 from spelgen.exporting.casadi_export import called_by_state, casadi_functions
 from spelgen.exporting.description import FrictionLaw, TrainedModel
-from spelgen.exporting.entry_points import ENTRY_POINTS, expression_function
+from spelgen.exporting.entry_points import ENTRY_POINTS
 from spelgen.exporting.mjcf_export import check_mjcf
 from spelgen.exporting.mjcf_file import mjcf_text
-from spelgen.exporting.onnx_export import called_by_onnx, onnx_session
-from spelgen.exporting.onnx_model import ENTRIES, onnx_model
+from spelgen.exporting.model_expressions import expression_function
+from spelgen.exporting.onnx_export import called_by_onnx, onnx_model, onnx_session
 from spelgen.exporting.parity import Called, Parity, check_parity
 from spelgen.exporting.rigid_body_projection import rigid_body_projection
+from spelgen.exporting.tip_chain import tip_in_body
+from spelgen.exporting.torch_programs import PROGRAMS
 from spelgen.exporting.trained import Trained
 from spelgen.loaded_arm import load_arm
 
@@ -60,7 +61,7 @@ def trained(robot: str, preset: str, size: float = 0.05, *, residuals: bool = Tr
 
 def parity() -> None:
     """The largest difference to the torch module at STATES states, relative to the largest value, by export."""
-    names = [entry.name for entry in ENTRY_POINTS]
+    names = list(ENTRY_POINTS)
     print(f"{'':24s}{'C double':>12s}{'C float':>12s}{'CasADi':>12s}{'ONNX':>12s}{'MuJoCo':>12s}")
     for robot in ARMS:
         for preset in PRESETS:
@@ -70,19 +71,18 @@ def parity() -> None:
             def worst(
                 called: Called, asked: list[str] = names, each: Trained = each, dtype: type = np.float64
             ) -> float:
-                memory = each.described.memory
-                return _largest(
-                    check_parity(called, each, asked, np.inf, memory=memory, states=STATES, dtype=dtype)
-                )
+                return _largest(check_parity(called, each, asked, np.inf, states=STATES, dtype=dtype))
 
             with tempfile.TemporaryDirectory() as folder:
                 kinds = (("", np.float64), (f"-D{model.name.upper()}_FLOAT", np.float32))
                 c = [worst(library(model, Path(folder), flag, kind), dtype=kind) for flag, kind in kinds]
             casadi = worst(called_by_state(casadi_functions(model)))
-            onnx = worst(called_by_onnx({name: onnx_model(model, name) for name in ENTRIES}), list(ENTRIES))
+            prepared = each.model.prepared()
+            files = {name: onnx_model(prepared, name) for name in PROGRAMS}
+            onnx = worst(called_by_onnx(files), list(PROGRAMS))
             projection = rigid_body_projection(each.model, each.arm)
             gains = model.inputs
-            text = mjcf_text(projection, gains, each.tip_in_body)
+            text = mjcf_text(projection, gains, tip_in_body(each.arm))
             mujoco = _largest(check_mjcf(text, projection, gains, states=STATES))
             print(
                 f"{robot:12s}{preset:12s}" + "".join(f"{x:12.1e}" for x in (*c, casadi, onnx, mujoco)),
@@ -97,15 +97,11 @@ def _largest(found: Parity) -> float:
 
 def library(model: TrainedModel, folder: Path, flag: str, kind: type) -> CLibrary:
     """The model's C, compiled."""
-    program, entries = compiler(), c_entries(model)
+    program, own_folder = compiler(), folder / kind.__name__
     assert program is not None
-    place = folder / kind.__name__ / f"{model.name}.c"
-    place.parent.mkdir()
-    place.write_text(c_source(model, entries))
-    place.with_suffix(".h").write_text(c_header(model, entries, ""))
-    return CLibrary(
-        link_library(compile_object(place, program, *([flag] * bool(flag))), program), model, kind
-    )
+    own_folder.mkdir()
+    compiled = compile_object(write_c(model, own_folder), program, *([flag] * bool(flag)))
+    return CLibrary(link_library(compiled, program), model, kind)
 
 
 TIMED = r"""
@@ -189,7 +185,7 @@ def latency(robot: str = "ur10e") -> None:
         print(f"{preset}, ONNX Runtime")
         given = {"q": q, "qd": qd, "tau": tau, "qdd": tau}
         for name in ("forward_dynamics", "inverse_dynamics"):
-            session = onnx_session(onnx_model(model, name))
+            session = onnx_session(onnx_model(prepared, name))
             wanted = [x.name for x in session.get_inputs()]
             states = {key: given[key].numpy()[None] for key in wanted if key in given}
             if "z" in wanted:
@@ -208,7 +204,7 @@ def time_c(model: TrainedModel, *, beside_casadi: bool) -> None:
     """Compile a program that times the model's C, and CasADi's of the same expressions, and show what it prints."""
     name, runs, include, sources = model.name, [], "", [f"{model.name}.c", "timed.c"]
     given = {"q": "q", "qd": "qd", "qdd": "x", "tau": "x", "z": "z", "dq": "qd"}
-    for entry in ENTRY_POINTS:
+    for entry in ENTRY_POINTS.values():
         arguments = [*(given[each] for each in entry.inputs), *("out", "a", "b")[: len(entry.outputs)]]
         if entry.name.startswith("friction_"):
             arguments[-1] = "z2"
@@ -216,7 +212,7 @@ def time_c(model: TrainedModel, *, beside_casadi: bool) -> None:
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
         if beside_casadi:
-            for entry in ENTRY_POINTS[:2]:
+            for entry in list(ENTRY_POINTS.values())[:2]:
                 function = expression_function(entry, model)
                 (place / f"{entry.name}_casadi.c").write_text(_generated(function))
                 include += f"int {entry.name}(const double **, double **, long long *, double *, int);\n"
@@ -226,9 +222,7 @@ def time_c(model: TrainedModel, *, beside_casadi: bool) -> None:
                     f'{{ const double *arg[20]; double *res[20]; RUN("CasADi\'s C of {entry.name}", {call}); }}'
                 )
                 sources.append(f"{entry.name}_casadi.c")
-        entries = c_entries(model)
-        (place / f"{name}.c").write_text(c_source(model, entries))
-        (place / f"{name}.h").write_text(c_header(model, entries, ""))
+        write_c(model, place)
         text = TIMED.format(
             name=name, include=include, n=model.n, nz=model.memory, square=max(6 * model.n, model.n**2, 16),
             calls=CALLS, runs="\n".join(runs),

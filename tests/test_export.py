@@ -81,7 +81,7 @@ def test_what_stands_beside_bodies_is_told(tmp_path):
     loaded, told = exported(run, tmp_path / "bodies.urdf")
     assert max(differences(model, loaded)) < 1e-8
     assert "bodies: the model's own" in told
-    assert "position_factor" not in (tmp_path / "bodies.friction.yaml").read_text().split("joints:")[1]
+    assert "position_factor" not in (tmp_path / "bodies.urdf.friction.yaml").read_text().split("joints:")[1]
     functions = model.joint_functions
     with torch.no_grad():
         model.residual_mass.raw_constants += 0.5
@@ -93,7 +93,7 @@ def test_what_stands_beside_bodies_is_told(tmp_path):
     assert found.projection.mass_error > 1e-3
     assert found.projection.gravity_error > 1e-3
     assert (found.projection.friction_error > 0.05).all()
-    law = yaml.safe_load(found.files[".friction.yaml"])["joints"]["joint1"]["law"]
+    law = yaml.safe_load(found.files[".urdf.friction.yaml"])["joints"]["joint1"]["law"]
     assert law["position_factor"][0] < 0.9 < 1.1 < law["position_factor"][1]
 
 
@@ -109,10 +109,10 @@ def test_networks_go_back_as_the_nearest_bodies(tmp_path):
 def test_the_models_own_friction_law_lies_beside(tmp_path):
     run, model = run_of("rpr", tmp_path, "closed-form", heavier)
     exported(run, tmp_path / "learned.urdf")
-    told = yaml.safe_load((tmp_path / "learned.friction.yaml").read_text())
+    told = yaml.safe_load((tmp_path / "learned.urdf.friction.yaml").read_text())
     law = [told["joints"][name]["law"]["coulomb"] for name in model.facts.joints]
     np.testing.assert_allclose(law, model.coulomb.detach().numpy(), rtol=1e-10)
-    assert len((tmp_path / "learned.README.md").read_text().splitlines()) == 5
+    assert len((tmp_path / "learned.urdf.README.md").read_text().splitlines()) == 5
 
 
 def test_what_lies_there_stays_unless_forced(tmp_path):
@@ -155,7 +155,7 @@ def test_a_model_in_memory_is_exported_with_its_arm(tmp_path):
     assert "bodies: the model's own" in repr(found)
     assert "Izz2" in found._repr_html_()
     written = [x.name for x in found.write(tmp_path / "arm.urdf")]
-    assert written == ["arm.urdf", "arm.yaml", "arm.friction.yaml", "arm.README.md"]
+    assert written == ["arm.urdf", "arm.yaml", "arm.urdf.friction.yaml", "arm.urdf.README.md"]
     with pytest.raises(RunError, match="this output exists already"):
         found.write(tmp_path / "arm.urdf")
     with pytest.raises(RunError, match=r"no robot\.urdf"):

@@ -15,9 +15,8 @@ from spelgen.building import build
 from spelgen.cli.main import app
 from spelgen.errors import RunError
 from spelgen.exporting import friction_expressions
-from spelgen.exporting.c_code import c_entries, c_header, c_source
 from spelgen.exporting.c_export import c_files
-from spelgen.exporting.c_library import CLibrary, compile_object, link_library
+from spelgen.exporting.c_library import CLibrary, compile_object, link_library, write_c
 from spelgen.exporting.casadi_export import export_casadi
 from spelgen.exporting.describe import identifier
 from spelgen.exporting.description import Bristles
@@ -28,7 +27,7 @@ from spelgen.exporting.trained import Trained
 from spelgen.loaded_arm import load_arm
 
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc on this machine")
-NAMES = [entry.name for entry in ENTRY_POINTS]
+NAMES = list(ENTRY_POINTS)
 BOTH = [("two_link", "closed-form"), ("rpr", "hybrid")]
 
 
@@ -61,7 +60,7 @@ def test_c_gives_what_the_model_gives(case, program, flags, compiled):
     library = library.rename(folder / f"{program}{len(flags)}.so")  # ctypes keeps what it has loaded by name
     kind, tolerance = (np.float32, 1e-5) if flags else (np.float64, 1e-12)
     called = CLibrary(library, model, kind)
-    parity = check_parity(called, trained, NAMES, tolerance, memory=model.memory, dtype=kind)
+    parity = check_parity(called, trained, NAMES, tolerance, dtype=kind)
     assert set(parity.differences) == set(NAMES)
 
 
@@ -117,11 +116,8 @@ def test_the_longest_name_is_a_name(tmp_path):
     """A function's first line may be too long by itself."""
     described = Trained(moved_model("two_link", "closed-form"), arm_of("two_link")).described
     model = replace(described, name=identifier("gen3" * 20))
-    source, entries = tmp_path / f"{model.name}.c", c_entries(model)
-    source.write_text(c_source(model, entries))
-    source.with_suffix(".h").write_text(c_header(model, entries, ""))
     assert len(model.name) == 40
-    assert compile_object(source, "gcc").exists()
+    assert compile_object(write_c(model, tmp_path), "gcc").exists()
 
 
 def test_a_wrong_export_is_refused():
@@ -163,7 +159,7 @@ def test_c_is_sound_whatever_it_is_given(case, compiled):
     trained, folder, _ = compiled[case]
     name, n = trained.described.name, trained.described.n
     calls = []
-    for entry in ENTRY_POINTS:
+    for entry in ENTRY_POINTS.values():
         given = [{"q": "q", "qd": "qd", "z": "z"}.get(each, "x") for each in entry.inputs]
         outputs = ["more", "most", "last"][: len(entry.outputs)] if len(entry.outputs) > 1 else ["out"]
         outputs = ["more"] if entry.name in ("tip_jacobian", "mass_matrix", "tip_pose") else outputs
@@ -210,10 +206,7 @@ def test_c_carries_frictions_memory(tmp_path):
     """Two elements a joint: z turns dry friction, and long sliding bends it fully. NZ says how many numbers."""
     model = Trained(moved_model("two_link", "closed-form"), arm_of("two_link")).described
     model = replace(model, bristles=BRISTLES)
-    entries = c_entries(model)
-    source = tmp_path / f"{model.name}.c"
-    source.write_text(c_source(model, entries))
-    source.with_suffix(".h").write_text(c_header(model, entries, ""))
+    source = write_c(model, tmp_path)
     assert "#define TWO_LINK_NZ 4" in source.with_suffix(".h").read_text()
     called = CLibrary(link_library(compile_object(source, "gcc"), "gcc"), model)
     given = random_inputs(model.coordinates, 5, 4)

@@ -73,7 +73,7 @@ def test_what_mujoco_has_no_words_for_is_told(preset, which, tmp_path):
     assert f"bodies: {which}; M differs by" in told.output.replace("\n", " ")
     assert "by MuJoCo" in told.output
     assert mujoco.MjModel.from_xml_path(str(tmp_path / "arm.xml")).nv == 2
-    assert len((tmp_path / "arm.README.md").read_text().splitlines()) == 5
+    assert len((tmp_path / "arm.xml.README.md").read_text().splitlines()) == 5
 
 
 def test_followers_motors_and_passive_joints_go_along(tmp_path):

@@ -277,11 +277,11 @@ def test_exports_hold_the_servos(fitted, arm, tmp_path, monkeypatch):
     xml = spelgen.export(fitted, to="mjcf").files[".xml"].decode()
     found = re.findall(r'<position name="\w+" joint="\w+" kp="([^"]+)" kv="([^"]+)" forcerange="-6 6"', xml)
     assert np.array(found, dtype=float) == pytest.approx(np.stack([kp, kd], axis=1))
-    held = yaml.safe_load(spelgen.export(fitted, to="urdf").files[".friction.yaml"])
+    held = yaml.safe_load(spelgen.export(fitted, to="urdf").files[".urdf.friction.yaml"])
     assert held["delay"] == pytest.approx(float(fitted.model.delay))
     assert held["joints"]["elbow"]["servo"]["kp"] == pytest.approx(kp[1])
     monkeypatch.setattr(fitted.model.servo, "dead_zone", torch.tensor([0.01, 0.0]).double())
-    assert "dead zones are left out" in spelgen.export(fitted, to="mjcf").files[".README.md"].decode()
+    assert "dead zones are left out" in spelgen.export(fitted, to="mjcf").files[".xml.README.md"].decode()
     files = spelgen.export(
         fitted, to="c"
     ).files  # checked against the module when exported, where there is a compiler

@@ -9,90 +9,107 @@ import shutil
 import subprocess
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from spelgen.errors import RunError
+from spelgen.exporting.c_source import c_entries, c_header, c_source
 from spelgen.exporting.description import TrainedModel
-from spelgen.exporting.entry_points import ENTRY_POINTS, SERVO
+from spelgen.exporting.entry_points import entry_points
 from spelgen.exporting.parity import Values
 
-FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror")
+_FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror")
 
 
 def compiler() -> str | None:
-    """The C compiler of this machine, gcc before others; None without one."""
-    return next((found for name in ("gcc", "clang", "cc") if (found := shutil.which(name))), None)
+    """Return the C compiler of this machine, gcc before others; None without one."""
+    for name in ("gcc", "clang", "cc"):
+        program = shutil.which(name)
+        if program:
+            return program
+    return None
+
+
+def write_c(model: TrainedModel, folder: Path) -> Path:
+    """Write header and source into a folder and return the source's path."""
+    entries = c_entries(model)
+    source = folder / f"{model.name}.c"
+    source.write_text(c_source(model, entries))
+    source.with_suffix(".h").write_text(c_header(model, entries, ""))
+    return source
 
 
 def compile_object(source: Path, program: str, *flags: str) -> Path:
-    """An object file of a C file beside it, with FLAGS. Raises RunError with what the compiler says."""
-    found = source.with_suffix(".o")
-    command = [program, *FLAGS, *flags, "-fPIC", "-fstack-usage", "-c", str(source), "-o", str(found)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise RunError(f"{Path(program).name} refuses the exported C", do=done.stderr.strip()[:500])
-    return found
+    """Compile a C file to an object beside it. Raises RunError with the messages of the compiler."""
+    target = source.with_suffix(".o")
+    command = [program, *_FLAGS, *flags, "-fPIC", "-fstack-usage", "-c", str(source), "-o", str(target)]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    if result.returncode:
+        raise RunError(f"{Path(program).name} refuses the exported C", do=result.stderr.strip()[:500])
+    return target
 
 
 def link_library(object_file: Path, program: str) -> Path:
-    """A shared library of an object file, beside it."""
+    """Link an object file to a shared library beside it."""
     library = object_file.with_suffix(".so")
     subprocess.run([program, "-shared", str(object_file), "-o", str(library), "-lm"], check=True)
     return library
 
 
-def measured(object_file: Path, program: str) -> str:
-    """A sentence on the code and the stack that an object file takes."""
+def measured(object_file: Path, program: str, model: TrainedModel) -> str:
+    """Return a sentence on the code and the stack of an object file."""
+    frames = {}
     usage = object_file.with_suffix(".su")
-    frames = [line.split("\t") for line in usage.read_text().splitlines()] if usage.exists() else []
-    own = {name.rsplit(":", 1)[-1]: int(size) for name, size, _ in frames}
-    public = [own[name] for name in own if any(name.endswith(entry.name) for entry in (*ENTRY_POINTS, SERVO))]
-    inner = sum(own.values()) - sum(public)  # at most: as if each called the next
+    if usage.exists():
+        for line in usage.read_text().splitlines():
+            function, size, _ = line.split("\t")
+            frames[function.rsplit(":", 1)[-1]] = int(size)
+    stack = "stack not known"
+    public = [frames.pop(f"{model.name}_{name}", 0) for name in entry_points(model)]
+    if any(public):
+        # at most: as if each of the other functions called the next
+        stack = f"at most {max(public) + sum(frames.values())} bytes of stack"
     version = subprocess.run([program, "-dumpfullversion"], capture_output=True, text=True, check=False)
     which = f"{Path(program).name} {version.stdout.strip()} -O2 on {platform.machine()}"
-    stack = f"at most {max(public) + inner} bytes of stack" if public else "stack not known"
     return f"By {which}: {_code_size(object_file)} bytes of code and constants, {stack}"
 
 
 def _code_size(object_file: Path) -> int:
-    """Code and constants of an object file, in bytes."""
-    if shutil.which("size") is None:
-        return object_file.stat().st_size
-    told = subprocess.run(["size", str(object_file)], capture_output=True, text=True, check=False).stdout
-    found = re.search(r"^\s*(\d+)\s+(\d+)", told, re.MULTILINE)
-    return int(found[1]) + int(found[2]) if found else object_file.stat().st_size
+    """Return the bytes of code and constants, of all of the object file where there is no program ``size``."""
+    if shutil.which("size"):
+        result = subprocess.run(["size", str(object_file)], capture_output=True, text=True, check=False)
+        sizes = re.search(r"^\s*(\d+)\s+(\d+)", result.stdout, re.MULTILINE)
+        if sizes:
+            return int(sizes[1]) + int(sizes[2])
+    return object_file.stat().st_size
 
 
 class CLibrary:
     """The functions of a compiled export, for arrays of states."""
 
-    def __init__(self, library: Path, model: TrainedModel, dtype: Any = np.float64) -> None:
+    def __init__(self, library: Path, model: TrainedModel, dtype: type = np.float64) -> None:
         self._library, self._model, self._dtype = ctypes.CDLL(str(library)), model, dtype
-        self._entries = {entry.name: entry for entry in (*ENTRY_POINTS, SERVO)}
 
     def __call__(self, name: str, inputs: Values) -> Mapping[str, np.ndarray]:
-        """An entry point's outputs, (states, ...), as float64."""
-        entry, n, count = self._entries[name], self._model.n, len(inputs["q"])
+        """Return an entry point's outputs, (states, ...), as float64."""
+        entry, states = entry_points(self._model)[name], len(inputs["q"])
         function = getattr(self._library, f"{self._model.name}_{name}")
         function.restype = None
-        given = [np.ascontiguousarray(inputs[key], dtype=self._dtype) for key in entry.inputs]
-        shapes = {key: _shape(name, key, n, self._model.memory) for key, _ in entry.outputs}
-        found = {key: np.full((count, *shape), np.nan, self._dtype) for key, shape in shapes.items()}
-        for state in range(count):
-            rows = [*(each[state] for each in given), *(each[state] for each in found.values())]
-            function(*(row.ctypes.data_as(ctypes.c_void_p) for row in rows))
-        return {key: value.astype(np.float64) for key, value in found.items()}
+        arrays: list[np.ndarray] = []
+        for key in entry.inputs:
+            arrays.append(np.ascontiguousarray(inputs[key], dtype=self._dtype))
+        outputs: dict[str, np.ndarray] = {}
+        for key in entry.output_names:
+            outputs[key] = np.full((states, *self._shape(name, key)), np.nan, self._dtype)
+        arrays += outputs.values()
+        for state in range(states):
+            function(*(array[state : state + 1].ctypes.data_as(ctypes.c_void_p) for array in arrays))
+        return {key: value.astype(np.float64) for key, value in outputs.items()}
 
-
-def _shape(entry: str, output: str, n: int, memory: int) -> tuple[int, ...]:
-    if entry in ("mass_matrix", "inverse_dynamics_derivatives", "forward_dynamics_derivatives"):
-        return n, n
-    return {
-        "pose": (4, 4),
-        "jacobian": (6, n),
-        "energy": (2,),
-        "z_next": (memory,),
-        "z_start": (memory,),
-    }.get(output, (n,))
+    def _shape(self, entry: str, output: str) -> tuple[int, ...]:
+        n, memory = self._model.n, self._model.memory
+        if output in ("z_next", "z_start"):
+            return (memory,)
+        if entry == "mass_matrix" or entry.endswith("_derivatives"):
+            return (n, n)
+        return {"energy": (2,), "pose": (4, 4), "jacobian": (6, n)}.get(output, (n,))

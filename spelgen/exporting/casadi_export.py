@@ -9,28 +9,21 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 
-from spelgen.exporting.casadi_residuals import residual_values
 from spelgen.exporting.description import TrainedModel
-from spelgen.exporting.entry_points import (
-    EntryPoint,
-    entry_points,
-    expression_function,
-    residuals_needed,
-)
-from spelgen.exporting.exported import Exported
+from spelgen.exporting.entry_points import EntryPoint, entry_points
+from spelgen.exporting.exported import UNITS, Exported, readme
+from spelgen.exporting.model_expressions import expression_function, residuals_needed
 from spelgen.exporting.parity import Called, Values, check_parity
-from spelgen.exporting.readme import UNITS, readme
+from spelgen.exporting.residual_expressions import residual_values
 from spelgen.exporting.trained import Trained
-
-TOLERANCE = 1e-12
+from spelgen.settings.tuning.exporting import TUNING
 
 
 def export_casadi(trained: Trained) -> Exported:
-    """A file for each entry point. Raises RunError where they do not give what the model gives."""
+    """Return a file for each entry point. Raises RunError where they differ from the model."""
     model = trained.described
     functions = casadi_functions(model)
-    names = list(functions)
-    parity = check_parity(called_by_state(functions), trained, names, TOLERANCE, memory=model.memory)
+    parity = check_parity(called_by_state(functions), trained, list(functions), TUNING.tolerance)
     checked = f"Checked when exported, by CasADi {ca.CasadiMeta.version()}: {parity.summary}."
     use = (
         "qdd = casadi.Function.load('forward_dynamics.casadi')(q, qd, tau, z) takes numbers or symbols: "
@@ -43,36 +36,34 @@ def export_casadi(trained: Trained) -> Exported:
 
 
 def casadi_functions(model: TrainedModel) -> dict[str, ca.Function]:
-    """Every entry point: of scalar expressions, and of matrices what stands beside rigid bodies."""
-    found: dict[str, ca.Function] = {}
-    for entry in entry_points(model):
-        if entry.level == "jets" and model.residuals:
-            found[entry.name] = _derivatives(entry, found[entry.name.removesuffix("_derivatives")])
+    """Return every entry point: rigid bodies and friction by scalars, residuals by matrices."""
+    functions: dict[str, ca.Function] = {}
+    for name, entry in entry_points(model).items():
+        if name.endswith("_derivatives") and model.residuals:
+            functions[name] = _derivatives(entry, functions[name.removesuffix("_derivatives")])
         else:
-            found[entry.name] = _with_residuals(entry, model)
-    return found
+            functions[name] = _with_residuals(entry, model)
+    return functions
 
 
 def _with_residuals(entry: EntryPoint, model: TrainedModel) -> ca.Function:
-    expressions = expression_function(entry, model)
-    needed = residuals_needed(expressions)
+    function = expression_function(entry, model)
+    needed = residuals_needed(function)
     if not needed:
-        return expressions
-    given = [ca.MX.sym(name, expressions.size1_in(name)) for name in entry.inputs]
-    states = dict(zip(entry.inputs, given, strict=True))
+        return function
+    states = {name: ca.MX.sym(name, function.size1_in(name)) for name in entry.inputs}
     residuals = residual_values(model, states["q"], states.get("qd"))
-    arguments = [*given, *(residuals[name] for name in needed)]
-    names = [name for name, _ in entry.outputs]
-    return ca.Function(entry.name, given, expressions.call(arguments), list(entry.inputs), names)
+    outputs = function.call([*states.values(), *(residuals[name] for name in needed)])
+    return ca.Function(entry.name, list(states.values()), outputs, list(states), list(entry.output_names))
 
 
 def _derivatives(entry: EntryPoint, function: ca.Function) -> ca.Function:
-    given = function.mx_in()
-    (output,) = function.call(given)
-    places = [name for name in entry.inputs if name in ("q", "qd", "tau")]
-    by_input = [ca.densify(ca.jacobian(output, given[entry.inputs.index(name)])) for name in places]
-    names = [name for name, _ in entry.outputs]
-    return ca.Function(entry.name, given, by_input, list(entry.inputs), names)
+    inputs = dict(zip(entry.inputs, function.mx_in(), strict=True))
+    (output,) = function.call(list(inputs.values()))
+    by_input = [
+        ca.densify(ca.jacobian(output, inputs[name])) for name in ("q", "qd", "tau") if name in inputs
+    ]
+    return ca.Function(entry.name, list(inputs.values()), by_input, list(inputs), list(entry.output_names))
 
 
 def _saved(function: ca.Function) -> bytes:
@@ -83,18 +74,16 @@ def _saved(function: ca.Function) -> bytes:
 
 
 def called_by_state(functions: Mapping[str, ca.Function]) -> Called:
-    """CasADi's functions, for arrays of states."""
+    """Return what calls CasADi's functions, state by state."""
 
     def called(name: str, inputs: Values) -> Values:
         function = functions[name]
         rows = [inputs[key] for key in function.name_in()]
-        found = [function.call([ca.DM(x) for x in state]) for state in zip(*rows, strict=True)]
-        outputs = function.name_out()
-        return {key: np.array([_array(each[k]) for each in found]) for k, key in enumerate(outputs)}
+        outputs: dict[str, list[np.ndarray]] = {key: [] for key in function.name_out()}
+        for state in zip(*rows, strict=True):
+            for values, result in zip(outputs.values(), function.call([*map(ca.DM, state)]), strict=True):
+                # CasADi's vectors are columns
+                values.append(result.full()[:, 0] if result.shape[1] == 1 else result.full())
+        return {key: np.array(values) for key, values in outputs.items()}
 
     return called
-
-
-def _array(value: ca.DM) -> np.ndarray:
-    full: np.ndarray = value.full()
-    return full[:, 0] if full.shape[1] == 1 else full

@@ -1,4 +1,4 @@
-"""A torch model and its arm -> its description: facts of the arm, values of the model; no text of the module."""
+"""A torch model and its arm -> its description: facts of the arm, values of the model, no text of the module."""
 
 from __future__ import annotations
 
@@ -9,73 +9,173 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from spelgen.dynamics.protocol import has_rigid_bodies, has_servos
-from spelgen.exporting.describe_residuals import array, constant_residual, residuals, unsupported
-from spelgen.exporting.description import Bristles, FrictionLaw, Servos, TrainedModel
+from spelgen.dynamics.protocol import has_friction_state, has_residuals, has_rigid_bodies, has_servos
+from spelgen.errors import RunError
+from spelgen.exporting.description import (
+    Bristles,
+    Encoding,
+    FrictionLaw,
+    Harmonics,
+    Network,
+    Residuals,
+    Servos,
+    Splines,
+    TrainedModel,
+)
 from spelgen.exporting.tip_chain import tip_chain
 from spelgen.loaded_arm import LoadedArm
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
+_LONGEST_NAME = 40
+_NO_SPLINES = Splines((), np.zeros(0), np.zeros(0), np.zeros((0, 4)))
+_NO_RESIDUALS = Residuals(Encoding(False, np.zeros(0), np.zeros(0)), None, None, _NO_SPLINES, (), _NO_SPLINES)
+
 
 def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
-    """The numbers of a trained model of this arm. Raises RunError for a preset that has no such description."""
-    exact: Any = copy.deepcopy(model).double().cpu().requires_grad_(False)
-    dynamics, preset = exact, model.facts.options.preset
+    """Return the numbers of a trained model of this arm. Raises RunError for a preset without rigid bodies."""
+    exact = copy.deepcopy(model).double().cpu().requires_grad_(False)
+    preset = model.facts.options.preset
     if not has_rigid_bodies(exact):
-        raise unsupported(f"the preset {preset}, which is not of rigid bodies")
-    with torch.no_grad():
-        prepared = dynamics.prepare()
-        tip_link, tip, end = tip_chain(loaded)
-        gains = array(prepared.input)
-        return TrainedModel(
-            name=identifier(loaded.arm.name),
-            robot=loaded.arm.name,
-            preset=preset,
-            coordinates=loaded.arm.coordinates,
-            identifiers=tuple(model.joint_names),
-            gravity=np.array(loaded.arm.gravity, dtype=float),
-            bodies=loaded.arm.bodies,
-            inertias=array(exact.inertial_parameters),
-            constant_mass=array(prepared.armature) + constant_residual(dynamics, prepared),
-            motors=array(dynamics.motors),
-            residuals=residuals(dynamics, prepared),
-            friction=_friction(prepared.friction),
-            bristles=_bristles(dynamics, prepared),
-            inputs=np.diag(gains) if gains.ndim == 1 else gains,
-            actuated=array(dynamics.input.actuated),
-            torque_offset=array(exact.torque_offset),
-            friction_compensation=array(dynamics.friction_compensation),
-            tip_link=tip_link,
-            tip=tip,
-            tip_end=end,
-            servos=servos_of(exact),
-        )
+        raise _unsupported(f"the preset {preset}, which is not of rigid bodies")
+    weights = exact.prepare()
+    tip_link, tip, end = tip_chain(loaded)
+    constant_mass = array(weights.armature)
+    residuals = _NO_RESIDUALS
+    if has_residuals(exact):
+        constant_mass += array(weights.residual.mass.constant).reshape(exact.n, exact.n)
+        residuals = _residuals(exact, weights)
+    gains = array(weights.input)
+    if gains.ndim == 1:
+        gains = np.diag(gains)
+    return TrainedModel(
+        name=identifier(loaded.arm.name),
+        robot=loaded.arm.name,
+        preset=preset,
+        coordinates=loaded.arm.coordinates,
+        identifiers=tuple(model.joint_names),
+        gravity=np.array(loaded.arm.gravity, dtype=float),
+        bodies=loaded.arm.bodies,
+        inertias=array(exact.inertial_parameters),
+        constant_mass=constant_mass,
+        motors=array(exact.motors),
+        residuals=residuals,
+        friction=_friction(weights.friction),
+        bristles=_bristles(exact, weights),
+        inputs=gains,
+        actuated=array(exact.actuated),
+        torque_offset=array(exact.torque_offset),
+        friction_compensation=array(exact.friction_compensation),
+        tip_link=tip_link,
+        tip=tip,
+        tip_end=end,
+        servos=servos_of(exact),
+    )
 
 
 def identifier(text: str) -> str:
-    """ASCII letters, digits and underscores of a text: a name that any language takes."""
-    plain = re.sub(r"[^0-9a-z]+", "_", text.lower()).strip("_")[:40]
-    bad = not plain or plain[0].isdigit() or keyword.iskeyword(plain)
-    return f"arm_{plain}".rstrip("_") if bad else plain
+    """Return ASCII letters, digits and underscores of a text: a name that any language takes."""
+    plain = re.sub(r"[^0-9a-z]+", "_", text.lower()).strip("_")[:_LONGEST_NAME]
+    if not plain or plain[0].isdigit() or keyword.iskeyword(plain):
+        return f"arm_{plain}".rstrip("_")
+    return plain
 
 
-def _friction(constants: Any) -> FrictionLaw:
-    return FrictionLaw(**{name: array(getattr(constants, name)) for name in FrictionLaw.__annotations__})
-
-
-def _bristles(dynamics: Any, prepared: Any) -> Bristles | None:
-    fractions = getattr(prepared.friction, "bristle_fractions", None)
-    if fractions is None or not fractions.shape[-1]:
-        return None
-    return Bristles(array(dynamics.friction.bristles.reach), array(fractions))
+def array(value: Tensor) -> np.ndarray:
+    """Return the numbers of a tensor, float64."""
+    values: np.ndarray = value.detach().double().cpu().numpy().copy()
+    return values
 
 
 def servos_of(model: Any) -> Servos | None:
-    """The position servos of a model, None where it has none."""
+    """Return the position servos of a model, None where it has none."""
     if not has_servos(model):
         return None
     kp, kd, limit, dead_zone = (array(x) for x in model.servo.prepare())
     return Servos(kp, kd, limit, dead_zone, float(model.servo.delay))
+
+
+def _unsupported(subject: str) -> RunError:
+    return RunError(
+        subject,
+        expected="closed-form, or hybrid with tanh networks",
+        do="--to torch, onnx, mjcf and urdf take every preset",
+    )
+
+
+def _friction(constants: Any) -> FrictionLaw:
+    values = constants._asdict()
+    return FrictionLaw(**{name: array(values[name]) for name in FrictionLaw.__annotations__})
+
+
+def _bristles(model: Any, weights: Any) -> Bristles | None:
+    if not has_friction_state(model):
+        return None
+    return Bristles(array(model.friction.bristles.reach), array(weights.friction.bristle_fractions))
+
+
+def _residuals(model: Any, weights: Any) -> Residuals:
+    """Return the residuals without those that are zero. Raises RunError for Kolmogorov-Arnold networks."""
+    encoding, functions = model.encoding, model.joint_functions
+    scale = functions.scale.unsqueeze(-1)
+    mass = _network(weights.residual.mass.layers)
+    if mass is not None:
+        mass = _tanh_then(mass, array(weights.residual.mass.functions))
+    return Residuals(
+        encoding=Encoding(encoding.prismatic, array(encoding.center), array(encoding.reach)),
+        mass=mass,
+        potential=_network(weights.residual.potential),
+        torque=_splines(functions, scale * functions.raw_torque_splines),
+        ripple=_ripple(functions, scale * functions.revolute * functions.raw_torque_ripple),
+        friction=_splines(functions, functions.friction_logarithms()),
+    )
+
+
+def _network(layers: Any) -> Network | None:
+    """Return a network, None where there is none or its last layer is zero."""
+    if layers is None or not (layers.weights[-1].any() or layers.biases[-1].any()):
+        return None
+    if type(layers).__name__ != "MLPLayers":
+        raise _unsupported("Kolmogorov-Arnold networks beside rigid bodies")
+    return Network(tuple(map(array, layers.weights)), tuple(map(array, layers.biases)))
+
+
+def _tanh_then(network: Network, functions: np.ndarray) -> Network:
+    """Return the network of tanh(y) @ functions as one with a layer more: tanh x is 2 sigmoid(2 x) - 1."""
+    *weights, last_weight = network.weights
+    *biases, last_bias = network.biases
+    used = last_weight.any(axis=1) | (last_bias != 0)
+    functions = functions[used]
+    weights += [2 * last_weight[used], 2 * functions.T]
+    biases += [2 * last_bias[used], -functions.sum(axis=0)]
+    return Network(tuple(weights), tuple(biases))
+
+
+def _splines(functions: Any, weights: Tensor) -> Splines:
+    joints = torch.nonzero(weights.any(dim=1)).flatten().tolist()
+    return Splines(
+        joints=tuple(joints),
+        center=array(functions.middles[joints].mean(dim=-1)),
+        spacing=array(functions.spacing[joints, 0]),
+        weights=array(weights[joints]),
+    )
+
+
+def _ripple(functions: Any, weights: Tensor) -> tuple[Harmonics, ...]:
+    """Return by joint the multiples of a turn, then, where they stand for themselves, those of the motor's turn."""
+    ripple: list[Harmonics] = []
+    cosines, sines = (array(half) for half in weights.chunk(2, dim=-1))
+    for joint, frequencies in enumerate(array(functions.frequencies)):
+        count = len(frequencies)
+        # how many follow one another from one on
+        regular = int(np.argmin(frequencies == np.arange(1, count + 1))) or count
+        for block in (slice(0, regular), slice(regular, count)):
+            c, s = cosines[joint, block], sines[joint, block]
+            used = np.flatnonzero((c != 0) | (s != 0))
+            if used.size:
+                last = used[-1] + 1
+                ripple.append(Harmonics(joint, float(frequencies[block][0]), c[:last], s[:last]))
+    return tuple(ripple)

@@ -1,4 +1,4 @@
-"""A trained model as plain numbers: the one description that every exporter reads."""
+"""The description of a trained model that exporters to source code read: plain numbers."""
 
 from __future__ import annotations
 
@@ -11,18 +11,17 @@ from spelgen.arm.arm import Body, Coordinate
 
 @dataclass(frozen=True, eq=False)
 class TipJoint:
-    """A joint on the way to the tip: origin (4, 4), then a turn or a slide by row @ q + offset about ``axis``."""
+    """A joint on the way to the tip: origin (4, 4), then a turn about z or a slide along it by row @ q + offset."""
 
     origin: np.ndarray
-    kind: str
-    axis: np.ndarray
+    revolute: bool
     row: np.ndarray
     offset: float
 
 
 @dataclass(frozen=True, eq=False)
 class FrictionLaw:
-    """The constants of ``runtime.friction_laws``, (n,) each, in their units."""
+    """Hold the constants of ``runtime.friction_laws``, (n,) each, in their units."""
 
     viscous: np.ndarray
     saturation: np.ndarray
@@ -36,8 +35,9 @@ class FrictionLaw:
 
 @dataclass(frozen=True, eq=False)
 class Bristles:
-    """Friction's memory: ``count`` elements a joint, each with a reach [rad, m] and its fraction of dry friction;
-    (n, count).
+    """The memory of friction: ``count`` elements a joint, (n, count).
+
+    reach: [rad, m]. fractions: of dry friction.
     """
 
     reach: np.ndarray
@@ -45,13 +45,13 @@ class Bristles:
 
     @property
     def count(self) -> int:
-        """Elements of a joint."""
+        """How many elements a joint has."""
         return int(self.reach.shape[1])
 
 
 @dataclass(frozen=True, eq=False)
 class Network:
-    """Learned functions of q: layers of sigmoids of the encoding, the last one linear.
+    """A network of q: layers of sigmoids of the encoding, the last one linear.
 
     weights: by layer, (units, units below).
     """
@@ -62,7 +62,7 @@ class Network:
 
 @dataclass(frozen=True, eq=False)
 class Encoding:
-    """What networks read: cos q, sin q and, where some joint is prismatic, (q - center) / reach."""
+    """The inputs of networks: cos q, sin q and, where some joint is prismatic, (q - center) / reach."""
 
     prismatic: bool
     center: np.ndarray
@@ -71,9 +71,9 @@ class Encoding:
 
 @dataclass(frozen=True, eq=False)
 class Splines:
-    """Of some joints each a sum of cubic B-splines, as in ``runtime.joint_functions``.
+    """Sums of cubic B-splines, one for each of some joints, as in ``runtime.joint_functions``.
 
-    The k-th of S is 2/3 high at center + spacing (k - (S - 1) / 2); weights: (joints, S).
+    The k-th of S splines is 2/3 high at center + spacing (k - (S - 1) / 2); weights: (joints, S).
     """
 
     joints: tuple[int, ...]
@@ -94,9 +94,9 @@ class Harmonics:
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """What a model has beside rigid bodies, as far as it is not zero.
+    """The parts of a model beside its rigid bodies, as far as they are not zero.
 
-    mass: gives what is added to M, (n n) rows; potential: to V, one row. torque and ripple: dV/dq by joint [Nm, N].
+    mass: is added to M, (n n) rows; potential: to V, one row. torque and ripple: dV/dq by joint [Nm, N].
     friction: the logarithm of a factor on a drive's friction.
     """
 
@@ -131,9 +131,9 @@ class Servos:
 class TrainedModel:
     """A trained arm of n joints. Units: rad and Nm, or m and N.
 
-    name: for code. inertias: (bodies, 10) about the joints' frames. constant_mass: what rotors and other constants add
-    to M, (n, n). motors: (n, n), the drives' speeds by the joints', which friction follows. inputs: G, (n, n);
-    actuated: (n,), 0 for a passive joint. friction_compensation: (n,) what the drives add by velocity.
+    name: for code. inertias: (bodies, 10) about the joints' frames. constant_mass: of rotors and other constants in
+    M, (n, n). motors: (n, n), the drives' speeds by the joints', which friction follows. inputs: G, (n, n);
+    actuated: (n,), 0 for a passive joint. friction_compensation: (n,) torque that the drives add by velocity, unseen.
     """
 
     name: str
@@ -165,5 +165,7 @@ class TrainedModel:
 
     @property
     def memory(self) -> int:
-        """Numbers of friction's memory."""
-        return self.n * self.bristles.count if self.bristles else 0
+        """How many numbers the memory of friction has."""
+        if self.bristles is None:
+            return 0
+        return self.n * self.bristles.count

@@ -1,123 +1,101 @@
-"""What a deployed model can be asked: one list for C, CasADi and the others, each as a CasADi function."""
+"""The quantities that a deployed model computes: one list for all formats."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields
-
-import casadi as ca
+from dataclasses import dataclass
 
 from spelgen.exporting.description import TrainedModel
-from spelgen.exporting.model_expressions import ModelExpressions
-from spelgen.exporting.residual_expressions import Level
-from spelgen.exporting.tip_expressions import tip
 
 
 @dataclass(frozen=True)
 class EntryPoint:
-    """A question: what is given, and what is answered (name, unit).
+    """A function of an export.
 
-    ``inputs`` are among q, qd, qdd, tau, u, dq (n rows) and z (friction's memory).
+    inputs: among q, qd, qdd, tau, u, dq (n numbers each) and z (the memory of friction). outputs: (name, unit) each.
     """
 
     name: str
     about: str
     inputs: tuple[str, ...]
     outputs: tuple[tuple[str, str], ...]
-    level: Level
-    expressions: Callable[[ModelExpressions], tuple[ca.SX, ...]]
+
+    @property
+    def output_names(self) -> tuple[str, ...]:
+        """The outputs without their units."""
+        return tuple(name for name, _ in self.outputs)
 
 
-RESIDUAL = "residual_"  # before the names of what is given of residuals
-_TORQUE, _MASS = "Nm, N", "kg m^2, kg m, kg"
+_TORQUE = "Nm, N"
 
-ENTRY_POINTS = (
+_ENTRY_POINTS = (
     EntryPoint(
-        "inverse_dynamics", "the torques that give qdd, friction included", ("q", "qd", "qdd", "z"),
-        (("tau", _TORQUE),), "rates", lambda m: (m.inverse_dynamics,),
+        "inverse_dynamics",
+        "the torques that give qdd, friction included",
+        ("q", "qd", "qdd", "z"),
+        (("tau", _TORQUE),),
     ),
     EntryPoint(
-        "forward_dynamics", "the accelerations under the torques tau", ("q", "qd", "tau", "z"),
-        (("qdd", "rad/s^2, m/s^2"),), "rates", lambda m: (m.forward_dynamics,),
+        "forward_dynamics",
+        "the accelerations under the torques tau",
+        ("q", "qd", "tau", "z"),
+        (("qdd", "rad/s^2, m/s^2"),),
+    ),
+    EntryPoint("mass_matrix", "M, armature included", ("q",), (("mass", "kg m^2, kg m, kg"),)),
+    EntryPoint("bias", "Coriolis, centrifugal and gravity torques", ("q", "qd"), (("bias", _TORQUE),)),
+    EntryPoint("gravity", "the torques that hold the arm still, dV/dq", ("q",), (("gravity", _TORQUE),)),
+    EntryPoint("friction", "the torques of friction", ("q", "qd", "z"), (("friction", _TORQUE),)),
+    EntryPoint(
+        "friction_step",
+        "the memory of friction after each joint moved one way by dq",
+        ("z", "dq"),
+        (("z_next", "rad, m"),),
     ),
     EntryPoint(
-        "mass_matrix", "M, armature included", ("q",),
-        (("mass", _MASS),), "values", lambda m: (m.mass_matrix,),
+        "friction_memory",
+        "the memory of friction of joints that slide at qd for long: to start from",
+        ("qd",),
+        (("z_start", "rad, m"),),
+    ),
+    EntryPoint("momentum", "M qd", ("q", "qd"), (("momentum", "Nm s, N s"),)),
+    EntryPoint("energy", "kinetic energy, then potential", ("q", "qd"), (("energy", "J"),)),
+    EntryPoint(
+        "tip_pose",
+        "the tip's homogeneous transform in the root link's frame",
+        ("q",),
+        (("pose", "1, m"),),
     ),
     EntryPoint(
-        "bias", "Coriolis, centrifugal and gravity torques", ("q", "qd"),
-        (("bias", _TORQUE),), "rates", lambda m: (m.bias,),
+        "tip_jacobian",
+        "the tip's linear, then angular velocity by qd, in the root link's axes",
+        ("q",),
+        (("jacobian", "m, 1"),),
     ),
     EntryPoint(
-        "gravity", "the torques that hold the arm still, dV/dq", ("q",),
-        (("gravity", _TORQUE),), "rates", lambda m: (m.gravity,),
+        "inverse_dynamics_derivatives",
+        "the derivatives of inverse_dynamics; its derivative by qdd is the mass matrix",
+        ("q", "qd", "qdd", "z"),
+        (("dtau_dq", "Nm/rad"), ("dtau_dqd", "Nm s/rad")),
     ),
     EntryPoint(
-        "friction", "what friction takes", ("q", "qd", "z"),
-        (("friction", _TORQUE),), "rates", lambda m: (m.friction,),
+        "forward_dynamics_derivatives",
+        "the derivatives of forward_dynamics",
+        ("q", "qd", "tau", "z"),
+        (("dqdd_dq", "1/s^2"), ("dqdd_dqd", "1/s"), ("dqdd_dtau", "1/(kg m^2)")),
     ),
-    EntryPoint(
-        "friction_step", "friction's memory after each joint went one way by dq", ("z", "dq"),
-        (("z_next", "rad, m"),), "values", lambda m: (m.friction_step,),
-    ),
-    EntryPoint(
-        "friction_memory", "friction's memory of joints that have long gone the way of qd: to start from", ("qd",),
-        (("z_start", "rad, m"),), "values", lambda m: (m.friction_memory,),
-    ),
-    EntryPoint(
-        "momentum", "M qd", ("q", "qd"),
-        (("momentum", "Nm s, N s"),), "values", lambda m: (m.momentum,),
-    ),
-    EntryPoint(
-        "energy", "kinetic energy, then potential", ("q", "qd"),
-        (("energy", "J"),), "values", lambda m: (m.energy,),
-    ),
-    EntryPoint(
-        "tip_pose", "the tip's homogeneous transform in the root link's frame", ("q",),
-        (("pose", "1, m"),), "values", lambda m: (tip(m.model, m.q)[0],),
-    ),
-    EntryPoint(
-        "tip_jacobian", "the tip's linear, then angular velocity by qd, in the root link's axes", ("q",),
-        (("jacobian", "m, 1"),), "values", lambda m: (tip(m.model, m.q)[1],),
-    ),
-    EntryPoint(
-        "inverse_dynamics_derivatives", "how inverse_dynamics changes; with qdd it does by the mass matrix",
-        ("q", "qd", "qdd", "z"), (("dtau_dq", "Nm/rad"), ("dtau_dqd", "Nm s/rad")), "jets",
-        lambda m: m.inverse_dynamics_derivatives(),
-    ),
-    EntryPoint(
-        "forward_dynamics_derivatives", "how forward_dynamics changes", ("q", "qd", "tau", "z"),
-        (("dqdd_dq", "1/s^2"), ("dqdd_dqd", "1/s"), ("dqdd_dtau", "1/(kg m^2)")), "jets",
-        lambda m: m.forward_dynamics_derivatives(),
-    ),
-)  # fmt: skip
+)
+ENTRY_POINTS = {entry.name: entry for entry in _ENTRY_POINTS}
+"""The functions of every model, by name."""
 
-
-SERVO = EntryPoint(
-    "servo_torque", "what position servos give under a command u, delayed as it was found", ("u", "q", "qd"),
-    (("tau", _TORQUE),), "values", lambda m: (m.servo_torque,),
-)  # fmt: skip
+SERVO_TORQUE = EntryPoint(
+    "servo_torque",
+    "the torques of position servos under a command u, which the caller delays",
+    ("u", "q", "qd"),
+    (("tau", _TORQUE),),
+)
 
 
-def entry_points(model: TrainedModel) -> tuple[EntryPoint, ...]:
-    """What this model can be asked."""
-    return ENTRY_POINTS if model.servos is None else (*ENTRY_POINTS, SERVO)
-
-
-def expression_function(entry: EntryPoint, model: TrainedModel) -> ca.Function:
-    """The entry point as a function of its inputs, then of what it needs of the residuals; outputs are dense."""
-    made = ModelExpressions(model, entry.level)
-    outputs = [ca.densify(each) for each in entry.expressions(made)]
-    inputs = {name: getattr(made, name) for name in entry.inputs}
-    every = ca.vertcat(*(ca.vec(each) for each in outputs))
-    for field in fields(made.residuals):
-        symbols = getattr(made.residuals, field.name)
-        if symbols.numel() and ca.depends_on(every, symbols):
-            inputs[f"{RESIDUAL}{field.name}"] = symbols
-    names = [name for name, _ in entry.outputs]
-    return ca.Function(entry.name, list(inputs.values()), outputs, list(inputs), names, {"cse": True})
-
-
-def residuals_needed(function: ca.Function) -> list[str]:
-    """What an ``expression_function`` is given of the residuals."""
-    return [name.removeprefix(RESIDUAL) for name in function.name_in() if name.startswith(RESIDUAL)]
+def entry_points(model: TrainedModel) -> dict[str, EntryPoint]:
+    """Return the functions of this model, by name."""
+    if model.servos is None:
+        return ENTRY_POINTS
+    return ENTRY_POINTS | {SERVO_TORQUE.name: SERVO_TORQUE}

@@ -1,20 +1,55 @@
-"""A trained model as files, and how they are written."""
+"""The formats, a trained model as files of one of them, and how they are written."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import pkgutil
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal
 
 from spelgen.errors import RunError
 from spelgen.files import write_bytes
+from spelgen.labels import printable
 
-Format = Literal["urdf", "mjcf", "c", "casadi", "onnx", "torch", "ros2"]
-FORMATS: tuple[str, ...] = get_args(Format)
+if TYPE_CHECKING:
+    from spelgen.exporting.trained import Trained
 
-SUFFIXES = {"urdf": ".urdf", "mjcf": ".xml"}
-"""Formats of one file, by its extension; what belongs to it lies beside it. All others are folders."""
+UNITS = "Units: rad and Nm for revolute joints, m and N for prismatic ones"
+
+
+@dataclass(frozen=True)
+class Exporter:
+    """A format of exports.
+
+    function_name: of what takes a ``Trained`` to an ``Exported``; it is imported when it is used, because the
+    packages that most formats need are extras. suffix: of a format of one file; all others are folders.
+    """
+
+    function_name: str
+    suffix: str = ""
+
+    def function(self) -> Callable[[Trained], Exported]:
+        """Return the function. Raises ModuleNotFoundError where an extra is not installed."""
+        function: Callable[[Trained], Exported] = pkgutil.resolve_name(self.function_name)
+        return function
+
+
+EXPORTERS = {
+    "urdf": Exporter("spelgen.exporting.urdf_export:export_urdf", suffix=".urdf"),
+    "mjcf": Exporter("spelgen.exporting.mjcf_export:export_mjcf", suffix=".xml"),
+    "c": Exporter("spelgen.exporting.c_export:export_c"),
+    "casadi": Exporter("spelgen.exporting.casadi_export:export_casadi"),
+    "onnx": Exporter("spelgen.exporting.onnx_export:export_onnx"),
+    "torch": Exporter("spelgen.exporting.torch_export:export_torch"),
+    "ros2": Exporter("spelgen.exporting.ros2_export:export_ros2"),
+}
+"""The formats by the names that --to takes."""
+
+if TYPE_CHECKING:
+    Format = str
+else:
+    Format = Literal[tuple(EXPORTERS)]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -31,48 +66,50 @@ class Exported:
     summary: tuple[str, ...]
 
     def write(self, path: Path | str, *, force: bool = False) -> tuple[Path, ...]:
-        """Write the files; return their paths. Raises RunError for a path that contradicts the format, and for what
-        exists, unless forced.
+        """Write the files and return their paths.
+
+        Raises RunError for a path that contradicts the format, and for what exists, unless forced.
         """
-        places = output_paths(self.to, Path(path), tuple(self.files))
-        require_free(self.to, Path(path), places, force=force)
-        return tuple(write_bytes(place, self.files[name]) for name, place in places.items())
+        path = Path(path)
+        require_fitting(self.to, path)
+        if EXPORTERS[self.to].suffix:
+            paths = [path.with_name(path.stem + name) for name in self.files]
+            outputs = paths
+        else:
+            paths = [path / name for name in self.files]
+            outputs = [path]
+        for output in outputs:
+            if output.exists() and not force:
+                raise RunError("this output exists already", file=output, do="force replaces it")
+        for file, content in zip(paths, self.files.values(), strict=True):
+            write_bytes(file, content)
+        return tuple(paths)
 
     def __repr__(self) -> str:
         return f"<Exported {self.robot!r} to {self.to}: {'; '.join(self.summary)}>"
 
 
-def output_paths(to: str, path: Path, names: Sequence[str]) -> dict[str, Path]:
-    """Where each of the files goes. Raises RunError for a path that contradicts the format."""
-    require_fitting(to, path)
-    if to in SUFFIXES:
-        return {name: path.with_name(path.stem + name) for name in names}
-    return {name: path / name for name in names}
-
-
 def require_fitting(to: str, path: Path) -> None:
     """Raise RunError for a path whose extension contradicts the format."""
-    suffix = SUFFIXES.get(to)
-    if suffix is None and path.suffix and not path.is_dir():
-        raise RunError(
-            f"the name {path.name!r} for --to {to}",
-            expected="a folder, named without an extension",
-            do=_hint(path.suffix),
-        )
-    if suffix is not None and path.suffix != suffix:
-        raise RunError(
-            f"the name {path.name!r} for --to {to}", expected=f"FILE{suffix}", do=_hint(path.suffix)
-        )
+    expected = None
+    suffix = EXPORTERS[to].suffix
+    if suffix and path.suffix != suffix:
+        expected = f"FILE{suffix}"
+    if not suffix and path.suffix and not path.is_dir():
+        expected = "a folder, named without an extension"
+    if expected is None:
+        return
+    formats = {exporter.suffix: name for name, exporter in EXPORTERS.items() if exporter.suffix}
+    advice = None
+    if path.suffix in formats:
+        advice = f"--to {formats[path.suffix]} writes such a file"
+    raise RunError(f"the name {path.name!r} for --to {to}", expected=expected, do=advice)
 
 
-def require_free(to: str, path: Path, places: Mapping[str, Path], *, force: bool) -> None:
-    """Raise RunError for an output that exists, unless it may be replaced."""
-    taken = list(places.values()) if to in SUFFIXES else [path]
-    for each in taken:
-        if each.exists() and not force:
-            raise RunError("this output exists already", file=each, do="force replaces it")
-
-
-def _hint(suffix: str) -> str | None:
-    meant = {ending: name for name, ending in SUFFIXES.items()}.get(suffix)
-    return f"--to {meant} writes such a file" if meant else None
+def readme(title: str, use: str, joints: Sequence[str], conventions: str, checked: str) -> bytes:
+    """Return the five lines beside an export: title, use, joints in their order, conventions, result of the check."""
+    names = ", ".join(printable(name) for name in joints)
+    lines = [f"# {printable(title)}", use, f"Joints, in this order: {names}.", conventions, checked]
+    if any("\n" in line for line in lines):
+        raise RunError("a line break", element="README")
+    return ("\n".join(lines) + "\n").encode()

@@ -3,97 +3,120 @@
 from __future__ import annotations
 
 import copy
-from typing import Any
 
 import mujoco
 import numpy as np
 import torch
 
-from spelgen.exporting.describe import servos_of
-from spelgen.exporting.exported import Exported
+from spelgen.exporting.describe import array, servos_of
+from spelgen.exporting.description import Servos
+from spelgen.exporting.exported import UNITS, Exported, readme
 from spelgen.exporting.mjcf_file import mjcf_text
-from spelgen.exporting.parity import STATES, Parity, random_inputs, relative
-from spelgen.exporting.readme import UNITS, readme
+from spelgen.exporting.parity import Parity, Values, random_inputs, relative
 from spelgen.exporting.rigid_body_projection import RigidBodyProjection, rigid_body_projection
+from spelgen.exporting.tip_chain import tip_in_body
 from spelgen.exporting.trained import Trained
-from spelgen.exporting.urdf_export import projection_summary
-
-TOLERANCE = 1e-9
+from spelgen.settings.tuning.exporting import TUNING
 
 
 def export_mjcf(trained: Trained) -> Exported:
-    """The MJCF of a trained model: its own bodies where it has such, else the nearest ones.
+    """Return the MJCF of a trained model: its own bodies where it has such, else the nearest ones.
 
     Raises RunError where MuJoCo's M, bias and forward dynamics are not those bodies'.
     """
     projection = rigid_body_projection(trained.model, trained.arm)
-    exact: Any = copy.deepcopy(trained.model).double().cpu().requires_grad_(False)
-    gains = exact.input_matrix(torch.zeros(exact.n, dtype=torch.float64)).numpy()
+    exact = copy.deepcopy(trained.model).double().cpu()
+    inputs = array(exact.input_matrix(torch.zeros(exact.n, dtype=torch.float64)))
     servos = servos_of(exact)
-    text = mjcf_text(projection, gains, trained.tip_in_body, servos)
-    summary = projection_summary(projection)
-    if servos is not None:
-        exact.servo.dead_zone.zero_()  # MuJoCo's actuators have none
-    parity = check_mjcf(text, projection, gains, exact.servo if servos else None)
+    text = mjcf_text(projection, inputs, tip_in_body(trained.arm), servos)
+    parity = check_mjcf(text, projection, inputs, servos)
     checked = f"Checked when exported, by MuJoCo {mujoco.__version__}, friction apart: {parity.summary}"
+    actuators = "a motor for each input."
+    if servos is not None:
+        actuators = (
+            f"a position actuator for each servo. Give ctrl the command of {servos.delay:.4g} s before."
+        )
+        if servos.dead_zone.any():
+            actuators += " The servos' dead zones are left out: MuJoCo's position actuators have none."
     use = (
         "mujoco.MjModel.from_xml_path(FILE.xml): bodies by the names of the links that their joints move, armature, "
-        "viscous friction as damping and Coulomb friction as frictionloss, a motor for each input."
+        f"viscous friction as damping and Coulomb friction as frictionloss, {actuators}"
     )
-    if servos is not None:
-        use = use.replace("a motor for each input", "a position actuator for each servo")
-        use += f" Give ctrl the command of {servos.delay:.4g} s before."
-        if servos.dead_zone.any():
-            use += " The servos' dead zones are left out: MuJoCo's position actuators have none."
     about = f"{UNITS}; a body's frame has its joint's axis as z; torque offsets of the sensors are left out."
-    name = trained.arm.arm.name
-    last = f"{'; '.join((checked, *summary))}."
-    text_of_readme = readme(f"{name} for MuJoCo", use, trained.joint_names, about, last)
-    return Exported("mjcf", name, {".xml": text, ".README.md": text_of_readme}, (*summary, checked))
+    result = f"{'; '.join((checked, *projection.summary))}."
+    text_of_readme = readme(f"{trained.robot} for MuJoCo", use, trained.joint_names, about, result)
+    files = {".xml": text, ".xml.README.md": text_of_readme}
+    return Exported("mjcf", trained.robot, files, (*projection.summary, checked))
 
 
 def check_mjcf(
-    text: bytes, projection: RigidBodyProjection, gains: np.ndarray, servo: Any = None, states: int = STATES
+    text: bytes,
+    projection: RigidBodyProjection,
+    inputs: np.ndarray,
+    servos: Servos | None = None,
+    states: int = TUNING.states,
 ) -> Parity:
-    """M, bias and forward dynamics without friction, by MuJoCo and by the bodies' own model. Raises RunError.
+    """Compare M, bias and forward dynamics without friction, of MuJoCo and of the bodies' own model. Raises RunError.
 
-    servo: of a model with position servos, whose actuators are given commands.
+    Under position servos the actuators are given commands.
     """
-    model, arm = projection.bodies, projection.arm.arm
-    simulated = mujoco.MjModel.from_xml_string(text.decode())
-    simulated.dof_damping[:], simulated.dof_frictionloss[:] = 0.0, 0.0
-    data = mujoco.MjData(simulated)
-    joints = [simulated.joint(body.name) for body in arm.bodies]
-    places = [int(simulated.jnt_dofadr[joint.id]) for joint in joints]
-    jacobian, offset = np.zeros((simulated.nv, model.n)), np.zeros(simulated.nv)
-    for place, body in zip(places, arm.bodies, strict=True):
-        jacobian[place, body.coordinate], offset[place] = float(body.multiplier), body.offset
-    inputs = random_inputs(arm.coordinates, states)
-    actuators = [simulated.actuator(c.name).id for c in arm.coordinates if _driven(simulated, c.name)]
-    driven = [k for k, c in enumerate(arm.coordinates) if _driven(simulated, c.name)]
-    masses, biases, accelerations = [], [], []
-    controls = inputs["tau"] if servo is None else inputs["u"]
-    for q, qd, control in zip(inputs["q"], inputs["qd"], controls, strict=True):
-        data.qpos[:], data.qvel[:] = jacobian @ q + offset, jacobian @ qd
-        data.ctrl[actuators] = control[driven]
-        mujoco.mj_forward(simulated, data)
-        full = np.zeros((simulated.nv, simulated.nv))
-        mujoco.mj_fullM(simulated, data, full)
-        masses.append(jacobian.T @ full @ jacobian)
-        biases.append(jacobian.T @ data.qfrc_bias)
-        accelerations.append(data.qacc[places[: model.n]].copy())
-    q, qd, tau = (torch.from_numpy(inputs[key]) for key in ("q", "qd", "tau"))
+    simulated = _Simulated(text, projection)
+    random = random_inputs(projection.arm.arm.coordinates, states)
+    q, qd = (torch.from_numpy(random[key]) for key in ("q", "qd"))
+    controls = random["tau"] if servos is None else random["u"]
+    torques = random["tau"] if servos is None else _servo_torques(servos, random)
+    masses, biases, accelerations = simulated(random["q"], random["qd"], controls)
+    mass, bias = projection.bodies.mass_matrix(q), projection.bodies.nonlinear_effects(q, qd)
     differences = {
-        "mass_matrix": relative(np.array(masses), model.mass_matrix(q).numpy()),
-        "bias": relative(np.array(biases), model.nonlinear_effects(q, qd).numpy()),
+        "mass_matrix": relative(masses, mass.numpy()),
+        "bias": relative(biases, bias.numpy()),
     }
-    if simulated.nv == model.n:  # with followers MuJoCo's constraint is soft
-        tau = tau if servo is None else servo(torch.from_numpy(inputs["u"]), q, qd)
-        force = tau @ torch.from_numpy(gains.T) - model.nonlinear_effects(q, qd)
-        free = torch.linalg.solve(model.mass_matrix(q), force.unsqueeze(-1))
-        differences["forward_dynamics"] = relative(np.array(accelerations), free.squeeze(-1).numpy())
-    return Parity(differences, TOLERANCE, states).require()
+    if not simulated.has_followers:  # MuJoCo's constraint for them is soft
+        force = torch.from_numpy(torques @ inputs.T) - bias
+        expected = torch.linalg.solve(mass, force)
+        differences["forward_dynamics"] = relative(accelerations, expected.numpy())
+    return Parity(differences, TUNING.mujoco_tolerance, states).require()
 
 
-def _driven(simulated: mujoco.MjModel, name: str) -> bool:
-    return mujoco.mj_name2id(simulated, mujoco.mjtObj.mjOBJ_ACTUATOR, name) >= 0
+def _servo_torques(servos: Servos, inputs: Values) -> np.ndarray:
+    """Return the torques of MuJoCo's position actuators, which have no dead zone, (states, n)."""
+    torques = servos.kp * (inputs["u"] - inputs["q"]) - servos.kd * inputs["qd"]
+    clipped: np.ndarray = np.clip(torques, -servos.limit, servos.limit)
+    return clipped
+
+
+class _Simulated:
+    """The MJCF in MuJoCo without friction, by the coordinates of the arm."""
+
+    def __init__(self, text: bytes, projection: RigidBodyProjection) -> None:
+        arm = projection.arm.arm
+        model = self._model = mujoco.MjModel.from_xml_string(text.decode())
+        model.dof_damping[:], model.dof_frictionloss[:] = 0.0, 0.0
+        self.has_followers = model.nv != len(arm.coordinates)
+        self._dofs = [int(model.jnt_dofadr[model.joint(body.name).id]) for body in arm.bodies]
+        self._jacobian = np.zeros((model.nv, len(arm.coordinates)))
+        self._offset = np.zeros(model.nv)
+        for dof, body in zip(self._dofs, arm.bodies, strict=True):
+            self._jacobian[dof, body.coordinate] = float(body.multiplier)
+            self._offset[dof] = body.offset
+        names = [model.actuator(k).name for k in range(model.nu)]
+        self._driven = [k for k, joint in enumerate(arm.coordinates) if joint.name in names]
+        self._actuators = [names.index(arm.coordinates[k].name) for k in self._driven]
+
+    def __call__(
+        self, q: np.ndarray, qd: np.ndarray, controls: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return M, bias and accelerations of states, (states, ...)."""
+        data = mujoco.MjData(self._model)
+        jacobian, full = self._jacobian, np.zeros((self._model.nv, self._model.nv))
+        masses, biases, accelerations = [], [], []
+        for state in range(len(q)):
+            data.qpos[:] = jacobian @ q[state] + self._offset
+            data.qvel[:] = jacobian @ qd[state]
+            data.ctrl[self._actuators] = controls[state, self._driven]
+            mujoco.mj_forward(self._model, data)
+            mujoco.mj_fullM(self._model, data, full)
+            masses.append(jacobian.T @ full @ jacobian)
+            biases.append(jacobian.T @ data.qfrc_bias)
+            accelerations.append(data.qacc[self._dofs].copy())
+        return np.array(masses), np.array(biases), np.array(accelerations)

@@ -6,13 +6,15 @@ from collections.abc import Iterable
 
 import numpy as np
 from lxml import etree
+from scipy.spatial.transform import Rotation
 
-from spelgen.arm.arm import Body, Coordinate
+from spelgen.arm.arm import Body
 from spelgen.exporting.description import Servos
 from spelgen.exporting.rigid_body_projection import RigidBodyProjection
 from spelgen.exporting.urdf_file import about_center
 
-HARD = "0.9999 0.9999 0.001 0.5 2"  # as hard as MuJoCo has friction: its default lets a loaded joint creep at rest
+_SOLIMPFRICTION = "0.9999 0.9999 0.001 0.5 2"
+"""As hard as MuJoCo has friction: its default lets a loaded joint creep at rest."""
 
 
 def mjcf_text(
@@ -21,148 +23,143 @@ def mjcf_text(
     tip: tuple[str, int, np.ndarray],
     servos: Servos | None = None,
 ) -> bytes:
-    """The MJCF of these bodies.
+    """Return the MJCF of these bodies.
 
     inputs: G, (n, n), each of whose columns that is not zero becomes an actuator; under position servos each joint has
-    one for its position instead. tip: a link, the body that it moves
-    with, and its pose in that body's frame, (4, 4).
+    one for its position instead. tip: a link, the body that it moves with, and its pose in that body's frame, (4, 4).
     """
     arm = projection.arm.arm
     root = etree.Element("mujoco", model=arm.name)
     etree.SubElement(root, "compiler", angle="radian", autolimits="true")
-    etree.SubElement(root, "option", gravity=_numbers(float(x) for x in arm.gravity))
+    etree.SubElement(root, "option", gravity=_numbers(arm.gravity))
+    bodies: list[etree._Element] = []
     world = etree.SubElement(root, "worldbody")
-    placed: list[etree._Element] = []
     for index, body in enumerate(arm.bodies):
-        above = world if body.parent < 0 else placed[body.parent]
-        placed.append(_body(above, projection, index, body))
+        parent = world if body.parent < 0 else bodies[body.parent]
+        bodies.append(_body(parent, projection, index))
     link, carrier, pose = tip
-    pose_of = {"pos": _numbers(pose[:3, 3]), "quat": _numbers(_quaternion(pose[:3, :3]))}
-    etree.SubElement(placed[carrier], "site", name=link, **pose_of)
-    _couple(root, arm.bodies, arm.coordinates)
-    for k in _coupled(projection.motors):
-        _tendon(root, f"rotor{k + 1}", arm.coordinates, projection.motors[k], projection.armature[k])
+    etree.SubElement(bodies[carrier], "site", name=link, **_placement(pose[:3, 3], pose[:3, :3]))
+    _followers(root, projection)
+    for k in _coupled_motors(projection):
+        _tendon(root, f"rotor{k + 1}", projection, projection.motors[k], projection.armature[k])
     if servos is None:
-        _drive(root, arm.coordinates, inputs)
+        _motors(root, projection, inputs)
     else:
-        _hold(root, arm.coordinates, servos)
+        _servos(root, projection, servos)
     etree.indent(root)
-    return etree.tostring(root, xml_declaration=True, encoding="utf-8") + b"\n"
+    text: bytes = etree.tostring(root, xml_declaration=True, encoding="utf-8")
+    return text + b"\n"
 
 
-def _body(above: etree._Element, projection: RigidBodyProjection, index: int, body: Body) -> etree._Element:
-    coordinates = projection.arm.arm.coordinates
-    rotation = np.array(body.rotation, dtype=float)
-    found = etree.SubElement(
-        above,
-        "body",
-        name=projection.arm.robot.joint[body.name].child,
-        pos=_numbers(float(x) for x in body.translation),
-        quat=_numbers(_quaternion(rotation)),
-    )
+def _body(parent: etree._Element, projection: RigidBodyProjection, index: int) -> etree._Element:
+    body = projection.arm.arm.bodies[index]
     mass, center, tensor = about_center(projection.inertias[index])
+    name = projection.arm.robot.joint[body.name].child
+    element = etree.SubElement(parent, "body", name=name, **_placement(body.translation, body.rotation))
     etree.SubElement(
-        found,
+        element,
         "inertial",
         mass=_number(mass),
         pos=_numbers(center),
         fullinertia=_numbers(tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]),
     )
-    joint = {"name": body.name, "axis": "0 0 1", "type": "hinge" if body.kind == "revolute" else "slide"}
-    own = coordinates[body.coordinate]
-    if own.name == body.name:
-        place = body.coordinate
-        joint["armature"] = _number(0 if place in _coupled(projection.motors) else projection.armature[place])
-        joint["damping"] = _number(projection.viscous[place])
-        joint["frictionloss"] = _number((projection.forward[place] - projection.backward[place]) / 2)
-        joint["solimpfriction"] = HARD
-        if not own.continuous and own.lower is not None and own.upper is not None:
-            joint["range"] = _numbers((own.lower, own.upper))
-    etree.SubElement(found, "joint", joint)
-    return found
+    etree.SubElement(element, "joint", _joint(projection, body))
+    return element
 
 
-def _couple(root: etree._Element, bodies: Iterable[Body], coordinates: tuple[Coordinate, ...]) -> None:
-    """Joints that follow others, as MuJoCo has it: by a soft constraint."""
-    followers = [body for body in bodies if coordinates[body.coordinate].name != body.name]
+def _joint(projection: RigidBodyProjection, body: Body) -> dict[str, str]:
+    """Return the attributes of a joint; a follower has no drive, no friction and no limits of its own."""
+    attributes = {"name": body.name, "axis": "0 0 1", "type": "slide"}
+    if body.kind == "revolute":
+        attributes["type"] = "hinge"
+    k = body.coordinate
+    coordinate = projection.arm.arm.coordinates[k]
+    if coordinate.name != body.name:
+        return attributes
+    # the rotor of a coupled motor is a tendon's armature
+    armature = 0.0 if k in _coupled_motors(projection) else projection.armature[k]
+    attributes["armature"] = _number(armature)
+    attributes["damping"] = _number(projection.viscous[k])
+    attributes["frictionloss"] = _number((projection.forward[k] - projection.backward[k]) / 2)
+    attributes["solimpfriction"] = _SOLIMPFRICTION
+    if not coordinate.continuous and coordinate.lower is not None and coordinate.upper is not None:
+        attributes["range"] = _numbers((coordinate.lower, coordinate.upper))
+    return attributes
+
+
+def _followers(root: etree._Element, projection: RigidBodyProjection) -> None:
+    """Add the joints that follow others, as MuJoCo has it: by soft constraints."""
+    arm = projection.arm.arm
+    followers = [body for body in arm.bodies if arm.coordinates[body.coordinate].name != body.name]
     if not followers:
         return
     equality = etree.SubElement(root, "equality")
     for body in followers:
-        law = (body.offset, float(body.multiplier), 0, 0, 0)
-        leader = coordinates[body.coordinate].name
-        etree.SubElement(equality, "joint", joint1=body.name, joint2=leader, polycoef=_numbers(law))
+        law = _numbers((body.offset, float(body.multiplier), 0, 0, 0))
+        leader = arm.coordinates[body.coordinate].name
+        etree.SubElement(equality, "joint", joint1=body.name, joint2=leader, polycoef=law)
 
 
-def _drive(root: etree._Element, coordinates: tuple[Coordinate, ...], inputs: np.ndarray) -> None:
-    """A motor for each input: at its joint, or at a tendon where it moves several."""
-    columns = [(k, column) for k, column in enumerate(inputs.T) if column.any()]
-    for k, column in columns:
-        if np.count_nonzero(column) > 1:
-            _tendon(root, f"motor{k + 1}", coordinates, column)
+def _motors(root: etree._Element, projection: RigidBodyProjection, inputs: np.ndarray) -> None:
+    """Add a motor for each input: at its joint, or at a tendon where it moves several."""
+    joints = projection.arm.arm.coordinates
+    actuators = etree.Element("actuator")
+    for k, column in enumerate(inputs.T):
+        moved = np.flatnonzero(column)
+        if moved.size == 1:
+            joint, gear = joints[int(moved[0])].name, _number(column[moved[0]])
+            etree.SubElement(actuators, "motor", name=joints[k].name, joint=joint, gear=gear)
+        elif moved.size > 1:
+            _tendon(root, f"motor{k + 1}", projection, column)
+            etree.SubElement(actuators, "motor", name=joints[k].name, tendon=f"motor{k + 1}")
+    root.append(actuators)
+
+
+def _servos(root: etree._Element, projection: RigidBodyProjection, servos: Servos) -> None:
+    """Add a position actuator for each joint; its control is the delayed command."""
     actuators = etree.SubElement(root, "actuator")
-    for k, column in columns:
-        name = coordinates[k].name
-        if np.count_nonzero(column) > 1:
-            etree.SubElement(actuators, "motor", name=name, tendon=f"motor{k + 1}")
-        else:
-            (joint,) = np.flatnonzero(column)
-            where = coordinates[int(joint)].name
-            etree.SubElement(actuators, "motor", name=name, joint=where, gear=_number(column[joint]))
+    for k, joint in enumerate(projection.arm.arm.coordinates):
+        gains = {"kp": _number(servos.kp[k]), "kv": _number(servos.kd[k])}
+        if np.isfinite(servos.limit[k]):
+            gains["forcerange"] = _numbers((-servos.limit[k], servos.limit[k]))
+        etree.SubElement(actuators, "position", name=joint.name, joint=joint.name, **gains)
 
 
-def _coupled(motors: np.ndarray) -> list[int]:
-    """The motors that move several joints, or are moved by them."""
-    return [k for k, row in enumerate(motors) if np.count_nonzero(row) > 1]
+def _coupled_motors(projection: RigidBodyProjection) -> list[int]:
+    """Return the motors that several joints turn."""
+    return np.flatnonzero(np.count_nonzero(projection.motors, axis=1) > 1).tolist()
 
 
 def _tendon(
     root: etree._Element,
     name: str,
-    coordinates: tuple[Coordinate, ...],
+    projection: RigidBodyProjection,
     coefficients: np.ndarray,
     armature: float = 0.0,
 ) -> None:
-    """A sum of joint positions times coefficients; armature: of what turns by it."""
+    """Add a sum of joint positions times coefficients; armature: of what turns by it."""
     tendons = root.find("tendon")
-    tendons = etree.SubElement(root, "tendon") if tendons is None else tendons
+    if tendons is None:
+        tendons = etree.SubElement(root, "tendon")
     fixed = etree.SubElement(tendons, "fixed", name=name)
     if armature:
         fixed.set("armature", _number(armature))
-    for joint in np.flatnonzero(coefficients):
-        coefficient = _number(coefficients[joint])
-        etree.SubElement(fixed, "joint", joint=coordinates[int(joint)].name, coef=coefficient)
+    for joint, coefficient in zip(projection.arm.arm.coordinates, coefficients, strict=True):
+        if coefficient:
+            etree.SubElement(fixed, "joint", joint=joint.name, coef=_number(coefficient))
 
 
-def _hold(root: etree._Element, coordinates: tuple[Coordinate, ...], servos: Servos) -> None:
-    """A position actuator for each joint; its control is the delayed command."""
-    actuators = etree.SubElement(root, "actuator")
-    for coordinate, kp, kd, limit in zip(coordinates, servos.kp, servos.kd, servos.limit, strict=True):
-        about = {"name": coordinate.name, "joint": coordinate.name, "kp": _number(kp), "kv": _number(kd)}
-        if np.isfinite(limit):
-            about["forcerange"] = _numbers((-limit, limit))
-        etree.SubElement(actuators, "position", about)
+def _placement(position: Iterable[object], rotation: object) -> dict[str, str]:
+    """Return the attributes of a pose; MuJoCo's quaternions are (w, x, y, z)."""
+    matrix = np.array(rotation, dtype=float)
+    quaternion = np.roll(Rotation.from_matrix(matrix).as_quat(canonical=True), 1)
+    quaternion[np.abs(quaternion) < 1e-16] = 0.0
+    return {"pos": _numbers(position), "quat": _numbers(quaternion)}
 
 
-def _quaternion(rotation: np.ndarray) -> np.ndarray:
-    """(w, x, y, z) of a rotation matrix (Bar-Itzhack's eigenvector, JGCD 23:1085, 2000)."""
-    r = rotation
-    symmetric = np.array(
-        [
-            [r[0, 0] + r[1, 1] + r[2, 2], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],
-            [0, r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]],
-            [0, 0, r[1, 1] - r[0, 0] - r[2, 2], r[1, 2] + r[2, 1]],
-            [0, 0, 0, r[2, 2] - r[0, 0] - r[1, 1]],
-        ]
-    )
-    found: np.ndarray = np.linalg.eigh(symmetric, UPLO="U")[1][:, -1]
-    found = np.where(np.abs(found) < 1e-16, 0.0, found)
-    return found if found[0] >= 0 else -found
-
-
-def _numbers(values: Iterable[float]) -> str:
+def _numbers(values: Iterable[object]) -> str:
     return " ".join(map(_number, values))
 
 
-def _number(value: float) -> str:
-    return f"{float(value):.17g}"
+def _number(value: object) -> str:
+    return f"{float(value):.17g}"  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""A trained model's quantities as CasADi expressions of q, qd, and what is given of its residuals."""
+"""The quantities of a trained model as CasADi expressions of q, qd and symbols of its residuals."""
 
 from __future__ import annotations
 
@@ -9,49 +9,37 @@ import numpy as np
 
 from spelgen.exporting import friction_expressions
 from spelgen.exporting.description import TrainedModel
+from spelgen.exporting.entry_points import EntryPoint
 from spelgen.exporting.residual_expressions import (
-    Level,
-    ResidualSymbols,
     coriolis,
-    entry_places,
-    jets,
-    placed,
+    entry_indices,
+    residual_symbols,
+    symbol_slopes,
+    symmetric,
 )
-from spelgen.exporting.rigid_expressions import RigidExpressions
-from spelgen.exporting.solved_expressions import solved
+from spelgen.exporting.rigid_expressions import RigidExpressions, constant
+from spelgen.exporting.tip_expressions import tip_expressions
+
+RESIDUAL = "residual_"
+"""Stands before the names of residuals among a function's inputs."""
 
 
 class ModelExpressions:
-    """M(q) qdd + h(q, qd) + friction = G (tau - offset), in symbols q, qd, qdd, tau, u, z, dq of n or ``memory`` rows.
+    """M(q) qdd + h(q, qd) + friction = G (tau - offset), in symbols q, qd, qdd, tau, u, z, dq of n or K n rows.
 
-    level: in which form ``residuals`` come in, see ``ResidualSymbols``.
+    Each entry point is a property of its name: an expression, or one for each output. derivatives: whether residuals
+    come with their derivatives by q.
     """
 
-    def __init__(self, model: TrainedModel, level: Level = "rates") -> None:
-        self.model, self.n, self.level = model, model.n, level
-        self.q, self.qd, self.qdd, self.tau, self.dq, self.u = (
-            ca.SX.sym(name, self.n) for name in ("q", "qd", "qdd", "tau", "dq", "u")
-        )
-        self.z = ca.SX.sym("z", model.memory)
-        self.residuals = ResidualSymbols.of(model)
-        self._places = entry_places(model)
+    def __init__(self, model: TrainedModel, *, derivatives: bool = False) -> None:
+        self.model, self.n, self._derivatives = model, model.n, derivatives
+        names = ("q", "qd", "qdd", "tau", "dq", "u")
+        self.inputs = {name: ca.SX.sym(name, self.n) for name in names}
+        self.inputs["z"] = ca.SX.sym("z", model.memory)
+        self.q, self.qd, self.qdd, self.tau, self.dq, self.u, self.z = self.inputs.values()
+        self.residuals = residual_symbols(model)
         self._rigid = RigidExpressions(model, self.q)
-
-    @property
-    def servo_torque(self) -> ca.SX:
-        """What position servos give under the delayed command u."""
-        servos = self.model.servos
-        assert servos is not None
-        pull = self.u - self.q
-        if servos.dead_zone.any():
-            zone = ca.DM(servos.dead_zone)
-            pull = ca.fmax(pull - zone, 0) - ca.fmax(-pull - zone, 0)
-        torque = ca.DM(servos.kp) * pull - ca.DM(servos.kd) * self.qd
-        rows = [
-            ca.fmax(-ca.fmax(-torque[k], -limit), -limit) if np.isfinite(limit) else torque[k]
-            for k, limit in enumerate(servos.limit.tolist())
-        ]
-        return ca.vertcat(*rows)
+        self._rest = ca.SX(self.n, 1)
 
     @cached_property
     def _composite(self) -> tuple[ca.SX, ca.SX]:
@@ -60,135 +48,188 @@ class ModelExpressions:
     @cached_property
     def _added_mass(self) -> ca.SX:
         """What drives and residuals add to M."""
-        return _sparse(self.model.constant_mass) + placed(self.n, self._places, self.residuals.mass)
+        network = symmetric(self.n, entry_indices(self.model), self.residuals["mass"])
+        return constant(self.model.constant_mass) + network
 
     @cached_property
     def mass_matrix(self) -> ca.SX:
-        """M, (n, n)."""
         return self._composite[0] + self._added_mass
 
     @cached_property
     def _rigid_gravity(self) -> ca.SX:
-        return self._rigid.torque(None, None)
+        return self._rigid.torque(self._rest, self._rest)
 
     @cached_property
     def _residual_gravity(self) -> ca.SX:
-        found = ca.SX(self.n, 1)
-        for each in (self.residuals.gravity, self.residuals.torque):
-            found = found + each if each.numel() else found
-        return found
+        torque = ca.SX(self.n, 1)
+        for name in ("gravity", "torque"):
+            if self.residuals[name].numel():
+                torque = torque + self.residuals[name]
+        return torque
 
     @cached_property
     def gravity(self) -> ca.SX:
-        """dV/dq, (n, 1)."""
         return self._rigid_gravity + self._residual_gravity
 
     @cached_property
     def _residual_bias(self) -> ca.SX:
-        if not self._places:
+        if self.model.residuals.mass is None:
             return self._residual_gravity
-        return self._residual_gravity + coriolis(self.residuals, self._places, self.level, self.qd)
+        moved = coriolis(self.model, self.residuals, self.qd, derivatives=self._derivatives)
+        return self._residual_gravity + moved
 
     @cached_property
     def bias(self) -> ca.SX:
-        """Coriolis, centrifugal and gravity torque, (n, 1)."""
-        return self._rigid.torque(self.qd, None) + self._residual_bias
+        return self._rigid.torque(self.qd, self._rest) + self._residual_bias
 
     @cached_property
     def friction(self) -> ca.SX:
-        """What friction takes, its memory included, (n, 1)."""
-        law, bristles, gravity = self.model.friction, self.model.bristles, ca.SX(self.n, 1)
-        speed, back = self._driven(self.qd), _sparse(self.model.motors.T)
+        """The torques of friction, which follows the speeds of the motors, (n, 1)."""
+        law, bristles, motors = self.model.friction, self.model.bristles, self.model.motors
+        speed = constant(motors) @ self.qd
+        load = self._rest
         if law.load_dependence.any():
-            gravity = _sparse(np.linalg.inv(self.model.motors).T) @ self._rigid_gravity
-        direction = (
-            friction_expressions.sliding_direction(law, speed)
-            if bristles is None
-            else friction_expressions.bristle_direction(bristles, self.z)
-        )
-        torque = friction_expressions.law_torque(law, speed, gravity, direction)
+            load = constant(np.linalg.inv(motors).T) @ self._rigid_gravity
+        if bristles is None:
+            direction = friction_expressions.sliding_direction(law, speed)
+        else:
+            direction = friction_expressions.bristle_direction(bristles, self.z)
+        torque = friction_expressions.law_torque(law, speed, load, direction)
         for k, joint in enumerate(self.model.residuals.friction.joints):
-            torque[joint] *= ca.exp(self.residuals.factor[k])
-        return back @ torque
+            torque[joint] *= ca.exp(self.residuals["factor"][k])
+        return constant(motors.T) @ torque
 
-    def _driven(self, joints: ca.SX) -> ca.SX:
-        """Velocities or displacements of the drives, (n, 1), by the joints'."""
-        return _sparse(self.model.motors) @ joints
-
-    @cached_property
+    @property
     def friction_step(self) -> ca.SX:
-        """Friction's memory after each joint went one way by dq, (memory, 1)."""
         if self.model.bristles is None:
             return self.z
-        return friction_expressions.bristle_step(self.model.bristles, self.z, self._driven(self.dq))
+        return friction_expressions.bristle_step(
+            self.model.bristles, self.z, constant(self.model.motors) @ self.dq
+        )
 
-    @cached_property
+    @property
     def friction_memory(self) -> ca.SX:
-        """Friction's memory of joints that have long gone the way of qd, (memory, 1)."""
         if self.model.bristles is None:
             return self.z
-        speed = self._driven(self.qd)
+        speed = constant(self.model.motors) @ self.qd
         return friction_expressions.sliding_bristles(self.model.bristles, self.model.friction, speed)
 
     @cached_property
-    def force(self) -> ca.SX:
-        """What the inputs do: M qdd + h + friction, less what the drives add unseen, (n, 1)."""
+    def _force(self) -> ca.SX:
+        """M qdd + h + friction, less what the drives add unseen, (n, 1)."""
         moved = self._rigid.torque(self.qd, self.qdd) + self._added_mass @ self.qdd
         return moved + self._residual_bias + self.friction - self._compensation
 
-    @cached_property
-    def inverse_dynamics(self) -> ca.SX:
-        """tau, (n, 1)."""
-        return self._inputs(self.force) + self.model.torque_offset
-
-    @cached_property
+    @property
     def _compensation(self) -> ca.SX:
-        """What the drives add unseen, (n, 1)."""
-        return _sparse(np.diag(self.model.friction_compensation)) @ self.qd
+        return constant(np.diag(self.model.friction_compensation)) @ self.qd
 
     def _inputs(self, force: ca.SX) -> ca.SX:
-        """The inputs that make these forces; (n, columns)."""
-        moved = self.model.inputs + np.diag(1 - self.model.actuated)
-        return force if np.array_equal(moved, np.eye(self.n)) else _sparse(np.linalg.inv(moved)) @ force
+        """Return the inputs that make these forces, (n, columns)."""
+        inputs = self.model.inputs + np.diag(1 - self.model.actuated)
+        if np.array_equal(inputs, np.eye(self.n)):
+            return force
+        return constant(np.linalg.inv(inputs)) @ force
+
+    @property
+    def inverse_dynamics(self) -> ca.SX:
+        return self._inputs(self._force) + self.model.torque_offset
 
     @cached_property
     def forward_dynamics(self) -> ca.SX:
-        """qdd, (n, 1)."""
-        force = _sparse(self.model.inputs) @ (self.tau - self.model.torque_offset)
-        return solved(self.mass_matrix, force + self._compensation - self.bias - self.friction)
+        force = constant(self.model.inputs) @ (self.tau - self.model.torque_offset)
+        return _solve(self.mass_matrix, force + self._compensation - self.bias - self.friction)
 
-    @cached_property
+    @property
     def momentum(self) -> ca.SX:
-        """M qd, (n, 1)."""
         return self.mass_matrix @ self.qd
 
-    @cached_property
+    @property
     def energy(self) -> ca.SX:
-        """Kinetic and potential, (2, 1) [J]."""
         potential = -ca.dot(self.model.gravity, self._composite[1])
-        for each in (self.residuals.energy, self.residuals.torque_energy):
-            potential = potential + each if each.numel() else potential
+        for name in ("energy", "torque_energy"):
+            if self.residuals[name].numel():
+                potential = potential + self.residuals[name]
         return ca.vertcat(0.5 * ca.dot(self.qd, self.momentum), potential)
 
-    def force_derivatives(self) -> tuple[ca.SX, ca.SX]:
-        """How ``force`` changes with q and with qd, (n, n) each; residuals come as jets."""
-        reads = [(self.q, ca.SX.eye(self.n)), *jets(self.model, self.residuals)]
-        symbols, slopes = (ca.vertcat(*column) for column in zip(*reads, strict=True))
-        return ca.jtimes(self.force, symbols, slopes), ca.jacobian(self.force, self.qd)
+    @property
+    def tip_pose(self) -> ca.SX:
+        return tip_expressions(self.model, self.q)[0]
 
+    @property
+    def tip_jacobian(self) -> ca.SX:
+        return tip_expressions(self.model, self.q)[1]
+
+    @property
+    def servo_torque(self) -> ca.SX:
+        servos = self.model.servos
+        assert servos is not None
+        error = self.u - self.q
+        if servos.dead_zone.any():
+            error = ca.fmax(error - servos.dead_zone, 0) - ca.fmax(-error - servos.dead_zone, 0)
+        torque: ca.SX = servos.kp * error - servos.kd * self.qd
+        for joint in np.flatnonzero(np.isfinite(servos.limit)).tolist():
+            limit = servos.limit[joint]
+            torque[joint] = ca.fmax(-ca.fmax(-torque[joint], -limit), -limit)
+        return torque
+
+    def _force_derivatives(self) -> tuple[ca.SX, ca.SX]:
+        """Return the derivatives of the force by q and by qd, (n, n) each."""
+        symbols, slopes = [self.q], [ca.SX.eye(self.n)]
+        for symbol, slope in symbol_slopes(self.model, self.residuals):
+            symbols.append(symbol)
+            slopes.append(slope)
+        by_position = ca.jtimes(self._force, ca.vertcat(*symbols), ca.vertcat(*slopes))
+        return by_position, ca.jacobian(self._force, self.qd)
+
+    @property
     def inverse_dynamics_derivatives(self) -> tuple[ca.SX, ca.SX]:
-        """dtau/dq and dtau/dqd, (n, n) each; dtau/dqdd is M where each torque is its own joint's."""
-        by_position, by_velocity = self.force_derivatives()
+        by_position, by_velocity = self._force_derivatives()
         return self._inputs(by_position), self._inputs(by_velocity)
 
-    def forward_dynamics_derivatives(self) -> tuple[ca.SX, ca.SX, ca.SX]:
-        """dqdd/dq, dqdd/dqd and dqdd/dtau, (n, n) each: M^-1 times what the force changes by at this qdd."""
-        by_position, by_velocity = self.force_derivatives()
-        right = ca.horzcat(-by_position, -by_velocity, _sparse(self.model.inputs))
-        moving = ca.substitute(right, self.qdd, self.forward_dynamics)
-        found = solved(self.mass_matrix, moving)
-        return found[:, : self.n], found[:, self.n : 2 * self.n], found[:, 2 * self.n :]
+    @property
+    def forward_dynamics_derivatives(self) -> tuple[ca.SX, ...]:
+        """M^-1 times the derivatives of the force at this qdd (Carpentier and Mansard, RSS 2018)."""
+        by_position, by_velocity = self._force_derivatives()
+        right = ca.horzcat(-by_position, -by_velocity, constant(self.model.inputs))
+        right = ca.substitute(right, self.qdd, self.forward_dynamics)
+        return tuple(ca.horzsplit(_solve(self.mass_matrix, right), self.n))
 
 
-def _sparse(matrix: np.ndarray) -> ca.DM:
-    return ca.sparsify(ca.DM(matrix))
+def expression_function(entry: EntryPoint, model: TrainedModel) -> ca.Function:
+    """Return the entry point as a function of its inputs, then of the residuals that it needs; outputs are dense."""
+    expressions = ModelExpressions(model, derivatives=entry.name.endswith("_derivatives"))
+    result = getattr(expressions, entry.name)
+    outputs = [ca.densify(output) for output in (result if isinstance(result, tuple) else (result,))]
+    inputs = {name: expressions.inputs[name] for name in entry.inputs}
+    for name, symbols in expressions.residuals.items():
+        if symbols.numel() and ca.depends_on(ca.veccat(*outputs), symbols):
+            inputs[RESIDUAL + name] = symbols
+    names = list(inputs), list(entry.output_names)
+    return ca.Function(entry.name, list(inputs.values()), outputs, *names, {"cse": True})
+
+
+def residuals_needed(function: ca.Function) -> list[str]:
+    """Return the names of the residuals that an ``expression_function`` takes."""
+    return [name.removeprefix(RESIDUAL) for name in function.name_in() if name.startswith(RESIDUAL)]
+
+
+def _solve(matrix: ca.SX, right: ca.SX) -> ca.SX:
+    """Return matrix^-1 right by L D L^T, (n, columns); matrix is positive definite.
+
+    Its lower triangle is never read, so that CasADi computes half of it. ``ca.ldl`` divides 21 times where this
+    divides 6 times.
+    """
+    n = matrix.shape[0]
+    matrix, right = ca.SX(matrix), ca.SX(right)
+    factors: list[ca.SX] = []
+    for k in range(n):
+        inverse, row = 1 / matrix[k, k], matrix[k, k + 1 :]
+        factor = inverse * row
+        matrix[k + 1 :, k + 1 :] -= factor.T @ row
+        right[k + 1 :, :] -= factor.T @ right[k, :]
+        right[k, :] *= inverse
+        factors.append(factor)
+    for k in reversed(range(n)):
+        right[k, :] -= factors[k] @ right[k + 1 :, :]
+    return right

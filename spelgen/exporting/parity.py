@@ -1,31 +1,30 @@
-"""Whether what was exported gives what the torch model gives: the largest difference at random states."""
+"""The parity check: the largest difference between an export and the torch model at random states."""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from functools import cached_property
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from spelgen.arm.arm import Coordinate
-from spelgen.dynamics.tip import tip_kinematics
+from spelgen.dynamics.protocol import has_friction_state
+from spelgen.dynamics.tip import TipKinematics, tip_kinematics
 from spelgen.errors import RunError
+from spelgen.exporting.entry_points import ENTRY_POINTS, SERVO_TORQUE
 from spelgen.exporting.trained import Trained
+from spelgen.settings.tuning.exporting import TUNING
 from spelgen.structure.nominal import working_range
 
-if TYPE_CHECKING:
-    from spelgen.loaded_arm import LoadedArm
-
-STATES = 200
-_TIP_TOLERANCE = 3e-6  # pytorch-kinematics rounds offsets to float32
 _USUAL_SPEED = {"revolute": 1.0, "prismatic": 0.3}  # rad/s, m/s where the URDF names none
 
 Values = dict[str, np.ndarray]
 Called = Callable[[str, Values], Mapping[str, np.ndarray]]
-"""What was exported: an entry point's name and its inputs, (states, n) each, to its outputs, (states, ...)."""
+"""An export: takes an entry point's name and its inputs, (states, n) each, to its outputs, (states, ...)."""
 
 
 @dataclass(frozen=True)
@@ -39,27 +38,27 @@ class Parity:
     @property
     def summary(self) -> str:
         """One sentence."""
-        of_model = [name for name in self.differences if not name.startswith("tip_")]
-        worst = max(of_model, key=lambda name: self.differences[name])
+        of_model = {name: value for name, value in self.differences.items() if not name.startswith("tip_")}
+        worst = max(of_model, key=of_model.__getitem__)
         return (
-            f"{self.states} random states: at most {self.differences[worst]:.1e} ({worst}) from the torch module, "
+            f"{self.states} random states: at most {of_model[worst]:.1e} ({worst}) from the torch module, "
             f"relative to the largest value; {self.tolerance:.0e} is allowed"
         )
 
     def require(self) -> Parity:
-        """Itself. Raises RunError where a difference is larger than allowed."""
+        """Return itself. Raises RunError where a difference is larger than allowed."""
         for name, difference in self.differences.items():
-            if not difference <= self._allowed(name):
+            allowed = self.tolerance
+            if name.startswith("tip_"):
+                allowed = max(allowed, TUNING.tip_tolerance)
+            if not difference <= allowed:  # NaN is refused as well
                 raise RunError(
                     f"{name} differs from the model by {difference:.1e}",
                     element="parity check",
-                    expected=f"at most {self._allowed(name):.0e} of the largest value",
+                    expected=f"at most {allowed:.0e} of the largest value",
                     do="nothing was written; please report this with the run folder",
                 )
         return self
-
-    def _allowed(self, name: str) -> float:
-        return max(self.tolerance, _TIP_TOLERANCE) if name.startswith("tip_") else self.tolerance
 
 
 def check_parity(
@@ -68,88 +67,145 @@ def check_parity(
     names: Sequence[str],
     tolerance: float,
     *,
-    memory: int = 0,
-    states: int = STATES,
-    dtype: Any = np.float64,
+    states: int | None = None,
+    dtype: type = np.float64,
 ) -> Parity:
-    """``called`` held against the torch model at random states, at each of these entry points. Raises RunError.
+    """Compare ``called`` with the torch model at random states, at each of these entry points. Raises RunError.
 
-    memory: numbers of friction's. dtype: of what ``called`` is given, to which the states are rounded.
+    dtype: of the export, to which the states are rounded for both.
     """
-    random = random_inputs(trained.arm.arm.coordinates, states, memory)
-    inputs = {key: value.astype(dtype).astype(np.float64) for key, value in random.items()}
-    exact = copy.deepcopy(trained.model).double().cpu().requires_grad_(False)
+    count = TUNING.states if states is None else states
+    inputs = random_inputs(trained.arm.arm.coordinates, count, trained.memory)
+    inputs = {key: value.astype(dtype).astype(np.float64) for key, value in inputs.items()}
+    reference = _Reference(trained)
     differences: dict[str, float] = {}
     for name in names:
-        expected, found = reference(name, exact, trained.arm, inputs), called(name, inputs)
-        differences[name] = max(relative(found[key], value) for key, value in expected.items())
-    return Parity(differences, tolerance, states).require()
+        outputs = called(name, inputs)
+        expected = reference(name, inputs)
+        differences[name] = max(relative(outputs[key], value) for key, value in expected.items())
+    return Parity(differences, tolerance, count).require()
 
 
 def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 0, seed: int = 0) -> Values:
-    """States over the joints' ranges at their usual speeds, with torques of the size of friction and gravity."""
+    """Return states over the joints' ranges at their usual speeds, (states, n) each, and z, (states, memory)."""
     random = np.random.default_rng(seed)
-    speed = np.array([c.velocity or _USUAL_SPEED[c.kind] for c in coordinates])
-    q = np.stack([random.uniform(*working_range(c), states) for c in coordinates], axis=-1)
-    qd, qdd, dq = (size * speed * random.standard_normal(q.shape) for size in (0.5, 2.0, 0.05))
-    z = 1e-4 * random.standard_normal((states, memory))
-    tau = 10.0 * random.standard_normal(q.shape)
-    u = q + 0.3 * random.standard_normal(q.shape)
-    return {"q": q, "qd": qd, "qdd": qdd, "tau": tau, "z": z, "dq": dq, "u": u}
+    speed = usual_speeds(coordinates)
+    q = np.stack([random.uniform(*working_range(joint), states) for joint in coordinates], axis=-1)
+    return {
+        "q": q,
+        "qd": 0.5 * speed * random.standard_normal(q.shape),
+        "qdd": 2.0 * speed * random.standard_normal(q.shape),
+        "dq": 0.05 * speed * random.standard_normal(q.shape),
+        "z": 1e-4 * random.standard_normal((states, memory)),
+        "tau": 10.0 * random.standard_normal(q.shape),
+        "u": q + 0.3 * random.standard_normal(q.shape),
+    }
 
 
-def relative(found: np.ndarray, expected: np.ndarray) -> float:
-    """The largest difference, relative to the largest value; NaN where one is NaN."""
+def usual_speeds(coordinates: Sequence[Coordinate]) -> np.ndarray:
+    """Return the URDF's limits of velocity, or usual speeds where it has none, (n,) [rad/s, m/s]."""
+    return np.array([joint.velocity or _USUAL_SPEED[joint.kind] for joint in coordinates])
+
+
+def relative(values: np.ndarray, expected: np.ndarray) -> float:
+    """Return the largest difference, relative to the largest value; NaN where one is NaN."""
     if not expected.size:
         return 0.0
     size = np.abs(expected).max()
     with np.errstate(invalid="ignore"):
-        return float(np.abs(found - expected).max() / (size if size > 0 else 1.0))
+        return float(np.abs(values - expected).max() / (size if size > 0 else 1.0))
 
 
-def reference(name: str, model: Any, arm: LoadedArm, inputs: Values) -> dict[str, np.ndarray]:
-    """What the torch model says of an entry point, by output."""
-    q, qd, qdd, tau, dq = (torch.from_numpy(inputs[key]) for key in ("q", "qd", "qdd", "tau", "dq"))
-    z = torch.from_numpy(inputs["z"]).unflatten(-1, (model.n, -1)) if inputs["z"].size else None
-    kept = () if z is None else (z,)
-    with torch.no_grad():
-        if name.startswith("tip_"):
-            tip = tip_kinematics(arm)
-            found = {"pose": tip.pose(q)} if name == "tip_pose" else {"jacobian": tip.jacobian(q)}
-        elif name == "servo_torque":
-            found = {"tau": model.servo(torch.from_numpy(inputs["u"]), q, qd)}
-        elif name == "energy":
-            kinetic = 0.5 * (model.momentum(q, qd) * qd).sum(dim=-1)
-            found = {"energy": torch.stack([kinetic, model.potential_energy(q)], dim=-1)}
-        elif name == "friction_step":
-            found = {"z_next": q[:, :0] if z is None else model.memory_after(z, dq).flatten(-2)}
-        elif name == "friction_memory":
-            found = {"z_start": q[:, :0] if z is None else model.memory(qd).flatten(-2)}
-        elif name.endswith("derivatives"):
-            found = _derivatives(name, model, q, qd, qdd if name.startswith("inverse") else tau, *kept)
-        else:
-            found = {key: value(model, q, qd, qdd, tau, kept) for key, value in [_VALUES[name]]}
-    return {key: value.numpy() for key, value in found.items()}
+class _Reference:
+    """The torch model in float64, asked by the names of the entry points."""
+
+    def __init__(self, trained: Trained) -> None:
+        self._model = copy.deepcopy(trained.model).double().cpu().requires_grad_(False)
+        self._trained = trained
+
+    def __call__(self, name: str, inputs: Values) -> Values:
+        """Return an entry point's outputs, (states, ...), by name."""
+        entry = (ENTRY_POINTS | {SERVO_TORQUE.name: SERVO_TORQUE})[name]
+        tensors = [self._tensor(key, inputs[key]) for key in entry.inputs]
+        outputs = getattr(self, name)(*tensors)
+        if isinstance(outputs, Tensor):
+            outputs = (outputs,)
+        arrays = [output.detach().numpy() for output in outputs]
+        return dict(zip(entry.output_names, arrays, strict=True))
+
+    def _tensor(self, name: str, values: np.ndarray) -> Tensor | None:
+        if name != "z":
+            return torch.from_numpy(values)
+        if not values.size:
+            return None
+        return torch.from_numpy(values).reshape(len(values), self._model.n, -1)
+
+    @cached_property
+    def _tip(self) -> TipKinematics:
+        return tip_kinematics(self._trained.arm)
+
+    def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None) -> Tensor:
+        return self._model.inverse_dynamics(q, qd, qdd, z)
+
+    def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
+        return self._model.forward_dynamics(q, qd, tau, z)
+
+    def mass_matrix(self, q: Tensor) -> Tensor:
+        return self._model.mass_matrix(q)
+
+    def bias(self, q: Tensor, qd: Tensor) -> Tensor:
+        return self._model.nonlinear_effects(q, qd)
+
+    def gravity(self, q: Tensor) -> Tensor:
+        return self._model.gravity(q)
+
+    def friction(self, q: Tensor, qd: Tensor, z: Tensor | None) -> Tensor:
+        return self._model.friction_torque(q, qd, z)
+
+    def friction_step(self, z: Tensor | None, dq: Tensor) -> Tensor:
+        if z is None:
+            return dq[:, :0]
+        return self._model.memory_after(z, dq).flatten(-2)
+
+    def friction_memory(self, qd: Tensor) -> Tensor:
+        if not has_friction_state(self._model):
+            return qd[:, :0]
+        return self._model.memory(qd).flatten(-2)
+
+    def momentum(self, q: Tensor, qd: Tensor) -> Tensor:
+        return self._model.momentum(q, qd)
+
+    def energy(self, q: Tensor, qd: Tensor) -> Tensor:
+        kinetic = 0.5 * (self._model.momentum(q, qd) * qd).sum(dim=-1)
+        return torch.stack([kinetic, self._model.potential_energy(q)], dim=-1)
+
+    def tip_pose(self, q: Tensor) -> Tensor:
+        return self._tip.pose(q)
+
+    def tip_jacobian(self, q: Tensor) -> Tensor:
+        return self._tip.jacobian(q)
+
+    def servo_torque(self, u: Tensor, q: Tensor, qd: Tensor) -> Tensor:
+        return self._model.servo(u, q, qd)
+
+    def inverse_dynamics_derivatives(
+        self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None
+    ) -> list[Tensor]:
+        return _derivatives(lambda q, qd: self._model.inverse_dynamics(q, qd, qdd, z), q, qd)
+
+    def forward_dynamics_derivatives(
+        self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None
+    ) -> list[Tensor]:
+        return _derivatives(lambda q, qd, tau: self._model.forward_dynamics(q, qd, tau, z), q, qd, tau)
 
 
-_VALUES: dict[str, tuple[str, Callable[..., torch.Tensor]]] = {
-    "inverse_dynamics": ("tau", lambda m, q, qd, qdd, tau, z: m.inverse_dynamics(q, qd, qdd, *z)),
-    "forward_dynamics": ("qdd", lambda m, q, qd, qdd, tau, z: m.forward_dynamics(q, qd, tau, *z)),
-    "mass_matrix": ("mass", lambda m, q, qd, qdd, tau, z: m.mass_matrix(q)),
-    "bias": ("bias", lambda m, q, qd, qdd, tau, z: m.nonlinear_effects(q, qd)),
-    "gravity": ("gravity", lambda m, q, qd, qdd, tau, z: m.gravity(q)),
-    "friction": ("friction", lambda m, q, qd, qdd, tau, z: m.friction_torque(q, qd, *z)),
-    "momentum": ("momentum", lambda m, q, qd, qdd, tau, z: m.momentum(q, qd)),
-}
+def _derivatives(function: Callable[..., Tensor], *inputs: Tensor) -> list[Tensor]:
+    """Return the derivatives by each input, (states, n, n), by automatic differentiation of all states at once.
 
-
-def _derivatives(name: str, model: Any, *states: torch.Tensor) -> dict[str, torch.Tensor]:
-    """By automatic differentiation, of all states at once: none of them has a part in what becomes of the others."""
-    function = getattr(model, name.removesuffix("_derivatives"))
-    keys = ("dtau_dq", "dtau_dqd") if name.startswith("inverse") else ("dqdd_dq", "dqdd_dqd", "dqdd_dtau")
-    given = [x.clone().requires_grad_() for x in states[: len(keys)]]
-    with torch.enable_grad():
-        outputs = function(*given, *states[len(keys) :]).sum(dim=0)
-        rows = [torch.autograd.grad(x, given, retain_graph=True, materialize_grads=True) for x in outputs]
-    by_state = zip(*rows, strict=True)
-    return {key: torch.stack(columns, dim=-2) for key, columns in zip(keys, by_state, strict=True)}
+    No state has a part in the outputs of another, so that a sum over the states has the derivatives of each.
+    """
+    inputs = tuple(x.clone().requires_grad_() for x in inputs)
+    rows = []
+    for output in function(*inputs).sum(dim=0):
+        rows.append(torch.autograd.grad(output, inputs, retain_graph=True, materialize_grads=True))
+    return [torch.stack(columns, dim=-2) for columns in zip(*rows, strict=True)]

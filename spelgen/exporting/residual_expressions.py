@@ -1,119 +1,178 @@
-"""What stands beside rigid bodies, as CasADi symbols for what is given of it at q.
+"""The part of a model beside its rigid bodies, as CasADi symbols and as CasADi expressions of q.
 
-So a program may loop over weights and look up splines: values, and either their rates along qd or their first and
-second derivatives by q.
+The scalar expressions of a model take it as symbols, so that a program may loop over weights and look up splines. Of
+M's entries that a network reaches (m of them) there are, by name: ``mass`` (m, 1); ``rate``, their change along qd;
+``kinetic``, d/dq of their 1/2 qd^T M qd (n, 1); of V's network ``energy`` and ``gravity``, dV/dq (n, 1); of single
+joints ``torque`` (n, 1) and ``torque_energy``; of the joints whose friction varies the logarithms ``factor`` (k, 1).
+
+Derivatives need, in place of rate and kinetic, ``first`` (m, n) and ``second`` (m, n (n + 1) / 2) by q, second ones by
+row and column of the upper triangle; ``stiffness`` (n (n + 1) / 2, 1) of V; ``torque_slope`` and ``factor_slope``.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
-
 import casadi as ca
 import numpy as np
 
-from spelgen.exporting.description import TrainedModel
+from spelgen.exporting.description import Encoding, Network, Residuals, Splines, TrainedModel
+from spelgen.exporting.rigid_expressions import constant
 
-Level = Literal["values", "rates", "jets"]
-"""What is given of residuals: values; also what forces need along qd; or first and second derivatives by q."""
-
-
-@dataclass(frozen=True, eq=False)
-class ResidualSymbols:
-    """What is given of the residuals of M's entries (m, 1), of V, and of single joints.
-
-    values and rates: ``rate``, how fast the entries change along qd (m, 1), ``kinetic``, d/dq of their
-    1/2 qd^T M qd (n, 1), ``gravity``, dV/dq of the network (n, 1), ``energy``, its V. jets: derivatives by q, second
-    ones by row and column of the upper triangle: ``first`` (m, n) and ``second`` (m, n (n + 1) / 2) of the entries,
-    ``gravity`` and ``stiffness`` (n (n + 1) / 2, 1) of V. Of single joints: ``torque`` (n, 1), its slope by q, its
-    energy; of those whose friction varies (k, 1) the ``factor``'s logarithm and its slope.
-    """
-
-    mass: ca.SX
-    rate: ca.SX
-    kinetic: ca.SX
-    first: ca.SX
-    second: ca.SX
-    energy: ca.SX
-    gravity: ca.SX
-    stiffness: ca.SX
-    torque: ca.SX
-    torque_slope: ca.SX
-    torque_energy: ca.SX
-    factor: ca.SX
-    factor_slope: ca.SX
-
-    @classmethod
-    def of(cls, model: TrainedModel) -> ResidualSymbols:
-        """Symbols for what a model has; empty ones for what it has not."""
-        residuals, n = model.residuals, model.n
-        entries, pairs = len(entry_places(model)), n * (n + 1) // 2
-        v, t, k = (
-            int(residuals.potential is not None),
-            int(residuals.has_torque),
-            len(residuals.friction.joints),
-        )
-        return cls(
-            mass=ca.SX.sym("mass", entries),
-            rate=ca.SX.sym("rate", entries),
-            kinetic=ca.SX.sym("kinetic", n if entries else 0),
-            first=ca.SX.sym("first", entries, n),
-            second=ca.SX.sym("second", entries, pairs),
-            energy=ca.SX.sym("energy", v),
-            gravity=ca.SX.sym("gravity", v * n),
-            stiffness=ca.SX.sym("stiffness", v * pairs),
-            torque=ca.SX.sym("torque", t * n),
-            torque_slope=ca.SX.sym("torque_slope", t * n),
-            torque_energy=ca.SX.sym("torque_energy", t),
-            factor=ca.SX.sym("factor", k),
-            factor_slope=ca.SX.sym("factor_slope", k),
-        )
+Symbols = dict[str, ca.SX]
 
 
-def entry_places(model: TrainedModel) -> list[tuple[int, int]]:
-    """The places in M's lower triangle that a network reaches."""
+def residual_symbols(model: TrainedModel) -> Symbols:
+    """Return symbols for all that a model may have; those of what it has not are empty."""
+    residuals, n = model.residuals, model.n
+    entries, pairs = len(entry_indices(model)), n * (n + 1) // 2
+    potential, torque = int(residuals.potential is not None), int(residuals.has_torque)
+    factors = len(residuals.friction.joints)
+    sizes = {
+        "mass": (entries, 1),
+        "rate": (entries, 1),
+        "kinetic": (n if entries else 0, 1),
+        "first": (entries, n),
+        "second": (entries, pairs),
+        "energy": (potential, 1),
+        "gravity": (potential * n, 1),
+        "stiffness": (potential * pairs, 1),
+        "torque": (torque * n, 1),
+        "torque_slope": (torque * n, 1),
+        "torque_energy": (torque, 1),
+        "factor": (factors, 1),
+        "factor_slope": (factors, 1),
+    }
+    return {name: ca.SX.sym(name, *size) for name, size in sizes.items()}
+
+
+def entry_indices(model: TrainedModel) -> list[tuple[int, int]]:
+    """Return the places in M's lower triangle that a network reaches."""
     network, n = model.residuals.mass, model.n
     if network is None:
         return []
     reached = (network.weights[-1] != 0).any(axis=1).reshape(n, n)
-    return [(row, column) for row in range(n) for column in range(row + 1) if reached[row, column]]
+    return [(int(row), int(column)) for row, column in np.argwhere(np.tril(reached))]
 
 
-def placed(n: int, places: list[tuple[int, int]], values: ca.SX) -> ca.SX:
-    """The symmetric matrix, (n, n), with these entries at their places."""
+def symmetric(n: int, indices: list[tuple[int, int]], values: ca.SX) -> ca.SX:
+    """Return the symmetric matrix, (n, n), with these entries at their places."""
     matrix = ca.SX(n, n)
-    for k, (row, column) in enumerate(places):
-        matrix[row, column] = values[k]
-        matrix[column, row] = values[k]
+    for k, (row, column) in enumerate(indices):
+        matrix[row, column] = matrix[column, row] = values[k]
     return matrix
 
 
-def coriolis(given: ResidualSymbols, places: list[tuple[int, int]], level: Level, qd: ca.SX) -> ca.SX:
-    """dR/dt qd - d/dq (1/2 qd^T R qd), (n, 1), of what networks add to M."""
-    n = qd.numel()
-    if level != "jets":
-        return placed(n, places, given.rate) @ qd - given.kinetic
-    rate = placed(n, places, given.first @ qd)
-    each = [placed(n, places, given.first[:, i]) for i in range(n)]
-    return rate @ qd - ca.vertcat(*(0.5 * ca.dot(qd, by_joint @ qd) for by_joint in each))
+def coriolis(model: TrainedModel, symbols: Symbols, qd: ca.SX, *, derivatives: bool) -> ca.SX:
+    """Return dR/dt qd - d/dq (1/2 qd^T R qd), (n, 1), of the networks' part R of M."""
+    n, indices = model.n, entry_indices(model)
+    if not derivatives:
+        return symmetric(n, indices, symbols["rate"]) @ qd - symbols["kinetic"]
+    slopes = [symmetric(n, indices, symbols["first"][:, joint]) for joint in range(n)]
+    kinetic = ca.vertcat(*(0.5 * ca.dot(qd, slope @ qd) for slope in slopes))
+    return symmetric(n, indices, symbols["first"] @ qd) @ qd - kinetic
 
 
-def jets(model: TrainedModel, given: ResidualSymbols) -> list[tuple[ca.SX, ca.SX]]:
-    """Symbols that depend on q, (k, 1) each, with their derivatives by it, (k, n)."""
-    n = model.n
-    found = [
-        (given.mass, given.first),
-        (ca.vec(given.first), ca.vertcat(*(given.second[:, _pairs(n, joint)] for joint in range(n)))),
-        (given.factor, given.factor_slope * ca.SX(np.eye(n)[list(model.residuals.friction.joints)])),
-    ]
+def symbol_slopes(model: TrainedModel, symbols: Symbols) -> list[tuple[ca.SX, ca.SX]]:
+    """Return the symbols that depend on q, (k, 1) each, with their derivatives by it, (k, n)."""
+    n, factor_joints = model.n, list(model.residuals.friction.joints)
+    pairs = [_second_derivatives(n, joint) for joint in range(n)]
+    slopes = [(symbols["factor"], symbols["factor_slope"] * ca.SX(np.eye(n)[factor_joints]))]
+    if model.residuals.mass is not None:
+        slopes.append((symbols["mass"], symbols["first"]))
+        second = ca.vertcat(*(symbols["second"][:, indices] for indices in pairs))
+        slopes.append((ca.vec(symbols["first"]), second))
     if model.residuals.potential is not None:
-        found.append((given.gravity, ca.vertcat(*(given.stiffness[_pairs(n, j)].T for j in range(n)))))
+        slopes.append(
+            (symbols["gravity"], ca.vertcat(*(symbols["stiffness"][indices].T for indices in pairs)))
+        )
     if model.residuals.has_torque:
-        found.append((given.torque, ca.diag(given.torque_slope)))
-    return [(symbols, slopes) for symbols, slopes in found if symbols.numel()]
+        slopes.append((symbols["torque"], ca.diag(symbols["torque_slope"])))
+    return slopes
 
 
-def _pairs(n: int, joint: int) -> list[int]:
-    """Where the second derivatives by a joint and each other stand, row by row of an upper triangle."""
-    upper = [(i, j) for i in range(n) for j in range(i, n)]
-    return [upper.index((min(i, joint), max(i, joint))) for i in range(n)]
+def _second_derivatives(n: int, joint: int) -> list[int]:
+    """Return where the second derivatives by a joint and each other stand in rows of an upper triangle."""
+    indices = np.zeros((n, n), dtype=int)
+    indices[np.triu_indices(n)] = np.arange(n * (n + 1) // 2)
+    row: list[int] = (indices + np.triu(indices, 1).T)[joint].tolist()
+    return row
+
+
+def residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[str, ca.MX]:
+    """Return what the symbols stand for at q, without derivatives, as expressions of matrices."""
+    residuals, n, values = model.residuals, model.n, {}
+    encoded = _encoded(residuals.encoding, q)
+    if residuals.mass is not None:
+        indices = entry_indices(model)
+        rows = [row * n + column for row, column in indices]
+        mass = values["mass"] = _network(residuals.mass, rows, encoded)
+        if qd is not None:
+            values["rate"] = ca.jtimes(mass, q, qd)
+            # an entry beside the diagonal stands in M twice
+            weights = [0.5 if row == column else 1.0 for row, column in indices]
+            products = qd[[row for row, _ in indices]] * qd[[column for _, column in indices]]
+            values["kinetic"] = ca.jtimes(mass, q, weights * products, True)
+    if residuals.potential is not None:
+        values["energy"] = _network(residuals.potential, [0], encoded)
+        values["gravity"] = ca.gradient(values["energy"], q)
+    if residuals.has_torque:
+        values["torque_energy"] = _torque_energy(residuals, q)
+        values["torque"] = ca.gradient(values["torque_energy"], q)
+    if residuals.friction.joints:
+        values["factor"] = _spline_values(residuals.friction, q)
+    return values
+
+
+def _encoded(encoding: Encoding, q: ca.MX) -> ca.MX:
+    """Return the inputs of the networks."""
+    waves = ca.vertcat(ca.cos(q), ca.sin(q))
+    if not encoding.prismatic:
+        return waves
+    return ca.vertcat(waves, (q - encoding.center) / encoding.reach)
+
+
+def _network(network: Network, rows: list[int], encoded: ca.MX) -> ca.MX:
+    layer = encoded
+    for weight, bias in zip(network.weights[:-1], network.biases[:-1], strict=True):
+        layer = 1 / (1 + ca.exp(-(constant(weight) @ layer + bias)))
+    return constant(network.weights[-1][rows]) @ layer + network.biases[-1][rows]
+
+
+def _torque_energy(residuals: Residuals, q: ca.MX) -> ca.MX:
+    """Return V of single joints; as in the runtime, a spline's energy is zero in its middle."""
+    energy, splines = ca.MX(0), residuals.torque
+    if splines.joints:
+        distance = _spline_distances(splines, q)
+        wide = _cubic_integral(ca.fmin(ca.fmax(distance, -2), 2), 2)
+        narrow = _cubic_integral(ca.fmin(ca.fmax(distance, -1), 1), 1)
+        weights = splines.weights * splines.spacing[:, None]
+        energy += ca.dot(weights.ravel(), wide / 6 - narrow * (4 / 6))
+    for ripple in residuals.ripple:
+        frequencies = ripple.frequency * np.arange(1, len(ripple.cosines) + 1)
+        phase = frequencies * q[ripple.joint]
+        energy += ca.dot(ripple.cosines / frequencies, ca.sin(phase))
+        energy -= ca.dot(ripple.sines / frequencies, ca.cos(phase))
+    return energy
+
+
+def _spline_values(splines: Splines, q: ca.MX) -> ca.MX:
+    """Return the sums of B-splines, (joints, 1)."""
+    away = ca.fabs(_spline_distances(splines, q))
+    height = (ca.fmax(2 - away, 0) ** 3 - 4 * ca.fmax(1 - away, 0) ** 3) / 6
+    count, size = splines.weights.shape
+    terms = ca.reshape(splines.weights.ravel() * height, size, count)
+    values: ca.MX = ca.sum1(terms).T
+    return values
+
+
+def _spline_distances(splines: Splines, q: ca.MX) -> ca.MX:
+    """Return how far q is from each spline's middle, in spacings, (joints S, 1)."""
+    count, size = splines.weights.shape
+    scaled = (q[list(splines.joints)] - splines.center) / splines.spacing
+    knots = np.tile(np.arange(size) - (size - 1) / 2, count)
+    return ca.vec(ca.repmat(scaled.T, size, 1)) - knots
+
+
+def _cubic_integral(x: ca.MX, size: float) -> ca.MX:
+    """Return the integral from zero to x of (size - |x|)^3."""
+    away = ca.fabs(x)
+    return x * (size**3 - 1.5 * size**2 * away + size * away**2 - 0.25 * away**3)

@@ -1,8 +1,8 @@
-"""Rigid bodies as CasADi expressions: Newton-Euler forward and back, and composite bodies for M.
+"""Rigid bodies as CasADi expressions: recursive Newton-Euler, and composite bodies for the mass matrix.
 
 Each body is seen in its joint's frame, whose z the joint turns about or slides along (Featherstone, Rigid Body Dynamics
-Algorithms, 2008, sections 5.3 and 6.2, in the classical form of Khalil and Dombre, 2002, section 9.5). Zeros of the
-geometry are left out by CasADi as the expressions are made.
+Algorithms, 2008, sections 5.3 and 6.2, in the classical form of Khalil and Dombre, 2002, section 9.5). CasADi leaves
+out what is structurally zero: zeros of the geometry, and velocities that are given as ``ca.SX(n, 1)``.
 """
 
 from __future__ import annotations
@@ -14,10 +14,17 @@ import numpy as np
 
 from spelgen.exporting.description import TrainedModel
 
+_Z = ca.sparsify(ca.DM([0, 0, 1]))
+
+
+def constant(values: object) -> ca.DM:
+    """Return numbers as a CasADi matrix whose zeros are structural."""
+    return ca.sparsify(ca.DM(np.array(values, dtype=float)))
+
 
 @dataclass(frozen=True, eq=False)
 class _Link:
-    """A body in expressions: its frame in its parent's, and what it is made of; all 3 rows."""
+    """A body: its frame in its parent's, and its mass, first moment and inertia about its frame's origin."""
 
     parent: int
     joint: int
@@ -29,149 +36,143 @@ class _Link:
     moment: ca.SX
     inertia: ca.SX
 
+    def along_axis(self, force: ca.SX, torque: ca.SX) -> ca.SX:
+        """Return what a wrench on the body asks of its joint's coordinate [Nm, N]."""
+        if self.revolute:
+            return self.ratio * torque[2]
+        return self.ratio * force[2]
+
+    def in_parent(self, force: ca.SX, torque: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """Return a wrench in the parent's frame, about its origin."""
+        force = self.rotation @ force
+        return force, self.rotation @ torque + ca.cross(self.position, force)
+
+
+@dataclass(frozen=True, eq=False)
+class _Motion:
+    """Angular velocity and acceleration, and the acceleration of the origin, in the body's frame."""
+
+    velocity: ca.SX
+    rate: ca.SX
+    acceleration: ca.SX
+
+    def spin(self) -> ca.SX:
+        """Return [w']x + [w]x [w]x, which takes points of the body to their accelerations."""
+        w = self.velocity
+        return ca.skew(self.rate) + w @ w.T - ca.dot(w, w) * ca.SX.eye(3)
+
 
 class RigidExpressions:
-    """An arm's rigid bodies at q, a column of n symbols; armature is not among them."""
+    """The rigid bodies of an arm at q, (n, 1); armature is not among them."""
 
     def __init__(self, model: TrainedModel, q: ca.SX) -> None:
         self.n = model.n
-        self.weight = ca.SX(-model.gravity)
-        self.links = [_link(model, index, q) for index in range(len(model.bodies))]
+        # the base accelerates upwards in place of gravity
+        self._base = _Motion(ca.SX(3, 1), ca.SX(3, 1), ca.SX(-model.gravity))
+        self._links = [_link(model, index, q) for index in range(len(model.bodies))]
 
-    def torque(self, qd: ca.SX | None, qdd: ca.SX | None) -> ca.SX:
-        """What the joints must give for this motion, (n, 1); None: zero."""
-        still = qd is None and qdd is None
-        zero = ca.SX(3, 1)
-        turns: list[ca.SX] = []
-        rates: list[ca.SX] = []
-        moves: list[tuple[ca.SX, ca.SX]] = []
+    def torque(self, qd: ca.SX, qdd: ca.SX) -> ca.SX:
+        """Return the torques of this motion in gravity, (n, 1) [Nm, N]."""
+        motions: list[_Motion] = []
         wrenches: list[tuple[ca.SX, ca.SX]] = []
-        for link in self.links:
-            below = link.parent >= 0
-            w = turns[link.parent] if below else zero
-            spin, rise = moves[link.parent] if below else (ca.SX(3, 3), self.weight)
-            # the acceleration of the origin; spin is [w']x + [w]x [w]x
-            rise = link.rotation.T @ (rise + spin @ link.position)
-            w = link.rotation.T @ w
-            rate = link.rotation.T @ rates[link.parent] if below else zero
-            if not still:
-                speed, push = (
-                    link.ratio * x[link.joint] if x is not None else ca.SX(1, 1) for x in (qd, qdd)
-                )
-                axis = ca.SX(ca.sparsify(ca.DM([0, 0, 1])))
-                if link.revolute:
-                    rate = rate + axis * push + ca.cross(w, axis) * speed
-                    w = w + axis * speed
-                else:
-                    rise = rise + axis * push + 2 * ca.cross(w, axis) * speed
-            spin = ca.SX(3, 3) if still else ca.skew(rate) + _square(w)
-            force = link.mass * rise + spin @ link.moment
-            torque = ca.cross(link.moment, rise)
-            if not still:
-                torque = torque + link.inertia @ rate + ca.cross(w, link.inertia @ w)
-            turns.append(w)
-            rates.append(rate)
-            moves.append((spin, rise))
-            wrenches.append((force, torque))
-        return self._joints(wrenches)
-
-    def _joints(self, wrenches: list[tuple[ca.SX, ca.SX]]) -> ca.SX:
-        """The joints' torques of the bodies' (forces, torques)."""
-        found = ca.SX(self.n, 1)
-        for index in reversed(range(len(self.links))):
-            link, (force, torque) = self.links[index], wrenches[index]
-            found[link.joint] += link.ratio * (torque if link.revolute else force)[2]
+        for link in self._links:
+            carrier = motions[link.parent] if link.parent >= 0 else self._base
+            motion = _moved(link, carrier, link.ratio * qd[link.joint], link.ratio * qdd[link.joint])
+            motions.append(motion)
+            w = motion.velocity
+            force = link.mass * motion.acceleration + motion.spin() @ link.moment
+            torque = ca.cross(link.moment, motion.acceleration) + link.inertia @ motion.rate
+            wrenches.append((force, torque + ca.cross(w, link.inertia @ w)))
+        torques = ca.SX(self.n, 1)
+        for index in reversed(range(len(self._links))):
+            link, wrench = self._links[index], wrenches[index]
+            torques[link.joint] += link.along_axis(*wrench)
             if link.parent >= 0:
-                force, torque = link.rotation @ force, link.rotation @ torque
-                below = wrenches[link.parent]
-                wrenches[link.parent] = (
-                    below[0] + force,
-                    below[1] + torque + ca.cross(link.position, force),
-                )
-        return found
+                force, torque = link.in_parent(*wrench)
+                own_force, own_torque = wrenches[link.parent]
+                wrenches[link.parent] = (own_force + force, own_torque + torque)
+        return torques
 
     def mass_and_moment(self) -> tuple[ca.SX, ca.SX]:
-        """M, (n, n), and the moment of mass of all bodies in the base's frame, (3, 1)."""
-        mass = [link.mass for link in self.links]
-        moment = [link.moment for link in self.links]
-        inertia = [link.inertia for link in self.links]
+        """Return M, (n, n), and the first moment of all bodies in the base's frame, (3, 1) [kg m]."""
+        mass = [link.mass for link in self._links]
+        moment = [link.moment for link in self._links]
+        inertia = [link.inertia for link in self._links]
         matrix, total = ca.SX(self.n, self.n), ca.SX(3, 1)
-        axis = ca.SX(ca.sparsify(ca.DM([0, 0, 1])))
-        for index in reversed(range(len(self.links))):
-            link = self.links[index]
-            if link.revolute:
-                force, torque = ca.cross(axis, moment[index]), inertia[index] @ axis
-            else:
-                force, torque = mass[index] * axis, ca.cross(moment[index], axis)
+        for index in reversed(range(len(self._links))):
+            link = self._links[index]
+            # by a unit acceleration of the joint
+            force, torque = ca.cross(_Z, moment[index]), inertia[index] @ _Z
+            if not link.revolute:
+                force, torque = mass[index] * _Z, ca.cross(moment[index], _Z)
             self._add_column(matrix, index, link.ratio * force, link.ratio * torque)
+            p, m, parent = link.position, mass[index], link.parent
             turned = link.rotation @ moment[index]
-            p, m, below = link.position, mass[index], link.parent
-            if below < 0:
+            if parent < 0:
                 total = total + turned + m * p
                 continue
             shift = p @ turned.T
             size = m * ca.dot(p, p) + 2 * ca.trace(shift)
             moved = link.rotation @ inertia[index] @ link.rotation.T
             moved = moved + size * ca.SX.eye(3) - m * (p @ p.T) - shift - shift.T
-            inertia[below] = inertia[below] + _symmetric(moved)
-            moment[below] = moment[below] + turned + m * p
-            mass[below] = mass[below] + m
+            # one expression for both triangles: half of the work
+            inertia[parent] = inertia[parent] + ca.tril2symm(ca.tril(moved))
+            moment[parent] = moment[parent] + turned + m * p
+            mass[parent] = mass[parent] + m
         return matrix, total
 
     def _add_column(self, matrix: ca.SX, index: int, force: ca.SX, torque: ca.SX) -> None:
-        """What a body's own joint, accelerated by one, asks of it and of those before it."""
-        at, column = index, self.links[index].joint
-        while at >= 0:
-            link = self.links[at]
-            value = link.ratio * (torque if link.revolute else force)[2]
+        """Add the wrench of a body's own joint, accelerated by one, to that joint's column of M and to its row."""
+        column = self._links[index].joint
+        ancestor = index
+        while ancestor >= 0:
+            link = self._links[ancestor]
+            value = link.along_axis(force, torque)
             matrix[link.joint, column] += value
-            if at != index:
+            if ancestor != index:
                 matrix[column, link.joint] += value
-            force = link.rotation @ force
-            torque = link.rotation @ torque + ca.cross(link.position, force)
-            at = link.parent
+            force, torque = link.in_parent(force, torque)
+            ancestor = link.parent
+
+
+def _moved(link: _Link, carrier: _Motion, speed: ca.SX, acceleration: ca.SX) -> _Motion:
+    """Return a body's motion by its carrier's and by its own joint's."""
+    w = link.rotation.T @ carrier.velocity
+    rate = link.rotation.T @ carrier.rate
+    linear = link.rotation.T @ (carrier.acceleration + carrier.spin() @ link.position)
+    if link.revolute:
+        return _Motion(w + _Z * speed, rate + _Z * acceleration + ca.cross(w, _Z) * speed, linear)
+    return _Motion(w, rate, linear + _Z * acceleration + 2 * ca.cross(w, _Z) * speed)
 
 
 def _link(model: TrainedModel, index: int, q: ca.SX) -> _Link:
-    body, ten = model.bodies[index], model.inertias[index]
-    value = float(body.multiplier) * q[body.coordinate] + body.offset
-    rotation, position = _exact(body.rotation), _exact(body.translation)
-    if body.kind == "revolute":
-        rotation = rotation @ turn(value)
+    body = model.bodies[index]
+    m, x, y, z, xx, xy, xz, yy, yz, zz = model.inertias[index]
+    ratio, revolute = float(body.multiplier), body.kind == "revolute"
+    rotation, position = ca.SX(constant(body.rotation)), ca.SX(constant(body.translation))
+    displacement = ratio * q[body.coordinate] + body.offset
+    if revolute:
+        rotation = rotation @ rotation_about_z(displacement)
     else:
-        position = position + rotation[:, 2] * value
-    xx, xy, xz, yy, yz, zz = ten[4:]
+        position = position + rotation[:, 2] * displacement
     return _Link(
         parent=body.parent,
         joint=body.coordinate,
-        ratio=float(body.multiplier),
-        revolute=body.kind == "revolute",
+        ratio=ratio,
+        revolute=revolute,
         rotation=rotation,
         position=position,
-        mass=ca.SX(float(ten[0])),
-        moment=_exact(ten[1:4]),
-        inertia=_exact([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]),
+        mass=ca.SX(float(m)),
+        moment=ca.SX(constant([x, y, z])),
+        inertia=ca.SX(constant([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])),
     )
 
 
-def turn(angle: ca.SX) -> ca.SX:
-    """The rotation about z, (3, 3)."""
+def rotation_about_z(angle: ca.SX) -> ca.SX:
+    """Return the rotation about z, (3, 3)."""
     c, s = ca.cos(angle), ca.sin(angle)
-    found = ca.SX(3, 3)
-    found[0, 0] = found[1, 1] = c
-    found[0, 1], found[1, 0], found[2, 2] = -s, s, 1
-    return found
-
-
-def _exact(values: object) -> ca.SX:
-    return ca.SX(ca.sparsify(ca.DM(np.array(values, dtype=float))))
-
-
-def _square(w: ca.SX) -> ca.SX:
-    """[w]x [w]x."""
-    return w @ w.T - ca.dot(w, w) * ca.SX.eye(3)
-
-
-def _symmetric(matrix: ca.SX) -> ca.SX:
-    """The lower triangle's numbers in both places: half of the work."""
-    return ca.tril2symm(ca.tril(matrix))
+    rotation = ca.SX(3, 3)
+    rotation[0, 0] = rotation[1, 1] = c
+    rotation[1, 0], rotation[0, 1] = s, -s
+    rotation[2, 2] = 1
+    return rotation

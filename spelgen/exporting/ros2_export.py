@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from spelgen.exporting.c_export import c_files
-from spelgen.exporting.exported import Exported
-from spelgen.exporting.readme import UNITS, readme
+from spelgen.exporting.exported import UNITS, Exported, readme
 from spelgen.exporting.trained import Trained
 from spelgen.templates import render
 

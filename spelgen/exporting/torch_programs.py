@@ -1,48 +1,62 @@
-"""A trained model's entry points as programs of torch.export: any batch size, nothing that depends on weights alone."""
+"""Programs of torch.export for the entry points of a trained model: any batch size, weights as constants."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from spelgen.dynamics.prepared import PreparedModel
+from spelgen.exporting.entry_points import ENTRY_POINTS
 
-PROGRAMS: dict[str, tuple[str, tuple[str, ...], str]] = {
-    "inverse_dynamics": ("inverse_dynamics", ("q", "qd", "qdd"), "tau"),
-    "forward_dynamics": ("forward_dynamics", ("q", "qd", "tau"), "qdd"),
-    "mass_matrix": ("mass_matrix", ("q",), "mass"),
-    "bias": ("bias", ("q", "qd"), "bias"),
-    "gravity": ("gravity", ("q",), "gravity"),
-    "friction": ("friction_torque", ("q", "qd"), "friction"),
+PROGRAMS: dict[str, Callable[..., Tensor]] = {
+    "inverse_dynamics": PreparedModel.inverse_dynamics,
+    "forward_dynamics": PreparedModel.forward_dynamics,
+    "mass_matrix": PreparedModel.mass_matrix,
+    "bias": PreparedModel.bias,
+    "gravity": PreparedModel.gravity,
+    "friction": PreparedModel.friction_torque,
 }
-"""By entry point: the method of ``PreparedModel``, its inputs, (batch, n) each, and its output."""
-
-_WITH_FRICTION = ("inverse_dynamics", "forward_dynamics", "friction")
+"""The entry points that have a program, and the methods that compute them."""
 
 
 class _Program(nn.Module):
-    def __init__(self, function: Callable[..., Tensor]) -> None:
+    def __init__(self, model: PreparedModel, name: str) -> None:
         super().__init__()
-        self._function = function
+        self._model, self._function = model, PROGRAMS[name]
+        self._has_memory = "z" in program_inputs(model, name)
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        return self._function(*inputs)
+        if self._has_memory:
+            *states, z = inputs
+            return self._function(self._model, *states, z.reshape(-1, self._model.n, self._model.elements))
+        return self._function(self._model, *inputs)
 
 
-def export_program(model: PreparedModel, name: str) -> torch.export.ExportedProgram:
-    """An entry point; the first dimension of its inputs is the batch."""
-    inputs = program_inputs(model, name)
-    batch = torch.export.Dim("batch")
-    sizes = [(2, model.n, model.elements) if each == "z" else (2, model.n) for each in inputs]
-    given = tuple(0.1 * torch.ones(size, dtype=torch.float64) for size in sizes)
-    shapes: Any = (tuple({0: batch} for _ in inputs),)
-    return torch.export.export(_Program(getattr(model, PROGRAMS[name][0])), given, dynamic_shapes=shapes)
+def export_program(
+    model: PreparedModel, name: str, *, flat_memory: bool = False
+) -> torch.export.ExportedProgram:
+    """Return the program of an entry point; the first dimension of its inputs is the batch.
+
+    z, the memory of friction, is (batch, n, K), or (batch, n K) where ``flat_memory``; the other inputs are (batch, n).
+    """
+    memory = (model.n * model.elements,) if flat_memory else (model.n, model.elements)
+    names = program_inputs(model, name)
+    # a batch of two: torch.export would take one for a constant
+    inputs = tuple(
+        torch.full((2, *(memory if key == "z" else (model.n,))), 0.1, dtype=torch.float64) for key in names
+    )
+    batch = tuple({0: torch.export.Dim("batch")} for _ in names)
+    return torch.export.export(_Program(model, name), inputs, dynamic_shapes=(batch,))
 
 
 def program_inputs(model: PreparedModel, name: str) -> tuple[str, ...]:
-    """An entry point's inputs: z, (batch, n, K), is among them where friction has a memory and a part in it."""
-    _, inputs, _ = PROGRAMS[name]
-    return (*inputs, "z") if model.elements and name in _WITH_FRICTION else inputs
+    """Return the names of an entry point's inputs; z is among them where friction has a memory."""
+    inputs = ENTRY_POINTS[name].inputs
+    return inputs if model.elements else tuple(key for key in inputs if key != "z")
+
+
+def program_output(name: str) -> str:
+    """Return the name of an entry point's only output."""
+    return ENTRY_POINTS[name].outputs[0][0]

@@ -1,4 +1,4 @@
-"""What is exported: a trained model, the arm it is of, and both as plain numbers."""
+"""A trained model and its arm: the input of every exporter."""
 
 from __future__ import annotations
 
@@ -6,11 +6,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from spelgen.exporting.describe import describe
 from spelgen.exporting.description import TrainedModel
-from spelgen.exporting.tip_chain import tip_in_body
 from spelgen.loaded_arm import LoadedArm
 
 if TYPE_CHECKING:
@@ -30,11 +27,16 @@ class Trained:
         return describe(self.model, self.arm)
 
     @property
-    def tip_in_body(self) -> tuple[str, int, np.ndarray]:
-        """The tip's link, the body that it moves with, and its pose in that body's frame, (4, 4)."""
-        return tip_in_body(self.arm)
+    def robot(self) -> str:
+        """The name of the robot in the URDF."""
+        return self.arm.arm.name
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """By the URDF's names."""
-        return tuple(coordinate.name for coordinate in self.arm.arm.coordinates)
+        """The names of the joints in the URDF."""
+        return tuple(joint.name for joint in self.arm.arm.coordinates)
+
+    @property
+    def memory(self) -> int:
+        """How many numbers the memory of friction has."""
+        return self.model.n * self.model.elements

@@ -12,11 +12,9 @@ from spelgen.exporting.rigid_body_projection import RigidBodyProjection
 from spelgen.urdf.document import urdf_bytes
 from spelgen.urdf.robot import Robot
 
-TEN = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-
 
 def urdf_text(projection: RigidBodyProjection) -> bytes:
-    """The arm's URDF with these inertials and friction.
+    """Return the arm's URDF with these inertials and friction.
 
     A link that a joint moves gets all that moves with it; the links it carries by fixed or locked joints lose
     their inertials to it.
@@ -26,77 +24,80 @@ def urdf_text(projection: RigidBodyProjection) -> bytes:
     root = etree.fromstring(urdf_bytes(robot.path), parser)
     links = {element.get("name"): element for element in root.findall("link")}
     joints = {element.get("name"): element for element in root.findall("joint")}
-    moved = {robot.joint[body.name].child for body in arm.bodies}
-    for name in _carried(robot, moved):
-        for element in links[name].findall("inertial"):
-            links[name].remove(element)
+    for name in _carried_links(robot, {robot.joint[body.name].child for body in arm.bodies}):
+        _remove(links[name], "inertial")
     rounding = AngleRounding(projection.arm.angle_tolerance)
-    for body, ten in zip(arm.bodies, projection.inertias, strict=True):
+    for body, inertia in zip(arm.bodies, projection.inertias, strict=True):
         joint = robot.joint[body.name]
-        _set_inertial(links[joint.child], _in_link(ten, alignment(rounding.axis(joint))))
+        _set_inertial(links[joint.child], inertia, alignment(rounding.axis(joint)))
+    # a URDF has one Coulomb friction for both directions
+    coulomb = (projection.forward - projection.backward) / 2
     for index, coordinate in enumerate(arm.coordinates):
-        mean = (projection.forward[index] - projection.backward[index]) / 2
         element = joints[coordinate.name]
-        for old in element.findall("dynamics"):
-            element.remove(old)
-        values = {"damping": _number(projection.viscous[index]), "friction": _number(mean)}
+        _remove(element, "dynamics")
+        values = {"damping": _number(projection.viscous[index]), "friction": _number(coulomb[index])}
         etree.SubElement(element, "dynamics", values)
-    return etree.tostring(root, xml_declaration=True, encoding="utf-8") + b"\n"
+    text: bytes = etree.tostring(root, xml_declaration=True, encoding="utf-8")
+    return text + b"\n"
 
 
 def settings_text(projection: RigidBodyProjection) -> str:
-    """The settings beside the arm's URDF with these drives and friction, in both directions."""
-    beside = projection.arm.robot.path.with_suffix(".yaml")
-    content = (yaml.safe_load(beside.read_text(encoding="utf-8")) if beside.exists() else None) or {}
+    """Return the settings beside the arm's URDF with these drives and friction, in both directions."""
+    path = projection.arm.robot.path.with_suffix(".yaml")
+    content: dict[str, dict[str, dict[str, object]]] = {}
+    if path.exists():
+        content = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
     joints = content.setdefault("joints", {})
     for index, coordinate in enumerate(projection.arm.arm.coordinates):
-        joint = joints.setdefault(coordinate.name, {})
         gear = projection.arm.settings.joint(coordinate.name).gear
-        joint["rotor_inertia"] = _rounded(projection.armature[index] / gear**2)
-        joint["viscous"] = _rounded(projection.viscous[index])
-        joint["coulomb"] = [_rounded(projection.forward[index]), _rounded(projection.backward[index])]
-    return yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+        joint = joints.setdefault(coordinate.name, {})
+        joint["rotor_inertia"] = rounded(projection.armature[index] / gear**2)
+        joint["viscous"] = rounded(projection.viscous[index])
+        joint["coulomb"] = [rounded(projection.forward[index]), rounded(projection.backward[index])]
+    text: str = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+    return text
 
 
-def _carried(robot: Robot, moved: set[str]) -> list[str]:
-    """Links with an inertial that move with another link."""
-    found = []
-    for link in robot.links:
-        above = {joint.child for joint in robot.path_to(link.name)}
-        if link.inertial is not None and link.name not in moved and above & moved:
-            found.append(link.name)
-    return found
-
-
-def about_center(ten: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Mass, centre of mass and the tensor about it, (3, 3), of ten parameters about the joint, in its frame."""
-    mass, center = ten[0], ten[1:4] / ten[0]
-    xx, xy, xz, yy, yz, zz = ten[4:]
+def about_center(inertia: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Return mass, centre of mass and the tensor about it, (3, 3), of ten parameters about the joint, in its frame."""
+    mass, center = inertia[0], inertia[1:4] / inertia[0]
+    xx, xy, xz, yy, yz, zz = inertia[4:]
     about_joint = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     return mass, center, about_joint - mass * (center @ center * np.eye(3) - np.outer(center, center))
 
 
-def _in_link(ten: np.ndarray, turned: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Mass, centre of mass and tensor about it in the link's frame; ``turned`` takes +z to the joint's axis."""
-    mass, center, tensor = about_center(ten)
-    return mass, turned @ center, turned @ tensor @ turned.T
+def rounded(value: float) -> float:
+    """Return a number of twelve digits: what a person may read, far beyond what a fit finds."""
+    return float(_number(value))
 
 
-def _set_inertial(link: etree._Element, values: tuple[float, np.ndarray, np.ndarray]) -> None:
-    mass, center, tensor = values
-    for old in link.findall("inertial"):
-        link.remove(old)
+def _carried_links(robot: Robot, moved: set[str]) -> list[str]:
+    """Return the links with an inertial that move with another link."""
+    carried = []
+    for link in robot.links:
+        above = {joint.child for joint in robot.path_to(link.name)}
+        if link.inertial is not None and link.name not in moved and above & moved:
+            carried.append(link.name)
+    return carried
+
+
+def _set_inertial(link: etree._Element, inertia: np.ndarray, rotation: np.ndarray) -> None:
+    """Set a link's inertial; ``rotation`` takes +z, the joint's axis in its own frame, to the axis in the link's."""
+    _remove(link, "inertial")
+    mass, center, tensor = about_center(inertia)
+    center, tensor = rotation @ center, rotation @ tensor @ rotation.T
     inertial = etree.Element("inertial")
     etree.SubElement(inertial, "origin", xyz=" ".join(map(_number, center)), rpy="0 0 0")
     etree.SubElement(inertial, "mass", value=_number(mass))
-    etree.SubElement(
-        inertial, "inertia", dict(zip(TEN, map(_number, tensor[np.triu_indices(3)]), strict=True))
-    )
+    names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    moments = map(_number, tensor[np.triu_indices(3)])
+    etree.SubElement(inertial, "inertia", dict(zip(names, moments, strict=True)))
     link.insert(0, inertial)
 
 
-def _rounded(value: float) -> float:
-    return float(_number(value))
+def _remove(element: etree._Element, tag: str) -> None:
+    for child in element.findall(tag):
+        element.remove(child)
 
 
 def _number(value: float) -> str:

@@ -1,0 +1,184 @@
+"""The part of a model beside its rigid bodies as C: networks as loops over tables, functions of single joints.
+
+Splines are a polynomial for each interval, harmonics turn a phasor. An entry point calls what its expressions need.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from textwrap import wrap
+
+import numpy as np
+
+from spelgen.exporting.description import Network, Splines, TrainedModel
+from spelgen.exporting.model_expressions import RESIDUAL
+from spelgen.exporting.residual_expressions import entry_indices, residual_symbols
+from spelgen.templates import render
+
+_WIDTH = 112  # characters of a line
+
+_PIECES = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6
+"""A cubic B-spline's sum on an interval, by powers of s from 0 to 1: of the weights of the four that are not zero."""
+
+_CALLS = (
+    (("first", "second"), "mass_jets(q", ("mass", "first", "second")),
+    (("rate", "kinetic"), "mass_rates(encoded, qd", ("mass", "rate", "kinetic")),
+    (("mass",), "mass_values(encoded", ("mass",)),
+    (("stiffness",), "potential_jets(q", ("gravity", "stiffness")),
+    (("gravity",), "potential_gradient(encoded", ("gravity",)),
+    (("energy",), "potential_value(encoded", ("energy",)),
+    (("torque", "torque_slope"), "joint_torques(q", ("torque", "torque_slope")),
+    (("torque_energy",), "joint_energies(q", ("torque_energy",)),
+    (("factor", "factor_slope"), "friction_factors(q", ("factor", "factor_slope")),
+)
+"""By what is needed: the call, and all that it computes; the first call that computes a residual is taken for it."""
+
+
+def residual_calls(model: TrainedModel, names: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return the variables, and the calls that compute these residuals of q, and of qd where they need it."""
+    missing, symbols = set(names), residual_symbols(model)
+    variables: list[str] = []
+    calls: list[str] = []
+    for needed, call, computed in _CALLS:
+        if not missing.intersection(needed):
+            continue
+        missing.difference_update(computed)
+        variables += [f"{RESIDUAL}{name}[{symbols[name].numel()}]" for name in computed]
+        calls.append(f"{call}, {', '.join(RESIDUAL + name for name in computed)});")
+    if "(encoded" in "".join(calls):
+        variables.insert(0, "encoded[ENCODED]")
+        calls.insert(0, "encode(q, encoded);")
+    return variables, calls
+
+
+def network_source(model: TrainedModel) -> list[str]:
+    """Return the C text of all networks, nothing where there are none."""
+    residuals, n, indices = model.residuals, model.n, entry_indices(model)
+    networks: dict[str, Network] = {}
+    if residuals.mass is not None:
+        rows = [row * n + column for row, column in indices]
+        networks["mass"] = _with_outputs(residuals.mass, rows)
+    if residuals.potential is not None:
+        networks["potential"] = _with_outputs(residuals.potential, [0])
+    if not networks:
+        return []
+    encoding = residuals.encoding
+    encoded = (3 if encoding.prismatic else 2) * n
+    tables: list[str] = []
+    if encoding.prismatic:
+        tables += [_table("center", encoding.center), _table("reach", encoding.reach)]
+    layers: dict[str, list[str]] = {}
+    width = max(len(indices), encoded)
+    for name, network in networks.items():
+        layers[name] = []
+        for k, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True), start=1):
+            layer = f"{name}_{k}"
+            tables += _layer_tables(layer, weight, bias)
+            fields = f"{layer}_bias, {layer}_weight, {layer}_first, {layer}_last"
+            layers[name].append(f"{weight.shape[1]}, {weight.shape[0]}, {fields}")
+            width = max(width, weight.shape[0])
+    text = render(
+        "networks.c.jinja",
+        n=n,
+        hidden=max(map(len, layers.values())) - 1,
+        width=width,
+        encoded=encoded,
+        lanes=1 + n + n * (n + 1) // 2,
+        scaled=encoding.prismatic,
+        tables=tables,
+        networks=layers,
+        entries=len(indices),
+        places=", ".join(f"{{{row}, {column}}}" for row, column in indices),
+        potential=residuals.potential is not None,
+    )
+    return [text.rstrip()]
+
+
+def _with_outputs(network: Network, rows: list[int]) -> Network:
+    """Return the network with these of its outputs alone."""
+    weights = (*network.weights[:-1], network.weights[-1][rows])
+    return Network(weights, (*network.biases[:-1], network.biases[-1][rows]))
+
+
+def _layer_tables(name: str, weight: np.ndarray, bias: np.ndarray) -> list[str]:
+    """Return tables of bias, weight by input from first to last that is not zero, first and last."""
+    first, last, packed = [], [], []
+    for column in weight.T:
+        reached = np.flatnonzero(column)
+        start, stop = (reached[0], reached[-1] + 1) if reached.size else (0, 0)
+        first.append(start)
+        last.append(stop)
+        packed.append(column[start:stop])
+    return [
+        _table(f"{name}_bias", bias),
+        _table(f"{name}_weight", np.concatenate(packed)),
+        _table(f"{name}_first", np.array(first)),
+        _table(f"{name}_last", np.array(last)),
+    ]
+
+
+def joint_function_source(model: TrainedModel) -> list[str]:
+    """Return the C text of all functions of single joints, nothing where there are none."""
+    residuals = model.residuals
+    torque, factor = residuals.torque, residuals.friction
+    if not (residuals.has_torque or factor.joints):
+        return []
+    tables: list[str] = []
+    if torque.joints:
+        tables.append(_table("torque_pieces", _pieces(torque).reshape(-1, 4)))
+        tables.append(_table("torque_energy", _energies(torque)))
+    if factor.joints:
+        tables.append(_table("factor_pieces", _pieces(factor).reshape(-1, 4)))
+    ripples: list[str] = []
+    for k, ripple in enumerate(residuals.ripple, start=1):
+        tables.append(_table(f"ripple_{k}", np.stack([ripple.cosines, ripple.sines], axis=1)))
+        ripples.append(f"{ripple.joint}, {len(ripple.cosines)}, {ripple.frequency!r}, ripple_{k}")
+    text = render(
+        "joint_functions.c.jinja",
+        n=model.n,
+        intervals=_pieces(factor).shape[1],
+        tables=tables,
+        torque=_spline_fields(torque),
+        factor=_spline_fields(factor),
+        ripple=ripples,
+    )
+    return [text.rstrip()]
+
+
+def _pieces(splines: Splines) -> np.ndarray:
+    """Return coefficients by spline, interval and power of s, (splines, S + 3, 4).
+
+    The intervals begin two spacings before the first middle.
+    """
+    padded = np.pad(splines.weights, ((0, 0), (3, 3)))
+    neighbours = np.lib.stride_tricks.sliding_window_view(padded, 4, axis=1)
+    pieces: np.ndarray = neighbours @ _PIECES.T
+    return pieces
+
+
+def _energies(splines: Splines) -> np.ndarray:
+    """Return the integral by q up to where each interval begins, (splines (S + 3),), zero in a spline's middle."""
+    intervals = _pieces(splines) @ (1 / np.arange(1, 5)) * splines.spacing[:, None]
+    half = 0.5 * splines.weights.sum(axis=1) * splines.spacing
+    energies: np.ndarray = np.cumsum(intervals, axis=1) - intervals - half[:, None]
+    return energies.ravel()
+
+
+def _spline_fields(splines: Splines) -> list[str]:
+    """Return by spline: joint, start, spacing."""
+    start = splines.center - splines.spacing * ((splines.weights.shape[1] - 1) / 2 + 2)
+    rows = zip(splines.joints, start.tolist(), splines.spacing.tolist(), strict=True)
+    return [f"{joint}, {first!r}, {spacing!r}" for joint, first, spacing in rows]
+
+
+def _table(name: str, values: np.ndarray) -> str:
+    """Return a constant array of C, numbers with all their digits."""
+    kind = "short" if values.dtype.kind == "i" else "real"
+    size = "[]"
+    if values.ndim == 2:
+        size = f"[][{values.shape[1]}]"
+        lines = [f"    {{{', '.join(map(repr, row))}}}," for row in values.tolist()]
+    else:
+        numbers = ", ".join(map(repr, values.tolist()))
+        lines = wrap(numbers, _WIDTH, initial_indent="    ", subsequent_indent="    ")
+    return "\n".join([f"static const {kind} {name}{size} = {{", *lines, "};"])
