@@ -1,10 +1,10 @@
-"""What a numerical check of the derived facts found, as people and programs read it."""
+"""Hold the result of a numerical check of the derived facts, as people and programs read it."""
 
 from __future__ import annotations
 
 import textwrap
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Literal
 
 from spelgen.listing import Listing
 
@@ -14,7 +14,7 @@ _MARKS = {"agrees": "ok", "differs": "DIFFERS", "undecided": "open"}
 
 @dataclass(frozen=True)
 class Check:
-    """One fact: what was derived, what an independent computation found, and whether the two agree.
+    """Hold one fact: what was derived, what an independent computation found, and whether the two agree.
 
     ``undecided`` stands for what double precision, or the other program, cannot tell.
     """
@@ -25,7 +25,7 @@ class Check:
     verdict: Verdict
 
     def to_dict(self) -> dict[str, str]:
-        """The four fields as a JSON object."""
+        """Return the four fields as a JSON object."""
         return asdict(self)
 
     def __str__(self) -> str:
@@ -34,7 +34,7 @@ class Check:
 
 @dataclass(frozen=True, repr=False)
 class Verification:
-    """The checks of one arm, made with ``samples`` random configurations from ``seed``."""
+    """Hold the checks of one arm, made with ``samples`` random configurations from ``seed``."""
 
     means: str
     samples: int
@@ -43,7 +43,7 @@ class Verification:
 
     @property
     def agrees(self) -> bool:
-        """Whether nothing that was found contradicts what was derived."""
+        """Whether no result contradicts what was derived."""
         return not self.differences
 
     @property
@@ -55,12 +55,12 @@ class Verification:
         return f"<Verification: {len(self.checks)} checks, {len(self.differences)} of them differ>"
 
     def _repr_html_(self) -> str:
-        rows = tuple((each.fact, each.derived, each.found, each.verdict) for each in self.checks)
+        rows = [(check.fact, check.derived, check.found, check.verdict) for check in self.checks]
         head = ("fact", "derived", "found", "")
-        return Listing(f"Verified by {self.means}", head, rows, left=(0, 1, 2, 3)).html()
+        return Listing(f"Verified by {self.means}", head, tuple(rows), left=(0, 1, 2, 3)).html()
 
-    def to_dict(self) -> dict[str, Any]:
-        """A JSON object; ``checks`` in the order they were made."""
+    def to_dict(self) -> dict[str, object]:
+        """Return a JSON object; ``checks`` in the order they were made."""
         return {
             "agrees": self.agrees,
             "means": self.means,
@@ -70,7 +70,7 @@ class Verification:
         }
 
     def text(self, width: int = 80) -> str:
-        """A paragraph for a terminal ``width`` columns wide: one line or more for every check."""
+        """Return a paragraph for a terminal ``width`` columns wide: one line or more for every check."""
         lines = textwrap.wrap(f"Verified by {self.means}", width)
         for check in self.checks:
             mark = f"  {_MARKS[check.verdict]:<7} "
@@ -80,6 +80,8 @@ class Verification:
         return "\n".join(lines)
 
 
-def size_told(size: float) -> str:
-    """The order of magnitude of an error: ``3e-12``, or ``0``."""
-    return f"{size:.0e}" if size else "0"
+def size_text(size: float) -> str:
+    """Return the order of magnitude of an error: ``3e-12``, or ``0``."""
+    if not size:
+        return "0"
+    return f"{size:.0e}"
