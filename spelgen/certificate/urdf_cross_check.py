@@ -215,7 +215,7 @@ def _check_loads(robot: Robot, arm: Arm, reading: _Reading, rounded: Roundings) 
         ours = turn @ pseudo_inertia(body.inertia or (0,) * 10) @ turn.T
         # a metre of lever counts as much as the body's reach: one measure for mass, moment and tensor
         scale = np.array([load.reach, load.reach, load.reach, 1.0])
-        error = float(np.linalg.norm((ours - load.pseudo) / np.outer(scale, scale))) / load.mass
+        error = float(np.abs((ours - load.pseudo) / np.outer(scale, scale)).max()) / load.mass
         angle = 0.0
         for name in _carried(robot, arm, robot.joint[body.name]):
             angle = max(angle, _rounding_angle(robot.path_to(name), rounded, robot.link[name]))
