@@ -1,4 +1,4 @@
-"""What a user reads when something is wrong: one exception per subject; diagnostics stop nothing."""
+"""Errors as a user reads them: one exception per subject; diagnostics stop nothing."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 Severity = Literal["info", "warning"]
-_TOLD_AT_MOST = 50
+LONGEST_LIST = 50  # errors of one pass that are printed
 
 
 class SpelgenError(Exception):
@@ -38,9 +38,11 @@ class SpelgenError(Exception):
 
     def __str__(self) -> str:
         statement = self.got if self.expected is None else f"got {self.got}, expected {self.expected}"
-        place = ":".join(str(part) for part in (self.file, self.line) if part is not None)
-        told = ": ".join(part for part in (place, self.element, statement) if part)
-        return told if self.do is None else f"{told}; {self.do}"
+        place = ":".join(str(x) for x in (self.file, self.line) if x is not None)
+        message = ": ".join(x for x in (place, self.element, statement) if x)
+        if self.do is not None:
+            message += f"; {self.do}"
+        return message
 
 
 class UrdfError(SpelgenError):
@@ -83,22 +85,23 @@ class SpelgenErrors(SpelgenError):
         self.errors = tuple(errors)
 
     def __str__(self) -> str:
-        alike: dict[tuple[object, ...], list[SpelgenError]] = {}
+        groups: dict[tuple[object, ...], list[SpelgenError]] = {}
         for error in self.errors:
-            alike.setdefault((error.line, error.element, error.got, error.expected, error.do), []).append(
-                error
-            )
-        told = [_told_once(group) for group in list(alike.values())[:_TOLD_AT_MOST]]
-        left = len(alike) - len(told)
-        return "\n".join(told + ([f"and {left} more like these"] if left else []))
+            key = (error.line, error.element, error.got, error.expected, error.do)
+            groups.setdefault(key, []).append(error)
+        lines = [_once(group) for group in list(groups.values())[:LONGEST_LIST]]
+        if len(groups) > LONGEST_LIST:
+            lines.append(f"and {len(groups) - LONGEST_LIST} more like these")
+        return "\n".join(lines)
 
 
-def _told_once(alike: Sequence[SpelgenError]) -> str:
-    """The first of errors that differ in their files alone, and the files of the others."""
-    others = dict.fromkeys(error.file for error in alike[1:] if error.file and error.file != alike[0].file)
-    if not others:
-        return str(alike[0])
-    return f"{alike[0]}\n  the same: {shortened(list(others), 5)}"
+def _once(alike: Sequence[SpelgenError]) -> str:
+    """Return the first of errors that differ in their files alone, and the files of the others."""
+    first = alike[0]
+    files = dict.fromkeys(error.file for error in alike if error.file and error.file != first.file)
+    if not files:
+        return str(first)
+    return f"{first}\n  the same: {shortened(list(files), 5)}"
 
 
 def collect(errors: Sequence[SpelgenError]) -> None:
@@ -109,20 +112,24 @@ def collect(errors: Sequence[SpelgenError]) -> None:
         raise SpelgenErrors(errors)
 
 
-def suggestion(name: str, known: Iterable[str]) -> str:
-    """Return what to tell someone who wrote ``name``: the nearest ``known`` name, or the first ten."""
-    names = list(known)
+def suggestion(name: str, names: Iterable[str]) -> str:
+    """Return a hint for someone who wrote ``name``: the nearest of the known ``names``, or the first ten."""
+    names = list(names)
     nearest = get_close_matches(name, names, n=1)
     if nearest:
         return f"did you mean {nearest[0]!r}?"
-    listed = ", ".join(repr(each) for each in names[:10])
-    return f"known are {listed}" + (f" and {len(names) - 10} more" if len(names) > 10 else "")
+    hint = f"known are {', '.join(map(repr, names[:10]))}"
+    if len(names) > 10:
+        hint += f" and {len(names) - 10} more"
+    return hint
 
 
-def shortened(names: Sequence[str], most: int) -> str:
-    """The names, or the first ``most`` of them and how many more there are."""
-    left = len(names) - most
-    return ", ".join(names if left <= 1 else [*names[:most], f"and {left} more"])
+def shortened(names: Sequence[str], limit: int) -> str:
+    """Return the names, or the first ``limit`` of them and how many more there are."""
+    rest = len(names) - limit
+    if rest <= 1:
+        return ", ".join(names)
+    return ", ".join([*names[:limit], f"and {rest} more"])
 
 
 @dataclass(frozen=True)
@@ -135,6 +142,6 @@ class Diagnostic:
     line: int | None
     message: str
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the five fields as a JSON object, in the order of the public contract."""
         return asdict(self)

@@ -13,18 +13,18 @@ def require_own_module(module: Path, urdf: Path) -> None:
     """Raise RunError unless the module is what its facts and the URDF beside it give, by this version of spelgen."""
     source = read_source(module)
     facts = parse_facts(source, module)
-    why, keeps = (
-        "there is no URDF beside it to write it anew from",
-        "; fit(arm=...) and train --robot keep one",
-    )
-    if urdf.is_file():
+    hint = ""
+    if not urdf.is_file():
+        reason = "there is no URDF beside it to write it anew from"
+        hint = "; fit(arm=...) and train --robot keep one"
+    else:
         try:
             if rebuilt(facts, urdf) == source:
                 return
-            keeps, why = "", "it is not what spelgen writes for the URDF beside it"
+            reason = "it is not what spelgen writes for the URDF beside it"
         except SpelgenError as error:
-            keeps, why = "", f"it cannot be written anew ({error})"
+            reason = f"it cannot be written anew ({error})"
     raise RunError(
-        f"a module that may do anything when it is run: {why}", file=module,
-        do="read it, then say --trust (in Python: trust=True), or build it again and start a new run" + keeps,
+        f"a module that may do anything when it is run: {reason}", file=module,
+        do="read it, then say --trust (in Python: trust=True), or build it again and start a new run" + hint,
     )  # fmt: skip

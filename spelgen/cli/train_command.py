@@ -32,45 +32,53 @@ if TYPE_CHECKING:
     from spelgen.settings.log_mapping import LogMapping
 
 
+TrainModule = Annotated[
+    Path | None,
+    typer.Argument(
+        metavar="MODULE.py",
+        help="A module of `spelgen build`; with --resume, a run will do.",
+        show_default=False,
+    ),
+]
+NewRun = Annotated[
+    Path | None, typer.Option("-o", "--output", metavar="RUN", help="Run folder; default: runs/<module>.")
+]
+Resume = Annotated[bool, typer.Option("--resume", help="Go on with the run in the run folder.")]
+Source = Annotated[
+    Path | None,
+    typer.Option("--from", metavar="RUN", help="Begin from a run; no MODULE. Torques adapt it."),
+]
+ObjectiveName = Annotated[
+    Objective | None,
+    typer.Option(help="Default: of rigid bodies torque, else rollout, after momentum steps."),
+]
+Assignments = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Set an option of the fit: epochs=50, seed=1, device=cuda; once for each.",
+    ),
+]
+MaxMinutes = Annotated[float | None, typer.Option(min=0.0, help="End the fit to windows after so long.")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="Show no progress.")]
+
+
 def train(
-    module: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="MODULE.py",
-            help="A module of `spelgen build`; with --resume, a run will do.",
-            show_default=False,
-        ),
-    ] = None,
+    module: TrainModule = None,
     more: MoreData = None,
     data: Data = None,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="RUN", help="Run folder; default: runs/<module>.")
-    ] = None,
+    output: NewRun = None,
     robot: RobotOption = None,
     mapping: Mapping = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in the run folder.")] = False,
+    resume: Resume = False,
     force: Force = False,
     trust: Trust = False,
-    source: Annotated[
-        Path | None,
-        typer.Option("--from", metavar="RUN", help="Begin from a run; no MODULE. Torques adapt it."),
-    ] = None,
-    objective: Annotated[
-        Objective | None,
-        typer.Option(help="Default: of rigid bodies torque, else rollout, after momentum steps."),
-    ] = None,
-    assignments: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="KEY=VALUE",
-            help="Set an option of the fit: epochs=50, seed=1, device=cuda; once for each.",
-        ),
-    ] = None,
-    max_minutes: Annotated[
-        float | None, typer.Option(min=0.0, help="End the fit to windows after so long.")
-    ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Show no progress.")] = False,
+    source: Source = None,
+    objective: ObjectiveName = None,
+    assignments: Assignments = None,
+    max_minutes: MaxMinutes = None,
+    quiet: Quiet = False,
 ) -> None:
     """Fit a module to logs.
 

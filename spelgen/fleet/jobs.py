@@ -194,11 +194,13 @@ def _judged(job: Job, run: RunFolder) -> RunResult:
     for every run anew.
     """
     logs = read_test_logs(job.folder, job.test, job.mapping)
-    results = evaluate(load_run(job.folder), logs).to_dict()
+    results = evaluate(load_run(job.folder), logs)
     keep_baseline(run.path, job.train)
-    write_json(run.evaluation, results)
-    errors = {}
-    for horizon in results["horizons"]:
-        errors[horizon["name"]] = {x: e["mean_relative_rms"] for x, e in horizon["errors"].items()}
-    torque = {name: error["mean_nmse"] for name, error in results["torque"].items()}
+    write_json(run.evaluation, results.to_dict())
+    errors: dict[str, dict[str, float | None]] = {}
+    for horizon in results.horizons:
+        errors[horizon.name] = {}
+        for predictor, error in horizon.errors.items():
+            errors[horizon.name][predictor] = error.mean_relative_rms
+    torque = {predictor: error.mean_nmse for predictor, error in results.torque.items()}
     return {"errors": errors, "torque": torque}

@@ -14,8 +14,8 @@ from markupsafe import Markup
 from spelgen.arm.arm import Arm, Coordinate
 from spelgen.baselines.names import MODEL
 from spelgen.certificate.facts import facts
-from spelgen.certificate.formula_text import to_dict
 from spelgen.certificate.formulas import formulas
+from spelgen.certificate.printing import Text
 from spelgen.labels import entry_name, joint_ranges, joints_in_ranges
 from spelgen.render.page import json_data
 from spelgen.render.plots import Record, numbers
@@ -66,7 +66,7 @@ def matrix(arm: Arm, structure: Structure) -> list[list[Cell]]:
 def _explanations(arm: Arm, structure: Structure) -> dict[str, str]:
     """Return by the name of an entry what it is, the facts that name it, and its formula."""
     every_fact = facts(arm, structure)
-    closed = {entry["name"]: entry for entry in to_dict(formulas(arm, structure))["entries"]}
+    closed = {formula.name: formula for formula in formulas(arm, structure).rows}
     explanations = {}
     for entry in structure.entries:
         name = entry_name(entry.row, entry.column)
@@ -76,10 +76,10 @@ def _explanations(arm: Arm, structure: Structure) -> dict[str, str]:
         if entry.kind == "varying":
             lines += [str(x) for x in every_fact if x.statement.startswith("M does not depend")]
         formula = closed[name]
-        if formula["expression"]:
-            lines.append(f"{name} = {formula['expression']}")
+        if formula.expression is not None:
+            lines.append(f"{name} = {Text().whole(formula.expression)}")
         elif entry.kind != "zero":
-            terms = formula["terms"] or "too many"
+            terms = formula.terms or "too many"
             lines.append(f"Its formula has {terms} terms: `spelgen inspect --entry` writes it.")
         explanations[name] = "\n".join(lines)
     return explanations

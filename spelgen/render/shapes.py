@@ -98,7 +98,8 @@ def _mesh(geometry: yourdfpy.Geometry, model: yourdfpy.URDF) -> Trimesh:
         box: Trimesh = trimesh.creation.box(extents=geometry.box.size)
         return box
     if geometry.cylinder is not None:
-        return trimesh.creation.cylinder(geometry.cylinder.radius, geometry.cylinder.length, sections=12)
+        radius, length = geometry.cylinder.radius, geometry.cylinder.length
+        return trimesh.creation.cylinder(radius, length, sections=12)
     if geometry.sphere is not None:
         sphere: Trimesh = trimesh.creation.uv_sphere(geometry.sphere.radius, count=[8, 10])
         return sphere

@@ -5,7 +5,7 @@ A group of keys that one step alone reads refuses that step alone.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -19,7 +19,7 @@ from spelgen.settings.messages import explain, unknown_name
 from spelgen.settings.simulation import SimulationSettings, TrackingSettings
 from spelgen.settings.training import TrainingSettings
 from spelgen.settings.values import Group, Number
-from spelgen.settings.yaml_document import Document, read_document
+from spelgen.settings.yaml_document import Document, Location, read_document
 
 GroupType = TypeVar("GroupType", bound=BaseModel)
 OF_A_STEP = ("simulation", "tracking", "training", "comparison", "logs")
@@ -27,7 +27,7 @@ OF_A_STEP = ("simulation", "tracking", "training", "comparison", "logs")
 
 
 class Unusable:
-    """In the place of a group that cannot be read: whoever reads it is told why."""
+    """Stand in the place of a group that cannot be read: whoever reads it gets the errors."""
 
     def __init__(self, errors: Sequence[SettingsError]) -> None:
         self.errors = tuple(errors)
@@ -74,14 +74,15 @@ class Settings(Group):
 
     @property
     def diagnostics(self) -> tuple[Diagnostic, ...]:
-        """Warnings of groups that cannot be read: the steps that need them will stop."""
-        groups = [getattr(self, name) for name in OF_A_STEP]
-        return tuple(
-            Diagnostic("warning", "unusable-settings", "settings", None, str(error))
-            for group in groups
-            if isinstance(group, Unusable)
-            for error in group.errors
-        )
+        """Return warnings of groups that cannot be read: the steps that need them will stop."""
+        diagnostics = []
+        for name in OF_A_STEP:
+            group = getattr(self, name)
+            if isinstance(group, Unusable):
+                for error in group.errors:
+                    message = str(error)
+                    diagnostics.append(Diagnostic("warning", "unusable-settings", "settings", None, message))
+        return tuple(diagnostics)
 
     def joint(self, name: str) -> JointSettings:
         """Return the settings of a joint, the defaults when the file does not list it."""
@@ -104,19 +105,21 @@ def load_settings(urdf_path: Path | str, joints: Iterable[str] | None = None) ->
     document = read_document(path)
     content = document.value()
     known = None if joints is None else list(joints)
-    apart = [name for name in OF_A_STEP if isinstance(content, dict) and name in content]
-    parts = {name: {name: content.pop(name)} for name in apart}
+    groups: dict[str, object] = {}
+    step_errors: list[SettingsError] = []
+    for name in OF_A_STEP:
+        if isinstance(content, dict) and name in content:
+            settings, errors = _read(document, {name: content.pop(name)}, known)
+            groups[name] = Unusable(errors) if errors else getattr(settings, name)
+            step_errors += errors
     settings, errors = _read(document, content, known)
-    groups: dict[str, Any] = {}
-    of_steps: list[SettingsError] = []
-    for name, part in parts.items():
-        read, wrong = _read(document, part, known)
-        groups[name] = Unusable(wrong) if wrong else getattr(read, name)
-        of_steps += wrong
-    collect(errors and [*errors, *of_steps])
-    if settings.input == "position" and not isinstance(groups.get("logs"), Unusable):
-        groups["logs"] = groups.get("logs", settings.logs).model_copy(update={"input": "position"})
-    return settings.model_copy(update=groups)
+    if errors:
+        collect([*errors, *step_errors])
+    settings = settings.model_copy(update=groups)
+    if settings.input == "position" and not isinstance(settings.logs, Unusable):
+        logs = settings.logs.model_copy(update={"input": "position"})
+        settings = settings.model_copy(update={"logs": logs})
+    return settings
 
 
 def load_mapping(path: Path | str, joints: Iterable[str]) -> LogMapping:
@@ -132,23 +135,33 @@ def load_mapping(path: Path | str, joints: Iterable[str]) -> LogMapping:
     return mapping
 
 
-def _read(document: Document, content: Any, known: list[str] | None) -> tuple[Settings, list[SettingsError]]:
-    """The settings in ``content``, and what is wrong with them; the defaults where they cannot be read."""
+def _read(
+    document: Document, content: object, known: list[str] | None
+) -> tuple[Settings, list[SettingsError]]:
+    """Return the settings in ``content``, the defaults where they cannot be read, and what is wrong with them."""
     settings, errors = _validated(document, content, Settings)
-    if known is None:
-        return settings, errors
-    spoken: list[tuple[tuple[Any, ...], str]] = [(("joints", name), name) for name in settings.joints]
-    spoken += [(("simulation", "positions", name), name) for name in settings.simulation.positions or ()]
-    spoken += [(("logs", "joints", name), name) for name in settings.logs.joints]
-    for number, coupling in enumerate(settings.couplings):
-        spoken += [(("couplings", number, "joints", at), name) for at, name in enumerate(coupling.joints)]
-    unknown = [(location, name) for location, name in spoken if name not in known]
-    errors += [unknown_name(location, "joint", name, known, document) for location, name in unknown]
+    if known is not None:
+        for location, name in _joint_names(settings):
+            if name not in known:
+                errors.append(unknown_name(location, "joint", name, known, document))
     return settings, errors
 
 
+def _joint_names(settings: Settings) -> Iterator[tuple[Location, str]]:
+    """Yield the places in a file that name a joint, and the names."""
+    for name in settings.joints:
+        yield ("joints", name), name
+    for name in settings.simulation.positions or ():
+        yield ("simulation", "positions", name), name
+    for name in settings.logs.joints:
+        yield ("logs", "joints", name), name
+    for number, coupling in enumerate(settings.couplings):
+        for index, name in enumerate(coupling.joints):
+            yield ("couplings", number, "joints", index), name
+
+
 def _validated(
-    document: Document, content: Any, group: type[GroupType]
+    document: Document, content: object, group: type[GroupType]
 ) -> tuple[GroupType, list[SettingsError]]:
     try:
         return group.model_validate({} if content is None else content), []
