@@ -99,7 +99,8 @@ def _mesh(geometry: yourdfpy.Geometry, model: yourdfpy.URDF) -> Trimesh:
         return box
     if geometry.cylinder is not None:
         radius, length = geometry.cylinder.radius, geometry.cylinder.length
-        return trimesh.creation.cylinder(radius, length, sections=12)
+        cylinder: Trimesh = trimesh.creation.cylinder(radius, length, sections=12)
+        return cylinder
     if geometry.sphere is not None:
         sphere: Trimesh = trimesh.creation.uv_sphere(geometry.sphere.radius, count=[8, 10])
         return sphere
