@@ -1,0 +1,121 @@
+"""docs/extending.md is followed: a preset, a log format, a baseline and an exporter are added, each
+where the page says, and work."""
+
+import inspect
+import re
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import spelgen
+from spelgen import design, pipeline
+from spelgen.baselines import registry
+from spelgen.baselines.baseline import Baseline
+from spelgen.baselines.predictor import Predictor
+from spelgen.emission.loading import load_module
+from spelgen.errors import RunError
+from spelgen.exporting import exported
+from spelgen.loaded_arm import load_arm
+from spelgen.logs import formats
+from spelgen.logs.read import read_logs
+from spelgen.logs.tables import LogFormat
+from spelgen.logs.trajectory import Trajectory
+
+ROOT = Path(__file__).parents[1]
+JOINTS = ["joint1", "joint2"]
+
+
+def places(thing: str) -> list[str]:
+    """The files that the page names for it."""
+    page = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
+    row = next(line for line in page.splitlines() if line.startswith(f"| {thing} |"))
+    return re.findall(r"`(spelgen/[\w/]+\.(?:py|yaml))`", row.split("|")[2])
+
+
+def stands_in(thing: str, module) -> bool:
+    """Whether the page sends there, and to one more file at most."""
+    named = places(thing)
+    return str(Path(inspect.getfile(module)).relative_to(ROOT)) in named and len(named) <= 2
+
+
+@pytest.fixture
+def log():
+    t = np.arange(400) / 100
+    q = np.stack([np.sin(t), np.cos(2 * t)], axis=1)
+    qd = np.stack([np.cos(t), -2 * np.sin(2 * t)], axis=1)
+    return Trajectory(t=t, q=q, qd=qd, tau=np.cos(3 * q))
+
+
+def test_a_preset(robots, tmp_path, monkeypatch):
+    assert stands_in("a preset", design)
+    presets = tmp_path / "presets"
+    shutil.copytree(design.PRESETS, presets)
+    text = (presets / "minimal.yaml").read_text(encoding="utf-8")
+    (presets / "toy.yaml").write_text(text.replace("dissipation: per-joint", "dissipation: dense-n"))
+    monkeypatch.setattr(design, "PRESETS", presets)
+    for module in (design, pipeline):
+        monkeypatch.setattr(module, "PRESET_NAMES", (*design.PRESET_NAMES, "toy"))
+    path = tmp_path / "toy.py"
+    path.write_text(pipeline.generate(robots / "two_link.urdf", "toy"), encoding="utf-8")
+    model = load_module(path)
+    q = torch.zeros(1, 2, dtype=torch.float64)
+    assert model.facts.options.preset == "toy"
+    assert model.dissipation(q, q)[0, 0, 1] != 0  # not of each joint by itself
+
+
+def test_a_log_format(tmp_path, monkeypatch, log):
+    assert stands_in("a log format", formats)
+
+    def read(path, joints, mapping):
+        path.with_suffix(".csv").write_text(path.read_text().replace(";", ","))
+        return formats.read_tables(path.with_suffix(".csv"), joints, mapping)
+
+    monkeypatch.setattr(formats, "FORMATS", [*formats.FORMATS, LogFormat(read, suffixes=(".toy",))])
+    spelgen.write_logs(tmp_path / "log.csv", [log], JOINTS)
+    text = (tmp_path / "log.csv").read_text()
+    (tmp_path / "log.csv").unlink()
+    (tmp_path / "log.toy").write_text(text.replace(",", ";"))
+    (read_back,) = read_logs([tmp_path / "log.toy"], JOINTS)
+    np.testing.assert_allclose(read_back.q, log.q)
+
+
+def test_a_baseline(robots, monkeypatch, log):
+    assert stands_in("a baseline", registry)
+
+    class StandsStill(Baseline):
+        def predictors(self, judged):
+            def still(windows):
+                later = windows.dt.shape[1]
+                q = windows.q[:, :1].expand(-1, later, -1)
+                return q, 0 * q
+
+            return [Predictor("stands still", still)]
+
+    for user in ("spelgen.evaluation.evaluate", "spelgen.baselines.keep"):
+        monkeypatch.setattr(f"{user}.BASELINES", (*registry.BASELINES, StandsStill()))
+    results = spelgen.evaluate(spelgen.build(load_arm(robots / "two_link.urdf"), "spel", width=4), log)
+    error = results.horizons[-1].errors["stands still"].mean_relative_rms
+    assert error == pytest.approx(1, rel=0.2)  # 1: as if the arm had stood still
+    assert "stands still" in results.text()
+
+
+def test_an_export(robots, tmp_path, monkeypatch):
+    assert stands_in("an export", exported)
+    (tmp_path / "toy_export.py").write_text(
+        "from spelgen.exporting.exported import Exported\n"
+        "def export_toy(trained):\n"
+        "    return Exported('toy', 'two_link', {'names.txt': ' '.join(trained.model.joint_names).encode()}, ())\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    arm = load_arm(robots / "two_link.urdf")
+    model = spelgen.build(arm, "closed-form")
+    with pytest.raises(RunError, match="the format 'toy'"):
+        spelgen.export(model, "toy", arm=arm)
+    monkeypatch.setitem(exported.EXPORTERS, "toy", exported.Exporter("toy_export:export_toy"))
+    spelgen.export(model, "toy", tmp_path / "out", arm=arm)
+    assert (tmp_path / "out" / "names.txt").read_text() == "joint1 joint2"
+    del sys.modules["toy_export"]
