@@ -62,6 +62,8 @@ def test_a_preset(robots, tmp_path, monkeypatch):
     path = tmp_path / "toy.py"
     path.write_text(pipeline.generate(robots / "two_link.urdf", "toy"), encoding="utf-8")
     model = load_module(path)
+    for parameter in model.parameters():
+        torch.nn.init.normal_(parameter)
     q = torch.zeros(1, 2, dtype=torch.float64)
     assert model.facts.options.preset == "toy"
     assert model.dissipation(q, q)[0, 0, 1] != 0  # not of each joint by itself
