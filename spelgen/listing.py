@@ -1,4 +1,4 @@
-"""Tables of text and of HTML: the same rows for a terminal, a file, a page and a notebook.
+"""Lay out tables as text and as HTML: the same rows for a terminal, a file, a page and a notebook.
 
 Rich lays them out. Its console is told all that it would else ask the terminal and the environment for (width,
 colours, notebook), so that the same rows give the same text wherever they go.
@@ -14,16 +14,16 @@ from html import escape
 from typing import Literal
 
 WIDTH = 80
-SHORTEST = (
-    8  # characters of a name in one line; a longer name goes on in the next where a table would be too wide
-)
-HEAD = 14  # likewise of a column's name
+SHORTEST = 8
+"""Characters of a name in one line; a longer name goes on in the next where a table would be too wide."""
+HEAD = 14
+"""The same of a column's name."""
 SEPARATOR = re.compile(r"(?<=[_\-/. ])(?<!\d\.)(?!s\))")  # after it a name may go on in the next line
 
 
 @dataclass(frozen=True)
 class Listing:
-    """A table with a name in the first column; the columns in `left` are aligned to the left, others to the right.
+    """Hold a table with a name in the first column; the columns in `left` are aligned to the left, others to the right.
 
     text(): a title, the head and the rows, indented by two, then the note, wrapped. Where a table does not fit 80
     columns its names are folded, numbers never are; and it is cut, where words would be. html(): the same for
@@ -37,103 +37,135 @@ class Listing:
     left: tuple[int, ...] = (0,)
 
     def text(self) -> str:
-        """For a terminal or a file, without a line end."""
+        """Return the table for a terminal or a file, without a line end."""
+        tables = "\n\n".join(table._layout() for table in self._cut())
         note = textwrap.wrap(self.note, WIDTH - 2, initial_indent="  ", subsequent_indent="  ")
-        lines = "\n\n".join("\n".join(part._lines()) for part in self._parts())
-        return "\n".join([*textwrap.wrap(self.title, WIDTH), lines, *note])
+        return "\n".join([*textwrap.wrap(self.title, WIDTH), tables, *note])
 
     def html(self) -> str:
-        """For a notebook."""
-        title = f"<p><b>{escape(self.title)}</b></p>" if self.title else ""
-        note = f"<p>{escape(self.note)}</p>" if self.note else ""
-        rows = "".join(self._row(row, "td") for row in self.rows)
-        return f"{title}<table><thead>{self._row(self.head, 'th')}</thead><tbody>{rows}</tbody></table>{note}"
+        """Return the table for a notebook."""
+        lines = []
+        if self.title:
+            lines.append(f"<p><b>{escape(self.title)}</b></p>")
+        lines += ["<table><thead>", self._html_row(self.head, "th"), "</thead><tbody>"]
+        for row in self.rows:
+            lines.append(self._html_row(row, "td"))
+        lines.append("</tbody></table>")
+        if self.note:
+            lines.append(f"<p>{escape(self.note)}</p>")
+        return "".join(lines)
 
-    def _head(self) -> tuple[str, ...]:
-        """The head, its names folded where the table would be too wide."""
-        needed = [max((_wide(row[k]) for row in self.rows), default=0) for k in range(len(self.head))]
-        if sum(2 + max(_wide(name), width) for name, width in zip(self.head, needed, strict=True)) <= WIDTH:
-            return self.head
-        folded = (_folded(x, max(HEAD, width)) for x, width in zip(self.head[1:], needed[1:], strict=True))
-        return (self.head[0], *folded)
-
-    def _widths(self) -> list[int]:
-        """Of the columns under that head."""
-        columns = zip(self._head(), *self.rows, strict=True)
-        return [max(_wide(line) for cell in column for line in cell.split("\n")) for column in columns]
-
-    def _parts(self) -> list[Listing]:
-        """The same columns in as many tables as it takes to leave room for the words in the names of rows."""
-        widths = [2 + width for width in self._widths()]
-        words = (_wide(word) for row in self.rows for word in SEPARATOR.split(row[0]))
-        most = WIDTH - 2 - max(SHORTEST, *words, 0)
-        if sum(widths[1:]) <= most or len(widths) == 2:
-            return [self]
-        parts: list[list[int]] = [[]]
-        for k in range(1, len(widths)):
-            if parts[-1] and sum(widths[j] for j in (*parts[-1], k)) > most:
-                parts.append([])
-            parts[-1].append(k)
-        return [
-            replace(
-                self, head=(self.head[0], *(self.head[k] for k in part)),
-                rows=tuple((row[0], *(row[k] for k in part)) for row in self.rows),
-                left=tuple(j + 1 for j, k in enumerate(part) if k in self.left) + ((0,) if 0 in self.left else ()),
-            )
-            for part in parts
-        ]  # fmt: skip
-
-    def _row(self, cells: tuple[str, ...], tag: str) -> str:
-        sides = ["left" if k in self.left else "right" for k in range(len(cells))]
-        text = "".join(
-            f'<{tag} style="text-align: {side}">{escape(cell)}</{tag}>'
-            for side, cell in zip(sides, cells, strict=True)
-        )
+    def _html_row(self, cells: tuple[str, ...], tag: str) -> str:
+        text = ""
+        for column, cell in enumerate(cells):
+            text += f'<{tag} style="text-align: {self._side(column)}">{escape(cell)}</{tag}>'
         return f"<tr>{text}</tr>"
 
-    def _lines(self) -> list[str]:
+    def _side(self, column: int) -> Literal["left", "right"]:
+        if column in self.left:
+            return "left"
+        return "right"
+
+    def _head(self) -> list[str]:
+        """Return the head, its names folded where the table would be too wide."""
+        widths = [0] * len(self.head)
+        for row in self.rows:
+            widths = [max(width, _wide(cell)) for width, cell in zip(widths, row, strict=True)]
+        total = 0
+        folded = [self.head[0]]
+        for name, width in zip(self.head, widths, strict=True):
+            total += 2 + max(_wide(name), width)
+        if total <= WIDTH:
+            return list(self.head)
+        for name, width in zip(self.head[1:], widths[1:], strict=True):
+            folded.append(_folded(name, max(HEAD, width)))
+        return folded
+
+    def _widths(self) -> list[int]:
+        """Return the widths of the columns under that head."""
+        widths = []
+        for column in zip(self._head(), *self.rows, strict=True):
+            lines = "\n".join(column).split("\n")
+            widths.append(max(map(_wide, lines)))
+        return widths
+
+    def _cut(self) -> list[Listing]:
+        """Return the same columns in as many tables as leave room for the words in the names of rows."""
+        longest_word = SHORTEST
+        for row in self.rows:
+            longest_word = max(longest_word, *map(_wide, SEPARATOR.split(row[0])))
+        room = WIDTH - 2 - longest_word
+        groups: list[list[int]] = [[]]
+        used = 0
+        for column, width in enumerate(self._widths()):
+            if column == 0:
+                continue
+            if groups[-1] and used + 2 + width > room:
+                groups.append([])
+                used = 0
+            groups[-1].append(column)
+            used += 2 + width
+        return [self._columns([0, *group]) for group in groups]
+
+    def _columns(self, columns: list[int]) -> Listing:
+        """Return the table of these columns alone."""
+        rows = []
+        for row in self.rows:
+            rows.append(tuple(row[column] for column in columns))
+        head = tuple(self.head[column] for column in columns)
+        left = tuple(columns.index(column) for column in self.left if column in columns)
+        return replace(self, head=head, rows=tuple(rows), left=left)
+
+    def _layout(self) -> str:
         from rich.console import Console  # here: `--help` and `import spelgen` stay fast
         from rich.table import Table
         from rich.text import Text
 
-        head, widths = self._head(), self._widths()
-        lines = [head, *self.rows]
-        widths[0] = min(widths[0], SHORTEST)
+        widths = self._widths()
+        room = max(SHORTEST, WIDTH - 2 * len(widths) - sum(widths[1:]))
+        widths[0] = min(widths[0], SHORTEST)  # names may be folded, numbers never are
         table = Table(box=None, show_header=False, padding=(0, 0, 0, 2))
-        for k, width in enumerate(widths):
-            side: Literal["left", "right"] = "left" if k in self.left else "right"
-            table.add_column(justify=side, overflow="fold", min_width=width, no_wrap=k > 0)
-        room = max(SHORTEST, WIDTH - sum(2 + width for width in widths[1:]) - 2)
-        for line in lines:
-            table.add_row(*map(Text, (_folded(line[0], room), *line[1:])))
+        for column, width in enumerate(widths):
+            table.add_column(justify=self._side(column), overflow="fold", min_width=width, no_wrap=column > 0)
+        for name, *cells in (self._head(), *self.rows):
+            table.add_row(Text(_folded(name, room)), *map(Text, cells))
         file = io.StringIO()
+        width = max(WIDTH, sum(widths) + 2 * len(widths))
         console = Console(
-            file=file, width=max(WIDTH, sum(widths) + 2 * len(widths)), color_system=None, force_terminal=False,
-            force_jupyter=False, legacy_windows=False, _environ={},
-        )  # fmt: skip
+            file=file,
+            width=width,
+            color_system=None,
+            force_terminal=False,
+            force_jupyter=False,
+            legacy_windows=False,
+            _environ={},
+        )
         console.print(table, crop=False)
-        return [line.rstrip() for line in file.getvalue().rstrip("\n").split("\n")]
+        lines = [line.rstrip() for line in file.getvalue().rstrip("\n").split("\n")]
+        return "\n".join(lines)
 
 
 def _wide(text: str) -> int:
-    """The characters of a terminal that a text takes."""
+    """Return the characters of a terminal that a text takes."""
     from rich.cells import cell_len
 
     return cell_len(text)
 
 
 def _folded(name: str, width: int) -> str:
-    """The name with line breaks after its separators where it is longer than the width."""
+    """Return the name with line breaks after its separators where it is longer than the width."""
     lines = [""]
-    for part in SEPARATOR.split(name):
-        if lines[-1] and len(lines[-1]) + len(part) > width:
+    for word in SEPARATOR.split(name):
+        if lines[-1] and len(lines[-1]) + len(word) > width:
             lines.append("")
-        lines[-1] += part
+        lines[-1] += word
     return "\n".join(lines)
 
 
 def number(value: float | None) -> str:
-    """Three significant digits; a dash for what is not known."""
+    """Return three significant digits; a dash for what is not known."""
     if value is None:
         return "-"
-    return f"{value:.3g}" if value == 0 or 1e-3 <= abs(value) < 1e4 else f"{value:.2e}"
+    if value == 0 or 1e-3 <= abs(value) < 1e4:
+        return f"{value:.3g}"
+    return f"{value:.2e}"

@@ -1,12 +1,11 @@
-"""A derived structure as people and programs read it: text of a given width, and the JSON contract (schema
-1).
-"""
+"""Present a derived structure as people and programs read it: text of a given width, and JSON (schema 1)."""
 
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from spelgen.arm.actuation import Actuation
 from spelgen.arm.arm import Arm, Coordinate
@@ -27,7 +26,7 @@ POSITION = "the springs of position servos: tau = clip(kp (u - q) - kd qd), whic
 
 @dataclass(frozen=True, repr=False)
 class Inspection:
-    """What ``spelgen inspect`` tells of an arm."""
+    """Hold what ``spelgen inspect`` says of an arm."""
 
     arm: Arm
     structure: Structure
@@ -37,19 +36,21 @@ class Inspection:
 
     @property
     def facts(self) -> tuple[Fact, ...]:
-        """What always holds, in plain words."""
+        """The facts that always hold, in plain words."""
         return facts(self.arm, self.structure)
 
     def closed_forms(self, entry: PlaceOfEntry | None = None, *, longest: int | None = None) -> Formulas:
-        """M and V, or one entry, as expressions; arguments and errors as for ``formulas.formulas.formulas``."""
+        """Return M and V, or one entry, as expressions; arguments and errors as for ``formulas.formulas.formulas``."""
         from spelgen.certificate.formulas import formulas
 
         return formulas(self.arm, self.structure, entry=entry, longest=longest)
 
-    def to_dict(self) -> dict[str, Any]:
-        """The JSON contract; names are the URDF's, rows and columns count from 1."""
+    def to_dict(self) -> dict[str, object]:
+        """Return the JSON contract; names are the URDF's, rows and columns count from 1."""
         structure = self.structure
-        n = len(structure.joints)
+        potential = "zero"
+        if structure.potential:
+            potential = "varying"
         return {
             "schema": SCHEMA,
             "robot": self.arm.name,
@@ -63,57 +64,46 @@ class Inspection:
                 "output_joints": [self._names(output.joints) for output in structure.outputs],
             },
             "potential_energy": {
-                "kind": "varying" if structure.potential else "zero",
+                "kind": potential,
                 "joints": self._names(structure.potential),
             },
-            "input_matrix": {
-                **({} if self.input == "torque" else self._position()),
-                "entries": [self._input(row, column) for row in range(n) for column in range(n)],
-            },
+            "input_matrix": self._input_matrix(),
             "base_parameters": structure.base_parameter_count,
             "facts": [fact.to_dict() for fact in self.facts],
             "diagnostics": [diagnostic.to_dict() for diagnostic in self.diagnostics],
         }
 
     def text(self, width: int = 80) -> str:
-        """A report for a terminal ``width`` columns wide."""
-        parts = [self._heading(), self._joint_table(), self._matrix(width), self._needs(width)]
-        parts += [self._in_words(width)] if self.facts else []
+        """Return a report for a terminal ``width`` columns wide."""
+        paragraphs = [self._heading(), self._joint_table(), self._matrix(width), self._needs(width)]
+        if self.facts:
+            paragraphs.append(_indented("In words", map(str, self.facts), width))
         if self.diagnostics:
-            parts.append(self._remarks(width))
-        return "\n\n".join(parts)
+            paragraphs.append(_indented("Remarks", map(_remark, self.diagnostics), width))
+        return "\n\n".join(paragraphs)
 
     def __repr__(self) -> str:
         needs = self.needs()
         return f"<Inspection of {self.arm.name!r}: {needs['M(q)'].split(' make ')[0]}, {needs['base']}>"
 
     def _repr_html_(self) -> str:
-        """The matrix, whole, for a notebook."""
+        """Return the whole matrix, for a notebook."""
         n = len(self.structure.joints)
-        cells = {(e.row, e.column): _cell(e) for e in self.structure.entries}
-        return Listing(
-            f"{self.arm.name}: mass matrix; joints each entry depends on, C constant, 0 always zero",
-            ("", *(str(column + 1) for column in range(n))),
-            tuple(
-                (
-                    f"{row + 1} {self.structure.joints[row]}",
-                    *(cells[max(row, k), min(row, k)] for k in range(n)),
-                )
-                for row in range(n)
-            ),
-            "; ".join(f"{name}: {need}" for name, need in self.needs().items()),
-        ).html()
+        cells = self._cells()
+        rows = []
+        for row, name in enumerate(self.structure.joints):
+            # M is symmetric: above the diagonal stand the entries below it
+            entries = [cells[max(row, column), min(row, column)] for column in range(n)]
+            rows.append((f"{row + 1} {name}", *entries))
+        title = f"{self.arm.name}: mass matrix; joints each entry depends on, C constant, 0 always zero"
+        head = ("", *map(str, range(1, n + 1)))
+        note = "; ".join(f"{name}: {need}" for name, need in self.needs().items())
+        return Listing(title, head, tuple(rows), note).html()
 
-    def _position(self) -> dict[str, Any]:
-        found = servo_rank(self.arm)
-        groups = [self._names(group) for group in found.groups]
-        left = [f"{name} of {self.structure.joints[joint]}" for name, joint in found.open]
-        return {"input": "position", "kp_in_ratio": groups, "with_inertia_only": left}
-
-    def _names(self, joints: tuple[int, ...]) -> list[str]:
+    def _names(self, joints: Iterable[int]) -> list[str]:
         return [self.structure.joints[joint] for joint in joints]
 
-    def _entry(self, entry: Entry) -> dict[str, Any]:
+    def _entry(self, entry: Entry) -> dict[str, object]:
         return {
             "row": entry.row + 1,
             "col": entry.column + 1,
@@ -121,127 +111,166 @@ class Inspection:
             "joints": self._names(entry.joints),
         }
 
-    def _input(self, row: int, column: int) -> dict[str, Any]:
-        found = [x for x in self.actuation.entries if (x.row, x.column) == (row, column)]
-        kind, value = (found[0].kind, found[0].value) if found else ("zero", 0.0)
-        return {"row": row + 1, "col": column + 1, "kind": kind, "value": value}
+    def _input_matrix(self) -> dict[str, object]:
+        n = len(self.structure.joints)
+        known = {(entry.row, entry.column): entry for entry in self.actuation.entries}
+        entries = []
+        for row in range(n):
+            for column in range(n):
+                cell: dict[str, object] = {"row": row + 1, "col": column + 1, "kind": "zero", "value": 0.0}
+                if (row, column) in known:
+                    cell["kind"] = known[row, column].kind
+                    cell["value"] = known[row, column].value
+                entries.append(cell)
+        if self.input == "torque":
+            return {"entries": entries}
+        rank = servo_rank(self.arm)
+        return {
+            "input": "position",
+            "kp_in_ratio": [self._names(group) for group in rank.groups],
+            "with_inertia_only": [f"{name} of {self.structure.joints[joint]}" for name, joint in rank.open],
+            "entries": entries,
+        }
 
-    def _determined(self) -> str:
-        """What logs of positions tell, by the rank of their equations."""
-        found = servo_rank(self.arm)
-        told = "logs of positions determine inertia, weight and friction in ratio to kp only"
-        known = [joints_in_ranges(group) for group in found.groups]
-        if len(known) == 1:
-            told += ": one kp, mass or load that is known tells all"
+    def _servo_needs(self) -> str:
+        """Return what logs of positions determine, by the rank of their equations."""
+        rank = servo_rank(self.arm)
+        text = f"{POSITION}; logs of positions determine inertia, weight and friction in ratio to kp only"
+        if len(rank.groups) == 1:
+            text += ": one kp, mass or load that is known tells all"
         else:
-            told += f": one kp, mass or load that is known tells those of {' or of '.join(known)}"
-        names: dict[str, list[int]] = {}
-        for name, joint in found.open:
-            names.setdefault(name, []).append(joint)
-        for name, joints in names.items():
-            told += f"; {name} of {joints_in_ranges(tuple(joints))} only together with the links' own inertia"
-        return told
+            groups = [joints_in_ranges(group) for group in rank.groups]
+            text += f": one kp, mass or load that is known tells those of {' or of '.join(groups)}"
+        undetermined: dict[str, list[int]] = {}
+        for name, joint in rank.open:
+            undetermined.setdefault(name, []).append(joint)
+        for name, joints in undetermined.items():
+            text += f"; {name} of {joints_in_ranges(tuple(joints))} only together with the links' own inertia"
+        return text
 
-    def _inputs(self) -> str:
-        """What is to be said of G."""
-        entries = self.actuation.entries
-        told = ["fixed" if self.input == "torque" else f"{POSITION}; {self._determined()}"]
+    def _input_needs(self) -> str:
+        """Return what a model needs of G."""
+        needs = ["fixed"]
+        if self.input == "position":
+            needs = [self._servo_needs()]
         if not self.actuation.direct:
-            told = ["motor torques"]
-            for kind, what in (("fixed", "gear known"), ("gain", "gain trained"), ("coupled", "coupled")):
-                joints = tuple(sorted({entry.row for entry in entries if entry.kind == kind}))
-                told += [f"{what} at {joints_in_ranges(joints)}"] if joints else []
+            needs = ["motor torques"]
+            for kind, meaning in (("fixed", "gear known"), ("gain", "gain trained"), ("coupled", "coupled")):
+                joints = {entry.row for entry in self.actuation.entries if entry.kind == kind}
+                if joints:
+                    needs.append(f"{meaning} at {joints_in_ranges(tuple(sorted(joints)))}")
         if self.actuation.couplings:
-            joints = tuple(sorted({entry.row for entry in self.actuation.couplings}))
-            told.append(f"motors coupled at {joints_in_ranges(joints)}")
-        passive = self.structure.passive
-        return ", ".join(told + ([f"{joints_in_ranges(passive)} without a drive"] if passive else []))
+            joints = {entry.row for entry in self.actuation.couplings}
+            needs.append(f"motors coupled at {joints_in_ranges(tuple(sorted(joints)))}")
+        if self.structure.passive:
+            needs.append(f"{joints_in_ranges(self.structure.passive)} without a drive")
+        return ", ".join(needs)
 
     def _heading(self) -> str:
-        trusted = (
-            "any inertial values" if self.structure.assume == "kinematics" else "the URDF's inertial values"
-        )
+        trusted = "any inertial values"
+        if self.structure.assume == "inertials":
+            trusted = "the URDF's inertial values"
         return f"{printable(self.arm.name)}: structure for {trusted}"
 
     def _joint_table(self) -> str:
-        lines = []
-        for index, coordinate in enumerate(self.arm.coordinates, start=1):
-            limits = reach(coordinate)
-            passive = ", passive" if index - 1 in self.structure.passive else ""
+        lines = ["Joints"]
+        for index, coordinate in enumerate(self.arm.coordinates):
             name = textwrap.shorten(printable(coordinate.name), 36, placeholder="...") or '""'
-            lines.append(f"  {index:>2}  {name:<36}  {coordinate.kind:<9}  {limits}{passive}")
-        return "Joints\n" + "\n".join(lines)
-
-    def _matrix(self, width: int) -> str:
-        """The lower triangle of M with each entry's joints, or by letters where that is too wide."""
-        n = len(self.structure.joints)
-        cells = {(e.row, e.column): _cell(e) for e in self.structure.entries}
-        column_widths = [max(len(cells[row, c]) for row in range(c, n)) for c in range(n)]
-        note = "joints each entry depends on; C constant, 0 always zero"
-        if 6 + sum(column_widths) + 2 * n > width:
-            cells = {key: cell if cell in ("0", "C") else "x" for key, cell in cells.items()}
-            column_widths = [max(1, len(str(c + 1))) for c in range(n)]
-            note = "x varies, C constant, 0 always zero"
-        lines = [f"Mass matrix: {note}"]
-        for row in range(n):
-            line = "  ".join(cells[row, c].ljust(column_widths[c]) for c in range(row + 1))
-            lines.append(f"  {row + 1:>2}  {line}".rstrip())
+            line = f"  {index + 1:>2}  {name:<36}  {coordinate.kind:<9}  {reach(coordinate)}"
+            if index in self.structure.passive:
+                line += ", passive"
+            lines.append(line)
         return "\n".join(lines)
 
+    def _cells(self) -> dict[tuple[int, int], str]:
+        return {(entry.row, entry.column): _cell(entry) for entry in self.structure.entries}
+
+    def _matrix(self, width: int) -> str:
+        """Return the lower triangle of M with each entry's joints, or by letters where that is too wide."""
+        cells = self._cells()
+        text = _triangle(cells, len(self.structure.joints))
+        if max(map(len, text)) <= width:
+            return "\n".join(["Mass matrix: joints each entry depends on; C constant, 0 always zero", *text])
+        for place, cell in cells.items():
+            if cell not in ("0", "C"):
+                cells[place] = "x"
+        text = _triangle(cells, len(self.structure.joints))
+        return "\n".join(["Mass matrix: x varies, C constant, 0 always zero", *text])
+
     def needs(self) -> dict[str, str]:
-        """What a model of M(q), V(q) and G needs, in words, and the number of base parameters."""
+        """Return what a model of M(q), V(q) and G needs, in words, and the number of base parameters."""
         structure = self.structure
         counts: dict[tuple[int, ...], int] = {}
         for output in structure.outputs:
             counts[output.joints] = counts.get(output.joints, 0) + 1
-        told = "; ".join(f"{count} of {joints_in_ranges(joints)}" for joints, count in counts.items())
-        entries, constants = len(structure.entries), len(structure.constants)
+        mass = f"{_many(len(structure.outputs), 'output')} and {_many(len(structure.constants), 'constant')}"
+        mass += f" make all {len(structure.entries)} entries"
+        if counts:
+            groups = [f"{count} of {joints_in_ranges(joints)}" for joints, count in counts.items()]
+            mass += f": {'; '.join(groups)}"
+        potential = "zero: gravity does no work"
+        if structure.potential:
+            potential = f"depends on {joints_in_ranges(structure.potential)}"
         return {
-            "M(q)": f"{_many(len(structure.outputs), 'output')} and {_many(constants, 'constant')} "
-            f"make all {entries} entries" + (f": {told}" if told else ""),
-            "V(q)": f"depends on {joints_in_ranges(structure.potential)}"
-            if structure.potential
-            else "zero: gravity does no work",
-            "G": self._inputs(),
+            "M(q)": mass,
+            "V(q)": potential,
+            "G": self._input_needs(),
             "base": f"{structure.base_parameter_count} base inertial parameters",
         }
 
     def _needs(self, width: int) -> str:
-        lines = []
-        for name, fact in self.needs().items():
-            lines += textwrap.wrap(fact, width, initial_indent=f"  {name:<5} ", subsequent_indent=" " * 8)
-        return "The model needs\n" + "\n".join(lines)
+        lines = ["The model needs"]
+        for name, need in self.needs().items():
+            lines += textwrap.wrap(need, width, initial_indent=f"  {name:<5} ", subsequent_indent=" " * 8)
+        return "\n".join(lines)
 
-    def _in_words(self, width: int) -> str:
-        lines = []
-        for fact in self.facts:
-            lines += textwrap.wrap(str(fact), width, initial_indent="  ", subsequent_indent="    ")
-        return "In words\n" + "\n".join(lines)
 
-    def _remarks(self, width: int) -> str:
-        lines = []
-        for each in self.diagnostics:
-            line = "" if each.line is None else f"line {each.line}: "
-            text = printable(f"{each.severity}: {line}{each.where}: {each.message}")
-            lines += textwrap.wrap(text, width, initial_indent="  ", subsequent_indent="    ")
-        return "Remarks\n" + "\n".join(lines)
+def _triangle(cells: dict[tuple[int, int], str], n: int) -> list[str]:
+    """Return the rows of a lower triangle, its columns aligned."""
+    lines = [f"  {row + 1:>2}" for row in range(n)]
+    for column in range(n):
+        texts = [cells[row, column] for row in range(column, n)]
+        width = max(map(len, texts))
+        for row, text in enumerate(texts, start=column):
+            lines[row] += f"  {text:<{width}}"
+    return [line.rstrip() for line in lines]
+
+
+def _indented(title: str, paragraphs: Iterable[str], width: int) -> str:
+    lines = [title]
+    for paragraph in paragraphs:
+        lines += textwrap.wrap(paragraph, width, initial_indent="  ", subsequent_indent="    ")
+    return "\n".join(lines)
+
+
+def _remark(diagnostic: Diagnostic) -> str:
+    line = ""
+    if diagnostic.line is not None:
+        line = f"line {diagnostic.line}: "
+    return printable(f"{diagnostic.severity}: {line}{diagnostic.where}: {diagnostic.message}")
 
 
 def reach(coordinate: Coordinate) -> str:
-    """How far a joint can move, with its unit."""
-    unit = "rad" if coordinate.kind == "revolute" else "m"
+    """Return how far a joint can move, with its unit."""
     if coordinate.continuous:
         return "continuous"
     if coordinate.lower is None or coordinate.upper is None:
         return "no limits"
+    unit = "m"
+    if coordinate.kind == "revolute":
+        unit = "rad"
     return f"{coordinate.lower:g} .. {coordinate.upper:g} {unit}"
 
 
 def _cell(entry: Entry) -> str:
     if entry.kind == "varying":
         return joint_ranges(entry.joints)
-    return "C" if entry.kind == "constant" else "0"
+    if entry.kind == "constant":
+        return "C"
+    return "0"
 
 
 def _many(count: int, noun: str) -> str:
-    return f"{count} {noun}{'s' * (count != 1)}"
+    if count == 1:
+        return f"1 {noun}"
+    return f"{count} {noun}s"
