@@ -17,19 +17,19 @@ from spelgen.baselines.predictor import Predictor
 from spelgen.comparison import metrics, runs
 from spelgen.comparison.formatting import comparison_tables
 from spelgen.comparison.known_urdf import with_wrong_inertials
-from spelgen.comparison.runs import run_study, time_steps
+from spelgen.comparison.runs import predict_example, run_study, time_steps
 from spelgen.comparison.study import VARIANTS, ablation_variants, prepare_study
-from spelgen.comparison.truth import example_positions, mass_error, true_mass
+from spelgen.comparison.truth import mass_error, true_mass
 from spelgen.design import load_design
 from spelgen.emission.loading import load_module
 from spelgen.errors import RunError
 from spelgen.evaluation import invariants
-from spelgen.evaluation.examples import predict_examples
 from spelgen.fitting.rollout import roll_out
 from spelgen.fleet.tasks import run_here
 from spelgen.logs.read import Trajectory, read_logs
 from spelgen.logs.windows import cut_windows, joined
 from spelgen.render.comparison_page import write_comparison
+from spelgen.settings.tuning.evaluation import EvaluationTuning
 from spelgen.urdf.read import read_urdf
 
 CHOSEN = [variant for variant in VARIANTS if variant.name in ("phnode", "hybrid")]
@@ -39,8 +39,7 @@ JOINTS = ("joint1", "joint2")
 @pytest.fixture(scope="module")
 def quick():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(invariants, "POSITIONS", 100)
-        patch.setattr(invariants, "FREE_STEPS", 50)
+        patch.setattr(invariants, "TUNING", EvaluationTuning(sampled_positions=100, free_steps=50))
         yield
 
 
@@ -131,21 +130,21 @@ def test_training_sees_the_beginning_only(study):
 
 def test_every_run_is_noted_and_measured(study, notes):
     assert len(notes) == 2
-    results = {result["variant"]: result for result in study.results()}
+    results = {result.variant: result for result in study.results()}
     assert set(results) == {"phnode", "hybrid"}
     for result in results.values():
-        parts = result["prediction"]
-        assert parts["loss"] == pytest.approx(parts["position"] + parts["velocity"])
-        assert result["invariants"]["least_eigenvalue"] > 0
-        assert result["invariants"]["orthogonality"] < 1e-14
-    assert results["hybrid"]["sizes"]["outputs"] == [1, 2, 0, 1]
-    assert results["phnode"]["sizes"]["outputs"] == [21, 21, 6, 1]  # as in the paper
-    assert results["phnode"]["sizes"]["inputs"] == 18
+        parts = result.prediction
+        assert parts.loss == pytest.approx(parts.position + parts.velocity)
+        assert result.invariants.least_eigenvalue > 0
+        assert result.invariants.orthogonality < 1e-14
+    assert results["hybrid"].sizes.outputs == (1, 2, 0, 1)
+    assert results["phnode"].sizes.outputs == (21, 21, 6, 1)  # as in the paper
+    assert results["phnode"].sizes.inputs == 18
 
 
 def test_losses_are_of_the_logs_that_they_are_named_after(study):
     """Worked out again from the logs of each role: sums over joints, means over samples and windows."""
-    (result,) = (x for x in study.results() if x["variant"] == "hybrid")
+    (result,) = (x for x in study.results() if x.variant == "hybrid")
     model = load_module(study.module(CHOSEN[1]))
     model.load_state_dict(torch.load(study.run(CHOSEN[1], 0) / "model.pt"))
     for key, role, samples in (("train", "train", 5), ("test", "test", 5), ("prediction", "test", 21)):
@@ -156,13 +155,13 @@ def test_losses_are_of_the_logs_that_they_are_named_after(study):
         ]
         windows = joined([cut_windows([each], samples, measured=False) for each in cut])
         with torch.no_grad():
-            predicted = [x.numpy() for x in roll_out(model, windows, result["substeps"])]
+            predicted = [x.numpy() for x in roll_out(model, windows, result.substeps)]
         q, qd = (np.stack([getattr(each, name)[1:] for each in cut]) for name in ("q", "qd"))
         away = (predicted[0] - q + np.pi) % (2 * np.pi) - np.pi
         position, velocity = (x.sum(axis=-1).mean() for x in (away**2, (predicted[1] - qd) ** 2))
-        assert result[key]["position"] == pytest.approx(position, rel=1e-9), key
-        assert result[key]["velocity"] == pytest.approx(velocity, rel=1e-9), key
-    assert result["train"] != result["test"]
+        assert getattr(result, key).position == pytest.approx(position, rel=1e-9), key
+        assert getattr(result, key).velocity == pytest.approx(velocity, rel=1e-9), key
+    assert result.train != result.test
 
 
 def test_a_comparison_goes_on_where_it_stopped(study, robot, quick):
@@ -211,7 +210,7 @@ def test_tables_stand_beside_published_figures(study):
     rows = {row.label: [cell.text for cell in row.cells] for table in tables for row in table.rows}
     assert rows["outputs of M"] == ["21", "1"]
     assert rows["published: prediction loss"] == ["0.194", ""]
-    base, ours = (result["prediction"]["loss"] for result in results)
+    base, ours = (result.prediction.loss for result in results)
     assert rows["phnode's prediction loss / this"] == ["1", f"{base / ours:.3g}"]
     assert all(line == line.rstrip() and len(line) <= 80 for x in tables for line in x.text().splitlines())
 
@@ -243,16 +242,16 @@ def test_the_page_shows_predictions_and_m_beside_the_truth(study):
     for name in ("M11", "M21", "M22"):
         assert f'aria-label="{name}"' in learned
     assert learned.count("<title>true</title>") == 3
-    (result,) = (x for x in study.results() if x["variant"] == "hybrid")
-    q = example_positions(result["examples"][0])
+    (result,) = (x for x in study.results() if x.variant == "hybrid")
+    q = torch.tensor(result.example.q, dtype=torch.float64)
     model = load_module(study.module(CHOSEN[1]))
     model.load_state_dict(torch.load(study.run(CHOSEN[1], 0) / "model.pt"))
-    np.testing.assert_allclose(result["mass"]["along"], model.mass_matrix(q).detach(), rtol=1e-12)
+    np.testing.assert_allclose(result.mass.along, model.mass_matrix(q).detach(), rtol=1e-12)
 
 
 def test_a_run_that_is_not_finite_counts_as_worst(study):
-    (result,) = (x for x in study.results() if x["variant"] == "hybrid")
-    broken = result | {"seed": 1, "prediction": {"loss": None, "position": None, "velocity": None}}
+    (result,) = (x for x in study.results() if x.variant == "hybrid")
+    broken = replace(result, seed=1, prediction=metrics.Prediction(None, None, None))
     table = comparison_tables([result, broken, broken], {"hybrid": 1.0}, {})[1]
     assert {row.label: row.cells[0].text for row in table.rows}["prediction loss, 1 s"] == "-"
 
@@ -265,10 +264,8 @@ def test_windows_and_examples_of_every_fourth_sample_begin_with_a_fourth_one():
     windows = metrics.thinned([log], 5, 4)
     assert not (windows.q % 4).any()
     assert torch.equal(windows.tau, windows.q[:, :-1] / 4)
-    (example,) = predict_examples(
-        Predictor("", hold_velocity), [log], 10, ["joint1"], decimation=4, measured=False
-    )
-    assert [x % 4 for x in example.joints[0].q_true] == [0] * 11
+    example = predict_example(Predictor("", hold_velocity), [log], 10, 4)
+    assert [x % 4 for (x,) in example.q] == [0] * 11
     np.testing.assert_allclose(example.t, 0.008 * np.arange(11), atol=1e-12)
 
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 from spelgen.baselines.baseline import CommandFollower
 from spelgen.baselines.names import POSITION_ACTUATORS
@@ -32,33 +31,43 @@ def keep_baseline(folder: Path | str, logs: Iterable[Path | str] | Sequence[Traj
     that are too sparse for accelerations give no parameters. Of an arm under position servos MuJoCo's actuators are
     fitted instead, where MuJoCo is installed.
     """
-    run, given = RunFolder(Path(folder)), list(logs)
+    run = RunFolder(Path(folder))
     record = run.read_config()
-    trajectories: Any = [each for each in given if isinstance(each, Trajectory)]
-    if not trajectories:
-        paths = [each for each in given if not isinstance(each, Trajectory)]
-        trajectories = open_logs(run.load_module(), paths, LogMapping(**record["mapping"]))
-    if isinstance(trajectories, LargeLogs) or not run.urdf.exists():
+    trajectories, paths = [], []
+    for log in logs:
+        if isinstance(log, Trajectory):
+            trajectories.append(log)
+        else:
+            paths.append(log)
+    if paths:
+        opened = open_logs(run.load_module(), paths, LogMapping(**record["mapping"]))
+        if isinstance(opened, LargeLogs):
+            return
+        trajectories += opened
+    if not run.urdf.exists():
         return
     kept: dict[str, object] = {"coverage": coverage(trajectories)}
-    used = Preprocessing(**record["preprocessing"])
+    preprocessing = Preprocessing(**record["preprocessing"])
     if record["objective"] == "servo":
-        kept |= _position_actuators(run, trajectories, used)
+        kept |= _fit_position_actuators(run, trajectories, preprocessing)
     else:
         for baseline in BASELINES:
-            kept |= baseline.fit(run, trajectories, used)
+            kept |= baseline.fit(run, trajectories, preprocessing)
     write_json(run.baseline, kept)
 
 
-def _position_actuators(
-    run: RunFolder, trajectories: Sequence[Trajectory], used: Preprocessing
+def _fit_position_actuators(
+    run: RunFolder, trajectories: Sequence[Trajectory], preprocessing: Preprocessing
 ) -> dict[str, object]:
     if not _has_mujoco():
         return {}
     from spelgen.baselines.position_actuators import MOST, fit_position_actuators
 
-    found = fit_position_actuators(run_arm(run), servo_windows(trajectories, used, MOST), trained_model(run))
-    return {} if found is None else {"position_actuators": found.to_dict()}
+    windows = servo_windows(trajectories, preprocessing, MOST)
+    actuators = fit_position_actuators(run_arm(run), windows, trained_model(run))
+    if actuators is None:
+        return {}
+    return {"position_actuators": actuators.to_dict()}
 
 
 def _has_mujoco() -> bool:

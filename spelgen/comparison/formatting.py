@@ -1,156 +1,153 @@
-"""What a comparison found, as tables: median over seeds, next to published figures."""
+"""A comparison as tables: medians over seeds, next to published figures."""
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
-from spelgen.evaluation.tables import Cell, Row, Table
+from spelgen.comparison.results import RunResult
+from spelgen.evaluation.tables import Cell, Row, Table, table
 from spelgen.listing import number
 from spelgen.settings.comparison import PublishedFigures
 
 BASELINE = "phnode"
-Result = Mapping[str, Any]
+Runs = Mapping[str, Sequence[RunResult]]
+"""By variant, those of all seeds."""
+Published = Mapping[str, PublishedFigures]
+Quantity = Callable[[RunResult], float | None]
+
+LOSSES: dict[str, Quantity] = {
+    "training loss": lambda run: run.train.loss,
+    "test loss": lambda run: run.test.loss,
+    "prediction loss, 1 s": lambda run: run.prediction.loss,
+    "velocity, 1 s": lambda run: run.prediction.velocity,
+    "position, 1 s": lambda run: run.prediction.position,
+    "M, relative error": lambda run: run.mass.error,
+}
+RATIOS = {"prediction loss, 1 s": "prediction loss", "velocity, 1 s": "velocity"}
+"""Of these the baseline's is told by that of each variant."""
+PUBLISHED = {
+    "training loss": "train_loss",
+    "test loss": "test_loss",
+    "prediction loss": "prediction_loss",
+    "velocity": "velocity",
+    "position": "position",
+}
+"""By label, fields of `PublishedFigures`."""
+INVARIANTS: dict[str, tuple[Quantity, Callable[[list[float]], float]]] = {
+    "least eigenvalue of M / mean": (lambda run: run.invariants.least_eigenvalue, min),
+    "|R R^T - I|, 10,000 steps": (lambda run: run.invariants.orthogonality, max),
+    "rise of energy, no input": (lambda run: run.invariants.energy_rise, max),
+    "energy drift, no friction": (lambda run: run.invariants.energy_drift, max),
+}
+"""By label, what is measured, and which of several is the worst."""
 
 
 def comparison_tables(
-    results: Sequence[Result], step_seconds: Mapping[str, float], published: Mapping[str, PublishedFigures]
+    results: Sequence[RunResult], step_seconds: Mapping[str, float], published: Published
 ) -> list[Table]:
-    """The tables of a comparison: sizes and speed, losses, those of each seed, invariants."""
-    by_variant: dict[str, list[Result]] = {}
+    """Return the tables of a comparison: sizes and speed, losses, those of each seed, invariants."""
+    runs: dict[str, list[RunResult]] = {}
     for result in results:
-        by_variant.setdefault(result["variant"], []).append(result)
+        runs.setdefault(result.variant, []).append(result)
     return [
-        _sizes(by_variant, step_seconds, published),
-        _losses(by_variant, published),
-        _by_seed(by_variant),
-        _invariants(by_variant),
+        _sizes(runs, step_seconds, published),
+        _losses(runs, published),
+        _by_seed(runs),
+        _invariants(runs),
     ]
 
 
-def _sizes(
-    found: Mapping[str, Sequence[Result]],
-    step_seconds: Mapping[str, float],
-    published: Mapping[str, PublishedFigures],
-) -> Table:
-    names = tuple(found)
-    first = {name: runs[0]["sizes"] for name, runs in found.items()}
-    rows = [
-        Row(f"outputs of {what}", tuple(Cell(str(first[name]["outputs"][k])) for name in names))
-        for k, what in enumerate("MDGV")
-    ]
-    rows.append(Row("inputs of M", tuple(Cell(str(first[name]["inputs"])) for name in names)))
-    rows.append(_row("parameters", {name: first[name]["parameters"] for name in names}, "{:,.0f}"))
-    milliseconds = {name: 1e3 * step_seconds[name] for name in names}
-    rows.append(_row("training step [ms]", milliseconds, "{:.1f}"))
-    rows += _published(names, published, "parameters", lambda each: each.parameters, "{:,.0f}")
-    rows += _published(names, published, "training step [s]", lambda each: each.step_seconds, "{:.2f}")
-    return Table("Sizes, and the time of a training step here; below, what is published", names, tuple(rows))
+def _sizes(runs: Runs, step_seconds: Mapping[str, float], published: Published) -> Table:
+    sizes = {name: of_seeds[0].sizes for name, of_seeds in runs.items()}
+    rows = []
+    for k, matrix in enumerate("MDGV"):
+        cells = [Cell(str(size.outputs[k])) for size in sizes.values()]
+        rows.append(Row(f"outputs of {matrix}", tuple(cells)))
+    rows.append(Row("inputs of M", tuple(Cell(str(size.inputs)) for size in sizes.values())))
+    rows.append(_row("parameters", {name: size.parameters for name, size in sizes.items()}, "{:,.0f}"))
+    rows.append(_row("training step [ms]", {name: 1e3 * step_seconds[name] for name in runs}, "{:.1f}"))
+    rows += _published(runs, published, "parameters", "parameters", "{:,.0f}")
+    rows += _published(runs, published, "training step [s]", "step_seconds", "{:.2f}")
+    title = "Sizes, and the time of a training step here; below, what is published"
+    return Table(title, tuple(runs), tuple(rows))
 
 
-def _losses(found: Mapping[str, Sequence[Result]], published: Mapping[str, PublishedFigures]) -> Table:
-    names = tuple(found)
-    quantities: dict[str, tuple[str, str]] = {
-        "training loss": ("train", "loss"),
-        "test loss": ("test", "loss"),
-        "prediction loss, 1 s": ("prediction", "loss"),
-        "velocity, 1 s": ("prediction", "velocity"),
-        "position, 1 s": ("prediction", "position"),
-    }
-    rows = [
-        _row(label, {name: _median(found[name], *path) for name in names})
-        for label, path in quantities.items()
-    ]
-    if BASELINE in found:
-        rows.insert(3, Row(f"{BASELINE}'s prediction loss / this", _ratios(found, names, "loss")))
-        rows.insert(5, Row(f"{BASELINE}'s velocity / this", _ratios(found, names, "velocity")))
-    rows.append(_row("M, relative error", {name: _median(found[name], "mass", "error") for name in names}))
-    rows += _published(names, published, "training loss", lambda each: each.train_loss)
-    rows += _published(names, published, "test loss", lambda each: each.test_loss)
-    rows += _published(names, published, "prediction loss", lambda each: each.prediction_loss)
-    rows += _published(names, published, "velocity", lambda each: each.velocity)
-    rows += _published(names, published, "position", lambda each: each.position)
+def _losses(runs: Runs, published: Published) -> Table:
+    rows = []
+    for label, quantity in LOSSES.items():
+        medians = {name: _median(of_seeds, quantity) for name, of_seeds in runs.items()}
+        rows.append(_row(label, medians))
+        if BASELINE in runs and label in RATIOS:
+            ratios = tuple(_ratio(medians[BASELINE], median) for median in medians.values())
+            rows.append(Row(f"{BASELINE}'s {RATIOS[label]} / this", ratios))
+    for label, field in PUBLISHED.items():
+        rows += _published(runs, published, label, field)
     title = (
         "Squared errors summed over joints [rad, m, s], mean over samples and windows, and the error of M, "
         "relative to M; median over seeds; below, what is published"
     )
-    return Table(title, names, tuple(rows))
+    return Table(title, tuple(runs), tuple(rows))
 
 
-def _by_seed(found: Mapping[str, Sequence[Result]]) -> Table:
-    names = tuple(found)
-    seeds = sorted({run["seed"] for runs in found.values() for run in runs})
+def _by_seed(runs: Runs) -> Table:
+    losses: dict[int, dict[str, float | None]] = {}
+    for name, of_seeds in runs.items():
+        for run in of_seeds:
+            losses.setdefault(run.seed, {})[name] = run.prediction.loss
+    labels = [f"seed {seed}" for seed in sorted(losses)]
+    return table("Prediction loss over 1 s of every run", labels, [losses[seed] for seed in sorted(losses)])
+
+
+def _invariants(runs: Runs) -> Table:
     rows = []
-    for seed in seeds:
-        losses = {
-            name: next((x["prediction"]["loss"] for x in found[name] if x["seed"] == seed), None)
-            for name in names
-        }
-        rows.append(_row(f"seed {seed}", losses))
-    return Table("Prediction loss over 1 s of every run", names, tuple(rows))
+    for label, (quantity, worst) in INVARIANTS.items():
+        cells = []
+        for of_seeds in runs.values():
+            values = [value for run in of_seeds if (value := quantity(run)) is not None]
+            all_finite = len(values) == len(of_seeds)
+            cells.append(Cell(number(worst(values) if all_finite else None)))
+        rows.append(Row(label, tuple(cells)))
+    return Table("Invariants, worst over seeds; a negative rise is a fall", tuple(runs), tuple(rows))
 
 
-def _invariants(found: Mapping[str, Sequence[Result]]) -> Table:
-    names = tuple(found)
-    worst: dict[str, tuple[str, Callable[[list[float]], float]]] = {
-        "least eigenvalue of M / mean": ("least_eigenvalue", min),
-        "|R R^T - I|, 10,000 steps": ("orthogonality", max),
-        "rise of energy, no input": ("energy_rise", max),
-        "energy drift, no friction": ("energy_drift", max),
-    }
-    rows = []
-    for label, (key, pick) in worst.items():
-        values = {name: _worst([run["invariants"][key] for run in found[name]], pick) for name in names}
-        rows.append(Row(label, tuple(Cell(number(values[name])) for name in names)))
-    return Table("Invariants, worst over seeds; a negative rise is a fall", names, tuple(rows))
+def _ratio(baseline: float | None, median: float | None) -> Cell:
+    """How many times worse than this variant the baseline predicts."""
+    if baseline is None or not median:
+        return Cell("-")
+    return Cell(f"{baseline / median:.3g}")
 
 
-def _worst(values: Sequence[float | None], pick: Callable[[list[float]], float]) -> float | None:
-    known = [value for value in values if value is not None]
-    return pick(known) if len(known) == len(values) else None
-
-
-def _ratios(found: Mapping[str, Sequence[Result]], names: Sequence[str], key: str) -> tuple[Cell, ...]:
-    """How many times worse than each the baseline predicts."""
-    base = _median(found[BASELINE], "prediction", key)
-    cells = []
-    for name in names:
-        value = _median(found[name], "prediction", key)
-        cells.append(Cell("-" if not value or base is None else f"{base / value:.3g}"))
-    return tuple(cells)
-
-
-def _median(runs: Sequence[Result], group: str, key: str) -> float | None:
-    """Over the seeds; a run that is not finite counts as infinitely bad."""
-    values = [run[group][key] if run[group][key] is not None else float("inf") for run in runs]
-    middle = statistics.median(values)
-    return None if middle == float("inf") else middle
+def _median(runs: Sequence[RunResult], quantity: Quantity) -> float | None:
+    """Return that over seeds; a run that is not finite counts as infinitely bad."""
+    values = [quantity(run) for run in runs]
+    middle = statistics.median(math.inf if value is None else value for value in values)
+    return middle if math.isfinite(middle) else None
 
 
 def _row(label: str, values: Mapping[str, float | None], form: str | None = None) -> Row:
-    known = [value for value in values.values() if value is not None]
-    least = min(known) if len(known) > 1 else None
-    cells = []
-    for value in values.values():
-        text = number(value) if form is None or value is None else form.format(value)
-        cells.append(Cell(text, best=value is not None and value == least))
-    return Row(label, tuple(cells))
+    """Return a row of numbers, the least marked."""
+    (row,) = table("", [label], [values]).rows
+    if form is None:
+        return row
+    cells = zip(values.values(), row.cells, strict=True)
+    return Row(label, tuple(Cell(form.format(value), cell.best) for value, cell in cells))
 
 
 def _published(
-    names: Sequence[str],
-    published: Mapping[str, PublishedFigures],
-    label: str,
-    of: Callable[[PublishedFigures], float | None],
-    form: str | None = None,
+    runs: Runs, published: Published, label: str, field: str, form: str | None = None
 ) -> list[Row]:
-    """A row of published figures, or none where there are none for this robot."""
-    values = {name: of(published[name]) if name in published else None for name in names}
-    if all(value is None for value in values.values()):
+    """Return a row of published figures, or none where there are none for this robot."""
+    texts = []
+    for name in runs:
+        value = getattr(published[name], field) if name in published else None
+        if value is None:
+            texts.append("")
+        elif form is None:
+            texts.append(number(value))
+        else:
+            texts.append(form.format(value))
+    if not any(texts):
         return []
-    cells = tuple(
-        Cell("" if value is None else number(value) if form is None else form.format(value))
-        for value in values.values()
-    )
-    return [Row(f"published: {label}", cells)]
+    return [Row(f"published: {label}", tuple(map(Cell, texts)))]

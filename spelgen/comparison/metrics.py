@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import math
 import statistics
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from spelgen.dynamics.protocol import has_residuals
+from spelgen.evaluation.plain import finite
 from spelgen.fitting.rollout import LossScales, position_difference, roll_out, rollout_loss
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
@@ -53,35 +53,37 @@ def thinned(pieces: Sequence[Trajectory], samples: int, decimation: int) -> Wind
 
 
 def predict(model: EmittedModel, windows: Windows, substeps: int) -> Prediction:
-    """The errors of these windows, each predicted from its first sample."""
+    """Return the errors of these windows, each predicted from its first sample."""
     with torch.no_grad():
         q, qd = roll_out(model, windows, substeps)
         away = position_difference(q, windows.q[:, 1:], model.joint_types)
-        position = away.square().sum(dim=-1).mean().item()
-        velocity = (qd - windows.qd[:, 1:]).square().sum(dim=-1).mean().item()
-    values = (position + velocity, position, velocity)
-    return Prediction(*(x if math.isfinite(x) else None for x in values))
+        position = away.square().sum(dim=-1).mean()
+        velocity = (qd - windows.qd[:, 1:]).square().sum(dim=-1).mean()
+    return Prediction(*finite(torch.stack([position + velocity, position, velocity])))
 
 
 def sizes(model: EmittedModel) -> Sizes:
-    """How many numbers the model's networks give and read, and how many are trained."""
+    """Return how many numbers the model's networks give and read, and how many are trained."""
     beside = "residual_" if has_residuals(model) else ""  # rigid bodies
-    names = (f"{beside}mass", "friction", "input", f"{beside}potential")
-    mass, friction, input, potential = (
-        getattr(getattr(model, name, None), "network", None) for name in names
-    )
-    outputs = [
-        0 if network is None else len(network.biases[-1]) for network in (mass, friction, input, potential)
-    ]
-    if friction is None:
+    outputs = []
+    for part in (f"{beside}mass", "friction", "input", f"{beside}potential"):
+        network = _network(model, part)
+        outputs.append(0 if network is None else len(network.biases[-1]))
+    if _network(model, "friction") is None:
         outputs[1] = model.n  # a function of each joint's own
-    parameters = sum(parameter.numel() for parameter in model.parameters())
+    mass = _network(model, f"{beside}mass")
     inputs = 0 if mass is None else int(mass.weights[0].shape[1])
+    parameters = sum(parameter.numel() for parameter in model.parameters())
     return Sizes((outputs[0], outputs[1], outputs[2], outputs[3]), inputs, parameters)
 
 
+def _network(model: EmittedModel, part: str) -> Any:
+    """Return the network of a part of the model; None where it has no such part or that has none."""
+    return getattr(getattr(model, part, None), "network", None)
+
+
 def step_seconds(model: EmittedModel, windows: Windows, scales: LossScales, substeps: int) -> float:
-    """Median time of a training step on these windows, without the update of the weights [s]."""
+    """Return the median time of a training step on these windows, without the update of the weights [s]."""
     times = []
     for _ in range(TIMED_STEPS):
         start = time.perf_counter()

@@ -3,27 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 
-from spelgen.baselines.names import MODEL
-from spelgen.baselines.predictor import of_dynamics
+from spelgen.baselines.predictor import Predictor, of_dynamics
 from spelgen.comparison.metrics import predict, sizes, step_seconds, thinned
+from spelgen.comparison.results import Example, LearnedMass, RunResult
 from spelgen.comparison.study import Study, Variant
-from spelgen.comparison.truth import example_positions, mass_error, true_mass
+from spelgen.comparison.truth import mass_error, true_mass
 from spelgen.emission.loading import load_module
-from spelgen.evaluation.examples import predict_examples
 from spelgen.evaluation.invariants import invariants
-from spelgen.files import write_json
+from spelgen.evaluation.plain import finite_rows
 from spelgen.fitting.fit import RunOptions
 from spelgen.fitting.rollout import LossScales, loss_scales
 from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.fitting.train import train
 from spelgen.fleet.tasks import RunTasks
 from spelgen.logs.read import read_logs
+from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.windows import cut_windows
 from spelgen.settings.fits import BATCH, Rollout
 from spelgen.spec import read_facts
 
@@ -35,12 +35,11 @@ HORIZON = 1.0  # s, over which trajectories are predicted
 
 def run_study(study: Study, run_tasks: RunTasks, *, note: Callable[[str], None]) -> None:
     """Train and measure what is not yet done; `note` hears of each run that ends. What a run raises ends all."""
-    waiting = [
-        (variant, seed)
-        for seed in range(study.settings.seeds)
-        for variant in study.variants
-        if not study.result(variant, seed).exists()
-    ]
+    waiting = []
+    for seed in range(study.settings.seeds):
+        for variant in study.variants:
+            if not study.result(variant, seed).exists():
+                waiting.append((variant, seed))
     count = len(study.variants) * study.settings.seeds
     done = count - len(waiting)
     if done:
@@ -49,62 +48,80 @@ def run_study(study: Study, run_tasks: RunTasks, *, note: Callable[[str], None])
         if isinstance(result, Exception):
             raise result
         done += 1
-        loss = result["prediction"]["loss"]
+        loss = result.prediction.loss
         shown = "not finite" if loss is None else f"{loss:.3g}"
-        took = f"{result['seconds']:.0f} s"
+        took = f"{result.seconds:.0f} s"
         note(f"{done}/{count} {variant.name}, seed {seed}: prediction loss {shown}, {took}")
 
 
-def _run(study: Study, chosen: tuple[Variant, int]) -> dict[str, Any]:
+def _run(study: Study, task: tuple[Variant, int]) -> RunResult:
     """Train one variant with one seed, or go on where it was stopped, and measure it."""
-    variant, seed = chosen
+    variant, seed = task
     folder = study.run(variant, seed)
     run = RunFolder(folder)
     resume = run.checkpoint.exists()
-    ended = train(
+    fit = train(
         study.module(variant), [study.logs], folder, study.training, preprocessing=study.preprocessing,
         validation=study.validation_fraction, seed=seed, urdf=study.urdf,
         options=RunOptions(resume=resume, force=not resume),
     )  # fmt: skip
-    if ended.status == "interrupted":
+    if fit.status == "interrupted":
         raise KeyboardInterrupt
-    found = _measured(study, trained_model(run), read_facts(run.module).joints, ended.substeps)
-    result = {
-        "variant": variant.name,
-        "seed": seed,
-        "seconds": ended.seconds,
-        "substeps": ended.substeps,
-        **found,
-    }
-    write_json(study.result(variant, seed), result)
+    model = trained_model(run)
+    result = _measure(study, variant.name, seed, fit.seconds, fit.substeps, model)
+    result.save(study.result(variant, seed))
     return result
 
 
-def _measured(study: Study, model: EmittedModel, joints: Sequence[str], substeps: int) -> dict[str, Any]:
-    """What result.json holds of a trained model."""
+def _measure(
+    study: Study, variant: str, seed: int, seconds: float, substeps: int, model: EmittedModel
+) -> RunResult:
+    joints = read_facts(study.module(study.variants[0])).joints
     decimation = study.preprocessing.decimation or 1
-    training, testing = (read_logs([study.logs], joints, role=role) for role in ("train", "test"))
+    training = read_logs([study.logs], joints, role="train")
+    testing = read_logs([study.logs], joints, role="test")
     steps = round(HORIZON / (decimation * float(testing[0].t[1] - testing[0].t[0])))
     far = thinned(testing, steps + 1, decimation)
-    near_train, near_test = (thinned(x, study.window, decimation) for x in (training, testing))
-    low, high = (torch.tensor(x, dtype=torch.float64) for x in (study.low, study.high))
-    examples = predict_examples(
-        of_dynamics(MODEL, model, substeps), testing, steps, joints, decimation=decimation, measured=False
-    )
-    along = example_positions(asdict(examples[0])) if examples else torch.zeros(0, len(joints))
+    low = torch.tensor(study.low, dtype=torch.float64)
+    high = torch.tensor(study.high, dtype=torch.float64)
+    example = predict_example(of_dynamics(variant, model, substeps), testing, steps, decimation)
+    along = []
+    if example is not None:
+        along = model.mass_matrix(torch.tensor(example.q, dtype=torch.float64)).tolist()
     seen = far.q[:, 0]
-    return {
-        "sizes": asdict(sizes(model)),
-        "train": asdict(predict(model, near_train, substeps)),
-        "test": asdict(predict(model, near_test, substeps)),
-        "prediction": asdict(predict(model, far, substeps)),
-        "invariants": asdict(invariants(model, far, low, high)),
-        "mass": {
-            "error": mass_error(model.mass_matrix(seen), true_mass(study.source, seen)),
-            "along": model.mass_matrix(along).tolist(),
-        },
-        "examples": [asdict(x) for x in examples],
-    }
+    return RunResult(
+        variant=variant,
+        seed=seed,
+        seconds=seconds,
+        substeps=substeps,
+        sizes=sizes(model),
+        train=predict(model, thinned(training, study.window, decimation), substeps),
+        test=predict(model, thinned(testing, study.window, decimation), substeps),
+        prediction=predict(model, far, substeps),
+        invariants=invariants(model, far, low, high),
+        mass=LearnedMass(mass_error(model.mass_matrix(seen), true_mass(study.source, seen)), along),
+        example=example,
+    )
+
+
+def predict_example(
+    predictor: Predictor, logs: Sequence[Trajectory], steps: int, decimation: int
+) -> Example | None:
+    """Predict `steps` steps of `decimation` samples in the middle of the first log that is long enough."""
+    span = steps * decimation
+    for log in logs:
+        if len(log) > span:
+            start = (len(log) - 1 - span) // (2 * decimation) * decimation
+            window = cut_windows(
+                [log[start : start + span + 1]], steps + 1, decimation=decimation, measured=False
+            )
+            q, qd = predictor.solver(window)
+            t = torch.cat([window.dt.new_zeros(1), window.dt[0].cumsum(dim=0)])
+            predicted_q = torch.cat([window.q[0, :1], q[0]])
+            predicted_qd = torch.cat([window.qd[0, :1], qd[0]])
+            motion = (finite_rows(x) for x in (window.q[0], window.qd[0], predicted_q, predicted_qd))
+            return Example(t.tolist(), *motion)
+    return None
 
 
 def time_steps(study: Study) -> dict[str, float]:

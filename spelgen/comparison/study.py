@@ -12,12 +12,13 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import yaml
 
 from spelgen import pipeline
 from spelgen.comparison.known_urdf import with_wrong_inertials, without_inertials
+from spelgen.comparison.results import RunResult
 from spelgen.design import Design, Net, Preset, load_design
 from spelgen.errors import RunError, SettingsError
 from spelgen.files import write_json, write_text
@@ -31,7 +32,7 @@ from spelgen.settings.settings import Settings
 from spelgen.structure.nominal import working_range
 from spelgen.trust import require_own_module
 
-SCHEMA = 4
+SCHEMA = 5
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,7 @@ VARIANTS = (
     Variant("phnode", "phnode"),
     Variant("spel", "spel"),
     Variant("spel-kan", "spel-kan"),
+    Variant("minimal", "minimal"),
     Variant("hybrid", "hybrid"),
     Variant("hybrid-kan", "hybrid", "kan"),
     Variant("closed-form", "closed-form"),
@@ -64,7 +66,7 @@ def ablation_variants() -> tuple[Variant, ...]:
         Variant("per-joint-friction", friction),
         Variant("known-inputs", inputs),
         Variant("fewest-outputs", outputs),
-        Variant("fewest-inputs", replace(outputs, potential="derived", encoding="joint")),
+        Variant("minimal", "minimal"),
         Variant("hybrid", "hybrid"),
     )
 
@@ -113,12 +115,12 @@ class Study:
     def result(self, variant: Variant, seed: int) -> Path:
         return self.run(variant, seed) / "result.json"
 
-    def results(self) -> Iterator[dict[str, Any]]:
-        """What was measured of every finished run."""
+    def results(self) -> Iterator[RunResult]:
+        """Yield the measurements of every finished run."""
         for variant in self.variants:
             for seed in range(self.settings.seeds):
                 if self.result(variant, seed).exists():
-                    yield json.loads(self.result(variant, seed).read_text(encoding="utf-8"))
+                    yield RunResult.read(self.result(variant, seed))
 
 
 def prepare_study(
@@ -144,15 +146,20 @@ def prepare_study(
             expected="torques: by these presets are compared",
             do="`spelgen train` fits what servos have to beat beside the model, `spelgen evaluate` compares them",
         )  # fmt: skip
-    chosen = {name: value for name, value in {"seeds": seeds, "steps": steps}.items() if value is not None}
-    settings = loaded.settings.comparison.model_copy(update=chosen)
+    settings = loaded.settings.comparison
+    settings = settings.model_copy(
+        update={"seeds": seeds or settings.seeds, "steps": steps or settings.steps}
+    )
     ranges = [working_range(coordinate) for coordinate in loaded.arm.coordinates]
+    training = None
+    if urdf_error is None:
+        training = _training(loaded.settings, settings)
     study = Study(
         folder=folder,
         source=robot,
         robot=loaded.arm.name,
         settings=settings,
-        training=_training(loaded.settings, settings) if urdf_error is None else None,
+        training=training,
         preprocessing=Preprocessing(**{**loaded.settings.training.preprocessing, "cutoff": 0.0}),
         validation_fraction=loaded.settings.training.validation_fraction,
         variants=tuple(variants),
@@ -161,28 +168,37 @@ def prepare_study(
         high=tuple(high for _, high in ranges),
     )
     description = _description(study, loaded)
-    if _known(folder, description, force=force):
+    if not force and _is_same_study(folder, description):
         for variant in study.variants:  # the folder may come from elsewhere
             require_own_module(study.module(variant), study.urdf)
         return study
+    for name in ("result.json", "checkpoint.pt"):  # else another comparison's runs would go on
+        for old in sorted(folder.glob(f"runs/*/{name}")):
+            old.unlink()
     _write_logs(study, loaded, progress)
-    known = without_inertials(robot) if urdf_error is None else with_wrong_inertials(robot, urdf_error)
-    study.urdf.write_bytes(known)
-    gravity = yaml.safe_dump({"gravity": list(loaded.settings.gravity)})
-    write_text(study.urdf.with_suffix(".yaml"), gravity)
-    for variant in variants:
-        source = pipeline.generate(
-            study.urdf, variant.preset, net=variant.net, width=settings.width, depth=settings.depth
-        )
-        write_text(study.module(variant), source)
+    _write_modules(study, loaded)
     write_json(folder / "study.json", description)
     return study
 
 
+def _write_modules(study: Study, loaded: LoadedArm) -> None:
+    """Write the URDF that the models know, and a module of each variant."""
+    if study.urdf_error is None:
+        study.urdf.write_bytes(without_inertials(study.source))
+    else:
+        study.urdf.write_bytes(with_wrong_inertials(study.source, study.urdf_error))
+    gravity = yaml.safe_dump({"gravity": list(loaded.settings.gravity)})
+    write_text(study.urdf.with_suffix(".yaml"), gravity)
+    width, depth = study.settings.width, study.settings.depth
+    for variant in study.variants:
+        source = pipeline.generate(study.urdf, variant.preset, net=variant.net, width=width, depth=depth)
+        write_text(study.module(variant), source)
+
+
 def _training(settings: Settings, comparison: ComparisonSettings) -> Rollout:
-    """How every variant is trained: without the URDF's regularizer, which would tell the answer."""
+    """Return how every variant is trained: without the URDF's regularizer, which would tell the answer."""
     epochs = -(-comparison.steps // TUNING.epoch_steps)
-    options: dict[str, Any] = {"urdf_weight": 0.0, "epochs": epochs, "patience": epochs}
+    options: dict[str, object] = {"urdf_weight": 0.0, "epochs": epochs, "patience": epochs}
     options["momentum_steps"] = comparison.momentum_steps
     if comparison.weight_decay is not None:
         options["weight_decay"] = comparison.weight_decay
@@ -190,8 +206,8 @@ def _training(settings: Settings, comparison: ComparisonSettings) -> Rollout:
     return cast("Rollout", fit_config("rollout", rigid_bodies=False, options=options, defaults=defaults))
 
 
-def _description(study: Study, loaded: LoadedArm) -> dict[str, Any]:
-    """What must be the same for a comparison to go on; seeds may be added."""
+def _description(study: Study, loaded: LoadedArm) -> dict[str, object]:
+    """Return what must be the same for a comparison to go on; seeds may be added."""
     return {
         "schema": SCHEMA,
         "robot": study.robot,
@@ -206,20 +222,16 @@ def _description(study: Study, loaded: LoadedArm) -> dict[str, Any]:
     }
 
 
-def _known(folder: Path, description: dict[str, Any], *, force: bool) -> bool:
-    """Whether the folder holds this very comparison; RunError if it holds another that may not be replaced."""
+def _is_same_study(folder: Path, description: dict[str, object]) -> bool:
+    """Return whether the folder holds this very comparison. Raises RunError where it holds another."""
     path = folder / "study.json"
-    if path.exists() and not force:
-        if json.loads(path.read_text(encoding="utf-8")) == json.loads(json.dumps(description)):
-            return True
+    if not path.exists():
+        return False
+    if json.loads(path.read_text(encoding="utf-8")) != json.loads(json.dumps(description)):
         raise RunError(
             "a comparison with other settings", file=path, do="--force begins anew, -o names another folder"
         )
-    for name in ("result.json", "checkpoint.pt"):  # else another comparison's runs would go on
-        for old in sorted(folder.glob(f"runs/*/{name}")):
-            old.unlink()
-    folder.mkdir(parents=True, exist_ok=True)
-    return False
+    return True
 
 
 def _write_logs(study: Study, loaded: LoadedArm, progress: Callable[[int, int], None] | None) -> None:
@@ -227,14 +239,14 @@ def _write_logs(study: Study, loaded: LoadedArm, progress: Callable[[int, int], 
 
     result = simulate(loaded, progress=progress)
     names = [coordinate.name for coordinate in loaded.arm.coordinates]
-    first = study.settings.first
+    training = [_beginning(trajectory, study.settings.first) for trajectory in result.train]
     study.logs.mkdir(parents=True, exist_ok=True)
-    write_logs(study.logs / "train.parquet", [_beginning(x, first) for x in result.train], names)
+    write_logs(study.logs / "train.parquet", training, names)
     write_logs(study.logs / "test.parquet", result.test, names)
 
 
 def _beginning(trajectory: Trajectory, seconds: float | None) -> Trajectory:
-    """The samples before so many seconds."""
+    """Return the samples before so many seconds."""
     if seconds is None:
         return trajectory
     elapsed = trajectory.t - trajectory.t[0]

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -17,11 +15,6 @@ def true_mass(robot: Path, q: torch.Tensor) -> torch.Tensor:
 
     loaded = load_arm(robot)
     return arm_dynamics(loaded.arm, loaded.settings).mass_matrix(q)
-
-
-def example_positions(example: Mapping[str, Any]) -> torch.Tensor:
-    """Measured positions (T, n) of one of result.json's examples."""
-    return torch.tensor([joint["q_true"] for joint in example["joints"]], dtype=torch.float64).T
 
 
 def mass_error(learned: torch.Tensor, true: torch.Tensor) -> float:

@@ -25,12 +25,15 @@ from spelgen.identification.samples import dynamics_samples
 from spelgen.logs.checks import check
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, require_joints, require_torques
+from spelgen.settings.tuning.evaluation import EvaluationTuning
 
 if TYPE_CHECKING:
     from spelgen.dynamics.protocol import RigidDynamics
     from spelgen.emission.loading import EmittedModel
     from spelgen.fitting.fitted import Fit
     from spelgen.loaded_arm import LoadedArm
+
+TUNING = EvaluationTuning()
 
 
 def evaluate(
@@ -86,7 +89,7 @@ def _evaluate_torques(
         used = (preprocessing or Preprocessing()).resolved([trajectory.sample_rate for trajectory in logs])
     tests = JudgedLogs(used.pieces(logs, shortest=2), used, judged.reach, types)
     lengths = horizon_lengths(tests, *ahead, notes)
-    probe = tests.probe(judged.window)
+    probe = tests.windows(judged.window - 1, TUNING.probed_model_windows)
     substeps = choose_substeps(model, probe, loss_scales(probe, types), start=judged.substeps_per_sample)
     predictors = [of_dynamics(MODEL, model, substeps)]
     for baseline in BASELINES:
@@ -96,7 +99,7 @@ def _evaluate_torques(
     tip = _tip(judged, notes)
     horizons, longest = [], None
     for name, k in lengths.items():
-        horizon, predictions = predict(name, k, tests, predictors, tip, judged.window, notes)
+        horizon, predictions = predict(name, k, tests, predictors, tip, notes)
         if all(k > other.steps for other in horizons):
             longest = predictions
         horizons.append(horizon)

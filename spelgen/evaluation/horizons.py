@@ -4,25 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, cast
 
 import torch
 
-from spelgen.baselines.names import MODEL, observed
-from spelgen.baselines.predictor import Predictor, of_accurate_dynamics, of_dynamics
+from spelgen.baselines.names import observed
+from spelgen.baselines.predictor import Predictor
 from spelgen.baselines.solver import Solver, States
 from spelgen.dynamics.bristles import BristleReach
 from spelgen.errors import Diagnostic
 from spelgen.evaluation.momentum_observer import observe, past_steps, without_past
 from spelgen.evaluation.state_errors import StateErrors, TipPosition, end_errors
-from spelgen.fitting.rollout import choose_substeps, loss_scales
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
 from spelgen.settings.tuning.evaluation import EvaluationTuning
-
-if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
 
 TUNING = EvaluationTuning()
 
@@ -72,16 +67,11 @@ class JudgedLogs:
             starts += [(piece, first) for first in range(0, len(piece) - span, stride)]
         return starts
 
-    def windows(self, samples: int, most: int, decimation: int = 1) -> Windows:
-        """Return the windows of so many samples that begin there, shorter ones where all pieces are."""
-        samples = min(samples, self.longest // decimation + 1)
-        stride = self.stride((samples - 1) * decimation, most)
-        measured = self.used.filtered
-        return cut_windows(self.pieces, samples, stride, decimation, measured=measured, reach=self.reach)
-
-    def probe(self, samples: int, decimation: int = 1) -> Windows:
-        """Return few windows, that say how many steps integrators need."""
-        return self.windows(samples, TUNING.probed_model_windows, decimation)
+    def windows(self, span: int, most: int) -> Windows:
+        """Return the windows of so many steps that begin there, shorter ones where all pieces are."""
+        span = min(span, self.longest)
+        stride, measured = self.stride(span, most), self.used.filtered
+        return cut_windows(self.pieces, span + 1, stride, measured=measured, reach=self.reach)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,25 +110,16 @@ def predict(
     logs: JudgedLogs,
     predictors: Sequence[Predictor],
     tip: TipPosition | None,
-    probed: int,
     notes: list[Diagnostic],
 ) -> tuple[Horizon, Predictions]:
-    """Judge rollouts over so many samples: open loop, and with what a momentum observer finds before they start.
-
-    probed: samples of the windows that say how many steps integrators need.
-    """
-    decimation = _decimation(steps, logs.rate)
-    if decimation > 1:
-        probe = logs.probe(probed, decimation)
-        predictors = [_in_steps_for(predictor, probe, logs.joint_types) for predictor in predictors]
-    past = past_steps(logs.rate / decimation)
-    if past * decimation + steps > logs.longest:
+    """Judge rollouts over so many samples: open loop, and with what a momentum observer finds before they start."""
+    past = past_steps(logs.rate)
+    if past + steps > logs.longest:
         message = f"no observer over {name}: the longest trajectory has {logs.longest} steps"
         notes.append(Diagnostic("info", "no-observer", "logs", None, message))
         past = 0
-    most = max(1, min(TUNING.most_windows, TUNING.most_predicted_steps // steps))
-    span = past * decimation + steps
-    windows = logs.windows(span // decimation + 1, most, decimation)
+    most = max(TUNING.fewest_windows, min(TUNING.most_windows, TUNING.most_predicted_steps // steps))
+    windows = logs.windows(past + steps, most)
     ahead = without_past(windows, past)
     states = {}
     for predictor in predictors:
@@ -151,25 +132,5 @@ def predict(
         states[observed(predictor.name)] = predictor.solver(started, disturbance)
     errors = {who: end_errors(state, ahead, logs.joint_types, tip) for who, state in states.items()}
     seconds = ahead.dt.sum(dim=1).mean().item()
-    starts = [(piece, first + past * decimation) for piece, first in logs.starts(span, most)]
+    starts = [(piece, first + past) for piece, first in logs.starts(past + steps, most)]
     return Horizon(name, steps, seconds, len(ahead), errors), Predictions(ahead, starts, states)
-
-
-def _in_steps_for(predictor: Predictor, probe: Windows, joint_types: Sequence[str]) -> Predictor:
-    """Return the same dynamics, in the steps that they need on windows whose samples lie farther apart."""
-    dynamics = predictor.dynamics
-    if dynamics is None:
-        return predictor
-    if predictor.name != MODEL:
-        return of_accurate_dynamics(predictor.name, dynamics, probe)
-    model = cast("EmittedModel", dynamics)
-    return of_dynamics(MODEL, dynamics, choose_substeps(model, probe, loss_scales(probe, joint_types)))
-
-
-def _decimation(steps: int, rate: float) -> int:
-    """Return the largest divisor of the steps that leaves enough of them, and samples dense enough.
-
-    Inputs of the samples between are averaged.
-    """
-    largest = max(1, min(int(rate / TUNING.densest_rate), steps // TUNING.fewest_steps))
-    return max(k for k in range(1, largest + 1) if steps % k == 0)

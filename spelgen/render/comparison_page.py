@@ -6,31 +6,33 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import torch
 from markupsafe import Markup
 
+from spelgen.comparison.results import Example, RunResult
 from spelgen.comparison.study import Study
-from spelgen.comparison.truth import example_positions, true_mass
-from spelgen.emission.loading import load_module
+from spelgen.comparison.truth import true_mass
 from spelgen.evaluation.tables import Table
 from spelgen.files import write_text
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.render.charts import Line, line_chart
 from spelgen.render.page import render_page
-from spelgen.render.plots import QUANTITIES, UNITS, Panel, Record, mass_panels
+from spelgen.render.plots import QUANTITIES, UNITS, Panel, mass_panels
+from spelgen.spec import Facts, read_facts
 
-STYLES = ("c1", "c2", "c3", "c4", "c5", "c6")
+STYLES = ("c1", "c2", "c3", "gravity", "c4", "c5", "c6")
 
 
 def write_comparison(study: Study, tables: Sequence[Table]) -> Path:
     """Write comparison.html into the study's folder; return its path."""
-    results = [result for result in study.results() if result["seed"] == 0]
-    styles = dict(zip([result["variant"] for result in results], STYLES, strict=False))
-    joint_types = load_module(study.module(study.variants[0])).joint_types
-    with_examples = [result for result in results if result["examples"]]
+    results = [result for result in study.results() if result.seed == 0]
+    styles = dict(zip([result.variant for result in results], STYLES, strict=False))
+    facts = read_facts(study.module(study.variants[0]))
+    examples = {result.variant: result.example for result in results if result.example is not None}
     panels, entries = [], []
-    if with_examples:
-        panels = _prediction_panels(with_examples, styles, joint_types)
-        entries = _mass_panels(study, with_examples, styles, joint_types)
+    if examples:
+        panels = _prediction_panels(examples, styles, facts)
+        entries = _mass_panels(study, results, styles, facts.joint_types)
     text = render_page(
         "comparison.html.jinja",
         study=study,
@@ -72,35 +74,42 @@ def _losses(study: Study, styles: Mapping[str, str]) -> Markup:
 
 
 def _mass_panels(
-    study: Study, results: Sequence[Record], styles: Mapping[str, str], joint_types: Sequence[str]
+    study: Study, results: Sequence[RunResult], styles: Mapping[str, str], joint_types: Sequence[str]
 ) -> list[Panel]:
     """Return M's lower triangle along the first example: the true robot's, and what every variant learned."""
-    example = results[0]["examples"][0]
-    along = {"true": true_mass(study.source, example_positions(example)).tolist()}
+    masses: dict[str, list[list[list[float]]]] = {}
+    example = None
     for result in results:
-        along[result["variant"]] = result["mass"]["along"]
+        if result.example is None:
+            continue
+        if example is None:
+            example = result.example
+            q = torch.tensor(example.q, dtype=torch.float64)
+            masses["true"] = true_mass(study.source, q).tolist()
+        masses[result.variant] = result.mass.along
+    if example is None:
+        return []
     entries = {}
     for i in range(len(joint_types)):
         for j in range(i + 1):
-            entries[i, j] = {name: [mass[i][j] for mass in masses] for name, masses in along.items()}
-    return mass_panels(example["t"], entries, {"true": "truth", **styles}, joint_types, width=400)
+            entries[i, j] = {name: [mass[i][j] for mass in along] for name, along in masses.items()}
+    return mass_panels(example.t, entries, {"true": "truth", **styles}, joint_types, width=400)
 
 
 def _prediction_panels(
-    results: Sequence[Record], styles: Mapping[str, str], joint_types: Sequence[str]
+    examples: Mapping[str, Example], styles: Mapping[str, str], facts: Facts
 ) -> list[Panel]:
     """Return the first test trajectory of the results: what was measured, and what every variant predicts."""
-    examples = {result["variant"]: result["examples"][0] for result in results}
-    first = results[0]["examples"][0]
+    measured = next(iter(examples.values()))
     panels = []
-    for k, (joint, kind) in enumerate(zip(first["joints"], joint_types, strict=True)):
+    for k, (joint, kind) in enumerate(zip(facts.joints, facts.joint_types, strict=True)):
         charts = []
         for (key, quantity), unit in zip(QUANTITIES.items(), UNITS[kind], strict=True):
-            lines = [Line("measured", first["t"], joint[f"{key}_true"], "truth")]
+            lines = [Line("measured", measured.t, [row[k] for row in getattr(measured, key)], "truth")]
             for name, example in examples.items():
-                predicted = example["joints"][k][f"{key}_pred"]
-                lines.append(Line(name, first["t"], predicted, styles[name]))
-            title = f"{quantity} of {joint['name']}"
+                predicted = getattr(example, f"predicted_{key}")
+                lines.append(Line(name, example.t, [row[k] for row in predicted], styles[name]))
+            title = f"{quantity} of {joint}"
             charts.append(line_chart(lines, title, "t [s]", f"{quantity} [{unit}]", height=170))
-        panels.append(Panel(joint["name"], tuple(charts)))
+        panels.append(Panel(joint, tuple(charts)))
     return panels

@@ -28,14 +28,11 @@ class EvaluationTuning:
     most_windows: int = 2000
     """[] that a horizon is judged on, evenly spread."""
     most_predicted_steps: int = 40_000
-    """[] of a predictor over a horizon: fewer windows where they are long."""
+    """[] of a predictor over a horizon: fewer windows where they are long, but not fewer than the next."""
+    fewest_windows: int = 100
+    """[] as far as there are so many."""
     probed_model_windows: int = 64
     """[] that say in which steps the model is integrated."""
-    densest_rate: float = 200.0
-    """[Hz] inputs of denser logs are averaged over horizons that still have as many steps as the next says."""
-    fewest_steps: int = 100
-    """[] of a horizon after that."""
-
     explained_for_contacts: float = 0.99
     """[] of the torque's variance; convention of this package, as the next two."""
     explained_for_feed_forward: float = 0.95
@@ -52,3 +49,12 @@ class EvaluationTuning:
     """[] ratio of slow and fast errors that is worth a word."""
     narrow_range: float = 0.5
     """[] of a joint's range: logs that cover less are called narrow."""
+
+    sampled_positions: int = 100_000
+    """[] at which M must be positive definite."""
+    free_steps: int = 10_000
+    """[] of 1 ms without input."""
+    started_states: int = 8
+    """[] that motion without input starts from."""
+    drift_calls: int = 30_000
+    """[] of the dynamics, after which they are too stiff to be integrated to thirteen digits."""

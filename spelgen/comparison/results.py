@@ -1,0 +1,62 @@
+"""The results of the runs of a comparison, as result.json has them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from spelgen.comparison.metrics import Prediction, Sizes
+from spelgen.evaluation.invariants import Invariants
+from spelgen.evaluation.plain import Rows, Series
+from spelgen.files import write_json
+
+
+@dataclass(frozen=True)
+class Example:
+    """A predicted piece of a test trajectory, (T, n), from its first sample; t counts from there [s]."""
+
+    t: Series
+    q: Rows
+    qd: Rows
+    predicted_q: Rows
+    predicted_qd: Rows
+
+
+@dataclass(frozen=True)
+class LearnedMass:
+    """error: of M, see `truth.mass_error`. along: M (T, n, n) at the measured positions of the example."""
+
+    error: float
+    along: list[list[list[float]]]
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """The measurements of a trained variant.
+
+    seconds: of training. train, test: errors over windows as long as those of training; prediction: over 1 s of tests.
+    """
+
+    variant: str
+    seed: int
+    seconds: float
+    substeps: int
+    sizes: Sizes
+    train: Prediction
+    test: Prediction
+    prediction: Prediction
+    invariants: Invariants
+    mass: LearnedMass
+    example: Example | None
+
+    def save(self, path: Path) -> None:
+        """Write it as JSON."""
+        write_json(path, asdict(self))
+
+    @classmethod
+    def read(cls, path: Path) -> RunResult:
+        """Read what `save` wrote."""
+        from pydantic import TypeAdapter  # slow to import
+
+        return TypeAdapter(cls).validate_python(json.loads(path.read_text(encoding="utf-8")))
