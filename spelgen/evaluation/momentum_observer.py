@@ -36,21 +36,25 @@ def observe(dynamics: Any, windows: Windows, past: int) -> tuple[Windows, Tensor
     dynamics: what a rollout integrates, see ``integrable``. The disturbance is a generalised force [Nm, N] where the
     state has momenta, an acceleration where it has velocities.
     """
-    q, qd = windows.q[:, : past + 1], windows.qd[:, : past + 1]
-    dt, tau = windows.dt[:, :past].unsqueeze(-1), windows.tau[:, :past]
+    q = windows.q[:, : past + 1]
+    qd = windows.qd[:, : past + 1]
+    dt = windows.dt[:, :past].unsqueeze(-1)
+    tau = windows.tau[:, :past]
     z = memory_along(dynamics, q, qd, windows.z)
-    prepared = dynamics.prepare()
-    p = dynamics.momentum(q, qd, prepared)
+    cache = dynamics.prepare()
+    p = dynamics.momentum(q, qd, cache)
     # the input jumps at samples: each interval has its own at both ends
-    _, at_start = dynamics.port_hamiltonian_rhs(q[:, :-1], p[:, :-1], tau, prepared, z[:, :-1])
-    _, at_end = dynamics.port_hamiltonian_rhs(q[:, 1:], p[:, 1:], tau, prepared, z[:, 1:])
-    lacking = p.diff(dim=1) / dt - (at_start + at_end) / 2  # (W, past, n)
+    _, at_start = dynamics.port_hamiltonian_rhs(q[:, :-1], p[:, :-1], tau, cache, z[:, :-1])
+    _, at_end = dynamics.port_hamiltonian_rhs(q[:, 1:], p[:, 1:], tau, cache, z[:, 1:])
+    lacking = p.diff(dim=1) / dt - (at_start + at_end) / 2  # d of each interval, (W, past, n)
     gain = 1 - torch.exp(-dt / TUNING.observer_time_constant)
-    r, response = torch.zeros_like(lacking[:, 0]), torch.zeros_like(gain[:, 0])
+    r = torch.zeros_like(lacking[:, 0])
+    response = torch.zeros_like(gain[:, 0])  # of the filter to d = 1
     for k in range(past):
         r = r + gain[:, k] * (lacking[:, k] - r)
         response = response + gain[:, k] * (1 - response)
-    return replace(without_past(windows, past), z=z[:, -1]), r / response
+    ahead = replace(without_past(windows, past), z=z[:, -1])
+    return ahead, r / response
 
 
 def without_past(windows: Windows, past: int) -> Windows:

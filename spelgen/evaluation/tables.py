@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
-from spelgen.baselines.names import observed
+from spelgen.baselines.names import MODEL, observed
 from spelgen.labels import thousandths
 from spelgen.listing import Listing, number
 
@@ -59,6 +59,8 @@ class Table:
 
 Numbers = Mapping[str, float | None]
 """By column."""
+Errors = TypeVar("Errors")
+Value = TypeVar("Value")
 
 
 def table(title: str, labels: Sequence[str], rows: Iterable[Numbers], note: str = "") -> Table:
@@ -67,7 +69,9 @@ def table(title: str, labels: Sequence[str], rows: Iterable[Numbers], note: str 
     columns: dict[str, None] = {}
     for row in numbers:
         columns |= dict.fromkeys(row)
-    lines = [Row(label, _cells(row, columns)) for label, row in zip(labels, numbers, strict=True)]
+    lines = []
+    for label, row in zip(labels, numbers, strict=True):
+        lines.append(Row(label, _cells(row, columns)))
     return Table(title, tuple(columns), tuple(lines), note)
 
 
@@ -88,24 +92,30 @@ def result_tables(results: Results) -> list[Table]:
     return [*_replay_tables(results), *_horizon_tables(results), *_torque_tables(results)]
 
 
+def _values(errors: Mapping[str, Errors], value: Callable[[Errors], Value]) -> dict[str, Value]:
+    """Return one value of the errors of each predictor."""
+    return {name: value(of_predictor) for name, of_predictor in errors.items()}
+
+
 def _horizon_tables(results: Results) -> list[Table]:
-    horizons = results.horizons
-    if not horizons:
+    if not results.horizons:
         return []
-    heads = []
-    for horizon in horizons:  # `10 steps (0.106 s)`
-        in_seconds = horizon.name.endswith(" s")
-        heads.append(horizon.name if in_seconds else f"{horizon.name} ({horizon.seconds:.3g} s)")
-    relative = [{name: errors.mean_relative_rms for name, errors in x.errors.items()} for x in horizons]
-    tips = [{name: errors.tip_mm for name, errors in x.errors.items()} for x in horizons]
-    note = OBSERVER if any(observed(name) in x.errors for x in horizons for name in x.errors) else ""
+    heads, relative, tips, note = [], [], [], ""
+    for horizon in results.horizons:
+        head = horizon.name
+        if not head.endswith(" s"):
+            head = f"{head} ({horizon.seconds:.3g} s)"
+        heads.append(head)
+        relative.append(_values(horizon.errors, lambda x: x.mean_relative_rms))
+        tips.append(_values(horizon.errors, lambda x: x.tip_mm))
+        if observed(MODEL) in horizon.errors:
+            note = OBSERVER
     title = "Error relative to the motion (0: none, 1: as if the arm had stood still)"
     tables = [table(title, heads, relative, note)]
     if any(value is not None for row in tips for value in row.values()):
         tables.append(table("Error of the tip's position [mm]", heads, tips))
-    last = horizons[-1].errors
-    positions = {name: errors.q for name, errors in last.items()}
-    velocities = {name: errors.qd for name, errors in last.items()}
+    last = results.horizons[-1].errors
+    positions, velocities = _values(last, lambda x: x.q), _values(last, lambda x: x.qd)
     tables.append(_by_joint(results, "Position error{} after " + heads[-1], POSITION, positions))
     tables.append(_by_joint(results, "Velocity error{} after " + heads[-1], VELOCITY, velocities))
     return tables
@@ -114,8 +124,8 @@ def _horizon_tables(results: Results) -> list[Table]:
 def _torque_tables(results: Results) -> list[Table]:
     if not results.torque:
         return []
-    mean = {name: errors.mean_nmse for name, errors in results.torque.items()}
-    by_joint = {name: errors.rmse for name, errors in results.torque.items()}
+    mean = _values(results.torque, lambda x: x.mean_nmse)
+    by_joint = _values(results.torque, lambda x: x.rmse)
     return [
         table("Torque error of the inverse dynamics", ["nMSE, mean of all"], [mean]),
         _by_joint(results, "Torque error by joint, RMSE{}", TORQUE, by_joint),
@@ -126,16 +136,16 @@ def _replay_tables(results: Results) -> list[Table]:
     """Return those of commands replayed: by trajectory and by joint."""
     tables, unit = [], thousandths(results.joint_types)
     for replay in results.replays:
-        trajectories = list(next(iter(replay.errors.values())).trajectories)
+        trajectories = list(replay.errors[MODEL].trajectories)
         rows = []
         for trajectory in trajectories:
-            rows.append({who: 1000 * x.trajectories[trajectory] for who, x in replay.errors.items()})
-        rows.append({who: 1000 * x.mean for who, x in replay.errors.items()})
+            rows.append(_values(replay.errors, lambda x: 1000 * x.trajectories[trajectory]))  # noqa: B023
+        rows.append(_values(replay.errors, lambda x: 1000 * x.mean))
         title = f"Commands replayed, {replay.name}: RMS of positions over all joints [{unit}]"
         tables.append(table(title, [*trajectories, "mean of these"], rows))
         by_joint = []
         for k in range(len(results.joints)):
-            by_joint.append({who: 1000 * x.joints[k] for who, x in replay.errors.items()})
+            by_joint.append(_values(replay.errors, lambda x: 1000 * x.joints[k]))  # noqa: B023
         tables.append(table(f"The same by joint, over all trajectories [{unit}]", results.joints, by_joint))
     return tables
 
@@ -146,10 +156,10 @@ def _by_joint(
     """Return a row for each joint; the unit stands in the title where all have the same, else beside each joint."""
     units = [UNITS[kind][quantity] for kind in results.joint_types]
     labels = list(results.joints)
+    common = ""
     if len(set(units)) == 1:
-        title = title.format(f" [{units[0]}]")
+        common = f" [{units[0]}]"
     else:
-        title = title.format("")
         labels = [f"{joint} [{unit}]" for joint, unit in zip(labels, units, strict=True)]
-    rows = [{name: column[k] for name, column in values.items()} for k in range(len(labels))]
-    return table(title, labels, rows)
+    rows = [_values(values, lambda x: x[k]) for k in range(len(labels))]  # noqa: B023
+    return table(title.format(common), labels, rows)
