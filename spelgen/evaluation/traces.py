@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spelgen.baselines.names import MODEL
+from spelgen.baselines.names import MODEL, is_drawn
 from spelgen.baselines.predictor import Predictor
 from spelgen.evaluation.horizons import JudgedLogs, Predictions
 from spelgen.evaluation.plain import Rows, Series, number, rows, series
@@ -185,6 +185,8 @@ def _growth(predictions: Predictions, joint_types: Sequence[str], tip: TipPositi
     scales = loss_scales(windows, joint_types)
     relative, tips = {}, {}
     for name, states in predictions.states.items():
+        if not is_drawn(name):
+            continue
         errors = _relative_errors(states, windows, scales, joint_types)
         relative[name] = _quantiles(errors[:, times])
         if tip is not None:

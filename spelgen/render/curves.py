@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from markupsafe import Markup
 
+from spelgen.baselines.names import is_drawn
 from spelgen.labels import thousandths
 from spelgen.listing import number
 from spelgen.render.picture import Picture
@@ -60,7 +61,7 @@ def predictors(evaluation: Record) -> list[tuple[str, str]]:
     names = evaluation.get("torque", {})
     if evaluation.get("horizons"):
         names = evaluation["horizons"][0]["errors"]
-    return [(style(name), name) for name in names]
+    return [(style(name), name) for name in names if is_drawn(name)]
 
 
 def curves(traces: Record, facts: Facts, picture: Picture) -> Curves:
