@@ -6,8 +6,8 @@ The arms are robots/rpr.urdf and robots/six_dof.urdf by default, with friction a
 say. Torques have noise of 2 % of their deviation. The URDF that models start from is the true one, one whose bodies are
 30 % wrong (see `spelgen compare --urdf-error`), or one of placeholders: every link 1 kg, a ball of 10 cm about its
 frame. What needs no inertials has one row: least squares, with and without friction's memory, and networks of the
-derived structure (spel) and without any (phnode), fitted to the same torques. nMSE on a minute of other motion, mean
-of the joints; the median of three draws of motion and noise.
+derived structure (minimal, spel) and without any (phnode), fitted to the same torques. nMSE on a minute of other
+motion, mean of the joints; the median of three draws of motion and noise.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def curves(robot: Path) -> None:
     plain, memory = LeastSquares("range"), LeastSquares("range", friction=FrictionModel(memory=True))
     row("least squares", lambda x: least_squares(arm, x, plain).torque, true, tests)
     row("least squares with memory", lambda x: least_squares(arm, x, memory).torque, true, tests)
-    for preset in ("spel", "phnode"):
+    for preset in ("minimal", "spel", "phnode"):
         row(f"{preset}, networks", lambda x, p=preset: networks(robot, p, x), true, tests)
 
 
