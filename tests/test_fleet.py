@@ -179,7 +179,7 @@ def test_a_search_finds_what_is_best_and_proposes_the_same_when_it_goes_on(tmp_p
 def test_the_spread_of_units_is_the_prior_about_what_they_share():
     common = {"rotors.raw": torch.zeros(2), "bodies.raw": torch.ones(3)}
     units = [{"rotors.raw": torch.full((2,), away), "bodies.raw": torch.ones(3)} for away in (0.1, -0.3, 5.0)]
-    prior = spread(units, common)
+    prior = spread(units, common, {"rotors.raw": "armature", "bodies.raw": "bodies"})
     assert prior.armature == pytest.approx(0.3)  # the middle one: one odd unit does not count
     assert prior.bodies == LEAST_DEVIATION
     assert prior.shared_armature == prior.shared_friction == 0.0

@@ -20,11 +20,11 @@ from spelgen.errors import LogError
 from spelgen.fitting import torque_fit, torque_jacobian
 from spelgen.fitting.body_steps import moved_bodies
 from spelgen.fitting.fit import fit
-from spelgen.fitting.gaussian_prior import SIZES, covariance, kind_of, most_probable
+from spelgen.fitting.gaussian_prior import ADAPTED, adapted_kinds, covariance, most_probable
 from spelgen.fitting.objectives import default_objective
-from spelgen.fitting.residual_fit import FRICTION, enter
+from spelgen.fitting.residual_fit import FRICTION, select_residuals
 from spelgen.fitting.torque_fit import fit_torque
-from spelgen.fitting.torque_jacobian import Left
+from spelgen.fitting.torque_jacobian import RIGID, ResidualSamples, RigidWeights
 from spelgen.fitting.torque_networks import adapt_networks
 from spelgen.fitting.torque_report import torque_notes
 from spelgen.fitting.torque_samples import TorqueSamples
@@ -37,6 +37,7 @@ from spelgen.logs.trajectory import Trajectory
 from spelgen.pipeline import generate
 from spelgen.runtime.rigid_body import pseudo_inertia
 from spelgen.settings.fits import GaussianPrior, Rollout, TorqueFit
+from spelgen.settings.tuning.fitting import TorqueTuning
 from tests.test_closed_form import FOLLOWED, drawn
 
 ROBOTS = ("two_link", "rpr", "six_dof")
@@ -108,9 +109,10 @@ def test_only_the_named_bodies_move(emitted):
 
 
 def test_the_prior_shares_what_joints_share():
-    weights = {"rotors.raw": torch.zeros(2), **{f"friction.{name}": torch.zeros(2) for name in SIZES}}
+    kinds = {"rotors": "armature", "viscous": "sizes", "coulomb": "sizes"}
+    weights = {name: torch.zeros(2) for name in kinds}
     prior = GaussianPrior(armature=0.5, shared_armature=2.0, sizes=0.3, shared_sizes=1.0, shared_friction=3.0)
-    found = covariance(prior, weights)
+    found = covariance(prior, weights, kinds)
     assert found[0, 0] == 0.25 + 4.0
     assert found[0, 1] == 4.0
     assert found[2, 2] == pytest.approx(0.09 + 1.0 + 9.0)
@@ -123,11 +125,11 @@ def test_the_prior_shares_what_joints_share():
 def test_the_prior_knows_every_weight(emitted):
     """What it knows nothing of would be taken for something else in silence."""
     module = emitted["six_dof"][0]
-    kinds = {kind_of(name) for name, _ in module.Model().named_parameters()}
-    assert kinds == {"bodies", "offset", "armature", "sizes", "velocities", "fractions"}
-    assert kind_of(torque_jacobian.COMPENSATION) == "friction_compensation"
-    with pytest.raises(StopIteration):
-        kind_of("unheard_of")
+    model = module.Model()
+    rigid = RigidWeights(model)
+    assert set(rigid.kinds) == {*dict(model.named_parameters()), "raw_friction_compensation"}
+    assert set(rigid.kinds.values()) == set(RIGID) - {"gains"}
+    assert covariance(GaussianPrior(), rigid.start, rigid.kinds).diagonal().min() > 0
 
 
 def test_deviations_are_those_of_the_largest_marginal_likelihood():
@@ -142,16 +144,17 @@ def test_deviations_are_those_of_the_largest_marginal_likelihood():
 
     best = np.exp(minimize_scalar(minus_log_likelihood, bounds=(-4, 3), method="bounded").x)
     weights = {"bodies.raw": torch.zeros(2, 10), "raw_offset": torch.zeros(2)}
+    kinds = adapted_kinds(weights, dict(zip(weights, ADAPTED, strict=True)))
     guess = prior = GaussianPrior(bodies=0.1, offset=0.1, degrees_of_freedom=1e-9)
     for _ in range(200):
         posterior = np.linalg.inv(rows.T @ rows / noise**2 + np.eye(20) / prior.bodies**2)
         mean = torch.from_numpy(posterior @ rows.T @ y / noise**2)
         variance = torch.from_numpy(np.diag(posterior).copy())
         both = [torch.cat([x, torch.full((2,), unit).double()]) for x, unit in ((mean, 0.1), (variance, 0.0))]
-        prior = most_probable(prior, guess, weights, *both)
+        prior = most_probable(prior, guess, kinds, *both)
     assert prior.bodies == pytest.approx(best, rel=1e-4)
     certain = prior.model_copy(update={"degrees_of_freedom": 1e12})
-    assert most_probable(certain, guess, weights, *both).bodies == pytest.approx(guess.bodies)
+    assert most_probable(certain, guess, kinds, *both).bodies == pytest.approx(guess.bodies)
 
 
 def test_a_urdf_that_is_wrong_is_given_up_and_that_is_said(emitted):
@@ -284,8 +287,8 @@ def at_once(emitted):
 def test_blocks_give_what_all_at_once_gives(emitted, at_once, monkeypatch, held, on_disk):
     """Of blocks that leave a rest, with regressors kept or computed anew, in memory or in a temporary file."""
     (samples, whole, expected), parts = at_once, emitted["rpr"][0].Model()
-    monkeypatch.setattr(torque_jacobian, "BLOCK", 64)
-    monkeypatch.setattr(torque_jacobian, "HELD", 1e12 if held else 0)
+    tuning = TorqueTuning(block=64, cached_bytes=1e12 if held else 0)
+    monkeypatch.setattr(torque_jacobian, "TUNING", tuning)
     table = (
         TorqueSamples.spooled(iter(samples), 3, decimation=2) if on_disk else TorqueSamples.held(samples, 2)
     )
@@ -517,7 +520,7 @@ def test_a_log_larger_than_memory_is_fitted_to_torques(emitted, robots, tmp_path
     (tmp_path / "arm.py").write_text(generate(robots / "two_link.urdf", preset="closed-form"))
     plain = train(tmp_path / "arm.py", [tmp_path / "train.parquet"], tmp_path / "plain")
     monkeypatch.setattr(chunks, "TUNING", replace(chunks.TUNING, in_memory=1000))
-    monkeypatch.setattr(torque_jacobian, "BLOCK", 100)
+    monkeypatch.setattr(torque_jacobian, "TUNING", TorqueTuning(block=100))
     large = train(tmp_path / "arm.py", [tmp_path / "train.parquet"], tmp_path / "large")
     assert {"streamed", "torque-fit"} <= {note.code for note in large.diagnostics}
     assert plain.config.objective == large.config.objective == "torque"
@@ -531,8 +534,7 @@ def test_few_of_very_many_samples_come_near_first(emitted, monkeypatch):
     samples = [recorded(drawn(module, seed=2, deviation=0.3), 6.0, 0.05, seed=seed) for seed in range(3)]
     plain, quick = module.Model(), module.Model()
     expected = fit_torque(plain, samples)
-    monkeypatch.setattr(torque_fit, "LARGE", 500)
-    monkeypatch.setattr(torque_fit, "FEW", 300)
+    monkeypatch.setattr(torque_fit, "TUNING", TorqueTuning(large=500, subset=300))
     found = fit_torque(quick, samples)
     assert found.steps != expected.steps
     assert found.cost == pytest.approx(expected.cost, rel=1e-3)
@@ -549,6 +551,6 @@ def test_friction_that_is_nearly_nothing_does_not_vary(robots):
     missing = 0.3 * (3 * q).sin() * qd.sign() + noise
     for friction, gain in ((1.0, 0.9), (1e-9, None)):
         model = build(robots / "two_link.urdf", "hybrid")
-        found = enter(model, Left(q, qd, 0 * q, missing, friction * qd.sign()), alike=5.0)
+        found = select_residuals(model, ResidualSamples(q, qd, 0 * q, missing, friction * qd.sign()), 5.0)
         varied = [x.gain for x in found if x.name == FRICTION]
         assert varied == [] if gain is None else min(varied) > gain and len(varied) == 2

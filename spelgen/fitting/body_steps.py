@@ -9,24 +9,26 @@ from __future__ import annotations
 
 import torch
 
-FARTHEST = 0.3  # of the way to the border of the possible bodies
+from spelgen.settings.tuning.fitting import TorqueTuning
+
+TUNING = TorqueTuning()
 
 
 def moved_bodies(raw: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
-    """Weights (B, 10) after a step (B, 10), as `InertialParameters` has them.
+    """Return weights (B, 10) after a step (B, 10), as `InertialParameters` has them.
 
     A body's pseudo-inertia is C S C^T, S = T T^T. To first order the step adds T (X + X^T) T^T to S, and that is what
     is added, or as much of it as keeps S positive definite.
     """
     row, column = torch.tril_indices(4, 4)
     on_diagonal = row == column
-    factor, change = (torch.zeros(len(raw), 4, 4).double() for _ in range(2))
+    factor, change = torch.zeros(2, len(raw), 4, 4).double()
     factor[:, row, column] = torch.where(on_diagonal, raw.exp(), raw)
     change[:, row, column] = torch.where(on_diagonal, raw.exp() * step, step)
     relative = torch.linalg.solve_triangular(factor, change, upper=False)
     added = relative + relative.mT
-    least = torch.linalg.eigvalsh(added)[:, 0]
-    part = (FARTHEST / (-least).clamp(min=1e-12)).clamp(max=1.0)
-    found = factor @ torch.linalg.cholesky(torch.eye(4).double() + part[:, None, None] * added)
-    entries = found[:, row, column]
+    smallest = torch.linalg.eigvalsh(added)[:, 0]
+    fraction = (TUNING.body_step / (-smallest).clamp(min=1e-12)).clamp(max=1.0)
+    root = torch.linalg.cholesky(torch.eye(4).double() + fraction[:, None, None] * added)
+    entries = (factor @ root)[:, row, column]
     return torch.where(on_diagonal, entries.abs().log(), entries)

@@ -12,9 +12,9 @@ import torch
 from torch.func import functional_call
 
 from spelgen.dynamics.servo_rollout import Load, ServoDrives, advanced, balanced, servo_drives
+from spelgen.fitting.functional_model import FunctionalModel
 from spelgen.fitting.servo_weights import BODIES, Point, ServoWeights, body_directions, inertial_slopes
 from spelgen.fitting.servo_windows import BodyLoad, Path, ServoWindows, body_load
-from spelgen.fitting.torque_jacobian import Asked
 
 NUDGE = 1e-4  # of weights
 DELAY_NUDGE = 2e-4  # s
@@ -28,7 +28,7 @@ class ServoProblem:
     def __init__(self, model: Any, windows: ServoWindows) -> None:
         self.model, self.windows = model, windows
         self.weights = ServoWeights(model)
-        self._asked = Asked(model)
+        self._asked = FunctionalModel(model)
         q = windows.q.flatten(0, 1)
         self.directions = body_directions(model, q[:: max(1, len(q) // GRAVITY_SAMPLES)])
         self._raw = model.get_parameter(BODIES).detach().clone()

@@ -1,15 +1,15 @@
-"""Fit rigid bodies to torques: their most probable weights, by Gauss-Newton steps (Levenberg-Marquardt).
+"""Fit rigid bodies to torques: their most probable weights, by Levenberg-Marquardt steps.
 
 The torque is linear in the bodies' parameters, which the log-Cholesky weights make possible ones, and smooth in the
 few constants of each joint: seconds are enough, and no step size is to be chosen. What is minimised is
 
     sum over joints and samples of (missing torque / noise)^2 + (weights - start)^T covariance^-1 (weights - start),
 
-with the covariance of a Gaussian prior (see ``covariance``). Where gains between logged and joint torques are trained,
-what is missed is told in the logged ones, else all torques would shrink with their gains. The noise of a joint is what
-is left of its torque, found in rounds, and so is how far the start is to be believed (see ``most_probable``). Sums over
-samples are made block by block, so that memory does not grow with the logs. What a model has beside rigid bodies is
-fitted to what these leave, where it pays (see ``residual_fit``), and then both in turn.
+half of it, with the covariance of a Gaussian prior (see ``covariance``). Where gains between logged and joint torques
+are trained, what is missed is in the logged ones, else all torques would shrink with their gains. The noise of a joint
+is what is left of its torque, found in rounds, and so is how far the start is to be trusted (see ``most_probable``).
+Sums over samples are made block by block, so that memory does not grow with the logs. What a model has beside rigid
+bodies is fitted to what these leave, where it pays (see ``residual_fit``), and then both in turn.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ import numpy as np
 import torch
 
 from spelgen.dynamics.protocol import has_residuals
-from spelgen.fitting.gaussian_prior import PRIORS, covariance, most_probable
+from spelgen.fitting.gaussian_prior import adapted_kinds, covariance, most_probable
 from spelgen.fitting.levenberg_marquardt import TUNING as DAMPING
 from spelgen.fitting.levenberg_marquardt import NormalEquations, SolverState, levenberg_marquardt
-from spelgen.fitting.residual_fit import Residual, enter, refine
-from spelgen.fitting.torque_jacobian import COMPENSATION, TorqueJacobian
+from spelgen.fitting.residual_fit import SelectedResidual, refit_residuals, select_residuals
+from spelgen.fitting.torque_jacobian import TUNING, TorqueJacobian
 from spelgen.fitting.torque_samples import TorqueSamples
 from spelgen.identification.samples import DynamicsSamples
 from spelgen.settings.fits import Adaptation, GaussianPrior
@@ -34,23 +34,8 @@ from spelgen.settings.fits import Adaptation, GaussianPrior
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
-DECIMATION = (
-    2  # samples taken of so many: filtered at 8 Hz and sampled at 100 Hz they say all that is to be said
-)
-ALIKE = 20.0  # of those: so many in a row, 0.4 s, err alike and count once
-ROUNDS = 8  # of weighing joints by what is left of their torque, and the start by how far it was left;
-LONGER, ENDED = 4, 0.98  # so many times as many while some joint's noise falls by more than that
-FIRST_ROUNDS = 3  # after which it is seen whether friction explains what is missed
-COMPENSATED = 0.1  # of what is missed: explained by a drive that adds torque with velocity,
-SIGNIFICANT = 4.0  # by so many standard deviations,
-VISIBLE = 0.05  # and so much of the torque's deviation: milliseconds between torque and motion look alike, but smaller
-STEPS = 5  # at most in a round
-LARGE = 2**15  # samples; of more, FEW of them are fitted first
-FEW, LAST_ROUNDS = 2**14, 2
-TURNS = 3  # of rigid bodies and what stands beside them, where something does
-GAIN = 1e-4  # relative: a step that gains less ends a round
-FIRST_NOISE = 0.1  # of a joint's torque range
-LEAST_NOISE = 1e-4  # likewise: noise-free samples are fitted to four digits of their torque's range
+State = SolverState[torch.Tensor]
+"""Weights (K,); as residuals the sums of squares of the torque that they miss (n,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +44,7 @@ class TorqueSolution:
 
     residual: (n,) root mean square of the torque that is missed [Nm, N]. prior: as the fit found it. covariance: of the
     weights after the fit (K, K), zero for those that did not move. compensated: (n,) joints whose drives add torque
-    that is not measured. residuals: what entered beside rigid bodies.
+    that is not measured. residuals: what was selected beside rigid bodies.
     """
 
     residual: np.ndarray
@@ -68,10 +53,7 @@ class TorqueSolution:
     prior: GaussianPrior
     covariance: torch.Tensor
     compensated: np.ndarray
-    residuals: tuple[Residual, ...]
-
-
-_State = SolverState[torch.Tensor]  # its residuals: sums of squares of the torque that is missed (n,)
+    residuals: tuple[SelectedResidual, ...]
 
 
 def fit_torque(
@@ -86,31 +68,24 @@ def fit_torque(
     as it is, and so does the prior of a load (see ``TorqueFit``).
     """
     if not isinstance(samples, TorqueSamples):
-        samples = TorqueSamples.held(samples, DECIMATION)
-    large = samples.count > LARGE
-    few = samples.thinned(FEW) if large else samples
-    prior = prior or (PRIORS[adapt] if adapt else GaussianPrior())
-    problem = _Problem(TorqueJacobian(model, few), prior, adapt)
-    at, noise = problem.settled()
-    residuals: list[Residual] = []
+        samples = TorqueSamples.held(samples, TUNING.decimation)
+    subset, large = samples, samples.count > TUNING.large
+    if large:
+        subset = samples.thinned(TUNING.subset)
+    problem = TorqueProblem(TorqueJacobian(model, subset), prior or _default_prior(adapt), adapt)
+    state = problem.multistart()
+    residuals: list[SelectedResidual] = []
     if adapt is None and has_residuals(model):
-        alike = max(1.0, ALIKE * few.count / samples.count)
-        problem.jacobian.write(at.x)
-        residuals = enter(model, problem.jacobian.left(at.x), alike)
-        for _ in range(TURNS if residuals else 0):
-            at = problem.again(at, TorqueJacobian(model, few))
-            at, noise = problem.solve(at, problem.noise(at.residuals), LAST_ROUNDS)
-            problem.jacobian.write(at.x)
-            refine(model, problem.jacobian.left(at.x), residuals, alike)
-        if residuals:  # seen with what was refined last
-            at = problem.again(at, TorqueJacobian(model, few))
-    if large:  # few of many samples came near, all of them finish
-        at, _ = problem.solve(problem.again(at, TorqueJacobian(model, samples)), noise, LAST_ROUNDS)
-    problem.jacobian.write(at.x)
+        state, residuals = _with_residuals(problem, state, samples.count)
+    if large:  # a subset of many samples came near, all of them finish
+        state = problem.set_samples(state, TorqueJacobian(model, samples))
+        state = problem.solve(state, TUNING.last_rounds)
+    problem.jacobian.write(state.x)
+    rms = (state.residuals / samples.count).sqrt() / problem.jacobian.per_gain(state.x)
     return TorqueSolution(
-        residual=((at.residuals / samples.count).sqrt() / problem.jacobian.per_gain(at.x)).numpy(),
-        steps=at.steps,
-        cost=at.cost,
+        residual=rms.numpy(),
+        steps=state.steps,
+        cost=state.cost,
         prior=problem.prior,
         covariance=problem.covariance,
         compensated=problem.compensated.numpy(),
@@ -118,131 +93,177 @@ def fit_torque(
     )
 
 
-class _Problem:
+def _default_prior(adapt: Adaptation | None) -> GaussianPrior:
+    if adapt is None:
+        return GaussianPrior()
+    return {
+        "load": TUNING.prior_of_load,
+        "friction": TUNING.prior_of_friction,
+        "unit": TUNING.prior_of_unit,
+    }[adapt]
+
+
+def _with_residuals(problem: TorqueProblem, state: State, count: int) -> tuple[State, list[SelectedResidual]]:
+    """Select what stands beside rigid bodies, and fit both in turn. count: of samples that the subset is of."""
+    model, samples = problem.jacobian.model, problem.jacobian.samples
+    correlation = max(1.0, TUNING.correlation_length * samples.count / count)
+    problem.jacobian.write(state.x)
+    residuals = select_residuals(model, problem.jacobian.residual_samples(state.x), correlation)
+    if not residuals:
+        return state, residuals
+    for _ in range(TUNING.turns):
+        state = problem.set_samples(state, TorqueJacobian(model, samples))
+        problem.set_noise(state.residuals)
+        state = problem.solve(state, TUNING.last_rounds)
+        problem.jacobian.write(state.x)
+        refit_residuals(model, problem.jacobian.residual_samples(state.x), residuals, correlation)
+    return problem.set_samples(state, TorqueJacobian(model, samples)), residuals
+
+
+class TorqueProblem:
+    """The cost of weights (K,) under a noise and a prior, which rounds of steps find anew: a `LeastSquares`.
+
+    compensated: (n,) joints whose drives compensate friction unseen. covariance: of the weights, as last found.
+    noise: (n,) standard deviations of errors as if they were independent from sample to sample.
+    """
+
     def __init__(self, jacobian: TorqueJacobian, prior: GaussianPrior, adapt: Adaptation | None) -> None:
         self.start, self.guess, self.adapt = jacobian.start, prior, adapt
-        self.compensated = jacobian.weights[COMPENSATION] != 0
+        rigid = jacobian.rigid
+        self.compensated = rigid.start[rigid.compensation] != 0
         self.covariance = torch.zeros(len(self.start), len(self.start)).double()
-        self.take(jacobian)
-        self.believe(prior)
+        self.kinds = adapted_kinds(rigid.start, rigid.kinds)
+        self._use(jacobian)
+        self.noise = self._first_noise()
+        self.set_prior(prior)
 
-    def take(self, jacobian: TorqueJacobian) -> None:
-        """Go on with these samples."""
+    def _use(self, jacobian: TorqueJacobian) -> None:
         self.jacobian, self.count = jacobian, jacobian.samples.count
         deviation = jacobian.torque_deviation()
         self.range = torch.maximum(deviation, 1e-3 * deviation.max())
 
-    def again(self, at: _State, jacobian: TorqueJacobian) -> _State:
-        """Go on from these weights with these samples."""
-        self.take(jacobian)
-        return replace(at, residuals=jacobian.squares(at.x))
+    def set_samples(self, state: State, jacobian: TorqueJacobian) -> State:
+        """Go on from a state with other samples."""
+        self._use(jacobian)
+        return replace(state, residuals=jacobian.squares(state.x))
 
-    def believe(self, prior: GaussianPrior) -> None:
-        """Go on with this prior."""
+    def set_prior(self, prior: GaussianPrior) -> None:
+        """Go on with another prior."""
         self.prior = prior
-        self.precision = torch.linalg.inv(covariance(prior, self.jacobian.weights))
+        rigid = self.jacobian.rigid
+        self.precision = torch.linalg.inv(covariance(prior, rigid.start, rigid.kinds))
+
+    def set_noise(self, squares: torch.Tensor, largest: torch.Tensor | None = None) -> None:
+        """Take for noise what is missed: sums of squares (n,). This is the one place of the noise model.
+
+        largest: (n,) noise where the start may be far off: torques that are not explained yet are no noise.
+        """
+        rms = torch.maximum((squares / self.count).sqrt(), TUNING.least_noise * self.range)
+        self.noise = TUNING.correlation_length**0.5 * rms
+        if largest is not None:
+            self.noise = torch.minimum(self.noise, largest)
+
+    def _first_noise(self) -> torch.Tensor:
+        return TUNING.correlation_length**0.5 * TUNING.first_noise * self.range
 
     @property
     def free(self) -> torch.Tensor:
         """Which weights (K,) move."""
         return self.jacobian.free(self.adapt, self.compensated)
 
-    def settled(self) -> tuple[_State, torch.Tensor]:
+    def multistart(self) -> State:
         """As `solve`, all rounds from the start; the more probable of two ways where the first leaves much.
 
         Bodies that are far off leave much of the torque, which is taken for noise, and noise asks for no better bodies:
         on the second way there is little noise until the fit is near.
         """
-        little = ALIKE**0.5 * FIRST_NOISE * self.range
-        ways = []
-        for most in (None, little):
-            at, noise = self.solve(*self.near(little, most), ROUNDS - FIRST_ROUNDS)
-            ways.append(
-                (self.evidence(at.x, noise), at, noise, self.prior, self.covariance.clone(), self.compensated)
-            )
-            if (noise <= little).all():
+        first_noise, ways = self._first_noise(), []
+        for largest in (None, first_noise):
+            state = self.solve(self._initial_fit(first_noise, largest), TUNING.rounds)
+            fitted = (state, self.noise, self.prior, self.covariance.clone(), self.compensated)
+            ways.append((self._evidence(state.x), fitted))
+            if (self.noise <= first_noise).all():
                 break
-        _, at, noise, prior, self.covariance, self.compensated = max(ways, key=lambda way: way[0])
-        self.believe(prior)
-        return at, noise
+        _, (state, self.noise, prior, self.covariance, self.compensated) = max(ways, key=lambda way: way[0])
+        self.set_prior(prior)
+        return state
 
-    def evidence(self, x: torch.Tensor, noise: torch.Tensor) -> float:
-        """The logarithm of the samples' marginal likelihood by Laplace's approximation, but for a constant."""
+    def _evidence(self, x: torch.Tensor) -> float:
+        """Return the logarithm of the samples' marginal likelihood by Laplace's approximation, but for a constant."""
         free, away = self.free, x - self.start
         prior, posterior = self.precision[free][:, free], self.covariance[free][:, free]
-        missed = self.count / ALIKE * noise.log().sum() + away @ self.precision @ away / 2
+        count = self.count / TUNING.correlation_length
+        missed = count * self.noise.log().sum() + away @ self.precision @ away / 2
         return float((prior.logdet() + posterior.logdet()) / 2 - missed)
 
-    def near(self, noise: torch.Tensor, most: torch.Tensor | None) -> tuple[_State, torch.Tensor]:
+    def _initial_fit(self, noise: torch.Tensor, largest: torch.Tensor | None) -> State:
         """As `solve`, some rounds from the start; from there anew while further joints want a compensation, for what
         a fit made of their torque without one leads astray.
         """
-        start = _State(self.start, self.jacobian.squares(self.start), float("inf"), DAMPING.first)
+        state = State(self.start, self.jacobian.squares(self.start), float("inf"), DAMPING.first)
         while True:
-            self.believe(self.guess)
-            at, found = self.solve(start, noise, FIRST_ROUNDS, most)
-            if self.adapt is not None or not self.compensate(at.x):
-                return at, found
-            start = replace(start, steps=at.steps)
+            self.set_prior(self.guess)
+            self.noise = noise
+            end = self.solve(state, TUNING.first_rounds, largest)
+            if self.adapt is not None or not self._compensate(end.x):
+                return end
+            state = replace(state, steps=end.steps)
 
-    def compensate(self, x: torch.Tensor) -> bool:
-        """Give a compensation to further joints that want one; whether there are such.
+    def _compensate(self, x: torch.Tensor) -> bool:
+        """Give a compensation to further joints that want one; return whether there are such.
 
         No friction explains a torque that falls with velocity: a drive that compensates friction by itself, after
         its torque was measured, does.
         """
         slope, explained, size = self.jacobian.by_velocity(x)
-        sure = explained * self.count / ALIKE > SIGNIFICANT**2 * (1 - explained)
-        falls = (slope < 0) & (explained > COMPENSATED) & (size > VISIBLE * self.range)
-        found = falls & sure & ~self.compensated
-        self.compensated = self.compensated | found
-        return bool(found.any())
+        count = self.count / TUNING.correlation_length
+        significant = explained * count > TUNING.compensation_deviations**2 * (1 - explained)
+        # milliseconds between torque and motion look alike, but smaller
+        visible = size > TUNING.compensation_visible * self.range
+        falls = (slope < 0) & (explained > TUNING.compensation_explained) & visible
+        further = falls & significant & ~self.compensated
+        self.compensated = self.compensated | further
+        return bool(further.any())
 
-    def solve(
-        self, at: _State, noise: torch.Tensor, rounds: int, most: torch.Tensor | None = None
-    ) -> tuple[_State, torch.Tensor]:
-        """Steps down, and the noise (n,) after them; after each round it is found anew, as the prior is.
+    def solve(self, state: State, rounds: int, largest: torch.Tensor | None = None) -> State:
+        """Take steps in rounds, after each of which noise and prior are found anew; more rounds while much is gained.
 
-        There are more rounds while much is gained. most: of the noise, where the start may be far off: torques that are
-        not explained yet are no noise.
+        largest: see `set_noise`.
         """
-        for number in range(LONGER * rounds):
-            self.weights = 1 / noise.square()
-            at = replace(at, cost=self.cost(at.x, at.residuals), converged=False)
-            *_, at = at, *levenberg_marquardt(self, at, max_steps=STEPS, relative_gain=GAIN)
-            before, noise = noise, self.noise(at.residuals)
-            noise = noise if most is None else torch.minimum(noise, most)
-            self.covariance[self.free[:, None] & self.free] = torch.linalg.inv(self.curvature).flatten()
+        for number in range(TUNING.longer * rounds):
+            state = replace(state, cost=self.cost(state.x, state.residuals), converged=False)
+            for step in levenberg_marquardt(self, state, max_steps=TUNING.steps, relative_gain=TUNING.gain):
+                state = step
+            before = self.noise
+            self.set_noise(state.residuals, largest)
+            free = self.free
+            self.covariance[free[:, None] & free] = torch.linalg.inv(self.curvature).flatten()
             if self.adapt != "load":
-                weights, variance = self.jacobian.weights, self.covariance.diagonal()
-                self.believe(most_probable(self.prior, self.guess, weights, at.x - self.start, variance))
-            if number + 1 >= rounds and (noise > ENDED * before).all():
+                away, variance = state.x - self.start, self.covariance.diagonal()
+                self.set_prior(most_probable(self.prior, self.guess, self.kinds, away, variance))
+            if number + 1 >= rounds and (self.noise > TUNING.noise_settled * before).all():
                 break
-        return at, noise
+        return state
 
     def residuals(self, x: torch.Tensor) -> torch.Tensor:
-        """Sums of squares of the torque that is missed (n,)."""
+        """Return sums of squares of the torque that is missed (n,)."""
         return self.jacobian.squares(x)
 
     def cost(self, x: torch.Tensor, residuals: torch.Tensor) -> float:
-        """See the top of this file."""
+        """Return what is minimised (see the top of this file)."""
         away = x - self.start
-        return float(((residuals * self.weights).sum() + away @ self.precision @ away) / 2)
+        return float(((residuals / self.noise.square()).sum() + away @ self.precision @ away) / 2)
 
     def normal_equations(self, x: torch.Tensor, residuals: torch.Tensor) -> NormalEquations:
-        """By the weights that move."""
+        """Return them by the weights that move."""
         free = self.free
-        curvature, descent = self.jacobian.normal_equations(x, self.weights.rsqrt(), free)
+        curvature, descent = self.jacobian.normal_equations(x, self.noise, free)
         away = self.precision @ (x - self.start)
         self.curvature = curvature + self.precision[free][:, free]
         return NormalEquations(self.curvature, descent - away[free])
 
     def moved(self, x: torch.Tensor, step: torch.Tensor) -> Iterator[torch.Tensor]:
-        """Straight in the weights, or in the bodies' parameters."""
+        """Yield where a step leads, straight in the weights or in the bodies' parameters."""
         change = torch.zeros_like(x).masked_scatter(self.free, step)
         yield x + change
         yield self.jacobian.moved(x, change)
-
-    def noise(self, squares: torch.Tensor) -> torch.Tensor:
-        """Standard deviations (n,) of errors as if they were independent from sample to sample."""
-        return ALIKE**0.5 * torch.maximum((squares / self.count).sqrt(), LEAST_NOISE * self.range)

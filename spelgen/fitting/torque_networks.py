@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
 PARTS: dict[Adaptation, tuple[str, ...]] = {
-    "load": ("mass", "potential"),
-    "friction": ("friction",),
+    "load": ("mass.", "potential."),
+    "friction": ("friction.",),
     "unit": ("",),
 }
-"""How the names of the weights begin that an adaptation moves."""
+"""The parts of a model whose weights an adaptation moves; a unit's are all."""
 BLOCK = 2**16  # samples in memory with all that their gradient needs
 
 

@@ -11,7 +11,7 @@ from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.dataset import TrainingData
 from spelgen.fitting.objective import FitRequest, PreparedLogs, Status
-from spelgen.fitting.torque_fit import DECIMATION, fit_torque
+from spelgen.fitting.torque_fit import TUNING, fit_torque
 from spelgen.fitting.torque_logs import prepare_windows, prepared_logs, regularizer_of, require_torque_input
 from spelgen.fitting.torque_networks import adapt_networks, fit_networks
 from spelgen.fitting.torque_report import torque_notes
@@ -104,7 +104,7 @@ def torque_samples(model: EmittedModel, data: TrainingData) -> TorqueSamples | N
     """
     decimation, reach = 1, bristle_reach(model)
     if has_rigid_bodies(model):
-        decimation = DECIMATION
+        decimation = TUNING.decimation
     if not data.chunks:
         samples = dynamics_samples(data.recordings, preprocessing=data.preprocessing, reach=reach)
         return TorqueSamples.held(samples, decimation) if any(len(x.q) for x in samples) else None

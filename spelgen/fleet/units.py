@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from spelgen.dynamics.parameters import parameter_table
 from spelgen.fitting.fitted import load_run
-from spelgen.fitting.gaussian_prior import KINDS
+from spelgen.fitting.gaussian_prior import prior_field
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fleet.jobs import Job
 from spelgen.fleet.prepare import PreparedArm
@@ -81,7 +82,8 @@ def unit_jobs(own: Sequence[Job], pooled: Sequence[Job], arms: Mapping[str, Prep
         common = _common_fit(jobs, pooled)
         if common is None:
             continue
-        prior = spread([_weights(job) for job in jobs], _weights(common))
+        kinds = {name: x.kind for name, x in parameter_table(load_run(common.folder).model).items()}
+        prior = spread([_weights(job) for job in jobs], _weights(common), kinds)
         for job in jobs:
             name = job.folder.name.replace(CLOSED_FORM, f"{CLOSED_FORM}-units")
             update = {"preset": SHARED, "folder": job.folder.with_name(name)}
@@ -89,17 +91,19 @@ def unit_jobs(own: Sequence[Job], pooled: Sequence[Job], arms: Mapping[str, Prep
     return near
 
 
-def spread(units: Sequence[Mapping[str, torch.Tensor]], common: Mapping[str, torch.Tensor]) -> GaussianPrior:
+def spread(
+    units: Sequence[Mapping[str, torch.Tensor]], common: Mapping[str, torch.Tensor], kinds: Mapping[str, str]
+) -> GaussianPrior:
     """Return the prior of a unit about the common weights.
 
     By kind of weight it is the root mean square of the distance of units from them, the median of the units. All joints
-    together move no more than each by itself.
+    together move no more than each by itself. kinds: of weights by name, see `dynamics.parameters`.
     """
     names: dict[str, list[str]] = {}
     for name in common:
-        for end, kind in KINDS.items():
-            if name.endswith(end) and kind != "friction_compensation":
-                names.setdefault(kind, []).append(name)
+        field = prior_field(kinds.get(name, ""))
+        if field in GaussianPrior.model_fields and field != "friction_compensation":
+            names.setdefault(field, []).append(name)
     deviations = {field: 0.0 for field in GaussianPrior.model_fields if field.startswith("shared_")}
     for kind, of_kind in names.items():
         squares = []

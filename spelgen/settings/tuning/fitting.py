@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+from spelgen.settings.fits import GaussianPrior
 
 
 @dataclass(frozen=True)
@@ -49,3 +51,88 @@ class LoopTuning:
     second_patience: int = 3  # epochs: residuals that belong to the arm soon help
     probe_every: int = 5  # epochs: friction that is learned may be too stiff for the substeps so far
     rollbacks: int = 8  # attempts at half the learning rate each, before a fit is given up
+
+
+DAY_TO_DAY = {
+    "sizes": 0.1,
+    "velocities": 0.1,
+    "fractions": 0.1,
+    "shared_sizes": 0.1,
+    "shared_velocities": 0.1,
+    "shared_friction": 0.3,
+}
+
+
+@dataclass(frozen=True)
+class TorqueTuning:
+    """Fits of rigid bodies to torques (`fitting.torque_fit`, `fitting.torque_jacobian`, `fitting.body_steps`)."""
+
+    decimation: int = 2  # samples at 100 Hz, filtered at 8 Hz: every second one says all that is to be said
+    correlation_length: float = 20.0  # of those, 0.4 s: so many in a row err alike and count once
+    rounds: int = 5  # after the first ones, of finding noise and prior anew
+    first_rounds: int = 3  # after which it is seen whether friction explains what is missed
+    last_rounds: int = 2  # where all but the last digits are fitted
+    longer: int = 4  # times as many rounds at most, while some joint's noise falls
+    noise_settled: float = 0.98  # [1] noise by that of the round before: what falls by less is settled
+    steps: int = 5  # at most in a round
+    gain: float = 1e-4  # [1] of the cost: a step that gains less ends a round
+    turns: int = 3  # of rigid bodies and what stands beside them
+    large: int = 2**15  # samples; of more, a subset is fitted first
+    subset: int = 2**14  # samples
+    first_noise: float = 0.1  # [1] of a joint's torque range
+    least_noise: float = (
+        1e-4  # [1] of it: noise-free samples are fitted to four digits of their torque's range
+    )
+    compensation_explained: float = (
+        0.1  # [1] of the missed squares, by a drive that adds torque with velocity
+    )
+    compensation_deviations: float = 4.0  # standard deviations that such a slope has to be away from zero
+    compensation_visible: float = (
+        0.05  # [1] of the torque's deviation: delays of milliseconds look alike, but smaller
+    )
+    block: int = 2**13  # samples at a time: of seven joints some 100 MB with their derivatives
+    cached_bytes: float = 2e8  # [B] of regressors, up to which they are kept from pass to pass
+    body_step: float = 0.3  # [1] of the way to the border of the possible bodies, at most in a step
+    # about a run that is adapted: nothing is known of a load before
+    prior_of_load: GaussianPrior = field(default_factory=lambda: GaussianPrior(bodies=10.0))
+    # warmth changes the friction of all joints by tens of per cent, of a joint by itself less (Bittencourt and
+    # Gunnarsson, J. Dyn. Sys. Meas. Control 134:051013, 2012)
+    prior_of_friction: GaussianPrior = field(default_factory=lambda: GaussianPrior(**DAY_TO_DAY))
+    # units of one make differ by a few per cent in mass, too
+    prior_of_unit: GaussianPrior = field(
+        default_factory=lambda: GaussianPrior(
+            **DAY_TO_DAY, bodies=0.1, gains=0.1, armature=0.1, shared_armature=0.1
+        )
+    )
+
+
+@dataclass(frozen=True)
+class ResidualTuning:
+    """Selection of what stands beside rigid bodies (`fitting.residual_fit`)."""
+
+    folds: int = 10  # blocks of samples that are held out in turn
+    standard_errors: float = (
+        2.82  # of a block's mean gain: 1 % of luck, by Student's t of nine degrees of freedom
+    )
+    least_gain: float = 1e-3  # [1] of the squares that are missed: what explains less is not worth a function
+    rounds: int = 30  # of the marginal likelihood's fixed point, at most
+    converged: float = 1e-3  # [1] relative change of the noise
+    network_samples: int = 2**12  # that networks are fitted to
+    network_folds: int = 2  # a network is fitted this often to be judged
+    network_evaluations: int = 100  # of its loss
+
+
+@dataclass(frozen=True)
+class TorqueReportTuning:
+    """When a fit to torques warns (`fitting.torque_report`)."""
+
+    undetermined: float = (
+        0.5  # [1] relative standard deviation from which on logs do not determine an inertia
+    )
+    hardly_trusted: float = (
+        5.0  # [1] a factor of the URDF's inertias: within more, they are not trusted any more
+    )
+    weak_acceleration: float = (
+        2.0  # [1] torque missed, by what accelerates a joint: beyond, motion is hardly predicted
+    )
+    positions: int = 50  # at which inertias are looked at

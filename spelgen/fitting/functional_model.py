@@ -1,0 +1,31 @@
+"""A model under other weights than its own, as torch's functions of functions need it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch.func import functional_call
+
+if TYPE_CHECKING:
+    from spelgen.emission.loading import EmittedModel
+
+Weights = Mapping[str, torch.Tensor]
+
+
+class FunctionalModel(torch.nn.Module):
+    """Evaluate functions of a model under weights that stand in for its own."""
+
+    def __init__(self, model: EmittedModel) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(self, function: Callable[[Any], Any]) -> Any:
+        """Return what a function gives for the model."""
+        return function(self.model)
+
+    def under(self, weights: Weights, function: Callable[[Any], Any]) -> Any:
+        """Return what a function gives for the model under these weights, by their names in the model."""
+        named = {f"model.{name}": weight for name, weight in weights.items()}
+        return functional_call(self, named, (function,))
