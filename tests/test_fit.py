@@ -9,7 +9,7 @@ from emitted import random_model
 
 import spelgen
 from spelgen.errors import LogError, RunError
-from spelgen.fitting.adaptive import LONG
+from spelgen.fitting.adaptive import TUNING as ADAPTIVE
 from spelgen.fitting.fit import RunOptions
 from spelgen.fitting.rollout import loss_scales, roll_out, rollout_loss
 from spelgen.fitting.train import train
@@ -192,7 +192,9 @@ def test_a_fit_tells_what_it_is():
     assert "momentum steps" in found._repr_html_()
 
 
-@pytest.mark.parametrize("samples, preset", [(4, "spel"), (4, "closed-form"), (LONG + 2, "phnode")])
+@pytest.mark.parametrize(
+    "samples, preset", [(4, "spel"), (4, "closed-form"), (ADAPTIVE.adjoint_samples + 2, "phnode")]
+)
 def test_both_solvers_agree(tmp_path, samples, preset):
     """In what they predict and in its gradient, which over long horizons comes from the adjoint equation."""
     model = random_model("two_link", tmp_path, seed=0, preset=preset)

@@ -9,9 +9,10 @@ import torch
 
 from spelgen.dynamics.protocol import has_friction_state, memory_after, sliding_memory
 from spelgen.logs.windows import Windows
+from spelgen.settings.tuning.fitting import AdaptiveTuning
 
-RELATIVE, ABSOLUTE = 1e-7, 1e-9  # tolerances of a step
-LONG = 20  # samples from which gradients come from the adjoint equation: memory does not grow with the steps
+TUNING = AdaptiveTuning()
+SOLVER: dict[str, Any] = {"method": "dopri5", "rtol": TUNING.relative, "atol": TUNING.absolute}
 
 
 def roll_out_adaptive(model: Any, windows: Windows) -> tuple[torch.Tensor, torch.Tensor]:
@@ -24,7 +25,11 @@ def roll_out_adaptive(model: Any, windows: Windows) -> tuple[torch.Tensor, torch
     """
     from torchdiffeq import odeint, odeint_adjoint  # half a second, for those who ask for dopri5 alone
 
-    long = windows.dt.shape[1] >= LONG and isinstance(model, torch.nn.Module) and torch.is_grad_enabled()
+    long = (
+        windows.dt.shape[1] >= TUNING.adjoint_samples
+        and isinstance(model, torch.nn.Module)
+        and torch.is_grad_enabled()
+    )
     adjoint = long and not has_friction_state(model)
     # the adjoint equation sees weights alone, so what is made of them cannot be prepared once for it
     prepared = None if adjoint else model.prepare()
@@ -37,11 +42,9 @@ def roll_out_adaptive(model: Any, windows: Windows) -> tuple[torch.Tensor, torch
         interval = _Interval(model, dt.unsqueeze(-1), tau, prepared, q, z)
         if adjoint:
             weights = tuple(x for x in model.parameters() if x.requires_grad)
-            solved = odeint_adjoint(
-                interval, state, unit, rtol=RELATIVE, atol=ABSOLUTE, method="dopri5", adjoint_params=weights
-            )
+            solved = odeint_adjoint(interval, state, unit, **SOLVER, adjoint_params=weights)
         else:
-            solved = odeint(interval, state, unit, rtol=RELATIVE, atol=ABSOLUTE, method="dopri5")
+            solved = odeint(interval, state, unit, **SOLVER)
         state, start = solved[-1], q
         q = state.chunk(2, dim=-1)[0]
         z = memory_after(model, z, q - start)

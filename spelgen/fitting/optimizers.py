@@ -13,13 +13,9 @@ from typing import Any, Protocol
 import torch
 
 from spelgen.logs.windows import Windows
+from spelgen.settings.tuning.fitting import OptimizerTuning
 
-VECTOR_FACTOR = 5.0  # on the learning rate of constants and biases
-GRADIENT_NORM = 1.0  # of the scaled loss; larger gradients are shortened to it
-HISTORY = 50  # steps that L-BFGS remembers
-CALL = 20  # evaluations between looks at whether more would help
-STALLED = 1 - 1e-3  # of the loss before a call: what ends above it has found next to nothing
-TOO_LARGE = 1e12  # told to the line search where a loss is not finite, so that it turns back
+TUNING = OptimizerTuning()
 
 Loss = Callable[[Any], torch.Tensor]  # of windows, or of what else is given to the optimizer
 LearningRate = Callable[[int], float]
@@ -60,7 +56,7 @@ class MiniBatchAdamW:
         self._optimizer = torch.optim.AdamW(
             [
                 {"params": weights, "weight_decay": weight_decay, "factor": 1.0},
-                {"params": numbers, "weight_decay": 0.0, "factor": VECTOR_FACTOR},
+                {"params": numbers, "weight_decay": 0.0, "factor": TUNING.number_factor},
             ]
         )
 
@@ -86,7 +82,7 @@ class MiniBatchAdamW:
         except torch.linalg.LinAlgError:  # numbers blew up within the rollout
             return math.nan
         value.backward()
-        norm = torch.nn.utils.clip_grad_norm_(self._parameters, GRADIENT_NORM)
+        norm = torch.nn.utils.clip_grad_norm_(self._parameters, TUNING.gradient_norm)
         self._optimizer.step()
         return value.detach() + 0.0 * norm
 
@@ -110,10 +106,10 @@ class LBFGS:
         self._parameters = [x for x in model.parameters() if x.requires_grad]
         self._weights = [parameter for parameter in self._parameters if parameter.dim() > 1]
         self._decay, self._finite = weight_decay, True
-        self._waits, self._reached = 0, (math.inf, math.inf)  # loss, and with the penalty
+        self._waits, self._last = 0, (math.inf, math.inf)  # loss, and with the penalty
         self._optimizer = torch.optim.LBFGS(
             self._parameters,
-            history_size=HISTORY,
+            history_size=TUNING.history,
             line_search_fn="strong_wolfe",
             tolerance_grad=1e-12,
             tolerance_change=1e-15,
@@ -133,15 +129,16 @@ class LBFGS:
             return math.nan
         try:
             with torch.no_grad():
-                found = torch.stack([loss(block) for block in blocks()]).sum()
-                reached = (found + self._penalty()).item()
+                total = torch.stack([loss(block) for block in blocks()]).sum()
+                penalised = (total + self._penalty()).item()
         except torch.linalg.LinAlgError:
             return math.nan
-        now = (found.item(), reached)
-        found_nothing = all(x > STALLED * before for x, before in zip(now, self._reached, strict=True))
-        self._waits = self._waits + 1 if found_nothing else 0
-        self._reached = now
-        return found.item()
+        before, self._last = self._last, (total.item(), penalised)
+        if all(value > TUNING.stalled * last for value, last in zip(self._last, before, strict=True)):
+            self._waits += 1
+        else:
+            self._waits = 0
+        return total.item()
 
     @property
     def stalled(self) -> bool:
@@ -163,7 +160,7 @@ class LBFGS:
         except torch.linalg.LinAlgError:
             pass
         self._optimizer.zero_grad()
-        return torch.tensor(TOO_LARGE, dtype=torch.float64)
+        return torch.tensor(TUNING.too_large, dtype=torch.float64)
 
     def _penalty(self) -> torch.Tensor | float:
         return 0.5 * self._decay * sum(weight.square().sum() for weight in self._weights)
@@ -172,14 +169,14 @@ class LBFGS:
         """All that a resumed run needs."""
         return {
             "optimizer": self._optimizer.state_dict(),
-            "reached": self._reached,
+            "reached": self._last,
             "waits": self._waits,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from a ``state_dict``."""
         self._optimizer.load_state_dict(state["optimizer"])
-        self._reached, self._waits = state["reached"], state["waits"]
+        self._last, self._waits = state["reached"], state["waits"]
 
 
 def minimise(
@@ -198,8 +195,8 @@ def minimise_sum(
     model: torch.nn.Module, loss: Loss, blocks: Blocks, evaluations: int, weight_decay: float = 0.0
 ) -> int:
     """As ``minimise``, of the sum of ``loss`` over ``blocks``, of which one at a time is in memory."""
-    optimizer, done = LBFGS(model, weight_decay), 0
-    while done < evaluations and not optimizer.stalled:
-        optimizer.run_on_blocks(loss, blocks, CALL)
-        done += CALL
-    return done
+    optimizer, count = LBFGS(model, weight_decay), 0
+    while count < evaluations and not optimizer.stalled:
+        optimizer.run_on_blocks(loss, blocks, TUNING.call)
+        count += TUNING.call
+    return count

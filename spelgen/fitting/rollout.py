@@ -15,19 +15,18 @@ from spelgen.dynamics.runge_kutta import runge_kutta
 from spelgen.fitting.adaptive import roll_out_adaptive
 from spelgen.logs.windows import Windows
 from spelgen.settings.fits import Solver
+from spelgen.settings.tuning.fitting import IntegrationTuning
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
-SUBSTEPS = (1, 2, 4, 8, 16, 32)  # rk4 steps between samples
-INTEGRATION_FRACTION = 0.03  # of the model's own error, what the integrator may add
-LEAST_ERROR = 1e-2  # no model is expected to be better, in units of the scales
+TUNING = IntegrationTuning()
 
 
 def roll_out(
     model: PortHamiltonianDynamics, windows: Windows, substeps: int = 1, solver: Solver = "rk4"
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Positions and velocities (W, K-1, n) predicted for samples 1..K-1 of each window from its sample 0.
+    """Return positions and velocities (W, K-1, n) predicted for samples 1..K-1 of each window from its sample 0.
 
     The state is (q, p), p = M(q) qd, so that no derivative of M in time is needed. Windows make one batch, each with
     its own sample times, and every interval between samples is solved by itself: the input jumps at its ends.
@@ -45,7 +44,7 @@ def roll_out(
     for dt, tau in zip(windows.dt.unbind(1), windows.tau.unbind(1), strict=True):
         step = dt.unsqueeze(-1) / substeps
         for substep in range(substeps):
-            rhs = partial(_rate, model, q, z, tau, prepared)
+            rhs = partial(_rhs, model, q, z, tau, prepared)
             moved, p, qd = runge_kutta(rhs, p, step)
             q, z = q + moved, memory_after(model, z, moved)
             if substep == 0:
@@ -55,7 +54,7 @@ def roll_out(
     return torch.stack(positions, dim=1), torch.stack(velocities, dim=1)  # each (W, K-1, n)
 
 
-def _rate(
+def _rhs(
     model: PortHamiltonianDynamics,
     q: torch.Tensor,
     z: torch.Tensor,
@@ -64,25 +63,23 @@ def _rate(
     moved: torch.Tensor,
     p: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """q' and p' where joints have moved so far from q, where friction's memory was z."""
+    """Return q' and p' where joints have moved so far from q, where friction's memory was z."""
     return model.port_hamiltonian_rhs(q + moved, p, tau, prepared, memory_after(model, z, moved))
 
 
 def position_difference(
     predicted: torch.Tensor, measured: torch.Tensor, joint_types: Sequence[str]
 ) -> torch.Tensor:
-    """Signed distance (..., n): prismatic the difference, revolute the geodesic distance on SO(3).
+    """Return the signed distance (..., n): prismatic the difference, revolute the geodesic distance on SO(3).
 
     For rotations about one common axis, R = exp(q e), the geodesic distance |log(R^T R')| / sqrt(2) is the
     wrapped angle |q' - q - 2 pi round((q' - q) / 2 pi)|, so the log map of SPEL eq. 8 needs no matrices
     here.
     """
-    turn = torch.tensor(
-        [2 * math.pi if kind == "revolute" else math.inf for kind in joint_types], dtype=predicted.dtype
-    )
+    revolute = torch.tensor([kind == "revolute" for kind in joint_types], device=predicted.device)
     difference = predicted - measured
-    turns = torch.round(difference.detach() / turn.to(predicted.device))
-    return difference - turns.nan_to_num() * turn.nan_to_num(posinf=0.0).to(predicted.device)
+    turns = torch.round(difference.detach() / (2 * math.pi))
+    return difference - 2 * math.pi * torch.where(revolute, turns, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,21 +98,27 @@ class LossScales:
 
 
 def loss_scales(windows: Windows, joint_types: Sequence[str]) -> LossScales:
-    """The scales of these windows; for a joint that hardly moves, a hundredth of the largest one."""
+    """Return the scales of these windows; for a joint that hardly moves, a hundredth of the largest one."""
     moved = position_difference(windows.q[:, 1:], windows.q[:, :1], joint_types)
     changed = windows.qd[:, 1:] - windows.qd[:, :1]
     varied = windows.tau - windows.tau.mean(dim=(0, 1))
-    means = moved.square().mean(dim=0), changed.square().mean(dim=0), varied.square().mean(dim=(0, 1))
-    scales = [mean.sqrt() for mean in means]
     return LossScales(
-        *(torch.maximum(x, (1e-2 * x.amax(dim=-1, keepdim=True)).clamp(min=1e-9)) for x in scales)
+        _scale(moved.square().mean(dim=0)),
+        _scale(changed.square().mean(dim=0)),
+        _scale(varied.square().mean(dim=(0, 1))),
     )
+
+
+def _scale(mean_square: torch.Tensor) -> torch.Tensor:
+    root = mean_square.sqrt()
+    smallest = (1e-2 * root.amax(dim=-1, keepdim=True)).clamp(min=1e-9)
+    return torch.maximum(root, smallest)
 
 
 def rollout_errors(
     model: EmittedModel, windows: Windows, scales: LossScales, substeps: int, solver: Solver = "rk4"
 ) -> torch.Tensor:
-    """Scaled errors (W, K-1, 2n) of the rollout: of the positions, then of the velocities."""
+    """Return scaled errors (W, K-1, 2n) of the rollout: of the positions, then of the velocities."""
     q, qd = roll_out(model, windows, substeps, solver)
     position = position_difference(q, windows.q[:, 1:], model.joint_types) / scales.q
     return torch.cat([position, (qd - windows.qd[:, 1:]) / scales.qd], dim=-1)
@@ -163,10 +166,10 @@ def momentum_loss(model: EmittedModel, windows: Windows, scales: LossScales) -> 
 
 
 def integration_error(model: EmittedModel, windows: Windows, scales: LossScales, substeps: int) -> float:
-    """Difference between rollouts with `substeps` and with twice as many, relative to the error of the
+    """Return the difference between rollouts with `substeps` and with twice as many, relative to the error of the
     latter.
 
-    Both are root mean squares in units of `scales`; of the model's error, at least LEAST_ERROR is taken.
+    Both are root mean squares in units of `scales`; of the model's error, at least `least_error` is taken.
     """
     try:
         with torch.no_grad():
@@ -174,15 +177,18 @@ def integration_error(model: EmittedModel, windows: Windows, scales: LossScales,
             difference = rollout_errors(model, windows, scales, substeps) - fine
     except torch.linalg.LinAlgError:  # numbers blew up
         return math.inf
-    error = difference.square().mean().sqrt().item() / max(fine.square().mean().sqrt().item(), LEAST_ERROR)
+    model_error = max(fine.square().mean().sqrt().item(), TUNING.least_error)
+    error = difference.square().mean().sqrt().item() / model_error
     return error if math.isfinite(error) else math.inf
 
 
 def choose_substeps(model: EmittedModel, windows: Windows, scales: LossScales, start: int = 1) -> int:
-    """The fewest rk4 steps per sample interval, from `start` on, that make integration a small part of the
+    """Return the fewest rk4 steps per sample interval, from `start` on, that make integration a small part of the
     error.
     """
-    for substeps in SUBSTEPS:
-        if substeps >= start and integration_error(model, windows, scales, substeps) < INTEGRATION_FRACTION:
+    for substeps in TUNING.substeps:
+        if substeps < start:
+            continue
+        if integration_error(model, windows, scales, substeps) < TUNING.fraction:
             return substeps
-    return max(start, SUBSTEPS[-1])
+    return max(start, TUNING.substeps[-1])

@@ -14,13 +14,12 @@ import torch
 
 from spelgen.dynamics.pinocchio_urdf import urdf_dynamics
 from spelgen.logs.windows import Windows
+from spelgen.settings.tuning.fitting import RegularizerTuning
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
-POINTS = 200
-WIDENED = 0.5  # of the logs' range, to both sides: a model is used a little beyond its logs
-LEAST_SCALE = 0.05  # of the largest gravity torque, for joints that gravity hardly loads
+TUNING = RegularizerTuning()
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,17 +53,22 @@ def urdf_regularizer(
     without it.
     """
     dynamics = urdf_dynamics(urdf, joints)
-    seen = windows.q.flatten(0, 1)
-    low, high = seen.amin(dim=0), seen.amax(dim=0)
-    low, high = low - WIDENED * (high - low), high + WIDENED * (high - low)
+    positions = windows.q.flatten(0, 1)
+    low, high = positions.amin(dim=0), positions.amax(dim=0)
+    low, high = low - TUNING.widened * (high - low), high + TUNING.widened * (high - low)
     generator = torch.Generator().manual_seed(0)
-    q = low + (high - low) * torch.rand(POINTS, len(joints), dtype=seen.dtype, generator=generator)
+    q = low + (high - low) * torch.rand(
+        TUNING.points, len(joints), dtype=positions.dtype, generator=generator
+    )
     with torch.no_grad():
         whitening = torch.linalg.inv(torch.linalg.cholesky(model.mass_matrix(q).mean(dim=0)))
     gravity = dynamics.gravity(q)
     scale = gravity.square().mean(dim=0).sqrt()
     largest = scale.max().item()
-    scale = scale.clamp(min=LEAST_SCALE * largest) if largest > 0 else torch.ones_like(scale)
+    floor = TUNING.least_scale * largest
+    if not largest:
+        floor = 1.0  # gravity loads no joint: any unit will do
+    scale = scale.clamp(min=floor)
     return UrdfRegularizer(q, whitening, _variation(dynamics.mass_matrix(q), whitening), gravity, scale)
 
 

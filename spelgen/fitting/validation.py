@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import torch
 
 from spelgen.fitting.dataset import TrainingData
-from spelgen.fitting.rollout import INTEGRATION_FRACTION, choose_substeps, integration_error, rollout_loss
+from spelgen.fitting.rollout import TUNING as INTEGRATION
+from spelgen.fitting.rollout import choose_substeps, integration_error, rollout_loss
 from spelgen.settings.fits import BATCH, Solver
 from spelgen.settings.tuning.fitting import ValidationTuning
 
@@ -63,6 +64,6 @@ class Validation:
             return self.prescribed
         if present is None:
             return choose_substeps(self.model, self.probe, self.scales)
-        if integration_error(self.model, self.probe, self.scales, present) <= INTEGRATION_FRACTION:
+        if integration_error(self.model, self.probe, self.scales, present) <= INTEGRATION.fraction:
             return present
         return choose_substeps(self.model, self.probe, self.scales, start=2 * present)

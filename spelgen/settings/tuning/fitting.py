@@ -136,3 +136,42 @@ class TorqueReportTuning:
         2.0  # [1] torque missed, by what accelerates a joint: beyond, motion is hardly predicted
     )
     positions: int = 50  # at which inertias are looked at
+
+
+@dataclass(frozen=True)
+class IntegrationTuning:
+    """Steps of the integrator in rollouts (`fitting.rollout`)."""
+
+    substeps: tuple[int, ...] = (1, 2, 4, 8, 16, 32)  # of rk4 between samples, that are tried
+    fraction: float = 0.03  # [1] of the model's own error, that the integrator may add
+    least_error: float = 1e-2  # [1] in units of the loss's scales: no model is expected to be better
+
+
+@dataclass(frozen=True)
+class AdaptiveTuning:
+    """Rollouts by dopri5 (`fitting.adaptive`)."""
+
+    relative: float = 1e-7  # [1] tolerance of a step
+    absolute: float = 1e-9  # [rad, m, and momenta] tolerance of a step
+    adjoint_samples: int = 20  # from so many on by the adjoint equation: memory does not grow with the steps
+
+
+@dataclass(frozen=True)
+class OptimizerTuning:
+    """Optimizers of networks (`fitting.optimizers`)."""
+
+    number_factor: float = 5.0  # [1] on the learning rate of constants and biases
+    gradient_norm: float = 1.0  # of the scaled loss; larger gradients are shortened to it
+    history: int = 50  # steps that L-BFGS remembers
+    call: int = 20  # evaluations between looks at whether more would help
+    stalled: float = 1 - 1e-3  # [1] of the loss before a call: what ends above it gained next to nothing
+    too_large: float = 1e12  # given to the line search where a loss is not finite, so that it turns back
+
+
+@dataclass(frozen=True)
+class RegularizerTuning:
+    """The regularizer towards the URDF (`fitting.urdf_regularizer`)."""
+
+    points: int = 200  # positions at which M and gravity are compared
+    widened: float = 0.5  # [1] of the logs' range, to both sides: a model is used a little beyond its logs
+    least_scale: float = 0.05  # [1] of the largest gravity torque, for joints that gravity hardly loads
