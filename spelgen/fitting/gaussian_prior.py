@@ -33,10 +33,10 @@ def covariance(prior: GaussianPrior, weights: Mapping[str, torch.Tensor], kinds:
         "velocities": prior.shared_velocities,
     }
     friction = []
-    for name, own in rows.items():
-        matrix[own[:, None], own] += shared.get(prior_field(kinds[name]), 0.0) ** 2
+    for name, row in rows.items():
+        matrix[row[:, None], row] += shared.get(prior_field(kinds[name]), 0.0) ** 2
         if kinds[name] == "sizes":
-            friction.append(own)
+            friction.append(row)
     if friction:
         together = torch.cat(friction)
         matrix[together[:, None], together] += prior.shared_friction**2
@@ -60,9 +60,9 @@ def most_probable(
     """
     deviations, freedom = {}, prior.degrees_of_freedom
     for place, kind in enumerate(ADAPTED):
-        own = kinds == place
-        determined = float((1 - variance[own] / getattr(prior, kind) ** 2).sum())
-        squares = float(away[own].square().sum()) + freedom * getattr(guess, kind) ** 2
+        mask = kinds == place
+        determined = float((1 - variance[mask] / getattr(prior, kind) ** 2).sum())
+        squares = float(away[mask].square().sum()) + freedom * getattr(guess, kind) ** 2
         deviations[kind] = (squares / (max(determined, 0.0) + freedom)) ** 0.5
     return prior.model_copy(update=deviations)
 

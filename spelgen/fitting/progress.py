@@ -69,10 +69,8 @@ class TrainingProgress:
             self._bar.reset(self._task, description="training", total=epochs)
         state = f"validation {record['validation']:.3g}, best {record['best']:.3g}"
         self._bar.update(self._task, completed=record["epoch"], state=state)
-        rate, epochs = record["step"] / record["seconds"], "epoch" if record["epoch"] == 1 else "epochs"
-        self._said = (
-            f"training: {record['epoch']} {epochs}, loss {record['loss']:.3g}, {state}, {rate:.1f} steps/s"
-        )
+        rate, plural = record["step"] / record["seconds"], "s" * (record["epoch"] != 1)
+        self._said = f"training: {record['epoch']} epoch{plural}, loss {record['loss']:.3g}, {state}, {rate:.1f} steps/s"
 
     def _end_stage(self) -> None:
         if self._said and self._show and not self._console.is_terminal:

@@ -136,11 +136,13 @@ def _candidates(model: Any, samples: ResidualSamples) -> Iterator[_Candidate]:
     )
     for parameter, features, scale, force, groups in kinds:
         for joint in range(len(motors)):
-            own = features[:, joint]
-            if not own.any() or scale[joint] <= 0:
+            columns = features[:, joint]
+            if not columns.any() or scale[joint] <= 0:
                 continue
-            friction = samples.friction[:, joint] if parameter == FRICTION else None
-            yield _Candidate(parameter, joint, float(scale[joint]), own, force[joint], groups, friction)
+            friction = None
+            if parameter == FRICTION:
+                friction = samples.friction[:, joint]
+            yield _Candidate(parameter, joint, float(scale[joint]), columns, force[joint], groups, friction)
 
 
 def _noise(missing: torch.Tensor) -> torch.Tensor:
@@ -172,24 +174,24 @@ def _held_out_gain(candidate: _Candidate, target: torch.Tensor, correlation: flo
     """
     folds = list(zip(candidate.chunks(), target.chunk(TUNING.folds), strict=True))
     everything = _Sums.of(candidate.features, target)
-    before, after = [], []
+    squares, missed = [], []
     for fold, y in folds:
-        own = _Sums.of(fold.features, y)
-        weights = _most_probable(everything.without(own), candidate.groups, correlation)
-        before.append(own.square)
-        after.append(float((y - fold.torque(weights)).square().sum()))
-    return _significant_gain(torch.tensor(before).double(), torch.tensor(after).double())
+        held_out = _Sums.of(fold.features, y)
+        weights = _most_probable(everything.without(held_out), candidate.groups, correlation)
+        squares.append(held_out.square)
+        missed.append(float((y - fold.torque(weights)).square().sum()))
+    return _significant_gain(torch.tensor(squares).double(), torch.tensor(missed).double())
 
 
-def _significant_gain(before: torch.Tensor, after: torch.Tensor) -> float | None:
+def _significant_gain(squares: torch.Tensor, missed: torch.Tensor) -> float | None:
     """Return the fraction by which sums of squares of blocks fell; None where luck could do that, or it is next to
     nothing.
     """
-    gains = before - after
+    gains = squares - missed
     error = gains.std() / len(gains) ** 0.5
     if not gains.isfinite().all() or gains.mean() <= TUNING.standard_errors * error:
         return None
-    fraction = float(gains.sum() / before.sum())
+    fraction = float(gains.sum() / squares.sum())
     return fraction if fraction > TUNING.least_gain else None
 
 
@@ -216,8 +218,8 @@ def _most_probable(sums: _Sums, groups: torch.Tensor, correlation: float) -> tor
         determined = (size - precision * (member.mT @ covariance.diagonal())).clamp(min=1e-9)
         precision = (determined / (member.mT @ weights.square()).clamp(min=1e-300)).clamp(max=1e14)
         missed = square - float(2 * weights @ moment - weights @ gram @ weights)
-        before, noise = noise, max(missed, 1e-12 * square) / count
-        if abs(noise - before) < TUNING.converged * before:
+        previous, noise = noise, max(missed, 1e-12 * square) / count
+        if abs(noise - previous) < TUNING.converged * previous:
             break
     return weights
 
@@ -250,23 +252,23 @@ def _fit_network(
     def loss(rows: torch.Tensor) -> Callable[[], torch.Tensor]:
         chosen = ResidualSamples(*(column[rows] for column in samples))
 
-        def missed() -> torch.Tensor:
+        def cost() -> torch.Tensor:
             error = chosen.missing - _network_torque(model, chosen) + present[rows]
             return 0.5 * (error / noise).square().sum() / correlation
 
-        return missed
+        return cost
 
-    after = torch.zeros(TUNING.folds).double()
+    missed = torch.zeros(TUNING.folds).double()
     for fold in range(TUNING.network_folds):
         held_out = blocks % TUNING.network_folds == fold
         network.load_state_dict(start)
         minimise(network, loss(~held_out), TUNING.network_evaluations, weight_decay=1.0)
         with torch.no_grad():
             error = (samples.missing - _network_torque(model, samples) + present) / noise
-        after.index_add_(0, blocks[held_out], error[held_out].square().sum(dim=1))
-    before = torch.zeros(TUNING.folds).double()
-    before.index_add_(0, blocks, (samples.missing / noise).square().sum(dim=1))
-    gain = _significant_gain(before, after)
+        missed.index_add_(0, blocks[held_out], error[held_out].square().sum(dim=1))
+    squares = torch.zeros(TUNING.folds).double()
+    squares.index_add_(0, blocks, (samples.missing / noise).square().sum(dim=1))
+    gain = _significant_gain(squares, missed)
     network.load_state_dict(start)
     if gain is not None:
         minimise(network, loss(blocks >= 0), TUNING.network_evaluations, weight_decay=1.0)

@@ -234,14 +234,14 @@ class TorqueProblem:
             state = replace(state, cost=self.cost(state.x, state.residuals), converged=False)
             for step in levenberg_marquardt(self, state, max_steps=TUNING.steps, relative_gain=TUNING.gain):
                 state = step
-            before = self.noise
+            previous = self.noise
             self.set_noise(state.residuals, largest)
             free = self.free
             self.covariance[free[:, None] & free] = torch.linalg.inv(self.curvature).flatten()
             if self.adapt != "load":
                 away, variance = state.x - self.start, self.covariance.diagonal()
                 self.set_prior(most_probable(self.prior, self.guess, self.kinds, away, variance))
-            if number + 1 >= rounds and (self.noise > TUNING.noise_settled * before).all():
+            if number + 1 >= rounds and (self.noise > TUNING.noise_settled * previous).all():
                 break
         return state
 
