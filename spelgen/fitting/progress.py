@@ -70,7 +70,8 @@ class TrainingProgress:
         state = f"validation {record['validation']:.3g}, best {record['best']:.3g}"
         self._bar.update(self._task, completed=record["epoch"], state=state)
         rate, plural = record["step"] / record["seconds"], "s" * (record["epoch"] != 1)
-        self._said = f"training: {record['epoch']} epoch{plural}, loss {record['loss']:.3g}, {state}, {rate:.1f} steps/s"
+        epochs_done = f"{record['epoch']} epoch{plural}"
+        self._said = f"training: {epochs_done}, loss {record['loss']:.3g}, {state}, {rate:.1f} steps/s"
 
     def _end_stage(self) -> None:
         if self._said and self._show and not self._console.is_terminal:
