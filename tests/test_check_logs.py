@@ -14,9 +14,11 @@ from spelgen.cli.main import app
 from spelgen.dynamics.regressor import regressor, urdf_parameters
 from spelgen.errors import LogError, SpelgenErrors
 from spelgen.loaded_arm import load_arm
+from spelgen.log_checks import check_logs as check_logs_room
+from spelgen.log_checks import robot_checks
 from spelgen.log_checks.check_logs import check_logs, require_possible_torques
 from spelgen.log_checks.statistics import noise_level, quantisation_step, statistics
-from spelgen.logs import chunks
+from spelgen.logs import checks, chunks
 from spelgen.logs.read import write_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.render.logs_page import page
@@ -273,6 +275,20 @@ def test_a_report_is_told_in_a_line_and_in_a_notebook(loaded, log):
     assert "&lt;b&gt;" in shown and "<b>: " not in shown
     assert shown.count("<table>") == 5
     assert json.loads(json.dumps(report.to_dict()))["files"] == 0
+
+
+@pytest.mark.parametrize("registry", [checks, robot_checks])
+@pytest.mark.parametrize("severity", ["info", "error"])
+def test_a_new_check_is_a_function_and_its_row(loaded, log, monkeypatch, registry, severity):
+    """As docs/extending.md says: `spelgen logs` reports it, and its severity decides whether logs are refused."""
+    check = checks.Check("odd-name", severity, lambda joint: "it is called odd", expected="another name")
+    monkeypatch.setattr(registry, "CHECKS", [*registry.CHECKS, check])
+    monkeypatch.setattr(check_logs_room, "CHECKS", robot_checks.CHECKS)
+    report = check_logs([log], loaded)
+    if severity == "error":
+        assert [error.got for error in report.errors] == ["it is called odd"] * 3
+    else:
+        assert {(x.code, x.message) for x in report.findings} == {("odd-name", "it is called odd")}
 
 
 def test_a_few_samples_are_told_without_judgement(loaded, arm, log):

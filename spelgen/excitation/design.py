@@ -1,4 +1,4 @@
-"""The motion that shows an arm's parameters best: random starts, the best of them improved by L-BFGS."""
+"""Design the motion that shows an arm's parameters best: random starts, the best of them improved by L-BFGS."""
 
 from __future__ import annotations
 
@@ -13,14 +13,12 @@ from spelgen.errors import SettingsError
 from spelgen.excitation.criterion import Criterion
 from spelgen.excitation.excitation import Excitation
 from spelgen.excitation.trajectory import ExcitationTrajectory, motion_bounds
+from spelgen.settings.tuning.simulation import ExcitationTuning
 
 if TYPE_CHECKING:
     from spelgen.loaded_arm import LoadedArm
 
-STARTS = 40  # motions at random, of which the best is improved
-HARMONICS_PER_SECOND = 0.4  # up to 0.4 Hz: what an arm follows well, far below its drives' ripple
-FEWEST_HARMONICS = 5
-MEMORY = 30  # steps from which L-BFGS knows the curvature
+TUNING = ExcitationTuning()
 
 
 def excite(
@@ -33,9 +31,9 @@ def excite(
     speed: float = 0.7,
     trials: int = 100,
     seed: int = 0,
-    progress: Callable[[int, int], None] = lambda done, all: None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Excitation:
-    """An exciting motion of this duration [s], sampled at about `sample_rate` [Hz]; the same for the same arguments.
+    """Return an exciting motion of this duration [s], sampled at about `sample_rate` [Hz]; same arguments, same motion.
 
     It starts and ends at rest and keeps the part `reach` of the joints' ranges and `speed` of their velocity
     limits; effort limits too, where the URDF has them and inertials, and where any motion can. Joints that follow
@@ -46,13 +44,13 @@ def excite(
     """
     _require(duration=duration, sample_rate=sample_rate, reach=reach, speed=speed)
     if harmonics is None:
-        harmonics = max(FEWEST_HARMONICS, round(HARMONICS_PER_SECOND * duration))
+        harmonics = max(TUNING.fewest_harmonics, round(TUNING.harmonics_per_second * duration))
     elif harmonics < 2:
         raise SettingsError(repr(harmonics), element="excite: harmonics", expected="2 or more")
     bounds = motion_bounds(arm.arm, reach, speed, arm.robot.joint)
     trajectory = ExcitationTrajectory(duration, harmonics, bounds)
     criterion = Criterion(arm.arm, trajectory)
-    starts = np.random.default_rng(seed).standard_normal((STARTS, trajectory.size))
+    starts = np.random.default_rng(seed).standard_normal((TUNING.starts, trajectory.size))
     best = _improved(criterion, min(starts, key=criterion.value), trials, progress)
     motion = trajectory.motion(best, np.linspace(0.0, duration, round(duration * sample_rate) + 1))
     first = criterion.motion(starts[0])
@@ -70,32 +68,33 @@ def excite(
 def _require(**values: float) -> None:
     """Raise SettingsError for values that are not positive, and parts that are more than the whole."""
     for name, value in values.items():
-        most = 1.0 if name in ("reach", "speed") else inf
-        if not 0 < value <= most or value == inf:
-            expected = "more than 0, at most 1" if most == 1.0 else "a positive number"
+        is_fraction = name in ("reach", "speed")
+        if not 0 < value < inf or (is_fraction and value > 1):
+            expected = "more than 0, at most 1" if is_fraction else "a positive number"
             raise SettingsError(repr(value), element=f"excite: {name}", expected=expected)
 
 
 def _improved(
     criterion: Criterion, start: np.ndarray, trials: int, progress: Callable[[int, int], None]
 ) -> np.ndarray:
-    """The best of so many trials from a start on. The criterion has kinks, where singular values meet and where
-    another sample is the fastest: L-BFGS gets far on such functions (Lewis and Overton, Math. Program. 141:135, 2013),
-    and what it saw counts, not where it ended.
+    """Return the best of so many trials from a start on.
+
+    The criterion has kinks, where singular values meet and where another sample is the fastest: L-BFGS gets far on
+    such functions (Lewis and Overton, Math. Program. 141:135, 2013), and what it saw counts, not where it ended.
     """
-    best, least, done = start, criterion.value(start), 0
-    if not isfinite(least):
+    best, lowest, done = start, criterion.value(start), 0
+    if not isfinite(lowest):
         return start
 
-    def tried(parameters: np.ndarray) -> tuple[float, np.ndarray]:
-        nonlocal best, least, done
+    def evaluate(parameters: np.ndarray) -> tuple[float, np.ndarray]:
+        nonlocal best, lowest, done
         value, gradient = criterion.value_and_gradient(parameters)
         done += 1
-        if value < least:
-            best, least = parameters.copy(), value
+        if value < lowest:
+            best, lowest = parameters.copy(), value
         progress(min(done, trials), trials)
         return value, gradient
 
-    options = {"maxfun": trials, "maxiter": trials, "maxcor": MEMORY, "ftol": 0.0}
-    minimize(tried, start, jac=True, method="L-BFGS-B", options=options)
+    options = {"maxfun": trials, "maxiter": trials, "maxcor": TUNING.memory, "ftol": 0.0}
+    minimize(evaluate, start, jac=True, method="L-BFGS-B", options=options)
     return best

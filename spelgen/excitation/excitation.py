@@ -1,4 +1,4 @@
-"""A proposed motion and what it is worth: for a terminal, a notebook, and as CSV for a controller."""
+"""Tell a proposed motion and what it is worth: for a terminal, a notebook, and as CSV for a controller."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ WARNING = (
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Excitation:
-    """A motion and what it is worth.
+    """Hold a motion and what it is worth.
 
     parameters: base parameters, friction and armature included. first, condition: condition number of their
     regressor (columns of length one) for the first motion at random, and for this one. efforts: largest
@@ -38,48 +38,49 @@ class Excitation:
     first_efforts: np.ndarray
 
     def text(self) -> str:
-        """What the motion is worth, and how near to the limits it goes, in 80 columns."""
+        """Return what the motion is worth, and how near to the limits it goes, in 80 columns."""
         overran = " (which overran effort limits)" if (self.first_efforts > 1).any() else ""
         head = (
             f"{self.arm.name}: {self.motion.t[-1]:g} s, {len(self.motion.t)} samples\n"
             f"condition number of the {self.parameters} base parameters' regressor: "
             f"{self.condition:.3g}\n  of the first motion at random{overran}: {self.first:.3g}"
         )
-        parts = [head, self.listing().text()]
+        paragraphs = [head, self.listing().text()]
         if (self.efforts > 1).any():
-            parts.append("warning: effort limits are overrun: no motion was found that keeps them")
+            paragraphs.append("warning: effort limits are overrun: no motion was found that keeps them")
         lacking = [c.name for c in self.arm.coordinates if not c.velocity]
         if lacking:
             summary = f"no velocity limit, 1 rad/s or 0.25 m/s taken: {', '.join(lacking)}"
-            parts.append(textwrap.fill(summary, WIDTH, subsequent_indent="  "))
-        return "\n\n".join(parts)
+            paragraphs.append(textwrap.fill(summary, WIDTH, subsequent_indent="  "))
+        return "\n\n".join(paragraphs)
 
     def listing(self) -> Listing:
-        """The ranges that the joints move in."""
+        """Return the ranges that the joints move in."""
         motion, rows = self.motion, []
         for k, coordinate in enumerate(self.arm.coordinates):
             q, speed = motion.q[:, k], np.abs(motion.qd[:, k]).max()
-            rows.append(
-                (
-                    coordinate.name,
-                    f"{q.min():.3g} .. {q.max():.3g}",
-                    f"{speed:.3g}",
-                    f"{speed / coordinate.velocity:.0%}" if coordinate.velocity else "-",
-                    f"{np.abs(motion.qdd[:, k]).max():.3g}",
-                    "-" if np.isnan(self.efforts[k]) else f"{self.efforts[k]:.0%}",
-                )
-            )
+            rows.append((
+                coordinate.name,
+                f"{q.min():.3g} .. {q.max():.3g}",
+                f"{speed:.3g}",
+                f"{speed / coordinate.velocity:.0%}" if coordinate.velocity else "-",
+                f"{np.abs(motion.qdd[:, k]).max():.3g}",
+                "-" if np.isnan(self.efforts[k]) else f"{self.efforts[k]:.0%}",
+            ))  # fmt: skip
         head = ("joint", "q", "qd", "of limit", "qdd", "effort")
         return Listing("Ranges [rad or m, s]; effort by the URDF's inertials", head, tuple(rows), WARNING)
 
     def csv(self) -> str:
-        """Columns `t`, then `q_<joint>`, `qd_<joint>` and `qdd_<joint>` by joint, nine decimals."""
-        names = [coordinate.name for coordinate in self.arm.coordinates]
+        """Return columns `t`, then `q_<joint>`, `qd_<joint>` and `qdd_<joint>` by joint, nine decimals."""
+        head = ["t"]
+        for quantity in ("q", "qd", "qdd"):
+            head += [f"{quantity}_{coordinate.name}" for coordinate in self.arm.coordinates]
         motion, file = self.motion, io.StringIO()
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["t", *(f"{what}_{name}" for what in ("q", "qd", "qdd") for name in names)])
+        writer.writerow(head)
         rows = np.concatenate([motion.t[:, None], motion.q, motion.qd, motion.qdd], axis=1)
-        writer.writerows([f"{x + 0.0:.9f}" for x in row] for row in np.round(rows, 9))
+        for row in np.round(rows, 9):
+            writer.writerow([f"{x + 0.0:.9f}" for x in row])  # adding zero turns -0 into 0
         return file.getvalue()
 
     def __repr__(self) -> str:

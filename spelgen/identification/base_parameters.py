@@ -1,4 +1,4 @@
-"""Base parameters: which inertial parameters the torque shows, alone or only in fixed combinations.
+"""Find base parameters: which inertial parameters the torque shows, alone or only in fixed combinations.
 
 Of the bodies they are those of ``structure.base_parameters``, the same in every command: exact combinations with
 their names and order. Friction and drives follow, found by elimination on the regressor at random states: a column
@@ -18,14 +18,13 @@ from spelgen.structure.base_parameters import base_parameters as body_base_param
 from spelgen.structure.base_parameters import parameter_name
 from spelgen.structure.structure import base_parameter_count
 
-_STATES_PER_PARAMETER = 2
-_DEPENDENT = 1e-9  # of its own length: what is left of a column that others span
-_ABSENT = 1e-8  # of the largest coefficient: what is smaller is rounding
+DEPENDENT = 1e-9  # of its own length: what is left of a column that others span
+ROUNDING = 1e-8  # of the largest coefficient
 
 
 @dataclass(frozen=True, eq=False)
 class BaseParameters:
-    """r base parameters of K parameters: ten a body, then those of friction and drives.
+    """Hold r base parameters of K parameters: ten a body, then those of friction and drives.
 
     names: of the base parameters; those of the bodies are ``inspect``'s. columns: (r,) of the regressor, the
     parameter each stands for. combination: (r, K), base parameters are this times the parameters, with a one in
@@ -42,56 +41,63 @@ class BaseParameters:
         return len(self.columns)
 
     def formulas(self) -> tuple[str, ...]:
-        """What each base parameter is made of, e.g. ``Izz1 + m2 + 0.1 hx2``."""
+        """Return what each base parameter is made of, e.g. ``Izz1 + m2 + 0.1 hx2``."""
         rows = zip(self.combination, self.columns, strict=True)
         return tuple(_sum(row, column, self.parameters) for row, column in rows)
 
     def identifiability(self) -> dict[str, str]:
-        """By parameter whether motion can show it: ``alone``, ``in combination`` or ``never``."""
-        alone = (np.abs(self.combination) > 0).sum(axis=1) == 1
-        seen = np.abs(self.combination).max(axis=0) > 0
-        single = {int(column) for column, one in zip(self.columns, alone, strict=True) if one}
-        return {
-            name: "alone" if k in single else "in combination" if seen[k] else "never"
-            for k, name in enumerate(self.parameters)
-        }
+        """Return by parameter whether motion can show it: ``alone``, ``in combination`` or ``never``."""
+        used = self.combination != 0
+        alone = set(self.columns[used.sum(axis=1) == 1].tolist())
+        result = dict.fromkeys(self.parameters, "never")
+        for k in np.flatnonzero(used.any(axis=0)).tolist():
+            result[self.parameters[k]] = "alone" if k in alone else "in combination"
+        return result
 
 
 def base_parameters(
     arm: Arm, friction: FrictionModel, motors: np.ndarray | None = None, seed: int = 0
 ) -> BaseParameters:
-    """The base parameters of ``arm`` and of this friction of its drives (see ``FrictionModel.columns``)."""
+    """Return the base parameters of ``arm`` and of this friction of its drives (see ``FrictionModel.columns``)."""
     n, inertial = len(arm.coordinates), 10 * len(arm.bodies)
     exact = body_base_parameters(arm, base_parameter_count(arm))
     names = [parameter_name(k) for k in range(inertial)]
-    names += [f"{effect}{joint + 1}" for effect in friction.effects for joint in range(n)]
+    for effect in friction.effects:
+        names += [f"{effect}{joint + 1}" for joint in range(n)]
     columns = _columns(arm, friction, motors, len(names), seed)
-    chosen = [parameter.index for parameter in exact]
-    basis = np.linalg.qr(columns[:, chosen])[0]
-    for k in range(inertial, len(names)):
-        left = columns[:, k]
-        for _ in range(2):  # once more takes away what rounding left
-            left = left - basis @ (basis.T @ left)
-        if np.linalg.norm(left) > _DEPENDENT * max(float(np.linalg.norm(columns[:, k])), 1.0):
-            chosen.append(k)
-            basis = np.column_stack([basis, left / np.linalg.norm(left)])
+    chosen = _chosen_columns(columns, [parameter.index for parameter in exact], inertial)
     combination = np.zeros((len(chosen), len(names)))
     for row, parameter in enumerate(exact):
         for k, weight in parameter.weights:
             combination[row, k] = float(weight)
     drives = np.linalg.lstsq(columns[:, chosen], columns[:, inertial:], rcond=None)[0]
-    drives[np.abs(drives) < _ABSENT * np.abs(drives).max(initial=1.0)] = 0.0
+    drives[np.abs(drives) < ROUNDING * np.abs(drives).max(initial=1.0)] = 0.0
     combination[:, inertial:] = drives
-    named = [parameter.name for parameter in exact] + [names[k] for k in chosen[len(exact) :]]
-    return BaseParameters(tuple(named), np.array(chosen), combination, tuple(names), len(exact))
+    base_names = [parameter.name for parameter in exact] + [names[k] for k in chosen[len(exact) :]]
+    return BaseParameters(tuple(base_names), np.array(chosen), combination, tuple(names), len(exact))
+
+
+def _chosen_columns(columns: np.ndarray, exact: list[int], inertial: int) -> list[int]:
+    """Return the base parameters' columns: those of the bodies, and of drives what no columns before it span."""
+    chosen = list(exact)
+    basis = np.linalg.qr(columns[:, chosen])[0]
+    for k in range(inertial, columns.shape[1]):
+        remainder = columns[:, k]
+        for _ in range(2):  # once more takes away what rounding left
+            remainder = remainder - basis @ (basis.T @ remainder)
+        length = float(np.linalg.norm(remainder))
+        if length > DEPENDENT * max(float(np.linalg.norm(columns[:, k])), 1.0):
+            chosen.append(k)
+            basis = np.column_stack([basis, remainder / length])
+    return chosen
 
 
 def _columns(
     arm: Arm, friction: FrictionModel, motors: np.ndarray | None, count: int, seed: int
 ) -> np.ndarray:
-    """The whole regressor at random states, (rows, count)."""
+    """Return the whole regressor at random states, (rows, count)."""
     n = len(arm.coordinates)
-    shape = (_STATES_PER_PARAMETER * count // n + 1, n)
+    shape = (2 * count // n + 1, n)  # twice as many equations as parameters
     q, qd, qdd = np.random.default_rng(seed).uniform(-3.0, 3.0, (3, *shape))
     bent = np.random.default_rng(seed + 1).uniform(-1.0, 1.0, (*shape, len(BRISTLES)))
     rows = np.concatenate([regressor(arm, q, qd, qdd), friction.columns(qd, qdd, bent, motors)], axis=2)

@@ -1,4 +1,4 @@
-"""Samples of motion with torques moved in time, thinned while logs go by: what `drive_hints` asks its questions of."""
+"""Hold samples of motion with torques moved in time, thinned while logs go by, for `drive_hints`."""
 
 from __future__ import annotations
 
@@ -11,54 +11,53 @@ from spelgen.identification.samples import dynamics_samples
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.values import earlier
 
-DELAYS = np.arange(-60, 61, 10) * 1e-3  # s
-MOST, LEAST = 1500, 400  # samples
+DELAYS = (
+    np.arange(-60, 61, 10) * 1e-3
+)  # [s] loggers and field buses are late by less; a filter of 8 Hz bends at 20 ms
+NO_DELAY = int(np.abs(DELAYS).argmin())
+MOST, FEWEST = 1500, 400  # samples: six joints have some 70 parameters
 
 
 class DriveSamples(NamedTuple):
-    """Samples (S, n) of motion, and the torques (D, S, n) logged later by `DELAYS`."""
+    """Hold samples (S, n) of motion, and the torques (D, S, n) logged later by `DELAYS`."""
 
     q: np.ndarray
     qd: np.ndarray
     qdd: np.ndarray
     tau: np.ndarray
 
-    def thinned(self, every: int) -> DriveSamples:
-        """Every so manieth sample."""
-        q, qd, qdd, tau = self
-        return DriveSamples(q[::every], qd[::every], qdd[::every], tau[:, ::every])
-
-
-def drive_samples(trajectory: Trajectory, inputs: np.ndarray) -> DriveSamples | None:
-    """Of one trajectory; None where it is too sparse or too short. inputs: G, (n, n)."""
-    torques = [earlier(trajectory.t, trajectory.tau @ inputs.T, delay) for delay in DELAYS]
-    found = dynamics_samples([replace(trajectory, tau=tau) for tau in torques])
-    if not found:
-        return None
-    return DriveSamples(found[0].q, found[0].qd, found[0].qdd, np.stack([x.tau for x in found]))
+    def thinned(self, stride: int) -> DriveSamples:
+        """Return one of so many samples."""
+        return DriveSamples(self.q[::stride], self.qd[::stride], self.qdd[::stride], self.tau[:, ::stride])
 
 
 class DriveLog:
-    """Samples of one trajectory after another, thinned evenly to at most twice `MOST`."""
+    """Collect samples of one trajectory after another, thinned evenly to at most twice `MOST`."""
 
     def __init__(self, inputs: np.ndarray) -> None:
-        self.inputs, self.parts, self.every = inputs, list[DriveSamples](), 1
+        """inputs: G, (n, n)."""
+        self._inputs = inputs
+        self._samples: list[DriveSamples] = []
+        self._every = 1
 
     def add(self, trajectory: Trajectory) -> None:
-        """Take in what a trajectory has for this."""
-        found = drive_samples(trajectory, self.inputs)
-        if found is None:
+        """Take in a trajectory, if it is dense and long enough for accelerations."""
+        joint_torque = trajectory.tau @ self._inputs.T
+        moved = [replace(trajectory, tau=earlier(trajectory.t, joint_torque, delay)) for delay in DELAYS]
+        samples = dynamics_samples(moved)
+        if not samples:
             return
-        self.parts.append(found.thinned(self.every))
-        while sum(len(x.q) for x in self.parts) > 2 * MOST:
-            self.parts = [x.thinned(2) for x in self.parts]
-            self.every *= 2
+        motion, tau = samples[0], np.stack([x.tau for x in samples])
+        self._samples.append(DriveSamples(motion.q, motion.qd, motion.qdd, tau).thinned(self._every))
+        while sum(len(x.q) for x in self._samples) > 2 * MOST:
+            self._samples = [x.thinned(2) for x in self._samples]
+            self._every *= 2
 
     def samples(self) -> DriveSamples | None:
-        """All together; None: too few to tell anything."""
-        if sum(len(x.q) for x in self.parts) < LEAST:
+        """Return all together; None where there are too few to tell anything."""
+        count = sum(len(x.q) for x in self._samples)
+        if count < FEWEST:
             return None
-        columns = [[getattr(x, name) for x in self.parts] for name in DriveSamples._fields]
-        q, qd, qdd = (np.concatenate(x) for x in columns[:3])
-        whole = DriveSamples(q, qd, qdd, np.concatenate(columns[3], axis=1))
-        return whole.thinned(-(-len(whole.q) // MOST))
+        q, qd, qdd = (np.concatenate([x[k] for x in self._samples]) for k in range(3))
+        tau = np.concatenate([x.tau for x in self._samples], axis=1)
+        return DriveSamples(q, qd, qdd, tau).thinned(-(-count // MOST))

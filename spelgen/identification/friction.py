@@ -1,4 +1,4 @@
-"""What friction and drives add to the torque, linear in unknown constants: one column a joint and effect."""
+"""Describe what friction and drives add to the torque: linear in constants, one column a joint and effect."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ STRIBECK_VELOCITY = 0.1  # [rad/s, m/s] at which the extra dry friction of slow 
 
 @dataclass(frozen=True)
 class FrictionModel:
-    """Which effects have a column: armature, viscous, Coulomb and offset always.
+    """Say which effects have a column: armature, viscous, Coulomb and offset always.
 
     coulomb_smoothing_velocity [rad/s, m/s]: width of the tanh in place of Coulomb friction's jump. stribeck: dry
     friction of slow motion (Gaussian, Armstrong-Helouvry 1991). polynomial: qd |qd| and qd^3. memory: dry friction by
@@ -28,10 +28,13 @@ class FrictionModel:
 
     @property
     def effects(self) -> tuple[str, ...]:
-        """Their names, in the columns' order."""
-        more = ("stribeck",) * self.stribeck + ("quadratic", "cubic") * self.polynomial
-        dry = BRISTLES if self.memory else ("coulomb",)
-        return ("armature", "viscous", *dry, "offset", *more)
+        """Names, in the columns' order."""
+        names = ["armature", "viscous", *(BRISTLES if self.memory else ("coulomb",)), "offset"]
+        if self.stribeck:
+            names.append("stribeck")
+        if self.polynomial:
+            names += ["quadratic", "cubic"]
+        return tuple(names)
 
     def columns(
         self,
@@ -40,15 +43,15 @@ class FrictionModel:
         bent: np.ndarray | None = None,
         motors: np.ndarray | None = None,
     ) -> np.ndarray:
-        """(T, n, effects n): effect e of drive j is column e n + j, which only the joints that it moves read.
+        """Return (T, n, effects n): effect e of drive j is column e n + j, which only the joints that it moves read.
 
         bent: (T, n, K), how far the bristles are bent, relative to their reach; None: not known. motors: (n, n), takes
         joints' velocities to the drives' (see ``motor_speeds``); None: each drive moves its own joint alone.
         """
         motors = np.eye(qd.shape[1]) if motors is None else motors
         qd, qdd = qd @ motors.T, qdd @ motors.T
-        parts = np.stack([qdd, *self._velocity_parts(qd, bent)], axis=-2)  # (T, effects, n)
-        columns: np.ndarray = parts[:, None] * motors.T[:, None]
+        effects = np.stack([qdd, *self._velocity_effects(qd, bent)], axis=-2)  # (T, effects, n)
+        columns: np.ndarray = effects[:, None] * motors.T[:, None]
         return columns.reshape(*qd.shape, -1)
 
     def torque(
@@ -58,20 +61,22 @@ class FrictionModel:
         bent: np.ndarray | None = None,
         motors: np.ndarray | None = None,
     ) -> np.ndarray:
-        """All but the armature's part, (T, n), of ``constants`` by effect and drive, (effects, n)."""
+        """Return all but the armature's part, (T, n), of ``constants`` by effect and drive, (effects, n)."""
         motors = np.eye(qd.shape[1]) if motors is None else motors
-        parts = zip(constants[1:], self._velocity_parts(qd @ motors.T, bent), strict=True)
-        torque: np.ndarray = np.sum([by_drive * part for by_drive, part in parts], axis=0) @ motors
+        effects = np.stack(self._velocity_effects(qd @ motors.T, bent))
+        torque: np.ndarray = np.einsum("en,e...n->...n", constants[1:], effects) @ motors
         return torque
 
-    def _velocity_parts(self, qd: np.ndarray, bent: np.ndarray | None) -> list[np.ndarray]:
+    def _velocity_effects(self, qd: np.ndarray, bent: np.ndarray | None) -> list[np.ndarray]:
+        """Return what each constant but the armature is multiplied with, each (T, n)."""
         sign = np.tanh(qd / self.coulomb_smoothing_velocity)
         dry = [sign]
-        if self.memory:  # not knowing the way here: as of a joint that has long gone the way it moves
-            dry = [sign if bent is None else bent[..., k] for k in range(len(BRISTLES))]
-        parts = [qd, *dry, np.ones_like(qd)]
+        if self.memory:
+            # where the motion before is not known: as of a joint that has long moved the way it does
+            dry = [sign] * len(BRISTLES) if bent is None else list(np.moveaxis(bent, -1, 0))
+        effects = [qd, *dry, np.ones_like(qd)]
         if self.stribeck:
-            parts.append(sign * np.exp(-((qd / STRIBECK_VELOCITY) ** 2)))
+            effects.append(sign * np.exp(-((qd / STRIBECK_VELOCITY) ** 2)))
         if self.polynomial:
-            parts += [qd * np.abs(qd), qd**3]
-        return parts
+            effects += [qd * np.abs(qd), qd**3]
+        return effects

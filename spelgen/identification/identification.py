@@ -1,11 +1,11 @@
-"""What an identification found: base parameters with how sure they are, for people, programs and notebooks."""
+"""Tell what an identification found: base parameters with how sure they are, for people, programs and notebooks."""
 
 from __future__ import annotations
 
 import textwrap
+from collections import Counter
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -18,15 +18,12 @@ from spelgen.identification.base_parameters import BaseParameters
 from spelgen.identification.friction import FrictionModel
 from spelgen.identification.method import LeastSquares
 from spelgen.listing import WIDTH, Listing
+from spelgen.settings.tuning.identification import IdentificationTuning
 
+TUNING = IdentificationTuning()
 SCHEMA = 2
-_CONDITIONS = (
-    (30.0, "well posed"),
-    (300.0, "acceptable"),
-    (np.inf, "poor: some parameters trade against each other; excite the arm more"),
-)
+DETERMINED = ("firm", "fair", "weak", "may be zero")
 _UNIT = {"revolute": "Nm", "prismatic": "N"}
-_DETERMINED = ((0.05, "firm"), (0.2, "fair"), (1.0, "weak"), (np.inf, "may be zero"))
 _WEIGHTED = {
     "equal": "each Nm counting the same",
     "range": "each joint weighted by its torque's range",
@@ -61,30 +58,25 @@ class Identification:
 
     @cached_property
     def dynamics(self) -> RegressorDynamics:
-        """The identified arm, e.g. as a baseline of ``evaluate``."""
+        """Return the identified arm, e.g. as a baseline of ``evaluate``."""
         return identified_dynamics(self.arm, self.method.friction, self.parameters, self.drives)
 
     def torque(
         self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, z: np.ndarray | None = None
     ) -> np.ndarray:
-        """Joint torques (T, n) of the identified arm; z: friction's memory (T, n, K)."""
-        found: np.ndarray = self.dynamics.joint_torque(q, qd, qdd, z)
-        return found
+        """Return joint torques (T, n) of the identified arm; z: friction's memory (T, n, K)."""
+        tau: np.ndarray = self.dynamics.joint_torque(q, qd, qdd, z)
+        return tau
 
     @property
     def determined(self) -> tuple[str, ...]:
         """How sure each base parameter is: ``firm``, ``fair``, ``weak`` or ``may be zero``."""
-        pairs = zip(self.values, self.deviations, strict=True)
-        return tuple(
-            next(word for limit, word in _DETERMINED if limit == np.inf or deviation <= limit * abs(value))
-            for value, deviation in pairs
-        )
+        return tuple(map(_determined, self.values, self.deviations))
 
-    def to_dict(self) -> dict[str, Any]:
-        """The JSON form, a public contract."""
+    def to_dict(self) -> dict[str, object]:
+        """Return the JSON form, a public contract."""
         joints = [coordinate.name for coordinate in self.arm.coordinates]
         friction = self.method.friction
-        columns = (self.base.names, self.base.formulas(), self.values, self.deviations, self.determined)
         return {
             "schema": SCHEMA,
             "robot": self.arm.name,
@@ -101,38 +93,44 @@ class Identification:
             },
             "condition": _finite(self.condition),
             "unseen_directions": self.unseen,
-            "base_parameters": [
-                {
-                    "name": name,
-                    "formula": formula,
-                    "value": float(value),
-                    "deviation": _finite(deviation),
-                    "determined": word,
-                }
-                for name, formula, value, deviation, word in zip(*columns, strict=True)
-            ],
+            "base_parameters": self._records(),
             "identifiability": self.base.identifiability(),
             "residual": dict(zip(joints, map(float, self.residual), strict=True)),
             "nmse": dict(zip(joints, map(_finite, self.nmse), strict=True)),
-            "diagnostics": [each.to_dict() for each in self.diagnostics],
+            "diagnostics": [diagnostic.to_dict() for diagnostic in self.diagnostics],
         }
 
+    def _records(self) -> list[dict[str, object]]:
+        """Return the base parameters as JSON."""
+        records: list[dict[str, object]] = []
+        formulas, determined = self.base.formulas(), self.determined
+        for k, name in enumerate(self.base.names):
+            records.append({
+                "name": name,
+                "formula": formulas[k],
+                "value": float(self.values[k]),
+                "deviation": _finite(self.deviations[k]),
+                "determined": determined[k],
+            })  # fmt: skip
+        return records
+
     def text(self) -> str:
-        """For a terminal, 80 columns."""
+        """Return all of it for a terminal, in 80 columns."""
         residuals, parameters = self.listings()
-        parts = [textwrap.fill(self.heading(), WIDTH), self.quality(), residuals.text(), parameters.text()]
-        formulas = zip(self.base.names, self.base.formulas(), strict=True)
-        meant = [
-            textwrap.fill(f"{name} = {formula}", WIDTH, initial_indent="  ", subsequent_indent=" " * 8)
-            for name, formula in formulas
-            if name != formula
-        ]
+        meant = ["where"]
+        for name, formula in zip(self.base.names, self.base.formulas(), strict=True):
+            if name != formula:
+                line = f"{name} = {formula}"
+                meant.append(textwrap.fill(line, WIDTH, initial_indent="  ", subsequent_indent=" " * 8))
         never = [name for name, how in self.base.identifiability().items() if how == "never"]
         unseen = f"No motion of this arm shows: {', '.join(never) or 'nothing; all have an effect'}."
-        return "\n\n".join([*parts, "\n".join(["where", *meant]), textwrap.fill(unseen, WIDTH)])
+        return "\n\n".join([
+            textwrap.fill(self.heading(), WIDTH), self.quality(), residuals.text(), parameters.text(),
+            "\n".join(meant), textwrap.fill(unseen, WIDTH),
+        ])  # fmt: skip
 
     def listings(self) -> tuple[Listing, Listing]:
-        """The torque that is not explained, by joint, and the base parameters."""
+        """Return tables: the torque that is not explained, by joint, and the base parameters."""
         joints = zip(self.arm.coordinates, self.residual, self.nmse, strict=True)
         values = zip(self.base.names, self.values, self.deviations, self.determined, strict=True)
         return (
@@ -145,7 +143,10 @@ class Identification:
             Listing(
                 "Base parameters [kg, m, s], with standard deviation; numbers after names: joint",
                 ("parameter", "value", "+-", "determined"),
-                tuple((name, f"{value:.5g}", f"{away:.2g}", word) for name, value, away, word in values),
+                tuple(
+                    (name, f"{value:.5g}", f"{deviation:.2g}", word)
+                    for name, value, deviation, word in values
+                ),
                 left=(0, 3),
             ),
         )
@@ -157,7 +158,7 @@ class Identification:
         return "".join(listing.html() for listing in self.listings())
 
     def heading(self) -> str:
-        """What was fitted to what."""
+        """Return what was fitted to what."""
         count, drives = len(self.trajectories), len(self.base) - self.base.bodies
         weighted = _WEIGHTED[self.method.weights]
         if self.method.ridge:
@@ -170,7 +171,7 @@ class Identification:
         )
 
     def quality(self) -> str:
-        """How well posed the fit is, and how many parameters are how sure."""
+        """Return how well posed the fit is, and how many parameters are how sure."""
         if self.unseen:
             directions = f"{self.unseen} direction{'s' * (self.unseen > 1)}"
             conditioned = (
@@ -178,17 +179,17 @@ class Identification:
                 "the arm more, or give --prior."
             )
         else:
-            word = next(word for limit, word in _CONDITIONS if self.condition < limit or limit == np.inf)
-            conditioned = f"Condition number {self.condition:.3g} (columns of length one): {word}."
-        words = [word for _, word in _DETERMINED if word in self.determined]
-        counts = ", ".join(f"{self.determined.count(word)} {word}" for word in words)
-        return textwrap.fill(conditioned, WIDTH) + f"\nParameters: {counts}."
+            verdict = _conditioned(self.condition)
+            conditioned = f"Condition number {self.condition:.3g} (columns of length one): {verdict}."
+        counts = Counter(self.determined)
+        sure = ", ".join(f"{counts[word]} {word}" for word in DETERMINED if word in counts)
+        return textwrap.fill(conditioned, WIDTH) + f"\nParameters: {sure}."
 
 
 def identified_dynamics(
     arm: Arm, friction: FrictionModel, parameters: np.ndarray, drives: Drives | None
 ) -> RegressorDynamics:
-    """The arm with these parameters, (K,), the bodies' first."""
+    """Return the arm with these parameters, (K,), the bodies' first."""
     n, inertial = len(arm.coordinates), 10 * len(arm.bodies)
     constants = parameters[inertial:].reshape(-1, n)
     motors = None if drives is None else drives.speeds
@@ -201,6 +202,22 @@ def identified_dynamics(
     return RegressorDynamics(arm, parameters[:inertial], constants[0], torque, drives, reach)
 
 
+def _determined(value: float, deviation: float) -> str:
+    """Return how sure a base parameter is."""
+    for word, limit in zip(DETERMINED, (TUNING.firm, TUNING.fair, 1.0), strict=False):
+        if deviation <= limit * abs(value):
+            return word
+    return DETERMINED[-1]
+
+
+def _conditioned(condition: float) -> str:
+    if condition < TUNING.well_posed:
+        return "well posed"
+    if condition < TUNING.acceptable:
+        return "acceptable"
+    return "poor: some parameters trade against each other; excite the arm more"
+
+
 def _finite(value: float) -> float | None:
-    """A float for JSON, which has no infinity."""
+    """Return a float for JSON, which has no infinity."""
     return float(value) if np.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""Identification of an arm from logs: base parameters, friction and drives by least squares, and how sure they are."""
+"""Identify an arm from logs: base parameters, friction and drives by least squares, and how sure they are."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from spelgen.errors import Diagnostic, LogError
 from spelgen.identification.base_parameters import BaseParameters, base_parameters
 from spelgen.identification.friction import FrictionModel
 from spelgen.identification.identification import Identification
-from spelgen.identification.least_squares import Solution, Triangles, deviations, reduce, solve
+from spelgen.identification.least_squares import Columns, Solution, Triangles, deviations, reduce, solve
 from spelgen.identification.method import LeastSquares
-from spelgen.identification.prior import GaussianPrior, gaussian_prior
+from spelgen.identification.prior import gaussian_prior
 from spelgen.identification.samples import DynamicsSamples, dynamics_samples
 from spelgen.loaded_arm import LoadedArm, load_arm
 from spelgen.logs.checks import check
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, require_joints, require_torques
+from spelgen.settings.tuning.identification import IdentificationTuning
 
-_BLOCK = 2000  # samples in memory at a time
-_ROUNDS = 4  # of weighing each joint by what is left of its torque
-_LEAST_NOISE = 0.02  # of a joint's torque range: few samples may be fitted better than their model deserves
+TUNING = IdentificationTuning()
+BLOCK = 2000  # samples in memory at a time
 
 
 def identify(
@@ -45,22 +45,24 @@ def identify(
     """
     arm = arm if isinstance(arm, LoadedArm) else load_arm(arm)
     logs = [logs] if isinstance(logs, Trajectory) else logs
-    coordinates, drives = arm.arm.coordinates, arm.actuation.drives()
+    joints = [c.name for c in arm.arm.coordinates]
+    kinds = [c.kind for c in arm.arm.coordinates]
     for trajectory in logs:
-        require_joints(trajectory, [c.name for c in coordinates])
+        require_joints(trajectory, joints)
     require_torques(logs)
-    notes = check(logs, [c.name for c in coordinates], [c.kind for c in coordinates])
+    notes = check(logs, joints, kinds)
     method = method or LeastSquares()
-    kinds = [c.kind for c in coordinates]
+    drives = arm.actuation.drives()
     reach = reach_of(kinds, drives.speeds) if method.friction.memory else None
     samples = dynamics_samples(logs, preprocessing=preprocessing or Preprocessing(), reach=reach)
-    left = sorted({x.name for x in logs} - {x.name for x in samples})
-    if left:
-        message = f"sampled too slowly or too short for accelerations: {', '.join(left)}"
+    unused = sorted({x.name for x in logs} - {x.name for x in samples})
+    if unused:
+        message = f"sampled too slowly or too short for accelerations: {', '.join(unused)}"
         notes.append(Diagnostic("warning", "no-accelerations", "logs", None, message))
+    # samples of motors' torques: the regressor's rows are joints'
     at_joints = [replace(x, tau=x.tau @ drives.inputs.T) for x in samples]
-    found = least_squares(arm.arm, at_joints, method, drives)
-    return replace(found, diagnostics=tuple(notes))
+    identification = least_squares(arm.arm, at_joints, method, drives)
+    return replace(identification, diagnostics=tuple(notes))
 
 
 def least_squares(
@@ -79,14 +81,11 @@ def least_squares(
             "no samples to identify from",
             expected="motion sampled at 50 Hz or faster, 1 s without a gap at least",
         )
-    motors = None if drives is None else drives.speeds
-    triangles = reduce((rows, tau) for rows, tau in _blocks(arm, samples, method.friction, motors))
-    base = base_parameters(arm, method.friction, motors)
-    prior = None
-    if method.prior is not None:
-        prior = gaussian_prior(arm, method.friction, triangles.deviation, method.prior)
-    fit = _fitted(arm, samples, method, motors, _space(base, triangles, prior, method))
-    return replace(_result(arm, samples, method, base, fit), drives=drives)
+    rows = _Rows(arm, samples, method.friction, None if drives is None else drives.speeds)
+    triangles = reduce(rows.blocks())
+    base = base_parameters(arm, method.friction, rows.motors)
+    fit = _fit(_problem(arm, base, triangles, method), rows, method)
+    return replace(_result(rows, method, base, fit), drives=drives)
 
 
 def columns(
@@ -98,20 +97,41 @@ def columns(
     z: np.ndarray | None = None,
     motors: np.ndarray | None = None,
 ) -> np.ndarray:
-    """The whole regressor (T, n, 10 B + e n): the bodies', then that of friction and drives."""
+    """Return the whole regressor (T, n, 10 B + e n): the bodies', then that of friction and drives."""
     bent = None if z is None else z / reach_of([x.kind for x in arm.coordinates]).values
     return np.concatenate([regressor(arm, q, qd, qdd), friction.columns(qd, qdd, bent, motors)], axis=2)
 
 
 @dataclass(frozen=True, eq=False)
-class _Space:
-    """The parameters that are fitted: x = start + basis z. penalty: of z; ridge: of it, times its column."""
+class _Rows:
+    """Give the equations of samples, a block in memory at a time. motors: joints' velocities to the drives', (n, n)."""
+
+    arm: Arm
+    samples: Sequence[DynamicsSamples]
+    friction: FrictionModel
+    motors: np.ndarray | None
+
+    def blocks(self) -> Iterator[Columns]:
+        for x in self.samples:
+            for start in range(0, len(x.q), BLOCK):
+                rows = slice(start, start + BLOCK)
+                z = None if x.z is None else x.z[rows]
+                motion = x.q[rows], x.qd[rows], x.qdd[rows]
+                yield columns(self.arm, self.friction, *motion, z, self.motors), x.tau[rows]
+
+    def residuals(self, parameters: np.ndarray) -> list[np.ndarray]:
+        return [regressors @ parameters - tau for regressors, tau in self.blocks()]
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """Say which parameters are fitted: x = start + basis z. penalty: of z; ridge: of it, times its column."""
 
     triangles: Triangles
     start: np.ndarray
     basis: np.ndarray
-    penalty: np.ndarray | None
-    ridge: float
+    penalty: np.ndarray | None = None
+    ridge: float = 0.0
 
     def solve(self, weights: np.ndarray) -> Solution:
         penalty = self.penalty
@@ -122,89 +142,74 @@ class _Space:
         return solve(self.triangles, weights, self.basis, self.start, penalty)
 
 
+def _problem(arm: Arm, base: BaseParameters, triangles: Triangles, method: LeastSquares) -> _Problem:
+    count = triangles.factors.shape[2] - 1
+    if method.prior is not None:
+        prior = gaussian_prior(arm, method.friction, triangles.deviation, method.prior)
+        return _Problem(triangles, prior.mean, prior.basis, penalty=1.0 / prior.deviation)
+    if method.ridge:
+        return _Problem(triangles, np.zeros(count), np.eye(count), ridge=method.ridge)
+    # each base parameter stands for the parameter that it is named after
+    return _Problem(triangles, np.zeros(count), np.eye(count)[:, base.columns])
+
+
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """A solution, its weights (n,), and the errors that it leaves: standard deviations (n,) as if independent."""
+    """Hold a solution, its weights (n,), and the errors that it leaves: standard deviations (n,) as if independent."""
 
-    space: _Space
+    problem: _Problem
     solution: Solution
     weights: np.ndarray
     noise: np.ndarray
 
     def covariance(self) -> np.ndarray:
-        """Of z, for errors as large as they turned out to be, whatever the weights were."""
+        """Return that of z, for errors as large as they turned out to be, whatever the weights were."""
         variance = np.square(self.weights**2 * self.noise)
-        rows = self.space.triangles.factors[..., :-1] @ self.space.basis
+        # the sandwich of weights that need not be the inverse of what the errors turned out to be
+        rows = self.problem.triangles.factors[..., :-1] @ self.problem.basis
         inner = np.einsum("j,jka,jkb->ab", variance, rows, rows)
-        if self.space.penalty is not None:
-            inner = inner + np.diag(self.space.penalty**2)
+        if self.problem.penalty is not None:
+            inner = inner + np.diag(self.problem.penalty**2)
         return self.solution.covariance @ inner @ self.solution.covariance
 
 
-def _space(
-    base: BaseParameters, triangles: Triangles, prior: GaussianPrior | None, method: LeastSquares
-) -> _Space:
-    count = triangles.factors.shape[2] - 1
-    if prior is not None:
-        return _Space(triangles, prior.mean, prior.basis, 1.0 / prior.deviation, 0.0)
-    if method.ridge:
-        return _Space(triangles, np.zeros(count), np.eye(count), None, method.ridge)
-    # each base parameter stands for the parameter that it is named after
-    return _Space(triangles, np.zeros(count), np.eye(count)[:, base.columns], None, 0.0)
+def _fit(problem: _Problem, rows: _Rows, method: LeastSquares) -> _Fit:
+    """Solve a problem; with the weights "noise" again, each joint weighted by what was left of its torque."""
+    deviation = problem.triangles.deviation
+    # a joint whose torque never changes must not weigh everything
+    torque_range = np.maximum(deviation, 1e-3 * deviation.max())
+    weights = np.ones_like(torque_range) if method.weights == "equal" else 1.0 / torque_range
+    fit = _weighted_fit(problem, rows, weights, torque_range)
+    if method.weights == "noise":
+        for _ in range(TUNING.rounds):
+            fit = _weighted_fit(problem, rows, 1.0 / fit.noise, torque_range)
+    return fit
 
 
-def _blocks(
-    arm: Arm, samples: Sequence[DynamicsSamples], friction: FrictionModel, motors: np.ndarray | None
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    for each in samples:
-        for start in range(0, len(each.q), _BLOCK):
-            part = slice(start, start + _BLOCK)
-            z = None if each.z is None else each.z[part]
-            rows = columns(arm, friction, each.q[part], each.qd[part], each.qdd[part], z, motors)
-            yield rows, each.tau[part]
+def _weighted_fit(problem: _Problem, rows: _Rows, weights: np.ndarray, torque_range: np.ndarray) -> _Fit:
+    solution = problem.solve(weights)
+    parameters = solution.rank if problem.penalty is None else 0
+    noise = deviations(rows.residuals(solution.parameters), parameters)
+    return _Fit(problem, solution, weights, np.maximum(noise, TUNING.least_noise * torque_range))
 
 
-def _fitted(
-    arm: Arm,
-    samples: Sequence[DynamicsSamples],
-    method: LeastSquares,
-    motors: np.ndarray | None,
-    space: _Space,
-) -> _Fit:
-    deviation = space.triangles.deviation
-    range_ = np.maximum(deviation, 1e-3 * deviation.max())
-    weights = np.ones_like(range_) if method.weights == "equal" else 1.0 / range_
-    for left in reversed(range(1 + (_ROUNDS if method.weights == "noise" else 0))):
-        found = space.solve(weights)
-        used = found.rank if space.penalty is None else 0
-        residuals = [
-            rows @ found.parameters - tau for rows, tau in _blocks(arm, samples, method.friction, motors)
-        ]
-        noise = np.maximum(deviations(residuals, used), _LEAST_NOISE * range_)
-        if left:
-            weights = 1.0 / noise
-    return _Fit(space, found, weights, noise)
-
-
-def _result(
-    arm: Arm, samples: Sequence[DynamicsSamples], method: LeastSquares, base: BaseParameters, fit: _Fit
-) -> Identification:
-    triangles, found, basis = fit.space.triangles, fit.solution, fit.space.basis
+def _result(rows: _Rows, method: LeastSquares, base: BaseParameters, fit: _Fit) -> Identification:
+    triangles, solution, basis = fit.problem.triangles, fit.solution, fit.problem.basis
     covariance = basis @ fit.covariance() @ basis.T
-    combined = base.combination @ covariance @ base.combination.T
-    squares = triangles.squares(found.parameters) / triangles.count
-    shown = fit.space.penalty is not None or method.ridge > 0
+    of_base = base.combination @ covariance @ base.combination.T
+    squares = triangles.squares(solution.parameters) / triangles.count
+    is_regularised = method.prior is not None or method.ridge > 0
     return Identification(
-        arm=arm,
+        arm=rows.arm,
         method=method,
         base=base,
-        parameters=found.parameters,
-        values=base.combination @ found.parameters,
-        deviations=np.sqrt(np.diag(combined)),
-        condition=found.condition,
-        unseen=0 if shown else basis.shape[1] - found.rank,
+        parameters=solution.parameters,
+        values=base.combination @ solution.parameters,
+        deviations=np.sqrt(np.diag(of_base)),
+        condition=solution.condition,
+        unseen=0 if is_regularised else basis.shape[1] - solution.rank,
         residual=np.sqrt(squares),
         nmse=squares / np.where(triangles.deviation > 0, triangles.deviation, np.nan) ** 2,
-        trajectories=tuple(x.name for x in samples),
+        trajectories=tuple(x.name for x in rows.samples),
         samples=triangles.count,
     )

@@ -1,14 +1,15 @@
-"""Linear least squares on torque samples: n small triangles hold all that any weighting or prior needs of the logs."""
+"""Solve least squares on torques: n small triangles hold all that a weighting or prior needs of the logs."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-_NEGLIGIBLE = 1e-10  # of the largest singular value: a direction in which the samples say nothing
-_LARGEST_LAG = 500  # samples over which residuals are followed in time
+from spelgen.settings.tuning.identification import IdentificationTuning
+
+TUNING = IdentificationTuning()
 
 Columns = tuple[np.ndarray, np.ndarray]
 """Of some samples: the regressor (T, n, K) and the torque (T, n)."""
@@ -16,7 +17,7 @@ Columns = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Triangles:
-    """The samples' normal equations by joint, as triangular factors (n, K + 1, K + 1) of [regressor, torque].
+    """Hold the samples' normal equations by joint, as triangular factors (n, K + 1, K + 1) of [regressor, torque].
 
     count: samples. deviation: (n,) standard deviation of each joint's torque [Nm, N].
     """
@@ -26,27 +27,29 @@ class Triangles:
     deviation: np.ndarray
 
     def squares(self, x: np.ndarray) -> np.ndarray:
-        """Sums of squared residuals by joint, (n,), of the parameters x (K,)."""
-        return np.square(self.factors @ np.append(x, -1.0)).sum(axis=1)
+        """Return sums of squared residuals by joint, (n,), of the parameters x (K,)."""
+        squares: np.ndarray = np.square(self.factors @ np.append(x, -1.0)).sum(axis=1)
+        return squares
 
 
 def reduce(blocks: Iterable[Columns]) -> Triangles:
-    """The triangles of all blocks, one in memory at a time."""
-    factors: list[np.ndarray] | None = None
+    """Return the triangles of all blocks, one in memory at a time."""
+    factors: list[np.ndarray] = []
     count, total, square = 0, 0.0, 0.0
     for regressor, torque in blocks:
-        rows = np.concatenate([regressor, torque[:, :, None]], axis=2)
-        joints = [rows[:, j] for j in range(rows.shape[1])]
-        if factors is not None:
+        joints = list(np.concatenate([regressor, torque[:, :, None]], axis=2).swapaxes(0, 1))
+        if factors:
             joints = [np.concatenate(pair) for pair in zip(factors, joints, strict=True)]
-        factors = [np.asarray(np.linalg.qr(joint, mode="r")) for joint in joints]
+        factors = [np.asarray(np.linalg.qr(rows, mode="r")) for rows in joints]
         count, total, square = count + len(torque), total + torque.sum(0), square + np.square(torque).sum(0)
-    if factors is None or not count:
+    if not count:
         raise ValueError("no samples")
     width = factors[0].shape[1]
-    padded = [np.concatenate([x, np.zeros((width - len(x), width))]) for x in factors]
+    padded = np.zeros((len(factors), width, width))
+    for joint, factor in enumerate(factors):
+        padded[joint, : len(factor)] = factor
     deviation = np.sqrt(np.maximum(square / count - np.square(total / count), 0.0))
-    return Triangles(np.stack(padded), count, deviation)
+    return Triangles(padded, count, deviation)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,51 +74,57 @@ def solve(
     start: np.ndarray | None = None,
     penalty: np.ndarray | None = None,
 ) -> Solution:
-    """The x = start + basis z with the least weighted squares and the least |penalty * z|^2.
+    """Return the x = start + basis z with the least weighted squares and the least |penalty * z|^2.
 
     weights (n,) by joint, basis (K, r), start (K,), penalty (r,): the inverse standard deviations of a Gaussian
     prior on z around zero. Without penalty, directions that the samples do not show stay at zero.
     """
-    x0 = np.zeros(len(basis)) if start is None else start
+    if start is None:
+        start = np.zeros(len(basis))
     weighted = (triangles.factors * weights[:, None, None]).reshape(-1, len(basis) + 1)
-    rows, target = weighted[:, :-1] @ basis, weighted[:, -1] - weighted[:, :-1] @ x0
+    rows, target = weighted[:, :-1] @ basis, weighted[:, -1] - weighted[:, :-1] @ start
     if penalty is not None:
         rows = np.concatenate([rows, np.diag(penalty)])
         target = np.concatenate([target, np.zeros(len(penalty))])
     length = np.linalg.norm(rows, axis=0)
     length[length == 0] = 1.0
-    left, values, right = np.linalg.svd(rows / length, full_matrices=False)
-    shown = values > _NEGLIGIBLE * values[0]
-    inverse = np.where(shown, 1.0 / np.where(shown, values, 1.0), 0.0)
-    root = (right.T * inverse) / length[:, None]
-    z = root @ (left.T @ target)
-    condition = float(values[0] / values[-1]) if shown.all() else float("inf")
-    return Solution(x0 + basis @ z, z, root @ root.T, condition, int(shown.sum()))
+    u, values, vt = np.linalg.svd(rows / length, full_matrices=False)
+    rank = int((values > TUNING.negligible * values[0]).sum())
+    # numpy's lstsq gives neither the covariance nor the pseudo-inverse that it takes
+    root = vt[:rank].T / values[:rank] / length[:, None]
+    z = root @ (u[:, :rank].T @ target)
+    condition = float(values[0] / values[-1]) if rank == len(values) else float("inf")
+    return Solution(start + basis @ z, z, root @ root.T, condition, rank)
 
 
-def deviations(residuals: Iterable[np.ndarray], used: int) -> np.ndarray:
-    """Standard deviations (n,) of errors as if they were independent from sample to sample.
+def deviations(residuals: Sequence[np.ndarray], parameters: int) -> np.ndarray:
+    """Return standard deviations (n,) of errors as if they were independent from sample to sample.
 
-    residuals: (T, n) by trajectory; used: parameters fitted. Filtered and modelled torques err for many samples
-    in the same sense: the variance is multiplied by the time over which residuals stay correlated, in samples
-    (1 + 2 sum of autocorrelations up to the first below zero).
+    residuals: (T, n) by trajectory; parameters: that were fitted. Filtered and modelled torques err for many samples
+    in the same sense: the variance is multiplied by the time over which residuals stay correlated, in samples.
     """
-    parts = list(residuals)
-    count = sum(map(len, parts))
-    variance = sum(np.square(x).sum(axis=0) for x in parts) / max(count - used / parts[0].shape[1], 1.0)
-    return np.sqrt(variance * correlation_time(parts))
-
-
-def correlation_time(residuals: list[np.ndarray]) -> np.ndarray:
-    """How many successive samples err alike, (n,), at least one."""
-    longest = min(_LARGEST_LAG, max(map(len, residuals)) - 1)
+    count = sum(map(len, residuals))
     power = sum(np.square(x).sum(axis=0) for x in residuals)
-    time = np.ones_like(power)
-    going = power > 0
+    variance = power / max(count - parameters / residuals[0].shape[1], 1.0)
+    deviation: np.ndarray = np.sqrt(variance * correlation_time(residuals))
+    return deviation
+
+
+def correlation_time(residuals: Sequence[np.ndarray]) -> np.ndarray:
+    """Return how many successive samples err alike, (n,), at least one.
+
+    1 + 2 times the sum of autocorrelations up to the first below zero (Geyer, Stat. Sci. 7:473, 1992).
+    """
+    longest = min(TUNING.largest_lag, max(map(len, residuals)) - 1)
+    power = sum(np.square(x).sum(axis=0) for x in residuals)
+    time: np.ndarray = np.ones_like(power)
+    correlated = power > 0
     for lag in range(1, longest + 1):
-        products = sum((x[lag:] * x[:-lag]).sum(axis=0) for x in residuals if len(x) > lag)
-        going = going & (products > 0)
-        if not going.any():
+        products = np.zeros_like(power)
+        for x in residuals:
+            products += (x[lag:] * x[:-lag]).sum(axis=0)
+        correlated &= products > 0
+        if not correlated.any():
             break
-        time = time + 2 * np.divide(products, power, out=np.zeros_like(power), where=going)
+        time = time + 2 * np.divide(products, power, out=np.zeros_like(power), where=correlated)
     return time

@@ -1,4 +1,4 @@
-"""How parameters are identified: one configuration, whose options agree with one another."""
+"""Configure how parameters are identified, by options that agree with one another."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The prior of an identification: the URDF's bodies, and the usual size of friction and armature."""
+"""Make the prior of an identification: the URDF's bodies, and the usual size of friction and armature."""
 
 from __future__ import annotations
 
@@ -12,12 +12,11 @@ from spelgen.dynamics.regressor import urdf_parameters
 from spelgen.emission.plan import guessed_armature, guessed_friction
 from spelgen.errors import ArmError
 from spelgen.identification.friction import BRISTLES, FrictionModel
+from spelgen.settings.tuning.identification import IdentificationTuning
 from spelgen.structure.pseudo_inertia import parameters_of, reference_factor, sensitivity
 from spelgen.structure.sampling import float_energies
 
-_FRICTION_OF_TORQUE = 0.1  # where the URDF names no effort
-_WIDE = 10.0  # times the guessed size: how far friction and armature may be from the guess
-_SPEED = 2.0  # [rad/s, m/s] likewise
+TUNING = IdentificationTuning()
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,13 +29,13 @@ class GaussianPrior:
 
 
 def gaussian_prior(arm: Arm, friction: FrictionModel, torque: np.ndarray, deviation: float) -> GaussianPrior:
-    """The prior of an arm with usable inertials, whose joint torques have the standard deviations ``torque`` (n,).
+    """Return the prior of an arm with inertials, whose joint torques have the standard deviations ``torque`` (n,).
 
     ``deviation`` is how far a body may be from the URDF's, in the first-order affine-invariant metric of its
     pseudo-inertia (see ``pseudo_inertia``): 0.1 is about 20 % in mass. Raises ArmError without inertials.
     """
     if not arm.has_inertials:
-        missing = [body.name for body in arm.bodies if body.inertia is None or body.inertia[0] <= 0]
+        missing = [x.name for x in arm.bodies if x.inertia is None or x.inertia[0] <= 0]
         raise ArmError(
             f"no inertials behind the joints {', '.join(missing)}",
             expected="masses, for a prior",
@@ -54,14 +53,14 @@ def gaussian_prior(arm: Arm, friction: FrictionModel, torque: np.ndarray, deviat
 
 
 def _drives(arm: Arm, friction: FrictionModel, torque: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Means and standard deviations of the friction columns' coefficients."""
+    """Return means and standard deviations of the friction columns' coefficients."""
     n = len(arm.coordinates)
     inertia = _mean_inertia(arm)
     usual, armature, speed = np.zeros(n), np.zeros(n), np.zeros(n)
     for k, coordinate in enumerate(arm.coordinates):
-        usual[k] = guessed_friction(coordinate) or _FRICTION_OF_TORQUE * torque[k]
+        usual[k] = guessed_friction(coordinate) or TUNING.friction_of_torque * torque[k]
         armature[k] = guessed_armature(coordinate)
-        speed[k] = coordinate.velocity or _SPEED
+        speed[k] = coordinate.velocity or TUNING.usual_speed
     means = {"armature": armature, "viscous": usual / speed, "coulomb": usual}
     means |= dict.fromkeys(BRISTLES, usual / len(BRISTLES))
     sizes = {
@@ -69,16 +68,20 @@ def _drives(arm: Arm, friction: FrictionModel, torque: np.ndarray) -> tuple[np.n
         "offset": usual, "stribeck": usual, "quadratic": usual / speed**2, "cubic": usual / speed**3,
         **dict.fromkeys(BRISTLES, usual),
     }  # fmt: skip
+    # where there is no guess the best one is none
     zero = np.zeros(n)
     return (
         np.concatenate([means.get(effect, zero) for effect in friction.effects]),
-        _WIDE * np.concatenate([sizes[effect] for effect in friction.effects]),
+        TUNING.friction_width * np.concatenate([sizes[effect] for effect in friction.effects]),
     )
 
 
 def _mean_inertia(arm: Arm) -> np.ndarray:
-    """The URDF's own M_ii (n,), at a hundred positions."""
+    """Return the URDF's own M_ii (n,), the mean over a hundred positions."""
     n = len(arm.coordinates)
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (100, n))
-    mass, _ = float_energies(arm, q, [[float(x) for x in body.inertia or ()] for body in arm.bodies])
-    return mass.mean(axis=0)[[k * (k + 3) // 2 for k in range(n)]]
+    inertias = [list(map(float, body.inertia or ())) for body in arm.bodies]
+    mass, _ = float_energies(arm, q, inertias)
+    # the lower triangle comes row by row
+    rows, columns = np.tril_indices(n)
+    return mass.mean(axis=0)[rows == columns]

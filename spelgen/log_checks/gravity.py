@@ -1,4 +1,4 @@
-"""Does the logged torque move with gravity? Asked joint by joint, with motion and friction taken out."""
+"""Tell whether the logged torque moves with gravity: joint by joint, with motion and friction taken out."""
 
 from __future__ import annotations
 
@@ -6,20 +6,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import orth
 
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.regressor import regressor, urdf_parameters
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
+from spelgen.settings.tuning.log_checks import LogCheckTuning
 
-SAMPLES = 400  # of one trajectory
-LEAST, MOST = 100, 6000  # of all
-COULOMB_SMOOTHING_VELOCITY = 0.02  # [rad/s, m/s]
-DEPENDENT = 1e-8
+TUNING = LogCheckTuning()
+MOST = 15 * TUNING.gravity_samples  # of all trajectories
+COULOMB_VELOCITY = 0.02  # [rad/s, m/s] where a tanh has risen to three quarters of dry friction
+DEPENDENT = 1e-8  # of its own size: what is left of a column that others span
 
 
 @dataclass(frozen=True, eq=False)
 class StateSamples:
-    """Evenly thinned samples of logs, each (S, n); tau are joint torques."""
+    """Hold evenly thinned samples of logs, each (S, n); tau are joint torques."""
 
     q: np.ndarray
     qd: np.ndarray
@@ -45,66 +47,69 @@ class GravityFit:
 
 
 def state_samples(trajectory: Trajectory, inputs: np.ndarray) -> StateSamples:
-    """Samples of one trajectory, accelerations by differences within gap-free pieces. inputs: G, (n, n)."""
+    """Return samples of one trajectory, accelerations by differences within gap-free pieces. inputs: G, (n, n)."""
     pieces = [piece for piece in split_at_gaps(trajectory) if len(piece) > 2]
-    every = -(-max(1, sum(map(len, pieces))) // SAMPLES)
-    columns = [
-        [x[::every] for x in (p.q, p.qd, np.gradient(p.qd, p.t, axis=0), p.tau @ inputs.T)] for p in pieces
-    ]
-    n = trajectory.q.shape[1]
-    joined = [np.concatenate(each) for each in zip(*columns, strict=True)] or [np.zeros((0, n))] * 4
-    return StateSamples(*joined)
+    if not pieces:
+        return StateSamples(*np.zeros((4, 0, trajectory.q.shape[1])))
+    stride = -(-sum(map(len, pieces)) // TUNING.gravity_samples)
+    columns = []
+    for piece in pieces:
+        qdd = np.gradient(piece.qd, piece.t, axis=0)
+        columns.append([x[::stride] for x in (piece.q, piece.qd, qdd, piece.tau @ inputs.T)])
+    return StateSamples(*(np.concatenate(arrays) for arrays in zip(*columns, strict=True)))
 
 
-def fit_gravity(arm: Arm, parts: Sequence[StateSamples]) -> list[GravityFit]:
-    """By joint, what gravity explains of the torques of these samples."""
+def fit_gravity(arm: Arm, samples: Sequence[StateSamples]) -> list[GravityFit]:
+    """Return by joint what gravity explains of the torques of these samples."""
     q, qd, qdd, tau = (
-        np.concatenate([getattr(part, name) for part in parts]) for name in ("q", "qd", "qdd", "tau")
+        np.concatenate([getattr(x, name) for x in samples]) for name in ("q", "qd", "qdd", "tau")
     )
-    if len(q) < LEAST:
+    if len(q) < TUNING.gravity_fewest:
         return [GravityFit()] * q.shape[1]
-    every = -(-len(q) // MOST)
-    q, qd, qdd, tau = (x[::every] for x in (q, qd, qdd, tau))
+    stride = -(-len(q) // MOST)
+    q, qd, qdd, tau = (x[::stride] for x in (q, qd, qdd, tau))
     still = np.zeros_like(q)
     rows = regressor(arm, q, still, still)  # (S, n, 10 B)
-    parameters = urdf_parameters(arm) if any(body.inertia for body in arm.bodies) else None
-    found = []
+    has_inertials = any(body.inertia for body in arm.bodies)
+    load = rows @ urdf_parameters(arm) if has_inertials else None
+    # beside friction and the joint's own inertia, which move with gravity in a slow swing
+    fits = []
     for joint in range(q.shape[1]):
         speed = qd[:, joint]
-        coulomb = np.tanh(speed / COULOMB_SMOOTHING_VELOCITY)
-        beside = np.stack([np.ones(len(q)), speed, coulomb, qdd[:, joint]], axis=1)
-        columns = rows[:, joint, :]
-        torque = None if parameters is None else columns @ parameters
-        found.append(_fit(tau[:, joint], beside, columns, torque))
-    return found
+        coulomb = np.tanh(speed / COULOMB_VELOCITY)
+        motion = np.stack([np.ones(len(q)), speed, coulomb, qdd[:, joint]], axis=1)
+        fits.append(_fit(tau[:, joint], motion, rows[:, joint], None if load is None else load[:, joint]))
+    return fits
 
 
-def _fit(tau: np.ndarray, beside: np.ndarray, columns: np.ndarray, torque: np.ndarray | None) -> GravityFit:
-    left = _without(beside, tau)
-    free = _without(beside, columns)
-    size = np.linalg.norm(free, axis=0)
-    free = free[:, size > DEPENDENT * max(1.0, float(np.abs(columns).max(initial=0.0))) * np.sqrt(len(tau))]
-    if not free.shape[1] or _is_rounding(left, tau):
+def _fit(tau: np.ndarray, motion: np.ndarray, columns: np.ndarray, load: np.ndarray | None) -> GravityFit:
+    """Fit torques (S,) beside columns of motion by columns of gravity. load: the URDF's gravity torque, (S,)."""
+    remainder = _without(motion, tau)
+    gravity = _without(motion, columns)
+    largest = max(1.0, float(np.abs(columns).max(initial=0.0)))
+    gravity = gravity[:, np.linalg.norm(gravity, axis=0) > DEPENDENT * largest * np.sqrt(len(tau))]
+    # a vertical axis, or a motor that was off
+    if not gravity.shape[1] or _is_rounding(remainder, tau):
         return GravityFit()
-    unexplained = _without(free, left)
-    explained = 1.0 - float(unexplained @ unexplained) / float(left @ left)
-    if torque is None:
+    unexplained = _without(gravity, remainder)
+    explained = 1.0 - float(unexplained @ unexplained) / float(remainder @ remainder)
+    if load is None:
         return GravityFit(explained)
-    load = _without(beside, torque)
-    if _is_rounding(load, torque):
+    own_load = _without(motion, load)
+    if _is_rounding(own_load, load):
         return GravityFit(explained, relative_deviation=0.0)
-    correlation = float(load @ left) / float(np.sqrt(load @ load) * np.sqrt(left @ left))
-    factor = float(load @ left) / float(load @ load)
-    return GravityFit(explained, factor, correlation, float(torque.std()) / float(tau.std()))
+    product, square = float(own_load @ remainder), float(own_load @ own_load)
+    correlation = product / float(np.sqrt(square) * np.sqrt(remainder @ remainder))
+    return GravityFit(explained, product / square, correlation, float(load.std()) / float(tau.std()))
 
 
-def _is_rounding(left: np.ndarray, whole: np.ndarray) -> bool:
-    """Whether what is left of the whole is no more than rounding: of a constant torque, say."""
-    return float(np.linalg.norm(left)) <= DEPENDENT * float(np.linalg.norm(whole))
+def _is_rounding(remainder: np.ndarray, values: np.ndarray) -> bool:
+    """Whether what is left of values is no more than rounding: of a constant torque, say."""
+    return float(np.linalg.norm(remainder)) <= DEPENDENT * float(np.linalg.norm(values))
 
 
 def _without(columns: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """What of the values (S,) or (S, K) no combination of the columns (S, C) explains."""
-    u, s, _ = np.linalg.svd(columns, full_matrices=False)
-    u = u[:, s > DEPENDENT * s.max(initial=0.0)]
-    return values - u @ (u.T @ values)
+    """Return what of the values (S,) or (S, K) no combination of the columns (S, C) explains."""
+    basis = orth(columns, rcond=DEPENDENT)
+    remainder: np.ndarray = values - basis @ (basis.T @ values)
+    return remainder

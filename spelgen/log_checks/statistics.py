@@ -1,4 +1,4 @@
-"""One trajectory -> numbers about its clock, its ranges and its noise."""
+"""Measure one trajectory: its clock, its ranges and its noise."""
 
 from __future__ import annotations
 
@@ -10,13 +10,11 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from spelgen.logs.checks import VelocityAgreement, velocity_agreement
 from spelgen.logs.trajectory import GAP, QUANTITIES, Trajectory
+from spelgen.settings.tuning.log_checks import LogCheckTuning
+from spelgen.settings.tuning.logs import LogTuning
 
-DENSE = 50.0  # [Hz] below this rate motion looks like noise
-SMALLEST = 0.05  # part of the differences between neighbouring levels that may be one step
-NEAR = 100.0  # steps
-WHOLE = 0.05  # a difference this near to a whole number of steps is that number
-FEWEST = 3  # differences between neighbouring levels that tell of steps
-MOSTLY = 0.95  # of the differences between neighbouring levels are whole steps where a signal is quantised
+TUNING = LogCheckTuning()
+DENSE = LogTuning().dense_rate  # [Hz] below this rate motion looks like noise
 
 
 @dataclass(frozen=True)
@@ -55,33 +53,30 @@ class Statistics:
 
 
 def statistics(trajectory: Trajectory) -> Statistics:
-    """The numbers of one trajectory."""
-    signals = {name: getattr(trajectory, name) for name in QUANTITIES}
-    dense = trajectory.sample_rate >= DENSE and len(trajectory.t) > 8
-    return Statistics(
-        clock=clock_of(trajectory),
-        low={name: values.min(axis=0) for name, values in signals.items()},
-        high={name: values.max(axis=0) for name, values in signals.items()},
-        noise={name: noise_level(trajectory.t, values) for name, values in signals.items()}
-        if dense
-        else None,
-        steps={
-            name: np.array([quantisation_step(column) for column in values.T])
-            for name, values in signals.items()
-        },
-        agreement=velocity_agreement(trajectory),
-    )
+    """Return the numbers of one trajectory."""
+    low, high, noise, steps = {}, {}, {}, {}
+    # third differences of sparse motion are motion
+    dense = trajectory.sample_rate >= DENSE and len(trajectory) > 8
+    for name in QUANTITIES:
+        signals: np.ndarray = getattr(trajectory, name)
+        low[name], high[name] = signals.min(axis=0), signals.max(axis=0)
+        steps[name] = np.array([quantisation_step(column) for column in signals.T])
+        if dense:
+            noise[name] = noise_level(trajectory.t, signals)
+    agreement = velocity_agreement(trajectory)
+    return Statistics(clock_of(trajectory), low, high, noise or None, steps, agreement)
 
 
 def clock_of(trajectory: Trajectory) -> Clock:
-    """Of one trajectory."""
+    """Return when the samples of a trajectory were taken."""
     steps = np.diff(trajectory.t)
-    regular = steps[steps <= GAP * np.median(steps)] if steps.size else np.ones(1)
-    gaps = steps[steps > GAP * np.median(steps)] if steps.size else steps
+    is_gap = steps > GAP * np.median(steps) if steps.size else np.zeros(0, bool)
+    gaps = steps[is_gap]
+    regular = steps[~is_gap] if steps.size else np.ones(1)
     return Clock(
         name=trajectory.name,
         file=None if trajectory.file is None else str(trajectory.file),
-        samples=len(trajectory.t),
+        samples=len(trajectory),
         duration=trajectory.duration,
         sample_rate=trajectory.sample_rate,
         jitter=float(regular.std() / regular.mean()),
@@ -91,31 +86,37 @@ def clock_of(trajectory: Trajectory) -> Clock:
 
 
 def noise_level(t: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Standard deviation (n,) of white noise on smooth signals (T, n) at jittered times (T,).
+    """Return the standard deviation (n,) of white noise on smooth signals (T, n) at jittered times (T,).
 
     From third divided differences, scaled so that white noise keeps its size: of smooth motion they are small,
     and the median leaves out the moments at which they are not.
     """
     times = sliding_window_view(t, 4)  # (T - 3, 4)
-    apart = times[:, :, None] - times[:, None, :] + np.eye(4)
-    weights = 1.0 / apart.prod(axis=2)
+    distances = times[:, :, None] - times[:, None, :] + np.eye(4)
+    weights = 1.0 / distances.prod(axis=2)
     weights /= np.linalg.norm(weights, axis=1, keepdims=True)
-    third = np.einsum("tk,tnk->tn", weights, sliding_window_view(values, 4, axis=0))
-    return np.median(np.abs(third), axis=0) / 0.6745
+    differences = np.einsum("tk,tnk->tn", weights, sliding_window_view(values, 4, axis=0))
+    # the median of |x| is 0.6745 standard deviations of a normal x
+    return np.asarray(np.median(np.abs(differences), axis=0) / 0.6745)
 
 
 def quantisation_step(values: np.ndarray) -> float:
-    """The step of a quantised signal (T,); NaN where it is not quantised, or never changes."""
-    apart = np.diff(np.unique(values))
-    if len(apart) < FEWEST:
+    """Return the step of a quantised signal (T,); NaN where it is not quantised, or never changes."""
+    differences = np.diff(np.unique(values))
+    # two levels more or less say nothing of a grid
+    if len(differences) < 3:
         return float("nan")
-    step = float(np.median(apart[apart <= 1.5 * np.quantile(apart, SMALLEST)]))
-    near = apart[apart < NEAR * step] / step  # far apart, whole steps cannot be told from rounding
-    whole = np.abs(near - np.round(near)) < WHOLE
-    return step if len(near) >= FEWEST and whole.mean() > MOSTLY else float("nan")
+    smallest = np.quantile(differences, TUNING.smallest_steps)
+    step = float(np.median(differences[differences <= 1.5 * smallest]))
+    # over a hundred steps rounding adds up to what whole steps are told by
+    near = differences[differences < 100 * step] / step
+    is_whole = np.abs(near - np.round(near)) < TUNING.whole_step
+    if len(near) < 3 or is_whole.mean() <= TUNING.mostly:
+        return float("nan")
+    return step
 
 
 def common_step(steps: Sequence[float]) -> float | None:
-    """The step of most trajectories, where the signal is quantised in most of them."""
-    known = [step for step in steps if np.isfinite(step)]
-    return float(np.median(known)) if 2 * len(known) > len(steps) else None
+    """Return the step of most trajectories, where the signal is quantised in most of them."""
+    finite = [step for step in steps if np.isfinite(step)]
+    return float(np.median(finite)) if 2 * len(finite) > len(steps) else None

@@ -119,6 +119,7 @@ def _messages(path: Path, topic: str | None) -> Iterator[tuple[int, JointState]]
         ) from error
     for file in path.rglob("*"):
         if not file.is_dir():
+            # rosbags opens whatever the folder holds
             require_regular_file(file, LogError, "files in the folder of a ROS 2 bag")
     store = get_typestore(Stores.ROS2_HUMBLE)
     with ExitStack() as stack:
@@ -129,6 +130,7 @@ def _messages(path: Path, topic: str | None) -> Iterator[tuple[int, JointState]]
                 state: JointState = store.deserialize_cdr(raw, MESSAGE)  # type: ignore[assignment]
                 clock = state.header.stamp  # type: ignore[attr-defined]
                 stamp = clock.sec * 1_000_000_000 + clock.nanosec
+                # one clock for all messages: the two may be hours apart
                 if by_header is None:
                     by_header = stamp != 0
                 yield stamp if by_header else recorded, state
@@ -144,9 +146,9 @@ def _connections(reader: Reader, topic: str | None, path: Path) -> list[Connecti
     connections = [x for x in reader.connections if x.msgtype == MESSAGE]
     topics = sorted({x.topic for x in connections})
     if not topics:
-        other = sorted({f"{x.topic} ({x.msgtype})" for x in reader.connections})
+        present = sorted({f"{x.topic} ({x.msgtype})" for x in reader.connections})
         raise LogError(
-            f"only the topics {', '.join(other) or '(none)'}", file=path, expected=f"one of {MESSAGE}"
+            f"only the topics {', '.join(present) or '(none)'}", file=path, expected=f"one of {MESSAGE}"
         )
     if topic is None and len(topics) > 1:
         raise LogError(

@@ -1,55 +1,75 @@
-"""What is odd about logs: gaps, columns that never change, velocities that are no derivative, degrees.
+"""Check logs alone: frozen columns, velocities that are no derivative, degrees, gaps. Nothing is repaired.
 
-Nothing is repaired. Each trajectory is checked by itself, so that logs need not lie in memory together.
+A check is a code, a severity and a function of a subject, registered in CHECKS. Each trajectory is checked by itself,
+so that logs need not lie in memory together. `log_checks` has the checks that take the robot.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Generic, Literal, TypeVar
 
 import numpy as np
 
 from spelgen.errors import Diagnostic, LogError, SpelgenError, collect
 from spelgen.logs.trajectory import Trajectory, gap_ends, split_at_gaps
+from spelgen.settings.tuning.log_checks import LogCheckTuning
 
-SPAN = 10  # steps over which q and the integral of qd are compared: quantisation of q then hides little
-DRIFT = 0.05  # [rad, m] that qd must say a joint moved, before a q that never changes is called frozen
-AGREEMENT, DEVIATION = 0.9, 0.1  # least correlation of q with the integral of qd, largest |factor - 1|
+TUNING = LogCheckTuning()
 DEGREES = 180.0 / np.pi
 TURNS = 4 * np.pi  # [rad] no revolute joint turns further, so what does is in degrees
 
-Code = Literal["degrees", "frozen", "velocity-is-no-derivative", "constant-torque", "joint-at-rest"]
-CODES: tuple[Code, ...] = (
-    "degrees", "frozen", "velocity-is-no-derivative", "constant-torque", "joint-at-rest",
-)  # fmt: skip
-ERRORS = {  # findings that are errors: what is expected, what to do
-    "degrees": (
-        "radians and rad/s",
-        "convert degrees, by 'units' under 'logs' in the robot's YAML; if the units are right, say so there, "
-        "or in the Parquet schema's metadata 'units'",
-    ),
-    "frozen": ("columns that belong together", "check the logger, and the names of the columns"),
-}
+Subject = TypeVar("Subject")
 
 
 @dataclass(frozen=True)
-class Finding:
-    """One thing that is odd about one joint of one trajectory. everywhere: odd only where all trajectories show it."""
+class Check(Generic[Subject]):
+    """Look for one thing that may be odd about logs.
 
-    code: Code
-    trajectory: str
-    file: Path | None
-    joint: str
-    what: str
+    find: from the subject to the message; None where nothing is odd. severity: logs with an error cannot be trained on.
+    unless: codes of checks, earlier in the list, whose findings explain this one. everywhere: it is odd only where
+    all trajectories show it. expected, do: of an error.
+    """
+
+    code: str
+    severity: Literal["info", "warning", "error"]
+    find: Callable[[Subject], str | None]
+    unless: tuple[str, ...] = ()
     everywhere: bool = False
+    expected: str | None = None
+    do: str | None = None
+
+    def error(self, message: str, element: str, file: Path | None = None) -> LogError:
+        """Return the finding of an error as it is raised."""
+        return LogError(message, file=file, element=element, expected=self.expected, do=self.do)
+
+    def diagnostic(self, message: str, where: str) -> Diagnostic:
+        """Return the finding of a remark or a warning."""
+        assert self.severity != "error"
+        return Diagnostic(self.severity, self.code, where, None, message)
+
+
+def run_checks(checks: Iterable[Check[Subject]], subject: Subject) -> list[tuple[Check[Subject], str]]:
+    """Return the checks that find something odd, with their messages."""
+    results: list[tuple[Check[Subject], str]] = []
+    codes: set[str] = set()
+    for check in checks:
+        # one cause, one message: degrees are no derivatives either
+        if not codes.isdisjoint(check.unless):
+            continue
+        message = check.find(subject)
+        if message is not None:
+            results.append((check, message))
+            codes.add(check.code)
+    return results
 
 
 @dataclass(frozen=True, eq=False)
 class VelocityAgreement:
-    """Sums over increments y of q and of the integral x of qd, over SPAN steps, for n joints.
+    """Hold sums over increments y of q and of the integral x of qd, over some steps, for n joints.
 
     xx, yy: (n,). xy: (n, n), of qd of the joint of the row with q of that of the column.
     """
@@ -58,70 +78,187 @@ class VelocityAgreement:
     yy: np.ndarray
     xy: np.ndarray
 
-    def __add__(self, other: VelocityAgreement) -> VelocityAgreement:
-        return VelocityAgreement(self.xx + other.xx, self.yy + other.yy, self.xy + other.xy)
+    def __add__(self, sums: VelocityAgreement) -> VelocityAgreement:
+        return VelocityAgreement(self.xx + sums.xx, self.yy + sums.yy, self.xy + sums.xy)
 
     def factor(self, joint: int) -> float:
-        """By what qd must be multiplied to be dq/dt; 1 where qd says nothing."""
-        return float(self.xy[joint, joint] / self.xx[joint]) if self.xx[joint] > 0 else 1.0
+        """Return by what qd must be multiplied to be dq/dt; 1 where qd says nothing."""
+        if not self.xx[joint] > 0:
+            return 1.0
+        return float(self.xy[joint, joint] / self.xx[joint])
 
-    def correlation(self, joint: int, other: int | None = None) -> float | None:
-        """1: qd of a joint is dq/dt, of the other one or its own, but for a factor; None where one is at rest."""
-        other = joint if other is None else other
-        size = float(np.sqrt(self.xx[joint]) * np.sqrt(self.yy[other]))
-        return None if size < 1e-12 else float(self.xy[joint, other]) / size
+    def correlation(self, joint: int, q_joint: int | None = None) -> float | None:
+        """Return 1 if qd of a joint is dq/dt, of the other one or its own, but for a factor; None where one rests."""
+        if q_joint is None:
+            q_joint = joint
+        size = float(np.sqrt(self.xx[joint]) * np.sqrt(self.yy[q_joint]))
+        if size < 1e-12:
+            return None
+        return float(self.xy[joint, q_joint]) / size
+
+
+@dataclass(frozen=True, eq=False)
+class JointSignals:
+    """Hold what one trajectory shows of one joint: the subject of the checks of logs alone."""
+
+    trajectory: Trajectory
+    index: int
+    joints: Sequence[str]
+    kind: str
+    agreement: VelocityAgreement
+
+    @property
+    def q(self) -> np.ndarray:
+        """(T,) [rad, m]."""
+        return self.trajectory.q[:, self.index]
+
+    @property
+    def qd(self) -> np.ndarray:
+        """(T,) [rad/s, m/s]."""
+        return self.trajectory.qd[:, self.index]
+
+    @cached_property
+    def factor(self) -> float:
+        """By what qd must be multiplied to be dq/dt."""
+        return self.agreement.factor(self.index)
+
+    @cached_property
+    def correlation(self) -> float | None:
+        """Of qd and dq/dt."""
+        return self.agreement.correlation(self.index)
+
+
+def is_factor(value: float, unit: float) -> bool:
+    """Whether a factor is near enough to that of a unit to be it."""
+    return 1 / TUNING.unit_factor < value / unit < TUNING.unit_factor
+
+
+def find_degrees(signals: JointSignals) -> str | None:
+    """Find revolute joints that look recorded in degrees, unless units are declared."""
+    if signals.kind != "revolute" or signals.trajectory.declares_units:
+        return None
+    factor, correlation = signals.factor, signals.correlation
+    if correlation is not None and correlation > TUNING.agreement:
+        if is_factor(factor, DEGREES):
+            return f"q that changes {factor:.3g} times as fast as qd says (180/pi is 57.3)"
+        if is_factor(factor, 1 / DEGREES):
+            return f"qd that is {1 / factor:.3g} times as large as q changes (180/pi is 57.3)"
+    q = signals.q
+    if np.ptp(q) > TURNS:
+        return f"q from {q.min():.3g} to {q.max():.3g}, more than two turns"
+    return None
+
+
+def find_frozen(signals: JointSignals) -> str | None:
+    """Find a position or a velocity that never changes while the other one does."""
+    q, qd = signals.q, signals.qd
+    # the trapezoidal rule: a constant q with a noisy qd around zero stays where it is
+    moved = np.cumsum((qd[1:] + qd[:-1]) / 2 * np.diff(signals.trajectory.t))
+    drift = np.abs(moved).max(initial=0.0)
+    if np.ptp(qd) == 0 and np.ptp(q) > TUNING.drift:
+        return f"qd always {qd[0]:g} while q goes from {q.min():.3g} to {q.max():.3g}"
+    if np.ptp(q) == 0 and drift > TUNING.drift:
+        return f"q always {q[0]:g} while qd says that it moves by {drift:.3g}"
+    return None
+
+
+def find_wrong_velocity(signals: JointSignals) -> str | None:
+    """Find velocities that are not the positions' derivative, and say what else they may be."""
+    factor, correlation = signals.factor, signals.correlation
+    if correlation is None:
+        return None
+    if correlation >= TUNING.agreement and abs(factor - 1) <= TUNING.derivative_error:
+        return None
+    return (
+        f"qd is not dq/dt: the best factor is {factor:.3g}, the correlation {correlation:.3g}; "
+        f"{_velocity_advice(signals, correlation)}"
+    )
+
+
+def _velocity_advice(signals: JointSignals, correlation: float) -> str:
+    for index, joint in enumerate(signals.joints):
+        fit = signals.agreement.correlation(signals.index, index)
+        if index != signals.index and fit is not None and fit > max(TUNING.agreement, correlation):
+            return f"it fits q of joint {joint!r}"
+    if abs(signals.factor + 1) <= TUNING.derivative_error:
+        return "its sign is the opposite of that of q"
+    if correlation > TUNING.agreement:
+        for unit, seconds in (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9)):
+            if is_factor(signals.factor, seconds):
+                return f"are the times in {unit}?"
+    return "check units, signs and the order of the joints"
+
+
+def find_constant_torque(signals: JointSignals) -> str | None:
+    """Find torques that never change; logs of commands have none."""
+    tau = signals.trajectory.tau
+    if not tau.size or np.ptp(tau[:, signals.index]) > 0:
+        return None
+    return f"tau is always {tau[0, signals.index]:g}: right for a joint without a motor only"
+
+
+def find_rest(signals: JointSignals) -> str | None:
+    """Find joints that do not move."""
+    if np.ptp(signals.q) > 0:
+        return None
+    return "does not move: the logs say nothing about its own dynamics"
+
+
+CHECKS: list[Check[JointSignals]] = [
+    Check(
+        "degrees", "error", find_degrees, expected="radians and rad/s",
+        do="convert degrees, by 'units' under 'logs' in the robot's YAML; if the units are right, say so there, "
+        "or in the Parquet schema's metadata 'units'",
+    ),
+    Check(
+        "frozen", "error", find_frozen, expected="columns that belong together",
+        do="check the logger, and the names of the columns",
+    ),
+    Check("velocity-is-no-derivative", "warning", find_wrong_velocity, unless=("degrees",)),
+    Check("constant-torque", "warning", find_constant_torque, everywhere=True),
+    Check("joint-at-rest", "info", find_rest, unless=("frozen",), everywhere=True),
+]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Say what a check finds odd about one joint of one trajectory."""
+
+    check: Check[JointSignals]
+    trajectory: str
+    file: Path | None
+    joint: str
+    message: str
 
 
 def check(
     trajectories: Iterable[Trajectory], joints: Sequence[str], joint_types: Sequence[str]
 ) -> list[Diagnostic]:
-    """What is odd about the logs, nothing repaired.
+    """Return what is odd about the logs, nothing repaired.
 
     Raises LogError when revolute joints look recorded in degrees, unless units are declared, and when a
     position or a velocity never changes while the other one does.
     """
-    gaps, found, count = [], [], 0
+    gaps: list[Diagnostic] = []
+    results: list[Finding] = []
+    count = 0
     for trajectory in trajectories:
         gaps += gap_diagnostics(trajectory)
-        found += findings(trajectory, joints, joint_types)
+        results += findings(trajectory, joints, joint_types)
         count += 1
-    notes, errors = summarised(found, joints, count)
+    notes, errors = summarised(results, joints, count)
     collect(errors)
     return [*gaps, *notes]
 
 
 def gap_diagnostics(trajectory: Trajectory) -> list[Diagnostic]:
-    """A note where the recording has holes."""
-    pieces = len(gap_ends(trajectory.t)) - 1
-    if pieces == 1:
+    """Return a note where the recording has holes."""
+    gaps = len(gap_ends(trajectory.t)) - 2
+    if not gaps:
         return []
     longest = np.diff(trajectory.t).max()
-    message = f"{pieces - 1} gaps in time, up to {longest:.3g} s long; no window crosses one"
+    message = f"{gaps} gaps in time, up to {longest:.3g} s long; no window crosses one"
     return [Diagnostic("info", "gap", f"trajectory {trajectory.name}", None, message)]
-
-
-def summarised(
-    found: Sequence[Finding], joints: Sequence[str], trajectories: int
-) -> tuple[list[Diagnostic], list[SpelgenError]]:
-    """Findings about that many trajectories, a sentence for each joint and kind: notes, and what `check` raises."""
-    by_kind: dict[tuple[str, Code], list[Finding]] = {(joint, code): [] for joint in joints for code in CODES}
-    for each in found:
-        by_kind[each.joint, each.code].append(each)
-    notes: list[Diagnostic] = []
-    errors: list[SpelgenError] = []
-    for (joint, code), same in by_kind.items():
-        if not same or (same[0].everywhere and len(same) < trajectories):
-            continue
-        others = f" (and in {len(same) - 1} more trajectories)" if len(same) > 1 else ""
-        where = f"trajectory {same[0].trajectory}, joint {joint!r}"
-        if code in ERRORS:
-            expected, do = ERRORS[code]
-            got = f"{same[0].what}{others}"
-            errors.append(LogError(got, file=same[0].file, element=where, expected=expected, do=do))
-        else:
-            severity: Literal["info", "warning"] = "info" if code == "joint-at-rest" else "warning"
-            notes.append(Diagnostic(severity, code, where, None, same[0].what + others))
-    return notes, errors
 
 
 def findings(
@@ -130,96 +267,52 @@ def findings(
     joint_types: Sequence[str],
     agreement: VelocityAgreement | None = None,
 ) -> list[Finding]:
-    """What is odd about the joints of one trajectory. agreement: where it is known already."""
-    agreement = velocity_agreement(trajectory) if agreement is None else agreement
-    return [
-        Finding(code, trajectory.name, trajectory.file, joint, what, everywhere)
-        for index, (joint, kind) in enumerate(zip(joints, joint_types, strict=True))
-        for code, what, everywhere in (
-            *_constant(trajectory, index),
-            *_velocity(trajectory, index, kind, agreement, joints),
-        )
-    ]
+    """Return what is odd about the joints of one trajectory. agreement: where it is known already."""
+    if agreement is None:
+        agreement = velocity_agreement(trajectory)
+    results = []
+    for index, (joint, kind) in enumerate(zip(joints, joint_types, strict=True)):
+        for odd, message in run_checks(CHECKS, JointSignals(trajectory, index, joints, kind, agreement)):
+            results.append(Finding(odd, trajectory.name, trajectory.file, joint, message))
+    return results
+
+
+def summarised(
+    results: Sequence[Finding], joints: Sequence[str], trajectories: int
+) -> tuple[list[Diagnostic], list[SpelgenError]]:
+    """Return notes and errors about so many trajectories: a sentence for each joint and check."""
+    groups: dict[tuple[str, str], list[Finding]] = {}
+    for finding in results:
+        groups.setdefault((finding.joint, finding.check.code), []).append(finding)
+    notes: list[Diagnostic] = []
+    errors: list[SpelgenError] = []
+    for joint in joints:
+        for odd in CHECKS:
+            alike = groups.get((joint, odd.code), [])
+            # a joint that rests in one motion and moves in another is no oddity
+            if not alike or (odd.everywhere and len(alike) < trajectories):
+                continue
+            message = alike[0].message
+            if len(alike) > 1:
+                message += f" (and in {len(alike) - 1} more trajectories)"
+            where = f"trajectory {alike[0].trajectory}, joint {joint!r}"
+            if odd.severity == "error":
+                errors.append(odd.error(message, where, alike[0].file))
+            else:
+                notes.append(odd.diagnostic(message, where))
+    return notes, errors
 
 
 def velocity_agreement(trajectory: Trajectory) -> VelocityAgreement:
-    """How far qd is dq/dt, within gap-free pieces."""
+    """Return how far qd is dq/dt, within gap-free pieces."""
     n = trajectory.q.shape[1]
     total = VelocityAgreement(np.zeros(n), np.zeros(n), np.zeros((n, n)))
     for piece in split_at_gaps(trajectory):
-        span = min(SPAN, len(piece.t) - 1)
+        span = min(TUNING.increments, len(piece) - 1)
         if span:
             steps = (piece.qd[1:] + piece.qd[:-1]) / 2 * np.diff(piece.t)[:, None]
-            area = np.concatenate([np.zeros((1, n)), np.cumsum(steps, axis=0)])
-            x, y = area[span:] - area[:-span], piece.q[span:] - piece.q[:-span]
+            # over several steps: from one sample to the next quantisation of q is larger than its change
+            integral = np.concatenate([np.zeros((1, n)), np.cumsum(steps, axis=0)])
+            x, y = integral[span:] - integral[:-span], piece.q[span:] - piece.q[:-span]
             total += VelocityAgreement((x * x).sum(axis=0), (y * y).sum(axis=0), x.T @ y)
     return total
-
-
-def _constant(trajectory: Trajectory, index: int) -> Iterator[tuple[Code, str, bool]]:
-    """Columns that never change."""
-    q, qd, tau = trajectory.q[:, index], trajectory.qd[:, index], trajectory.tau[:, index : index + 1]
-    drift = np.abs(np.cumsum((qd[1:] + qd[:-1]) / 2 * np.diff(trajectory.t))).max(initial=0.0)
-    if tau.size and np.ptp(tau) == 0:
-        yield (
-            "constant-torque",
-            (f"tau is always {tau[0, 0]:g}: right for a joint without a motor only"),
-            True,
-        )
-    if np.ptp(q) > 0 and np.ptp(qd) == 0 and np.ptp(q) > DRIFT:
-        yield "frozen", f"qd always {qd[0]:g} while q goes from {q.min():.3g} to {q.max():.3g}", False
-    elif np.ptp(q) == 0 and drift > DRIFT:
-        yield "frozen", f"q always {q[0]:g} while qd says that it moves by {drift:.3g}", False
-    elif np.ptp(q) == 0:
-        yield "joint-at-rest", "does not move: the logs say nothing about its own dynamics", True
-
-
-def _velocity(
-    trajectory: Trajectory, index: int, kind: str, agreement: VelocityAgreement, joints: Sequence[str]
-) -> Iterator[tuple[Code, str, bool]]:
-    """Degrees, and velocities that are not the positions' derivative."""
-    factor, correlation = agreement.factor(index), agreement.correlation(index)
-    degrees = None
-    if kind == "revolute" and not trajectory.declares_units:
-        degrees = _degrees(trajectory.q[:, index], factor, correlation)
-    if degrees:
-        yield "degrees", degrees, False
-    elif correlation is not None and (correlation < AGREEMENT or abs(factor - 1) > DEVIATION):
-        yield (
-            "velocity-is-no-derivative",
-            (
-                f"qd is not dq/dt: the best factor is {factor:.3g}, the correlation "
-                f"{correlation:.3g}; {_advice(index, agreement, factor, correlation, joints)}"
-            ),
-            False,
-        )
-
-
-def _advice(
-    index: int, agreement: VelocityAgreement, factor: float, correlation: float, joints: Sequence[str]
-) -> str:
-    fits = [
-        joint
-        for k, joint in enumerate(joints)
-        if k != index and (agreement.correlation(index, k) or 0.0) > max(AGREEMENT, correlation)
-    ]
-    if fits:
-        return f"it fits q of joint {fits[0]!r}"
-    if abs(factor + 1) <= DEVIATION:
-        return "its sign is the opposite of that of q"
-    for unit, size in (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9)):
-        if correlation > AGREEMENT and 0.8 < factor / size < 1.25:
-            return f"are the times in {unit}?"
-    return "check units, signs and the order of the joints"
-
-
-def _degrees(q: np.ndarray, factor: float, correlation: float | None) -> str | None:
-    """Why a revolute joint seems to be recorded in degrees: the numbers that say so."""
-    agrees = correlation is not None and correlation > AGREEMENT
-    if agrees and 0.8 < factor / DEGREES < 1.25:
-        return f"q that changes {factor:.3g} times as fast as qd says (180/pi is 57.3)"
-    if agrees and 0.8 < factor * DEGREES < 1.25:
-        return f"qd that is {1 / factor:.3g} times as large as q changes (180/pi is 57.3)"
-    if np.ptp(q) > 4 * np.pi:
-        return f"q from {q.min():.3g} to {q.max():.3g}, more than two turns"
-    return None

@@ -54,6 +54,7 @@ class Chunk:
 
     def load(self) -> Trajectory:
         """Return the chunk's samples, the same as `scan` gave. Raises LogError where the file has changed."""
+        # rows of another file under the same name would be fitted without a word
         if _stamp(self.log.file) != self.log.stamp:
             raise LogError(
                 "a file that has changed since it was first read", file=self.log.file, do="start a new run"
@@ -98,6 +99,7 @@ def large_files(
     for file in parquet:
         with reading(file):
             rows += pa.parquet.read_metadata(file).num_rows
+    # from metadata alone: to count by reading would take what streaming is to save
     numbers = rows * (1 + 3 * len(joints))
     if 8 * numbers <= TUNING.in_memory:
         return []
@@ -138,6 +140,7 @@ def scan(
     """
     mapping = mapping or LogMapping()
     collect(mapping.misfits(joints, joint_types))
+    # names as `read_logs` gives them, though not all files are known when the first is read
     stems = Counter(file.stem for file in files)
     for file in files:
         log = _open_log(file, joints, mapping)
@@ -145,6 +148,7 @@ def scan(
         last = ("", -np.inf)  # recording and time of the last sample
         for chunk, recording, data in _chunks(log, stem, len(files) > 1):
             t = data[:, 0]
+            # times must increase across the border between chunks, too
             if last[0] == recording:
                 t = np.concatenate([[last[1]], t])
             rows = np.arange(chunk.stop - len(t), chunk.stop)
@@ -215,6 +219,7 @@ def _label_runs(log: ParquetLog) -> list[tuple[str, int]]:
     runs: list[tuple[str, int]] = []
     row = 0
     for batch in _source(log.file).iter_batches(ROW_GROUP, columns=[log.layout.labels]):
+        # runs, and not rows: a label repeats a million times
         encoded = pa.compute.run_end_encode(batch.column(0).cast(pa.string()))
         ends = encoded.run_ends.to_pylist()
         for value, end in zip(encoded.values.to_pylist(), ends, strict=True):

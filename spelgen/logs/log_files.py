@@ -19,11 +19,13 @@ def log_files(
     role: "train" or "test": of a folder that holds train.* or test.* files, only those with this stem.
     """
     files: dict[Path, None] = {}
-    for given in [paths] if isinstance(paths, str | Path) else paths:
-        path = local(given)
+    if isinstance(paths, str | Path):
+        paths = [paths]
+    for name in paths:
+        path = local(name)
         try:
             if not path.exists():
-                raise LogError("no such file or folder", file=given, expected="a log", do="check the path")
+                raise LogError("no such file or folder", file=name, expected="a log", do="check the path")
             files |= dict.fromkeys(_logs_at(path, role))
         except LogError as error:
             errors.append(error)

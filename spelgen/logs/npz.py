@@ -121,17 +121,17 @@ def _table(
 ) -> LogTable:
     """Return the table of one recording, whose name is the text."""
     times, labels = mapping.columns.t, mapping.columns.trajectory
-    wanted = [times]
+    names = [times]
     columns: dict[str, np.ndarray] = {}
     if times in arrays:
         columns[times] = arrays[times]
     for quantity in wanted_quantities(mapping):
         for index in range(len(joints)):
             name, values = _joint_column(arrays, quantity, index, joints, mapping, file)
-            wanted.append(name)
+            names.append(name)
             if values is not None:
                 columns[name] = values
-    missing = [name for name in wanted if name not in columns]
+    missing = [name for name in names if name not in columns]
     if missing:
         raise missing_columns(missing, list(arrays), file, mapping, joints)
     _require_samples(columns, file)
@@ -140,7 +140,7 @@ def _table(
         columns[labels] = arrays[labels]
     with reading(file):
         table = pa.table({name: _arrow_compatible(array) for name, array in columns.items()})
-    return LogTable(text, table, make_layout(wanted, labels if has_labels else None, joints, mapping))
+    return LogTable(text, table, make_layout(names, labels if has_labels else None, joints, mapping))
 
 
 def _joint_column(
@@ -165,6 +165,7 @@ def _joint_column(
 
 def _arrow_compatible(array: np.ndarray) -> np.ndarray:
     """Return the array in a type that Arrow knows: this machine's byte order, at most double precision."""
+    # Arrow refuses half and extended precision, and the other byte order
     if array.dtype.kind == "f":
         return array.astype(float)
     return array.astype(array.dtype.newbyteorder("="))

@@ -50,7 +50,7 @@ def read_logs(
         try:
             for table in read_tables(file, source.joints, source.mapping):
                 trajectories += _trajectories(table, file)
-        except LogError as error:
+        except LogError as error:  # all files are told of at once
             errors.append(error)
     collect(errors)
     return _with_unique_names(trajectories)
@@ -79,6 +79,7 @@ def write_logs(path: Path | str, trajectories: Sequence[Trajectory], arm: Logged
         values = np.concatenate([getattr(x, quantity) for x in trajectories])
         for index, joint in enumerate(joints):
             columns[f"{quantity}_{joint}"] = values[:, index]
+    # the file says that it is in SI units, so that no mapping is applied when it is read back
     table = pa.table(columns).replace_schema_metadata({UNITS_KEY: UNITS})
     with replacing(path) as unfinished:
         if path.suffix == ".csv":

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -40,8 +41,7 @@ UNITS = {
 }
 
 
-@dataclass(frozen=True)
-class Column:
+class Column(NamedTuple):
     """Describe a column, or one element of a column of lists. number: its place, or the last number in its name."""
 
     name: str
@@ -58,65 +58,51 @@ class Suggestion:
     missing: tuple[str, ...]
 
 
-@dataclass
-class Draft:
-    """Collect what is known of a log. columns: by quantity and joint; units: of all joints; angles: of turning ones."""
-
-    clock: str
-    columns: dict[str, dict[str, Column]]
-    units: dict[str, str]
-    angles: dict[str, str]
-    in_urdf_order: bool = False
-    missing: list[str] = field(default_factory=list)
-
-
 def suggest_mapping(file: Path, joints: Sequence[str], joint_types: Sequence[str]) -> Suggestion:
     """Return how a file may be read. Raises LogError where it cannot be opened, or has no column of times."""
     table = _table(file)
     columns = _measured_columns(table)
-    order = _joint_order(table, file)
     times = [column for column in columns if column.quantity == "t"]
     if not times:
         names = ", ".join(table.column_names)
         raise LogError(f"only the columns {names}", file=file, expected="one of times, called t or time")
+    # `time` before `timestamp_of_receipt`: what has the fewest words is the plain clock
     clock = min(times, key=lambda column: len(column.words))
+    order = _joint_order(table, file)
     by_joint = {quantity: _by_joint(columns, quantity, joints, order) for quantity in QUANTITIES}
     turning = [joint for joint, kind in zip(joints, joint_types, strict=True) if kind == "revolute"]
     units = {"t": _time_unit(clock, table)}
-    angles = _angle_units(by_joint, turning, _Values(table, file, clock.name, TIMES[units["t"]]))
+    angles = _angle_units(by_joint, turning, table, file, clock.name, TIMES[units["t"]])
     if len(turning) == len(joints):
         units |= angles
     torque = _unit_in_names("tau", by_joint["tau"].values())
     if torque is not None:
         units["tau"] = torque
-    draft = Draft(clock.name, by_joint, units, angles if len(turning) < len(joints) else {})
-    named = any(names_joint(column.name, joint) for column in by_joint["q"].values() for joint in joints)
-    draft.in_urdf_order = not order and not named
-    for quantity in ("q", "tau"):
-        draft.missing += [f"{quantity} of {joint}" for joint in joints if joint not in by_joint[quantity]]
-    return Suggestion(_yaml(draft, file, joints, turning), tuple(draft.missing))
-
-
-def _yaml(draft: Draft, file: Path, joints: Sequence[str], turning: Collection[str]) -> str:
-    differentiated = len(draft.columns["qd"]) < len(joints)
+    differentiated = len(by_joint["qd"]) < len(joints)
     lines = [f"# Read off the names and numbers of {json.dumps(file.name)}: check it before you rely on it."]
-    if draft.in_urdf_order:
+    named = [joint for joint, column in by_joint["q"].items() if names_joint(column.name, joint)]
+    if not order and not named:
         lines.append("# Joints are taken in the URDF's order: the log does not name them.")
-    lines += [f"columns: {{t: {json.dumps(draft.clock)}}}", f"units: {json.dumps(draft.units)}"]
+    lines += [f"columns: {{t: {json.dumps(clock.name)}}}", f"units: {json.dumps(units)}"]
     if differentiated:
         lines.append("velocity: differentiated")
+        del by_joint["qd"]
     lines.append("joints:")
-    quantities = ("q", "tau") if differentiated else QUANTITIES
     for joint in joints:
-        names = {x: draft.columns[x][joint].name for x in quantities if joint in draft.columns[x]}
-        lines += [f"  {json.dumps(joint)}:", f"    columns: {json.dumps(names)}"]
-        if draft.angles and joint in turning:
-            lines.append(f"    units: {json.dumps(draft.angles)}")
-        torque = draft.units.get("tau")
+        entries: dict[str, str] = {}
+        for quantity, named_columns in by_joint.items():
+            if joint in named_columns:
+                entries[quantity] = named_columns[joint].name
+        lines += [f"  {json.dumps(joint)}:", f"    columns: {json.dumps(entries)}"]
+        if angles and joint in turning and len(turning) < len(joints):
+            lines.append(f"    units: {json.dumps(angles)}")
         if torque in ("A", "mA"):
             lines.append(f"    gain: 1.0 # Nm per {torque} at the joint, the gear included: say what it is")
-    lines += [f"# no column was found for {missing}" for missing in draft.missing]
-    return "\n".join(lines) + "\n"
+    missing = []
+    for quantity in ("q", "tau"):
+        missing += [f"{quantity} of {joint}" for joint in joints if joint not in by_joint[quantity]]
+    lines += [f"# no column was found for {column}" for column in missing]
+    return Suggestion("\n".join(lines) + "\n", tuple(missing))
 
 
 def _table(file: Path) -> pa.Table:
@@ -145,6 +131,7 @@ def _measured_columns(table: pa.Table) -> list[Column]:
 
 
 def _quantity(words: Collection[str]) -> str | None:
+    # set points have the names of what they are set points of
     if not NOT_MEASURED.isdisjoint(words):
         return None
     for quantity, spoken in WORDS.items():
@@ -162,6 +149,7 @@ def _joint_order(table: pa.Table, file: Path) -> list[str]:
         names = table[column]
         if column.strip("/").lower() not in JOINT_NAMES or _list_length(names) is None:
             continue
+        # a mapping says one place for each joint: it cannot follow an order that changes
         orders = pa.compute.unique(names.cast(pa.string()) if _is_text(names) else names)
         if len(orders) > 1:
             raise LogError(
@@ -182,7 +170,7 @@ def _words(name: str) -> tuple[str, ...]:
 
 
 def _is_text(values: pa.ChunkedArray) -> bool:
-    return pa.types.is_string(values.type) or pa.types.is_large_string(values.type)
+    return bool(pa.types.is_string(values.type) or pa.types.is_large_string(values.type))
 
 
 def _list_length(values: pa.ChunkedArray) -> int | None:
@@ -243,38 +231,26 @@ def _unit_in_names(quantity: str, columns: Iterable[Column]) -> str | None:
     return None
 
 
-@dataclass(frozen=True)
-class _Values:
-    """Give the numbers of a table's columns. time_scale: from times as logged to seconds."""
-
-    table: pa.Table
-    file: Path
-    clock: str
-    time_scale: float
-
-    def of(self, column: Column) -> np.ndarray:
-        return column_values(self.table, column.name, self.file)
-
-    def time_steps(self) -> np.ndarray:
-        return np.diff(column_values(self.table, self.clock, self.file)) * self.time_scale
-
-
 def _angle_units(
-    columns: dict[str, dict[str, Column]], turning: Collection[str], values: _Values
+    columns: dict[str, dict[str, Column]],
+    turning: Collection[str],
+    table: pa.Table,
+    file: Path,
+    clock: str,
+    time_scale: float,
 ) -> dict[str, str]:
     """Return degrees where positions of turning joints are no radians: of q, and of qd where that is its derivative."""
-    positions = {joint: x for joint, x in columns["q"].items() if joint in turning}
-    speeds = {joint: x for joint, x in columns["qd"].items() if joint in turning}
-    unit = _unit_in_names("q", positions.values())
-    speed_unit = _unit_in_names("qd", speeds.values())
-    q = [values.of(x) for x in positions.values()]
+    positions = [x for joint, x in columns["q"].items() if joint in turning]
+    speeds = [x for joint, x in columns["qd"].items() if joint in turning]
+    unit, speed_unit = _unit_in_names("q", positions), _unit_in_names("qd", speeds)
+    q = [column_values(table, x.name, file) for x in positions]
     if unit is None and any(np.ptp(x) > TURNS for x in q):
         unit = "deg"
-    if unit == "deg" and speed_unit is None and speeds.keys() == positions.keys():
-        dt = values.time_steps()
+    if unit == "deg" and speed_unit is None and len(speeds) == len(positions):
+        dt = np.diff(column_values(table, clock, file)) * time_scale
         distance = sum(np.abs(np.diff(x)).sum() for x in q)
-        integral = sum(np.abs(values.of(x)[1:] * dt).sum() for x in speeds.values())
-        # 1 if speeds are in degrees as positions are, 57 if in radians: halfway between the two
+        integral = sum(np.abs(column_values(table, x.name, file)[1:] * dt).sum() for x in speeds)
+        # 1 if speeds are in degrees as positions are, 57 if in radians: between the two
         if distance < 8 * integral:
             speed_unit = "deg/s"
     units = {"q": unit, "qd": speed_unit}

@@ -94,6 +94,7 @@ def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, 
     What spelgen itself wrote is read as such, whatever the mapping says.
     """
     metadata = schema.metadata or {}
+    # simulated logs of an arm whose settings describe its real logger
     if metadata.get(UNITS_KEY) == UNITS:
         mapping = LogMapping(input=mapping.input)
     columns = [mapping.columns.t]
@@ -101,6 +102,7 @@ def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, 
         columns += [mapping.column(quantity, joint) for joint in joints]
     _require_columns(schema.names, columns, file, mapping, joints)
     labels = mapping.columns.trajectory if mapping.columns.trajectory in schema.names else None
+    # a list has no text that names a recording
     if labels and pa.types.is_nested(schema.field(labels).type):
         kind = schema.field(labels).type
         raise LogError(f"values of type {kind}", file=file, element=f"column {labels}", expected="names")
@@ -141,20 +143,20 @@ def stored_columns(layout: Layout, columns: Collection[str]) -> list[str]:
 
 
 def _require_columns(
-    columns: Sequence[str], wanted: Sequence[str], file: Path, mapping: LogMapping, joints: Sequence[str]
+    columns: Sequence[str], required: Sequence[str], file: Path, mapping: LogMapping, joints: Sequence[str]
 ) -> None:
-    shared = sorted({name for name in wanted if wanted.count(name) > 1})
+    shared = sorted({name for name in required if required.count(name) > 1})
     if shared:
         raise LogError(
             "one column for several joints", file=file, element=f"column {', '.join(shared)}",
             expected="'{joint}' in its name under 'logs'",
         )  # fmt: skip
-    repeated = sorted({name for name in wanted if columns.count(name) > 1})
+    repeated = sorted({name for name in required if columns.count(name) > 1})
     if repeated:
         raise LogError(
             "the same column twice", file=file, element=f"column {', '.join(repeated)}", expected="it once"
         )
-    missing = [name for name in wanted if name not in columns and not list_element(name, columns)]
+    missing = [name for name in required if name not in columns and not list_element(name, columns)]
     if missing:
         raise missing_columns(missing, columns, file, mapping, joints)
 
@@ -182,6 +184,7 @@ def _advice(
         for joint in joints:
             owners[mapping.column(quantity, joint)] = (quantity, joint)
     quantities = {owners.get(name, ("", ""))[0] for name in missing}
+    # the usual gap of loggers, and the only one with a remedy of its own
     if quantities == {"qd"}:
         return "say 'velocity: differentiated' under 'logs' in the robot's YAML where none were logged"
     joint = ""

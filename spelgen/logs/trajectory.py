@@ -45,6 +45,7 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         for column in ("t", *self.quantities):
+            # frozen, and still from lists and tensors
             object.__setattr__(self, column, self._as_array(column))
         self._require_shapes()
         self._require_possible("t", np.isfinite(self.t))
@@ -52,8 +53,8 @@ class Trajectory:
             self._require_possible(column, np.abs(getattr(self, column)) < TUNING.largest_value)
         backward = np.flatnonzero(np.diff(self.t) <= 0)
         if backward.size:
-            before, after = self.t[backward[0]], self.t[backward[0] + 1]
-            raise self._error("t", f"{after:g} s after {before:g} s", "increasing times")
+            k = backward[0]
+            raise self._error("t", f"{self.t[k + 1]:g} s after {self.t[k]:g} s", "increasing times")
 
     def __len__(self) -> int:
         """Return the number of samples."""
@@ -80,6 +81,7 @@ class Trajectory:
         steps = np.diff(self.t)
         if not steps.size:
             return 0.0
+        # a pause of a minute would halve the rate
         return float(1.0 / steps[steps <= GAP * np.median(steps)].mean())
 
     def __repr__(self) -> str:

@@ -40,8 +40,9 @@ def values_in_si(
     logged = [_times(table, layout, file, start, row)]
     logged += [_floats(_column(table, name), name, file, row) for name in layout.columns[1:]]
     factors, offsets = layout.units
+    # what overflows is told below, with its row
     with np.errstate(over="ignore", invalid="ignore"):
-        data = np.stack(logged, axis=1) * factors + offsets
+        data: np.ndarray = np.stack(logged, axis=1) * factors + offsets
     _require_possible(data, layout.columns, file, row)
     return data
 
@@ -90,10 +91,12 @@ def _times(table: pa.Table | pa.RecordBatch, layout: Layout, file: Path, start: 
     name = layout.columns[0]
     times = _column(table, name)
     nanoseconds = _nanoseconds(times)
+    # integers are subtracted before they become floats: 1.7e18 ns keeps no microseconds as a double
     if nanoseconds is not None and not nanoseconds.null_count:
-        return (nanoseconds.to_numpy() - start) * 1e-9 / TIMES[layout.mapping.units.t]
+        counts: np.ndarray = nanoseconds.to_numpy()
+        return np.asarray((counts - start) * 1e-9 / TIMES[layout.mapping.units.t])
     if start and nanoseconds is None and not times.null_count:
-        return (times.to_numpy() - start).astype(float)
+        return np.asarray(times.to_numpy() - start, dtype=float)
     return _floats(times, name, file, row)
 
 
@@ -133,6 +136,7 @@ def _floats(values: pa.ChunkedArray | pa.Array, column: str, file: Path, row: in
         floats: np.ndarray = values.cast(pa.float64()).to_numpy(zero_copy_only=False)
         return floats
     except (pa.ArrowException, ValueError) as error:
+        # Arrow does not say which row
         if pa.types.is_string(values.type):
             for index, text in enumerate(values.to_pylist()):
                 if not _is_number(text):

@@ -50,9 +50,9 @@ class Windows:
         return columns if self.z is None else [*columns, self.z]
 
 
-def thinned(windows: Windows, most: int) -> Windows:
-    """Return at most that many windows, evenly spread."""
-    return windows[:: -(-len(windows) // most)]
+def thinned(windows: Windows, count: int) -> Windows:
+    """Return at most ``count`` windows, evenly spread."""
+    return windows[:: -(-len(windows) // count)]
 
 
 def joined(batches: Sequence[Windows]) -> Windows:
@@ -98,8 +98,11 @@ def _cut(
     piece: Trajectory, window: int, stride: int, decimation: int, measured: bool, reach: BristleReach | None
 ) -> list[np.ndarray]:
     """Return dt, q, qd, tau, and z where a reach is given, of the windows of one piece."""
-    held = (piece.tau[:-1] + piece.tau[1:]) / 2 if measured else piece.tau[:-1]
-    impulses = held * np.diff(piece.t)[:, None]
+    tau = piece.tau[:-1]
+    if measured:
+        tau = (tau + piece.tau[1:]) / 2
+    # sums of impulses: steps of a jittered clock are not alike
+    impulses = tau * np.diff(piece.t)[:, None]
     impulse = sliding_window_view(impulses, decimation, axis=0).sum(axis=-1)  # (T - decimation, n)
     dt = (piece.t[decimation:] - piece.t[:-decimation])[:, None]
     columns = [
@@ -137,12 +140,16 @@ def split_validation(trajectories: Sequence[Trajectory], fraction: float, seed: 
     total = len(trajectories)
     if total == 1:
         return _split_in_time(trajectories[0], fraction)
+    # whole trajectories: neighbouring windows share samples, and would tell the answer
     count = min(max(1, round(fraction * total)), total - 1)
     chosen = set(np.random.default_rng(seed).permutation(total)[:count].tolist())
     training: list[Trajectory] = []
     validation: list[Trajectory] = []
     for index, trajectory in enumerate(trajectories):
-        (validation if index in chosen else training).append(trajectory)
+        if index in chosen:
+            validation.append(trajectory)
+        else:
+            training.append(trajectory)
     names = f"{count} of {total} trajectories"
     if count <= 3:
         names = ", ".join(x.name for x in validation)

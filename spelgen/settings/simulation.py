@@ -13,7 +13,7 @@ class SimulationSettings(Group):
     """How `spelgen simulate` makes logs.
 
     protocol: random-inputs, or tracking: controlled motions, see `TrackingSettings`. Where neither it nor any `inputs`
-        are said: tracking, of fewer and longer trajectories than these (`simulation.simulate.CONTROLLED`).
+        are said: tracking, of fewer and longer trajectories than these (`ControlledSimulation`).
     trajectories: number, each from its own initial position, at rest.
     duration: of each [s]. sample_rate: of samples and of the inputs, which are held in between [Hz].
     inputs: the torques each actuated joint draws from, every sample anew [Nm].
@@ -41,6 +41,25 @@ class SimulationSettings(Group):
             if lowest > highest:
                 raise ValueError(f"the lowest position of {name!r} first, then the highest")
         return value
+
+
+class ControlledSimulation(SimulationSettings):
+    """Defaults of arms that are controlled where nobody says how they are driven: fewer and longer trajectories."""
+
+    protocol: Literal["random-inputs", "tracking"] = "tracking"
+    trajectories: Count = 4
+    duration: Positive = 8.0
+    sample_rate: Positive = 125.0
+    test_fraction: Share = 0.25
+
+
+class ServoSimulation(SimulationSettings):
+    """Defaults of arms under position servos."""
+
+    trajectories: Count = 6
+    duration: Positive = 20.0
+    sample_rate: Positive = 50.0
+    test_fraction: Share = 0.34
 
 
 class TrackingSettings(Group):

@@ -1,4 +1,4 @@
-"""Friction of simulated joints: viscous, and Coulomb's with its jump at rest smoothed."""
+"""Describe friction of simulated joints: viscous, and Coulomb's with its jump at rest smoothed."""
 
 from __future__ import annotations
 
@@ -34,15 +34,16 @@ class Friction:
         never drives: its product with qd is not negative.
         """
         s = np.tanh(qd / self.smoothing_velocity)
-        return self.viscous * qd + s * (self._odd + s * self._even)
+        torque: np.ndarray = self.viscous * qd + s * (self._odd + s * self._even)
+        return torque
 
     @cached_property
     def _odd(self) -> np.ndarray:
-        return 0.5 * (self.forward - self.backward)
+        return np.asarray(0.5 * (self.forward - self.backward))
 
     @cached_property
     def _even(self) -> np.ndarray:
-        return 0.5 * (self.forward + self.backward)
+        return np.asarray(0.5 * (self.forward + self.backward))
 
     @cached_property
     def widths(self) -> np.ndarray:

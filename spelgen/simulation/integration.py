@@ -1,4 +1,4 @@
-"""Integration of an arm's motion under held torques, as exact as floating-point numbers allow.
+"""Integrate an arm's motion under held torques, as exact as floating-point numbers allow.
 
     M(q) qdd + nonlinear_effects(q, qd) = tau - friction(qd)        tau held between samples
 
@@ -12,12 +12,11 @@ from scipy.integrate import DOP853, LSODA
 
 from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
 from spelgen.errors import RunError
+from spelgen.settings.tuning.simulation import SimulationTuning
 from spelgen.simulation.friction import Friction
 
-RTOL, ATOL = 1e-13, 1e-15
-STIFF = 100.0  # times that friction could stop a joint between two samples
-STIFF_RTOL, STIFF_ATOL = 1e-9, 1e-11  # of what is seen through encoders: 1e-13 takes ten times as long
-LOOSER = 100.0  # tolerances of the second integration, which the first is compared with
+TUNING = SimulationTuning()
+LOOSER = TUNING.check_loosening
 
 
 def rollout(
@@ -35,28 +34,30 @@ def rollout(
     looser: factor on the error allowed. Raises RunError where it cannot go on.
     """
     n = tau.shape[1]
+    stiff_looser = TUNING.stiff_loosening * looser
     states = np.empty((t.size, 2 * n))
     states[0] = start
-    stiff = _decay(dynamics, friction, start[:n]) * np.diff(t).max(initial=0.0) > STIFF
+    stiff = _decay(dynamics, friction, start[:n]) * np.diff(t).max(initial=0.0) > TUNING.stiff
 
     def derivative(_: float, state: np.ndarray) -> np.ndarray:
         qd = state[n:]
-        return np.concatenate([qd, dynamics.forward_dynamics(state[:n], qd, held - friction(qd))])
+        return np.concatenate([qd, dynamics.forward_dynamics(state[:n], qd, torque - friction(qd))])
 
     for k in range(t.size - 1):
-        held = tau[k]
+        torque = tau[k]
         span = (derivative, t[k], states[k], t[k + 1])
         if stiff:
-            states[k + 1] = _finish_stiff(LSODA(*span, rtol=STIFF_RTOL * looser, atol=STIFF_ATOL * looser))
+            tolerances = {"rtol": TUNING.rtol * stiff_looser, "atol": TUNING.atol * stiff_looser}
+            states[k + 1] = _finish_stiff(LSODA(*span, **tolerances))
             continue
-        solver = DOP853(*span, rtol=RTOL * looser, atol=ATOL * looser)
+        solver = DOP853(*span, rtol=TUNING.rtol * looser, atol=TUNING.atol * looser)
         _finish(solver, friction.widths, stretch=looser**0.125)  # as error control lengthens steps of order 8
         states[k + 1] = solver.y
     return states
 
 
 def _decay(dynamics: PinocchioDynamics, friction: Friction, q: np.ndarray) -> float:
-    """How fast friction stops the fastest joint near rest [1/s]: the largest eigenvalue of M^-1 d friction / d qd."""
+    """Return how fast friction stops joints near rest [1/s]: the largest eigenvalue of M^-1 d friction / d qd."""
     slope = friction.viscous + (friction.forward - friction.backward) / (2 * friction.smoothing_velocity)
     try:
         rates = np.linalg.eigvals(np.linalg.solve(dynamics.mass_matrix(q), np.diag(slope)))
@@ -66,14 +67,14 @@ def _decay(dynamics: PinocchioDynamics, friction: Friction, q: np.ndarray) -> fl
 
 
 def _finish_stiff(solver: LSODA) -> np.ndarray:
-    """The state (2n,) at the end of a solver's interval."""
+    """Return the state (2n,) at the end of a solver's interval."""
     failure = None
     while solver.status == "running" and failure is None:
         failure = solver.step()
         failure = failure if np.isfinite(solver.y).all() else "a velocity is not finite"
     if failure is not None:
         raise _stuck(solver.t, failure)
-    return solver.y
+    return np.asarray(solver.y)
 
 
 def _stuck(t: float, failure: str) -> RunError:

@@ -1,4 +1,4 @@
-"""Where a controlled arm shall be: sines of one frequency, or motions as `spelgen excite` begins its search with."""
+"""Say where a controlled arm shall be: sines of a frequency, or motions as `spelgen excite` begins its search with."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ from spelgen.arm.arm import Arm
 from spelgen.errors import SettingsError, SpelgenError, collect
 from spelgen.excitation.trajectory import SPEEDS, ExcitationTrajectory, Motion, MotionBounds
 from spelgen.settings.settings import Settings
+from spelgen.settings.tuning.simulation import ExcitationTuning, SimulationTuning
 from spelgen.simulation.random_inputs import initial_range
 
-USED = 0.7  # of a joint's range and of its speed limit, where nothing is said
-HARMONICS = 5  # of the motion's length
+TUNING = SimulationTuning()
+HARMONICS = ExcitationTuning().fewest_harmonics
 
 
 def paths(arm: Arm, settings: Settings, t: np.ndarray) -> list[Motion]:
-    """The path of each trajectory at times t (T,) [s], by `settings.tracking`; none depends on how many there are.
+    """Return the path of each trajectory at times t (T,) [s], by `settings.tracking`, whatever their number.
 
     Raises SettingsError where sines do not fit into a joint's range, or a joint has none.
     """
@@ -36,7 +37,7 @@ def paths(arm: Arm, settings: Settings, t: np.ndarray) -> list[Motion]:
 def sines(
     middle: np.ndarray, amplitude: np.ndarray | float, frequency: float, phase: np.ndarray, t: np.ndarray
 ) -> Motion:
-    """middle + amplitude sin(2 pi frequency t + phase), all but the frequency [Hz] and t (T,) of shape (n,)."""
+    """Return middle + amplitude sin(2 pi frequency t + phase), all but the frequency [Hz] and t (T,) of shape (n,)."""
     omega = 2 * np.pi * frequency
     angle = omega * t[:, None] + phase
     swing = amplitude * np.sin(angle)
@@ -44,21 +45,21 @@ def sines(
 
 
 def _bounds(arm: Arm, low: np.ndarray, high: np.ndarray) -> MotionBounds:
-    """The middle of the ranges at moderate speeds: a first try at an arm that nobody knows."""
+    """Return the middle of the ranges at moderate speeds: a first try at an arm that nobody knows."""
     middle, half = (low + high) / 2, (high - low) / 2
-    speed = [min(USED * (x.velocity or np.inf), SPEEDS[x.kind]) for x in arm.coordinates]
-    return MotionBounds(middle - USED * half, middle + USED * half, np.array(speed))
+    speed = [min(TUNING.used_range * (x.velocity or np.inf), SPEEDS[x.kind]) for x in arm.coordinates]
+    return MotionBounds(middle - TUNING.used_range * half, middle + TUNING.used_range * half, np.array(speed))
 
 
 def _amplitude(arm: Arm, settings: Settings, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """The amplitude (n,) of each joint's sines, which must fit into its range."""
+    """Return the amplitude (n,) of each joint's sines, which must fit into its range."""
     amplitude, errors = np.full(len(low), settings.tracking.amplitude), list[SpelgenError]()
     if "amplitude" not in settings.tracking.model_fields_set:
-        amplitude = np.minimum(amplitude, USED * (high - low) / 2)
-    for joint, lowest, highest, wanted in zip(arm.coordinates, low, high, amplitude, strict=True):
-        if highest - lowest < 2 * wanted:
+        amplitude = np.minimum(amplitude, TUNING.used_range * (high - low) / 2)
+    for joint, lowest, highest, swing in zip(arm.coordinates, low, high, amplitude, strict=True):
+        if highest - lowest < 2 * swing:
             error = SettingsError(
-                f"{wanted:g} beside the range {lowest:g} to {highest:g} of {joint.name!r}",
+                f"{swing:g} beside the range {lowest:g} to {highest:g} of {joint.name!r}",
                 element="tracking.amplitude", expected="sines within the range",
                 do="make it smaller or give the joint wider simulation.positions",
             )  # fmt: skip

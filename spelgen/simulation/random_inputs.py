@@ -1,4 +1,4 @@
-"""Arm + Settings -> logs under random torques, held from sample to sample, and how exact they are."""
+"""Simulate logs under random torques, held from sample to sample, and say how exact they are."""
 
 from __future__ import annotations
 
@@ -36,6 +36,7 @@ def random_inputs(
     lowest, highest = initial_range(arm, settings)
     torques = [_torques(coordinate, settings) for coordinate in arm.coordinates]
     t = np.arange(round(protocol.duration * protocol.sample_rate) + 1) / protocol.sample_rate
+    # a seed for each trajectory: more of them leave the first ones as they were
     split_seed, *seeds = np.random.SeedSequence(protocol.seed).spawn(protocol.trajectories + 1)
     trajectories, errors = [], []
     for number, seed in enumerate(seeds):
@@ -50,11 +51,14 @@ def random_inputs(
         if progress is not None:
             progress(number + 1, protocol.trajectories)
     tested = _tested(protocol.trajectories, protocol.test_fraction, np.random.default_rng(split_seed))
-    return SimulatedLogs(
-        train=tuple(each for number, each in enumerate(trajectories) if number not in tested),
-        test=tuple(each for number, each in enumerate(trajectories) if number in tested),
-        integration_error=float(max(errors)),
-    )
+    train: list[Trajectory] = []
+    test: list[Trajectory] = []
+    for number, trajectory in enumerate(trajectories):
+        if number in tested:
+            test.append(trajectory)
+        else:
+            train.append(trajectory)
+    return SimulatedLogs(train, test, float(max(errors)))
 
 
 def _torques(coordinate: Coordinate, settings: Settings) -> np.ndarray:
@@ -66,11 +70,11 @@ def _torques(coordinate: Coordinate, settings: Settings) -> np.ndarray:
 
 def initial_range(arm: Arm, settings: Settings) -> tuple[np.ndarray, np.ndarray]:
     """Return the lowest and highest positions (n,) [rad; m] to start from; SettingsError where a joint has none."""
-    given = settings.simulation.positions or {}
+    positions = settings.simulation.positions or {}
     ranges, errors = [], []
     for joint in arm.coordinates:
-        if joint.name in given:
-            ranges.append(given[joint.name])
+        if joint.name in positions:
+            ranges.append(positions[joint.name])
         elif joint.continuous:
             ranges.append((-np.pi, np.pi))
         elif joint.lower is not None and joint.upper is not None:
@@ -84,5 +88,5 @@ def initial_range(arm: Arm, settings: Settings) -> tuple[np.ndarray, np.ndarray]
 
 
 def _tested(count: int, fraction: float, random: np.random.Generator) -> set[int]:
-    """Numbers of the trajectories kept for testing; at least one is left to train on."""
+    """Return the numbers of the trajectories kept for testing; at least one is left to train on."""
     return set(random.permutation(count)[: min(round(fraction * count), count - 1)].tolist())

@@ -1,4 +1,4 @@
-"""An arm -> simulated logs, in memory, by the protocol that its settings name."""
+"""Simulate logs of an arm, in memory, by the protocol that its settings name."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from spelgen.errors import collect
 from spelgen.settings.messages import explain
 from spelgen.settings.settings import Settings
-from spelgen.settings.simulation import SimulationSettings
+from spelgen.settings.simulation import ControlledSimulation, ServoSimulation, SimulationSettings
 from spelgen.settings.yaml_document import Document
 from spelgen.simulation.random_inputs import random_inputs
 from spelgen.simulation.servo_motions import servo_motions
@@ -22,10 +22,6 @@ if TYPE_CHECKING:
     from spelgen.loaded_arm import LoadedArm
 
 CONTROL_RATE = 125.0  # [Hz] about
-CONTROLLED = {
-    "protocol": "tracking", "trajectories": 4, "duration": 8.0, "sample_rate": 125.0, "test_fraction": 0.25,
-}  # fmt: skip
-SERVOS = {"trajectories": 6, "duration": 20.0, "sample_rate": 50.0, "test_fraction": 0.34}
 PROTOCOLS = {"random-inputs": random_inputs, "tracking": track}
 
 
@@ -39,7 +35,7 @@ def simulate(
     seed: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> SimulatedLogs:
-    """Simulated logs of the arm: all trajectories in a list, `train` and `test` apart, and how exact they are.
+    """Return simulated logs of the arm: all trajectories in a list, `train` and `test` apart, and how exact they are.
 
     What is not given is as `simulation` in the settings beside the URDF says: how many trajectories, of which
     duration [s] and sample rate [Hz], the part kept for testing, the seed. Same arguments, same logs. progress:
@@ -47,11 +43,11 @@ def simulate(
     Raises ArmError without inertials, SettingsError for values that cannot be or a joint without a range of initial
     positions, and RunError when the motion cannot be integrated.
     """
-    given = {
+    arguments = {
         "trajectories": trajectories, "duration": duration, "sample_rate": sample_rate,
         "test_fraction": test_fraction, "seed": seed,
     }  # fmt: skip
-    changes = {key: value for key, value in given.items() if value is not None}
+    changes = {key: value for key, value in arguments.items() if value is not None}
     changed = _changed(arm.settings.simulation, changes)
     settings = _controlled(arm.settings.model_copy(update={"simulation": changed}))
     run = servo_motions if settings.input == "position" else PROTOCOLS[settings.simulation.protocol]
@@ -62,23 +58,23 @@ def _controlled(settings: Settings) -> Settings:
     """The settings, with the arm controlled where nobody says how it is driven: under random torques it would fall."""
     simulation, tracking = settings.simulation, settings.tracking
     if settings.input == "position":
-        usual_of_servos = SERVOS | simulation.model_dump(exclude_unset=True)
-        return settings.model_copy(update={"simulation": _changed(SimulationSettings(), usual_of_servos)})
-    said = {"protocol", "inputs"} & simulation.model_fields_set
-    if said or any(joint.inputs for joint in settings.joints.values()):
+        usual = ServoSimulation(**simulation.model_dump(exclude_unset=True))
+        return settings.model_copy(update={"simulation": usual})
+    is_driven = {"protocol", "inputs"} & simulation.model_fields_set
+    if is_driven or any(joint.inputs for joint in settings.joints.values()):
         return settings
-    simulation = _changed(SimulationSettings(), CONTROLLED | simulation.model_dump(exclude_unset=True))
+    simulation = ControlledSimulation(**simulation.model_dump(exclude_unset=True))
     rate = simulation.sample_rate
-    usual: dict[str, object] = {
+    changes: dict[str, object] = {
         "control": "computed-torque",
         "paths": "own" if {"amplitude", "frequency"} & tracking.model_fields_set else "excitation",
         "control_rate": rate / max(1, round(rate / CONTROL_RATE)),
         "cutoff": min(tracking.cutoff, rate / 4),
     }
-    usual = {name: value for name, value in usual.items() if name not in tracking.model_fields_set}
-    return settings.model_copy(
-        update={"simulation": simulation, "tracking": tracking.model_copy(update=usual)}
-    )
+    for name in tracking.model_fields_set:
+        changes.pop(name, None)
+    tracking = tracking.model_copy(update=changes)
+    return settings.model_copy(update={"simulation": simulation, "tracking": tracking})
 
 
 def _changed(settings: SimulationSettings, changes: Mapping[str, object]) -> SimulationSettings:
@@ -86,5 +82,5 @@ def _changed(settings: SimulationSettings, changes: Mapping[str, object]) -> Sim
         return SimulationSettings.model_validate({**settings.model_dump(exclude_unset=True), **changes})
     except ValidationError as error:
         keys = Document(Path("simulate"), None)
-        collect([explain(each, keys, SimulationSettings) for each in error.errors(include_url=False)])
+        collect([explain(detail, keys, SimulationSettings) for detail in error.errors(include_url=False)])
         raise

@@ -1,4 +1,4 @@
-"""What a simulation gives: its trajectories, which of them are for training, and how exact they are."""
+"""Hold what a simulation gives: its trajectories, which of them are for training, and how exact they are."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Arm + Settings -> logs as a real arm gives them: controlled along paths, seen by encoders, velocities by differences.
+"""Simulate logs as real arms give them: controlled along paths, seen by encoders, velocities by differences.
 
 Stands in for the protocol of the paper's real arm (Wang, Chen, Ding, Sci Rep 15:33179, 2025), whose logs are not
 public. What the paper leaves open is ours: gains, phases, encoders and the filter's cutoff.
@@ -16,27 +16,26 @@ from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
 from spelgen.errors import SettingsError
 from spelgen.excitation.trajectory import Motion
+from spelgen.logs.filtering import low_pass_regular
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.settings import Settings
 from spelgen.settings.simulation import TrackingSettings
+from spelgen.settings.tuning.simulation import SimulationTuning
 from spelgen.simulation.friction import Friction, make_friction
 from spelgen.simulation.integration import LOOSER, rollout
 from spelgen.simulation.paths import paths
 from spelgen.simulation.random_inputs import initial_range
 from spelgen.simulation.simulated_logs import SimulatedLogs
 
-FILTER_ORDER = 4
-STRETCH = 32  # samples
-UNSEEN = 0.01  # of an encoder's step: an error of integration that nobody sees
-INTEGRAL_GAIN = 0.2  # a tenth of what makes a joint without friction unstable
+TUNING = SimulationTuning()
 
-Wanted = tuple[np.ndarray, np.ndarray, np.ndarray]
+Target = tuple[np.ndarray, np.ndarray, np.ndarray]
 """q, qd and qdd (n,)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Gains:
-    """Of a PID controller at each joint, (n,): torque per error of position, of its integral and of velocity."""
+    """Hold a PID controller's gains by joint, (n,): torque per error of position, of its integral and of velocity."""
 
     proportional: np.ndarray
     integral: np.ndarray
@@ -86,28 +85,31 @@ def track(
         effect = recording.tau @ inputs.T
         errors.append(_integration_error(dynamics, friction, recording, effect))
         log = measured(recording, settings.tracking, f"traj_{number:02d}")
-        kept = max(1, len(log) - round(protocol.test_fraction * len(log)))
-        train.append(log[:kept])
-        if kept < len(log):
-            test.append(replace(log[kept:], name=f"{log.name}_end"))
+        cut = max(1, len(log) - round(protocol.test_fraction * len(log)))
+        train.append(log[:cut])
+        if cut < len(log):
+            test.append(replace(log[cut:], name=f"{log.name}_end"))
         if progress is not None:
             progress(number + 1, protocol.trajectories)
-    return SimulatedLogs(train, test, float(max(errors)), allowed=UNSEEN * settings.tracking.resolution)
+    return SimulatedLogs(
+        train, test, float(max(errors)), allowed=TUNING.unseen * settings.tracking.resolution
+    )
 
 
 def _integration_error(
     dynamics: PinocchioDynamics, friction: Friction, recording: Recording, effect: np.ndarray
 ) -> float:
-    """The largest difference to looser integration, begun anew every STRETCH samples: an arm that falls when nobody
-    controls it carries any difference away.
+    """Return the largest difference to looser integration, begun anew every few samples.
+
+    An arm that falls when nobody controls it carries any difference away.
     """
     largest = 0.0
-    for start in range(0, len(recording.t) - 1, STRETCH):
-        part = slice(start, start + STRETCH + 1)
+    for start in range(0, len(recording.t) - 1, TUNING.stretch):
+        rows = slice(start, start + TUNING.stretch + 1)
         again = rollout(
-            dynamics, friction, recording.states[start], recording.t[part], effect[part], looser=LOOSER
+            dynamics, friction, recording.states[start], recording.t[rows], effect[rows], looser=LOOSER
         )
-        largest = max(largest, float(np.abs(recording.states[part] - again).max()))
+        largest = max(largest, float(np.abs(recording.states[rows] - again).max()))
     return largest
 
 
@@ -116,13 +118,13 @@ def tuned_gains(inertia: np.ndarray, bandwidth: float) -> Gains:
     [Hz].
     """
     omega = 2 * np.pi * bandwidth
-    return Gains(inertia * omega**2, INTEGRAL_GAIN * inertia * omega**3, 2 * inertia * omega)
+    return Gains(inertia * omega**2, TUNING.integral_gain * inertia * omega**3, 2 * inertia * omega)
 
 
 def computed_torque(
     dynamics: PinocchioDynamics,
     friction: Friction,
-    wanted: Wanted,
+    target: Target,
     seen: np.ndarray,
     lag: np.ndarray,
     omega: float,
@@ -130,16 +132,16 @@ def computed_torque(
     """Return the joint torques (n,) of a controller that knows the arm: M (qdd* + 2 omega e' + omega^2 e) + what
     motion, gravity and friction take (Siciliano et al., Robotics, 2009, 8.5.2).
 
-    wanted: q*, qd*, qdd* (n,). seen: positions (n,); lag: e', the error of velocity. Where viscous friction alone makes
+    target: q*, qd*, qdd* (n,). seen: positions (n,); lag: e', the error of velocity. Where viscous friction alone makes
     a joint slower than omega, a stiffness of viscous * omega beside it.
     """
-    q, qd, qdd = wanted
+    q, qd, qdd = target
     error = q - seen
     mass = dynamics.mass_matrix(seen)
     slow = np.where(friction.viscous > np.diag(mass) * omega, friction.viscous * omega, 0.0)
     accelerated = mass @ (qdd + 2 * omega * lag + omega**2 * error)
-    held: np.ndarray = dynamics.nonlinear_effects(seen, qd) + friction(qd) + slow * error
-    return accelerated + held
+    holding: np.ndarray = dynamics.nonlinear_effects(seen, qd) + friction(qd) + slow * error
+    return accelerated + holding
 
 
 def record(
@@ -157,25 +159,27 @@ def record(
     omega: of computed torques [rad/s], where these are asked for.
     """
     tracking, n = settings.tracking, path.q.shape[1]
-    tick, held = 1.0 / tracking.control_rate, _samples_of_a_tick(settings)
+    tick, samples = 1.0 / tracking.control_rate, _samples_of_a_tick(settings)
+    # passive joints have no motor: the pseudo-inverse leaves them alone
     to_motors = np.linalg.pinv(inputs)
     state = np.concatenate([path.q[0], np.zeros(n)])
+    # begun at the arm's weight, as a brake is released: else it falls until the integral has grown
     integral = dynamics.nonlinear_effects(*np.split(state, 2))
-    before = seen = _seen(state[:n], tracking)
+    previous = seen = _seen(state[:n], tracking)
     states, torques = [], []
-    for k, wanted in enumerate(zip(path.q, path.qd, path.qdd, strict=True)):
-        before, seen = seen, _seen(state[:n], tracking)
-        error = wanted[0] - seen
-        lag = wanted[1] - (seen - before) / tick
+    for k, target in enumerate(zip(path.q, path.qd, path.qdd, strict=True)):
+        previous, seen = seen, _seen(state[:n], tracking)
+        error = target[0] - seen
+        lag = target[1] - (seen - previous) / tick
         integral = integral + tick * gains.integral * error
         effort = gains.proportional * error + gains.derivative * lag + integral
         if tracking.control == "computed-torque":
-            effort = computed_torque(dynamics, friction, wanted, seen, lag, omega)
+            effort = computed_torque(dynamics, friction, target, seen, lag, omega)
         tau = to_motors @ effort
-        t = k * tick + np.arange(held + 1) / settings.simulation.sample_rate
-        passed = rollout(dynamics, friction, state, t, np.tile(inputs @ tau, (held + 1, 1)))
+        t = k * tick + np.arange(samples + 1) / settings.simulation.sample_rate
+        passed = rollout(dynamics, friction, state, t, np.tile(inputs @ tau, (samples + 1, 1)))
         states.append(passed[:-1])
-        torques.append(np.tile(tau, (held, 1)))
+        torques.append(np.tile(tau, (samples, 1)))
         state = passed[-1]
     true = np.concatenate(states)
     t = np.arange(len(true)) / settings.simulation.sample_rate
@@ -184,30 +188,24 @@ def record(
 
 def measured(recording: Recording, tracking: TrackingSettings, name: str) -> Trajectory:
     """Return what is logged of a motion: filtered positions, their differences, and the torques."""
-    from scipy.signal import butter, sosfiltfilt  # as in logs/filtering.py
-
     sample_rate = 1.0 / (recording.t[1] - recording.t[0])
-    low_pass = butter(FILTER_ORDER, tracking.cutoff, fs=sample_rate, output="sos")
-    padding = min(
-        len(recording.t) - 1, int(3 * sample_rate / tracking.cutoff)
-    )  # as `low_pass` of logs/filtering.py
-    q = sosfiltfilt(low_pass, recording.encoders, axis=0, padlen=padding)
+    q = low_pass_regular(recording.encoders, sample_rate, tracking.cutoff)
     return Trajectory(recording.t, q, np.gradient(q, recording.t, axis=0), recording.tau, name)
 
 
 def _seen(q: np.ndarray, tracking: TrackingSettings) -> np.ndarray:
-    """The nearest whole steps of the encoders."""
+    """Return the nearest whole steps of the encoders."""
     return np.round(q / tracking.resolution) * tracking.resolution
 
 
 def _ticks(settings: Settings) -> int:
-    """How many there are in a trajectory."""
+    """Return how many there are in a trajectory."""
     simulation = settings.simulation
     return -(-round(simulation.duration * simulation.sample_rate) // _samples_of_a_tick(settings))
 
 
 def _samples_of_a_tick(settings: Settings) -> int:
-    """How many samples the controller holds a torque."""
+    """Return how many samples the controller holds a torque."""
     sample_rate, control_rate = settings.simulation.sample_rate, settings.tracking.control_rate
     count = round(sample_rate / control_rate)
     if count < 1 or abs(count * control_rate - sample_rate) > 1e-9 * sample_rate:

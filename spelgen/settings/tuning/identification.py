@@ -14,3 +14,34 @@ class IdentificationTuning:
     )
     moving: float = 0.02  # [rad/s, m/s] samples at which every joint is slower say nothing of dynamics
     shortest_piece: float = 1.0  # [s] shorter pieces are all filter transient
+    rounds: int = (
+        4  # of weighing each joint by what is left of its torque; later ones change no digit (UR10e)
+    )
+    least_noise: float = (
+        0.02  # of a joint's torque range: few samples may be fitted better than the model deserves
+    )
+    largest_lag: int = 500  # [samples] over which residuals are followed in time: 5 s
+    negligible: float = 1e-10  # of the largest singular value: a direction in which the samples say nothing
+    friction_of_torque: float = 0.1  # of a torque's deviation, where the URDF names no effort; a prior's
+    friction_width: float = 10.0  # times the guess: how far friction and armature may be from it; a prior's
+    usual_speed: float = 2.0  # [rad/s, m/s] where the URDF names none; a prior's
+    well_posed: float = 30.0  # condition number up to which errors are hardly amplified
+    acceptable: float = 300.0  # condition number up to which parameters can be told apart
+    firm: float = 0.05  # of a value, the deviation up to which it is firm
+    fair: float = 0.2  # likewise fair; above, up to the value itself, weak
+
+
+@dataclass(frozen=True)
+class DriveHintTuning:
+    """Numbers from which on logs are said to show late torques or coupled motors."""
+
+    coulomb_velocity: float = (
+        0.02  # [rad/s, m/s] width of the tanh of dry friction: thinned samples know no way
+    )
+    blocks: int = 10  # of time, each judged by what the others say
+    coarse: int = 4  # one of so many samples begins the search for couplings
+    refined: int = 4  # couplings whose ratio is searched for
+    delay_gain: float = 0.8  # of the squared error, what is left at most where a delay is worth telling
+    coupling_gain: float = 0.5  # likewise of a coupling; that of the TX40's wrist leaves 0.05
+    standard_errors: float = 2.82  # over blocks, of a gain that is no luck: 1 in 400, as of what enters a fit
+    simple_ratio: float = 0.02  # of the squared error, what a ratio of small numbers may cost

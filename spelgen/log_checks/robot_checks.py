@@ -1,0 +1,158 @@
+"""Check logs against the robot: limits, and torques that must move with gravity."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from spelgen.arm.arm import Coordinate
+from spelgen.log_checks.gravity import GravityFit
+from spelgen.logs.checks import Check
+from spelgen.settings.tuning.log_checks import LogCheckTuning
+
+TUNING = LogCheckTuning()
+UNITS = {"revolute": ("rad", "rad/s", "Nm"), "prismatic": ("m", "m/s", "N")}
+SAY_UNIT = (
+    "say 'units: {tau: ...}' or a 'gain' under 'logs' in the robot's YAML; 'Nm' says that they are right"
+)
+TORQUE_ERRORS = ("torque-sense", "torque-unit", "torque-beyond-drive")
+
+
+@dataclass(frozen=True)
+class JointEvidence:
+    """Hold what all trajectories show of one joint: the subject of the checks against the robot.
+
+    low, high: of q, qd and tau. declared: the mapping says the unit of torques, so their size is believed.
+    """
+
+    coordinate: Coordinate
+    low: dict[str, float]
+    high: dict[str, float]
+    gravity: GravityFit
+    declared: bool
+
+    def largest(self, quantity: str) -> float:
+        """Return the largest size of "q", "qd" or "tau"."""
+        return max(abs(self.low[quantity]), abs(self.high[quantity]))
+
+    def gravity_in_torque(self) -> tuple[float, float] | None:
+        """Return factor and correlation of the URDF's gravity in the torque; None where it is too small to be seen."""
+        fit = self.gravity
+        # of a joint that gravity hardly loads the factor is chance
+        if fit.factor is None or fit.correlation is None:
+            return None
+        if (fit.relative_deviation or 0.0) < TUNING.loaded:
+            return None
+        return fit.factor, fit.correlation
+
+
+def find_position_below(joint: JointEvidence) -> str | None:
+    """Find positions below the lower limit."""
+    lower = joint.coordinate.lower
+    if joint.coordinate.continuous or lower is None or joint.low["q"] >= lower - TUNING.limit_rounding:
+        return None
+    unit = UNITS[joint.coordinate.kind][0]
+    return f"q down to {joint.low['q']:.4g} {unit}, the limit is {lower:.4g}"
+
+
+def find_position_above(joint: JointEvidence) -> str | None:
+    """Find positions above the upper limit."""
+    upper = joint.coordinate.upper
+    if joint.coordinate.continuous or upper is None or joint.high["q"] <= upper + TUNING.limit_rounding:
+        return None
+    unit = UNITS[joint.coordinate.kind][0]
+    return f"q up to {joint.high['q']:.4g} {unit}, the limit is {upper:.4g}"
+
+
+def find_speed_above(joint: JointEvidence) -> str | None:
+    """Find speeds above the limit."""
+    return _above("velocity", joint.largest("qd"), joint.coordinate.velocity, UNITS[joint.coordinate.kind][1])
+
+
+def find_effort_above(joint: JointEvidence) -> str | None:
+    """Find torques above the limit."""
+    return _above("effort", joint.largest("tau"), joint.coordinate.effort, UNITS[joint.coordinate.kind][2])
+
+
+def _above(name: str, value: float, limit: float | None, unit: str) -> str | None:
+    if not limit or value <= limit * (1 + TUNING.limit_rounding):
+        return None
+    return f"{name} up to {value:.4g} {unit}, the limit is {limit:.4g}"
+
+
+def find_wrong_sense(joint: JointEvidence) -> str | None:
+    """Find torques that certainly move against gravity."""
+    fit = joint.gravity_in_torque()
+    if fit is None or fit[1] >= -TUNING.agreement:
+        return None
+    return f"torques that move against gravity, {fit[0]:.3g} times the URDF's"
+
+
+def find_wrong_unit(joint: JointEvidence) -> str | None:
+    """Find torques that certainly move with gravity, by a factor that only another unit has."""
+    fit = joint.gravity_in_torque()
+    if fit is None or joint.declared or fit[1] <= TUNING.agreement:
+        return None
+    if 1 / TUNING.impossible_factor < fit[0] < TUNING.impossible_factor:
+        return None
+    return f"torques that move with {fit[0]:.3g} times the URDF's gravity torque"
+
+
+def find_beyond_drive(joint: JointEvidence) -> str | None:
+    """Find torques that no drive of the joint's effort limit gives."""
+    limit, largest = joint.coordinate.effort or 0.0, joint.largest("tau")
+    # who says the unit is believed: a limit in a URDF may be a placeholder
+    if joint.declared or limit <= 0 or largest <= TUNING.beyond_drives * limit:
+        return None
+    return f"up to {largest:.4g}, {largest / limit:.3g} times what the drive can give"
+
+
+def find_no_gravity(joint: JointEvidence) -> str | None:
+    """Find torques without gravity in them."""
+    fit = joint.gravity_in_torque()
+    if fit is None or abs(fit[1]) >= TUNING.unseen:
+        return None
+    return (
+        f"tau does not move with gravity: their correlation is {fit[1]:.2g}, while the URDF's gravity torque varies "
+        f"{joint.gravity.relative_deviation:.2g} times as much as tau; is it compensated in the log?"
+    )
+
+
+def find_against_gravity(joint: JointEvidence) -> str | None:
+    """Find torques that seem to move against gravity."""
+    fit = joint.gravity_in_torque()
+    if fit is None or fit[1] >= -TUNING.seen:
+        return None
+    return f"tau moves against gravity: {fit[0]:.3g} times the URDF's; a sign of tau or q is wrong"
+
+
+def find_unusual_scale(joint: JointEvidence) -> str | None:
+    """Find torques that move with gravity, by a factor that errors of inertials do not explain."""
+    fit = joint.gravity_in_torque()
+    if fit is None or fit[1] <= TUNING.seen:
+        return None
+    if 1 / TUNING.unusual_factor < fit[0] < TUNING.unusual_factor:
+        return None
+    return (
+        f"tau moves with {fit[0]:.3g} times the URDF's gravity torque; check its unit and gain, or let the "
+        f"gain be found: 'torque: motor', and 'gear: {1 / fit[0]:.3g}' with 'gain: trained' of this joint"
+    )
+
+
+CHECKS: list[Check[JointEvidence]] = [
+    Check(
+        "torque-sense", "error", find_wrong_sense, expected="the URDF's sense",
+        do="say 'sign: -1' or a negative 'gain' of the joint under 'logs', or the gravity of this mounting",
+    ),
+    Check("torque-unit", "error", find_wrong_unit, expected="Nm or N at the joint", do=SAY_UNIT),
+    Check(
+        "torque-beyond-drive", "error", find_beyond_drive, unless=("torque-sense", "torque-unit"),
+        expected="Nm or N at the joint", do=SAY_UNIT,
+    ),
+    Check("beyond-position-limit", "warning", find_position_below),
+    Check("beyond-position-limit", "warning", find_position_above),
+    Check("beyond-velocity-limit", "warning", find_speed_above),
+    Check("beyond-effort-limit", "warning", find_effort_above),
+    Check("torque-without-gravity", "warning", find_no_gravity, unless=TORQUE_ERRORS),
+    Check("torque-against-gravity", "warning", find_against_gravity, unless=TORQUE_ERRORS),
+    Check("torque-scale", "warning", find_unusual_scale, unless=TORQUE_ERRORS),
+]  # fmt: skip

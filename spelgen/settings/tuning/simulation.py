@@ -1,0 +1,42 @@
+"""Hold the tuned numbers of simulated logs and of motions that are designed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class ExcitationTuning:
+    """Numbers that decide which motion `spelgen excite` proposes."""
+
+    starts: int = 40  # motions at random, of which the best is improved
+    harmonics_per_second: float = 0.4  # up to 0.4 Hz: what an arm follows well, far below its drives' ripple
+    fewest_harmonics: int = 5  # as in Swevers et al. 1997
+    memory: int = 30  # steps from which L-BFGS knows the curvature
+    samples_per_harmonic: int = 12  # of a motion that is tried
+    penalty: float = 50.0  # on the squared part of an effort limit that a sample overruns
+    effort: float = 0.9  # of the effort limits: friction comes on top of what the URDF says
+    usual_speed: float = 1.0  # [rad/s] where the URDF names no limit; of sliding joints a quarter of it [m/s]
+
+
+@dataclass(frozen=True)
+class SimulationTuning:
+    """Numbers that decide how exactly motion is simulated, and how arms are controlled."""
+
+    rtol: float = 1e-13  # of integration: as exact as floating-point numbers allow
+    atol: float = 1e-15  # [rad, rad/s] likewise
+    stiff: float = (
+        100.0  # times that friction could stop a joint between two samples, where another solver begins
+    )
+    stiff_loosening: float = (
+        1e4  # of tolerances, of what encoders see: 1e-13 takes ten times as long (measured)
+    )
+    check_loosening: float = (
+        100.0  # of tolerances of the second integration, which the first is compared with
+    )
+    used_range: float = 0.7  # of a joint's range and of its speed limit, where nothing is said
+    stretch: int = (
+        32  # [samples] over which integration is checked: an arm that falls carries any difference away
+    )
+    unseen: float = 0.01  # of an encoder's step: an error of integration that nobody sees
+    integral_gain: float = 0.2  # of the PID: a tenth of what makes a joint without friction unstable
