@@ -22,16 +22,16 @@ from spelgen.errors import Diagnostic
 from spelgen.identification.base_parameters import base_parameters
 from spelgen.identification.drive_samples import DELAYS, NO_DELAY, DriveLog, DriveSamples
 from spelgen.identification.friction import FrictionModel
-from spelgen.settings.tuning.identification import DriveHintTuning
+from spelgen.settings.tuning.identification import DriveHintTuning, IdentificationTuning
 
 if TYPE_CHECKING:
     from spelgen.loaded_arm import LoadedArm
     from spelgen.settings.log_mapping import LogMapping
 
 TUNING = DriveHintTuning()
-FRICTION = FrictionModel(coulomb_smoothing_velocity=TUNING.coulomb_velocity)
+FRICTION = FrictionModel(coulomb_smoothing_velocity=IdentificationTuning().moving)
 RATIOS = (1.0, -1.0, 0.4, -0.4, 2.5, -2.5)  # that begin the search: each covers half of it to twice
-NEGLIGIBLE = 1e-10  # of what it stands beside: rounding
+NEGLIGIBLE = IdentificationTuning().negligible
 
 LoggedAt = Literal["joints", "motors"]
 

@@ -64,7 +64,8 @@ def fit_gravity(arm: Arm, samples: Sequence[StateSamples]) -> list[GravityFit]:
     q, qd, qdd, tau = (
         np.concatenate([getattr(x, name) for x in samples]) for name in ("q", "qd", "qdd", "tau")
     )
-    if len(q) < TUNING.gravity_fewest:
+    # fewer cannot tell gravity from friction
+    if len(q) < TUNING.gravity_samples / 4:
         return [GravityFit()] * q.shape[1]
     stride = -(-len(q) // MOST)
     q, qd, qdd, tau = (x[::stride] for x in (q, qd, qdd, tau))

@@ -109,7 +109,7 @@ def find_beyond_drive(joint: JointEvidence) -> str | None:
 def find_no_gravity(joint: JointEvidence) -> str | None:
     """Find torques without gravity in them."""
     fit = joint.gravity_in_torque()
-    if fit is None or abs(fit[1]) >= TUNING.unseen:
+    if fit is None or abs(fit[1]) >= 1 - TUNING.seen:
         return None
     return (
         f"tau does not move with gravity: their correlation is {fit[1]:.2g}, while the URDF's gravity torque varies "

@@ -106,12 +106,12 @@ def quantisation_step(values: np.ndarray) -> float:
     # two levels more or less say nothing of a grid
     if len(differences) < 3:
         return float("nan")
-    smallest = np.quantile(differences, TUNING.smallest_steps)
+    smallest = np.quantile(differences, TUNING.step_tolerance)
     step = float(np.median(differences[differences <= 1.5 * smallest]))
     # over a hundred steps rounding adds up to what whole steps are told by
     near = differences[differences < 100 * step] / step
-    is_whole = np.abs(near - np.round(near)) < TUNING.whole_step
-    if len(near) < 3 or is_whole.mean() <= TUNING.mostly:
+    is_whole = np.abs(near - np.round(near)) < TUNING.step_tolerance
+    if len(near) < 3 or is_whole.mean() <= 1 - TUNING.step_tolerance:
         return float("nan")
     return step
 

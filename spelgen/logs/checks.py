@@ -167,7 +167,7 @@ def find_wrong_velocity(signals: JointSignals) -> str | None:
     factor, correlation = signals.factor, signals.correlation
     if correlation is None:
         return None
-    if correlation >= TUNING.agreement and abs(factor - 1) <= TUNING.derivative_error:
+    if correlation >= TUNING.agreement and abs(factor - 1) <= 1 - TUNING.agreement:
         return None
     return (
         f"qd is not dq/dt: the best factor is {factor:.3g}, the correlation {correlation:.3g}; "
@@ -180,7 +180,7 @@ def _velocity_advice(signals: JointSignals, correlation: float) -> str:
         fit = signals.agreement.correlation(signals.index, index)
         if index != signals.index and fit is not None and fit > max(TUNING.agreement, correlation):
             return f"it fits q of joint {joint!r}"
-    if abs(signals.factor + 1) <= TUNING.derivative_error:
+    if abs(signals.factor + 1) <= 1 - TUNING.agreement:
         return "its sign is the opposite of that of q"
     if correlation > TUNING.agreement:
         for unit, seconds in (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9)):

@@ -1,4 +1,4 @@
-"""How a user's logs are named and measured: the group `logs` of a sidecar file, or a mapping file of its own.
+"""Describe how a user's logs are named and measured: the group `logs` of a sidecar file, or a mapping file of its own.
 
 q = sign * unit * value + offset, and so is u, a commanded position; qd = sign * unit * value,
 tau = sign * gain * unit * value + torque_offset.
@@ -124,31 +124,33 @@ class LogMapping(Group):
     joints: dict[str, JointLog] = Field(default={})
 
     def joint(self, name: str) -> JointLog:
-        """How a joint is logged, by its URDF name."""
+        """Return how a joint is logged, by its URDF name."""
         return self.joints.get(name, JointLog())
 
     def log_name(self, joint: str) -> str:
-        """A joint's name in the log."""
+        """Return a joint's name in the log."""
         return self.joint(joint).name or joint
 
     def column(self, quantity: str, joint: str) -> str:
-        """The column that holds "q", "qd", "tau" or "u" of a joint."""
-        own: str | None = getattr(self.joint(joint).columns, quantity)
+        """Return the column that holds "q", "qd", "tau" or "u" of a joint."""
+        name: str | None = getattr(self.joint(joint).columns, quantity)
         pattern: str = getattr(self.columns, quantity)
-        return own or pattern.replace("{joint}", self.log_name(joint))
+        return name or pattern.replace("{joint}", self.log_name(joint))
 
     def of_trajectory(self, text: str) -> LogMapping:
-        """The mapping for one recording of a file: `{trajectory}` in the columns' names is its text."""
+        """Return the mapping for one recording of a file: `{trajectory}` in the columns' names is its text."""
         named = {key: name.replace("{trajectory}", text) for key, name in self.columns.model_dump().items()}
         return self.model_copy(update={"columns": LogColumns(**named)})
 
     def unit(self, quantity: str, joint: str) -> str | None:
-        """The unit of "q", "qd", "tau" or "u" of a joint; None where none was said: commands are measured as q is."""
-        own: str | None = getattr(self.joint(joint).units, quantity) or getattr(self.units, quantity)
-        return self.unit("q", joint) if own is None and quantity == "u" else own
+        """Return the unit of "q", "qd", "tau" or "u" of a joint, None where none was said; u is measured as q is."""
+        unit: str | None = getattr(self.joint(joint).units, quantity) or getattr(self.units, quantity)
+        if unit is None and quantity == "u":
+            return self.unit("q", joint)
+        return unit
 
     def scale(self, quantity: str, joint: str) -> float:
-        """What a logged value is multiplied with, sign included."""
+        """Return what a logged value is multiplied with, sign included."""
         logged, unit = self.joint(joint), self.unit(quantity, joint)
         if quantity == "tau":
             return logged.sign * (1.0 if logged.gain is None else logged.gain) * EFFORTS[unit or "Nm"]
@@ -158,29 +160,32 @@ class LogMapping(Group):
         return logged.sign * {**ANGLES, **LENGTHS, **RATES}[unit or "rad"]
 
     def offset(self, quantity: str, joint: str) -> float:
-        """What is added after that."""
+        """Return what is added after that."""
         logged = self.joint(joint)
         return {"q": logged.offset, "u": logged.offset, "tau": logged.torque_offset}.get(quantity, 0.0)
 
     def misfits(self, joints: Sequence[str], joint_types: Sequence[str] | None = None) -> list[SettingsError]:
-        """What the mapping lacks for these joints, or says of them that cannot be; empty where it fits."""
-        found = []
+        """Return what the mapping lacks for these joints, or says of them that cannot be; empty where it fits."""
+        errors = []
         kinds: Sequence[str | None] = joint_types or [None] * len(joints)
+        quantities = ("q", "u") if self.input == "position" else ("q", "qd", "tau")
         for joint, kind in zip(joints, kinds, strict=True):
-            for quantity in ("q", "u") if self.input == "position" else ("q", "qd", "tau"):
+            for quantity in quantities:
                 unit = self.unit(quantity, joint)
-                missing = self._missing(unit, self.joint(joint), kind)
-                if missing:
+                expected = self._missing(unit, self.joint(joint), kind)
+                if expected:
                     where = f"logs: joint {joint!r}, {quantity}"
-                    found.append(SettingsError(f"the unit {unit}", element=where, expected=missing))
-        return found
+                    errors.append(SettingsError(f"the unit {unit}", element=where, expected=expected))
+        return errors
 
     def _missing(self, unit: str | None, logged: JointLog, kind: str | None) -> str | None:
         if unit in CURRENTS and logged.gain is None:
             return "a gain beside it"
         if unit in COUNTS:
-            counts = {"revolute": logged.counts_per_turn, "prismatic": logged.counts_per_metre}
-            if not any(counts.values() if kind is None else [counts[kind]]):
+            # of a joint whose kind is not known either will do
+            in_turns = logged.counts_per_turn if kind != "prismatic" else None
+            in_metres = logged.counts_per_metre if kind != "revolute" else None
+            if not (in_turns or in_metres):
                 return f"{'counts_per_metre' if kind == 'prismatic' else 'counts_per_turn'} beside it"
         if unit in ONLY.get(kind or "", ()):
             return f"one of a {kind} joint"

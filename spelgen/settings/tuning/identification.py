@@ -9,17 +9,11 @@ from dataclasses import dataclass
 class IdentificationTuning:
     """Numbers that decide which samples least squares gets, and how it judges what it found."""
 
-    sample_rate: float = (
-        100.0  # [Hz] of the common grid: twelve times the low-pass, as in the published protocols
-    )
-    moving: float = 0.02  # [rad/s, m/s] samples at which every joint is slower say nothing of dynamics
+    sample_rate: float = 100.0  # [Hz] of the common grid: twelve times the low-pass, as is usual
+    moving: float = 0.02  # [rad/s, m/s] joints that are slower rest, and say nothing of dynamics
     shortest_piece: float = 1.0  # [s] shorter pieces are all filter transient
-    rounds: int = (
-        4  # of weighing each joint by what is left of its torque; later ones change no digit (UR10e)
-    )
-    least_noise: float = (
-        0.02  # of a joint's torque range: few samples may be fitted better than the model deserves
-    )
+    rounds: int = 4  # of weighing joints by what is left of their torque; later ones change no digit (UR10e)
+    least_noise: float = 0.02  # of a joint's torque range: few samples may be fitted better than deserved
     largest_lag: int = 500  # [samples] over which residuals are followed in time: 5 s
     negligible: float = 1e-10  # of the largest singular value: a direction in which the samples say nothing
     friction_of_torque: float = 0.1  # of a torque's deviation, where the URDF names no effort; a prior's
@@ -35,9 +29,6 @@ class IdentificationTuning:
 class DriveHintTuning:
     """Numbers from which on logs are said to show late torques or coupled motors."""
 
-    coulomb_velocity: float = (
-        0.02  # [rad/s, m/s] width of the tanh of dry friction: thinned samples know no way
-    )
     blocks: int = 10  # of time, each judged by what the others say
     coarse: int = 4  # one of so many samples begins the search for couplings
     refined: int = 4  # couplings whose ratio is searched for

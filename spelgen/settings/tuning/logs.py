@@ -9,23 +9,13 @@ from dataclasses import dataclass
 class LogTuning:
     """Numbers that decide how logs are read, cut, filtered and differentiated."""
 
-    in_memory: int = (
-        100_000_000  # [bytes] of numbers above which logs are streamed; windows take five times that
-    )
-    chunk_samples: int = (
-        2**16
-    )  # of a streamed log held at once: of 7 joints 12 MB, as windows 53 MB (measured)
+    in_memory: int = 100_000_000  # [bytes] of numbers above which logs are streamed; windows take five times
+    chunk_samples: int = 2**16  # of a streamed log held at once: of 7 joints 12 MB, as windows 53 MB
     npz_bytes: int = 2**30  # unpacked at most from one NPZ archive, which zeros pack a thousandfold
     largest_value: float = 1e9  # [rad, rad/s, Nm; m, m/s, N] no arm has more: what is beyond is a wrong unit
-    gap: float = (
-        4.0  # [median steps] a longer step is a hole in the recording; jitter of USB loggers stays below 3
-    )
-    automatic_cutoff: float = (
-        8.0  # [Hz] rigid-body motion lies below, drive ripple and quantisation above (UR10e)
-    )
-    dense_rate: float = (
-        50.0  # [Hz] more slowly sampled logs give no accelerations and are not filtered unasked
-    )
+    gap: float = 4.0  # [median steps] a longer step is a hole; jitter of USB loggers stays below 3
+    automatic_cutoff: float = 8.0  # [Hz] rigid-body motion lies below, ripple and quantisation above (UR10e)
+    dense_rate: float = 50.0  # [Hz] slower logs give no accelerations and are not filtered unasked
     filter_order: int = 4  # of the Butterworth low-pass, run both ways: as in the logs' published protocols
     samples_per_period: int = 3  # of the cutoff's period that windows keep; two are Nyquist's bound
     derivative_span: float = 0.18  # [s] of the cubic through encoder positions (SO-101: noise against lag)

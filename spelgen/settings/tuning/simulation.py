@@ -25,18 +25,9 @@ class SimulationTuning:
 
     rtol: float = 1e-13  # of integration: as exact as floating-point numbers allow
     atol: float = 1e-15  # [rad, rad/s] likewise
-    stiff: float = (
-        100.0  # times that friction could stop a joint between two samples, where another solver begins
-    )
-    stiff_loosening: float = (
-        1e4  # of tolerances, of what encoders see: 1e-13 takes ten times as long (measured)
-    )
-    check_loosening: float = (
-        100.0  # of tolerances of the second integration, which the first is compared with
-    )
+    stiff: float = 100.0  # times that friction could stop a joint within a sample: another solver is used
+    check_loosening: float = 100.0  # of tolerances, of the integration that the first is compared with
     used_range: float = 0.7  # of a joint's range and of its speed limit, where nothing is said
-    stretch: int = (
-        32  # [samples] over which integration is checked: an arm that falls carries any difference away
-    )
+    stretch: int = 32  # [samples] over which integration is checked: falling arms carry differences away
     unseen: float = 0.01  # of an encoder's step: an error of integration that nobody sees
     integral_gain: float = 0.2  # of the PID: a tenth of what makes a joint without friction unstable
