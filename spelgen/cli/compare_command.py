@@ -51,6 +51,7 @@ def compare(
     from spelgen.fleet.tasks import workers
     from spelgen.render.comparison_page import write_comparison
 
+    # before logs are simulated
     if urdf_error is not None and steps is not None:
         raise UsageError(
             "--steps: belongs to models that know kinematics alone, these are trained by defaults"

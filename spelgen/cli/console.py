@@ -55,6 +55,7 @@ def handle_errors(command: Callable[..., None]) -> Callable[..., None]:
         except BaseException as error:
             fail(error, debug=debug)
 
+    # annotations are strings, as files begin with `from __future__ import annotations`
     signature = inspect.signature(command, eval_str=True)
     for parameter in signature.parameters.values():
         name_values(parameter.annotation)

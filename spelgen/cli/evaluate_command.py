@@ -17,7 +17,7 @@ Format = Literal["text", "json", "csv"]
 
 def evaluate(
     run: Run,
-    more: MoreData = None,
+    extra_logs: MoreData = None,
     data: Data = None,
     mapping: Mapping = None,
     filter: Filter = None,
@@ -29,7 +29,7 @@ def evaluate(
 
     The result is kept in the run folder, as evaluation.json.
     """
-    paths = options.logs(data, more)
+    paths = options.logs(data, extra_logs)
     import torch
 
     from spelgen.evaluation.evaluate import evaluate as evaluate_model
@@ -39,7 +39,7 @@ def evaluate(
     from spelgen.fitting.run_folder import RunFolder
     from spelgen.logs.preprocessing import Preprocessing
 
-    torch.set_num_threads(1)
+    torch.set_num_threads(1)  # matrices are tiny: threads would cost more than they gain
     preprocessing = None
     if filter is not None:
         preprocessing = Preprocessing(cutoff=filter)

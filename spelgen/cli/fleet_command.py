@@ -36,7 +36,9 @@ def fleet(
     from spelgen.render.fleet_page import write_fleet
 
     settings = load_fleet(file)
+    # workers have folders of their own: paths must not depend on them
     folder = (output or Path("fleets") / file.stem).absolute()
+    # of a container or a job of a scheduler, which may own fewer cores than the machine has
     count = jobs or len(os.sched_getaffinity(0))
     with locked(folder), termination_as_interrupt(), workers(count, address, settings.gpus) as run_tasks:
         results = run_fleet(settings, folder, run_tasks, note)

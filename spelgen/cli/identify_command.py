@@ -18,7 +18,7 @@ EFFECTS = ("stribeck", "polynomial", "memory")
 
 def identify(
     robot: Robot,
-    more: MoreData = None,
+    extra_logs: MoreData = None,
     data: Data = None,
     mapping: Mapping = None,
     joints: Joints = None,
@@ -47,7 +47,7 @@ def identify(
     output: Output = None,
 ) -> None:
     """Identify an arm's base parameters, friction and armature from logs by least squares."""
-    paths = options.logs(data, more)
+    paths = options.logs(data, extra_logs)
     from spelgen.identification.friction import FrictionModel
     from spelgen.identification.identify import identify as identify_arm
     from spelgen.identification.method import LeastSquares
@@ -67,6 +67,7 @@ def identify(
         raise typer.BadParameter(error.got, param_hint=f"'--{error.element}'") from None
     arm = load_arm(robot, options.names(joints), tip, angle_tolerance)
     logs = read_logs(paths, arm, mapping, role="train")
+    # least squares would fit wrong units without a word
     require_possible_torques(logs, arm, log_source(arm, mapping).mapping)
     result = identify_arm(arm, logs, method, preprocessing=Preprocessing(cutoff=filter))
     for diagnostic in result.diagnostics:

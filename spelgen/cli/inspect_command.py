@@ -42,6 +42,7 @@ def inspect(
     chosen = options.choose_format(format, output, Format)
     arm = load_arm(robot, options.names(joints), tip, angle_tolerance)
     inspection = arm.inspect(assume)
+    # other programs, which take seconds
     proof = arm.verify(assume) if verify else None
     closed = None
     if formulas or chosen_entry is not None or chosen in ("latex", "sympy"):

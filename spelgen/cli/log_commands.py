@@ -48,7 +48,7 @@ def excite(
     from spelgen.excitation.design import excite as design_motion
     from spelgen.loaded_arm import load_arm
 
-    options.require_free(output, force=force)
+    options.require_free(output, force=force)  # before minutes of search
     arm = load_arm(robot, options.names(joints), tip, angle_tolerance)
     with progress_bar("searching") as progress:
         motion = design_motion(
@@ -104,6 +104,7 @@ def logs(
         note(f"wrote {write_text(html, page(result, arm.arm, arm.actuation.matrix()))}")
     if result.errors:
         note(str(SpelgenErrors(result.errors)))
+    # what is wrong comes first: a warning is no news beside an error
     if strict:
         refuse_warnings("", len(result.warnings))
     if result.errors:

@@ -57,6 +57,7 @@ def build(
     force: Force = False,
 ) -> None:
     """Write the PyTorch module tailored to an arm."""
+    # before the URDF is read, which takes longest
     if preset not in PRESET_NAMES and Path(preset).suffix not in (".yaml", ".yml"):
         message = f"{preset!r} is none of {', '.join(PRESET_NAMES)}, nor a YAML file"
         raise typer.BadParameter(message, param_hint="'--preset'")
@@ -68,6 +69,7 @@ def build(
     arm = load_arm(robot, options.names(joints), tip, angle_tolerance)
     source = generate(arm, preset, net=net, width=width, depth=depth, assume=assume)
     path = output or Path(f"{robot.stem}_spel.py")
+    # the same text: nothing is replaced, and its date stays
     if path.is_file() and path.read_bytes() == source.encode():
         say(f"{path} is up to date")
         return

@@ -111,6 +111,7 @@ def names(text: str | None) -> list[str] | None:
     """Return `a, b, "c, d"` as three names; None stays None."""
     if text is None:
         return None
+    # as CSV: names of joints may hold commas, in quotes
     cells: list[str] = next(csv.reader([text], skipinitialspace=True), [])
     return [name.strip() for name in cells]
 
@@ -127,11 +128,11 @@ def entry(text: str | None) -> tuple[int, int] | Literal["V"] | None:
     return int(match[1]), int(match[2])
 
 
-def logs(data: list[Path] | None, more: list[Path] | None) -> list[Path]:
+def logs(data: list[Path] | None, extra_logs: list[Path] | None) -> list[Path]:
     """Return the paths after --data, however often it stands there; a usage error without any."""
     if not data:
         raise typer.BadParameter("name at least one file or folder", param_hint="'--data'")
-    return [*data, *(more or [])]
+    return [*data, *(extra_logs or [])]
 
 
 def mapping(file: Path | None, urdf: Path | None, joints: Sequence[str]) -> LogMapping | None:

@@ -66,7 +66,7 @@ Quiet = Annotated[bool, typer.Option("--quiet", help="Show no progress.")]
 
 def train(
     module: TrainModule = None,
-    more: MoreData = None,
+    extra_logs: MoreData = None,
     data: Data = None,
     output: NewRun = None,
     robot: RobotOption = None,
@@ -85,21 +85,21 @@ def train(
     What is not given here comes from `training` in the settings beside the robot, whose keys --set takes, too.
     docs/cli.md lists them. It is an error to set one that does not apply to the objective.
     """
-    start_time = time.monotonic()
+    start_time = time.monotonic()  # --max-minutes counts from here, reading of logs included
     values = read_assignments(assignments or [])
     if max_minutes is not None:
         values[TIME_LIMIT] = max_minutes
     request = Request(objective, values)
     if source is not None:
         if module is not None:
-            more = [module, *(more or [])]  # with --from, all that stands there is logs
+            extra_logs = [module, *(extra_logs or [])]  # with --from, all that stands there is logs
         module, robot = _module_of_run(source, robot)
         request = _warm_start(request)
     elif "adapt" in values:
         raise UsageError("--set adapt: belongs to --from")
     if module is None:
         raise typer.BadParameter("name a module, or a run with --from", param_hint="'MODULE.py'")
-    paths = options.logs(data, more)
+    paths = options.logs(data, extra_logs)
     folder = output or _default_folder(module, resume)
     urdf = None
     if resume:
@@ -109,6 +109,7 @@ def train(
         start = new_run(module, urdf, request)
     log_mapping = options.mapping(mapping, urdf, read_facts(start.module).joints) or start.mapping
     machine = Machine.model_validate({name: values[name] for name in Machine.model_fields if name in values})
+    # torch is imported where it is needed: --help and mistakes are answered at once
     from spelgen.fitting.fit import RunOptions
     from spelgen.fitting.train import train as train_files
 

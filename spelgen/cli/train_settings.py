@@ -92,6 +92,7 @@ def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
 
     Raises a usage error for an unknown key, with the nearest known one, and for a value that cannot be.
     """
+    # first gathered: fields of one group are checked together
     texts: dict[str, object] = {}
     for assignment in assignments:
         key, equals, text = assignment.partition("=")
@@ -150,7 +151,7 @@ def _new_config(
             defaults["torque_first"] = False  # it would start the bodies anew
         return fit_config(objective, rigid_bodies=rigid_bodies, options=options, defaults=defaults)
     if rates is None and rigid_bodies:
-        return None
+        return None  # torques need dense logs, which are not read yet
     if TIME_LIMIT in options:  # whoever sets it cannot know which objective the logs will lead to
         defaults[TIME_LIMIT] = options.pop(TIME_LIMIT)
     config = default_config(model, rates or [], options, defaults)

@@ -81,6 +81,7 @@ def run_fleet(fleet: Fleet, folder: Path, run_tasks: RunTasks, note: Callable[[s
     if fleet.search is not None:
         search = search_options(fleet.search, starts, lambda jobs: runner.run("search", jobs))
     options = {(x.robot, x.preset): x.options for x in search}
+    # arm by arm, so that the first rankings can be read while the rest runs
     jobs = []
     for arm, preset, seed, split in product(
         arms.values(), fleet.presets, range(fleet.seeds), range(fleet.splits)
@@ -90,12 +91,13 @@ def run_fleet(fleet: Fleet, folder: Path, run_tasks: RunTasks, note: Callable[[s
     results = runner.results("training", jobs)
     units: list[Units] = []
     if fleet.shared:
-        own = [job for job in jobs if job.preset == "closed-form" and job.seed == 0 and job.result()]
-        pooled = pooled_jobs(own, arms, folder)
+        # seed 0 alone: fits of rigid bodies do not depend on seeds
+        separate = [job for job in jobs if job.preset == "closed-form" and job.seed == 0 and job.result()]
+        pooled = pooled_jobs(separate, arms, folder)
         results += runner.results("pooling", pooled)
         pooled = [job for job in pooled if job.result()]
-        results += runner.results("units", unit_jobs(own, pooled, arms))
-        units = compare_units(own, pooled, arms, fleet)
+        results += runner.results("units", unit_jobs(separate, pooled, arms))
+        units = compare_units(separate, pooled, arms, fleet)
     fleet_results = FleetResults(results, runner.failures, search, tuple(units))
     write_json(folder / "fleet.json", fleet_results.to_dict())
     return fleet_results
@@ -205,6 +207,7 @@ def search_options(
                 options = {name: _drawn(trial, name, x) for name, x in search.over.items()}
                 jobs.append(trial_job(start, trial.number, options))
                 trials[jobs[-1].folder] = study, trial
+        # workers end in any order; the sampler must hear of trials in the order in which it proposed them
         outcomes = {job.folder: outcome for job, outcome in run_jobs(jobs)}
         for folder, (study, trial) in trials.items():
             study.tell(trial, _loss(outcomes[folder]))

@@ -81,6 +81,7 @@ class Job(Group):
         design = self.design
         if Path(design).suffix:
             design = Path(design).read_text(encoding="utf-8")
+        # where files lie does not change a result; `data` is the digest of what is in them
         content = self.model_dump_json(exclude={"folder", "train", "test"}, exclude_unset=True)
         return hashlib.sha256(f"{__version__} {design} {content}".encode()).hexdigest()[:16]
 
@@ -111,6 +112,7 @@ def run_job(job: Job) -> RunResult:
     result = job.result()
     if result is not None:
         return result
+    # as many workers as cores: more threads would wait for one another
     torch.set_num_threads(1)
     start, run = time.monotonic(), RunFolder(job.folder)
     _remove_foreign_run(job, run)
@@ -128,6 +130,7 @@ def run_job(job: Job) -> RunResult:
     else:
         config = _ConfigChoice(training, job.prior)
         fit = train(_module(job), job.train, job.folder, config, urdf=job.urdf, **common)
+    # a worker that is asked to end leaves a checkpoint, from which the next one goes on
     if fit.status == "interrupted":
         raise KeyboardInterrupt
     result = {

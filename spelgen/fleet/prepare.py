@@ -59,6 +59,7 @@ def prepare(preparation: Preparation) -> PreparedArm:
         mapping = load_mapping(robot.mapping, [joint.name for joint in arm.robot.joints])
     group = _digest(arm.robot.digest, robot.joints, robot.tip)
     settings = arm.settings.model_dump_json(exclude_unset=True)
+    # reading logs takes longer than asking for their times of change
     key = _digest(group, settings, mapping.model_dump_json(exclude_unset=True), _stamps(robot), splits)
     names = [coordinate.name for coordinate in arm.arm.coordinates]
     element = f"robots.{preparation.name}.data"
@@ -69,6 +70,7 @@ def prepare(preparation: Preparation) -> PreparedArm:
     paths = [
         (folder / f"split{k}" / "train.parquet", folder / f"split{k}" / "test.parquet") for k in range(splits)
     ]
+    # written last: a folder without it holds logs that were cut off
     record = folder / "prepared.json"
     if not record.exists() or json.loads(record.read_text(encoding="utf-8")) != {"key": key}:
         record.unlink(missing_ok=True)
@@ -94,6 +96,7 @@ def _splits(robot: FleetRobot, arm: LoadedArm, mapping: LogMapping, count: int, 
         raise LogError(f"{len(logs)} trajectories", element=element, expected=expected)
     splits: list[Split] = []
     for fold in np.array_split(np.random.default_rng(0).permutation(len(logs)), count):
+        # the order of the logs is kept, so that equal files give equal fits
         tested = set(fold.tolist())
         training = [log for k, log in enumerate(logs) if k not in tested]
         splits.append((training, [logs[k] for k in sorted(tested)]))

@@ -51,6 +51,7 @@ def ranking(robot: str, runs: Sequence[RunResult]) -> Listing:
     for name in _common(_predictors(run) for run in runs):
         if name != MODEL:
             lines.append(_line(f"({name})", runs, name, horizons))
+    # baselines stand among the models: a model below one of them is not worth its training
     lines.sort(key=lambda line: line.order)
     head = ("", *horizons, "nMSE", "parameters", "runs", "time [s]")
     return Listing(f"{robot}, best first: {MEASURE}; medians of all runs", head, tuple(x.row for x in lines))
@@ -106,8 +107,13 @@ def _predictors(run: RunResult) -> list[str]:
 
 def _common(lists: Iterable[Iterable[str]]) -> list[str]:
     """Return the names that are in all lists, once, in the order of the first."""
-    first, *others = [list(names) for names in lists] or [[]]
-    return [name for name in dict.fromkeys(first) if all(name in names for names in others)]
+    common: dict[str, None] | None = None
+    for names in lists:
+        if common is None:
+            common = dict.fromkeys(names)
+        else:
+            common = dict.fromkeys(name for name in common if name in names)
+    return list(common or ())
 
 
 def _by_robot(fleet: FleetResults) -> dict[str, list[RunResult]]:
@@ -133,7 +139,9 @@ def _unit_listing(units: Units, quantity: Quantity) -> Listing:
     rows = []
     for k, label in enumerate(quantity.labels):
         rows.append((label, *(number(column[k]) for column in columns)))
-    names = [f"{name} {day or ''}".rstrip() for name, day in zip(units.names, units.days, strict=True)]
+    names = []
+    for name, day in zip(units.names, units.days, strict=True):
+        names.append(name if day is None else f"{name} {day}")
     title = f"{units.arm}: {quantity.name} [{quantity.unit}] of {len(units.names)} units or days"
     return Listing(title, ("", *names, "all", "spread"), tuple(rows))
 

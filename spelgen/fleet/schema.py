@@ -96,6 +96,7 @@ def load_fleet(path: Path) -> Fleet:
 
     Raises SettingsError, or SpelgenErrors with all that is wrong.
     """
+    # YAML that knows its lines, for messages
     document = read_document(path)
     content = document.value()
     try:
@@ -133,11 +134,11 @@ def _preset_errors(fleet: Fleet, document: Document) -> Iterator[SettingsError]:
 def _search_errors(fleet: Fleet, document: Document) -> Iterator[SettingsError]:
     if fleet.search is None:
         return
-    known = [name for name in SearchedOptions.model_fields if name not in NOT_SEARCHED]
+    searchable = [name for name in SearchedOptions.model_fields if name not in NOT_SEARCHED]
     for name, candidates in fleet.search.over.items():
         location = ("search", "over", name)
-        if name not in known:
-            yield _error(document, location, f"unknown option {name!r}", suggestion(name, known))
+        if name not in searchable:
+            yield _error(document, location, f"unknown option {name!r}", suggestion(name, searchable))
             continue
         if isinstance(candidates, Range):
             candidates = (candidates.low, candidates.high)

@@ -68,9 +68,9 @@ def workers(jobs: int, address: str | None = None, gpus: float = 0.0) -> Iterato
     try:
         ray.init(**cluster, log_to_driver=False, logging_level=logging.ERROR)
     except (ConnectionError, RuntimeError, ValueError) as error:
-        place = "this machine" if address is None else repr(address)
+        location = "this machine" if address is None else repr(address)
         raise RunError(
-            f"no Ray cluster at {place} ({' '.join(str(error).split())[:200]})",
+            f"no Ray cluster at {location} ({' '.join(str(error).split())[:200]})",
             do="start one by `ray start --head`, or leave --address out",
         ) from error
     try:

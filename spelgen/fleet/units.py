@@ -59,10 +59,10 @@ class Units:
     quantities: tuple[Quantity, ...]
 
 
-def pooled_jobs(own: Sequence[Job], arms: Mapping[str, PreparedArm], folder: Path) -> list[Job]:
+def pooled_jobs(separate: Sequence[Job], arms: Mapping[str, PreparedArm], folder: Path) -> list[Job]:
     """Return, for each arm of several units and each split, the fit to the logs of all units."""
     pooled = []
-    for jobs in _by_arm(own, arms):
+    for jobs in _by_arm(separate, arms):
         first = jobs[0]
         name = f"all-{first.urdf.stem}-{arms[first.robot].group[:4]}"
         train: tuple[Path, ...] = ()
@@ -75,10 +75,10 @@ def pooled_jobs(own: Sequence[Job], arms: Mapping[str, PreparedArm], folder: Pat
     return pooled
 
 
-def unit_jobs(own: Sequence[Job], pooled: Sequence[Job], arms: Mapping[str, PreparedArm]) -> list[Job]:
+def unit_jobs(separate: Sequence[Job], pooled: Sequence[Job], arms: Mapping[str, PreparedArm]) -> list[Job]:
     """Return, for each unit, the fit that starts from the common one and stays as near as units are to one another."""
     near = []
-    for jobs in _by_arm(own, arms):
+    for jobs in _by_arm(separate, arms):
         common = _common_fit(jobs, pooled)
         if common is None:
             continue
@@ -110,16 +110,17 @@ def spread(
         for unit in units:
             distances = torch.cat([(unit[name] - common[name]).flatten() for name in of_kind])
             squares.append(distances.square().mean())
+        # the median: one odd unit must not loosen the prior of all
         deviations[kind] = max(float(torch.stack(squares).median().sqrt()), LEAST_DEVIATION)
     return GaussianPrior(**deviations)
 
 
 def compare_units(
-    own: Sequence[Job], pooled: Sequence[Job], arms: Mapping[str, PreparedArm], fleet: Fleet
+    separate: Sequence[Job], pooled: Sequence[Job], arms: Mapping[str, PreparedArm], fleet: Fleet
 ) -> list[Units]:
     """Return the units of each arm beside one another, after their own fits (first split)."""
     compared = []
-    for jobs in _by_arm([job for job in own if job.split == 0], arms):
+    for jobs in _by_arm([job for job in separate if job.split == 0], arms):
         common = _common_fit(jobs, pooled)
         if common is None:
             continue
@@ -160,14 +161,15 @@ def _base_parameters(common: Job, models: Sequence[EmittedModel]) -> Quantity:
 def _quantity(name: str, unit: str, labels: tuple[str, ...], rows: np.ndarray) -> Quantity:
     """Return the quantity of rows (units + 1, labels): those of the units and, last, the common ones."""
     values = rows[:-1]
+    # ddof 1: units are few
     deviation = values.std(axis=0, ddof=1)
     return Quantity(name, unit, labels, values.tolist(), rows[-1].tolist(), deviation.tolist())
 
 
-def _by_arm(own: Sequence[Job], arms: Mapping[str, PreparedArm]) -> list[list[Job]]:
+def _by_arm(separate: Sequence[Job], arms: Mapping[str, PreparedArm]) -> list[list[Job]]:
     """Return the jobs of each arm and split that has several units."""
     groups: dict[tuple[str, int], list[Job]] = {}
-    for job in own:
+    for job in separate:
         groups.setdefault((arms[job.robot].group, job.split), []).append(job)
     return [jobs for jobs in groups.values() if len(jobs) > 1]
 

@@ -59,8 +59,10 @@ def matrix(arm: Arm, structure: Structure) -> list[list[Cell]]:
         name = entry_name(entry.row, entry.column)
         cell = Cell(entry.kind, text, tuple(entry.joints), explanations[name])
         cells[entry.row, entry.column] = cells[entry.column, entry.row] = cell
-    joints = range(len(structure.joints))
-    return [[cells[row, column] for column in joints] for row in joints]
+    rows = []
+    for row in range(len(structure.joints)):
+        rows.append([cells[row, column] for column in range(len(structure.joints))])
+    return rows
 
 
 def _explanations(arm: Arm, structure: Structure) -> dict[str, str]:
@@ -72,9 +74,11 @@ def _explanations(arm: Arm, structure: Structure) -> dict[str, str]:
         name = entry_name(entry.row, entry.column)
         default = f"depends on {joints_in_ranges(entry.joints)} only"
         lines = [f"{name} {KINDS.get(entry.kind, default)}."]
-        lines += [str(fact) for fact in every_fact if name in ENTRY.findall(fact.statement)]
-        if entry.kind == "varying":
-            lines += [str(x) for x in every_fact if x.statement.startswith("M does not depend")]
+        for fact in every_fact:
+            # joints that M does not depend on are a fact about every entry that varies
+            of_all = entry.kind == "varying" and fact.statement.startswith("M does not depend")
+            if of_all or name in ENTRY.findall(fact.statement):
+                lines.append(str(fact))
         formula = closed[name]
         if formula.expression is not None:
             lines.append(f"{name} = {Text().whole(formula.expression)}")
@@ -115,13 +119,17 @@ def _view(drawn: Scene, q: Sequence[Sequence[float]]) -> dict[str, object]:
     """Return the view of a motion for the script [mm]; the ground lies below all links, at the root where they stay
     above it.
     """
+    # a dozen poses of a motion hold its extent well enough
     poses = q[:: max(1, len(q) // 12)]
     view = drawn.view(poses)
-    lowest = min(float(position[2]) for pose in poses for _, position in drawn.frames(pose))
+    ground = 0.0
+    for pose in poses:
+        for _, position in drawn.frames(pose):
+            ground = min(ground, float(position[2]))
     return {
         "middle": (1000 * view.middle).round(1).tolist(),
         "scale": round(view.scale, 2),
-        "ground": round(1000 * min(0.0, lowest), 1),
+        "ground": round(1000 * ground, 1),
     }
 
 
@@ -131,6 +139,7 @@ def _motions(traces: Record) -> list[dict[str, Any]]:
     for example in traces.get("trajectories", ()):
         q, predicted = numbers(example["q"]), numbers(example["predicted_q"])
         moved = np.ptp(q, axis=0)
+        # a joint that hardly moved is measured by the motion of the others
         error = np.abs(predicted - q) / np.maximum(moved, 1e-2 * moved.max() + 1e-9)
         label = f"{example['which']} prediction beside what was measured ({example['trajectory']})"
         motions.append(_motion(f"prediction {example['which']}", label, example, error))
@@ -163,6 +172,7 @@ def _sweep(arm: Arm) -> dict[str, Any]:
 
 def _range(coordinate: Coordinate) -> tuple[float, float]:
     """Return the range that is shown: that of the URDF, or a usual one where it has none or a very wide one."""
+    # limits of a hundred turns, as some URDFs have them, would show a blur
     usual = 1.2 if coordinate.kind == "revolute" else 0.3
     low, high = -usual, usual
     if not coordinate.continuous and coordinate.lower is not None:
@@ -179,8 +189,8 @@ def _unseen(arm: Arm, identified: Record) -> list[float] | None:
     identifiability = identified.get("identifiability")
     if not identifiability:
         return None
-    shown = [IDENTIFIED.get(x, 0.0) for x in list(identifiability.values())[: 10 * len(arm.bodies)]]
-    unseen = 1 - np.array(shown).reshape(-1, 10).mean(axis=1)
+    fractions = [IDENTIFIED.get(x, 0.0) for x in list(identifiability.values())[: 10 * len(arm.bodies)]]
+    unseen = 1 - np.array(fractions).reshape(-1, 10).mean(axis=1)
     worst = np.zeros(len(arm.coordinates))
     np.maximum.at(worst, [body.coordinate for body in arm.bodies], unseen)
     return list(worst.round(3).tolist())

@@ -22,8 +22,8 @@ Values = Sequence[float] | np.ndarray
 class Margins:
     """Room around the curves [pixels]. bare: below a chart whose x axis has no numbers."""
 
-    left: int = 62
-    right: int = 14
+    start: int = 62
+    end: int = 14
     top: int = 10
     bottom: int = 36
     bare: int = 8
@@ -123,24 +123,27 @@ def line_chart(
         empty = {"x": width / 2, "y": height / 2, "text-anchor": "middle"}
         return element("svg", attributes, element("text", empty, "no finite values to show"))
     bottom = height - (MARGINS.bottom if x_label else MARGINS.bare)
-    x_axis = _axis(x_values, MARGINS.left, width - MARGINS.right, pad=0.0, log=log_x)
+    x_axis = _axis(x_values, MARGINS.start, width - MARGINS.end, pad=0.0, log=log_x)
+    # SVG counts pixels downwards: the axis of y starts at the bottom
     y_axis = _axis(y_values, bottom, MARGINS.top, pad=0.0 if limits else 0.06, log=log)
     attributes |= {"data-x": x_axis.data(), "data-y": y_axis.data()}
     if motion:
         attributes["data-motion"] = motion
-    parts = [_frame(x_axis, y_axis, x_label, y_label)]
+    elements = [_frame(x_axis, y_axis, x_label, y_label)]
     for x, text in verticals:
         if x_axis.low <= x <= x_axis.high:
-            parts.append(_vertical(float(x_axis.pixels(np.array(x))), text, x_axis, y_axis))
+            elements.append(_vertical(float(x_axis.pixels(np.array(x))), text, x_axis, y_axis))
     # lines are drawn last, above all bands and dots
     for mark in sorted(marks, key=lambda mark: type(mark) is Line):
-        parts.append(_drawn(mark, x_axis, y_axis))
-    return element("svg", attributes, Markup("").join(parts))
+        elements.append(_drawn(mark, x_axis, y_axis))
+    return element("svg", attributes, Markup("").join(elements))
 
 
 def element(tag: str, attributes: Mapping[str, object], content: str = "") -> Markup:
     """Return an XML element; attributes, and content that is no markup, are escaped."""
-    words = Markup("").join(Markup(' {}="{}"').format(*item) for item in attributes.items())
+    words = Markup("")
+    for name, value in attributes.items():
+        words += Markup(' {}="{}"').format(name, value)
     return Markup("<{0}{1}>{2}</{0}>").format(tag, words, content)
 
 
@@ -172,6 +175,7 @@ def _axis(values: np.ndarray, start: float, end: float, *, pad: float, log: bool
         factor = (high / low) ** pad if high > low else 2.0
         return Axis(low / factor, high * factor, start, end, log=True)
     room = pad * (high - low)
+    # rounding alone would otherwise fill the chart with noise of 1e-16
     if high - low <= 1e-9 * max(abs(low), abs(high)):
         room = 0.5 * abs(high) or 1.0  # a flat line lies in the middle
     return Axis(low - room, high + room, start, end)
@@ -203,9 +207,10 @@ def _steps(low: float, high: float) -> tuple[list[float], list[str]]:
     """Return multiples of 1, 2 or 5 times a power of ten, with as many decimals as they need."""
     rough = (high - low) / 5
     power = math.floor(math.log10(rough))
-    step = next(m * 10.0**power for m in (1, 2, 5, 10) if m * 10.0**power >= rough * (1 - 1e-9))
+    fine = 10.0**power * np.array([1, 2, 5, 10])
+    step = float(fine[fine >= rough * (1 - 1e-9)][0])  # rounding must not skip a step that just fits
     first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
-    values = [k * step for k in range(first, last + 1)]
+    values: list[float] = (step * np.arange(first, last + 1)).tolist()
     decimals = max(0, -math.floor(math.log10(step) + 1e-9))
     if decimals > 4 or max(abs(low), abs(high)) >= 1e5:
         return values, [f"{value:.2g}" for value in values]
@@ -214,25 +219,25 @@ def _steps(low: float, high: float) -> tuple[list[float], list[str]]:
 
 def _frame(x_axis: Axis, y_axis: Axis, x_label: str, y_label: str) -> Markup:
     """Return grid, axes and their labels."""
-    left, right, bottom = x_axis.start, x_axis.end, y_axis.start
-    parts = []
+    start, end, bottom = x_axis.start, x_axis.end, y_axis.start
+    elements = []
     for y, label in y_axis.ticks():
-        parts.append(element("path", {"class": "grid", "d": f"M{left:.1f} {y:.1f}H{right:.1f}"}))
-        parts.append(_text(left - 7, y + 4, "end", label))
-    parts.append(element("path", {"class": "axis", "d": f"M{left:.1f} {bottom:.1f}H{right:.1f}"}))
+        elements.append(element("path", {"class": "grid", "d": f"M{start:.1f} {y:.1f}H{end:.1f}"}))
+        elements.append(_text(start - 7, y + 4, "end", label))
+    elements.append(element("path", {"class": "axis", "d": f"M{start:.1f} {bottom:.1f}H{end:.1f}"}))
     if x_label:
         for x, label in x_axis.ticks():
-            parts.append(_text(x, bottom + 16, "middle", label))
-        parts.append(_text((left + right) / 2, bottom + 31, "middle", x_label, {"class": "label"}))
+            elements.append(_text(x, bottom + 16, "middle", label))
+        elements.append(_text((start + end) / 2, bottom + 31, "middle", x_label, {"class": "label"}))
     y = (bottom + y_axis.end) / 2
     turned = {"class": "label", "transform": f"rotate(-90 12 {y:.1f})"}
-    parts.append(_text(12, y, "middle", y_label, turned))
-    return Markup("").join(parts)
+    elements.append(_text(12, y, "middle", y_label, turned))
+    return Markup("").join(elements)
 
 
 def _text(x: float, y: float, anchor: str, text: str, attributes: Mapping[str, str] | None = None) -> Markup:
-    place = {"x": f"{x:.1f}", "y": f"{y:.1f}", "text-anchor": anchor}
-    return element("text", {**place, **(attributes or {})}, text)
+    position = {"x": f"{x:.1f}", "y": f"{y:.1f}", "text-anchor": anchor}
+    return element("text", {**position, **(attributes or {})}, text)
 
 
 def _vertical(x: float, text: str, x_axis: Axis, y_axis: Axis) -> Markup:
@@ -251,15 +256,16 @@ def _drawn(mark: Mark, x_axis: Axis, y_axis: Axis) -> Markup:
     x, y = np.asarray(mark.x, dtype=float), np.asarray(mark.y, dtype=float)
     if isinstance(mark, Dots):
         inside = (x >= x_axis.low) & (x <= x_axis.high) & (y >= y_axis.low) & (y <= y_axis.high)
-        places = zip(x_axis.pixels(x[inside]), y_axis.pixels(y[inside]), strict=True)
+        points = zip(x_axis.pixels(x[inside]), y_axis.pixels(y[inside]), strict=True)
         # lines without length, whose round ends are the dots
-        path = "".join(f"M{a:.1f} {b:.1f}h0" for a, b in places)
+        path = "".join(f"M{a:.1f} {b:.1f}h0" for a, b in points)
         return element("path", {"class": f"dots {mark.style}", "d": path}, title)
     return element("path", {"class": f"line {mark.style}", "d": _path(x, y, x_axis, y_axis)}, title)
 
 
 def _path(x: np.ndarray, y: np.ndarray, x_axis: Axis, y_axis: Axis) -> str:
     """Return a path in tenths of a pixel, relative steps being shorter; broken where a value cannot be drawn."""
+    # every so many samples, and the last one, so that the line ends where the data do
     stride = max(1, math.ceil(len(x) / TUNING.points))
     rows = np.unique([*range(0, len(x), stride), max(len(x) - 1, 0)])[: len(x)]
     x, y = x[rows], y[rows]
@@ -283,6 +289,7 @@ def _path(x: np.ndarray, y: np.ndarray, x_axis: Axis, y_axis: Axis) -> str:
 def _outline(band: Band, x_axis: Axis, y_axis: Axis) -> str:
     """Return the corners up to the first value that is not finite; what exceeds the axis ends at its edge."""
     x, low, high = (np.asarray(values, dtype=float) for values in (band.x, band.low, band.high))
+    # a prediction that left all bounds has no upper end, but still a lower one
     finite = np.isfinite(x) & np.isfinite(low)
     count = len(x) if finite.all() else int(np.argmin(finite))
     columns = x_axis.pixels(x[:count])

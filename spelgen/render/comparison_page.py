@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 import torch
 from markupsafe import Markup
 
@@ -15,9 +16,9 @@ from spelgen.comparison.truth import true_mass
 from spelgen.evaluation.tables import Table
 from spelgen.files import write_text
 from spelgen.fitting.run_folder import RunFolder
-from spelgen.render.charts import Line, line_chart
+from spelgen.render.charts import Line, Values, line_chart
 from spelgen.render.page import render_page
-from spelgen.render.plots import QUANTITIES, UNITS, Panel, mass_panels
+from spelgen.render.plots import QUANTITIES, UNITS, Panel, mass_panels, numbers
 from spelgen.spec import Facts, read_facts
 
 STYLES = ("c1", "c2", "c3", "gravity", "c4", "c5", "c6")
@@ -89,10 +90,10 @@ def _mass_panels(
         masses[result.variant] = result.mass.along
     if example is None:
         return []
-    entries = {}
-    for i in range(len(joint_types)):
-        for j in range(i + 1):
-            entries[i, j] = {name: [mass[i][j] for mass in along] for name, along in masses.items()}
+    entries: dict[tuple[int, int], dict[str, Values]] = {}
+    rows, columns = np.tril_indices(len(joint_types))
+    for i, j in zip(rows.tolist(), columns.tolist(), strict=True):
+        entries[i, j] = {name: numbers(along)[:, i, j] for name, along in masses.items()}
     return mass_panels(example.t, entries, {"true": "truth", **styles}, joint_types, width=400)
 
 

@@ -77,8 +77,8 @@ def curves(traces: Record, facts: Facts, picture: Picture) -> Curves:
     drawn.trajectories = [_prediction(example, facts) for example in traces.get("trajectories", [])]
     mass = traces.get("mass") or {}
     if mass.get("by"):
-        kinds = [[cell.kind for cell in row] for row in picture.rows]
-        drawn.mass, drawn.eigenvalues = trace_mass_panels(mass, kinds, types), eigenvalue_chart(mass)
+        drawn.mass = trace_mass_panels(mass, picture.kinds, types)
+        drawn.eigenvalues = eigenvalue_chart(mass)
         drawn.along = str(mass["trajectory"])
     if traces.get("friction"):
         drawn.friction = friction_panels(traces["friction"], torques, joints, types)
@@ -104,7 +104,7 @@ def _prediction(example: Record, facts: Facts) -> Section:
 def coverage(traces: Record, identified: Record | None, facts: Facts, limits: Limits) -> list[Panel]:
     """Return where training and test logs have been."""
     logs = {"training": (identified or {}).get("coverage"), "test": traces.get("coverage")}
-    known = {name: covered for name, covered in logs.items() if covered}
-    if not known:
+    recorded = {name: covered for name, covered in logs.items() if covered}
+    if not recorded:
         return []
-    return coverage_panels(known, facts.joints, facts.joint_types, limits)
+    return coverage_panels(recorded, facts.joints, facts.joint_types, limits)

@@ -13,7 +13,7 @@ def page(identification: Identification, arm: LoadedArm) -> str:
     """The page about an identification: what was determined and how surely, the arm, and the torque that is left."""
     record = identification.to_dict()
     words = [parameter["determined"] for parameter in record["base_parameters"]]
-    never = [name for name, shown in record["identifiability"].items() if shown == "never"]
+    never = [name for name, visibility in record["identifiability"].items() if visibility == "never"]
     return render_page(
         "identification.html.jinja",
         robot=identification.arm.name,

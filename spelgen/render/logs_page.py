@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from spelgen.arm.arm import Arm
@@ -32,20 +34,19 @@ def page(report: LogReport, arm: Arm, inputs: np.ndarray) -> str:
 
 def charts(log: Trajectory, arm: Arm, inputs: np.ndarray) -> list[Panel]:
     """Return by joint q; qd beside dq/dt; torque beside the URDF's gravity torque. Of servos: q beside u."""
-    stride = -(-len(log.t) // TUNING.points)
-    pieces = [piece[::stride] for piece in split_at_gaps(log)]
-    t, q = (np.concatenate([getattr(piece, name) for piece in pieces]) for name in ("t", "q"))
+    # gaps are kept: no line is drawn over one by a slope across it
+    pieces = [piece[:: -(-len(log.t) // TUNING.points)] for piece in split_at_gaps(log)]
+    t, q = _joined(pieces, "t"), _joined(pieces, "q")
     quantities = {"position": [("logged", q, "truth")]}
     if log.u is not None:
-        commands = np.concatenate([piece.u for piece in pieces if piece.u is not None])
-        quantities["position"].append(("commanded", commands, "predicted"))
+        quantities["position"].append(("commanded", _joined(pieces, "u"), "predicted"))
     else:
-        qd, tau = (np.concatenate([getattr(piece, name) for piece in pieces]) for name in ("qd", "tau"))
         slope = np.concatenate([_slope(piece) for piece in pieces])
-        quantities["velocity"] = [("logged", qd, "truth"), ("dq/dt", slope, "predicted")]
-        quantities["torque"] = [("logged", tau @ inputs.T, "truth")]
+        quantities["velocity"] = [("logged", _joined(pieces, "qd"), "truth"), ("dq/dt", slope, "predicted")]
+        quantities["torque"] = [("logged", _joined(pieces, "tau") @ inputs.T, "truth")]
         if any(body.inertia for body in arm.bodies):
-            gravity = regressor(arm, q, np.zeros_like(q), np.zeros_like(q)) @ urdf_parameters(arm)  # (T, n)
+            rest = np.zeros_like(q)
+            gravity = regressor(arm, q, rest, rest) @ urdf_parameters(arm)  # (T, n)
             quantities["torque"].append(("gravity of the URDF", gravity, "predicted"))
     panels = []
     for k, joint in enumerate(arm.coordinates):
@@ -62,6 +63,10 @@ def charts(log: Trajectory, arm: Arm, inputs: np.ndarray) -> list[Panel]:
             drawn.append(line_chart(lines, title, x_label, y_label, height=height))
         panels.append(Panel(joint.name, tuple(drawn)))
     return panels
+
+
+def _joined(pieces: Sequence[Trajectory], column: str) -> np.ndarray:
+    return np.concatenate([getattr(piece, column) for piece in pieces])
 
 
 def _slope(piece: Trajectory) -> np.ndarray:

@@ -33,6 +33,7 @@ def render_page(template: str, **context: object) -> str:
 
 def json_data(data: object) -> Markup:
     """JSON that may stand in a <script> element: none of its text can end the element."""
+    # NaN is no JSON: better an error here than a page whose script stops
     text = json.dumps(data, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
     return Markup(text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e"))
 

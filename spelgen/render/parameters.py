@@ -36,14 +36,14 @@ FRICTION_UNITS = {
 
 @dataclass(frozen=True)
 class ParameterTable:
-    """title, heads and rows of text; the first column is a name. more: rows that are folded away. note: below it."""
+    """title, heads and rows of text; the first column is a name. folded: rows that are folded away. note: below it."""
 
     title: str
     head: tuple[str, ...]
     rows: Rows
     note: str = ""
-    more: Rows = ()
-    more_title: str = ""
+    folded: Rows = ()
+    folded_title: str = ""
 
 
 @dataclass(frozen=True)
@@ -105,8 +105,8 @@ def base_table(model: EmittedModel | None, arm: LoadedArm, identified: Record) -
             value += f" ± {TUNING.interval * parameter['deviation']:.2g}"
         row = [parameter["name"], f"{nominal[k]:.4g}" if of_bodies and arm.arm.has_inertials else ""]
         if learned is not None:
-            known = of_bodies or parameter["name"].startswith("armature")
-            row.append(f"{learned[k]:.4g}" if known else "")
+            has_value = of_bodies or parameter["name"].startswith("armature")
+            row.append(f"{learned[k]:.4g}" if has_value else "")
         row += [value, parameter["determined"], parameter["formula"].replace(parameter["name"], "", 1)]
         if parameter["formula"] != parameter["name"]:
             row[-1] = parameter["formula"]
@@ -135,6 +135,7 @@ def _learned(model: EmittedModel | None, combination: np.ndarray) -> np.ndarray 
     bodies = None if model is None else body_parameters(model)
     if model is None or bodies is None:
         return None
+    # ten a body, then those of drives, of which a model has the armature in common with least squares
     parameters = np.zeros(combination.shape[1])
     parameters[: bodies.size] = bodies.ravel()
     parameters[bodies.size : bodies.size + model.n] = model.armature.detach().numpy()
@@ -150,6 +151,7 @@ def _body_table(values: np.ndarray, arm: LoadedArm | None) -> ParameterTable:
         if arm.arm.has_inertials:
             nominal = urdf_parameters(arm.arm).reshape(-1, 10)
     rows = []
+    # the URDF below the model, body by body: differences are read down a column
     for k, name in enumerate(names):
         rows.append((name, "model", *_about_centre(values[k])))
         if nominal is not None:
@@ -246,13 +248,13 @@ def mass_constants(run: RunFolder) -> list[Constant]:
 
     Raises ModuleError or RunError when the run cannot be read.
     """
-    before, after = run.load_module(), trained_model(run)
-    mass: Any = getattr(after, "mass", None)
+    untrained, trained = run.load_module(), trained_model(run)
+    mass: Any = getattr(trained, "mass", None)
     if not hasattr(mass, "constants"):
         return []
     constants = []
-    bases = mass.constant_basis.reshape(-1, after.n, after.n)
-    start: Any = before.mass
+    bases = mass.constant_basis.reshape(-1, trained.n, trained.n)
+    start: Any = untrained.mass
     for basis, old, new in zip(bases, start.constants().tolist(), mass.constants().tolist(), strict=True):
         entries = [(row, column) for row, column in basis.tril().nonzero().tolist()]
         terms = []
@@ -262,7 +264,7 @@ def mass_constants(run: RunFolder) -> list[Constant]:
             factor = "" if size == 1 else f"{size:.4g} "
             terms.append(f"{sign} {factor}M{_index(row, column)}")
         row, column = entries[0]
-        unit = inertia_unit(after.joint_types[row], after.joint_types[column])
+        unit = inertia_unit(trained.joint_types[row], trained.joint_types[column])
         where = " ".join(terms).removeprefix("+ ").replace("- ", "-", terms[0].startswith("-"))
         constants.append(Constant(where, old, new, unit))
     return constants

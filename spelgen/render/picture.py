@@ -31,7 +31,10 @@ class Picture:
     @property
     def kinds(self) -> list[list[str]]:
         """Return the kind of each entry."""
-        return [[cell.kind for cell in row] for row in self.rows]
+        kinds = []
+        for row in self.rows:
+            kinds.append([cell.kind for cell in row])
+        return kinds
 
 
 def read_picture(module: Path) -> Picture:

@@ -19,7 +19,7 @@ from spelgen.baselines.names import (
     observed,
 )
 from spelgen.labels import entry_name
-from spelgen.render.charts import Band, Dots, Line, Mark, line_chart
+from spelgen.render.charts import Band, Dots, Line, Mark, Values, line_chart
 from spelgen.settings.tuning.render import TUNING
 
 Record = Mapping[str, Any]
@@ -121,20 +121,21 @@ def growth_charts(growth: Record) -> list[Panel]:
     curves = {}
     for measure in ERRORS:
         curves[measure] = {name: (growth["seconds"], error) for name, error in growth[measure].items()}
-    styles = {name: style(name) for of_measure in curves.values() for name in of_measure}
-    return growth_panels(curves, styles, (MODEL, LEAST_SQUARES))
+    styles = {name: style(name) for name in {**growth["relative"], **growth["tip_mm"]}}
+    return growth_panels(curves, styles, (MODEL, LEAST_SQUARES))  # bands of all would hide one another
 
 
 def _error_limits(errors: Mapping[str, tuple[Sequence[float], Record]]) -> tuple[float, float] | None:
     """Return limits of medians and the model's band, baselines that are hopeless cut off; None without a model."""
+    # pages of several runs have no baselines, and so nothing to cut off
     if MODEL not in errors:
         return None
-    own = _positive([errors[MODEL][1][key] for key in ("low", "high")])
+    model_errors = _positive([errors[MODEL][1][key] for key in ("low", "high")])
     medians = _positive([error["median"] for _, error in errors.values()])
-    if not own.size or not medians.size:
+    if not model_errors.size or not medians.size:
         return None
-    high = max(own.max(), medians[medians < TUNING.outlier * own.max()].max(initial=0.0))
-    return float(min(own.min(), medians.min())) / 1.3, 1.3 * float(high)
+    high = max(model_errors.max(), medians[medians < TUNING.outlier * model_errors.max()].max(initial=0.0))
+    return float(min(model_errors.min(), medians.min())) / 1.3, 1.3 * float(high)
 
 
 def _positive(columns: Sequence[object]) -> np.ndarray:
@@ -151,14 +152,14 @@ def torque_panels(trace: Record, joints: Sequence[str], joint_types: Sequence[st
     panels = []
     for k, (joint, kind) in enumerate(zip(joints, joint_types, strict=True)):
         unit = FORCE[kind]
-        both = [
+        torques = [
             Line("measured", t, measured[:, k], "truth"),
             Line("predicted", t, predicted[:, k], "predicted"),
         ]
         residual = [Line("measured less predicted", t, measured[:, k] - predicted[:, k], "model")]
         lines = [Line(name, t, torque[:, k], name.lower()) for name, torque in components.items()]
         charts = (
-            line_chart(both, f"Torque of {joint}", "", f"torque [{unit}]", motion=motion, height=150),
+            line_chart(torques, f"Torque of {joint}", "", f"torque [{unit}]", motion=motion, height=150),
             line_chart(residual, f"Residual of {joint}", "", f"residual [{unit}]", motion=motion, height=84),
             line_chart(lines, f"Parts of the torque of {joint}", "t [s]", f"parts [{unit}]", motion=motion),
         )
@@ -197,7 +198,7 @@ def trajectory_panels(example: Record, joints: Sequence[str], joint_types: Seque
 
 def mass_panels(
     t: Sequence[float],
-    entries: Mapping[tuple[int, int], Mapping[str, Sequence[float]]],
+    entries: Mapping[tuple[int, int], Mapping[str, Values]],
     styles: Mapping[str, str],
     joint_types: Sequence[str],
     width: int = 330,
@@ -217,8 +218,9 @@ def trace_mass_panels(
 ) -> list[Panel]:
     """Return the entries of M that are not always zero, by the model and its baselines. kinds: of each entry."""
     entries = {}
-    places = [(i, j) for i in range(len(joint_types)) for j in range(i + 1)]
-    for number, (i, j) in enumerate(places):
+    # the lower triangle, row by row, as the trace lists it
+    rows, columns = np.tril_indices(len(joint_types))
+    for number, (i, j) in enumerate(zip(rows.tolist(), columns.tolist(), strict=True)):
         if kinds[i][j] != "zero":
             entries[i, j] = {name: x["entries"][number] for name, x in mass["by"].items()}
     styles = {name: style(name) for name in mass["by"]}
@@ -247,6 +249,7 @@ def friction_panels(
     for k, (joint, kind) in enumerate(zip(joints, joint_types, strict=True)):
         dots = friction["measured"][k]
         marks: list[Mark] = [Dots("measured", numbers(dots["qd"]), numbers(dots["torque"]), "truth")]
+        # one trajectory is enough: loops of two would cover each other
         for trace in torques[:1]:
             qd = numbers(trace["qd"])[:, k]
             measured = numbers(trace["measured"])[:, k] - numbers(trace["without_friction"])[:, k]
@@ -274,6 +277,7 @@ def _friction_limits(measured: np.ndarray, curve: np.ndarray) -> tuple[float, fl
     values = values[np.isfinite(values)]
     if not values.size:
         return None
+    # samples at reversals are far off where friction was smoothed or delayed
     low, high = np.quantile(values, [1 - TUNING.bulk, TUNING.bulk])
     room = 0.15 * (high - low) or 1.0
     return float(min(low, np.nanmin(curve)) - room), float(max(high, np.nanmax(curve)) + room)
@@ -311,6 +315,7 @@ def coverage_panels(
 def _histogram(name: str, histogram: Record) -> Band:
     """Return the outline of a histogram's bars; heights sum to one."""
     counts = numbers(histogram["counts"])
+    # each bar as two points, so that the outline has steps
     edges = np.linspace(histogram["low"], histogram["high"], len(counts) + 1)
     heights = np.repeat(counts / max(counts.sum(), 1.0), 2)
     style = "train" if name == "training" else "model"

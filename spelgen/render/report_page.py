@@ -105,6 +105,7 @@ def render_report(folder: Path | str, robot: Path | str | None = None) -> str:
         raise RunError(
             "no run", file=run.path, expected="a folder with module.py", do="make one with `spelgen train`"
         )
+    # files of a run folder may come from anywhere and hold anything
     try:
         return _rendered(_read(run), robot)
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, TemplateError) as error:
@@ -116,6 +117,7 @@ def render_report(folder: Path | str, robot: Path | str | None = None) -> str:
 
 
 def _read(folder: RunFolder) -> Run:
+    # the page stands without a URDF: a run may have none, or one that this version refuses
     try:
         arm = run_arm(folder)
     except SpelgenError:
@@ -175,12 +177,15 @@ def _cells(arm: LoadedArm | None, facts: Facts, picture: Picture) -> list[list[C
     """Return M with reasons where the model's structure is the arm's own, else as the module's docstring has it."""
     if arm is not None:
         derived = matrix(arm.arm, arm.structure_for(facts.options.assume))
-        if [[cell.kind for cell in row] for row in derived] == picture.kinds:
+        kinds = []
+        for cells in derived:
+            kinds.append([cell.kind for cell in cells])
+        if kinds == picture.kinds:  # a dense preset keeps nothing of the arm's structure
             return derived
-    cells: list[list[Cell]] = []
+    pictured: list[list[Cell]] = []
     for i, row in enumerate(picture.rows):
-        cells.append([])
+        pictured.append([])
         for j, entry in enumerate(row):
             name, text = entry_name(max(i, j), min(i, j)), LETTERS.get(entry.kind, entry.joints)
-            cells[-1].append(Cell(entry.kind, text, (), f"{name}: {entry.kind}"))
-    return cells
+            pictured[-1].append(Cell(entry.kind, text, (), f"{name}: {entry.kind}"))
+    return pictured

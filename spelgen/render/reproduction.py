@@ -29,6 +29,7 @@ def files(folder: Path) -> list[File]:
     """Return every file of the folder but pages and what is being written."""
     entries = []
     for path in sorted(folder.iterdir()):
+        # pages are made from the folder and so are no part of what is reproduced
         if path.is_file() and not path.name.startswith(".") and path.suffix != ".html":
             content = path.read_bytes()
             entries.append(File(path.name, _size(len(content)), hashlib.sha256(content).hexdigest()))
@@ -38,6 +39,7 @@ def files(folder: Path) -> list[File]:
 def commands(run: RunFolder, facts: Facts, record: Record | None) -> list[str]:
     """Return what makes a run again, from its config.json; the logs' place is not known to the run."""
     urdf = shlex.quote(facts.urdf)
+    # the module names its URDF, the folder calls it robot.urdf
     lines = []
     if run.urdf.exists():  # under the name that the module knows it by
         lines.append(f"cp RUN/{run.urdf.name} {urdf}")

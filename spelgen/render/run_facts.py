@@ -45,6 +45,7 @@ def head_numbers(
     if torque and torque["mean_nmse"] is not None:
         value = f"{100 * torque['mean_nmse']:.3g} %"
         figures.append(Number(value, "of the torque's variance is not explained"))
+    # the longest horizon is the hardest, and what a simulation needs
     for horizon in evaluation.get("horizons", ())[-1:]:
         error = horizon["errors"][MODEL]
         if error["mean_relative_rms"] is not None:
@@ -82,15 +83,16 @@ def training_facts(config: Record, metrics: Sequence[Record], identified: Record
         count = f"{identified['samples']:,}"
         facts["dense samples"] = f"{count} that move, from which least squares is fitted as well"
     chart = None
+    # fits to torques have no epochs
     if metrics:
         last = metrics[-1]
-        best_epoch, kept = 0, "the start: no epoch was better"
+        best_epoch, origin = 0, "the start: no epoch was better"
         for record in metrics:
             if record["validation"] == last["best"]:
-                best_epoch, kept = record["epoch"], f"epoch {record['epoch']}"
+                best_epoch, origin = record["epoch"], f"epoch {record['epoch']}"
                 break
         facts["length"] = f"{last['epoch']} epochs, {last['step']:,} steps, {_duration(last['seconds'])}"
-        facts["kept"] = f"the model of {kept}, validation loss {number(last['best'])}"
+        facts["kept"] = f"the model of {origin}, validation loss {number(last['best'])}"
         facts["setbacks"] = f"{last['rollbacks']} epochs undone" if last["rollbacks"] else "none"
         if options.get("solver", "rk4") == "rk4":
             facts["integrator"] = f"rk4, {last['substeps']} steps between samples"

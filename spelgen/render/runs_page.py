@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +19,10 @@ from spelgen.render.page import render_page
 from spelgen.render.plots import ERRORS, FORCE, Panel, Record, growth_panels
 from spelgen.spec import Facts, read_facts
 
+MEASURES = {
+    "mean_relative_rms": "Error relative to the motion",
+    "tip_mm": "Error of the tip's position [mm]",
+}
 STYLES = ("model", "train", "gravity", "coriolis", "friction", "hold")
 
 
@@ -99,16 +103,16 @@ def _verdict(runs: Sequence[EvaluatedRun]) -> str:
     """Say which run misses least over the longest horizon that all have, which in torque, which under commands."""
     sentences = []
     for horizon in _common(runs, "horizons")[-1:]:
-        best = _best({run.name: run.errors("horizons", horizon)["mean_relative_rms"] for run in runs})
+        best = _best(_horizon_errors(runs, horizon, "mean_relative_rms"))
         if best:
             sentences.append(
                 f"{best[1]} predicts best over {horizon} ({number(best[0])} of the motion missed)"
             )
-    best = _best({run.name: (run.torque() or {}).get("mean_nmse") for run in runs})
+    best = _best(_torque_errors(runs))
     if best:
         sentences.append(f"{best[1]} has the least torque error (nMSE {number(best[0])})")
     for replay in _common(runs, "replays")[:1]:
-        best = _best({run.name: run.replay_error(replay) for run in runs})
+        best = _best(_replay_errors(runs, replay))
         if best:
             unit = thousandths(runs[0].facts.joint_types)
             sentences.append(f"{best[1]} follows commands best, {replay} ({number(best[0])} {unit} off)")
@@ -119,57 +123,82 @@ def _verdict(runs: Sequence[EvaluatedRun]) -> str:
 
 def _best(errors: Mapping[str, float | None]) -> tuple[float, str] | None:
     """Return the smallest error and the name of its run; None where no run has one."""
-    known = [(error, name) for name, error in errors.items() if error is not None]
-    return min(known, default=None)
+    finite = [(error, name) for name, error in errors.items() if error is not None]
+    return min(finite, default=None)
 
 
 def _common(runs: Sequence[EvaluatedRun], kind: str) -> list[str]:
     """Return the names of the horizons, or of the replays, that all runs were judged over."""
-    first, *others = [[x["name"] for x in run.evaluation.get(kind, ())] for run in runs]
-    return [name for name in first if all(name in names for names in others)]
+    names = []
+    for run in runs:
+        names.append([x["name"] for x in run.evaluation.get(kind, ())])
+    return _in_all(names)
+
+
+def _in_all(lists: Sequence[Iterable[str]]) -> list[str]:
+    """Return the names that stand in all lists, in the order of the first."""
+    names = list(lists[0])
+    for other in lists[1:]:
+        names = [name for name in names if name in other]
+    return names
 
 
 def _tables(runs: Sequence[EvaluatedRun]) -> list[Table]:
     tables = []
     horizons = _common(runs, "horizons")
-    for measure, title in (
-        ("mean_relative_rms", "Error relative to the motion"),
-        ("tip_mm", "Error of the tip's position [mm]"),
-    ):
-        rows = [{run.name: run.errors("horizons", name)[measure] for run in runs} for name in horizons]
-        if any(value is not None for row in rows for value in row.values()):
+    for measure, title in MEASURES.items():
+        rows = [_horizon_errors(runs, horizon, measure) for horizon in horizons]
+        if any(set(row.values()) != {None} for row in rows):  # there is no tip without a URDF
             tables.append(table(title, horizons, rows))
     tables += _torque_tables(runs)
-    tables += [_replay_table(runs, name) for name in _common(runs, "replays")]
+    for replay in _common(runs, "replays"):
+        tables.append(_replay_table(runs, replay))
     return tables
 
 
+def _horizon_errors(runs: Sequence[EvaluatedRun], horizon: str, measure: str) -> dict[str, float | None]:
+    return {run.name: run.errors("horizons", horizon)[measure] for run in runs}
+
+
+def _torque_errors(runs: Sequence[EvaluatedRun]) -> dict[str, float | None]:
+    """Return the mean nMSE of torques by run, None where its logs tell none."""
+    errors: dict[str, float | None] = {}
+    for run in runs:
+        torque = run.torque()
+        errors[run.name] = None if torque is None else torque["mean_nmse"]
+    return errors
+
+
+def _replay_errors(runs: Sequence[EvaluatedRun], replay: str) -> dict[str, float | None]:
+    return {run.name: run.replay_error(replay) for run in runs}
+
+
 def _torque_tables(runs: Sequence[EvaluatedRun]) -> list[Table]:
-    errors = {}
+    facts = runs[0].facts
+    labels = [f"{joint} [{FORCE[kind]}]" for joint, kind in zip(facts.joints, facts.joint_types, strict=True)]
+    rows: list[dict[str, float | None]] = [{} for _ in labels]
+    same_joints = True
     for run in runs:
         torque = run.torque()
         if torque is None:
             return []
-        errors[run.name] = torque
-    means = {name: error["mean_nmse"] for name, error in errors.items()}
-    tables = [table("Torque error, nMSE", ["mean of all"], [means])]
-    facts = runs[0].facts
-    if all(run.facts.joints == facts.joints for run in runs):
-        labels, rows = [], []
-        for k, (joint, kind) in enumerate(zip(facts.joints, facts.joint_types, strict=True)):
-            labels.append(f"{joint} [{FORCE[kind]}]")
-            rows.append({name: error["rmse"][k] for name, error in errors.items()})
+        same_joints &= run.facts.joints == facts.joints
+        for row, error in zip(rows, torque["rmse"], strict=False):
+            row[run.name] = error
+    tables = [table("Torque error, nMSE", ["mean of all"], [_torque_errors(runs)])]
+    if same_joints:  # joints of other arms have nothing to be compared with
         tables.append(table("Torque error by joint, RMSE", labels, rows))
     return tables
 
 
 def _replay_table(runs: Sequence[EvaluatedRun], name: str) -> Table:
     """Return errors of the logs that all runs have replayed, and the mean of each run's own."""
-    by_run = {run.name: run.errors("replays", name)["trajectories"] for run in runs}
-    first, *others = by_run.values()
-    logs = [log for log in first if all(log in errors for errors in others)]
-    rows = [{run: 1000 * errors[log] for run, errors in by_run.items()} for log in logs]
-    rows.append({run.name: run.replay_error(name) for run in runs})
+    errors = {run.name: run.errors("replays", name)["trajectories"] for run in runs}
+    logs = _in_all(list(errors.values()))
+    rows: list[dict[str, float | None]] = []
+    for log in logs:
+        rows.append({run: 1000 * error[log] for run, error in errors.items()})
+    rows.append(_replay_errors(runs, name))
     unit = thousandths(runs[0].facts.joint_types)
     return table(f"Commands replayed, {name}: RMS of positions [{unit}]", [*logs, "mean of all"], rows)
 

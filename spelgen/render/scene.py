@@ -140,6 +140,7 @@ class Scene:
         """Return triangles from the farthest to the nearest (painter's algorithm), those that look away left out."""
         corners = (self.triangles(q) - view.middle) @ CAMERA.axes().T
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 1])
+        # half of all faces look away from the eye, and would be painted over
         facing = normals[:, 2] > 0
         corners, normals = corners[facing], normals[facing]
         cosines = normals @ np.array(CAMERA.light) / np.linalg.norm(normals, axis=1)
@@ -165,10 +166,8 @@ def scene(urdf: Path, joints: Sequence[str]) -> Scene:
     constraint = mimic_constraint(robot, joints)
     names = _links(robot, joints)
     shapes = visual_shapes(urdf, names)
-    lengths = [
-        float(np.linalg.norm(robot.joint_above[name].xyz)) for name in names if name in robot.joint_above
-    ]
-    reach = max(sum(lengths), 1e-3)
+    lengths = [np.linalg.norm(joint.xyz) for name, joint in robot.joint_above.items() if name in names]
+    reach = max(float(sum(lengths)), 1e-3)  # an arm of joints in one point has a size, too
     links = []
     for name in names:
         if shapes:
@@ -186,6 +185,7 @@ def _link(robot: Robot, name: str, names: Sequence[str], constraint: Constraint,
         return SceneLink(name, -1, np.eye(3), root, np.array([0.0, 0.0, 1.0]), False, -1, 0.0, 0.0, shape)
     driver, ratio, offset = -1, 0.0, 0.0
     if joint.moves:
+        # a mimic joint follows the joint that drives it; a locked one follows none
         row = constraint.names.index(joint.name)
         offset = float(constraint.offset[row])
         drivers = np.flatnonzero(constraint.jacobian[row])
@@ -208,32 +208,34 @@ def _link(robot: Robot, name: str, names: Sequence[str], constraint: Constraint,
 
 def _links(robot: Robot, joints: Sequence[str]) -> list[str]:
     """Return the links from the root to the last joint, and all that the joints carry; parents first."""
-    shown = {robot.joint[name].child for name in joints}
+    visible = {robot.joint[name].child for name in joints}
+    # from the root on, so that whatever hangs on a carried link is carried, too
     for joint in robot.joints_from_root:
-        if joint.parent in shown:
-            shown.add(joint.child)
+        if joint.parent in visible:
+            visible.add(joint.child)
     for name in joints:
-        shown |= {joint.parent for joint in robot.path_to(robot.joint[name].child)}
-    return [robot.root, *(joint.child for joint in robot.joints_from_root if joint.child in shown)]
+        for joint in robot.path_to(robot.joint[name].child):
+            visible.add(joint.parent)
+    return [robot.root, *(joint.child for joint in robot.joints_from_root if joint.child in visible)]
 
 
 def _tubes(robot: Robot, name: str, names: Sequence[str], radius: float) -> Shape:
     """Return tubes from the link's origin to the joints that it carries; the last link ends at its centre of mass."""
     joint, inertial = robot.joint_above.get(name), robot.link[name].inertial
     below = [joint for joint in robot.joints_below[name] if joint.child in names]
-    parts = []
+    meshes = []
     for carried in below:
         end = np.array(carried.xyz, dtype=float)
-        parts += tube(np.zeros(3), end, radius)
+        meshes += tube(np.zeros(3), end, radius)
         if carried.type == "prismatic":  # its rail
             travel = max(abs(carried.lower or 0.0), abs(carried.upper or 0.0))
-            parts += tube(end, end + travel * _rotation(carried) @ _axis(carried), 0.4 * radius)
+            meshes += tube(end, end + travel * _rotation(carried) @ _axis(carried), 0.4 * radius)
     if not below and inertial is not None:
-        parts += tube(np.zeros(3), np.array(inertial.com, dtype=float), 0.7 * radius)
+        meshes += tube(np.zeros(3), np.array(inertial.com, dtype=float), 0.7 * radius)
     if joint is not None and joint.moves:
         shape = slide if joint.type == "prismatic" else drum
-        parts += shape(_axis(joint), 1.5 * radius)
-    return joined(parts)
+        meshes += shape(_axis(joint), 1.5 * radius)
+    return joined(meshes)
 
 
 def _axis(joint: Joint) -> np.ndarray:

@@ -72,6 +72,7 @@ def _visual_shapes(urdf: Path, links: Sequence[str]) -> dict[str, Shape]:
     """Return shapes in the links' frames. Raises where a file is not there: an arm with holes is worse than tubes."""
     import yourdfpy
 
+    # it warns of every mesh that it does not find, which the page says in one sentence
     logging.getLogger("yourdfpy").setLevel(logging.CRITICAL)
     model = yourdfpy.URDF.load(
         str(urdf), build_scene_graph=False, load_meshes=False, build_collision_scene_graph=False
@@ -123,7 +124,9 @@ def _simplified(shape: Shape, count: int) -> Shape:
         _, cluster = np.unique(grid, axis=0, return_inverse=True)
         faces = cluster.ravel()[shape.faces]
         a, b, c = faces.T
+        # triangles whose corners fell together have no area
         faces = faces[(a != b) & (b != c) & (a != c)]
+        # two triangles of the same corners lie in one place
         _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
         if len(first) <= count or cells < 3:
             break

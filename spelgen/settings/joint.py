@@ -57,6 +57,7 @@ class Coupling(Group):
 
 def _independent(rows: list[list[Fraction]]) -> bool:
     """Whether a square matrix has an inverse, by elimination, exactly."""
+    # exact: a floating determinant of a gear matrix may be 1e-17 where it is 0
     while rows:
         pivot = next((row for row in rows if row[0]), None)
         if pivot is None:

@@ -25,9 +25,10 @@ def explain(detail: Mapping[str, Any], document: Document | None, group: type[Ba
     """
     location, kind = tuple(detail["loc"]), detail["type"]
     if kind == "extra_forbidden":
-        known = _group_at(group, location[:-1]).model_fields
-        return unknown_name(location, "key", str(location[-1]), known, document)
+        names = _group_at(group, location[:-1]).model_fields
+        return unknown_name(location, "key", str(location[-1]), names, document)
     expected = EXPECTED.get(kind) or expected_text(detail["msg"])
+    # pydantic has this place for a key of a dict that is none
     if location[-1:] == ("[key]",):
         location, expected = location[:-1], "a name; write it in quotes"
         if kind == "string_pattern_mismatch":
@@ -37,18 +38,19 @@ def explain(detail: Mapping[str, Any], document: Document | None, group: type[Ba
         got = "nothing"
     elif kind == "value_error" and not location:
         got = "these settings"
+    # a list of a thousand numbers would bury the message
     if len(got) > LONGEST_VALUE:
         got = got[: LONGEST_VALUE - 3] + "..."
     return SettingsError(got, expected=expected, **_place(location, document))
 
 
 def unknown_name(
-    location: Location, kind: str, name: str, known: Iterable[str], document: Document | None
+    location: Location, kind: str, name: str, names: Iterable[str], document: Document | None
 ) -> SettingsError:
     """Return the error for a name that a file speaks of and nothing has, with the known name that is closest."""
-    place = _place(location, document)
-    place["element"] = dotted(location[:-1])
-    return SettingsError(f"unknown {kind} {name!r}", do=suggestion(name, known), **place)
+    fields = _place(location, document)
+    fields["element"] = dotted(location[:-1])
+    return SettingsError(f"unknown {kind} {name!r}", do=suggestion(name, names), **fields)
 
 
 def expected_text(message: str) -> str:

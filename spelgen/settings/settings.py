@@ -104,18 +104,21 @@ def load_settings(urdf_path: Path | str, joints: Iterable[str] | None = None) ->
         return Settings()
     document = read_document(path)
     content = document.value()
-    known = None if joints is None else list(joints)
+    joint_names = None if joints is None else list(joints)
+    # a group that one step reads must not stop the others: it is taken out and read by itself
     groups: dict[str, object] = {}
     step_errors: list[SettingsError] = []
     for name in OF_A_STEP:
         if isinstance(content, dict) and name in content:
-            settings, errors = _read(document, {name: content.pop(name)}, known)
+            settings, errors = _read(document, {name: content.pop(name)}, joint_names)
             groups[name] = Unusable(errors) if errors else getattr(settings, name)
             step_errors += errors
-    settings, errors = _read(document, content, known)
+    settings, errors = _read(document, content, joint_names)
+    # what is wrong with the arm is told with all else that is wrong
     if errors:
         collect([*errors, *step_errors])
     settings = settings.model_copy(update=groups)
+    # the arm says once what it is commanded by; its logs follow
     if settings.input == "position" and not isinstance(settings.logs, Unusable):
         logs = settings.logs.model_copy(update={"input": "position"})
         settings = settings.model_copy(update={"logs": logs})
@@ -127,23 +130,23 @@ def load_mapping(path: Path | str, joints: Iterable[str]) -> LogMapping:
 
     Raises SettingsError as `load_settings` does, and for joints that are not among `joints`.
     """
-    document, known = read_document(Path(path)), list(joints)
+    document, joint_names = read_document(Path(path)), list(joints)
     mapping, errors = _validated(document, document.value(), LogMapping)
-    unknown = [name for name in mapping.joints if name not in known]
-    errors += [unknown_name(("joints", name), "joint", name, known, document) for name in unknown]
+    unknown = [name for name in mapping.joints if name not in joint_names]
+    errors += [unknown_name(("joints", name), "joint", name, joint_names, document) for name in unknown]
     collect(errors)
     return mapping
 
 
 def _read(
-    document: Document, content: object, known: list[str] | None
+    document: Document, content: object, joint_names: list[str] | None
 ) -> tuple[Settings, list[SettingsError]]:
     """Return the settings in ``content``, the defaults where they cannot be read, and what is wrong with them."""
     settings, errors = _validated(document, content, Settings)
-    if known is not None:
+    if joint_names is not None:
         for location, name in _joint_names(settings):
-            if name not in known:
-                errors.append(unknown_name(location, "joint", name, known, document))
+            if name not in joint_names:
+                errors.append(unknown_name(location, "joint", name, joint_names, document))
     return settings, errors
 
 

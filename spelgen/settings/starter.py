@@ -40,12 +40,12 @@ def starter(urdf: str, joints: Sequence[StarterJoint]) -> str:
         "## trained where the gear between logged motor torques and the joint is to be learned.",
         "# joints:",
     ]
-    for each in joints:
+    for joint in joints:
         drive = {
-            "rotor_inertia": 0.0, "gear": 1.0, "viscous": each.damping,
-            "coulomb": [each.friction, -each.friction], "actuated": True, "gain": "known",
+            "rotor_inertia": 0.0, "gear": 1.0, "viscous": joint.damping,
+            "coulomb": [joint.friction, -joint.friction], "actuated": True, "gain": "known",
         }  # fmt: skip
-        lines.append(f"#   {json.dumps(each.name)}: {_flow(drive)}")
+        lines.append(f"#   {json.dumps(joint.name)}: {_flow(drive)}")
     lines += [
         "",
         "## How this arm's logs are named and measured: docs/logs.md; `spelgen logs LOG --robot ROBOT --suggest FILE`",
@@ -57,11 +57,11 @@ def starter(urdf: str, joints: Sequence[StarterJoint]) -> str:
         "#   units: {t: s}",
         "#   joints:",
     ]
-    for each in joints:
-        turns = each.kind == "revolute"
+    for joint in joints:
+        turns = joint.kind == "revolute"
         units = {"q": "rad", "qd": "rad/s", "tau": "Nm"} if turns else {"q": "m", "qd": "m/s", "tau": "N"}
-        log = {"name": each.name, "sign": 1, "offset": 0.0, "torque_offset": 0.0, "units": units}
-        lines.append(f"#     {json.dumps(each.name)}: {_flow(log)}")
+        log = {"name": joint.name, "sign": 1, "offset": 0.0, "torque_offset": 0.0, "units": units}
+        lines.append(f"#     {json.dumps(joint.name)}: {_flow(log)}")
     lines += [
         "",
         "## How `spelgen simulate` drives the arm: tracking, or random-inputs: torques drawn from `inputs` [Nm].",
