@@ -94,7 +94,7 @@ def _mass_panels(
     rows, columns = np.tril_indices(len(joint_types))
     for i, j in zip(rows.tolist(), columns.tolist(), strict=True):
         entries[i, j] = {name: numbers(along)[:, i, j] for name, along in masses.items()}
-    return mass_panels(example.t, entries, {"true": "truth", **styles}, joint_types, width=400)
+    return mass_panels(numbers(example.t), entries, {"true": "truth", **styles}, joint_types, width=400)
 
 
 def _prediction_panels(
@@ -109,7 +109,7 @@ def _prediction_panels(
             lines = [Line("measured", measured.t, [row[k] for row in getattr(measured, key)], "truth")]
             for name, example in examples.items():
                 predicted = getattr(example, f"predicted_{key}")
-                lines.append(Line(name, example.t, [row[k] for row in predicted], styles[name]))
+                lines.append(Line(name, numbers(example.t), [row[k] for row in predicted], styles[name]))
             title = f"{quantity} of {joint}"
             charts.append(line_chart(lines, title, "t [s]", f"{quantity} [{unit}]", height=170))
         panels.append(Panel(joint, tuple(charts)))

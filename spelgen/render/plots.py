@@ -197,7 +197,7 @@ def trajectory_panels(example: Record, joints: Sequence[str], joint_types: Seque
 
 
 def mass_panels(
-    t: Sequence[float],
+    t: Values,
     entries: Mapping[tuple[int, int], Mapping[str, Values]],
     styles: Mapping[str, str],
     joint_types: Sequence[str],
