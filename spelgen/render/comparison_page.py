@@ -106,10 +106,10 @@ def _prediction_panels(
     for k, (joint, kind) in enumerate(zip(facts.joints, facts.joint_types, strict=True)):
         charts = []
         for (key, quantity), unit in zip(QUANTITIES.items(), UNITS[kind], strict=True):
-            lines = [Line("measured", measured.t, [row[k] for row in getattr(measured, key)], "truth")]
+            lines = [Line("measured", numbers(measured.t), numbers(getattr(measured, key))[:, k], "truth")]
             for name, example in examples.items():
-                predicted = getattr(example, f"predicted_{key}")
-                lines.append(Line(name, numbers(example.t), [row[k] for row in predicted], styles[name]))
+                predicted = numbers(getattr(example, f"predicted_{key}"))[:, k]
+                lines.append(Line(name, numbers(example.t), predicted, styles[name]))
             title = f"{quantity} of {joint}"
             charts.append(line_chart(lines, title, "t [s]", f"{quantity} [{unit}]", height=170))
         panels.append(Panel(joint, tuple(charts)))
