@@ -3,7 +3,6 @@
 import shutil
 
 import numpy as np
-import onnx
 import pytest
 import torch
 from exported_runs import arm_of, moved_model
@@ -15,7 +14,6 @@ from spelgen.exporting.c_source import c_entries, c_source
 from spelgen.exporting.casadi_export import called_by_state, casadi_functions
 from spelgen.exporting.describe import describe
 from spelgen.exporting.entry_points import ENTRY_POINTS
-from spelgen.exporting.onnx_export import called_by_onnx, onnx_model
 from spelgen.exporting.parity import check_parity
 from spelgen.exporting.trained import Trained
 
@@ -57,16 +55,13 @@ def c_library(model, folder):
 
 
 def test_what_is_zero_is_left_out():
-    """C of a fit without residuals is that of closed-form, byte for byte, and ONNX as small."""
+    """C of a fit without residuals is that of closed-form, byte for byte."""
     model = with_parts("rpr")
     ours = describe(model, arm_of("rpr"))
     other = describe(closed_form(model, "rpr"), arm_of("rpr"))
     assert not ours.residuals
     text, plain = (c_source(each, c_entries(each)).split("\n", 1)[1] for each in (ours, other))
     assert text == plain
-    pair = (model, closed_form(model, "rpr"))
-    graphs = [onnx.load_from_string(onnx_model(each.prepared(), "inverse_dynamics")).graph for each in pair]
-    assert len(graphs[0].node) == len(graphs[1].node)
 
 
 @needs_gcc
@@ -89,9 +84,6 @@ def test_each_part_goes_alone(parts, tmp_path):
     values = [name for name in names if not name.endswith("derivatives")]
     casadi = called_by_state(casadi_functions(model))
     check_parity(casadi, trained, values, 1e-12, states=20)
-    prepared = trained.model.prepared()
-    runtime = called_by_onnx({name: onnx_model(prepared, name) for name in ("inverse_dynamics", "gravity")})
-    check_parity(runtime, trained, ["inverse_dynamics", "gravity"], 1e-12, states=20)
 
 
 def test_a_function_of_one_joint_stays_with_it():

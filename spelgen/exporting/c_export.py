@@ -40,5 +40,6 @@ def c_files(trained: Trained) -> tuple[dict[str, bytes], str]:
             library = CLibrary(link_library(compiled, program), model)
             parity = check_parity(library, trained, list(entry_points(model)), TUNING.tolerance)
             checked = f"Checked when exported, compiled by {Path(program).name}: {parity.summary}."
+    # again, for the sizes are known after it was compiled
     header = c_header(model, c_entries(model), sizes)
     return {f"{model.name}.h": header.encode(), f"{model.name}.c": content}, checked

@@ -67,8 +67,9 @@ def measured(object_file: Path, program: str, model: TrainedModel) -> str:
     stack = "stack not known"
     public = [frames.pop(f"{model.name}_{name}", 0) for name in entry_points(model)]
     if any(public):
-        # at most: as if each of the other functions called the next
-        stack = f"at most {max(public) + sum(frames.values())} bytes of stack"
+        # an upper bound: as if each of the inner functions called the next
+        inner = sum(frames.values())
+        stack = f"at most {max(public) + inner} bytes of stack"
     version = subprocess.run([program, "-dumpfullversion"], capture_output=True, text=True, check=False)
     which = f"{Path(program).name} {version.stdout.strip()} -O2 on {platform.machine()}"
     return f"By {which}: {_code_size(object_file)} bytes of code and constants, {stack}"
@@ -88,11 +89,14 @@ class CLibrary:
     """The functions of a compiled export, for arrays of states."""
 
     def __init__(self, library: Path, model: TrainedModel, dtype: type = np.float64) -> None:
-        self._library, self._model, self._dtype = ctypes.CDLL(str(library)), model, dtype
+        self._library = ctypes.CDLL(str(library))
+        self._model = model
+        self._dtype = dtype
 
     def __call__(self, name: str, inputs: Values) -> Mapping[str, np.ndarray]:
         """Return an entry point's outputs, (states, ...), as float64."""
-        entry, states = entry_points(self._model)[name], len(inputs["q"])
+        entry = entry_points(self._model)[name]
+        states = len(inputs["q"])
         function = getattr(self._library, f"{self._model.name}_{name}")
         function.restype = None
         arrays: list[np.ndarray] = []
@@ -100,10 +104,13 @@ class CLibrary:
             arrays.append(np.ascontiguousarray(inputs[key], dtype=self._dtype))
         outputs: dict[str, np.ndarray] = {}
         for key in entry.output_names:
-            outputs[key] = np.full((states, *self._shape(name, key)), np.nan, self._dtype)
+            # NaN: what the function does not write is noticed
+            shape = (states, *self._shape(name, key))
+            outputs[key] = np.full(shape, np.nan, self._dtype)
         arrays += outputs.values()
         for state in range(states):
-            function(*(array[state : state + 1].ctypes.data_as(ctypes.c_void_p) for array in arrays))
+            rows = [array[state : state + 1] for array in arrays]
+            function(*(row.ctypes.data_as(ctypes.c_void_p) for row in rows))
         return {key: value.astype(np.float64) for key, value in outputs.items()}
 
     def _shape(self, entry: str, output: str) -> tuple[int, ...]:

@@ -36,15 +36,19 @@ _CALLS = (
 
 def residual_calls(model: TrainedModel, names: Sequence[str]) -> tuple[list[str], list[str]]:
     """Return the variables, and the calls that compute these residuals of q, and of qd where they need it."""
-    missing, symbols = set(names), residual_symbols(model)
+    missing = set(names)
+    symbols = residual_symbols(model)
     variables: list[str] = []
     calls: list[str] = []
     for needed, call, computed in _CALLS:
         if not missing.intersection(needed):
             continue
         missing.difference_update(computed)
-        variables += [f"{RESIDUAL}{name}[{symbols[name].numel()}]" for name in computed]
-        calls.append(f"{call}, {', '.join(RESIDUAL + name for name in computed)});")
+        arguments = []
+        for name in computed:
+            variables.append(f"{RESIDUAL}{name}[{symbols[name].numel()}]")
+            arguments.append(RESIDUAL + name)
+        calls.append(f"{call}, {', '.join(arguments)});")
     if "(encoded" in "".join(calls):
         variables.insert(0, "encoded[ENCODED]")
         calls.insert(0, "encode(q, encoded);")
@@ -53,7 +57,9 @@ def residual_calls(model: TrainedModel, names: Sequence[str]) -> tuple[list[str]
 
 def network_source(model: TrainedModel) -> list[str]:
     """Return the C text of all networks, nothing where there are none."""
-    residuals, n, indices = model.residuals, model.n, entry_indices(model)
+    n = model.n
+    residuals = model.residuals
+    indices = entry_indices(model)
     networks: dict[str, Network] = {}
     if residuals.mass is not None:
         rows = [row * n + column for row, column in indices]
@@ -74,9 +80,10 @@ def network_source(model: TrainedModel) -> list[str]:
         for k, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True), start=1):
             layer = f"{name}_{k}"
             tables += _layer_tables(layer, weight, bias)
+            outputs, inputs = weight.shape
             fields = f"{layer}_bias, {layer}_weight, {layer}_first, {layer}_last"
-            layers[name].append(f"{weight.shape[1]}, {weight.shape[0]}, {fields}")
-            width = max(width, weight.shape[0])
+            layers[name].append(f"{inputs}, {outputs}, {fields}")
+            width = max(width, outputs)
     text = render(
         "networks.c.jinja",
         n=n,
@@ -102,13 +109,15 @@ def _with_outputs(network: Network, rows: list[int]) -> Network:
 
 def _layer_tables(name: str, weight: np.ndarray, bias: np.ndarray) -> list[str]:
     """Return tables of bias, weight by input from first to last that is not zero, first and last."""
-    first, last, packed = [], [], []
+    first: list[int] = []
+    last: list[int] = []
+    packed: list[np.ndarray] = []
     for column in weight.T:
-        reached = np.flatnonzero(column)
-        start, stop = (reached[0], reached[-1] + 1) if reached.size else (0, 0)
-        first.append(start)
-        last.append(stop)
-        packed.append(column[start:stop])
+        # masked networks: an input reaches a block of the outputs
+        reached = np.flatnonzero(column).tolist() or [0, -1]
+        first.append(reached[0])
+        last.append(reached[-1] + 1)
+        packed.append(column[first[-1] : last[-1]])
     return [
         _table(f"{name}_bias", bias),
         _table(f"{name}_weight", np.concatenate(packed)),
@@ -120,7 +129,8 @@ def _layer_tables(name: str, weight: np.ndarray, bias: np.ndarray) -> list[str]:
 def joint_function_source(model: TrainedModel) -> list[str]:
     """Return the C text of all functions of single joints, nothing where there are none."""
     residuals = model.residuals
-    torque, factor = residuals.torque, residuals.friction
+    torque = residuals.torque
+    factor = residuals.friction
     if not (residuals.has_torque or factor.joints):
         return []
     tables: list[str] = []
@@ -166,19 +176,26 @@ def _energies(splines: Splines) -> np.ndarray:
 
 def _spline_fields(splines: Splines) -> list[str]:
     """Return by spline: joint, start, spacing."""
-    start = splines.center - splines.spacing * ((splines.weights.shape[1] - 1) / 2 + 2)
-    rows = zip(splines.joints, start.tolist(), splines.spacing.tolist(), strict=True)
-    return [f"{joint}, {first!r}, {spacing!r}" for joint, first, spacing in rows]
+    fields: list[str] = []
+    size = splines.weights.shape[1]
+    for joint, center, spacing in zip(splines.joints, splines.center, splines.spacing, strict=True):
+        start = center - spacing * ((size - 1) / 2 + 2)
+        fields.append(f"{joint}, {float(start)!r}, {float(spacing)!r}")
+    return fields
 
 
 def _table(name: str, values: np.ndarray) -> str:
     """Return a constant array of C, numbers with all their digits."""
-    kind = "short" if values.dtype.kind == "i" else "real"
-    size = "[]"
-    if values.ndim == 2:
-        size = f"[][{values.shape[1]}]"
-        lines = [f"    {{{', '.join(map(repr, row))}}}," for row in values.tolist()]
-    else:
+    kind = "real"
+    if values.dtype.kind == "i":
+        kind = "short"
+    if values.ndim == 1:
+        size = "[]"
         numbers = ", ".join(map(repr, values.tolist()))
         lines = wrap(numbers, _WIDTH, initial_indent="    ", subsequent_indent="    ")
+    else:
+        size = f"[][{values.shape[1]}]"
+        lines = []
+        for row in values.tolist():
+            lines.append(f"    {{{', '.join(map(repr, row))}}},")
     return "\n".join([f"static const {kind} {name}{size} = {{", *lines, "};"])

@@ -84,6 +84,7 @@ def _title(model: TrainedModel) -> str:
 def _entry(model: TrainedModel, entry: EntryPoint) -> CEntry:
     function = expression_function(entry, model)
     signature = _signature(model, entry, function)
+    # residuals first, for the statements read them
     residuals, calls = residual_calls(model, residuals_needed(function))
     variables, lines = statements(function, entry.output_names)
     text = " ".join((*calls, *lines))

@@ -52,18 +52,25 @@ def _with_residuals(entry: EntryPoint, model: TrainedModel) -> ca.Function:
     if not needed:
         return function
     states = {name: ca.MX.sym(name, function.size1_in(name)) for name in entry.inputs}
+    arguments = list(states.values())
     residuals = residual_values(model, states["q"], states.get("qd"))
-    outputs = function.call([*states.values(), *(residuals[name] for name in needed)])
-    return ca.Function(entry.name, list(states.values()), outputs, list(states), list(entry.output_names))
+    for name in needed:
+        arguments.append(residuals[name])
+    outputs = function.call(arguments)
+    names = list(entry.inputs), list(entry.output_names)
+    return ca.Function(entry.name, list(states.values()), outputs, *names)
 
 
 def _derivatives(entry: EntryPoint, function: ca.Function) -> ca.Function:
     inputs = dict(zip(entry.inputs, function.mx_in(), strict=True))
-    (output,) = function.call(list(inputs.values()))
-    by_input = [
-        ca.densify(ca.jacobian(output, inputs[name])) for name in ("q", "qd", "tau") if name in inputs
-    ]
-    return ca.Function(entry.name, list(inputs.values()), by_input, list(inputs), list(entry.output_names))
+    arguments = list(inputs.values())
+    (output,) = function.call(arguments)
+    derivatives: list[ca.MX] = []
+    for name in ("q", "qd", "tau"):
+        if name in inputs:
+            derivatives.append(ca.densify(ca.jacobian(output, inputs[name])))
+    names = list(entry.inputs), list(entry.output_names)
+    return ca.Function(entry.name, arguments, derivatives, *names)
 
 
 def _saved(function: ca.Function) -> bytes:
@@ -78,12 +85,14 @@ def called_by_state(functions: Mapping[str, ca.Function]) -> Called:
 
     def called(name: str, inputs: Values) -> Values:
         function = functions[name]
-        rows = [inputs[key] for key in function.name_in()]
-        outputs: dict[str, list[np.ndarray]] = {key: [] for key in function.name_out()}
-        for state in zip(*rows, strict=True):
-            for values, result in zip(outputs.values(), function.call([*map(ca.DM, state)]), strict=True):
-                # CasADi's vectors are columns
-                values.append(result.full()[:, 0] if result.shape[1] == 1 else result.full())
-        return {key: np.array(values) for key, values in outputs.items()}
+        states = zip(*(inputs[key] for key in function.name_in()), strict=True)
+        results = [function.call([ca.DM(x) for x in state]) for state in states]
+        outputs: Values = {}
+        for k, key in enumerate(function.name_out()):
+            values = np.array([result[k].full() for result in results])
+            if values.shape[-1] == 1:  # CasADi's vectors are columns
+                values = values[..., 0]
+            outputs[key] = values
+        return outputs
 
     return called

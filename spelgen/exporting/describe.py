@@ -43,13 +43,14 @@ def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
         raise _unsupported(f"the preset {preset}, which is not of rigid bodies")
     weights = exact.prepare()
     tip_link, tip, end = tip_chain(loaded)
+    # what does not depend on q is one matrix, whatever it comes from
     constant_mass = array(weights.armature)
     residuals = _NO_RESIDUALS
     if has_residuals(exact):
         constant_mass += array(weights.residual.mass.constant).reshape(exact.n, exact.n)
         residuals = _residuals(exact, weights)
     gains = array(weights.input)
-    if gains.ndim == 1:
+    if gains.ndim == 1:  # joints that are driven one by one
         gains = np.diag(gains)
     return TrainedModel(
         name=identifier(loaded.arm.name),
@@ -79,6 +80,7 @@ def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
 def identifier(text: str) -> str:
     """Return ASCII letters, digits and underscores of a text: a name that any language takes."""
     plain = re.sub(r"[^0-9a-z]+", "_", text.lower()).strip("_")[:_LONGEST_NAME]
+    # emitted Python has the same names
     if not plain or plain[0].isdigit() or keyword.iskeyword(plain):
         return f"arm_{plain}".rstrip("_")
     return plain
@@ -138,6 +140,7 @@ def _network(layers: Any) -> Network | None:
     """Return a network, None where there is none or its last layer is zero."""
     if layers is None or not (layers.weights[-1].any() or layers.biases[-1].any()):
         return None
+    # an emitted module brings classes of its own
     if type(layers).__name__ != "MLPLayers":
         raise _unsupported("Kolmogorov-Arnold networks beside rigid bodies")
     return Network(tuple(map(array, layers.weights)), tuple(map(array, layers.biases)))
@@ -147,6 +150,7 @@ def _tanh_then(network: Network, functions: np.ndarray) -> Network:
     """Return the network of tanh(y) @ functions as one with a layer more: tanh x is 2 sigmoid(2 x) - 1."""
     *weights, last_weight = network.weights
     *biases, last_bias = network.biases
+    # outputs that are always zero would be units of the last hidden layer
     used = last_weight.any(axis=1) | (last_bias != 0)
     functions = functions[used]
     weights += [2 * last_weight[used], 2 * functions.T]
@@ -174,6 +178,7 @@ def _ripple(functions: Any, weights: Tensor) -> tuple[Harmonics, ...]:
         regular = int(np.argmin(frequencies == np.arange(1, count + 1))) or count
         for block in (slice(0, regular), slice(regular, count)):
             c, s = cosines[joint, block], sines[joint, block]
+            # a phasor turns from one on: zeros between stay, those behind go
             used = np.flatnonzero((c != 0) | (s != 0))
             if used.size:
                 last = used[-1] + 1

@@ -13,6 +13,7 @@ from spelgen.arm.arm import Body, Coordinate
 class TipJoint:
     """A joint on the way to the tip: origin (4, 4), then a turn about z or a slide along it by row @ q + offset."""
 
+    name: str
     origin: np.ndarray
     revolute: bool
     row: np.ndarray

@@ -77,7 +77,7 @@ class Exported:
             outputs = paths
         else:
             paths = [path / name for name in self.files]
-            outputs = [path]
+            outputs = [path]  # a folder of another export is no less in the way than a file
         for output in outputs:
             if output.exists() and not force:
                 raise RunError("this output exists already", file=output, do="force replaces it")
@@ -108,6 +108,7 @@ def require_fitting(to: str, path: Path) -> None:
 
 def readme(title: str, use: str, joints: Sequence[str], conventions: str, checked: str) -> bytes:
     """Return the five lines beside an export: title, use, joints in their order, conventions, result of the check."""
+    # names come from a file that anyone may have written
     names = ", ".join(printable(name) for name in joints)
     lines = [f"# {printable(title)}", use, f"Joints, in this order: {names}.", conventions, checked]
     if any("\n" in line for line in lines):

@@ -12,11 +12,15 @@ def law_torque(law: FrictionLaw, qd: ca.SX, gravity: ca.SX, direction: ca.SX) ->
 
     direction: of dry friction, from -1 to 1.
     """
-    dry = ca.SX(law.coulomb) + law.load_dependence * ca.fabs(gravity)
+    load = law.load_dependence * ca.fabs(gravity)
+    dry = ca.SX(law.coulomb) + load
+    # CasADi would not see that zero times an exponential is zero
     if law.stribeck.any():
-        dry = dry + law.stribeck * ca.exp(-((qd / law.stribeck_velocity) ** 2))
+        fading = ca.exp(-((qd / law.stribeck_velocity) ** 2))
+        dry = dry + law.stribeck * fading
+    viscous = law.viscous * qd
     saturating = law.saturation * ca.tanh(qd / law.saturation_velocity)
-    torque: ca.SX = law.viscous * qd + saturating + dry * direction
+    torque: ca.SX = viscous + saturating + dry * direction
     return torque
 
 
@@ -28,8 +32,10 @@ def sliding_direction(law: FrictionLaw, qd: ca.SX) -> ca.SX:
 def bristle_direction(bristles: Bristles, z: ca.SX) -> ca.SX:
     """Return the sum of fraction z / reach over a joint's elements, (n, 1); z: joint by joint, (n K, 1)."""
     n, count = bristles.reach.shape
-    bent = z * (bristles.fractions / bristles.reach).ravel()
-    return ca.sum2(ca.reshape(bent, count, n).T)
+    stiffness = bristles.fractions / bristles.reach
+    bent = z * stiffness.ravel()
+    # CasADi reshapes column by column: a joint's elements are a column
+    return ca.sum1(ca.reshape(bent, count, n)).T
 
 
 def sliding_bristles(bristles: Bristles, law: FrictionLaw, qd: ca.SX) -> ca.SX:

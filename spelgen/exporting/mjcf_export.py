@@ -62,11 +62,15 @@ def check_mjcf(
     """
     simulated = _Simulated(text, projection)
     random = random_inputs(projection.arm.arm.coordinates, states)
-    q, qd = (torch.from_numpy(random[key]) for key in ("q", "qd"))
-    controls = random["tau"] if servos is None else random["u"]
-    torques = random["tau"] if servos is None else _servo_torques(servos, random)
+    q = torch.from_numpy(random["q"])
+    qd = torch.from_numpy(random["qd"])
+    controls = torques = random["tau"]
+    if servos is not None:
+        controls = random["u"]
+        torques = _servo_torques(servos, random)
     masses, biases, accelerations = simulated(random["q"], random["qd"], controls)
-    mass, bias = projection.bodies.mass_matrix(q), projection.bodies.nonlinear_effects(q, qd)
+    mass = projection.bodies.mass_matrix(q)
+    bias = projection.bodies.nonlinear_effects(q, qd)
     differences = {
         "mass_matrix": relative(masses, mass.numpy()),
         "bias": relative(biases, bias.numpy()),
@@ -91,7 +95,9 @@ class _Simulated:
     def __init__(self, text: bytes, projection: RigidBodyProjection) -> None:
         arm = projection.arm.arm
         model = self._model = mujoco.MjModel.from_xml_string(text.decode())
-        model.dof_damping[:], model.dof_frictionloss[:] = 0.0, 0.0
+        # MuJoCo's friction is not the model's: it is left out of the comparison
+        model.dof_damping[:] = 0.0
+        model.dof_frictionloss[:] = 0.0
         self.has_followers = model.nv != len(arm.coordinates)
         self._dofs = [int(model.jnt_dofadr[model.joint(body.name).id]) for body in arm.bodies]
         self._jacobian = np.zeros((model.nv, len(arm.coordinates)))
@@ -108,14 +114,18 @@ class _Simulated:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return M, bias and accelerations of states, (states, ...)."""
         data = mujoco.MjData(self._model)
-        jacobian, full = self._jacobian, np.zeros((self._model.nv, self._model.nv))
-        masses, biases, accelerations = [], [], []
+        jacobian = self._jacobian
+        full = np.zeros((self._model.nv, self._model.nv))
+        masses: list[np.ndarray] = []
+        biases: list[np.ndarray] = []
+        accelerations: list[np.ndarray] = []
         for state in range(len(q)):
             data.qpos[:] = jacobian @ q[state] + self._offset
             data.qvel[:] = jacobian @ qd[state]
             data.ctrl[self._actuators] = controls[state, self._driven]
             mujoco.mj_forward(self._model, data)
             mujoco.mj_fullM(self._model, data, full)
+            # by the arm's coordinates: followers move with their leaders
             masses.append(jacobian.T @ full @ jacobian)
             biases.append(jacobian.T @ data.qfrc_bias)
             accelerations.append(data.qacc[self._dofs].copy())

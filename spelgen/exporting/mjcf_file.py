@@ -30,6 +30,7 @@ def mjcf_text(
     """
     arm = projection.arm.arm
     root = etree.Element("mujoco", model=arm.name)
+    # MJCF's default is degrees; a limit counts where it stands
     etree.SubElement(root, "compiler", angle="radian", autolimits="true")
     etree.SubElement(root, "option", gravity=_numbers(arm.gravity))
     bodies: list[etree._Element] = []
@@ -153,7 +154,7 @@ def _placement(position: Iterable[object], rotation: object) -> dict[str, str]:
     """Return the attributes of a pose; MuJoCo's quaternions are (w, x, y, z)."""
     matrix = np.array(rotation, dtype=float)
     quaternion = np.roll(Rotation.from_matrix(matrix).as_quat(canonical=True), 1)
-    quaternion[np.abs(quaternion) < 1e-16] = 0.0
+    quaternion[np.abs(quaternion) < 1e-16] = 0.0  # rounding
     return {"pos": _numbers(position), "quat": _numbers(quaternion)}
 
 

@@ -32,7 +32,9 @@ class ModelExpressions:
     """
 
     def __init__(self, model: TrainedModel, *, derivatives: bool = False) -> None:
-        self.model, self.n, self._derivatives = model, model.n, derivatives
+        self.model = model
+        self.n = model.n
+        self._derivatives = derivatives
         names = ("q", "qd", "qdd", "tau", "dq", "u")
         self.inputs = {name: ca.SX.sym(name, self.n) for name in names}
         self.inputs["z"] = ca.SX.sym("z", model.memory)
@@ -85,9 +87,12 @@ class ModelExpressions:
     @cached_property
     def friction(self) -> ca.SX:
         """The torques of friction, which follows the speeds of the motors, (n, 1)."""
-        law, bristles, motors = self.model.friction, self.model.bristles, self.model.motors
+        law = self.model.friction
+        bristles = self.model.bristles
+        motors = self.model.motors
         speed = constant(motors) @ self.qd
         load = self._rest
+        # gravity would be computed for nothing
         if law.load_dependence.any():
             load = constant(np.linalg.inv(motors).T) @ self._rigid_gravity
         if bristles is None:
@@ -117,8 +122,10 @@ class ModelExpressions:
     @cached_property
     def _force(self) -> ca.SX:
         """M qdd + h + friction, less what the drives add unseen, (n, 1)."""
-        moved = self._rigid.torque(self.qd, self.qdd) + self._added_mass @ self.qdd
-        return moved + self._residual_bias + self.friction - self._compensation
+        # one pass of Newton and Euler, where M qdd + h would take two
+        rigid = self._rigid.torque(self.qd, self.qdd)
+        added = self._added_mass @ self.qdd + self._residual_bias
+        return rigid + added + self.friction - self._compensation
 
     @property
     def _compensation(self) -> ca.SX:
@@ -126,6 +133,7 @@ class ModelExpressions:
 
     def _inputs(self, force: ca.SX) -> ca.SX:
         """Return the inputs that make these forces, (n, columns)."""
+        # a passive joint's own torque is what it lacks
         inputs = self.model.inputs + np.diag(1 - self.model.actuated)
         if np.array_equal(inputs, np.eye(self.n)):
             return force
@@ -138,7 +146,8 @@ class ModelExpressions:
     @cached_property
     def forward_dynamics(self) -> ca.SX:
         force = constant(self.model.inputs) @ (self.tau - self.model.torque_offset)
-        return _solve(self.mass_matrix, force + self._compensation - self.bias - self.friction)
+        force = force + self._compensation - self.bias - self.friction
+        return _solve(self.mass_matrix, force)
 
     @property
     def momentum(self) -> ca.SX:
@@ -170,12 +179,16 @@ class ModelExpressions:
         torque: ca.SX = servos.kp * error - servos.kd * self.qd
         for joint in np.flatnonzero(np.isfinite(servos.limit)).tolist():
             limit = servos.limit[joint]
-            torque[joint] = ca.fmax(-ca.fmax(-torque[joint], -limit), -limit)
+            # by maxima alone: C's fmin would be one function more
+            lowered = -ca.fmax(-torque[joint], -limit)
+            torque[joint] = ca.fmax(lowered, -limit)
         return torque
 
     def _force_derivatives(self) -> tuple[ca.SX, ca.SX]:
         """Return the derivatives of the force by q and by qd, (n, n) each."""
-        symbols, slopes = [self.q], [ca.SX.eye(self.n)]
+        symbols = [self.q]
+        slopes = [ca.SX.eye(self.n)]
+        # the chain rule through what the program computes by loops
         for symbol, slope in symbol_slopes(self.model, self.residuals):
             symbols.append(symbol)
             slopes.append(slope)
@@ -200,7 +213,9 @@ def expression_function(entry: EntryPoint, model: TrainedModel) -> ca.Function:
     """Return the entry point as a function of its inputs, then of the residuals that it needs; outputs are dense."""
     expressions = ModelExpressions(model, derivatives=entry.name.endswith("_derivatives"))
     result = getattr(expressions, entry.name)
-    outputs = [ca.densify(output) for output in (result if isinstance(result, tuple) else (result,))]
+    if not isinstance(result, tuple):
+        result = (result,)
+    outputs = [ca.densify(output) for output in result]
     inputs = {name: expressions.inputs[name] for name in entry.inputs}
     for name, symbols in expressions.residuals.items():
         if symbols.numel() and ca.depends_on(ca.veccat(*outputs), symbols):
@@ -221,10 +236,13 @@ def _solve(matrix: ca.SX, right: ca.SX) -> ca.SX:
     divides 6 times.
     """
     n = matrix.shape[0]
-    matrix, right = ca.SX(matrix), ca.SX(right)
+    # copies: they are changed
+    matrix = ca.SX(matrix)
+    right = ca.SX(right)
     factors: list[ca.SX] = []
     for k in range(n):
-        inverse, row = 1 / matrix[k, k], matrix[k, k + 1 :]
+        inverse = 1 / matrix[k, k]
+        row = matrix[k, k + 1 :]
         factor = inverse * row
         matrix[k + 1 :, k + 1 :] -= factor.T @ row
         right[k + 1 :, :] -= factor.T @ right[k, :]

@@ -7,7 +7,10 @@ import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
+import numpy as np
+import onnx
 import onnxruntime
+import onnxscript
 import torch
 from torch import Tensor
 
@@ -47,6 +50,7 @@ def onnx_model(model: PreparedModel, name: str) -> bytes:
             dynamo=True,
             input_names=program_inputs(model, name),
             output_names=[program_output(name)],
+            custom_translation_table={torch.ops.aten.scalar_tensor.default: _scalar_tensor},
             verbose=False,
         )
     assert exported is not None
@@ -62,10 +66,13 @@ def onnx_model(model: PreparedModel, name: str) -> bytes:
 
 def _solve(matrix: Tensor, right: Tensor, *, left: bool = True) -> Tensor:
     """Return matrix^-1 right by Gauss and Jordan; M is positive definite and needs no pivoting."""
-    n = matrix.shape[-1]
+    n = matrix.shape[-1]  # a constant of the program, so that the loop is written out
     identity = torch.eye(n, dtype=matrix.dtype)
-    # a matrix of inputs has no batch
-    rows = torch.cat([matrix.expand(*right.shape[:-1], n), right], dim=-1)
+    # a matrix of inputs has no batch, nor has a right side that is the identity
+    batch = torch.broadcast_shapes(matrix.shape[:-2], right.shape[:-2])
+    matrix = matrix.expand(*batch, n, n)
+    right = right.expand(*batch, *right.shape[-2:])
+    rows = torch.cat([matrix, right], dim=-1)
     for k in range(n):
         pivot = rows[..., k : k + 1, :]
         pivot = pivot / pivot[..., k : k + 1]
@@ -73,12 +80,32 @@ def _solve(matrix: Tensor, right: Tensor, *, left: bool = True) -> Tensor:
     return rows[..., n:]
 
 
+def _solve_triangular(
+    matrix: Tensor, right: Tensor, *, upper: bool, left: bool = True, unitriangular: bool = False
+) -> Tensor:
+    """Return matrix^-1 right, of one triangle of the matrix."""
+    if unitriangular:
+        matrix = torch.eye(matrix.shape[-1], dtype=matrix.dtype) + (
+            matrix.triu(1) if upper else matrix.tril(-1)
+        )
+    else:
+        matrix = matrix.triu() if upper else matrix.tril()
+    return _solve(matrix, right)
+
+
+def _softplus(x: Tensor, beta: float = 1.0, threshold: float = 20.0) -> Tensor:
+    """Return log(1 + exp(x)), which ONNX Runtime has in float32 alone."""
+    smooth = torch.relu(x) + torch.log(1 + torch.exp(-x.abs()))
+    return torch.where(x > threshold, x, smooth)
+
+
 def _cholesky_ex(matrix: Tensor, *, upper: bool = False, check_errors: bool = False) -> tuple[Tensor, Tensor]:
     """Return L with L L^T the matrix, and 1 where it is not positive definite, else 0.
 
     Networks of M ask for the latter alone, and ONNX leaves L out.
     """
-    rows, columns = matrix, []
+    rows = matrix
+    columns: list[Tensor] = []
     info = torch.zeros(matrix.shape[:-2], dtype=torch.int32)
     for k in range(matrix.shape[-1]):
         pivot = rows[..., k : k + 1, k : k + 1]
@@ -89,9 +116,24 @@ def _cholesky_ex(matrix: Tensor, *, upper: bool = False, check_errors: bool = Fa
     return torch.cat(columns, dim=-1), info
 
 
+def _scalar_tensor(
+    s: float,
+    dtype: int = onnx.TensorProto.DOUBLE,
+    layout: str = "",
+    device: str = "",
+    pin_memory: bool = False,
+) -> onnxscript.ir.Value:
+    """Return a constant: torch's own translation rounds it to float32 first, an error of 1e-8 in networks."""
+    value = np.array(s, dtype=onnx.helper.tensor_dtype_to_np_dtype(dtype))
+    constant: onnxscript.ir.Value = onnxscript.opset18.Constant(value=onnx.numpy_helper.from_array(value))
+    return constant
+
+
 # ONNX has no operators for these
 _DECOMPOSITIONS = {
     torch.ops.aten.linalg_solve.default: _solve,
+    torch.ops.aten.linalg_solve_triangular.default: _solve_triangular,
+    torch.ops.aten.softplus.default: _softplus,
     torch.ops.aten.linalg_cholesky_ex.default: _cholesky_ex,
 }
 
@@ -125,6 +167,8 @@ def called_by_onnx(files: Mapping[str, bytes]) -> Called:
 def onnx_session(content: bytes) -> onnxruntime.InferenceSession:
     """Return a session on one core: the matrices are small."""
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    # threads cost more than they take off such small matrices
+    options.intra_op_num_threads = 1
+    options.inter_op_num_threads = 1
     options.log_severity_level = 3  # an input that a graph does not need is no matter
     return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])

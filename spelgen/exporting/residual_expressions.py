@@ -22,10 +22,12 @@ Symbols = dict[str, ca.SX]
 
 def residual_symbols(model: TrainedModel) -> Symbols:
     """Return symbols for all that a model may have; those of what it has not are empty."""
-    residuals, n = model.residuals, model.n
-    entries, pairs = len(entry_indices(model)), n * (n + 1) // 2
-    potential, torque = int(residuals.potential is not None), int(residuals.has_torque)
-    factors = len(residuals.friction.joints)
+    n = model.n
+    entries = len(entry_indices(model))
+    pairs = n * (n + 1) // 2
+    potential = int(model.residuals.potential is not None)
+    torque = int(model.residuals.has_torque)
+    factors = len(model.residuals.friction.joints)
     sizes = {
         "mass": (entries, 1),
         "rate": (entries, 1),
@@ -46,10 +48,11 @@ def residual_symbols(model: TrainedModel) -> Symbols:
 
 def entry_indices(model: TrainedModel) -> list[tuple[int, int]]:
     """Return the places in M's lower triangle that a network reaches."""
-    network, n = model.residuals.mass, model.n
+    network = model.residuals.mass
     if network is None:
         return []
-    reached = (network.weights[-1] != 0).any(axis=1).reshape(n, n)
+    outputs = network.weights[-1].any(axis=1)  # (n n,)
+    reached = outputs.reshape(model.n, model.n)
     return [(int(row), int(column)) for row, column in np.argwhere(np.tril(reached))]
 
 
@@ -66,24 +69,26 @@ def coriolis(model: TrainedModel, symbols: Symbols, qd: ca.SX, *, derivatives: b
     n, indices = model.n, entry_indices(model)
     if not derivatives:
         return symmetric(n, indices, symbols["rate"]) @ qd - symbols["kinetic"]
-    slopes = [symmetric(n, indices, symbols["first"][:, joint]) for joint in range(n)]
-    kinetic = ca.vertcat(*(0.5 * ca.dot(qd, slope @ qd) for slope in slopes))
+    kinetic = ca.SX(n, 1)
+    for joint in range(n):
+        slope = symmetric(n, indices, symbols["first"][:, joint])
+        kinetic[joint] = 0.5 * ca.dot(qd, slope @ qd)
     return symmetric(n, indices, symbols["first"] @ qd) @ qd - kinetic
 
 
 def symbol_slopes(model: TrainedModel, symbols: Symbols) -> list[tuple[ca.SX, ca.SX]]:
     """Return the symbols that depend on q, (k, 1) each, with their derivatives by it, (k, n)."""
-    n, factor_joints = model.n, list(model.residuals.friction.joints)
-    pairs = [_second_derivatives(n, joint) for joint in range(n)]
-    slopes = [(symbols["factor"], symbols["factor_slope"] * ca.SX(np.eye(n)[factor_joints]))]
+    pairs = [_second_derivatives(model.n, joint) for joint in range(model.n)]
+    # the factor of a joint depends on that joint alone
+    joints = np.eye(model.n)[list(model.residuals.friction.joints)]
+    slopes = [(symbols["factor"], symbols["factor_slope"] * ca.SX(joints))]
     if model.residuals.mass is not None:
+        second = [symbols["second"][:, pair] for pair in pairs]
         slopes.append((symbols["mass"], symbols["first"]))
-        second = ca.vertcat(*(symbols["second"][:, indices] for indices in pairs))
-        slopes.append((ca.vec(symbols["first"]), second))
+        slopes.append((ca.vec(symbols["first"]), ca.vertcat(*second)))
     if model.residuals.potential is not None:
-        slopes.append(
-            (symbols["gravity"], ca.vertcat(*(symbols["stiffness"][indices].T for indices in pairs)))
-        )
+        stiffness = [symbols["stiffness"][pair].T for pair in pairs]
+        slopes.append((symbols["gravity"], ca.vertcat(*stiffness)))
     if model.residuals.has_torque:
         slopes.append((symbols["torque"], ca.diag(symbols["torque_slope"])))
     return slopes
@@ -99,18 +104,21 @@ def _second_derivatives(n: int, joint: int) -> list[int]:
 
 def residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[str, ca.MX]:
     """Return what the symbols stand for at q, without derivatives, as expressions of matrices."""
-    residuals, n, values = model.residuals, model.n, {}
+    residuals = model.residuals
+    values: dict[str, ca.MX] = {}
     encoded = _encoded(residuals.encoding, q)
     if residuals.mass is not None:
         indices = entry_indices(model)
-        rows = [row * n + column for row, column in indices]
+        rows = [row * model.n + column for row, column in indices]
         mass = values["mass"] = _network(residuals.mass, rows, encoded)
         if qd is not None:
             values["rate"] = ca.jtimes(mass, q, qd)
             # an entry beside the diagonal stands in M twice
-            weights = [0.5 if row == column else 1.0 for row, column in indices]
-            products = qd[[row for row, _ in indices]] * qd[[column for _, column in indices]]
-            values["kinetic"] = ca.jtimes(mass, q, weights * products, True)
+            products = []
+            for row, column in indices:
+                weight = 0.5 if row == column else 1.0
+                products.append(weight * qd[row] * qd[column])
+            values["kinetic"] = ca.jtimes(mass, q, ca.vertcat(*products), True)
     if residuals.potential is not None:
         values["energy"] = _network(residuals.potential, [0], encoded)
         values["gravity"] = ca.gradient(values["energy"], q)
@@ -157,7 +165,9 @@ def _torque_energy(residuals: Residuals, q: ca.MX) -> ca.MX:
 def _spline_values(splines: Splines, q: ca.MX) -> ca.MX:
     """Return the sums of B-splines, (joints, 1)."""
     away = ca.fabs(_spline_distances(splines, q))
-    height = (ca.fmax(2 - away, 0) ** 3 - 4 * ca.fmax(1 - away, 0) ** 3) / 6
+    wide = ca.fmax(2 - away, 0) ** 3
+    narrow = ca.fmax(1 - away, 0) ** 3
+    height = (wide - 4 * narrow) / 6
     count, size = splines.weights.shape
     terms = ca.reshape(splines.weights.ravel() * height, size, count)
     values: ca.MX = ca.sum1(terms).T

@@ -120,10 +120,12 @@ def _nearest_bodies(model: EmittedModel, arm: LoadedArm, q: Tensor) -> EmittedMo
     def distance() -> Tensor:
         mass_error = whitening @ bodies.mass_matrix(q) @ whitening.mT - mass
         gravity_error = (bodies.gravity(q) - gravity) / load
-        weights = torch.cat([parameter.flatten() for parameter in bodies.parameters()])
         mean_mass_error = mass_error.square().sum(dim=(-2, -1)).mean() / model.n
         mean_gravity_error = gravity_error.square().sum(dim=-1).mean()
-        return mean_mass_error + mean_gravity_error + 0.5 * TUNING.ridge * weights.square().sum()
+        # zero weights are the URDF's bodies
+        weights = torch.cat([parameter.flatten() for parameter in bodies.parameters()])
+        ridge = 0.5 * TUNING.ridge * weights.square().sum()
+        return mean_mass_error + mean_gravity_error + ridge
 
     minimise(bodies, distance, TUNING.steps)
     return bodies.requires_grad_(False)
@@ -142,16 +144,21 @@ def _nearest_friction(arm: Arm, model: EmittedModel, q: Tensor) -> np.ndarray:
     fractions = np.geomspace(0.02, 1.0, TUNING.friction_speeds)
     fractions = np.concatenate([-fractions[::-1], fractions])
     speeds = np.outer(fractions, usual_speeds(arm.coordinates))
-    positions = q[:: TUNING.positions // TUNING.friction_positions].unsqueeze(1).expand(-1, len(speeds), -1)
+    positions = q[:: TUNING.positions // TUNING.friction_positions]
+    positions = positions.unsqueeze(1).expand(-1, len(speeds), -1)  # (positions, speeds, n)
     qd = torch.from_numpy(speeds).expand_as(positions)
     torques = model.friction_torque(positions, qd).numpy()  # (positions, speeds, n)
     rows: list[tuple[float, float, float, float]] = []
     for joint, speed in enumerate(speeds.T):
-        torque, direction = torques[..., joint], np.sign(speed)
+        torque = torques[..., joint]
+        direction = np.sign(speed)
+        # against the motion, so that what friction may be is not negative
         columns = np.stack([np.abs(speed), speed > 0, speed < 0], axis=-1)
         (viscous, forward, backward), _ = nnls(columns, torque.mean(axis=0) * direction)
         fitted = direction * (columns @ (viscous, forward, backward))
         size = np.linalg.norm(torque)
-        error = float(np.linalg.norm(torque - fitted) / size) if size else 0.0
+        error = 0.0
+        if size > 0:
+            error = float(np.linalg.norm(torque - fitted) / size)
         rows.append((viscous, forward, -backward, error))
     return np.array(rows).T

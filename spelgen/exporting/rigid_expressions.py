@@ -67,50 +67,64 @@ class RigidExpressions:
 
     def __init__(self, model: TrainedModel, q: ca.SX) -> None:
         self.n = model.n
-        # the base accelerates upwards in place of gravity
+        # in place of gravity the base accelerates upwards
         self._base = _Motion(ca.SX(3, 1), ca.SX(3, 1), ca.SX(-model.gravity))
         self._links = [_link(model, index, q) for index in range(len(model.bodies))]
 
     def torque(self, qd: ca.SX, qdd: ca.SX) -> ca.SX:
         """Return the torques of this motion in gravity, (n, 1) [Nm, N]."""
         motions: list[_Motion] = []
-        wrenches: list[tuple[ca.SX, ca.SX]] = []
+        forces: list[ca.SX] = []
+        torques: list[ca.SX] = []
         for link in self._links:
             carrier = motions[link.parent] if link.parent >= 0 else self._base
-            motion = _moved(link, carrier, link.ratio * qd[link.joint], link.ratio * qdd[link.joint])
+            speed = link.ratio * qd[link.joint]
+            acceleration = link.ratio * qdd[link.joint]
+            motion = _moved(link, carrier, speed, acceleration)
             motions.append(motion)
+            # Newton, then Euler about the frame's origin
+            forces.append(link.mass * motion.acceleration + motion.spin() @ link.moment)
+            torque = ca.cross(link.moment, motion.acceleration)
+            torque = torque + link.inertia @ motion.rate
             w = motion.velocity
-            force = link.mass * motion.acceleration + motion.spin() @ link.moment
-            torque = ca.cross(link.moment, motion.acceleration) + link.inertia @ motion.rate
-            wrenches.append((force, torque + ca.cross(w, link.inertia @ w)))
-        torques = ca.SX(self.n, 1)
+            torques.append(torque + ca.cross(w, link.inertia @ w))
+        joint_torques = ca.SX(self.n, 1)
+        # children stand behind their parents
         for index in reversed(range(len(self._links))):
-            link, wrench = self._links[index], wrenches[index]
-            torques[link.joint] += link.along_axis(*wrench)
+            link = self._links[index]
+            # several bodies share a joint where one follows another
+            joint_torques[link.joint] += link.along_axis(forces[index], torques[index])
             if link.parent >= 0:
-                force, torque = link.in_parent(*wrench)
-                own_force, own_torque = wrenches[link.parent]
-                wrenches[link.parent] = (own_force + force, own_torque + torque)
-        return torques
+                force, torque = link.in_parent(forces[index], torques[index])
+                forces[link.parent] = forces[link.parent] + force
+                torques[link.parent] = torques[link.parent] + torque
+        return joint_torques
 
     def mass_and_moment(self) -> tuple[ca.SX, ca.SX]:
         """Return M, (n, n), and the first moment of all bodies in the base's frame, (3, 1) [kg m]."""
         mass = [link.mass for link in self._links]
         moment = [link.moment for link in self._links]
         inertia = [link.inertia for link in self._links]
-        matrix, total = ca.SX(self.n, self.n), ca.SX(3, 1)
+        matrix = ca.SX(self.n, self.n)
+        total = ca.SX(3, 1)
         for index in reversed(range(len(self._links))):
             link = self._links[index]
-            # by a unit acceleration of the joint
-            force, torque = ca.cross(_Z, moment[index]), inertia[index] @ _Z
-            if not link.revolute:
-                force, torque = mass[index] * _Z, ca.cross(moment[index], _Z)
+            # the wrench on all that the joint carries, by a unit acceleration of it
+            if link.revolute:
+                force = ca.cross(_Z, moment[index])
+                torque = inertia[index] @ _Z
+            else:
+                force = mass[index] * _Z
+                torque = ca.cross(moment[index], _Z)
             self._add_column(matrix, index, link.ratio * force, link.ratio * torque)
-            p, m, parent = link.position, mass[index], link.parent
+            m = mass[index]
+            p = link.position
             turned = link.rotation @ moment[index]
+            parent = link.parent
             if parent < 0:
                 total = total + turned + m * p
                 continue
+            # the parallel axis theorem for a frame that is not at the centre of mass
             shift = p @ turned.T
             size = m * ca.dot(p, p) + 2 * ca.trace(shift)
             moved = link.rotation @ inertia[index] @ link.rotation.T
@@ -140,16 +154,20 @@ def _moved(link: _Link, carrier: _Motion, speed: ca.SX, acceleration: ca.SX) -> 
     w = link.rotation.T @ carrier.velocity
     rate = link.rotation.T @ carrier.rate
     linear = link.rotation.T @ (carrier.acceleration + carrier.spin() @ link.position)
+    turning = ca.cross(w, _Z) * speed
     if link.revolute:
-        return _Motion(w + _Z * speed, rate + _Z * acceleration + ca.cross(w, _Z) * speed, linear)
-    return _Motion(w, rate, linear + _Z * acceleration + 2 * ca.cross(w, _Z) * speed)
+        return _Motion(w + _Z * speed, rate + _Z * acceleration + turning, linear)
+    # Coriolis: twice, for the point moves and its direction turns
+    return _Motion(w, rate, linear + _Z * acceleration + 2 * turning)
 
 
 def _link(model: TrainedModel, index: int, q: ca.SX) -> _Link:
     body = model.bodies[index]
     m, x, y, z, xx, xy, xz, yy, yz, zz = model.inertias[index]
-    ratio, revolute = float(body.multiplier), body.kind == "revolute"
-    rotation, position = ca.SX(constant(body.rotation)), ca.SX(constant(body.translation))
+    ratio = float(body.multiplier)
+    revolute = body.kind == "revolute"
+    rotation = ca.SX(constant(body.rotation))
+    position = ca.SX(constant(body.translation))
     displacement = ratio * q[body.coordinate] + body.offset
     if revolute:
         rotation = rotation @ rotation_about_z(displacement)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from spelgen.arm.arm import Body
 from spelgen.arm.rational import alignment, rotation_about, rotation_from_rpy
 from spelgen.dynamics.constraint import mimic_constraint
 from spelgen.dynamics.tip import last_link
@@ -29,8 +28,16 @@ def tip_chain(loaded: LoadedArm) -> tuple[str, tuple[TipJoint, ...], np.ndarray]
         axis = np.array(joint.axis, dtype=float)
         turned = _transform(alignment(axis / np.linalg.norm(axis)), (0, 0, 0))
         index = constraint.names.index(joint.name)
-        row, offset = constraint.jacobian[index], float(constraint.offset[index])
-        joints.append(TipJoint(_without_rounding(pose @ turned), joint.type != "prismatic", row, offset))
+        joints.append(
+            TipJoint(
+                name=joint.name,
+                origin=_without_rounding(pose @ turned),
+                revolute=joint.type != "prismatic",
+                row=constraint.jacobian[index],
+                offset=float(constraint.offset[index]),
+            )
+        )
+        # the link's own axes again
         pose = turned.T
     return link, tuple(joints), _without_rounding(pose)
 
@@ -38,31 +45,24 @@ def tip_chain(loaded: LoadedArm) -> tuple[str, tuple[TipJoint, ...], np.ndarray]
 def tip_in_body(loaded: LoadedArm) -> tuple[str, int, np.ndarray]:
     """Return the tip's link, the body that carries it, and the tip's pose in that body's frame, (4, 4)."""
     link, joints, end = tip_chain(loaded)
-    tip = np.eye(4)
-    for joint in joints:
-        tip = tip @ joint.origin @ _joint_motion(joint.revolute, joint.offset)
-    tip = tip @ end
     names = [body.name for body in loaded.arm.bodies]
-    carrier = max(names.index(joint.name) for joint in loaded.robot.path_to(link) if joint.name in names)
-    frame, index = np.eye(4), carrier
-    while index >= 0:
-        body = loaded.arm.bodies[index]
-        frame, index = _body_motion(body) @ frame, body.parent
-    return link, carrier, np.linalg.solve(frame, tip)
+    carrier = -1
+    pose = np.eye(4)
+    for joint in joints:
+        if joint.name in names:
+            # a body's frame is its joint's, with the axis as z
+            carrier = names.index(joint.name)
+            pose = np.eye(4)
+        else:
+            pose = pose @ joint.origin @ _locked(joint)
+    return link, carrier, pose @ end
 
 
-def _body_motion(body: Body) -> np.ndarray:
-    """Return a body's pose in its parent's frame where all coordinates are zero, (4, 4)."""
-    placed = _transform(body.rotation, body.translation)
-    pose: np.ndarray = placed @ _joint_motion(body.kind == "revolute", body.offset)
-    return pose
-
-
-def _joint_motion(revolute: bool, value: float) -> np.ndarray:
-    """Return a turn about z [rad] or a displacement along it [m], (4, 4)."""
-    if revolute:
-        return _transform(rotation_about(_Z, value), (0, 0, 0))
-    return _transform(np.eye(3), value * _Z)
+def _locked(joint: TipJoint) -> np.ndarray:
+    """Return the motion of a joint that stands at its offset, (4, 4)."""
+    if joint.revolute:
+        return _transform(rotation_about(_Z, joint.offset), (0, 0, 0))
+    return _transform(np.eye(3), joint.offset * _Z)
 
 
 def _transform(rotation: object, position: object) -> np.ndarray:

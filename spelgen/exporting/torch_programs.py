@@ -41,13 +41,12 @@ def export_program(
 
     z, the memory of friction, is (batch, n, K), or (batch, n K) where ``flat_memory``; the other inputs are (batch, n).
     """
-    memory = (model.n * model.elements,) if flat_memory else (model.n, model.elements)
-    names = program_inputs(model, name)
+    shapes = dict.fromkeys(program_inputs(model, name), (model.n,))
+    if "z" in shapes:
+        shapes["z"] = (model.n * model.elements,) if flat_memory else (model.n, model.elements)
     # a batch of two: torch.export would take one for a constant
-    inputs = tuple(
-        torch.full((2, *(memory if key == "z" else (model.n,))), 0.1, dtype=torch.float64) for key in names
-    )
-    batch = tuple({0: torch.export.Dim("batch")} for _ in names)
+    inputs = tuple(torch.full((2, *shape), 0.1, dtype=torch.float64) for shape in shapes.values())
+    batch = tuple({0: torch.export.Dim("batch")} for _ in inputs)
     return torch.export.export(_Program(model, name), inputs, dynamic_shapes=(batch,))
 
 

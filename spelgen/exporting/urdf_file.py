@@ -19,12 +19,14 @@ def urdf_text(projection: RigidBodyProjection) -> bytes:
     A link that a joint moves gets all that moves with it; the links it carries by fixed or locked joints lose
     their inertials to it.
     """
-    robot, arm = projection.arm.robot, projection.arm.arm
+    robot = projection.arm.robot
+    arm = projection.arm.arm
     parser = etree.XMLParser(resolve_entities=False, no_network=True)
     root = etree.fromstring(urdf_bytes(robot.path), parser)
     links = {element.get("name"): element for element in root.findall("link")}
     joints = {element.get("name"): element for element in root.findall("joint")}
-    for name in _carried_links(robot, {robot.joint[body.name].child for body in arm.bodies}):
+    moved = {robot.joint[body.name].child for body in arm.bodies}
+    for name in _carried_links(robot, moved):
         _remove(links[name], "inertial")
     rounding = AngleRounding(projection.arm.angle_tolerance)
     for body, inertia in zip(arm.bodies, projection.inertias, strict=True):
@@ -60,10 +62,13 @@ def settings_text(projection: RigidBodyProjection) -> str:
 
 def about_center(inertia: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     """Return mass, centre of mass and the tensor about it, (3, 3), of ten parameters about the joint, in its frame."""
-    mass, center = inertia[0], inertia[1:4] / inertia[0]
+    mass = inertia[0]
+    center = inertia[1:4] / mass
     xx, xy, xz, yy, yz, zz = inertia[4:]
     about_joint = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    return mass, center, about_joint - mass * (center @ center * np.eye(3) - np.outer(center, center))
+    # the parallel axis theorem
+    shift = center @ center * np.eye(3) - np.outer(center, center)
+    return mass, center, about_joint - mass * shift
 
 
 def rounded(value: float) -> float:
@@ -75,8 +80,11 @@ def _carried_links(robot: Robot, moved: set[str]) -> list[str]:
     """Return the links with an inertial that move with another link."""
     carried = []
     for link in robot.links:
+        if link.inertial is None or link.name in moved:
+            continue
         above = {joint.child for joint in robot.path_to(link.name)}
-        if link.inertial is not None and link.name not in moved and above & moved:
+        # links before the first joint stay as they are
+        if above & moved:
             carried.append(link.name)
     return carried
 
@@ -85,12 +93,13 @@ def _set_inertial(link: etree._Element, inertia: np.ndarray, rotation: np.ndarra
     """Set a link's inertial; ``rotation`` takes +z, the joint's axis in its own frame, to the axis in the link's."""
     _remove(link, "inertial")
     mass, center, tensor = about_center(inertia)
-    center, tensor = rotation @ center, rotation @ tensor @ rotation.T
+    center = rotation @ center
+    tensor = rotation @ tensor @ rotation.T
     inertial = etree.Element("inertial")
     etree.SubElement(inertial, "origin", xyz=" ".join(map(_number, center)), rpy="0 0 0")
     etree.SubElement(inertial, "mass", value=_number(mass))
     names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    moments = map(_number, tensor[np.triu_indices(3)])
+    moments = [_number(x) for x in tensor[np.triu_indices(3)]]
     etree.SubElement(inertial, "inertia", dict(zip(names, moments, strict=True)))
     link.insert(0, inertial)
 
