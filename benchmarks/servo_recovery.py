@@ -122,7 +122,7 @@ def main() -> None:
         parser.error(f"{asked.urdf.with_suffix('.yaml')} has to say 'input: position'")
     if (asked.backlash and not asked.mujoco) or (asked.dead_zone and asked.mujoco):
         parser.error("--backlash belongs to --mujoco, --dead-zone to the arm without")
-    truths = {"kd": LAG, "armature": ARMATURE, "dry": DRY, "lost": DRY + asked.dead_zone}
+    truths = {"kd": LAG, "armature": ARMATURE, "dry": DRY, "static_error": DRY + asked.dead_zone}
     truths |= {"dead_zone": asked.dead_zone} if asked.dead_zone else {}
     errors, held, left = {x: [] for x in truths}, {x: [] for x in truths}, {x: 0 for x in truths}
     for seed, logs in enumerate(recordings(arm, asked)):
@@ -139,10 +139,10 @@ def main() -> None:
             if x
         )
         print(f"seed {seed}: {time.monotonic() - since:.0f} s; median errors so far {row}", flush=True)
-    print("           bias   median   90 % below   within 3 %   intervals that hold the truth   left open")
+    print("             bias   median   90 % below   within 3 %   intervals that hold the truth   left open")
     for what, x in ((what, np.array(x)) for what, x in errors.items() if x):
         print(
-            f"{what:10}{100 * x.mean():5.2f} %{100 * np.median(np.abs(x)):7.2f} %"
+            f"{what:12}{100 * x.mean():5.2f} %{100 * np.median(np.abs(x)):7.2f} %"
             f"{100 * np.quantile(np.abs(x), 0.9):11.2f} %{100 * np.mean(np.abs(x) <= 0.03):11.1f} %"
             f"{100 * np.mean(held[what]):21.1f} % of {len(x):4}{left[what]:10}"
         )

@@ -23,13 +23,13 @@ from spelgen.dynamics.servo_rank import servo_rank
 from spelgen.dynamics.servo_rollout import replayed
 from spelgen.errors import LogError, OptionError, RunError, SettingsError
 from spelgen.files import write_json
-from spelgen.fitting import servo_descent, servo_fit
+from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.run_folder import RunFolder
-from spelgen.fitting.servo_descent import Normal
-from spelgen.fitting.servo_intervals import covariance
-from spelgen.fitting.servo_problem import ServoProblem
-from spelgen.fitting.servo_report import servo_text
-from spelgen.fitting.servo_windows import servo_windows
+from spelgen.fitting.servo import objective
+from spelgen.fitting.servo.intervals import covariance
+from spelgen.fitting.servo.problem import ServoProblem
+from spelgen.fitting.servo.report import servo_text
+from spelgen.fitting.servo.windows import servo_windows
 from spelgen.listing import number
 from spelgen.logs.commands import delayed_commands
 from spelgen.logs.preprocessing import Preprocessing
@@ -170,9 +170,10 @@ def test_intervals_count_errors_that_are_alike_once():
     for _ in range(300):
         slopes = torch.ones(20, 50, 1).double() + 0.3 * torch.randn(20, 50, 1, generator=rng).double()
         errors = torch.randn(20, 1, generator=rng).double().expand(20, 50)  # a window errs as a whole
-        matrix, target = slopes.mT @ slopes, (slopes.mT @ errors.unsqueeze(-1)).squeeze(-1)
-        step = -torch.linalg.solve(matrix.sum(dim=0), target.sum(dim=0))
-        at_end = Normal(matrix, (slopes.mT @ (errors.unsqueeze(-1) + slopes * step)).squeeze(-1))
+        curvature, descent = slopes.mT @ slopes, -(slopes.mT @ errors.unsqueeze(-1)).squeeze(-1)
+        step = torch.linalg.solve(curvature.sum(dim=0), descent.sum(dim=0))
+        left = (slopes.mT @ (errors.unsqueeze(-1) + slopes * step)).squeeze(-1)
+        at_end = NormalEquations(curvature, -left)
         told.append(float(covariance(at_end, torch.zeros(1).double(), torch.zeros(1).double())))
         found.append(float(step))
     assert np.mean(told) == pytest.approx(
@@ -181,8 +182,7 @@ def test_intervals_count_errors_that_are_alike_once():
 
 
 def test_a_known_kp_stays(tmp_path, logs, monkeypatch):
-    monkeypatch.setattr(servo_fit, "ROUNDS", 1)
-    monkeypatch.setattr(servo_descent, "STEPS", 1)
+    monkeypatch.setattr(objective, "TUNING", replace(objective.TUNING, rounds=1, steps=1))
     settings = "input: position\njoints: {shoulder: {kp: 14.0}}\n"
     model = spelgen.build(write_servo_arm(tmp_path, settings), "closed-form")
     fit = spelgen.fit(model, [x[:100] for x in logs[:2]])
@@ -227,7 +227,7 @@ def test_what_is_told_covers_the_truth(fitted):
         for what, truth in (
             ("kd", TRUTH.kd[k] / TRUTH.kp[k]),
             ("armature", TRUTH.armature[k] / TRUTH.kp[k]),
-            ("lost", TRUTH.coulomb[k] / TRUTH.kp[k] + TRUTH.dead_zone[k]),
+            ("static_error", TRUTH.coulomb[k] / TRUTH.kp[k] + TRUTH.dead_zone[k]),
         ):
             assert joint[what]["determined"]
             assert joint[what]["value"] == pytest.approx(truth, rel=0.03), what
@@ -239,7 +239,9 @@ def test_what_is_told_covers_the_truth(fitted):
 def test_what_logs_will_tell_is_said_before_the_fit(fitted):
     (note,) = [x.message for x in fitted.diagnostics if x.code == "identifiability"]
     assert "these logs determine kd/kp of shoulder, " in note and "unless one kp, mass or load is" in note
-    assert {"kd/kp of elbow", "lost of elbow"} <= {*fitted.record["foreseen"]["determined"]}
+    assert {"kd/kp of elbow", "static error of elbow"} <= {
+        *fitted.record["expected_identifiability"]["determined"]
+    }
 
 
 @pytest.mark.parametrize(
@@ -361,11 +363,10 @@ def test_presets_are_not_compared_under_servos(tmp_path):
 def test_joints_by_themselves_move_as_the_arm_does(arm):
     model = spelgen.build(arm, "closed-form")
     windows = replace(servo_windows(moved(model, 3.0), Preprocessing()), steps=24)
-    problem = ServoProblem(model, windows)
-    start = replace(
-        problem.start, present=torch.ones_like(problem.start.present)
-    )  # all laws, as the logs have
+    problem = ServoProblem(model, windows, torch.full((2,), 1e-5).double())
+    # all laws, as the logs have
+    start = replace(problem.start, active=torch.ones_like(problem.start.active))
     for _ in range(2):
-        problem.relinearise(start, problem.path(start))
-    errors = problem.errors(start).square().mean(dim=(0, 1)).sqrt()
+        problem.linearise(start, problem.predicted_path(start))
+    errors = problem.residuals(start).square().mean(dim=(0, 1)).sqrt()
     assert errors.max() < 6e-4

@@ -15,7 +15,7 @@ from spelgen.baselines.run_arm import run_arm
 from spelgen.errors import RunError
 from spelgen.files import write_json
 from spelgen.fitting.run_folder import RunFolder, trained_model
-from spelgen.fitting.servo_windows import servo_windows
+from spelgen.fitting.servo.windows import servo_windows
 from spelgen.fitting.streaming import LargeLogs
 from spelgen.fitting.train import open_logs
 from spelgen.logs.coverage import coverage
@@ -61,9 +61,9 @@ def _fit_position_actuators(
 ) -> dict[str, object]:
     if not _has_mujoco():
         return {}
-    from spelgen.baselines.position_actuators import MOST, fit_position_actuators
+    from spelgen.baselines.position_actuators import TUNING, fit_position_actuators
 
-    windows = servo_windows(trajectories, preprocessing, MOST)
+    windows = servo_windows(trajectories, preprocessing, TUNING.windows)
     actuators = fit_position_actuators(run_arm(run), windows, trained_model(run))
     if actuators is None:
         return {}

@@ -159,15 +159,15 @@ def _tell(fit: Fit, folder: Path, paths: Sequence[Path], *, resume: bool) -> Non
 
 def _outcome(fit: Fit) -> tuple[str, str]:
     """Return how a fit ended, with the reason where its status does not say it, and what it came to."""
-    if fit.config.objective == "servo":
-        from spelgen.fitting.servo_report import servo_text
+    from spelgen.fitting.objectives import fit_summary
 
-        result = f"{fit.steps} steps were taken"
-        if "servo" in fit.record:
-            result = servo_text(fit.record["servo"])
-        return f"{fit.status}: servos fitted in {fit.seconds:.0f} s", result
     config, loss = fit.config, f"validation loss {fit.best_validation:.3g}"
     if not isinstance(config, Rollout):  # windows only judge
+        summary = fit_summary(fit.record)
+        if summary is not None:
+            loss = summary.text
+        elif not fit.record["validation_windows"]:
+            loss = f"{fit.steps} steps were taken"
         return f"{fit.status}: {config.objective} fitted in {fit.seconds:.0f} s", loss
     reason = ""
     if fit.status == "stopped early":

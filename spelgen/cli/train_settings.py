@@ -171,7 +171,7 @@ def resumed_run(folder: Path, request: Request) -> Start:
 
     run = RunFolder(folder)
     record = run.read_config()
-    if record["validation_fraction"] is None and record["objective"] != "servo":  # which needs none
+    if record["validation_fraction"] is None and record["validation"]:
         raise RunError(
             "a run with validation logs that were given in memory",
             file=folder,

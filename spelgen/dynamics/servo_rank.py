@@ -1,8 +1,8 @@
-"""What logs of commanded positions can tell of an arm at all: by the rank of its equations along a rich motion.
+"""Derive what logs of commanded positions can determine of an arm at all, from the rank of its equations.
 
 Of each joint kp (u - q) = kd qd + armature qdd + dry sgn(qd) + Y(q, qd, qdd) pi, with q and u known: linear and
 homogeneous in all that is not, so that logs determine kp, kd, armature, dry and pi up to the null space of these
-columns. What moves there by the same factor as kp is known in ratio to it.
+columns. What changes there by the same factor as kp is known in ratio to it.
 """
 
 from __future__ import annotations
@@ -10,20 +10,22 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import null_space
 
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.regressor import regressor
 
-PARTS = ("kp", "kd", "armature", "dry")
-NOTHING = 1e-9  # of the largest singular value
-SAME = 1e-6
-RANGE = 2.0  # rad, m to both sides of joints
+PARAMETERS = ("kp", "kd", "armature", "dry")
+ROUNDING = 1e-9  # of the largest singular value
+EQUAL = 1e-6  # rounding of null vectors is a thousand times that of the columns
 
 
 @dataclass(frozen=True)
 class ServoRank:
-    """groups: joints whose kp are known in ratio to one another, so that one kp, mass or load tells all of them. open:
-    what of which joint is not even known in ratio to its kp: only together with what the bodies are.
+    """Say what is known in ratio to what.
+
+    groups: joints whose kp are known in ratio to one another, so that one kp, mass or load determines all of them.
+    open: what of which joint is not even known in ratio to its kp: only together with what the bodies are.
     """
 
     groups: tuple[tuple[int, ...], ...]
@@ -31,39 +33,37 @@ class ServoRank:
 
 
 def servo_rank(arm: Arm) -> ServoRank:
-    """By random states, parameters and drives: the rank is that of almost all, whatever the arm weighs."""
+    """Return it by random states, parameters and drives: the rank is that of almost all, whatever the arm weighs."""
     random, n = np.random.default_rng(0), len(arm.coordinates)
-    samples = 2 * (10 * len(arm.bodies) // n + len(PARTS)) + 20
-    q, (qd, qdd) = random.uniform(-RANGE, RANGE, (samples, n)), random.normal(size=(2, samples, n))
-    columns = regressor(arm, q, qd, qdd)  # (T, n, 10 B)
-    _, sizes, turned = np.linalg.svd(columns.reshape(samples * n, -1), full_matrices=False)
-    felt = turned[sizes > NOTHING * sizes[0]].T
-    bodies = columns @ (felt * random.uniform(0.5, 2.0, felt.shape[1]))  # (T, n, r), of unknowns that are 1
+    samples = 2 * (10 * len(arm.bodies) // n + len(PARAMETERS)) + 20
+    q, qd, qdd = random.normal(size=(3, samples, n))
+    columns = regressor(arm, q, qd, qdd).reshape(samples * n, -1)
+    _, sizes, directions = np.linalg.svd(columns, full_matrices=False)
+    identifiable = directions[sizes > ROUNDING * sizes[0]].T
+    bodies = columns @ (
+        identifiable * random.uniform(0.5, 2.0, identifiable.shape[1])
+    )  # of unknowns that are 1
     drives = np.stack([qd, qdd, np.sign(qd)], axis=-1) * random.uniform(0.5, 2.0, (n, 3))
-    torque = drives.sum(axis=-1) + bodies.sum(axis=-1)
-    own = np.concatenate([-torque[..., None], drives], axis=-1)  # (T, n, 4)
-    rows = np.zeros((samples, n, n, len(PARTS)))
-    rows[:, range(n), range(n)] = own
-    system = np.concatenate([rows.reshape(samples * n, -1), bodies.reshape(samples * n, -1)], axis=1)
-    _, sizes, turned = np.linalg.svd(system / np.linalg.norm(system, axis=0))
-    null = (turned[sizes < NOTHING * sizes[0]] / np.linalg.norm(system, axis=0)).T  # (unknowns, d)
-    moved = null[: n * len(PARTS)].reshape(n, len(PARTS), -1)
-    size = np.abs(moved).max()
-
-    def alike(one: np.ndarray, other: np.ndarray) -> bool:
-        return bool(np.abs(one - other).max() < SAME * size)
-
-    groups: list[list[int]] = []
+    torque = drives.sum(axis=-1) + bodies.sum(axis=-1).reshape(samples, n)
+    rows = np.zeros((samples, n, n, len(PARAMETERS)))
     for joint in range(n):
-        known = next((group for group in groups if alike(moved[group[0], 0], moved[joint, 0])), None)
-        if known is None:
-            groups.append([joint])
+        rows[:, joint, joint, 0] = -torque[:, joint]
+        rows[:, joint, joint, 1:] = drives[:, joint]
+    system = np.concatenate([rows.reshape(samples * n, -1), bodies], axis=1)
+    size = np.linalg.norm(system, axis=0)
+    null = null_space(system / size, rcond=ROUNDING) / size[:, None]  # (unknowns, d)
+    changes = null[: n * len(PARAMETERS)].reshape(n, len(PARAMETERS), -1)
+    changes = changes / np.abs(changes).max()
+    groups: list[list[int]] = []
+    in_no_ratio = []
+    for joint in range(n):
+        for group in groups:
+            if np.abs(changes[group[0], 0] - changes[joint, 0]).max() < EQUAL:
+                group.append(joint)
+                break
         else:
-            known.append(joint)
-    left = [
-        (name, joint)
-        for k, name in enumerate(PARTS)
-        for joint in range(n)
-        if not alike(moved[joint, k], moved[joint, 0])
-    ]
-    return ServoRank(tuple(map(tuple, groups)), tuple(left))
+            groups.append([joint])
+        apart = np.abs(changes[joint] - changes[joint, 0]).max(axis=-1) > EQUAL
+        in_no_ratio += [(PARAMETERS[k], joint) for k in np.flatnonzero(apart)]
+    in_no_ratio.sort(key=lambda entry: PARAMETERS.index(entry[0]))
+    return ServoRank(tuple(map(tuple, groups)), tuple(in_no_ratio))

@@ -67,6 +67,7 @@ class ServoModel:
         lengths = [rows.stop - rows.start - 1 for _, rows in parts]
         commands, intervals = [], []
         for (log, rows), length in zip(parts, lengths, strict=True):
+            # in one rollout of all: its small operations cost the same for one part and for many
             padding = (0, max(lengths) - length)
             delayed = delayed_commands(log, rows, float(self._model.servo.delay), steps)
             commands.append(np.pad(delayed, (padding, (0, 0), (0, 0)), mode="edge"))
@@ -100,6 +101,7 @@ def replays(
         notes.append(Diagnostic("info", code, "logs", None, message))
     predictors = {MODEL: ServoModel(model), **baselines}
     logs_from_rest = [(piece, slice(0, len(piece))) for piece in pieces]
+    # logs begin before the arm moves; within them windows begin in motion
     q = np.stack([piece.q[0] for piece in pieces])
     errors = _errors(predictors, logs_from_rest, q, np.zeros_like(q))
     results = [Replay("whole log", _summaries(logs_from_rest, errors))]
@@ -133,6 +135,7 @@ def _summaries(parts: Sequence[LogRows], errors: Errors) -> dict[str, ReplayErro
 
 
 def _summary(names: Sequence[str], errors: Sequence[np.ndarray]) -> ReplayErrors:
+    # a log with gaps is several pieces of one name
     by_name: dict[str, list[np.ndarray]] = {name: [] for name in names}
     for name, error in zip(names, errors, strict=True):
         by_name[name].append(error)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol
 
 from spelgen.errors import Diagnostic
 from spelgen.fitting.streaming import LargeLogs
+from spelgen.listing import Listing
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.fits import FitConfig
@@ -64,6 +65,18 @@ class PreparedLogs:
     mapping: LogMapping
     notes: tuple[Diagnostic, ...]
     further: dict[str, object] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class FitSummary:
+    """Hold what a fit determined, for people.
+
+    text: for a terminal. listing: parameters with their intervals. headline: the first figure, and what it is.
+    """
+
+    text: str
+    listing: Listing
+    headline: tuple[str, str]
 
 
 class Objective(Protocol):

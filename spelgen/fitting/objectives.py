@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 from spelgen.dynamics.protocol import has_rigid_bodies, has_servos
-from spelgen.fitting.objective import FitRequest, Objective
-from spelgen.fitting.servo_objective import ServoObjective
+from spelgen.fitting.objective import FitRequest, FitSummary, Objective
+from spelgen.fitting.servo.objective import ServoObjective
+from spelgen.fitting.servo.report import servo_summary
 from spelgen.fitting.torque_objective import TorqueObjective
 from spelgen.fitting.window_objectives import MomentumObjective, RolloutObjective
 from spelgen.identification.samples import DENSE
@@ -20,6 +21,16 @@ OBJECTIVES: dict[str, type[Objective]] = {
     objective.name: objective
     for objective in (TorqueObjective, MomentumObjective, RolloutObjective, ServoObjective)
 }
+
+
+SUMMARIES: dict[str, Callable[[Mapping[str, Any]], FitSummary | None]] = {ServoObjective.name: servo_summary}
+"""What an objective says of a run's config.json, where it determines more than a model."""
+
+
+def fit_summary(record: Mapping[str, Any]) -> FitSummary | None:
+    """Return what a fit determined, None where its objective has nothing to say, or is not over."""
+    summary = SUMMARIES.get(record.get("objective", ""))
+    return None if summary is None else summary(record)
 
 
 def objective_of(request: FitRequest) -> Objective:

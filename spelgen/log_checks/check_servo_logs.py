@@ -54,6 +54,7 @@ def check_servo_logs(logs: Iterable[Trajectory], arm: LoadedArm) -> ServoLogRepo
         reports.append(report)
         wrong = _wrong_command(k, joints, following)
         if wrong is None:
+            # some loggers write measured positions in place of commands
             copied = all(np.array_equal(log.q[:, k], require_commands(log)[:, k]) for log in logs)
             notes += [*_odd_command(k, report, following, copied=copied), *_beyond_limits(coordinate, report)]
         else:
@@ -92,6 +93,7 @@ def _joint(arm: LoadedArm, k: int, logs: Sequence[Trajectory], following: Follow
         lag = float(DELAYS[delay])
     steady_state_error, saturated = None, None
     if len(following.steady_state_errors[k]):
+        # nine tenths: where an arm leans on something it may be anywhere
         steady_state_error = float(np.quantile(np.abs(following.steady_state_errors[k]), 0.9))
     if arm.settings.joint(coordinate.name).kp is not None:
         saturated = float(following.saturated[k])
@@ -136,6 +138,7 @@ def _wrong_command(k: int, joints: Sequence[str], following: Following) -> LogEr
         return None
     where, delay = f"joint {joints[k]!r}", following.best_delay(k, k)
     correlation, gain = float(following.correlation[delay, k, k]), float(following.gain[delay, k, k])
+    # a servo follows its command to a fifth, unless one of the two is in degrees
     in_degrees = 0.8 < gain * DEGREES < 1.25 or 0.8 < gain / DEGREES < 1.25
     if correlation > TUNING.follows and in_degrees:
         got = f"positions that move {gain:.3g} times as far as commands (180/pi is 57.3)"

@@ -12,7 +12,6 @@ import torch
 from spelgen.dynamics.protocol import has_rigid_bodies, has_servos
 from spelgen.dynamics.regressor import urdf_parameters
 from spelgen.fitting.run_folder import RunFolder, trained_model
-from spelgen.fitting.servo_report import open_text, servo_listing
 from spelgen.identification.base_parameters import base_parameters
 from spelgen.identification.friction import FrictionModel
 from spelgen.loaded_arm import LoadedArm
@@ -54,12 +53,6 @@ class Constant:
     start: float
     learned: float
     unit: str
-
-
-def servo_table(record: Record) -> ParameterTable:
-    """Return what a fit of position servos found by joint; `record`: the run's, of servos."""
-    listing = servo_listing(record, zones=True)
-    return ParameterTable(listing.title, listing.head, listing.rows, f"{listing.note} {open_text(record)}.")
 
 
 def parameter_tables(

@@ -15,13 +15,14 @@ from spelgen.evaluation.results import Results
 from spelgen.evaluation.tables import result_tables
 from spelgen.evaluation.verdict import Verdict, verdict
 from spelgen.files import write_json, write_text
+from spelgen.fitting.objectives import fit_summary
 from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.labels import entry_name
 from spelgen.loaded_arm import LoadedArm
 from spelgen.render.arm_section import LETTERS, Cell, arm_section, matrix
 from spelgen.render.curves import coverage, curves, predictors
 from spelgen.render.page import render_page
-from spelgen.render.parameters import body_parameters, mass_constants, parameter_tables, servo_table
+from spelgen.render.parameters import body_parameters, mass_constants, parameter_tables
 from spelgen.render.picture import Picture, read_picture
 from spelgen.render.plots import FORCE, UNITS, Limits, Record
 from spelgen.render.reproduction import commands, files
@@ -141,11 +142,9 @@ def _json(folder: RunFolder, path: Path) -> Record | None:
 def _rendered(run: Run, robot: Path | str | None) -> str:
     facts, config, evaluation = run.facts, run.config or {}, run.evaluation or {}
     picture, traces = read_picture(run.folder.module), evaluation.get("traces") or {}
-    arm, servos = None, None
+    arm = None
     if run.arm is not None:
         arm = arm_section(run.arm.arm, Path(robot or run.arm.robot.path), traces, run.identified)
-    if "servo" in config:
-        servos = servo_table(config["servo"])
     return render_page(
         "report.html.jinja",
         facts=facts,
@@ -165,8 +164,8 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
         coverage=coverage(traces, run.identified, facts, run.limits),
         trained=run.model is not None,
         constants=mass_constants(run.folder) if run.model is not None else [],
-        under_servos=config.get("objective") == "servo",
-        servos=servos,
+        under_servos=config.get("mapping", {}).get("input") == "position",
+        summary=fit_summary(config),
         parameters=parameter_tables(run.model, run.arm, run.identified),
         files=files(run.folder.path),
         commands=commands(run.folder, facts, run.config),

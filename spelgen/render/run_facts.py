@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from markupsafe import Markup
 
 from spelgen.baselines.names import MODEL
-from spelgen.fitting.servo_report import delay_text
+from spelgen.fitting.objectives import fit_summary
 from spelgen.labels import thousandths
 from spelgen.listing import number
 from spelgen.logs.preprocessing import Preprocessing
@@ -58,8 +58,9 @@ def head_numbers(
     for replay in evaluation.get("replays", ()):
         value = f"{number(1000 * replay['errors'][MODEL]['mean'])} {thousandths(evaluation['joint_types'])}"
         figures.append(Number(value, f"off measured positions, commands replayed, {replay['name']}"))
-    if "servo" in config:
-        figures.append(Number(delay_text(config["servo"]), "from commands to what they do"))
+    summary = fit_summary(config)
+    if summary is not None:
+        figures.append(Number(*summary.headline))
     elif model is not None:
         count = sum(parameter.numel() for parameter in model.parameters())
         figures.append(Number(f"{count:,}", "trained parameters"))

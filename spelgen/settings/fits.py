@@ -187,7 +187,7 @@ class Rollout(OnWindows):
 
 
 class ServoFit(FitConfig):
-    """Fit position servos, friction and weight of an arm to what follows its commands (see `fit_servos`)."""
+    """Fit position servos, friction and weight of an arm to what follows its commands (see `fitting.servo`)."""
 
     objective: ClassVar[Objective] = "servo"
 

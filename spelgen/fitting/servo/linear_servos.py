@@ -9,13 +9,17 @@ import numpy as np
 from scipy.linalg import expm
 from scipy.optimize import least_squares, minimize_scalar
 
-from spelgen.fitting.servo_windows import ServoWindows
+from spelgen.fitting.servo.windows import ServoWindows
 from spelgen.logs.commands import LogRows, delayed_commands
 
 LATEST = 0.4  # s, of delays
-START = (20.0, 1.0, 0.02, 0.0)  # frequency [rad/s], damping ratio, delay [s], offset [rad, m]
-BOUNDS = ((1.0, 0.05, 0.0, -1.0), (200.0, 20.0, LATEST, 1.0))
-SCALE = (10.0, 1.0, 0.02, 0.02)  # of steps
+START = (
+    np.log(20.0),
+    0.0,
+    0.02,
+    0.0,
+)  # logarithms of frequency [rad/s] and damping ratio; delay [s]; offset [rad, m]
+BOUNDS = ((-np.inf, -np.inf, 0.0, -np.inf), (np.inf, np.inf, LATEST, np.inf))
 
 
 @dataclass(frozen=True)
@@ -81,19 +85,20 @@ def fit_linear_servos(windows: ServoWindows) -> LinearServos:
     def delayed_error(delay: float) -> float:
         return float(np.square(commands(delay) - measured).mean())
 
+    # the error has one minimum: commands move slowly against so short delays
     late = minimize_scalar(delayed_error, bounds=(0, LATEST), method="bounded").x
     fits = []
     for joint in range(q.shape[2]):
 
         def residuals(x: np.ndarray, joint: int = joint) -> np.ndarray:
-            frequency, damping, delay, offset = x.tolist()
-            u = commands(delay)[..., joint] + offset
-            predicted = _rollout(q[:, 0, joint], qd[:, 0, joint], u, dt, frequency, damping)
+            u = commands(x[2])[..., joint] + x[3]
+            predicted = _rollout(q[:, 0, joint], qd[:, 0, joint], u, dt, *np.exp(x[:2]))
             return (predicted - measured[..., joint])[:, windows.settling :].ravel()
 
-        fit = least_squares(residuals, START, bounds=BOUNDS, x_scale=SCALE, diff_step=1e-4, max_nfev=30)
-        fits.append(fit.x.tolist())
-    return LinearServos(*zip(*fits, strict=True), float(late))
+        fits.append(least_squares(residuals, START, bounds=BOUNDS, x_scale="jac", max_nfev=30).x)
+    columns = np.array(fits).T
+    columns[:2] = np.exp(columns[:2])
+    return LinearServos(*map(tuple, columns.tolist()), float(late))
 
 
 def _rollout(

@@ -26,3 +26,118 @@ class ServoLogTuning:
     follows: float = 0.9  # correlation from which on a position follows a command
     ignores: float = 0.5  # correlation below which a position does not follow its command
     sparse_rate: float = 20.0  # [Hz] below it delays and friction are not seen
+
+
+@dataclass(frozen=True)
+class ServoWindowTuning:
+    """Decide which windows a fit of servos predicts."""
+
+    length: float = (
+        4.0  # [s] as long as gravity and friction need to show; longer ones diverge with the delay
+    )
+    settling: float = 1.0  # [s] of its beginning that is not judged: friction's state forms there
+    count: int = 200  # at most, evenly spread: ten minutes of motion
+
+
+@dataclass(frozen=True)
+class ServoPriorTuning:
+    """Standard deviations of the Gaussian prior of a fit of servos, from where its parameters start."""
+
+    logarithm: float = 2.0  # [1] of a joint's gains, armature and friction: a factor of seven
+    stribeck_velocity: float = (
+        1.0  # [1] of its logarithm: by more, friction that falls at any speed fits offsets
+    )
+    dead_zone: float = 0.02  # [rad, m] half a dead zone: gears of hobby servos have a few mrad
+    delay: float = 0.1  # [s]
+    bodies: float = 0.3  # [1] of the bodies' parameters, some 60 % in mass
+    body_directions: int = 6  # that change gravity most; further ones move by less than their prior
+
+
+@dataclass(frozen=True)
+class ServoCostTuning:
+    """Decide what errors of predicted windows count, and how their slopes are taken."""
+
+    correlation_time: float = 0.5  # [s] at most, over which errors say the same; measured: most are over 0.2
+    nudge: float = 1e-4  # of parameters, in their units: rollouts in double precision lose half their digits
+
+
+@dataclass(frozen=True)
+class ServoSolverTuning:
+    """Decide when rounds of a fit of servos end."""
+
+    rounds: int = (
+        5  # each with the bodies' load along the motion predicted before; measured: a sixth changes nothing
+    )
+    coarse_rounds: int = 3  # of these, with half of the steps between samples
+    steps: int = 12  # of a round at most
+    gain: float = 0.5  # [1] of the cost: a step that gains less ends a coarse round, and a comparison of laws
+    later_damping: float = (
+        1e-5  # [1] of the first step of a round, after the first round; by 1e-3 kd ends 0.3 % off
+    )
+    fine_gain: float = 0.025  # [1] and a fine round
+    last_nudge: float = (
+        1e-3  # of parameters for the last slopes: by shorter ones a joint that just slips looks known
+    )
+
+
+@dataclass(frozen=True)
+class ServoLawTuning:
+    """Decide which joints get a dead zone or friction that falls with velocity."""
+
+    dead_zone_fraction: float = 0.2  # [1] of the static error, that a dead zone makes up to begin with
+    larger_dead_zone_fraction: float = 0.6  # [1] likewise, of the second start
+    significance: float = 3.0  # [1] standard deviations that a law has to be worth
+    least_dead_zone: float = 1e-3  # [rad, m] smaller ones are none: a step of a 12-bit encoder is 1.5e-3
+
+
+@dataclass(frozen=True)
+class ServoIntervalTuning:
+    """Decide what is reported as determined."""
+
+    variance_inflation: float = (
+        50.0  # [1] from which on two effects are one; measured on SO-101s: below 30, above 90
+    )
+    law_deviation: float = (
+        0.015  # [1] of ratios, by what friction's laws are not: benchmarks/servo_recovery.py
+    )
+    open_factor: float = 1.25  # [1] what may be larger by this factor within its interval is not determined
+    least_remaining: float = (
+        0.01  # [1] of the cost after the first step; its second derivatives may promise more
+    )
+
+
+@dataclass(frozen=True)
+class ServoStartTuning:
+    """Decide where a fit of servos starts."""
+
+    significance: float = (
+        8.0  # [1] standard deviations of kp by gravity: samples of neighbouring windows are alike
+    )
+    kp_range: float = (
+        20.0  # [1] factor on the kp of the settings, or 2 efforts a rad, beyond which it is not believed
+    )
+    least: float = (
+        0.05  # [1] of usual dry friction; squared of kd/kp, cubed of armature/kp: so that these have a log
+    )
+
+
+@dataclass(frozen=True)
+class PositionActuatorTuning:
+    """Decide how MuJoCo's position actuators are fitted, the baseline of servo fits."""
+
+    step: float = 5e-3  # [s] at most; frictionloss is as hard as twice this allows
+    windows: int = 60  # half a minute of fitting
+    iterations: int = 8  # of mujoco.minimize
+    nudge: float = 1e-4  # of unknowns, for slopes
+
+
+@dataclass(frozen=True)
+class ServoSimulationTuning:
+    """Decide how `spelgen simulate` moves an arm under position servos."""
+
+    step: float = 1e-3  # [s] at most
+    widest: float = 0.6  # [rad, m] of commands, from the middle of a joint's range
+    held_level: float = 2.0  # [s] between jumps of the commands
+    lowest_frequency: float = 0.05  # [Hz] of the commands' sines
+    highest_frequency: float = 1.2  # [Hz] above it servos of hobby arms hardly follow
+    allowed_error: float = 5e-3  # [rad, m] joints that stick or not by a hair are that far apart

@@ -1,0 +1,204 @@
+"""The objective servo: fit position servos, friction and weight of an arm to what follows its commands.
+
+First least squares on the command error (`start`), then predicted windows (`problem`), in rounds: each takes the
+bodies' load along what has been predicted, and the scale of errors, anew. Before the fine ones joints get the laws that
+they turn out to have (`laws`).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+import torch
+
+from spelgen.dynamics.bristles import encoder_step
+from spelgen.dynamics.protocol import has_servos
+from spelgen.errors import Diagnostic, LogError, OptionError
+from spelgen.fitting.dataset import digest
+from spelgen.fitting.levenberg_marquardt import levenberg_marquardt, start
+from spelgen.fitting.objective import FitRequest, PreparedLogs, Status
+from spelgen.fitting.servo.laws import select_laws, without_faint
+from spelgen.fitting.servo.linear_servos import fit_linear_servos
+from spelgen.fitting.servo.parameters import ServoParameters
+from spelgen.fitting.servo.problem import ServoProblem
+from spelgen.fitting.servo.report import (
+    expected_solution,
+    expected_text,
+    identifiability,
+    joint_records,
+    servo_record,
+    solution,
+)
+from spelgen.fitting.servo.start import start_servos
+from spelgen.fitting.servo.windows import servo_windows
+from spelgen.fitting.streaming import LargeLogs
+from spelgen.logs.checks import check
+from spelgen.logs.trajectory import Trajectory, require_commands, require_joints
+from spelgen.settings.log_mapping import LogMapping
+from spelgen.settings.tuning.servo import ServoSolverTuning
+
+if TYPE_CHECKING:
+    from spelgen.emission.loading import EmittedModel
+    from spelgen.fitting.progress import TrainingProgress
+
+TUNING = ServoSolverTuning()
+
+
+class ServoObjective:
+    """Fit all logs, so that none is left to validate on; each round can be gone on with.
+
+    What a round computes with, the bodies' load and the scale of errors, comes of the parameters where it and the
+    rounds before it began: these are all that a checkpoint keeps.
+    """
+
+    name: ClassVar[str] = "servo"
+
+    def __init__(self, request: FitRequest) -> None:
+        if not has_servos(request.model):
+            raise OptionError("objective", "servo belongs to arms with 'input: position' in their settings")
+        self.request = request
+        self.history: list[dict[str, Any]] = []
+        self._results: dict[str, object] = {}
+        self._rounds: list[ServoParameters] = []  # where they began
+        self._steps = 0
+
+    def prepare(self) -> PreparedLogs:
+        """See `Objective`."""
+        request = self.request
+        self._logs = _commanded(request.model, request.logs)
+        notes = check(self._logs, request.model.facts.joints, request.model.joint_types)
+        self._windows = servo_windows(self._logs, request.preprocessing)
+        return PreparedLogs(
+            config=request.config,
+            preprocessing=request.preprocessing,
+            digest=digest(self._logs),
+            training=tuple(log.name for log in self._logs),
+            validation=(),
+            training_windows=len(self._windows.q),
+            validation_windows=0,
+            mapping=request.mapping or LogMapping(input="position"),
+            notes=tuple(notes),
+        )
+
+    def begin(self) -> list[Diagnostic]:
+        """Start servos by least squares, and say what the logs will determine."""
+        model, self._since = self.request.model, time.monotonic()
+        start_servos(model, self._windows)
+        self._start = {name: x.clone() for name, x in model.state_dict().items()}
+        self._problem = self._new_problem()
+        self._begin_round(self._problem.start)
+        expected = expected_solution(self._problem, self._problem.start)
+        determined, undetermined = identifiability(joint_records(self._problem, expected))
+        self._problem.write(self._problem.start)
+        self._results = {"expected_identifiability": {"determined": determined, "open": undetermined}}
+        known_kp = bool((model.servo.trained == 0).any())
+        text = expected_text(determined, undetermined, known_kp=known_kp)
+        return [Diagnostic("info", "identifiability", "logs", None, text)]
+
+    def resume(
+        self, checkpoint: dict[str, Any], history: list[dict[str, Any]], record: dict[str, Any]
+    ) -> None:
+        """Go on from the beginning of the last round."""
+        self._since = time.monotonic() - checkpoint["seconds"]
+        state = checkpoint["servo"]
+        self._start = state["start"]
+        self.request.model.load_state_dict(self._start)
+        self._problem = self._new_problem()
+        for parameters in state["rounds"]:
+            self._begin_round(ServoParameters(**parameters))
+        self._steps = checkpoint["step"]
+        self._results = {"expected_identifiability": record.get("expected_identifiability")}
+
+    def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
+        """See `Objective`."""
+        problem = self._problem
+        while True:
+            fine = len(self._rounds) > TUNING.coarse_rounds
+            gain = TUNING.fine_gain if fine else TUNING.gain
+            first = start(problem, self._rounds[-1], steps=self._steps)
+            if len(self._rounds) > 1:  # near the minimum from where the round before ended
+                first = replace(first, damping=TUNING.later_damping)
+            for state in levenberg_marquardt(problem, first, max_steps=TUNING.steps, least_gain=gain):
+                rms = float(state.residuals.square().mean().sqrt())
+                progress.round(len(self._rounds), TUNING.rounds, state.steps, rms)
+            x, self._steps = state.x, state.steps
+            if len(self._rounds) == TUNING.rounds:
+                break
+            # laws are chosen when gains are right: before, errors are those of the gains
+            if len(self._rounds) == TUNING.coarse_rounds:
+                x = select_laws(problem, x)
+            elif fine:
+                x = without_faint(problem, x)
+            self._begin_round(x)
+            save()
+        self._finish(x)
+        save()
+        return "finished"
+
+    def _finish(self, x: ServoParameters) -> None:
+        """Take half as long steps, from which errors of the integration are known, and report the result."""
+        problem = self._problem
+        problem.windows = replace(self._windows, steps=2 * self._windows.steps)
+        halved = problem.normal_equations(x, problem.residuals(x)).step()
+        x = x.moved(halved)
+        problem.nudge = TUNING.last_nudge  # by shorter ones a joint that just slips looks known
+        problem.write(x)
+        record = servo_record(problem, solution(problem, x, halved), x, self._steps)
+        linear = fit_linear_servos(self._windows).to_dict()
+        self._results["servo"] = record | {"linear": linear}
+        self._take_checkpoint(float(np.sqrt(np.square(record["rms"]).mean())))
+
+    def checkpoint(self) -> dict[str, Any]:
+        """Return that of the last round's beginning, or of the end."""
+        return self._checkpoint
+
+    def results(self) -> dict[str, object]:
+        """Return what the logs were to determine, and at the end what they did."""
+        return self._results
+
+    def _new_problem(self) -> ServoProblem:
+        steps = np.max([encoder_step(log.q) for log in self._logs], axis=0)
+        # the standard deviation of an encoder's rounding, at the least of a hundredth of a milliradian
+        noise = torch.from_numpy(steps).clamp(min=1e-5) / 12**0.5
+        # while parameters are far off, errors of the integration matter little
+        half = replace(self._windows, steps=-(-self._windows.steps // 2))
+        return ServoProblem(self.request.model, half, noise)
+
+    def _begin_round(self, x: ServoParameters) -> None:
+        problem = self._problem
+        if len(self._rounds) >= TUNING.coarse_rounds:
+            problem.windows = self._windows
+        if self._rounds:
+            problem.linearise(x, problem.predicted_path(x))
+        problem.weigh(x)
+        problem.write(x)  # for the checkpoint: an interrupted fit is usable
+        self._rounds.append(x)
+        self._take_checkpoint(float(problem.residuals(x).square().mean().sqrt()))
+
+    def _take_checkpoint(self, rms: float) -> None:
+        weights = {name: x.clone() for name, x in self.request.model.state_dict().items()}
+        self._checkpoint = {
+            "epoch": 0,
+            "step": self._steps,
+            "best_epoch": 0,
+            "best_loss": rms,
+            "best_weights": weights,
+            "seconds": time.monotonic() - self._since,
+            "substeps": self._windows.steps,
+            "servo": {"start": self._start, "rounds": [vars(x) for x in self._rounds]},
+        }
+
+
+def _commanded(model: EmittedModel, logs: Sequence[Trajectory] | LargeLogs) -> Sequence[Trajectory]:
+    """Return the logs, which hold commands. Raises LogError where they do not."""
+    if isinstance(logs, LargeLogs):
+        expected = "some hours of them: every tenth file, say"
+        raise LogError("logs of positions larger than memory", expected=expected)
+    for log in logs:
+        require_joints(log, model.facts.joints)
+        require_commands(log)
+    return logs

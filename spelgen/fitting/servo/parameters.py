@@ -1,0 +1,151 @@
+"""Name the parameters that logs of commanded positions determine, with their Gaussian prior, and a point among them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch.func import functional_call, jacfwd
+
+from spelgen.dynamics.parameters import parameters_of_kind
+from spelgen.settings.tuning.servo import ServoPriorTuning
+
+if TYPE_CHECKING:
+    from spelgen.emission.loading import EmittedModel
+
+TUNING = ServoPriorTuning()
+# of all joints, whatever part of a model holds them
+KINDS = ("stiffness", "damping", "armature", "offset")
+FRICTION_KINDS = ("load_dependence", "fractions", "dead_zone")
+DEAD_ZONE = "servo.dead_zone"
+COULOMB, STRIBECK = "friction.raw_coulomb", "friction.raw_stribeck"
+STRIBECK_VELOCITY = "friction.raw_stribeck_velocity"
+# of laws that only some joints have: the values at the others. exp(-12) of the usual friction is none
+INACTIVE = {STRIBECK: -12.0, STRIBECK_VELOCITY: 0.0, DEAD_ZONE: 0.0}
+FIXED = 1e-9  # deviation of a parameter that is not fitted
+
+
+@dataclass(frozen=True, eq=False)
+class ServoParameters:
+    """Hold parameters of joints (p, n), along directions of the bodies (r,), and the delay [s].
+
+    active: (p, n) whether a joint has the law that a parameter belongs to; where not, the parameter stays.
+    """
+
+    joints: torch.Tensor
+    bodies: torch.Tensor
+    delay: float
+    active: torch.Tensor
+
+    def moved(self, step: torch.Tensor) -> ServoParameters:
+        """Return the parameters one step (k,) further; no command acts early."""
+        joints, bodies, delay = step.split([self.joints.numel(), len(self.bodies), 1])
+        return replace(
+            self,
+            joints=self.joints + joints.view_as(self.joints) * self.active,
+            bodies=self.bodies + bodies,
+            delay=max(0.0, self.delay + float(delay)),
+        )
+
+    @property
+    def flat(self) -> torch.Tensor:
+        """Return all in one vector, (k,) with k = p n + r + 1."""
+        delay = torch.tensor([self.delay], dtype=torch.float64)
+        return torch.cat([self.joints.flatten(), self.bodies, delay])
+
+
+class ParameterRows:
+    """Map the parameters of a model's joints to rows (p, n) and back.
+
+    names: of the rows; a parameter of several numbers a joint has as many rows.
+    """
+
+    def __init__(self, model: EmittedModel) -> None:
+        self._n = model.n
+        tensors = {**dict(model.named_parameters()), **dict(model.named_buffers())}
+        # a drive's viscous friction and kd are one number: kd has it all
+        names: list[str] = []
+        for kind in KINDS:
+            names += parameters_of_kind(model, kind)
+        names += [COULOMB, STRIBECK, STRIBECK_VELOCITY]
+        for kind in FRICTION_KINDS:
+            names += parameters_of_kind(model, kind)
+        self.tensors = {name: tensors[name] for name in names}
+        self._widths = {name: x[:1].numel() for name, x in self.tensors.items()}
+        self.names: list[str] = []
+        for name, width in self._widths.items():
+            self.names += width * [name]
+        self._inactive = torch.tensor([INACTIVE.get(name, 0.0) for name in self.names]).double()
+        always = torch.tensor([name not in INACTIVE for name in self.names])
+        self.active = always.unsqueeze(-1).expand(-1, model.n)  # (p, n), at the start
+        deviations = torch.full((len(self.names), 1), TUNING.logarithm).double()
+        deviations[self.row(STRIBECK_VELOCITY)] = TUNING.stribeck_velocity
+        deviations[self.row(DEAD_ZONE)] = TUNING.dead_zone
+        self._deviations = deviations
+
+    def row(self, name: str) -> int:
+        """Return where the first row of a parameter is."""
+        return self.names.index(name)
+
+    def read(self) -> torch.Tensor:
+        """Return what the model has, (p, n); 0 of laws that no joint has yet, which is where these start."""
+        columns = [x.detach().reshape(self._n, -1).mT for x in self.tensors.values()]
+        return torch.where(self.active, torch.cat(columns), 0.0)
+
+    def named(self, joints: torch.Tensor, active: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Return (P, p, n) as the model's tensors by name, each (P, 1, n) or (P, 1, n, K); active: (p, n)."""
+        joints = torch.where(active, joints, self._inactive.unsqueeze(-1))
+        parts = joints.unsqueeze(1).mT.split(list(self._widths.values()), dim=-1)  # (P, 1, n, K)
+        named = {}
+        for (name, tensor), part in zip(self.tensors.items(), parts, strict=True):
+            named[name] = part.reshape(*part.shape[:2], *tensor.shape)
+        return named
+
+    def write(self, x: ServoParameters) -> None:
+        """Give the model the parameters of its joints."""
+        with torch.no_grad():
+            for name, rows in self.named(x.joints.unsqueeze(0), x.active).items():
+                self.tensors[name].copy_(rows[0, 0])
+
+    def precision(self, x: ServoParameters) -> torch.Tensor:
+        """Return the prior's, (k,)."""
+        joints = torch.where(x.active, self._deviations, FIXED)
+        others = torch.tensor([1.0] * len(x.bodies) + [TUNING.delay]).double()
+        return torch.cat([joints.flatten(), others]) ** -2
+
+    def activated(self, x: ServoParameters, *names: str) -> ServoParameters:
+        """Return the parameters with these laws at every joint."""
+        active = x.active.clone()
+        active[[self.row(name) for name in names]] = True
+        return replace(x, active=active)
+
+
+def body_parameters(model: EmittedModel) -> torch.nn.Parameter:
+    """Return what the bodies' inertial parameters are made of, (B, 10)."""
+    (name,) = parameters_of_kind(model, "bodies")
+    return model.get_parameter(name)
+
+
+def body_directions(model: EmittedModel, q: torch.Tensor) -> torch.Tensor:
+    """Return directions of the bodies' parameters that change gravity at q (M, n) most, (10 B, r), each as long as its
+    standard deviation.
+    """
+    zero = torch.zeros_like(q)
+    with torch.no_grad():
+        gravity = model.regressor(q, zero, zero) @ inertial_slopes(model)
+    _, sizes, directions = torch.linalg.svd(gravity.flatten(0, 1), full_matrices=False)
+    strong = sizes[: TUNING.body_directions] > 1e-3 * sizes[:1].clamp(min=1e-12)
+    return TUNING.bodies * directions[: len(strong)][strong].mT
+
+
+def inertial_slopes(model: EmittedModel) -> torch.Tensor:
+    """Return the derivative of the ten parameters of all bodies by the parameters that are trained, (10 B, 10 B)."""
+    bodies, raw = model.bodies, body_parameters(model).detach()
+
+    def inertial(flat: torch.Tensor) -> torch.Tensor:
+        parameters: torch.Tensor = functional_call(bodies, {"raw": flat.view_as(raw)}, ())
+        return parameters.flatten()
+
+    slopes: torch.Tensor = jacfwd(inertial)(raw.flatten())
+    return slopes.detach()
