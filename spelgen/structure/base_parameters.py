@@ -1,4 +1,4 @@
-"""The base inertial parameters of an arm, exactly: the fewest combinations that M and V are linear in.
+"""Derive the base inertial parameters of an arm, exactly: the fewest combinations that M and V are linear in.
 
 Every value of M, and of V less its value elsewhere, is a row of coefficients over the ten parameters of each
 body. Rows at random rational configurations span all of them; the reduced echelon form of that span is the
@@ -28,7 +28,7 @@ _GRID = 1000
 
 @dataclass(frozen=True)
 class BaseParameter:
-    """A combination of inertial parameters that the motion depends on.
+    """Hold a combination of inertial parameters that the motion depends on.
 
     ``name`` is that of its first parameter, with an R where others are regrouped into it; ``weights`` are
     (parameter, coefficient), parameters counted 10 body + i in the order of ``PARAMETERS``. ``value`` is the
@@ -42,31 +42,34 @@ class BaseParameter:
 
 
 def parameter_name(index: int) -> str:
-    """``Izz2`` is the tensor component zz of the second body."""
+    """Return its name: ``Izz2`` is the tensor component zz of the second body."""
     return f"{PARAMETERS[index % 10]}{index // 10 + 1}"
 
 
 @lru_cache(maxsize=16)  # of one arm they are asked for by least squares, logs and closed forms
 def base_parameters(arm: Arm, count: int) -> tuple[BaseParameter, ...]:
-    """The ``count`` base parameters of ``arm``, by body from the root."""
+    """Return the ``count`` base parameters of ``arm``, by body from the root."""
     order = [10 * body + PARAMETERS.index(name) for body in range(len(arm.bodies)) for name in _PREFERRED]
     rows = np.concatenate(list(_enough_rows(arm, count)))[:, order]
-    residues = np.array([[_residue(x) for x in row] for row in rows], dtype=np.uint64)
+    residues = _residues(rows)
+    # which parameters are independent shows in the prime field; the coefficients are then solved for exactly
     bound = field.pivots(field.row_basis(residues))
-    chosen = field.pivots(field.row_basis(residues[:, bound].T))
-    free = [column for column in range(len(order)) if column not in set(bound) and rows[:, column].any()]
-    coefficients = _solved(rows[np.ix_(chosen, bound)], rows[np.ix_(chosen, free)])
-    found = []
-    for place, pivot in enumerate(bound):
-        weights = [(order[pivot], Fraction(1))]
-        weights += [
-            (order[column], Fraction(int(coefficient.p), int(coefficient.q)))
-            for column, coefficient in zip(free, coefficients[place], strict=True)
-            if coefficient
-        ]
-        name = parameter_name(order[pivot]) + ("R" if len(weights) > 1 else "")
-        found.append(BaseParameter(name, order[pivot], tuple(weights), _value(arm, weights)))
-    return tuple(found)
+    independent_rows = field.pivots(field.row_basis(residues[:, bound].T))
+    moving = np.flatnonzero(residues.any(axis=0)).tolist()
+    free = [column for column in moving if column not in bound]
+    coefficients = _solved(rows[np.ix_(independent_rows, bound)], rows[np.ix_(independent_rows, free)])
+    result = []
+    for pivot, regrouped in zip(bound, coefficients, strict=True):
+        index = order[pivot]
+        name = parameter_name(index)
+        weights = [(index, Fraction(1))]
+        for column, coefficient in zip(free, regrouped, strict=True):
+            if coefficient:
+                weights.append((order[column], Fraction(int(coefficient.p), int(coefficient.q))))
+        if len(weights) > 1:
+            name += "R"
+        result.append(BaseParameter(name, index, tuple(weights), _value(arm, weights)))
+    return tuple(result)
 
 
 def _value(arm: Arm, weights: list[tuple[int, Fraction]]) -> Fraction | None:
@@ -80,33 +83,46 @@ def _value(arm: Arm, weights: list[tuple[int, Fraction]]) -> Fraction | None:
 
 
 def _enough_rows(arm: Arm, count: int) -> list[np.ndarray]:
-    """Coefficient rows at as many random configurations as it takes to have rank ``count``."""
+    """Return coefficient rows at as many random configurations as it takes to have rank ``count``."""
     generator = random.Random(0)
-    gathered = field.Independent(10 * len(arm.bodies))
+    independent = field.Independent(10 * len(arm.bodies))
     reference = _rows(arm, generator)[-1]
     blocks: list[np.ndarray] = []
-    while len(gathered.rows) < count:
+    while len(independent.rows) < count:
         rows = _rows(arm, generator)
         rows[-1] = rows[-1] - reference  # a constant part of V moves nothing
-        for row in rows:
-            gathered.add(np.array([_residue(x) for x in row], dtype=np.uint64))
+        for row in _residues(rows):
+            independent.add(row)
         blocks.append(rows)
     return blocks
 
 
 def _rows(arm: Arm, generator: random.Random) -> np.ndarray:
-    """Coefficients of M's entries and of V at one random configuration, (n(n+1)/2 + 1, 10 bodies) of fmpq."""
+    """Return coefficients of M's entries and of V at one random configuration, (n(n+1)/2 + 1, 10 bodies) of fmpq."""
     n, parameters = len(arm.coordinates), 10 * len(arm.bodies)
     positions = []
     for _ in range(n):
-        t, value = (fmpq(generator.randrange(1, _GRID), generator.randrange(1, _GRID)) for _ in range(2))
-        positions.append(Position((1 - t * t) / (1 + t * t), 2 * t / (1 + t * t), value))
-    zero, one = fmpq(0), fmpq(1)
-    units = np.array([[one if i == j else zero for j in range(parameters)] for i in range(parameters)])
+        t = fmpq(generator.randrange(1, _GRID), generator.randrange(1, _GRID))
+        value = fmpq(generator.randrange(1, _GRID), generator.randrange(1, _GRID))
+        # t is the tangent of half the angle, so that cosine and sine are rational
+        norm = 1 + t * t
+        positions.append(Position((1 - t * t) / norm, 2 * t / norm, value))
+    units = np.full((parameters, parameters), fmpq(0))
+    np.fill_diagonal(units, fmpq(1))
     inertias = [list(units[10 * body : 10 * body + 10]) for body in range(len(arm.bodies))]
     result = energies(arm, motions(arm, positions, _rational), inertias, _rational)
-    elements = [result.mass[key] for key in triangle(n)] + [result.potential]
-    return np.array([x if isinstance(x, np.ndarray) else np.full(parameters, zero) for x in elements])
+    rows = np.full((n * (n + 1) // 2 + 1, parameters), fmpq(0))
+    for row, key in enumerate(triangle(n)):
+        rows[row] = _row(result.mass[key], parameters)
+    rows[-1] = _row(result.potential, parameters)
+    return rows
+
+
+def _row(element: np.ndarray | int, parameters: int) -> np.ndarray:
+    """Return an element of the ring as coefficients; where nothing moves it is a plain 0."""
+    if isinstance(element, np.ndarray):
+        return element
+    return np.full(parameters, fmpq(0))
 
 
 def _solved(left: np.ndarray, right: np.ndarray) -> list[list[fmpq]]:
@@ -117,6 +133,12 @@ def _solved(left: np.ndarray, right: np.ndarray) -> list[list[fmpq]]:
 
 def _rational(number: Fraction) -> fmpq:
     return fmpq(number.numerator, number.denominator)
+
+
+def _residues(rows: np.ndarray) -> np.ndarray:
+    """Return rational numbers as elements of the prime field."""
+    residues = [_residue(number) for number in rows.ravel().tolist()]
+    return np.array(residues, dtype=np.uint64).reshape(rows.shape)
 
 
 def _residue(number: fmpq) -> int:

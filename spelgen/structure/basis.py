@@ -1,4 +1,4 @@
-"""The smallest exact form M(q) = sum_k c_k A_k + sum_j f_j(q) B_j, with every f_j on as few joints as
+"""Find the smallest exact form M(q) = sum_k c_k A_k + sum_j f_j(q) B_j, with every f_j on as few joints as
 possible.
 
 U is the span of all changes of M, W the span of M. A read-out is a weighting of M's entries; on the joints
@@ -17,11 +17,11 @@ from math import gcd
 
 import numpy as np
 
+from spelgen.settings.tuning.structure import StructureTuning
 from spelgen.structure import field
 from spelgen.structure.spans import Spans
 
-_ALL_SUBSETS_UP_TO = 8
-"""Arms with more joints are searched over contiguous ranges of joints instead of all subsets."""
+TUNING = StructureTuning()
 
 Weights = tuple[tuple[int, int, Fraction], ...]
 """A sparse symmetric matrix by its lower triangle: (row, column, value), 0-based."""
@@ -29,7 +29,7 @@ Weights = tuple[tuple[int, int, Fraction], ...]
 
 @dataclass(frozen=True)
 class Output:
-    """One function f(q) of ``joints`` that is left open: f = sum of ``reads`` x M, and it enters M through
+    """Hold one function f(q) of ``joints`` that is left open: f = sum of ``reads`` x M, and it enters M through
     ``basis``.
     """
 
@@ -40,7 +40,7 @@ class Output:
 
 @dataclass(frozen=True)
 class Constant:
-    """One constant c = sum of ``reads`` x M, which enters M through ``basis``."""
+    """Hold one constant c = sum of ``reads`` x M, which enters M through ``basis``."""
 
     reads: Weights
     basis: Weights
@@ -48,7 +48,7 @@ class Constant:
 
 @dataclass(frozen=True)
 class _Reading:
-    """A read-out: its exact weights in the field, and the same in double precision."""
+    """Hold a read-out: its exact weights in the field, and the same in double precision."""
 
     joints: tuple[int, ...]
     weights: np.ndarray
@@ -56,7 +56,7 @@ class _Reading:
 
 
 def smallest_form(spans: Spans) -> tuple[tuple[Output, ...], tuple[Constant, ...]]:
-    """The outputs and constants of the smallest exact form."""
+    """Return the outputs and constants of the smallest exact form."""
     readings = list(_readings(spans))
     entries = len(spans.keys)
     weights = np.array([r.weights for r in readings], dtype=np.uint64).reshape(-1, entries)
@@ -79,7 +79,7 @@ def _constants(
     rest: tuple[np.ndarray, np.ndarray],
     basis: tuple[np.ndarray, np.ndarray],
 ) -> tuple[Constant, ...]:
-    """A basis of what the outputs leave of W; entries that are constant themselves are the first choice for a
+    """Return a basis of what the outputs leave of W; entries that are constant themselves are the first choice for a
     constant.
     """
     order = sorted(range(len(spans.keys)), key=lambda index: (len(spans.entry_joints[index]), -index))
@@ -103,12 +103,14 @@ def _constants(
 
 
 def _readings(spans: Spans) -> Iterator[_Reading]:
-    """Independent read-outs that together fix every change of M."""
+    """Yield independent read-outs that together fix every change of M."""
     chosen, tried = field.Independent(len(spans.varying)), set[int]()
     for joints in _joint_sets(spans):
         outside = field.row_basis(spans.outside(joints))
         kernel = field.null_space(outside)
-        missing = field.rank(np.concatenate([chosen.rows, kernel])) - len(chosen.rows) if len(kernel) else 0
+        missing = 0
+        if len(kernel):
+            missing = field.rank(np.concatenate([chosen.rows, kernel])) - len(chosen.rows)
         candidates = _candidates(spans, joints, outside, tried)
         while missing:
             weights, values = next(candidates)
@@ -119,21 +121,22 @@ def _readings(spans: Spans) -> Iterator[_Reading]:
 
 
 def _joint_sets(spans: Spans) -> Iterator[frozenset[int]]:
-    """Sets of joints that M depends on, nearest the tip first, small before large."""
+    """Yield sets of joints that M depends on, nearest the tip first, small before large."""
     active = [k for k in range(spans.n) if len(spans.change_bases[k])]
     for position in reversed(range(len(active))):
         first, later = active[position], active[position + 1 :]
-        if spans.n <= _ALL_SUBSETS_UP_TO:
-            tails = [tail for size in range(len(later) + 1) for tail in combinations(later, size)]
-        else:
-            tails = [tuple(later[:size]) for size in range(len(later) + 1)]
-        yield from (frozenset((first, *tail)) for tail in tails)
+        for size in range(len(later) + 1):
+            if spans.n <= TUNING.all_subsets_up_to:
+                for tail in combinations(later, size):
+                    yield frozenset((first, *tail))
+            else:
+                yield frozenset((first, *later[:size]))
 
 
 def _candidates(
     spans: Spans, joints: frozenset[int], outside: np.ndarray, tried: set[int]
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Read-outs that depend on ``joints`` only: single entries of M, then the sparsest sums of entries.
+    """Yield read-outs that depend on ``joints`` only: single entries of M, then the sparsest sums of entries.
 
     ``outside`` is the basis of the changes made by all other joints, in the basis of U. Entries that were ``tried``
     for fewer joints are chosen or depend on those that are: they are left out, and those of now are put in.
@@ -152,10 +155,11 @@ def _candidates(
     samples = spans.float_changes(frozenset(range(spans.n)) - joints)
     coefficients = _solved(samples[:, bound], samples[:, free])
     for row in sorted(kernel, key=np.count_nonzero):
-        (own,) = {int(index) for index in np.flatnonzero(row)} - set(bound)
+        # each row of a null space is 1 at one free entry, and elsewhere nonzero at bound ones only
+        (entry,) = set(np.flatnonzero(row).tolist()) - set(bound)
         values = np.zeros(len(row))
-        values[own] = 1.0
-        values[bound] = -coefficients[:, free.index(own)]
+        values[entry] = 1.0
+        values[bound] = -coefficients[:, free.index(entry)]
         yield row, np.where(row != 0, values, 0.0)
 
 
@@ -166,7 +170,7 @@ def _single(spans: Spans, index: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _solved(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Least-squares solution X of left X = right, both tall."""
+    """Return the least-squares solution X of left X = right, both tall."""
     width = left.shape[1]
     # the triangular factor holds all there is to know, and is small
     factor = np.asarray(np.linalg.qr(np.concatenate([left, right], axis=1), mode="r"))
@@ -181,7 +185,7 @@ def _weights(spans: Spans, exact: np.ndarray, values: np.ndarray) -> Weights:
 
 
 def _fraction(element: int, value: float) -> Fraction:
-    """The rational number behind a field element, near ``value``.
+    """Return the rational number behind a field element, near ``value``.
 
     Rational reconstruction finds it when numerator and denominator are below 2^30 (von zur Gathen and
     Gerhard, *Modern Computer Algebra*, section 5.10). Geometry with irrational sizes gives longer
@@ -197,7 +201,7 @@ def _fraction(element: int, value: float) -> Fraction:
         )
     numerator, denominator = current
     if denominator and gcd(numerator, denominator) == 1:
-        found = Fraction(numerator, denominator)
-        if abs(found - Fraction(value)) <= 1e-8 * max(1.0, abs(value)):
-            return found
+        candidate = Fraction(numerator, denominator)
+        if abs(candidate - Fraction(value)) <= 1e-8 * max(1.0, abs(value)):
+            return candidate
     return Fraction(value)

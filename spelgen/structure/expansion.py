@@ -1,4 +1,4 @@
-"""Entries of M, and V, as exact polynomials for one inertial parameter at a time, within a budget.
+"""Expand entries of M, and V, to exact polynomials for one inertial parameter at a time, within a budget.
 
 The recursion is run once over operations that are only written down; what an entry needs is then carried
 out, for one parameter set to 1 and all others to 0. So nothing is expanded that was not asked for, memory
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from fractions import Fraction
-from typing import Any
+from typing import TypeAlias
 
 from flint import Ordering, fmpq, fmpq_mpoly, fmpq_mpoly_ctx
 
@@ -17,21 +17,24 @@ from spelgen.arm.arm import Arm
 from spelgen.structure.recursion import energies
 from spelgen.structure.sampling import Position, motions
 
-Value = Any
+Value: TypeAlias = fmpq_mpoly | fmpq | int
 """A polynomial, or a number where nothing else is needed."""
 
 
 class Deferred:
-    """An operation of the recursion that waits to be carried out, or a leaf of it."""
+    """Hold an operation of the recursion that waits to be carried out, or a leaf of it."""
 
-    __slots__ = ("action", "parts")
+    __slots__ = ("action", "operands")
 
-    def __init__(self, action: str, *parts: Any):
+    def __init__(self, action: str, *operands: Deferred | Value):
         self.action = action
-        self.parts = parts
+        self.operands = operands
 
     def __add__(self, other: Deferred | int) -> Deferred:
-        return self if isinstance(other, int) and other == 0 else Deferred("add", self, other)
+        # zeros are common, and what is not written down need not be carried out
+        if isinstance(other, int) and other == 0:
+            return self
+        return Deferred("add", self, other)
 
     __radd__ = __add__
 
@@ -45,19 +48,21 @@ class Deferred:
         return -self + other
 
     def __mul__(self, other: Deferred | int) -> Deferred | int:
-        if isinstance(other, int) and other in (0, 1):
-            return self if other else 0
+        if isinstance(other, int) and other == 0:
+            return 0
+        if isinstance(other, int) and other == 1:
+            return self
         return Deferred("multiply", self, other)
 
     __rmul__ = __mul__
 
 
 class TooLarge(Exception):
-    """An expansion needs more multiplications of terms than its budget holds."""
+    """Tell that an expansion needs more multiplications of terms than its budget holds."""
 
 
 class Budget:
-    """How many multiplications of terms are left."""
+    """Count how many multiplications of terms are left."""
 
     def __init__(self, left: int):
         self.left = left
@@ -70,7 +75,7 @@ class Budget:
 
 
 class Expansion:
-    """The recursion of ``arm``, written down over c1, s1, q1, c2, ... three variables a coordinate."""
+    """Hold the recursion of ``arm``, written down over c1, s1, q1, c2, ... three variables a coordinate."""
 
     def __init__(self, arm: Arm):
         n = len(arm.coordinates)
@@ -85,27 +90,30 @@ class Expansion:
         self.written = energies(arm, motions(arm, positions, _number), inertias, _number)
 
     def polynomial(self, element: Deferred | int, parameter: int, budget: Budget) -> fmpq_mpoly:
-        """What ``parameter`` (10 body + i) is multiplied by in ``element``. Raises TooLarge."""
-        known: dict[int, Value] = {
-            id(leaf): int(index == parameter) for index, leaf in enumerate(self._parameters)
-        }
-        waiting = [element] if isinstance(element, Deferred) else []
-        while waiting:
-            at = waiting[-1]
-            missing = [part for part in at.parts if isinstance(part, Deferred) and id(part) not in known]
-            if id(at) in known or not missing:
-                waiting.pop()
-                known.setdefault(id(at), _carried_out(at, known, budget))
-            waiting += missing
-        return _value(element, known) + 0 * self.context.gens()[0]
+        """Return what ``parameter`` (10 body + i) is multiplied by in ``element``. Raises TooLarge."""
+        values: dict[int, Value] = {}
+        for index, leaf in enumerate(self._parameters):
+            values[id(leaf)] = int(index == parameter)
+        # a stack and no recursion: the operations of a long arm are nested deeper than Python may call
+        stack = [element]
+        while stack:
+            node = stack[-1]
+            missing = []
+            if isinstance(node, Deferred) and id(node) not in values:
+                missing = [x for x in node.operands if isinstance(x, Deferred) and id(x) not in values]
+                if not missing:
+                    values[id(node)] = _carried_out(node, values, budget)
+            if missing:
+                stack += missing
+            else:
+                stack.pop()
+        return _value(element, values) + self.context.from_dict({})
 
 
-def _carried_out(node: Deferred, known: dict[int, Value], budget: Budget) -> Value:
+def _carried_out(node: Deferred, values: dict[int, Value], budget: Budget) -> Value:
     if node.action == "constant":
-        return node.parts[0]
-    if node.action == "parameter":
-        return known[id(node)]
-    x, y = (_value(part, known) for part in node.parts)
+        return _value(node.operands[0], values)
+    x, y = (_value(operand, values) for operand in node.operands)
     if node.action == "add":
         return x + y
     if _is_zero(x) or _is_zero(y):
@@ -114,8 +122,10 @@ def _carried_out(node: Deferred, known: dict[int, Value], budget: Budget) -> Val
     return x * y
 
 
-def _value(part: Deferred | int, known: dict[int, Value]) -> Value:
-    return known[id(part)] if isinstance(part, Deferred) else part
+def _value(operand: Deferred | Value, values: dict[int, Value]) -> Value:
+    if isinstance(operand, Deferred):
+        return values[id(operand)]
+    return operand
 
 
 def _is_zero(value: Value) -> bool:
@@ -123,7 +133,9 @@ def _is_zero(value: Value) -> bool:
 
 
 def _terms(value: Value) -> int:
-    return max(1, len(value)) if isinstance(value, fmpq_mpoly) else 1
+    if isinstance(value, fmpq_mpoly):
+        return max(1, len(value))
+    return 1
 
 
 def _number(value: Fraction) -> Deferred:

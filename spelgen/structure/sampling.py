@@ -1,4 +1,4 @@
-"""Mass matrices and potential energies of an arm at random points, in the prime field and in floating point.
+"""Sample mass matrices and potential energies of an arm at random points, in the prime field and in floating point.
 
 Both kinds of sample come as a base block and, for every coordinate, a block in which that coordinate alone
 has moved: what changes between the two depends on the coordinate.
@@ -30,7 +30,7 @@ Ten = Sequence[Element]
 
 @dataclass(frozen=True)
 class Samples:
-    """``mass`` (1 + n, samples, n(n+1)/2) and ``potential`` (1 + n, samples); block 0 is the base, block k
+    """Hold ``mass`` (1 + n, samples, n(n+1)/2) and ``potential`` (1 + n, samples); block 0 is the base, block k
     has coordinate k moved.
     """
 
@@ -40,7 +40,7 @@ class Samples:
 
 @dataclass(frozen=True)
 class Position:
-    """One coordinate's position: the cosine and sine of its base angle, and its value where something slides."""
+    """Hold one coordinate's position: the cosine and sine of its base angle, and its value where something slides."""
 
     cos: Element
     sin: Element
@@ -48,7 +48,7 @@ class Position:
 
 
 def field_samples(arm: Arm, assume: Assume, samples: int, seed: int = 0) -> Samples:
-    """Samples in the field of 2^61 - 1; under ``kinematics`` every sample has inertial parameters of its own."""
+    """Return samples in the field of 2^61 - 1; under ``kinematics`` every sample has inertial parameters of its own."""
     rng = np.random.default_rng(seed)
     n, blocks = len(arm.coordinates), 1 + len(arm.coordinates)
     positions = []
@@ -56,9 +56,9 @@ def field_samples(arm: Arm, assume: Assume, samples: int, seed: int = 0) -> Samp
         # an angle's cosine and sine and a sliding distance are independent as functions, so each is drawn for
         # itself
         c, s = random_circle_points(rng, 2 * samples)
-        drawn = (c, s, random_residues(rng, (2 * samples,)))
-        parts = [Residues(_one_moved(values, index, blocks)) for values in drawn]
-        positions.append(Position(*parts))
+        value = random_residues(rng, (2 * samples,))
+        moved = (Residues(_one_moved(x, index, blocks)) for x in (c, s, value))
+        positions.append(Position(*moved))
     inertias: list[Ten]
     if assume == "kinematics":
         inertias = [
@@ -74,7 +74,7 @@ def field_samples(arm: Arm, assume: Assume, samples: int, seed: int = 0) -> Samp
 
 
 def regressor_rows(arm: Arm, points: int, seed: int = 1) -> np.ndarray:
-    """Rows of the energy regressor in the field, ((n(n+1)/2 + 1) points, 10 bodies).
+    """Return rows of the energy regressor in the field, ((n(n+1)/2 + 1) points, 10 bodies).
 
     M(q) and V(q) - V(q0) are linear in the inertial parameters and fix the torque, so the rows' rank is
     the number of base parameters (Gautier and Khalil 1990).
@@ -98,7 +98,7 @@ def regressor_rows(arm: Arm, points: int, seed: int = 1) -> np.ndarray:
 
 
 def float_samples(arm: Arm, assume: Assume, samples: int, seed: int = 2) -> Samples:
-    """The same kind of samples in double precision."""
+    """Return the same kind of samples in double precision."""
     rng = np.random.default_rng(seed)
     n, blocks = len(arm.coordinates), 1 + len(arm.coordinates)
     q = [_one_moved(rng.uniform(-3.0, 3.0, 2 * samples), index, blocks) for index in range(n)]
@@ -112,7 +112,7 @@ def float_samples(arm: Arm, assume: Assume, samples: int, seed: int = 2) -> Samp
 
 
 def float_energies(arm: Arm, q: np.ndarray, inertias: Sequence[Ten]) -> tuple[np.ndarray, np.ndarray]:
-    """Lower triangles of M, (points, n(n+1)/2), and V [J], (points,), at ``q`` (points, n) [rad, m]."""
+    """Return lower triangles of M, (points, n(n+1)/2), and V [J], (points,), at ``q`` (points, n) [rad, m]."""
     bases = base_denominators(arm)
     positions = [
         Position(np.cos(value / base), np.sin(value / base), value)
@@ -125,7 +125,7 @@ def float_energies(arm: Arm, q: np.ndarray, inertias: Sequence[Ten]) -> tuple[np
 
 
 def motions(arm: Arm, positions: Sequence[Position], number: Callable[[Fraction], Element]) -> list[Motion]:
-    """How every body's joint has moved when the coordinates stand at ``positions``."""
+    """Return how every body's joint has moved when the coordinates stand at ``positions``."""
     bases = base_denominators(arm)
     moved = []
     for body in arm.bodies:
@@ -148,7 +148,7 @@ def motions(arm: Arm, positions: Sequence[Position], number: Callable[[Fraction]
 
 
 def circle_point(angle: float) -> tuple[Fraction, Fraction]:
-    """The cosine and sine of an angle [rad], as a rational point of the circle within 1e-13 of it."""
+    """Return the cosine and sine of an angle [rad], as a rational point of the circle within 1e-13 of it."""
     if abs(cos(angle)) < 1e-12 or abs(sin(angle)) < 1e-12:
         return Fraction(round(cos(angle))), Fraction(round(sin(angle)))
     t = Fraction(tan(angle / 2)).limit_denominator(10**7)
@@ -156,18 +156,17 @@ def circle_point(angle: float) -> tuple[Fraction, Fraction]:
 
 
 def base_denominators(arm: Arm) -> list[int]:
-    """By coordinate, the d for which every body's angle is a whole multiple of q / d."""
-    return [
-        lcm(
-            *(b.multiplier.denominator for b in arm.bodies if b.coordinate == index and b.kind == "revolute"),
-            1,
-        )
-        for index in range(len(arm.coordinates))
-    ]
+    """Return by coordinate the d for which every body's angle is a whole multiple of q / d."""
+    denominators = [1] * len(arm.coordinates)
+    for body in arm.bodies:
+        if body.kind == "revolute":
+            index = body.coordinate
+            denominators[index] = lcm(denominators[index], body.multiplier.denominator)
+    return denominators
 
 
 def _turned(c: Element, s: Element, turns: int) -> tuple[Element, Element]:
-    """Cosine and sine of ``turns`` times an angle, by repeated doubling."""
+    """Return cosine and sine of ``turns`` times an angle, by repeated doubling."""
     result: tuple[Element, Element] = (1, 0)
     for bit in bin(abs(turns))[2:]:
         x, y = result
@@ -175,13 +174,17 @@ def _turned(c: Element, s: Element, turns: int) -> tuple[Element, Element]:
         if bit == "1":
             x, y = result
             result = (x * c - y * s, y * c + x * s)
-    return (result[0], result[1] if turns > 0 else -result[1])
+    if turns < 0:
+        return result[0], -result[1]
+    return result
 
 
 def _one_moved(values: np.ndarray, index: int, blocks: int) -> np.ndarray:
-    """The first half of ``values`` in every block, but the second half in coordinate ``index``'s own."""
-    base, other = np.split(values, 2)
-    return np.concatenate([other if block == index + 1 else base for block in range(blocks)])
+    """Return the first half of ``values`` in every block, but the second half in coordinate ``index``'s own."""
+    base, moved = np.split(values, 2)
+    result = np.tile(base, (blocks, 1))
+    result[index + 1] = moved
+    return result.ravel()
 
 
 def _residue_values(element: Residues | int, count: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The spans that decide an arm's structure: of its mass matrix, and of the changes each joint makes to it."""
+"""Find the spans that decide an arm's structure: of its mass matrix, and of the changes each joint makes to it."""
 
 from __future__ import annotations
 
@@ -7,16 +7,17 @@ from functools import cached_property
 import numpy as np
 
 from spelgen.arm.arm import Arm
+from spelgen.settings.tuning.structure import StructureTuning
 from spelgen.spec import Assume
 from spelgen.structure import field
 from spelgen.structure.recursion import triangle
 from spelgen.structure.sampling import Samples, field_samples, float_samples
 
-_SPARE_SAMPLES = 4
+TUNING = StructureTuning()
 
 
 class Spans:
-    """Row vectors over the n(n+1)/2 entries of M, in the prime field: ``mass`` spans W, ``changes[k]`` spans
+    """Hold row vectors over the n(n+1)/2 entries of M, in the prime field: ``mass`` spans W, ``changes[k]`` spans
     T_k.
     """
 
@@ -25,22 +26,18 @@ class Spans:
         self.keys = triangle(self.n)
         # a span of dimension d shows in d samples, and the spare ones would have shown a larger one, all but
         # surely
-        count = len(self.keys) + _SPARE_SAMPLES
+        count = len(self.keys) + TUNING.spare_samples
         samples = field_samples(arm, assume, count)
         self._arm, self._assume, self._count = arm, assume, count
         self.mass = samples.mass[0]
-        self.changes = [field.difference(samples.mass[k + 1], samples.mass[0]) for k in range(self.n)]
-        self.potential_changes = [
-            bool((samples.potential[k + 1] != samples.potential[0]).any()) for k in range(self.n)
-        ]
+        self.changes = [field.difference(moved, samples.mass[0]) for moved in samples.mass[1:]]
+        self.potential_changes = (samples.potential[1:] != samples.potential[0]).any(axis=1).tolist()
 
     @cached_property
     def entry_joints(self) -> list[frozenset[int]]:
         """The joints each entry of M depends on."""
-        return [
-            frozenset(k for k in range(self.n) if self.changes[k][:, index].any())
-            for index in range(len(self.keys))
-        ]
+        moved = np.array([change.any(axis=0) for change in self.changes])  # (n, entries)
+        return [frozenset(np.flatnonzero(column).tolist()) for column in moved.T]
 
     @cached_property
     def change_bases(self) -> list[np.ndarray]:
@@ -81,14 +78,15 @@ class Spans:
         """Rows that span the changes made by joints outside ``joints``, as coordinates in the basis of U."""
         first, last = min(joints), max(joints)
         between = [self._coordinates[k] for k in range(first, last) if k not in joints]
-        return np.concatenate([self._before[first], *between, self._after[last]])
+        return np.concatenate([self._nearer_root[first], *between, self._nearer_tip[last]])
 
     def changes_of(self, coordinates: np.ndarray) -> np.ndarray:
         """Changes of M's entries, (m, entries), by their coordinates (m, dim U) in the basis of U."""
-        others = [index for index in range(len(self.keys)) if index not in set(self._pivots)]
+        free = np.ones(len(self.keys), dtype=bool)
+        free[self._pivots] = False
         changes = np.zeros((len(coordinates), len(self.keys)), dtype=np.uint64)
         changes[:, self._pivots] = coordinates
-        changes[:, others] = field.product(coordinates, self.varying[:, others])
+        changes[:, free] = field.product(coordinates, self.varying[:, free])
         return changes
 
     @cached_property
@@ -101,7 +99,7 @@ class Spans:
         return [basis[:, self._pivots] for basis in self.change_bases]
 
     @cached_property
-    def _before(self) -> list[np.ndarray]:
+    def _nearer_root(self) -> list[np.ndarray]:
         """By joint, a basis of the changes made by the joints before it."""
         bases = [self._coordinates[0][:0]]
         for rows in self._coordinates[:-1]:
@@ -109,7 +107,7 @@ class Spans:
         return bases
 
     @cached_property
-    def _after(self) -> list[np.ndarray]:
+    def _nearer_tip(self) -> list[np.ndarray]:
         """By joint, a basis of the changes made by the joints after it."""
         bases = [self._coordinates[0][:0]]
         for rows in reversed(self._coordinates[1:]):
