@@ -105,8 +105,10 @@ def validate(values: Mapping[str, Any], document: Document | None = None) -> Non
             errors.append(SettingsError(got, file=file, line=line(name), element=name, expected=expected))
     collect(errors)
     errors = [
-        SettingsError(f"{one}: {values[one]} with {other}: {values[other]}", file=file, line=line(one), do=do)
-        for one, other, do in _conflicts(values)
+        SettingsError(
+            f"{first}: {values[first]} with {second}: {values[second]}", file=file, line=line(first), do=do
+        )
+        for first, second, do in _conflicts(values)
     ]
     collect(errors)
 

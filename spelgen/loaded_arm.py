@@ -53,8 +53,8 @@ class LoadedArm:
     @property
     def diagnostics(self) -> tuple[Diagnostic, ...]:
         """What reading the URDF and the settings, taking the arm and its inputs had to tell."""
-        parts = (self.robot, self.arm, self.actuation, self.settings)
-        return tuple(each for part in parts for each in part.diagnostics)
+        sources = (self.robot, self.arm, self.actuation, self.settings)
+        return tuple(item for source in sources for item in source.diagnostics)
 
     def structure_for(self, assume: Assume) -> Structure:
         """The structure that holds for any inertial values, or (``inertials``) for the URDF's own.

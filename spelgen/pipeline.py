@@ -76,7 +76,7 @@ def make_spec(loaded: LoadedArm, options: Options) -> ModelSpec:
         options,
         urdf=loaded.robot.path.name,
         urdf_sha256=loaded.robot.digest,
-        drives={each.name: loaded.settings.joint(each.name) for each in loaded.arm.coordinates},
+        drives={item.name: loaded.settings.joint(item.name) for item in loaded.arm.coordinates},
         servos=loaded.settings.input == "position",
     )
 
@@ -101,29 +101,29 @@ def check(module: str | Path, urdf: str | Path | None = None) -> CheckResult:
     module = Path(module)
     facts = read_facts(module)
     options = facts.options
-    found = Path(urdf) if urdf is not None else find_urdf(module, facts.urdf)
-    loaded = load_arm(found, options.joints, options.tip, options.angle_tolerance)
+    urdf_path = Path(urdf) if urdf is not None else find_urdf(module, facts.urdf)
+    loaded = load_arm(urdf_path, options.joints, options.tip, options.angle_tolerance)
     spec = make_spec(loaded, options)
     reasons = []
     if spec.urdf_sha256 != facts.urdf_sha256:
-        reasons.append(f"{found} has changed since the module was built")
+        reasons.append(f"{urdf_path} has changed since the module was built")
     if spec.sha256 != facts.spec_sha256:
         reasons.append("the derived model differs from the one in the module")
     if emit(spec) != module.read_text(encoding="utf-8"):
         reasons.append("the module's text differs from what `spelgen build` writes now")
     proof = loaded.verify(options.assume)
     reasons += [str(difference) for difference in proof.differences]
-    return CheckResult(found, not reasons, tuple(reasons), proof)
+    return CheckResult(urdf_path, not reasons, tuple(reasons), proof)
 
 
 def find_urdf(module: Path, name: str) -> Path:
     """The URDF called ``name`` near ``module``. Raises ModuleError."""
-    places = [module.parent, Path(), Path("robots"), module.parent / "robots"]
-    for place in places:
-        if (place / name).is_file():
-            return place / name
+    folders = [module.parent, Path(), Path("robots"), module.parent / "robots"]
+    for folder in folders:
+        if (folder / name).is_file():
+            return folder / name
     raise ModuleError(
-        f"its URDF {name!r} is in none of " + ", ".join(dict.fromkeys(str(place) for place in places)),
+        f"its URDF {name!r} is in none of " + ", ".join(dict.fromkeys(str(folder) for folder in folders)),
         file=module,
         do="name it with --robot",
     )

@@ -152,7 +152,7 @@ class ModelSpec:
     inputs: tuple[tuple[int, int, float, bool], ...] = ()
     """(row, column, value, trained) of G; none where each torque acts on its own actuated joint as it is."""
     motor_speeds: tuple[tuple[float, ...], ...] = ()
-    """By joint velocities, where G is none and motors move several joints all the same."""
+    """By joint velocities, where motors move several joints."""
     servos: tuple[ServoSpec, ...] = ()
     """Of joints that are commanded positions."""
 

@@ -122,7 +122,7 @@ def bounded(model: nn.Module, q: torch.Tensor) -> torch.Tensor:
     """Where, (...), M would not be positive definite by itself."""
     prepared = model.prepare()
     residuals = model.mass_at(model.configuration(q, prepared), prepared)[1]
-    part: torch.Tensor = residuals.part
+    part: torch.Tensor = residuals.fraction
     return part < 1
 
 

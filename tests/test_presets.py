@@ -23,6 +23,7 @@ from published_phnode import ByJvp, Published
 from test_model import bias
 
 from spelgen.design import Preset, load_design
+from spelgen.dynamics.protocol import has_friction_state
 from spelgen.fitting.rollout import position_difference
 from spelgen.loaded_arm import load_arm
 from spelgen.pipeline import generate, make_spec
@@ -116,8 +117,8 @@ def test_any_batch_shape(preset, net, batch, tmp_path):
 def test_backpropagation_reaches_every_weight(preset, net, tmp_path):
     model = random_model("rpr", tmp_path, seed=0, deviation=0.3, preset=preset, net=net)
     q, qd, _, tau = states(3)
-    z = 0.3 * model.memory(qd)
-    model.forward_dynamics(q, qd, tau, z).square().sum().backward()
+    past = [0.3 * model.memory(qd)] if has_friction_state(model) else []
+    model.forward_dynamics(q, qd, tau, *past).square().sum().backward()
     for name, parameter in model.named_parameters():
         # V's own level moves nothing
         assert "potential.network.biases" in name or parameter.grad.abs().max() > 0, name

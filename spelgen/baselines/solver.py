@@ -30,10 +30,10 @@ class Disturbed:
         return getattr(self.form, name)
 
     def port_hamiltonian_rhs(
-        self, q: Tensor, p: Tensor, tau: Tensor, prepared: object, z: Tensor | None = None
+        self, q: Tensor, p: Tensor, tau: Tensor, prepared: object, *state: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         """Return q' and p', (W, n)."""
-        qd, force = self.form.port_hamiltonian_rhs(q, p, tau, prepared, z)
+        qd, force = self.form.port_hamiltonian_rhs(q, p, tau, prepared, *state)
         return qd, force + self.disturbance
 
 

@@ -21,6 +21,6 @@ def on_arrays(function: Callable[..., np.ndarray], *states: Any) -> Any:
     return like(function(*rows), first)
 
 
-def like(found: np.ndarray, given: Any) -> Any:
+def like(result: np.ndarray, like_this: Any) -> Any:
     """``found`` as the array or tensor that ``given`` is."""
-    return found if isinstance(given, np.ndarray) else given.new_tensor(found)
+    return result if isinstance(like_this, np.ndarray) else like_this.new_tensor(result)

@@ -53,13 +53,13 @@ def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
     moved = np.diff(encoded(q), axis=0, prepend=q[:1])
     moved = (moved if bristles.motors is None else moved @ bristles.motors.T)[..., None]  # (T, n, 1)
     reach = bristles.values
-    kept = np.exp(-np.abs(moved) / reach)
-    added = np.sign(moved) * reach * (1 - kept)
+    decay = np.exp(-np.abs(moved) / reach)
+    added = np.sign(moved) * reach * (1 - decay)
     # z[k] = kept[k] z[k - 1] + added[k]: pairs are joined, then fours, ...
     shift = 1
     while shift < len(q):
-        added[shift:] += kept[shift:] * added[:-shift]
-        kept[shift:] *= kept[:-shift].copy()
+        added[shift:] += decay[shift:] * added[:-shift]
+        decay[shift:] *= decay[:-shift].copy()
         shift *= 2
     return added
 
@@ -72,9 +72,9 @@ def encoded(q: np.ndarray) -> np.ndarray:
     low, high = q - step, q + step  # clamping to a band after a band is clamping to one
     shift = 1
     while shift < len(q):
-        before, after = slice(None, -shift), slice(shift, None)
-        clamped = [np.clip(x[before], low[after], high[after]) for x in (low, high)]
-        low[after], high[after] = clamped
+        earlier, later = slice(None, -shift), slice(shift, None)
+        clamped = [np.clip(x[earlier], low[later], high[later]) for x in (low, high)]
+        low[later], high[later] = clamped
         shift *= 2
     return np.clip(np.broadcast_to(q[:1], q.shape), low, high)
 

@@ -24,14 +24,14 @@ class Constraint:
 
 def mimic_constraint(robot: Robot, coordinates: Sequence[str]) -> Constraint:
     """All moving joints of ``robot``: the coordinates, what follows them, and the others locked at 0."""
-    places = {name: k for k, name in enumerate(coordinates)}
+    columns = {name: k for k, name in enumerate(coordinates)}
     moving = [joint.name for joint in robot.joints if joint.moves]
-    jacobian, offset = np.zeros((len(moving), len(places))), np.zeros(len(moving))
+    jacobian, offset = np.zeros((len(moving), len(columns))), np.zeros(len(moving))
     for row, name in enumerate(moving):
         leader, multiplier, shift = _followed(robot, name)
         offset[row] = shift
-        if leader in places:
-            jacobian[row, places[leader]] = multiplier
+        if leader in columns:
+            jacobian[row, columns[leader]] = multiplier
     return Constraint(tuple(moving), jacobian, offset)
 
 

@@ -31,9 +31,9 @@ def parameter_table(model: nn.Module) -> dict[str, ParameterInfo]:
     Buffers are those that a part declares: what only some logs can tell, such as a friction compensation.
     """
     table = {name: NETWORK for name, _ in model.named_parameters()}
-    for path, part in model.named_modules():
-        for name, kind, unit in getattr(part, "kinds", ()):
-            if getattr(part, name) is not None:  # a part may do without
+    for path, module in model.named_modules():
+        for name, kind, unit in getattr(module, "kinds", ()):
+            if getattr(module, name) is not None:  # a part may do without
                 table[f"{path}.{name}" if path else name] = ParameterInfo(kind, unit)
     return table
 

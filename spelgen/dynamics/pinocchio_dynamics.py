@@ -66,7 +66,7 @@ class PinocchioDynamics:
 
     def gravity(self, q: Array) -> Array:
         """dV/dq, (..., n) [Nm, N]."""
-        return on_arrays(lambda at: self._effects(at, np.zeros_like(at)), q)
+        return on_arrays(lambda q: self._effects(q, np.zeros_like(q)), q)
 
     def friction_torque(self, q: Array, qd: Array) -> Array:
         """What friction takes, (..., n) [Nm, N]."""
@@ -89,9 +89,9 @@ class PinocchioDynamics:
             return positions
         configuration: np.ndarray = np.tile(pin.neutral(self.model), (*q.shape[:-1], 1))
         configuration[..., self._lines[:, 0]] = positions[..., self._lines[:, 1]]
-        for place, row in self._circles:  # a continuous joint is (cos, sin) in Pinocchio
-            configuration[..., place] = np.cos(positions[..., row])
-            configuration[..., place + 1] = np.sin(positions[..., row])
+        for index, row in self._circles:  # a continuous joint is (cos, sin) in Pinocchio
+            configuration[..., index] = np.cos(positions[..., row])
+            configuration[..., index + 1] = np.sin(positions[..., row])
         return configuration
 
     def _by_joint(self, algorithm: Callable[..., np.ndarray], *states: np.ndarray) -> np.ndarray:
@@ -100,8 +100,8 @@ class PinocchioDynamics:
         if not batch:
             return algorithm(self.model, self.data, *states)
         rows = zip(*(x.reshape(-1, x.shape[-1]) for x in states), strict=True)
-        found = np.array([algorithm(self.model, self.data, *each) for each in rows])
-        return found.reshape(*batch, *found.shape[1:])
+        result = np.array([algorithm(self.model, self.data, *row) for row in rows])
+        return result.reshape(*batch, *result.shape[1:])
 
     def _mass(self, q: np.ndarray) -> np.ndarray:
         upper = np.triu(self._by_joint(pin.crba, self.configuration(q)))
@@ -111,8 +111,8 @@ class PinocchioDynamics:
 
     def _effects(self, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
         effects = self._by_joint(pin.nle, self.configuration(q), qd @ self.jacobian.T)
-        found: np.ndarray = effects @ self.jacobian
-        return found
+        result: np.ndarray = effects @ self.jacobian
+        return result
 
     def _lost(self, qd: np.ndarray) -> np.ndarray:
         return np.zeros_like(qd) if self.friction is None else self.friction(qd)
@@ -126,8 +126,8 @@ class PinocchioDynamics:
         if self._same:  # a copy, for Pinocchio writes over what it gave
             return np.array(self._by_joint(pin.aba, self.configuration(q), qd, force))
         by_joint = (x @ self.jacobian.T for x in (qd, force))
-        found: np.ndarray = self._by_joint(pin.aba, self.configuration(q), *by_joint) @ self.jacobian
-        return found
+        result: np.ndarray = self._by_joint(pin.aba, self.configuration(q), *by_joint) @ self.jacobian
+        return result
 
     def _inverse(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
         by_joint = (x @ self.jacobian.T for x in (qd, qdd))
@@ -140,5 +140,5 @@ class PinocchioDynamics:
 
 def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     """x (..., n) of matrix (..., n, n) x = right (..., n)."""
-    found: np.ndarray = np.linalg.solve(matrix, right[..., None])[..., 0]
-    return found
+    result: np.ndarray = np.linalg.solve(matrix, right[..., None])[..., 0]
+    return result

@@ -34,16 +34,16 @@ def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) ->
     missing = [name for name in constraint.names if not model.existJointName(name)]
     if missing:
         raise ValueError(f"Pinocchio sees no joint {', '.join(missing)}")
-    known = settings.joints if drives else {}
+    by_joint = settings.joints if drives else {}
     damping, coulomb = (
         np.array([getattr(robot.joint[name], what) for name in joints]) for what in ("damping", "friction")
     )
     forward, backward = coulomb, -coulomb
     for k, name in enumerate(joints):
-        if name in known:
-            damping[k], (forward[k], backward[k]) = known[name].viscous, known[name].coulomb
-            place = model.joints[model.getJointId(name)].idx_v
-            model.armature[place] = known[name].rotor_inertia * known[name].gear ** 2
+        if name in by_joint:
+            damping[k], (forward[k], backward[k]) = by_joint[name].viscous, by_joint[name].coulomb
+            index = model.joints[model.getJointId(name)].idx_v
+            model.armature[index] = by_joint[name].rotor_inertia * by_joint[name].gear ** 2
 
     def friction(qd: np.ndarray) -> np.ndarray:
         s = np.tanh(qd / COULOMB_SMOOTHING_VELOCITY)
@@ -56,5 +56,5 @@ def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) ->
 
 def has_drives(urdf: Path, joints: Sequence[str]) -> bool:
     """Whether the settings beside a URDF tell of rotors or friction of these joints."""
-    known = load_settings(urdf).joints
-    return any(x.rotor_inertia or x.viscous or any(x.coulomb) for k, x in known.items() if k in joints)
+    drives = load_settings(urdf).joints
+    return any(x.rotor_inertia or x.viscous or any(x.coulomb) for k, x in drives.items() if k in joints)

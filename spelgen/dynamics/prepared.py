@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from spelgen.dynamics.protocol import memory_after
+from spelgen.dynamics.protocol import memory_after, sliding_memory
 from spelgen.dynamics.residuals import without_idle_residuals
 from spelgen.dynamics.runge_kutta import runge_kutta
 
@@ -57,22 +57,21 @@ class PreparedModel:
 
     def memory(self, qd: Tensor) -> Tensor:
         """Friction's memory z, (..., n, K), of joints that have long gone the way of qd: zero at rest."""
-        z: Tensor = self._dynamics.memory(qd)
-        return z
+        return sliding_memory(self._dynamics, qd)
 
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
         """qdd, (..., n), under the input tau."""
         mass, force = self._mass_and_force(q, qd, tau, z)
-        found: Tensor = torch.linalg.solve(mass, force.unsqueeze(-1))
-        return found.squeeze(-1)
+        result: Tensor = torch.linalg.solve(mass, force.unsqueeze(-1))
+        return result.squeeze(-1)
 
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None = None) -> Tensor:
         """The input, (..., n), that gives qdd."""
-        at = self._at(q)
-        mass, bias = self._mass_and_bias(at, qd)
+        pose = self._at(q)
+        mass, bias = self._mass_and_bias(pose, qd)
         force = (mass @ qdd.unsqueeze(-1)).squeeze(-1) + bias
-        force = force + self._friction(at, qd, z)
-        tau: Tensor = self._dynamics.input_torque(at, qd, force, self._weights)
+        force = force + self._friction(pose, qd, z)
+        tau: Tensor = self._dynamics.input_torque(pose, qd, force, self._weights)
         return tau
 
     def momentum(self, q: Tensor, qd: Tensor) -> Tensor:
@@ -81,10 +80,10 @@ class PreparedModel:
 
     def momentum_rate(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
         """p', (..., n) [Nm, N], under the input tau: what a momentum observer compares with."""
-        at, weights = self._at(q), self._weights
-        residuals = self._dynamics.mass_at(at, weights)[1]
-        force: Tensor = self._dynamics.lagrangian_gradient(at, qd, residuals, weights)
-        return force + self._dynamics.input_force(at, qd, tau, weights) - self._friction(at, qd, z)
+        pose, weights = self._at(q), self._weights
+        residuals = self._dynamics.mass_at(pose, weights)[1]
+        force: Tensor = self._dynamics.lagrangian_gradient(pose, qd, residuals, weights)
+        return force + self._dynamics.input_force(pose, qd, tau, weights) - self._friction(pose, qd, z)
 
     def step(
         self, q: Tensor, qd: Tensor, tau: Tensor, dt: float, z: Tensor | None = None, *, substeps: int = 1
@@ -101,10 +100,10 @@ class PreparedModel:
     ) -> State:
         """q and qd, (steps + 1, ..., n), and z from a state on; tau, (steps, ..., n), is held for dt [s] each."""
         states = [State(q, qd, self.memory(qd) if z is None else z)]
-        for held in tau:
-            at = states[-1]
-            states.append(self.step(at.q, at.qd, held, dt, at.z, substeps=substeps))
-        return State(*(torch.stack(each) for each in zip(*states, strict=True)))
+        for held_tau in tau:
+            q, qd, z = states[-1]
+            states.append(self.step(q, qd, held_tau, dt, z, substeps=substeps))
+        return State(*(torch.stack(values) for values in zip(*states, strict=True)))
 
     def linearize(
         self,
@@ -123,12 +122,12 @@ class PreparedModel:
         n = self.n
         z = self.memory(qd) if z is None else z
 
-        def function(state: Tensor, held: Tensor, kept: Tensor) -> Tensor:
-            place, speed = state.split(n)
+        def function(state: Tensor, tau: Tensor, z: Tensor) -> Tensor:
+            position, speed = state.split(n)
             if dt is None:
-                return torch.cat([speed, self._differentiable(place, speed, held, kept)])
-            after = self._stepped(self._differentiable, State(place, speed, kept), held, dt, substeps)
-            return torch.cat([after.q, after.qd])
+                return torch.cat([speed, self._differentiable(position, speed, tau, z)])
+            end = self._stepped(self._differentiable, State(position, speed, z), tau, dt, substeps)
+            return torch.cat([end.q, end.qd])
 
         batch, elements = q.shape[:-1], z.shape[-1]
         states = torch.cat([q, qd], dim=-1).reshape(-1, 2 * n)
@@ -139,22 +138,22 @@ class PreparedModel:
 
     def pose(self, q: Tensor) -> Tensor:
         """The tip's homogeneous transform in the root link's frame, (..., 4, 4). Raises ValueError without a tip."""
-        found: Tensor = self._kinematics().pose(q)
-        return found
+        result: Tensor = self._kinematics().pose(q)
+        return result
 
     def jacobian(self, q: Tensor) -> Tensor:
         """The tip's linear, then angular velocity by qd, (..., 6, n). Raises ValueError without a tip."""
-        found: Tensor = self._kinematics().jacobian(q)
-        return found
+        result: Tensor = self._kinematics().jacobian(q)
+        return result
 
     def compile(self) -> PreparedModel:
         """Itself, its forward and inverse dynamics compiled by ``torch.compile`` at their first calls."""
-        found = copy.copy(self)
+        result = copy.copy(self)
         for name in ("forward_dynamics", "inverse_dynamics"):
             # asserts between the kernels would take a tenth of the time
-            ready = torch.compile(getattr(self, name), fullgraph=True, options={"size_asserts": False})
-            setattr(found, name, ready)
-        return found
+            compiled = torch.compile(getattr(self, name), fullgraph=True, options={"size_asserts": False})
+            setattr(result, name, compiled)
+        return result
 
     def _kinematics(self) -> Any:
         if self._tip is None:
@@ -164,25 +163,26 @@ class PreparedModel:
     def _at(self, q: Tensor) -> Any:
         return self._dynamics.configuration(q, self._weights)
 
-    def _mass_and_bias(self, at: Any, qd: Tensor) -> tuple[Tensor, Tensor]:
-        mass, residuals = self._dynamics.mass_at(at, self._weights)
-        return mass, self._dynamics.nonlinear_at(at, qd, residuals, self._weights)
+    def _mass_and_bias(self, pose: Any, qd: Tensor) -> tuple[Tensor, Tensor]:
+        mass, residuals = self._dynamics.mass_at(pose, self._weights)
+        return mass, self._dynamics.nonlinear_at(pose, qd, residuals, self._weights)
 
-    def _friction(self, at: Any, qd: Tensor, z: Tensor | None) -> Tensor:
-        torque: Tensor = self._dynamics.friction_at(at, qd, self._weights, z if self.elements else None)
+    def _friction(self, pose: Any, qd: Tensor, z: Tensor | None) -> Tensor:
+        past = (z,) if self.elements else ()
+        torque: Tensor = self._dynamics.friction_at(pose, qd, self._weights, *past)
         return torque
 
     def _mass_and_force(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None) -> tuple[Tensor, Tensor]:
-        at = self._at(q)
-        mass, bias = self._mass_and_bias(at, qd)
-        force = self._dynamics.input_force(at, qd, tau, self._weights) - bias
-        return mass, force - self._friction(at, qd, z)
+        pose = self._at(q)
+        mass, bias = self._mass_and_bias(pose, qd)
+        force = self._dynamics.input_force(pose, qd, tau, self._weights) - bias
+        return mass, force - self._friction(pose, qd, z)
 
     def _differentiable(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
         """``forward_dynamics`` by the inverse: vmap of a forward derivative of linalg.solve is wrong in torch 2.13."""
         mass, force = self._mass_and_force(q, qd, tau, z)
-        found: Tensor = torch.linalg.inv(mass) @ force
-        return found
+        result: Tensor = torch.linalg.inv(mass) @ force
+        return result
 
     def _stepped(
         self, accelerations: Callable[..., Tensor], start: State, tau: Tensor, dt: float, substeps: int

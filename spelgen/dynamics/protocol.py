@@ -55,7 +55,7 @@ class PortHamiltonianDynamics(RigidDynamics, Protocol):
         """qd, (..., n)."""
 
     def port_hamiltonian_rhs(
-        self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Any, z: Tensor | None = None
+        self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Any, *state: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         """q' and p', (..., n), under the inputs tau; without, of the arm left to itself."""
 
@@ -106,10 +106,10 @@ def memory_along(dynamics: Any, q: Tensor, qd: Tensor, z: Tensor | None = None) 
 
     It starts at z, (W, n, elements), by default as of joints that have long gone the way of the first qd.
     """
-    found = [sliding_memory(dynamics, qd[:, 0]) if z is None else z]
+    states = [sliding_memory(dynamics, qd[:, 0]) if z is None else z]
     for moved in q.diff(dim=1).unbind(1):
-        found.append(memory_after(dynamics, found[-1], moved))
-    return torch.stack(found, dim=1)
+        states.append(memory_after(dynamics, states[-1], moved))
+    return torch.stack(states, dim=1)
 
 
 def known_past(dynamics: Any, z: Tensor | None) -> tuple[Tensor, ...]:

@@ -52,15 +52,15 @@ class RegressorDynamics:
 
     def mass_matrix(self, q: Array) -> Array:
         """M, (..., n, n) [kg m^2, kg m, kg]."""
-        return self._by_rows(lambda at, _: self._mass_and_bias(at, 0 * at)[0], q)
+        return self._by_rows(lambda position, _: self._mass_and_bias(position, 0 * position)[0], q)
 
     def gravity(self, q: Array) -> Array:
         """dV/dq, (..., n) [Nm, N]."""
-        return self._by_rows(lambda at, _: self._mass_and_bias(at, 0 * at)[1], q)
+        return self._by_rows(lambda position, _: self._mass_and_bias(position, 0 * position)[1], q)
 
     def nonlinear_effects(self, q: Array, qd: Array) -> Array:
         """Coriolis, centrifugal and gravity torques, (..., n) [Nm, N]."""
-        return self._by_rows(lambda at, speed, _: self._mass_and_bias(at, speed)[1], q, qd)
+        return self._by_rows(lambda position, speed, _: self._mass_and_bias(position, speed)[1], q, qd)
 
     def friction_torque(self, q: Array, qd: Array, z: Array | None = None) -> Array:
         """What friction takes, and what the measured torque shows without any, (..., n) [Nm, N]."""
@@ -115,5 +115,5 @@ class RegressorDynamics:
         """``function`` of states (T, n), and z (T, n, K) or None, for states (..., n)."""
         rows = np.broadcast_arrays(*(np.asarray(x) for x in states))
         past = None if z is None else np.asarray(z).reshape(-1, self.n, np.asarray(z).shape[-1])
-        found = function(*(x.reshape(-1, self.n) for x in rows), past)
-        return like(found.reshape(*rows[0].shape[:-1], *found.shape[1:]), states[0])
+        result = function(*(x.reshape(-1, self.n) for x in rows), past)
+        return like(result.reshape(*rows[0].shape[:-1], *result.shape[1:]), states[0])

@@ -12,17 +12,17 @@ def idle_residuals(model: Any) -> list[str]:
     """Return the names of a model's parameters of residuals that add nothing to it as it is."""
     if not has_residuals(model):
         return []
-    parts = [("joint_functions", model.joint_functions), ("residual_mass", model.residual_mass)]
+    modules = [("joint_functions", model.joint_functions), ("residual_mass", model.residual_mass)]
     idle = [
-        f"{part}.{name}"
-        for part, module in parts
+        f"{owner}.{name}"
+        for owner, module in modules
         for name, x in module.named_parameters(recurse=False)
         if not x.any()
     ]
-    for part in ("residual_mass", "residual_potential"):
-        network = getattr(getattr(model, part), "network", None)
+    for owner in ("residual_mass", "residual_potential"):
+        network = getattr(getattr(model, owner), "network", None)
         if network is not None and _is_idle(network):
-            idle += [f"{part}.network.{name}" for name, _ in network.named_parameters()]
+            idle += [f"{owner}.network.{name}" for name, _ in network.named_parameters()]
     return idle
 
 

@@ -37,8 +37,8 @@ class TipKinematics:
 
     def pose(self, q: torch.Tensor) -> torch.Tensor:
         """The homogeneous transform, (..., 4, 4)."""
-        found: torch.Tensor = self._chain.forward_kinematics(self._rows(q)).get_matrix()
-        return found.reshape(*q.shape[:-1], 4, 4)
+        result: torch.Tensor = self._chain.forward_kinematics(self._rows(q)).get_matrix()
+        return result.reshape(*q.shape[:-1], 4, 4)
 
     def position(self, q: torch.Tensor) -> torch.Tensor:
         """The link's origin, (..., 3) [m]."""
@@ -46,8 +46,8 @@ class TipKinematics:
 
     def jacobian(self, q: torch.Tensor) -> torch.Tensor:
         """Velocity of the link's origin [m/s], then angular velocity [rad/s], by qd; (..., 6, n), in root axes."""
-        found: torch.Tensor = self._chain.jacobian(self._rows(q)) @ self._jacobian
-        return found.reshape(*q.shape[:-1], 6, q.shape[-1])
+        result: torch.Tensor = self._chain.jacobian(self._rows(q)) @ self._jacobian
+        return result.reshape(*q.shape[:-1], 6, q.shape[-1])
 
     def _rows(self, q: torch.Tensor) -> torch.Tensor:
         """Positions of the chain's joints, (states, joints)."""
@@ -93,13 +93,15 @@ def _way(robot: Robot, link: str) -> bytes:
     for name in (robot.root, *(joint.child for joint in path)):
         etree.SubElement(root, "link", name=name)
     for joint in path:
-        own = etree.SubElement(root, "joint", name=joint.name, type=joint.type if joint.moves else "fixed")
-        etree.SubElement(own, "origin", xyz=_numbers(joint.xyz), rpy=_numbers(joint.rpy))
-        etree.SubElement(own, "parent", link=joint.parent)
-        etree.SubElement(own, "child", link=joint.child)
-        etree.SubElement(own, "axis", xyz=_numbers(joint.axis))
-    found: bytes = etree.tostring(root)
-    return found
+        joint_element = etree.SubElement(
+            root, "joint", name=joint.name, type=joint.type if joint.moves else "fixed"
+        )
+        etree.SubElement(joint_element, "origin", xyz=_numbers(joint.xyz), rpy=_numbers(joint.rpy))
+        etree.SubElement(joint_element, "parent", link=joint.parent)
+        etree.SubElement(joint_element, "child", link=joint.child)
+        etree.SubElement(joint_element, "axis", xyz=_numbers(joint.axis))
+    result: bytes = etree.tostring(root)
+    return result
 
 
 def _numbers(values: Sequence[float]) -> str:

@@ -33,15 +33,23 @@ class Runtime:
 def bundle(tailored: str) -> tuple[str, str]:
     """The imports, and the runtime's definitions, that the source text ``tailored`` needs."""
     runtime = load_runtime()
-    used = names_in(ast.parse(tailored))
+    tree = ast.parse(tailored)
+    # a kind of part, such as Network, is in a module the class of its own part
+    defined_here = {_defined(node) for node in tree.body}
+    used = names_in(tree)
     waiting = list(used)
     while waiting:
-        definition = runtime.definitions.get(waiting.pop())
+        name = waiting.pop()
+        definition = None if name in defined_here else runtime.definitions.get(name)
         new = definition.uses - used if definition else frozenset()
         used |= new
         waiting += new
-    parts = [definition.text for name, definition in runtime.definitions.items() if name in used]
-    return _imports(used, runtime.imports), "\n\n\n".join(parts)
+    texts = [
+        definition.text
+        for name, definition in runtime.definitions.items()
+        if name in used and name not in defined_here
+    ]
+    return _imports(used, runtime.imports), "\n\n\n".join(texts)
 
 
 @cache
@@ -50,7 +58,7 @@ def load_runtime() -> Runtime:
     folder = files("spelgen") / "runtime"
     texts = {
         path.name.removesuffix(".py"): path.read_text(encoding="utf-8")
-        for path in sorted(folder.iterdir(), key=lambda each: each.name)
+        for path in sorted(folder.iterdir(), key=lambda path: path.name)
         if path.name.endswith(".py") and path.name != "__init__.py"
     }
     trees = {name: ast.parse(text) for name, text in texts.items()}
@@ -72,8 +80,8 @@ def names_in(tree: ast.AST) -> set[str]:
 
 def _needs(tree: ast.Module) -> list[str]:
     """The runtime files that a file imports from, in a stable order."""
-    found = [node.module for node in tree.body if isinstance(node, ast.ImportFrom) and node.module]
-    return sorted(module.removeprefix(_OURS) for module in found if module.startswith(_OURS))
+    modules = [node.module for node in tree.body if isinstance(node, ast.ImportFrom) and node.module]
+    return sorted(module.removeprefix(_OURS) for module in modules if module.startswith(_OURS))
 
 
 def _bound(node: ast.Import | ast.ImportFrom) -> dict[str, str]:
@@ -103,18 +111,18 @@ def _text(node: ast.stmt, source: str) -> str:
     """A statement's lines, with decorators and with the comment right above it."""
     lines = source.splitlines()
     decorators = getattr(node, "decorator_list", [])
-    first = min([node.lineno, *(each.lineno for each in decorators)]) - 1
+    first = min([node.lineno, *(node_above.lineno for node_above in decorators)]) - 1
     while first and lines[first - 1].startswith("#"):
         first -= 1
     return "\n".join(lines[first : node.end_lineno])
 
 
-def _imports(used: Iterable[str], known: dict[str, str]) -> str:
+def _imports(used: Iterable[str], imports: dict[str, str]) -> str:
     """The imports of the used names, the standard library's first, then torch's, sorted as an import sorter does."""
     members: dict[str, list[str]] = {}
     plain = []
     for name in sorted(used):
-        statement = known.get(name)
+        statement = imports.get(name)
         if statement is None:
             continue
         if statement.startswith("from "):

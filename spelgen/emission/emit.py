@@ -25,6 +25,7 @@ def emit(spec: ModelSpec) -> str:
         types=tailored.names("joint_types", [joint.kind for joint in spec.joints]),
         class_summary=docstring.class_summary(spec),
         base=tailored.base(spec),
+        roles=tailored.roles(spec),
         elements=len(BRISTLE_REACH["revolute"]) if spec.design.memory == "bristles" else 0,
         setup=tailored.setup(spec),
         mass_entries=tailored.mass_entries(spec),

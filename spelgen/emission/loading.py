@@ -98,8 +98,8 @@ def load_module(module: str | Path, *, seed: int = 0) -> EmittedModel:
         exec(_compiled(source, path), vars(code))
         model = code.Model(seed=seed)
     except Exception as error:
-        told = f"import fails ({type(error).__name__}: {error})"
-        raise ModuleError(told, file=file, do="build it again") from error
+        problem = f"import fails ({type(error).__name__}: {error})"
+        raise ModuleError(problem, file=file, do="build it again") from error
     missing = [name for name in ("n", "joint_names", "joint_types", *METHODS) if not hasattr(model, name)]
     if missing or not isinstance(model, torch.nn.Module):
         raise ModuleError(f"a class Model without {', '.join(missing)}", file=file, expected=_EXPECTED)
@@ -128,8 +128,8 @@ def _private_name(source: str) -> str:
 def _summary(model: EmittedModel) -> str:
     count = sum(parameter.numel() for parameter in model.parameters())
     options = model.facts.options
-    made = options.preset + (f", {options.net}" if options.net in ("mlp", "kan") else "")
-    return f"<Model of {printable(model.facts.robot)!r} ({made}): {model.n} joints, {count} parameters>"
+    preset = options.preset + (f", {options.net}" if options.net in ("mlp", "kan") else "")
+    return f"<Model of {printable(model.facts.robot)!r} ({preset}): {model.n} joints, {count} parameters>"
 
 
 def _page(model: EmittedModel) -> str:

@@ -7,6 +7,8 @@ import re
 from collections.abc import Mapping
 from dataclasses import replace
 
+import numpy as np
+
 from spelgen.arm.actuation import Actuation
 from spelgen.arm.arm import Arm, Coordinate
 from spelgen.design import load_design
@@ -46,7 +48,7 @@ def plan_model(
     ``drives``: what is known of the joints' motors and gears; where no rotor inertia is, one is guessed.
     ``servos``: whether positions are commanded. Raises SettingsError where the design has no friction that remembers.
     """
-    known = drives or {}
+    settings_of = drives or {}
     design = load_design(options.design or options.preset, options.net)
     if servos and design.memory == "none":
         raise SettingsError(
@@ -66,7 +68,7 @@ def plan_model(
         options=replace(options, net=None if design.net == "none" else design.net),
         design=design,
         joints=tuple(
-            _joint(coordinate, identifiers[k], sizes, k, known.get(coordinate.name, JointSettings()))
+            _joint(coordinate, identifiers[k], sizes, k, settings_of.get(coordinate.name, JointSettings()))
             for k, coordinate in enumerate(arm.coordinates)
         ),
         entries=tuple((e.row, e.column, e.kind, e.joints) for e in structure.entries),
@@ -95,11 +97,19 @@ def plan_model(
         inputs=()
         if actuation.direct
         else tuple((x.row, x.column, x.value, x.kind == "gain") for x in actuation.entries),
-        motor_speeds=tuple(map(tuple, actuation.drives().speeds.tolist())) if actuation.couplings else (),
-        servos=tuple(_servo(x, known.get(x.name, JointSettings())) for x in arm.coordinates)
+        motor_speeds=_motor_speeds(actuation),
+        servos=tuple(_servo(x, settings_of.get(x.name, JointSettings())) for x in arm.coordinates)
         if servos
         else (),
     )
+
+
+def _motor_speeds(actuation: Actuation) -> tuple[tuple[float, ...], ...]:
+    """Return C, by which motors' speeds are C qd; empty where each motor moves its own joint alone."""
+    speeds = actuation.drives().speeds
+    if np.array_equal(speeds, np.eye(actuation.joints)):
+        return ()
+    return tuple(map(tuple, speeds.tolist()))
 
 
 def _joint(
@@ -152,27 +162,27 @@ def _friction(coordinate: Coordinate, sizes: Nominal, index: int) -> float:
     """The size of friction to start from: a share of the drive's effort, or of the torques the nominal arm
     needs.
     """
-    known = guessed_friction(coordinate)
-    if known is not None:
-        return known
+    friction = guessed_friction(coordinate)
+    if friction is not None:
+        return friction
     # a wrist may need next to no torque by itself, but its gear rubs like its neighbour's
     return _FRICTION_OF_TORQUE * max(sizes.joint_torque[index], 0.01 * max(sizes.joint_torque))
 
 
 def _identifiers(names: list[str]) -> list[str]:
     """Unique ASCII identifiers, recognisable where the name allows it."""
-    taken: set[str] = set()
-    found = []
+    used: set[str] = set()
+    identifiers = []
     for index, name in enumerate(names, start=1):
         plain = re.sub(r"[^0-9a-z]+", "_", name.lower()).strip("_")[:40]
         if not plain or keyword.iskeyword(plain) or keyword.issoftkeyword(plain) or plain[0].isdigit():
             plain = f"joint_{plain or index}"
         unique, count = plain, 2
-        while unique in taken:
+        while unique in used:
             unique, count = f"{plain}_{count}", count + 1
-        taken.add(unique)
-        found.append(unique)
-    return found
+        used.add(unique)
+        identifiers.append(unique)
+    return identifiers
 
 
 def _floats(weights: Weights) -> Entries:

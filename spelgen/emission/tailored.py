@@ -9,6 +9,7 @@ from textwrap import wrap
 
 from spelgen.design import BRISTLE_REACH
 from spelgen.emission.source import WIDTH, Call, Code, assignment, call, laid_out
+from spelgen.emission.unit_joints import hidden_units
 from spelgen.labels import entry_name, joint_ranges
 from spelgen.spec import ModelSpec
 
@@ -31,6 +32,20 @@ def base(spec: ModelSpec) -> str:
     return "RigidBodyDynamics" if spec.design.net == "none" else "ResidualDynamics"
 
 
+def roles(spec: ModelSpec) -> list[tuple[str, str]]:
+    """The class of each kind of part that the model has, by the name that the runtime has for the kind."""
+    pairs = [("Network", "MaskedKAN" if spec.design.net == "kan" else "MaskedMLP")]
+    if not spec.bodies:
+        mass = "DenseMass" if spec.design.mass == "dense-3n" else "DerivedMass"
+        if mass == "DerivedMass" and not spec.outputs:
+            mass = "ConstantMass"
+        friction = "JointFriction" if spec.design.dissipation == "per-joint" else "DenseFriction"
+        pairs += [("Mass", mass), ("Friction", friction)]
+    coupled = "MotorInput" if spec.inputs else "DirectInput"
+    pairs.append(("Input", "DenseInput" if spec.design.input == "dense-3n" else coupled))
+    return pairs[1:] if spec.design.net == "none" else pairs
+
+
 def setup(spec: ModelSpec) -> str:
     """The statements of the model's ``__init__`` that make its parts, and itself of them."""
     lines = [assignment("joints", _joints(spec), _INDENT)]
@@ -43,7 +58,7 @@ def mass_entries(spec: ModelSpec) -> str:
     if spec.design.mass != "derived" and (not spec.bodies or spec.design.net == "none"):
         return ""
     cells: defaultdict[tuple[int, int], list[tuple[float, str]]] = defaultdict(list)
-    functions, constants = [each.basis for each in spec.outputs], [each.basis for each in spec.constants]
+    functions, constants = [term.basis for term in spec.outputs], [term.basis for term in spec.constants]
     for letter, bases in (("f", functions), ("c", constants)):
         for number, basis in enumerate(bases, start=1):
             for row, column, factor in basis:
@@ -60,8 +75,8 @@ def mass_entries(spec: ModelSpec) -> str:
                 text = name
             names.append(text)
         rows.append(Code(f"[{', '.join(names)}]"))
-    whole = laid_out("return ", Call("symmetric", tuple((None, row) for row in rows)), _INDENT)
-    return "\n".join(" " * _INDENT + line for line in lines) + "\n" + " " * _INDENT + whole
+    statement = laid_out("return ", Call("symmetric", tuple((None, row) for row in rows)), _INDENT)
+    return "\n".join(" " * _INDENT + line for line in lines) + "\n" + " " * _INDENT + statement
 
 
 def names(target: str, values: Iterable[str]) -> str:
@@ -77,10 +92,10 @@ def units(spec: ModelSpec) -> int:
 
 def _told(spec: ModelSpec) -> list[str]:
     """Comments that say which joints the functions read."""
-    told = ", ".join(
+    text = ", ".join(
         f"f{number}(q{joint_ranges(output.joints)})" for number, output in enumerate(spec.outputs, start=1)
     )
-    return [f"# {line}" for line in wrap(told, WIDTH - _INDENT - 2, break_on_hyphens=False)]
+    return [f"# {line}" for line in wrap(text, WIDTH - _INDENT - 2, break_on_hyphens=False)]
 
 
 def _unpacked(letter: str, count: int) -> list[str]:
@@ -89,12 +104,12 @@ def _unpacked(letter: str, count: int) -> list[str]:
         return (
             [f"{', '.join(names)} = {letter}" if count > 1 else f"({names[0]},) = {letter}"] if names else []
         )
-    starts = range(0, count, _UNPACKED)
-    return [
-        f"{', '.join(part)}{',' * (len(part) == 1)} = {letter}[{start}:{start + len(part)}]"
-        for start in starts
-        for part in [names[start : start + _UNPACKED]]
-    ]
+    lines = []
+    for start in range(0, count, _UNPACKED):
+        chunk = names[start : start + _UNPACKED]
+        comma = "," if len(chunk) == 1 else ""
+        lines.append(f"{', '.join(chunk)}{comma} = {letter}[{start}:{start + len(chunk)}]")
+    return lines
 
 
 def _sum(terms: Iterable[tuple[float, str]]) -> str:
@@ -146,15 +161,18 @@ def _rigid_bodies(spec: ModelSpec) -> list[str]:
         inertia=tuple(tuple(body.reference[k] for k in (4, 7, 9)) for body in spec.bodies),
         products=tuple(tuple(body.reference[k] for k in (5, 6, 8)) for body in spec.bodies),
     )
-    made: list[tuple[str, object]] = [("bodies", bodies)]
-    parts: list[object] = [Code("joints"), Code("bodies"), spec.gravity, _input(spec)]
+    statements: list[tuple[str, object]] = [("bodies", bodies)]
+    statements += _input(spec)
+    arguments: list[object] = [Code("joints"), Code("bodies"), spec.gravity, Code("input")]
     if spec.design.net != "none":
-        made += _residuals(spec)
-        parts += [Code("mass"), Code("potential") if spec.potential else None]
+        statements += _residuals(spec)
+        arguments += [Code("mass"), Code("potential") if spec.potential else None]
     reach = tuple(BRISTLE_REACH[x.kind] for x in spec.joints)
-    remembers = {"reach": reach} if spec.design.memory == "bristles" else {}
-    lines = [assignment(name, value, _INDENT) for name, value in made]
-    lines.append(_base_setup(call("super().__init__", *parts, **remembers)))
+    named: dict[str, object] = {"reach": reach} if spec.design.memory == "bristles" else {}
+    if spec.motor_speeds:
+        named["motors"] = spec.motor_speeds
+    lines = [assignment(name, value, _INDENT) for name, value in statements]
+    lines.append(_base_setup(call("super().__init__", *arguments, **named)))
     if spec.servos:
         lines.append(assignment("self.servo", _servo(spec), _INDENT))
     return lines
@@ -162,19 +180,16 @@ def _rigid_bodies(spec: ModelSpec) -> list[str]:
 
 def _residuals(spec: ModelSpec) -> list[tuple[str, object]]:
     """What stands beside rigid bodies, in the order in which it draws its random weights."""
-    made: list[tuple[str, object]] = []
+    statements: list[tuple[str, object]] = []
     if spec.outputs or spec.potential:
-        made.append(("generator", Code("torch.Generator().manual_seed(seed)")))
+        statements.append(("generator", Code("torch.Generator().manual_seed(seed)")))
     network: object = None
     if spec.outputs:
-        made += [
-            ("functions", _grouped("functions = ", [each.joints for each in spec.outputs])),
-            ("network", _mass_network(spec, Code("functions"))),
-        ]
+        statements += _mass_network(spec)
         network = Code("network")
     sizes = len(spec.outputs), len(spec.constants)
     mass = call("ResidualMass", Code("joints"), Code("self.mass_entries"), *sizes, network)
-    return [*made, ("mass", mass), *_potential(spec)]
+    return [*statements, ("mass", mass), *_potential(spec)]
 
 
 def _grouped(start: str, rows: Sequence[tuple[int, ...]]) -> Code:
@@ -206,17 +221,16 @@ def _servo(spec: ModelSpec) -> Call:
 
 def _networks(spec: ModelSpec) -> list[str]:
     """Parts in the order in which they draw their random weights: mass, potential, friction, input."""
-    made: list[tuple[str, object]] = [
+    statements: list[tuple[str, object]] = [
         ("generator", Code("torch.Generator().manual_seed(seed)")),
         ("encoding", Code("JointEncoding(joints)")),
     ]
-    made += [*_mass(spec), *_potential(spec), ("friction", _friction(spec))]
-    parts: list[object] = [Code(name) for name in ("encoding", "mass", "potential", "friction")]
+    statements += [*_mass(spec), *_potential(spec), *_friction(spec), *_input(spec)]
+    arguments: list[object] = [Code(name) for name in ("encoding", "mass", "potential", "friction", "input")]
     if not spec.potential:
-        parts[2] = None
-    parts.append(_input(spec))
-    lines = [assignment(name, value, _INDENT) for name, value in made]
-    return [*lines, _base_setup(call("super().__init__", *parts))]
+        arguments[2] = None
+    lines = [assignment(name, value, _INDENT) for name, value in statements]
+    return [*lines, _base_setup(call("super().__init__", *arguments))]
 
 
 def _base_setup(value: Call) -> str:
@@ -227,33 +241,35 @@ def _mass(spec: ModelSpec) -> list[tuple[str, object]]:
     if spec.design.mass == "dense-3n":
         sensitivity = tuple(joint.mass_sensitivity for joint in spec.joints)
         rows = 3 * len(spec.joints)
-        outputs = Code(f"[range({len(spec.joints)})] * {rows * (rows + 1) // 2}")
-        network = _network(spec, outputs, tuple(range(len(spec.joints))), sensitivity)
-        made = call("DenseMass", Code("joints"), mean=mean_mass(spec), network=network)
-        return [("mass", made)]
-    constants = tuple((each.start, each.scale) for each in spec.constants)
+        everything = tuple(range(len(spec.joints)))
+        network = _network(spec, "mass", (everything,) * (rows * (rows + 1) // 2), everything, sensitivity)
+        mass = call("DenseMass", Code("joints"), mean=mean_mass(spec), network=Code("network"))
+        return [*network, ("mass", mass)]
+    constants = tuple((term.start, term.scale) for term in spec.constants)
     if not spec.outputs:
         return [("mass", call("ConstantMass", Code("joints"), Code("self.mass_entries"), constants))]
-    functions = tuple(
-        call("MassFunction", each.joints, mean=each.mean, scale=each.scale) for each in spec.outputs
+    mass = call(
+        "DerivedMass",
+        Code("joints"),
+        Code("self.mass_entries"),
+        mean=tuple(output.mean for output in spec.outputs),
+        scale=tuple(output.scale for output in spec.outputs),
+        constants=constants,
+        network=Code("network"),
+        margin=spec.margin,
     )
-    parts = [Code(name) for name in ("joints", "self.mass_entries", "functions", "constants", "network")]
-    return [
-        ("functions", functions),
-        ("constants", constants),
-        ("network", _mass_network(spec, Code("[function.joints for function in functions]"))),
-        ("mass", call("DerivedMass", *parts, spec.margin)),
-    ]
+    return [*_mass_network(spec), ("mass", mass)]
 
 
-def _mass_network(spec: ModelSpec, outputs: Code) -> Call:
+def _mass_network(spec: ModelSpec) -> list[tuple[str, object]]:
     """The network of M's functions, which reads the joints that they depend on."""
-    least = _LEAST_UNITS if spec.design.net == "mlp" else _LEAST_KAN_UNITS
-    read = tuple(sorted({joint for each in spec.outputs for joint in each.joints}))
+    fewest = _LEAST_KAN_UNITS if spec.design.net == "kan" else _LEAST_UNITS
+    outputs = tuple(output.joints for output in spec.outputs)
+    read = tuple(sorted({joint for joints in outputs for joint in joints}))
     if spec.design.encoding == "lie-group":
         read = tuple(range(len(spec.joints)))
     sensitivity = tuple(joint.mass_sensitivity for joint in spec.joints)
-    return _network(spec, outputs, read, sensitivity, least=least)
+    return _network(spec, "mass", outputs, read, sensitivity, fewest=fewest)
 
 
 def _potential(spec: ModelSpec) -> list[tuple[str, object]]:
@@ -261,59 +277,61 @@ def _potential(spec: ModelSpec) -> list[tuple[str, object]]:
         return []
     sensitivity = tuple(joint.potential_sensitivity for joint in spec.joints)
     width = max(_LEAST_UNITS, round(_POTENTIAL_FRACTION * units(spec)))
-    network = _network(spec, (spec.potential,), spec.potential, sensitivity, width=width)
-    made = call("LearnedPotential", spec.potential_scale, Code("network"))
-    return [("network", network), ("potential", made)]
+    network = _network(spec, "potential", (spec.potential,), spec.potential, sensitivity, width=width)
+    return [*network, ("potential", call("LearnedPotential", spec.potential_scale, Code("network")))]
 
 
 def _network(
     spec: ModelSpec,
-    outputs: object,
+    quantity: str,
+    outputs: tuple[tuple[int, ...], ...],
     read: tuple[int, ...],
     sensitivity: object,
     *,
     axes: int = 0,
     width: int | None = None,
-    least: int | None = None,
-) -> Call:
-    """A network of ``outputs``; ``read``: the joints whose encoding it reads."""
+    fewest: int = 1,
+) -> list[tuple[str, object]]:
+    """Return the statements that make a network of ``outputs`` for a quantity; ``read``: the joints that it reads."""
     if spec.design.encoding == "lie-group":
         inputs = call("lie_group_input", Code("joints"), sensitivity)
     else:
         inputs = call("joint_input", Code("joints"), read, sensitivity)
     if axes:
         inputs = call("with_velocities", inputs, Code("joints"), axes)
-    size = {"width": width or units(spec), "depth": spec.options.depth} | ({"least": least} if least else {})
-    kind = "MaskedMLP" if spec.design.net == "mlp" else "MaskedKAN"
-    return call(kind, inputs, call("unit_joints", outputs, **size), _SEED)
+    hidden = hidden_units(outputs, width or units(spec), fewest)
+    layers = ", ".join([*([f"{quantity}_hidden"] * spec.options.depth), f"{quantity}_outputs"])
+    return [
+        (f"{quantity}_outputs", _grouped(f"{quantity}_outputs = ", outputs)),
+        (f"{quantity}_hidden", _grouped(f"{quantity}_hidden = ", hidden)),
+        ("network", call("Network", inputs, Code(f"({layers})"), _SEED)),
+    ]
 
 
-def _friction(spec: ModelSpec) -> Call:
+def _friction(spec: ModelSpec) -> list[tuple[str, object]]:
     if spec.design.dissipation == "per-joint":
-        return call("JointFriction", Code("joints"), Code("encoding"), _SEED)
+        return [("friction", call("JointFriction", Code("joints"), Code("encoding"), _SEED))]
     n, axes = len(spec.joints), _FRICTION_AXES[spec.design.dissipation]
     everything, rows = tuple(range(n)), axes * n
-    outputs = Code(f"[range({n})] * {rows * (rows + 1) // 2}")
-    sensitivity = (_POSITION_SENSITIVITY,) * n
-    network = _network(spec, outputs, everything, sensitivity, axes=axes)
-    return call("DenseFriction", Code("joints"), network, axes=axes)
+    outputs = (everything,) * (rows * (rows + 1) // 2)
+    network = _network(spec, "friction", outputs, everything, (_POSITION_SENSITIVITY,) * n, axes=axes)
+    friction = call("DenseFriction", Code("joints"), Code("network"), axes=axes)
+    return [*network, ("friction", friction)]
 
 
-def _input(spec: ModelSpec) -> Call:
+def _input(spec: ModelSpec) -> list[tuple[str, object]]:
     if spec.design.input == "dense-3n":
         n = len(spec.joints)
         everything = tuple(range(n))
-        outputs = Code(f"[range({n})] * {3 * n}")
-        network = _network(spec, outputs, everything, (1.0,) * n)
-        return call("DenseInput", Code("joints"), network)
+        network = _network(spec, "input", (everything,) * (3 * n), everything, (1.0,) * n)
+        return [*network, ("input", call("DenseInput", Code("joints"), Code("network")))]
     if not spec.inputs:
-        speeds = {"motor_speeds": spec.motor_speeds} if spec.motor_speeds else {}
-        return call("DirectInput", Code("joints"), **speeds)
+        return [("input", call("DirectInput", Code("joints")))]
     gains = tuple(
         call("MotorGain", joint, motor, value, trained=trained)
         for joint, motor, value, trained in spec.inputs
     )
-    return call("MotorInput", Code("joints"), gains)
+    return [("input", call("MotorInput", Code("joints"), gains))]
 
 
 def mean_mass(spec: ModelSpec) -> tuple[tuple[float, ...], ...]:

@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from spelgen.dynamics.protocol import memory_along
+from spelgen.dynamics.protocol import known_past, memory_along
 from spelgen.logs.windows import Windows
 from spelgen.settings.tuning.evaluation import EvaluationTuning
 
@@ -44,8 +44,10 @@ def observe(dynamics: Any, windows: Windows, past: int) -> tuple[Windows, Tensor
     cache = dynamics.prepare()
     p = dynamics.momentum(q, qd, cache)
     # the input jumps at samples: each interval has its own at both ends
-    _, at_start = dynamics.port_hamiltonian_rhs(q[:, :-1], p[:, :-1], tau, cache, z[:, :-1])
-    _, at_end = dynamics.port_hamiltonian_rhs(q[:, 1:], p[:, 1:], tau, cache, z[:, 1:])
+    _, at_start = dynamics.port_hamiltonian_rhs(
+        q[:, :-1], p[:, :-1], tau, cache, *known_past(dynamics, z[:, :-1])
+    )
+    _, at_end = dynamics.port_hamiltonian_rhs(q[:, 1:], p[:, 1:], tau, cache, *known_past(dynamics, z[:, 1:]))
     lacking = p.diff(dim=1) / dt - (at_start + at_end) / 2  # d of each interval, (W, past, n)
     gain = 1 - torch.exp(-dt / TUNING.observer_time_constant)
     r = torch.zeros_like(lacking[:, 0])

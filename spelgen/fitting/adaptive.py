@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import torch
 
-from spelgen.dynamics.protocol import has_friction_state, memory_after, sliding_memory
+from spelgen.dynamics.protocol import has_friction_state, known_past, memory_after, sliding_memory
 from spelgen.logs.windows import Windows
 from spelgen.settings.tuning.fitting import AdaptiveTuning
 
@@ -69,7 +68,7 @@ class _Interval(torch.nn.Module):
         z: torch.Tensor,
     ) -> None:
         super().__init__()
-        self.past = partial(memory_after, model, z)
+        self.past = lambda moved: known_past(model, memory_after(model, z, moved))
         # functions, not parts of this module: the weights are the model's own
         self.rhs, self.prepare, self.prepared = model.port_hamiltonian_rhs, model.prepare, prepared
         self.step, self.tau, self.start = step, tau, start
@@ -77,4 +76,4 @@ class _Interval(torch.nn.Module):
     def forward(self, t: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
         q, p = state.chunk(2, dim=-1)
         prepared = self.prepare() if self.prepared is None else self.prepared
-        return self.step * torch.cat(self.rhs(q, p, self.tau, prepared, self.past(q - self.start)), dim=-1)
+        return self.step * torch.cat(self.rhs(q, p, self.tau, prepared, *self.past(q - self.start)), dim=-1)

@@ -50,7 +50,7 @@ class Compiled:
         p: torch.Tensor,
         tau: torch.Tensor | None,
         prepared: Any,
-        z: torch.Tensor | None = None,
+        *state: torch.Tensor | None,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """As the model's. A window's first q, a measured one, is made like all later ones: else it would be compiled
         for by itself, which doubles the wait.
@@ -58,7 +58,7 @@ class Compiled:
         q = q.contiguous()
         if torch.is_grad_enabled() and not q.requires_grad:
             q = q.detach().requires_grad_()
-        return self._rhs(q, p, tau, prepared, z)
+        return self._rhs(q, p, tau, prepared, *state)
 
 
 def compiled(model: EmittedModel, windows: Windows, scales: LossScales) -> EmittedModel:

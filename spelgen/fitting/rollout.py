@@ -10,7 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from spelgen.dynamics.protocol import PortHamiltonianDynamics, memory_after, memory_along, sliding_memory
+from spelgen.dynamics.protocol import (
+    PortHamiltonianDynamics,
+    known_past,
+    memory_after,
+    memory_along,
+    sliding_memory,
+)
 from spelgen.dynamics.runge_kutta import runge_kutta
 from spelgen.fitting.adaptive import roll_out_adaptive
 from spelgen.logs.windows import Windows
@@ -64,7 +70,8 @@ def _rhs(
     p: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return q' and p' where joints have moved so far from q, where friction's memory was z."""
-    return model.port_hamiltonian_rhs(q + moved, p, tau, prepared, memory_after(model, z, moved))
+    past = known_past(model, memory_after(model, z, moved))
+    return model.port_hamiltonian_rhs(q + moved, p, tau, prepared, *past)
 
 
 def position_difference(
@@ -152,7 +159,8 @@ def momentum_loss(model: EmittedModel, windows: Windows, scales: LossScales) -> 
     mass, residuals = dynamics.mass_at(at, prepared)
     p = (mass @ qd.unsqueeze(-1)).squeeze(-1)
     force = dynamics.lagrangian_gradient(at, qd, residuals, prepared)
-    force = force - dynamics.friction_at(at, qd, prepared, memory_along(model, q, qd, windows.z))
+    past = known_past(model, memory_along(model, q, qd, windows.z))
+    force = force - dynamics.friction_at(at, qd, prepared, *past)
     driven = [
         dynamics.input_force(at, qd, torch.cat(held, dim=1), prepared)
         for held in ((tau, tau[:, -1:]), (tau[:, :1], tau))  # over the interval after each sample, and before

@@ -43,8 +43,8 @@ def fit_networks(
     scale = torch.maximum(scale, 1e-2 * scale.amax())
 
     def missed(block: tuple[int, Block]) -> torch.Tensor:
-        number, (q, qd, qdd, tau, z) = block
-        error = ((model.inverse_dynamics(q, qd, qdd, z if z.shape[-1] else None) - tau) / scale).square()
+        number, (q, qd, qdd, tau, _) = block
+        error = ((model.inverse_dynamics(q, qd, qdd) - tau) / scale).square()
         part = error.mean() if count <= BLOCK else error.sum() / (count * joints)
         if number or penalty is None:
             return part

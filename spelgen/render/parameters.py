@@ -236,6 +236,15 @@ def _unit(column: str, kind: str) -> str:
     return FRICTION_UNITS.get(column, "{force}").format(force=FORCE[kind], length=length, speed=speed)
 
 
+def constant_basis(mass: Any) -> torch.Tensor:
+    """Return what each constant adds to M, (constants, n, n)."""
+    count = len(mass.raw_constants)
+    functions = torch.zeros(len(getattr(mass, "function_mean", ())), count, dtype=torch.float64)
+    units = torch.eye(count, dtype=torch.float64)
+    basis: torch.Tensor = mass.entries(functions.unbind(), units.unbind())
+    return basis
+
+
 def mass_constants(run: RunFolder) -> list[Constant]:
     """Return the constants of M that the best model of a run has learned; none where its preset has none.
 
@@ -246,7 +255,7 @@ def mass_constants(run: RunFolder) -> list[Constant]:
     if not hasattr(mass, "constants"):
         return []
     constants = []
-    bases = mass.constant_basis.reshape(-1, trained.n, trained.n)
+    bases = constant_basis(mass)
     start: Any = untrained.mass
     for basis, old, new in zip(bases, start.constants().tolist(), mass.constants().tolist(), strict=True):
         entries = [(row, column) for row, column in basis.tril().nonzero().tolist()]

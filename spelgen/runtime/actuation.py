@@ -9,55 +9,32 @@ import torch
 from torch import Tensor, nn
 
 from spelgen.runtime.joints import Joints, vector
-from spelgen.runtime.network import Network
-
-
-def motor_speeds(gains: Tensor) -> Tensor:
-    """C, (n, n): the motors' speeds are C qd, where the joints' torques are ``gains`` times the motors'.
-
-    By the same power, each motor's in the units of the joint that it moves most: C is the identity where
-    each moves its own joint alone.
-    """
-    largest = gains.gather(0, gains.abs().argmax(dim=0, keepdim=True))
-    passive = largest == 0
-    return (gains / torch.where(passive, torch.ones_like(largest), largest)).mT + torch.diag(
-        passive[0].to(gains)
-    )
+from spelgen.runtime.parts import Network
 
 
 class DirectInput(nn.Module):
-    """G is the identity: each input is the torque of its own joint, and none that of a passive one.
-
-    motor_speeds: C, (n, n), where motors move several joints all the same: they turn by C qd.
-    """
+    """G is the identity: each input is the torque of its own joint, and none that of a passive one."""
 
     actuated: Tensor
 
-    def __init__(self, joints: Joints, motor_speeds: Sequence[Sequence[float]] = ()) -> None:
+    def __init__(self, joints: Joints) -> None:
         super().__init__()
         self.register_buffer("actuated", vector(float(x) for x in joints.actuated))
-        self._motor_speeds = motor_speeds
-
-    def motor_speeds(self) -> Tensor:
-        """C, (n, n), by joint velocities."""
-        if not self._motor_speeds:
-            return torch.eye(len(self.actuated), dtype=torch.float64)
-        return torch.tensor(self._motor_speeds, dtype=torch.float64)
 
     def prepare(self) -> Tensor:
-        """The diagonal of G, (n,)."""
+        """Return the diagonal of G, (n,)."""
         return self.actuated
 
     def forward(self, encoded: Tensor, prepared: Tensor) -> Tensor:
-        """G, (..., n, n)."""
-        return torch.diag(prepared).expand(*encoded.shape[:-1], len(prepared), len(prepared))
+        """Return G, (..., n, n)."""
+        return torch.diag(prepared).expand(*encoded.shape[:-1], -1, -1)
 
     def force(self, encoded: Tensor, tau: Tensor, prepared: Tensor) -> Tensor:
-        """G tau, (..., n)."""
+        """Return G tau, (..., n)."""
         return prepared * tau
 
     def solve(self, encoded: Tensor, force: Tensor, prepared: Tensor) -> Tensor:
-        """The inputs, (..., n), that make this force; a passive joint shows the torque it lacks."""
+        """Return the inputs, (..., n), that make this force; a passive joint shows the torque it lacks."""
         return force
 
 
@@ -76,7 +53,7 @@ class MotorInput(nn.Module):
     kinds = (("raw_gains", "gains", "1"),)
 
     actuated: Tensor
-    known: Tensor
+    constant: Tensor
     trained: Tensor
     rows: Tensor  # of the trained gains
     raw_gains: nn.Parameter | None
@@ -84,27 +61,23 @@ class MotorInput(nn.Module):
     def __init__(self, joints: Joints, gains: Sequence[MotorGain]) -> None:
         super().__init__()
         n = joints.n
-        known, trained = torch.zeros(2, n, n, dtype=torch.float64)
-        for each in gains:
-            (trained if each.trained else known)[each.joint, each.motor] = each.value
+        constant, trained = torch.zeros(2, n, n, dtype=torch.float64)
+        for gain in gains:
+            (trained if gain.trained else constant)[gain.joint, gain.motor] = gain.value
         self.register_buffer("actuated", vector(float(x) for x in joints.actuated))
-        self.register_buffer("known", known)
+        self.register_buffer("constant", constant)
         self.register_buffer("trained", trained)
-        rows = [each.joint for each in gains if each.trained]
+        rows = [gain.joint for gain in gains if gain.trained]
         self.register_buffer("rows", torch.tensor(rows, dtype=torch.long))
         raw = nn.Parameter(torch.zeros(len(rows), dtype=torch.float64)) if rows else None
         self.register_parameter("raw_gains", raw)
 
-    def motor_speeds(self) -> Tensor:
-        """C, (n, n), by joint velocities."""
-        return motor_speeds(self.prepare().detach())
-
     def prepare(self) -> Tensor:
         """G, (n, n)."""
         if self.raw_gains is None:
-            return self.known
+            return self.constant
         gain = torch.ones_like(self.actuated).index_put((self.rows,), self.raw_gains.exp())
-        return self.known + gain.unsqueeze(-1) * self.trained
+        return self.constant + gain.unsqueeze(-1) * self.trained
 
     def forward(self, encoded: Tensor, prepared: Tensor) -> Tensor:
         """G, (..., n, n): joint torques by motor torques."""
@@ -136,7 +109,7 @@ class DenseInput(nn.Module):
         return self.network.prepare(self.moving, self.moving.sum(dim=1))
 
     def _gains(self, encoded: Tensor, prepared: Any) -> Tensor:
-        return self.network(encoded, prepared)[0]
+        return self.network.forward(encoded, prepared)[0]
 
     def forward(self, encoded: Tensor, prepared: Any) -> Tensor:
         """G(q), (..., n, n), diagonal."""

@@ -66,10 +66,10 @@ class BodyChain(nn.Module):
         """The bodies at q, (..., n)."""
         value = self._by_bodies(q)
         features = torch.cat([value.cos(), value.sin(), value], dim=-1)
-        own = blocks(F.linear(features, self.table, self.fixed), 6, 6).unbind(dim=-3)
+        relative = blocks(F.linear(features, self.table, self.fixed), 6, 6).unbind(dim=-3)
         placed: list[Tensor] = []
         for index, parent in enumerate(self.parents):
-            placed.append(own[index] if parent < 0 else placed[parent] @ own[index])
+            placed.append(relative[index] if parent < 0 else placed[parent] @ relative[index])
         frames = torch.cat(placed, dim=-1)
         axes = (frames @ self.reading).roll(3, dims=-2)
         twists = (axes.mT @ frames) * self.carried
@@ -80,31 +80,41 @@ class BodyChain(nn.Module):
         """What is given by joint, (..., n), for the bodies that they move, (..., bodies)."""
         return joints if self.single else joints @ self.ratios.mT
 
-    def turning(self, at: Chain, qd: Tensor) -> tuple[Tensor, Tensor]:
+    def turning(self, pose: Chain, qd: Tensor) -> tuple[Tensor, Tensor]:
         """The bodies' twists, and how these turn the bodies' axes; in the base's frame, (..., 6, bodies)."""
-        twists = (at.axes * self._by_bodies(qd).unsqueeze(-2)) @ self.carriers
-        return twists, crossed(twists, at.axes)
+        twists = (pose.axes * self._by_bodies(qd).unsqueeze(-2)) @ self.carriers
+        return twists, crossed(twists, pose.axes)
 
-    def accelerations(self, at: Chain, qd: Tensor, turning: Tensor) -> Tensor:
+    def accelerations(self, pose: Chain, qd: Tensor, turning: Tensor) -> Tensor:
         """The bodies' accelerations at steady qd, gravity taken as one, (..., 6 bodies)."""
         steady = (turning * self._by_bodies(qd).unsqueeze(-2)) @ self.carriers
-        bodies = blocks(at.frames, 6) * steady.unsqueeze(-1)
-        return bodies.sum(dim=-3).flatten(-2) + at.weight
+        bodies = blocks(pose.frames, 6) * steady.unsqueeze(-1)
+        return bodies.sum(dim=-3).flatten(-2) + pose.weight
 
-    def at_base(self, at: Chain, momenta: Tensor) -> Tensor:
+    def at_base(self, pose: Chain, momenta: Tensor) -> Tensor:
         """Momenta of the bodies, (..., 6 bodies), in the base's frame, (..., 6, bodies)."""
-        return blocks(at.frames * momenta.unsqueeze(-2), 6).sum(dim=-1)
+        return blocks(pose.frames * momenta.unsqueeze(-2), 6).sum(dim=-1)
 
     def by_joints(self, axes: Tensor, wrenches: Tensor) -> Tensor:
         """What joints feel along ``axes`` of wrenches on all that they carry, (..., n)."""
         felt = (axes * (wrenches @ self.carriers.mT)).sum(dim=-2)
         return felt if self.single else felt @ self.ratios
 
-    def energy(self, at: Chain, inertia: Tensor) -> Tensor:
+    def steady_torque(self, pose: Chain, qd: Tensor, momenta: Tensor) -> Tensor:
+        """Return the torque that holds qd steady, (..., n), by Newton and Euler.
+
+        momenta: of the chain's twists, by joint velocity, (..., n, 6 bodies).
+        """
+        twists, turning = self.turning(pose, qd)
+        rising = applied(momenta, self.accelerations(pose, qd, turning))
+        pushed = pushed_along(twists, self.at_base(pose, combined(qd, momenta)))
+        return rising + self.by_joints(pose.axes, pushed)
+
+    def energy(self, pose: Chain, inertia: Tensor) -> Tensor:
         """The bodies' energy in gravity, (...) [J]; zero at the base's origin."""
         # of all bodies together; the moment of mass stands in the inertia's upper right block
-        whole = at.frames @ inertia @ at.frames.mT
-        moment = torch.stack([whole[..., 2, 4], whole[..., 0, 5], whole[..., 1, 3]], dim=-1)
+        total = pose.frames @ inertia @ pose.frames.mT
+        moment = torch.stack([total[..., 2, 4], total[..., 0, 5], total[..., 1, 3]], dim=-1)
         return applied(moment.unsqueeze(-2), self.base[3:]).squeeze(-1)
 
     def regressor(self, q: Tensor, qd: Tensor, qdd: Tensor, basis: Tensor) -> Tensor:
@@ -112,13 +122,13 @@ class BodyChain(nn.Module):
 
         basis: ``inertia_basis()``.
         """
-        at = self(q)
-        rises = self.accelerations(at, qd, self.turning(at, qd)[1]) + combined(qdd, at.twists)
-        rises, twists = (blocks(rows, 6) for rows in (rises, combined(qd, at.twists)))
+        pose = self(q)
+        rises = self.accelerations(pose, qd, self.turning(pose, qd)[1]) + combined(qdd, pose.twists)
+        rises, twists = (blocks(rows, 6) for rows in (rises, combined(qd, pose.twists)))
         # by body and parameter: (..., bodies, 6, 10)
         momenta = torch.tensordot(twists, basis, dims=([-1], [2])).mT
         wrenches = torch.tensordot(rises, basis, dims=([-1], [2])).mT
         wrenches = wrenches + pushed_along(twists.unsqueeze(-1), momenta)
-        columns = blocks(at.twists, 6).transpose(-3, -2)  # (..., bodies, n, 6)
+        columns = blocks(pose.twists, 6).transpose(-3, -2)  # (..., bodies, n, 6)
         rows: Tensor = (columns @ wrenches).transpose(-3, -2)
         return rows.reshape(*q.shape, 10 * len(self.parents))

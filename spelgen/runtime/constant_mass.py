@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from spelgen.runtime.armature import Armature
 from spelgen.runtime.joints import Joints, vector
-from spelgen.runtime.symmetric import Entries, entry_basis
+from spelgen.runtime.symmetric import Entries
 
 
 class ConstantMass(nn.Module):
@@ -22,15 +22,12 @@ class ConstantMass(nn.Module):
     kinds = (("raw_constants", "mass_constants", "kg m^2, kg m, kg"),)
 
     constant_scale: Tensor
-    constant_basis: Tensor
 
     def __init__(self, joints: Joints, entries: Entries, constants: Sequence[tuple[float, float]]) -> None:
         super().__init__()
-        self.n = joints.n
-        start = vector(first for first, _ in constants)
+        self.n, self.entries = joints.n, entries
         self.register_buffer("constant_scale", vector(unit for _, unit in constants))
-        self.register_buffer("constant_basis", entry_basis(entries, 0, len(constants))[1])
-        self.raw_constants = nn.Parameter(start / self.constant_scale)
+        self.raw_constants = nn.Parameter(vector(start / unit for start, unit in constants))
         self.rotors = Armature(joints)
 
     def constants(self) -> Tensor:
@@ -39,8 +36,7 @@ class ConstantMass(nn.Module):
 
     def prepare(self, definite: bool = True) -> Tensor:
         """M, (n, n)."""
-        rows = self.constants() @ self.constant_basis
-        return rows.reshape(self.n, self.n) + torch.diag(self.rotors())
+        return self.entries((), self.constants().unbind()) + torch.diag(self.rotors.forward())
 
     def forward(self, encoded: Tensor, prepared: Tensor) -> tuple[Tensor, None]:
         """M, for each state."""

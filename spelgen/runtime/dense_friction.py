@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from spelgen.runtime.joints import Joints, vector
-from spelgen.runtime.network import Network
+from spelgen.runtime.parts import Network
 
 FACTOR_START = 0.35  # diagonal of L, relative to the root of the joints' usual friction by speed
 
@@ -49,7 +49,7 @@ class DenseFriction(nn.Module):
         return self.network.prepare(output_map, (size * self.start).flatten())
 
     def _factor(self, encoded: Tensor, qd: Tensor, layers: Any) -> Tensor:
-        rows: Tensor = self.network(torch.cat([encoded, qd / self.speed], dim=-1), layers)[0]
+        rows = self.network.forward(torch.cat([encoded, qd / self.speed], dim=-1), layers)[0]
         return rows.reshape(*qd.shape[:-1], *self.start.shape)
 
     def forward(self, encoded: Tensor, qd: Tensor, layers: Any) -> Tensor:

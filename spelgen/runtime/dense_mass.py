@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from spelgen.runtime.joints import Joints, vector
-from spelgen.runtime.network import Network
+from spelgen.runtime.parts import Network
 
 
 class DenseResiduals(NamedTuple):
@@ -73,7 +73,7 @@ class DenseMass(nn.Module):
 
     def inverse(self, encoded: Tensor, prepared: Any) -> Tensor:
         """M^-1 over all three axes of every joint, of which z moves; (..., 3 n, 3 n)."""
-        factor, scale = self._factor(self.network(encoded, prepared)[0])
+        factor, scale = self._factor(self.network.forward(encoded, prepared)[0])
         lower = self.nominal @ (factor + torch.eye(self.size).to(factor))
         return (lower * scale.unsqueeze(-2)) @ lower.mT
 
@@ -95,7 +95,7 @@ class DenseMass(nn.Module):
 
     def forward(self, encoded: Tensor, prepared: Any) -> tuple[Tensor, DenseResiduals]:
         """M(q), and what its derivatives need."""
-        raw, residuals = self.network(encoded, prepared)
+        raw, residuals = self.network.forward(encoded, prepared)
         factor, scale = self._factor(raw)
         moved = self._unit_solved(factor, self.moving)
         mass = moved.mT @ (moved / scale.unsqueeze(-1))

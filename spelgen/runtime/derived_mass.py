@@ -6,21 +6,14 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from spelgen.runtime.armature import Armature
 from spelgen.runtime.joints import Joints, vector
-from spelgen.runtime.network import Network
+from spelgen.runtime.parts import Network
 from spelgen.runtime.regularisation import PositiveDefiniteBound
-from spelgen.runtime.symmetric import Entries, entry_basis
-
-
-class MassFunction(NamedTuple):
-    """A learned function f of some joints: mean + scale * network."""
-
-    joints: tuple[int, ...]
-    mean: float  # over the workspace, with nominal inertias
-    scale: float
+from spelgen.runtime.symmetric import Entries
 
 
 class MassPrepared(NamedTuple):
@@ -34,60 +27,58 @@ class MassResiduals(NamedTuple):
     """What M's derivatives need of the work done for M."""
 
     network: Any
-    part: Tensor  # of the functions' changes that M takes, see PositiveDefiniteBound
+    fraction: Tensor  # of the functions' changes that M takes, see PositiveDefiniteBound
 
 
 class DerivedMass(nn.Module):
-    """M(q), (..., n, n), with ``entries`` saying where functions and constants stand.
+    """M(q), (..., n, n): ``entries`` of functions f and constants c, and the armature.
 
-    A constant starts at the first of its two numbers, and is trained in units of the second. Where
-    M would not exceed margin * its nominal mean, it is drawn towards that mean (see
-    PositiveDefiniteBound): M is positive definite for all q and all weights.
+    f = mean + scale y, with y a network's outputs. A constant starts at the first of its two numbers
+    and is trained in units of the second. Where M would not exceed margin times its nominal mean, it is
+    drawn towards that mean (see PositiveDefiniteBound): M is positive definite for all q and weights.
     """
 
     kinds = (("raw_constants", "mass_constants", "kg m^2, kg m, kg"),)
 
     constant_scale: Tensor
-    constant_basis: Tensor  # (constants, n n)
     function_mean: Tensor
     function_scale: Tensor
-    function_basis: Tensor  # (functions, n n)
 
     def __init__(
         self,
         joints: Joints,
         entries: Entries,
-        functions: Sequence[MassFunction],
+        mean: Sequence[float],
+        scale: Sequence[float],
         constants: Sequence[tuple[float, float]],
         network: Network,
         margin: float,
     ) -> None:
         super().__init__()
-        self.n = joints.n
-        start = vector(first for first, _ in constants)
-        by_function, by_constant = entry_basis(entries, len(functions), len(constants))
+        self.n, self.entries, self.network = joints.n, entries, network
         self.register_buffer("constant_scale", vector(unit for _, unit in constants))
-        self.register_buffer("constant_basis", by_constant)
-        self.register_buffer("function_mean", vector(each.mean for each in functions))
-        self.register_buffer("function_scale", vector(each.scale for each in functions))
-        self.register_buffer("function_basis", by_function)
-        mean = start @ self.constant_basis + self.function_mean @ self.function_basis
-        self.bound = PositiveDefiniteBound(self._square(mean), margin)
-        self.raw_constants = nn.Parameter(start / self.constant_scale)
-        self.network = network
+        self.register_buffer("function_mean", vector(mean))
+        self.register_buffer("function_scale", vector(scale))
+        self.raw_constants = nn.Parameter(vector(start / unit for start, unit in constants))
         self.rotors = Armature(joints)
+        self.bound = PositiveDefiniteBound(self._by_outputs()[-1].detach(), margin)
 
     def constants(self) -> Tensor:
-        """The constants of M, (constants,), in their units."""
+        """Return the constants of M, (constants,), in their units."""
         return self.constant_scale * self.raw_constants
 
+    def _by_outputs(self) -> Tensor:
+        """Return what each of the network's outputs adds to M, then M without any, (outputs + 1, n, n)."""
+        functions = torch.cat([torch.diag(self.function_scale), self.function_mean.unsqueeze(-1)], dim=1)
+        constants = F.pad(self.constants().unsqueeze(-1), (len(functions), 0))
+        return self.entries(functions.unbind(), constants.unbind())
+
     def prepare(self, definite: bool = True) -> MassPrepared:
-        """All that depends on the weights alone; ``definite``: keep M positive definite."""
-        armature = torch.diag(self.rotors())
-        constant = self.constants() @ self.constant_basis
-        constant = constant + self.function_mean @ self.function_basis + armature.flatten()
-        output_map = (self.function_scale.unsqueeze(-1) * self.function_basis).mT
-        return MassPrepared(self.network.prepare(output_map, constant), definite)
+        """Return all that depends on the weights alone; ``definite``: keep M positive definite."""
+        rows = self._by_outputs()
+        offset = rows[-1] + torch.diag(self.rotors.forward())
+        output_map = rows[:-1].flatten(1).mT
+        return MassPrepared(self.network.prepare(output_map, offset.flatten()), definite)
 
     def _square(self, rows: Tensor) -> Tensor:
         """(..., n n) as (..., n, n)."""
@@ -95,20 +86,20 @@ class DerivedMass(nn.Module):
 
     def forward(self, encoded: Tensor, prepared: MassPrepared) -> tuple[Tensor, MassResiduals]:
         """M(q), and what its derivatives need."""
-        rows, residuals = self.network(encoded, prepared.layers)
+        rows, residuals = self.network.forward(encoded, prepared.layers)
         mass = self._square(rows)
-        part = torch.ones_like(mass[..., 0, 0])
+        fraction = torch.ones_like(mass[..., 0, 0])
         if prepared.definite:
-            mass, part = self.bound(mass)
-        return mass, MassResiduals(residuals, part)
+            mass, fraction = self.bound.forward(mass)
+        return mass, MassResiduals(residuals, fraction)
 
     def kinetic_vjp(self, encoded: Tensor, qd: Tensor, residuals: MassResiduals) -> Tensor:
         """The derivative of 1/2 qd^T M(q) qd by the encoding."""
-        half = 0.5 * residuals.part.unsqueeze(-1) * qd
+        half = 0.5 * residuals.fraction.unsqueeze(-1) * qd
         weight = (half.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2)
         return self.network.vjp(residuals.network, weight)
 
     def jvp(self, rate: Tensor, residuals: MassResiduals) -> Tensor:
         """dM/dt, (..., n, n), where the encoding changes at this rate."""
         rows = self.network.jvp(residuals.network, rate)
-        return residuals.part[..., None, None] * self._square(rows)
+        return residuals.fraction[..., None, None] * self._square(rows)

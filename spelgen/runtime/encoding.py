@@ -30,20 +30,20 @@ class JointEncoding(nn.Module):
 
     def forward(self, q: Tensor) -> Tensor:
         """The encoding of q."""
-        parts = [q.cos(), q.sin()]
-        return torch.cat([*parts, self.scaled(q)] if self.prismatic else parts, dim=-1)
+        columns = [q.cos(), q.sin()]
+        return torch.cat([*columns, self.scaled(q)] if self.prismatic else columns, dim=-1)
 
     def jvp(self, encoded: Tensor, qd: Tensor) -> Tensor:
         """How fast the encoding changes along qd."""
         cos, sin = encoded.chunk(3 if self.prismatic else 2, dim=-1)[:2]
-        parts = [-sin * qd, cos * qd]
-        return torch.cat([*parts, qd / self.reach] if self.prismatic else parts, dim=-1)
+        columns = [-sin * qd, cos * qd]
+        return torch.cat([*columns, qd / self.reach] if self.prismatic else columns, dim=-1)
 
     def vjp(self, encoded: Tensor, cotangent: Tensor) -> Tensor:
         """d/dq, (..., n), of what has the derivative ``cotangent`` by the encoding."""
-        parts = 3 if self.prismatic else 2
-        cos, sin = encoded.chunk(parts, dim=-1)[:2]
-        by_cos, by_sin, *by_scaled = cotangent.chunk(parts, dim=-1)
+        columns = 3 if self.prismatic else 2
+        cos, sin = encoded.chunk(columns, dim=-1)[:2]
+        by_cos, by_sin, *by_scaled = cotangent.chunk(columns, dim=-1)
         by_joint = by_sin * cos - by_cos * sin
         return by_joint + by_scaled[0] / self.reach if self.prismatic else by_joint
 
@@ -64,8 +64,8 @@ def joint_input(joints: Joints, chosen: Iterable[int], sensitivity: Sequence[flo
     turning = [joint for joint in chosen if joints.revolute[joint]]
     sliding = [joint for joint in chosen if not joints.revolute[joint]]
     owners = (*turning, *turning, *sliding)
-    places = [*turning, *(n + joint for joint in turning), *(2 * n + joint for joint in sliding)]
-    matrix = torch.eye(encoded, dtype=torch.float64)[places]
+    columns = [*turning, *(n + joint for joint in turning), *(2 * n + joint for joint in sliding)]
+    matrix = torch.eye(encoded, dtype=torch.float64)[columns]
     return NetworkInput(owners, vector(sensitivity[j] for j in owners), matrix, 0 * matrix.sum(dim=1))
 
 
@@ -111,3 +111,9 @@ def with_velocities(inputs: NetworkInput, joints: Joints, axes: int) -> NetworkI
         matrix=matrix,
         offset=torch.cat([inputs.offset, 0 * velocities]),
     )
+
+
+def joint_mask(units: Sequence[tuple[int, ...]], below: Sequence[tuple[int, ...]]) -> Tensor:
+    """Return 1 where a unit may read a unit below it, which reads no other joints; (units, units below)."""
+    rows = [[float(set(joints) <= set(unit)) for joints in below] for unit in units]
+    return torch.tensor(rows, dtype=torch.float64)

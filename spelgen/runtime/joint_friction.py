@@ -73,11 +73,11 @@ class JointFriction(nn.Module):
 
         Their tanh x is computed as 2 sigmoid(2 x) - 1, which takes a fraction of the time.
         """
-        own = torch.eye(self.out.shape[0], dtype=self.out.dtype, device=self.out.device)
+        identity = torch.eye(self.out.shape[0], dtype=self.out.dtype, device=self.out.device)
         return FrictionLayers(
             weight=2 * (self.weight.mT @ self.matrix).flatten(0, 1),
             bias=2 * self.bias.flatten(),
-            out=2 * (own.unsqueeze(-1) * self.out).flatten(1),
+            out=2 * (identity.unsqueeze(-1) * self.out).flatten(1),
             offset=self.offset - self.out.sum(dim=1),
             viscous=self.viscous(),
             smoothing=self.coulomb_smoothing_velocity() ** 2,

@@ -27,23 +27,23 @@ class JointFunctionWeights(NamedTuple):
 
 def ripple_frequencies(joints: Joints) -> Tensor:
     """How often in a turn of the joint a ripple may come again, (n, HARMONICS + 2)."""
-    few = tuple(range(1, HARMONICS + 3))
-    rows = [(*few[:-2], gear, 2 * gear) if gear > HARMONICS else few for gear in joints.gear]
+    harmonics = tuple(range(1, HARMONICS + 3))
+    rows = [(*harmonics[:-2], gear, 2 * gear) if gear > HARMONICS else harmonics for gear in joints.gear]
     return torch.tensor(rows, dtype=torch.float64)
 
 
 def _products(cosines: Tensor, sines: Tensor) -> Tensor:
     """By which products of fine and coarse waves harmonics are made, (n, 2 FINE + 2, 2 COARSE + 6)."""
     pads = FINE + 1, (2 * FINE + 1) * COARSE + FINE - HARMONICS
-    above, below, own = [], [], []
+    above, below, motor = [], [], []
     for harmonics in (cosines, sines):
-        regular, few = harmonics.tensor_split((HARMONICS,), dim=1)
+        regular, motor_harmonics = harmonics.tensor_split((HARMONICS,), dim=1)
         rows = F.pad(regular, pads).reshape(-1, COARSE + 1, 2 * FINE + 1).mT  # (n, b + FINE, a)
         above.append(rows[:, FINE:])
         below.append(F.pad(rows[:, :FINE].flip(1), (0, 0, 1, 0)))
-        own.append(F.pad(few.unsqueeze(1), (0, 0, 0, FINE)))
-    by_cos = above[0] + below[0], own[0], above[1] + below[1], own[1]
-    by_sin = above[1] - below[1], 0 * own[0], below[0] - above[0], 0 * own[1]
+        motor.append(F.pad(motor_harmonics.unsqueeze(1), (0, 0, 0, FINE)))
+    by_cos = above[0] + below[0], motor[0], above[1] + below[1], motor[1]
+    by_sin = above[1] - below[1], 0 * motor[0], below[0] - above[0], 0 * motor[1]
     return torch.cat([torch.cat(by_cos, dim=2), torch.cat(by_sin, dim=2)], dim=1)
 
 
@@ -86,7 +86,9 @@ class JointFunctions(nn.Module):
         self.register_buffer("scale", vector(joints.friction))
         self.register_buffer("spacing", spacing)
         self.register_buffer("middles", vector(joints.center).unsqueeze(-1) + spacing * knots)
-        self.register_buffer("revolute", vector(float(each) for each in joints.revolute).unsqueeze(-1))
+        self.register_buffer(
+            "revolute", vector(float(revolute) for revolute in joints.revolute).unsqueeze(-1)
+        )
         frequencies = ripple_frequencies(joints)
         fine, coarse = torch.arange(FINE + 1.0), (2 * FINE + 1) * torch.arange(COARSE + 1.0)
         fine, coarse = fine.double().expand(n, -1), coarse.double().expand(n, -1)
@@ -125,15 +127,15 @@ class JointFunctions(nn.Module):
     def ripple(self, q: Tensor) -> Tensor:
         """Cosines, then sines of frequency times q, (..., n, 2 HARMONICS + 4); zero for a prismatic joint."""
         phase = q.unsqueeze(-1) * self.frequencies
-        both = torch.cat([phase.cos(), phase.sin()], dim=-1)
-        return both * self.revolute if self.prismatic else both
+        waves = torch.cat([phase.cos(), phase.sin()], dim=-1)
+        return waves * self.revolute if self.prismatic else waves
 
     def energy(self, q: Tensor) -> Tensor:
         """V, (...) [J]; of what ends where the range does, half on either side."""
-        place = self._places(q)
-        away = place.abs()
-        part = 0.5 - (2 - away).relu() ** 4 / 24 + (1 - away).relu() ** 4 / 6
-        smooth = (self.spacing * place.sign() * part * self.raw_torque_splines).sum(dim=-1)
+        distance = self._places(q)
+        away = distance.abs()
+        step = 0.5 - (2 - away).relu() ** 4 / 24 + (1 - away).relu() ** 4 / 6
+        smooth = (self.spacing * distance.sign() * step * self.raw_torque_splines).sum(dim=-1)
         by_cos, by_sin = (self.ripple(q) / self.frequencies.repeat(1, 2)).chunk(2, dim=-1)
         turned = torch.cat([by_sin, -by_cos], dim=-1)
         return (self.scale * (smooth + (turned * self.raw_torque_ripple).sum(dim=-1))).sum(dim=-1)

@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from spelgen.runtime.encoding import NetworkInput
+from spelgen.runtime.encoding import NetworkInput, joint_mask
 
 GRID = 4  # bumps on an edge
 SPACING = 2 / (GRID - 1)
@@ -25,7 +25,7 @@ class KANLayers(NamedTuple):
 class Bumps(NamedTuple):
     """A layer's inputs as the grid sees them, (..., inputs, GRID)."""
 
-    place: Tensor  # distance from each grid point, in grid spacings
+    distance: Tensor  # distance from each grid point, in grid spacings
     height: Tensor
 
 
@@ -50,30 +50,29 @@ class MaskedKAN(nn.Module):
     def __init__(
         self,
         inputs: NetworkInput,
-        layers: Sequence[Sequence[frozenset[int]]],
+        layers: Sequence[Sequence[tuple[int, ...]]],
         generator: torch.Generator,
     ) -> None:
         super().__init__()
         grid = torch.linspace(-1, 1, GRID, dtype=torch.float64)
         self.register_buffer("grid", grid / SPACING)
-        each = torch.eye(GRID, dtype=torch.float64)
+        bumps = torch.eye(GRID, dtype=torch.float64)
         # the bumps of -x are those of x in reverse
         forth, back = inputs.matrix.clamp(min=0), (-inputs.matrix).clamp(min=0)
-        self.register_buffer("matrix", torch.kron(forth, each) + torch.kron(back, each.flip(0)))
+        self.register_buffer("matrix", torch.kron(forth, bumps) + torch.kron(back, bumps.flip(0)))
         still = 1 - inputs.matrix.abs().sum(dim=1, keepdim=True)
         self.register_buffer("offset", (still * self._bumps(inputs.offset).height).flatten())
         self.weights = nn.ParameterList()
         self.biases = nn.ParameterList()
-        below = [frozenset((joint,)) for joint in inputs.joints]
+        below: Sequence[tuple[int, ...]] = [(joint,) for joint in inputs.joints]
         for index, units in enumerate(layers):
-            allowed = [[[float(lower <= upper)] for lower in below] for upper in units]
-            mask = torch.tensor(allowed, dtype=torch.float64)
+            mask = joint_mask(units, below).unsqueeze(-1)
             slope = torch.randn(mask.shape, dtype=torch.float64, generator=generator)
             self.weights.append(nn.Parameter(slope * grid / mask.sum(dim=1, keepdim=True).sqrt()))
             mask = mask * inputs.sensitivity.unsqueeze(-1) if index == 0 else mask
             self.register_buffer(f"mask{index}", mask)
             self.biases.append(nn.Parameter(torch.zeros(len(units), dtype=torch.float64)))
-            below = list(units)
+            below = units
         nn.init.zeros_(self.weights[-1])  # so that nothing is learned yet
 
     def prepare(self, output_map: Tensor, offset: Tensor) -> KANLayers:
@@ -86,8 +85,8 @@ class MaskedKAN(nn.Module):
         return KANLayers(tuple(weights), tuple(biases))
 
     def _bumps(self, value: Tensor) -> Bumps:
-        place = (value / SPACING).unsqueeze(-1) - self.grid
-        return Bumps(place, torch.exp(-place * place))
+        distance = (value / SPACING).unsqueeze(-1) - self.grid
+        return Bumps(distance, torch.exp(-distance * distance))
 
     def forward(self, encoded: Tensor, layers: KANLayers) -> tuple[Tensor, KANResiduals]:
         """offset + output_map y, (..., rows); and what ``vjp`` and ``jvp`` need."""
@@ -108,14 +107,14 @@ class MaskedKAN(nn.Module):
         return layer
 
     def _bumps_vjp(self, bumps: Bumps, cotangent: Tensor) -> Tensor:
-        cotangent = cotangent.reshape(*cotangent.shape[:-1], *bumps.place.shape[-2:])
-        return (-2 / SPACING) * (bumps.place * bumps.height * cotangent).sum(dim=-1)
+        cotangent = cotangent.reshape(*cotangent.shape[:-1], *bumps.distance.shape[-2:])
+        return (-2 / SPACING) * (bumps.distance * bumps.height * cotangent).sum(dim=-1)
 
     def jvp(self, residuals: KANResiduals, tangent: Tensor) -> Tensor:
         """The forward sweep: d/d encoded times the encoding's tangent; (..., rows)."""
         bumps, hidden, layers = residuals
         for index, weight in enumerate(layers.weights):
-            slopes = bumps[index].place * bumps[index].height
+            slopes = bumps[index].distance * bumps[index].height
             tangent = F.linear((-2 / SPACING) * (slopes * tangent.unsqueeze(-1)).flatten(-2), weight)
             if index < len(hidden):
                 tangent = tangent * (1 - hidden[index] * hidden[index])

@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from spelgen.runtime.encoding import NetworkInput
+from spelgen.runtime.encoding import NetworkInput, joint_mask
 
 
 class MLPLayers(NamedTuple):
@@ -41,7 +41,7 @@ class MaskedMLP(nn.Module):
     def __init__(
         self,
         inputs: NetworkInput,
-        layers: Sequence[Sequence[frozenset[int]]],
+        layers: Sequence[Sequence[tuple[int, ...]]],
         generator: torch.Generator,
     ) -> None:
         super().__init__()
@@ -49,16 +49,15 @@ class MaskedMLP(nn.Module):
         self.register_buffer("offset", inputs.offset)
         self.weights = nn.ParameterList()
         self.biases = nn.ParameterList()
-        below = [frozenset((joint,)) for joint in inputs.joints]
+        below: Sequence[tuple[int, ...]] = [(joint,) for joint in inputs.joints]
         for index, units in enumerate(layers):
-            allowed = [[float(lower <= upper) for lower in below] for upper in units]
-            mask = torch.tensor(allowed, dtype=torch.float64)
+            mask = joint_mask(units, below)
             weight = torch.randn(mask.shape, dtype=torch.float64, generator=generator)
             self.weights.append(nn.Parameter(weight / mask.sum(dim=1, keepdim=True).sqrt()))
             mask = mask * inputs.sensitivity if index == 0 else mask
             self.register_buffer(f"mask{index}", mask)
             self.biases.append(nn.Parameter(torch.zeros(len(units), dtype=torch.float64)))
-            below = list(units)
+            below = units
         nn.init.zeros_(self.weights[-1])  # so that nothing is learned yet
 
     def prepare(self, output_map: Tensor, offset: Tensor) -> MLPLayers:

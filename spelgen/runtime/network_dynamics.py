@@ -25,7 +25,7 @@ class NetworkPrepared(NamedTuple):
 class NetworkDynamics(PortHamiltonian):
     """The dynamics made of these parts; without a ``potential`` gravity does no work.
 
-    ``at``, all that is computed of q alone, is q as networks read it (see ``JointEncoding``).
+    ``pose``, all that is computed of q alone, is q as networks read it (see ``JointEncoding``).
     """
 
     def __init__(
@@ -37,85 +37,65 @@ class NetworkDynamics(PortHamiltonian):
         input: Input,
     ) -> None:
         super().__init__()
-        self.encoding = encoding
-        # Any: what a part has beside its protocol is there to be asked for
-        self.mass: Any = mass
-        self.friction: Any = friction
-        self.input: Any = input
-        self.potential = potential
+        self.encoding, self.mass, self.potential = encoding, mass, potential
+        self.friction, self.input = friction, input
 
     def prepare(self, definite: bool = True) -> NetworkPrepared:
-        """All that depends on the weights alone; holds until they change."""
-        return NetworkPrepared(
-            mass=self.mass.prepare(definite),
-            potential=None if self.potential is None else self.potential.prepare(),
-            friction=self.friction.prepare(),
-            input=self.input.prepare(),
-        )
+        """Return all that depends on the weights alone; M is kept ``definite``, or is as learned."""
+        potential = None if self.potential is None else self.potential.prepare()
+        mass = self.mass.prepare(definite)
+        return NetworkPrepared(mass, potential, self.friction.prepare(), self.input.prepare())
 
     def configuration(self, q: Tensor, prepared: NetworkPrepared) -> Tensor:
-        """What networks read of q."""
-        encoded: Tensor = self.encoding(q)
-        return encoded
+        """Return what networks read of q."""
+        return self.encoding.forward(q)
 
-    def mass_at(self, at: Tensor, prepared: NetworkPrepared) -> tuple[Tensor, Any]:
-        """M(q), (..., n, n), and what its derivatives need."""
-        found: tuple[Tensor, Any] = self.mass(at, prepared.mass)
-        return found
+    def mass_at(self, pose: Tensor, prepared: NetworkPrepared) -> tuple[Tensor, Any]:
+        """Return M(q), (..., n, n), and what its derivatives need."""
+        return self.mass.forward(pose, prepared.mass)
 
-    def energy_at(self, at: Tensor, prepared: NetworkPrepared) -> Tensor:
-        """V(q), (...) [J]."""
+    def energy_at(self, pose: Tensor, prepared: NetworkPrepared) -> Tensor:
+        """Return V(q), (...) [J]."""
         if self.potential is None:
-            return at.new_zeros(at.shape[:-1])
-        energy: Tensor = self.potential(at, prepared.potential)
-        return energy
+            return pose.new_zeros(pose.shape[:-1])
+        return self.potential.forward(pose, prepared.potential)
 
-    def gravity_at(self, at: Tensor, prepared: NetworkPrepared) -> Tensor:
-        """dV/dq, (..., n) [Nm, N]."""
+    def gravity_at(self, pose: Tensor, prepared: NetworkPrepared) -> Tensor:
+        """Return dV/dq, (..., n) [Nm, N]."""
         if self.potential is None:
-            return torch.zeros_like(at[..., : self.n])
-        gradient: Tensor = self.encoding.vjp(at, self.potential.vjp(at, prepared.potential))
-        return gradient
+            return torch.zeros_like(pose[..., : self.n])
+        return self.encoding.vjp(pose, self.potential.vjp(pose, prepared.potential))
 
     def lagrangian_gradient(
-        self, at: Tensor, qd: Tensor, residuals: Any, prepared: NetworkPrepared
+        self, pose: Tensor, qd: Tensor, residuals: Any, prepared: NetworkPrepared
     ) -> Tensor:
-        """d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
-        by_encoded = self.mass.kinetic_vjp(at, qd, residuals)
+        """Return d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
+        by_encoded = self.mass.kinetic_vjp(pose, qd, residuals)
         if self.potential is not None:
-            by_encoded = by_encoded - self.potential.vjp(at, prepared.potential)
-        gradient: Tensor = self.encoding.vjp(at, by_encoded)
-        return gradient
+            by_encoded = by_encoded - self.potential.vjp(pose, prepared.potential)
+        return self.encoding.vjp(pose, by_encoded)
 
-    def nonlinear_at(self, at: Tensor, qd: Tensor, residuals: Any, prepared: NetworkPrepared) -> Tensor:
-        """dM/dt qd - d/dq (1/2 qd^T M qd) + dV/dq, (..., n)."""
-        gradient = self.lagrangian_gradient(at, qd, residuals, prepared)
-        mass_rate: Tensor = self.mass.jvp(self.encoding.jvp(at, qd), residuals)
-        return applied(mass_rate, qd) - gradient
+    def nonlinear_at(self, pose: Tensor, qd: Tensor, residuals: Any, prepared: NetworkPrepared) -> Tensor:
+        """Return dM/dt qd - d/dq (1/2 qd^T M qd) + dV/dq, (..., n)."""
+        mass_rate = self.mass.jvp(self.encoding.jvp(pose, qd), residuals)
+        return applied(mass_rate, qd) - self.lagrangian_gradient(pose, qd, residuals, prepared)
 
-    def friction_at(
-        self, at: Tensor, qd: Tensor, prepared: NetworkPrepared, z: Tensor | None = None
-    ) -> Tensor:
-        """D(q, qd) qd, (..., n) [Nm, N]; this friction has no memory."""
-        torque: Tensor = self.friction(at, qd, prepared.friction)
-        return torque
+    def friction_at(self, pose: Tensor, qd: Tensor, prepared: NetworkPrepared) -> Tensor:
+        """Return D(q, qd) qd, (..., n) [Nm, N]."""
+        return self.friction.forward(pose, qd, prepared.friction)
 
-    def dissipation_at(self, at: Tensor, qd: Tensor, prepared: NetworkPrepared) -> Tensor:
-        """D(q, qd), (..., n, n)."""
-        matrix: Tensor = self.friction.dissipation(at, qd, prepared.friction)
-        return matrix
+    def dissipation_at(self, pose: Tensor, qd: Tensor, prepared: NetworkPrepared) -> Tensor:
+        """Return D(q, qd), (..., n, n)."""
+        return self.friction.dissipation(pose, qd, prepared.friction)
 
-    def input_at(self, at: Tensor, prepared: NetworkPrepared) -> Tensor:
-        """G(q), (..., n, n)."""
-        matrix: Tensor = self.input(at, prepared.input)
-        return matrix
+    def input_at(self, pose: Tensor, prepared: NetworkPrepared) -> Tensor:
+        """Return G(q), (..., n, n)."""
+        return self.input.forward(pose, prepared.input)
 
-    def input_force(self, at: Tensor, qd: Tensor, tau: Tensor, prepared: NetworkPrepared) -> Tensor:
-        """G tau, (..., n) [Nm, N]."""
-        force: Tensor = self.input.force(at, tau, prepared.input)
-        return force
+    def input_force(self, pose: Tensor, qd: Tensor, tau: Tensor, prepared: NetworkPrepared) -> Tensor:
+        """Return G tau, (..., n) [Nm, N]."""
+        return self.input.force(pose, tau, prepared.input)
 
-    def input_torque(self, at: Tensor, qd: Tensor, force: Tensor, prepared: NetworkPrepared) -> Tensor:
-        """The tau, (..., n), that makes this force."""
-        tau: Tensor = self.input.solve(at, force, prepared.input)
-        return tau
+    def input_torque(self, pose: Tensor, qd: Tensor, force: Tensor, prepared: NetworkPrepared) -> Tensor:
+        """Return the tau, (..., n), that makes this force."""
+        return self.input.solve(pose, force, prepared.input)

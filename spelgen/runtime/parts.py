@@ -1,4 +1,4 @@
-"""What a model needs of its parts."""
+"""What a model needs of its parts; an emitted module has the class of its own part under each of these names."""
 
 from __future__ import annotations
 
@@ -7,53 +7,62 @@ from typing import Any, Protocol
 from torch import Tensor
 
 
+class Network(Protocol):
+    """Learned functions y of an encoding, each of its own joints, with derivatives written out."""
+
+    def prepare(self, output_map: Tensor, offset: Tensor) -> Any:
+        """Return the weights made ready for many states, for offset + output_map y in place of y."""
+
+    def forward(self, encoded: Tensor, layers: Any) -> tuple[Tensor, Any]:
+        """Return offset + output_map y, (..., rows), and residuals, which ``vjp`` and ``jvp`` need."""
+
+    def vjp(self, residuals: Any, cotangent: Tensor) -> Tensor:
+        """Return cotangent, (..., rows), times d/d encoded."""
+
+    def jvp(self, residuals: Any, tangent: Tensor) -> Tensor:
+        """Return d/d encoded times the encoding's tangent, (..., rows)."""
+
+
 class Mass(Protocol):
     """What gives M(q) and its derivatives."""
 
     def prepare(self, definite: bool = True) -> Any:
-        """All that depends on the weights alone; ``definite``: keep M positive definite."""
+        """Return all that depends on the weights alone; ``definite``: keep M positive definite."""
 
-    def __call__(self, encoded: Tensor, prepared: Any) -> tuple[Tensor, Any]:
-        """M(q), (..., n, n), and what its derivatives need."""
+    def forward(self, encoded: Tensor, prepared: Any) -> tuple[Tensor, Any]:
+        """Return M(q), (..., n, n), and what its derivatives need."""
 
     def kinetic_vjp(self, encoded: Tensor, qd: Tensor, residuals: Any) -> Tensor:
-        """The derivative of 1/2 qd^T M(q) qd by the encoding."""
+        """Return the derivative of 1/2 qd^T M(q) qd by the encoding."""
 
     def jvp(self, rate: Tensor, residuals: Any) -> Tensor:
-        """dM/dt, (..., n, n), where the encoding changes at this rate."""
+        """Return dM/dt, (..., n, n), where the encoding changes at this rate."""
 
 
 class Friction(Protocol):
     """What gives D(q, qd)."""
 
     def prepare(self) -> Any:
-        """All that depends on the weights alone."""
+        """Return all that depends on the weights alone."""
 
-    def __call__(self, encoded: Tensor, qd: Tensor, prepared: Any) -> Tensor:
-        """D qd, (..., n) [Nm, N]."""
+    def forward(self, encoded: Tensor, qd: Tensor, prepared: Any) -> Tensor:
+        """Return D qd, (..., n) [Nm, N]."""
 
     def dissipation(self, encoded: Tensor, qd: Tensor, prepared: Any) -> Tensor:
-        """D, (..., n, n)."""
+        """Return D, (..., n, n)."""
 
 
 class Input(Protocol):
     """What gives G."""
 
     def prepare(self) -> Any:
-        """All that depends on the weights alone."""
+        """Return all that depends on the weights alone."""
 
-    def __call__(self, encoded: Tensor, prepared: Any) -> Tensor:
-        """G, (..., n, n)."""
+    def forward(self, encoded: Tensor, prepared: Any) -> Tensor:
+        """Return G, (..., n, n)."""
 
     def force(self, encoded: Tensor, tau: Tensor, prepared: Any) -> Tensor:
-        """G tau, (..., n)."""
+        """Return G tau, (..., n)."""
 
     def solve(self, encoded: Tensor, force: Tensor, prepared: Any) -> Tensor:
-        """The inputs, (..., n), that make this force."""
-
-
-class DriveInput(Input, Protocol):
-    """What gives a constant G, and how the drives turn."""
-
-    def motor_speeds(self) -> Tensor:
-        """C, (n, n): the drives' speeds are C qd."""
+        """Return the inputs, (..., n), that make this force."""

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from spelgen.runtime.network import Network
+from spelgen.runtime.parts import Network
 
 
 class LearnedPotential(nn.Module):
@@ -26,10 +26,9 @@ class LearnedPotential(nn.Module):
 
     def forward(self, encoded: Tensor, prepared: Any) -> Tensor:
         """V(q), (...) [J]."""
-        energy: Tensor = self.network(encoded, prepared)[0].squeeze(-1)
-        return energy
+        return self.network.forward(encoded, prepared)[0].squeeze(-1)
 
     def vjp(self, encoded: Tensor, prepared: Any) -> Tensor:
         """The derivative of V by the encoding."""
-        _, residuals = self.network(encoded, prepared)
+        _, residuals = self.network.forward(encoded, prepared)
         return self.network.vjp(residuals, encoded.new_ones(1))

@@ -16,22 +16,22 @@ class PositiveDefiniteBound(nn.Module):
     """
 
     center: Tensor  # C
-    least: Tensor  # margin C
+    smallest: Tensor  # margin C
     unit: Tensor  # an entry's largest part in the norm relative to C, divided by 1 - margin
 
     def __init__(self, center: Tensor, margin: float) -> None:
         super().__init__()
         scale = center.diagonal().rsqrt()
         scaled = scale.unsqueeze(-1) * center * scale
-        least = torch.linalg.eigvalsh(scaled)[0]
+        smallest = torch.linalg.eigvalsh(scaled)[0]
         self.register_buffer("center", center)
-        self.register_buffer("least", margin * center)
-        self.register_buffer("unit", scale.unsqueeze(-1) * scale / least / (1 - margin))
+        self.register_buffer("smallest", margin * center)
+        self.register_buffer("unit", scale.unsqueeze(-1) * scale / smallest / (1 - margin))
 
     def forward(self, mass: Tensor) -> tuple[Tensor, Tensor]:
         """M', (..., n, n), and t, (...)."""
         fixed = mass.detach()
-        indefinite = torch.linalg.cholesky_ex(fixed - self.least).info != 0
+        indefinite = torch.linalg.cholesky_ex(fixed - self.smallest).info != 0
         size = torch.linalg.vector_norm(self.unit * (fixed - self.center), dim=(-2, -1))
-        part = torch.where(indefinite, torch.exp2(-torch.ceil(torch.log2(size)).clamp(min=1.0)), 1.0)
-        return torch.lerp(self.center, mass, part[..., None, None]), part
+        fraction = torch.where(indefinite, torch.exp2(-torch.ceil(torch.log2(size)).clamp(min=1.0)), 1.0)
+        return torch.lerp(self.center, mass, fraction[..., None, None]), fraction

@@ -11,7 +11,7 @@ from torch import Tensor
 from spelgen.runtime.encoding import JointEncoding
 from spelgen.runtime.joint_functions import JointFunctions, JointFunctionWeights
 from spelgen.runtime.joints import Joints
-from spelgen.runtime.parts import DriveInput
+from spelgen.runtime.parts import Input
 from spelgen.runtime.port_hamiltonian import applied
 from spelgen.runtime.potential import LearnedPotential
 from spelgen.runtime.residual_mass import ResidualMass
@@ -53,12 +53,13 @@ class ResidualDynamics(RigidBodyDynamics):
         joints: Joints,
         bodies: Bodies,
         gravity: tuple[float, float, float],
-        input: DriveInput,
+        input: Input,
         mass: ResidualMass,
         potential: LearnedPotential | None,
         reach: Sequence[Sequence[float]] = (),
+        motors: Sequence[Sequence[float]] = (),
     ) -> None:
-        super().__init__(joints, bodies, gravity, input, reach)
+        super().__init__(joints, bodies, gravity, input, reach, motors)
         self.encoding = JointEncoding(joints)
         self.joint_functions = JointFunctions(joints)
         self.residual_mass = mass
@@ -76,52 +77,54 @@ class ResidualDynamics(RigidBodyDynamics):
 
     def configuration(self, q: Tensor, prepared: RigidPrepared) -> Motion:
         """How the bodies may move at q, and what residuals read of q."""
-        at = super().configuration(q, prepared)
-        return at if self.residual_mass is None else at._replace(residual=self._read(q, prepared))
+        pose = super().configuration(q, prepared)
+        return pose if self.residual_mass is None else pose._replace(residual=self._read(q, prepared))
 
     def _read(self, q: Tensor, prepared: RigidPrepared) -> ResidualMotion:
         return ResidualMotion(q, self.encoding(q), *self.joint_functions(q, prepared.residual.functions))
 
-    def mass_at(self, at: Motion, prepared: RigidPrepared) -> tuple[Tensor, Any]:
+    def mass_at(self, pose: Motion, prepared: RigidPrepared) -> tuple[Tensor, Any]:
         """M(q), (..., n, n), and what its derivatives need."""
-        mass = super().mass_at(at, prepared)[0]
+        mass = super().mass_at(pose, prepared)[0]
         if self.residual_mass is None:
             return mass, None
-        more, residuals = self.residual_mass(at.residual.encoded, prepared.residual.mass)
-        return mass + more, residuals
+        residual, residuals = self.residual_mass(pose.residual.encoded, prepared.residual.mass)
+        return mass + residual, residuals
 
-    def energy_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
+    def energy_at(self, pose: Motion, prepared: RigidPrepared) -> Tensor:
         """V(q), (...) [J]."""
-        energy = super().energy_at(at, prepared)
+        energy = super().energy_at(pose, prepared)
         if self.residual_mass is None:
             return energy
-        energy = energy + self.joint_functions.energy(at.residual.q)
+        energy = energy + self.joint_functions.energy(pose.residual.q)
         if self.residual_potential is None:
             return energy
-        more: Tensor = self.residual_potential(at.residual.encoded, prepared.residual.potential)
-        return energy + more
+        residual: Tensor = self.residual_potential(pose.residual.encoded, prepared.residual.potential)
+        return energy + residual
 
-    def gravity_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
+    def gravity_at(self, pose: Motion, prepared: RigidPrepared) -> Tensor:
         """dV/dq, (..., n) [Nm, N]."""
         if self.residual_mass is None:
-            return at.gravity
-        kinetic = torch.zeros_like(at.residual.encoded)
-        return at.gravity - self._gradient(at.residual, kinetic, prepared)
+            return pose.gravity
+        kinetic = torch.zeros_like(pose.residual.encoded)
+        return pose.gravity - self._gradient(pose.residual, kinetic, prepared)
 
-    def lagrangian_gradient(self, at: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
+    def lagrangian_gradient(
+        self, pose: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared
+    ) -> Tensor:
         """d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
-        gradient = super().lagrangian_gradient(at, qd, None, prepared)
+        gradient = super().lagrangian_gradient(pose, qd, None, prepared)
         if self.residual_mass is None:
             return gradient
-        kinetic = self.residual_mass.kinetic_vjp(at.residual.encoded, qd, residuals)
-        return gradient + self._gradient(at.residual, kinetic, prepared)
+        kinetic = self.residual_mass.kinetic_vjp(pose.residual.encoded, qd, residuals)
+        return gradient + self._gradient(pose.residual, kinetic, prepared)
 
-    def nonlinear_at(self, at: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
+    def nonlinear_at(self, pose: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
         """The torque that holds qd steady without friction, (..., n)."""
-        torque = super().nonlinear_at(at, qd, None, prepared)
+        torque = super().nonlinear_at(pose, qd, None, prepared)
         if self.residual_mass is None:
             return torque
-        return torque + self._nonlinear(at.residual, qd, residuals, prepared)
+        return torque + self._nonlinear(pose.residual, qd, residuals, prepared)
 
     def residual_torque(self, q: Tensor, qd: Tensor, qdd: Tensor, prepared: RigidPrepared) -> Tensor:
         """What the residuals of M and V take, (..., n) [Nm, N]."""
@@ -138,11 +141,11 @@ class ResidualDynamics(RigidBodyDynamics):
         factor: Tensor = self.joint_functions(q, self.joint_functions.prepare())[1]
         return factor
 
-    def _varied(self, friction: Tensor, at: Motion) -> Tensor:
+    def _varied(self, friction: Tensor, pose: Motion) -> Tensor:
         """The laws' friction of the drives as it is at this position, (..., n)."""
         if self.residual_mass is None:
             return friction
-        factor: Tensor = at.residual.factor
+        factor: Tensor = pose.residual.factor
         return factor * friction
 
     def _nonlinear(self, read: ResidualMotion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:

@@ -9,9 +9,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from spelgen.runtime.joints import Joints, blocks
-from spelgen.runtime.network import Network
+from spelgen.runtime.parts import Network
 from spelgen.runtime.port_hamiltonian import applied, combined
-from spelgen.runtime.symmetric import Entries, entry_basis
+from spelgen.runtime.symmetric import Entries
 
 PART = 0.9  # of the drives' inertia, which the residual may take away at most
 NEVER = 1e30  # how large a function may be by an entry where it does not stand
@@ -34,20 +34,16 @@ class ResidualMass(nn.Module):
 
     kinds = (("raw_constants", "mass_residuals", "kg m^2, kg m, kg"),)
 
-    basis: Tensor  # (functions + constants, n, n)
-    inverse: Tensor  # one by |basis|, NEVER where that is zero
+    inverse: Tensor  # one by the size of each function and constant in an entry, NEVER where it has none
 
     def __init__(
         self, joints: Joints, entries: Entries, functions: int, constants: int, network: Network | None
     ) -> None:
         super().__init__()
-        n = self.n = joints.n
-        basis = torch.cat(entry_basis(entries, functions, constants)).reshape(-1, n, n)
-        stands = basis != 0
-        self.register_buffer("basis", basis)
-        self.register_buffer("inverse", torch.where(stands, 1 / basis.abs(), NEVER))
-        self.part = PART / float(stands.sum(dim=(0, 2)).max())  # of all that meet in a row of M
-        self.functions, self.network = functions, network
+        self.n, self.functions, self.entries, self.network = joints.n, functions, entries, network
+        size = self._scaled(torch.ones(functions + constants, dtype=torch.float64)).abs()
+        self.register_buffer("inverse", torch.where(size > 0, 1 / size, NEVER))
+        self.part = PART / float((size > 0).sum(dim=(0, 2)).max())  # of all that meet in a row of M
         self.raw_constants = nn.Parameter(torch.zeros(constants, dtype=torch.float64))
 
     def bounds(self, armature: Tensor) -> Tensor:
@@ -61,9 +57,14 @@ class ResidualMass(nn.Module):
         smallest: Tensor = (pairs * self.inverse).amin(dim=(-2, -1))
         return self.part * smallest
 
+    def _scaled(self, sizes: Tensor) -> Tensor:
+        """Return what functions and constants of these sizes add to M, (functions + constants, n, n)."""
+        rows = torch.diag(sizes).unbind()
+        return self.entries(rows[: self.functions], rows[self.functions :])
+
     def prepare(self, armature: Tensor) -> ResidualMassPrepared:
         """All that depends on the weights alone."""
-        rows = self.bounds(armature).unsqueeze(-1) * self.basis.flatten(1)
+        rows = self._scaled(self.bounds(armature)).flatten(1)
         functions, constants = rows.tensor_split((self.functions,))
         layers = None
         if self.network is not None:
@@ -75,7 +76,7 @@ class ResidualMass(nn.Module):
         """R(q), and what its derivatives need."""
         if self.network is None:
             return self._square(prepared.constant).expand(*encoded.shape[:-1], -1, -1), None
-        y, residuals = self.network(encoded, prepared.layers)
+        y, residuals = self.network.forward(encoded, prepared.layers)
         height = y.tanh()
         rows = F.linear(height, prepared.functions.mT, prepared.constant)
         return self._square(rows), (residuals, 1 - height * height, prepared.functions)

@@ -86,12 +86,12 @@ def motion_table(bodies: Bodies) -> tuple[Tensor, Tensor]:
     return by_term.reshape(36 * count, 3 * count), fixed.flatten()
 
 
-def crossed(twists: Tensor, others: Tensor) -> Tensor:
+def crossed(twists: Tensor, axes: Tensor) -> Tensor:
     """How twists that are carried along by ``twists`` change; columns, (..., 6, k) each.
 
     Featherstone's cross product of motion vectors (2008, eq. 2.31).
     """
-    (w, u), (a, m) = twists.chunk(2, dim=-2), others.chunk(2, dim=-2)
+    (w, u), (a, m) = twists.chunk(2, dim=-2), axes.chunk(2, dim=-2)
     linear = torch.linalg.cross(w, m, dim=-2) + torch.linalg.cross(u, a, dim=-2)
     return torch.cat([torch.linalg.cross(w, a, dim=-2), linear], dim=-2)
 
@@ -106,14 +106,21 @@ def pushed_along(twists: Tensor, momenta: Tensor) -> Tensor:
     return torch.cat([angular, torch.linalg.cross(w, f, dim=-2)], dim=-2)
 
 
+def block_diagonal(blocks: Tensor) -> Tensor:
+    """Return the matrix, (k m, k m), with these blocks, (k, m, m), on its diagonal."""
+    k, m, _ = blocks.shape
+    identity = torch.eye(k, dtype=blocks.dtype, device=blocks.device)
+    return (identity[:, None, :, None] * blocks[:, :, None, :]).reshape(k * m, k * m)
+
+
 def inertia_basis() -> Tensor:
     """Spatial inertias of bodies with one parameter one and the others zero, (10, 6, 6)."""
     basis = torch.zeros(10, 6, 6, dtype=torch.float64)
     basis[0, 3:, 3:] = torch.eye(3)
     for axis, unit in enumerate(torch.eye(3, dtype=torch.float64)):
         basis[1 + axis, :3, 3:], basis[1 + axis, 3:, :3] = skew(unit), -skew(unit)
-    for place, (row, column) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))):
-        basis[4 + place, row, column] = basis[4 + place, column, row] = 1
+    for component, (row, column) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))):
+        basis[4 + component, row, column] = basis[4 + component, column, row] = 1
     return basis
 
 

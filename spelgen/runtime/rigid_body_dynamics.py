@@ -12,16 +12,9 @@ from spelgen.runtime.armature import Armature
 from spelgen.runtime.body_chain import BodyChain, Chain
 from spelgen.runtime.friction_laws import FrictionConstants, FrictionLaws
 from spelgen.runtime.joints import Joints, vector
-from spelgen.runtime.parts import DriveInput
+from spelgen.runtime.parts import Input
 from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied, combined
-from spelgen.runtime.rigid_body import Bodies, InertialParameters, inertia_basis, pushed_along
-
-
-def block_diagonal(blocks: Tensor) -> Tensor:
-    """The matrix, (k m, k m), with these blocks, (k, m, m), on its diagonal."""
-    k, m, _ = blocks.shape
-    own = torch.eye(k, dtype=blocks.dtype, device=blocks.device)
-    return (own[:, None, :, None] * blocks[:, :, None, :]).reshape(k * m, k * m)
+from spelgen.runtime.rigid_body import Bodies, InertialParameters, block_diagonal, inertia_basis
 
 
 class RigidPrepared(NamedTuple):
@@ -46,7 +39,11 @@ class Motion(NamedTuple):
 
 
 class RigidBodyDynamics(PortHamiltonian):
-    """Rigid bodies with trained inertial parameters, friction by laws, a trained torque offset."""
+    """Rigid bodies with trained inertial parameters, friction by laws, a trained torque offset.
+
+    z, (..., n, K), is the state of friction's bristles [rad, m], and adds their energy to H; without it
+    friction is that of joints that slide the way they move. motors: C, the drives' speeds are C qd.
+    """
 
     kinds = (
         ("raw_offset", "offset", "Nm, N"),
@@ -64,8 +61,9 @@ class RigidBodyDynamics(PortHamiltonian):
         joints: Joints,
         bodies: Bodies,
         gravity: tuple[float, float, float],
-        input: DriveInput,
+        input: Input,
         reach: Sequence[Sequence[float]] = (),
+        motors: Sequence[Sequence[float]] = (),
     ) -> None:
         super().__init__()
         self.elements = len(reach[0]) if reach else 0
@@ -76,9 +74,10 @@ class RigidBodyDynamics(PortHamiltonian):
         self.rotors = Armature(joints)
         self.friction = FrictionLaws(joints, reach)
         self.input = input
-        self.register_buffer("motors", self.input.motor_speeds())
+        self.coupled = len(motors) > 0  # each drive moves its own joint alone where they are not given
+        identity = torch.eye(joints.n, dtype=torch.float64)
+        self.register_buffer("motors", torch.tensor(motors).to(identity) if motors else identity)
         self.register_buffer("loads", torch.linalg.inv(self.motors))
-        self.coupled = not torch.equal(self.motors, torch.eye(self.n).double())
         # of the measured torque, in units of the joints' usual friction
         self.raw_offset = nn.Parameter(torch.zeros(self.n, dtype=torch.float64))
         # in units of usual friction at usual speed; no parameter: only a fit to torques may find one
@@ -133,38 +132,36 @@ class RigidBodyDynamics(PortHamiltonian):
 
     def configuration(self, q: Tensor, prepared: RigidPrepared) -> Motion:
         """How the bodies may move at q, and what they weigh there."""
-        chain: Chain = self.chain(q)
+        chain = self.chain.forward(q)
         momenta = chain.twists @ prepared.inertia
         return Motion(chain, momenta, applied(momenta, chain.weight))
 
-    def mass_at(self, at: Motion, prepared: RigidPrepared) -> tuple[Tensor, None]:
+    def mass_at(self, pose: Motion, prepared: RigidPrepared) -> tuple[Tensor, None]:
         """M(q), (..., n, n)."""
-        return at.momenta @ at.chain.twists.mT + prepared.armature, None
+        return pose.momenta @ pose.chain.twists.mT + prepared.armature, None
 
-    def energy_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
+    def energy_at(self, pose: Motion, prepared: RigidPrepared) -> Tensor:
         """V(q), (...) [J]; zero for a mass at the base's origin."""
-        return self.chain.energy(at.chain, prepared.inertia)
+        return self.chain.energy(pose.chain, prepared.inertia)
 
-    def gravity_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
+    def gravity_at(self, pose: Motion, prepared: RigidPrepared) -> Tensor:
         """dV/dq, (..., n) [Nm, N]."""
-        return at.gravity
+        return pose.gravity
 
-    def lagrangian_gradient(self, at: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
+    def lagrangian_gradient(
+        self, pose: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared
+    ) -> Tensor:
         """d/dq of 1/2 qd^T M(q) qd - V(q), (..., n).
 
         The kinetic part: the momentum of all that a joint carries, by what its displacement adds to
         their twist.
         """
-        momenta = self.chain.at_base(at.chain, combined(qd, at.momenta))
-        return self.chain.by_joints(self.chain.turning(at.chain, qd)[1], momenta) - at.gravity
+        momenta = self.chain.at_base(pose.chain, combined(qd, pose.momenta))
+        return self.chain.by_joints(self.chain.turning(pose.chain, qd)[1], momenta) - pose.gravity
 
-    def nonlinear_at(self, at: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
+    def nonlinear_at(self, pose: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
         """The torque that holds qd steady without friction, (..., n), by Newton and Euler."""
-        chain = self.chain
-        twists, turning = chain.turning(at.chain, qd)
-        rising = applied(at.momenta, chain.accelerations(at.chain, qd, turning))
-        pushed = pushed_along(twists, chain.at_base(at.chain, combined(qd, at.momenta)))
-        return rising + chain.by_joints(at.chain.axes, pushed)
+        return self.chain.steady_torque(pose.chain, qd, pose.momenta)
 
     def regressor(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
         """Y, (..., n, 10 bodies): Y @ inertial parameters is the bodies' torque."""
@@ -178,7 +175,7 @@ class RigidBodyDynamics(PortHamiltonian):
         """How much more friction the drives have at q than their laws say, (..., n): nowhere any."""
         return torch.ones_like(q)
 
-    def _varied(self, friction: Tensor, at: Motion) -> Tensor:
+    def _varied(self, friction: Tensor, pose: Motion) -> Tensor:
         """The laws' friction of the drives as it is at this position, (..., n)."""
         return friction
 
@@ -186,47 +183,64 @@ class RigidBodyDynamics(PortHamiltonian):
         """Rows times a matrix that is the identity where each motor moves its own joint alone."""
         return joints @ matrix if self.coupled else joints
 
-    def friction_at(self, at: Motion, qd: Tensor, prepared: RigidPrepared, z: Tensor | None = None) -> Tensor:
+    def friction_at(
+        self, pose: Motion, qd: Tensor, prepared: RigidPrepared, z: Tensor | None = None
+    ) -> Tensor:
         """The friction torque C^T f(C qd), (..., n) [Nm, N]."""
-        speeds, loads = self._by_motors(qd, self.motors.mT), self._by_motors(at.gravity, self.loads)
-        torque: Tensor = self.friction(speeds, loads, prepared.friction, z)
-        return self._by_motors(self._varied(torque, at), self.motors)
+        speeds, loads = self._by_motors(qd, self.motors.mT), self._by_motors(pose.gravity, self.loads)
+        torque = self.friction.forward(speeds, loads, prepared.friction, z)
+        return self._by_motors(self._varied(torque, pose), self.motors)
 
-    def stored_energy(self, z: Tensor, prepared: RigidPrepared) -> Tensor:
-        """What the bristles give back, (...) [J]."""
-        return self.friction.stored_energy(z, prepared.friction)
+    def friction_torque(self, q: Tensor, qd: Tensor, z: Tensor | None = None) -> Tensor:
+        """Return D(q, qd) qd, or the torque of bristles at z, (..., n) [Nm, N]."""
+        prepared = self.prepare()
+        return self.friction_at(self.configuration(q, prepared), qd, prepared, z)
+
+    def hamiltonian(self, q: Tensor, p: Tensor, z: Tensor | None = None) -> Tensor:
+        """Return H, (...) [J]."""
+        energy = super().hamiltonian(q, p)
+        return energy if z is None else energy + self.friction.stored_energy(z, self.friction.prepare())
 
     def memory(self, qd: Tensor) -> Tensor:
-        """z, (..., n, K), of drives that have long gone this way."""
+        """Return z, (..., n, K), of drives that have long gone this way."""
         return self.friction.sliding(qd @ self.motors.mT)
 
-    def memory_rate(self, qd: Tensor, z: Tensor) -> Tensor:
-        """z', (..., n, K)."""
-        return self.friction.bristles.rate(qd @ self.motors.mT, z)
-
     def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
-        """z after joints went one way by (..., n), exactly."""
+        """Return z after joints went one way by (..., n), exactly."""
         return self.friction.bristles.moved(z, displacement @ self.motors.mT)
 
-    def dissipation_at(self, at: Motion, qd: Tensor, prepared: RigidPrepared) -> Tensor:
+    def forward(self, t: Tensor, state: Tensor) -> Tensor:
+        """Return the rate of (q, p, z), (..., 2 n + n K), or of (q, p, z, tau), where tau is held.
+
+        A state that is too short for z has none: friction is then that of joints which slide.
+        """
+        n, size = self.n, self.n * self.elements
+        if not size or state.shape[-1] < 2 * n + size:
+            return super().forward(t, state)
+        q, p, flat, tau = state.tensor_split((n, 2 * n, 2 * n + size), dim=-1)
+        z = flat.reshape(*flat.shape[:-1], n, self.elements)
+        qd, force = self.port_hamiltonian_rhs(q, p, tau if tau.shape[-1] else None, self.prepare(), z)
+        rate = self.friction.bristles.rate(qd @ self.motors.mT, z).flatten(-2)
+        return torch.cat([qd, force, rate, torch.zeros_like(tau)], dim=-1)
+
+    def dissipation_at(self, pose: Motion, qd: Tensor, prepared: RigidPrepared) -> Tensor:
         """D(q, qd), (..., n, n), diagonal where each drive moves its own joint alone."""
-        speeds, loads = qd @ self.motors.mT, at.gravity @ self.loads
+        speeds, loads = qd @ self.motors.mT, pose.gravity @ self.loads
         resistance = self.friction.resistance(speeds, loads, prepared.friction)
-        resistance = self._varied(resistance, at)
+        resistance = self._varied(resistance, pose)
         return self.motors.mT @ (resistance.unsqueeze(-1) * self.motors)
 
-    def input_at(self, at: Motion, prepared: RigidPrepared) -> Tensor:
+    def input_at(self, pose: Motion, prepared: RigidPrepared) -> Tensor:
         """G, (..., n, n)."""
-        matrix: Tensor = self.input(at.gravity, prepared.input)
-        return matrix
+        return self.input.forward(pose.gravity, prepared.input)
 
-    def input_force(self, at: Motion, qd: Tensor, tau: Tensor, prepared: RigidPrepared) -> Tensor:
+    def input_force(self, pose: Motion, qd: Tensor, tau: Tensor, prepared: RigidPrepared) -> Tensor:
         """G (tau - torque offset) + friction compensation qd, (..., n) [Nm, N]."""
-        force: Tensor = self.input.force(at.gravity, tau - prepared.offset, prepared.input)
+        force = self.input.force(pose.gravity, tau - prepared.offset, prepared.input)
         return force + prepared.compensation * qd
 
-    def input_torque(self, at: Motion, qd: Tensor, force: Tensor, prepared: RigidPrepared) -> Tensor:
+    def input_torque(self, pose: Motion, qd: Tensor, force: Tensor, prepared: RigidPrepared) -> Tensor:
         """The tau, (..., n), that is measured while the drives make this force."""
-        shown = force - prepared.compensation * qd
-        tau: Tensor = self.input.solve(at.gravity, shown, prepared.input)
+        measured = force - prepared.compensation * qd
+        tau = self.input.solve(pose.gravity, measured, prepared.input)
         return tau + prepared.offset

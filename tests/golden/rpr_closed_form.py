@@ -20,8 +20,8 @@ Joints, in the order of q, qd and tau:
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -36,6 +36,10 @@ FACTS = r"""{"format": 2, "robot": "rpr", "urdf": "rpr.urdf",
 
 
 # ---- this arm ----
+
+
+# what the parts of this arm's model are
+Input = DirectInput
 
 
 class Model(RigidBodyDynamics):
@@ -72,8 +76,9 @@ class Model(RigidBodyDynamics):
             ),
             products=((0.0, 0.0, 0.0), (0.0, 0.0, -0.55647375), (0.0, 0.0, 0.00536544)),
         )  # fmt: skip
+        input = DirectInput(joints)
         super().__init__(
-            joints, bodies, (0.0, 0.0, -9.81), DirectInput(joints),
+            joints, bodies, (0.0, 0.0, -9.81), input,
             reach=((0.0001, 0.001, 0.01, 0.1), (1e-05, 0.0001, 0.001, 0.01), (0.0001, 0.001, 0.01, 0.1)),
         )  # fmt: skip
         self.to(dtype)

@@ -21,9 +21,8 @@ Joints, in the order of q, qd and tau:
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -38,6 +37,11 @@ FACTS = r"""{"format": 2, "robot": "rpr", "urdf": "rpr.urdf",
 
 
 # ---- this arm ----
+
+
+# what the parts of this arm's model are
+Network = MaskedMLP
+Input = DirectInput
 
 
 class Model(ResidualDynamics):
@@ -74,19 +78,24 @@ class Model(ResidualDynamics):
             ),
             products=((0.0, 0.0, 0.0), (0.0, 0.0, -0.55647375), (0.0, 0.0, 0.00536544)),
         )  # fmt: skip
+        input = DirectInput(joints)
         generator = torch.Generator().manual_seed(seed)
-        functions = ((2,),) + ((1, 2),) * 2
-        network = MaskedMLP(
-            joint_input(joints, (1, 2), (0.02, 1.0, 0.518)),
-            unit_joints(functions, width=64, depth=2, least=4), generator,
+        mass_outputs = ((2,),) + ((1, 2),) * 2
+        mass_hidden = ((2,),) * 21 + ((1, 2),) * 43
+        network = Network(
+            joint_input(joints, (1, 2), (0.02, 1.0, 0.518)), (mass_hidden, mass_hidden, mass_outputs),
+            generator,
         )  # fmt: skip
         mass = ResidualMass(joints, self.mass_entries, 3, 2, network)
-        network = MaskedMLP(
-            joint_input(joints, (2,), (0.02, 0.02, 1.0)), unit_joints(((2,),), width=32, depth=2), generator
-        )
+        potential_outputs = ((2,),)
+        potential_hidden = ((2,),) * 32
+        network = Network(
+            joint_input(joints, (2,), (0.02, 0.02, 1.0)),
+            (potential_hidden, potential_hidden, potential_outputs), generator,
+        )  # fmt: skip
         potential = LearnedPotential(0.703291, network)
         super().__init__(
-            joints, bodies, (0.0, 0.0, -9.81), DirectInput(joints), mass, potential,
+            joints, bodies, (0.0, 0.0, -9.81), input, mass, potential,
             reach=((0.0001, 0.001, 0.01, 0.1), (1e-05, 0.0001, 0.001, 0.01), (0.0001, 0.001, 0.01, 0.1)),
         )  # fmt: skip
         self.to(dtype)

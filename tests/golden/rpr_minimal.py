@@ -19,9 +19,8 @@ Joints, in the order of q, qd and tau:
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -36,6 +35,13 @@ FACTS = r"""{"format": 2, "robot": "rpr", "urdf": "rpr.urdf",
 
 
 # ---- this arm ----
+
+
+# what the parts of this arm's model are
+Network = MaskedMLP
+Mass = DerivedMass
+Friction = JointFriction
+Input = DirectInput
 
 
 class Model(NetworkDynamics):
@@ -57,23 +63,27 @@ class Model(NetworkDynamics):
         )  # fmt: skip
         generator = torch.Generator().manual_seed(seed)
         encoding = JointEncoding(joints)
-        functions = (
-            MassFunction((2,), mean=-0.00167665, scale=1.36528),
-            MassFunction((1, 2), mean=-0.00154309, scale=0.0595527),
-            MassFunction((1, 2), mean=139.887, scale=12.6351),
+        mass_outputs = ((2,),) + ((1, 2),) * 2
+        mass_hidden = ((2,),) * 21 + ((1, 2),) * 43
+        network = Network(
+            joint_input(joints, (1, 2), (0.02, 1.0, 0.518)), (mass_hidden, mass_hidden, mass_outputs),
+            generator,
         )  # fmt: skip
-        constants = ((0.0101411, 0.0101411), (5.33, 5.33))
-        network = MaskedMLP(
-            joint_input(joints, (1, 2), (0.02, 1.0, 0.518)),
-            unit_joints([function.joints for function in functions], width=64, depth=2, least=4), generator,
+        mass = DerivedMass(
+            joints, self.mass_entries, mean=(-0.00167665, -0.00154309, 139.887),
+            scale=(1.36528, 0.0595527, 12.6351), constants=((0.0101411, 0.0101411), (5.33, 5.33)),
+            network=network, margin=0.08,
         )  # fmt: skip
-        mass = DerivedMass(joints, self.mass_entries, functions, constants, network, 0.08)
-        network = MaskedMLP(
-            joint_input(joints, (2,), (0.02, 0.02, 1.0)), unit_joints(((2,),), width=32, depth=2), generator
-        )
+        potential_outputs = ((2,),)
+        potential_hidden = ((2,),) * 32
+        network = Network(
+            joint_input(joints, (2,), (0.02, 0.02, 1.0)),
+            (potential_hidden, potential_hidden, potential_outputs), generator,
+        )  # fmt: skip
         potential = LearnedPotential(0.703291, network)
         friction = JointFriction(joints, encoding, generator)
-        super().__init__(encoding, mass, potential, friction, DirectInput(joints))
+        input = DirectInput(joints)
+        super().__init__(encoding, mass, potential, friction, input)
         self.to(dtype)
 
     @staticmethod

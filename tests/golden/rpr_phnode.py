@@ -20,9 +20,8 @@ Joints, in the order of q, qd and tau:
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -37,6 +36,13 @@ FACTS = r"""{"format": 2, "robot": "rpr", "urdf": "rpr.urdf",
 
 
 # ---- this arm ----
+
+
+# what the parts of this arm's model are
+Network = MaskedMLP
+Mass = DenseMass
+Friction = DenseFriction
+Input = DenseInput
 
 
 class Model(NetworkDynamics):
@@ -58,34 +64,33 @@ class Model(NetworkDynamics):
         )  # fmt: skip
         generator = torch.Generator().manual_seed(seed)
         encoding = JointEncoding(joints)
+        mass_outputs = ((0, 1, 2),) * 45
+        mass_hidden = ((0, 1, 2),) * 64
+        network = Network(
+            lie_group_input(joints, (0.02, 1.0, 0.518)), (mass_hidden, mass_hidden, mass_outputs), generator
+        )
         mass = DenseMass(
-            joints, mean=((139.887,), (-0.00167665, 5.33), (-0.00154309, 0.0, 0.0101411)),
-            network=MaskedMLP(
-                lie_group_input(joints, (0.02, 1.0, 0.518)), unit_joints([range(3)] * 45, width=64, depth=2),
-                generator,
-            ),
-        )  # fmt: skip
-        network = MaskedMLP(
-            lie_group_input(joints, (0.02, 0.02, 1.0)), unit_joints(((0, 1, 2),), width=32, depth=2),
-            generator,
+            joints, mean=((139.887,), (-0.00167665, 5.33), (-0.00154309, 0.0, 0.0101411)), network=network
+        )
+        potential_outputs = ((0, 1, 2),)
+        potential_hidden = ((0, 1, 2),) * 32
+        network = Network(
+            lie_group_input(joints, (0.02, 0.02, 1.0)),
+            (potential_hidden, potential_hidden, potential_outputs), generator,
         )  # fmt: skip
         potential = LearnedPotential(0.703291, network)
-        friction = DenseFriction(
-            joints,
-            MaskedMLP(
-                with_velocities(lie_group_input(joints, (0.1, 0.1, 0.1)), joints, 3),
-                unit_joints([range(3)] * 45, width=64, depth=2), generator,
-            ),
-            axes=3,
+        friction_outputs = ((0, 1, 2),) * 45
+        friction_hidden = ((0, 1, 2),) * 64
+        network = Network(
+            with_velocities(lie_group_input(joints, (0.1, 0.1, 0.1)), joints, 3),
+            (friction_hidden, friction_hidden, friction_outputs), generator,
         )  # fmt: skip
-        super().__init__(
-            encoding, mass, potential, friction,
-            DenseInput(
-                joints,
-                MaskedMLP(
-                    lie_group_input(joints, (1.0, 1.0, 1.0)), unit_joints([range(3)] * 9, width=64, depth=2),
-                    generator,
-                ),
-            ),
-        )  # fmt: skip
+        friction = DenseFriction(joints, network, axes=3)
+        input_outputs = ((0, 1, 2),) * 9
+        input_hidden = ((0, 1, 2),) * 64
+        network = Network(
+            lie_group_input(joints, (1.0, 1.0, 1.0)), (input_hidden, input_hidden, input_outputs), generator
+        )
+        input = DenseInput(joints, network)
+        super().__init__(encoding, mass, potential, friction, input)
         self.to(dtype)

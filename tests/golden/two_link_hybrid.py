@@ -19,9 +19,8 @@ Joints, in the order of q, qd and tau:
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -36,6 +35,11 @@ FACTS = r"""{"format": 2, "robot": "two_link", "urdf": "two_link.urdf",
 
 
 # ---- this arm ----
+
+
+# what the parts of this arm's model are
+Network = MaskedMLP
+Input = DirectInput
 
 
 class Model(ResidualDynamics):
@@ -65,19 +69,23 @@ class Model(ResidualDynamics):
             moment=((0.5, 0.0, 0.0), (0.5, 0.0, 0.0)), inertia=((0.6, 0.85, 1.25), (0.6, 0.85, 1.25)),
             products=((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
         )  # fmt: skip
+        input = DirectInput(joints)
         generator = torch.Generator().manual_seed(seed)
-        functions = ((1,),)
-        network = MaskedMLP(
-            joint_input(joints, (1,), (0.02, 1.0)), unit_joints(functions, width=64, depth=2, least=4),
-            generator,
-        )  # fmt: skip
-        mass = ResidualMass(joints, self.mass_entries, 1, 2, network)
-        network = MaskedMLP(
-            joint_input(joints, (0, 1), (1.0, 0.307)), unit_joints(((0, 1),), width=32, depth=2), generator
+        mass_outputs = ((1,),)
+        mass_hidden = ((1,),) * 64
+        network = Network(
+            joint_input(joints, (1,), (0.02, 1.0)), (mass_hidden, mass_hidden, mass_outputs), generator
         )
+        mass = ResidualMass(joints, self.mass_entries, 1, 2, network)
+        potential_outputs = ((0, 1),)
+        potential_hidden = ((0, 1),) * 32
+        network = Network(
+            joint_input(joints, (0, 1), (1.0, 0.307)),
+            (potential_hidden, potential_hidden, potential_outputs), generator,
+        )  # fmt: skip
         potential = LearnedPotential(10.8194, network)
         super().__init__(
-            joints, bodies, (0.0, -9.81, 0.0), DirectInput(joints), mass, potential,
+            joints, bodies, (0.0, -9.81, 0.0), input, mass, potential,
             reach=((0.0001, 0.001, 0.01, 0.1), (0.0001, 0.001, 0.01, 0.1)),
         )  # fmt: skip
         self.to(dtype)
