@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
-from torch.func import functional_call
 
 from spelgen.dynamics.servo_rollout import Load, ServoDrives, advanced, balanced, servo_drives
 from spelgen.fitting.functional_model import FunctionalModel
@@ -80,7 +79,7 @@ class ServoProblem:
         self.model, self.windows, self._noise = model, windows, noise
         self.rows = ParameterRows(model)
         self.nudge = TUNING.nudge
-        self._asked = FunctionalModel(model)
+        self._functional = FunctionalModel(model)
         q = windows.q.flatten(0, 1)
         self.directions = body_directions(model, q[:: max(1, len(q) // GRAVITY_SAMPLES)])
         self._raw_bodies = body_parameters(model).detach().clone()
@@ -209,9 +208,9 @@ class ServoProblem:
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return q and qd (P, W, K, n) of parameters (P, p, n), (P, r) under commands (P, W, K-1, S, n)."""
         named = self.rows.named(joints, x.active)
-        tensors = {f"model.{name}": tensor.detach() for name, tensor in named.items()}
+        tensors = {name: tensor.detach() for name, tensor in named.items()}
         with torch.inference_mode():  # small operations, of which each takes a tenth less so
-            drives, armature = functional_call(self._asked, tensors, (_drives,))
+            drives, armature = self._functional.under(tensors, _drives)
             change = torch.einsum("wknr,pr->pwkn", self.load.slopes, bodies - self._bodies)
             return self._integrate(drives, armature, change, commands)
 

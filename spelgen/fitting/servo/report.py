@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, TypedDict
 
 import torch
 from scipy.special import stdtrit
-from torch.func import functional_call
 
 from spelgen.fitting.functional_model import FunctionalModel
 from spelgen.fitting.levenberg_marquardt import NormalEquations
@@ -117,10 +116,8 @@ def ratios_with_deviations(
     """Return the ratios to kp, and the standard deviations of their logarithms, each (n,)."""
     tensors = {name: x.detach().clone().requires_grad_() for name, x in problem.rows.tensors.items()}
     qd, gravity = problem.along.qd, problem.load.gravity
-    named = {f"model.{name}": x for name, x in tensors.items()}
-    values = functional_call(
-        FunctionalModel(problem.model), named, (lambda model: ratios(model, qd, gravity),)
-    )
+    functional = FunctionalModel(problem.model)
+    values = functional.under(tensors, lambda model: ratios(model, qd, gravity))
     p, n = problem.start.joints.shape
     blocks = solution.covariance[: p * n, : p * n].view(p, n, p, n).diagonal(dim1=1, dim2=3)  # (p, p, n)
     result = {}
