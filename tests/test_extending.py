@@ -1,4 +1,4 @@
-"""docs/extending.md is followed: a preset, a log format, a baseline and an exporter are added, each
+"""docs/extending.md is followed: a preset, a log format, a baseline, an exporter and a check of logs are added, each
 where the page says, and work."""
 
 import inspect
@@ -20,7 +20,8 @@ from spelgen.emission.loading import load_module
 from spelgen.errors import RunError
 from spelgen.exporting import exported
 from spelgen.loaded_arm import load_arm
-from spelgen.logs import formats
+from spelgen.log_checks.check_logs import check_logs
+from spelgen.logs import checks, formats
 from spelgen.logs.read import read_logs
 from spelgen.logs.tables import LogFormat
 from spelgen.logs.trajectory import Trajectory
@@ -121,3 +122,16 @@ def test_an_export(robots, tmp_path, monkeypatch):
     spelgen.export(model, "toy", tmp_path / "out", arm=arm)
     assert (tmp_path / "out" / "names.txt").read_text() == "joint1 joint2"
     del sys.modules["toy_export"]
+
+
+def test_a_check_of_logs(robots, monkeypatch, log):
+    assert stands_in("a check of logs", checks)
+
+    def find_left(signals):
+        return "is always left of its zero" if (signals.q < 0).all() else None
+
+    monkeypatch.setattr(checks, "CHECKS", [*checks.CHECKS, checks.Check("left", "warning", find_left)])
+    arm = load_arm(robots / "two_link.urdf")
+    assert "left" not in [x.code for x in check_logs([log], arm).findings]
+    report = check_logs([Trajectory(t=log.t, q=log.q - 2, qd=log.qd, tau=log.tau)], arm)
+    assert "is always left of its zero" in report.text()
