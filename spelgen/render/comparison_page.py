@@ -68,7 +68,7 @@ def _losses(study: Study, styles: Mapping[str, str]) -> Markup:
     for variant in study.variants:
         records = RunFolder(study.run(variant, 0)).read_metrics()
         if variant.name in styles and records:
-            steps, losses = [record["step"] for record in records], [record["best"] for record in records]
+            steps, losses = numbers([(record["step"], record["best"]) for record in records]).T
             lines.append(Line(variant.name, steps, losses, styles[variant.name]))
     title = "Best validation loss by step"
     return line_chart(lines, title, "training step", "loss", log=True, width=560, height=250)

@@ -7,11 +7,12 @@ from spelgen.loaded_arm import LoadedArm
 from spelgen.render.arm_section import arm_section, matrix
 from spelgen.render.page import render_page
 from spelgen.render.parameters import DETERMINED, base_table
+from spelgen.render.plots import Record
 
 
 def page(identification: Identification, arm: LoadedArm) -> str:
     """The page about an identification: what was determined and how surely, the arm, and the torque that is left."""
-    record = identification.to_dict()
+    record: Record = identification.to_dict()
     words = [parameter["determined"] for parameter in record["base_parameters"]]
     never = [name for name, visibility in record["identifiability"].items() if visibility == "never"]
     return render_page(

@@ -98,13 +98,16 @@ def base_table(model: EmittedModel | None, arm: LoadedArm, identified: Record) -
             value += f" ± {TUNING.interval * parameter['deviation']:.2g}"
         row = [parameter["name"], f"{nominal[k]:.4g}" if of_bodies and arm.arm.has_inertials else ""]
         if learned is not None:
-            has_value = of_bodies or parameter["name"].startswith("armature")
-            row.append(f"{learned[k]:.4g}" if has_value else "")
+            row.append("")
+            if of_bodies or parameter["name"].startswith("armature"):
+                row[-1] = f"{learned[k]:.4g}"
         row += [value, parameter["determined"], parameter["formula"].replace(parameter["name"], "", 1)]
         if parameter["formula"] != parameter["name"]:
             row[-1] = parameter["formula"]
-        rows = sure if parameter["determined"] in DETERMINED else unsure
-        rows.append(tuple(row))
+        if parameter["determined"] in DETERMINED:
+            sure.append(tuple(row))
+        else:
+            unsure.append(tuple(row))
     head = ["parameter", "URDF", "least squares, 95 %", "determined", "made of"]
     note = "The intervals are those of least squares on the training logs [kg, m, s]"
     if learned is not None:
@@ -125,8 +128,10 @@ def base_table(model: EmittedModel | None, arm: LoadedArm, identified: Record) -
 
 def _learned(model: EmittedModel | None, combination: np.ndarray) -> np.ndarray | None:
     """Return base parameters of a model of rigid bodies; those of friction follow other laws, and stay zero."""
-    bodies = None if model is None else body_parameters(model)
-    if model is None or bodies is None:
+    if model is None:
+        return None
+    bodies = body_parameters(model)
+    if bodies is None:
         return None
     # ten a body, then those of drives, of which a model has the armature in common with least squares
     parameters = np.zeros(combination.shape[1])
@@ -261,10 +266,12 @@ def mass_constants(run: RunFolder) -> list[Constant]:
         entries = [(row, column) for row, column in basis.tril().nonzero().tolist()]
         terms = []
         for row, column in entries:
-            sign = "-" if basis[row, column] < 0 else "+"
-            size = abs(basis[row, column].item())
-            factor = "" if size == 1 else f"{size:.4g} "
-            terms.append(f"{sign} {factor}M{_index(row, column)}")
+            factor = f"{basis[row, column].item():+.4g}"
+            sign, size = factor[0], factor[1:]
+            entry = f"M{_index(row, column)}"
+            if size != "1":
+                entry = f"{size} {entry}"
+            terms.append(f"{sign} {entry}")
         row, column = entries[0]
         unit = inertia_unit(trained.joint_types[row], trained.joint_types[column])
         where = " ".join(terms).removeprefix("+ ").replace("- ", "-", terms[0].startswith("-"))

@@ -72,10 +72,11 @@ def numbers(values: object) -> np.ndarray:
 
 def loss_chart(metrics: Sequence[Record], best_epoch: int) -> Markup:
     """Return training and validation loss by epoch, with the epoch of the model that was kept."""
-    epochs = [record["epoch"] for record in metrics]
+    columns = [(record["epoch"], record["loss"], record["validation"]) for record in metrics]
+    epochs, training, validation = numbers(columns).T
     lines = [
-        Line("training loss", epochs, [record["loss"] for record in metrics], "train"),
-        Line("validation loss", epochs, [record["validation"] for record in metrics], "model"),
+        Line("training loss", epochs, training, "train"),
+        Line("validation loss", epochs, validation, "model"),
     ]
     best = [(best_epoch, "best")]
     return line_chart(

@@ -61,12 +61,17 @@ class Run:
     @property
     def results(self) -> Results | None:
         """Return the evaluation; None before there is one."""
-        return None if self.evaluation is None else Results.from_dict(self.evaluation)
+        if self.evaluation is None:
+            return None
+        return Results.from_dict(self.evaluation)
 
     @property
     def verdict(self) -> Verdict | None:
         """Return what the model is good for; None before it is evaluated."""
-        return None if self.results is None else verdict(self.results, self.identified, self.limits)
+        results = self.results
+        if results is None:
+            return None
+        return verdict(results, self.identified, self.limits)
 
 
 def write_report(
@@ -79,7 +84,7 @@ def write_report(
     Raises RunError or ModuleError when the folder is no run, or a file of it cannot be read.
     """
     folder = Path(folder)
-    path = Path(output) if output else folder / "report.html"
+    path = Path(output or folder / "report.html")
     if path.suffix == ".json":
         return write_json(path, report_data(folder))
     return write_text(path, render_report(folder, robot))
@@ -88,15 +93,16 @@ def write_report(
 def report_data(folder: Path | str) -> dict[str, Any]:
     """Return all that the page shows, for programs: the verdict, the evaluation, least squares, the parameters."""
     run = _read(RunFolder(Path(folder)))
-    bodies = None if run.model is None else body_parameters(run.model)
-    return {
-        "schema": SCHEMA,
-        "verdict": None if run.verdict is None else asdict(run.verdict),
-        "evaluation": run.evaluation,
-        "least_squares": run.identified,
-        "bodies": None if bodies is None else bodies.tolist(),
-        "tables": [asdict(table) for table in parameter_tables(run.model, run.arm, run.identified)],
-    }
+    data: dict[str, Any] = {"schema": SCHEMA, "verdict": None, "bodies": None}
+    if run.verdict is not None:
+        data["verdict"] = asdict(run.verdict)
+    if run.model is not None:
+        bodies = body_parameters(run.model)
+        if bodies is not None:
+            data["bodies"] = bodies.tolist()
+    tables = parameter_tables(run.model, run.arm, run.identified)
+    data["tables"] = [asdict(table) for table in tables]
+    return data | {"evaluation": run.evaluation, "least_squares": run.identified}
 
 
 def render_report(folder: Path | str, robot: Path | str | None = None) -> str:
@@ -136,13 +142,22 @@ def _read(folder: RunFolder) -> Run:
 
 
 def _json(folder: RunFolder, path: Path) -> Record | None:
-    return folder.read_json(path) if path.is_file() else None
+    if not path.is_file():
+        return None
+    record: Record = folder.read_json(path)
+    return record
 
 
 def _rendered(run: Run, robot: Path | str | None) -> str:
     facts, config, evaluation = run.facts, run.config or {}, run.evaluation or {}
     picture, traces = read_picture(run.folder.module), evaluation.get("traces") or {}
-    arm = None
+    arm, training, tables, constants = None, None, [], []
+    if config:
+        training = training_facts(config, run.metrics, run.identified)
+    if run.results is not None:
+        tables = result_tables(run.results)
+    if run.model is not None:
+        constants = mass_constants(run.folder)
     if run.arm is not None:
         arm = arm_section(run.arm.arm, Path(robot or run.arm.robot.path), traces, run.identified)
     return render_page(
@@ -156,14 +171,14 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
         numbers=head_numbers(run.model, config, run.metrics, evaluation),
         verdict=run.verdict,
         config=run.config,
-        training=training_facts(config, run.metrics, run.identified) if config else None,
+        training=training,
         evaluation=run.evaluation,
         predictors=predictors(evaluation),
-        tables=[] if run.results is None else result_tables(run.results),
+        tables=tables,
         curves=curves(traces, facts, picture),
         coverage=coverage(traces, run.identified, facts, run.limits),
         trained=run.model is not None,
-        constants=mass_constants(run.folder) if run.model is not None else [],
+        constants=constants,
         under_servos=config.get("mapping", {}).get("input") == "position",
         summary=fit_summary(config),
         parameters=parameter_tables(run.model, run.arm, run.identified),
