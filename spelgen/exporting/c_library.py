@@ -42,6 +42,7 @@ def write_c(model: TrainedModel, folder: Path) -> Path:
 def compile_object(source: Path, program: str, *flags: str) -> Path:
     """Compile a C file to an object beside it. Raises RunError with the messages of the compiler."""
     target = source.with_suffix(".o")
+    # -fPIC for ctypes, -fstack-usage for the header
     command = [program, *_FLAGS, *flags, "-fPIC", "-fstack-usage", "-c", str(source), "-o", str(target)]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     if result.returncode:
@@ -98,6 +99,7 @@ class CLibrary:
         entry = entry_points(self._model)[name]
         states = len(inputs["q"])
         function = getattr(self._library, f"{self._model.name}_{name}")
+        # all results are written to arrays
         function.restype = None
         arrays: list[np.ndarray] = []
         for key in entry.inputs:

@@ -41,6 +41,7 @@ def residual_calls(model: TrainedModel, names: Sequence[str]) -> tuple[list[str]
     variables: list[str] = []
     calls: list[str] = []
     for needed, call, computed in _CALLS:
+        # jets stand first: what they compute is not computed again
         if not missing.intersection(needed):
             continue
         missing.difference_update(computed)
@@ -74,6 +75,7 @@ def network_source(model: TrainedModel) -> list[str]:
     if encoding.prismatic:
         tables += [_table("center", encoding.center), _table("reach", encoding.reach)]
     layers: dict[str, list[str]] = {}
+    # buffers are of one size, that of the widest layer
     width = max(len(indices), encoded)
     for name, network in networks.items():
         layers[name] = []
@@ -160,6 +162,7 @@ def _pieces(splines: Splines) -> np.ndarray:
 
     The intervals begin two spacings before the first middle.
     """
+    # at either end three intervals have fewer than four splines
     padded = np.pad(splines.weights, ((0, 0), (3, 3)))
     neighbours = np.lib.stride_tricks.sliding_window_view(padded, 4, axis=1)
     pieces: np.ndarray = neighbours @ _PIECES.T
@@ -169,6 +172,7 @@ def _pieces(splines: Splines) -> np.ndarray:
 def _energies(splines: Splines) -> np.ndarray:
     """Return the integral by q up to where each interval begins, (splines (S + 3),), zero in a spline's middle."""
     intervals = _pieces(splines) @ (1 / np.arange(1, 5)) * splines.spacing[:, None]
+    # as in the runtime: half of a spline's area on either side of its middle
     half = 0.5 * splines.weights.sum(axis=1) * splines.spacing
     energies: np.ndarray = np.cumsum(intervals, axis=1) - intervals - half[:, None]
     return energies.ravel()

@@ -37,6 +37,7 @@ def c_entries(model: TrainedModel) -> tuple[CEntry, ...]:
 
 def c_header(model: TrainedModel, entries: Sequence[CEntry], sizes: str) -> str:
     """Return the header; ``sizes`` is a sentence on the sizes of code and stack."""
+    # a bound for control loops: no branch depends on data
     longest = max(entries, key=lambda entry: entry.operations)
     facts = wrap(
         f"{sizes}; at most {longest.operations} operations, in {longest.name}, beside those of networks.",
@@ -93,6 +94,7 @@ def _entry(model: TrainedModel, entry: EntryPoint) -> CEntry:
     body = [f"(void){name};" for name in unused] + calls + lines
     if residuals or variables:
         body.insert(0, f"real {', '.join((*residuals, *variables))};")
+    # (rows) of a vector, (rows, columns) of a matrix
     shapes = []
     for k, (name, unit) in enumerate(entry.outputs):
         rows, columns = function.size_out(k)

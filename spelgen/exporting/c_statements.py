@@ -33,6 +33,7 @@ def statements(function: ca.Function, outputs: Sequence[str]) -> tuple[list[str]
     It reads arrays of the names of the function's inputs and writes ``outputs``, matrices row by row; outputs are
     dense, so that each of their numbers is written once.
     """
+    # CasADi reuses slots: as few variables as live at a time
     inputs = function.name_in()
     shapes = [function.size_out(k) for k in range(function.n_out())]
     variables: dict[str, None] = {}
@@ -52,6 +53,7 @@ def statements(function: ca.Function, outputs: Sequence[str]) -> tuple[list[str]
             value = _number(function.instruction_constant(k))
         else:
             value = _FORMS[operation].format(*(f"a{slot}" for slot in reads))
+        # a dict keeps the order in which CasADi first writes them
         variables[f"a{writes[0]}"] = None
         lines.append(f"a{writes[0]} = {value};")
     return list(variables), lines

@@ -68,12 +68,14 @@ def _derivatives(entry: EntryPoint, function: ca.Function) -> ca.Function:
     derivatives: list[ca.MX] = []
     for name in ("q", "qd", "tau"):
         if name in inputs:
+            # who calls it reads n x n numbers, whatever is zero
             derivatives.append(ca.densify(ca.jacobian(output, inputs[name])))
     names = list(entry.inputs), list(entry.output_names)
     return ca.Function(entry.name, arguments, derivatives, *names)
 
 
 def _saved(function: ca.Function) -> bytes:
+    # CasADi writes to files alone
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "function.casadi")
         function.save(str(path))
@@ -86,6 +88,7 @@ def called_by_state(functions: Mapping[str, ca.Function]) -> Called:
     def called(name: str, inputs: Values) -> Values:
         function = functions[name]
         states = zip(*(inputs[key] for key in function.name_in()), strict=True)
+        # one by one: a map over states would compile another function
         results = [function.call([ca.DM(x) for x in state]) for state in states]
         outputs: Values = {}
         for k, key in enumerate(function.name_out()):

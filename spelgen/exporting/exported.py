@@ -31,6 +31,7 @@ class Exporter:
 
     def function(self) -> Callable[[Trained], Exported]:
         """Return the function. Raises ModuleNotFoundError where an extra is not installed."""
+        # imports the module
         function: Callable[[Trained], Exported] = pkgutil.resolve_name(self.function_name)
         return function
 

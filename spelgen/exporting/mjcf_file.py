@@ -47,6 +47,7 @@ def mjcf_text(
         _motors(root, projection, inputs)
     else:
         _servos(root, projection, servos)
+    # a person may read and change it
     etree.indent(root)
     text: bytes = etree.tostring(root, xml_declaration=True, encoding="utf-8")
     return text + b"\n"
@@ -62,6 +63,7 @@ def _body(parent: etree._Element, projection: RigidBodyProjection, index: int) -
         "inertial",
         mass=_number(mass),
         pos=_numbers(center),
+        # MuJoCo has xx, yy, zz, xy, xz, yz
         fullinertia=_numbers(tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]),
     )
     etree.SubElement(element, "joint", _joint(projection, body))
@@ -81,6 +83,7 @@ def _joint(projection: RigidBodyProjection, body: Body) -> dict[str, str]:
     armature = 0.0 if k in _coupled_motors(projection) else projection.armature[k]
     attributes["armature"] = _number(armature)
     attributes["damping"] = _number(projection.viscous[k])
+    # MuJoCo has one Coulomb friction for both directions
     attributes["frictionloss"] = _number((projection.forward[k] - projection.backward[k]) / 2)
     attributes["solimpfriction"] = _SOLIMPFRICTION
     if not coordinate.continuous and coordinate.lower is not None and coordinate.upper is not None:
@@ -96,6 +99,7 @@ def _followers(root: etree._Element, projection: RigidBodyProjection) -> None:
         return
     equality = etree.SubElement(root, "equality")
     for body in followers:
+        # a polynomial of the leader's position
         law = _numbers((body.offset, float(body.multiplier), 0, 0, 0))
         leader = arm.coordinates[body.coordinate].name
         etree.SubElement(equality, "joint", joint1=body.name, joint2=leader, polycoef=law)
@@ -113,6 +117,7 @@ def _motors(root: etree._Element, projection: RigidBodyProjection, inputs: np.nd
         elif moved.size > 1:
             _tendon(root, f"motor{k + 1}", projection, column)
             etree.SubElement(actuators, "motor", name=joints[k].name, tendon=f"motor{k + 1}")
+    # behind the tendons that it names
     root.append(actuators)
 
 

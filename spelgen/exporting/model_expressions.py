@@ -98,6 +98,7 @@ class ModelExpressions:
         if bristles is None:
             direction = friction_expressions.sliding_direction(law, speed)
         else:
+            # dry friction follows bristles or velocity, never both
             direction = friction_expressions.bristle_direction(bristles, self.z)
         torque = friction_expressions.law_torque(law, speed, load, direction)
         for k, joint in enumerate(self.model.residuals.friction.joints):
@@ -205,6 +206,7 @@ class ModelExpressions:
         """M^-1 times the derivatives of the force at this qdd (Carpentier and Mansard, RSS 2018)."""
         by_position, by_velocity = self._force_derivatives()
         right = ca.horzcat(-by_position, -by_velocity, constant(self.model.inputs))
+        # the derivatives at the acceleration that the torques give
         right = ca.substitute(right, self.qdd, self.forward_dynamics)
         return tuple(ca.horzsplit(_solve(self.mass_matrix, right), self.n))
 
@@ -213,6 +215,7 @@ def expression_function(entry: EntryPoint, model: TrainedModel) -> ca.Function:
     """Return the entry point as a function of its inputs, then of the residuals that it needs; outputs are dense."""
     expressions = ModelExpressions(model, derivatives=entry.name.endswith("_derivatives"))
     result = getattr(expressions, entry.name)
+    # most quantities have one output
     if not isinstance(result, tuple):
         result = (result,)
     outputs = [ca.densify(output) for output in result]
@@ -221,6 +224,7 @@ def expression_function(entry: EntryPoint, model: TrainedModel) -> ca.Function:
         if symbols.numel() and ca.depends_on(ca.veccat(*outputs), symbols):
             inputs[RESIDUAL + name] = symbols
     names = list(inputs), list(entry.output_names)
+    # what is computed twice becomes one step: by cse
     return ca.Function(entry.name, list(inputs.values()), outputs, *names, {"cse": True})
 
 

@@ -38,6 +38,7 @@ class Parity:
     @property
     def summary(self) -> str:
         """One sentence."""
+        # the tip is kinematics, of other tolerance
         of_model = {name: value for name, value in self.differences.items() if not name.startswith("tip_")}
         worst = max(of_model, key=of_model.__getitem__)
         return (
@@ -88,6 +89,7 @@ def check_parity(
 
 def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 0, seed: int = 0) -> Values:
     """Return states over the joints' ranges at their usual speeds, (states, n) each, and z, (states, memory)."""
+    # the same states each time: an export is reproducible
     random = np.random.default_rng(seed)
     speed = usual_speeds(coordinates)
     q = np.stack([random.uniform(*working_range(joint), states) for joint in coordinates], axis=-1)
@@ -96,6 +98,7 @@ def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 
         "qd": 0.5 * speed * random.standard_normal(q.shape),
         "qdd": 2.0 * speed * random.standard_normal(q.shape),
         "dq": 0.05 * speed * random.standard_normal(q.shape),
+        # bristles bend by fractions of a milliradian before they slide
         "z": 1e-4 * random.standard_normal((states, memory)),
         "tau": 10.0 * random.standard_normal(q.shape),
         "u": q + 0.3 * random.standard_normal(q.shape),

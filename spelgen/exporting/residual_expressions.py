@@ -30,8 +30,10 @@ def residual_symbols(model: TrainedModel) -> Symbols:
     factors = len(model.residuals.friction.joints)
     sizes = {
         "mass": (entries, 1),
+        # first derivatives along qd: a program takes them in one sweep, without n^2 numbers
         "rate": (entries, 1),
         "kinetic": (n if entries else 0, 1),
+        # jets: second derivatives of forces need these
         "first": (entries, n),
         "second": (entries, pairs),
         "energy": (potential, 1),
@@ -121,6 +123,7 @@ def residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[str
             values["kinetic"] = ca.jtimes(mass, q, ca.vertcat(*products), True)
     if residuals.potential is not None:
         values["energy"] = _network(residuals.potential, [0], encoded)
+        # reverse sweep of CasADi: as cheap as the network itself
         values["gravity"] = ca.gradient(values["energy"], q)
     if residuals.has_torque:
         values["torque_energy"] = _torque_energy(residuals, q)
@@ -132,6 +135,7 @@ def residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[str
 
 def _encoded(encoding: Encoding, q: ca.MX) -> ca.MX:
     """Return the inputs of the networks."""
+    # by cos and sin a turn later is the same position
     waves = ca.vertcat(ca.cos(q), ca.sin(q))
     if not encoding.prismatic:
         return waves
@@ -141,6 +145,7 @@ def _encoded(encoding: Encoding, q: ca.MX) -> ca.MX:
 def _network(network: Network, rows: list[int], encoded: ca.MX) -> ca.MX:
     layer = encoded
     for weight, bias in zip(network.weights[:-1], network.biases[:-1], strict=True):
+        # CasADi has no sigmoid
         layer = 1 / (1 + ca.exp(-(constant(weight) @ layer + bias)))
     return constant(network.weights[-1][rows]) @ layer + network.biases[-1][rows]
 
@@ -150,12 +155,14 @@ def _torque_energy(residuals: Residuals, q: ca.MX) -> ca.MX:
     energy, splines = ca.MX(0), residuals.torque
     if splines.joints:
         distance = _spline_distances(splines, q)
+        # beyond its reach a spline's energy is constant
         wide = _cubic_integral(ca.fmin(ca.fmax(distance, -2), 2), 2)
         narrow = _cubic_integral(ca.fmin(ca.fmax(distance, -1), 1), 1)
         weights = splines.weights * splines.spacing[:, None]
         energy += ca.dot(weights.ravel(), wide / 6 - narrow * (4 / 6))
     for ripple in residuals.ripple:
         frequencies = ripple.frequency * np.arange(1, len(ripple.cosines) + 1)
+        # (harmonics,)
         phase = frequencies * q[ripple.joint]
         energy += ca.dot(ripple.cosines / frequencies, ca.sin(phase))
         energy -= ca.dot(ripple.sines / frequencies, ca.cos(phase))
@@ -169,6 +176,7 @@ def _spline_values(splines: Splines, q: ca.MX) -> ca.MX:
     narrow = ca.fmax(1 - away, 0) ** 3
     height = (wide - 4 * narrow) / 6
     count, size = splines.weights.shape
+    # a joint's splines are a column, since CasADi reshapes column by column
     terms = ca.reshape(splines.weights.ravel() * height, size, count)
     values: ca.MX = ca.sum1(terms).T
     return values

@@ -100,6 +100,7 @@ def rigid_body_projection(model: EmittedModel, arm: LoadedArm) -> RigidBodyProje
 
 def sampled_positions(arm: Arm) -> Tensor:
     """Return positions over the joints' ranges, (positions, n), the same each time."""
+    # the same positions each time: an export is reproducible
     random = np.random.default_rng(0)
     columns = [random.uniform(*working_range(joint), TUNING.positions) for joint in arm.coordinates]
     return torch.from_numpy(np.stack(columns, axis=-1))

@@ -137,7 +137,9 @@ class RigidExpressions:
 
     def _add_column(self, matrix: ca.SX, index: int, force: ca.SX, torque: ca.SX) -> None:
         """Add the wrench of a body's own joint, accelerated by one, to that joint's column of M and to its row."""
+        # M is symmetric: a row is the column
         column = self._links[index].joint
+        # bodies that do not carry this one feel nothing of it
         ancestor = index
         while ancestor >= 0:
             link = self._links[ancestor]

@@ -18,6 +18,7 @@ def tip_chain(loaded: LoadedArm) -> tuple[str, tuple[TipJoint, ...], np.ndarray]
     """Return the tip's link, the joints on the way to it, and the pose of the tip behind the last, (4, 4)."""
     names = [joint.name for joint in loaded.arm.coordinates]
     link = loaded.tip or last_link(loaded.robot, names)
+    # followers move as their leaders do; what is no coordinate is locked at zero
     constraint = mimic_constraint(loaded.robot, names)
     joints: list[TipJoint] = []
     pose = np.eye(4)

@@ -25,6 +25,7 @@ def tip_expressions(model: TrainedModel, q: ca.SX) -> tuple[ca.SX, ca.SX]:
     pose = pose @ constant(model.tip_end)
     jacobian = ca.SX(6, model.n)
     for joint, frame in zip(model.tip, frames, strict=True):
+        # the axis is z of the joint's frame
         axis = frame[:3, 2]
         column = ca.vertcat(axis, ca.SX(3, 1))
         if joint.revolute:

@@ -52,6 +52,7 @@ def _called_by_torch(files: dict[str, bytes], model: PreparedModel) -> Called:
         tensors = {key: torch.from_numpy(value) for key, value in inputs.items()}
         if model.elements:
             tensors["z"] = tensors["z"].reshape(-1, model.n, model.elements)
+        # the weights are constants
         with torch.no_grad():
             output = programs[name](*(tensors[key] for key in program_inputs(model, name)))
         return {program_output(name): output.numpy()}

@@ -105,6 +105,7 @@ def _friction_text(trained: Trained, projection: RigidBodyProjection) -> str:
 def _law_constants(trained: Trained, projection: RigidBodyProjection) -> dict[str, np.ndarray]:
     """Return the constants of the model's own law of friction by name, (n, ...) each; none for networks."""
     model = trained.model
+    # networks have no law with constants
     if not projection.own:
         return {}
     constants = {name: array(value) for name, value in model.friction.prepare()._asdict().items()}

@@ -21,6 +21,7 @@ def urdf_text(projection: RigidBodyProjection) -> bytes:
     """
     robot = projection.arm.robot
     arm = projection.arm.arm
+    # a robot's file may come from anywhere
     parser = etree.XMLParser(resolve_entities=False, no_network=True)
     root = etree.fromstring(urdf_bytes(robot.path), parser)
     links = {element.get("name"): element for element in root.findall("link")}
@@ -51,6 +52,7 @@ def settings_text(projection: RigidBodyProjection) -> str:
         content = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
     joints = content.setdefault("joints", {})
     for index, coordinate in enumerate(projection.arm.arm.coordinates):
+        # settings have the rotor's own inertia, the model that of the joint's side
         gear = projection.arm.settings.joint(coordinate.name).gear
         joint = joints.setdefault(coordinate.name, {})
         joint["rotor_inertia"] = rounded(projection.armature[index] / gear**2)
@@ -101,6 +103,7 @@ def _set_inertial(link: etree._Element, inertia: np.ndarray, rotation: np.ndarra
     names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
     moments = [_number(x) for x in tensor[np.triu_indices(3)]]
     etree.SubElement(inertial, "inertia", dict(zip(names, moments, strict=True)))
+    # first, as most URDFs have it
     link.insert(0, inertial)
 
 
