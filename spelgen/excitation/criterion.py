@@ -55,7 +55,7 @@ class Criterion:
 
     def efforts(self, motion: Motion) -> np.ndarray:
         """Return torques of the rigid bodies, as part of the limits, (T, n); NaN where these are not known."""
-        return regressor(self.arm, motion.q, motion.qd, motion.qdd) @ self.inertial / self.limits
+        return np.asarray(regressor(self.arm, motion.q, motion.qd, motion.qdd) @ self.inertial / self.limits)
 
     def value(self, parameters: np.ndarray) -> float:
         """Return the criterion."""
@@ -83,7 +83,7 @@ class Criterion:
 
     @staticmethod
     def _overrun(efforts: np.ndarray) -> np.ndarray:
-        return np.nan_to_num(np.abs(efforts) - TUNING.effort).clip(min=0.0)
+        return np.asarray(np.nan_to_num(np.abs(efforts) - TUNING.effort).clip(min=0.0))
 
     def _rows(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
         """Return the regressor (T, n, K) of bodies, friction and drives."""

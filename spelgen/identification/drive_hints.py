@@ -79,7 +79,7 @@ class DriveProblem:
     @property
     def tau(self) -> np.ndarray:
         """Torques as logged, (S, n)."""
-        return self.samples.tau[NO_DELAY]
+        return np.asarray(self.samples.tau[NO_DELAY])
 
     def thinned(self, stride: int) -> DriveProblem:
         """Return the problem on one of so many samples."""

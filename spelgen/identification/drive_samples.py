@@ -43,7 +43,9 @@ class DriveLog:
     def add(self, trajectory: Trajectory) -> None:
         """Take in a trajectory, if it is dense and long enough for accelerations."""
         joint_torque = trajectory.tau @ self._inputs.T
-        moved = [replace(trajectory, tau=earlier(trajectory.t, joint_torque, delay)) for delay in DELAYS]
+        moved = []
+        for delay in DELAYS:
+            moved.append(replace(trajectory, tau=earlier(trajectory.t, joint_torque, delay)))
         samples = dynamics_samples(moved)
         if not samples:
             return

@@ -97,7 +97,7 @@ class Identification:
             "identifiability": self.base.identifiability(),
             "residual": dict(zip(joints, map(float, self.residual), strict=True)),
             "nmse": dict(zip(joints, map(_finite, self.nmse), strict=True)),
-            "diagnostics": [diagnostic.to_dict() for diagnostic in self.diagnostics],
+            "diagnostics": list(map(Diagnostic.to_dict, self.diagnostics)),
         }
 
     def _records(self) -> list[dict[str, object]]:

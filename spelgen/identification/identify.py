@@ -170,7 +170,7 @@ class _Fit:
         inner = np.einsum("j,jka,jkb->ab", variance, rows, rows)
         if self.problem.penalty is not None:
             inner = inner + np.diag(self.problem.penalty**2)
-        return self.solution.covariance @ inner @ self.solution.covariance
+        return np.asarray(self.solution.covariance @ inner @ self.solution.covariance)
 
 
 def _fit(problem: _Problem, rows: _Rows, method: LeastSquares) -> _Fit:

@@ -84,4 +84,4 @@ def _mean_inertia(arm: Arm) -> np.ndarray:
     mass, _ = float_energies(arm, q, inertias)
     # the lower triangle comes row by row
     rows, columns = np.tril_indices(n)
-    return mass.mean(axis=0)[rows == columns]
+    return np.asarray(mass.mean(axis=0)[rows == columns])

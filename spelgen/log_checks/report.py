@@ -74,9 +74,9 @@ class LogReport:
             "files": self.files,
             "samples": self.samples,
             "duration": self.duration,
-            "trajectories": [asdict(clock) for clock in self.trajectories],
-            "joints": [asdict(joint) for joint in self.joints],
-            "errors": [str(error) for error in self.errors],
+            "trajectories": list(map(asdict, self.trajectories)),
+            "joints": list(map(asdict, self.joints)),
+            "errors": list(map(str, self.errors)),
             "findings": [finding.to_dict() for finding in self.findings],
         }
 
@@ -132,7 +132,7 @@ def _ranges(report: LogReport) -> Listing:
     head = ("joint", "q", "of its range", "qd", "tau")
     rows = []
     for joint in report.joints:
-        q, qd, tau = (f"{number(joint.low[name])} .. {number(joint.high[name])}" for name in QUANTITIES)
+        q, qd, tau = (_span(joint.low[name], joint.high[name]) for name in QUANTITIES)
         rows.append((joint.name, q, _percent(joint.range_fraction), qd, tau))
     kinds = {joint.kind for joint in report.joints}
     units = "; ".join(text for kind, text in _UNITS.items() if kind in kinds)
@@ -140,12 +140,12 @@ def _ranges(report: LogReport) -> Listing:
 
 
 def _signals(report: LogReport) -> Listing:
-    head = ("joint", *(f"{name} noise" for name in QUANTITIES), *(f"{name} step" for name in QUANTITIES))
+    head = ("joint", "q noise", "qd noise", "tau noise", "q step", "qd step", "tau step")
     rows = []
     for joint in report.joints:
-        noise = joint.noise or {}
-        row = [joint.name, *(number(noise.get(name)) for name in QUANTITIES)]
-        rows.append((*row, *(number(joint.steps[name]) for name in QUANTITIES)))
+        noise = map((joint.noise or {}).get, QUANTITIES)
+        steps = map(joint.steps.get, QUANTITIES)
+        rows.append((joint.name, *map(number, noise), *map(number, steps)))
     note = (
         "noise: standard deviation of what changes from sample to sample, from 50 Hz on; "
         "step: between the levels of a quantised signal; in the units above."
@@ -168,6 +168,10 @@ def _physics(report: LogReport) -> Listing:
         "own gravity torque that is."
     )
     return Listing("Physics", head, tuple(rows), note)
+
+
+def _span(low: float, high: float) -> str:
+    return f"{number(low)} .. {number(high)}"
 
 
 def _percent(fraction: float | None) -> str:

@@ -159,7 +159,7 @@ def _joint_order(table: pa.Table, file: Path) -> list[str]:
         first = orders[0].as_py()
         if isinstance(first, str):
             return re.findall(r"[^\[\](),;'\"\s]+", first)
-        return [str(name) for name in first]
+        return list(map(str, first))
     return []
 
 
@@ -199,11 +199,14 @@ def _by_joint(
         return named
     numbered = {column.number: column for column in candidates if column.number is not None}
     if order:
-        listed = [joint for joint in joints if joint in order and order.index(joint) in numbered]
-        return {joint: numbered[order.index(joint)] for joint in listed}
+        for joint in joints:
+            number = order.index(joint) if joint in order else None
+            if number in numbered:
+                named[joint] = numbered[number]
+        return named
     if len(numbered) < len(joints):
         return {}
-    return dict(zip(joints, [numbered[number] for number in sorted(numbered)], strict=False))
+    return dict(zip(joints, map(numbered.__getitem__, sorted(numbered)), strict=False))
 
 
 def _time_unit(clock: Column, table: pa.Table) -> str:
@@ -224,7 +227,9 @@ def _time_unit(clock: Column, table: pa.Table) -> str:
 
 def _unit_in_names(quantity: str, columns: Iterable[Column]) -> str | None:
     """Return the unit that the columns' names say."""
-    words = {word for column in columns for word in column.words}
+    words: set[str] = set()
+    for column in columns:
+        words.update(column.words)
     for word, unit in UNITS[quantity].items():
         if word in words:
             return unit

@@ -141,7 +141,7 @@ def computed_torque(
     slow = np.where(friction.viscous > np.diag(mass) * omega, friction.viscous * omega, 0.0)
     accelerated = mass @ (qdd + 2 * omega * lag + omega**2 * error)
     holding: np.ndarray = dynamics.nonlinear_effects(seen, qd) + friction(qd) + slow * error
-    return accelerated + holding
+    return np.asarray(accelerated + holding)
 
 
 def record(
