@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from fractions import Fraction
-from math import atan2, lcm, pi, tan
+from math import atan2, cos, lcm, pi, sin, tan
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from spelgen.settings.tuning.structure import GeometryTuning
 
@@ -59,13 +58,21 @@ def rounded_angle(angle: float, tolerance: float) -> float:
 
 def rotation_from_rpy(rpy: Sequence[float]) -> np.ndarray:
     """Return Rz(yaw) Ry(pitch) Rx(roll) of URDF's fixed-axis angles [rad], (3, 3) float64."""
-    rotation: np.ndarray = Rotation.from_euler("xyz", rpy).as_matrix()
-    return rotation
+    # written out: SciPy's Rotation takes as long for one origin as all else for a joint
+    (cr, cp, cy), (sr, sp, sy) = map(cos, rpy), map(sin, rpy)
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
 
 
 def rotation_about(axis: np.ndarray, angle: float) -> np.ndarray:
-    """Return the rotation by ``angle`` [rad] about the unit vector ``axis``, (3, 3) float64."""
-    rotation: np.ndarray = Rotation.from_rotvec(angle * axis).as_matrix()
+    """Return the rotation by ``angle`` [rad] about the unit vector ``axis``, (3, 3) float64 (Rodrigues)."""
+    cross = np.cross(np.eye(3), axis)
+    rotation: np.ndarray = np.eye(3) + sin(angle) * cross + (1.0 - cos(angle)) * (cross @ cross)
     return rotation
 
 
