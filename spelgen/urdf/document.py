@@ -152,8 +152,8 @@ def _syntax_error(path: Path, error: etree.XMLSyntaxError) -> UrdfError:
             expected="well-formed XML",
             do=f'add xmlns:{prefix}="..." to <robot>, or remove the prefix',
         )
-    told = " ".join(re.sub(r",? ?line \d+, column \d+.*", "", message).split())
-    return UrdfError(f"not well-formed XML ({told})", file=path, line=error.lineno)
+    reason = " ".join(re.sub(r",? ?line \d+, column \d+.*", "", message).split())
+    return UrdfError(f"not well-formed XML ({reason})", file=path, line=error.lineno)
 
 
 def _check_root(path: Path, root: etree._Element) -> None:
@@ -167,8 +167,11 @@ def _check_root(path: Path, root: etree._Element) -> None:
             do=f'remove xmlns="{name.namespace}"',
         )
     if name.localname != "robot":
-        known, do = _OTHER_FORMATS.get(name.localname, ("", "convert it to URDF first"))
-        got = f"the root element <{name.localname}>" + (f" of {known}" if known else "")
+        got = f"the root element <{name.localname}>"
+        do = "convert it to URDF first"
+        if name.localname in _OTHER_FORMATS:
+            description, do = _OTHER_FORMATS[name.localname]
+            got += f" of {description}"
         raise UrdfError(got, file=path, line=root.sourceline, expected="<robot>", do=do)
 
 

@@ -155,27 +155,22 @@ def _read_axis(notes: Notes, element: etree._Element, kind: str | None, where: s
 
 def _read_limit(notes: Notes, element: etree._Element, kind: str | None, where: str) -> Limits:
     limit = first_child(notes, element, "limit", where)
-    wanted = {
-        "revolute": ("lower", "upper", "effort", "velocity"),
-        "prismatic": ("lower", "upper", "effort", "velocity"),
-        "continuous": ("effort", "velocity") if limit is not None else (),
-    }.get(kind or "", ())
-    missing = [key for key in wanted if limit is None or key not in limit.attrib]
-    if missing:
-        told = "no <limit>" if limit is None else f"<limit> lacks {', '.join(missing)}"
-        line = element.sourceline if limit is None else limit.sourceline
-        notes.warn(line, "incomplete-limit", where, f"{told}: read as unlimited")
     if limit is None:
+        # a continuous joint needs none, and what is held has none
+        if kind in ("revolute", "prismatic"):
+            notes.warn(element.sourceline, "incomplete-limit", where, "no <limit>: read as unlimited")
         return _NO_LIMITS
-    told_where = f"{where} limit"
-    lower, upper = (
-        read_number(notes, limit, key, told_where, bounded=False) if kind != "continuous" else None
-        for key in ("lower", "upper")
-    )
-    effort, velocity = (
-        read_number(notes, limit, key, told_where, bounded=False) for key in ("effort", "velocity")
-    )
-    return lower, upper, effort, velocity
+    keys = ["lower", "upper", "effort", "velocity"]
+    if kind == "continuous":
+        keys = ["effort", "velocity"]
+    missing = [key for key in keys if key not in limit.attrib]
+    if missing and kind in MOVING:
+        message = f"<limit> lacks {', '.join(missing)}: read as unlimited"
+        notes.warn(limit.sourceline, "incomplete-limit", where, message)
+    values: dict[str, float | None] = {}
+    for key in keys:
+        values[key] = read_number(notes, limit, key, f"{where} limit", bounded=False)
+    return values.get("lower"), values.get("upper"), values["effort"], values["velocity"]
 
 
 def _read_dynamics(notes: Notes, element: etree._Element, where: str) -> tuple[float, float]:
@@ -197,13 +192,15 @@ def _read_mimic(notes: Notes, element: etree._Element, where: str) -> Mimic | No
     if not joint:
         notes.error(mimic.sourceline, where, "no joint", 'joint="..." naming the joint to follow')
         return None
-    multiplier, offset = (read_number(notes, mimic, key, where) for key in ("multiplier", "offset"))
-    if (
-        multiplier and abs(multiplier) < 1 / MAX_MAGNITUDE
-    ):  # its inverse is as large as no number of a URDF may be
+    multiplier = read_number(notes, mimic, "multiplier", where)
+    if multiplier is None:
+        multiplier = 1.0
+    offset = read_number(notes, mimic, "offset", where) or 0.0
+    # its inverse would be as large as no number of a URDF may be
+    if multiplier and abs(multiplier) < 1 / MAX_MAGNITUDE:
         expected = f"0, or {1 / MAX_MAGNITUDE:g} at least"
         notes.error(mimic.sourceline, f"{where} multiplier", repr(mimic.get("multiplier")), expected)
-    return Mimic(joint, 1.0 if multiplier is None else multiplier, 0.0 if offset is None else offset)
+    return Mimic(joint, multiplier, offset)
 
 
 def _warn_instead(notes: Notes, own: Notes) -> None:

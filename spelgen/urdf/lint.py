@@ -1,16 +1,15 @@
-"""Robot -> warnings about what is impossible or likely a mistake; nothing here stops the reading."""
+"""Warn about what is impossible or likely a mistake; nothing here stops the reading."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
 
 import numpy as np
 
 from spelgen.errors import Diagnostic
-from spelgen.urdf.robot import Inertial, Joint, Link, Robot
+from spelgen.urdf.robot import Inertial, Joint, Link, Robot, Tensor
 
-# Computed tensors are printed with rounding: what is violated by less than this share is not worth a word.
+# computed tensors are printed with rounding: what is violated by less than this share is not worth a word
 _ROUNDING = 1e-6
 _UNIT_AXIS = 1e-3
 
@@ -47,29 +46,30 @@ def _lint_inertial(link: Link, inertial: Inertial) -> Iterator[Diagnostic]:
         )
         yield _warning("non-psd-inertia", where, line, message)
     elif smallest + middle < largest * (1 - _ROUNDING):
-        told = f"{smallest:.3g} + {middle:.3g} < {largest:.3g}"
-        message = f"no mass distribution has these principal moments: {told}"
+        inequality = f"{smallest:.3g} + {middle:.3g} < {largest:.3g}"
+        message = f"no mass distribution has these principal moments: {inequality}"
         yield _warning("triangle-inequality", where, line, message)
 
 
 def _principal_moments(inertial: Inertial) -> tuple[float, float, float]:
-    xx, xy, xz, yy, yz, zz = inertial.tensor
-    smallest, middle, largest = np.linalg.eigvalsh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
-    return float(smallest), float(middle), float(largest)
+    tensor = np.zeros((3, 3))
+    tensor[np.triu_indices(3)] = inertial.tensor
+    smallest, middle, largest = np.linalg.eigvalsh(tensor, UPLO="U").tolist()
+    return smallest, middle, largest
 
 
 def _lint_placeholders(robot: Robot) -> Iterator[Diagnostic]:
-    """One tensor repeated on most links was copied, not computed."""
-    inertials = [
-        link.inertial for link in robot.links if link.inertial is not None and any(link.inertial.tensor)
-    ]
-    if len(inertials) < 3:
-        return
-    tensor, count = Counter(each.tensor for each in inertials).most_common(1)[0]
-    if count > len(inertials) / 2 and count >= 3:
-        first = next(each for each in inertials if each.tensor == tensor)
-        message = f"{count} of {len(inertials)} links have the same inertia tensor: perhaps placeholders"
-        yield _warning("placeholder-inertial", "robot", first.line, message)
+    """Warn of placeholders: one tensor repeated on most links was copied, not computed."""
+    lines: dict[Tensor, list[int]] = {}
+    total = 0
+    for link in robot.links:
+        if link.inertial is not None and any(link.inertial.tensor):
+            lines.setdefault(link.inertial.tensor, []).append(link.inertial.line)
+            total += 1
+    repeated = max(lines.values(), key=len, default=[])
+    if len(repeated) > total / 2 and len(repeated) >= 3:
+        message = f"{len(repeated)} of {total} links have the same inertia tensor: perhaps placeholders"
+        yield _warning("placeholder-inertial", "robot", repeated[0], message)
 
 
 def _lint_joints(robot: Robot) -> Iterator[Diagnostic]:
@@ -95,7 +95,7 @@ def _lint_joint(joint: Joint) -> Iterator[Diagnostic]:
 
 
 def _lint_groups(robot: Robot) -> Iterator[Diagnostic]:
-    """What each moving joint carries rigidly, its child link and all fixed to it, should have mass."""
+    """Warn where what a moving joint carries rigidly, its child link and all fixed to it, has no mass."""
     if all(link.inertial is None for link in robot.links):
         yield _warning(
             "missing-inertial", "robot", 1, "no link has an <inertial>: masses and inertias are unknown"

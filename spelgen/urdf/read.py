@@ -49,10 +49,14 @@ def read_urdf(path: Path) -> Robot:
     _check_ends(notes, links, joints)
     _check_mimics(notes, joints)
     joint_names = [joint.name for joint in joints]
-    transmissions = [read_transmission(notes, each, joint_names) for each in root.findall("transmission")]
+    transmissions = [
+        read_transmission(notes, element, joint_names) for element in root.findall("transmission")
+    ]
     # a joint that could not be read leaves false roots behind, so these are sought in a sound file only
-    tops = [] if notes.errors else _check_tree(notes, root, links, joints)
-    collect(sorted(notes.errors, key=lambda each: each.line or 0))
+    tops: list[str] = []
+    if not notes.errors:
+        tops = _check_tree(notes, root, links, joints)
+    collect(sorted(notes.errors, key=lambda error: error.line or 0))
     robot = Robot(
         name=name,
         path=path,
@@ -68,10 +72,13 @@ def read_urdf(path: Path) -> Robot:
 
 
 def _diagnostics(notes: Notes, robot: Robot) -> tuple[Diagnostic, ...]:
-    """What reading and lint found, by line; that an absent tensor is a zero tensor is not said twice."""
-    absent = {each.line for each in notes.diagnostics if each.code == "inertial-without-inertia"}
-    found = [each for each in lint(robot) if each.code != "zero-inertia" or each.line not in absent]
-    return tuple(sorted([*notes.diagnostics, *found], key=lambda each: each.line or 0))
+    """Return what reading and lint remarked, by line; that an absent tensor is a zero tensor is not said twice."""
+    diagnostics = list(notes.diagnostics)
+    absent = {remark.line for remark in notes.diagnostics if remark.code == "inertial-without-inertia"}
+    for warning in lint(robot):
+        if warning.code != "zero-inertia" or warning.line not in absent:
+            diagnostics.append(warning)
+    return tuple(sorted(diagnostics, key=lambda remark: remark.line or 0))
 
 
 def _robot_name(notes: Notes, root: etree._Element) -> str:
@@ -88,38 +95,37 @@ def _read_links(notes: Notes, root: etree._Element) -> list[Link]:
         notes.error(root.sourceline, "<robot>", f"{len(elements)} links", f"at most {MAX_LINKS}")
         collect(notes.errors)
     if not elements:
-        is_xacro = any(uri.endswith("/xacro") for uri in root.nsmap.values())
-        do = "this is a xacro file: expand it with the xacro command first" if is_xacro else None
+        do = None
+        if any(uri.endswith("/xacro") for uri in root.nsmap.values()):
+            do = "this is a xacro file: expand it with the xacro command first"
         notes.error(root.sourceline, "<robot>", "no <link>", "a tree of links and joints", do)
     elif root.find("joint") is None:
         notes.error(root.sourceline, "<robot>", "no <joint>", "a tree of links and joints")
     return _unique(notes, [read_link(notes, element) for element in elements])
 
 
-def _unique(notes: Notes, parts: Sequence[Part | None]) -> list[Part]:
-    """The parts that could be read; a name used twice is an error (a link and a joint may share one)."""
-    kept: dict[str, Part] = {}
-    for part in parts:
-        if part is None:
+def _unique(notes: Notes, elements: Sequence[Part | None]) -> list[Part]:
+    """Return what could be read; a name used twice is an error (a link and a joint may share one)."""
+    by_name: dict[str, Part] = {}
+    for element in elements:
+        if element is None:
             continue
-        if part.name in kept:
-            kind = type(part).__name__.lower()
-            got = f"a second {kind} of that name (the first is in line {kept[part.name].line})"
-            notes.error(part.line, f"{kind} {part.name!r}", got, "unique names", "rename or remove one")
-        else:
-            kept[part.name] = part
-    return list(kept.values())
+        first = by_name.setdefault(element.name, element)
+        if first is not element:
+            kind = type(element).__name__.lower()
+            got = f"a second {kind} of that name (the first is in line {first.line})"
+            notes.error(element.line, f"{kind} {element.name!r}", got, "unique names", "rename or remove one")
+    return list(by_name.values())
 
 
 def _check_ends(notes: Notes, links: Sequence[Link], joints: Sequence[Joint]) -> None:
-    """Both links of a joint exist, and no link hangs from two joints."""
-    names = [link.name for link in links]
-    known = set(names)
+    """Check that both links of a joint exist, and that no link hangs from two joints."""
+    names = {link.name: None for link in links}
     above: dict[str, Joint] = {}
     for joint in joints:
         where = f"joint {joint.name!r}"
         for role, link in (("parent", joint.parent), ("child", joint.child)):
-            if link not in known:
+            if link not in names:
                 got = f"no link is named {link!r}"
                 notes.error(joint.line, f"{where} {role}", got, do=suggestion(link, names))
         if joint.child in above:
@@ -131,7 +137,7 @@ def _check_ends(notes: Notes, links: Sequence[Link], joints: Sequence[Joint]) ->
 
 
 def _check_mimics(notes: Notes, joints: Sequence[Joint]) -> None:
-    """Every leader exists, has one degree of freedom, and leads to no circle."""
+    """Check that every leader exists, has one degree of freedom, and leads to no circle."""
     by_name = {joint.name: joint for joint in joints}
     for joint in joints:
         if joint.mimic is None:
@@ -151,35 +157,38 @@ def _check_mimics(notes: Notes, joints: Sequence[Joint]) -> None:
 def _is_circle(joint: Joint, by_name: dict[str, Joint]) -> bool:
     """Whether following leaders from ``joint`` comes back to it."""
     seen: set[str] = set()
-    at: Joint | None = joint
-    while at is not None and at.mimic is not None and at.name not in seen:
-        seen.add(at.name)
-        at = by_name.get(at.mimic.joint)
-    return at is not None and at.name == joint.name and joint.name in seen
+    leader: Joint | None = joint
+    while leader is not None and leader.mimic is not None and leader.name not in seen:
+        seen.add(leader.name)
+        leader = by_name.get(leader.mimic.joint)
+    return leader is joint and bool(seen)
 
 
 def _check_tree(
     notes: Notes, root: etree._Element, links: Sequence[Link], joints: Sequence[Joint]
 ) -> list[str]:
-    """The names of the links that hang from no joint: exactly one, from which all others are reached."""
+    """Return the names of the links that hang from no joint: exactly one, from which all others are reached."""
     children = {joint.child for joint in joints}
     tops = [link for link in links if link.name not in children]
     if len(tops) != 1:
         listed = ", ".join(f"{top.name!r} (line {top.line})" for top in tops[:10])
-        got = f"{len(tops)} root links: {listed}" if tops else "no root link: the joints form a circle"
-        do = "join the trees by a fixed joint" if tops else None
+        got = "no root link: the joints form a circle"
+        do = None
+        if tops:
+            got = f"{len(tops)} root links: {listed}"
+            do = "join the trees by a fixed joint"
         notes.error(root.sourceline, "<robot>", got, "one link that is no joint's child", do)
         return []
     below: dict[str, list[str]] = {}
     for joint in joints:
         below.setdefault(joint.parent, []).append(joint.child)
-    reached = {tops[0].name}
+    connected = {tops[0].name}
     pending = [tops[0].name]
     while pending:
-        pending.extend(each for each in below.get(pending.pop(), []))
-        reached.update(pending)
+        pending += below.get(pending.pop(), [])
+        connected.update(pending)
     for link in links:
-        if link.name not in reached:
+        if link.name not in connected:
             got = f"a circle of joints that never meets the root {tops[0].name!r}"
             notes.error(link.line, f"link {link.name!r}", got, "a tree")
     return [tops[0].name]
