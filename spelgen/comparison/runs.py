@@ -24,7 +24,7 @@ from spelgen.fleet.tasks import RunTasks
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import cut_windows
-from spelgen.settings.fits import BATCH, Rollout
+from spelgen.settings.fits import DEFAULTS, Rollout
 from spelgen.spec import read_facts
 
 if TYPE_CHECKING:
@@ -129,7 +129,7 @@ def time_steps(study: Study) -> dict[str, float]:
     joints = read_facts(study.module(study.variants[0])).joints
     training = read_logs([study.logs], joints, role="train")
     windows = thinned(training, study.window, study.preprocessing.decimation or 1)
-    windows = windows[: (study.training or Rollout()).batch or BATCH]
+    windows = windows[: (study.training or Rollout()).batch or DEFAULTS.batch]
     times = {}
     torch.set_num_threads(1)
     for variant in study.variants:

@@ -10,7 +10,7 @@ import torch
 from spelgen.fitting.optimizers import minimise_sum
 from spelgen.fitting.torque_samples import Block, TorqueSamples
 from spelgen.identification.samples import DynamicsSamples
-from spelgen.settings.fits import LBFGS_DECAY, Adaptation
+from spelgen.settings.fits import DEFAULTS, Adaptation
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
@@ -27,7 +27,7 @@ BLOCK = 2**16  # samples in memory with all that their gradient needs
 def fit_networks(
     model: EmittedModel,
     samples: TorqueSamples | Sequence[DynamicsSamples],
-    weight_decay: float = LBFGS_DECAY,
+    weight_decay: float = DEFAULTS.lbfgs_decay,
     penalty: Callable[[], torch.Tensor | float] | None = None,
     evaluations: int = 2000,
 ) -> int:
@@ -57,7 +57,7 @@ def adapt_networks(
     model: EmittedModel,
     samples: TorqueSamples | Sequence[DynamicsSamples],
     adapt: Adaptation,
-    weight_decay: float = LBFGS_DECAY,
+    weight_decay: float = DEFAULTS.lbfgs_decay,
     evaluations: int = 2000,
 ) -> int:
     """Move a part of a fitted model to what meets the samples' torques best; return the evaluations it took.

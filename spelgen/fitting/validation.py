@@ -10,7 +10,7 @@ import torch
 from spelgen.fitting.dataset import TrainingData
 from spelgen.fitting.rollout import TUNING as INTEGRATION
 from spelgen.fitting.rollout import choose_substeps, integration_error, rollout_loss
-from spelgen.settings.fits import BATCH, Solver
+from spelgen.settings.fits import DEFAULTS, Solver
 from spelgen.settings.tuning.fitting import ValidationTuning
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ class Validation:
         data: TrainingData,
         device: str = "cpu",
         *,
-        batch: int = BATCH,
+        batch: int = DEFAULTS.batch,
         solver: Solver = "rk4",
         substeps: int | None = None,
     ) -> None:

@@ -14,7 +14,7 @@ from spelgen.fitting.dataset import TrainingData
 from spelgen.fitting.optimizers import LBFGS, MiniBatchAdamW, WindowOptimizer
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer
 from spelgen.fitting.validation import Validation
-from spelgen.settings.fits import BATCH, LEARNING_RATE, WindowConfig
+from spelgen.settings.fits import DEFAULTS, WindowConfig
 from spelgen.settings.tuning.fitting import WindowTuning
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ class WindowProblem:
         self.scales = data.scales.to(device)
         self.regularizer = None if regularizer is None else regularizer.to(device)
         self.whole = config.optimizer == "lbfgs"
-        self.batch = min(config.batch or BATCH, len(self.training))
+        self.batch = min(config.batch or DEFAULTS.batch, len(self.training))
         self.call_steps = TUNING.epoch_steps
         self.epoch_steps = TUNING.epoch_steps
         if not self.whole:
@@ -101,4 +101,4 @@ class WindowProblem:
         cosine = (1 + math.cos(math.pi * min(fraction, 1.0))) / 2
         fall = TUNING.final_rate + (1 - TUNING.final_rate) * cosine
         rise = min(1.0, (fraction + 1e-3) / TUNING.warm_up)
-        return (self.config.learning_rate or LEARNING_RATE) * rise * fall
+        return (self.config.learning_rate or DEFAULTS.learning_rate) * rise * fall

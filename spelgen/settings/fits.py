@@ -6,11 +6,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, ValidationError, model_validator
 
 from spelgen.errors import OptionError, SettingsError, collect, suggestion
+from spelgen.settings.tuning.fit_defaults import FitDefaults
 from spelgen.settings.values import Count, Group, NonNegative, Positive, Whole
 
 Objective = Literal["torque", "momentum", "rollout", "servo"]
@@ -20,9 +21,7 @@ Solver = Literal["rk4", "dopri5"]
 Window = Annotated[Count, Field(ge=2)]
 Substeps = Annotated[Count, Field(le=1000)]  # more never end
 
-FEW_WINDOWS = 1024  # of which L-BFGS takes all at once
-LBFGS_DECAY, ADAMW_DECAY = 2e-5, 0.2
-BATCH, LEARNING_RATE = 256, 1e-3
+DEFAULTS = FitDefaults()
 UNLESS = {  # options that belong to one value of another option
     "batch": ("optimizer", "adamw", "lbfgs"),
     "learning_rate": ("optimizer", "adamw", "lbfgs"),
@@ -65,10 +64,11 @@ class FitConfig(Group):
 
     @model_validator(mode="before")
     @classmethod
-    def _only_own(cls, options: Any) -> Any:
-        for name in options if isinstance(options, Mapping) else ():
-            if name not in cls.model_fields:
-                raise _not_of(name, cls)
+    def _refuse_foreign(cls, options: object) -> object:
+        if isinstance(options, Mapping):
+            for name in options:
+                if name not in cls.model_fields:
+                    raise _foreign(name, cls)
         return options
 
     @model_validator(mode="after")
@@ -84,19 +84,24 @@ class FitConfig(Group):
             raise OptionError(
                 "objective", "momentum belongs to models of networks alone, this is one of rigid bodies"
             )
-        kind = "models of networks alone" if rigid_bodies else "models of rigid bodies"
-        for name in self.of_networks if rigid_bodies else self.of_rigid_bodies:
+        kind = "models of rigid bodies"
+        if rigid_bodies:
+            kind = "models of networks alone"
+        for name in self.unused(rigid_bodies=rigid_bodies):
             if name in self.model_fields_set:
                 raise OptionError(name, f"with the objective {self.objective} belongs to {kind}")
 
-    def record(self, *, rigid_bodies: bool) -> dict[str, Any]:
-        """The options that apply, for config.json."""
-        unused = self.of_networks if rigid_bodies else self.of_rigid_bodies
+    def record(self, *, rigid_bodies: bool) -> dict[str, object]:
+        """Return the options that apply, for config.json."""
+        unused = self.unused(rigid_bodies=rigid_bodies)
         return self.model_dump(mode="json", exclude_none=True, exclude=set(unused))
 
-    def resolved(self, windows: int) -> Self:
-        """The same with all that depends on the number of windows decided."""
-        return self
+    @classmethod
+    def unused(cls, *, rigid_bodies: bool) -> tuple[str, ...]:
+        """Return the options that do not apply to this kind of model."""
+        if rigid_bodies:
+            return cls.of_networks
+        return cls.of_rigid_bodies
 
 
 class TorqueFit(FitConfig):
@@ -116,7 +121,7 @@ class TorqueFit(FitConfig):
     prior: GaussianPrior | None = None
     adapt: Adaptation | None = None
     evaluations: Count = 2000
-    weight_decay: NonNegative = LBFGS_DECAY
+    weight_decay: NonNegative = DEFAULTS.lbfgs_decay
     urdf_weight: NonNegative = 1.0
 
 
@@ -143,15 +148,18 @@ class OnWindows(FitConfig):
     max_minutes: NonNegative | None = None
 
     def resolved(self, windows: int) -> Self:
-        """With optimizer, batch, learning rate and weight decay decided for so many windows."""
-        optimizer = self.optimizer or ("lbfgs" if windows <= FEW_WINDOWS else "adamw")
-        update: dict[str, Any] = {"optimizer": optimizer}
+        """Return the same with optimizer, batch, learning rate and weight decay decided for so many windows."""
+        optimizer = self.optimizer
+        if optimizer is None:
+            optimizer = "lbfgs" if windows <= DEFAULTS.few_windows else "adamw"
+        batch, rate, decay = None, None, DEFAULTS.lbfgs_decay
         if optimizer == "adamw":
-            update |= {"batch": self.batch or BATCH, "learning_rate": self.learning_rate or LEARNING_RATE}
-        else:
-            update |= {"batch": None, "learning_rate": None}
-        decay = LBFGS_DECAY if optimizer == "lbfgs" else ADAMW_DECAY
-        update["weight_decay"] = decay if self.weight_decay is None else self.weight_decay
+            batch = self.batch or DEFAULTS.batch
+            rate = self.learning_rate or DEFAULTS.learning_rate
+            decay = DEFAULTS.adamw_decay
+        if self.weight_decay is not None:
+            decay = self.weight_decay
+        update = {"optimizer": optimizer, "batch": batch, "learning_rate": rate, "weight_decay": decay}
         return self.model_copy(update=update)
 
 
@@ -193,55 +201,67 @@ class ServoFit(FitConfig):
 
 
 WindowConfig = MomentumFit | Rollout
-CONFIGS: dict[str, type[FitConfig]] = {x.objective: x for x in (TorqueFit, MomentumFit, Rollout, ServoFit)}
-OWNERS: dict[str, list[str]] = {
-    name: [objective for objective, config in CONFIGS.items() if name in config.model_fields]
-    for name in dict.fromkeys(name for config in CONFIGS.values() for name in config.model_fields)
+CONFIGS: dict[str, type[FitConfig]] = {
+    "torque": TorqueFit,
+    "momentum": MomentumFit,
+    "rollout": Rollout,
+    "servo": ServoFit,
 }
+
+
+def _owners() -> dict[str, list[str]]:
+    owners: dict[str, list[str]] = {}
+    for objective, config in CONFIGS.items():
+        for name in config.model_fields:
+            owners.setdefault(name, []).append(objective)
+    return owners
+
+
+OWNERS = _owners()
 
 
 def fit_config(
     objective: str,
     *,
     rigid_bodies: bool,
-    options: Mapping[str, Any] | None = None,
-    defaults: Mapping[str, Any] | None = None,
+    options: Mapping[str, object] | None = None,
+    defaults: Mapping[str, object] | None = None,
 ) -> FitConfig:
-    """The configuration of an objective; raises OptionError for an option that does not apply to what is fitted.
+    """Return the configuration of an objective. Raises OptionError for an option that does not apply to what is fitted.
 
     Of ``defaults``, a robot's settings for whatever is fitted, those that do not apply are left out.
     """
     kind, options = CONFIGS[objective], dict(options or {})
-    unused = kind.of_networks if rigid_bodies else kind.of_rigid_bodies
-    usual = {k: x for k, x in (defaults or {}).items() if k in kind.model_fields and k not in unused}
+    applicable = set(kind.model_fields) - set(kind.unused(rigid_bodies=rigid_bodies))
+    settings = {name: value for name, value in (defaults or {}).items() if name in applicable}
     for name, (other, _, against) in UNLESS.items():
-        if options.get(other, usual.get(other)) == against:
-            usual.pop(name, None)
-        elif name in options and other not in options and usual.get(other) == against:
-            usual.pop(other)
-    found = make_config(kind, usual | options)
-    found.require(rigid_bodies=rigid_bodies)
-    return found
+        if options.get(other, settings.get(other)) == against:
+            settings.pop(name, None)
+        elif name in options and other not in options and settings.get(other) == against:
+            settings.pop(other)
+    config = make_config(kind, settings | options)
+    config.require(rigid_bodies=rigid_bodies)
+    return config
 
 
-def make_config(kind: type[FitConfig], options: Mapping[str, Any]) -> FitConfig:
-    """The configuration with these options. Raises SettingsError for values that cannot be."""
+def make_config(kind: type[FitConfig], options: Mapping[str, object]) -> FitConfig:
+    """Return the configuration with these options. Raises SettingsError for values that cannot be."""
     try:
-        return kind(**options)
+        return kind.model_validate(dict(options))
     except ValidationError as error:
-        collect([
-            SettingsError(
-                repr(each["input"]), element=".".join(map(str, each["loc"])),
-                expected=each["msg"].removeprefix("Input should be "),
-            )
-            for each in error.errors(include_url=False)
-        ])  # fmt: skip
+        problems = []
+        for detail in error.errors(include_url=False):
+            element = ".".join(map(str, detail["loc"]))
+            expected = detail["msg"].removeprefix("Input should be ")
+            problems.append(SettingsError(repr(detail["input"]), element=element, expected=expected))
+        collect(problems)
         raise
 
 
-def _not_of(name: str, config: type[FitConfig]) -> SettingsError:
+def _foreign(name: str, config: type[FitConfig]) -> SettingsError:
     owners = OWNERS.get(name)
     if owners is None:
         return SettingsError(f"unknown option {name!r}", do=suggestion(name, config.model_fields))
-    several = f"objective{'s' if len(owners) > 1 else ''} {' and '.join(owners)}"
-    return OptionError(name, f"belongs to the {several}, this fits {config.objective}")
+    plural = "s" * (len(owners) > 1)
+    objectives = f"objective{plural} {' and '.join(owners)}"
+    return OptionError(name, f"belongs to the {objectives}, this fits {config.objective}")

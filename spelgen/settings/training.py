@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Annotated, Any
 
 from pydantic import Field, ValidationInfo, field_validator
@@ -11,7 +12,7 @@ from spelgen.settings.values import Count, Group, NonNegative, Number, Positive,
 
 
 class TrainingSettings(Group):
-    """Defaults of `spelgen train`; command-line flags override them. None: not said here.
+    """Hold the defaults of `spelgen train` for a robot; command-line flags override them. None: not set here.
 
     objective: what is fitted; an option that belongs to others only is an error beside it. The options are those of
     `TorqueFit`, `MomentumFit` and `Rollout`; those of `Preprocessing` stand beside them.
@@ -53,11 +54,18 @@ class TrainingSettings(Group):
 
     @property
     def options(self) -> dict[str, Any]:
-        """What is said of the options of any objective."""
-        return {name: getattr(self, name) for name in OWNERS if getattr(self, name, None) is not None}
+        """Options of any objective that are set."""
+        return self._set(OWNERS)
 
     @property
     def preprocessing(self) -> dict[str, Any]:
-        """What is said of the options of `Preprocessing`."""
-        said = {name: getattr(self, name) for name in ("cutoff", "decimation", "gap")}
-        return {name: value for name, value in said.items() if value is not None}
+        """Options of `Preprocessing` that are set."""
+        return self._set(("cutoff", "decimation", "gap"))
+
+    def _set(self, names: Iterable[str]) -> dict[str, Any]:
+        values = {}
+        for name in names:
+            value = getattr(self, name, None)
+            if value is not None:
+                values[name] = value
+        return values
