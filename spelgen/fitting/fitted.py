@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from spelgen.files import write_json
 from spelgen.fitting.objective import Status
 from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.fitting.run_lock import locked
-from spelgen.fitting.run_record import recorded_config
+from spelgen.fitting.run_record import Content, recorded_config
 from spelgen.identification.samples import DENSE, dynamics_samples
 from spelgen.listing import Listing
 from spelgen.logs.filtering import low_pass
@@ -41,11 +41,11 @@ class Fit:
     model: EmittedModel
     config: FitConfig
     preprocessing: Preprocessing
-    history: Sequence[dict[str, Any]]
+    history: Sequence[Content]
     diagnostics: tuple[Diagnostic, ...]
     status: Status | None
-    record: dict[str, Any]
-    checkpoint: dict[str, Any]
+    record: Content
+    checkpoint: Content
     urdf: Path | None = None
     folder: Path | None = None
 

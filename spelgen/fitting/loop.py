@@ -6,7 +6,7 @@ import copy
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 
@@ -16,6 +16,7 @@ from spelgen.fitting.momentum import momentum_stage
 from spelgen.fitting.optimizers import WindowOptimizer
 from spelgen.fitting.progress import TrainingProgress
 from spelgen.fitting.rollout import rollout_loss
+from spelgen.fitting.run_record import Content
 from spelgen.fitting.validation import Validation
 from spelgen.fitting.window_problem import Clock, Measured, WindowProblem, measure
 from spelgen.logs.windows import Windows
@@ -66,7 +67,7 @@ class TrainingLoop:
         self.clock = Clock(config.max_minutes, seconds)
         self._step_seconds, self._validation_seconds = 0.0, 0.0
         self.momentum_done = not config.momentum_steps
-        self.history: list[dict[str, Any]] = []
+        self.history: list[Content] = []
         start = measure(self.model, validation)
         self.substeps, self.best_loss, self.best_weights = start.substeps, start.loss, start.weights
 
@@ -113,7 +114,7 @@ class TrainingLoop:
             return "out of time"
         return "finished" if self._done() >= self._stage_end else None
 
-    def _run_epoch(self) -> dict[str, Any]:
+    def _run_epoch(self) -> Content:
         """Run one epoch with finite losses, after as many attempts at a lower learning rate as that takes."""
         while True:
             before = copy.deepcopy((self.model.state_dict(), self.optimizer.state_dict(), self.step))
@@ -183,7 +184,7 @@ class TrainingLoop:
         self.optimizer = self._optimizer()
         return self._end() is None
 
-    def _roll_back(self, weights: dict[str, Any], optimizer: dict[str, Any], step: int) -> None:
+    def _roll_back(self, weights: Content, optimizer: Content, step: int) -> None:
         """Undo an epoch whose numbers were not finite, and halve the learning rate from here on."""
         self.rollbacks += 1
         self.model.load_state_dict(weights)
@@ -200,13 +201,13 @@ class TrainingLoop:
         self.step = step
         self.learning_rate_factor /= 2
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> Content:
         """Return all that a resumed run needs: what checkpoint.pt holds."""
         state = {name: getattr(self, name) for name in PLAIN}
         state["model"], state["optimizer"] = self.model.state_dict(), self.optimizer.state_dict()
         return state | {"generator": self.generator.get_state()}
 
-    def restore(self, state: dict[str, Any], history: list[dict[str, Any]]) -> None:
+    def restore(self, state: Content, history: list[Content]) -> None:
         """Continue from what `state` gave, after so many epochs."""
         for name in PLAIN:
             setattr(self, name, state[name])

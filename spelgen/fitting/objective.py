@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol
+from typing import TYPE_CHECKING, ClassVar, Literal, Protocol
 
 from spelgen.errors import Diagnostic
+from spelgen.fitting.run_record import Content
 from spelgen.fitting.streaming import LargeLogs
 from spelgen.listing import Listing
 from spelgen.logs.preprocessing import Preprocessing
@@ -87,7 +88,7 @@ class Objective(Protocol):
     """
 
     name: ClassVar[str]
-    history: list[dict[str, Any]]  # lines of metrics.jsonl
+    history: list[Content]  # lines of metrics.jsonl
 
     def __init__(self, request: FitRequest) -> None:
         """Raise OptionError for a config or a model that this objective is not for."""
@@ -98,9 +99,7 @@ class Objective(Protocol):
     def begin(self) -> list[Diagnostic]:
         """Do what comes before the first checkpoint of a new fit; return what there is to tell."""
 
-    def resume(
-        self, checkpoint: dict[str, Any], history: list[dict[str, Any]], record: dict[str, Any]
-    ) -> None:
+    def resume(self, checkpoint: Content, history: list[Content], record: Content) -> None:
         """Go on from what the run folder holds. Raises KeyError, RuntimeError, TypeError, ValueError or AttributeError
         where that is of another model.
         """
@@ -110,14 +109,14 @@ class Objective(Protocol):
         anywhere.
         """
 
-    def checkpoint(self) -> dict[str, Any]:
+    def checkpoint(self) -> Content:
         """Return what a resumed fit needs, with "best_weights", and the numbers of `run_record.Checkpoint`."""
 
     def results(self) -> dict[str, object]:
         """Return what config.json says of how it went, beside what `prepare` told."""
 
 
-def record_of(request: FitRequest, prepared: PreparedLogs, *, rigid_bodies: bool) -> dict[str, Any]:
+def record_of(request: FitRequest, prepared: PreparedLogs, *, rigid_bodies: bool) -> Content:
     """Return what goes into config.json: options that were used, resolved, and nothing that does not apply."""
     model, facts = request.model, getattr(request.model, "facts", None)
     fraction = request.validation if prepared.validation and isinstance(request.validation, float) else None

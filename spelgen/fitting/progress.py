@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from types import TracebackType
-from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from spelgen.errors import Diagnostic
+from spelgen.fitting.run_record import Content
 
 
 class TrainingProgress:
@@ -62,7 +62,7 @@ class TrainingProgress:
         self._bar.update(self._task, description="servos", completed=number, total=rounds, state=state)
         self._said = f"servos: {state}"
 
-    def epoch(self, record: dict[str, Any], epochs: int) -> None:
+    def epoch(self, record: Content, epochs: int) -> None:
         """Show one line of metrics.jsonl, of so many epochs at most."""
         if not self._said.startswith("training"):
             self._end_stage()

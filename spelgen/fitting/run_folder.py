@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 
@@ -16,7 +16,7 @@ from spelgen.addresses import local, sent
 from spelgen.emission.loading import has_run, load_module
 from spelgen.errors import RunError
 from spelgen.files import naming, remove, require_regular_file, write_bytes
-from spelgen.fitting.run_record import Checkpoint, Epoch, require, require_record
+from spelgen.fitting.run_record import Checkpoint, Content, Epoch, require, require_record
 from spelgen.spec import read_source
 from spelgen.urdf.document import urdf_bytes
 
@@ -112,18 +112,18 @@ class RunFolder:
         robot = [(self.urdf, urdf_bytes(urdf))] if urdf.exists() else []  # what a xacro file expands to
         return robot + ([(self.settings, settings.read_bytes())] if settings.is_file() else [])
 
-    def save(self, weights: dict[str, Any], checkpoint: dict[str, Any]) -> None:
+    def save(self, weights: Content, checkpoint: Content) -> None:
         """Write model.pt and checkpoint.pt."""
         write_state(self.weights, weights)
         write_state(self.checkpoint, checkpoint)
 
-    def append_metrics(self, record: dict[str, Any]) -> None:
+    def append_metrics(self, record: Content) -> None:
         """Add one line to metrics.jsonl."""
         with naming(self.metrics), self.metrics.open("a", encoding="utf-8") as file:
             file.write(json.dumps(record) + "\n")
         sent(self.metrics)
 
-    def write_metrics(self, records: Sequence[dict[str, Any]]) -> None:
+    def write_metrics(self, records: Sequence[Content]) -> None:
         """All lines of metrics.jsonl; no file for none."""
         if records:
             write_bytes(self.metrics, "".join(json.dumps(record) + "\n" for record in records).encode())
@@ -134,7 +134,7 @@ class RunFolder:
             lines = _text(self.metrics, "replace").splitlines(keepends=True)
             write_bytes(self.metrics, "".join(lines[:epochs]).encode())
 
-    def read_metrics(self) -> list[dict[str, Any]]:
+    def read_metrics(self) -> list[Content]:
         """The lines of metrics.jsonl, without a last one that is torn."""
         lines = _text(self.metrics, "replace").splitlines() if self.metrics.exists() else []
         records = []
@@ -148,7 +148,7 @@ class RunFolder:
                     raise RunError(f"broken JSON ({error})", file=self.metrics, line=count) from error
         return records
 
-    def read_json(self, path: Path) -> dict[str, Any]:
+    def read_json(self, path: Path) -> Content:
         """One of the folder's JSON files. Raises RunError when it is absent or broken."""
         if not path.exists():
             raise RunError(
@@ -162,17 +162,17 @@ class RunFolder:
             raise RunError(f"{type(found).__name__} in JSON", file=path, expected="an object")
         return found
 
-    def read_config(self) -> dict[str, Any]:
+    def read_config(self) -> Content:
         """What config.json says. Raises RunError when it is absent, broken, or lacks what every run has."""
         return require_record(self.read_json(self.config), self.config)
 
-    def load_checkpoint(self) -> dict[str, Any]:
+    def load_checkpoint(self) -> Content:
         """checkpoint.pt, with the numbers that every one has. Raises RunError."""
         checkpoint = self.load_state(self.checkpoint)
         require(Checkpoint, checkpoint, self.checkpoint)
         return checkpoint
 
-    def load_state(self, path: Path) -> dict[str, Any]:
+    def load_state(self, path: Path) -> Content:
         """checkpoint.pt or model.pt, on the CPU; nothing but tensors and plain values is ever unpickled."""
         if not path.is_file():
             raise RunError(f"no {path.name}", file=self.path, expected="a run folder", do="spelgen train")
@@ -202,7 +202,7 @@ def _text(path: Path, errors: str = "strict") -> str:
     return path.read_text(encoding="utf-8", errors=errors)
 
 
-def write_state(path: Path, state: dict[str, Any]) -> None:
+def write_state(path: Path, state: Content) -> None:
     """torch.save, all or nothing."""
     buffer = io.BytesIO()
     torch.save(state, buffer)

@@ -13,6 +13,9 @@ from spelgen.settings.fits import CONFIGS, FitConfig, Objective, Substeps, make_
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.values import Count, NonNegative, Positive, Whole
 
+Content = dict[str, Any]
+"""What a file of a run folder holds, by key: JSON, or what torch saves."""
+
 Schema = TypeVar("Schema", bound=BaseModel)
 MAY_CHANGE = ("epochs", "patience", "max_minutes", "compile")  # between a run and its resumption
 
@@ -75,7 +78,7 @@ def require(schema: type[Schema], content: object, file: Path, line: int | None 
         raise RunError(str(error), file=file, line=line) from error
 
 
-def require_record(content: dict[str, Any], file: Path) -> dict[str, Any]:
+def require_record(content: Content, file: Path) -> Content:
     """Return what config.json says. Raises RunError as `require`, and for a configuration that cannot be."""
     record = require(Record, content, file)
     try:
@@ -85,12 +88,12 @@ def require_record(content: dict[str, Any], file: Path) -> dict[str, Any]:
     return content
 
 
-def recorded_config(record: dict[str, Any], **changed: object) -> FitConfig:
+def recorded_config(record: Content, **changed: object) -> FitConfig:
     """Return the configuration in config.json, with some options changed. Raises OptionError as `FitConfig`."""
     return make_config(CONFIGS[record["objective"]], record["config"] | changed)
 
 
-def require_same(started: dict[str, Any], now: dict[str, Any], folder: Path) -> None:
+def require_same(started: Content, now: Content, folder: Path) -> None:
     """Raise RunError where a run would be resumed with other data or settings than it was started with."""
     if started["data_digest"] != now["data_digest"]:
         raise RunError(
@@ -112,6 +115,6 @@ def require_same(started: dict[str, Any], now: dict[str, Any], folder: Path) -> 
         )
 
 
-def _settings(record: dict[str, Any]) -> dict[str, object]:
+def _settings(record: Content) -> dict[str, object]:
     settings = {name: record.get(name) for name in ("objective", "validation_fraction", "seed")}
     return record["config"] | record["preprocessing"] | settings

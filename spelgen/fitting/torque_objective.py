@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from spelgen.dynamics.bristles import bristle_reach
 from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.dataset import TrainingData
 from spelgen.fitting.objective import FitRequest, PreparedLogs, Status
+from spelgen.fitting.run_record import Content
 from spelgen.fitting.torque_fit import TUNING, fit_torque
 from spelgen.fitting.torque_logs import prepare_windows, prepared_logs, regularizer_of, require_torque_input
 from spelgen.fitting.torque_networks import adapt_networks, fit_networks
@@ -42,8 +43,8 @@ class TorqueObjective:
         require_torque_input(request.model, request.config)
         assert isinstance(request.config, TorqueFit)
         self.request, self.config = request, request.config
-        self.history: list[dict[str, Any]] = []
-        self._checkpoint: dict[str, Any] = {}
+        self.history: list[Content] = []
+        self._checkpoint: Content = {}
 
     def prepare(self) -> PreparedLogs:
         """See `Objective`."""
@@ -77,9 +78,7 @@ class TorqueObjective:
         }
         return notes
 
-    def resume(
-        self, checkpoint: dict[str, Any], history: list[dict[str, Any]], record: dict[str, Any]
-    ) -> None:
+    def resume(self, checkpoint: Content, history: list[Content], record: Content) -> None:
         """Take the model as it was fitted."""
         self.request.model.load_state_dict(checkpoint["best_weights"])
         self._checkpoint = checkpoint
@@ -88,7 +87,7 @@ class TorqueObjective:
         """Do nothing more."""
         return "finished"
 
-    def checkpoint(self) -> dict[str, Any]:
+    def checkpoint(self) -> Content:
         """See `Objective`."""
         return self._checkpoint
 

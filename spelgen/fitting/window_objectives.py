@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.errors import Diagnostic, LogError
@@ -13,6 +13,7 @@ from spelgen.fitting.dataset import TrainingData
 from spelgen.fitting.loop import TrainingLoop
 from spelgen.fitting.momentum import momentum_stage
 from spelgen.fitting.objective import FitRequest, PreparedLogs, Status
+from spelgen.fitting.run_record import Content
 from spelgen.fitting.streaming import LargeLogs
 from spelgen.fitting.torque_logs import prepare_windows, prepared_logs, regularizer_of, require_torque_input
 from spelgen.fitting.torque_objective import fit_torques, torque_samples
@@ -45,7 +46,7 @@ class MomentumObjective:
         require_torque_input(request.model, request.config)
         assert isinstance(request.config, MomentumFit)
         self.request, self.config = request, request.config
-        self.history: list[dict[str, Any]] = []
+        self.history: list[Content] = []
 
     def prepare(self) -> PreparedLogs:
         """See `Objective`."""
@@ -64,9 +65,7 @@ class MomentumObjective:
         self.done = False
         return notes
 
-    def resume(
-        self, checkpoint: dict[str, Any], history: list[dict[str, Any]], record: dict[str, Any]
-    ) -> None:
+    def resume(self, checkpoint: Content, history: list[Content], record: Content) -> None:
         """Go on from the weights so far; steps that were not all taken start again."""
         self.begin()
         self.request.model.load_state_dict(checkpoint["best_weights"])
@@ -84,7 +83,7 @@ class MomentumObjective:
         save()
         return "finished"
 
-    def checkpoint(self) -> dict[str, Any]:
+    def checkpoint(self) -> Content:
         """See `Objective`."""
         return {
             "epoch": 0,
@@ -113,7 +112,7 @@ class RolloutObjective:
         self.request, self.config = request, request.config
 
     @property
-    def history(self) -> list[dict[str, Any]]:
+    def history(self) -> list[Content]:
         """A record for each epoch."""
         return self.loop.history
 
@@ -127,9 +126,7 @@ class RolloutObjective:
         """Fit torques, and measure the model then."""
         return self._start(torque_first=self.config.torque_first and has_rigid_bodies(self.request.model))
 
-    def resume(
-        self, checkpoint: dict[str, Any], history: list[dict[str, Any]], record: dict[str, Any]
-    ) -> None:
+    def resume(self, checkpoint: Content, history: list[Content], record: Content) -> None:
         """Go on from the last whole epoch."""
         self._start(torque_first=False)
         self.loop.restore(checkpoint, history)
@@ -138,7 +135,7 @@ class RolloutObjective:
         """See `Objective`."""
         return self.loop.run(progress, save)
 
-    def checkpoint(self) -> dict[str, Any]:
+    def checkpoint(self) -> Content:
         """See `Objective`."""
         return self.loop.state()
 

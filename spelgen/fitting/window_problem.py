@@ -6,12 +6,13 @@ import copy
 import math
 import time
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 
 from spelgen.fitting.dataset import TrainingData
 from spelgen.fitting.optimizers import LBFGS, MiniBatchAdamW, WindowOptimizer
+from spelgen.fitting.run_record import Content
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer
 from spelgen.fitting.validation import Validation
 from spelgen.settings.fits import DEFAULTS, WindowConfig
@@ -48,7 +49,7 @@ class Measured:
 
     substeps: int
     loss: float
-    weights: dict[str, Any]
+    weights: Content
 
 
 def measure(model: EmittedModel, validation: Validation) -> Measured:
