@@ -41,10 +41,10 @@ def keep_baseline(folder: Path | str, logs: Iterable[Path | str] | Sequence[Traj
             paths.append(log)
     if paths:
         opened = open_logs(run.load_module(), paths, LogMapping(**record["mapping"]))
-        if isinstance(opened, LargeLogs):
+        if isinstance(opened, LargeLogs):  # least squares takes all samples at once
             return
         trajectories += opened
-    if not run.urdf.exists():
+    if not run.urdf.exists():  # without an arm there is nothing to identify
         return
     kept: dict[str, object] = {"coverage": coverage(trajectories)}
     preprocessing = Preprocessing(**record["preprocessing"])

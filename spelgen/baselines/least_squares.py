@@ -40,6 +40,7 @@ class IdentifiedArm(Baseline):
                 fits[key] = identify(arm, logs, LeastSquares(friction=friction), preprocessing=preprocessing)
         except (LogError, np.linalg.LinAlgError):
             return {}
+        # numbers and their intervals are those of the usual friction; with memory only the parameters are kept
         parameters = {key: fit.parameters.tolist() for key, fit in fits.items()}
         return {**fits["parameters"].to_dict(), **parameters}
 

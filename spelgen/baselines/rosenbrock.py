@@ -58,6 +58,7 @@ def _step(
         """Return (1 - h A)^-1 of a state's two halves."""
         force = (mass @ acceleration.unsqueeze(-1)).squeeze(-1) - h * stiffness * velocity
         solution, info = torch.linalg.solve_ex(matrix, force)
+        # one singular matrix must not stop the other windows
         solution = torch.where(info.unsqueeze(-1) == 0, solution, torch.nan)
         return velocity + h * solution, solution
 
@@ -80,10 +81,13 @@ def _friction_slopes(form: VelocityState, q: Tensor, qd: Tensor, z: Tensor) -> t
         return torch.as_tensor(dynamics.friction_torque(q, velocity, *past))
 
     still = torch.zeros_like(q)
+    # central differences: dry friction jumps at standstill
     width = VELOCITY_STEP * qd.abs().amax(dim=0).clamp(min=1e-3)
+    # friction that falls with velocity is left to the explicit part: its damping would be negative
     slope = (friction(qd + width, still) - friction(qd - width, still)) / (2 * width)
     damping = slope.clamp(min=0)
     if not has_friction_state(dynamics):
         return damping, torch.zeros_like(damping)
+    # bristles load the way a joint goes
     way = DISPLACEMENT_STEP * torch.where(qd < 0, -1.0, 1.0).to(q)
     return damping, ((friction(qd, way) - friction(qd, still)) / way).clamp(min=0)

@@ -60,6 +60,7 @@ class Solver:
             return self._by_halves(windows, disturbance)
 
     def _by_halves(self, windows: Windows, disturbance: Tensor | None) -> States:
+        # LAPACK says that some matrix of the batch failed, not which
         if len(windows) == 1:
             nowhere = torch.full_like(windows.q[:, 1:], torch.nan)
             return nowhere, nowhere
@@ -78,6 +79,7 @@ def accurate_solver(dynamics: RigidDynamics, probe: Windows) -> Solver:
     explicit = Solver(integrable(dynamics), roll_out, 1)
     implicit = Solver(VelocityState(dynamics), roll_out_stiff, 1)
     windows = thinned(probe, TUNING.probed_windows)
+    # each doubling is tried against the next: powers of two waste no rollout
     most = 1
     while 2 * most <= TUNING.most_substeps and probe.dt.mean() / (2 * most) >= TUNING.shortest_step:
         most *= 2
@@ -88,11 +90,13 @@ def accurate_solver(dynamics: RigidDynamics, probe: Windows) -> Solver:
         accurate = _with_enough_steps(solver, windows, tolerance, most)
         if accurate is not None:
             return accurate
+    # dynamics that leave all bounds are not worth smaller steps
     return replace(implicit, substeps=most)
 
 
 def _with_enough_steps(solver: Solver, probe: Windows, tolerance: float, most: int) -> Solver | None:
     """Return the solver with the fewest steps between samples that twice as many agree with."""
+    # errors below a tenth of the motion are accurate enough for any comparison
     motion = (probe.qd - probe.qd[:, :1]).square().mean().sqrt().clamp(min=1e-9)
     coarse = solver(probe)[1]
     while solver.substeps <= most:

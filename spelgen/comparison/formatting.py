@@ -122,6 +122,7 @@ def _ratio(baseline: float | None, median: float | None) -> Cell:
 def _median(runs: Sequence[RunResult], quantity: Quantity) -> float | None:
     """Return that over seeds; a run that is not finite counts as infinitely bad."""
     values = [quantity(run) for run in runs]
+    # infinite and not left out: a variant that blows up in one seed of two is no better than the other seed
     middle = statistics.median(math.inf if value is None else value for value in values)
     return middle if math.isfinite(middle) else None
 

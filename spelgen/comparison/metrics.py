@@ -85,6 +85,7 @@ def _network(model: EmittedModel, part: str) -> Any:
 def step_seconds(model: EmittedModel, windows: Windows, scales: LossScales, substeps: int) -> float:
     """Return the median time of a training step on these windows, without the update of the weights [s]."""
     times = []
+    # the median: other programs run beside
     for _ in range(TIMED_STEPS):
         start = time.perf_counter()
         model.zero_grad()

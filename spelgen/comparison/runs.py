@@ -36,6 +36,7 @@ HORIZON = 1.0  # s, over which trajectories are predicted
 def run_study(study: Study, run_tasks: RunTasks, *, note: Callable[[str], None]) -> None:
     """Train and measure what is not yet done; `note` hears of each run that ends. What a run raises ends all."""
     waiting = []
+    # seed by seed: a comparison that is stopped has all variants of the first seeds
     for seed in range(study.settings.seeds):
         for variant in study.variants:
             if not study.result(variant, seed).exists():
@@ -85,10 +86,10 @@ def _measure(
     low = torch.tensor(study.low, dtype=torch.float64)
     high = torch.tensor(study.high, dtype=torch.float64)
     example = predict_example(of_dynamics(variant, model, substeps), testing, steps, decimation)
-    along = []
+    along = []  # no test trajectory may be long enough
     if example is not None:
         along = model.mass_matrix(torch.tensor(example.q, dtype=torch.float64)).tolist()
-    seen = far.q[:, 0]
+    seen = far.q[:, 0]  # M is judged where the arm has been
     return RunResult(
         variant=variant,
         seed=seed,
@@ -111,6 +112,7 @@ def predict_example(
     span = steps * decimation
     for log in logs:
         if len(log) > span:
+            # a multiple of the decimation: the controller holds its torque so long
             start = (len(log) - 1 - span) // (2 * decimation) * decimation
             window = cut_windows(
                 [log[start : start + span + 1]], steps + 1, decimation=decimation, measured=False

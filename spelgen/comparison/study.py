@@ -160,6 +160,7 @@ def prepare_study(
         robot=loaded.arm.name,
         settings=settings,
         training=training,
+        # simulated states have no noise that a filter would take away
         preprocessing=Preprocessing(**{**loaded.settings.training.preprocessing, "cutoff": 0.0}),
         validation_fraction=loaded.settings.training.validation_fraction,
         variants=tuple(variants),

@@ -16,6 +16,7 @@ HEAD = ("quantity", "unit", "horizon_s", "joint", "trajectory", "predictor", "va
 def csv_text(results: Results) -> str:
     """Return the table, with its head; nothing stands where a number is not known."""
     file = io.StringIO()
+    # what a row has no use for stays empty
     writer = csv.DictWriter(file, HEAD, restval="", lineterminator="\n")
     writer.writeheader()
     for rows in (_replays, _states, _torques, _growth):

@@ -62,7 +62,7 @@ def evaluate(
         require_joints(trajectory, judged.joints)
     notes = check(logs, judged.joints, judged.model.joint_types)
     seen = [trajectory.name for trajectory in logs if trajectory.name in judged.trained_on]
-    if seen:
+    if seen:  # names are all that a run keeps of its logs
         message = f"names also used in training: {', '.join(seen)}; errors on training data prove nothing"
         notes.append(Diagnostic("warning", "tested-on-training-data", "logs", None, message))
     if has_servos(judged.model):
@@ -87,9 +87,11 @@ def _evaluate_torques(
     used = judged.preprocessing
     if preprocessing is not None or used is None:
         used = (preprocessing or Preprocessing()).resolved([trajectory.sample_rate for trajectory in logs])
+    # a rollout takes a start and a sample after it
     tests = JudgedLogs(used.pieces(logs, shortest=2), used, judged.reach, types)
     lengths = horizon_lengths(tests, *ahead, notes)
     probe = tests.windows(judged.window - 1, TUNING.probed_model_windows)
+    # the fit has judged its steps on more windows than these: never fewer
     substeps = choose_substeps(model, probe, loss_scales(probe, types), start=judged.substeps_per_sample)
     predictors = [of_dynamics(MODEL, model, substeps)]
     for baseline in BASELINES:
@@ -100,6 +102,7 @@ def _evaluate_torques(
     horizons, longest = [], None
     for name, k in lengths.items():
         horizon, predictions = predict(name, k, tests, predictors, tip, notes)
+        # the curves of the longest horizon show the shorter ones on their way
         if all(k > other.steps for other in horizons):
             longest = predictions
         horizons.append(horizon)

@@ -118,10 +118,12 @@ def predict(
         message = f"no observer over {name}: the longest trajectory has {logs.longest} steps"
         notes.append(Diagnostic("info", "no-observer", "logs", None, message))
         past = 0
+    # rollouts cost by their steps
     most = max(TUNING.fewest_windows, min(TUNING.most_windows, TUNING.most_predicted_steps // steps))
     windows = logs.windows(past + steps, most)
     ahead = without_past(windows, past)
     states = {}
+    # both rollouts of a predictor start from the same states of friction, those at the end of the past
     for predictor in predictors:
         if not past or not isinstance(predictor.solver, Solver):
             states[predictor.name] = predictor.solver(ahead)

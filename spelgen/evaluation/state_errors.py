@@ -40,6 +40,7 @@ def end_errors(
     """Return errors of predicted q and qd (W, K-1, n) of these windows at their ends."""
     q, qd = (predicted[:, -1] for predicted in states)  # (W, n)
     measured_q, measured_qd = windows.q[:, -1], windows.qd[:, -1]
+    # a revolute joint may have gone a turn farther: the angle between counts
     q_error = _rms(position_difference(q, measured_q, joint_types))
     qd_error = _rms(qd - measured_qd)
     q_relative = q_error / _rms(position_difference(measured_q, windows.q[:, 0], joint_types))

@@ -105,6 +105,7 @@ def _of_model(model: EmittedModel, urdf: Path | str | None) -> Subject:
     weights = next(model.parameters(), None)
     if weights is not None and (weights.dtype != torch.float64 or not weights.is_cpu):  # as logs are
         model = copy.deepcopy(model).double().cpu()
+    # friction without a state is judged beside least squares with one: z is found for that
     reach = bristle_reach(model)
     if not reach.elements:
         reach = reach_of(model.joint_types)

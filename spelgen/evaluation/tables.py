@@ -77,7 +77,7 @@ def table(title: str, labels: Sequence[str], rows: Iterable[Numbers], note: str 
 
 def _cells(row: Numbers, columns: Iterable[str]) -> tuple[Cell, ...]:
     least = None
-    if len(row) > 1:
+    if len(row) > 1:  # alone it would be the best of nothing
         least = min((value for value in row.values() if value is not None), default=None)
     cells = []
     for name in columns:
@@ -112,6 +112,7 @@ def _horizon_tables(results: Results) -> list[Table]:
             note = OBSERVER
     title = "Error relative to the motion (0: none, 1: as if the arm had stood still)"
     tables = [table(title, heads, relative, note)]
+    # no tip is known without a URDF
     if any(value is not None for row in tips for value in row.values()):
         tables.append(table("Error of the tip's position [mm]", heads, tips))
     last = results.horizons[-1].errors

@@ -27,6 +27,7 @@ class TorqueErrors:
 
     def summary(self) -> TorqueSummary:
         """Return means over joints and trajectories."""
+        # a joint whose torque never varies has no nMSE, and says nothing
         by_trajectory = np.nanmean(self.nmse, axis=1)
         nmse = dict(zip(self.trajectories, finite(by_trajectory), strict=True))
         (mean,) = finite(by_trajectory.mean(keepdims=True))

@@ -69,6 +69,7 @@ def torque_traces(dynamics: Mapping[str, RigidDynamics], logs: JudgedLogs) -> tu
             continue
         with torch.no_grad():
             missed = _inverse_dynamics(model, motion) - motion.tau
+        # a torque that never varies would weigh infinitely
         nmse = missed.square().mean(dim=0) / motion.tau.var(dim=0).clamp(min=1e-12)
         motions[piece.name] = motion
         errors[piece.name] = nmse.mean().nan_to_num(nan=math.inf).item()
@@ -95,7 +96,7 @@ def _motion(piece: Trajectory, logs: JudgedLogs) -> Motion | None:
         return None
     t = columns[0] - columns[0][0]
     count = min(len(t), int(np.searchsorted(t, SECONDS)) + 1)
-    start = (len(t) - count) // 2
+    start = (len(t) - count) // 2  # logs begin and end at rest
     part = slice(start, start + count)
     tensors = [torch.from_numpy(np.ascontiguousarray(x[part])) for x in (t - t[start], *columns[1:])]
     return Motion(*tensors)
@@ -121,8 +122,9 @@ def _sparse_columns(piece: Trajectory, logs: JudgedLogs) -> tuple[np.ndarray, ..
     if logs.reach.elements:
         z = bristles_along(piece.q, logs.reach)
     t, q, qd, z = ((x[1:] + x[:-1]) / 2 for x in (piece.t, piece.q, piece.qd, z))
-    tau = piece.tau[:-1]
+    tau = piece.tau[:-1]  # held from its sample on, as simulators apply it
     if logs.used.filtered:
+        # measured at its sample: a filter has no delay
         tau = (piece.tau[1:] + piece.tau[:-1]) / 2
     return t, q, qd, np.diff(piece.qd, axis=0) / np.diff(piece.t)[:, None], tau, z
 

@@ -174,6 +174,7 @@ def replay_traces(missed: Sequence[Missed]) -> Traces:
 
 def _typical_and_worst(errors: Tensor) -> dict[str, int]:
     """Return which of these (N,) is in the middle, and which the largest."""
+    # stable: the same logs give the same page
     order = errors.nan_to_num(nan=torch.inf).argsort(stable=True)
     return {"typical": int(order[len(order) // 2]), "worst": int(order[-1])}
 
@@ -181,6 +182,7 @@ def _typical_and_worst(errors: Tensor) -> dict[str, int]:
 def _growth(predictions: Predictions, joint_types: Sequence[str], tip: TipPosition | None) -> Growth:
     windows = predictions.windows
     steps = windows.dt.shape[1]
+    # errors grow by orders of magnitude: as many points for the first tenth as for the last
     times = np.unique(np.geomspace(1, steps, TIMES).round().astype(int)) - 1
     scales = loss_scales(windows, joint_types)
     relative, tips = {}, {}
@@ -252,7 +254,7 @@ def _mass_trace(
     for name, predictor in dynamics.items():
         with torch.no_grad():
             mass = torch.as_tensor(predictor.mass_matrix(q))
-        if mass.isfinite().all():
+        if mass.isfinite().all():  # else it has no eigenvalues
             eigenvalues = torch.linalg.eigvalsh(mass)
             curves[name] = MassCurves(rows(mass[:, row, column].mT), rows(eigenvalues.mT))
     return MassTrace(along.trajectory, along.t[::stride], curves)
@@ -266,6 +268,7 @@ def _friction_trace(
     middle = torch.from_numpy(q.mean(axis=0))
     n = len(middle)
     grid = np.sinh(np.linspace(-4, 4, 81)) / np.sinh(4)  # dense where friction turns around
+    # the fastest samples are often spikes of differenced positions
     speeds = torch.from_numpy(grid[:, None] * fast)  # (81, n)
     curves = {}
     for name, predictor in dynamics.items():

@@ -96,7 +96,7 @@ def _judge_torques(results: Results, uses: _Uses) -> None:
     summary = results.torque.get(MODEL)
     if summary is None or summary.mean_nmse is None:
         return
-    explained = 1 - summary.mean_nmse
+    explained = 1 - summary.mean_nmse  # coefficient of determination
     if explained >= TUNING.explained_for_contacts:
         uses.good += ["feed-forward control", "telling contacts from its own error"]
     elif explained >= TUNING.explained_for_feed_forward:
@@ -112,6 +112,7 @@ def _judge_torques(results: Results, uses: _Uses) -> None:
 
 
 def _judge_motion(results: Results, uses: _Uses) -> None:
+    # a long horizon may blow up where a short one tells something
     finite = [x for x in results.horizons if x.errors[MODEL].mean_relative_rms is not None]
     if not finite:
         if results.horizons:
@@ -143,7 +144,7 @@ def _judge_replays(results: Results, uses: _Uses) -> None:
     if not results.replays:
         return
     replay = results.replays[0]
-    own = replay.errors[MODEL].mean
+    own = replay.errors[MODEL].mean  # of whole logs: windows forgive what drifts
     if own == min(errors.mean for errors in replay.errors.values()):
         uses.good.append("simulation from commands")
     else:
@@ -212,10 +213,12 @@ def _worst_torque(results: Results) -> _Failure:
     qd = np.concatenate([np.array(trace.qd, dtype=float) for trace in traces])
     residual = measured - predicted
     deviation = np.nanstd(measured, axis=0)
+    # a joint whose torque never varies has nothing to explain
     ratios = np.sqrt(np.nanmean(residual**2, axis=0)) / np.where(deviation > 0, deviation, math.inf)
     k = int(np.nanargmax(ratios))
     joint, when = results.joints[k], ""
     slow = np.abs(qd[:, k]) < TUNING.slow * np.nanmax(np.abs(qd[:, k]))
+    # a handful of samples tells no root mean square
     if 5 < slow.sum() < len(slow) - 5:
         size_slow, size_fast = (np.sqrt(np.nanmean(residual[x, k] ** 2)) for x in (slow, ~slow))
         if size_slow > TUNING.uneven * size_fast:
@@ -265,6 +268,7 @@ def _range_fractions(trained: Mapping[str, Any], joints: Sequence[str], limits: 
     fractions = {}
     for name, covered, bound in zip(joints, trained.get("q", ()), limits, strict=False):
         if bound is not None and bound[1] > bound[0]:
+            # a turn shows all of a joint that can go on turning
             room = min(bound[1] - bound[0], 2 * math.pi)
             fractions[name] = (covered["high"] - covered["low"]) / room
     return fractions
