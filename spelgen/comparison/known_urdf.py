@@ -12,13 +12,13 @@ MASSLESS = 1e-9  # kg: links of no more than this stay as they are
 
 
 def without_inertials(robot: Path) -> bytes:
-    """The URDF with nothing but kinematics and limits."""
+    """Return the URDF with nothing but kinematics and limits."""
     return _written(_plain(robot, ("inertial", "dynamics", "visual", "collision")))
 
 
 def with_wrong_inertials(robot: Path, error: float) -> bytes:
-    """The URDF without friction, whose bodies are other possible ones: each of mass, size of the inertia about the
-    centre of mass, and place of that (relative to the body's own size) errs by this standard deviation.
+    """Return the URDF without friction, whose bodies are other possible ones: each of mass, size of the inertia about
+    the centre of mass, and place of that (relative to the body's own size) errs by this standard deviation.
 
     Masses and inertias by factors exp(error N(0, 1)): 0.3 is 30 %, 1 a factor of e; drawn anew for each link, the same
     ones in every call.
@@ -44,7 +44,7 @@ def with_wrong_inertials(robot: Path, error: float) -> bytes:
 
 
 def _plain(robot: Path, left_out: tuple[str, ...]) -> etree._ElementTree:
-    """The URDF without these elements; it was read before, so it is known to be harmless."""
+    """Return the URDF without these elements; it was read before, so it is known to be harmless."""
     parser = etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True)
     tree = etree.ElementTree(etree.fromstring(robot.read_bytes(), parser))
     for name in left_out:
@@ -54,4 +54,5 @@ def _plain(robot: Path, left_out: tuple[str, ...]) -> etree._ElementTree:
 
 
 def _written(tree: etree._ElementTree) -> bytes:
-    return etree.tostring(tree, xml_declaration=True, encoding="utf-8")
+    text: bytes = etree.tostring(tree, xml_declaration=True, encoding="utf-8")
+    return text

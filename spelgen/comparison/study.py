@@ -25,7 +25,8 @@ from spelgen.files import write_json, write_text
 from spelgen.fitting.window_problem import TUNING
 from spelgen.loaded_arm import LoadedArm, load_arm
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.read import Trajectory, write_logs
+from spelgen.logs.read import write_logs
+from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.comparison import ComparisonSettings
 from spelgen.settings.fits import Rollout, fit_config
 from spelgen.settings.settings import Settings

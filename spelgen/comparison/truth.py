@@ -10,7 +10,7 @@ from spelgen.loaded_arm import load_arm
 
 
 def true_mass(robot: Path, q: torch.Tensor) -> torch.Tensor:
-    """M (T, n, n) [kg m^2, kg m, kg] of a URDF and its sidecar, by Pinocchio, at q (T, n); rotors included."""
+    """Return M (T, n, n) [kg m^2, kg m, kg] of a URDF and its sidecar, by Pinocchio, at q (T, n); rotors included."""
     from spelgen.dynamics.pinocchio_arm import arm_dynamics
 
     loaded = load_arm(robot)
@@ -18,11 +18,11 @@ def true_mass(robot: Path, q: torch.Tensor) -> torch.Tensor:
 
 
 def mass_error(learned: torch.Tensor, true: torch.Tensor) -> float:
-    """How far M is off (T, n, n), without unit: root mean square of the entries of L^-1 (learned - true) L^-T.
+    """Return how far M is off (T, n, n), without unit: root mean square of the entries of L^-1 (learned - true) L^-T.
 
     L L^T is the mean true M: so every entry counts in the units of its own joints.
     """
     factor = torch.linalg.cholesky(true.mean(dim=0))
     half = torch.linalg.solve_triangular(factor, learned - true, upper=False)
-    whole = torch.linalg.solve_triangular(factor, half.mT, upper=False)
-    return whole.square().mean().sqrt().item()
+    relative = torch.linalg.solve_triangular(factor, half.mT, upper=False)
+    return float(relative.square().mean().sqrt())

@@ -12,7 +12,7 @@ from spelgen.baselines.predictor import Predictor, of_accurate_dynamics, of_dyna
 from spelgen.baselines.registry import BASELINES
 from spelgen.dynamics.protocol import has_servos
 from spelgen.errors import Diagnostic, LogError
-from spelgen.evaluation.horizons import JudgedLogs, horizon_lengths, predict
+from spelgen.evaluation.horizons import Horizon, JudgedLogs, Predictions, horizon_lengths, predict
 from spelgen.evaluation.invariants import energy_drift
 from spelgen.evaluation.replay import replays
 from spelgen.evaluation.results import Results
@@ -99,7 +99,8 @@ def _evaluate_torques(
     for name, dynamics in others.items():
         predictors.append(of_accurate_dynamics(name, dynamics, probe))
     tip = _tip(judged, notes)
-    horizons, longest = [], None
+    horizons: list[Horizon] = []
+    longest: Predictions | None = None
     for name, k in lengths.items():
         horizon, predictions = predict(name, k, tests, predictors, tip, notes)
         # the curves of the longest horizon show the shorter ones on their way

@@ -49,7 +49,7 @@ def _least_eigenvalue(model: EmittedModel, low: Tensor, high: Tensor) -> float:
     generator = torch.Generator().manual_seed(0)
     count = TUNING.sampled_positions
     q = low + (high - low) * torch.rand(count, len(low), dtype=low.dtype, generator=generator)
-    parts = q.split(max(1, count // 10))  # all at once would take gigabytes
+    parts = q.chunk(10)  # all at once would take gigabytes
     eigenvalues = torch.cat([torch.linalg.eigvalsh(model.mass_matrix(part)) for part in parts])
     return (eigenvalues.min() / eigenvalues.mean().abs()).item()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,18 +21,19 @@ def rollout(
     solver: Solver = "rk4",
     substeps: int = 1,
 ) -> tuple[Tensor, Tensor]:
-    """Positions and velocities, (..., T + 1, n), from q and qd (..., n) on, under tau (..., T, n).
+    """Return positions and velocities, (..., T + 1, n), from q and qd (..., n) on, under tau (..., T, n).
 
     tau[k] is held for dt [s], or for dt[k] of (..., T). ``model``: an emitted one or any other dynamics. solver:
     ``rk4`` takes ``substeps`` steps of the classical Runge-Kutta method in each dt, ``dopri5`` torchdiffeq's
     adaptive steps, and over long horizons its adjoint equation for gradients.
     """
-    batch, (samples, n) = torch.broadcast_shapes(q.shape[:-1], tau.shape[:-2]), tau.shape[-2:]
+    batch = np.broadcast_shapes(q.shape[:-1], tau.shape[:-2])
+    samples, n = tau.shape[-2:]
     steps = torch.as_tensor(dt, dtype=q.dtype, device=q.device).expand(*batch, samples)
     q, qd = (x.expand(*batch, n).reshape(-1, 1, n) for x in (q, qd))
     inputs = tau.expand(*batch, samples, n).reshape(-1, samples, n)
     windows = Windows(steps.reshape(-1, samples), q, qd, inputs)
-    found = roll_out(integrable(model), windows, substeps, solver)
-    joined = (torch.cat(pair, dim=1) for pair in zip((q, qd), found, strict=True))
-    positions, velocities = (x.reshape(*batch, samples + 1, n) for x in joined)
-    return positions, velocities
+    positions, velocities = roll_out(integrable(model), windows, substeps, solver)
+    shape = (*batch, samples + 1, n)
+    positions = torch.cat([q, positions], dim=1).reshape(shape)
+    return positions, torch.cat([qd, velocities], dim=1).reshape(shape)

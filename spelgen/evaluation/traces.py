@@ -156,6 +156,7 @@ def replay_traces(missed: Sequence[Missed]) -> Traces:
     examples = []
     for which, k in _typical_and_worst(torch.tensor(errors)).items():
         log, error = missed[k]
+        assert log.u is not None  # a log without commands cannot be replayed
         stride = -(-len(log) // SHOWN_OF_LOG)
         predicted = np.concatenate([log.q[:1], log.q[1:] + error])
         examples.append(
