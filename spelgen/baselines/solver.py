@@ -48,28 +48,30 @@ class Solver:
     def __call__(self, windows: Windows, disturbance: Tensor | None = None) -> States:
         """Return q and qd, (W, K-1, n); under a disturbance (W, n) that is added to p'.
 
-        Leaving all bounds is no error: a window whose numbers blow up is NaN, and spoils no other.
+        Leaving all bounds is no error: where numbers blow up they are NaN, for few windows beside those to blame.
         """
-        form = self.form
-        if disturbance is not None:
-            form = Disturbed(form, disturbance)
         try:
-            with torch.no_grad(), np.errstate(over="ignore", invalid="ignore"):
-                return self.method(form, windows, self.substeps)
+            return self._roll_out(windows, disturbance)
         except torch.linalg.LinAlgError:
-            return self._by_halves(windows, disturbance)
-
-    def _by_halves(self, windows: Windows, disturbance: Tensor | None) -> States:
-        # LAPACK says that some matrix of the batch failed, not which
-        if len(windows) == 1:
-            nowhere = torch.full_like(windows.q[:, 1:], torch.nan)
-            return nowhere, nowhere
+            # LAPACK says that some matrix of the batch failed, not which; window by window would take minutes
+            parts = torch.arange(len(windows)).tensor_split(min(len(windows), TUNING.parts_of_windows))
         positions, velocities = [], []
-        for rows in torch.arange(len(windows)).tensor_split(2):
-            q, qd = self(windows[rows], None if disturbance is None else disturbance[rows])
+        for rows in parts:
+            part = windows[rows]
+            try:
+                q, qd = self._roll_out(part, None if disturbance is None else disturbance[rows])
+            except torch.linalg.LinAlgError:
+                q = qd = torch.full_like(part.q[:, 1:], torch.nan)
             positions.append(q)
             velocities.append(qd)
         return torch.cat(positions), torch.cat(velocities)
+
+    def _roll_out(self, windows: Windows, disturbance: Tensor | None) -> States:
+        form = self.form
+        if disturbance is not None:
+            form = Disturbed(form, disturbance)
+        with torch.no_grad(), np.errstate(over="ignore", invalid="ignore"):
+            return self.method(form, windows, self.substeps)
 
 
 def accurate_solver(dynamics: RigidDynamics, probe: Windows) -> Solver:

@@ -24,6 +24,8 @@ class EvaluationTuning:
     """[] the same of the Rosenbrock method, which has order two."""
     probed_windows: int = 16
     """[] that say in which steps a baseline is integrated."""
+    parts_of_windows: int = 32
+    """[] that are rolled out one by one where numbers blow up; those of a part are lost together."""
 
     most_windows: int = 2000
     """[] that a horizon is judged on, evenly spread."""
