@@ -38,7 +38,8 @@ class NumericSamples:
     @property
     def changes(self) -> np.ndarray:
         """How M changes when one coordinate moves, (n, samples, n(n+1)/2)."""
-        return self.mass[1:] - self.mass[0]
+        result: np.ndarray = self.mass[1:] - self.mass[0]
+        return result
 
     def row(self, weights: Weights) -> np.ndarray:
         """Return weights of entries of M as a row (n(n+1)/2,)."""

@@ -21,7 +21,7 @@ _LONG_SUM = 20
 _DOUBLE = 10**17  # more digits than a double holds
 
 
-class _AsBuilt(Printer):
+class _AsBuilt(Printer):  # type: ignore[misc]  # SymPy has no types
     """Print sums and products in the order they were put together, numbers as decimals."""
 
     times = "*"
@@ -68,7 +68,8 @@ class _AsBuilt(Printer):
         return _sign(number) + self.times.join(written)
 
     def _print_Function(self, expression: Function, **power: str) -> str:
-        return super()._print_Function(expression, **power).replace(" ", _FIXED)
+        text: str = super()._print_Function(expression, **power).replace(" ", _FIXED)
+        return text
 
     def _print_Rational(self, number: Rational) -> str:
         return _sign(number) + decimal(abs(number))

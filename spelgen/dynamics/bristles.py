@@ -76,7 +76,8 @@ def encoded(q: np.ndarray) -> np.ndarray:
         clamped = [np.clip(x[earlier], low[later], high[later]) for x in (low, high)]
         low[later], high[later] = clamped
         shift *= 2
-    return np.clip(np.broadcast_to(q[:1], q.shape), low, high)
+    result: np.ndarray = np.clip(np.broadcast_to(q[:1], q.shape), low, high)
+    return result
 
 
 def encoder_step(q: np.ndarray) -> np.ndarray:

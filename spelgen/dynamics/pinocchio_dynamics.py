@@ -58,27 +58,33 @@ class PinocchioDynamics:
 
     def mass_matrix(self, q: Array) -> Array:
         """M, (..., n, n) [kg m^2, kg m, kg]."""
-        return on_arrays(self._mass, q)
+        result: Array = on_arrays(self._mass, q)
+        return result
 
     def nonlinear_effects(self, q: Array, qd: Array) -> Array:
         """Coriolis, centrifugal and gravity torques, (..., n) [Nm, N]."""
-        return on_arrays(self._effects, q, qd)
+        result: Array = on_arrays(self._effects, q, qd)
+        return result
 
     def gravity(self, q: Array) -> Array:
         """dV/dq, (..., n) [Nm, N]."""
-        return on_arrays(lambda q: self._effects(q, np.zeros_like(q)), q)
+        result: Array = on_arrays(lambda q: self._effects(q, np.zeros_like(q)), q)
+        return result
 
     def friction_torque(self, q: Array, qd: Array) -> Array:
         """What friction takes, (..., n) [Nm, N]."""
-        return on_arrays(lambda _, velocity: self._lost(velocity), q, qd)
+        result: Array = on_arrays(lambda _, velocity: self._lost(velocity), q, qd)
+        return result
 
     def forward_dynamics(self, q: Array, qd: Array, tau: Array) -> Array:
         """qdd, (..., n), under the inputs tau."""
-        return on_arrays(self._forward, q, qd, tau)
+        result: Array = on_arrays(self._forward, q, qd, tau)
+        return result
 
     def inverse_dynamics(self, q: Array, qd: Array, qdd: Array) -> Array:
         """The inputs, (..., n), that make qdd; those of a passive joint are the torques that it lacks."""
-        return on_arrays(self._inverse, q, qd, qdd)
+        result: Array = on_arrays(self._inverse, q, qd, qdd)
+        return result
 
     def configuration(self, q: np.ndarray) -> np.ndarray:
         """Pinocchio's configuration (..., nq) at q (..., n)."""
@@ -133,7 +139,8 @@ class PinocchioDynamics:
         by_joint = (x @ self.jacobian.T for x in (qd, qdd))
         force = self._by_joint(pin.rnea, self.configuration(q), *by_joint) @ self.jacobian + self._lost(qd)
         if self.inputs is None:
-            return force
+            result: np.ndarray = force
+            return result
         moved = self.inputs + np.diag(~self.inputs.any(axis=1)).astype(float)
         return _solved(moved, force)
 

@@ -83,7 +83,10 @@ class PreparedModel:
         pose, weights = self._at(q), self._weights
         residuals = self._dynamics.mass_at(pose, weights)[1]
         force: Tensor = self._dynamics.lagrangian_gradient(pose, qd, residuals, weights)
-        return force + self._dynamics.input_force(pose, qd, tau, weights) - self._friction(pose, qd, z)
+        result: Tensor = (
+            force + self._dynamics.input_force(pose, qd, tau, weights) - self._friction(pose, qd, z)
+        )
+        return result
 
     def step(
         self, q: Tensor, qd: Tensor, tau: Tensor, dt: float, z: Tensor | None = None, *, substeps: int = 1

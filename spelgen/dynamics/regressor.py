@@ -118,4 +118,5 @@ def _wrench(state: _State) -> tuple[np.ndarray, np.ndarray]:
 
 def _crossing(vector: np.ndarray) -> np.ndarray:
     """[a]x with [a]x b = a x b, (T, 3, 3)."""
-    return np.einsum("ikj,tk->tij", _CROSS, vector)
+    result: np.ndarray = np.einsum("ikj,tk->tij", _CROSS, vector)
+    return result

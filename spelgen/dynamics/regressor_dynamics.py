@@ -104,7 +104,8 @@ class RegressorDynamics:
 
     def _torque(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, z: np.ndarray | None) -> np.ndarray:
         mass, bias = self._mass_and_bias(q, qd)
-        return (mass @ qdd[..., None])[..., 0] + bias + self.friction(qd, z)
+        result: np.ndarray = (mass @ qdd[..., None])[..., 0] + bias + self.friction(qd, z)
+        return result
 
     def _inverse(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, z: np.ndarray | None) -> np.ndarray:
         force = self._torque(q, qd, qdd, z)
@@ -116,4 +117,5 @@ class RegressorDynamics:
         rows = np.broadcast_arrays(*(np.asarray(x) for x in states))
         past = None if z is None else np.asarray(z).reshape(-1, self.n, np.asarray(z).shape[-1])
         result = function(*(x.reshape(-1, self.n) for x in rows), past)
-        return like(result.reshape(*rows[0].shape[:-1], *result.shape[1:]), states[0])
+        value: Array = like(result.reshape(*rows[0].shape[:-1], *result.shape[1:]), states[0])
+        return value

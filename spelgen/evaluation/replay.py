@@ -145,4 +145,5 @@ def _summary(names: Sequence[str], errors: Sequence[np.ndarray]) -> ReplayErrors
 
 
 def _rms(x: np.ndarray, axis: int | None) -> np.ndarray:
-    return np.sqrt(np.square(x).mean(axis=axis))
+    result: np.ndarray = np.sqrt(np.square(x).mean(axis=axis))
+    return result

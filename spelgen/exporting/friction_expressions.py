@@ -35,7 +35,8 @@ def bristle_direction(bristles: Bristles, z: ca.SX) -> ca.SX:
     stiffness = bristles.fractions / bristles.reach
     bent = z * stiffness.ravel()
     # CasADi reshapes column by column: a joint's elements are a column
-    return ca.sum1(ca.reshape(bent, count, n)).T
+    result: ca.SX = ca.sum1(ca.reshape(bent, count, n)).T
+    return result
 
 
 def sliding_bristles(bristles: Bristles, law: FrictionLaw, qd: ca.SX) -> ca.SX:

@@ -74,4 +74,5 @@ def compiled(model: EmittedModel, windows: Windows, scales: LossScales) -> Emitt
         reason = (str(cause).strip() or type(cause).__name__).splitlines()[0]
         raise RunError(f"a right-hand side that torch cannot compile ({reason})", do=CURE) from error
     model.zero_grad()
-    return ready
+    result: EmittedModel = ready
+    return result

@@ -30,7 +30,8 @@ class NormalEquations(NamedTuple):
         """Return the damped step (..., k); damping: one for all, or (...) of each system of equations."""
         factor = torch.as_tensor(damping, dtype=self.curvature.dtype)[..., None, None]
         diagonal = torch.diag_embed(self.curvature.diagonal(dim1=-2, dim2=-1))
-        return torch.linalg.solve(self.curvature + factor * diagonal, self.descent)
+        result: torch.Tensor = torch.linalg.solve(self.curvature + factor * diagonal, self.descent)
+        return result
 
     def promised(self, step: torch.Tensor) -> float:
         """Return by how much the quadratic model of the cost falls along a step (k,)."""

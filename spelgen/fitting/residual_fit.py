@@ -56,8 +56,10 @@ class _Candidate:
     def weights(self, functions: Any) -> torch.Tensor:
         """Return the model's (P,)."""
         if self.friction is not None:
-            return functions.friction_logarithms()[self.joint].detach()
-        return functions.get_parameter(self.parameter)[self.joint].detach() * self.scale
+            result: torch.Tensor = functions.friction_logarithms()[self.joint].detach()
+            return result
+        result = functions.get_parameter(self.parameter)[self.joint].detach() * self.scale
+        return result
 
     def write(self, functions: Any, weights: torch.Tensor) -> None:
         """Make them the model's."""

@@ -170,7 +170,8 @@ def momentum_loss(model: EmittedModel, windows: Windows, scales: LossScales) -> 
     with torch.no_grad():
         inputs = dynamics.input_at(at, prepared).abs()
     unit = (inputs @ scales.tau).mean(dim=(0, 1))  # gears may stand between motor and joint
-    return (missing / torch.maximum(unit, 1e-2 * unit.amax())).square().mean()
+    result: torch.Tensor = (missing / torch.maximum(unit, 1e-2 * unit.amax())).square().mean()
+    return result
 
 
 def integration_error(model: EmittedModel, windows: Windows, scales: LossScales, substeps: int) -> float:

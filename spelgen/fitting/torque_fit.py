@@ -164,7 +164,8 @@ class TorqueProblem:
             self.noise = torch.minimum(self.noise, largest)
 
     def _first_noise(self) -> torch.Tensor:
-        return TUNING.correlation_length**0.5 * TUNING.first_noise * self.range
+        result: torch.Tensor = TUNING.correlation_length**0.5 * TUNING.first_noise * self.range
+        return result
 
     @property
     def free(self) -> torch.Tensor:

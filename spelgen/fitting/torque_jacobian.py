@@ -340,7 +340,8 @@ class TorqueJacobian:
         (by_load,) = gradient(friction.sum(), load, materialize_grads=True)  # each drive's by its own load
         at_drives = (samples.factor * by_load).unsqueeze(-1) * samples.load_regressor
         loaded = samples.regressor + torch.einsum("mj,tmk->tjk", self.model.motors, at_drives)
-        return ((loaded @ change) * self._per_gain(weights)[:, None]).detach()
+        result: torch.Tensor = ((loaded @ change) * self._per_gain(weights)[:, None]).detach()
+        return result
 
 
 def _colours(coupled: torch.Tensor) -> list[int]:

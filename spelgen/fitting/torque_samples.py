@@ -90,7 +90,8 @@ class TorqueSamples:
             total += tau.sum(dim=0)
         for _, _, _, tau, _ in self.blocks(size):
             squares += ((tau - total / self.count) @ gains.mT).square().sum(dim=0)
-        return (squares / (self.count - 1)).sqrt()
+        result: torch.Tensor = (squares / (self.count - 1)).sqrt()
+        return result
 
 
 def _columns(samples: DynamicsSamples, decimation: int) -> list[np.ndarray]:

@@ -174,7 +174,8 @@ def _solved(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     width = left.shape[1]
     # the triangular factor holds all there is to know, and is small
     factor = np.asarray(np.linalg.qr(np.concatenate([left, right], axis=1), mode="r"))
-    return np.linalg.lstsq(factor[:, :width], factor[:, width:], rcond=None)[0]
+    result: np.ndarray = np.linalg.lstsq(factor[:, :width], factor[:, width:], rcond=None)[0]
+    return result
 
 
 def _weights(spans: Spans, exact: np.ndarray, values: np.ndarray) -> Weights:

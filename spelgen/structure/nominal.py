@@ -142,7 +142,8 @@ def _gravity_torque(arm: Arm, q: np.ndarray, inertias: list[list[float]]) -> np.
     _, forward = _energies_of_each(arm, q + shifts, inertias)
     _, backward = _energies_of_each(arm, q - shifts, inertias)
     slopes = (forward - backward) / (2 * step)
-    return np.sqrt((slopes**2).mean(axis=1))
+    result: np.ndarray = np.sqrt((slopes**2).mean(axis=1))
+    return result
 
 
 def _mass_changes(arm: Arm, q: np.ndarray, inertias: list[list[float]], typical: np.ndarray) -> np.ndarray:
@@ -152,7 +153,8 @@ def _mass_changes(arm: Arm, q: np.ndarray, inertias: list[list[float]], typical:
     for index in range(q.shape[1]):
         moved[index, :, index] = np.roll(q[:, index], 1)  # to where it stands in another sample
     mass, _ = _energies_of_each(arm, moved, inertias)
-    return np.sqrt((((mass - base) / typical) ** 2).mean(axis=(1, 2)))
+    result: np.ndarray = np.sqrt((((mass - base) / typical) ** 2).mean(axis=(1, 2)))
+    return result
 
 
 def _energies_of_each(arm: Arm, q: np.ndarray, inertias: list[list[float]]) -> tuple[np.ndarray, np.ndarray]:

@@ -42,7 +42,8 @@ def parameters_of(pseudo: np.ndarray) -> np.ndarray:
 
 def _trace(matrices: np.ndarray) -> np.ndarray:
     """Return traces (..., 1, 1) of (..., 3, 3)."""
-    return np.trace(matrices, axis1=-2, axis2=-1)[..., None, None]
+    result: np.ndarray = np.trace(matrices, axis1=-2, axis2=-1)[..., None, None]
+    return result
 
 
 def reference_factor(parameters: np.ndarray) -> tuple[np.ndarray, bool]:

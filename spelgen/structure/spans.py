@@ -67,7 +67,8 @@ class Spans:
     @property
     def float_mass(self) -> np.ndarray:
         """Rows that span W in double precision."""
-        return self.floats.mass[0]
+        result: np.ndarray = self.floats.mass[0]
+        return result
 
     def float_changes(self, joints: frozenset[int]) -> np.ndarray:
         """Rows that span the changes made by ``joints``, in double precision."""

@@ -26,7 +26,8 @@ def covariance(windows: NormalEquations, precision: torch.Tensor, halved: torch.
     shifts = shifts - shifts.mean(dim=0)
     inverse = torch.linalg.inv(total)
     jackknife = (count - 1) / count * shifts.mT @ shifts
-    return jackknife + inverse @ prior @ inverse + torch.outer(halved, halved)
+    result: torch.Tensor = jackknife + inverse @ prior @ inverse + torch.outer(halved, halved)
+    return result
 
 
 def identifiable(windows: NormalEquations, precision: torch.Tensor, unknowns: torch.Tensor) -> torch.Tensor:

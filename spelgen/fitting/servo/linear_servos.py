@@ -93,7 +93,8 @@ def fit_linear_servos(windows: ServoWindows) -> LinearServos:
         def residuals(x: np.ndarray, joint: int = joint) -> np.ndarray:
             u = commands(x[2])[..., joint] + x[3]
             predicted = _rollout(q[:, 0, joint], qd[:, 0, joint], u, dt, *np.exp(x[:2]))
-            return (predicted - measured[..., joint])[:, windows.settling :].ravel()
+            result: np.ndarray = (predicted - measured[..., joint])[:, windows.settling :].ravel()
+            return result
 
         fits.append(least_squares(residuals, START, bounds=BOUNDS, x_scale="jac", max_nfev=30).x)
     columns = np.array(fits).T

@@ -136,7 +136,8 @@ def body_directions(model: EmittedModel, q: torch.Tensor) -> torch.Tensor:
         gravity = model.regressor(q, zero, zero) @ inertial_slopes(model)
     _, sizes, directions = torch.linalg.svd(gravity.flatten(0, 1), full_matrices=False)
     strong = sizes[: TUNING.body_directions] > 1e-3 * sizes[:1].clamp(min=1e-12)
-    return TUNING.bodies * directions[: len(strong)][strong].mT
+    result: torch.Tensor = TUNING.bodies * directions[: len(strong)][strong].mT
+    return result
 
 
 def inertial_slopes(model: EmittedModel) -> torch.Tensor:
