@@ -50,7 +50,8 @@ def bristle_step(bristles: Bristles, z: ca.SX, dq: ca.SX) -> ca.SX:
     moved = _by_element(bristles, dq)
     reach = bristles.reach.ravel()
     end = ca.sign(moved) * reach
-    return end + (z - end) * ca.exp(-ca.fabs(moved) / reach)
+    z_next: ca.SX = end + (z - end) * ca.exp(-ca.fabs(moved) / reach)
+    return z_next
 
 
 def _by_element(bristles: Bristles, values: ca.SX) -> ca.SX:

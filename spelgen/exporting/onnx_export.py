@@ -6,6 +6,7 @@ import logging
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from typing import cast
 
 import numpy as np
 import onnx
@@ -69,7 +70,7 @@ def _solve(matrix: Tensor, right: Tensor, *, left: bool = True) -> Tensor:
     n = matrix.shape[-1]  # a constant of the program, so that the loop is written out
     identity = torch.eye(n, dtype=matrix.dtype)
     # a matrix of inputs has no batch, nor has a right side that is the identity
-    batch = torch.broadcast_shapes(matrix.shape[:-2], right.shape[:-2])
+    batch = torch.broadcast_shapes(matrix.shape[:-2], right.shape[:-2])  # type: ignore[no-untyped-call]
     matrix = matrix.expand(*batch, n, n)
     right = right.expand(*batch, *right.shape[-2:])
     rows = torch.cat([matrix, right], dim=-1)
@@ -125,8 +126,8 @@ def _scalar_tensor(
 ) -> onnxscript.ir.Value:
     """Return a constant: torch's own translation rounds it to float32 first, an error of 1e-8 in networks."""
     value = np.array(s, dtype=onnx.helper.tensor_dtype_to_np_dtype(dtype))
-    constant: onnxscript.ir.Value = onnxscript.opset18.Constant(value=onnx.numpy_helper.from_array(value))
-    return constant
+    constant = onnxscript.opset18.Constant(value=onnx.numpy_helper.from_array(value))
+    return cast("onnxscript.ir.Value", constant)
 
 
 # ONNX has no operators for these

@@ -170,12 +170,14 @@ class _Reference:
     def friction_step(self, z: Tensor | None, dq: Tensor) -> Tensor:
         if z is None:
             return dq[:, :0]
-        return self._model.memory_after(z, dq).flatten(-2)
+        moved: Tensor = self._model.memory_after(z, dq)
+        return moved.flatten(-2)
 
     def friction_memory(self, qd: Tensor) -> Tensor:
         if not has_friction_state(self._model):
             return qd[:, :0]
-        return self._model.memory(qd).flatten(-2)
+        z: Tensor = self._model.memory(qd)
+        return z.flatten(-2)
 
     def momentum(self, q: Tensor, qd: Tensor) -> Tensor:
         return self._model.momentum(q, qd)
@@ -191,7 +193,8 @@ class _Reference:
         return self._tip.jacobian(q)
 
     def servo_torque(self, u: Tensor, q: Tensor, qd: Tensor) -> Tensor:
-        return self._model.servo(u, q, qd)
+        torque: Tensor = self._model.servo(u, q, qd)
+        return torque
 
     def inverse_dynamics_derivatives(
         self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None

@@ -126,7 +126,8 @@ def _nearest_bodies(model: EmittedModel, arm: LoadedArm, q: Tensor) -> EmittedMo
         # zero weights are the URDF's bodies
         weights = torch.cat([parameter.flatten() for parameter in bodies.parameters()])
         ridge = 0.5 * TUNING.ridge * weights.square().sum()
-        return mean_mass_error + mean_gravity_error + ridge
+        distance: Tensor = mean_mass_error + mean_gravity_error + ridge
+        return distance
 
     minimise(bodies, distance, TUNING.steps)
     return bodies.requires_grad_(False)

@@ -41,7 +41,7 @@ def export_program(
 
     z, the memory of friction, is (batch, n, K), or (batch, n K) where ``flat_memory``; the other inputs are (batch, n).
     """
-    shapes = dict.fromkeys(program_inputs(model, name), (model.n,))
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(program_inputs(model, name), (model.n,))
     if "z" in shapes:
         shapes["z"] = (model.n * model.elements,) if flat_memory else (model.n, model.elements)
     # a batch of two: torch.export would take one for a constant
