@@ -128,7 +128,7 @@ def _undriven(robot: Robot, settings: Settings, driven: Sequence[str]) -> Iterat
 def _geared(robot: Robot, settings: Settings, name: str, index: int) -> InputEntry:
     """Return the gear between a motor and its joint: the sidecar's, else the URDF's, else a gain to be trained."""
     joint = settings.joint(name)
-    gear = joint.gear
+    gear: float | None = joint.gear
     if "gear" not in joint.model_fields_set:
         gear = _reduction(robot, name)
     if gear is None:

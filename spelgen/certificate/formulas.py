@@ -224,7 +224,7 @@ class _Writer:
             return Formula(place, terms, None)
         functions = []
         for base, polynomial in zip(self.base, polynomials, strict=True):
-            if polynomial != 0:
+            if polynomial:
                 functions.append((parameter(base.name), self._shortener.shortest(polynomial)))
         return Formula(place, terms, grouped(functions))
 

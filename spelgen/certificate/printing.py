@@ -77,11 +77,11 @@ class _AsBuilt(Printer):  # type: ignore[misc]  # SymPy has no types
     _print_Integer = _print_Rational
 
 
-class Text(_AsBuilt, StrPrinter):
+class Text(_AsBuilt, StrPrinter):  # type: ignore[misc]
     """Print as one types: numbers as short decimals, else with twelve digits."""
 
 
-class Latex(_AsBuilt, LatexPrinter):
+class Latex(_AsBuilt, LatexPrinter):  # type: ignore[misc]
     r"""Print a formula of LaTeX's, with brackets that unlike \left( may stand on different lines."""
 
     times = rf"{_FIXED}\,{_FIXED}"
@@ -108,7 +108,7 @@ class Latex(_AsBuilt, LatexPrinter):
     _print_Integer = _print_Rational
 
 
-class Python(_AsBuilt, StrPrinter):
+class Python(_AsBuilt, StrPrinter):  # type: ignore[misc]
     """Print Python that SymPy evaluates exactly: fractions as they are, unless they have more digits than a double."""
 
     def _print_Add(self, expression: Add, order: str | None = None) -> str:

@@ -132,7 +132,7 @@ def _load(robot: Robot, arm: Arm, model: URDF, joint: Joint, origin: np.ndarray)
             tensor = inertial.inertia
         frame = frame.copy()
         frame[:3, 3] -= origin
-        central = pseudo_inertia([inertial.mass, 0.0, 0.0, 0.0, *tensor[np.triu_indices(3)]])
+        central = pseudo_inertia(np.array([inertial.mass, 0.0, 0.0, 0.0, *tensor[np.triu_indices(3)]]))
         pseudo += frame @ central @ frame.T
         mass += abs(inertial.mass)
         second_moment += float(np.linalg.norm(tensor))
@@ -212,7 +212,7 @@ def _check_loads(robot: Robot, arm: Arm, reading: _Reading, rounded: Roundings) 
         load = reading.loads[index]
         turn = np.eye(4)
         turn[:3, :3] = poses[index][:3, :3]
-        ours = turn @ pseudo_inertia(body.inertia or (0,) * 10) @ turn.T
+        ours = turn @ pseudo_inertia(np.array(body.inertia or np.zeros(10), dtype=float)) @ turn.T
         # a metre of lever counts as much as the body's reach: one measure for mass, moment and tensor
         scale = np.array([load.reach, load.reach, load.reach, 1.0])
         error = float(np.abs((ours - load.pseudo) / np.outer(scale, scale)).max()) / load.mass

@@ -19,7 +19,7 @@ from spelgen.certificate.verification import Check, Verification, size_text
 from spelgen.errors import SpelgenError
 from spelgen.labels import entry_name, joints_in_ranges
 from spelgen.settings.tuning.structure import CertificateTuning
-from spelgen.structure.basis import Output
+from spelgen.structure.basis import Constant, Output
 from spelgen.structure.structure import Structure
 from spelgen.urdf.robot import Robot
 
@@ -164,7 +164,8 @@ def _smallest_form(case: _Case) -> Iterator[Check]:
     rebuilt = np.zeros_like(samples.mass)
     largest = 0.0
     against = _Contradictions()
-    for term in (*structure.outputs, *structure.constants):
+    terms: list[Output | Constant] = [*structure.outputs, *structure.constants]
+    for term in terms:
         reads = samples.row(term.reads)
         values = samples.mass @ (reads * samples.scale)
         rebuilt += values[..., None] * samples.row(term.basis) / samples.scale

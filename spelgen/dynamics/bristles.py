@@ -61,7 +61,8 @@ def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
         added[shift:] += decay[shift:] * added[:-shift]
         decay[shift:] *= decay[:-shift].copy()
         shift *= 2
-    return added
+    bends: np.ndarray = added
+    return bends
 
 
 def encoded(q: np.ndarray) -> np.ndarray:

@@ -70,7 +70,7 @@ def _solve(matrix: Tensor, right: Tensor, *, left: bool = True) -> Tensor:
     n = matrix.shape[-1]  # a constant of the program, so that the loop is written out
     identity = torch.eye(n, dtype=matrix.dtype)
     # a matrix of inputs has no batch, nor has a right side that is the identity
-    batch = torch.broadcast_shapes(matrix.shape[:-2], right.shape[:-2])  # type: ignore[no-untyped-call]
+    batch = torch.broadcast_shapes(matrix.shape[:-2], right.shape[:-2])
     matrix = matrix.expand(*batch, n, n)
     right = right.expand(*batch, *right.shape[-2:])
     rows = torch.cat([matrix, right], dim=-1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -68,7 +69,9 @@ class _Interval(torch.nn.Module):
         z: torch.Tensor,
     ) -> None:
         super().__init__()
-        self.past = lambda moved: known_past(model, memory_after(model, z, moved))
+        self.past: Callable[[torch.Tensor], tuple[torch.Tensor, ...]] = lambda moved: known_past(
+            model, memory_after(model, z, moved)
+        )
         # functions, not parts of this module: the weights are the model's own
         self.rhs, self.prepare, self.prepared = model.port_hamiltonian_rhs, model.prepare, prepared
         self.step, self.tau, self.start = step, tau, start

@@ -88,10 +88,13 @@ class Objective(Protocol):
     """
 
     name: ClassVar[str]
-    history: list[Content]  # lines of metrics.jsonl
 
     def __init__(self, request: FitRequest) -> None:
         """Raise OptionError for a config or a model that this objective is not for."""
+
+    @property
+    def history(self) -> list[Content]:
+        """Return the lines of metrics.jsonl."""
 
     def prepare(self) -> PreparedLogs:
         """Check the logs and read what is fitted. Raises LogError and RunError."""

@@ -18,8 +18,10 @@ if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
 OBJECTIVES: dict[str, type[Objective]] = {
-    objective.name: objective
-    for objective in (TorqueObjective, MomentumObjective, RolloutObjective, ServoObjective)
+    TorqueObjective.name: TorqueObjective,
+    MomentumObjective.name: MomentumObjective,
+    RolloutObjective.name: RolloutObjective,
+    ServoObjective.name: ServoObjective,
 }
 
 

@@ -158,7 +158,7 @@ class _Sums(NamedTuple):
     gram: torch.Tensor
     moment: torch.Tensor
     square: float
-    count: int
+    samples: int
 
     @classmethod
     def of(cls, x: torch.Tensor, y: torch.Tensor) -> _Sums:
@@ -167,7 +167,7 @@ class _Sums(NamedTuple):
     def without(self, other: _Sums) -> _Sums:
         """Return the sums over all samples but those of another."""
         gram, moment = self.gram - other.gram, self.moment - other.moment
-        return _Sums(gram, moment, self.square - other.square, self.count - other.count)
+        return _Sums(gram, moment, self.square - other.square, self.samples - other.samples)
 
 
 def _held_out_gain(candidate: _Candidate, target: torch.Tensor, correlation: float) -> float | None:

@@ -117,4 +117,4 @@ def require_same(started: Content, now: Content, folder: Path) -> None:
 
 def _settings(record: Content) -> dict[str, object]:
     settings = {name: record.get(name) for name in ("objective", "validation_fraction", "seed")}
-    return record["config"] | record["preprocessing"] | settings
+    return {**record["config"], **record["preprocessing"], **settings}

@@ -12,7 +12,8 @@ from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.dataset import TrainingData
 from spelgen.fitting.objective import FitRequest, PreparedLogs, Status
 from spelgen.fitting.run_record import Content
-from spelgen.fitting.torque_fit import TUNING, fit_torque
+from spelgen.fitting.torque_fit import fit_torque
+from spelgen.fitting.torque_jacobian import TUNING
 from spelgen.fitting.torque_logs import prepare_windows, prepared_logs, regularizer_of, require_torque_input
 from spelgen.fitting.torque_networks import adapt_networks, fit_networks
 from spelgen.fitting.torque_report import torque_notes
@@ -53,7 +54,8 @@ class TorqueObjective:
 
     def begin(self) -> list[Diagnostic]:
         """Fit the model. Raises LogError where no log is sampled densely enough for accelerations."""
-        model, notes = self.request.model, []
+        model = self.request.model
+        notes: list[Diagnostic] = []
         samples = torque_samples(model, self.data)
         if samples is None:
             what = "to adapt to" if self.config.adapt else "to fit torques to"

@@ -59,7 +59,8 @@ def train(
     Raises ModuleError, LogError, and RunError when the folder holds a run or cannot be resumed with this.
     """
     run, module = RunFolder(Path(folder)), Path(module)
-    robot, notes = None, []
+    robot = None
+    notes: list[Diagnostic] = []
     if options.resume:
         record = run.read_config()  # a missing run is told before anything is read
         config = config or recorded_config(record)

@@ -56,7 +56,8 @@ class MomentumObjective:
 
     def begin(self) -> list[Diagnostic]:
         """Measure the model as it is."""
-        request, notes = self.request, []
+        request = self.request
+        notes: list[Diagnostic] = []
         regularizer = regularizer_of(request, self.data, self.config.urdf_weight, notes)
         self.problem = WindowProblem(request.model, self.data, self.config, request.device, regularizer)
         self.validation = Validation(request.model, self.data, request.device, batch=self.problem.batch)
@@ -145,7 +146,8 @@ class RolloutObjective:
 
     def _start(self, *, torque_first: bool) -> list[Diagnostic]:
         """Make the loop; return what there is to tell."""
-        request, config, notes = self.request, self.config, []
+        request, config = self.request, self.config
+        notes: list[Diagnostic] = []
         model = request.model
         stepped = self._compiled(notes)
         # towards the URDF as the model has it before any fit, in a resumed run too

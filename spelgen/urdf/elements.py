@@ -43,7 +43,7 @@ def read_name(notes: Notes, element: etree._Element) -> str | None:
     if "${" in name or "$(" in name:
         note_unexpanded(notes, element, f"<{element.tag}> name", name)
         return None
-    return name
+    return str(name)
 
 
 def read_link(notes: Notes, element: etree._Element) -> Link | None:
@@ -128,7 +128,7 @@ def _read_end(notes: Notes, element: etree._Element, tag: str, where: str) -> st
         got = f"{len(ends)} <{tag}> elements" if len(ends) != 1 else f"a <{tag}> without a link"
         notes.error(element.sourceline, where, got, f'one <{tag} link="..."/>')
         return None
-    return link
+    return str(link)
 
 
 def _read_origin(notes: Notes, element: etree._Element, where: str) -> tuple[Vector, Vector]:

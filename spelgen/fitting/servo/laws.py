@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 
@@ -124,7 +125,7 @@ def divided(problem: ServoProblem, x: ServoParameters, fraction: float) -> Servo
     return replace(x, joints=joints, active=active)
 
 
-def sliding_friction(friction: torch.nn.Module, qd: torch.Tensor, gravity: torch.Tensor) -> torch.Tensor:
+def sliding_friction(friction: Any, qd: torch.Tensor, gravity: torch.Tensor) -> torch.Tensor:
     """Return dry friction of each joint, (n,) [Nm, N], over what it slid; qd and gravity's torque: (..., n)."""
     slid = qd.abs() + 1e-9  # so that joints which never move have friction
     dry = friction.dry(qd, gravity, friction.prepare()) * slid

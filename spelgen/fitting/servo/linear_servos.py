@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 from scipy.linalg import expm
@@ -53,10 +54,13 @@ class LinearServos:
         return asdict(self)
 
     @classmethod
-    def from_dict(cls, record: Mapping[str, list[float] | float]) -> LinearServos:
+    def from_dict(cls, record: Mapping[str, Any]) -> LinearServos:
         """Read what `to_dict` gave."""
-        names = ("frequency", "damping", "delay", "offset")
-        return cls(*(tuple(np.atleast_1d(record[name]).tolist()) for name in names), float(record["late"]))
+        frequency, damping, delay, offset = (
+            tuple(np.atleast_1d(record[name]).tolist())
+            for name in ("frequency", "damping", "delay", "offset")
+        )
+        return cls(frequency, damping, delay, offset, float(record["late"]))
 
     def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
         """Return positions (K, n) after each interval of each part of a log, from q and qd (parts, n)."""
@@ -99,7 +103,8 @@ def fit_linear_servos(windows: ServoWindows) -> LinearServos:
         fits.append(least_squares(residuals, START, bounds=BOUNDS, x_scale="jac", max_nfev=30).x)
     columns = np.array(fits).T
     columns[:2] = np.exp(columns[:2])
-    return LinearServos(*map(tuple, columns.tolist()), float(late))
+    frequency, damping, delay, offset = map(tuple, columns.tolist())
+    return LinearServos(frequency, damping, delay, offset, float(late))
 
 
 def _rollout(

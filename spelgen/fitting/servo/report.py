@@ -230,7 +230,8 @@ def open_text(record: ServoRecord) -> str:
 
 def identifiability(joints: Sequence[JointRecord]) -> tuple[list[str], list[str]]:
     """Return the names of ratios that are determined, and of those that are not."""
-    determined, undetermined = [], []
+    determined: list[str] = []
+    undetermined: list[str] = []
     for joint in joints:
         for ratio in UNITS:
             names = determined if joint[ratio]["determined"] else undetermined

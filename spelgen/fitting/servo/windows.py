@@ -104,7 +104,8 @@ def servo_windows(
     qd = np.stack([smooth_velocities[id(log)][rows] for log, rows in parts])
     dt = np.stack([np.diff(log.t[rows]) for log, rows in parts])
     steps = max(steps_between(log) for log, _ in parts)
-    return ServoWindows(tuple(parts), *map(torch.from_numpy, (q, qd, dt)), settling, steps)
+    tensors = torch.from_numpy(q), torch.from_numpy(qd), torch.from_numpy(dt)
+    return ServoWindows(tuple(parts), *tensors, settling, steps)
 
 
 class BodyLoad(NamedTuple):
