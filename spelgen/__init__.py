@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from spelgen.settings.fits import GaussianPrior, MomentumFit, Rollout, TorqueFit
     from spelgen.simulation.simulate import simulate
 
-__version__ = "0.1.0"
+__version__ = "1.0.0rc1"
 
 _HOME = {
     "load_arm": "loaded_arm",
