@@ -1,15 +1,16 @@
 """Fit arms whose truth is known, and measure how far each method ends from it.
 
-    python benchmarks/truth.py [--arms 100] [--first 0] [--jobs 2] [--out truth.jsonl] [--arms-folder ../shared/arms]
+    python benchmarks/truth.py [--arms 100] [--first 0] [--jobs 2] [--out truth.jsonl] [--panda]
 
-Every case is drawn from its number alone: an arm (a real URDF or a random chain), what the given URDF errs by, friction of one
-of six kinds, armature, offsets, springs, a motion, a sample rate, noise and a delay of the torques. Fitted are the presets
-`hybrid` and `closed-form` and least squares without and with friction state, all to the same logs. Results are
-appended to a file of JSON lines as they come, so that a run goes on where it stopped. `--panda` adds the case of docs/truth.md.
+Every case is drawn from its number alone: an arm (a real URDF or a random chain), the error of the given URDF,
+friction of one of six kinds, armature, offsets, springs, a motion, a sample rate, noise and a delay of the
+torques. Fitted to the same logs are the presets `hybrid` and `closed-form` and least squares without and with
+friction state. Results are appended to a file of JSON lines as they come, so that a run goes on where it stopped.
+`--panda` adds a simulated Panda with 40 s of logs at 200 Hz and 3 % noise.
 
-M error: mean over positions of |M - M*| / |M*| (Frobenius norm), and the largest relative error of a diagonal entry; g error: root mean
-square relative to that of g*; friction error: likewise, along the test motion without offsets; torque nMSE on another noise-free motion,
-raw and after a low-pass of 8 Hz.
+M error: mean over positions of |M - M*| / |M*| (Frobenius norm), and the largest relative error of a diagonal
+entry; g error: root mean square relative to that of g*; friction error: likewise, along the test motion, without
+offsets; torque nMSE on another motion without noise, raw and after a low-pass of 8 Hz.
 """
 
 from __future__ import annotations
@@ -141,8 +142,10 @@ class Truth:
 
 
 def _maxwell_slip(q: np.ndarray, coulomb: np.ndarray) -> np.ndarray:
-    """Friction of six elements in parallel that stick up to their own reach and then slip (Al-Bender et al., IEEE TAC 50:1883,
-    2005): not the law of the fitted models, whose bristles slide gradually.
+    """Return friction of six elements in parallel that stick up to their own reach and then slip.
+
+    The generalised Maxwell-slip model (Al-Bender et al., IEEE TAC 50:1883, 2005), which is not the law of the
+    fitted models: their bristles slide gradually.
     """
     reaches = np.geomspace(2e-4, 3e-2, 6)
     z = np.zeros((len(reaches), q.shape[1]))
@@ -366,7 +369,9 @@ def usable_arms(folder: Path) -> list[str]:
 
 def summary(rows: Sequence[dict[str, Any]]) -> str:
     """Medians by method, and how often the default is near the better least squares."""
-    lines = [f"{'':20}{'M':>10}{'g':>10}{'friction':>10}{'nMSE':>12}{'filtered':>12}{'worst Mjj':>11}{'s':>7}"]
+    lines = [
+        f"{'':20}{'M':>10}{'g':>10}{'friction':>10}{'nMSE':>12}{'filtered':>12}{'worst Mjj':>11}{'s':>7}"
+    ]
     good = [row for row in rows if all("error" not in x for x in row["results"].values())]
     for name in METHODS:
         each = [row["results"][name] for row in good]
@@ -385,13 +390,16 @@ def summary(rows: Sequence[dict[str, Any]]) -> str:
         ratio = np.array([r["results"]["hybrid"][key] for r in good]) / better
         lines.append(
             f"{key}: hybrid by the better least squares: median {np.median(ratio):.2f}; "
-            f"at most 1.2 on {100 * (ratio <= 1.2).mean():.0f} %, at most 1 on {100 * (ratio <= 1).mean():.0f} % of {len(good)}"
+            f"at most 1.2 on {100 * (ratio <= 1.2).mean():.0f} %, "
+            f"at most 1 on {100 * (ratio <= 1).mean():.0f} % of {len(good)}"
         )
     failed = len(rows) - len(good)
     return "\n".join([*lines, f"{failed} cases with an error"])
 
 
-PANDA = Case(1_000_000, "panda_erd", 0.25, "coulomb", True, False, False, "excitation", 40.0, 200.0, 0.03, 0.0)
+PANDA = Case(
+    1_000_000, "panda_erd", 0.25, "coulomb", True, False, False, "excitation", 40.0, 200.0, 0.03, 0.0
+)
 
 
 def _work(task: tuple[Case, Path]) -> dict[str, Any]:
