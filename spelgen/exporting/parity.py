@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from spelgen.arm.arm import Coordinate
-from spelgen.dynamics.protocol import has_friction_state
+from spelgen.dynamics.protocol import has_friction_state, known_past
 from spelgen.dynamics.tip import TipKinematics, tip_kinematics
 from spelgen.errors import RunError
 from spelgen.exporting.entry_points import ENTRY_POINTS, SERVO_TORQUE
@@ -150,10 +150,10 @@ class _Reference:
         return tip_kinematics(self._trained.arm)
 
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None) -> Tensor:
-        return self._model.inverse_dynamics(q, qd, qdd, z)
+        return self._model.inverse_dynamics(q, qd, qdd, *known_past(self._model, z))
 
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
-        return self._model.forward_dynamics(q, qd, tau, z)
+        return self._model.forward_dynamics(q, qd, tau, *known_past(self._model, z))
 
     def mass_matrix(self, q: Tensor) -> Tensor:
         return self._model.mass_matrix(q)
@@ -165,7 +165,7 @@ class _Reference:
         return self._model.gravity(q)
 
     def friction(self, q: Tensor, qd: Tensor, z: Tensor | None) -> Tensor:
-        return self._model.friction_torque(q, qd, z)
+        return self._model.friction_torque(q, qd, *known_past(self._model, z))
 
     def friction_step(self, z: Tensor | None, dq: Tensor) -> Tensor:
         if z is None:
@@ -199,12 +199,19 @@ class _Reference:
     def inverse_dynamics_derivatives(
         self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None
     ) -> list[Tensor]:
-        return _derivatives(lambda q, qd: self._model.inverse_dynamics(q, qd, qdd, z), q, qd)
+        return _derivatives(
+            lambda q, qd: self._model.inverse_dynamics(q, qd, qdd, *known_past(self._model, z)), q, qd
+        )
 
     def forward_dynamics_derivatives(
         self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None
     ) -> list[Tensor]:
-        return _derivatives(lambda q, qd, tau: self._model.forward_dynamics(q, qd, tau, z), q, qd, tau)
+        return _derivatives(
+            lambda q, qd, tau: self._model.forward_dynamics(q, qd, tau, *known_past(self._model, z)),
+            q,
+            qd,
+            tau,
+        )
 
 
 def _derivatives(function: Callable[..., Tensor], *inputs: Tensor) -> list[Tensor]:
