@@ -109,7 +109,7 @@ def test_a_wrong_preset_is_told_with_its_place(tmp_path, monkeypatch, change, me
 def test_no_preset_at_all():
     with pytest.raises(SettingsError) as error:
         load_design("minmal")
-    expected = "hybrid, spel, spel-kan, phnode, closed-form, or a YAML file"
+    expected = "hybrid, closed-form, minimal, spel, spel-kan, phnode, or a YAML file"
     assert str(error.value) == f"got the preset 'minmal', expected one of {expected}"
     with pytest.raises(SettingsError, match="net: kan with encoding: none"):
         load_design("closed-form", "kan")
