@@ -3,6 +3,8 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from spelgen.version import __version__
+
 if TYPE_CHECKING:
     from spelgen.baselines.keep import keep_baseline
     from spelgen.building import build
@@ -30,7 +32,6 @@ if TYPE_CHECKING:
     from spelgen.settings.fits import GaussianPrior, MomentumFit, Rollout, TorqueFit
     from spelgen.simulation.simulate import simulate
 
-__version__ = "1.0.0rc1"
 
 _HOME = {
     "load_arm": "loaded_arm",

@@ -1,14 +1,22 @@
-"""Read regular files alone, and write files so that each is either complete or not there."""
+"""Read regular files alone, write files so that each is either complete or not there, and copy what lies at addresses.
+
+Addresses are those that fsspec knows, such as `s3://bucket/logs`. All else in spelgen works on local paths: a copy lies
+in a temporary folder for as long as the process lives, and what is written to it is sent to the address.
+"""
 
 from __future__ import annotations
 
+import atexit
 import json
 import os
+import re
+import shutil
+import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Protocol
 
-from spelgen.addresses import sent
 from spelgen.errors import SpelgenError
 
 
@@ -72,3 +80,117 @@ def write_text(path: Path | str, text: str) -> Path:
 def write_json(path: Path | str, content: Mapping[str, object]) -> Path:
     """Write indented JSON, all or nothing; return the path."""
     return write_text(path, json.dumps(content, indent=2) + "\n")
+
+
+# `Path` makes one slash of two; a Windows drive is one letter
+ADDRESS = re.compile(r"^([a-z][a-z0-9+.-]+):/+(?=[^/])")
+
+_copies: dict[str, Path] = {}  # address -> its local copy
+
+
+class FileSystem(Protocol):
+    """What is used of a file system of fsspec, which has no types."""
+
+    def isdir(self, path: str) -> bool: ...
+    def exists(self, path: str) -> bool: ...
+    def find(self, path: str) -> list[str]: ...
+    def get_file(self, remote: str, local: str) -> None: ...
+    def put_file(self, local: str, remote: str) -> None: ...
+    def rm_file(self, path: str) -> None: ...
+    def makedirs(self, path: str, exist_ok: bool) -> None: ...
+
+
+def local(path: Path | str) -> Path:
+    """Return a local path as it is, and of an address the copy of the file or folder there.
+
+    What is written to the copy, and into it, is sent to the address (see `sent`). Raises SpelgenError where the
+    address cannot be reached, or names files outside itself.
+    """
+    match = ADDRESS.match(str(path))
+    if match is None or Path(path).exists():
+        return Path(path)
+    if match[1] == "file":  # whose slashes `Path` has taken, too
+        return Path("/" + str(path)[match.end() :])
+    address = f"{match[1]}://{str(path)[match.end() :]}".rstrip("/")
+    if address not in _copies:
+        _copies[address] = _fetch(address)
+    return _copies[address]
+
+
+def sent(path: Path) -> None:
+    """Send a file that was written to its address, or remove it there if it was removed here."""
+    target = address_of(path)
+    if target is None:
+        return
+    with reached(target) as (system, remote):
+        if path.exists():
+            system.makedirs(remote.rpartition("/")[0], exist_ok=True)
+            system.put_file(str(path), remote)
+        elif system.exists(remote):
+            system.rm_file(remote)
+
+
+def address_of(path: Path) -> str | None:
+    """Return the address that a path is copied from; None of a local path."""
+    for address, copy in _copies.items():
+        if path == copy:
+            return address
+        if copy in path.parents:
+            return f"{address}/{path.relative_to(copy).as_posix()}"
+    return None
+
+
+def with_addresses(text: str) -> str:
+    """Return a text with addresses in place of their local copies."""
+    for address, copy in _copies.items():
+        text = text.replace(str(copy), address)
+    return text
+
+
+@contextmanager
+def reached(address: str) -> Iterator[tuple[FileSystem, str]]:
+    """Yield the file system of an address, and the path there.
+
+    Within it every exception becomes a SpelgenError that names the address: each file system raises kinds of its own.
+    """
+    try:
+        import fsspec
+
+        yield fsspec.core.url_to_fs(address)
+    except SpelgenError:
+        raise
+    except ImportError as error:
+        raise SpelgenError(
+            f"an address that needs a package ({error})", file=address, do="install it"
+        ) from error
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise SpelgenError(f"cannot be reached ({reason})", file=address) from error
+
+
+def _fetch(address: str) -> Path:
+    """Copy the file or folder at an address into a new temporary folder; return where it then lies."""
+    folder = Path(tempfile.mkdtemp(prefix="spelgen-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    copy = _inside(folder, address.rpartition("/")[2], address)
+    with reached(address) as (system, remote):
+        if system.isdir(remote):
+            copy.mkdir()
+            for key in system.find(remote):
+                target = _inside(copy, key.removeprefix(remote.rstrip("/")).lstrip("/"), address)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                system.get_file(key, str(target))
+        elif system.exists(remote):
+            system.get_file(remote, str(copy))
+    return copy
+
+
+def _inside(folder: Path, name: str, address: str) -> Path:
+    """Return where a name lies in a folder. Raises SpelgenError where it leads out of it.
+
+    Archives and object stores take any text for a key, `../../.bashrc` too.
+    """
+    path = folder / name
+    if folder.resolve() not in path.resolve().parents:
+        raise SpelgenError(f"the key {name!r}", file=address, expected="keys inside the address alone")
+    return path

@@ -8,9 +8,9 @@ import fsspec
 import pytest
 from typer.testing import CliRunner
 
-from spelgen.addresses import local
 from spelgen.cli.main import app
 from spelgen.errors import LogError, SpelgenError
+from spelgen.files import local
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.loaded_arm import load_arm
 from spelgen.logs.read import read_logs, write_logs

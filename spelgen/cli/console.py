@@ -14,10 +14,9 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from spelgen.addresses import local, with_addresses
 from spelgen.cli.command import name_values
 from spelgen.errors import Diagnostic, SpelgenError
-from spelgen.files import write_text
+from spelgen.files import local, with_addresses, write_text
 from spelgen.labels import printable
 
 FAILED = 1

@@ -11,7 +11,6 @@ from typing import Annotated
 
 import typer
 
-from spelgen import __version__
 from spelgen.cli import (
     compare_command,
     evaluate_command,
@@ -26,6 +25,7 @@ from spelgen.cli import (
 )
 from spelgen.cli.command import Command, Group
 from spelgen.cli.console import handle_errors, say
+from spelgen.version import __version__
 
 CONTEXT = {"max_content_width": 80, "help_option_names": ["-h", "--help"]}
 

@@ -79,9 +79,9 @@ def build(
 
 def check(module: Module, robot: RobotOption = None) -> None:
     """Tell whether a module is what its URDF gives today."""
-    from spelgen import pipeline
+    from spelgen.pipeline import check as check_module
 
-    result = pipeline.check(module, robot)
+    result = check_module(module, robot)
     for reason in result.reasons:
         note(f"{module}: {reason}")
     if not result.fresh:

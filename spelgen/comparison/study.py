@@ -16,7 +16,6 @@ from typing import cast
 
 import yaml
 
-from spelgen import pipeline
 from spelgen.comparison.known_urdf import with_wrong_inertials, without_inertials
 from spelgen.comparison.results import RunResult
 from spelgen.design import Design, Net, Preset, load_design
@@ -27,6 +26,7 @@ from spelgen.loaded_arm import LoadedArm, load_arm
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import write_logs
 from spelgen.logs.trajectory import Trajectory
+from spelgen.pipeline import generate
 from spelgen.settings.comparison import ComparisonSettings
 from spelgen.settings.fits import Rollout, fit_config
 from spelgen.settings.settings import Settings
@@ -193,7 +193,7 @@ def _write_modules(study: Study, loaded: LoadedArm) -> None:
     write_text(study.urdf.with_suffix(".yaml"), gravity)
     width, depth = study.settings.width, study.settings.depth
     for variant in study.variants:
-        source = pipeline.generate(study.urdf, variant.preset, net=variant.net, width=width, depth=depth)
+        source = generate(study.urdf, variant.preset, net=variant.net, width=width, depth=depth)
         write_text(study.module(variant), source)
 
 

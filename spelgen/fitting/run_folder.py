@@ -12,10 +12,9 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from spelgen.addresses import local, sent
 from spelgen.emission.loading import has_run, load_module
 from spelgen.errors import RunError
-from spelgen.files import naming, remove, require_regular_file, write_bytes
+from spelgen.files import local, naming, remove, require_regular_file, sent, write_bytes
 from spelgen.fitting.run_record import Checkpoint, Content, Epoch, require, require_record
 from spelgen.spec import read_source
 from spelgen.urdf.document import urdf_bytes

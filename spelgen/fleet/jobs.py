@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from spelgen import __version__, pipeline
 from spelgen.baselines.keep import keep_baseline
 from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.evaluation.evaluate import evaluate
@@ -25,11 +24,13 @@ from spelgen.fitting.train import train
 from spelgen.fleet.schema import SIZES
 from spelgen.loaded_arm import load_arm
 from spelgen.logs.preprocessing import Preprocessing
+from spelgen.pipeline import generate
 from spelgen.settings.fits import FitConfig, GaussianPrior, fit_config
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.settings import load_settings
 from spelgen.settings.training import TrainingSettings
 from spelgen.settings.values import Group
+from spelgen.version import __version__
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
@@ -162,7 +163,7 @@ def _remove_foreign_run(job: Job, run: RunFolder) -> None:
 def _module(job: Job) -> Path:
     """Write the module of the job's arm and preset; return its path."""
     arm = load_arm(job.urdf, job.joints, job.tip)
-    source = pipeline.generate(arm, job.design, width=job.width, depth=job.depth)
+    source = generate(arm, job.design, width=job.width, depth=job.depth)
     return write_text(job.folder / "built.py", source)
 
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from spelgen.addresses import local
 from spelgen.errors import LogError, SpelgenError
-from spelgen.files import require_regular_file
+from spelgen.files import local, require_regular_file
 from spelgen.logs.formats import describe_formats, format_of
 
 

@@ -9,8 +9,8 @@ from functools import cache
 
 from markupsafe import Markup
 
-from spelgen import __version__
 from spelgen.templates import read, render
+from spelgen.version import __version__
 
 SCRIPTS = ("page.js", "arm.js")
 
