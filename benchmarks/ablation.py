@@ -30,10 +30,11 @@ import truth
 from real_logs import first, mean, samples_of, torque_of
 
 import spelgen
-from spelgen.fitting import levenberg_marquardt, residual_fit, torque_fit, torque_jacobian
+from spelgen.fitting import levenberg_marquardt, residual_fit, torque_fit, torque_jacobian, torque_objective
 from spelgen.fitting.torque_fit import fit_torque
 
 NEVER = float("inf")
+READERS = (torque_fit, torque_jacobian, torque_objective, residual_fit, levenberg_marquardt)
 SIMULATED = (
     truth.PANDA,
     replace(truth.PANDA, number=1_000_001, friction="bristles", seconds=20.0),
@@ -51,15 +52,13 @@ class Mechanism:
     switches: tuple[tuple[Any, str, Any], ...]
 
 
-def tuned(module: Any, **changes: Any) -> tuple[Any, str, Any]:
-    """A switch that changes fields of a module's table of tuned numbers."""
-    return (module, "TUNING", replace(module.TUNING, **changes))
-
-
-def torque_tuned(**changes: Any) -> tuple[tuple[Any, str, Any], ...]:
-    """The same of the torque fits', which two modules read."""
-    table = replace(torque_jacobian.TUNING, **changes)
-    return ((torque_jacobian, "TUNING", table), (torque_fit, "TUNING", table))
+def tuned(module: Any, **changes: Any) -> tuple[tuple[Any, str, Any], ...]:
+    """Switches that change fields of a module's table of tuned numbers, wherever that table is read."""
+    table, changed = module.TUNING, replace(module.TUNING, **changes)
+    readers = [x for name, x in sys.modules.items() if name.startswith("spelgen.")]
+    return tuple(
+        (reader, name, changed) for reader in readers for name, x in vars(reader).items() if x is table
+    )
 
 
 def keep_prior(prior: Any, *_: Any) -> Any:
@@ -70,19 +69,19 @@ def keep_prior(prior: Any, *_: Any) -> Any:
 def mechanisms() -> list[Mechanism]:
     """All that are switched off."""
     return [
-        Mechanism("correlated errors (20 samples)", torque_tuned(correlation_length=1.0)),
-        Mechanism("a second way with little noise", torque_tuned(first_noise=1e6)),
-        Mechanism("more rounds while noise falls", torque_tuned(longer=1)),
+        Mechanism("correlated errors (20 samples)", tuned(torque_jacobian, correlation_length=1.0)),
+        Mechanism("a second way with little noise", tuned(torque_jacobian, first_noise=1e6)),
+        Mechanism("more rounds while noise falls", tuned(torque_jacobian, longer=1)),
         Mechanism("priors that yield", ((torque_fit, "most_probable", keep_prior),)),
-        Mechanism("friction compensated unseen", torque_tuned(compensation_explained=NEVER)),
-        Mechanism("every second sample alone", torque_tuned(decimation=1)),
-        Mechanism("a subset of large logs first", torque_tuned(large=2**40)),
-        Mechanism("steps in the bodies' parameters", (tuned(levenberg_marquardt, kept_promise=-NEVER),)),
-        Mechanism("turns of bodies and residuals", torque_tuned(turns=1)),
-        Mechanism("residuals beside rigid bodies", (tuned(residual_fit, standard_errors=NEVER),)),
-        Mechanism("significance of residuals", (tuned(residual_fit, standard_errors=0.0),)),
-        Mechanism("least gain of residuals", (tuned(residual_fit, least_gain=0.0),)),
-        Mechanism("networks among residuals", ((residual_fit, "_networks", lambda *_: iter(())),)),
+        Mechanism("friction compensated unseen", tuned(torque_jacobian, compensation_explained=NEVER)),
+        Mechanism("every second sample alone", tuned(torque_jacobian, decimation=1)),
+        Mechanism("a subset of large logs first", tuned(torque_jacobian, large=2**40)),
+        Mechanism("steps in the bodies' parameters", tuned(levenberg_marquardt, kept_promise=-NEVER)),
+        Mechanism("turns of bodies and residuals", tuned(torque_jacobian, turns=1)),
+        Mechanism("residuals beside rigid bodies", tuned(residual_fit, standard_errors=NEVER)),
+        Mechanism("significance of residuals", tuned(residual_fit, standard_errors=0.0)),
+        Mechanism("least gain of residuals", tuned(residual_fit, least_gain=0.0)),
+        Mechanism("networks among residuals", ((residual_fit, "_select_networks", lambda *_: iter(())),)),
     ]
 
 
@@ -147,7 +146,7 @@ def main() -> None:
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
     chosen = [each for each in mechanisms() if options.only in each.name]
-    cases = [*simulated_cases(options.logs.parent / "arms"), *real_cases(options.logs)]
+    cases = [*real_cases(options.logs), *simulated_cases(options.logs.parent / "arms")]
     for name, run in cases:
         reference = run()
         shown = ", ".join(f"{key} {value:.5f}" for key, value in reference.items())
