@@ -1,6 +1,6 @@
 """Fit arms whose truth is known, and measure how far each method ends from it.
 
-    python benchmarks/truth.py [--arms 100] [--first 0] [--jobs 2] [--out truth.jsonl] [--panda]
+    python benchmarks/truth.py [--arms 100] [--first 0] [--jobs 2] [--out runs/truth.jsonl] [--panda]
 
 Every case is drawn from its number alone: an arm (a real URDF or a random chain), the error of the given URDF,
 friction of one of six kinds, armature, offsets, springs, a motion, a sample rate, noise and a delay of the
@@ -412,7 +412,7 @@ def main() -> None:
     parser.add_argument("--arms", type=int, default=100)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--out", type=Path, default=Path("truth.jsonl"))
+    parser.add_argument("--out", type=Path, default=Path("runs/truth.jsonl"))
     default = Path(__file__).parents[2] / "shared" / "arms"
     parser.add_argument("--arms-folder", type=Path, default=default)
     parser.add_argument("--panda", action="store_true")
@@ -421,6 +421,7 @@ def main() -> None:
     names = usable_arms(options.arms_folder) if options.arms_folder.is_dir() else []
     cases = [draw_case(k, names) for k in range(options.first, options.first + options.arms)]
     cases = ([PANDA] if options.panda else []) + cases
+    options.out.parent.mkdir(parents=True, exist_ok=True)
     done = {row["number"] for row in rows}
     tasks = [(case, options.arms_folder) for case in cases if case.number not in done]
     with multiprocessing.get_context("spawn").Pool(options.jobs) as pool, options.out.open("a") as file:
