@@ -1,4 +1,4 @@
-"""Write a polynomial in cosines, sines and distances the shortest of several equal ways.
+"""Write a polynomial in cosines, sines and distances the shortest of several equal candidates.
 
 Tried are: cosines and sines of each angle, and multiple-angle sums of products along runs of joints with parallel
 axes; squares of the sine or of the cosine; and what terms have in common. Sums of angles before products, and
@@ -45,18 +45,18 @@ class Shortener:
         plain = self._expanded(polynomial)
         if len(polynomial) > TUNING.most_terms_shortened:
             return plain
-        ways = [plain]
+        candidates = [plain]
         squares_of_sines = self._with_sines_squared(polynomial)
         if len(squares_of_sines) < len(polynomial):
-            ways.append(self._expanded(squares_of_sines))
-            ways += self._multiple_angles(squares_of_sines)
-        ways += self._multiple_angles(polynomial)
+            candidates.append(self._expanded(squares_of_sines))
+            candidates += self._multiple_angles(squares_of_sines)
+        candidates += self._multiple_angles(polynomial)
         # collecting is the slow step, so it goes on from the shortest few
-        ways = sorted(ways, key=length)[: TUNING.ways_collected]
-        for terms in list(ways):
+        candidates = sorted(candidates, key=length)[: TUNING.ways_collected]
+        for terms in list(candidates):
             for run in self._runs:
-                ways.append(collected(terms, set(run)))
-        return min(ways, key=length)
+                candidates.append(collected(terms, set(run)))
+        return min(candidates, key=length)
 
     def _with_sines_squared(self, polynomial: fmpq_mpoly) -> fmpq_mpoly:
         """Return it with squares of sines in place of those of cosines wherever that is shorter."""
@@ -66,16 +66,16 @@ class Shortener:
                 polynomial = swapped
         return polynomial
 
-    def _without_square(self, polynomial: fmpq_mpoly, place: int, other: int) -> fmpq_mpoly:
-        """Use c^2 + s^2 = 1 until the variable at ``place`` stands to the first power at most."""
-        if polynomial.degrees()[place] < 2:
+    def _without_square(self, polynomial: fmpq_mpoly, variable: int, partner: int) -> fmpq_mpoly:
+        """Use c^2 + s^2 = 1 until ``variable`` stands to the first power at most."""
+        if polynomial.degrees()[variable] < 2:
             return polynomial
         total = 0 * polynomial
         for exponents, coefficient in polynomial.terms():
             powers = list(exponents)
-            powers[place] %= 2
+            powers[variable] %= 2
             term = self._context.from_dict({tuple(powers): coefficient})
-            total += term * (1 - self._gens[other] ** 2) ** (exponents[place] // 2)
+            total += term * (1 - self._gens[partner] ** 2) ** (exponents[variable] // 2)
         return total
 
     def _expanded(self, polynomial: fmpq_mpoly) -> Terms:
@@ -111,9 +111,9 @@ class Shortener:
                 sums.append(multiple_angles([(self._angles[k], *exponents[3 * k : 3 * k + 2]) for k in run]))
                 for joint in run:
                     remaining[3 * joint] = remaining[3 * joint + 1] = 0
-            others = self._monomial(remaining)
+            monomial = self._monomial(remaining)
             for terms in product(*sums):
-                factors = ordered([*others, *chain.from_iterable(function for function, _ in terms)])
+                factors = ordered([*monomial, *chain.from_iterable(function for function, _ in terms)])
                 value = coefficient
                 for _, number in terms:
                     value *= number

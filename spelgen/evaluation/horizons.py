@@ -55,22 +55,22 @@ class JudgedLogs:
         """Steps of the longest piece."""
         return max(map(len, self.pieces)) - 1
 
-    def stride(self, span: int, most: int) -> int:
-        """Return how many samples lie between the starts of about `most` windows of so many steps."""
-        return -(-sum(max(0, len(piece) - span) for piece in self.pieces) // most)
+    def stride(self, span: int, window_count: int) -> int:
+        """Return how many samples lie between the starts of about `window_count` windows of so many steps."""
+        return -(-sum(max(0, len(piece) - span) for piece in self.pieces) // window_count)
 
-    def starts(self, span: int, most: int) -> list[tuple[Trajectory, int]]:
+    def starts(self, span: int, window_count: int) -> list[tuple[Trajectory, int]]:
         """Return the pieces and first samples of these windows."""
-        stride = self.stride(span, most)
+        stride = self.stride(span, window_count)
         starts: list[tuple[Trajectory, int]] = []
         for piece in self.pieces:
             starts += [(piece, first) for first in range(0, len(piece) - span, stride)]
         return starts
 
-    def windows(self, span: int, most: int) -> Windows:
+    def windows(self, span: int, window_count: int) -> Windows:
         """Return the windows of so many steps that begin there, shorter ones where all pieces are."""
         span = min(span, self.longest)
-        stride, measured = self.stride(span, most), self.used.filtered
+        stride, measured = self.stride(span, window_count), self.used.filtered
         return cut_windows(self.pieces, span + 1, stride, measured=measured, reach=self.reach)
 
 
@@ -119,8 +119,8 @@ def predict(
         notes.append(Diagnostic("info", "no-observer", "logs", None, message))
         past = 0
     # rollouts cost by their steps
-    most = max(TUNING.fewest_windows, min(TUNING.most_windows, TUNING.most_predicted_steps // steps))
-    windows = logs.windows(past + steps, most)
+    window_count = max(TUNING.fewest_windows, min(TUNING.most_windows, TUNING.most_predicted_steps // steps))
+    windows = logs.windows(past + steps, window_count)
     ahead = without_past(windows, past)
     states = {}
     # both rollouts of a predictor start from the same states of friction, those at the end of the past
@@ -134,5 +134,5 @@ def predict(
         states[observed(predictor.name)] = predictor.solver(started, disturbance)
     errors = {who: end_errors(state, ahead, logs.joint_types, tip) for who, state in states.items()}
     seconds = ahead.dt.sum(dim=1).mean().item()
-    starts = [(piece, first + past) for piece, first in logs.starts(past + steps, most)]
+    starts = [(piece, first + past) for piece, first in logs.starts(past + steps, window_count)]
     return Horizon(name, steps, seconds, len(ahead), errors), Predictions(ahead, starts, states)
