@@ -125,8 +125,8 @@ def _conflicts(values: Mapping[str, str]) -> Iterator[tuple[str, str, str]]:
     if values["net"] == "none" and not rigid:
         yield "mass", "net", "net: none goes with mass: closed-form alone"
     if (values["net"] == "none") != (values["encoding"] == "none"):
-        yield "net", "encoding", "encoding says what networks read: none where there are none"
+        yield "net", "encoding", "encoding is the input of networks: none for a model without networks"
     if rigid and values["encoding"] == "lie-group":
-        yield "mass", "encoding", "what stands beside rigid bodies reads single joints: encoding: joint"
+        yield "mass", "encoding", "residual terms beside rigid bodies need encoding: joint"
     if rigid and values["input"] != "derived":
         yield "mass", "input", "input: derived goes with mass: closed-form"

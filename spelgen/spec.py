@@ -20,7 +20,7 @@ from spelgen.errors import ModuleError
 from spelgen.files import require_regular_file
 
 Assume = Literal["kinematics", "inertials"]
-"""Which values of the URDF are trusted: the kinematics alone, or the inertials' zeros and symmetries too."""
+"""Values of the URDF that the structure uses: the kinematics, or also the inertials' zeros and symmetries."""
 
 Kind = Literal["zero", "constant", "varying"]
 Entries = tuple[tuple[int, int, float], ...]

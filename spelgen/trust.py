@@ -25,6 +25,6 @@ def require_own_module(module: Path, urdf: Path) -> None:
         except SpelgenError as error:
             reason = f"it cannot be written anew ({error})"
     raise RunError(
-        f"a module that may do anything when it is run: {reason}", file=module,
-        do="read it, then say --trust (in Python: trust=True), or build it again and start a new run" + hint,
+        f"a module that spelgen cannot verify: {reason}", file=module,
+        do="read it, then pass --trust (in Python: trust=True), or build it again and start a new run" + hint,
     )  # fmt: skip

@@ -76,7 +76,7 @@ def test_a_sound_log_is_measured_and_not_doubted(loaded, arm, log):
     for joint in loaded:
         assert joint.gravity.factor == pytest.approx(1, abs=0.1)
         assert joint.gravity.explained > 0.9
-    assert "Nothing is odd." in result.text()
+    assert "No findings." in result.text()
 
 
 def test_motor_torques_are_taken_to_the_joints(loaded, arm, log):
@@ -138,7 +138,7 @@ def test_torques_beyond_all_drives_are_errors(loaded, arm, log):
     weak = replace(loaded, arm=replace(arm, coordinates=coordinates))
     wrong = replace(log, tau=500 * random.standard_normal(log.tau.shape))
     with pytest.raises(
-        SpelgenErrors, match=r"times what the drive can give, expected Nm or N at the joint; say 'un"
+        SpelgenErrors, match=r"times what the drive can give, expected Nm or N at the joint; write 'un"
     ):
         require_possible_torques([wrong], weak)
 
@@ -237,7 +237,7 @@ def test_what_logs_do_not_need_does_not_refuse_them(spelgen, robots, arm, log, t
     write_logs(tmp_path / "logs.csv", [log], [c.name for c in arm.coordinates])
     shown = spelgen("logs", "logs.csv", "--robot", "arm.urdf")
     assert shown.exit_code == 0, shown.stderr
-    assert "Nothing is odd." in shown.stdout
+    assert "No findings." in shown.stdout
 
 
 def test_logs_larger_than_memory_are_told_by_parts(spelgen, robots, arm, log, tmp_path, monkeypatch):
@@ -294,7 +294,7 @@ def test_a_new_check_is_a_function_and_its_row(loaded, log, monkeypatch, registr
 def test_a_few_samples_are_told_without_judgement(loaded, arm, log):
     result = check_logs([log[:20]], loaded)
     assert [x.gravity.explained for x in result.joints] == [None] * 3
-    assert "Nothing is odd." in result.text()
+    assert "No findings." in result.text()
 
 
 def test_real_arms_are_believed(shared):

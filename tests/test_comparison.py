@@ -181,7 +181,7 @@ def test_a_comparison_with_a_module_of_somebody_else_is_refused(study, robot):
     module = study.module(CHOSEN[0])
     own = module.read_text()
     module.write_text(own + "print('anything')\n")
-    with pytest.raises(RunError, match="a module that may do anything"):
+    with pytest.raises(RunError, match="a module that spelgen cannot verify"):
         prepare_study(robot, study.folder, variants=CHOSEN)
     module.write_text(own)
 

@@ -121,7 +121,8 @@ def test_bodies_without_inertials_are_all_named():
     told = str(error.value).splitlines()
     assert [x.split(": ")[0] for x in told] == ["joint 'a'", "joint 'b'"]
     assert all(
-        "got a link without <inertial>, expected mass" in x and "give them in the URDF" in x for x in told
+        "got a link without <inertial>, expected mass" in x and "write estimates into the URDF" in x
+        for x in told
     )
     assert all(isinstance(each, ArmError) for each in error.value.errors)
 

@@ -202,7 +202,7 @@ def test_what_could_not_be_done_is_said(run):
     result = evaluated(run, run.parent / "logs" / "train.parquet", seconds=(5.0,))
     assert {x.code: x.message for x in result.diagnostics} == {
         "tested-on-training-data": "names also used in training: motion_00, motion_01, motion_02, motion_03; "
-        "errors on training data prove nothing",
+        "errors on training data are not test errors",
         "horizon-too-long": "no prediction over 5 s: the longest trajectory has 24 steps",
         "no-urdf-baseline": "no comparison with the URDF: no arm is known",
     }

@@ -152,7 +152,7 @@ def test_a_joint_without_room_is_refused(robots, tmp_path):
         excite(load_arm(tmp_path / "stuck.urdf"), **CHOICE, trials=1)
     assert str(caught.value).splitlines()[0] == (
         "joint 'joint1': got the limits 0 .. 0, expected room to move; "
-        "correct them, or leave the joint out by --joints"
+        "correct them, or omit the joint by --joints"
     )
 
 

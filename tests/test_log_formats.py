@@ -261,7 +261,7 @@ NPZ = {
         {"t": T, "q": Q, "tau": TAU},
         "{}: missing columns qd_shoulder, qd_elbow: got only the columns t, q, tau, "
         "expected t, q_<joint>, qd_<joint>, tau_<joint>; "
-        "say 'velocity: differentiated' under 'logs' in the robot's YAML where none were logged",
+        "write 'velocity: differentiated' under 'logs' in the robot's YAML where none were logged",
     ),
     "short": (
         {"t": T, "q": Q[:3], "qd": QD, "tau": TAU},

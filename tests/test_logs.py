@@ -264,7 +264,7 @@ def test_degrees_are_refused(case):
     with pytest.raises(SpelgenErrors) as caught:
         check([trajectory], JOINTS, ("revolute", "revolute"))
     advice = (
-        "; convert degrees, by 'units' under 'logs' in the robot's YAML; if the units are right, say so there, "
+        "; convert degrees, by 'units' under 'logs' in the robot's YAML; if the units are right, declare them there, "
         "or in the Parquet schema's metadata 'units'"
     )
     assert str(caught.value).splitlines()[0] == message + advice
@@ -325,7 +325,7 @@ def test_what_never_changes_in_any_trajectory_is_said():
         ),
         (
             "info", "joint-at-rest", "trajectory x, joint 'b'",
-            "does not move: the logs say nothing about its own dynamics",
+            "does not move: the logs do not excite its dynamics",
         ),
     ]  # fmt: skip
     assert check([resting, swing()], JOINTS, ("revolute", "revolute")) == []

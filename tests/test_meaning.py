@@ -44,7 +44,7 @@ WORDS = {
         "M33 is constant: for a sliding joint the entry is the mass that it carries. It needs a number, no network.",
         LAST.format(n=4),
         ROOT,
-        "M does not depend on joint 3: it leaves the axes of joints 1 and 2 in place, as if it moved the whole arm. "
+        "M does not depend on joint 3: it does not move the axes of joints 1 and 2, as if it moved the whole arm. "
         "No network of M reads it.",
         "V does not depend on joints 1, 2 and 4: turning about the vertical lifts nothing. "
         "The network of V does not read them.",
@@ -209,7 +209,7 @@ CHECKS: dict[str, Check] = {
     "for a sliding joint the entry is the mass that it carries": lambda s, about, _: all(
         s.slides(k) and np.allclose(s.mass(k), s.mass_behind(k), rtol=1e-12) for k in about
     ),
-    "it leaves the ax[ie]s of ## in place, as if it moved the whole arm": lambda s, about, named: (
+    "it does not move the ax[ie]s of ##, as if it moved the whole arm": lambda s, about, named: (
         named == list(range(1, about[0])) and s.commute(about[0], named)
     ),
     "joint # slides along the ax[ie]s of ##, and what turns about an axis never moves along it": (

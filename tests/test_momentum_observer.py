@@ -92,7 +92,7 @@ def test_rollouts_that_hold_it_stand_beside_open_loop():
         assert error[observed(MODEL)] < 0.1 * error[MODEL]
         assert error[MODEL] < error[CONSTANT_VELOCITY]
     text = " ".join(result.text().split())
-    assert "+ observer: holds the disturbance that a momentum observer finds" in text
+    assert "+ observer: with the constant disturbance" in text
     whole = evaluate(
         load_module(STAND_IN), motions(seconds=0.5), preprocessing=UNFILTERED, steps=(), seconds=(0.45,)
     )

@@ -120,7 +120,7 @@ def test_same_folder_gives_same_bytes(run):
 def test_numbers_are_those_of_the_run(run):
     text = " ".join(" ".join(Page(render_report(run)).text).split())
     assert "0.0123" in text and "0.8 mm" in text
-    assert "Good enough for feed-forward control, telling contacts" in text
+    assert "Good enough for feed-forward control, contact detection" in text
     assert "simulation 1 s ahead; worst at joint1" in text
     assert "It explains 99 % of the variance of the torques and misses 1.23 % of the motion" in text
     assert "But URDF is better after 1 step." in text

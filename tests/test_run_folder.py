@@ -97,8 +97,8 @@ def test_a_foreign_module_is_not_run(foreign, start, use):
     with pytest.raises(RunError) as caught:
         use(foreign, start / "train.parquet")
     assert str(caught.value) == (
-        f"{foreign / 'module.py'}: a module that may do anything when it is run: it is not what spelgen writes for "
-        "the URDF beside it; read it, then say --trust (in Python: trust=True), or build it again and start a new run"
+        f"{foreign / 'module.py'}: a module that spelgen cannot verify: it is not what spelgen writes for "
+        "the URDF beside it; read it, then pass --trust (in Python: trust=True), or build it again and start a new run"
     )
     assert not (foreign / "mark").exists()
 
@@ -114,7 +114,7 @@ def test_commands_demand_trust_in_a_foreign_module(foreign, start, tmp_path, com
     first = start / "module.py" if command == "train" else foreign
     told = CliRunner().invoke(app, [command, *map(str, [first, *more[command]])])
     assert told.exit_code == 1
-    assert "then say --trust" in told.stderr
+    assert "then pass --trust" in told.stderr
     assert not (foreign / "mark").exists()
 
 

@@ -327,7 +327,7 @@ def test_a_missing_column_is_named(tmp_path, logs, arm, quantity):
 
 
 def test_what_does_not_belong_together_is_told(arm, logs, robots):
-    with pytest.raises(SettingsError, match="preset whose friction remembers"):
+    with pytest.raises(SettingsError, match="preset with bristle friction"):
         spelgen.build(arm, "spel")
     with pytest.raises(OptionError, match="this arm has position servos"):
         spelgen.fit(spelgen.build(arm, "closed-form"), logs, spelgen.TorqueFit())

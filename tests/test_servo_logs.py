@@ -46,7 +46,7 @@ def test_logs_of_a_servo_arm_are_told(arm, logs):
     assert 0.05 < shoulder.lag < 0.15  # the delay, and kd/kp
     assert shoulder.saturated < 0.02 and elbow.saturated is None
     assert shoulder.steady_state_error is None  # its command never rests
-    for text in ("Positions and commands [rad]", "Commands act after", "Nothing is odd."):
+    for text in ("Positions and commands [rad]", "Commands act after", "No findings."):
         assert text in found.text()
     told = json.loads(json.dumps(found.to_dict()))
     assert told["joints"][1]["name"] == "elbow" and tuple(told["delay"]) == found.delay

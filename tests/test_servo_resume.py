@@ -67,7 +67,7 @@ def test_an_interrupted_one_is_usable_and_goes_on(start, whole, tmp_path, monkey
         patch.setattr(TrainingProgress, "round", interrupt)
         told = CliRunner().invoke(app, list(map(str, command)))
     assert told.exit_code == 130, told.stderr
-    assert "the best model so far is in the run folder; --resume goes on" in told.stderr
+    assert "the best model so far is in the run folder; resume it by --resume" in told.stderr
     assert "servo" not in json.loads((run / "config.json").read_text())
     assert spelgen.evaluate(run, servo_logs(1, 1.0)).replays[0].errors["model"].mean < 0.1
     told = CliRunner().invoke(app, [*map(str, command), "--resume"])

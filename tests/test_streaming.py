@@ -119,7 +119,7 @@ def test_windows_are_not_streamed(log, tmp_path):
     with pytest.raises(LogError) as caught:
         train(STAND_IN, [log], tmp_path / "run", Rollout(epochs=1))
     assert str(caught.value) == (
-        "got logs larger than memory, expected some hours of them: every tenth file, say; "
+        "got logs larger than memory, expected fewer logs, for example every tenth file; "
         "or fit torques, which read them in chunks: the objective torque"
     )
     assert not (tmp_path / "run").exists()

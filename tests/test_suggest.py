@@ -77,7 +77,7 @@ def test_numbered_columns_beside_set_points_without_velocities(scara, tmp_path):
     assert "velocity: differentiated" in text
     assert "# Joints are taken in the URDF's order" in text
     assert 'units: {"t": "s", "tau": "A"}' in text
-    assert text.count("gain: 1.0 # Nm per A at the joint, the gear included: say what it is") == 4
+    assert text.count("gain: 1.0 # Nm per A at the joint, the gear included: write its value") == 4
 
 
 def test_names_of_joints_count_before_numbers(scara, tmp_path):
@@ -113,5 +113,5 @@ def test_the_command_writes_it_and_goes_on_with_it(robots, tmp_path):
     written(path, head, [[t, *q, *tau] for t, q, tau in zip(T, Q, TAU, strict=True)])
     told = CliRunner().invoke(app, [*command, "--force"])
     assert told.stdout.startswith(
-        f"wrote {tmp_path}/map.yaml: to be read, then used by --mapping\nscara: 1 trajectory"
+        f"wrote {tmp_path}/map.yaml; check it, then pass it by --mapping\nscara: 1 trajectory"
     )

@@ -172,8 +172,8 @@ def test_a_urdf_that_is_wrong_is_given_up_and_that_is_said(emitted):
     samples = TorqueSamples.held(few)
     told = [next(torque_notes(found, samples, each)).message for each in (wrong, right)]
     assert told == [
-        f"the URDF's inertias are {how} to within a factor of {np.exp(2 * each.prior.bodies):.2g}"
-        for how, each in (("hardly believed, only", wrong), ("believed", right))
+        f"prior standard deviation of URDF inertias: factor {np.exp(2 * each.prior.bodies):.2g}"
+        for each in (wrong, right)
     ]
 
 
@@ -269,8 +269,8 @@ def test_slow_logs_are_told_to_say_little_of_inertia(emitted):
         samples, found = TorqueSamples.held([DynamicsSamples(name, q, qd, qdd, tau)]), module.Model()
         fit = fit_torque(found, samples)
         codes[name] = {note.code for note in torque_notes(found, samples, fit)}
-    assert codes["quick"] == {"urdf-believed"}
-    assert codes["slow"] == {"urdf-believed", "inertia-undetermined", "acceleration-unseen"}
+    assert codes["quick"] == {"urdf-prior"}
+    assert codes["slow"] == {"urdf-prior", "inertia-undetermined", "acceleration-unseen"}
 
 
 @pytest.fixture(scope="module")

@@ -53,12 +53,12 @@ def torques(slow, fast):
 
 
 @pytest.mark.parametrize("relative, nmse, said", [
-    (0.05, 0.004, "Good enough for feed-forward control, telling contacts from its own error and simulation 1 s ahead"),
-    (0.2, 0.03, "Good enough for feed-forward control and rough simulation 1 s ahead, not for telling contacts"),
+    (0.05, 0.004, "Good enough for feed-forward control, contact detection and simulation 1 s ahead"),
+    (0.2, 0.03, "Good enough for feed-forward control and rough simulation 1 s ahead, not for contact detection"),
     (0.09, 0.03, "and simulation 1 s ahead"),
     (0.7, 0.1, "Good enough for gravity compensation, not for feed-forward control and simulation 1 s ahead"),
-    (0.7, 0.5, "Not good enough yet to rely on"),
-    (0.7, None, "Not good enough yet to rely on"),
+    (0.7, 0.5, "Not accurate enough yet"),
+    (0.7, None, "Not accurate enough yet"),
 ])  # fmt: skip
 def test_what_it_is_good_for_follows_the_figures(relative, nmse, said):
     assert said in verdict(evaluation(relative, nmse)).sentence
@@ -97,12 +97,12 @@ def test_what_to_record_follows_what_the_logs_cover():
 
 def test_a_test_on_training_logs_is_no_proof():
     told = verdict(evaluation(seen=True)).sentence
-    assert told.startswith("Judged on logs that it was trained on, which proves little: good enough for")
+    assert told.startswith("Evaluated on training logs: good enough for")
 
 
 def test_where_a_constant_velocity_is_better_the_model_is_for_torques():
     still = "velocity stays constant"
-    better = "A constant velocity predicts better 1 s ahead: there the model is for torques, not for motion."
+    better = "A constant velocity predicts better 1 s ahead: there, use the model for torques only."
     assert better in verdict(evaluation(0.9, 0.004, **{still: 0.6})).because
     held = evaluation(0.9, 0.004, **{still: 0.6, "model + observer": 0.2})
     assert "A constant velocity" not in verdict(held).because
@@ -114,4 +114,4 @@ def test_errors_beyond_the_motion_are_told_as_such():
 
 
 def test_nothing_to_judge_by_is_said():
-    assert verdict(results([], {})).sentence == "Nothing to judge by: no horizon and no torque was evaluated."
+    assert verdict(results([], {})).sentence == "No verdict: no horizon and no torque was evaluated."

@@ -121,7 +121,7 @@ def _undriven(robot: Robot, settings: Settings, driven: Sequence[str]) -> Iterat
         return
     for name in driven:
         if name not in transmitted and name not in settings.joints:
-            message = "no transmission drives it, others have one: taken as driven (else say actuated: false)"
+            message = "no transmission drives it, others have one: taken as driven (otherwise write actuated: false)"
             yield Diagnostic("info", "no-transmission", f"joint {name!r}", robot.joint[name].line, message)
 
 

@@ -128,11 +128,11 @@ def _locked_remarks(following: Mapping[str, Follow], held: Sequence[Joint]) -> I
             continue
         followed = following[joint.name]
         if joint.mimic is not None:
-            message = f"follows {followed.leader.name!r}: held at {float(followed.offset):g}"
+            message = f"follows {followed.leader.name!r}: locked at {float(followed.offset):g}"
         elif joint.moves:
             message = "not part of the chain: locked at 0"
         else:
-            message = f"a {joint.type} joint off the chain: held at its origin"
+            message = f"a {joint.type} joint off the chain: locked at its origin"
         yield _info("locked-joint", joint, message)
 
 

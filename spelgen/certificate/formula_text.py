@@ -61,8 +61,7 @@ def _notes(formulas: Formulas) -> list[str]:
             if row.place is not None:
                 option = f"{row.place[0] + 1},{row.place[1] + 1}"
             notes.append(
-                f"What is not written out: --entry {option} shows {row.name} alone, and -o FILE.py writes a file "
-                "for SymPy with all of them."
+                f"Omitted here: --entry {option} shows {row.name} alone, and -o FILE.py writes all entries for SymPy."
             )
             break
     return notes

@@ -137,10 +137,10 @@ class Inspection:
         rank = servo_rank(self.arm)
         text = f"{POSITION}; logs of positions determine inertia, weight and friction in ratio to kp only"
         if len(rank.groups) == 1:
-            text += ": one kp, mass or load that is known tells all"
+            text += ": one known kp, mass or load determines all"
         else:
             groups = [joints_in_ranges(group) for group in rank.groups]
-            text += f": one kp, mass or load that is known tells those of {' or of '.join(groups)}"
+            text += f": one known kp, mass or load determines those of {' or of '.join(groups)}"
         undetermined: dict[str, list[int]] = {}
         for name, joint in rank.open:
             undetermined.setdefault(name, []).append(joint)

@@ -91,7 +91,7 @@ def idle_reason(axes: Axes, structure: Structure, joint: int) -> str | None:
         return "it moves the whole arm as one piece"
     nearer = list(range(joint))
     if all(axes.commute(joint, other) for other in nearer):
-        return f"it leaves {axes_told(nearer)} in place, as if it moved the whole arm"
+        return f"it does not move {axes_told(nearer)}, as if it moved the whole arm"
     if joint == len(axes.slides) - 1 and structure.assume == "inertials" and axes.symmetric:
         return "what it carries is symmetric about its axis"
     return None

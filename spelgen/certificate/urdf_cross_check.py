@@ -63,7 +63,7 @@ def urdf_cross_check(robot: Robot, arm: Arm, *, samples: int = 6, seed: int = 0)
         readings = list(_yourdfpy_readings(robot, arm, samples, seed))
     except Exception as problem:  # another program's failure proves nothing about ours
         text = " ".join(str(problem).split())[:120]
-        result = f"yourdfpy cannot say ({type(problem).__name__}: {text})"
+        result = f"yourdfpy fails ({type(problem).__name__}: {text})"
         return (Check("reading of the file", "the moving bodies", result, "undecided"),)
     rounded: Roundings = {}
     for diagnostic in arm.diagnostics:
@@ -237,7 +237,7 @@ def _check(fact: str, derived: str, result: str, outside: list[int], noun: str) 
 def _within(angle: float) -> str:
     if not angle:
         return ""
-    return f", within the roundings told ({size_text(angle)} rad in all)"
+    return f", within the reported roundings ({size_text(angle)} rad in all)"
 
 
 def _rounding_angle(path: Sequence[Joint], rounded: Roundings, link: Link | None = None) -> float:

@@ -16,34 +16,38 @@ from spelgen.errors import SpelgenError, suggestion
 def compare(
     robot: Robot,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="FOLDER", help="Default: comparisons/<robot>.")
+        Path | None,
+        typer.Option("-o", "--output", metavar="FOLDER", help="Output folder; default: comparisons/<robot>."),
     ] = None,
     presets: Annotated[
-        str | None, typer.Option(metavar="A,B,C", help="Only these, of phnode, spel, ...")
+        str | None, typer.Option(metavar="A,B,C", help="Presets to compare, e.g. phnode,spel; default: all.")
     ] = None,
-    seeds: Annotated[int | None, typer.Option(min=1, help="Runs of each preset.")] = None,
+    seeds: Annotated[int | None, typer.Option(min=1, help="Number of runs of each preset.")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Training steps of each run.")] = None,
     ablation: Annotated[
-        bool, typer.Option("--ablation", help="From phnode to hybrid, one change after the other.")
+        bool,
+        typer.Option(
+            "--ablation", help="Compare variants from phnode to hybrid that differ by one change each."
+        ),
     ] = False,
     urdf_error: Annotated[
         float | None,
         typer.Option(
             min=0.0,
             metavar="PART",
-            help="Models know the URDF's inertials, wrong by so much (0.3: 30 %), and are "
-            "trained as `train` does by itself. Default: kinematics alone, the same steps for all.",
+            help="Relative error of the URDF's inertials, which models are then built with (0.3: 30 %). "
+            "Default: models without inertials, all trained for the same number of steps.",
         ),
     ] = None,
     jobs: Annotated[
-        int, typer.Option(min=1, help="Runs at a time, one core each; of several Ray runs them.")
+        int, typer.Option(min=1, help="Number of parallel runs, one core each; Ray runs more than one.")
     ] = 1,
     address: Address = None,
     force: Force = False,
 ) -> None:
-    """Train every preset on the same simulated logs, and set them beside one another.
+    """Train every preset on the same simulated logs, and compare the results.
 
-    Started again with the same settings, it goes on where it stopped.
+    The same command resumes an interrupted comparison.
     """
     from spelgen.comparison.formatting import comparison_tables
     from spelgen.comparison.runs import run_study, time_steps

@@ -25,9 +25,9 @@ def evaluate(
     output: Output = None,
     trust: Trust = False,
 ) -> None:
-    """Judge a trained run on test logs, beside its baselines.
+    """Evaluate a trained run and its baselines on test logs.
 
-    The result is kept in the run folder, as evaluation.json.
+    The result is also written to evaluation.json in the run folder.
     """
     paths = options.logs(data, extra_logs)
     import torch
@@ -63,7 +63,7 @@ def evaluate(
 
 def report(
     runs: Annotated[
-        list[Path], typer.Argument(metavar="RUN...", help="Run folders; several are set side by side.")
+        list[Path], typer.Argument(metavar="RUN...", help="Run folders; several are compared on one page.")
     ],
     output: Annotated[
         Path | None,
@@ -71,16 +71,16 @@ def report(
             "-o",
             "--output",
             metavar="FILE",
-            help="Default: report.html in the run folder; of several runs.html. A name with .json: its data.",
+            help="HTML file, or .json for the data. Default: report.html in the run folder, runs.html for several.",
         ),
     ] = None,
     robot: Annotated[
         Path | None,
-        typer.Option(metavar="ROBOT.urdf", help="The run's URDF where its meshes are found, to draw them."),
+        typer.Option(metavar="ROBOT.urdf", help="URDF with its meshes, for the picture of the arm."),
     ] = None,
     trust: Trust = False,
 ) -> None:
-    """Write one HTML page about a run, or about several side by side."""
+    """Write an HTML page about one run or several."""
     from spelgen.fitting.run_folder import RunFolder
 
     if trust:

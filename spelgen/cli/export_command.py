@@ -16,17 +16,17 @@ from spelgen.exporting.exported import Format
 def export(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="A folder that `spelgen train` wrote.")],
     output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="FILE|FOLDER", help="A file for urdf and mjcf.")
+        Path, typer.Option("-o", "--output", metavar="FILE|FOLDER", help="Output file or folder.")
     ],
-    to: Annotated[Format, typer.Option(help="What to write.")] = "urdf",
+    to: Annotated[Format, typer.Option(help="Export format.")] = "urdf",
     force: Force = False,
     trust: Trust = False,
 ) -> None:
-    """Write what was learned for other tools, compared with the model before anything is written.
+    """Export a trained model to other tools. Each export is compared with the model before it is written.
 
-    urdf: bodies of a closed-form model as they are; of other models, the rigid bodies nearest to them.
-    mjcf: such bodies, drives and friction for MuJoCo. c: a C99 header and source without dependencies. ros2: a colcon
-    package around these. casadi, onnx, torch: a file for each function.
+    urdf: the rigid bodies; for models with networks in M, the nearest rigid bodies. mjcf: rigid bodies, drives and
+    friction for MuJoCo. c: a C99 header and source without dependencies. ros2: a colcon package around these. casadi,
+    onnx, torch: a file for each function.
     """
     from spelgen.exporting.export import export as export_run
     from spelgen.exporting.exported import require_fitting

@@ -13,19 +13,24 @@ from spelgen.cli.options import Address
 
 
 def fleet(
-    file: Annotated[Path, typer.Argument(metavar="FLEET.yaml", help="Which arms, presets, seeds, splits.")],
+    file: Annotated[
+        Path, typer.Argument(metavar="FLEET.yaml", help="YAML file with arms, presets, seeds and splits.")
+    ],
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", metavar="FOLDER", help="Default: fleets/<name of the file>."),
+        typer.Option(
+            "-o", "--output", metavar="FOLDER", help="Output folder; default: fleets/<name of the file>."
+        ),
     ] = None,
     jobs: Annotated[
-        int | None, typer.Option(min=1, help="Runs at a time, one core each; default: as there are cores.")
+        int | None,
+        typer.Option(min=1, help="Number of parallel runs, one core each; default: the number of cores."),
     ] = None,
     address: Address = None,
 ) -> None:
-    """Train and judge every preset on every arm, on all cores or a Ray cluster.
+    """Train and evaluate every preset on every arm, on all cores or a Ray cluster.
 
-    Started again, it goes on with what is left.
+    The same command resumes an interrupted fleet.
     """
     from spelgen.fitting.process import termination_as_interrupt
     from spelgen.fitting.run_lock import locked

@@ -27,20 +27,24 @@ def identify(
     filter: Filter = None,
     weights: Annotated[
         Literal["equal", "range", "noise"],
-        typer.Option(help="Of the joints: equal, or by their torque's range or noise."),
+        typer.Option(help="Weights of the joints: equal, by torque range, or by torque noise."),
     ] = "noise",
     ridge: Annotated[
-        float, typer.Option(min=0.0, help="Penalty on every parameter, relative to its column.")
+        float,
+        typer.Option(min=0.0, help="Ridge penalty on all parameters, relative to the norm of the column."),
     ] = 0.0,
     prior: Annotated[
-        float | None, typer.Option(min=1e-6, help="Stay near the URDF's inertials; 0.5 suits few data.")
+        float | None,
+        typer.Option(
+            min=1e-6, help="Standard deviation of a prior at the URDF's inertials; 0.5 suits short logs."
+        ),
     ] = None,
     friction: Annotated[
         str | None,
         typer.Option(
             metavar="stribeck,polynomial,memory",
-            help="Beside viscous and Coulomb friction, one or several of: more of it in slow motion; qd |qd| and "
-            "qd^3; bristles, by the way the joint came.",
+            help="Friction terms beside viscous and Coulomb friction: Stribeck effect; qd |qd| and qd^3; bristles "
+            "(hysteresis).",
         ),
     ] = None,
     format: Annotated[Format | None, options.result_format()] = None,

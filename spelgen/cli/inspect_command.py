@@ -33,7 +33,9 @@ def inspect(
     format: Annotated[Format | None, options.result_format()] = None,
     output: Output = None,
     strict: Strict = False,
-    verify: Annotated[bool, typer.Option("--verify", help="Prove it again by other programs.")] = False,
+    verify: Annotated[
+        bool, typer.Option("--verify", help="Verify the structure by Pinocchio, SymPy and numeric samples.")
+    ] = False,
 ) -> None:
     """Show the exact structure of an arm's dynamics."""
     from spelgen.loaded_arm import load_arm

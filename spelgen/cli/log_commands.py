@@ -20,28 +20,29 @@ if TYPE_CHECKING:
 
 def excite(
     robot: Robot,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE.csv", help="The motion.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="FILE.csv", help="Output file of the motion.")
+    ],
     joints: Joints = None,
     tip: Tip = None,
     angle_tolerance: AngleTolerance = 2e-3,
-    duration: Annotated[float, typer.Option(min=2.0, max=600.0, help="In seconds.")] = 30.0,
-    sample_rate: Annotated[float, typer.Option(min=1.0, max=10000.0, help="Samples a second.")] = 100.0,
+    duration: Annotated[float, typer.Option(min=2.0, max=600.0, help="Duration [s].")] = 30.0,
+    sample_rate: Annotated[float, typer.Option(min=1.0, max=10000.0, help="Sample rate [Hz].")] = 100.0,
     harmonics: Annotated[
-        int | None, typer.Option(min=2, max=100, help="Default: 0.4 a second, at least 5.")
+        int | None,
+        typer.Option(min=2, max=100, help="Number of harmonics; default: 0.4 per second, at least 5."),
     ] = None,
     reach: Annotated[
-        float, typer.Option(min=0.05, max=1.0, help="Part of the joints' ranges that is used.")
+        float, typer.Option(min=0.05, max=1.0, help="Fraction of the position range to use.")
     ] = 0.9,
     speed: Annotated[
-        float, typer.Option(min=0.05, max=1.0, help="Part of the velocity limits that is used.")
+        float, typer.Option(min=0.05, max=1.0, help="Fraction of the velocity limits to use.")
     ] = 0.7,
-    trials: Annotated[
-        int, typer.Option(min=1, help="Motions that the search looks at, beside random ones.")
-    ] = 100,
-    seed: Annotated[int, typer.Option(min=0, help="Of the search.")] = 0,
+    trials: Annotated[int, typer.Option(min=1, help="Candidates of the search, beside random ones.")] = 100,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the search.")] = 0,
     force: Force = False,
 ) -> None:
-    """Propose a motion that shows an arm's inertial parameters and friction.
+    """Propose an excitation trajectory to identify inertial parameters and friction.
 
     Collisions are not checked.
     """
@@ -67,23 +68,26 @@ def excite(
 
 
 def logs(
-    paths: Annotated[list[Path], typer.Argument(metavar="LOGS...", help="Log files, or folders of them.")],
-    robot: Annotated[Path, typer.Option(metavar="ROBOT.urdf", help="The arm that was logged.")],
+    paths: Annotated[list[Path], typer.Argument(metavar="LOGS...", help="Log files or folders.")],
+    robot: Annotated[Path, typer.Option(metavar="ROBOT.urdf", help="URDF of the logged arm.")],
     joints: Joints = None,
     tip: Tip = None,
     angle_tolerance: AngleTolerance = 2e-3,
     mapping: Mapping = None,
-    format: Annotated[Literal["text", "json"], typer.Option(help="Of the result.")] = "text",
-    html: Annotated[Path | None, typer.Option(metavar="FILE", help="Write a page with plots too.")] = None,
+    format: Annotated[Literal["text", "json"], typer.Option(help="Format of the result.")] = "text",
+    html: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Also write an HTML page with plots.")
+    ] = None,
     suggest: Annotated[
-        Path | None, typer.Option(help="Write the mapping that names and numbers of the first log suggest.")
+        Path | None,
+        typer.Option(help="Write a mapping drafted from the column names and values of the first log."),
     ] = None,
     force: Force = False,
     strict: Strict = False,
 ) -> None:
-    """Check logs: what they hold, and what is odd about them.
+    """Check logs against the robot, and report their contents.
 
-    Nothing is changed. Exit code 1 where the logs cannot be trained on.
+    The logs are not changed. The exit code is 1 if they cannot be used for training.
     """
     from spelgen.loaded_arm import load_arm
     from spelgen.log_checks.check_logs import check_logs
@@ -122,8 +126,8 @@ def _suggested(paths: list[Path], arm: LoadedArm, file: Path) -> Path:
     collect(errors)
     coordinates = arm.arm.coordinates
     suggestion = suggest_mapping(logs[0], [x.name for x in coordinates], [x.kind for x in coordinates])
-    say(f"wrote {write_text(file, suggestion.text)}: to be read, then used by --mapping")
+    say(f"wrote {write_text(file, suggestion.text)}; check it, then pass it by --mapping")
     if suggestion.missing:
-        note(f"no column was found for {', '.join(suggestion.missing)}; say their names in {file}")
+        note(f"no column was found for {', '.join(suggestion.missing)}; write their names into {file}")
         raise typer.Exit(FAILED)
     return file

@@ -68,7 +68,7 @@ def common(
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
     ] = False,
 ) -> None:
-    """URDF in, a PyTorch model of the arm's dynamics with its exact structure out."""
+    """Derive, train and export dynamics models of robot arms from URDF files and logs."""
     if ctx.invoked_subcommand is None:
         say(ctx.get_help())
 

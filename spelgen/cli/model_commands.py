@@ -19,7 +19,10 @@ def init(
     joints: Joints = None,
     tip: Tip = None,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="FILE.yaml", help="Default: beside the URDF.")
+        Path | None,
+        typer.Option(
+            "-o", "--output", metavar="FILE.yaml", help="Output file; default: ROBOT.yaml beside the URDF."
+        ),
     ] = None,
     force: Force = False,
 ) -> None:
@@ -44,15 +47,20 @@ def build(
     preset: Annotated[
         str,
         typer.Option(
-            metavar="NAME|FILE.yaml", help=f"How the model is made: {', '.join(PRESET_NAMES)}, or yours."
+            metavar="NAME|FILE.yaml", help=f"Preset of the model: {', '.join(PRESET_NAMES)}, or a YAML file."
         ),
     ] = "hybrid",
-    net: Annotated[Net | None, typer.Option(help="The kind of networks; default: the preset's own.")] = None,
-    width: Annotated[int, typer.Option(min=1, max=4096, help="Units in a hidden layer.")] = 64,
-    depth: Annotated[int, typer.Option(min=1, max=16, help="Hidden layers.")] = 2,
+    net: Annotated[Net | None, typer.Option(help="Kind of networks; default: that of the preset.")] = None,
+    width: Annotated[int, typer.Option(min=1, max=4096, help="Hidden units per layer.")] = 64,
+    depth: Annotated[int, typer.Option(min=1, max=16, help="Number of hidden layers.")] = 2,
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", metavar="MODULE.py", help="Default: <robot>_spel.py here."),
+        typer.Option(
+            "-o",
+            "--output",
+            metavar="MODULE.py",
+            help="Output file; default: <robot>_spel.py in this folder.",
+        ),
     ] = None,
     force: Force = False,
 ) -> None:
@@ -78,7 +86,7 @@ def build(
 
 
 def check(module: Module, robot: RobotOption = None) -> None:
-    """Tell whether a module is what its URDF gives today."""
+    """Check whether a module is up to date with its URDF."""
     from spelgen.pipeline import check as check_module
 
     result = check_module(module, robot)

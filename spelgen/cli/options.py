@@ -20,25 +20,30 @@ if TYPE_CHECKING:
 SUFFIXES = {".json": "json", ".csv": "csv", ".html": "html", ".tex": "latex", ".py": "sympy"}
 
 Robot = Annotated[
-    Path, typer.Argument(metavar="ROBOT.urdf", help="The arm's URDF; ROBOT.yaml beside it holds settings.")
+    Path,
+    typer.Argument(
+        metavar="ROBOT.urdf", help="URDF of the arm; settings are read from ROBOT.yaml beside it."
+    ),
 ]
 RobotOption = Annotated[
     Path | None,
-    typer.Option("--robot", metavar="ROBOT.urdf", help="The module's URDF, where it is not found by name."),
+    typer.Option("--robot", metavar="ROBOT.urdf", help="URDF of the module, if it is not found by name."),
 ]
 Module = Annotated[Path, typer.Argument(metavar="MODULE.py", help="A module written by `spelgen build`.")]
 Run = Annotated[Path, typer.Argument(metavar="RUN", help="A run folder of `spelgen train`.")]
 Joints = Annotated[
     str | None,
-    typer.Option("--joints", metavar="A,B,C", help="The moving joints; all others are locked at zero."),
+    typer.Option("--joints", metavar="A,B,C", help="Moving joints; all others are locked at zero."),
 ]
 Tip = Annotated[
-    str | None, typer.Option("--tip", metavar="LINK", help="Take the chain from the root to this link.")
+    str | None,
+    typer.Option("--tip", metavar="LINK", help="Last link of the chain, which starts at the root."),
 ]
 Assumption = Annotated[
     Assume,
     typer.Option(
-        "--assume", help="What is trusted: the kinematics, or also the inertials' zeros and symmetries."
+        "--assume",
+        help="URDF values the structure may use: kinematics, or also zeros and symmetries of inertials.",
     ),
 ]
 AngleTolerance = Annotated[
@@ -48,7 +53,7 @@ AngleTolerance = Annotated[
         metavar="RAD",
         min=0.0,
         max=0.1,
-        help="Angles this near to a special one are that one.",
+        help="Tolerance for rounding angles to special values such as pi/2.",
     ),
 ]
 Entry = Annotated[
@@ -57,42 +62,52 @@ Entry = Annotated[
 ]
 Data = Annotated[
     list[Path] | None,
-    typer.Option("--data", metavar="LOGS...", help="Log files, or folders of them.", show_default=False),
+    typer.Option("--data", metavar="LOGS...", help="Log files or folders.", show_default=False),
 ]
 MoreData = Annotated[
     list[Path] | None,
-    typer.Argument(metavar="LOGS", help="More logs: several may follow --data.", show_default=False),
+    typer.Argument(
+        metavar="LOGS", help="More log files or folders; several may follow --data.", show_default=False
+    ),
 ]
 Mapping = Annotated[
     Path | None,
     typer.Option(
-        "--mapping", metavar="FILE", help="YAML: how the logs are named and measured; see docs/logs.md."
+        "--mapping",
+        metavar="FILE",
+        help="YAML file with column names and units of the logs; see docs/logs.md.",
     ),
 ]
 Filter = Annotated[
     float | None,
     typer.Option(
-        "--filter", metavar="HZ", min=0.0, help="Cutoff of the zero-phase low-pass on the logs; 0: none."
+        "--filter",
+        metavar="HZ",
+        min=0.0,
+        help="Cutoff frequency of the zero-phase low-pass filter; 0: no filter.",
     ),
 ]
 Trust = Annotated[
-    bool, typer.Option("--trust", help="Run the run folder's module, even where spelgen did not write it.")
+    bool,
+    typer.Option("--trust", help="Execute the module of the run folder even if spelgen did not write it."),
 ]
 Output = Annotated[
     Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write the result to a file.")
 ]
 Address = Annotated[
     str | None,
-    typer.Option(metavar="HOST:PORT", help="A Ray cluster that runs already; default: one on this machine."),
+    typer.Option(
+        metavar="HOST:PORT", help="Address of a running Ray cluster; default: a new one on this machine."
+    ),
 ]
 Strict = Annotated[bool, typer.Option("--strict", help="Exit with 1 if there is any warning.")]
-Force = Annotated[bool, typer.Option("--force", help="Replace an output that exists.")]
+Force = Annotated[bool, typer.Option("--force", help="Overwrite existing output.")]
 
 
 def result_format() -> OptionInfo:
     """Return the option `--format`; one for each command, whose formats are its own."""
     option: OptionInfo = typer.Option(
-        help="Of the result; without it, by the suffix of -o, else text.", show_default=False
+        help="Format of the result; default: that of the suffix of -o, else text.", show_default=False
     )
     return option
 

@@ -20,10 +20,12 @@ def simulate(
     joints: Joints = None,
     tip: Tip = None,
     angle_tolerance: AngleTolerance = 2e-3,
-    seed: Annotated[int | None, typer.Option(min=0, help="Default: that of the robot's settings.")] = None,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Random seed; default: that of the robot's settings.")
+    ] = None,
     force: Force = False,
 ) -> None:
-    """Make training and test logs with Pinocchio."""
+    """Simulate training and test logs with Pinocchio."""
     from spelgen.loaded_arm import load_arm
     from spelgen.logs.read import write_logs
     from spelgen.simulation.simulate import simulate as simulate_arm

@@ -36,31 +36,31 @@ TrainModule = Annotated[
     Path | None,
     typer.Argument(
         metavar="MODULE.py",
-        help="A module of `spelgen build`; with --resume, a run will do.",
+        help="Module of `spelgen build`; with --resume, a run folder.",
         show_default=False,
     ),
 ]
 NewRun = Annotated[
     Path | None, typer.Option("-o", "--output", metavar="RUN", help="Run folder; default: runs/<module>.")
 ]
-Resume = Annotated[bool, typer.Option("--resume", help="Go on with the run in the run folder.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Resume the run in the run folder.")]
 Source = Annotated[
     Path | None,
-    typer.Option("--from", metavar="RUN", help="Begin from a run; no MODULE. Torques adapt it."),
+    typer.Option("--from", metavar="RUN", help="Adapt the model of this run; replaces MODULE."),
 ]
 ObjectiveName = Annotated[
     Objective | None,
-    typer.Option(help="Default: of rigid bodies torque, else rollout, after momentum steps."),
+    typer.Option(help="Default: torque for rigid bodies; rollout, after momentum steps, for networks alone."),
 ]
 Assignments = Annotated[
     list[str] | None,
     typer.Option(
         "--set",
         metavar="KEY=VALUE",
-        help="Set an option of the fit: epochs=50, seed=1, device=cuda; once for each.",
+        help="Set an option of the fit, e.g. epochs=50; repeat it for more options.",
     ),
 ]
-MaxMinutes = Annotated[float | None, typer.Option(min=0.0, help="End the fit to windows after so long.")]
+MaxMinutes = Annotated[float | None, typer.Option(min=0.0, help="Time limit of fits to windows.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Show no progress.")]
 
 
@@ -82,8 +82,8 @@ def train(
 ) -> None:
     """Fit a module to logs.
 
-    What is not given here comes from `training` in the settings beside the robot, whose keys --set takes, too.
-    docs/cli.md lists them. It is an error to set one that does not apply to the objective.
+    Defaults come from `training` in the robot's settings; --set takes the same keys, which docs/cli.md lists. A key
+    that does not apply to the objective is an error.
     """
     start_time = time.monotonic()  # --max-minutes counts from here, reading of logs included
     values = read_assignments(assignments or [])
@@ -153,7 +153,7 @@ def _tell(fit: Fit, folder: Path, paths: Sequence[Path], *, resume: bool) -> Non
         say(line)
     say(f"run folder: {folder}")
     if interrupted:
-        note("the best model so far is in the run folder; --resume goes on")
+        note("the best model so far is in the run folder; resume it by --resume")
         raise typer.Exit(INTERRUPTED)
 
 

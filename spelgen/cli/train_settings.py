@@ -173,9 +173,9 @@ def resumed_run(folder: Path, request: Request) -> Start:
     record = run.read_config()
     if record["validation_fraction"] is None and record["validation"]:
         raise RunError(
-            "a run with validation logs that were given in memory",
+            "a run whose validation logs were passed from Python",
             file=folder,
-            do="go on with spelgen.fit(..., folder=..., options=spelgen.RunOptions(resume=True))",
+            do="resume it by spelgen.fit(..., folder=..., options=spelgen.RunOptions(resume=True))",
         )
 
     def config(model: EmittedModel, rates: Sequence[float] | None) -> FitConfig:

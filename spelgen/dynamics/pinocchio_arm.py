@@ -47,7 +47,7 @@ def pinocchio_model(arm: Arm, settings: Settings) -> pin.Model:
 
 def _without_inertial(name: str) -> ArmError:
     what, expected = "a link without <inertial>", "mass, centre of mass and inertia of all that moves"
-    do = "give them in the URDF: guesses do, a model that is trained on logs needs none"
+    do = "write estimates into the URDF; a model that is trained on logs needs none"
     return ArmError(what, element=f"joint {name!r}", expected=expected, do=do)
 
 

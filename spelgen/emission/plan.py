@@ -53,7 +53,7 @@ def plan_model(
     if servos and design.memory == "none":
         raise SettingsError(
             f"position servos with the preset {options.preset}", element="input",
-            expected="a preset whose friction remembers: what servos hold rests on it", do="--preset closed-form",
+            expected="a preset with bristle friction, which position servos need", do="--preset closed-form",
         )  # fmt: skip
     everything = tuple(range(len(arm.coordinates)))
     sizes = nominal(arm, structure)

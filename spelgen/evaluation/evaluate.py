@@ -63,7 +63,9 @@ def evaluate(
     notes = check(logs, judged.joints, judged.model.joint_types)
     seen = [trajectory.name for trajectory in logs if trajectory.name in judged.trained_on]
     if seen:  # names are all that a run keeps of its logs
-        message = f"names also used in training: {', '.join(seen)}; errors on training data prove nothing"
+        message = (
+            f"names also used in training: {', '.join(seen)}; errors on training data are not test errors"
+        )
         notes.append(Diagnostic("warning", "tested-on-training-data", "logs", None, message))
     if has_servos(judged.model):
         if baselines:

@@ -13,7 +13,10 @@ from spelgen.listing import Listing, number
 if TYPE_CHECKING:
     from spelgen.evaluation.results import Results
 
-OBSERVER = "+ observer: holds the disturbance that a momentum observer finds in the 0.1 s before; all else is open loop"
+OBSERVER = (
+    "+ observer: with the constant disturbance that a momentum observer estimates from the 0.1 s before; "
+    "all others are open-loop"
+)
 UNITS = {"revolute": ("rad", "rad/s", "Nm"), "prismatic": ("m", "m/s", "N")}
 POSITION, VELOCITY, TORQUE = range(3)  # in these
 

@@ -67,15 +67,15 @@ def verdict(results: Results, identified: Mapping[str, Any] | None = None, limit
     _judge_motion(results, uses)
     _judge_replays(results, uses)
     if not uses.proofs:
-        return Verdict("Nothing to judge by: no horizon and no torque was evaluated.", "")
+        return Verdict("No verdict: no horizon and no torque was evaluated.", "")
     worst = _worst_joint(results)
     recommendations = _recommendations(results, identified or {}, limits, worst)
-    sentence = "Not good enough yet to rely on"
+    sentence = "Not accurate enough yet"
     if uses.good:
         sentence = f"Good enough for {listed(uses.good)}"
     if any(diagnostic.code == SEEN for diagnostic in results.diagnostics):
         sentence = sentence[0].lower() + sentence[1:]
-        sentence = f"Judged on logs that it was trained on, which proves little: {sentence}"
+        sentence = f"Evaluated on training logs: {sentence}"
     if uses.good and uses.bad:
         sentence += f", not for {listed(uses.bad)}"
     if worst.joint:
@@ -98,10 +98,10 @@ def _judge_torques(results: Results, uses: _Uses) -> None:
         return
     explained = 1 - summary.mean_nmse  # coefficient of determination
     if explained >= TUNING.explained_for_contacts:
-        uses.good += ["feed-forward control", "telling contacts from its own error"]
+        uses.good += ["feed-forward control", "contact detection"]
     elif explained >= TUNING.explained_for_feed_forward:
         uses.good.append("feed-forward control")
-        uses.bad.append("telling contacts from its own error")
+        uses.bad.append("contact detection")
     elif explained >= TUNING.explained_for_gravity:
         uses.good.append("gravity compensation")
         uses.bad.append("feed-forward control")
@@ -117,7 +117,7 @@ def _judge_motion(results: Results, uses: _Uses) -> None:
     if not finite:
         if results.horizons:
             uses.bad.append("simulation")
-            uses.proofs.append("predicts nothing that stays finite")
+            uses.proofs.append("predicts no finite motion")
         return
     last = finite[-1]
     error = _relative(last.errors[MODEL])
@@ -169,7 +169,9 @@ def _constant_velocity(results: Results) -> str:
             times.append(horizon.name)
     if not times:
         return ""
-    return f"A constant velocity predicts better {listed(times)} ahead: there the model is for torques, not for motion."
+    return (
+        f"A constant velocity predicts better {listed(times)} ahead: there, use the model for torques only."
+    )
 
 
 def _better_baselines(results: Results) -> str:
@@ -203,7 +205,7 @@ def _worst_joint(results: Results) -> _Failure:
     k = int(np.argmax(np.array(errors, dtype=float)))
     amount = _percent(float(errors[k] or 0))
     joint = results.joints[k]
-    return _Failure(joint, "", f"At {joint} it misses {amount} of the motion after {last.name}.")
+    return _Failure(joint, "", f"At {joint} the error after {last.name} is {amount} of the motion.")
 
 
 def _worst_torque(results: Results) -> _Failure:
@@ -226,7 +228,9 @@ def _worst_torque(results: Results) -> _Failure:
         elif size_fast > TUNING.uneven * size_slow:
             when = " at speed"
     amount = _percent(float(ratios[k]))
-    return _Failure(joint, when, f"At {joint} {amount} of the torque's variation is left.")
+    return _Failure(
+        joint, when, f"At {joint} the torque residual is {amount} of the torque's standard deviation."
+    )
 
 
 def _recommendations(
@@ -241,11 +245,11 @@ def _recommendations(
     trained = identified.get("coverage") or {}
     unseen = identified.get("unseen_directions")
     if unseen:
-        reason = f"The training logs say nothing in {unseen} directions of the base parameters"
+        reason = f"The training logs do not excite {unseen} directions of the base parameters"
         recommend(f"a richer motion {EXCITE}", reason)
     outside = _outside(trained, results.traces.coverage, results.joints)
     if outside:
-        reason = f"The test logs go where the training logs do not: {shortened(outside, 3)}"
+        reason = f"The test logs exceed the range of the training logs: {shortened(outside, 3)}"
         recommend(f"motion with the {outside[0]} that the test logs have", reason)
     if worst.when.endswith(STANDSTILL):
         recommend(f"slow reversals of {worst.joint}", "Dry friction is learned from slow reversals")
@@ -258,7 +262,7 @@ def _recommendations(
     base = identified.get("base_parameters", ())
     weak = [parameter for parameter in base if parameter["determined"] in ("weak", "may be zero")]
     if weak:
-        reason = f"{len(weak)} of {len(base)} base parameters can hardly be told from zero by these logs"
+        reason = f"{len(weak)} of {len(base)} base parameters are not significantly different from zero"
         recommend(f"faster motion of all joints together {EXCITE}", reason)
     return recommendations
 

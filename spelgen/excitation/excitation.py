@@ -14,8 +14,8 @@ from spelgen.excitation.trajectory import Motion
 from spelgen.listing import WIDTH, Listing
 
 WARNING = (
-    "Not checked: collisions of the arm with itself, its load and its surroundings. Look at the motion, then run "
-    "it slowly. Move to its first position before: it starts and ends at rest there."
+    "Not checked: collisions of the arm with itself, its load and its surroundings. View the motion, then run it "
+    "slowly. Move the arm to the first position before. The motion starts and ends at rest."
 )
 
 

@@ -49,7 +49,7 @@ def motion_bounds(
         if not lowest < highest:
             errors.append(ArmError(
                 f"the limits {lowest:g} .. {highest:g}", element=f"joint {coordinate.name!r}",
-                expected="room to move", do="correct them, or leave the joint out by --joints",
+                expected="room to move", do="correct them, or omit the joint by --joints",
             ))  # fmt: skip
     collect(errors)
     low, high, speeds = np.array(limits).T

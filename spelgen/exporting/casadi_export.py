@@ -27,7 +27,7 @@ def export_casadi(trained: Trained) -> Exported:
     checked = f"Checked when exported, by CasADi {ca.CasadiMeta.version()}: {parity.summary}."
     use = (
         "qdd = casadi.Function.load('forward_dynamics.casadi')(q, qd, tau, z) takes numbers or symbols: "
-        "its derivatives, of any order, are CasADi's; *_derivatives.casadi hold the first ones ready."
+        "its derivatives, of any order, are CasADi's; *_derivatives.casadi contain the first derivatives."
     )
     about = f"{UNITS}; z is friction's memory, {model.memory} numbers: casadi.DM(0, 1) where there are none."
     files = {f"{name}.casadi": _saved(function) for name, function in functions.items()}

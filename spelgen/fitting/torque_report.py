@@ -1,4 +1,4 @@
-"""What a fit to torques says in words: how far the URDF was trusted, and what the logs leave open."""
+"""Notes of a fit to torques: width of the prior, selected residual terms, undetermined inertias."""
 
 from __future__ import annotations
 
@@ -39,9 +39,8 @@ def torque_notes(
     names = np.array(model.joint_names)
     # a deviation s of a coordinate is a factor e^s in a root of the pseudo-inertia
     factor = float(np.exp(2 * solution.prior.bodies))
-    trust = "hardly believed, only" if factor > TUNING.hardly_trusted else "believed"
-    message = f"the URDF's inertias are {trust} to within a factor of {factor:.2g}"
-    yield Diagnostic("info", "urdf-believed", "bodies", None, message)
+    message = f"prior standard deviation of URDF inertias: factor {factor:.2g}"
+    yield Diagnostic("info", "urdf-prior", "bodies", None, message)
     if solution.compensated.any():
         yield _compensation(model, solution, names)
     if has_residuals(model):
@@ -53,13 +52,13 @@ def torque_notes(
     undetermined = deviation > TUNING.undetermined
     if undetermined.any():
         joints = ", ".join(names[undetermined])
-        message = f"these logs hardly tell the inertia at {joints}: it is mostly a guess"
+        message = f"these logs do not determine the inertia at {joints}; its value is mostly the prior"
         yield Diagnostic("warning", "inertia-undetermined", "logs", None, message)
     weak = solution.residual > TUNING.weak_acceleration * inertia * qdd.std(dim=0).numpy()
     if weak.any():
         message = (
-            f"far more torque is missed than accelerates {', '.join(names[weak])}: torques are predicted, but motion "
-            "under the measured torque may be predicted worse than by constant velocity; record faster motion"
+            f"the torque residual exceeds the inertial torque at {', '.join(names[weak])}: a simulation may be worse "
+            "than constant velocity; record faster motion"
         )
         yield Diagnostic("warning", "acceleration-unseen", "logs", None, message)
 
@@ -68,7 +67,7 @@ def _compensation(model: EmittedModel, solution: TorqueSolution, names: np.ndarr
     value = model.friction_compensation.detach().numpy()
     joints = ", ".join(f"{names[k]} {value[k]:.3g}" for k in np.flatnonzero(solution.compensated))
     message = (
-        "the measured torque falls as velocity grows, as of a drive that compensates friction unseen: "
+        "the measured torque decreases with velocity, as if the drive compensated friction: "
         f"{joints} Nm s/rad (N s/m) are added; check the torques' signs and what the controller subtracts"
     )
     return Diagnostic("warning", "friction-compensated", "logs", None, message)
@@ -77,7 +76,7 @@ def _compensation(model: EmittedModel, solution: TorqueSolution, names: np.ndarr
 def _selected(solution: TorqueSolution, names: np.ndarray) -> str:
     """Return what stands beside rigid bodies, with the fraction that it explains of what was missed where it acts."""
     if not solution.residuals:
-        return "nothing beside rigid bodies and friction's laws: held-out samples ask for no more"
+        return "no residual terms selected (cross-validation)"
     parts = []
     for residual in solution.residuals:
         effect = EFFECTS[residual.name]
@@ -85,7 +84,7 @@ def _selected(solution: TorqueSolution, names: np.ndarray) -> str:
             effect += f" at {names[residual.joint]}"
         parts.append(f"{effect} ({residual.gain:.1%})")
     return (
-        "beside rigid bodies, with the part of the missed torque's squares that held-out samples lost: "
+        "residual terms selected by cross-validation, with the decrease of the mean squared torque residual: "
         + ", ".join(parts)
     )
 

@@ -123,8 +123,8 @@ def robot_of(module: Path, urdf: Path | str | None, facts: Facts) -> tuple[Path 
         if urdf is not None:
             raise RunError("no such file", file=path, expected="the URDF the module was built from")
         message = (
-            f"no {facts.urdf} beside the module: --robot names it; without it evaluation lacks the URDF's own values "
-            "as a baseline and asks for --trust, for the module cannot be written anew"
+            f"no {facts.urdf} beside the module; pass it by --robot. Without it, evaluation has no baseline with the "
+            "URDF's values and needs --trust"
         )
         return None, [Diagnostic("warning", "no-urdf", "run", None, message)]
     if hashlib.sha256(urdf_bytes(path)).hexdigest() == facts.urdf_sha256:

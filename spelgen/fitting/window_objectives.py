@@ -31,7 +31,7 @@ def _prepare(request: FitRequest, config: WindowConfig) -> TrainingData:
     if isinstance(request.logs, LargeLogs):
         raise LogError(
             "logs larger than memory",
-            expected="some hours of them: every tenth file, say",
+            expected="fewer logs, for example every tenth file",
             do="or fit torques, which read them in chunks: the objective torque",
         )
     return prepare_windows(request, config.window, config.stride)

@@ -26,7 +26,7 @@ def fleet_listings(fleet: FleetResults) -> list[Listing]:
         tables += [_unit_listing(units, quantity) for quantity in units.quantities]
     if fleet.failures:
         rows = tuple((f"{name}: {reason}",) for name, reason in fleet.failures.items())
-        tables.append(Listing("What failed; started again, it is tried again", ("",), rows))
+        tables.append(Listing("Failed runs; the same command runs them again", ("",), rows))
     return tables
 
 
@@ -129,7 +129,7 @@ def _search_listing(search: Sequence[SearchResult]) -> Listing:
         options = ", ".join(f"{name} {_text(value)}" for name, value in result.options.items())
         name = f"{result.robot}, {result.preset}"
         rows.append((name, options, number(result.validation), str(result.trials)))
-    title = "What the search chose, by validation loss"
+    title = "Selected by the search, by validation loss"
     return Listing(title, ("", "options", "loss", "trials"), tuple(rows), left=(0, 1))
 
 

@@ -71,7 +71,7 @@ def workers(jobs: int, address: str | None = None, gpus: float = 0.0) -> Iterato
         location = "this machine" if address is None else repr(address)
         raise RunError(
             f"no Ray cluster at {location} ({' '.join(str(error).split())[:200]})",
-            do="start one by `ray start --head`, or leave --address out",
+            do="start one by `ray start --head`, or omit --address",
         ) from error
     try:
         with redirect_stdout(sys.stderr):  # Ray reports workers that died there: stdout is for results

@@ -25,7 +25,7 @@ SCHEMA = 2
 DETERMINED = ("firm", "fair", "weak", "may be zero")
 _UNIT = {"revolute": "Nm", "prismatic": "N"}
 _WEIGHTED = {
-    "equal": "each Nm counting the same",
+    "equal": "joints weighted equally",
     "range": "each joint weighted by its torque's range",
     "noise": "each joint weighted by the noise left",
 }
@@ -123,7 +123,7 @@ class Identification:
                 line = f"{name} = {formula}"
                 meant.append(textwrap.fill(line, WIDTH, initial_indent="  ", subsequent_indent=" " * 8))
         never = [name for name, how in self.base.identifiability().items() if how == "never"]
-        unseen = f"No motion of this arm shows: {', '.join(never) or 'nothing; all have an effect'}."
+        unseen = f"Unidentifiable: {', '.join(never) or 'none'}."
         return "\n\n".join([
             textwrap.fill(self.heading(), WIDTH), self.quality(), residuals.text(), parameters.text(),
             "\n".join(meant), textwrap.fill(unseen, WIDTH),
@@ -135,7 +135,7 @@ class Identification:
         values = zip(self.base.names, self.values, self.deviations, self.determined, strict=True)
         return (
             Listing(
-                "Torque not explained: root mean square, and its square by the torque's variance",
+                "Torque residual: RMSE and nMSE",
                 ("joint", "RMS", "", "nMSE"),
                 tuple((x.name, f"{rms:.4g}", _UNIT[x.kind], f"{nmse:.3g}") for x, rms, nmse in joints),
                 left=(0, 2),
@@ -175,7 +175,7 @@ class Identification:
         if self.unseen:
             directions = f"{self.unseen} direction{'s' * (self.unseen > 1)}"
             conditioned = (
-                f"The logs say nothing in {directions} of the base parameters: those values are arbitrary; excite "
+                f"The logs do not excite {directions} of the base parameters: those values are arbitrary; excite "
                 "the arm more, or give --prior."
             )
         else:

@@ -142,7 +142,7 @@ def _wrong_command(k: int, joints: Sequence[str], following: Following) -> LogEr
     in_degrees = 0.8 < gain * DEGREES < 1.25 or 0.8 < gain / DEGREES < 1.25
     if correlation > TUNING.follows and in_degrees:
         got = f"positions that move {gain:.3g} times as far as commands (180/pi is 57.3)"
-        do = "say 'units' of q and u under 'logs' in the robot's YAML"
+        do = "write 'units' of q and u under 'logs' in the robot's YAML"
         return LogError(got, element=where, expected="both in radians", do=do)
     if correlation < -TUNING.follows:
         got = f"positions that move against commands (correlation {correlation:.2g})"
@@ -167,7 +167,7 @@ def _odd_command(
         message = "u is q, to the last bit: are the commands those that were sent?"
         yield _warning("commands-are-positions", report.name, message)
     elif not following.moves[k]:
-        message = f"its command moves by {report.u[1] - report.u[0]:.3g} alone: what its servo is stays open"
+        message = f"its command moves by {report.u[1] - report.u[0]:.3g} alone: its servo is not determined"
         yield _warning("idle-command", report.name, message)
     elif correlation < TUNING.ignores:
         message = f"it does not follow its command (correlation {correlation:.2g})"

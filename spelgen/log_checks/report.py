@@ -100,7 +100,7 @@ class LogReport:
         if self.findings:
             paragraphs.append("\n".join(["Findings", *map(_wrapped, self.findings)]))
         else:
-            paragraphs.append("Nothing is odd.")
+            paragraphs.append("No findings.")
         return "\n\n".join(paragraphs)
 
     def __repr__(self) -> str:

@@ -11,9 +11,7 @@ from spelgen.settings.tuning.log_checks import LogCheckTuning
 
 TUNING = LogCheckTuning()
 UNITS = {"revolute": ("rad", "rad/s", "Nm"), "prismatic": ("m", "m/s", "N")}
-SAY_UNIT = (
-    "say 'units: {tau: ...}' or a 'gain' under 'logs' in the robot's YAML; 'Nm' says that they are right"
-)
+SAY_UNIT = "write 'units: {tau: ...}' or a 'gain' under 'logs' in the robot's YAML; 'Nm' confirms the unit"
 TORQUE_ERRORS = ("torque-sense", "torque-unit", "torque-beyond-drive")
 
 
@@ -141,7 +139,7 @@ def find_unusual_scale(joint: JointEvidence) -> str | None:
 CHECKS: list[Check[JointEvidence]] = [
     Check(
         "torque-sense", "error", find_wrong_sense, expected="the URDF's sense",
-        do="say 'sign: -1' or a negative 'gain' of the joint under 'logs', or the gravity of this mounting",
+        do="write 'sign: -1' or a negative 'gain' of the joint under 'logs', or the gravity of this mounting",
     ),
     Check("torque-unit", "error", find_wrong_unit, expected="Nm or N at the joint", do=SAY_UNIT),
     Check(

@@ -201,13 +201,13 @@ def find_rest(signals: JointSignals) -> str | None:
     """Find joints that do not move."""
     if np.ptp(signals.q) > 0:
         return None
-    return "does not move: the logs say nothing about its own dynamics"
+    return "does not move: the logs do not excite its dynamics"
 
 
 CHECKS: list[Check[JointSignals]] = [
     Check(
         "degrees", "error", find_degrees, expected="radians and rad/s",
-        do="convert degrees, by 'units' under 'logs' in the robot's YAML; if the units are right, say so there, "
+        do="convert degrees, by 'units' under 'logs' in the robot's YAML; if the units are right, declare them there, "
         "or in the Parquet schema's metadata 'units'",
     ),
     Check(

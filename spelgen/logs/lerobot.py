@@ -49,7 +49,7 @@ def dataset_mapping(folder: Path, joints: Sequence[str], mapping: LogMapping) ->
             if name not in names:
                 raise LogError(
                     f"the motors {', '.join(names) or 'without names'}", file=folder / INFO, element=f"joint {joint}",
-                    expected=f"{name} among them", do="say its name under 'logs', 'joints' in the robot's YAML",
+                    expected=f"{name} among them", do="write its name under 'logs', 'joints' in the robot's YAML",
                 )  # fmt: skip
         columns = {"q": f"{STATE}[{states.index(name)}]", "u": f"{ACTION}[{actions.index(name)}]"}
         joint_log = mapping.joint(joint)

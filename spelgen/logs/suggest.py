@@ -97,7 +97,7 @@ def suggest_mapping(file: Path, joints: Sequence[str], joint_types: Sequence[str
         if angles and joint in turning and len(turning) < len(joints):
             lines.append(f"    units: {json.dumps(angles)}")
         if torque in ("A", "mA"):
-            lines.append(f"    gain: 1.0 # Nm per {torque} at the joint, the gear included: say what it is")
+            lines.append(f"    gain: 1.0 # Nm per {torque} at the joint, the gear included: write its value")
     missing = []
     for quantity in ("q", "tau"):
         missing += [f"{quantity} of {joint}" for joint in joints if joint not in by_joint[quantity]]

@@ -186,7 +186,7 @@ def _advice(
     quantities = {owners.get(name, ("", ""))[0] for name in missing}
     # the usual gap of loggers, and the only one with a remedy of its own
     if quantities == {"qd"}:
-        return "say 'velocity: differentiated' under 'logs' in the robot's YAML where none were logged"
+        return "write 'velocity: differentiated' under 'logs' in the robot's YAML where none were logged"
     joint = ""
     if missing[0] in owners:
         joint = mapping.log_name(owners[missing[0]][1])
@@ -195,7 +195,7 @@ def _advice(
         if names_joint(close, joint):
             return f"rename the column {close!r} to {missing[0]!r}?"
     return (
-        "rename the columns, or say their names under 'logs' in the robot's YAML: "
+        "rename the columns, or write their names under 'logs' in the robot's YAML: "
         "`spelgen logs LOGS --robot ROBOT.urdf --suggest FILE` drafts them"
     )
 

@@ -113,16 +113,16 @@ def base_table(model: EmittedModel | None, arm: LoadedArm, identified: Record) -
     if learned is not None:
         head.insert(2, "model")
         note += (
-            "; a value of the model outside its interval is either drawn there by the URDF, or tells of an effect "
-            "that least squares has no column for"
+            "; a value of the model may lie outside its interval because of the prior, or of an effect that least "
+            "squares has no column for"
         )
     return ParameterTable(
-        "Base parameters: the only combinations that motion shows",
+        "Base parameters: identifiable combinations",
         tuple(head),
         tuple(sure),
         f"{note}.",
         tuple(unsure),
-        f"{len(unsure)} more that these logs hardly tell from zero",
+        f"{len(unsure)} more, not significantly different from zero",
     )
 
 

@@ -42,8 +42,8 @@ STYLES = {
 }
 COMPONENTS = ("inertia", "Coriolis", "gravity", "friction")
 ERRORS = {
-    "relative": ("Relative to the motion", "error / motion"),
-    "tip_mm": ("Of the tip", "error of the tip [mm]"),
+    "relative": ("Relative error", "error / motion"),
+    "tip_mm": ("Tip error", "tip error [mm]"),
 }
 
 

@@ -117,7 +117,7 @@ def render_report(folder: Path | str, robot: Path | str | None = None) -> str:
         return _rendered(_read(run), robot)
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, TemplateError) as error:
         raise RunError(
-            f"files that do not hold what a report needs ({type(error).__name__}: {error})",
+            f"files without the data of a report ({type(error).__name__}: {error})",
             file=run.path,
             do="run `spelgen evaluate` again",
         ) from error

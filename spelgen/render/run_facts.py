@@ -77,7 +77,7 @@ def training_facts(config: Record, metrics: Sequence[Record], identified: Record
         "objective": config["objective"],
         "training logs": _names(config["training"]),
         "validation logs": _names(config["validation"]),
-        "windows": f"{config['training_windows']:,} to train, {config['validation_windows']:,} held out",
+        "windows": f"{config['training_windows']:,} for training, {config['validation_windows']:,} for validation",
         "filter": f"{preprocessing.cutoff:g} Hz, zero phase" if preprocessing.filtered else "none",
     }
     if identified and "samples" in identified:

@@ -19,16 +19,16 @@ class StarterJoint(NamedTuple):
 def starter(urdf: str, joints: Sequence[StarterJoint]) -> str:
     """YAML for the URDF of this file name: prose after ``##``, settings after ``# ``; without that they are said."""
     lines = [
-        f"## What {json.dumps(urdf)} does not say of its arm. Each line that begins with one # and a space says what",
-        "## holds without it: take these two characters away, also above it where it is indented, and change it.",
+        f"## Settings of the arm {json.dumps(urdf)}. Each line that begins with one # and a space is a default:",
+        "## delete these two characters (also in the line above, where it is indented) and change the value.",
         "",
-        "## What this arm is, and where the values come from.",
+        "## Description of the arm and sources of the values.",
         '# about: ""',
         "",
         "## Gravity in the frame of the root link [m/s^2]: turn it for an arm on a wall or under a ceiling.",
         "# gravity: [0.0, 0.0, -9.81]",
         "",
-        "## What commands the joints, and is logged: torque, or position (u) of servos that hold them like springs, as",
+        "## Commanded and logged input: torque, or position (u) of position servos, as",
         "## of hobby arms. A servo whose kp [Nm/rad] is known: kp, among the drives below.",
         "# input: torque",
         "",

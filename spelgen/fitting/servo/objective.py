@@ -196,7 +196,7 @@ class ServoObjective:
 def _commanded(model: EmittedModel, logs: Sequence[Trajectory] | LargeLogs) -> Sequence[Trajectory]:
     """Return the logs, which hold commands. Raises LogError where they do not."""
     if isinstance(logs, LargeLogs):
-        expected = "some hours of them: every tenth file, say"
+        expected = "fewer logs, for example every tenth file"
         raise LogError("logs of positions larger than memory", expected=expected)
     for log in logs:
         require_joints(log, model.facts.joints)

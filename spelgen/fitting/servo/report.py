@@ -241,11 +241,14 @@ def identifiability(joints: Sequence[JointRecord]) -> tuple[list[str], list[str]
 
 def expected_text(determined: Sequence[str], undetermined: Sequence[str], *, known_kp: bool) -> str:
     """Say in a sentence what logs will determine."""
-    scale = "kp and masses are known in ratio alone, unless one kp, mass or load is: kp rests on the URDF's masses"
+    scale = (
+        "only ratios of kp and masses are determined, unless one kp, mass or load is known; kp is scaled by the "
+        "URDF's masses"
+    )
     if known_kp:
-        scale = "kp is known of one joint at least, which determines masses"
+        scale = "kp of at least one joint is known, which determines the masses"
     names, others = ", ".join(determined) or "nothing", ", ".join(undetermined) or "nothing"
-    return f"by the rank of what they show, these logs determine {names}; they leave open {others}; {scale}"
+    return f"by the rank of the equations, these logs determine {names}; not determined: {others}; {scale}"
 
 
 def _shown(interval: Interval | None) -> str:

@@ -129,9 +129,6 @@ class TorqueReportTuning:
     undetermined: float = (
         0.5  # [1] relative standard deviation from which on logs do not determine an inertia
     )
-    hardly_trusted: float = (
-        5.0  # [1] a factor of the URDF's inertias: within more, they are not trusted any more
-    )
     weak_acceleration: float = (
         2.0  # [1] torque missed, by what accelerates a joint: beyond, motion is hardly predicted
     )
