@@ -14,7 +14,7 @@ from spelgen.certificate.inspection import Inspection
 from spelgen.certificate.verification import Verification
 from spelgen.errors import Diagnostic
 from spelgen.settings.settings import Settings, load_settings
-from spelgen.spec import Assume
+from spelgen.spec import Assume, Facts
 from spelgen.structure.base_parameters import BaseParameter, base_parameters
 from spelgen.structure.structure import Structure, derive
 from spelgen.urdf.read import read_urdf
@@ -103,13 +103,16 @@ def load_arm(
 ) -> LoadedArm:
     """Read the URDF at ``path`` and its sidecar, and take the arm from it.
 
-    ``joints`` names the moving joints, or ``tip`` the last link; else the longest actuated chain is taken.
+    ``joints`` names the moving joints, or ``tip`` the last link; else the sidecar does, or the longest actuated chain
+    is taken.
     Angles within ``angle_tolerance`` [rad] of a special one are that one; at 0 the file's numbers are taken as
     they stand. Raises UrdfError, ArmError or SettingsError.
     """
     path = Path(path)
     robot = read_urdf(path)
     settings = load_settings(path, [joint.name for joint in robot.joints])
+    if joints is None and tip is None:
+        joints, tip = settings.moving_joints, settings.tip
     arm = make_arm(robot, joints=joints, tip=tip, angle_tolerance=angle_tolerance, gravity=settings.gravity)
     coordinates = tuple(
         replace(coordinate, passive=not settings.joint(coordinate.name).actuated)
@@ -124,3 +127,9 @@ def load_arm(
         tip=tip,
         angle_tolerance=angle_tolerance,
     )
+
+
+def arm_of_module(facts: Facts, urdf: str | Path) -> LoadedArm:
+    """Return the arm of an emitted module, taken from its URDF as the module was built from it."""
+    options = facts.options
+    return load_arm(urdf, options.joints, options.tip, options.angle_tolerance)

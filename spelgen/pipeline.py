@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +13,7 @@ from spelgen.design import PRESET_NAMES, Design, Net, load_design
 from spelgen.emission.emit import emit
 from spelgen.emission.plan import plan_model
 from spelgen.errors import ModuleError
-from spelgen.loaded_arm import LoadedArm, load_arm
+from spelgen.loaded_arm import LoadedArm, arm_of_module, load_arm
 from spelgen.spec import Assume, Facts, ModelSpec, Options, read_facts
 
 
@@ -36,12 +37,14 @@ def generate(
     width: int = 64,
     depth: int = 2,
     assume: Assume = "kinematics",
+    module: Path | None = None,
 ) -> str:
     """The source of the module tailored to an arm, or to that of a URDF.
 
     ``preset``: one that comes with spelgen by its name, one of yours by its YAML file, or a ``Design``. ``net``
     takes the place of its own networks, which have ``depth`` hidden layers of ``width``.
-    ``assume`` as for ``inspect``. Raises what ``load_arm`` raises, SettingsError for a design that stands for
+    ``assume`` as for ``inspect``. ``module``: the file that the source is for, which then names the way to its URDF.
+    Raises what ``load_arm`` raises, SettingsError for a design that stands for
     no model.
     """
     loaded = arm if isinstance(arm, LoadedArm) else load_arm(arm)
@@ -57,14 +60,16 @@ def generate(
         width=width,
         depth=depth,
     )
-    return emit(make_spec(loaded, options))
+    spec = make_spec(loaded, options)
+    if module is not None:
+        spec = replace(spec, urdf=_way_to_urdf(module, loaded.robot.path))
+    return emit(spec)
 
 
 def rebuilt(facts: Facts, urdf: Path) -> str:
     """The text of the module that has these facts, written anew from a copy of its URDF. Raises as ``load_arm``."""
-    options = facts.options
-    loaded = load_arm(urdf, options.joints, options.tip, options.angle_tolerance)
-    return emit(replace(make_spec(loaded, options), urdf=facts.urdf))
+    spec = make_spec(arm_of_module(facts, urdf), facts.options)
+    return emit(replace(spec, urdf=facts.urdf))
 
 
 def make_spec(loaded: LoadedArm, options: Options) -> ModelSpec:
@@ -100,10 +105,9 @@ def check(module: str | Path, urdf: str | Path | None = None) -> CheckResult:
     """
     module = Path(module)
     facts = read_facts(module)
-    options = facts.options
     urdf_path = Path(urdf) if urdf is not None else find_urdf(module, facts.urdf)
-    loaded = load_arm(urdf_path, options.joints, options.tip, options.angle_tolerance)
-    spec = make_spec(loaded, options)
+    loaded = arm_of_module(facts, urdf_path)
+    spec = replace(make_spec(loaded, facts.options), urdf=facts.urdf)
     reasons = []
     if spec.urdf_sha256 != facts.urdf_sha256:
         reasons.append(f"{urdf_path} has changed since the module was built")
@@ -111,9 +115,19 @@ def check(module: str | Path, urdf: str | Path | None = None) -> CheckResult:
         reasons.append("the derived model differs from the one in the module")
     if emit(spec) != module.read_text(encoding="utf-8"):
         reasons.append("the module's text differs from what `spelgen build` writes now")
-    proof = loaded.verify(options.assume)
+    proof = loaded.verify(facts.options.assume)
     reasons += [str(difference) for difference in proof.differences]
     return CheckResult(urdf_path, not reasons, tuple(reasons), proof)
+
+
+def _way_to_urdf(module: Path, urdf: Path) -> str:
+    """Return by what a module names its URDF: the file's name where `find_urdf` finds it, else the way to it."""
+    try:
+        if find_urdf(module, urdf.name).samefile(urdf):
+            return urdf.name
+    except ModuleError:
+        pass
+    return Path(os.path.relpath(urdf, module.parent)).as_posix()
 
 
 def find_urdf(module: Path, name: str) -> Path:

@@ -193,7 +193,7 @@ def test_what_motion_does_not_show_is_said(robots):
 
 def test_errors_tell_what_is_missing(robots):
     arm = load_arm(robots / "two_link.urdf").arm
-    with pytest.raises(LogError, match="50 Hz"):
+    with pytest.raises(LogError, match="24 Hz"):
         least_squares(arm, [], LeastSquares())
 
 

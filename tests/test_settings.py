@@ -179,8 +179,8 @@ def test_all_errors_of_a_file_are_told_at_once(urdf):
         load_settings(urdf("gear: 1\njoints:\n  a: {gear: 0}\n"))
     assert str(error.value).splitlines() == [
         "arm.yaml:3: joints.a.gear: got 0, expected greater than 0",
-        "arm.yaml:1: unknown key 'gear'; known are 'about', 'input', 'torque', 'couplings', 'gravity', 'joints', "
-        "'simulation', 'tracking', 'training', 'comparison' and 1 more",
+        "arm.yaml:1: unknown key 'gear'; known are 'about', 'tip', 'moving_joints', 'input', 'torque', 'couplings', "
+        "'gravity', 'joints', 'simulation', 'tracking' and 3 more",
     ]
 
 

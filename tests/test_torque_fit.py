@@ -394,7 +394,7 @@ def test_logs_too_slow_for_accelerations_are_fitted_by_windows(emitted, robots):
     assert default_objective(model, [20.0]) == "rollout"
     assert default_objective(model, [20.0, 100.0]) == "torque"
     for adapt, what in ((None, "to fit torques to"), ("load", "to adapt to")):
-        with pytest.raises(LogError, match=f"no motion {what}, expected samples at 50 Hz or more that move"):
+        with pytest.raises(LogError, match=f"no motion {what}, expected samples at 24 Hz or more that move"):
             fit(model, logs, TorqueFit(adapt=adapt))
 
 

@@ -75,8 +75,8 @@ def build(
     from spelgen.pipeline import generate
 
     arm = load_arm(robot, options.names(joints), tip, angle_tolerance)
-    source = generate(arm, preset, net=net, width=width, depth=depth, assume=assume)
     path = output or Path(f"{robot.stem}_spel.py")
+    source = generate(arm, preset, net=net, width=width, depth=depth, assume=assume, module=path)
     # the same text: nothing is replaced, and its date stays
     if path.is_file() and path.read_bytes() == source.encode():
         say(f"{path} is up to date")

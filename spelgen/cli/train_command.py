@@ -212,11 +212,10 @@ def _torque_check(
     """Return what raises LogError for logs whose torques cannot be those of the arm; None: nothing to check."""
     if urdf is None:
         return None
-    from spelgen.loaded_arm import load_arm
+    from spelgen.loaded_arm import arm_of_module
     from spelgen.log_checks.check_logs import require_possible_torques
 
-    facts = read_facts(module).options
-    arm = load_arm(urdf, facts.joints, facts.tip, facts.angle_tolerance)
+    arm = arm_of_module(read_facts(module), urdf)
     if arm.settings.input == "position":
         return None
     return lambda logs: require_possible_torques(logs, arm, mapping)

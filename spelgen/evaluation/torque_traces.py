@@ -16,8 +16,9 @@ from spelgen.dynamics.bristles import bristles_along
 from spelgen.dynamics.protocol import known_past
 from spelgen.evaluation.horizons import JudgedLogs
 from spelgen.evaluation.plain import Rows, Series, rows, series
-from spelgen.identification.samples import DENSE, FREQUENCY, dynamics_samples
+from spelgen.identification.samples import FREQUENCY, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
+from spelgen.logs.rates import shows_accelerations
 from spelgen.logs.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -90,7 +91,7 @@ def _inverse_dynamics(dynamics: Any, motion: Motion) -> Tensor:
 def _motion(piece: Trajectory, logs: JudgedLogs) -> Motion | None:
     """Return up to ten seconds from the middle of what moves; None where nothing does."""
     columns: tuple[np.ndarray, ...] | None = _sparse_columns(piece, logs)
-    if piece.sample_rate >= DENSE:
+    if shows_accelerations(piece.sample_rate):
         columns = _dense_columns(piece, logs)
     if columns is None:
         return None

@@ -9,7 +9,7 @@ from spelgen.errors import RunError, suggestion
 from spelgen.exporting.exported import EXPORTERS, Exported, require_fitting
 from spelgen.exporting.trained import Trained
 from spelgen.fitting.fitted import Fit, load_run
-from spelgen.loaded_arm import LoadedArm, load_arm
+from spelgen.loaded_arm import LoadedArm, arm_of_module
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
@@ -58,4 +58,4 @@ def _loaded(model: EmittedModel, arm: LoadedArm | Path | str | None) -> LoadedAr
             element="export",
             expected="a run of `spelgen train --robot FILE.urdf`, or an arm",
         )
-    return load_arm(arm, model.facts.joints, angle_tolerance=model.facts.options.angle_tolerance)
+    return arm_of_module(model.facts, arm)

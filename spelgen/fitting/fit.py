@@ -20,6 +20,7 @@ from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.run_lock import locked
 from spelgen.fitting.run_record import require_same
 from spelgen.fitting.streaming import LargeLogs
+from spelgen.identification.samples import SHORTEST
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.fits import FitConfig
@@ -143,10 +144,10 @@ def fit(
 
 
 def sample_rates(logs: Logs) -> list[float]:
-    """Return those of all logs [Hz]."""
+    """Return those of all logs [Hz] that are long enough for accelerations."""
     if isinstance(logs, LargeLogs):
         return logs.rates
-    return [log.sample_rate for log in logs]
+    return [log.sample_rate for log in logs if log.duration >= SHORTEST]
 
 
 def _urdf(arm: ArmOfFile | Path | str | None) -> Path | None:

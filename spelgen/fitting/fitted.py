@@ -18,10 +18,11 @@ from spelgen.fitting.objective import Status
 from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.fitting.run_lock import locked
 from spelgen.fitting.run_record import Content, recorded_config
-from spelgen.identification.samples import DENSE, dynamics_samples
+from spelgen.identification.samples import dynamics_samples
 from spelgen.listing import Listing
 from spelgen.logs.filtering import low_pass
 from spelgen.logs.preprocessing import Preprocessing
+from spelgen.logs.rates import SLOWEST
 from spelgen.logs.trajectory import Trajectory, gap_ends
 from spelgen.settings.fits import FitConfig
 
@@ -110,7 +111,7 @@ class Fit:
         samples = [x for x in samples if len(x.q)]
         if not samples:
             raise LogError(
-                "no motion to judge torques on", expected=f"samples at {DENSE:g} Hz or more that move"
+                "no motion to judge torques on", expected=f"samples at {SLOWEST:g} Hz or more that move"
             )
         scores = []
         for x in samples:

@@ -11,7 +11,7 @@ from spelgen.fitting.servo.objective import ServoObjective
 from spelgen.fitting.servo.report import servo_summary
 from spelgen.fitting.torque_objective import TorqueObjective
 from spelgen.fitting.window_objectives import MomentumObjective, RolloutObjective
-from spelgen.identification.samples import DENSE
+from spelgen.logs.rates import shows_accelerations
 from spelgen.settings.fits import FitConfig, fit_config
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def default_objective(model: EmittedModel, rates: Sequence[float]) -> str:
     """
     if has_servos(model):
         return "servo"
-    if has_rigid_bodies(model) and any(rate >= DENSE for rate in rates):
+    if has_rigid_bodies(model) and any(map(shows_accelerations, rates)):
         return "torque"
     return "rollout"
 

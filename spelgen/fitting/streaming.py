@@ -19,7 +19,7 @@ from spelgen.fitting.dataset import (
     WindowCutting,
 )
 from spelgen.fitting.rollout import loss_scales
-from spelgen.logs.checks import Finding, findings, gap_diagnostics, summarised
+from spelgen.logs.checks import Finding, clock_diagnostics, findings, summarised
 from spelgen.logs.chunks import Chunk, scan
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import GAP, gap_ends
@@ -123,14 +123,14 @@ def _read_once(logs: LargeLogs) -> LogContents:
     pieces: list[list[int]] = []
     rates: list[float] = []
     problems: list[Finding] = []
-    gaps: list[Diagnostic] = []
+    clock_notes: list[Diagnostic] = []
     numbers = hashlib.sha256()
     for chunk, trajectory in scan(logs.files, logs.joints, logs.mapping, logs.joint_types):
         chunks.append(chunk)
         pieces.append(np.diff(gap_ends(trajectory.t, logs.gap)).tolist())
         rates.append(trajectory.sample_rate)
         problems += findings(trajectory, logs.joints, logs.joint_types)
-        gaps += gap_diagnostics(trajectory)
+        clock_notes += clock_diagnostics(trajectory)
         for array in (trajectory.t, trajectory.q, trajectory.qd, trajectory.tau):
             numbers.update(np.ascontiguousarray(array).data)
     notes, errors = summarised(problems, logs.joints, len(chunks))
@@ -138,4 +138,4 @@ def _read_once(logs: LargeLogs) -> LogContents:
     # the last samples of a recording may be a chunk of their own, too short to tell a rate
     lengths = [sum(lengths) for lengths in pieces]
     reliable = [rate for rate, length in zip(rates, lengths, strict=True) if length > max(lengths) / 10]
-    return LogContents(chunks, reliable, [*gaps[:1], *notes], numbers.hexdigest(), pieces)
+    return LogContents(chunks, reliable, [*clock_notes[:1], *notes], numbers.hexdigest(), pieces)

@@ -21,7 +21,8 @@ from spelgen.fitting.torque_samples import TorqueSamples
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer
 from spelgen.fitting.validation import Validation
 from spelgen.fitting.window_problem import measure
-from spelgen.identification.samples import DENSE, DynamicsSamples, dynamics_samples
+from spelgen.identification.samples import DynamicsSamples, dynamics_samples
+from spelgen.logs.rates import SLOWEST
 from spelgen.settings.fits import TorqueFit
 
 if TYPE_CHECKING:
@@ -61,7 +62,7 @@ class TorqueObjective:
             what = "to adapt to" if self.config.adapt else "to fit torques to"
             raise LogError(
                 f"no motion {what}",
-                expected=f"samples at {DENSE:g} Hz or more that move",
+                expected=f"samples at {SLOWEST:g} Hz or more that move",
                 do="fit windows: the objective rollout",
             )
         regularizer = None

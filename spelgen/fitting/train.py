@@ -118,7 +118,7 @@ def open_logs(
 
 def robot_of(module: Path, urdf: Path | str | None, facts: Facts) -> tuple[Path | None, list[Diagnostic]]:
     """The URDF to copy into the run, and what there is to say about it."""
-    path = module.with_name(facts.urdf) if urdf is None else Path(urdf)
+    path = module.parent / facts.urdf if urdf is None else Path(urdf)
     if not path.is_file():
         if urdf is not None:
             raise RunError("no such file", file=path, expected="the URDF the module was built from")

@@ -19,7 +19,7 @@ from spelgen.fitting.torque_logs import prepare_windows, prepared_logs, regulari
 from spelgen.fitting.torque_objective import fit_torques, torque_samples
 from spelgen.fitting.validation import Validation
 from spelgen.fitting.window_problem import Clock, Measured, WindowProblem, measure
-from spelgen.identification.samples import DENSE
+from spelgen.logs.rates import SLOWEST
 from spelgen.settings.fits import MomentumFit, Rollout, TorqueFit, WindowConfig
 
 if TYPE_CHECKING:
@@ -178,7 +178,9 @@ class RolloutObjective:
         samples = torque_samples(self.request.model, self.data)
         if samples is not None:
             return fit_torques(self.request.model, samples, TorqueFit())
-        message = f"no torque fit: these logs are sampled below {DENSE:g} Hz; windows alone are fitted"
+        message = (
+            f"no torque fit: no log that moves has {SLOWEST:g} Hz for a second; windows alone are fitted"
+        )
         return [Diagnostic("warning", "no-torque-fit", "logs", None, message)]
 
     def _compiled(self, notes: list[Diagnostic]) -> EmittedModel:

@@ -19,10 +19,11 @@ from spelgen.identification.identification import Identification
 from spelgen.identification.least_squares import Columns, Solution, Triangles, deviations, reduce, solve
 from spelgen.identification.method import LeastSquares
 from spelgen.identification.prior import gaussian_prior
-from spelgen.identification.samples import DynamicsSamples, dynamics_samples
+from spelgen.identification.samples import SHORTEST, DynamicsSamples, dynamics_samples
 from spelgen.loaded_arm import LoadedArm, load_arm
 from spelgen.logs.checks import check
 from spelgen.logs.preprocessing import Preprocessing
+from spelgen.logs.rates import SLOWEST
 from spelgen.logs.trajectory import Trajectory, require_joints, require_torques
 from spelgen.settings.tuning.identification import IdentificationTuning
 
@@ -79,7 +80,7 @@ def least_squares(
     if not any(len(x.q) for x in samples):
         raise LogError(
             "no samples to identify from",
-            expected="motion sampled at 50 Hz or faster, 1 s without a gap at least",
+            expected=f"motion sampled at {SLOWEST:g} Hz or faster, {SHORTEST:g} s without a gap at least",
         )
     rows = _Rows(arm, samples, method.friction, None if drives is None else drives.speeds)
     triangles = reduce(rows.blocks())

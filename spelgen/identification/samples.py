@@ -11,13 +11,14 @@ import numpy as np
 from spelgen.dynamics.bristles import BristleReach, bristles_along
 from spelgen.logs.filtering import low_pass, low_pass_regular, resample
 from spelgen.logs.preprocessing import Preprocessing
+from spelgen.logs.rates import shows_accelerations
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.tuning.identification import IdentificationTuning
 from spelgen.settings.tuning.logs import LogTuning
 
 TUNING = IdentificationTuning()
 FREQUENCY = TUNING.sample_rate
-DENSE = LogTuning().dense_rate
+SHORTEST = TUNING.shortest_piece
 HOLE = 0.25 / LogTuning().automatic_cutoff  # [s] a shorter one loses nothing that the filter lets through
 AUTOMATIC = Preprocessing()
 
@@ -46,15 +47,15 @@ def dynamics_samples(
 ) -> list[DynamicsSamples]:
     """Return the moving samples of each dense enough trajectory.
 
-    At 100 Hz, through the zero-phase low-pass of ``preprocessing``, by default of 8 Hz, on q, qd and tau (before the
-    change of rate where the log is denser, after it where not), qdd by central differences of the filtered qd, only
-    samples with some |qd| > 0.02 rad/s; pieces between gaps separately. ``pauses``: all samples from the first that
-    moves to the last, standstill between them included. ``reach``: of the bristles whose states z are
-    wanted, through the same filter; see ``bristles_along``.
+    At 100 Hz (logs from 24 Hz on are interpolated, see `resample`), through the zero-phase low-pass of
+    ``preprocessing``, by default of 8 Hz, on q, qd and tau (before the change of rate where the log is denser, after
+    it where not), qdd by central differences of the filtered qd, only samples with some |qd| > 0.02 rad/s; pieces
+    between gaps separately. ``pauses``: all samples from the first that moves to the last, standstill between them
+    included. ``reach``: of the bristles whose states z are wanted, through the same filter; see ``bristles_along``.
     """
     samples = []
     for trajectory in trajectories:
-        if trajectory.sample_rate < DENSE:
+        if not shows_accelerations(trajectory.sample_rate):
             continue
         pieces = _long_pieces(trajectory, preprocessing.gap)
         if not pieces:
@@ -74,7 +75,7 @@ def _long_pieces(trajectory: Trajectory, gap: float) -> list[Trajectory]:
     pieces = []
     for start, stop in pairwise([0, *holes, len(trajectory)]):
         piece = trajectory[start:stop]
-        if piece.duration >= TUNING.shortest_piece:
+        if piece.duration >= SHORTEST:
             pieces.append(piece)
     return pieces
 

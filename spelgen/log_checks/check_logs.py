@@ -16,7 +16,7 @@ from spelgen.log_checks.gravity import GravityFit, StateSamples, fit_gravity, st
 from spelgen.log_checks.report import JointReport, LogReport, range_fraction
 from spelgen.log_checks.robot_checks import CHECKS, JointEvidence
 from spelgen.log_checks.statistics import Statistics, common_step, statistics
-from spelgen.logs.checks import Finding, findings, gap_diagnostics, run_checks, summarised
+from spelgen.logs.checks import Finding, clock_diagnostics, findings, run_checks, summarised
 from spelgen.logs.trajectory import QUANTITIES, Trajectory, require_joints, require_torques
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping |
         samples.append(state_samples(trajectory, inputs))
         drives.add(trajectory)
         odd += findings(trajectory, joints, kinds, measured[-1].agreement)
-        notes += gap_diagnostics(trajectory)
+        notes += clock_diagnostics(trajectory)
         if len(examples) < EXAMPLES:
             examples.append(trajectory)
     if not measured:

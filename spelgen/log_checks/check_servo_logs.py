@@ -13,14 +13,14 @@ from spelgen.log_checks.following import DELAYS, NO_DELAY, TUNING, Following, me
 from spelgen.log_checks.report import range_fraction
 from spelgen.log_checks.servo_report import ServoJointReport, ServoLogReport
 from spelgen.log_checks.statistics import (
-    DENSE,
     Clock,
     clock_of,
     common_step,
     noise_level,
     quantisation_step,
 )
-from spelgen.logs.checks import DEGREES, Finding, findings, gap_diagnostics, summarised
+from spelgen.logs.checks import DEGREES, Finding, clock_diagnostics, findings, summarised
+from spelgen.logs.rates import is_dense
 from spelgen.logs.trajectory import Trajectory, require_commands, require_joints
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def check_servo_logs(logs: Iterable[Trajectory], arm: LoadedArm) -> ServoLogRepo
         require_joints(log, joints)
         require_commands(log)
         odd += findings(log, joints, kinds)
-        notes += gap_diagnostics(log)
+        notes += clock_diagnostics(log)
     summaries, errors = summarised(odd, joints, len(logs))
     notes += summaries
     following = measure_following(logs, _saturation(arm))
@@ -125,7 +125,7 @@ def _noise(logs: Sequence[Trajectory], k: int) -> float | None:
     """Return the standard deviation of the position's noise, None where logs are too sparse to tell."""
     levels = []
     for log in logs:
-        if log.sample_rate >= DENSE and len(log) > 8:
+        if is_dense(log.sample_rate) and len(log) > 8:
             levels.append(noise_level(log.t, log.q[:, [k]]))
     if not levels:
         return None

@@ -9,12 +9,11 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from spelgen.logs.checks import VelocityAgreement, velocity_agreement
+from spelgen.logs.rates import is_dense
 from spelgen.logs.trajectory import GAP, QUANTITIES, Trajectory
 from spelgen.settings.tuning.log_checks import LogCheckTuning
-from spelgen.settings.tuning.logs import LogTuning
 
 TUNING = LogCheckTuning()
-DENSE = LogTuning().dense_rate  # [Hz] below this rate motion looks like noise
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,7 @@ def statistics(trajectory: Trajectory) -> Statistics:
     """Return the numbers of one trajectory."""
     low, high, noise, steps = {}, {}, {}, {}
     # third differences of sparse motion are motion
-    dense = trajectory.sample_rate >= DENSE and len(trajectory) > 8
+    dense = is_dense(trajectory.sample_rate) and len(trajectory) > 8
     for name in QUANTITIES:
         signals: np.ndarray = getattr(trajectory, name)
         low[name], high[name] = signals.min(axis=0), signals.max(axis=0)

@@ -15,6 +15,7 @@ from typing import Generic, Literal, TypeVar
 import numpy as np
 
 from spelgen.errors import Diagnostic, LogError, SpelgenError, collect
+from spelgen.logs.rates import is_dense, shows_accelerations
 from spelgen.logs.trajectory import Trajectory, gap_ends, split_at_gaps
 from spelgen.settings.tuning.log_checks import LogCheckTuning
 
@@ -239,26 +240,35 @@ def check(
     Raises LogError when revolute joints look recorded in degrees, unless units are declared, and when a
     position or a velocity never changes while the other one does.
     """
-    gaps: list[Diagnostic] = []
+    notes: list[Diagnostic] = []
     results: list[Finding] = []
     count = 0
     for trajectory in trajectories:
-        gaps += gap_diagnostics(trajectory)
+        notes += clock_diagnostics(trajectory)
         results += findings(trajectory, joints, joint_types)
         count += 1
-    notes, errors = summarised(results, joints, count)
+    summaries, errors = summarised(results, joints, count)
     collect(errors)
-    return [*gaps, *notes]
+    return [*notes, *summaries]
 
 
-def gap_diagnostics(trajectory: Trajectory) -> list[Diagnostic]:
-    """Return a note where the recording has holes."""
+def clock_diagnostics(trajectory: Trajectory) -> list[Diagnostic]:
+    """Return what the times of a recording keep from being seen: holes, and a low sample rate."""
+    notes: list[Diagnostic] = []
+    where = f"trajectory {trajectory.name}"
     gaps = len(gap_ends(trajectory.t)) - 2
-    if not gaps:
-        return []
-    longest = np.diff(trajectory.t).max()
-    message = f"{gaps} gaps in time, up to {longest:.3g} s long; no window crosses one"
-    return [Diagnostic("info", "gap", f"trajectory {trajectory.name}", None, message)]
+    if gaps:
+        longest = np.diff(trajectory.t).max()
+        message = f"{gaps} gaps in time, up to {longest:.3g} s long; no window crosses one"
+        notes.append(Diagnostic("info", "gap", where, None, message))
+    rate = trajectory.sample_rate
+    if trajectory.u is None and shows_accelerations(rate) and not is_dense(rate):
+        message = (
+            f"{rate:.3g} Hz: interpolated for fits to torques; motion faster than {rate / 2:.3g} Hz, delays below "
+            f"{1e3 / rate:.0f} ms and friction where a joint reverses are not visible at this rate"
+        )
+        notes.append(Diagnostic("warning", "low-rate", where, None, message))
+    return notes
 
 
 def findings(

@@ -2,35 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from spelgen.errors import LogError, SpelgenError, collect
+from spelgen.logs.rates import is_dense
 from spelgen.logs.trajectory import GAP, Trajectory, split_at_gaps
 from spelgen.settings.tuning.logs import LogTuning
 
 TUNING = LogTuning()
-
-
-def automatic_cutoff(rates: Iterable[float]) -> float | None:
-    """Return the cutoff [Hz] of measured logs; None, no filter, where one is too slow to be filtered unasked.
-
-    rates: of the trajectories [Hz].
-    """
-    dense = all(rate > TUNING.dense_rate for rate in rates)
-    return TUNING.automatic_cutoff if dense else None
-
-
-def automatic_decimation(rates: Iterable[float], cutoff: float | None) -> int:
-    """Return how many samples lie from one sample of a window to the next.
-
-    Every sample counts, unless logs that were filtered at ``cutoff`` are denser than that needs.
-    """
-    if cutoff is None:
-        return 1
-    return max(1, int(min(rates) / (TUNING.samples_per_period * cutoff)))
 
 
 def low_pass(trajectory: Trajectory, cutoff: float) -> Trajectory:
@@ -71,14 +54,24 @@ def low_pass_regular(signals: np.ndarray, rate: float, cutoff: float) -> np.ndar
 
 
 def resample(trajectory: Trajectory, frequency: float) -> Trajectory:
-    """Return one gap-free piece at a regular rate [Hz], by linear interpolation."""
+    """Return one gap-free piece at a regular rate [Hz]: between dense samples on lines, between others on a cubic."""
     t = np.arange(trajectory.t[0], trajectory.t[-1], 1.0 / frequency)
+    if is_dense(trajectory.sample_rate):
+        at = partial(_on_lines, t, trajectory.t)
+    else:
+        # a line from sample to sample would cut off the peaks of the motion
+        at = partial(_on_cubic, t, trajectory.t)
+    return replace(trajectory, t=t, q=at(trajectory.q), qd=at(trajectory.qd), tau=at(trajectory.tau))
 
-    def at_new_times(values: np.ndarray) -> np.ndarray:
-        return np.stack([np.interp(t, trajectory.t, column) for column in values.T], axis=1)
 
-    q, qd, tau = (at_new_times(x) for x in (trajectory.q, trajectory.qd, trajectory.tau))
-    return replace(trajectory, t=t, q=q, qd=qd, tau=tau)
+def _on_lines(t: np.ndarray, samples: np.ndarray, values: np.ndarray) -> np.ndarray:
+    return np.stack([np.interp(t, samples, column) for column in values.T], axis=1)
+
+
+def _on_cubic(t: np.ndarray, samples: np.ndarray, values: np.ndarray) -> np.ndarray:
+    from scipy.interpolate import CubicSpline  # takes long to import, as in `low_pass`
+
+    return np.asarray(CubicSpline(samples, values)(t))
 
 
 def prepare(

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 from math import isfinite
 
 from spelgen.errors import Diagnostic, SettingsError
-from spelgen.logs.filtering import automatic_cutoff, automatic_decimation, prepare
+from spelgen.logs.filtering import prepare
+from spelgen.logs.rates import automatic_cutoff, automatic_decimation
 from spelgen.logs.trajectory import GAP, Trajectory
 from spelgen.settings.tuning.logs import LogTuning
 

@@ -38,15 +38,14 @@ def files(folder: Path) -> list[File]:
 
 def commands(run: RunFolder, facts: Facts, record: Record | None) -> list[str]:
     """Return what makes a run again, from its config.json; the logs' place is not known to the run."""
-    urdf = shlex.quote(facts.urdf)
-    # the module names its URDF, the folder calls it robot.urdf
+    # the module may name a folder of another machine before its URDF, the run calls it robot.urdf
+    name = Path(facts.urdf).name
+    urdf = shlex.quote(name)
     lines = []
     if run.urdf.exists():  # under the name that the module knows it by
         lines.append(f"cp RUN/{run.urdf.name} {urdf}")
         if run.settings.exists():
-            lines.append(
-                f"cp RUN/{run.settings.name} {shlex.quote(str(Path(facts.urdf).with_suffix('.yaml')))}"
-            )
+            lines.append(f"cp RUN/{run.settings.name} {shlex.quote(str(Path(name).with_suffix('.yaml')))}")
     build = f"spelgen build {urdf}"
     for key, value in _changed(asdict(facts.options), asdict(Options())).items():
         words = ",".join(value) if isinstance(value, (list, tuple)) else str(value)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
@@ -42,6 +42,7 @@ class Settings(Group):
     """One robot's sidecar file. about: why the robot is here and where its values come from.
 
     gravity: in the frame of the root link [m/s^2]. joints: by URDF name; a joint not listed has the defaults.
+    tip, moving_joints: what `--tip` and `--joints` say, so that no command has to repeat it; one of the two.
     input: what commands the joints and is logged: torques, or positions ("u") of servos that hold them like springs.
     torque: whether the logs' tau are joint torques, or motor torques before the gear. couplings: of motors that move
     several joints: their friction and rotors belong to the motors, whatever the logged torques are.
@@ -49,6 +50,8 @@ class Settings(Group):
     """
 
     about: str = ""
+    tip: str | None = None
+    moving_joints: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
     input: Literal["torque", "position"] = "torque"
     torque: Literal["joint", "motor"] = "joint"
     couplings: tuple[Coupling, ...] = ()
@@ -62,6 +65,8 @@ class Settings(Group):
 
     @model_validator(mode="after")
     def _drives(self) -> Settings:
+        if self.tip is not None and self.moving_joints is not None:
+            raise ValueError("'tip' or 'moving_joints', not both")
         if self.input == "position" and (self.torque == "motor" or self.couplings):
             raise ValueError("'input: position' or 'torque: motor' and couplings, not both")
         coupled = [name for coupling in self.couplings for name in coupling.joints]

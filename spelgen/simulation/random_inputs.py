@@ -77,10 +77,11 @@ def initial_range(arm: Arm, settings: Settings) -> tuple[np.ndarray, np.ndarray]
             ranges.append(positions[joint.name])
         elif joint.continuous:
             ranges.append((-np.pi, np.pi))
-        elif joint.lower is not None and joint.upper is not None:
+        elif joint.lower is not None and joint.upper is not None and joint.lower < joint.upper:
             ranges.append((joint.lower, joint.upper))
         else:
-            message = "the joint has no limits: give its lowest and highest initial position"
+            # 0 to 0 is what exporters write where nobody said a range
+            message = "the joint has no range: give its lowest and highest initial position"
             errors.append(SettingsError(message, element=f"simulation.positions.{joint.name}"))
     collect(errors)
     lowest, highest = np.array(ranges, dtype=float).T

@@ -15,7 +15,10 @@ class LogTuning:
     largest_value: float = 1e9  # [rad, rad/s, Nm; m, m/s, N] no arm has more: what is beyond is a wrong unit
     gap: float = 4.0  # [median steps] a longer step is a hole; jitter of USB loggers stays below 3
     automatic_cutoff: float = 8.0  # [Hz] rigid-body motion lies below, ripple and quantisation above (UR10e)
-    dense_rate: float = 50.0  # [Hz] slower logs give no accelerations and are not filtered unasked
+    dense_rate: float = (
+        50.0  # [Hz] slower logs are interpolated by cubics, and windows of them are not filtered
+    )
+    clock_error: float = 0.002  # of a rate: nominal 50 Hz are 49.95 Hz of one logger, 50.1 Hz of another
     filter_order: int = 4  # of the Butterworth low-pass, run both ways: as in the logs' published protocols
     samples_per_period: int = 3  # of the cutoff's period that windows keep; two are Nyquist's bound
     derivative_span: float = 0.18  # [s] of the cubic through encoder positions (SO-101: noise against lag)

@@ -1,0 +1,78 @@
+"""The way of a newcomer, with the defaults of each command: every robot here, and arms of others."""
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from spelgen.cli.main import app
+from spelgen.spec import read_facts
+
+OWN = ("two_link", "rpr", "scara", "six_dof", "panda", "ur10e")
+OTHERS = (
+    "drm_2link",
+    "fingerpro",
+    "interbotix_px100",
+    "igus_rebel_4dof",
+    "dobot_mg400",
+    "i2rt_yam",
+    "kinova_gen3_6dof",
+    "abb_irb120",
+    "franka_fr3",
+    "iiwa14_drake",
+)
+SHORT = {"trajectories": 2, "duration": 2.4, "sample_rate": 50.0, "test_fraction": 0.5}
+FEW_STEPS = {"epochs": 1, "momentum_steps": 5}
+
+
+def spelgen(*arguments):
+    done = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    assert done.exit_code == 0, done.output
+    return done.output
+
+
+def whole_way(urdf, folder, settings, monkeypatch, judged=True):
+    """Build, simulate, train, evaluate from another folder than the URDF's, and ask no questions."""
+    elsewhere = folder / "robots of others"
+    elsewhere.mkdir()
+    copied = elsewhere / urdf.name
+    copied.write_bytes(urdf.read_bytes())
+    copied.with_suffix(".yaml").write_text(yaml.safe_dump(settings))
+    work = folder / "work"
+    work.mkdir()
+    monkeypatch.chdir(work)
+    spelgen("build", copied, "--preset", "closed-form", "-o", "m.py")
+    spelgen("simulate", copied, "-o", "logs")
+    spelgen("train", "m.py", "--data", "logs", "-o", "run")
+    if not judged:
+        return
+    spelgen("evaluate", "run", "--data", "logs")
+    assert json.loads(Path("run/evaluation.json").read_text())["horizons"]
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_every_robot_here(name, robots, tmp_path, monkeypatch):
+    settings = yaml.safe_load((robots / f"{name}.yaml").read_text())
+    # as it is driven, for a shorter time
+    settings.pop("tracking", None)
+    driven = "inputs" in settings["simulation"]
+    settings["simulation"] = settings["simulation"] | {"trajectories": 4} if driven else SHORT
+    settings["training"] = FEW_STEPS
+    whole_way(robots / f"{name}.urdf", tmp_path, settings, monkeypatch, judged=name == "rpr")
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_arms_of_others(name, shared, tmp_path, monkeypatch):
+    settings = {"simulation": SHORT, "training": FEW_STEPS}
+    whole_way(shared / "arms" / f"{name}.urdf", tmp_path, settings, monkeypatch, judged=name == "drm_2link")
+
+
+def test_a_tip_reaches_every_step(robots, tmp_path, monkeypatch):
+    """Not the arm that all commands would choose: its first two joints, as arm.yaml says once."""
+    settings = yaml.safe_load((robots / "rpr.yaml").read_text())
+    settings |= {"tip": "link2", "training": FEW_STEPS}
+    settings["simulation"]["trajectories"] = 4
+    whole_way(robots / "rpr.urdf", tmp_path, settings, monkeypatch)
+    assert tuple(read_facts("run/module.py").joints) == ("joint1", "joint2")
