@@ -118,13 +118,12 @@ def networks_alone(model: EmittedModel, data: Data) -> None:
     total = torch.zeros((), dtype=torch.float64)
     for _ in range(4 * (SAMPLES - 1)):
         features = network_inputs(model, q).requires_grad_()
-        total = (
-            total + dynamics.mass.network(features, getattr(prepared.mass, "layers", prepared.mass))[0].sum()
-        )
-        total = total + dynamics.potential.network(features, prepared.potential)[0].sum()
+        layers = prepared.mass[0] if hasattr(dynamics.mass, "bound") else prepared.mass
+        total = total + dynamics.mass.network(features, layers)[0].sum()
+        total = total + dynamics.potential(features, prepared.potential)[0].sum()
         total = total + dynamics.friction(features, qd, prepared.friction).sum()
-        if hasattr(dynamics.input, "network"):
-            total = total + dynamics.input.network(features, prepared.input)[0].sum()
+        if hasattr(dynamics, "input_network"):
+            total = total + dynamics.input_network(features, prepared.input)[0].sum()
     total.backward()
 
 
@@ -160,8 +159,8 @@ def sizes(model: EmittedModel) -> str:
     """Outputs of the networks of M, D, G and V, and inputs of that of M."""
     if not hasattr(model, "mass"):
         return ""
-    parts = (model.mass, model.friction, model.input, model.potential)
-    mass, friction, given, potential = (getattr(part, "network", None) for part in parts)
+    mass, friction = (getattr(part, "network", None) for part in (model.mass, model.friction))
+    given, potential = getattr(model, "input_network", None), model.potential
     outputs = (
         len(mass.biases[-1]),
         len(friction.biases[-1]) if friction else model.n,

@@ -98,7 +98,7 @@ def randomise(model: nn.Module, seed: int, deviation: float | None = None) -> No
             parameter.data = deviation * draw
         elif "joint_functions" in name or "residual_mass.raw" in name:
             parameter.data = 0.3 * draw
-        elif "network" in name:
+        elif "network" in name or "potential." in name:
             # a Kolmogorov-Arnold network has a grid of weights for each input
             inputs = parameter[0].numel() if parameter.dim() == 3 else parameter.shape[-1]
             parameter.data = draw * inputs**-0.5
@@ -122,7 +122,7 @@ def bounded(model: nn.Module, q: torch.Tensor) -> torch.Tensor:
     """Where, (...), M would not be positive definite by itself."""
     prepared = model.prepare()
     residuals = model.mass_at(model.configuration(q, prepared), prepared)[1]
-    part: torch.Tensor = residuals.fraction
+    part: torch.Tensor = residuals[1]
     return part < 1
 
 
@@ -180,7 +180,7 @@ def exact_model(robot: str, folder: Path) -> nn.Module:
     source, structure = built(robot, design=NETWORKS)
     module = import_source(source, folder / f"{robot}_exact.py")
     model = frictionless(module.Model())
-    mass, potential = model.mass, model.potential
+    mass = model.mass
     mass.rotors.nominal.zero_()
     true = polynomials(_loaded(robot).arm, inertials=True)
     if structure.outputs:
@@ -188,8 +188,8 @@ def exact_model(robot: str, folder: Path) -> nn.Module:
         encoding = model.encoding
         mass.network = ExactFunctions(functions, mass.function_mean, mass.function_scale, encoding)
     if structure.potential:
-        scale = potential.scale[0]
-        potential.network = ExactFunctions([true.potential], torch.zeros_like(scale), scale, model.encoding)
+        scale = model.scale[0]
+        model.potential = ExactFunctions([true.potential], torch.zeros_like(scale), scale, model.encoding)
     constants = [true.combination(constant.reads) for constant in structure.constants]
     assert all(sum(c.degrees()) == 0 for c in constants), "a constant depends on q"
     values = torch.tensor([_float(c.leading_coefficient()) for c in constants], dtype=torch.float64)

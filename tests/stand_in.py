@@ -111,9 +111,6 @@ class Model(nn.Module):
     def friction_at(self, at, qd, prepared, z=None):
         return self.friction_torque(at, qd)
 
-    def input_at(self, at, prepared):
-        return self.input_matrix(at)
-
     def input_force(self, at, qd, tau, prepared):
         return tau
 

@@ -8,6 +8,7 @@ from emitted import import_source
 from typer.testing import CliRunner
 
 from spelgen.cli.main import app
+from spelgen.dynamics.rigid_bodies import regressor_of
 from spelgen.loaded_arm import load_arm
 from spelgen.pipeline import generate
 from spelgen.structure.pseudo_inertia import pseudo_inertia
@@ -92,7 +93,7 @@ def test_untrained_it_is_the_urdfs_rigid_arm(emitted, robots, robot):
     each = list(zip(q.numpy(), qd.numpy(), qdd.numpy(), strict=True))
     tau = torch.from_numpy(np.array([pin.rnea(other, data, *x) for x in each]))
     near(model.inverse_dynamics(q, qd, qdd), tau, 1e-8)
-    near(model.regressor(q, qd, qdd) @ model.inertial_parameters.flatten(), tau, 1e-8)
+    near(regressor_of(model.chain, q, qd, qdd) @ model.inertial_parameters.flatten(), tau, 1e-8)
     height = torch.from_numpy(np.array([pin.computePotentialEnergy(other, data, x) for x in q.numpy()]))
     near(model.potential_energy(q) - model.potential_energy(q[:1]), height - height[0], 1e-8)
 
@@ -153,7 +154,7 @@ def test_any_batch_shape(emitted, batch):
         assert value.shape == (*batch, 3)
     for value in (model.mass_matrix(q), model.dissipation(q, qd), model.input_matrix(q)):
         assert value.shape == (*batch, 3, 3)
-    assert model.regressor(q, qd, tau).shape == (*batch, 3, 30)
+    assert regressor_of(model.chain, q, qd, tau).shape == (*batch, 3, 30)
     assert model.potential_energy(q).shape == batch
     assert model(torch.zeros(()), torch.cat([q, qd, tau], dim=-1)).shape == (*batch, 9)
 

@@ -24,7 +24,7 @@ PARTS = {
     "friction": "joint_functions.raw_friction_splines",
     "constants": "residual_mass.raw_constants",
     "mass": "residual_mass.network",
-    "potential": "residual_potential.network",
+    "potential": "residual_potential",
 }
 RESIDUALS = ("joint_functions.", "residual_")
 

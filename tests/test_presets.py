@@ -79,7 +79,7 @@ def test_written_out_derivatives_equal_autograd(robot, preset, net, tmp_path):
 def test_forward_and_inverse_dynamics_undo_each_other(robot, preset, net, tmp_path):
     model = random_model(robot, tmp_path, seed=3, preset=preset, net=net)
     if preset == "phnode":  # random gains may be next to zero
-        torch.nn.init.zeros_(model.input.network.weights[-1])
+        torch.nn.init.zeros_(model.input_network.weights[-1])
     q, qd, _, tau = states(model.n)
     near(model.inverse_dynamics(q, qd, model.forward_dynamics(q, qd, tau)), tau, 1e-8)
 
@@ -121,7 +121,7 @@ def test_backpropagation_reaches_every_weight(preset, net, tmp_path):
     model.forward_dynamics(q, qd, tau, *past).square().sum().backward()
     for name, parameter in model.named_parameters():
         # V's own level moves nothing
-        assert "potential.network.biases" in name or parameter.grad.abs().max() > 0, name
+        assert "potential.biases" in name or parameter.grad.abs().max() > 0, name
 
 
 @pytest.mark.parametrize("preset", get_args(Preset))
@@ -168,12 +168,12 @@ def test_spel_keeps_zeros_constants_and_relations(robot, preset, tmp_path):
         assert entry.kind != "varying" or values.std() > 0
 
 
-@pytest.mark.parametrize("part", ["mass", "potential", "input"])
+@pytest.mark.parametrize("part", ["mass.network", "potential", "input_network"])
 @pytest.mark.parametrize("net", ["mlp", "kan"])
 def test_networks_read_rotation_matrices(net, part, tmp_path):
     """Layer by layer as the papers write them, on the 9 numbers of R and the 3 of r."""
     owner = random_model("rpr", tmp_path, seed=5, preset="phnode", net=net)
-    model, encoding = getattr(owner, part).network, owner.encoding
+    model, encoding = owner.get_submodule(part), owner.encoding
     q = states(3)[0]
     parts = owner.to_group(q)
     parts[1] = (parts[1] - encoding.center[1] * torch.tensor([0, 0, 1.0], dtype=q.dtype)) / encoding.reach[1]

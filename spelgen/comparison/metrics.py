@@ -66,7 +66,7 @@ def sizes(model: EmittedModel) -> Sizes:
     """Return how many numbers the model's networks give and read, and how many are trained."""
     beside = "residual_" if has_residuals(model) else ""  # rigid bodies
     outputs = []
-    for part in (f"{beside}mass", "friction", "input", f"{beside}potential"):
+    for part in (f"{beside}mass", "friction", "input_network", f"{beside}potential"):
         network = _network(model, part)
         outputs.append(0 if network is None else len(network.biases[-1]))
     if _network(model, "friction") is None:
@@ -79,7 +79,8 @@ def sizes(model: EmittedModel) -> Sizes:
 
 def _network(model: EmittedModel, part: str) -> Any:
     """Return the network of a part of the model; None where it has no such part or that has none."""
-    return getattr(getattr(model, part, None), "network", None)
+    owner = getattr(model, part, None)
+    return owner if hasattr(owner, "biases") else getattr(owner, "network", None)
 
 
 def step_seconds(model: EmittedModel, windows: Windows, scales: LossScales, substeps: int) -> float:

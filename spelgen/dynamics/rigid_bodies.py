@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from spelgen.arm.arm import Arm
 from spelgen.runtime.body_chain import BodyChain
-from spelgen.runtime.rigid_body import Bodies, Row, block_diagonal, inertia_basis
+from spelgen.runtime.joints import blocks
+from spelgen.runtime.port_hamiltonian import combined
+from spelgen.runtime.rigid_body import Bodies, Row, block_diagonal, inertia_basis, pushed_along
 
 PER_BODY = 10  # inertial parameters
 
 
 def body_chain(arm: Arm) -> BodyChain:
     """Return how the arm's bodies may move, for q (..., n) [rad; m]."""
-    zero = ((0.0, 0.0, 0.0),) * len(arm.bodies)  # a chain is geometry: the nominal inertias do not matter
     bodies = Bodies(
         parent=tuple(body.parent for body in arm.bodies),
         joint=tuple(body.coordinate for body in arm.bodies),
@@ -25,10 +27,7 @@ def body_chain(arm: Arm) -> BodyChain:
             (_row(body.rotation[0]), _row(body.rotation[1]), _row(body.rotation[2])) for body in arm.bodies
         ),
         position=tuple(_row(body.translation) for body in arm.bodies),
-        mass=(0.0,) * len(arm.bodies),
-        moment=zero,
-        inertia=zero,
-        products=zero,
+        inertia=((),) * len(arm.bodies),  # a chain is geometry
     )
     return BodyChain(len(arm.coordinates), bodies, _row(arm.gravity))
 
@@ -53,3 +52,21 @@ class RigidBodies:
 def _row(values: tuple[object, object, object]) -> Row:
     x, y, z = (float(value) for value in values)  # type: ignore[arg-type]
     return x, y, z
+
+
+def regressor_of(chain: BodyChain, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
+    """Return Y, (..., n, 10 bodies): Y @ inertial parameters is the bodies' torque.
+
+    ``chain`` is that of this package or of an emitted module.
+    """
+    basis = inertia_basis().to(q)
+    pose = chain.forward(q)
+    rises = chain.accelerations(pose, qd, chain.turning(pose, qd)[1]) + combined(qdd, pose.twists)
+    rises, twists = (blocks(rows, 6) for rows in (rises, combined(qd, pose.twists)))
+    # by body and parameter: (..., bodies, 6, 10)
+    momenta = torch.tensordot(twists, basis, dims=([-1], [2])).mT
+    wrenches = torch.tensordot(rises, basis, dims=([-1], [2])).mT
+    wrenches = wrenches + pushed_along(twists.unsqueeze(-1), momenta)
+    columns = blocks(pose.twists, 6).transpose(-3, -2)  # (..., bodies, n, 6)
+    rows: Tensor = (columns @ wrenches).transpose(-3, -2)
+    return rows.reshape(*q.shape, PER_BODY * len(chain.parents))

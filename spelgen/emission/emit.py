@@ -18,21 +18,27 @@ Value = tuple[str, str, str]
 
 def emit(spec: ModelSpec) -> str:
     """The Python source of the module that ``spec`` describes; it needs torch alone."""
+    part_types, parts = tailored.parts(spec)
+    arm = render(
+        "arm.py.jinja",
+        mass_entries=tailored.mass_entries(spec),
+        mass_about=docstring.mass_entries(spec),
+        part_types=part_types,
+        parts=parts,
+    )
     model = render(
         "model.py.jinja",
         n=len(spec.joints),
         names=tailored.names("joint_names", [joint.identifier for joint in spec.joints]),
         types=tailored.names("joint_types", [joint.kind for joint in spec.joints]),
         class_summary=docstring.class_summary(spec),
-        base=tailored.base(spec),
+        bases=tailored.bases(spec),
         roles=tailored.roles(spec),
         elements=len(BRISTLE_REACH["revolute"]) if spec.design.memory == "bristles" else 0,
-        setup=tailored.setup(spec),
-        mass_entries=tailored.mass_entries(spec),
-        mass_about=docstring.mass_entries(spec),
+        servo=tailored.servo(spec),
         values=_values(spec),
     )
-    imports, runtime = bundle(model)
+    imports, runtime = bundle(f"{arm}\n{model}")
     return render(
         "module.py.jinja",
         title=docstring.title(spec),
@@ -41,6 +47,7 @@ def emit(spec: ModelSpec) -> str:
         joint_table=docstring.joint_table(spec),
         imports=imports,
         facts=facts_json(spec),
+        arm=arm.strip(),
         model=model.rstrip(),
         runtime=runtime,
     )
@@ -52,7 +59,7 @@ def _values(spec: ModelSpec) -> list[Value]:
         return list(_SERVO)
     values: list[Value] = []
     if spec.design.mass == "derived":
-        values += _ARMATURE
+        values.append(_ARMATURE)
     if spec.design.dissipation == "per-joint":
         values.append(_VISCOUS)
     return values
@@ -63,13 +70,10 @@ _SERVO: tuple[Value, ...] = (
     ("kd", "Of the servos, torque by velocity, (n,) [Nm s/rad, N s/m].", "self.servo.kd()"),
     ("delay", "Of the commands [s].", "self.servo.delay"),
 )
-_ARMATURE: tuple[Value, ...] = (
-    ("armature", "What the drives add to M's diagonal, (n,) [kg m^2, kg].", "self.mass.rotors.forward()"),
-    (
-        "rotor_inertia",
-        "The drives' inertia before the gear, (n,) [kg m^2, kg].",
-        "self.mass.rotors.rotor_inertia()",
-    ),
+_ARMATURE: Value = (
+    "armature",
+    "What the drives add to M's diagonal, (n,) [kg m^2, kg].",
+    "self.mass.rotors.forward()",
 )
 _VISCOUS: Value = (
     "viscous",

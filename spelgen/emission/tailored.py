@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from itertools import groupby
 from textwrap import wrap
 
@@ -22,14 +23,25 @@ _LEAST_ARMATURE = 0.01
 _FRICTION_AXES = {"dense-n": 1, "dense-3n": 3}
 _UNPACKED = 10  # names on a line
 _SEED = Code("generator")
-_INDENT = 8
+_INDENT = 4
 
 
-def base(spec: ModelSpec) -> str:
-    """The class of the runtime that the model is."""
-    if not spec.bodies:
-        return "NetworkDynamics"
-    return "RigidBodyDynamics" if spec.design.net == "none" else "ResidualDynamics"
+@dataclass(frozen=True)
+class _Parts:
+    """The statements that make a model's parts, and the parts: the type and the expression of each."""
+
+    statements: list[tuple[str, object]]
+    values: list[tuple[str, object]]
+
+
+def bases(spec: ModelSpec) -> str:
+    """Return the classes of the runtime that the model is."""
+    if spec.design.input == "dense-3n":
+        return "DenseInput"
+    dynamics = "NetworkDynamics"
+    if spec.bodies:
+        dynamics = "RigidBodyDynamics" if spec.design.net == "none" else "ResidualDynamics"
+    return f"{dynamics}, MotorInput" if spec.inputs else dynamics
 
 
 def roles(spec: ModelSpec) -> list[tuple[str, str]]:
@@ -41,16 +53,22 @@ def roles(spec: ModelSpec) -> list[tuple[str, str]]:
             mass = "ConstantMass"
         friction = "JointFriction" if spec.design.dissipation == "per-joint" else "DenseFriction"
         pairs += [("Mass", mass), ("Friction", friction)]
-    coupled = "MotorInput" if spec.inputs else "DirectInput"
-    pairs.append(("Input", "DenseInput" if spec.design.input == "dense-3n" else coupled))
     return pairs[1:] if spec.design.net == "none" else pairs
 
 
-def setup(spec: ModelSpec) -> str:
-    """The statements of the model's ``__init__`` that make its parts, and itself of them."""
-    lines = [assignment("joints", _joints(spec), _INDENT)]
-    lines += _rigid_bodies(spec) if spec.bodies else _networks(spec)
-    return "\n".join(lines)
+def parts(spec: ModelSpec) -> tuple[str, str]:
+    """Return the types of what the model is made of, and the statements that make and return it."""
+    statements: list[tuple[str, object]] = [("joints", _joints(spec))]
+    made = _rigid_bodies(spec) if spec.bodies else _networks(spec)
+    lines = [assignment(name, value, _INDENT) for name, value in statements + made.statements]
+    values = tuple(value for _, value in made.values)
+    lines.append(" " * _INDENT + laid_out("return ", values, _INDENT))
+    return ", ".join(kind for kind, _ in made.values), "\n".join(lines)
+
+
+def servo(spec: ModelSpec) -> str:
+    """Return the statement that puts position servos before the model's joints; empty without them."""
+    return assignment("self.servo", _servo(spec), 2 * _INDENT) if spec.servos else ""
 
 
 def mass_entries(spec: ModelSpec) -> str:
@@ -133,6 +151,9 @@ def _joints(spec: ModelSpec) -> Call:
         joint.armature or (float(f"{_LEAST_ARMATURE * mean[k][k]:.3g}") if spec.bodies else 0.0)
         for k, joint in enumerate(spec.joints)
     )
+    optional: dict[str, object] = {"gains": spec.inputs} if spec.inputs else {}
+    if spec.bodies and spec.design.net != "none":
+        optional["gear"] = tuple(joint.gear for joint in spec.joints)
     return call(
         "Joints",
         revolute=tuple(joint.kind == "revolute" for joint in spec.joints),
@@ -141,12 +162,12 @@ def _joints(spec: ModelSpec) -> Call:
         speed=tuple(joint.speed for joint in spec.joints),
         friction=tuple(joint.friction for joint in spec.joints),
         armature=armature,
-        gear=tuple(joint.gear for joint in spec.joints),
         actuated=tuple(joint.actuated for joint in spec.joints),
+        **optional,
     )
 
 
-def _rigid_bodies(spec: ModelSpec) -> list[str]:
+def _rigid_bodies(spec: ModelSpec) -> _Parts:
     bodies = call(
         "Bodies",
         parent=tuple(body.parent for body in spec.bodies),
@@ -156,26 +177,23 @@ def _rigid_bodies(spec: ModelSpec) -> list[str]:
         offset=tuple(body.offset for body in spec.bodies),
         rotation=tuple(body.rotation for body in spec.bodies),
         position=tuple(body.position for body in spec.bodies),
-        mass=tuple(body.reference[0] for body in spec.bodies),
-        moment=tuple(body.reference[1:4] for body in spec.bodies),
-        inertia=tuple(tuple(body.reference[k] for k in (4, 7, 9)) for body in spec.bodies),
-        products=tuple(tuple(body.reference[k] for k in (5, 6, 8)) for body in spec.bodies),
+        inertia=tuple(body.reference for body in spec.bodies),
     )
-    statements: list[tuple[str, object]] = [("bodies", bodies)]
-    statements += _input(spec)
-    arguments: list[object] = [Code("joints"), Code("bodies"), spec.gravity, Code("input")]
+    reach = tuple(BRISTLE_REACH[x.kind] for x in spec.joints) if spec.design.memory == "bristles" else ()
+    made = _Parts(
+        [("bodies", bodies)],
+        [
+            ("Joints", Code("joints")),
+            ("Bodies", Code("bodies")),
+            ("Row", spec.gravity),
+            ("Rows", reach),
+            ("Rows", spec.motor_speeds),
+        ],
+    )
     if spec.design.net != "none":
-        statements += _residuals(spec)
-        arguments += [Code("mass"), Code("potential") if spec.potential else None]
-    reach = tuple(BRISTLE_REACH[x.kind] for x in spec.joints)
-    named: dict[str, object] = {"reach": reach} if spec.design.memory == "bristles" else {}
-    if spec.motor_speeds:
-        named["motors"] = spec.motor_speeds
-    lines = [assignment(name, value, _INDENT) for name, value in statements]
-    lines.append(_base_setup(call("super().__init__", *arguments, **named)))
-    if spec.servos:
-        lines.append(assignment("self.servo", _servo(spec), _INDENT))
-    return lines
+        made.statements.extend(_residuals(spec))
+        made.values.extend([("ResidualMass", Code("mass")), *_potential_values(spec)])
+    return made
 
 
 def _residuals(spec: ModelSpec) -> list[tuple[str, object]]:
@@ -188,8 +206,15 @@ def _residuals(spec: ModelSpec) -> list[tuple[str, object]]:
         statements += _mass_network(spec)
         network = Code("network")
     sizes = len(spec.outputs), len(spec.constants)
-    mass = call("ResidualMass", Code("joints"), Code("self.mass_entries"), *sizes, network)
+    mass = call("ResidualMass", Code("joints"), Code("mass_entries"), *sizes, network)
     return [*statements, ("mass", mass), *_potential(spec)]
+
+
+def _potential_values(spec: ModelSpec) -> list[tuple[str, object]]:
+    """The network of the potential energy, and the unit of it."""
+    if not spec.potential:
+        return [("None", None), ("float", 1.0)]
+    return [("Network", Code("potential")), ("float", spec.potential_scale)]
 
 
 def _grouped(start: str, rows: Sequence[tuple[int, ...]]) -> Code:
@@ -219,22 +244,18 @@ def _servo(spec: ModelSpec) -> Call:
     )
 
 
-def _networks(spec: ModelSpec) -> list[str]:
+def _networks(spec: ModelSpec) -> _Parts:
     """Parts in the order in which they draw their random weights: mass, potential, friction, input."""
-    statements: list[tuple[str, object]] = [
-        ("generator", Code("torch.Generator().manual_seed(seed)")),
-        ("encoding", Code("JointEncoding(joints)")),
-    ]
-    statements += [*_mass(spec), *_potential(spec), *_friction(spec), *_input(spec)]
-    arguments: list[object] = [Code(name) for name in ("encoding", "mass", "potential", "friction", "input")]
-    if not spec.potential:
-        arguments[2] = None
-    lines = [assignment(name, value, _INDENT) for name, value in statements]
-    return [*lines, _base_setup(call("super().__init__", *arguments))]
-
-
-def _base_setup(value: Call) -> str:
-    return " " * _INDENT + laid_out("", value, _INDENT)
+    statements: list[tuple[str, object]] = [("generator", Code("torch.Generator().manual_seed(seed)"))]
+    statements += [*_mass(spec), *_potential(spec), *_friction(spec)]
+    values = [("Joints", Code("joints")), ("Mass", Code("mass")), *_potential_values(spec)]
+    values.append(("Friction", Code("friction")))
+    if spec.design.input == "dense-3n":
+        n = len(spec.joints)
+        everything = tuple(range(n))
+        statements += _network(spec, "input", (everything,) * (3 * n), everything, (1.0,) * n)
+        values.append(("Network", Code("network")))
+    return _Parts(statements, values)
 
 
 def _mass(spec: ModelSpec) -> list[tuple[str, object]]:
@@ -247,13 +268,12 @@ def _mass(spec: ModelSpec) -> list[tuple[str, object]]:
         return [*network, ("mass", mass)]
     constants = tuple((term.start, term.scale) for term in spec.constants)
     if not spec.outputs:
-        return [("mass", call("ConstantMass", Code("joints"), Code("self.mass_entries"), constants))]
+        return [("mass", call("ConstantMass", Code("joints"), Code("mass_entries"), constants))]
     mass = call(
         "DerivedMass",
         Code("joints"),
-        Code("self.mass_entries"),
-        mean=tuple(output.mean for output in spec.outputs),
-        scale=tuple(output.scale for output in spec.outputs),
+        Code("mass_entries"),
+        functions=tuple((output.mean, output.scale) for output in spec.outputs),
         constants=constants,
         network=Code("network"),
         margin=spec.margin,
@@ -277,8 +297,9 @@ def _potential(spec: ModelSpec) -> list[tuple[str, object]]:
         return []
     sensitivity = tuple(joint.potential_sensitivity for joint in spec.joints)
     width = max(_LEAST_UNITS, round(_POTENTIAL_FRACTION * units(spec)))
-    network = _network(spec, "potential", (spec.potential,), spec.potential, sensitivity, width=width)
-    return [*network, ("potential", call("LearnedPotential", spec.potential_scale, Code("network")))]
+    return _network(
+        spec, "potential", (spec.potential,), spec.potential, sensitivity, width=width, name="potential"
+    )
 
 
 def _network(
@@ -291,6 +312,7 @@ def _network(
     axes: int = 0,
     width: int | None = None,
     fewest: int = 1,
+    name: str = "network",
 ) -> list[tuple[str, object]]:
     """Return the statements that make a network of ``outputs`` for a quantity; ``read``: the joints that it reads."""
     if spec.design.encoding == "lie-group":
@@ -304,34 +326,19 @@ def _network(
     return [
         (f"{quantity}_outputs", _grouped(f"{quantity}_outputs = ", outputs)),
         (f"{quantity}_hidden", _grouped(f"{quantity}_hidden = ", hidden)),
-        ("network", call("Network", inputs, Code(f"({layers})"), _SEED)),
+        (name, call("Network", inputs, Code(f"({layers})"), _SEED)),
     ]
 
 
 def _friction(spec: ModelSpec) -> list[tuple[str, object]]:
     if spec.design.dissipation == "per-joint":
-        return [("friction", call("JointFriction", Code("joints"), Code("encoding"), _SEED))]
+        return [("friction", call("JointFriction", Code("joints"), _SEED))]
     n, axes = len(spec.joints), _FRICTION_AXES[spec.design.dissipation]
     everything, rows = tuple(range(n)), axes * n
     outputs = (everything,) * (rows * (rows + 1) // 2)
     network = _network(spec, "friction", outputs, everything, (_POSITION_SENSITIVITY,) * n, axes=axes)
     friction = call("DenseFriction", Code("joints"), Code("network"), axes=axes)
     return [*network, ("friction", friction)]
-
-
-def _input(spec: ModelSpec) -> list[tuple[str, object]]:
-    if spec.design.input == "dense-3n":
-        n = len(spec.joints)
-        everything = tuple(range(n))
-        network = _network(spec, "input", (everything,) * (3 * n), everything, (1.0,) * n)
-        return [*network, ("input", call("DenseInput", Code("joints"), Code("network")))]
-    if not spec.inputs:
-        return [("input", call("DirectInput", Code("joints")))]
-    gains = tuple(
-        call("MotorGain", joint, motor, value, trained=trained)
-        for joint, motor, value, trained in spec.inputs
-    )
-    return [("input", call("MotorInput", Code("joints"), gains))]
 
 
 def mean_mass(spec: ModelSpec) -> tuple[tuple[float, ...], ...]:

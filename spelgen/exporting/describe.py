@@ -49,9 +49,6 @@ def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
     if has_residuals(exact):
         constant_mass += array(weights.residual.mass.constant).reshape(exact.n, exact.n)
         residuals = _residuals(exact, weights)
-    gains = array(weights.input)
-    if gains.ndim == 1:  # joints that are driven one by one
-        gains = np.diag(gains)
     return TrainedModel(
         name=identifier(loaded.arm.name),
         robot=loaded.arm.name,
@@ -66,7 +63,7 @@ def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
         residuals=residuals,
         friction=_friction(weights.friction),
         bristles=_bristles(exact, weights),
-        inputs=gains,
+        inputs=array(exact.input_matrix(torch.zeros(exact.n).double())),
         actuated=array(exact.actuated),
         torque_offset=array(exact.torque_offset),
         friction_compensation=array(exact.friction_compensation),

@@ -8,6 +8,7 @@ import numpy as np
 import yaml
 
 from spelgen.dynamics.protocol import has_friction_state
+from spelgen.dynamics.residuals import friction_factor
 from spelgen.exporting.describe import array, servos_of
 from spelgen.exporting.exported import UNITS, Exported, readme
 from spelgen.exporting.rigid_body_projection import (
@@ -109,7 +110,7 @@ def _law_constants(trained: Trained, projection: RigidBodyProjection) -> dict[st
     if not projection.own:
         return {}
     constants = {name: array(value) for name, value in model.friction.prepare()._asdict().items()}
-    factor = array(model.friction_factor(sampled_positions(projection.arm.arm)))
+    factor = array(friction_factor(model, sampled_positions(projection.arm.arm)))
     if (factor != 1).any():
         constants["position_factor"] = np.stack([factor.min(axis=0), factor.max(axis=0)], axis=-1)
     if has_friction_state(model):

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import torch
 
+from spelgen.dynamics.residuals import residual_torque
 from spelgen.fitting.optimizers import minimise
 from spelgen.fitting.torque_jacobian import ResidualSamples
 from spelgen.runtime.joint_functions import LARGEST
@@ -279,5 +280,4 @@ def _fit_network(
 
 
 def _network_torque(model: Any, samples: ResidualSamples) -> torch.Tensor:
-    torque: torch.Tensor = model.residual_torque(samples.q, samples.qd, samples.qdd, model.prepare())
-    return torque
+    return residual_torque(model, samples.q, samples.qd, samples.qdd)

@@ -168,7 +168,7 @@ def momentum_loss(model: EmittedModel, windows: Windows, scales: LossScales) -> 
     mean = (force[:, :-1] + driven[0][:, :-1] + force[:, 1:] + driven[1][:, 1:]) / 2
     missing = (p[:, 1:] - p[:, :1] - (dt * mean).cumsum(dim=1)) / dt.cumsum(dim=1)
     with torch.no_grad():
-        inputs = dynamics.input_at(at, prepared).abs()
+        inputs = dynamics.input_matrix(q).abs()
     unit = (inputs @ scales.tau).mean(dim=(0, 1))  # gears may stand between motor and joint
     result: torch.Tensor = (missing / torch.maximum(unit, 1e-2 * unit.amax())).square().mean()
     return result

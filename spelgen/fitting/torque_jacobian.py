@@ -11,6 +11,8 @@ from torch.autograd import grad as gradient
 from torch.autograd.functional import jacobian
 
 from spelgen.dynamics.parameters import parameter_table
+from spelgen.dynamics.residuals import friction_factor, residual_torque
+from spelgen.dynamics.rigid_bodies import regressor_of
 from spelgen.fitting.body_steps import moved_bodies
 from spelgen.fitting.functional_model import FunctionalModel, Weights
 from spelgen.fitting.torque_samples import Block, TorqueSamples
@@ -138,7 +140,7 @@ class TorqueJacobian:
         ones = torch.ones(self.samples.joints).double()
         for name in self.rigid.of_kind("gains"):  # logarithms of gains between logged and joint torques
             change = weights[name] - self.rigid.start[name]
-            return ones.index_put((self.model.input.rows,), (-change).exp())
+            return ones.index_put((self.model.gain_rows,), (-change).exp())
         return ones
 
     def normal_equations(
@@ -222,6 +224,7 @@ class TorqueJacobian:
         rest = torch.zeros_like(q)
         model = self.model
         with torch.no_grad():
+            gravity_regressor = regressor_of(model.chain, q, rest, rest)
             return _Samples(
                 q=q,
                 qd=qd,
@@ -229,10 +232,10 @@ class TorqueJacobian:
                 tau=tau,
                 z=z if z.shape[-1] else None,
                 speed=qd @ model.motors.mT,
-                regressor=model.regressor(q, qd, qdd),
-                load_regressor=torch.einsum("jm,tjk->tmk", model.loads, model.regressor(q, rest, rest)),
-                residual=model.residual_torque(q, qd, qdd, model.prepare()),
-                factor=model.friction_factor(q),
+                regressor=regressor_of(model.chain, q, qd, qdd),
+                load_regressor=torch.einsum("jm,tjk->tmk", model.loads, gravity_regressor),
+                residual=residual_torque(model, q, qd, qdd),
+                factor=friction_factor(model, q),
             )
 
     def _by_joint(self) -> _Directions:
@@ -249,7 +252,7 @@ class TorqueJacobian:
             column = torch.arange(size).repeat(len(weight))
             joint = row
             if self.rigid.kinds[name] == "gains":
-                joint = self.model.input.rows[row]
+                joint = self.model.gain_rows[row]
             direction = count + colours * column + colour[joint]
             changes = torch.zeros(total, len(weight), size).double()
             changes[direction, row, column] = 1.0
@@ -283,8 +286,7 @@ class TorqueJacobian:
             prepared, parameters = model.prepare(), model.inertial_parameters.flatten()
             load = samples.load_regressor @ parameters
             friction = samples.factor * model.friction(samples.speed, load, prepared.friction, samples.z)
-            force = model.input.force(load, samples.tau - model.torque_offset, prepared.input)
-            force = force + model.friction_compensation * samples.qd
+            force = model.input_force(None, samples.qd, samples.tau, prepared)
             inertial = samples.regressor @ parameters + samples.qdd @ prepared.armature
             difference: torch.Tensor = force - inertial - samples.residual - friction @ model.motors
             return difference

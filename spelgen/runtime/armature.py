@@ -13,19 +13,11 @@ class Armature(nn.Module):
 
     kinds = (("raw", "armature", "kg m^2, kg"),)
 
-    nominal: Tensor
-    gear: Tensor
-
     def __init__(self, joints: Joints) -> None:
         super().__init__()
-        self.register_buffer("nominal", vector(joints.armature))
-        self.register_buffer("gear", vector(joints.gear))
+        self.nominal = nn.Buffer(vector(joints.armature))
         self.raw = nn.Parameter(torch.zeros(joints.n, dtype=torch.float64))
 
     def forward(self) -> Tensor:
-        """The diagonal of the drives' part of M, (n,) [kg m^2, kg]."""
+        """Return the diagonal of the drives' part of M, (n,) [kg m^2, kg]."""
         return self.nominal * self.raw.exp()
-
-    def rotor_inertia(self) -> Tensor:
-        """As the motors feel it, before the gear, (n,) [kg m^2, kg]."""
-        return self.nominal * self.raw.exp() / self.gear**2

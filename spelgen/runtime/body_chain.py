@@ -30,16 +30,6 @@ class BodyChain(nn.Module):
     over all that carries a body, or that it carries, are products with a mask, so few operations are left.
     """
 
-    table: (
-        Tensor  # takes cos, sin and value of the displacements to frames in parents', (36 bodies, 3 bodies)
-    )
-    fixed: Tensor  # what is added there, (36 bodies,)
-    reading: Tensor  # where axes stand in ``frames``, (6 bodies, bodies)
-    carriers: Tensor  # whether a body carries another, or is it, (bodies, bodies)
-    carried: Tensor  # likewise, six times each, (bodies, 6 bodies)
-    base: Tensor  # acceleration of the base that stands for gravity, (6,)
-    ratios: Tensor  # displacements by q, (bodies, n)
-
     def __init__(self, n: int, bodies: Bodies, gravity: tuple[float, float, float]) -> None:
         super().__init__()
         self.parents, count = bodies.parent, len(bodies.parent)
@@ -53,13 +43,16 @@ class BodyChain(nn.Module):
             if parent >= 0:
                 carriers[:, index] += carriers[:, parent]
         table, fixed = motion_table(bodies)
-        self.register_buffer("table", table)
-        self.register_buffer("fixed", fixed)
-        self.register_buffer("reading", reading.flatten(0, 1))
-        self.register_buffer("carriers", carriers)
-        self.register_buffer("carried", carriers.repeat_interleave(6, dim=1))
-        self.register_buffer("base", vector((0, 0, 0, *(-g for g in gravity))))
-        self.register_buffer("ratios", ratios)
+        self.table = nn.Buffer(table)  # see ``motion_table``
+        self.fixed = nn.Buffer(fixed)
+        # where axes stand in ``frames``, (6 bodies, bodies)
+        self.reading = nn.Buffer(reading.flatten(0, 1))
+        self.carriers = nn.Buffer(carriers)  # whether a body carries another, or is it, (bodies, bodies)
+        # likewise, six times each, (bodies, 6 bodies)
+        self.carried = nn.Buffer(carriers.repeat_interleave(6, dim=1))
+        # acceleration of the base that stands for gravity, (6,)
+        self.base = nn.Buffer(vector((0, 0, 0, *(-g for g in gravity))))
+        self.ratios = nn.Buffer(ratios)  # displacements by q, (bodies, n)
         self.single = torch.equal(ratios, torch.eye(n).double())  # no joint moves several bodies
 
     def forward(self, q: Tensor) -> Chain:
@@ -116,19 +109,3 @@ class BodyChain(nn.Module):
         total = pose.frames @ inertia @ pose.frames.mT
         moment = torch.stack([total[..., 2, 4], total[..., 0, 5], total[..., 1, 3]], dim=-1)
         return applied(moment.unsqueeze(-2), self.base[3:]).squeeze(-1)
-
-    def regressor(self, q: Tensor, qd: Tensor, qdd: Tensor, basis: Tensor) -> Tensor:
-        """Y, (..., n, 10 bodies): Y @ inertial parameters is the bodies' torque.
-
-        basis: ``inertia_basis()``.
-        """
-        pose = self(q)
-        rises = self.accelerations(pose, qd, self.turning(pose, qd)[1]) + combined(qdd, pose.twists)
-        rises, twists = (blocks(rows, 6) for rows in (rises, combined(qd, pose.twists)))
-        # by body and parameter: (..., bodies, 6, 10)
-        momenta = torch.tensordot(twists, basis, dims=([-1], [2])).mT
-        wrenches = torch.tensordot(rises, basis, dims=([-1], [2])).mT
-        wrenches = wrenches + pushed_along(twists.unsqueeze(-1), momenta)
-        columns = blocks(pose.twists, 6).transpose(-3, -2)  # (..., bodies, n, 6)
-        rows: Tensor = (columns @ wrenches).transpose(-3, -2)
-        return rows.reshape(*q.shape, 10 * len(self.parents))

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor, nn
 
 from spelgen.runtime.armature import Armature
-from spelgen.runtime.joints import Joints, vector
+from spelgen.runtime.joints import Joints, Pairs, vector
 from spelgen.runtime.symmetric import Entries
 
 
@@ -21,12 +19,10 @@ class ConstantMass(nn.Module):
 
     kinds = (("raw_constants", "mass_constants", "kg m^2, kg m, kg"),)
 
-    constant_scale: Tensor
-
-    def __init__(self, joints: Joints, entries: Entries, constants: Sequence[tuple[float, float]]) -> None:
+    def __init__(self, joints: Joints, entries: Entries, constants: Pairs) -> None:
         super().__init__()
         self.n, self.entries = joints.n, entries
-        self.register_buffer("constant_scale", vector(unit for _, unit in constants))
+        self.constant_scale = nn.Buffer(vector(unit for _, unit in constants))
         self.raw_constants = nn.Parameter(vector(start / unit for start, unit in constants))
         self.rotors = Armature(joints)
 

@@ -27,19 +27,14 @@ class DenseFriction(nn.Module):
     A joint moves along the last of its axes alone, so only those rows of L are worked out.
     """
 
-    speed: Tensor
-    nominal: Tensor
-    entries: Tensor
-    start: Tensor
-
     def __init__(self, joints: Joints, network: Network, axes: int) -> None:
         super().__init__()
         rows = axes * joints.n
-        self.register_buffer("speed", vector(joints.speed))
-        self.register_buffer("nominal", vector(joints.friction))
+        self.speed = nn.Buffer(vector(joints.speed))
+        self.nominal = nn.Buffer(vector(joints.friction))
         moving = slice(axes - 1, None, axes)
-        self.register_buffer("entries", lower_entries(rows)[moving])
-        self.register_buffer("start", FACTOR_START * torch.eye(rows).double()[moving])
+        self.entries = nn.Buffer(lower_entries(rows)[moving])
+        self.start = nn.Buffer(FACTOR_START * torch.eye(rows).double()[moving])
         self.network = network
 
     def prepare(self) -> Any:

@@ -49,22 +49,18 @@ class DenseMass(nn.Module):
     (U^-1 A)^T diag(1 / e) U^-1 A, where A is the moving columns of C^-1.
     """
 
-    nominal: Tensor
-    moving: Tensor
-    below: Tensor  # where the entries below U's diagonal stand in U, row by row
-    start: Tensor
-
     def __init__(self, joints: Joints, mean: Sequence[Sequence[float]], network: Network) -> None:
         super().__init__()
         self.size = 3 * joints.n
         factor = nominal_factor(joints, mean)
-        self.register_buffer("nominal", factor)
-        self.register_buffer("moving", torch.linalg.inv(factor)[:, 2::3])
+        self.nominal = nn.Buffer(factor)
+        self.moving = nn.Buffer(torch.linalg.inv(factor)[:, 2::3])
         row, column = torch.tril_indices(self.size, self.size, -1)
-        self.register_buffer("below", row * self.size + column)
+        # where the entries below U's diagonal stand in U, row by row
+        self.below = nn.Buffer(row * self.size + column)
         # so that U starts without entries below its diagonal, and e at one
         start = vector([0.0] * len(row) + [math.log(math.e - 1)] * self.size)
-        self.register_buffer("start", start)
+        self.start = nn.Buffer(start)
         self.network = network
 
     def prepare(self, definite: bool = True) -> Any:

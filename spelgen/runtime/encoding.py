@@ -14,33 +14,25 @@ from spelgen.runtime.joints import Joints, vector
 class JointEncoding(nn.Module):
     """cos q, sin q and, where some joint is prismatic, the scaled q: (..., 2 n) or (..., 3 n)."""
 
-    center: Tensor
-    reach: Tensor
-
     def __init__(self, joints: Joints) -> None:
         super().__init__()
         self.prismatic = not all(joints.revolute)
-        self.size = (3 if self.prismatic else 2) * joints.n
-        self.register_buffer("center", vector(joints.center))
-        self.register_buffer("reach", vector(joints.reach))
-
-    def scaled(self, q: Tensor) -> Tensor:
-        """q in units of a joint's reach about its center, (..., n)."""
-        return (q - self.center) / self.reach
+        self.center = nn.Buffer(vector(joints.center))
+        self.reach = nn.Buffer(vector(joints.reach))
 
     def forward(self, q: Tensor) -> Tensor:
-        """The encoding of q."""
+        """Return the encoding of q."""
         columns = [q.cos(), q.sin()]
-        return torch.cat([*columns, self.scaled(q)] if self.prismatic else columns, dim=-1)
+        return torch.cat([*columns, (q - self.center) / self.reach] if self.prismatic else columns, dim=-1)
 
     def jvp(self, encoded: Tensor, qd: Tensor) -> Tensor:
-        """How fast the encoding changes along qd."""
+        """Return how fast the encoding changes along qd."""
         cos, sin = encoded.chunk(3 if self.prismatic else 2, dim=-1)[:2]
         columns = [-sin * qd, cos * qd]
         return torch.cat([*columns, qd / self.reach] if self.prismatic else columns, dim=-1)
 
     def vjp(self, encoded: Tensor, cotangent: Tensor) -> Tensor:
-        """d/dq, (..., n), of what has the derivative ``cotangent`` by the encoding."""
+        """Return d/dq, (..., n), of what has the derivative ``cotangent`` by the encoding."""
         columns = 3 if self.prismatic else 2
         cos, sin = encoded.chunk(columns, dim=-1)[:2]
         by_cos, by_sin, *by_scaled = cotangent.chunk(columns, dim=-1)
@@ -75,24 +67,17 @@ def lie_group_input(joints: Joints, sensitivity: Sequence[float]) -> NetworkInpu
     z is the joint's axis, so R = [[cos q, -sin q, 0], [sin q, cos q, 0], [0, 0, 1]].
     """
     n = joints.n
-    encoded = (2 if all(joints.revolute) else 3) * n
-    owners: list[int] = []
-    matrices, offsets = [], []
+    owners = [joint for joint in range(n) for _ in range(9 if joints.revolute[joint] else 3)]
+    matrix = torch.zeros(len(owners), (2 if all(joints.revolute) else 3) * n, dtype=torch.float64)
+    offset = torch.zeros(len(owners), dtype=torch.float64)
     for joint, revolute in enumerate(joints.revolute):
-        size = 9 if revolute else 3
-        matrix, offset = torch.zeros(size, encoded), torch.zeros(size)
+        first = owners.index(joint)
         if revolute:
-            matrix[[0, 4], joint], offset[8] = 1.0, 1.0
-            matrix[1, n + joint], matrix[3, n + joint] = -1.0, 1.0
+            matrix[[first, first + 4], joint], offset[first + 8] = 1.0, 1.0
+            matrix[first + 1, n + joint], matrix[first + 3, n + joint] = -1.0, 1.0
         else:
-            matrix[2, 2 * n + joint] = 1.0
-        owners += [joint] * size
-        matrices.append(matrix)
-        offsets.append(offset)
-    weights = [sensitivity[joint] for joint in owners]
-    return NetworkInput(
-        tuple(owners), vector(weights), torch.cat(matrices).double(), torch.cat(offsets).double()
-    )
+            matrix[first + 2, 2 * n + joint] = 1.0
+    return NetworkInput(tuple(owners), vector(sensitivity[joint] for joint in owners), matrix, offset)
 
 
 def with_velocities(inputs: NetworkInput, joints: Joints, axes: int) -> NetworkInput:
@@ -105,12 +90,9 @@ def with_velocities(inputs: NetworkInput, joints: Joints, axes: int) -> NetworkI
     matrix[:rows, :encoded] = inputs.matrix
     matrix[rows + axes - 1 :: axes, encoded:] = torch.eye(n, dtype=torch.float64)
     velocities = torch.ones(axes * n, dtype=torch.float64)
-    return NetworkInput(
-        joints=(*inputs.joints, *(joint for joint in range(n) for _ in range(axes))),
-        sensitivity=torch.cat([inputs.sensitivity, velocities]),
-        matrix=matrix,
-        offset=torch.cat([inputs.offset, 0 * velocities]),
-    )
+    owners = (*inputs.joints, *(joint for joint in range(n) for _ in range(axes)))
+    sensitivity = torch.cat([inputs.sensitivity, velocities])
+    return NetworkInput(owners, sensitivity, matrix, torch.cat([inputs.offset, 0 * velocities]))
 
 
 def joint_mask(units: Sequence[tuple[int, ...]], below: Sequence[tuple[int, ...]]) -> Tensor:

@@ -8,7 +8,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from spelgen.runtime.encoding import JointEncoding
 from spelgen.runtime.joints import Joints, vector
 
 HIDDEN = 8  # units of a joint's network
@@ -36,21 +35,19 @@ class JointFriction(nn.Module):
         ("raw_smoothing", "velocities", "rad/s, m/s"),
     )
 
-    matrix: Tensor  # where the inputs of a joint's network stand, (joints, inputs, encoded + 2 n)
-    speed: Tensor
-    nominal: Tensor
-
-    def __init__(self, joints: Joints, encoding: JointEncoding, generator: torch.Generator) -> None:
+    def __init__(self, joints: Joints, generator: torch.Generator) -> None:
         super().__init__()
         n, inputs = joints.n, 4
-        matrix = torch.zeros(n, inputs, encoding.size + 2 * n, dtype=torch.float64)
+        encoded = (2 if all(joints.revolute) else 3) * n
+        matrix = torch.zeros(n, inputs, encoded + 2 * n, dtype=torch.float64)
         for i, revolute in enumerate(joints.revolute):
             cos, sin = (i, n + i) if revolute else (2 * n + i, 2 * n + i)
             matrix[i, 0, cos] = matrix[i, 1, sin] = POSITION_SENSITIVITY
             matrix[i, 2, i - 2 * n], matrix[i, 3, i - n] = 1 / joints.speed[i], 1.0
-        self.register_buffer("matrix", matrix)
-        self.register_buffer("speed", vector(joints.speed))
-        self.register_buffer("nominal", vector(joints.friction))
+        # where the inputs of a joint's network stand, (joints, inputs, encoded + 2 n)
+        self.matrix = nn.Buffer(matrix)
+        self.speed = nn.Buffer(vector(joints.speed))
+        self.nominal = nn.Buffer(vector(joints.friction))
         self.raw_smoothing = nn.Parameter(torch.zeros(n, dtype=torch.float64))
         self.raw_viscous = nn.Parameter(torch.full((n,), -2.0, dtype=torch.float64))
         shape = (n, inputs, HIDDEN)

@@ -69,34 +69,25 @@ class JointFunctions(nn.Module):
         ("raw_friction_splines", "friction_splines", "1"),
     )
 
-    scale: Tensor
-    spacing: Tensor
-    middles: Tensor
-    revolute: Tensor
-    frequencies: Tensor
-    waves: Tensor  # how often fine ones, then coarse ones and the motor's, come again in a turn
-    quarter: Tensor  # by how much cosines are ahead of sines
-
     def __init__(self, joints: Joints) -> None:
         super().__init__()
         n = joints.n
         self.prismatic = not all(joints.revolute)
         spacing = 2 * vector(joints.reach).unsqueeze(-1) / (SPLINES - 3)
         knots = torch.arange(SPLINES).double() - (SPLINES - 1) / 2
-        self.register_buffer("scale", vector(joints.friction))
-        self.register_buffer("spacing", spacing)
-        self.register_buffer("middles", vector(joints.center).unsqueeze(-1) + spacing * knots)
-        self.register_buffer(
-            "revolute", vector(float(revolute) for revolute in joints.revolute).unsqueeze(-1)
-        )
+        self.scale = nn.Buffer(vector(joints.friction))
+        self.spacing = nn.Buffer(spacing)
+        self.middles = nn.Buffer(vector(joints.center).unsqueeze(-1) + spacing * knots)
+        self.revolute = nn.Buffer(vector(float(revolute) for revolute in joints.revolute).unsqueeze(-1))
         frequencies = ripple_frequencies(joints)
         fine, coarse = torch.arange(FINE + 1.0), (2 * FINE + 1) * torch.arange(COARSE + 1.0)
         fine, coarse = fine.double().expand(n, -1), coarse.double().expand(n, -1)
         coarse = torch.cat([coarse, frequencies[:, HARMONICS:]], dim=1)
-        self.register_buffer("frequencies", frequencies)
-        self.register_buffer("waves", torch.cat([fine, fine, coarse, coarse], dim=1))
+        self.frequencies = nn.Buffer(frequencies)
+        # how often fine ones, then coarse ones and the motor's, come again in a turn
+        self.waves = nn.Buffer(torch.cat([fine, fine, coarse, coarse], dim=1))
         ahead = [torch.full_like(half[0], x) for half in (fine, coarse) for x in (math.pi / 2, 0.0)]
-        self.register_buffer("quarter", torch.cat(ahead))
+        self.quarter = nn.Buffer(torch.cat(ahead))  # by how much cosines are ahead of sines
         self.raw_torque_splines = nn.Parameter(torch.zeros(n, SPLINES, dtype=torch.float64))
         self.raw_torque_ripple = nn.Parameter(torch.zeros(n, 2 * (HARMONICS + 2), dtype=torch.float64))
         self.raw_friction_splines = nn.Parameter(torch.zeros(n, SPLINES, dtype=torch.float64))

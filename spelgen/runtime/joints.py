@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+
+Pairs = Sequence[tuple[float, float]]
+Rows = Sequence[Sequence[float]]
 
 
 class Joints(NamedTuple):
@@ -19,8 +22,9 @@ class Joints(NamedTuple):
     speed: tuple[float, ...]  # usual velocity
     friction: tuple[float, ...]  # usual size of the friction torque
     armature: tuple[float, ...]  # nominal rotor inertia times gear squared [kg m^2, kg]
-    gear: tuple[float, ...]  # turns of the motor in a turn of the joint
     actuated: tuple[bool, ...]
+    gains: tuple[tuple[int, int, float, bool], ...] = ()  # joint, motor, torque by torque, whether trained
+    gear: tuple[float, ...] = ()  # turns of the motor in a turn of the joint
 
     @property
     def n(self) -> int:

@@ -43,10 +43,6 @@ class MaskedKAN(nn.Module):
     has no path to a joint it must not depend on.
     """
 
-    matrix: Tensor
-    offset: Tensor
-    grid: Tensor
-
     def __init__(
         self,
         inputs: NetworkInput,
@@ -55,13 +51,13 @@ class MaskedKAN(nn.Module):
     ) -> None:
         super().__init__()
         grid = torch.linspace(-1, 1, GRID, dtype=torch.float64)
-        self.register_buffer("grid", grid / SPACING)
+        self.grid = nn.Buffer(grid / SPACING)
         bumps = torch.eye(GRID, dtype=torch.float64)
         # the bumps of -x are those of x in reverse
         forth, back = inputs.matrix.clamp(min=0), (-inputs.matrix).clamp(min=0)
-        self.register_buffer("matrix", torch.kron(forth, bumps) + torch.kron(back, bumps.flip(0)))
+        self.matrix = nn.Buffer(torch.kron(forth, bumps) + torch.kron(back, bumps.flip(0)))
         still = 1 - inputs.matrix.abs().sum(dim=1, keepdim=True)
-        self.register_buffer("offset", (still * self._bumps(inputs.offset).height).flatten())
+        self.offset = nn.Buffer((still * self._bumps(inputs.offset).height).flatten())
         self.weights = nn.ParameterList()
         self.biases = nn.ParameterList()
         below: Sequence[tuple[int, ...]] = [(joint,) for joint in inputs.joints]

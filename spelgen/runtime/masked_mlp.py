@@ -35,9 +35,6 @@ class MaskedMLP(nn.Module):
     others are masked, so that a unit has no path to a joint it must not depend on.
     """
 
-    matrix: Tensor
-    offset: Tensor
-
     def __init__(
         self,
         inputs: NetworkInput,
@@ -45,8 +42,8 @@ class MaskedMLP(nn.Module):
         generator: torch.Generator,
     ) -> None:
         super().__init__()
-        self.register_buffer("matrix", inputs.matrix)
-        self.register_buffer("offset", inputs.offset)
+        self.matrix = nn.Buffer(inputs.matrix)
+        self.offset = nn.Buffer(inputs.offset)
         self.weights = nn.ParameterList()
         self.biases = nn.ParameterList()
         below: Sequence[tuple[int, ...]] = [(joint,) for joint in inputs.joints]

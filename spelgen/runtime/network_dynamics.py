@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from spelgen.runtime.encoding import JointEncoding
-from spelgen.runtime.parts import Friction, Input, Mass
+from spelgen.runtime.joints import Joints
+from spelgen.runtime.parts import Friction, Mass, Network
 from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied
-from spelgen.runtime.potential import LearnedPotential
 
 
 class NetworkPrepared(NamedTuple):
@@ -19,32 +19,31 @@ class NetworkPrepared(NamedTuple):
     mass: Any
     potential: Any
     friction: Any
-    input: Any
+    input: Any = None
 
 
 class NetworkDynamics(PortHamiltonian):
-    """The dynamics made of these parts; without a ``potential`` gravity does no work.
+    """M and D of these parts; V is a network's, in units of ``scale`` [J]; without one gravity does no work.
 
     ``pose``, all that is computed of q alone, is q as networks read it (see ``JointEncoding``).
     """
 
     def __init__(
-        self,
-        encoding: JointEncoding,
-        mass: Mass,
-        potential: LearnedPotential | None,
-        friction: Friction,
-        input: Input,
+        self, joints: Joints, mass: Mass, potential: Network | None, scale: float, friction: Friction
     ) -> None:
-        super().__init__()
-        self.encoding, self.mass, self.potential = encoding, mass, potential
-        self.friction, self.input = friction, input
+        super().__init__(joints)
+        self.encoding, self.mass, self.potential, self.friction = (
+            JointEncoding(joints),
+            mass,
+            potential,
+            friction,
+        )
+        self.scale = nn.Buffer(torch.full((1, 1), scale, dtype=torch.float64))
 
     def prepare(self, definite: bool = True) -> NetworkPrepared:
         """Return all that depends on the weights alone; M is kept ``definite``, or is as learned."""
-        potential = None if self.potential is None else self.potential.prepare()
-        mass = self.mass.prepare(definite)
-        return NetworkPrepared(mass, potential, self.friction.prepare(), self.input.prepare())
+        potential = None if self.potential is None else self.potential.prepare(self.scale, 0 * self.scale[0])
+        return NetworkPrepared(self.mass.prepare(definite), potential, self.friction.prepare())
 
     def configuration(self, q: Tensor, prepared: NetworkPrepared) -> Tensor:
         """Return what networks read of q."""
@@ -58,22 +57,24 @@ class NetworkDynamics(PortHamiltonian):
         """Return V(q), (...) [J]."""
         if self.potential is None:
             return pose.new_zeros(pose.shape[:-1])
-        return self.potential.forward(pose, prepared.potential)
+        return self.potential.forward(pose, prepared.potential)[0].squeeze(-1)
 
     def gravity_at(self, pose: Tensor, prepared: NetworkPrepared) -> Tensor:
         """Return dV/dq, (..., n) [Nm, N]."""
-        if self.potential is None:
-            return torch.zeros_like(pose[..., : self.n])
-        return self.encoding.vjp(pose, self.potential.vjp(pose, prepared.potential))
+        return -self._downhill(pose, torch.zeros_like(pose), prepared)
+
+    def _downhill(self, pose: Tensor, kinetic: Tensor, prepared: NetworkPrepared) -> Tensor:
+        """The derivative by q of what has the derivative ``kinetic`` by the encoding, less dV/dq."""
+        if self.potential is not None:
+            residuals = self.potential.forward(pose, prepared.potential)[1]
+            kinetic = kinetic - self.potential.vjp(residuals, pose.new_ones(1))
+        return self.encoding.vjp(pose, kinetic)
 
     def lagrangian_gradient(
         self, pose: Tensor, qd: Tensor, residuals: Any, prepared: NetworkPrepared
     ) -> Tensor:
         """Return d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
-        by_encoded = self.mass.kinetic_vjp(pose, qd, residuals)
-        if self.potential is not None:
-            by_encoded = by_encoded - self.potential.vjp(pose, prepared.potential)
-        return self.encoding.vjp(pose, by_encoded)
+        return self._downhill(pose, self.mass.kinetic_vjp(pose, qd, residuals), prepared)
 
     def nonlinear_at(self, pose: Tensor, qd: Tensor, residuals: Any, prepared: NetworkPrepared) -> Tensor:
         """Return dM/dt qd - d/dq (1/2 qd^T M qd) + dV/dq, (..., n)."""
@@ -87,15 +88,3 @@ class NetworkDynamics(PortHamiltonian):
     def dissipation_at(self, pose: Tensor, qd: Tensor, prepared: NetworkPrepared) -> Tensor:
         """Return D(q, qd), (..., n, n)."""
         return self.friction.dissipation(pose, qd, prepared.friction)
-
-    def input_at(self, pose: Tensor, prepared: NetworkPrepared) -> Tensor:
-        """Return G(q), (..., n, n)."""
-        return self.input.forward(pose, prepared.input)
-
-    def input_force(self, pose: Tensor, qd: Tensor, tau: Tensor, prepared: NetworkPrepared) -> Tensor:
-        """Return G tau, (..., n) [Nm, N]."""
-        return self.input.force(pose, tau, prepared.input)
-
-    def input_torque(self, pose: Tensor, qd: Tensor, force: Tensor, prepared: NetworkPrepared) -> Tensor:
-        """Return the tau, (..., n), that makes this force."""
-        return self.input.solve(pose, force, prepared.input)

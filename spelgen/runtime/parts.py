@@ -50,19 +50,3 @@ class Friction(Protocol):
 
     def dissipation(self, encoded: Tensor, qd: Tensor, prepared: Any) -> Tensor:
         """Return D, (..., n, n)."""
-
-
-class Input(Protocol):
-    """What gives G."""
-
-    def prepare(self) -> Any:
-        """Return all that depends on the weights alone."""
-
-    def forward(self, encoded: Tensor, prepared: Any) -> Tensor:
-        """Return G, (..., n, n)."""
-
-    def force(self, encoded: Tensor, tau: Tensor, prepared: Any) -> Tensor:
-        """Return G tau, (..., n)."""
-
-    def solve(self, encoded: Tensor, force: Tensor, prepared: Any) -> Tensor:
-        """Return the inputs, (..., n), that make this force."""

@@ -8,6 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from spelgen.runtime.joints import Joints, vector
+
 
 def solved(matrix: Tensor, right: Tensor) -> Tensor:
     """Return matrix^-1 right, (..., n)."""
@@ -42,8 +44,7 @@ class PortHamiltonian(nn.Module):
     joint_names: tuple[str, ...]
     joint_types: tuple[str, ...]  # "revolute" or "prismatic"
     elements = 0  # K, the numbers of friction's state at a joint
-
-    # what arms of networks and arms of rigid bodies have each of their own
+    # networks and rigid bodies have these each of their own
     prepare: Callable[..., Any]
     configuration: Callable[[Tensor, Any], Any]  # of q
     mass_at: Callable[[Any, Any], tuple[Tensor, Any]]  # M, and the residuals that its derivatives need
@@ -53,45 +54,55 @@ class PortHamiltonian(nn.Module):
     nonlinear_at: Callable[[Any, Tensor, Any, Any], Tensor]  # Coriolis, centrifugal and gravity torque
     friction_at: Callable[..., Tensor]  # D(q, qd) qd
     dissipation_at: Callable[[Any, Tensor, Any], Tensor]  # D, (..., n, n)
-    input_at: Callable[[Any, Any], Tensor]  # G, (..., n, n)
-    input_force: Callable[[Any, Tensor, Tensor, Any], Tensor]  # G tau at qd
-    input_torque: Callable[[Any, Tensor, Tensor, Any], Tensor]  # the tau that makes a force at qd
+
+    def __init__(self, joints: Joints) -> None:
+        super().__init__()
+        # 1 where a joint is driven, 0 where it is passive
+        self.actuated = nn.Buffer(vector(float(x) for x in joints.actuated))
+
+    def at(self, q: Tensor, prepared: Any = None) -> tuple[Any, Any]:
+        """Return the pose at q, and what depends on the weights alone."""
+        prepared = self.prepare() if prepared is None else prepared
+        return self.configuration(q, prepared), prepared
 
     def mass_matrix(self, q: Tensor, prepared: Any = None) -> Tensor:
         """Return M(q), (..., n, n) [kg m^2, kg m, kg]."""
-        prepared = self.prepare() if prepared is None else prepared
-        return self.mass_at(self.configuration(q, prepared), prepared)[0]
+        return self.mass_at(*self.at(q, prepared))[0]
 
     def potential_energy(self, q: Tensor) -> Tensor:
         """Return V(q), (...) [J]."""
-        prepared = self.prepare()
-        return self.energy_at(self.configuration(q, prepared), prepared)
+        return self.energy_at(*self.at(q))
 
     def gravity(self, q: Tensor) -> Tensor:
         """Return dV/dq, (..., n) [Nm, N]."""
-        prepared = self.prepare()
-        return self.gravity_at(self.configuration(q, prepared), prepared)
+        return self.gravity_at(*self.at(q))
 
     def nonlinear_effects(self, q: Tensor, qd: Tensor) -> Tensor:
         """Return the Coriolis, centrifugal and gravity torque, (..., n) [Nm, N]."""
-        prepared = self.prepare()
-        pose = self.configuration(q, prepared)
+        pose, prepared = self.at(q)
         return self.nonlinear_at(pose, qd, self.mass_at(pose, prepared)[1], prepared)
 
-    def friction_torque(self, q: Tensor, qd: Tensor) -> Tensor:
+    def friction_torque(self, q: Tensor, qd: Tensor, *state: Tensor | None) -> Tensor:
         """Return D(q, qd) qd, (..., n) [Nm, N]."""
-        prepared = self.prepare()
-        return self.friction_at(self.configuration(q, prepared), qd, prepared)
+        pose, prepared = self.at(q)
+        return self.friction_at(pose, qd, prepared, *state)
 
     def dissipation(self, q: Tensor, qd: Tensor) -> Tensor:
         """Return D(q, qd), (..., n, n) [Nm s/rad, N s/m]."""
-        prepared = self.prepare()
-        return self.dissipation_at(self.configuration(q, prepared), qd, prepared)
+        pose, prepared = self.at(q)
+        return self.dissipation_at(pose, qd, prepared)
 
     def input_matrix(self, q: Tensor) -> Tensor:
-        """Return G(q), (..., n, n): joint torques by inputs."""
-        prepared = self.prepare()
-        return self.input_at(self.configuration(q, prepared), prepared)
+        """Return G(q), (..., n, n): an input is the torque of its own joint, none of a passive one."""
+        return torch.diag(self.actuated).expand(*q.shape, -1)
+
+    def input_force(self, pose: Any, qd: Tensor, tau: Tensor, prepared: Any) -> Tensor:
+        """Return G tau, (..., n) [Nm, N]."""
+        return self.actuated * tau
+
+    def input_torque(self, pose: Any, qd: Tensor, force: Tensor, prepared: Any) -> Tensor:
+        """Return the tau, (..., n), that makes this force; a passive joint shows the torque it lacks."""
+        return force
 
     def momentum(self, q: Tensor, qd: Tensor, prepared: Any = None) -> Tensor:
         """Return p = M(q) qd, (..., n)."""
@@ -107,17 +118,14 @@ class PortHamiltonian(nn.Module):
 
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, *state: Tensor | None) -> Tensor:
         """Return qdd, (..., n), under the input tau."""
-        prepared = self.prepare()
-        pose = self.configuration(q, prepared)
+        pose, prepared = self.at(q)
         mass, residuals = self.mass_at(pose, prepared)
-        force = self.input_force(pose, qd, tau, prepared)
-        force = force - self.nonlinear_at(pose, qd, residuals, prepared)
+        force = self.input_force(pose, qd, tau, prepared) - self.nonlinear_at(pose, qd, residuals, prepared)
         return solved(mass, force - self.friction_at(pose, qd, prepared, *state))
 
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor, *state: Tensor | None) -> Tensor:
         """Return the input tau, (..., n), that gives qdd."""
-        prepared = self.prepare()
-        pose = self.configuration(q, prepared)
+        pose, prepared = self.at(q)
         mass, residuals = self.mass_at(pose, prepared)
         force = applied(mass, qdd) + self.nonlinear_at(pose, qd, residuals, prepared)
         return self.input_torque(pose, qd, force + self.friction_at(pose, qd, prepared, *state), prepared)
@@ -148,12 +156,12 @@ class PortHamiltonian(nn.Module):
         pairs = zip(self.joint_types, rotations, positions, strict=True)
         return [rotation if kind == "revolute" else position for kind, rotation, position in pairs]
 
-    def from_group(self, elements_of_joints: list[Tensor]) -> Tensor:
+    def from_group(self, elements: list[Tensor]) -> Tensor:
         """Return q, (..., n), with angles in [-pi, pi]; the inverse of ``to_group``."""
         values = []
-        for kind, element in zip(self.joint_types, elements_of_joints, strict=True):
-            revolute = kind == "revolute"
-            values.append(
-                torch.atan2(element[..., 1, 0], element[..., 0, 0]) if revolute else element[..., 2]
-            )
+        for kind, element in zip(self.joint_types, elements, strict=True):
+            if kind == "revolute":
+                values.append(torch.atan2(element[..., 1, 0], element[..., 0, 0]))
+            else:
+                values.append(element[..., 2])
         return torch.stack(values, dim=-1)

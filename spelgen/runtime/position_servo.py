@@ -36,24 +36,17 @@ class PositionServo(nn.Module):
         ("delay", "delay", "s"),
     )
 
-    nominal_kp: Tensor
-    nominal_kd: Tensor
-    trained: Tensor
-    limit: Tensor
-    delay: Tensor
-    dead_zone: Tensor
-
     def __init__(
         self, kp: Sequence[float], kd: Sequence[float], limit: Sequence[float], known: Sequence[bool]
     ) -> None:
         super().__init__()
-        self.register_buffer("nominal_kp", vector(kp))
-        self.register_buffer("nominal_kd", vector(kd))
-        self.register_buffer("trained", vector(float(not x) for x in known))
-        self.register_buffer("limit", vector(limit))
-        self.register_buffer("delay", torch.zeros((), dtype=torch.float64))  # [s]
+        self.nominal_kp = nn.Buffer(vector(kp))
+        self.nominal_kd = nn.Buffer(vector(kd))
+        self.trained = nn.Buffer(vector(float(not x) for x in known))
+        self.limit = nn.Buffer(vector(limit))
+        self.delay = nn.Buffer(torch.zeros((), dtype=torch.float64))  # [s]
         # no parameter: only a fit to commands may find one
-        self.register_buffer("dead_zone", torch.zeros(len(kp), dtype=torch.float64))
+        self.dead_zone = nn.Buffer(torch.zeros(len(kp), dtype=torch.float64))
         self.raw_kp = nn.Parameter(torch.zeros(len(kp), dtype=torch.float64))
         self.raw_kd = nn.Parameter(torch.zeros(len(kp), dtype=torch.float64))
 

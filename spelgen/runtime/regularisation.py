@@ -15,18 +15,15 @@ class PositiveDefiniteBound(nn.Module):
     t times those of M. C has M's own zeros and linear relations, which therefore hold in M'.
     """
 
-    center: Tensor  # C
-    smallest: Tensor  # margin C
-    unit: Tensor  # an entry's largest part in the norm relative to C, divided by 1 - margin
-
     def __init__(self, center: Tensor, margin: float) -> None:
         super().__init__()
         scale = center.diagonal().rsqrt()
         scaled = scale.unsqueeze(-1) * center * scale
         smallest = torch.linalg.eigvalsh(scaled)[0]
-        self.register_buffer("center", center)
-        self.register_buffer("smallest", margin * center)
-        self.register_buffer("unit", scale.unsqueeze(-1) * scale / smallest / (1 - margin))
+        self.center = nn.Buffer(center)  # C
+        self.smallest = nn.Buffer(margin * center)  # margin C
+        # an entry's largest part in the norm relative to C, divided by 1 - margin
+        self.unit = nn.Buffer(scale.unsqueeze(-1) * scale / smallest / (1 - margin))
 
     def forward(self, mass: Tensor) -> tuple[Tensor, Tensor]:
         """M', (..., n, n), and t, (...)."""

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from spelgen.runtime.encoding import JointEncoding
 from spelgen.runtime.joint_functions import JointFunctions, JointFunctionWeights
-from spelgen.runtime.joints import Joints
-from spelgen.runtime.parts import Input
+from spelgen.runtime.joints import Joints, Rows
+from spelgen.runtime.parts import Network
 from spelgen.runtime.port_hamiltonian import applied
-from spelgen.runtime.potential import LearnedPotential
 from spelgen.runtime.residual_mass import ResidualMass
-from spelgen.runtime.rigid_body import Bodies
+from spelgen.runtime.rigid_body import Bodies, Row
 from spelgen.runtime.rigid_body_dynamics import Motion, RigidBodyDynamics, RigidPrepared
 
 
@@ -40,70 +38,67 @@ class ResidualDynamics(RigidBodyDynamics):
     """Rigid bodies with residuals in M, V and friction; with their weights zero they are bodies alone.
 
     M = that of bodies and drives + R(q), positive definite for all weights (see ``ResidualMass``).
-    V = that of bodies + a network's + each joint's own. Friction is multiplied by a positive factor.
-    Where ``residual_mass`` is None there are no residuals: for a model that is asked often, and has none.
+    V = that of bodies + a network's, in units of ``scale`` [J], + each joint's own. Friction is multiplied
+    by a positive factor. Where ``residual_mass`` is None, what has no residuals is not computed.
     """
 
-    joint_functions: JointFunctions
     residual_mass: ResidualMass | None
-    residual_potential: LearnedPotential | None
 
     def __init__(
         self,
         joints: Joints,
         bodies: Bodies,
-        gravity: tuple[float, float, float],
-        input: Input,
+        gravity: Row,
+        reach: Rows,
+        motors: Rows,
         mass: ResidualMass,
-        potential: LearnedPotential | None,
-        reach: Sequence[Sequence[float]] = (),
-        motors: Sequence[Sequence[float]] = (),
+        potential: Network | None,
+        scale: float,
     ) -> None:
-        super().__init__(joints, bodies, gravity, input, reach, motors)
-        self.encoding = JointEncoding(joints)
-        self.joint_functions = JointFunctions(joints)
-        self.residual_mass = mass
-        self.residual_potential = potential
+        super().__init__(joints, bodies, gravity, reach, motors)
+        self.encoding, self.joint_functions = JointEncoding(joints), JointFunctions(joints)
+        self.residual_mass, self.residual_potential = mass, potential
+        self.scale = nn.Buffer(torch.full((1, 1), scale, dtype=torch.float64))
 
     def prepare(self, definite: bool = True) -> RigidPrepared:
-        """All that depends on the weights alone; holds until they change."""
-        prepared = super().prepare(definite)
+        """Return all that depends on the weights alone; holds until they change."""
+        prepared, potential, scale = super().prepare(definite), self.residual_potential, self.scale
         if self.residual_mass is None:
             return prepared
-        potential = None if self.residual_potential is None else self.residual_potential.prepare()
+        layers = None if potential is None else potential.prepare(scale, 0 * scale[0])
         mass = self.residual_mass.prepare(prepared.armature)
-        functions = self.joint_functions.prepare()
-        return prepared._replace(residual=ResidualPrepared(mass, potential, functions))
+        return prepared._replace(residual=ResidualPrepared(mass, layers, self.joint_functions.prepare()))
 
     def configuration(self, q: Tensor, prepared: RigidPrepared) -> Motion:
-        """How the bodies may move at q, and what residuals read of q."""
+        """Return how the bodies may move at q, and what residuals read of q."""
         pose = super().configuration(q, prepared)
         return pose if self.residual_mass is None else pose._replace(residual=self._read(q, prepared))
 
     def _read(self, q: Tensor, prepared: RigidPrepared) -> ResidualMotion:
-        return ResidualMotion(q, self.encoding(q), *self.joint_functions(q, prepared.residual.functions))
+        functions = self.joint_functions.forward(q, prepared.residual.functions)
+        return ResidualMotion(q, self.encoding.forward(q), *functions)
 
     def mass_at(self, pose: Motion, prepared: RigidPrepared) -> tuple[Tensor, Any]:
-        """M(q), (..., n, n), and what its derivatives need."""
+        """Return M(q), (..., n, n), and what its derivatives need."""
         mass = super().mass_at(pose, prepared)[0]
         if self.residual_mass is None:
             return mass, None
-        residual, residuals = self.residual_mass(pose.residual.encoded, prepared.residual.mass)
+        residual, residuals = self.residual_mass.forward(pose.residual.encoded, prepared.residual.mass)
         return mass + residual, residuals
 
     def energy_at(self, pose: Motion, prepared: RigidPrepared) -> Tensor:
-        """V(q), (...) [J]."""
+        """Return V(q), (...) [J]."""
         energy = super().energy_at(pose, prepared)
         if self.residual_mass is None:
             return energy
         energy = energy + self.joint_functions.energy(pose.residual.q)
         if self.residual_potential is None:
             return energy
-        residual: Tensor = self.residual_potential(pose.residual.encoded, prepared.residual.potential)
-        return energy + residual
+        residual = self.residual_potential.forward(pose.residual.encoded, prepared.residual.potential)[0]
+        return energy + residual.squeeze(-1)
 
     def gravity_at(self, pose: Motion, prepared: RigidPrepared) -> Tensor:
-        """dV/dq, (..., n) [Nm, N]."""
+        """Return dV/dq, (..., n) [Nm, N]."""
         if self.residual_mass is None:
             return pose.gravity
         kinetic = torch.zeros_like(pose.residual.encoded)
@@ -112,7 +107,7 @@ class ResidualDynamics(RigidBodyDynamics):
     def lagrangian_gradient(
         self, pose: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared
     ) -> Tensor:
-        """d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
+        """Return d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
         gradient = super().lagrangian_gradient(pose, qd, None, prepared)
         if self.residual_mass is None:
             return gradient
@@ -120,33 +115,23 @@ class ResidualDynamics(RigidBodyDynamics):
         return gradient + self._gradient(pose.residual, kinetic, prepared)
 
     def nonlinear_at(self, pose: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
-        """The torque that holds qd steady without friction, (..., n)."""
+        """Return the torque that holds qd steady without friction, (..., n)."""
         torque = super().nonlinear_at(pose, qd, None, prepared)
         if self.residual_mass is None:
             return torque
         return torque + self._nonlinear(pose.residual, qd, residuals, prepared)
 
     def residual_torque(self, q: Tensor, qd: Tensor, qdd: Tensor, prepared: RigidPrepared) -> Tensor:
-        """What the residuals of M and V take, (..., n) [Nm, N]."""
+        """Return what the residuals of M and V take, (..., n) [Nm, N]."""
         if self.residual_mass is None:
             return torch.zeros_like(q)
         read = self._read(q, prepared)
-        mass, residuals = self.residual_mass(read.encoded, prepared.residual.mass)
+        mass, residuals = self.residual_mass.forward(read.encoded, prepared.residual.mass)
         return applied(mass, qdd) + self._nonlinear(read, qd, residuals, prepared)
-
-    def friction_factor(self, q: Tensor) -> Tensor:
-        """How much more friction the drives have at q than their laws say, (..., n)."""
-        if self.residual_mass is None:
-            return torch.ones_like(q)
-        factor: Tensor = self.joint_functions(q, self.joint_functions.prepare())[1]
-        return factor
 
     def _varied(self, friction: Tensor, pose: Motion) -> Tensor:
         """The laws' friction of the drives as it is at this position, (..., n)."""
-        if self.residual_mass is None:
-            return friction
-        factor: Tensor = pose.residual.factor
-        return factor * friction
+        return friction if self.residual_mass is None else pose.residual.factor * friction
 
     def _nonlinear(self, read: ResidualMotion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
         """dR/dt qd - d/dq of what the residuals add to 1/2 qd^T M(q) qd - V(q), (..., n)."""
@@ -158,6 +143,6 @@ class ResidualDynamics(RigidBodyDynamics):
     def _gradient(self, read: ResidualMotion, kinetic: Tensor, prepared: RigidPrepared) -> Tensor:
         """d/dq of what the residuals add to 1/2 qd^T M(q) qd - V(q), (..., n); kinetic: by the encoding."""
         if self.residual_potential is not None:
-            kinetic = kinetic - self.residual_potential.vjp(read.encoded, prepared.residual.potential)
-        gradient: Tensor = self.encoding.vjp(read.encoded, kinetic)
-        return gradient - read.torque
+            residuals = self.residual_potential.forward(read.encoded, prepared.residual.potential)[1]
+            kinetic = kinetic - self.residual_potential.vjp(residuals, read.encoded.new_ones(1))
+        return self.encoding.vjp(read.encoded, kinetic) - read.torque

@@ -34,15 +34,14 @@ class ResidualMass(nn.Module):
 
     kinds = (("raw_constants", "mass_residuals", "kg m^2, kg m, kg"),)
 
-    inverse: Tensor  # one by the size of each function and constant in an entry, NEVER where it has none
-
     def __init__(
         self, joints: Joints, entries: Entries, functions: int, constants: int, network: Network | None
     ) -> None:
         super().__init__()
         self.n, self.functions, self.entries, self.network = joints.n, functions, entries, network
         size = self._scaled(torch.ones(functions + constants, dtype=torch.float64)).abs()
-        self.register_buffer("inverse", torch.where(size > 0, 1 / size, NEVER))
+        # one by the size of each function and constant in an entry, NEVER where it has none
+        self.inverse = nn.Buffer(torch.where(size > 0, 1 / size, NEVER))
         self.part = PART / float((size > 0).sum(dim=(0, 2)).max())  # of all that meet in a row of M
         self.raw_constants = nn.Parameter(torch.zeros(constants, dtype=torch.float64))
 

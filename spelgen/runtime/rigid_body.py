@@ -25,10 +25,7 @@ class Bodies(NamedTuple):
     offset: tuple[float, ...]
     rotation: tuple[tuple[Row, Row, Row], ...]  # of the joint's frame in its parent's
     position: tuple[Row, ...]  # likewise [m]
-    mass: tuple[float, ...]  # nominal m [kg]
-    moment: tuple[Row, ...]  # nominal m c [kg m]
-    inertia: tuple[Row, ...]  # nominal Ixx, Iyy, Izz about the joint [kg m^2]
-    products: tuple[Row, ...]  # likewise Ixy, Ixz, Iyz
+    inertia: tuple[tuple[float, ...], ...]  # nominal m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz about the joint
 
 
 def skew(a: Tensor) -> Tensor:
@@ -39,68 +36,44 @@ def skew(a: Tensor) -> Tensor:
     return rows.reshape(*a.shape[:-1], 3, 3)
 
 
-def twist_map(rotation: Tensor, position: Tensor) -> Tensor:
-    """Takes twists (angular, linear) to a frame at ``position`` turned by ``rotation``^T, (6, 6)."""
-    top = torch.cat([rotation, torch.zeros_like(rotation)], dim=1)
-    return torch.cat([top, torch.cat([-rotation @ skew(position), rotation], dim=1)])
-
-
-def transform_table(bodies: Bodies, index: int) -> Tensor:
-    """A body's twist map from its parent's frame is table[0] + table[1] cos + table[2] sin, (3, 6, 6).
-
-    A prismatic one's is table[0] + displacement table[1].
-    """
-    rotation = torch.stack([vector(row) for row in bodies.rotation[index]]).mT
-    position = vector(bodies.position[index])
-    table = torch.zeros(3, 6, 6, dtype=torch.float64)
-    if bodies.revolute[index]:
-        about = torch.zeros(3, 3, 3, dtype=torch.float64)
-        about[0, 2, 2] = about[1, 0, 0] = about[1, 1, 1] = about[2, 0, 1] = 1
-        about[2, 1, 0] = -1
-        for term in range(3):
-            table[term] = twist_map(about[term] @ rotation, position)
-    else:
-        table[0] = twist_map(rotation, position)
-        table[1] = twist_map(rotation, position + rotation[2]) - table[0]
-    return table
-
-
 def motion_table(bodies: Bodies) -> tuple[Tensor, Tensor]:
-    """Takes cos, sin and value of all displacements to what takes rows of twists from parents' frames.
+    """Return what takes cos, sin and value of all q to what takes rows of twists from parents' frames.
 
-    (36 bodies, 3 bodies), and what is added, (36 bodies,). Offsets of the displacements are in both.
+    (36 bodies, 3 bodies), and what is added, (36 bodies,). The displacements' offsets are in both.
     """
-    count = len(bodies.parent)
+    count, turn = len(bodies.parent), skew(vector((0, 0, 1)))
     by_term = torch.zeros(count, 6, 6, 3, count, dtype=torch.float64)
     fixed = torch.zeros(count, 6, 6, dtype=torch.float64)
     for index, (revolute, offset) in enumerate(zip(bodies.revolute, bodies.offset, strict=True)):
-        constant, first, second = transform_table(bodies, index).mT
+        # (w, v) at the frame of a body that has not moved
+        rotation = torch.stack([vector(row) for row in bodies.rotation[index]]).mT
+        start = block_diagonal(rotation.expand(2, 3, 3)).clone()
+        start[3:, :3] = -rotation @ skew(vector(bodies.position[index]))
+        # a motion takes it to (constant + cos terms[0] + sin terms[1] + value terms[2]) start
+        constant, terms = torch.eye(6, dtype=torch.float64), torch.zeros(3, 6, 6, dtype=torch.float64)
         if revolute:
-            cos, sin = math.cos(offset), math.sin(offset)
-            by_term[index, :, :, 0, index] = cos * first + sin * second
-            by_term[index, :, :, 1, index] = cos * second - sin * first
-            fixed[index] = constant
+            terms[1] = block_diagonal(-turn.expand(2, 3, 3))
+            terms[0] = -terms[1] @ terms[1]
+            constant = constant - terms[0]
         else:
-            by_term[index, :, :, 2, index] = first
-            fixed[index] = constant + offset * first
+            terms[2, 3:, :3] = -turn
+        start = (
+            constant + math.cos(offset) * terms[0] + math.sin(offset) * terms[1] + offset * terms[2]
+        ) @ start
+        by_term[index, :, :, :, index] = (terms @ start).permute(2, 1, 0)
+        fixed[index] = (constant @ start).mT
     return by_term.reshape(36 * count, 3 * count), fixed.flatten()
 
 
 def crossed(twists: Tensor, axes: Tensor) -> Tensor:
-    """How twists that are carried along by ``twists`` change; columns, (..., 6, k) each.
-
-    Featherstone's cross product of motion vectors (2008, eq. 2.31).
-    """
+    """Return how axes carried along by ``twists`` change, (..., 6, k) (Featherstone 2008, eq. 2.31)."""
     (w, u), (a, m) = twists.chunk(2, dim=-2), axes.chunk(2, dim=-2)
     linear = torch.linalg.cross(w, m, dim=-2) + torch.linalg.cross(u, a, dim=-2)
     return torch.cat([torch.linalg.cross(w, a, dim=-2), linear], dim=-2)
 
 
 def pushed_along(twists: Tensor, momenta: Tensor) -> Tensor:
-    """How momenta that are carried along by ``twists`` change; columns, (..., 6, k) each.
-
-    Featherstone's cross product of force vectors (2008, eq. 2.32).
-    """
+    """Return how momenta carried along by ``twists`` change, (..., 6, k) (Featherstone, eq. 2.32)."""
     (w, u), (n, f) = twists.chunk(2, dim=-2), momenta.chunk(2, dim=-2)
     angular = torch.linalg.cross(w, n, dim=-2) + torch.linalg.cross(u, f, dim=-2)
     return torch.cat([angular, torch.linalg.cross(w, f, dim=-2)], dim=-2)
@@ -145,32 +118,22 @@ class InertialParameters(nn.Module):
 
     kinds = (("raw", "bodies", "kg, kg m, kg m^2"),)
 
-    factors: Tensor
-    triangle: Tensor
-
     def __init__(self, bodies: Bodies) -> None:
         super().__init__()
-        columns = zip(bodies.mass, bodies.moment, bodies.inertia, bodies.products, strict=True)
-        nominal = torch.stack(
-            [
-                vector((m, *moment, xx, xy, xz, yy, yz, zz))
-                for m, moment, (xx, yy, zz), (xy, xz, yz) in columns
-            ]
-        )
-        self.register_buffer("factors", torch.linalg.cholesky(pseudo_inertia(nominal)))
+        nominal = torch.stack([vector(ten) for ten in bodies.inertia])
+        self.factors = nn.Buffer(torch.linalg.cholesky(pseudo_inertia(nominal)))
         row, column = torch.tril_indices(4, 4)
-        self.register_buffer("triangle", torch.eye(16, dtype=torch.float64)[4 * row + column])
-        self.raw = nn.Parameter(torch.zeros(len(bodies.mass), 10, dtype=torch.float64))
+        self.triangle = nn.Buffer(torch.eye(16, dtype=torch.float64)[4 * row + column])
+        self.raw = nn.Parameter(torch.zeros(len(nominal), 10, dtype=torch.float64))
 
     def forward(self) -> Tensor:
-        """By body (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) about its joint's frame, (bodies, 10)."""
+        """Return, by body, (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) about its joint's frame, (bodies, 10)."""
         on_diagonal = self.triangle[:, ::5].sum(dim=1) > 0
         lower = torch.where(on_diagonal, self.raw.exp(), self.raw) @ self.triangle
         root = self.factors @ lower.reshape(-1, 4, 4)
         pseudo = root @ root.mT
-        moments, tensor = pseudo[:, 3, :3], -pseudo[:, :3, :3]
-        trace = -tensor.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
-        xx, yy, zz = (trace.unsqueeze(-1) + tensor.diagonal(dim1=-2, dim2=-1)).unbind(dim=-1)
-        xy, xz, yz = tensor[:, 0, 1], tensor[:, 0, 2], tensor[:, 1, 2]
-        six = torch.stack([xx, xy, xz, yy, yz, zz], dim=-1)
-        return torch.cat([pseudo[:, 3, 3:], moments, six], dim=-1)
+        second = pseudo[:, :3, :3]
+        trace = second.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
+        inertia = trace[:, None, None] * torch.eye(3).to(pseudo) - second
+        row, column = torch.triu_indices(3, 3)
+        return torch.cat([pseudo[:, 3, 3:], pseudo[:, 3, :3], inertia[:, row, column]], dim=-1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -11,10 +10,9 @@ from torch import Tensor, nn
 from spelgen.runtime.armature import Armature
 from spelgen.runtime.body_chain import BodyChain, Chain
 from spelgen.runtime.friction_laws import FrictionConstants, FrictionLaws
-from spelgen.runtime.joints import Joints, vector
-from spelgen.runtime.parts import Input
+from spelgen.runtime.joints import Joints, Rows
 from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied, combined
-from spelgen.runtime.rigid_body import Bodies, InertialParameters, block_diagonal, inertia_basis
+from spelgen.runtime.rigid_body import Bodies, InertialParameters, Row, block_diagonal, inertia_basis
 
 
 class RigidPrepared(NamedTuple):
@@ -23,7 +21,6 @@ class RigidPrepared(NamedTuple):
     inertia: Tensor  # spatial inertias on the diagonal, (6 bodies, 6 bodies)
     armature: Tensor  # what the rotors add to M, (n, n)
     friction: FrictionConstants
-    input: Tensor
     offset: Tensor  # what the measured torque shows without any, (n,)
     compensation: Tensor  # what the drives add by velocity, unseen, (n,)
     residual: Any = None  # of what a model has beside rigid bodies
@@ -50,38 +47,24 @@ class RigidBodyDynamics(PortHamiltonian):
         ("raw_friction_compensation", "friction_compensation", "Nm s/rad, N s/m"),
     )
 
-    basis: Tensor
-    actuated: Tensor
-    motors: Tensor  # C: the drives' speeds are C qd, (n, n)
-    loads: Tensor  # its inverse
-    raw_friction_compensation: Tensor
-
     def __init__(
-        self,
-        joints: Joints,
-        bodies: Bodies,
-        gravity: tuple[float, float, float],
-        input: Input,
-        reach: Sequence[Sequence[float]] = (),
-        motors: Sequence[Sequence[float]] = (),
+        self, joints: Joints, bodies: Bodies, gravity: Row, reach: Rows = (), motors: Rows = ()
     ) -> None:
-        super().__init__()
+        super().__init__(joints)
         self.elements = len(reach[0]) if reach else 0
         self.chain = BodyChain(joints.n, bodies, gravity)
-        self.register_buffer("basis", inertia_basis())
-        self.register_buffer("actuated", vector(float(x) for x in joints.actuated))
-        self.bodies = InertialParameters(bodies)
-        self.rotors = Armature(joints)
+        self.basis = nn.Buffer(inertia_basis())
+        self.bodies, self.rotors = InertialParameters(bodies), Armature(joints)
         self.friction = FrictionLaws(joints, reach)
-        self.input = input
         self.coupled = len(motors) > 0  # each drive moves its own joint alone where they are not given
         identity = torch.eye(joints.n, dtype=torch.float64)
-        self.register_buffer("motors", torch.tensor(motors).to(identity) if motors else identity)
-        self.register_buffer("loads", torch.linalg.inv(self.motors))
+        # C: the drives' speeds are C qd, (n, n)
+        self.motors = nn.Buffer(torch.tensor(motors).to(identity) if motors else identity)
+        self.loads = nn.Buffer(torch.linalg.inv(self.motors))  # its inverse
         # of the measured torque, in units of the joints' usual friction
-        self.raw_offset = nn.Parameter(torch.zeros(self.n, dtype=torch.float64))
+        self.raw_offset = nn.Parameter(torch.zeros(joints.n, dtype=torch.float64))
         # in units of usual friction at usual speed; no parameter: only a fit to torques may find one
-        self.register_buffer("raw_friction_compensation", torch.zeros(self.n, dtype=torch.float64))
+        self.raw_friction_compensation = nn.Buffer(torch.zeros(joints.n, dtype=torch.float64))
 
     @property
     def inertial_parameters(self) -> Tensor:
@@ -92,11 +75,6 @@ class RigidBodyDynamics(PortHamiltonian):
     def armature(self) -> Tensor:
         """What the drives add to M's diagonal, (n,) [kg m^2, kg]."""
         return self.rotors.forward()
-
-    @property
-    def rotor_inertia(self) -> Tensor:
-        """The drives' inertia before the gear, (n,) [kg m^2, kg]."""
-        return self.rotors.rotor_inertia()
 
     @property
     def viscous(self) -> Tensor:
@@ -119,39 +97,34 @@ class RigidBodyDynamics(PortHamiltonian):
         return self.raw_friction_compensation * self.friction.nominal / self.friction.speed * self.actuated
 
     def prepare(self, definite: bool = True) -> RigidPrepared:
-        """All that depends on the weights alone; holds until they change."""
-        inertia = torch.tensordot(self.inertial_parameters, self.basis, dims=1)
-        return RigidPrepared(
-            inertia=block_diagonal(inertia),
-            armature=self.motors.mT @ (self.armature.unsqueeze(-1) * self.motors),
-            friction=self.friction.prepare(),
-            input=self.input.prepare(),
-            offset=self.torque_offset,
-            compensation=self.friction_compensation,
-        )
+        """Return all that depends on the weights alone; holds until they change."""
+        inertia = block_diagonal(torch.tensordot(self.inertial_parameters, self.basis, dims=1))
+        armature = self.motors.mT @ (self.armature.unsqueeze(-1) * self.motors)
+        drives = self.friction.prepare(), self.torque_offset, self.friction_compensation
+        return RigidPrepared(inertia, armature, *drives)
 
     def configuration(self, q: Tensor, prepared: RigidPrepared) -> Motion:
-        """How the bodies may move at q, and what they weigh there."""
+        """Return how the bodies may move at q, and what they weigh there."""
         chain = self.chain.forward(q)
         momenta = chain.twists @ prepared.inertia
         return Motion(chain, momenta, applied(momenta, chain.weight))
 
-    def mass_at(self, pose: Motion, prepared: RigidPrepared) -> tuple[Tensor, None]:
-        """M(q), (..., n, n)."""
+    def mass_at(self, pose: Motion, prepared: RigidPrepared) -> tuple[Tensor, Any]:
+        """Return M(q), (..., n, n)."""
         return pose.momenta @ pose.chain.twists.mT + prepared.armature, None
 
     def energy_at(self, pose: Motion, prepared: RigidPrepared) -> Tensor:
-        """V(q), (...) [J]; zero for a mass at the base's origin."""
+        """Return V(q), (...) [J]; zero for a mass at the base's origin."""
         return self.chain.energy(pose.chain, prepared.inertia)
 
     def gravity_at(self, pose: Motion, prepared: RigidPrepared) -> Tensor:
-        """dV/dq, (..., n) [Nm, N]."""
+        """Return dV/dq, (..., n) [Nm, N]."""
         return pose.gravity
 
     def lagrangian_gradient(
         self, pose: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared
     ) -> Tensor:
-        """d/dq of 1/2 qd^T M(q) qd - V(q), (..., n).
+        """Return d/dq of 1/2 qd^T M(q) qd - V(q), (..., n).
 
         The kinetic part: the momentum of all that a joint carries, by what its displacement adds to
         their twist.
@@ -160,20 +133,8 @@ class RigidBodyDynamics(PortHamiltonian):
         return self.chain.by_joints(self.chain.turning(pose.chain, qd)[1], momenta) - pose.gravity
 
     def nonlinear_at(self, pose: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
-        """The torque that holds qd steady without friction, (..., n), by Newton and Euler."""
+        """Return the torque that holds qd steady without friction, (..., n), by Newton and Euler."""
         return self.chain.steady_torque(pose.chain, qd, pose.momenta)
-
-    def regressor(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
-        """Y, (..., n, 10 bodies): Y @ inertial parameters is the bodies' torque."""
-        return self.chain.regressor(q, qd, qdd, self.basis)
-
-    def residual_torque(self, q: Tensor, qd: Tensor, qdd: Tensor, prepared: RigidPrepared) -> Tensor:
-        """What else than bodies, drives and friction takes torque, (..., n) [Nm, N]: nothing."""
-        return torch.zeros_like(q)
-
-    def friction_factor(self, q: Tensor) -> Tensor:
-        """How much more friction the drives have at q than their laws say, (..., n): nowhere any."""
-        return torch.ones_like(q)
 
     def _varied(self, friction: Tensor, pose: Motion) -> Tensor:
         """The laws' friction of the drives as it is at this position, (..., n)."""
@@ -186,15 +147,10 @@ class RigidBodyDynamics(PortHamiltonian):
     def friction_at(
         self, pose: Motion, qd: Tensor, prepared: RigidPrepared, z: Tensor | None = None
     ) -> Tensor:
-        """The friction torque C^T f(C qd), (..., n) [Nm, N]."""
+        """Return the friction torque C^T f(C qd), (..., n) [Nm, N]."""
         speeds, loads = self._by_motors(qd, self.motors.mT), self._by_motors(pose.gravity, self.loads)
         torque = self.friction.forward(speeds, loads, prepared.friction, z)
         return self._by_motors(self._varied(torque, pose), self.motors)
-
-    def friction_torque(self, q: Tensor, qd: Tensor, z: Tensor | None = None) -> Tensor:
-        """Return D(q, qd) qd, or the torque of bristles at z, (..., n) [Nm, N]."""
-        prepared = self.prepare()
-        return self.friction_at(self.configuration(q, prepared), qd, prepared, z)
 
     def hamiltonian(self, q: Tensor, p: Tensor, z: Tensor | None = None) -> Tensor:
         """Return H, (...) [J]."""
@@ -224,23 +180,18 @@ class RigidBodyDynamics(PortHamiltonian):
         return torch.cat([qd, force, rate, torch.zeros_like(tau)], dim=-1)
 
     def dissipation_at(self, pose: Motion, qd: Tensor, prepared: RigidPrepared) -> Tensor:
-        """D(q, qd), (..., n, n), diagonal where each drive moves its own joint alone."""
-        speeds, loads = qd @ self.motors.mT, pose.gravity @ self.loads
-        resistance = self.friction.resistance(speeds, loads, prepared.friction)
-        resistance = self._varied(resistance, pose)
-        return self.motors.mT @ (resistance.unsqueeze(-1) * self.motors)
-
-    def input_at(self, pose: Motion, prepared: RigidPrepared) -> Tensor:
-        """G, (..., n, n)."""
-        return self.input.forward(pose.gravity, prepared.input)
+        """Return D(q, qd), (..., n, n), diagonal where each drive moves its own joint alone."""
+        resistance = self.friction.resistance(
+            qd @ self.motors.mT, pose.gravity @ self.loads, prepared.friction
+        )
+        return self.motors.mT @ (self._varied(resistance, pose).unsqueeze(-1) * self.motors)
 
     def input_force(self, pose: Motion, qd: Tensor, tau: Tensor, prepared: RigidPrepared) -> Tensor:
-        """G (tau - torque offset) + friction compensation qd, (..., n) [Nm, N]."""
-        force = self.input.force(pose.gravity, tau - prepared.offset, prepared.input)
+        """Return G (tau - torque offset) + friction compensation qd, (..., n) [Nm, N]."""
+        force = super().input_force(pose, qd, tau - prepared.offset, prepared)
         return force + prepared.compensation * qd
 
     def input_torque(self, pose: Motion, qd: Tensor, force: Tensor, prepared: RigidPrepared) -> Tensor:
-        """The tau, (..., n), that is measured while the drives make this force."""
+        """Return the tau, (..., n), that is measured while the drives make this force."""
         measured = force - prepared.compensation * qd
-        tau = self.input.solve(pose.gravity, measured, prepared.input)
-        return tau + prepared.offset
+        return super().input_torque(pose, qd, measured, prepared) + prepared.offset

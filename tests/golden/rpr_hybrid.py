@@ -36,12 +36,64 @@ FACTS = r"""{"format": 2, "robot": "rpr", "urdf": "rpr.urdf",
  "joints": {"joint1": "revolute", "joint2": "prismatic", "joint3": "revolute"}}"""
 
 
-# ---- this arm ----
+# ---- this arm; `Model`, at the end of the file, is made of these parts ----
+
+
+def mass_entries(f: Sequence[Tensor], c: Sequence[Tensor]) -> Tensor:
+    """Return R, what M has beside rigid bodies, (..., n, n), by its functions f(q) and its constants c."""
+    # f1(q3), f2(q2,3), f3(q2,3)
+    f1, f2, f3 = f
+    c1, c2 = c
+    return symmetric([f3], [f1, c2], [f2, 0, c1])
+
+
+def make_parts(seed: int) -> tuple[Joints, Bodies, Row, Rows, Rows, ResidualMass, Network, float]:
+    """Return what this arm's `Model` is made of, with random weights of this seed."""
+    joints = Joints(
+        revolute=(True, False, True), center=(0.0, 0.7875, 0.0), reach=(2.96706, 0.4825, 2.96706),
+        speed=(3.0, 1.0, 6.0), friction=(0.4, 0.4, 0.4), armature=(2.19, 0.782, 0.106),
+        actuated=(True, True, True), gear=(1.0, 1.0, 1.0),
+    )  # fmt: skip
+    bodies = Bodies(
+        parent=(-1, 0, 1), joint=(0, 1, 2), revolute=(True, False, True), ratio=(1.0, 1.0, 1.0),
+        offset=(0.0, 0.0, 0.0),
+        rotation=(
+            ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+            ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
+            ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+        ),
+        position=((0.0, 0.0, 0.0), (0.0, 0.0, 0.154), (0.0, -0.0203, 0.0)),
+        inertia=(
+            (5.01, 0.0, 0.0, -4.48896, 4.13010816, 0.0, 0.0, 4.12210816, 0.0, 0.018),
+            (4.25, 0.0, -0.086275, -27.4125, 179.3223764, 0.0, 0.0, 179.320625, -0.55647375, 0.0077513825),
+            (1.08, 0.0, 0.09936, -0.05832, 0.0142904, 0.0, 0.0, 0.00425851, 0.00536544, 0.0102504),
+        ),
+    )  # fmt: skip
+    generator = torch.Generator().manual_seed(seed)
+    mass_outputs = ((2,),) + ((1, 2),) * 2
+    mass_hidden = ((2,),) * 21 + ((1, 2),) * 43
+    network = Network(
+        joint_input(joints, (1, 2), (0.02, 1.0, 0.518)), (mass_hidden, mass_hidden, mass_outputs), generator
+    )
+    mass = ResidualMass(joints, mass_entries, 3, 2, network)
+    potential_outputs = ((2,),)
+    potential_hidden = ((2,),) * 32
+    potential = Network(
+        joint_input(joints, (2,), (0.02, 0.02, 1.0)), (potential_hidden, potential_hidden, potential_outputs),
+        generator,
+    )  # fmt: skip
+    return (
+        joints, bodies, (0.0, 0.0, -9.81),
+        ((0.0001, 0.001, 0.01, 0.1), (1e-05, 0.0001, 0.001, 0.01), (0.0001, 0.001, 0.01, 0.1)), (), mass,
+        potential, 0.703291,
+    )  # fmt: skip
+
+
+# ---- this arm's model ----
 
 
 # what the parts of this arm's model are
 Network = MaskedMLP
-Input = DirectInput
 
 
 class Model(ResidualDynamics):
@@ -57,53 +109,5 @@ class Model(ResidualDynamics):
     joint_types = ("revolute", "prismatic", "revolute")
 
     def __init__(self, seed: int = 0, dtype: torch.dtype = torch.float64) -> None:
-        joints = Joints(
-            revolute=(True, False, True), center=(0.0, 0.7875, 0.0), reach=(2.96706, 0.4825, 2.96706),
-            speed=(3.0, 1.0, 6.0), friction=(0.4, 0.4, 0.4), armature=(2.19, 0.782, 0.106),
-            gear=(1.0, 1.0, 1.0), actuated=(True, True, True),
-        )  # fmt: skip
-        bodies = Bodies(
-            parent=(-1, 0, 1), joint=(0, 1, 2), revolute=(True, False, True), ratio=(1.0, 1.0, 1.0),
-            offset=(0.0, 0.0, 0.0),
-            rotation=(
-                ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
-                ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
-                ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
-            ),
-            position=((0.0, 0.0, 0.0), (0.0, 0.0, 0.154), (0.0, -0.0203, 0.0)), mass=(5.01, 4.25, 1.08),
-            moment=((0.0, 0.0, -4.48896), (0.0, -0.086275, -27.4125), (0.0, 0.09936, -0.05832)),
-            inertia=(
-                (4.13010816, 4.12210816, 0.018), (179.3223764, 179.320625, 0.0077513825),
-                (0.0142904, 0.00425851, 0.0102504),
-            ),
-            products=((0.0, 0.0, 0.0), (0.0, 0.0, -0.55647375), (0.0, 0.0, 0.00536544)),
-        )  # fmt: skip
-        input = DirectInput(joints)
-        generator = torch.Generator().manual_seed(seed)
-        mass_outputs = ((2,),) + ((1, 2),) * 2
-        mass_hidden = ((2,),) * 21 + ((1, 2),) * 43
-        network = Network(
-            joint_input(joints, (1, 2), (0.02, 1.0, 0.518)), (mass_hidden, mass_hidden, mass_outputs),
-            generator,
-        )  # fmt: skip
-        mass = ResidualMass(joints, self.mass_entries, 3, 2, network)
-        potential_outputs = ((2,),)
-        potential_hidden = ((2,),) * 32
-        network = Network(
-            joint_input(joints, (2,), (0.02, 0.02, 1.0)),
-            (potential_hidden, potential_hidden, potential_outputs), generator,
-        )  # fmt: skip
-        potential = LearnedPotential(0.703291, network)
-        super().__init__(
-            joints, bodies, (0.0, 0.0, -9.81), input, mass, potential,
-            reach=((0.0001, 0.001, 0.01, 0.1), (1e-05, 0.0001, 0.001, 0.01), (0.0001, 0.001, 0.01, 0.1)),
-        )  # fmt: skip
+        super().__init__(*make_parts(seed))
         self.to(dtype)
-
-    @staticmethod
-    def mass_entries(f: Sequence[Tensor], c: Sequence[Tensor]) -> Tensor:
-        """R, what M has beside rigid bodies, (..., n, n), by its functions f(q) and its constants c."""
-        # f1(q3), f2(q2,3), f3(q2,3)
-        f1, f2, f3 = f
-        c1, c2 = c
-        return symmetric([f3], [f1, c2], [f2, 0, c1])

@@ -35,17 +35,56 @@ FACTS = r"""{"format": 2, "robot": "rpr", "urdf": "rpr.urdf",
  "joints": {"joint1": "revolute", "joint2": "prismatic", "joint3": "revolute"}}"""
 
 
-# ---- this arm ----
+# ---- this arm; `Model`, at the end of the file, is made of these parts ----
+
+
+def make_parts(seed: int) -> tuple[Joints, Mass, Network, float, Friction, Network]:
+    """Return what this arm's `Model` is made of, with random weights of this seed."""
+    joints = Joints(
+        revolute=(True, False, True), center=(0.0, 0.7875, 0.0), reach=(2.96706, 0.4825, 2.96706),
+        speed=(3.0, 1.0, 6.0), friction=(0.4, 0.4, 0.4), armature=(2.19, 0.782, 0.106),
+        actuated=(True, True, True),
+    )  # fmt: skip
+    generator = torch.Generator().manual_seed(seed)
+    mass_outputs = ((0, 1, 2),) * 45
+    mass_hidden = ((0, 1, 2),) * 64
+    network = Network(
+        lie_group_input(joints, (0.02, 1.0, 0.518)), (mass_hidden, mass_hidden, mass_outputs), generator
+    )
+    mass = DenseMass(
+        joints, mean=((139.887,), (-0.00167665, 5.33), (-0.00154309, 0.0, 0.0101411)), network=network
+    )
+    potential_outputs = ((0, 1, 2),)
+    potential_hidden = ((0, 1, 2),) * 32
+    potential = Network(
+        lie_group_input(joints, (0.02, 0.02, 1.0)), (potential_hidden, potential_hidden, potential_outputs),
+        generator,
+    )  # fmt: skip
+    friction_outputs = ((0, 1, 2),) * 45
+    friction_hidden = ((0, 1, 2),) * 64
+    network = Network(
+        with_velocities(lie_group_input(joints, (0.1, 0.1, 0.1)), joints, 3),
+        (friction_hidden, friction_hidden, friction_outputs), generator,
+    )  # fmt: skip
+    friction = DenseFriction(joints, network, axes=3)
+    input_outputs = ((0, 1, 2),) * 9
+    input_hidden = ((0, 1, 2),) * 64
+    network = Network(
+        lie_group_input(joints, (1.0, 1.0, 1.0)), (input_hidden, input_hidden, input_outputs), generator
+    )
+    return (joints, mass, potential, 0.703291, friction, network)
+
+
+# ---- this arm's model ----
 
 
 # what the parts of this arm's model are
 Network = MaskedMLP
 Mass = DenseMass
 Friction = DenseFriction
-Input = DenseInput
 
 
-class Model(NetworkDynamics):
+class Model(DenseInput):
     """The arm's dynamics: 45 learned functions of q make M^-1 over all axes.
 
     q, qd, qdd, tau and p are (..., n), with any leading dimensions; rad and Nm, m and N if prismatic. For all
@@ -57,40 +96,5 @@ class Model(NetworkDynamics):
     joint_types = ("revolute", "prismatic", "revolute")
 
     def __init__(self, seed: int = 0, dtype: torch.dtype = torch.float64) -> None:
-        joints = Joints(
-            revolute=(True, False, True), center=(0.0, 0.7875, 0.0), reach=(2.96706, 0.4825, 2.96706),
-            speed=(3.0, 1.0, 6.0), friction=(0.4, 0.4, 0.4), armature=(2.19, 0.782, 0.106),
-            gear=(1.0, 1.0, 1.0), actuated=(True, True, True),
-        )  # fmt: skip
-        generator = torch.Generator().manual_seed(seed)
-        encoding = JointEncoding(joints)
-        mass_outputs = ((0, 1, 2),) * 45
-        mass_hidden = ((0, 1, 2),) * 64
-        network = Network(
-            lie_group_input(joints, (0.02, 1.0, 0.518)), (mass_hidden, mass_hidden, mass_outputs), generator
-        )
-        mass = DenseMass(
-            joints, mean=((139.887,), (-0.00167665, 5.33), (-0.00154309, 0.0, 0.0101411)), network=network
-        )
-        potential_outputs = ((0, 1, 2),)
-        potential_hidden = ((0, 1, 2),) * 32
-        network = Network(
-            lie_group_input(joints, (0.02, 0.02, 1.0)),
-            (potential_hidden, potential_hidden, potential_outputs), generator,
-        )  # fmt: skip
-        potential = LearnedPotential(0.703291, network)
-        friction_outputs = ((0, 1, 2),) * 45
-        friction_hidden = ((0, 1, 2),) * 64
-        network = Network(
-            with_velocities(lie_group_input(joints, (0.1, 0.1, 0.1)), joints, 3),
-            (friction_hidden, friction_hidden, friction_outputs), generator,
-        )  # fmt: skip
-        friction = DenseFriction(joints, network, axes=3)
-        input_outputs = ((0, 1, 2),) * 9
-        input_hidden = ((0, 1, 2),) * 64
-        network = Network(
-            lie_group_input(joints, (1.0, 1.0, 1.0)), (input_hidden, input_hidden, input_outputs), generator
-        )
-        input = DenseInput(joints, network)
-        super().__init__(encoding, mass, potential, friction, input)
+        super().__init__(*make_parts(seed))
         self.to(dtype)

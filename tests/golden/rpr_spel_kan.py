@@ -34,14 +34,58 @@ FACTS = r"""{"format": 2, "robot": "rpr", "urdf": "rpr.urdf",
  "joints": {"joint1": "revolute", "joint2": "prismatic", "joint3": "revolute"}}"""
 
 
-# ---- this arm ----
+# ---- this arm; `Model`, at the end of the file, is made of these parts ----
+
+
+def mass_entries(f: Sequence[Tensor], c: Sequence[Tensor]) -> Tensor:
+    """Return M without armature, (..., n, n), by its functions f(q) and its constants c."""
+    # f1(q1-3), f2(q1-3), f3(q1-3)
+    f1, f2, f3 = f
+    c1, c2 = c
+    return symmetric([f3], [f1, c2], [f2, 0, c1])
+
+
+def make_parts(seed: int) -> tuple[Joints, Mass, Network, float, Friction]:
+    """Return what this arm's `Model` is made of, with random weights of this seed."""
+    joints = Joints(
+        revolute=(True, False, True), center=(0.0, 0.7875, 0.0), reach=(2.96706, 0.4825, 2.96706),
+        speed=(3.0, 1.0, 6.0), friction=(0.4, 0.4, 0.4), armature=(2.19, 0.782, 0.106),
+        actuated=(True, True, True),
+    )  # fmt: skip
+    generator = torch.Generator().manual_seed(seed)
+    mass_outputs = ((0, 1, 2),) * 3
+    mass_hidden = ((0, 1, 2),) * 16
+    network = Network(
+        lie_group_input(joints, (0.02, 1.0, 0.518)), (mass_hidden, mass_hidden, mass_outputs), generator
+    )
+    mass = DerivedMass(
+        joints, mass_entries,
+        functions=((-0.00167665, 1.36528), (-0.00154309, 0.0595527), (139.887, 12.6351)),
+        constants=((0.0101411, 0.0101411), (5.33, 5.33)), network=network, margin=0.08,
+    )  # fmt: skip
+    potential_outputs = ((0, 1, 2),)
+    potential_hidden = ((0, 1, 2),) * 8
+    potential = Network(
+        lie_group_input(joints, (0.02, 0.02, 1.0)), (potential_hidden, potential_hidden, potential_outputs),
+        generator,
+    )  # fmt: skip
+    friction_outputs = ((0, 1, 2),) * 6
+    friction_hidden = ((0, 1, 2),) * 16
+    network = Network(
+        with_velocities(lie_group_input(joints, (0.1, 0.1, 0.1)), joints, 1),
+        (friction_hidden, friction_hidden, friction_outputs), generator,
+    )  # fmt: skip
+    friction = DenseFriction(joints, network, axes=1)
+    return (joints, mass, potential, 0.703291, friction)
+
+
+# ---- this arm's model ----
 
 
 # what the parts of this arm's model are
 Network = MaskedKAN
 Mass = DerivedMass
 Friction = DenseFriction
-Input = DirectInput
 
 
 class Model(NetworkDynamics):
@@ -56,57 +100,11 @@ class Model(NetworkDynamics):
     joint_types = ("revolute", "prismatic", "revolute")
 
     def __init__(self, seed: int = 0, dtype: torch.dtype = torch.float64) -> None:
-        joints = Joints(
-            revolute=(True, False, True), center=(0.0, 0.7875, 0.0), reach=(2.96706, 0.4825, 2.96706),
-            speed=(3.0, 1.0, 6.0), friction=(0.4, 0.4, 0.4), armature=(2.19, 0.782, 0.106),
-            gear=(1.0, 1.0, 1.0), actuated=(True, True, True),
-        )  # fmt: skip
-        generator = torch.Generator().manual_seed(seed)
-        encoding = JointEncoding(joints)
-        mass_outputs = ((0, 1, 2),) * 3
-        mass_hidden = ((0, 1, 2),) * 16
-        network = Network(
-            lie_group_input(joints, (0.02, 1.0, 0.518)), (mass_hidden, mass_hidden, mass_outputs), generator
-        )
-        mass = DerivedMass(
-            joints, self.mass_entries, mean=(-0.00167665, -0.00154309, 139.887),
-            scale=(1.36528, 0.0595527, 12.6351), constants=((0.0101411, 0.0101411), (5.33, 5.33)),
-            network=network, margin=0.08,
-        )  # fmt: skip
-        potential_outputs = ((0, 1, 2),)
-        potential_hidden = ((0, 1, 2),) * 8
-        network = Network(
-            lie_group_input(joints, (0.02, 0.02, 1.0)),
-            (potential_hidden, potential_hidden, potential_outputs), generator,
-        )  # fmt: skip
-        potential = LearnedPotential(0.703291, network)
-        friction_outputs = ((0, 1, 2),) * 6
-        friction_hidden = ((0, 1, 2),) * 16
-        network = Network(
-            with_velocities(lie_group_input(joints, (0.1, 0.1, 0.1)), joints, 1),
-            (friction_hidden, friction_hidden, friction_outputs), generator,
-        )  # fmt: skip
-        friction = DenseFriction(joints, network, axes=1)
-        input = DirectInput(joints)
-        super().__init__(encoding, mass, potential, friction, input)
+        super().__init__(*make_parts(seed))
         self.to(dtype)
-
-    @staticmethod
-    def mass_entries(f: Sequence[Tensor], c: Sequence[Tensor]) -> Tensor:
-        """M without armature, (..., n, n), by its functions f(q) and its constants c."""
-        # f1(q1-3), f2(q1-3), f3(q1-3)
-        f1, f2, f3 = f
-        c1, c2 = c
-        return symmetric([f3], [f1, c2], [f2, 0, c1])
 
     @property
     def armature(self) -> Tensor:
         """What the drives add to M's diagonal, (n,) [kg m^2, kg]."""
         value: Tensor = self.mass.rotors.forward()
-        return value
-
-    @property
-    def rotor_inertia(self) -> Tensor:
-        """The drives' inertia before the gear, (n,) [kg m^2, kg]."""
-        value: Tensor = self.mass.rotors.rotor_inertia()
         return value

@@ -34,12 +34,60 @@ FACTS = r"""{"format": 2, "robot": "two_link", "urdf": "two_link.urdf",
  "joints": {"joint1": "revolute", "joint2": "revolute"}}"""
 
 
-# ---- this arm ----
+# ---- this arm; `Model`, at the end of the file, is made of these parts ----
+
+
+def mass_entries(f: Sequence[Tensor], c: Sequence[Tensor]) -> Tensor:
+    """Return R, what M has beside rigid bodies, (..., n, n), by its functions f(q) and its constants c."""
+    # f1(q2)
+    (f1,) = f
+    c1, c2 = c
+    m11 = 2 * f1 + c2
+    return symmetric([m11], [f1, c1])
+
+
+def make_parts(seed: int) -> tuple[Joints, Bodies, Row, Rows, Rows, ResidualMass, Network, float]:
+    """Return what this arm's `Model` is made of, with random weights of this seed."""
+    joints = Joints(
+        revolute=(True, True), center=(0.0, 0.0), reach=(3.14159, 3.14159), speed=(10.0, 10.0),
+        friction=(1.0, 1.0), armature=(0.1, 0.1), actuated=(True, True), gear=(1.0, 1.0),
+    )  # fmt: skip
+    bodies = Bodies(
+        parent=(-1, 0), joint=(0, 1), revolute=(True, True), ratio=(1.0, 1.0), offset=(0.0, 0.0),
+        rotation=(
+            ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+            ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+        ),
+        position=((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)),
+        inertia=(
+            (1.0, 0.5, 0.0, 0.0, 0.6, 0.0, 0.0, 0.85, 0.0, 1.25),
+            (1.0, 0.5, 0.0, 0.0, 0.6, 0.0, 0.0, 0.85, 0.0, 1.25),
+        ),
+    )  # fmt: skip
+    generator = torch.Generator().manual_seed(seed)
+    mass_outputs = ((1,),)
+    mass_hidden = ((1,),) * 64
+    network = Network(
+        joint_input(joints, (1,), (0.02, 1.0)), (mass_hidden, mass_hidden, mass_outputs), generator
+    )
+    mass = ResidualMass(joints, mass_entries, 1, 2, network)
+    potential_outputs = ((0, 1),)
+    potential_hidden = ((0, 1),) * 32
+    potential = Network(
+        joint_input(joints, (0, 1), (1.0, 0.307)), (potential_hidden, potential_hidden, potential_outputs),
+        generator,
+    )  # fmt: skip
+    return (
+        joints, bodies, (0.0, -9.81, 0.0), ((0.0001, 0.001, 0.01, 0.1), (0.0001, 0.001, 0.01, 0.1)), (), mass,
+        potential, 10.8194,
+    )  # fmt: skip
+
+
+# ---- this arm's model ----
 
 
 # what the parts of this arm's model are
 Network = MaskedMLP
-Input = DirectInput
 
 
 class Model(ResidualDynamics):
@@ -55,46 +103,5 @@ class Model(ResidualDynamics):
     joint_types = ("revolute", "revolute")
 
     def __init__(self, seed: int = 0, dtype: torch.dtype = torch.float64) -> None:
-        joints = Joints(
-            revolute=(True, True), center=(0.0, 0.0), reach=(3.14159, 3.14159), speed=(10.0, 10.0),
-            friction=(1.0, 1.0), armature=(0.1, 0.1), gear=(1.0, 1.0), actuated=(True, True),
-        )  # fmt: skip
-        bodies = Bodies(
-            parent=(-1, 0), joint=(0, 1), revolute=(True, True), ratio=(1.0, 1.0), offset=(0.0, 0.0),
-            rotation=(
-                ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
-                ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
-            ),
-            position=((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), mass=(1.0, 1.0),
-            moment=((0.5, 0.0, 0.0), (0.5, 0.0, 0.0)), inertia=((0.6, 0.85, 1.25), (0.6, 0.85, 1.25)),
-            products=((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
-        )  # fmt: skip
-        input = DirectInput(joints)
-        generator = torch.Generator().manual_seed(seed)
-        mass_outputs = ((1,),)
-        mass_hidden = ((1,),) * 64
-        network = Network(
-            joint_input(joints, (1,), (0.02, 1.0)), (mass_hidden, mass_hidden, mass_outputs), generator
-        )
-        mass = ResidualMass(joints, self.mass_entries, 1, 2, network)
-        potential_outputs = ((0, 1),)
-        potential_hidden = ((0, 1),) * 32
-        network = Network(
-            joint_input(joints, (0, 1), (1.0, 0.307)),
-            (potential_hidden, potential_hidden, potential_outputs), generator,
-        )  # fmt: skip
-        potential = LearnedPotential(10.8194, network)
-        super().__init__(
-            joints, bodies, (0.0, -9.81, 0.0), input, mass, potential,
-            reach=((0.0001, 0.001, 0.01, 0.1), (0.0001, 0.001, 0.01, 0.1)),
-        )  # fmt: skip
+        super().__init__(*make_parts(seed))
         self.to(dtype)
-
-    @staticmethod
-    def mass_entries(f: Sequence[Tensor], c: Sequence[Tensor]) -> Tensor:
-        """R, what M has beside rigid bodies, (..., n, n), by its functions f(q) and its constants c."""
-        # f1(q2)
-        (f1,) = f
-        c1, c2 = c
-        m11 = 2 * f1 + c2
-        return symmetric([m11], [f1, c1])

@@ -9,6 +9,7 @@ import torch
 from torch.func import functional_call, jacfwd
 
 from spelgen.dynamics.parameters import parameters_of_kind
+from spelgen.dynamics.rigid_bodies import regressor_of
 from spelgen.settings.tuning.servo import ServoPriorTuning
 
 if TYPE_CHECKING:
@@ -133,7 +134,7 @@ def body_directions(model: EmittedModel, q: torch.Tensor) -> torch.Tensor:
     """
     zero = torch.zeros_like(q)
     with torch.no_grad():
-        gravity = model.regressor(q, zero, zero) @ inertial_slopes(model)
+        gravity = regressor_of(model.chain, q, zero, zero) @ inertial_slopes(model)
     _, sizes, directions = torch.linalg.svd(gravity.flatten(0, 1), full_matrices=False)
     strong = sizes[: TUNING.body_directions] > 1e-3 * sizes[:1].clamp(min=1e-12)
     result: torch.Tensor = TUNING.bodies * directions[: len(strong)][strong].mT

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import torch
 
+from spelgen.dynamics.rigid_bodies import regressor_of
 from spelgen.errors import LogError
 from spelgen.logs.commands import LogRows, delayed_commands, steps_between
 from spelgen.logs.preprocessing import Preprocessing
@@ -134,7 +135,7 @@ def body_load(model: EmittedModel, path: Path, directions: torch.Tensor) -> Body
             inertia = mass.diagonal(dim1=-2, dim2=-1) - armature
             coupling = (mass @ qdd.unsqueeze(-1)).squeeze(-1) - (inertia + armature) * qdd
             bias = model.nonlinear_at(at, qd, residuals, prepared) + coupling
-            slopes = model.regressor(q, qd, qdd) @ directions
+            slopes = regressor_of(model.chain, q, qd, qdd) @ directions
             blocks.append(BodyLoad(inertia, bias, model.gravity_at(at, prepared), slopes))
     shape = path.q.shape[:2]
     return BodyLoad(*(torch.cat(columns).unflatten(0, shape) for columns in zip(*blocks, strict=True)))
