@@ -1,31 +1,24 @@
-"""Many runs at once: each result once, whatever dies; what is left goes on; units of an arm learn from one another."""
+"""Many runs at once: each result once, whatever dies; what is left goes on."""
 
 import json
 import os
 import signal
 import threading
 import time
-from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
 from spelgen.errors import RunError, SettingsError, SpelgenError
-from spelgen.fitting.fitted import load_run
-from spelgen.fleet import jobs
-from spelgen.fleet.fleet import run_fleet, search_options
-from spelgen.fleet.jobs import Job
+from spelgen.fleet.fleet import run_fleet
 from spelgen.fleet.prepare import Preparation, prepare
 from spelgen.fleet.ranking import fleet_listings, winners
-from spelgen.fleet.schema import FleetRobot, Search, load_fleet
+from spelgen.fleet.schema import FleetRobot, load_fleet
 from spelgen.fleet.tasks import run_here, workers
-from spelgen.fleet.units import LEAST_DEVIATION, spread
 from spelgen.loaded_arm import load_arm
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.render.fleet_page import write_fleet
-from spelgen.settings.fits import GaussianPrior
 from spelgen.simulation.simulate import simulate
 
 QUICK = {"presets": ["spel"], "width": 4, "depth": 1, "training": {"epochs": 2, "momentum_steps": 0}}
@@ -150,80 +143,6 @@ def test_folds_test_every_trajectory_once(logs, robots, tmp_path):
         prepare(Preparation("a", robot, 9, tmp_path))
 
 
-def test_a_search_finds_what_is_best_and_proposes_the_same_when_it_goes_on(tmp_path):
-    search = Search(
-        over={"learning_rate": {"low": 1e-5, "high": 1.0, "log": True}, "width": [8, 16]}, trials=24
-    )
-    start = Job(
-        robot="a", preset="spel", seed=0, split=0, folder=tmp_path / "spel", urdf=tmp_path, train=(), test=(),
-        data="", design="spel",
-    )  # fmt: skip
-    asked: list[list[Job]] = []
-
-    def run_all(jobs):
-        asked.append(list(jobs))
-        for job in reversed(jobs):  # workers end in any order
-            loss = abs(np.log10(job.training.learning_rate) + 2) + (job.width != 16)
-            yield job, RunError("not finite") if loss > 3 else {"validation": loss}
-
-    (best,) = search_options(search, [start], run_all)
-    assert best.options["width"] == 16
-    assert best.validation < 0.3
-    assert best.trials == 24
-    once, asked = asked, []
-    assert search_options(search, [start], run_all) == (best,)
-    assert [[x.key for x in each] for each in asked] == [[x.key for x in each] for each in once]
-    assert len({x.folder for each in once for x in each}) == 24
-
-
-def test_the_spread_of_units_is_the_prior_about_what_they_share():
-    common = {"rotors.raw": torch.zeros(2), "bodies.raw": torch.ones(3)}
-    units = [{"rotors.raw": torch.full((2,), away), "bodies.raw": torch.ones(3)} for away in (0.1, -0.3, 5.0)]
-    prior = spread(units, common, {"rotors.raw": "armature", "bodies.raw": "bodies"})
-    assert prior.armature == pytest.approx(0.3)  # the middle one: one odd unit does not count
-    assert prior.bodies == LEAST_DEVIATION
-    assert prior.shared_armature == prior.shared_friction == 0.0
-    assert prior.velocities == GaussianPrior().velocities  # of which there are no weights
-
-
-def test_units_of_an_arm_share_what_they_know(robots, tmp_path, monkeypatch):
-    """Three days of a two_link whose friction grows; of the third there is little, which the others make up for."""
-
-    def torque_alone(job, run):
-        score = load_run(job.folder).score(read_logs(job.test, ["joint1", "joint2"]))
-        return {"errors": {}, "torque": {"model": 1 - score}}
-
-    monkeypatch.setattr(jobs, "_judged", torque_alone)
-    arm, entries = load_arm(robots / "two_link.urdf"), {}
-    names = [coordinate.name for coordinate in arm.arm.coordinates]
-    for day, viscous in enumerate((0.5, 1.0, 1.5), start=1):
-        joint = arm.settings.joints["joint1"].model_copy(update={"viscous": viscous})
-        settings = arm.settings.model_copy(update={"joints": {**arm.settings.joints, "joint1": joint}})
-        made = simulate(replace(arm, settings=settings), trajectories=8, sample_rate=100.0, seed=day)
-        folder = tmp_path / f"day{day}"
-        write_logs(folder / "train.parquet", made.train[: 1 if day == 3 else None], names)
-        write_logs(folder / "test.parquet", made.test, names)
-        entries[f"day{day}"] = {
-            "urdf": str(robots / "two_link.urdf"), "data": [str(folder)], "day": f"2026-01-0{day}",
-        }  # fmt: skip
-    content = {
-        "robots": entries,
-        "presets": ["closed-form"],
-        "shared": True,
-        "training": {"objective": "torque"},
-    }
-    (tmp_path / "fleet.yaml").write_text(json.dumps(content))
-    found = run_fleet(load_fleet(tmp_path / "fleet.yaml"), tmp_path / "out", run_here, silent)
-    assert not found.failures
-    assert len(found.results) == 7
-    (units,) = found.units
-    assert units.days == ("2026-01-01", "2026-01-02", "2026-01-03")
-    viscous = next(x for x in units.quantities if x.name == "viscous")
-    assert viscous.values[0][0] < viscous.values[1][0]
-    missed = {(x["robot"], x["preset"]): x["torque"]["model"] for x in found.results}
-    assert missed["day3", "closed-form, units"] < missed["day3", "closed-form"]
-
-
 @pytest.mark.parametrize(
     ("text", "told"),
     [
@@ -232,14 +151,6 @@ def test_units_of_an_arm_share_what_they_know(robots, tmp_path, monkeypatch):
             "robots:\n  a: {urdf: none.urdf}\npresets: [spell]\n",
             "fleet.yaml:3: presets.0: unknown preset 'spell'; did you mean 'spel'?\n"
             "fleet.yaml:2: robots.a.urdf: no such file: none.urdf; check the path",
-        ),
-        (
-            "robots:\n  a: {urdf: .}\nsearch:\n  over: {wdith: [1]}\n",
-            "fleet.yaml:4: search.over.wdith: unknown option 'wdith'; did you mean 'width'?",
-        ),
-        (
-            "robots:\n  a: {urdf: .}\nsearch:\n  over:\n    epochs: [1, 0]\n",
-            "fleet.yaml:5: search.over.epochs: 0; expected greater than or equal to 1",
         ),
         (
             "robots:\n  ../a: {urdf: .}\n",

@@ -31,7 +31,6 @@ EXTRAS = {
     "onnxruntime": "deploy",
     "onnxscript": "deploy",
     "safetensors": "deploy",
-    "optuna": "fleet",
     "ray": "fleet",
 }
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,11 +21,10 @@ from spelgen.fitting.fitted import load_run
 from spelgen.fitting.objectives import default_config
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.train import train
-from spelgen.fleet.schema import SIZES
 from spelgen.loaded_arm import load_arm
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.pipeline import generate
-from spelgen.settings.fits import FitConfig, GaussianPrior, fit_config
+from spelgen.settings.fits import FitConfig, fit_config
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.settings import load_settings
 from spelgen.settings.training import TrainingSettings
@@ -43,8 +42,6 @@ class Job(Group):
     """A run. robot, preset, seed, split: its name in the report; `folder`: of the run. data: digest of the logs.
 
     design: a preset or its file. joints, tip, width, depth: of its module. training: over the settings beside the URDF.
-    source: a run whose weights it starts from, prior: how far it may go from these. judged: on test logs; if not, by
-    validation alone.
     """
 
     robot: str
@@ -63,10 +60,7 @@ class Job(Group):
     width: int = 64
     depth: int = 2
     training: TrainingSettings = TrainingSettings()
-    source: Path | None = None
-    prior: GaussianPrior | None = None
     device: str = "cpu"
-    judged: bool = True
 
     @property
     def name(self) -> str:
@@ -97,14 +91,6 @@ class Job(Group):
         return result
 
 
-def with_options(job: Job, options: Mapping[str, object]) -> Job:
-    """Return the job with other options of training, width and depth."""
-    update = {name: value for name, value in options.items() if name in SIZES}
-    training = {name: value for name, value in options.items() if name not in SIZES}
-    update["training"] = job.training.model_copy(update=training)
-    return job.model_copy(update=update)
-
-
 def run_job(job: Job) -> RunResult:
     """Train and judge, or go on where that was stopped; return the result, which result.json then holds too.
 
@@ -120,7 +106,6 @@ def run_job(job: Job) -> RunResult:
     training = _training(job)
     resume = run.config.exists()
     common: dict[str, Any] = {
-        "source": job.source,
         "preprocessing": Preprocessing(**training.preprocessing),
         "validation": training.validation_fraction,
         "seed": job.seed,
@@ -129,7 +114,7 @@ def run_job(job: Job) -> RunResult:
     if resume:
         fit = train(run.module, job.train, job.folder, **common)
     else:
-        config = _ConfigChoice(training, job.prior)
+        config = _ConfigChoice(training)
         fit = train(_module(job), job.train, job.folder, config, urdf=job.urdf, **common)
     # a worker that is asked to end leaves a checkpoint, from which the next one goes on
     if fit.status == "interrupted":
@@ -144,8 +129,7 @@ def run_job(job: Job) -> RunResult:
         "parameters": fit.parameters,
         "validation": fit.best_validation,
     }
-    if job.judged:
-        result |= _judged(job, run)
+    result |= _judged(job, run)
     result["seconds"] = time.monotonic() - start
     write_json(job.folder / "result.json", result)
     return result
@@ -176,19 +160,18 @@ def _training(job: Job) -> TrainingSettings:
 class _ConfigChoice:
     """Choose the objective that is asked for, or that suits the model and its logs, with its own options."""
 
-    def __init__(self, training: TrainingSettings, prior: GaussianPrior | None) -> None:
+    def __init__(self, training: TrainingSettings) -> None:
         self._training = training
-        self._options = {} if prior is None else {"prior": prior}
 
     def __call__(self, model: EmittedModel, rates: Sequence[float] | None) -> FitConfig | None:
         rigid_bodies, objective = has_rigid_bodies(model), self._training.objective
         if objective is not None and not (rigid_bodies and objective == "momentum"):
             return fit_config(
-                objective, rigid_bodies=rigid_bodies, options=self._options, defaults=self._training.options
+                objective, rigid_bodies=rigid_bodies, options={}, defaults=self._training.options
             )
         if rates is None and rigid_bodies:
             return None  # the logs decide
-        return default_config(model, rates or [], self._options, self._training.options)
+        return default_config(model, rates or [], {}, self._training.options)
 
 
 def _judged(job: Job, run: RunFolder) -> RunResult:

@@ -39,13 +39,12 @@ class Preparation:
 
 @dataclass(frozen=True)
 class PreparedArm:
-    """Hold an arm's logs. key: digest of all that they were made from. group: of its URDF and choice of joints, equal
-    for units of the same arm. data: for each split the paths of training and of test logs, which `mapping` reads.
+    """Hold an arm's logs. key: digest of all that they were made from. data: for each split the paths of training and of
+    test logs, which `mapping` reads.
     """
 
     name: str
     key: str
-    group: str
     data: tuple[tuple[tuple[Path, ...], tuple[Path, ...]], ...]
     mapping: LogMapping
 
@@ -57,16 +56,16 @@ def prepare(preparation: Preparation) -> PreparedArm:
     mapping = arm.settings.logs
     if robot.mapping is not None:
         mapping = load_mapping(robot.mapping, [joint.name for joint in arm.robot.joints])
-    group = _digest(arm.robot.digest, robot.joints, robot.tip)
     settings = arm.settings.model_dump_json(exclude_unset=True)
     # reading logs takes longer than asking for their times of change
-    key = _digest(group, settings, mapping.model_dump_json(exclude_unset=True), _stamps(robot), splits)
+    chain = (arm.robot.digest, robot.joints, robot.tip)
+    key = _digest(*chain, settings, mapping.model_dump_json(exclude_unset=True), _stamps(robot), splits)
     names = [coordinate.name for coordinate in arm.arm.coordinates]
     element = f"robots.{preparation.name}.data"
     if robot.data and large_files(robot.data, names):
         if splits > 1:
             raise LogError("logs larger than memory", element=element, expected="splits: 1 of them")
-        return PreparedArm(preparation.name, key, group, ((robot.data, robot.data),), mapping)
+        return PreparedArm(preparation.name, key, ((robot.data, robot.data),), mapping)
     paths = [
         (folder / f"split{k}" / "train.parquet", folder / f"split{k}" / "test.parquet") for k in range(splits)
     ]
@@ -79,7 +78,7 @@ def prepare(preparation: Preparation) -> PreparedArm:
                 write_logs(path, trajectories, names)
         write_json(record, {"key": key})
     data = tuple(((train,), (test,)) for train, test in paths)
-    return PreparedArm(preparation.name, key, group, data, LogMapping())
+    return PreparedArm(preparation.name, key, data, LogMapping())
 
 
 def _splits(robot: FleetRobot, arm: LoadedArm, mapping: LogMapping, count: int, element: str) -> list[Split]:

@@ -1,4 +1,4 @@
-"""Lay a fleet's results out in tables: models ranked for each arm, what a search chose, how units differ."""
+"""Lay a fleet's results out in tables: models ranked for each arm."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from spelgen.baselines.names import MODEL
-from spelgen.fleet.fleet import FleetResults, SearchResult
-from spelgen.fleet.units import Quantity, Units
+from spelgen.fleet.fleet import FleetResults
 from spelgen.listing import Listing, number
 
 RunResult = Mapping[str, Any]
@@ -20,10 +19,6 @@ MEASURE = "relative RMS after each time (0: no error, 1: as if the arm had stood
 def fleet_listings(fleet: FleetResults) -> list[Listing]:
     """Return all tables of a fleet's report."""
     tables = [ranking(robot, runs) for robot, runs in _by_robot(fleet).items()]
-    if fleet.search:
-        tables.append(_search_listing(fleet.search))
-    for units in fleet.units:
-        tables += [_unit_listing(units, quantity) for quantity in units.quantities]
     if fleet.failures:
         rows = tuple((f"{name}: {reason}",) for name, reason in fleet.failures.items())
         tables.append(Listing("Failed runs; the same command runs them again", ("",), rows))
@@ -123,32 +118,7 @@ def _by_robot(fleet: FleetResults) -> dict[str, list[RunResult]]:
     return robots
 
 
-def _search_listing(search: Sequence[SearchResult]) -> Listing:
-    rows = []
-    for result in search:
-        options = ", ".join(f"{name} {_text(value)}" for name, value in result.options.items())
-        name = f"{result.robot}, {result.preset}"
-        rows.append((name, options, number(result.validation), str(result.trials)))
-    title = "Selected by the search, by validation loss"
-    return Listing(title, ("", "options", "loss", "trials"), tuple(rows), left=(0, 1))
-
-
-def _unit_listing(units: Units, quantity: Quantity) -> Listing:
-    """Return a row for each joint or parameter; a column for each unit, in order of their days."""
-    columns = [*quantity.values, quantity.common, quantity.spread]
-    rows = []
-    for k, label in enumerate(quantity.labels):
-        rows.append((label, *(number(column[k]) for column in columns)))
-    names = []
-    for name, day in zip(units.names, units.days, strict=True):
-        names.append(name if day is None else f"{name} {day}")
-    title = f"{units.arm}: {quantity.name} [{quantity.unit}] of {len(units.names)} units or days"
-    return Listing(title, ("", *names, "all", "spread"), tuple(rows))
-
-
-def _text(value: float | str | None) -> str:
-    if isinstance(value, str):
-        return value
+def _text(value: float | None) -> str:
     if isinstance(value, int):
         return f"{value:,}"
     return number(value)
