@@ -39,7 +39,7 @@ class Preparation:
 
 @dataclass(frozen=True)
 class PreparedArm:
-    """Hold an arm's logs. key: digest of all that they were made from. data: for each split the paths of training and of
+    """Hold an arm's logs. key: digest of all that they were made from. data: by split, the paths of training and of
     test logs, which `mapping` reads.
     """
 
