@@ -8,7 +8,7 @@ from emitted import import_source
 from typer.testing import CliRunner
 
 from spelgen.cli.main import app
-from spelgen.dynamics.rigid_bodies import regressor_of
+from spelgen.dynamics.body_regressor import regressor_of
 from spelgen.loaded_arm import load_arm
 from spelgen.pipeline import generate
 from spelgen.structure.pseudo_inertia import pseudo_inertia

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from spelgen.arm.arm import Arm
 from spelgen.runtime.body_chain import BodyChain
-from spelgen.runtime.joints import blocks
-from spelgen.runtime.port_hamiltonian import combined
-from spelgen.runtime.rigid_body import Bodies, Row, block_diagonal, inertia_basis, pushed_along
+from spelgen.runtime.rigid_body import Bodies, Row, block_diagonal, inertia_basis
 
 PER_BODY = 10  # inertial parameters
 
@@ -52,21 +49,3 @@ class RigidBodies:
 def _row(values: tuple[object, object, object]) -> Row:
     x, y, z = (float(value) for value in values)  # type: ignore[arg-type]
     return x, y, z
-
-
-def regressor_of(chain: BodyChain, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
-    """Return Y, (..., n, 10 bodies): Y @ inertial parameters is the bodies' torque.
-
-    ``chain`` is that of this package or of an emitted module.
-    """
-    basis = inertia_basis().to(q)
-    pose = chain.forward(q)
-    rises = chain.accelerations(pose, qd, chain.turning(pose, qd)[1]) + combined(qdd, pose.twists)
-    rises, twists = (blocks(rows, 6) for rows in (rises, combined(qd, pose.twists)))
-    # by body and parameter: (..., bodies, 6, 10)
-    momenta = torch.tensordot(twists, basis, dims=([-1], [2])).mT
-    wrenches = torch.tensordot(rises, basis, dims=([-1], [2])).mT
-    wrenches = wrenches + pushed_along(twists.unsqueeze(-1), momenta)
-    columns = blocks(pose.twists, 6).transpose(-3, -2)  # (..., bodies, n, 6)
-    rows: Tensor = (columns @ wrenches).transpose(-3, -2)
-    return rows.reshape(*q.shape, PER_BODY * len(chain.parents))

@@ -10,9 +10,9 @@ import torch
 from torch.autograd import grad as gradient
 from torch.autograd.functional import jacobian
 
+from spelgen.dynamics.body_regressor import regressor_of
 from spelgen.dynamics.parameters import parameter_table
 from spelgen.dynamics.residuals import friction_factor, residual_torque
-from spelgen.dynamics.rigid_bodies import regressor_of
 from spelgen.fitting.body_steps import moved_bodies
 from spelgen.fitting.functional_model import FunctionalModel, Weights
 from spelgen.fitting.torque_samples import Block, TorqueSamples

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch.func import functional_call, jacfwd
 
+from spelgen.dynamics.body_regressor import regressor_of
 from spelgen.dynamics.parameters import parameters_of_kind
-from spelgen.dynamics.rigid_bodies import regressor_of
 from spelgen.settings.tuning.servo import ServoPriorTuning
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import torch
 
-from spelgen.dynamics.rigid_bodies import regressor_of
+from spelgen.dynamics.body_regressor import regressor_of
 from spelgen.errors import LogError
 from spelgen.logs.commands import LogRows, delayed_commands, steps_between
 from spelgen.logs.preprocessing import Preprocessing

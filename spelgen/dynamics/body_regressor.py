@@ -1,0 +1,29 @@
+"""The matrix that makes torques of the inertial parameters of a chain of bodies, as fits to torques need it."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from spelgen.runtime.body_chain import BodyChain
+from spelgen.runtime.joints import blocks
+from spelgen.runtime.port_hamiltonian import combined
+from spelgen.runtime.rigid_body import inertia_basis, pushed_along
+
+
+def regressor_of(chain: BodyChain, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
+    """Return Y, (..., n, 10 bodies): Y @ inertial parameters is the bodies' torque.
+
+    ``chain`` is that of this package or of an emitted module.
+    """
+    basis = inertia_basis().to(q)
+    pose = chain.forward(q)
+    rises = chain.accelerations(pose, qd, chain.turning(pose, qd)[1]) + combined(qdd, pose.twists)
+    rises, twists = (blocks(rows, 6) for rows in (rises, combined(qd, pose.twists)))
+    # by body and parameter: (..., bodies, 6, 10)
+    momenta = torch.tensordot(twists, basis, dims=([-1], [2])).mT
+    wrenches = torch.tensordot(rises, basis, dims=([-1], [2])).mT
+    wrenches = wrenches + pushed_along(twists.unsqueeze(-1), momenta)
+    columns = blocks(pose.twists, 6).transpose(-3, -2)  # (..., bodies, n, 6)
+    rows: Tensor = (columns @ wrenches).transpose(-3, -2)
+    return rows.reshape(*q.shape, 10 * len(chain.parents))
