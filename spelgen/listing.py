@@ -163,9 +163,11 @@ def _folded(name: str, width: int) -> str:
 
 
 def number(value: float | None) -> str:
-    """Return three significant digits; a dash for what is not known."""
+    """Return three significant digits, whole numbers from 1000 on; a dash for None."""
     if value is None:
         return "-"
-    if value == 0 or 1e-3 <= abs(value) < 1e4:
+    if value == 0 or 1e-3 <= abs(value) < 1e3:
         return f"{value:.3g}"
+    if 1e3 <= abs(value) < 1e6:
+        return f"{value:.0f}"
     return f"{value:.2e}"

@@ -209,7 +209,9 @@ const arm = (() => {
   readColours();
   state.time = 0.6 * scene.motions[0].t.at(-1); // where measured and predicted have come apart
   window.addEventListener("resize", draw);
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { readColours(); draw(); });
+  for (const media of ["(prefers-color-scheme: dark)", "print"]) {
+    matchMedia(media).addEventListener("change", () => { readColours(); draw(); });
+  }
   draw();
   return { light(joints) { state.lit = joints; draw(); } };
 })();

@@ -1,4 +1,4 @@
-// Reads values off charts, and tells of an entry of M what makes it so.
+// Reads values off charts, and explains the entries of M.
 "use strict";
 document.documentElement.classList.add("script");
 for (const chart of document.querySelectorAll("svg.chart[data-x]")) {

@@ -71,7 +71,7 @@ def test_figures_and_better_baselines_are_told():
 
 
 @pytest.mark.parametrize("slow, fast, place", [
-    (0.5, 0.1, "worst at b near standstill; next, record slow reversals of b."),
+    (0.5, 0.1, "worst at b near standstill."),
     (0.1, 0.5, "worst at b at speed."),
     (0.2, 0.2, "worst at b."),
 ])  # fmt: skip
@@ -84,15 +84,22 @@ def test_what_to_record_follows_what_the_logs_cover():
         return {"q": [{"low": 0.0, "high": x} for x in (1.0, high)], "qd": [{"low": -1.0, "high": 1.0}] * 2}
 
     tested = evaluation(traces={"coverage": ranges(2.0)})
-    assert (
-        "next, record motion with the positions of b" in verdict(tested, {"coverage": ranges(1.0)}).sentence
-    )
+    assert "Next, record motion with the positions of b" in verdict(tested, {"coverage": ranges(1.0)}).because
     inside = evaluation(traces={"coverage": ranges(1.0)})
     narrow = verdict(inside, {"coverage": ranges(1.0)}, [(0.0, 1.2), (0.0, 4.0)])
-    assert (
-        narrow.sentence.endswith("next, record wider motion of b.") and "25 % of its range" in narrow.because
-    )
-    assert "record" not in verdict(inside, {"coverage": ranges(1.0)}, [None, None]).sentence
+    assert "Next, record wider motion of b." in narrow.because and "25 % of its range" in narrow.because
+    assert "record" not in verdict(inside, {"coverage": ranges(1.0)}, [None, None]).because
+
+
+@pytest.mark.parametrize("errors", [(0.05, 0.004), (0.9, 0.2), (0.2, 0.03)])
+def test_a_headline_has_twenty_words_at_most(errors):
+    full = evaluation(*errors, seen=True, traces=torques(0.5, 0.1))
+    assert len(verdict(full).sentence.split()) <= 20
+
+
+def test_the_urdf_that_made_the_logs_is_called_that():
+    told = verdict(evaluation(0.05, 0.004, **{"URDF and drives": 1e-5})).because
+    assert "URDF and drives reproduces these logs" in told and "But" not in told
 
 
 def test_a_test_on_training_logs_is_no_proof():

@@ -16,7 +16,7 @@ def title(spec: ModelSpec) -> str:
 
 def class_summary(spec: ModelSpec) -> str:
     """What the model consists of, in a line."""
-    beside = ", and networks for what they leave" if _residual(spec) else ""
+    beside = ", and residual networks" if _residual(spec) else ""
     return f"The arm's dynamics: {_bodies(spec) if spec.bodies else _count(spec)}{beside}."
 
 
@@ -52,7 +52,7 @@ def summary(spec: ModelSpec) -> str:
         if spec.started_from_urdf
         else "The URDF's inertials are missing or impossible: sizes and starting values are those of 1 kg links."
     )
-    beside = f";\nnetworks for what they leave: {_functions(spec)} in M" if _residual(spec) else ""
+    beside = f";\nresidual networks: {_functions(spec)} in M" if _residual(spec) else ""
     servos = (
         "\nG is the spring of position servos: tau = clip(kp (u - q) - kd qd), which stores 1/2 kp (q - u)^2."
         if spec.servos

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, TypeVar
 
 from spelgen.baselines.names import MODEL, observed
@@ -92,7 +92,18 @@ def _cells(row: Numbers, columns: Iterable[str]) -> tuple[Cell, ...]:
 
 def result_tables(results: Results) -> list[Table]:
     """Return the tables of an evaluation: commands replayed, errors by horizon and by joint, torques."""
-    return [*_replay_tables(results), *_horizon_tables(results), *_torque_tables(results)]
+    tables = [*_replay_tables(results), *_horizon_tables(results), *_torque_tables(results)]
+    return [_without_empty_columns(table) for table in tables]
+
+
+def _without_empty_columns(table: Table) -> Table:
+    """Return the table without baselines whose cells are all dashes or empty."""
+    kept = []
+    for k, name in enumerate(table.columns):
+        if name == MODEL or any(row.cells[k].text not in ("", "-") for row in table.rows):
+            kept.append(k)
+    rows = [Row(row.label, tuple(row.cells[k] for k in kept)) for row in table.rows]
+    return replace(table, columns=tuple(table.columns[k] for k in kept), rows=tuple(rows))
 
 
 def _values(errors: Mapping[str, Errors], value: Callable[[Errors], Value]) -> dict[str, Value]:

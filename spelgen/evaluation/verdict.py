@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from spelgen.baselines.names import CONSTANT_VELOCITY, MODEL, observed
+from spelgen.baselines.names import CONSTANT_VELOCITY, MODEL, URDF_WITH_DRIVES, observed
 from spelgen.errors import shortened
 from spelgen.labels import listed, thousandths
 from spelgen.listing import number
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 TUNING = EvaluationTuning()
 SEEN = "tested-on-training-data"
+HEADLINE = 20  # words
+SIMULATED = 1e-3  # relative error below which a URDF is the model that made the logs
 STANDSTILL = "near standstill"
 EXCITE = "(as spelgen excite proposes)"
 Limits = Sequence[tuple[float, float] | None]
@@ -78,11 +80,20 @@ def verdict(results: Results, identified: Mapping[str, Any] | None = None, limit
         sentence = f"Evaluated on training logs: {sentence}"
     if uses.good and uses.bad:
         sentence += f", not for {listed(uses.bad)}"
+    details = []
     if worst.joint:
-        sentence += f"; worst at {worst.joint}{worst.when}"
+        details.append(f"worst at {worst.joint}{worst.when}")
     if recommendations:
-        sentence += f"; next, record {recommendations[0].motion}"
-    because = [
+        details.append(f"next, record {recommendations[0].motion}")
+    because = []
+    for detail in details:
+        longer = f"{sentence}; {detail}"
+        # a headline is read at a glance
+        if len(longer.split()) <= HEADLINE:
+            sentence = longer
+        else:
+            because.append(f"{detail[0].upper()}{detail[1:]}.")
+    because += [
         f"It {listed(uses.proofs)}.",
         _constant_velocity(results),
         worst.proof,
@@ -189,6 +200,9 @@ def _better_baselines(results: Results) -> str:
             better.setdefault(best, []).append("in torque")
     if not better:
         return ""
+    drives = [results.horizons[-1].errors.get(URDF_WITH_DRIVES)] if results.horizons else []
+    if any(_relative(errors) < SIMULATED for errors in drives):
+        return f"{URDF_WITH_DRIVES} reproduces these logs: it is the model that simulated them."
     return f"But {listed([f'{name} is better {listed(where)}' for name, where in better.items()])}."
 
 

@@ -81,7 +81,7 @@ def rigid_body_projection(model: EmittedModel, arm: LoadedArm) -> RigidBodyProje
     q = sampled_positions(arm.arm)
     own = has_rigid_bodies(model)
     bodies: EmittedModel = without_residuals(model) if own else _nearest_bodies(model, arm, q)
-    viscous, forward, backward, friction_error = _nearest_friction(arm.arm, model, q)
+    viscous, forward, backward, friction_error = nearest_friction(arm.arm, model, q)
     return RigidBodyProjection(
         arm=arm,
         inertias=bodies.inertial_parameters.numpy(),
@@ -138,7 +138,7 @@ def _relative_rms(values: Tensor, expected: Tensor) -> float:
     return float((values - expected).square().mean().sqrt() / size)
 
 
-def _nearest_friction(arm: Arm, model: EmittedModel, q: Tensor) -> np.ndarray:
+def nearest_friction(arm: Arm, model: EmittedModel, q: Tensor) -> np.ndarray:
     """Return viscous and Coulomb friction forward and backward nearest to the model's, and its relative error.
 
     (4, n); the last is of all positions and speeds.

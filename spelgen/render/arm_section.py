@@ -1,4 +1,4 @@
-"""The arm of a page: a picture that plays, and beside it M, whose cells tell what makes them so."""
+"""The arm of a page: a motion in three dimensions, and M, whose cells explain their structure."""
 
 from __future__ import annotations
 
@@ -43,7 +43,6 @@ class Cell:
 class ArmSection:
     """data: for the script. motions: their names. colours: what the links can be coloured by."""
 
-    picture: Markup
     data: Markup
     motions: tuple[str, ...]
     colours: tuple[str, ...]
@@ -97,8 +96,6 @@ def arm_section(
     motions = _motions(traces or {}) or [_sweep(arm)]
     for motion in motions:
         motion |= _view(drawn, motion["q"])
-    first = motions[0]["q"]
-    poses = [first[round(k * (len(first) - 1) / TUNING.ghosts)] for k in range(TUNING.ghosts + 1)]
     unseen = _unseen(arm, identified or {})
     data = drawn.to_dict() | {"motions": motions, "identifiability": unseen}
     colours = []
@@ -107,7 +104,6 @@ def arm_section(
     if unseen is not None:
         colours.append("known")
     return ArmSection(
-        picture=drawn.still(drawn.view(poses), poses, f"{arm.name} in {len(poses)} positions"),
         data=json_data(data),
         motions=tuple(motion["told"] for motion in motions),
         colours=tuple(colours),

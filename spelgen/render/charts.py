@@ -22,9 +22,9 @@ Values = Sequence[float] | np.ndarray
 class Margins:
     """Room around the curves [pixels]. bare: below a chart whose x axis has no numbers."""
 
-    start: int = 62
+    start: int = 52
     end: int = 14
-    top: int = 10
+    top: int = 22
     bottom: int = 36
     bare: int = 8
 
@@ -59,6 +59,26 @@ class Band:
 
 
 Mark = Line | Band
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A line of a legend: CSS classes of the mark, and its label."""
+
+    style: str
+    label: str
+
+
+@dataclass(frozen=True)
+class Chart:
+    """An SVG element, and the legend of the marks that are visible in it."""
+
+    svg: Markup
+    legend: tuple[Entry, ...]
+
+    def __html__(self) -> str:
+        """Return the element, for templates."""
+        return str(self.svg)
 
 
 @dataclass(frozen=True)
@@ -103,17 +123,16 @@ def line_chart(
     *,
     log: bool = False,
     log_x: bool = False,
-    verticals: Sequence[tuple[float, str]] = (),
     motion: str = "",
     limits: tuple[float, float] | None = None,
     width: int = 400,
     height: int = 190,
-) -> Markup:
-    """Return one SVG element with lines, bands and dots, axes, grid and vertical lines (x, text).
+) -> Chart:
+    """Return lines, bands and dots over axes and grid.
 
     log, log_x: logarithmic axes. motion: name of the motion whose time x is, which a script may follow. limits: of y,
-    in place of its values'. Without an x_label the x axis has no numbers: those of the chart below are its own. The
-    legend is the page's business (`style`, `label`). Without a finite value the chart says so.
+    in place of its values'; the chart names the lines beyond them. Without an x_label the x axis has no numbers: those
+    of the chart below are its own. Without a finite value the chart says so.
     """
     x_values, y_values = _finite([mark.x for mark in marks], log_x), _finite(_heights(marks), log)
     if limits is not None:
@@ -121,7 +140,7 @@ def line_chart(
     attributes = {"class": "chart", "viewBox": f"0 0 {width} {height}", "role": "img", "aria-label": title}
     if not x_values.size or not y_values.size:
         empty = {"x": width / 2, "y": height / 2, "text-anchor": "middle"}
-        return element("svg", attributes, element("text", empty, "no finite values to show"))
+        return Chart(element("svg", attributes, element("text", empty, "no finite values to show")), ())
     bottom = height - (MARGINS.bottom if x_label else MARGINS.bare)
     x_axis = _axis(x_values, MARGINS.start, width - MARGINS.end, pad=0.0, log=log_x)
     # SVG counts pixels downwards: the axis of y starts at the bottom
@@ -130,13 +149,20 @@ def line_chart(
     if motion:
         attributes["data-motion"] = motion
     elements = [_frame(x_axis, y_axis, x_label, y_label)]
-    for x, text in verticals:
-        if x_axis.low <= x <= x_axis.high:
-            elements.append(_vertical(float(x_axis.pixels(np.array(x))), text, x_axis, y_axis))
+    entries, beyond = [], []
     # lines are drawn last, above all bands and dots
     for mark in sorted(marks, key=lambda mark: type(mark) is Line):
         elements.append(_drawn(mark, x_axis, y_axis))
-    return element("svg", attributes, Markup("").join(elements))
+    for mark in marks:
+        heights = _finite(_heights([mark]), log)
+        if ((heights >= y_axis.low) & (heights <= y_axis.high)).any():
+            entries.append(Entry(f"{_kind(mark)} {mark.style}", mark.label))
+        if type(mark) is Line and ((heights < y_axis.low) | (heights > y_axis.high)).any():
+            beyond.append(mark.label)
+    if beyond:
+        text = f"partly outside: {', '.join(beyond)}"
+        elements.append(_text(width - MARGINS.end, 14, "end", text, {"class": "label"}))
+    return Chart(element("svg", attributes, Markup("").join(elements)), tuple(entries))
 
 
 def element(tag: str, attributes: Mapping[str, object], content: str = "") -> Markup:
@@ -145,6 +171,10 @@ def element(tag: str, attributes: Mapping[str, object], content: str = "") -> Ma
     for name, value in attributes.items():
         words += Markup(' {}="{}"').format(name, value)
     return Markup("<{0}{1}>{2}</{0}>").format(tag, words, content)
+
+
+def _kind(mark: Mark) -> str:
+    return type(mark).__name__.lower()
 
 
 def _heights(marks: Sequence[Mark]) -> list[Values]:
@@ -229,22 +259,14 @@ def _frame(x_axis: Axis, y_axis: Axis, x_label: str, y_label: str) -> Markup:
         for x, label in x_axis.ticks():
             elements.append(_text(x, bottom + 16, "middle", label))
         elements.append(_text((start + end) / 2, bottom + 31, "middle", x_label, {"class": "label"}))
-    y = (bottom + y_axis.end) / 2
-    turned = {"class": "label", "transform": f"rotate(-90 12 {y:.1f})"}
-    elements.append(_text(12, y, "middle", y_label, turned))
+    # above the frame no number can lie across it
+    elements.append(_text(start, 14, "start", y_label, {"class": "label"}))
     return Markup("").join(elements)
 
 
 def _text(x: float, y: float, anchor: str, text: str, attributes: Mapping[str, str] | None = None) -> Markup:
     position = {"x": f"{x:.1f}", "y": f"{y:.1f}", "text-anchor": anchor}
     return element("text", {**position, **(attributes or {})}, text)
-
-
-def _vertical(x: float, text: str, x_axis: Axis, y_axis: Axis) -> Markup:
-    line = element("path", {"class": "mark", "d": f"M{x:.1f} {y_axis.start:.1f}V{y_axis.end:.1f}"})
-    if x > (x_axis.start + x_axis.end) / 2:
-        return line + _text(x - 5, y_axis.end + 10, "end", text)
-    return line + _text(x + 5, y_axis.end + 10, "start", text)
 
 
 def _drawn(mark: Mark, x_axis: Axis, y_axis: Axis) -> Markup:

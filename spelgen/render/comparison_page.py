@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from markupsafe import Markup
 
 from spelgen.comparison.results import Example, RunResult
 from spelgen.comparison.study import Study
@@ -16,7 +15,7 @@ from spelgen.comparison.truth import true_mass
 from spelgen.evaluation.tables import Table
 from spelgen.files import write_text
 from spelgen.fitting.run_folder import RunFolder
-from spelgen.render.charts import Line, Values, line_chart
+from spelgen.render.charts import Chart, Line, Values, line_chart
 from spelgen.render.page import render_page
 from spelgen.render.plots import QUANTITIES, UNITS, Panel, mass_panels, numbers
 from spelgen.spec import Facts, read_facts
@@ -38,7 +37,6 @@ def write_comparison(study: Study, tables: Sequence[Table]) -> Path:
         "comparison.html.jinja",
         study=study,
         tables=tables,
-        key=[(style, name) for name, style in styles.items()],
         verdict=_verdict(tables),
         losses=_losses(study, styles),
         panels=panels,
@@ -62,7 +60,7 @@ def _verdict(tables: Sequence[Table]) -> str:
     return f"{name} is the best in {count} of {rows} rows."
 
 
-def _losses(study: Study, styles: Mapping[str, str]) -> Markup:
+def _losses(study: Study, styles: Mapping[str, str]) -> Chart:
     """Return the validation loss of the first seed's runs by training step."""
     lines = []
     for variant in study.variants:

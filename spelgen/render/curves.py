@@ -5,14 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from markupsafe import Markup
-
-from spelgen.baselines.names import is_drawn
 from spelgen.labels import thousandths
 from spelgen.listing import number
+from spelgen.render.charts import Chart
 from spelgen.render.picture import Picture
 from spelgen.render.plots import (
-    COMPONENTS,
     Limits,
     Panel,
     Record,
@@ -21,24 +18,18 @@ from spelgen.render.plots import (
     energy_chart,
     friction_panels,
     growth_charts,
-    style,
     torque_panels,
     trace_mass_panels,
     trajectory_panels,
 )
 from spelgen.spec import Facts
 
-Legend = tuple[tuple[str, str], ...]
-"""Style and label of each line."""
-BOTH: Legend = (("truth", "measured"), ("predicted", "predicted"))
-
 
 @dataclass(frozen=True)
 class Section:
-    """A part of the page: a heading, its legend and panels."""
+    """A part of the page: a heading and panels."""
 
     title: str
-    key: Legend
     panels: list[Panel]
 
 
@@ -50,18 +41,10 @@ class Curves:
     torques: Sequence[Section] = ()
     trajectories: Sequence[Section] = ()
     mass: Sequence[Panel] = ()
-    eigenvalues: Markup | None = None
+    eigenvalues: Chart | None = None
     along: str = ""
     friction: Sequence[Panel] = ()
-    energy: Markup | None = None
-
-
-def predictors(evaluation: Record) -> list[tuple[str, str]]:
-    """Return the legend of all that predicts: style and name."""
-    names = evaluation.get("torque", {})
-    if evaluation.get("horizons"):
-        names = evaluation["horizons"][0]["errors"]
-    return [(style(name), name) for name in names if is_drawn(name)]
+    energy: Chart | None = None
 
 
 def curves(traces: Record, facts: Facts, picture: Picture) -> Curves:
@@ -87,8 +70,7 @@ def curves(traces: Record, facts: Facts, picture: Picture) -> Curves:
 
 def _torques(trace: Record, facts: Facts) -> Section:
     title = f"{trace['which'].capitalize()} trajectory: {trace['trajectory']}"
-    key = (*BOTH, *((name.lower(), name) for name in COMPONENTS))
-    return Section(title, key, torque_panels(trace, facts.joints, facts.joint_types))
+    return Section(title, torque_panels(trace, facts.joints, facts.joint_types))
 
 
 def _prediction(example: Record, facts: Facts) -> Section:
@@ -96,13 +78,13 @@ def _prediction(example: Record, facts: Facts) -> Section:
     panels = trajectory_panels(example, facts.joints, facts.joint_types)
     if "u" in example:
         title = f"{kind} log replayed: {name}, {number(1000 * error)} {thousandths(facts.joint_types)} off"
-        return Section(title, (*BOTH, ("hold", "commanded")), panels)
+        return Section(title, panels)
     title = f"{kind} prediction: {name}, {example['start']:.3g} s into it, relative error {number(error)}"
-    return Section(title, BOTH, panels)
+    return Section(title, panels)
 
 
 def coverage(traces: Record, identified: Record | None, facts: Facts, limits: Limits) -> list[Panel]:
-    """Return where training and test logs have been."""
+    """Return histograms of positions and velocities of training and test logs."""
     logs = {"training": (identified or {}).get("coverage"), "test": traces.get("coverage")}
     recorded = {name: covered for name, covered in logs.items() if covered}
     if not recorded:

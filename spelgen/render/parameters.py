@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +10,7 @@ import torch
 
 from spelgen.dynamics.protocol import has_rigid_bodies, has_servos
 from spelgen.dynamics.regressor import urdf_parameters
+from spelgen.exporting.rigid_body_projection import nearest_friction, sampled_positions
 from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.identification.base_parameters import base_parameters
 from spelgen.identification.friction import FrictionModel
@@ -23,14 +23,6 @@ if TYPE_CHECKING:
 
 Rows = tuple[tuple[str, ...], ...]
 DETERMINED = ("firm", "fair")
-# of all others the unit is that of a torque
-FRICTION_UNITS = {
-    "viscous": "{force} s/{length}",
-    "saturation_velocity": "{speed}",
-    "stribeck_velocity": "{speed}",
-    "coulomb_smoothing_velocity": "{speed}",
-    "load_dependence": "",
-}
 
 
 @dataclass(frozen=True)
@@ -58,7 +50,7 @@ class Constant:
 def parameter_tables(
     model: EmittedModel | None, arm: LoadedArm | None, identified: Record | None
 ) -> list[ParameterTable]:
-    """Return all that is known of a run's parameters; `identified`: by least squares on the same logs."""
+    """Return the tables of a run's parameters; `identified`: by least squares on the same logs."""
     tables = []
     if arm is not None and identified and "base_parameters" in identified:
         tables.append(base_table(model, arm, identified))
@@ -67,9 +59,9 @@ def parameter_tables(
     bodies = body_parameters(model)
     if bodies is not None:
         tables.append(_body_table(bodies, arm))
-    columns = _joint_columns(model)
-    if columns:
-        tables.append(_joint_table(model, columns, arm))
+    joints = _joint_table(model, arm)
+    if joints is not None:
+        tables.append(joints)
     return tables
 
 
@@ -158,8 +150,8 @@ def _body_table(values: np.ndarray, arm: LoadedArm | None) -> ParameterTable:
         "Masses, centres of mass and inertias",
         ("moves with", "by", "m [kg]", "centre of mass x, y, z [m]", "principal moments about it [kg m²]"),
         tuple(rows),
-        "In the frame of the joint, z its axis. One of many sets that move alike: what motion shows are base "
-        "parameters; all sets shown belong to some real distribution of mass.",
+        "In the frame of the joint; z is its axis. Only the base parameters are identifiable: many such sets give the "
+        "same motion. Every set shown is physically consistent.",
     )
 
 
@@ -181,64 +173,41 @@ def _listed(values: np.ndarray) -> str:
     return ", ".join(f"{value:.3g}" for value in values)
 
 
-def _joint_columns(model: EmittedModel) -> dict[str, list[float]]:
-    """Return the constants with one number a joint: armature, friction laws and torque offset."""
-    columns = {}
-    if hasattr(model, "armature"):
-        columns["armature"] = model.armature.tolist()
-    if not has_rigid_bodies(model):
-        return columns
-    with torch.no_grad():
-        constants = model.friction.prepare()._asdict()
-    for name, values in constants.items():
-        if torch.is_tensor(values) and values.shape == (model.n,) and name not in _unused(model):
-            columns[name] = values.tolist()
-    columns["torque offset"] = model.torque_offset.tolist()
-    return columns
-
-
-def _unused(model: EmittedModel) -> set[str]:
-    """Return constants of friction that this model does not have, or that kd of its servos stands for."""
-    unused = {"offset", "smoothing"}
-    if getattr(model.friction, "raw_coulomb_smoothing_velocity", None) is None:
-        unused.add("coulomb_smoothing_velocity")
-    if has_servos(model):
-        unused |= {"viscous", "saturation", "saturation_velocity"}
-    return unused
-
-
-def _joint_table(
-    model: EmittedModel, columns: Mapping[str, Sequence[float]], arm: LoadedArm | None
-) -> ParameterTable:
-    head = ["joint", *(name.replace("_", " ") for name in columns)]
+def _joint_table(model: EmittedModel, arm: LoadedArm | None) -> ParameterTable | None:
+    """Return armature, friction and torque offset of each joint; None of a model without armature."""
+    if not hasattr(model, "armature"):
+        return None
+    head, columns = ["joint", "armature"], [model.armature.tolist()]
+    units = [tuple(inertia_unit(kind, kind) for kind in model.joint_types)]
+    forces = tuple(FORCE[kind] for kind in model.joint_types)
+    slopes = tuple(f"{FORCE[kind]} s/{UNITS[kind][0]}" for kind in model.joint_types)
+    note, names = "", [f"joint {k + 1}" for k in range(model.n)]
     if arm is not None:
-        head.append("URDF: viscous, Coulomb")
+        names = [joint.name for joint in arm.arm.coordinates]
+        joints = arm.arm.coordinates
+        if has_rigid_bodies(model):
+            viscous, forward, backward, _ = nearest_friction(arm.arm, model, sampled_positions(arm.arm))
+            # kd of a servo contains its joint's viscous friction
+            if not has_servos(model):
+                head.append("viscous")
+                columns.append(viscous)
+                units.append(slopes)
+            head += ["Coulomb, qd > 0", "Coulomb, qd < 0"]
+            columns += [forward, backward]
+            units += [forces, forces]
+            note = "Viscous and Coulomb friction are fitted to the model's friction law, as in exports."
+        head += ["URDF: viscous", "URDF: Coulomb"]
+        columns += [[joint.damping for joint in joints], [joint.friction for joint in joints]]
+        units += [slopes, forces]
+    if has_rigid_bodies(model):
+        head.append("torque offset")
+        columns.append(model.torque_offset.tolist())
+        units.append(forces)
     rows = []
-    for k, kind in enumerate(model.joint_types):
-        name = f"joint {k + 1}" if arm is None else arm.arm.coordinates[k].name
-        row = [name]
-        for column, values in columns.items():
-            text = f"{values[k]:.3g} {_unit(column, kind)}".strip()
-            row.append("none" if _is_absent(column, columns, k) else text)
-        if arm is not None:
-            joint = arm.arm.coordinates[k]
-            row.append(f"{joint.damping:.3g}, {joint.friction:.3g}")
-        rows.append(tuple(row))
-    return ParameterTable("Drives and friction", tuple(head), tuple(rows))
-
-
-def _is_absent(column: str, columns: Mapping[str, Sequence[float]], joint: int) -> bool:
-    """Return whether the column belongs to a law that a fit did not give to this joint."""
-    if column not in ("stribeck", "stribeck_velocity") or "coulomb" not in columns:
-        return False
-    return columns["stribeck"][joint] <= TUNING.no_law * columns["coulomb"][joint]
-
-
-def _unit(column: str, kind: str) -> str:
-    if column == "armature":
-        return inertia_unit(kind, kind)
-    length, speed = UNITS[kind]
-    return FRICTION_UNITS.get(column, "{force}").format(force=FORCE[kind], length=length, speed=speed)
+    for k, name in enumerate(names):
+        cells = [f"{column[k]:.3g} {unit[k]}" for column, unit in zip(columns, units, strict=True)]
+        rows.append((name, *cells))
+    return ParameterTable("Drives and friction", tuple(head), tuple(rows), note)
 
 
 def constant_basis(mass: Any) -> torch.Tensor:

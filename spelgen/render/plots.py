@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from markupsafe import Markup
 
 from spelgen.baselines.names import (
     CONSTANT_VELOCITY,
@@ -19,7 +19,7 @@ from spelgen.baselines.names import (
     observed,
 )
 from spelgen.labels import entry_name
-from spelgen.render.charts import Band, Dots, Line, Mark, Values, line_chart
+from spelgen.render.charts import Band, Chart, Dots, Line, Mark, Values, line_chart
 from spelgen.settings.tuning.render import TUNING
 
 Record = Mapping[str, Any]
@@ -52,7 +52,7 @@ class Panel:
     """Charts that belong together: a joint's, or that of an entry of M."""
 
     name: str
-    charts: tuple[Markup, ...]
+    charts: tuple[Chart, ...]
 
 
 def style(predictor: str) -> str:
@@ -70,7 +70,7 @@ def numbers(values: object) -> np.ndarray:
     return np.array(values, dtype=float)
 
 
-def loss_chart(metrics: Sequence[Record], best_epoch: int) -> Markup:
+def loss_chart(metrics: Sequence[Record], best_epoch: int) -> Chart:
     """Return training and validation loss by epoch, with the epoch of the model that was kept."""
     columns = [(record["epoch"], record["loss"], record["validation"]) for record in metrics]
     epochs, training, validation = numbers(columns).T
@@ -78,10 +78,10 @@ def loss_chart(metrics: Sequence[Record], best_epoch: int) -> Markup:
         Line("training loss", epochs, training, "train"),
         Line("validation loss", epochs, validation, "model"),
     ]
-    best = [(best_epoch, "best")]
-    return line_chart(
-        lines, "Loss by epoch", "epoch", "loss", log=True, verticals=best, width=560, height=240
-    )
+    losses = np.concatenate([training, validation])
+    ends = (np.nanmin(losses), np.nanmax(losses))
+    lines.append(Line("epoch of the best model", (best_epoch, best_epoch), ends, "hold"))
+    return line_chart(lines, "Loss by epoch", "epoch", "loss", log=True, width=560, height=240)
 
 
 def growth_panels(
@@ -97,7 +97,7 @@ def growth_panels(
     for measure, (title, label) in ERRORS.items():
         marks: list[Mark] = []
         for name, (seconds, error) in curves.get(measure, {}).items():
-            marks.append(Line(f"{name}, median", seconds, numbers(error["median"]), styles[name]))
+            marks.append(Line(name, seconds, numbers(error["median"]), styles[name]))
             if name in banded:
                 low, high = numbers(error["low"]), numbers(error["high"])
                 marks.append(Band(f"{name}, 10 to 90 %", seconds, low, high, styles[name]))
@@ -157,12 +157,14 @@ def torque_panels(trace: Record, joints: Sequence[str], joint_types: Sequence[st
             Line("measured", t, measured[:, k], "truth"),
             Line("predicted", t, predicted[:, k], "predicted"),
         ]
-        residual = [Line("measured less predicted", t, measured[:, k] - predicted[:, k], "model")]
+        residual = [Line("residual", t, measured[:, k] - predicted[:, k], "model")]
         lines = [Line(name, t, torque[:, k], name.lower()) for name, torque in components.items()]
         charts = (
-            line_chart(torques, f"Torque of {joint}", "", f"torque [{unit}]", motion=motion, height=150),
-            line_chart(residual, f"Residual of {joint}", "", f"residual [{unit}]", motion=motion, height=84),
-            line_chart(lines, f"Parts of the torque of {joint}", "t [s]", f"parts [{unit}]", motion=motion),
+            line_chart(torques, f"Torque of {joint}", "", f"torque [{unit}]", motion=motion, height=160),
+            line_chart(residual, f"Residual of {joint}", "", f"residual [{unit}]", motion=motion, height=100),
+            line_chart(
+                lines, f"Components of the torque of {joint}", "t [s]", f"components [{unit}]", motion=motion
+            ),
         )
         panels.append(Panel(joint, charts))
     return panels
@@ -183,11 +185,11 @@ def trajectory_panels(example: Record, joints: Sequence[str], joint_types: Seque
             lines = [Line("measured", t, measured, "truth"), Line("predicted", t, predicted, "predicted")]
             if "u" in example:
                 lines.insert(0, Line("commanded", t, numbers(example["u"])[:, k], "hold"))
-            error = [Line("predicted less measured", t, predicted - measured, "model")]
-            title, label, height = f"{quantity} of {joint}", "", 84
+            error = [Line("error", t, predicted - measured, "model")]
+            title, label, height = f"{quantity} of {joint}", "", 100
             if key == keys[-1]:  # the time stands below the last chart alone
-                label, height = "t [s]", 112
-            charts.append(line_chart(lines, title, "", f"{quantity} [{unit}]", motion=motion, height=120))
+                label, height = "t [s]", 128
+            charts.append(line_chart(lines, title, "", f"{quantity} [{unit}]", motion=motion, height=130))
             charts.append(
                 line_chart(
                     error, f"Error of the {title}", label, f"error [{unit}]", motion=motion, height=height
@@ -228,7 +230,7 @@ def trace_mass_panels(
     return mass_panels(mass["t"], entries, styles, joint_types)
 
 
-def eigenvalue_chart(mass: Record) -> Markup:
+def eigenvalue_chart(mass: Record) -> Chart:
     """Return the smallest and the largest eigenvalue of M along a trajectory; what is not positive is not drawn."""
     lines = []
     for name, trace in mass["by"].items():
@@ -255,8 +257,8 @@ def friction_panels(
             qd = numbers(trace["qd"])[:, k]
             measured = numbers(trace["measured"])[:, k] - numbers(trace["without_friction"])[:, k]
             modelled = numbers(trace["parts"]["friction"])[:, k]
-            marks.append(Line("measured, in the order of time", qd, measured, "loop"))
-            marks.append(Line("model along it", qd, modelled, "loop model"))
+            marks.append(Line("measured, over time", qd, measured, "loop"))
+            marks.append(Line("model, over time", qd, modelled, "loop model"))
         for name, curves in friction["by"].items():
             marks.append(Line(name, friction["qd"][k], numbers(curves[k]), style(name)))
         model = friction["by"].get(MODEL)
@@ -292,19 +294,20 @@ def coverage_panels(
     for k, (joint, kind) in enumerate(zip(joints, joint_types, strict=True)):
         charts = []
         for (key, quantity), unit in zip(QUANTITIES.items(), UNITS[kind], strict=True):
-            marks: list[Mark] = [_histogram(name, logs[key][k]) for name, logs in by_logs.items()]
-            verticals = []
+            bands = [_histogram(name, logs[key][k]) for name, logs in by_logs.items()]
+            marks: list[Mark] = list(bands)
             bounds = limits[k]
             if key == "q" and bounds is not None:
-                verticals = [(bound, "limit") for bound in bounds]
-                marks.append(Line("limits", bounds, (0, 0), "edge"))
+                top = max(float(np.max(band.high)) for band in bands)
+                low, high = bounds
+                x, y = (low, low, high, high, high), (0.0, top, math.nan, 0.0, top)
+                marks.append(Line("joint limits", x, y, "hold"))
             charts.append(
                 line_chart(
                     marks,
                     f"{quantity} of {joint}",
                     f"{quantity} [{unit}]",
-                    "share",
-                    verticals=verticals,
+                    "fraction of samples",
                     width=300,
                     height=130,
                 )
@@ -320,11 +323,11 @@ def _histogram(name: str, histogram: Record) -> Band:
     edges = np.linspace(histogram["low"], histogram["high"], len(counts) + 1)
     heights = np.repeat(counts / max(counts.sum(), 1.0), 2)
     style = "train" if name == "training" else "model"
-    return Band(name, np.repeat(edges, 2)[1:-1], np.zeros_like(heights), heights, style)
+    return Band(f"{name} logs", np.repeat(edges, 2)[1:-1], np.zeros_like(heights), heights, style)
 
 
-def energy_chart(trace: Record) -> Markup:
-    """Return where the drives' work went along a trajectory."""
+def energy_chart(trace: Record) -> Chart:
+    """Return the energy balance along a trajectory."""
     styles = ("truth", "urdf", "friction", "model")
     lines = []
     for (name, energy), color in zip(trace["energy"].items(), styles, strict=True):

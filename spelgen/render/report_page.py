@@ -20,7 +20,7 @@ from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.labels import entry_name
 from spelgen.loaded_arm import LoadedArm
 from spelgen.render.arm_section import LETTERS, Cell, arm_section, matrix
-from spelgen.render.curves import coverage, curves, predictors
+from spelgen.render.curves import coverage, curves
 from spelgen.render.page import render_page
 from spelgen.render.parameters import body_parameters, mass_constants, parameter_tables
 from spelgen.render.picture import Picture, read_picture
@@ -173,7 +173,6 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
         config=run.config,
         training=training,
         evaluation=run.evaluation,
-        predictors=predictors(evaluation),
         tables=tables,
         curves=curves(traces, facts, picture),
         coverage=coverage(traces, run.identified, facts, run.limits),

@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from markupsafe import Markup
-
 from spelgen.baselines.names import MODEL
 from spelgen.fitting.objectives import fit_summary
 from spelgen.labels import thousandths
 from spelgen.listing import number
 from spelgen.logs.preprocessing import Preprocessing
+from spelgen.render.charts import Chart
 from spelgen.render.plots import Record, loss_chart
 
 if TYPE_CHECKING:
@@ -31,7 +30,7 @@ class Number:
 class Training:
     """How the run went: its loss curves where it took epochs, what it was fitted to, and what it was set to."""
 
-    chart: Markup | None
+    chart: Chart | None
     facts: dict[str, str]
     settings: dict[str, str]
 
@@ -44,20 +43,19 @@ def head_numbers(
     torque = evaluation.get("torque", {}).get(MODEL)
     if torque and torque["mean_nmse"] is not None:
         value = f"{100 * torque['mean_nmse']:.3g} %"
-        figures.append(Number(value, "of the torque's variance is not explained"))
+        figures.append(Number(value, "of the torque variance is unexplained (nMSE)"))
     # the longest horizon is the hardest, and what a simulation needs
     for horizon in evaluation.get("horizons", ())[-1:]:
         error = horizon["errors"][MODEL]
         if error["mean_relative_rms"] is not None:
-            value = f"{100 * error['mean_relative_rms']:.3g} %"
-            figures.append(Number(value, f"of the motion is missed after {horizon['name']}"))
-        if error["tip_mm"] is not None:
             figures.append(
-                Number(f"{number(error['tip_mm'])} mm", f"error of the tip after {horizon['name']}")
+                Number(_fraction(error["mean_relative_rms"]), f"rollout error after {horizon['name']}")
             )
+        if error["tip_mm"] is not None:
+            figures.append(Number(f"{number(error['tip_mm'])} mm", f"tip error after {horizon['name']}"))
     for replay in evaluation.get("replays", ()):
         value = f"{number(1000 * replay['errors'][MODEL]['mean'])} {thousandths(evaluation['joint_types'])}"
-        figures.append(Number(value, f"off measured positions, commands replayed, {replay['name']}"))
+        figures.append(Number(value, f"position error, commands replayed, {replay['name']}"))
     summary = fit_summary(config)
     if summary is not None:
         figures.append(Number(*summary.headline))
@@ -102,6 +100,13 @@ def training_facts(config: Record, metrics: Sequence[Record], identified: Record
         facts["start"] = f"{options['momentum_steps']:,} steps on the momentum along the logs"
     settings = {key.replace("_", " "): str(value) for key, value in options.items() if value is not None}
     return Training(chart, facts, settings)
+
+
+def _fraction(error: float) -> str:
+    """Return an error relative to the motion."""
+    if error < 10:
+        return f"{100 * error:.3g} %"
+    return f"{error:,.0f} x motion"
 
 
 def _names(trajectories: Sequence[str]) -> str:

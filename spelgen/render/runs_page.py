@@ -68,7 +68,6 @@ def render_runs(folders: Sequence[Path]) -> str:
         runs=runs,
         verdict=_verdict(runs),
         robots=sorted({run.facts.robot for run in runs}),
-        key=[(run.style, run.name) for run in runs],
         tables=_tables(runs),
         growth=_growth(runs),
     )

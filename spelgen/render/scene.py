@@ -1,4 +1,4 @@
-"""A URDF -> the arm as a page draws it: links that hang on one another, each with its triangles, and a still picture.
+"""A URDF -> the arm as a page draws it: links that hang on one another, each with its triangles.
 
 The triangles are those of the file's visual shapes where these are found, simplified to fit a page; else tubes from
 joint to joint, with a drum about the axis of each that turns.
@@ -11,11 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from markupsafe import Markup
 from scipy.spatial.transform import Rotation
 
 from spelgen.dynamics.constraint import Constraint, mimic_constraint
-from spelgen.render.charts import element
 from spelgen.render.shapes import Shape, drum, joined, slide, tube, visual_shapes
 from spelgen.settings.tuning.render import TUNING
 from spelgen.urdf.read import read_urdf
@@ -24,15 +22,13 @@ from spelgen.urdf.robot import Joint, Robot
 
 @dataclass(frozen=True)
 class Camera:
-    """Direction of the camera [rad], size of the picture and room for the arm in it. light: points to the light."""
+    """Direction of the camera [rad], size of the picture and the fraction of it that the arm fills."""
 
     yaw: float = 2.3
     pitch: float = 0.36
     width: int = 640
     height: int = 420
     fill: float = 0.86
-    light: tuple[float, float, float] = (-0.352, 0.624, 0.704)
-    shades: int = 8
 
     def axes(self) -> np.ndarray:
         """Return what takes the root's axes to right, up and towards the eye, (3, 3)."""
@@ -122,37 +118,13 @@ class Scene:
     def view(self, poses: Sequence[Sequence[float]]) -> View:
         """Return the view that holds the arm at all these positions."""
         points = np.concatenate([np.zeros((1, 3)), *(self.triangles(q).reshape(-1, 3) for q in poses)])
-        middle = (points.min(axis=0) + points.max(axis=0)) / 2
-        across, up, _ = np.maximum(np.abs((points - middle) @ CAMERA.axes().T).max(axis=0), 1e-6)
-        return View(middle, CAMERA.fill * min(CAMERA.width / 2 / across, CAMERA.height / 2 / up))
-
-    def still(self, view: View, poses: Sequence[Sequence[float]], title: str) -> Markup:
-        """Return a picture of the arm at the first of these positions, and pale at the others: what a page shows
-        without a script, and on paper.
-        """
-        ghosts = [element("g", {"class": "ghost"}, self._polygons(view, q, shaded=False)) for q in poses[1:]]
-        picture = Markup("").join([*ghosts, self._polygons(view, poses[0], shaded=True)])
-        size = f"0 0 {CAMERA.width} {CAMERA.height}"
-        attributes = {"class": "still", "viewBox": size, "role": "img", "aria-label": title}
-        return element("svg", attributes, picture)
-
-    def _polygons(self, view: View, q: Sequence[float], *, shaded: bool) -> Markup:
-        """Return triangles from the farthest to the nearest (painter's algorithm), those that look away left out."""
-        corners = (self.triangles(q) - view.middle) @ CAMERA.axes().T
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 1])
-        # half of all faces look away from the eye, and would be painted over
-        facing = normals[:, 2] > 0
-        corners, normals = corners[facing], normals[facing]
-        cosines = normals @ np.array(CAMERA.light) / np.linalg.norm(normals, axis=1)
-        shades = np.round((CAMERA.shades - 1) * np.maximum(0.0, cosines)).astype(int)
-        flat = np.array([CAMERA.width, CAMERA.height]) / 2 + view.scale * corners[..., :2] * [1, -1]
-        polygons = []
-        for k in np.argsort(corners[..., 2].mean(axis=1), kind="stable"):
-            attributes = {"points": " ".join(f"{x:.0f},{y:.0f}" for x, y in flat[k])}
-            if shaded:
-                attributes = {"class": f"s{shades[k]}", **attributes}
-            polygons.append(element("polygon", attributes))
-        return Markup("").join(polygons)
+        axes = CAMERA.axes()
+        seen = points @ axes.T
+        low, high = seen.min(axis=0), seen.max(axis=0)
+        across, up, _ = np.maximum(high - low, 1e-6)
+        # the middle of the picture, not of the arm's box: an oblique arm fills the frame too
+        middle = (low + high) / 2 @ axes
+        return View(middle, CAMERA.fill * min(CAMERA.width / across, CAMERA.height / up))
 
     def to_dict(self) -> dict[str, object]:
         """Return the scene for a script, in millimetres and short names."""
@@ -207,7 +179,9 @@ def _link(robot: Robot, name: str, names: Sequence[str], constraint: Constraint,
 
 
 def _links(robot: Robot, joints: Sequence[str]) -> list[str]:
-    """Return the links from the root to the last joint, and all that the joints carry; parents first."""
+    """Return the links from the root to the last joint, all that the joints carry, and what is fixed to these links;
+    parents first.
+    """
     visible = {robot.joint[name].child for name in joints}
     # from the root on, so that whatever hangs on a carried link is carried, too
     for joint in robot.joints_from_root:
@@ -216,6 +190,10 @@ def _links(robot: Robot, joints: Sequence[str]) -> list[str]:
     for name in joints:
         for joint in robot.path_to(robot.joint[name].child):
             visible.add(joint.parent)
+    visible.add(robot.root)
+    for joint in robot.joints_from_root:
+        if joint.parent in visible and not joint.moves:
+            visible.add(joint.child)
     return [robot.root, *(joint.child for joint in robot.joints_from_root if joint.child in visible)]
 
 

@@ -57,19 +57,26 @@ def slide(axis: np.ndarray, radius: float) -> list[Trimesh]:
 def visual_shapes(urdf: Path, links: Sequence[str]) -> dict[str, Shape]:
     """Return what the URDF shows of these links, simplified to fit a page; nothing where a mesh is not found."""
     try:
-        shapes = _visual_shapes(urdf, links)
+        meshes = _visual_meshes(urdf, links)
     except Exception:  # what the readers of a dozen mesh formats raise; the page stands without
         return {}
-    total = sum(len(shape.faces) for shape in shapes.values())
-    simple = {}
-    for name, shape in shapes.items():
-        share = len(shape.faces) / max(total, TUNING.faces)
-        simple[name] = _simplified(shape, max(24, int(TUNING.faces * share)))
-    return simple
+    area = sum(mesh.area for mesh in meshes.values()) or 1.0
+    shapes = {}
+    for name, mesh in meshes.items():
+        # by size: a fine mesh of a small screw gets no more faces than it shows
+        count = max(TUNING.least_faces, int(TUNING.faces * mesh.area / area))
+        if len(mesh.faces) > count:
+            mesh = mesh.simplify_quadric_decimation(face_count=count, aggression=3)
+        shapes[name] = Shape(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    return shapes
 
 
-def _visual_shapes(urdf: Path, links: Sequence[str]) -> dict[str, Shape]:
-    """Return shapes in the links' frames. Raises where a file is not there: an arm with holes is worse than tubes."""
+def _visual_meshes(urdf: Path, links: Sequence[str]) -> dict[str, Any]:
+    """Return meshes in the links' frames, one a link.
+
+    Raises where a file is missing: an arm with holes is worse than tubes.
+    """
+    import trimesh
     import yourdfpy
 
     # it warns of every mesh that it does not find, which the page says in one sentence
@@ -77,7 +84,7 @@ def _visual_shapes(urdf: Path, links: Sequence[str]) -> dict[str, Shape]:
     model = yourdfpy.URDF.load(
         str(urdf), build_scene_graph=False, load_meshes=False, build_collision_scene_graph=False
     )
-    shapes = {}
+    by_link = {}
     for link in model.robot.links:
         meshes = []
         for visual in link.visuals:
@@ -88,8 +95,8 @@ def _visual_shapes(urdf: Path, links: Sequence[str]) -> dict[str, Shape]:
                 mesh.apply_transform(visual.origin)
             meshes.append(mesh)
         if meshes:
-            shapes[link.name] = joined(meshes)
-    return shapes
+            by_link[link.name] = trimesh.util.concatenate(meshes)
+    return by_link
 
 
 def _mesh(geometry: yourdfpy.Geometry, model: yourdfpy.URDF) -> Trimesh:
@@ -113,25 +120,3 @@ def _mesh(geometry: yourdfpy.Geometry, model: yourdfpy.URDF) -> Trimesh:
         mesh.apply_scale(geometry.mesh.scale)
     loaded: Trimesh = mesh
     return loaded
-
-
-def _simplified(shape: Shape, count: int) -> Shape:
-    """Return at most so many triangles: vertices are drawn together on a grid, as coarse as it takes."""
-    size = float(np.ptp(shape.vertices, axis=0).max()) or 1.0
-    cells = 512.0
-    while True:
-        grid = np.round(shape.vertices * (cells / size)).astype(np.int64)
-        _, cluster = np.unique(grid, axis=0, return_inverse=True)
-        faces = cluster.ravel()[shape.faces]
-        a, b, c = faces.T
-        # triangles whose corners fell together have no area
-        faces = faces[(a != b) & (b != c) & (a != c)]
-        # two triangles of the same corners lie in one place
-        _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
-        if len(first) <= count or cells < 3:
-            break
-        cells *= 0.8
-    members = np.bincount(cluster.ravel())
-    means = np.stack([np.bincount(cluster.ravel(), column) for column in shape.vertices.T], axis=1)
-    used, triangles = np.unique(faces[np.sort(first)], return_inverse=True)
-    return Shape(means[used] / members[used, None], triangles.reshape(-1, 3))

@@ -1,7 +1,7 @@
 r"""Port-Hamiltonian model of an arm with 3 joints, written by `spelgen build`.
 
 3 rigid bodies with trained inertial parameters;
-networks for what they leave: 3 learned functions of q and 2 constants in M.
+residual networks: 3 learned functions of q and 2 constants in M.
 The potential energy depends on joint 3.
 Sizes and starting values are the URDF's inertials.
 
@@ -97,7 +97,7 @@ Network = MaskedMLP
 
 
 class Model(ResidualDynamics):
-    """The arm's dynamics: 3 rigid bodies with trained inertial parameters, and networks for what they leave.
+    """The arm's dynamics: 3 rigid bodies with trained inertial parameters, and residual networks.
 
     q, qd, qdd, tau and p are (..., n), with any leading dimensions; rad and Nm, m and N if prismatic. For all
     weights M is positive definite, D positive semi-definite. ``prepared``: what ``prepare`` gave, for speed.

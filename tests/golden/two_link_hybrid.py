@@ -1,7 +1,7 @@
 r"""Port-Hamiltonian model of an arm with 2 joints, written by `spelgen build`.
 
 2 rigid bodies with trained inertial parameters;
-networks for what they leave: 1 learned function of q and 2 constants in M.
+residual networks: 1 learned function of q and 2 constants in M.
 The potential energy depends on joints 1,2.
 Sizes and starting values are the URDF's inertials.
 
@@ -91,7 +91,7 @@ Network = MaskedMLP
 
 
 class Model(ResidualDynamics):
-    """The arm's dynamics: 2 rigid bodies with trained inertial parameters, and networks for what they leave.
+    """The arm's dynamics: 2 rigid bodies with trained inertial parameters, and residual networks.
 
     q, qd, qdd, tau and p are (..., n), with any leading dimensions; rad and Nm, m and N if prismatic. For all
     weights M is positive definite, D positive semi-definite. ``prepared``: what ``prepare`` gave, for speed.
