@@ -4,12 +4,14 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
+TOOLS := $(VENV)/installed-tools
 DEMO := demo
 MINUTES ?= 20
 
 # The networks are tiny: more threads than one only cost time, and one makes runs repeatable.
 export OMP_NUM_THREADS ?= 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
+export PIP_ROOT_USER_ACTION := ignore
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test fuzz check docs format bench golden lock clean
@@ -30,48 +32,63 @@ demo: $(STAMP) ## the whole way on robots/rpr.urdf: inspect, build, simulate, tr
 test: check ## run the checks, then the tests
 	$(BIN)/python -m pytest
 
-fuzz: $(STAMP) ## URDFs, logs, settings and run folders drawn at random, new ones for MINUTES=20
+fuzz: $(TOOLS) ## URDFs, logs, settings and run folders drawn at random, new ones for MINUTES=20
 	FUZZ_MINUTES=$(MINUTES) $(BIN)/python -m pytest -q tests/test_fuzz.py tests/test_fuzz_files.py
 
-check: $(STAMP) ## format, lint, types, import direction
+check: $(TOOLS) ## format, lint, types, import direction
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest -q tests/test_imports.py
 
-docs: $(STAMP) ## write the docs as a site into site/
+docs: $(TOOLS) ## write the docs as a site into site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 
-format: $(STAMP) ## format the code and sort the imports
+format: $(TOOLS) ## format the code and sort the imports
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-bench: $(STAMP) ## run every script of benchmarks/
+bench: $(TOOLS) ## run every script of benchmarks/
 	@for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script || exit 1; done
 
-golden: $(STAMP) ## rewrite the golden files after an intended change; read the diff before committing
+golden: $(TOOLS) ## rewrite the golden files after an intended change; read the diff before committing
 	$(BIN)/python -m pytest -q tests/test_emit.py::test_golden_text --update
 
-lock: ## write requirements.txt anew: the newest versions that the ranges of pyproject.toml admit
-	rm -rf .lock-venv
+# Where pip finds no build of torch for the CPU alone (UV_FIND_LINKS), NVIDIA's packages are locked too.
+LOCK = .lock-venv/bin/uv pip compile --quiet --upgrade --generate-hashes --no-annotate --no-header \
+    --constraints requirements-torch.txt --no-emit-package torch
+# Trimesh's reader of meshes works without these, which yourdfpy names for all else that trimesh can do.
+UNUSED := anyio certifi charset-normalizer colorlog embreex h11 httpcore httpx idna jsonschema jsonschema-specifications \
+    attrs referencing rpds-py manifold3d mapbox-earcut rtree setuptools shapely svg-path vhacdx xxhash
+
+lock: ## write the pinned versions and hashes anew: the newest that the ranges of pyproject.toml admit
 	$(PYTHON) -m venv .lock-venv
-	.lock-venv/bin/pip install -qq torch==2.13.0
-	.lock-venv/bin/pip install -qq --editable '.[simulate,ros,deploy,xacro,fleet,dev]'
-	sed -n '/^#/p' requirements.txt > .lock-venv/header
-	.lock-venv/bin/pip freeze --exclude-editable | sed 's/+cpu$$//' | cat .lock-venv/header - > .lock-venv/lock
-	mv .lock-venv/lock requirements.txt
+	.lock-venv/bin/pip install -qq uv
+	printf 'hatchling\neditables\n' | $(LOCK) $(UNUSED:%=--no-emit-package %) --extra simulate pyproject.toml - > .lock-venv/demo
+	$(LOCK) --constraints .lock-venv/demo --all-extras pyproject.toml > .lock-venv/tools
+	sed -n '/^#/p' requirements.txt | cat - .lock-venv/demo > .lock-venv/lock && mv .lock-venv/lock requirements.txt
+	sed -n '/^#/p' requirements-tools.txt | cat - .lock-venv/tools > .lock-venv/lock && mv .lock-venv/lock requirements-tools.txt
 	rm -rf .lock-venv
 
 clean: ## remove the environment, caches and demo output
 	rm -rf $(VENV) .lock-venv $(DEMO) site build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
 
-# Everything pinned; made once, and again when the pins or the package's metadata change.
-$(STAMP): requirements.txt pyproject.toml
+# Each file of packages is checked against its hash in requirements.txt, where no package is left out (--no-deps). Headers
+# of C++ (Boost's with Pinocchio) and torch's tests are a sixth of the disk space, and nothing here uses them.
+$(STAMP): requirements.txt requirements-torch.txt pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 	    echo "spelgen needs Python 3.11 or newer; $(PYTHON) is $$($(PYTHON) --version 2>&1)." >&2; \
 	    echo "Name another one: make $(MAKECMDGOALS) PYTHON=python3.11" >&2; exit 1; }
 	@echo "Installing the pinned packages into $(VENV): once, then never again." >&2
 	@$(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install -qq --requirement requirements.txt
+	@$(BIN)/python -m pip install -qq --no-compile --no-deps --require-hashes --requirement requirements.txt
+	@$(BIN)/python -m pip install -qq --no-compile --requirement requirements-torch.txt
 	@$(BIN)/python -m pip install -qq --no-deps --no-build-isolation --editable .
+	@rm -rf $(VENV)/lib/python*/site-packages/cmeel.prefix/include $(VENV)/lib/python*/site-packages/torch/test
+	@touch $@
+
+# What the tests, the checks and the docs need beside that, into the same environment.
+$(TOOLS): $(STAMP) requirements-tools.txt
+	@echo "Installing what the tests need beside that: once, then never again." >&2
+	@$(BIN)/python -m pip install -qq --no-compile --no-deps --require-hashes --requirement requirements-tools.txt
 	@touch $@
