@@ -10,6 +10,7 @@ from typing import Literal
 
 Severity = Literal["info", "warning"]
 LONGEST_LIST = 50  # errors of one pass that are printed
+LONGEST_TEXT = 2000  # characters of a part of a message that are printed
 
 
 class SpelgenError(Exception):
@@ -37,11 +38,13 @@ class SpelgenError(Exception):
         self.do = do
 
     def __str__(self) -> str:
-        statement = self.got if self.expected is None else f"got {self.got}, expected {self.expected}"
+        statement = _in_short(self.got)
+        if self.expected is not None:
+            statement = f"got {statement}, expected {_in_short(self.expected)}"
         place = ":".join(str(x) for x in (self.file, self.line) if x is not None)
-        message = ": ".join(x for x in (place, self.element, statement) if x)
+        message = ": ".join(x for x in (_in_short(place), _in_short(self.element or ""), statement) if x)
         if self.do is not None:
-            message += f"; {self.do}"
+            message += f"; {_in_short(self.do)}"
         return message
 
 
@@ -102,6 +105,14 @@ def _once(alike: Sequence[SpelgenError]) -> str:
     if not files:
         return str(first)
     return f"{first}\n  the same: {shortened(list(files), 5)}"
+
+
+def _in_short(text: str) -> str:
+    """Return a text, or the ends of one that no one reads: a file may hold a name of a million characters."""
+    if len(text) <= LONGEST_TEXT:
+        return text
+    half = LONGEST_TEXT // 3
+    return f"{text[:half]}... ({len(text)} characters) ...{text[-half:]}"
 
 
 def collect(errors: Sequence[SpelgenError]) -> None:

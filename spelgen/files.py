@@ -19,11 +19,37 @@ from typing import Protocol
 
 from spelgen.errors import SpelgenError
 
+LARGEST_TEXT = 2**25  # bytes: parsed JSON or Python takes some thirty times as much memory
+
 
 def require_regular_file(path: Path, error: type[SpelgenError], expected: str | None = None) -> None:
     """Raise ``error`` unless a path is a regular file: whoever opens a pipe or a device may wait for ever."""
     if not path.is_file():
         raise error("no regular file", file=path, expected=expected)
+
+
+def read_bytes(
+    path: Path,
+    error: type[SpelgenError],
+    kind: str | None = None,
+    largest: int = LARGEST_TEXT,
+    do: str | None = None,
+) -> bytes:
+    """Return what a regular file of at most so many bytes holds.
+
+    Raises ``error``. kind: what is expected there. do: what to do where the file is too large.
+    """
+    try:
+        size = path.stat().st_size  # FileNotFoundError before all else
+        require_regular_file(path, error, kind)
+        if size <= largest:
+            return path.read_bytes()
+    except FileNotFoundError:
+        raise error("no such file", file=path) from None
+    except (OSError, ValueError) as problem:  # ValueError: a null character in the name
+        reason = getattr(problem, "strerror", None) or str(problem)
+        raise error(f"cannot be read ({reason})", file=path) from None
+    raise error(f"a file of {size} bytes", file=path, expected=f"at most {largest}", do=do)
 
 
 @contextmanager

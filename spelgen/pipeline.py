@@ -14,7 +14,7 @@ from spelgen.emission.emit import emit
 from spelgen.emission.plan import plan_model
 from spelgen.errors import ModuleError
 from spelgen.loaded_arm import LoadedArm, arm_of_module, load_arm
-from spelgen.spec import Assume, Facts, ModelSpec, Options, read_facts
+from spelgen.spec import Assume, Facts, ModelSpec, Options, read_facts, read_source
 
 
 def inspect(
@@ -113,7 +113,7 @@ def check(module: str | Path, urdf: str | Path | None = None) -> CheckResult:
         reasons.append(f"{urdf_path} has changed since the module was built")
     if spec.sha256 != facts.spec_sha256:
         reasons.append("the derived model differs from the one in the module")
-    if emit(spec) != module.read_text(encoding="utf-8"):
+    if emit(spec) != read_source(module):
         reasons.append("the module's text differs from what `spelgen build` writes now")
     proof = loaded.verify(facts.options.assume)
     reasons += [str(difference) for difference in proof.differences]

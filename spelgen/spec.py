@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from spelgen.design import Design, Net
-from spelgen.errors import ModuleError
-from spelgen.files import require_regular_file
+from spelgen.errors import ModuleError, SettingsError
+from spelgen.files import read_bytes
 
 Assume = Literal["kinematics", "inertials"]
 """Values of the URDF that the structure uses: the kinematics, or also the inertials' zeros and symmetries."""
@@ -28,6 +28,9 @@ Entries = tuple[tuple[int, int, float], ...]
 
 MODULE_FORMAT = 2
 """Of emitted modules: it changes when a module, or weights of one, written before cannot be used any more."""
+LARGEST_MODULE = 2**22  # bytes: the largest that `build` writes has a tenth
+_MOST_WEIGHTS = 2**24  # of the hidden layers of one network: 134 MB in double precision
+_MOST_LAYERS = 16
 _FACTS_WIDTH = 100
 _FOREIGN = (
     SyntaxError, ValueError, KeyError, TypeError, StopIteration, AttributeError, RecursionError, MemoryError,
@@ -50,6 +53,15 @@ class Options:
     angle_tolerance: float = 2e-3
     width: int = 64
     depth: int = 2
+
+    def __post_init__(self) -> None:
+        """Raise SettingsError for networks that no memory holds: the facts of a module may say any number."""
+        weights = self.width * self.width * self.depth
+        if min(self.width, self.depth) < 1 or self.depth > _MOST_LAYERS or weights > _MOST_WEIGHTS:
+            raise SettingsError(
+                f"{self.depth} hidden layers of {self.width} units",
+                expected=f"1 to {_MOST_LAYERS} layers of at least 1, with at most {_MOST_WEIGHTS:,} weights",
+            )
 
 
 @dataclass(frozen=True)
@@ -240,10 +252,10 @@ def read_source(path: str | Path) -> str:
     path = Path(path)
     if not path.exists():
         raise ModuleError("no such file", file=path, do="build it with `spelgen build`")
-    require_regular_file(path, ModuleError, "a module written by `spelgen build`")
+    content = read_bytes(path, ModuleError, "a module written by `spelgen build`", LARGEST_MODULE)
     try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, ValueError) as problem:
+        return content.decode("utf-8").replace("\r\n", "\n")
+    except ValueError as problem:
         raise _no_facts(problem, path) from None
 
 
@@ -253,6 +265,8 @@ def parse_facts(source: str, file: Path | None = None) -> Facts:
         record = _record(source)
         if record.get("format") == MODULE_FORMAT:
             return _facts(source)
+    except SettingsError as problem:
+        raise ModuleError(f"options of no module ({problem})", file=file, do="build it again") from None
     except _FOREIGN as problem:
         raise _no_facts(problem, file) from None
     raise ModuleError(
@@ -270,15 +284,13 @@ def _record(source: str) -> dict[str, Any]:
 
 
 def _facts(source: str) -> Facts:
+    from pydantic import TypeAdapter  # slow to import
+
     record = _record(source)
-    return Facts(
-        robot=record["robot"],
-        urdf=record["urdf"],
-        urdf_sha256=record["urdf_sha256"],
-        spec_sha256=record["spec_sha256"],
-        options=_options(_tupled(record["options"])),
-        joints=tuple(record["joints"]),
-        joint_types=tuple(record["joints"].values()),
+    joints = record["joints"]
+    # a field of another type is refused here, and not wherever it is used first
+    return TypeAdapter(Facts).validate_python(
+        record | {"joints": tuple(joints), "joint_types": tuple(joints.values())}
     )
 
 

@@ -5,6 +5,8 @@ import json
 import os
 import re
 import resource
+import time
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +18,7 @@ from typer.testing import CliRunner
 
 import spelgen
 from spelgen.cli.main import app
-from spelgen.errors import LogError, RunError
+from spelgen.errors import LogError, ModuleError, RunError
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.exporting.export import export
 from spelgen.fitting import loop, window_problem
@@ -29,6 +31,7 @@ from spelgen.logs import chunks
 from spelgen.logs.read import write_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.pipeline import generate
+from spelgen.render.report_page import render_report
 from spelgen.settings.fits import Rollout
 from spelgen.settings.tuning.fitting import WindowTuning
 from spelgen.trust import require_own_module
@@ -260,6 +263,98 @@ def test_a_checkpoint_that_lost_a_number_is_told(plain, tmp_path):
         RunError, match=r"checkpoint\.pt: substeps: Input should be less than or equal to 1000"
     ):
         load_run(tmp_path)
+
+
+def copied(plain: Path, folder: Path) -> Path:
+    folder.mkdir(exist_ok=True)
+    for path in plain.iterdir():
+        (folder / path.name).write_bytes(path.read_bytes())
+    return folder
+
+
+def not_a_number(state):
+    next(iter(state.values())).view(-1)[0] = torch.nan
+    return state
+
+
+def repeated(state):
+    """A tensor of 4 TB that is one number."""
+    return state | {next(iter(state)): torch.zeros(1).expand(10**12)}
+
+
+@pytest.mark.parametrize("change", [not_a_number, repeated])
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda run, log: evaluate(run, motions()),
+        lambda run, log: export(run),
+        lambda run, log: train(run / "module.py", [log], run.parent / "more", QUICK, source=run),
+    ],
+)
+def test_weights_that_are_no_numbers_are_told(plain, start, tmp_path, change, use):
+    run = copied(plain, tmp_path)
+    torch.save(change(weights(run)), run / "model.pt")
+    with pytest.raises(
+        RunError, match=r"model\.pt: .*: got no finite numbers, expected weights; start a new"
+    ):
+        use(run, start / "train.parquet")
+
+
+def test_a_run_whose_weights_are_no_numbers_is_not_resumed(plain, start, tmp_path):
+    run = copied(plain, tmp_path)
+    state = torch.load(run / "checkpoint.pt", weights_only=True)
+    not_a_number(state["best_weights"])
+    torch.save(state, run / "checkpoint.pt")
+    with pytest.raises(RunError, match=r"checkpoint\.pt: .*: got no finite numbers"):
+        train("", [start / "train.parquet"], run, options=RunOptions(resume=True))
+
+
+def test_weights_that_unpack_to_gigabytes_are_told(plain, tmp_path):
+    run = copied(plain, tmp_path)
+    with zipfile.ZipFile(run / "model.pt", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        archive.writestr("model/data/0", bytes(600_000_000))
+    with pytest.raises(RunError, match=r"model\.pt: got unreadable \(ValueError\)"):
+        load_run(run)
+
+
+FACTS = {
+    "gigabytes of weights": (
+        '"width": 8',
+        '"width": 1000000000',
+        "1 hidden layers of 1000000000 units, expected",
+    ),
+    "a number for joints": ('"joints": null', '"joints": 3', "no facts of spelgen in it"),
+    "a number for a name": ('"tip": null', '"tip": 5', "no facts of spelgen in it"),
+    "a list for a design": ('"design": null', '"design": [1]', "no facts of spelgen in it"),
+    "text for a number": ('"angle_tolerance": 0.002', '"angle_tolerance": "x"', "no facts of spelgen in it"),
+}
+
+
+@pytest.mark.parametrize("case", FACTS)
+def test_facts_of_another_type_or_size_are_told(plain, tmp_path, case):
+    old, new, message = FACTS[case]
+    run = copied(plain, tmp_path)
+    source = (run / "module.py").read_text()
+    assert old in source
+    (run / "module.py").write_text(source.replace(old, new, 1))
+    for use in (load_run, render_report):
+        with pytest.raises(ModuleError, match=message):
+            use(run)
+
+
+def test_a_huge_file_is_listed_without_being_read(plain, start, tmp_path):
+    run = copied(plain, tmp_path)
+    with (run / "notes.bin").open("wb") as file:
+        file.truncate(40 * 10**9)  # takes no space
+    begin = time.process_time()
+    assert "not computed of a file above 1 GB" in render_report(run)
+    assert time.process_time() - begin < 10
+    for name in ("config.json", "metrics.jsonl", "module.py", "robot.urdf"):
+        huge = copied(plain, tmp_path / name)
+        with (huge / name).open("wb") as file:
+            file.truncate(40 * 10**9)
+        with pytest.raises(spelgen.SpelgenError, match=r"got a file of 40000000000 bytes, expected at most"):
+            load_run(huge)
 
 
 def test_a_log_that_changes_under_training_is_told(start, tmp_path, monkeypatch):

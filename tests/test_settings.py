@@ -164,7 +164,7 @@ def test_a_wrong_value_is_told_with_its_place(urdf, text, message):
         ),
         ("about: 2025-99-99", "arm.yaml: not plain YAML: month must be in 1..12"),
         ("about: " + 40 * "[", "arm.yaml:1: not plain YAML: more than 16 levels"),
-        ("about: |\n" + 300_000 * " ", "arm.yaml: got a large file, expected at most 262144 bytes"),
+        ("about: |\n" + 300_000 * " ", "arm.yaml: got a file of 300009 bytes, expected at most 262144"),
         (b"about: \xff", "arm.yaml: got bytes that are not UTF-8, expected YAML text"),
         (b"about: \x00", "arm.yaml: not plain YAML: characters that YAML does not allow"),
         ("about: a\n---\nabout: b", "arm.yaml:2: not plain YAML: found another document"),

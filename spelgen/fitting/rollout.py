@@ -18,6 +18,7 @@ from spelgen.dynamics.protocol import (
     sliding_memory,
 )
 from spelgen.dynamics.runge_kutta import runge_kutta
+from spelgen.errors import LogError
 from spelgen.fitting.adaptive import roll_out_adaptive
 from spelgen.logs.windows import Windows
 from spelgen.settings.fits import Solver
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
 TUNING = IntegrationTuning()
+AT_REST = 1e-6  # [rad, m] finer than encoders
 
 
 def roll_out(
@@ -105,8 +107,15 @@ class LossScales:
 
 
 def loss_scales(windows: Windows, joint_types: Sequence[str]) -> LossScales:
-    """Return the scales of these windows; for a joint that hardly moves, a hundredth of the largest one."""
+    """Return the scales of these windows; for a joint that hardly moves, a hundredth of the largest one.
+
+    Raises LogError where none moves at all: any model predicts rest.
+    """
     moved = position_difference(windows.q[:, 1:], windows.q[:, :1], joint_types)
+    if moved.abs().max() < AT_REST:
+        raise LogError(
+            f"windows in which no joint moves by {AT_REST:g} rad or m", expected="motion", do="record some"
+        )
     changed = windows.qd[:, 1:] - windows.qd[:, :1]
     varied = windows.tau - windows.tau.mean(dim=(0, 1))
     return LossScales(

@@ -9,18 +9,22 @@ from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
+from zipfile import ZipFile
 
 import torch
 
 from spelgen.emission.loading import has_run, load_module
 from spelgen.errors import RunError
-from spelgen.files import local, naming, remove, require_regular_file, sent, write_bytes
+from spelgen.files import local, naming, read_bytes, remove, require_regular_file, sent, write_bytes
 from spelgen.fitting.run_record import Checkpoint, Content, Epoch, require, require_record
 from spelgen.spec import read_source
 from spelgen.urdf.document import urdf_bytes
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
+
+
+LARGEST_STATE = 2**29  # bytes of model.pt or checkpoint.pt, unpacked
 
 
 @dataclass(frozen=True)
@@ -173,9 +177,11 @@ class RunFolder:
 
     def load_state(self, path: Path) -> Content:
         """checkpoint.pt or model.pt, on the CPU; nothing but tensors and plain values is ever unpickled."""
-        if not path.is_file():
+        if not path.exists():
             raise RunError(f"no {path.name}", file=self.path, expected="a run folder", do="spelgen train")
+        require_regular_file(path, RunError)
         try:
+            _require_unpacked_size(path)
             found = torch.load(path, map_location="cpu", weights_only=True)
         except Exception as error:  # torch names no common type for what a broken file raises
             raise RunError(
@@ -183,6 +189,7 @@ class RunFolder:
             ) from error
         if not isinstance(found, dict):
             raise RunError(type(found).__name__, file=path, expected="a file of `spelgen train`")
+        _require_finite(found, path)
         return found
 
     def load_module(self, *, trust: bool = False) -> EmittedModel:
@@ -196,9 +203,32 @@ class RunFolder:
 
 
 def _text(path: Path, errors: str = "strict") -> str:
-    """The text of a file; RunError for a pipe, which might never end."""
-    require_regular_file(path, RunError)
-    return path.read_text(encoding="utf-8", errors=errors)
+    """The text of a file; RunError for a pipe, which might never end, and for one that would fill the memory."""
+    return read_bytes(path, RunError).decode("utf-8", errors)
+
+
+def _require_unpacked_size(path: Path) -> None:
+    """Raise ValueError where tensors would fill the memory: torch itself takes what a file says of their sizes."""
+    with ZipFile(path) as archive:
+        size = sum(member.file_size for member in archive.infolist())
+    if size > LARGEST_STATE:
+        raise ValueError(f"{size} bytes, expected at most {LARGEST_STATE}")
+
+
+def _require_finite(state: object, path: Path, name: str = "") -> None:
+    """Raise RunError for a tensor with a number that is none, or one that repeats a few numbers to fill the memory."""
+    if isinstance(state, dict):
+        for key, value in state.items():
+            _require_finite(value, path, str(key))
+    elif isinstance(state, list | tuple):
+        for value in state:
+            _require_finite(value, path, name)
+    elif isinstance(state, torch.Tensor):
+        repeated = state.numel() * state.element_size() > state.untyped_storage().nbytes()
+        if repeated or not state.isfinite().all():
+            raise RunError(
+                "no finite numbers", file=path, element=name, expected="weights", do="start a new run"
+            )
 
 
 def write_state(path: Path, state: Content) -> None:
@@ -208,12 +238,18 @@ def write_state(path: Path, state: Content) -> None:
     write_bytes(path, buffer.getvalue())
 
 
-def trained_model(run: RunFolder, *, trust: bool = False) -> EmittedModel:
-    """A run's module (see `RunFolder.load_module`) with its best weights, which take no gradients."""
+def fitted_model(run: RunFolder, *, trust: bool = False) -> EmittedModel:
+    """A run's module (see `RunFolder.load_module`) with its best weights."""
     model = run.load_module(trust=trust)
     try:
         model.load_state_dict(run.load_state(run.weights))
     except (RuntimeError, TypeError, AttributeError) as error:
         raise RunError("weights of another model", file=run.weights, do="start a new run") from error
+    return model
+
+
+def trained_model(run: RunFolder, *, trust: bool = False) -> EmittedModel:
+    """A run's module with its best weights, which take no gradients."""
+    model = fitted_model(run, trust=trust)
     model.requires_grad_(False).eval()
     return model

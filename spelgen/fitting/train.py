@@ -13,7 +13,7 @@ from spelgen.emission.loading import load_module
 from spelgen.errors import Diagnostic, ModuleError, RunError
 from spelgen.fitting.fit import AUTOMATIC, QUIET, RunOptions, fit, sample_rates
 from spelgen.fitting.fitted import Fit
-from spelgen.fitting.run_folder import RunFolder
+from spelgen.fitting.run_folder import RunFolder, fitted_model
 from spelgen.fitting.run_record import recorded_config
 from spelgen.fitting.streaming import LargeLogs
 from spelgen.logs.chunks import large_files
@@ -88,10 +88,7 @@ def train(
 def _new_model(module: Path, source: Path | str | None, *, trust: bool) -> EmittedModel:
     if source is None:
         return load_module(module)
-    run = RunFolder(Path(source))
-    model = run.load_module(trust=trust)
-    model.load_state_dict(run.load_state(run.weights))
-    return model
+    return fitted_model(RunFolder(Path(source)), trust=trust)
 
 
 def mapping_of(model: Any, mapping: LogMapping | None) -> LogMapping:

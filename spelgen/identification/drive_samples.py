@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from spelgen.identification.samples import dynamics_samples
+from spelgen.identification.samples import TUNING, dynamics_samples
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.values import earlier
 
@@ -42,6 +42,8 @@ class DriveLog:
 
     def add(self, trajectory: Trajectory) -> None:
         """Take in a trajectory, if it is dense and long enough for accelerations."""
+        if trajectory.duration < TUNING.shortest_piece:  # most of ten thousand short motions, at no cost
+            return
         joint_torque = trajectory.tau @ self._inputs.T
         moved = []
         for delay in DELAYS:

@@ -101,6 +101,8 @@ def noise_level(t: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 def quantisation_step(values: np.ndarray) -> float:
     """Return the step of a quantised signal (T,); NaN where it is not quantised, or never changes."""
+    if len(values) < 4:
+        return float("nan")
     differences = np.diff(np.unique(values))
     # two levels more or less say nothing of a grid
     if len(differences) < 3:

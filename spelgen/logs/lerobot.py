@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from spelgen.errors import LogError
-from spelgen.files import require_regular_file
+from spelgen.files import read_bytes, require_regular_file
 from spelgen.logs.parquet_files import read_parquet
 from spelgen.logs.tables import LogFormat, LogTable
 from spelgen.settings.log_mapping import JointLog, LogMapping
@@ -61,7 +61,7 @@ def dataset_mapping(folder: Path, joints: Sequence[str], mapping: LogMapping) ->
 def _motor_names(folder: Path, feature: str) -> list[str]:
     """Return the motors' names of a feature, without LeRobot's ending."""
     try:
-        info = json.loads((folder / INFO).read_text(encoding="utf-8"))
+        info = json.loads(read_bytes(folder / INFO, LogError))
         groups = info["features"][feature]["names"]
         if not isinstance(groups, dict):
             groups = {"motors": groups or []}  # LeRobot writes a list, or a group of lists

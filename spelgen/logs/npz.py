@@ -59,7 +59,10 @@ class NpzArrays(Mapping[str, np.ndarray]):
                 expected=f"at most {TUNING.npz_bytes / 1e9:.3g} GB", do="write larger logs as Parquet",
             )  # fmt: skip
         with reading(self._file), self._archive.open(member) as data:
-            return np.lib.format.read_array(data, allow_pickle=False)
+            try:
+                return np.lib.format.read_array(data, allow_pickle=False)
+            except MemoryError:
+                raise ValueError(f"array {member.filename} is larger than the file says") from None
 
 
 def read_npz(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:

@@ -106,10 +106,13 @@ def _recordings(log: LogTable, stem: str) -> list[tuple[str, np.ndarray]]:
     """Return name and rows of each recording of a table, in order of their first rows."""
     if log.layout.labels is None:
         return [(log.recording or stem, np.arange(log.table.num_rows))]
+    # each label once: a name of a megabyte on a million rows is a small file
+    labels = log.table[log.layout.labels].dictionary_encode("encode").combine_chunks()
     codes: dict[str, int] = {}
-    code_of_row = []
-    for label in log.table[log.layout.labels].to_pylist():
-        code_of_row.append(codes.setdefault(str(label), len(codes)))
+    code_of_label = []
+    for label in labels.dictionary.to_pylist():
+        code_of_label.append(codes.setdefault(str(label), len(codes)))
+    code_of_row = np.array(code_of_label)[labels.indices.to_numpy()]
     # sorting keeps time and memory in proportion to the rows, however many recordings there are
     rows = np.argsort(code_of_row, kind="stable")
     ends = np.cumsum(np.bincount(code_of_row))

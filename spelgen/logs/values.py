@@ -12,7 +12,7 @@ import pyarrow.compute
 
 from spelgen.errors import LogError
 from spelgen.logs.tables import Layout, list_element, wanted_quantities
-from spelgen.logs.trajectory import Trajectory, gap_ends
+from spelgen.logs.trajectory import LATEST, SHORTEST, Trajectory, gap_ends
 from spelgen.settings.log_mapping import TIMES
 from spelgen.settings.tuning.logs import LogTuning
 
@@ -23,7 +23,10 @@ EXACT = 2**53  # whole numbers up to here are exact as floating-point numbers
 def clock_start(times: pa.ChunkedArray | pa.Array) -> int:
     """Return from where times count: the first one of a clock too wide for floating-point numbers, else 0."""
     first = times[:1]
-    nanoseconds = _nanoseconds(first)
+    try:
+        nanoseconds = _nanoseconds(first)
+    except pa.ArrowInvalid:
+        return 0  # told of by `_times`, which knows the file
     if nanoseconds is not None:
         return nanoseconds[0].as_py() or 0
     start = first[0].as_py() if pa.types.is_integer(first.type) else None
@@ -90,7 +93,13 @@ def _times(table: pa.Table | pa.RecordBatch, layout: Layout, file: Path, start: 
     """Return the times (T,) in the layout's unit, from `start` on."""
     name = layout.columns[0]
     times = _column(table, name)
-    nanoseconds = _nanoseconds(times)
+    try:
+        nanoseconds = _nanoseconds(times)
+    except pa.ArrowInvalid as error:
+        raise LogError(
+            f"dates beyond what nanoseconds count ({times.type})", file=file, element=f"column {name}",
+            expected="years from 1678 to 2262", do="check the unit of the stamps",
+        ) from error  # fmt: skip
     # integers are subtracted before they become floats: 1.7e18 ns keeps no microseconds as a double
     if nanoseconds is not None and not nanoseconds.null_count:
         counts: np.ndarray = nanoseconds.to_numpy()
@@ -159,7 +168,8 @@ def _is_number(text: str | None) -> bool:
 def _require_possible(data: np.ndarray, columns: Sequence[str], file: Path, first: int) -> None:
     """Raise LogError where data (T, C) in SI units, from row `first` of the file on, is no number or far too large."""
     bad = ~np.isfinite(data)
-    bad[:, 1:] |= ~(np.abs(data[:, 1:]) < TUNING.largest_value)
+    largest = np.array([LATEST] + [TUNING.largest_value] * (len(columns) - 1))
+    bad |= ~(np.abs(data) < largest)
     if not bad.any():
         return
     row, column = np.argwhere(bad)[0]
@@ -168,7 +178,7 @@ def _require_possible(data: np.ndarray, columns: Sequence[str], file: Path, firs
     do = "remove those rows; a gap in t is understood"
     if np.isfinite(value):
         got, kind = f"{value:.3g} in SI units", "value"
-        expected, do = f"a number below {TUNING.largest_value:g}", "check units and gains"
+        expected, do = f"a number below {largest[column]:g}", "check units and gains"
     raise LogError(
         f"{got} ({count} of {len(data)} rows have such a {kind}, this is the first)",
         file=file, line=_line(file, row + first), element=f"row {row + first + 1}, column {columns[column]}",
@@ -178,7 +188,7 @@ def _require_possible(data: np.ndarray, columns: Sequence[str], file: Path, firs
 
 def require_increasing_times(t: np.ndarray, rows: np.ndarray, file: Path, column: str) -> None:
     """Raise LogError unless times (T,), of these rows of the file, increase."""
-    backward = np.flatnonzero(np.diff(t) <= 0)
+    backward = np.flatnonzero(np.diff(t) < SHORTEST)
     if backward.size:
         k = int(backward[0])
         raise LogError(

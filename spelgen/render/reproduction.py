@@ -15,6 +15,8 @@ from spelgen.settings.fits import CONFIGS
 from spelgen.settings.training import TrainingSettings
 from spelgen.spec import Facts, Options
 
+HASHED = 10**9  # bytes of the largest file whose digest is computed, in some seconds
+
 
 @dataclass(frozen=True)
 class File:
@@ -31,8 +33,11 @@ def files(folder: Path) -> list[File]:
     for path in sorted(folder.iterdir()):
         # pages are made from the folder and so are no part of what is reproduced
         if path.is_file() and not path.name.startswith(".") and path.suffix != ".html":
-            content = path.read_bytes()
-            entries.append(File(path.name, _size(len(content)), hashlib.sha256(content).hexdigest()))
+            size, digest = path.stat().st_size, "not computed of a file above 1 GB"
+            if size <= HASHED:
+                with path.open("rb") as content:
+                    digest = hashlib.file_digest(content, "sha256").hexdigest()
+            entries.append(File(path.name, _size(size), digest))
     return entries
 
 

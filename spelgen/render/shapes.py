@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import io
 import logging
-from collections.abc import Sequence
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from spelgen.render import mesh_child
 from spelgen.settings.tuning.render import TUNING
 
 if TYPE_CHECKING:
@@ -84,13 +88,16 @@ def _visual_meshes(urdf: Path, links: Sequence[str]) -> dict[str, Any]:
     model = yourdfpy.URDF.load(
         str(urdf), build_scene_graph=False, load_meshes=False, build_collision_scene_graph=False
     )
+    visuals = [x for link in model.robot.links if link.name in links for x in link.visuals]
+    named = [x.geometry.mesh for x in visuals if x.geometry.mesh is not None]
+    files = _read_meshes({mesh.filename: Path(model._filename_handler(mesh.filename)) for mesh in named})
     by_link = {}
     for link in model.robot.links:
         meshes = []
         for visual in link.visuals:
             if link.name not in links:
                 break
-            mesh = _mesh(visual.geometry, model)
+            mesh = _mesh(visual.geometry, files)
             if visual.origin is not None:
                 mesh.apply_transform(visual.origin)
             meshes.append(mesh)
@@ -99,7 +106,23 @@ def _visual_meshes(urdf: Path, links: Sequence[str]) -> dict[str, Any]:
     return by_link
 
 
-def _mesh(geometry: yourdfpy.Geometry, model: yourdfpy.URDF) -> Trimesh:
+def _read_meshes(files: Mapping[str, Path]) -> dict[str, Trimesh]:
+    """Return the meshes in these files. Raises CalledProcessError where one is no mesh, or too large for a page."""
+    import trimesh
+
+    if not files:
+        return {}
+    command = [sys.executable, "-P", mesh_child.__file__, *map(str, files.values())]
+    # a file may say that it is a thousand times as large as it is, or name one that never ends
+    run = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=60, check=True)
+    arrays = np.load(io.BytesIO(run.stdout))
+    meshes = {}
+    for index, name in enumerate(files):
+        meshes[name] = trimesh.Trimesh(arrays[f"v{index}"], arrays[f"f{index}"], process=False)
+    return meshes
+
+
+def _mesh(geometry: yourdfpy.Geometry, files: Mapping[str, Trimesh]) -> Trimesh:
     import trimesh
 
     if geometry.box is not None:
@@ -112,11 +135,7 @@ def _mesh(geometry: yourdfpy.Geometry, model: yourdfpy.URDF) -> Trimesh:
     if geometry.sphere is not None:
         sphere: Trimesh = trimesh.creation.uv_sphere(geometry.sphere.radius, count=[8, 10])
         return sphere
-    path = Path(model._filename_handler(geometry.mesh.filename))
-    if path.stat().st_size > TUNING.mesh_bytes:
-        raise ValueError("a mesh too large for a page")
-    mesh: Any = trimesh.load(path, force="mesh")
+    mesh = files[geometry.mesh.filename].copy()
     if geometry.mesh.scale is not None:
         mesh.apply_scale(geometry.mesh.scale)
-    loaded: Trimesh = mesh
-    return loaded
+    return mesh

@@ -11,6 +11,7 @@ from typing import Annotated, ClassVar, Literal, Self
 from pydantic import Field, ValidationError, model_validator
 
 from spelgen.errors import OptionError, SettingsError, collect, suggestion
+from spelgen.settings.messages import expected_text
 from spelgen.settings.tuning.fit_defaults import FitDefaults
 from spelgen.settings.values import Count, Group, NonNegative, Positive, Whole
 
@@ -252,7 +253,7 @@ def make_config(kind: type[FitConfig], options: Mapping[str, object]) -> FitConf
         problems = []
         for detail in error.errors(include_url=False):
             element = ".".join(map(str, detail["loc"]))
-            expected = detail["msg"].removeprefix("Input should be ")
+            expected = expected_text(detail["msg"])
             problems.append(SettingsError(repr(detail["input"]), element=element, expected=expected))
         collect(problems)
         raise

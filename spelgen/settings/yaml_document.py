@@ -10,7 +10,7 @@ import yaml
 from yaml.composer import ComposerError
 
 from spelgen.errors import SettingsError
-from spelgen.files import require_regular_file
+from spelgen.files import read_bytes
 
 Location: TypeAlias = tuple[int | str, ...]
 """Keys and numbers of list items that lead to a place in a file."""
@@ -95,13 +95,9 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
 
 def read_document(path: Path) -> Document:
     """Return a small YAML file of one document; raises SettingsError where it is no such thing."""
+    content = read_bytes(path, SettingsError, "a YAML file", MAX_BYTES)
     try:
-        require_regular_file(path, SettingsError, "a YAML file")
-        if path.stat().st_size > MAX_BYTES:
-            raise SettingsError("a large file", file=path, expected=f"at most {MAX_BYTES} bytes")
-        return Document(path, _Loader(path.read_bytes().decode("utf-8")).get_single_node())
-    except OSError as error:
-        raise SettingsError(f"cannot be read ({error.strerror})", file=path) from error
+        return Document(path, _Loader(content.decode("utf-8")).get_single_node())
     except UnicodeDecodeError as error:
         raise SettingsError("bytes that are not UTF-8", file=path, expected="YAML text") from error
     except yaml.YAMLError as error:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-import stat
 from dataclasses import dataclass
 from pathlib import Path
 
 from lxml import etree
 
 from spelgen.errors import UrdfError, collect
+from spelgen.files import read_bytes
 from spelgen.urdf.xacro_input import Expansion, expand, is_xacro
 
 MAX_BYTES = 20_000_000
@@ -74,29 +74,9 @@ def read_document(path: Path) -> Document:
 
 
 def _expanded(path: Path) -> Expansion:
-    data = _bytes(path)
+    data = read_bytes(path, UrdfError, "a URDF file", MAX_BYTES, "keep meshes in files of their own")
     _refuse_damage(path, data)
     return expand(path, MAX_BYTES) if is_xacro(path) else Expansion(data, ())
-
-
-def _bytes(path: Path) -> bytes:
-    try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode):
-            raise UrdfError("no regular file", file=path, expected="a URDF file")
-        if status.st_size <= MAX_BYTES:
-            return path.read_bytes()
-    except FileNotFoundError:
-        raise UrdfError("no such file", file=path) from None
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise UrdfError(f"cannot be read ({reason})", file=path) from None
-    raise UrdfError(
-        f"a file of {status.st_size} bytes",
-        file=path,
-        expected=f"at most {MAX_BYTES}",
-        do="keep meshes in files of their own",
-    )
 
 
 def _line_of(data: bytes, position: int) -> int:
