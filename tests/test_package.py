@@ -1,10 +1,11 @@
-"""The package as users install it: a wheel, away from the repository."""
+"""The package as users install it: a wheel and an sdist, away from the repository, and what it depends on."""
 
 import os
 import pkgutil
+import re
 import subprocess
 import sys
-import zipfile
+from importlib.metadata import PackageNotFoundError, metadata, requires
 from pathlib import Path
 
 import pytest
@@ -17,19 +18,33 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory) -> Path:
-    """The unpacked wheel."""
-    pytest.importorskip("hatchling", reason="building the wheel needs hatchling")
-    folder = tmp_path_factory.mktemp("wheel")
-    command = ["-m", "pip", "wheel", "-qq", "--no-deps", "--no-build-isolation", "-w", str(folder), str(ROOT)]
-    subprocess.run([sys.executable, *command], check=True)
-    (wheel,) = folder.glob("*.whl")
-    with zipfile.ZipFile(wheel) as archive:
-        archive.extractall(folder / "site")
-    return folder / "site"
+    """Where pip installed a wheel of the checkout."""
+    return pip_install(ROOT, tmp_path_factory.mktemp("wheel") / "site")
+
+
+def pip_install(source: Path, site: Path) -> Path:
+    """Install a checkout, a wheel or an sdist, without what it depends on."""
+    pytest.importorskip("hatchling", reason="building the package needs hatchling")
+    options = ["-qq", "--no-deps", "--no-build-isolation", "--no-compile", "--target", str(site)]
+    subprocess.run([sys.executable, "-m", "pip", "install", *options, str(source)], check=True)
+    return site
+
+
+def files_of(site: Path) -> set[str]:
+    """What lies in an installation, but for what pip notes about its source."""
+    files = [path for path in site.rglob("*") if path.is_file() and path.parent.name != "bin"]
+    return {str(path.relative_to(site)) for path in files if path.name not in ("direct_url.json", "RECORD")}
+
+
+def test_an_sdist_installs_as_the_checkout_does(installed, tmp_path):
+    command = [sys.executable, "-m", "hatchling", "build", "--target", "sdist", "--directory", str(tmp_path)]
+    subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+    (sdist,) = tmp_path.glob("*.tar.gz")
+    assert files_of(pip_install(sdist, tmp_path / "site")) == files_of(installed)
 
 
 def test_wheel_holds_all_that_the_package_needs(installed):
-    files = {str(path.relative_to(installed)) for path in installed.rglob("*") if path.is_file()}
+    files = files_of(installed)
     source = [path for path in (ROOT / "spelgen").rglob("*") if path.is_file() and path.suffix != ".pyc"]
     assert {str(path.relative_to(ROOT)) for path in source} <= files
     templates = [path for path in (ROOT / "templates").rglob("*") if path.is_file()]
@@ -69,3 +84,65 @@ def test_objects_are_short_to_read(robots):
     for each in (arm, arm.inspect(), arm.verify(), arm.formulas((2, 2))):
         assert len(repr(each)) < 100
         assert each._repr_html_().count("<tr>") >= 2
+
+
+# ---- what it depends on
+
+
+def pinned(name: str) -> dict[str, str]:
+    """Versions of a file of requirements, each with a hash where the file has one."""
+    text = (ROOT / name).read_text()
+    blocks = re.findall(r"^([\w.-]+)==(\S+)((?: \\\n +--hash=sha256:[0-9a-f]{64})*)$", text, re.MULTILINE)
+    if name != "requirements-torch.txt":
+        assert all(hashes for _, _, hashes in blocks)
+    return {canonical(package): version for package, version, _ in blocks}
+
+
+def canonical(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def test_every_package_is_pinned_by_hash():
+    """And `make demo` installs what the package itself needs with Pinocchio, nothing of the other extras."""
+    demo, tools = pinned("requirements.txt"), pinned("requirements-tools.txt")
+    assert demo.items() <= tools.items()
+    assert not {"ray", "mujoco", "onnx", "casadi", "mkdocs", "mypy"} & set(demo)
+    needed = [re.match(r"[\w.-]+", line)[0] for line in requires("spelgen") if "extra ==" not in line]
+    assert {canonical(name) for name in needed} - {"torch"} <= set(demo)
+    everything = {canonical(re.match(r"[\w.-]+", line)[0]) for line in requires("spelgen")}
+    assert everything - {"torch"} <= set(tools)
+    assert list(pinned("requirements-torch.txt")) == ["torch"]
+
+
+def licence(package: str) -> str | None:
+    """What a package says of its licence; None where it is not installed."""
+    try:
+        about = metadata(package)
+    except PackageNotFoundError:
+        return None
+    named = [
+        line.rpartition(" :: ")[2] for line in about.get_all("Classifier", []) if line.startswith("License")
+    ]
+    short = (about.get("License") or "").strip()
+    first = about.get("License-Expression") or ", ".join(dict.fromkeys(named)) or short.split("\n")[0]
+    return first[:80] or "not said"
+
+
+def test_licences_of_dependencies_are_listed(request):
+    """`pytest --update` writes the list anew."""
+    packages = sorted({*pinned("requirements.txt"), *pinned("requirements-torch.txt")})
+    page = ROOT / "docs" / "licences.md"
+    if request.config.getoption("--update"):
+        head = page.read_text().partition("| package")[0]
+        rows = ["| package | licence |", "|---|---|", *(f"| {name} | {licence(name)} |" for name in packages)]
+        page.write_text(head + "\n".join(rows) + "\n")
+    listed = dict(re.findall(r"^\| ([\w.-]+) \| (.*) \|$", page.read_text(), re.MULTILINE))
+    listed.pop("package")
+    assert sorted(listed) == packages
+    for package, text in listed.items():
+        assert text == (licence(package) or text)
+        # what may not be combined with the Apache licence of this package, or forbids use
+        assert (
+            not re.search(r"\b(A?GPL|AGPL|proprietary|non-?commercial)", text, re.IGNORECASE)
+            or "LGPL" in text
+        )

@@ -173,6 +173,7 @@ class RunFolder:
         """checkpoint.pt, with the numbers that every one has. Raises RunError."""
         checkpoint = self.load_state(self.checkpoint)
         require(Checkpoint, checkpoint, self.checkpoint)
+        _require_finite(checkpoint["best_weights"], self.checkpoint)
         return checkpoint
 
     def load_state(self, path: Path) -> Content:
@@ -189,7 +190,6 @@ class RunFolder:
             ) from error
         if not isinstance(found, dict):
             raise RunError(type(found).__name__, file=path, expected="a file of `spelgen train`")
-        _require_finite(found, path)
         return found
 
     def load_module(self, *, trust: bool = False) -> EmittedModel:
@@ -215,17 +215,14 @@ def _require_unpacked_size(path: Path) -> None:
         raise ValueError(f"{size} bytes, expected at most {LARGEST_STATE}")
 
 
-def _require_finite(state: object, path: Path, name: str = "") -> None:
-    """Raise RunError for a tensor with a number that is none, or one that repeats a few numbers to fill the memory."""
-    if isinstance(state, dict):
-        for key, value in state.items():
-            _require_finite(value, path, str(key))
-    elif isinstance(state, list | tuple):
-        for value in state:
-            _require_finite(value, path, name)
-    elif isinstance(state, torch.Tensor):
-        repeated = state.numel() * state.element_size() > state.untyped_storage().nbytes()
-        if repeated or not state.isfinite().all():
+def _require_finite(weights: Content, path: Path) -> None:
+    """Raise RunError where a weight is no number: all that follows from it would be none."""
+    for name, tensor in weights.items():
+        if not isinstance(tensor, torch.Tensor):
+            continue
+        # the numbers that the file holds: a shape may repeat them to any size
+        stored = tensor.new_empty(0).set_(tensor.untyped_storage())
+        if not stored.isfinite().all():
             raise RunError(
                 "no finite numbers", file=path, element=name, expected="weights", do="start a new run"
             )
@@ -241,8 +238,10 @@ def write_state(path: Path, state: Content) -> None:
 def fitted_model(run: RunFolder, *, trust: bool = False) -> EmittedModel:
     """A run's module (see `RunFolder.load_module`) with its best weights."""
     model = run.load_module(trust=trust)
+    weights = run.load_state(run.weights)
+    _require_finite(weights, run.weights)
     try:
-        model.load_state_dict(run.load_state(run.weights))
+        model.load_state_dict(weights)
     except (RuntimeError, TypeError, AttributeError) as error:
         raise RunError("weights of another model", file=run.weights, do="start a new run") from error
     return model

@@ -1,0 +1,147 @@
+"""Logs and options as strangers send them: an answer, or one error that is ours; no warning of NumPy, no waiting."""
+
+import io
+import struct
+import time
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet
+import pytest
+
+from spelgen.building import build
+from spelgen.errors import LogError, SettingsError, SpelgenError
+from spelgen.exporting.exported import readme
+from spelgen.fitting.fit import fit
+from spelgen.loaded_arm import load_arm
+from spelgen.log_checks.check_logs import check_logs
+from spelgen.logs.read import read_logs
+from spelgen.logs.trajectory import Trajectory
+from spelgen.settings.fits import MomentumFit, Rollout, make_config
+
+JOINTS = ("joint1", "joint2")
+SAMPLES = 60
+
+
+@pytest.fixture(scope="module")
+def arm(robots):
+    return load_arm(robots / "two_link.urdf")
+
+
+def columns(t: object = None, scale: float = 1.0) -> dict[str, object]:
+    steps = np.arange(SAMPLES) / 60.0
+    found = {"t": steps if t is None else t}
+    for shift, quantity in enumerate(("q", "qd", "tau")):
+        for index, joint in enumerate(JOINTS):
+            found[f"{quantity}_{joint}"] = scale * np.sin(3 * steps + shift + index)
+    return found
+
+
+def parquet(times: object) -> Callable[[Path], Path]:
+    def write(folder: Path) -> Path:
+        pa.parquet.write_table(pa.table(columns(times)), folder / "log.parquet")
+        return folder / "log.parquet"
+
+    return write
+
+
+def npz(times: object, **more: object) -> Callable[[Path], Path]:
+    def write(folder: Path) -> Path:
+        np.savez(folder / "log.npz", **columns(times), **more)
+        return folder / "log.npz"
+
+    return write
+
+
+def npz_that_says_1e12_samples(folder: Path) -> Path:
+    buffer = io.BytesIO()
+    np.save(buffer, np.arange(SAMPLES) / 60.0)
+    head, _, body = buffer.getvalue().partition(b"\n")
+    head = head[10:].replace(b"(60,)", b"(1000000000000,)").rstrip().ljust(117) + b"\n"
+    path = npz(None)(folder)
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    members["t.npy"] = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head + body
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    return path
+
+
+def csv_of_a_long_name(folder: Path) -> Path:
+    (folder / "log.csv").write_text(",".join(["x" * 400_000, *list(columns())[1:]]) + "\n")
+    return folder / "log.csv"
+
+
+COUNTS = np.arange(SAMPLES)
+DATES = "column t: got dates beyond what nanoseconds count"
+LARGE = r"row \d+, column t: got 1e\+300 in SI units .* expected a number below 1e\+24"
+REPEATED = r"row 2, column t: .* \(59 such steps, this is the first\), expected increasing times"
+REFUSED = {
+    "stamps in a far year": (parquet(pa.array(2**62 + COUNTS, pa.timestamp("us"))), DATES),
+    "days in a far year": (parquet(pa.array((2**31 - 100 + COUNTS).astype("i4"), pa.date32())), DATES),
+    "times of 1e300": (npz(COUNTS * 1e300), LARGE),
+    "one time of 1e300": (npz(np.append(COUNTS[:-1] / 60.0, 1e300)), LARGE),
+    "times of 1e-300": (npz(COUNTS * 1e-300), REPEATED),
+    "denormal times": (npz(COUNTS * 5e-324), REPEATED),
+    "a header of 1e12 samples": (npz_that_says_1e12_samples, r"array t\.npy is larger than the file says"),
+    "a name of 400 kB": (csv_of_a_long_name, r"xxx\.\.\. \(\d+ characters\) \.\.\."),
+}
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("case", REFUSED)
+def test_logs_that_are_none_are_told_in_our_words(tmp_path, arm, case):
+    make, message = REFUSED[case]
+    with pytest.raises(LogError, match=message) as caught:
+        check_logs(read_logs(make(tmp_path), arm), arm)
+    assert len(str(caught.value)) < 5000
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("scale", [0.0, 1e-150, 1e-320])
+@pytest.mark.parametrize("config", [Rollout(epochs=1, momentum_steps=0), MomentumFit(momentum_steps=1)])
+def test_windows_without_motion_are_not_fitted(robots, scale, config):
+    t = COUNTS / 60.0
+    motion = scale * np.stack([np.sin(3 * t), np.cos(2 * t)], axis=1)
+    logs = [Trajectory(t, motion, motion, motion, name) for name in "ab"]
+    model = build(robots / "two_link.urdf", "minimal", width=8, depth=1)
+    with pytest.raises(SpelgenError):
+        fit(model, logs, config)
+
+
+def test_twenty_thousand_recordings_of_two_samples_take_seconds(tmp_path, arm):
+    count = 20_000
+    t = np.tile([0.0, 0.01], count)
+    steps = np.arange(2 * count) / 100.0
+    table = {"trajectory": np.repeat([f"motion{k}" for k in range(count)], 2), "t": t}
+    for shift, quantity in enumerate(("q", "qd", "tau")):
+        for index, joint in enumerate(JOINTS):
+            table[f"{quantity}_{joint}"] = np.sin(3 * steps + shift + index)
+    pa.parquet.write_table(pa.table(table), tmp_path / "log.parquet")
+    begin = time.process_time()
+    logs = read_logs(tmp_path / "log.parquet", arm)
+    assert len(logs) == count
+    check_logs(logs[: count // 4], arm)
+    assert time.process_time() - begin < 10
+
+
+def test_a_name_of_a_megabyte_on_every_row_is_kept_once(tmp_path, arm):
+    table = columns() | {"trajectory": pa.array(["x" * 10**6] * SAMPLES)}
+    pa.parquet.write_table(pa.table(table), tmp_path / "log.parquet")
+    (log,) = read_logs(tmp_path / "log.parquet", arm)
+    assert len(log) == SAMPLES
+
+
+def test_a_line_break_in_a_name_is_shown_as_one():
+    lines = readme("a\nb", "use\nit", ["j\r1", "j\u20282"], "as it is", "checked").decode().splitlines()
+    assert lines[:3] == [r"# a\nb", r"use\nit", r"Joints, in this order: j\r1, j\u20282."]
+
+
+def test_an_impossible_learning_rate_is_told_without_words_of_pydantic():
+    with pytest.raises(SettingsError) as caught:
+        make_config(Rollout, {"learning_rate": 1e30})
+    assert str(caught.value) == "learning_rate: got 1e+30, expected a number within +-1e+12"
