@@ -220,9 +220,11 @@ def _require_finite(weights: Content, path: Path) -> None:
     for name, tensor in weights.items():
         if not isinstance(tensor, torch.Tensor):
             continue
-        # the numbers that the file holds: a shape may repeat them to any size
-        stored = tensor.new_empty(0).set_(tensor.untyped_storage())
-        if not stored.isfinite().all():
+        stored = tensor.untyped_storage()
+        # a shape may repeat a few numbers to any size
+        if tensor.numel() * tensor.element_size() > stored.nbytes():
+            tensor = tensor.new_empty(0).set_(stored)
+        if not tensor.isfinite().all():
             raise RunError(
                 "no finite numbers", file=path, element=name, expected="weights", do="start a new run"
             )

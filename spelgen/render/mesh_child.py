@@ -46,12 +46,13 @@ def main(paths: list[Path], output: IO[bytes]) -> None:
         resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
     import trimesh
 
-    arrays: dict[str, np.ndarray] = {}
+    arrays: dict[str, Any] = {}
     faces = 0
     for index, path in enumerate(paths):
         kind = path.suffix.lower().lstrip(".")
         content = io.BytesIO(read(path))
-        mesh: Any = trimesh.load(content, file_type=kind, resolver=Neighbours(path.parent), force="mesh")
+        neighbours: Any = Neighbours(path.parent)
+        mesh: Any = trimesh.load(content, file_type=kind, resolver=neighbours, force="mesh")
         faces += len(mesh.faces)
         if not len(mesh.faces) or faces > FACES or not np.isfinite(mesh.vertices).all():
             raise ValueError(f"{path}: none or too many triangles, or corners that are no numbers")

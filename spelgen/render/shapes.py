@@ -135,7 +135,8 @@ def _mesh(geometry: yourdfpy.Geometry, files: Mapping[str, Trimesh]) -> Trimesh:
     if geometry.sphere is not None:
         sphere: Trimesh = trimesh.creation.uv_sphere(geometry.sphere.radius, count=[8, 10])
         return sphere
-    mesh = files[geometry.mesh.filename].copy()
+    mesh: Any = files[geometry.mesh.filename].copy()
     if geometry.mesh.scale is not None:
         mesh.apply_scale(geometry.mesh.scale)
-    return mesh
+    scaled: Trimesh = mesh
+    return scaled

@@ -68,9 +68,9 @@ def nominal(arm: Arm, structure: Structure) -> Nominal:
     _, potential = float_energies(arm, q, inertias)
     return Nominal(
         output_means=_rounded(outputs.mean(axis=0)),
-        output_scales=_rounded(np.maximum(outputs.std(axis=0), output_floor)),
+        output_scales=_rounded(np.maximum(outputs.std(axis=0), output_floor), least=0.0),
         constants=_rounded(constants),
-        constant_scales=_rounded(np.maximum(np.abs(constants), constant_floor)),
+        constant_scales=_rounded(np.maximum(np.abs(constants), constant_floor), least=0.0),
         potential_scale=_round(max(float(potential.std()), 1e-3), _DIGITS),
         joint_torque=_rounded(np.hypot(torque, inertial)),
         mass_sensitivities=_sensitivities(_mass_changes(arm, q, inertias, typical)),
@@ -96,7 +96,10 @@ def _mass_samples(arm: Arm, q: np.ndarray) -> tuple[np.ndarray, bool]:
     """Return lower triangles of M at ``q``, and whether the URDF's inertials gave them."""
     if arm.has_inertials:
         mass, _ = float_energies(arm, q, nominal_inertias(arm, True))
-        if _least_eigenvalue(mass, mass.mean(axis=0), q.shape[1]) > 1e-6:
+        rows, columns = np.tril_indices(q.shape[1])
+        lightest = mass.mean(axis=0)[rows == columns].min()
+        # a joint that carries 1e-12 kg carries a placeholder, which rounding takes for zero
+        if lightest > 1e-11 and _least_eigenvalue(mass, mass.mean(axis=0), q.shape[1]) > 1e-6:
             return mass, True
     mass, _ = float_energies(arm, q, nominal_inertias(arm, False))
     return mass, False
@@ -181,12 +184,15 @@ def _matrix(structure: Structure, reads: Sequence[Weights]) -> np.ndarray:
     return matrix
 
 
-def _rounded(values: np.ndarray, digits: int = _DIGITS) -> tuple[float, ...]:
-    return tuple(_round(value, digits) for value in values.tolist())
+def _rounded(values: np.ndarray, digits: int = _DIGITS, least: float = 1e-12) -> tuple[float, ...]:
+    return tuple(_round(value, digits, least) for value in values.tolist())
 
 
-def _round(value: float, digits: int) -> float:
-    """Return a number of so many significant digits, so that it is the same on every machine."""
-    if abs(value) < 1e-12:
+def _round(value: float, digits: int, least: float = 1e-12) -> float:
+    """Return a number of so many significant digits, so that it is the same on every machine; 0 for a smaller one.
+
+    What models divide by, as an arm of 1e-12 kg gives, has no least.
+    """
+    if abs(value) <= least:
         return 0.0
     return round(value, digits - 1 - floor(log10(abs(value))))
