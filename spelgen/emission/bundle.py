@@ -31,7 +31,7 @@ class Runtime:
 
 
 def bundle(tailored: str) -> tuple[str, str]:
-    """The imports, and the runtime's definitions, that the source text ``tailored`` needs."""
+    """Return the imports, and the runtime's definitions, that the source text ``tailored`` needs."""
     runtime = load_runtime()
     tree = ast.parse(tailored)
     # a kind of part, such as Network, is in a module the class of its own part
@@ -40,15 +40,15 @@ def bundle(tailored: str) -> tuple[str, str]:
     waiting = list(used)
     while waiting:
         name = waiting.pop()
-        definition = None if name in defined_here else runtime.definitions.get(name)
-        new = definition.uses - used if definition else frozenset()
+        if name in defined_here or name not in runtime.definitions:
+            continue
+        new = runtime.definitions[name].uses - used
         used |= new
         waiting += new
-    texts = [
-        definition.text
-        for name, definition in runtime.definitions.items()
-        if name in used and name not in defined_here
-    ]
+    texts = []
+    for name, definition in runtime.definitions.items():
+        if name in used and name not in defined_here:
+            texts.append(definition.text)
     return _imports(used, runtime.imports), "\n\n\n".join(texts)
 
 

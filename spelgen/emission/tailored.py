@@ -44,16 +44,27 @@ def bases(spec: ModelSpec) -> str:
     return f"{dynamics}, MotorInput" if spec.inputs else dynamics
 
 
-def roles(spec: ModelSpec) -> list[tuple[str, str]]:
-    """The class of each kind of part that the model has, by the name that the runtime has for the kind."""
-    pairs = [("Network", "MaskedKAN" if spec.design.net == "kan" else "MaskedMLP")]
-    if not spec.bodies:
-        mass = "DenseMass" if spec.design.mass == "dense-3n" else "DerivedMass"
-        if mass == "DerivedMass" and not spec.outputs:
-            mass = "ConstantMass"
-        friction = "JointFriction" if spec.design.dissipation == "per-joint" else "DenseFriction"
-        pairs += [("Mass", mass), ("Friction", friction)]
-    return pairs[1:] if spec.design.net == "none" else pairs
+def roles(spec: ModelSpec) -> dict[str, str]:
+    """Return the type of each kind of part that the model has, by the name that the runtime has for the kind."""
+    prefix = "KAN" if spec.design.net == "kan" else "MLP"
+    layers, residuals = f"{prefix}Layers", f"{prefix}Residuals"
+    network = {"Network": f"Masked{prefix}", "Layers": layers, "NetworkResiduals": residuals}
+    if spec.bodies:
+        rigid = {"Pose": "Motion", "Prepared": "RigidPrepared", "MassResiduals": "object"}
+        if spec.design.net == "none":
+            return rigid
+        return network | rigid | {"MassResiduals": "FunctionResiduals | None"}
+    mass = ("DerivedMass", f"tuple[{layers}, bool]", f"tuple[{residuals}, Tensor]")
+    if spec.design.mass == "dense-3n":
+        mass = ("DenseMass", layers, "DenseResiduals")
+    elif not spec.outputs:
+        mass = ("ConstantMass", "Tensor", "object")
+    friction = ("DenseFriction", layers)
+    if spec.design.dissipation == "per-joint":
+        friction = ("JointFriction", "FrictionLayers")
+    pairs = {"Pose": "Tensor", "Prepared": "NetworkPrepared"}
+    pairs |= dict(zip(("Mass", "MassPrepared", "MassResiduals"), mass, strict=True))
+    return network | pairs | dict(zip(("Friction", "FrictionPrepared"), friction, strict=True))
 
 
 def parts(spec: ModelSpec) -> tuple[str, str]:

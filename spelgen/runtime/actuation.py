@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor, nn
 
 from spelgen.runtime.joints import Joints
 from spelgen.runtime.network_dynamics import NetworkDynamics, NetworkPrepared
-from spelgen.runtime.parts import Friction, Mass, Network
+from spelgen.runtime.parts import Friction, Mass, Network, Pose, Prepared
 from spelgen.runtime.port_hamiltonian import PortHamiltonian, solved
 
 
@@ -46,11 +44,11 @@ class MotorInput(PortHamiltonian):
         """Return G, (..., n, n)."""
         return self.gains().expand(*q.shape, -1)
 
-    def input_force(self, pose: Any, qd: Tensor, tau: Tensor, prepared: Any) -> Tensor:
+    def input_force(self, pose: Pose, qd: Tensor, tau: Tensor, prepared: Prepared) -> Tensor:
         """Return G tau, (..., n) [Nm, N]."""
         return tau @ self.gains().mT
 
-    def input_torque(self, pose: Any, qd: Tensor, force: Tensor, prepared: Any) -> Tensor:
+    def input_torque(self, pose: Pose, qd: Tensor, force: Tensor, prepared: Prepared) -> Tensor:
         """Return the inputs, (..., n), that make this force; a passive joint shows the torque it lacks."""
         return solved(self.gains() + torch.diag(1 - self.actuated), force)
 

@@ -38,10 +38,10 @@ class ConstantMass(nn.Module):
         """M, for each state."""
         return prepared.expand(*encoded.shape[:-1], self.n, self.n), None
 
-    def kinetic_vjp(self, encoded: Tensor, qd: Tensor, residuals: None) -> Tensor:
+    def kinetic_vjp(self, encoded: Tensor, qd: Tensor, residuals: object) -> Tensor:
         """The derivative of 1/2 qd^T M qd by the encoding: zero."""
         return torch.zeros_like(encoded)
 
-    def jvp(self, rate: Tensor, residuals: None) -> Tensor:
+    def jvp(self, rate: Tensor, residuals: object) -> Tensor:
         """dM/dt, (..., n, n): zero."""
         return rate.new_zeros(*rate.shape[:-1], self.n, self.n)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor, nn
 
 from spelgen.runtime.joints import Joints, vector
-from spelgen.runtime.parts import Network
+from spelgen.runtime.parts import Layers, Network
 
 FACTOR_START = 0.35  # diagonal of L, relative to the root of the joints' usual friction by speed
 
@@ -37,22 +35,22 @@ class DenseFriction(nn.Module):
         self.start = nn.Buffer(FACTOR_START * torch.eye(rows).double()[moving])
         self.network = network
 
-    def prepare(self) -> Any:
+    def prepare(self) -> Layers:
         """The network's weights made ready for many states."""
         size = torch.sqrt(self.nominal / self.speed).unsqueeze(-1)
         output_map = (size.unsqueeze(-1) * self.entries).flatten(0, 1)
         return self.network.prepare(output_map, (size * self.start).flatten())
 
-    def _factor(self, encoded: Tensor, qd: Tensor, layers: Any) -> Tensor:
+    def _factor(self, encoded: Tensor, qd: Tensor, layers: Layers) -> Tensor:
         rows = self.network.forward(torch.cat([encoded, qd / self.speed], dim=-1), layers)[0]
         return rows.reshape(*qd.shape[:-1], *self.start.shape)
 
-    def forward(self, encoded: Tensor, qd: Tensor, layers: Any) -> Tensor:
+    def forward(self, encoded: Tensor, qd: Tensor, layers: Layers) -> Tensor:
         """The friction torque D qd, (..., n) [Nm, N]."""
         factor = self._factor(encoded, qd, layers)
         return (factor @ (factor.mT @ qd.unsqueeze(-1))).squeeze(-1)
 
-    def dissipation(self, encoded: Tensor, qd: Tensor, layers: Any) -> Tensor:
+    def dissipation(self, encoded: Tensor, qd: Tensor, layers: Layers) -> Tensor:
         """D, (..., n, n)."""
         factor = self._factor(encoded, qd, layers)
         return factor @ factor.mT

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from spelgen.runtime.joints import Joints, vector
-from spelgen.runtime.parts import Network
+from spelgen.runtime.parts import Layers, Network, NetworkResiduals
 
 
 class DenseResiduals(NamedTuple):
     """What M's derivatives need of the work done for M."""
 
-    network: Any
+    network: NetworkResiduals
     factor: Tensor  # U
     moved: Tensor  # U^-1 A, with A the moving columns of C^-1
     scale: Tensor  # e
@@ -63,11 +63,11 @@ class DenseMass(nn.Module):
         self.start = nn.Buffer(start)
         self.network = network
 
-    def prepare(self, definite: bool = True) -> Any:
+    def prepare(self, definite: bool = True) -> Layers:
         """The network's weights made ready for many states."""
         return self.network.prepare(torch.diag(0 * self.start + 1), self.start)
 
-    def inverse(self, encoded: Tensor, prepared: Any) -> Tensor:
+    def inverse(self, encoded: Tensor, prepared: Layers) -> Tensor:
         """M^-1 over all three axes of every joint, of which z moves; (..., 3 n, 3 n)."""
         factor, scale = self._factor(self.network.forward(encoded, prepared)[0])
         lower = self.nominal @ (factor + torch.eye(self.size).to(factor))
@@ -89,7 +89,7 @@ class DenseMass(nn.Module):
         solution: Tensor = torch.linalg.solve_triangular(factor, right, upper=upper, unitriangular=True)
         return solution
 
-    def forward(self, encoded: Tensor, prepared: Any) -> tuple[Tensor, DenseResiduals]:
+    def forward(self, encoded: Tensor, prepared: Layers) -> tuple[Tensor, DenseResiduals]:
         """M(q), and what its derivatives need."""
         raw, residuals = self.network.forward(encoded, prepared)
         factor, scale = self._factor(raw)

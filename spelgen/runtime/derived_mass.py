@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from spelgen.runtime.armature import Armature
 from spelgen.runtime.joints import Joints, Pairs, vector
-from spelgen.runtime.parts import Network
+from spelgen.runtime.parts import Layers, Network, NetworkResiduals
 from spelgen.runtime.regularisation import PositiveDefiniteBound
 from spelgen.runtime.symmetric import Entries
 
@@ -52,7 +50,7 @@ class DerivedMass(nn.Module):
         constants = F.pad(self.constants().unsqueeze(-1), (len(functions), 0))
         return self.entries(functions.unbind(), constants.unbind())
 
-    def prepare(self, definite: bool = True) -> tuple[Any, bool]:
+    def prepare(self, definite: bool = True) -> tuple[Layers, bool]:
         """Return the network's layers, which give M's entries; ``definite``: keep M positive definite."""
         rows = self._by_outputs()
         offset = rows[-1] + torch.diag(self.rotors.forward())
@@ -62,7 +60,9 @@ class DerivedMass(nn.Module):
         """(..., n n) as (..., n, n)."""
         return rows.reshape(*rows.shape[:-1], *self.bound.center.shape)
 
-    def forward(self, encoded: Tensor, prepared: tuple[Any, bool]) -> tuple[Tensor, Any]:
+    def forward(
+        self, encoded: Tensor, prepared: tuple[Layers, bool]
+    ) -> tuple[Tensor, tuple[NetworkResiduals, Tensor]]:
         """Return M(q), what the network's derivatives need, and how much of its changes M takes."""
         layers, definite = prepared
         rows, residuals = self.network.forward(encoded, layers)
@@ -70,14 +70,14 @@ class DerivedMass(nn.Module):
         mass, fraction = self.bound.forward(mass) if definite else (mass, torch.ones_like(mass[..., 0, 0]))
         return mass, (residuals, fraction)
 
-    def kinetic_vjp(self, encoded: Tensor, qd: Tensor, residuals: Any) -> Tensor:
+    def kinetic_vjp(self, encoded: Tensor, qd: Tensor, residuals: tuple[NetworkResiduals, Tensor]) -> Tensor:
         """Return the derivative of 1/2 qd^T M(q) qd by the encoding."""
         network, fraction = residuals
         half = 0.5 * fraction.unsqueeze(-1) * qd
         by_encoded: Tensor = self.network.vjp(network, (half.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2))
         return by_encoded
 
-    def jvp(self, rate: Tensor, residuals: Any) -> Tensor:
+    def jvp(self, rate: Tensor, residuals: tuple[NetworkResiduals, Tensor]) -> Tensor:
         """Return dM/dt, (..., n, n), where the encoding changes at this rate."""
         network, fraction = residuals
         moved: Tensor = fraction[..., None, None] * self._square(self.network.jvp(network, rate))

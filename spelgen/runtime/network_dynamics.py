@@ -9,16 +9,23 @@ from torch import Tensor, nn
 
 from spelgen.runtime.encoding import JointEncoding
 from spelgen.runtime.joints import Joints
-from spelgen.runtime.parts import Friction, Mass, Network
+from spelgen.runtime.parts import (
+    Friction,
+    FrictionPrepared,
+    Mass,
+    MassPrepared,
+    MassResiduals,
+    Network,
+)
 from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied
 
 
 class NetworkPrepared(NamedTuple):
     """What depends on the weights alone, by part."""
 
-    mass: Any
-    potential: Any
-    friction: Any
+    mass: MassPrepared
+    potential: Any  # a network's layers, or None
+    friction: FrictionPrepared
     input: Any = None
 
 
@@ -32,12 +39,8 @@ class NetworkDynamics(PortHamiltonian):
         self, joints: Joints, mass: Mass, potential: Network | None, scale: float, friction: Friction
     ) -> None:
         super().__init__(joints)
-        self.encoding, self.mass, self.potential, self.friction = (
-            JointEncoding(joints),
-            mass,
-            potential,
-            friction,
-        )
+        self.encoding, self.mass = JointEncoding(joints), mass
+        self.potential, self.friction = potential, friction
         self.scale = nn.Buffer(torch.full((1, 1), scale, dtype=torch.float64))
 
     def prepare(self, definite: bool = True) -> NetworkPrepared:
@@ -49,7 +52,7 @@ class NetworkDynamics(PortHamiltonian):
         """Return what networks read of q."""
         return self.encoding.forward(q)
 
-    def mass_at(self, pose: Tensor, prepared: NetworkPrepared) -> tuple[Tensor, Any]:
+    def mass_at(self, pose: Tensor, prepared: NetworkPrepared) -> tuple[Tensor, MassResiduals]:
         """Return M(q), (..., n, n), and what its derivatives need."""
         return self.mass.forward(pose, prepared.mass)
 
@@ -71,12 +74,14 @@ class NetworkDynamics(PortHamiltonian):
         return self.encoding.vjp(pose, kinetic)
 
     def lagrangian_gradient(
-        self, pose: Tensor, qd: Tensor, residuals: Any, prepared: NetworkPrepared
+        self, pose: Tensor, qd: Tensor, residuals: MassResiduals, prepared: NetworkPrepared
     ) -> Tensor:
         """Return d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
         return self._downhill(pose, self.mass.kinetic_vjp(pose, qd, residuals), prepared)
 
-    def nonlinear_at(self, pose: Tensor, qd: Tensor, residuals: Any, prepared: NetworkPrepared) -> Tensor:
+    def nonlinear_at(
+        self, pose: Tensor, qd: Tensor, residuals: MassResiduals, prepared: NetworkPrepared
+    ) -> Tensor:
         """Return dM/dt qd - d/dq (1/2 qd^T M qd) + dV/dq, (..., n)."""
         mass_rate = self.mass.jvp(self.encoding.jvp(pose, qd), residuals)
         return applied(mass_rate, qd) - self.lagrangian_gradient(pose, qd, residuals, prepared)

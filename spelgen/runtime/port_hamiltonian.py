@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from spelgen.runtime.joints import Joints, vector
+from spelgen.runtime.parts import MassResiduals, Pose, Prepared
 
 
 def solved(matrix: Tensor, right: Tensor) -> Tensor:
@@ -45,27 +45,28 @@ class PortHamiltonian(nn.Module):
     joint_types: tuple[str, ...]  # "revolute" or "prismatic"
     elements = 0  # K, the numbers of friction's state at a joint
     # networks and rigid bodies have these each of their own
-    prepare: Callable[..., Any]
-    configuration: Callable[[Tensor, Any], Any]  # of q
-    mass_at: Callable[[Any, Any], tuple[Tensor, Any]]  # M, and the residuals that its derivatives need
-    energy_at: Callable[[Any, Any], Tensor]  # V, (...) [J]
-    gravity_at: Callable[[Any, Any], Tensor]  # dV/dq
-    lagrangian_gradient: Callable[[Any, Tensor, Any, Any], Tensor]  # d/dq of 1/2 qd^T M qd - V
-    nonlinear_at: Callable[[Any, Tensor, Any, Any], Tensor]  # Coriolis, centrifugal and gravity torque
+    prepare: Callable[..., Prepared]
+    configuration: Callable[[Tensor, Prepared], Pose]  # of q
+    mass_at: Callable[[Pose, Prepared], tuple[Tensor, MassResiduals]]  # M, and what its derivatives need
+    energy_at: Callable[[Pose, Prepared], Tensor]  # V, (...) [J]
+    gravity_at: Callable[[Pose, Prepared], Tensor]  # dV/dq
+    # d/dq of 1/2 qd^T M qd - V; then the Coriolis, centrifugal and gravity torque
+    lagrangian_gradient: Callable[[Pose, Tensor, MassResiduals, Prepared], Tensor]
+    nonlinear_at: Callable[[Pose, Tensor, MassResiduals, Prepared], Tensor]
     friction_at: Callable[..., Tensor]  # D(q, qd) qd
-    dissipation_at: Callable[[Any, Tensor, Any], Tensor]  # D, (..., n, n)
+    dissipation_at: Callable[[Pose, Tensor, Prepared], Tensor]  # D, (..., n, n)
 
     def __init__(self, joints: Joints) -> None:
         super().__init__()
         # 1 where a joint is driven, 0 where it is passive
         self.actuated = nn.Buffer(vector(float(x) for x in joints.actuated))
 
-    def at(self, q: Tensor, prepared: Any = None) -> tuple[Any, Any]:
+    def at(self, q: Tensor, prepared: Prepared | None = None) -> tuple[Pose, Prepared]:
         """Return the pose at q, and what depends on the weights alone."""
         prepared = self.prepare() if prepared is None else prepared
         return self.configuration(q, prepared), prepared
 
-    def mass_matrix(self, q: Tensor, prepared: Any = None) -> Tensor:
+    def mass_matrix(self, q: Tensor, prepared: Prepared | None = None) -> Tensor:
         """Return M(q), (..., n, n) [kg m^2, kg m, kg]."""
         return self.mass_at(*self.at(q, prepared))[0]
 
@@ -96,19 +97,19 @@ class PortHamiltonian(nn.Module):
         """Return G(q), (..., n, n): an input is the torque of its own joint, none of a passive one."""
         return torch.diag(self.actuated).expand(*q.shape, -1)
 
-    def input_force(self, pose: Any, qd: Tensor, tau: Tensor, prepared: Any) -> Tensor:
+    def input_force(self, pose: Pose, qd: Tensor, tau: Tensor, prepared: Prepared) -> Tensor:
         """Return G tau, (..., n) [Nm, N]."""
         return self.actuated * tau
 
-    def input_torque(self, pose: Any, qd: Tensor, force: Tensor, prepared: Any) -> Tensor:
+    def input_torque(self, pose: Pose, qd: Tensor, force: Tensor, prepared: Prepared) -> Tensor:
         """Return the tau, (..., n), that makes this force; a passive joint shows the torque it lacks."""
         return force
 
-    def momentum(self, q: Tensor, qd: Tensor, prepared: Any = None) -> Tensor:
+    def momentum(self, q: Tensor, qd: Tensor, prepared: Prepared | None = None) -> Tensor:
         """Return p = M(q) qd, (..., n)."""
         return applied(self.mass_matrix(q, prepared), qd)
 
-    def velocity(self, q: Tensor, p: Tensor, prepared: Any = None) -> Tensor:
+    def velocity(self, q: Tensor, p: Tensor, prepared: Prepared | None = None) -> Tensor:
         """Return qd = M(q)^-1 p, (..., n)."""
         return solved(self.mass_matrix(q, prepared), p)
 
@@ -131,7 +132,7 @@ class PortHamiltonian(nn.Module):
         return self.input_torque(pose, qd, force + self.friction_at(pose, qd, prepared, *state), prepared)
 
     def port_hamiltonian_rhs(
-        self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Any, *state: Tensor | None
+        self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Prepared, *state: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         """Return q' and p', (..., n), under the input tau; without one, of the arm left to itself."""
         pose = self.configuration(q, prepared)

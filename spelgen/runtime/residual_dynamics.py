@@ -10,9 +10,9 @@ from torch import Tensor, nn
 from spelgen.runtime.encoding import JointEncoding
 from spelgen.runtime.joint_functions import JointFunctions, JointFunctionWeights
 from spelgen.runtime.joints import Joints, Rows
-from spelgen.runtime.parts import Network
+from spelgen.runtime.parts import MassResiduals, Network
 from spelgen.runtime.port_hamiltonian import applied
-from spelgen.runtime.residual_mass import ResidualMass
+from spelgen.runtime.residual_mass import ResidualMass, ResidualMassPrepared
 from spelgen.runtime.rigid_body import Bodies, Row
 from spelgen.runtime.rigid_body_dynamics import Motion, RigidBodyDynamics, RigidPrepared
 
@@ -20,8 +20,8 @@ from spelgen.runtime.rigid_body_dynamics import Motion, RigidBodyDynamics, Rigid
 class ResidualPrepared(NamedTuple):
     """What depends on the weights alone."""
 
-    mass: Any
-    potential: Any
+    mass: ResidualMassPrepared
+    potential: Any  # a network's layers, or None
     functions: JointFunctionWeights
 
 
@@ -78,7 +78,7 @@ class ResidualDynamics(RigidBodyDynamics):
         functions = self.joint_functions.forward(q, prepared.residual.functions)
         return ResidualMotion(q, self.encoding.forward(q), *functions)
 
-    def mass_at(self, pose: Motion, prepared: RigidPrepared) -> tuple[Tensor, Any]:
+    def mass_at(self, pose: Motion, prepared: RigidPrepared) -> tuple[Tensor, MassResiduals]:
         """Return M(q), (..., n, n), and what its derivatives need."""
         mass = super().mass_at(pose, prepared)[0]
         if self.residual_mass is None:
@@ -105,7 +105,7 @@ class ResidualDynamics(RigidBodyDynamics):
         return pose.gravity - self._gradient(pose.residual, kinetic, prepared)
 
     def lagrangian_gradient(
-        self, pose: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared
+        self, pose: Motion, qd: Tensor, residuals: MassResiduals, prepared: RigidPrepared
     ) -> Tensor:
         """Return d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
         gradient = super().lagrangian_gradient(pose, qd, None, prepared)
@@ -114,7 +114,9 @@ class ResidualDynamics(RigidBodyDynamics):
         kinetic = self.residual_mass.kinetic_vjp(pose.residual.encoded, qd, residuals)
         return gradient + self._gradient(pose.residual, kinetic, prepared)
 
-    def nonlinear_at(self, pose: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
+    def nonlinear_at(
+        self, pose: Motion, qd: Tensor, residuals: MassResiduals, prepared: RigidPrepared
+    ) -> Tensor:
         """Return the torque that holds qd steady without friction, (..., n)."""
         torque = super().nonlinear_at(pose, qd, None, prepared)
         if self.residual_mass is None:
@@ -133,7 +135,9 @@ class ResidualDynamics(RigidBodyDynamics):
         """The laws' friction of the drives as it is at this position, (..., n)."""
         return friction if self.residual_mass is None else pose.residual.factor * friction
 
-    def _nonlinear(self, read: ResidualMotion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
+    def _nonlinear(
+        self, read: ResidualMotion, qd: Tensor, residuals: MassResiduals, prepared: RigidPrepared
+    ) -> Tensor:
         """dR/dt qd - d/dq of what the residuals add to 1/2 qd^T M(q) qd - V(q), (..., n)."""
         rate = self.encoding.jvp(read.encoded, qd)
         assert self.residual_mass is not None

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from spelgen.runtime.joints import Joints, blocks
-from spelgen.runtime.parts import Network
+from spelgen.runtime.parts import Network, NetworkResiduals
 from spelgen.runtime.port_hamiltonian import applied, combined
 from spelgen.runtime.symmetric import Entries
 
@@ -23,6 +23,14 @@ class ResidualMassPrepared(NamedTuple):
     layers: Any  # of the network
     functions: Tensor  # what each function adds to M at its largest, (functions, n n)
     constant: Tensor  # what the constants add, (n n,)
+
+
+class FunctionResiduals(NamedTuple):
+    """What the derivatives of R's functions need."""
+
+    network: NetworkResiduals
+    slope: Tensor  # of the functions by the network's outputs
+    functions: Tensor  # what each adds to M at its largest
 
 
 class ResidualMass(nn.Module):
@@ -71,31 +79,35 @@ class ResidualMass(nn.Module):
             layers = self.network.prepare(identity, rows.new_zeros(self.functions))
         return ResidualMassPrepared(layers, functions, self.raw_constants.tanh() @ constants)
 
-    def forward(self, encoded: Tensor, prepared: ResidualMassPrepared) -> tuple[Tensor, Any]:
+    def forward(
+        self, encoded: Tensor, prepared: ResidualMassPrepared
+    ) -> tuple[Tensor, FunctionResiduals | None]:
         """R(q), and what its derivatives need."""
         if self.network is None:
             return self._square(prepared.constant).expand(*encoded.shape[:-1], -1, -1), None
         y, residuals = self.network.forward(encoded, prepared.layers)
         height = y.tanh()
         rows = F.linear(height, prepared.functions.mT, prepared.constant)
-        return self._square(rows), (residuals, 1 - height * height, prepared.functions)
+        return self._square(rows), FunctionResiduals(residuals, 1 - height * height, prepared.functions)
 
     def _square(self, rows: Tensor) -> Tensor:
         """(..., n n) as (..., n, n)."""
         return rows.reshape(*rows.shape[:-1], self.n, self.n)
 
-    def coriolis(self, rate: Tensor, qd: Tensor, residuals: Any) -> tuple[Tensor, Tensor]:
+    def coriolis(
+        self, rate: Tensor, qd: Tensor, residuals: FunctionResiduals | None
+    ) -> tuple[Tensor, Tensor]:
         """dR/dt qd, (..., n), where the encoding changes at this rate, and what ``kinetic_vjp`` gives."""
-        if self.network is None:
+        if self.network is None or residuals is None:
             return torch.zeros_like(qd), torch.zeros_like(rate)
         network, slope, functions = residuals
         moved = self._moved(qd, functions)
         by_encoded = self.network.vjp(network, 0.5 * slope * applied(moved, qd))
         return combined(slope * self.network.jvp(network, rate), moved), by_encoded
 
-    def kinetic_vjp(self, encoded: Tensor, qd: Tensor, residuals: Any) -> Tensor:
+    def kinetic_vjp(self, encoded: Tensor, qd: Tensor, residuals: FunctionResiduals | None) -> Tensor:
         """The derivative of 1/2 qd^T R(q) qd by the encoding."""
-        if self.network is None:
+        if self.network is None or residuals is None:
             return torch.zeros_like(encoded)
         network, slope, functions = residuals
         by_encoded: Tensor = self.network.vjp(network, 0.5 * slope * applied(self._moved(qd, functions), qd))

@@ -11,6 +11,7 @@ from spelgen.runtime.armature import Armature
 from spelgen.runtime.body_chain import BodyChain, Chain
 from spelgen.runtime.friction_laws import FrictionConstants, FrictionLaws
 from spelgen.runtime.joints import Joints, Rows
+from spelgen.runtime.parts import MassResiduals
 from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied, combined
 from spelgen.runtime.rigid_body import Bodies, InertialParameters, Row, block_diagonal, inertia_basis
 
@@ -109,7 +110,7 @@ class RigidBodyDynamics(PortHamiltonian):
         momenta = chain.twists @ prepared.inertia
         return Motion(chain, momenta, applied(momenta, chain.weight))
 
-    def mass_at(self, pose: Motion, prepared: RigidPrepared) -> tuple[Tensor, Any]:
+    def mass_at(self, pose: Motion, prepared: RigidPrepared) -> tuple[Tensor, MassResiduals]:
         """Return M(q), (..., n, n)."""
         return pose.momenta @ pose.chain.twists.mT + prepared.armature, None
 
@@ -122,7 +123,7 @@ class RigidBodyDynamics(PortHamiltonian):
         return pose.gravity
 
     def lagrangian_gradient(
-        self, pose: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared
+        self, pose: Motion, qd: Tensor, residuals: MassResiduals, prepared: RigidPrepared
     ) -> Tensor:
         """Return d/dq of 1/2 qd^T M(q) qd - V(q), (..., n).
 
@@ -132,7 +133,9 @@ class RigidBodyDynamics(PortHamiltonian):
         momenta = self.chain.at_base(pose.chain, combined(qd, pose.momenta))
         return self.chain.by_joints(self.chain.turning(pose.chain, qd)[1], momenta) - pose.gravity
 
-    def nonlinear_at(self, pose: Motion, qd: Tensor, residuals: Any, prepared: RigidPrepared) -> Tensor:
+    def nonlinear_at(
+        self, pose: Motion, qd: Tensor, residuals: MassResiduals, prepared: RigidPrepared
+    ) -> Tensor:
         """Return the torque that holds qd steady without friction, (..., n), by Newton and Euler."""
         return self.chain.steady_torque(pose.chain, qd, pose.momenta)
 

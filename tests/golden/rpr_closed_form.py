@@ -70,6 +70,9 @@ def make_parts(seed: int) -> tuple[Joints, Bodies, Row, Rows, Rows]:
 
 
 # what the parts of this arm's model are
+Pose = Motion
+Prepared = RigidPrepared
+MassResiduals = object
 
 
 class Model(RigidBodyDynamics):

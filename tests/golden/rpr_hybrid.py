@@ -94,6 +94,11 @@ def make_parts(seed: int) -> tuple[Joints, Bodies, Row, Rows, Rows, ResidualMass
 
 # what the parts of this arm's model are
 Network = MaskedMLP
+Layers = MLPLayers
+NetworkResiduals = MLPResiduals
+Pose = Motion
+Prepared = RigidPrepared
+MassResiduals = FunctionResiduals | None
 
 
 class Model(ResidualDynamics):

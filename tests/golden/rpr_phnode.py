@@ -80,8 +80,15 @@ def make_parts(seed: int) -> tuple[Joints, Mass, Network, float, Friction, Netwo
 
 # what the parts of this arm's model are
 Network = MaskedMLP
+Layers = MLPLayers
+NetworkResiduals = MLPResiduals
+Pose = Tensor
+Prepared = NetworkPrepared
 Mass = DenseMass
+MassPrepared = MLPLayers
+MassResiduals = DenseResiduals
 Friction = DenseFriction
+FrictionPrepared = MLPLayers
 
 
 class Model(DenseInput):

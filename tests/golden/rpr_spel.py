@@ -84,8 +84,15 @@ def make_parts(seed: int) -> tuple[Joints, Mass, Network, float, Friction]:
 
 # what the parts of this arm's model are
 Network = MaskedMLP
+Layers = MLPLayers
+NetworkResiduals = MLPResiduals
+Pose = Tensor
+Prepared = NetworkPrepared
 Mass = DerivedMass
+MassPrepared = tuple[MLPLayers, bool]
+MassResiduals = tuple[MLPResiduals, Tensor]
 Friction = DenseFriction
+FrictionPrepared = MLPLayers
 
 
 class Model(NetworkDynamics):

@@ -84,8 +84,15 @@ def make_parts(seed: int) -> tuple[Joints, Mass, Network, float, Friction]:
 
 # what the parts of this arm's model are
 Network = MaskedKAN
+Layers = KANLayers
+NetworkResiduals = KANResiduals
+Pose = Tensor
+Prepared = NetworkPrepared
 Mass = DerivedMass
+MassPrepared = tuple[KANLayers, bool]
+MassResiduals = tuple[KANResiduals, Tensor]
 Friction = DenseFriction
+FrictionPrepared = KANLayers
 
 
 class Model(NetworkDynamics):
