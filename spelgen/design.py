@@ -30,7 +30,7 @@ class Design:
     derived: by the arm's structure. dense: as if nothing were known of the arm (Wang et al., Sci Rep
     15:33179, 2025, and Duong et al., IEEE T-RO 40:3695, 2024), over all three axes of each joint where it
     says 3n. closed-form: that of rigid bodies with trained inertial parameters, and networks for
-    what those leave, if any. constants: friction's laws with
+    residual terms, if any. constants: friction's laws with
     trained constants. Raises SettingsError for a combination that stands for no model.
     """
 

@@ -14,9 +14,9 @@ LONGEST_TEXT = 2000  # characters of a part of a message that are printed
 
 
 class SpelgenError(Exception):
-    """An error told as ``FILE:LINE: element: got X, expected Y; do Z``, with the absent parts left out.
+    """An error printed as ``FILE:LINE: element: got X, expected Y; do Z``, without the absent parts.
 
-    ``got`` alone may be a full statement; it is then told as it is, without the word "got".
+    ``got`` alone may be a full statement; it is then printed as it is, without the word "got".
     """
 
     def __init__(

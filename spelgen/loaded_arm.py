@@ -29,7 +29,7 @@ class LoadedArm:
     """The robot of a URDF as read, its sidecar's settings, the arm taken from them, and its inputs.
 
     ``joints``, ``tip`` and ``angle_tolerance`` are those that ``load_arm`` was given. What is derived is worked
-    out when it is first asked for.
+    out on first use.
     """
 
     robot: Robot
@@ -52,14 +52,14 @@ class LoadedArm:
 
     @property
     def diagnostics(self) -> tuple[Diagnostic, ...]:
-        """What reading the URDF and the settings, taking the arm and its inputs had to tell."""
+        """Return diagnostics of the URDF, the settings, the arm and its inputs."""
         sources = (self.robot, self.arm, self.actuation, self.settings)
         return tuple(item for source in sources for item in source.diagnostics)
 
     def structure_for(self, assume: Assume) -> Structure:
-        """The structure that holds for any inertial values, or (``inertials``) for the URDF's own.
+        """Return the structure for any inertial values, or (``inertials``) for the URDF's own.
 
-        Raises ArmError where these are asked for and absent.
+        Raises ArmError where these are required and absent.
         """
         return self.structure if assume == "kinematics" else derive(self.arm, assume)
 

@@ -111,7 +111,7 @@ def test_a_last_sample_alone_changes_nothing(log, monkeypatch):
     plain = prepare_data(read_logs([log], JOINTS), JOINTS, KINDS, AUTOMATIC)
     assert found.preprocessing.cutoff == plain.preprocessing.cutoff == 8.0
     assert found.training.dt.mean().item() == pytest.approx(plain.training.dt.mean().item(), rel=0.01)
-    assert "validation on 2 chunks, 8 hold no window" in found.diagnostics[-1].message
+    assert "validation on 2 chunks, 8 have no window" in found.diagnostics[-1].message
 
 
 @pytest.mark.parametrize("log", [1000], indirect=True)

@@ -26,7 +26,7 @@ POSITION = "the springs of position servos: tau = clip(kp (u - q) - kd qd), whic
 
 @dataclass(frozen=True, repr=False)
 class Inspection:
-    """Hold what ``spelgen inspect`` says of an arm."""
+    """The facts that ``spelgen inspect`` shows of an arm."""
 
     arm: Arm
     structure: Structure
@@ -36,7 +36,7 @@ class Inspection:
 
     @property
     def facts(self) -> tuple[Fact, ...]:
-        """The facts that always hold, in plain words."""
+        """Return the facts about the structure, in plain words."""
         return facts(self.arm, self.structure)
 
     def closed_forms(self, entry: PlaceOfEntry | None = None, *, longest: int | None = None) -> Formulas:

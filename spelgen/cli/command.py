@@ -37,7 +37,7 @@ def name_values(annotation: object) -> None:
 
 
 def is_coloured() -> bool:
-    """Return whether stdout is a terminal that shows colours, and nobody set NO_COLOR (no-color.org)."""
+    """Return whether stdout is a terminal that shows colours, and NO_COLOR is not set (no-color.org)."""
     return sys.stdout.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
 
 

@@ -75,7 +75,7 @@ def _local(value: object) -> object:
 
 
 def fail(error: BaseException, *, debug: bool = False) -> NoReturn:
-    """Report an exception on stderr and leave with its exit code; with `debug`, its traceback first."""
+    """Report an exception on stderr and exit with its exit code; with `debug`, its traceback first."""
     if isinstance(error, BrokenPipeError):
         # Nobody listens any more: let the interpreter's last flush go nowhere, and say nothing.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -141,7 +141,7 @@ def deliver(text: str, output: Path | None) -> None:
 
 
 def refuse_warnings(subject: str, count: int) -> None:
-    """Leave with 1 where there are warnings and --strict allows none."""
+    """Exit with 1 if there are warnings and --strict allows none."""
     if count:
         note(f"{subject}{count} warning{'s' * (count > 1)}, and --strict allows none")
         raise typer.Exit(FAILED)

@@ -143,7 +143,7 @@ def train(
 
 
 def _tell(fit: Fit, folder: Path, paths: Sequence[Path], *, resume: bool) -> None:
-    """Print how the fit ended, and keep the baselines of a new run; leave with 130 where it was interrupted."""
+    """Print how the fit ended, and keep the baselines of a new run; exit with 130 if it was interrupted."""
     interrupted = fit.status == "interrupted"
     if not resume and not interrupted:
         from spelgen.baselines.keep import keep_baseline

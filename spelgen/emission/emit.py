@@ -66,13 +66,13 @@ def _values(spec: ModelSpec) -> list[Value]:
 
 
 _SERVO: tuple[Value, ...] = (
-    ("kp", "Of the servos, torque by the distance from the command, (n,) [Nm/rad, N/m].", "self.servo.kp()"),
-    ("kd", "Of the servos, torque by velocity, (n,) [Nm s/rad, N s/m].", "self.servo.kd()"),
-    ("delay", "Of the commands [s].", "self.servo.delay"),
+    ("kp", "Position gains of the servos, (n,) [Nm/rad, N/m].", "self.servo.kp()"),
+    ("kd", "Velocity gains of the servos, (n,) [Nm s/rad, N s/m].", "self.servo.kd()"),
+    ("delay", "Delay of the commands [s].", "self.servo.delay"),
 )
 _ARMATURE: Value = (
     "armature",
-    "What the drives add to M's diagonal, (n,) [kg m^2, kg].",
+    "Armature, the drives' part of M's diagonal, (n,) [kg m^2, kg].",
     "self.mass.rotors.forward()",
 )
 _VISCOUS: Value = (

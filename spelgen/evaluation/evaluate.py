@@ -52,9 +52,9 @@ def evaluate(
     the fit's: it gives the URDF as a baseline, and errors of the tip. baselines: other dynamics to be judged beside
     those of `baselines.registry` and what the fit's folder keeps, by name, e.g. ``{"truth": identify(...).dynamics}``.
     preprocessing: of states and torques; by default as the model was fitted. steps, seconds: horizons in samples and in
-    time; those longer than every trajectory are left out, and said.
-    All that has dynamics is judged open loop, and with the disturbance held that a momentum observer finds before a
-    prediction starts (see `momentum_observer.py`). No random numbers enter. Raises LogError.
+    time; those longer than every trajectory are omitted, with a note.
+    All that has dynamics is judged open loop, and with the constant disturbance that a momentum observer finds before a
+    prediction starts (see `momentum_observer.py`). The result is deterministic. Raises LogError.
     """
     judged = subject(model, arm)
     logs = [logs] if isinstance(logs, Trajectory) else list(logs)

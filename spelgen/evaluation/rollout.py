@@ -23,7 +23,7 @@ def rollout(
 ) -> tuple[Tensor, Tensor]:
     """Return positions and velocities, (..., T + 1, n), from q and qd (..., n) on, under tau (..., T, n).
 
-    tau[k] is held for dt [s], or for dt[k] of (..., T). ``model``: an emitted one or any other dynamics. solver:
+    tau[k] is constant for dt [s], or for dt[k] of (..., T). ``model``: an emitted one or any other dynamics. solver:
     ``rk4`` takes ``substeps`` steps of the classical Runge-Kutta method in each dt, ``dopri5`` torchdiffeq's
     adaptive steps, and over long horizons its adjoint equation for gradients.
     """

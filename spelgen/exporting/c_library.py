@@ -73,7 +73,7 @@ def measured(object_file: Path, program: str, model: TrainedModel) -> str:
         stack = f"at most {max(public) + inner} bytes of stack"
     version = subprocess.run([program, "-dumpfullversion"], capture_output=True, text=True, check=False)
     which = f"{Path(program).name} {version.stdout.strip()} -O2 on {platform.machine()}"
-    return f"By {which}: {_code_size(object_file)} bytes of code and constants, {stack}"
+    return f"Compiled by {which}: {_code_size(object_file)} bytes of code and constants, {stack}"
 
 
 def _code_size(object_file: Path) -> int:

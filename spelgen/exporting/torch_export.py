@@ -27,7 +27,7 @@ def export_torch(trained: Trained) -> Exported:
     use = (
         "qdd = torch.export.load('forward_dynamics.pt2').module()(q, qd, tau), float64 (batch, n), any batch, then z, "
         "(batch, n, K), where friction has a memory; "
-        "model.safetensors holds the trained weights by the names of the emitted module."
+        "model.safetensors contains the trained weights by the names of the emitted module."
     )
     about = f"{UNITS}; the programs take no gradients by the weights."
     files["model.safetensors"] = save(weights)

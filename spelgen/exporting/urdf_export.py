@@ -56,8 +56,8 @@ def export_urdf(trained: Trained) -> ExportedUrdf:
     projection = rigid_body_projection(trained.model, trained.arm)
     summary = projection.summary
     use = (
-        "The .urdf holds inertials, viscous and Coulomb friction, which simulators ignore; the .yaml beside it, which "
-        "spelgen reads, rotor inertia and friction in both directions; .urdf.friction.yaml the model's own law."
+        "The .urdf contains inertials, viscous and Coulomb friction, which simulators ignore; the .yaml beside it, "
+        "which spelgen reads, rotor inertia and friction in both directions; .urdf.friction.yaml the model's own law."
     )
     about = f"{UNITS}; inertials of a body stand with the link that its joint moves."
     title, checked = f"{trained.robot} as a URDF", f"{summary[0]}; {summary[1]}."

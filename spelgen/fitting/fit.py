@@ -48,7 +48,7 @@ class RunOptions:
 
     device, threads: of torch. resume: go on from the folder's checkpoint, exactly as if there had been no interruption.
     force: replace a run. progress: show it on stderr. mapping: how the logs were read, kept with the run. notes: found
-    before, to be told with the rest. began: from when the allowed time counts (`time.monotonic`); None: from now.
+    before, to be reported with the others. began: from when the allowed time counts (`time.monotonic`); None: from now.
     """
 
     device: str = "cpu"
@@ -85,8 +85,8 @@ def fit(
     for the run folder. folder: where checkpoints go after every epoch (see `RunFolder`); without one, `Fit.save`
     writes all that.
     Ctrl-C or SIGTERM end the fit with status "interrupted".
-    Raises OptionError for an option that does not apply to this model, LogError, and RunError when the folder holds a
-    run or cannot be resumed with this.
+    Raises OptionError for an option that does not apply to this model, LogError, and RunError when the folder contains
+    a run or cannot be resumed with this.
     """
     began = options.began or time.monotonic()
     run = None if folder is None else RunFolder(Path(folder))

@@ -32,10 +32,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Fit:
-    """A fitted model and how it was found.
+    """A fitted model and the record of its fit.
 
     config, preprocessing: as they were resolved. history: a record for each epoch. status: how the fit ended; None:
-    not known, of a run that was loaded. record: what config.json holds. checkpoint: what checkpoint.pt holds.
+    not known, of a run that was loaded. record: contents of config.json. checkpoint: those of checkpoint.pt.
     urdf: of the robot, where it is known. folder: of the run, where there is one.
     """
 
@@ -172,7 +172,7 @@ def load_run(folder: Path | str, *, trust: bool = False) -> Fit:
     """A run folder of `spelgen train` or `Fit.save`, with its best weights. Raises RunError and ModuleError.
 
     Its module is a program: unless it ran in this process before, it must be what spelgen itself writes for the robot
-    in the folder, or be trusted.
+    in the folder, or `trust` be true.
     """
     run = RunFolder(Path(folder))
     record = run.read_config()

@@ -76,7 +76,7 @@ def prepare_streamed(
     windows = _sample([contents.chunks[k] for k in training], cutting)
     message = (
         f"larger than memory: read in {len(contents.chunks)} chunks; validation on {len(validating)} chunks, "
-        f"{len(contents.chunks) - len(usable)} hold no window"
+        f"{len(contents.chunks) - len(usable)} have no window"
     )
     return TrainingData(
         training=windows,

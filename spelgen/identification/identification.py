@@ -33,11 +33,11 @@ _WEIGHTED = {
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Identification:
-    """What least squares found of an arm with n joints and K parameters, r of them base parameters.
+    """Result of least squares for an arm with n joints and K parameters, r of them base parameters.
 
     parameters: (K,), whose torque is the fit's; without prior those outside the base are zero. values, deviations:
     (r,) of the base parameters. condition: of the regressor (columns of length one, joints weighted). unseen:
-    directions of the base parameters in which these logs say nothing. residual: (n,) root mean square [Nm, N];
+    directions of the base parameters that these logs do not excite. residual: (n,) root mean square [Nm, N];
     nmse: (n,) its square by the torque's variance. drives: between logged torques and joints; None: nothing is.
     """
 

@@ -30,7 +30,7 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping |
     """Report all about the logs of an arm, read once, one trajectory after another; nothing is repaired or raised.
 
     What keeps logs from being trained on is among the report's `errors`. mapping: by which they were read, that of
-    the arm's settings unless given; a unit that it says of torques is believed. Logged torques go through the arm's
+    the arm's settings unless given; a unit that it declares for torques is not checked. Logged torques go through the arm's
     input matrix to the joints'. Raises LogError without any trajectory, or with one of another number of joints, and
     where an arm's settings say 'input: position', without commands.
     """

@@ -193,7 +193,7 @@ def _beyond_limits(coordinate: Coordinate, report: ServoJointReport) -> Iterator
 def _sparse(clocks: Sequence[Clock]) -> Iterator[Diagnostic]:
     for clock in clocks:
         if clock.sample_rate < TUNING.sparse_rate:
-            message = f"{clock.sample_rate:.3g} Hz: below {TUNING.sparse_rate:g} Hz delays and friction are hardly seen"
+            message = f"{clock.sample_rate:.3g} Hz: below {TUNING.sparse_rate:g} Hz delays and friction are poorly determined"
             yield Diagnostic("warning", "sparse", f"trajectory {clock.name}", None, message)
             return
 

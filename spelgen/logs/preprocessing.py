@@ -59,7 +59,7 @@ class Preprocessing:
 
     @property
     def filtered(self) -> bool:
-        """Whether windows are cut from filtered logs; of a ``resolved`` one."""
+        """Return whether windows are cut from filtered logs; needs a ``resolved`` one."""
         return bool(self.cutoff)
 
     @property

@@ -37,9 +37,9 @@ def read_logs(
     has the columns `q_<j>`, `qd_<j>`, `tau_<j>`, beside the time `t` [s]. A column `trajectory` splits one file
     into several. mapping: how the logs are named and measured, as a LogMapping, its keys in a dict, or a YAML file
     of them; by default what the settings beside the arm's URDF say under `logs`. role "train" or "test": of a folder
-    that holds train.* or test.* files, only those with this stem are read. joint_types: what the mapping's units are
+    that contains train.* or test.* files, only those with this stem are read. joint_types: what the mapping's units are
     checked against, where `arm` is names alone.
-    Raises LogError (or one error that holds several) naming file, row and column, and SettingsError where
+    Raises LogError (or one error with several) naming file, row and column, and SettingsError where
     the mapping does not fit the joints.
     """
     source = log_source(arm, mapping)

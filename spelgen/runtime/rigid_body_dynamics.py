@@ -74,7 +74,7 @@ class RigidBodyDynamics(PortHamiltonian):
 
     @property
     def armature(self) -> Tensor:
-        """What the drives add to M's diagonal, (n,) [kg m^2, kg]."""
+        """Armature, the drives' part of M's diagonal, (n,) [kg m^2, kg]."""
         return self.rotors.forward()
 
     @property

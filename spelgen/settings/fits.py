@@ -112,7 +112,7 @@ class TorqueFit(FitConfig):
     at most `evaluations` of the loss, to which are added `weight_decay` times half the sum of squares of all
     weights, and `urdf_weight` times the distance from the URDF (see `UrdfRegularizer`).
     adapt: what of a fitted model moves, from where it is: a `load` at the tip (the last body; of networks M and V), the
-    `friction` of another day with the torque offsets, or all that tells another `unit` of the same arm from the first.
+    `friction` of another day with the torque offsets, or all that differs in another `unit` of the same arm.
     """
 
     objective: ClassVar[Objective] = "torque"

@@ -47,7 +47,7 @@ class Recording:
     """One motion of T samples: what happened, and what the arm's own sensors saw of it.
 
     t: (T,) [s]. states: (T, 2n) true positions and velocities. encoders: (T, n) positions in whole steps of the
-    encoders. tau: (T, n) motor torques, tau[k] held from t[k] to t[k+1], known exactly.
+    encoders. tau: (T, n) motor torques, tau[k] constant from t[k] to t[k+1], known exactly.
     """
 
     t: np.ndarray

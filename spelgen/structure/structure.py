@@ -53,7 +53,7 @@ class Structure:
     def __repr__(self) -> str:
         made = f"{len(self.outputs)} outputs, {len(self.constants)} constants"
         base = f"{self.base_parameter_count} base parameters"
-        return f"<Structure of {len(self.joints)} joints ({self.assume} trusted): {made}, {base}>"
+        return f"<Structure of {len(self.joints)} joints ({self.assume} used): {made}, {base}>"
 
     def outputs_from(self, first: int) -> int:
         """How many outputs read coordinates from ``first`` (0-based) to the tip only."""

@@ -112,6 +112,6 @@ class Model(NetworkDynamics):
 
     @property
     def armature(self) -> Tensor:
-        """What the drives add to M's diagonal, (n,) [kg m^2, kg]."""
+        """Armature, the drives' part of M's diagonal, (n,) [kg m^2, kg]."""
         value: Tensor = self.mass.rotors.forward()
         return value

@@ -34,10 +34,9 @@ LABELS = {
     "dead_zone": "half dead zone",
 }
 ABOUT = (
-    "divided by kp, +- half an interval of 95 %: logs of positions determine no more. kp itself rests on the URDF's "
-    "masses, where it is not known. kd stands for kd and viscous friction, which such logs cannot distinguish. dry: "
-    "friction of a joint that slides, over what it slid, open where it and a dead zone look alike, as without gravity; "
-    "static error: both together, dry/kp and half the dead zone"
+    "divided by kp, with half a 95 % interval. kp itself is scaled by the URDF's masses, unless it is known. kd is the "
+    "sum of kd and viscous friction, which such logs do not distinguish. dry: dry friction; open where it cannot be "
+    "distinguished from a dead zone, as without gravity. static error: the sum of dry/kp and half the dead zone"
 )
 
 

@@ -1,0 +1,97 @@
+"""Texts for users are plain technical English: no metaphors from this list, no fragments for sentences."""
+
+import ast
+import inspect
+import re
+from pathlib import Path
+
+import pytest
+
+import spelgen
+
+ROOT = Path(__file__).parents[1]
+UNUSED = re.compile(
+    r"\b(ask(s|ed|ing)?|tell(s|ing)?|told|believ(e|es|ed|ing)|belief|trust(s|ed)?|hold(s|ing)?|held|worth|nobody|odd"
+    r"|leav(e|es|ing)|enter(s|ed|ing)?|rests?|hopeless|hardly|forgets?|to be found)\b",
+    re.IGNORECASE,
+)
+FRAGMENT = re.compile(r"^(What|Of|By|Whoever|Whether) ")
+# terms of mechanics, and the name of an option
+ALLOWED = re.compile(
+    r"\b(at|from|to) rest\b|--trust|trust=True|`trust`|hold(s|ing)? the arm|held against gravity|zero-order hold|^trust$"
+)
+CODE = re.compile(r"^```.*?^```$|^(?: {4}|\t).*$|`[^`\n]*`|\]\([^)]*\)", re.MULTILINE | re.DOTALL)
+# texts for developers: what each number of a table means
+INTERNAL = ("settings/tuning", "runtime")
+
+
+def wrong(text: str) -> list[str]:
+    plain = ALLOWED.sub("", text)
+    return [match.group() for match in (*UNUSED.finditer(plain), *FRAGMENT.finditer(plain))]
+
+
+def documented(tree: ast.Module) -> set[ast.AST]:
+    """The constants that are docstrings, or stand below a name as its comment."""
+    return {x.value for x in ast.walk(tree) if isinstance(x, ast.Expr) and isinstance(x.value, ast.Constant)}
+
+
+def messages(path: Path) -> list[str]:
+    """Strings of several words in the code; values in f-strings are left as a mark."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    skipped = documented(tree)
+    texts = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.JoinedStr):
+            skipped |= set(node.values)
+            parts = [str(x.value) if isinstance(x, ast.Constant) else "_" for x in node.values]
+            texts.append("".join(parts))
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in skipped:
+            texts.append(node.value)
+    return [text for text in texts if len(text.split()) > 1]
+
+
+def api_docs() -> list[str]:
+    texts = []
+    for name in spelgen.__all__:
+        member = getattr(spelgen, name)
+        texts.append(inspect.getdoc(member) or "")
+        if inspect.isclass(member):
+            public = [x for key, x in vars(member).items() if not key.startswith("_")]
+            texts += [inspect.getdoc(x) or "" for x in public if callable(x) or isinstance(x, property)]
+    for path in (ROOT / "spelgen/cli").glob("*.py"):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        texts += [ast.get_docstring(x) or "" for x in tree.body if isinstance(x, ast.FunctionDef)]
+    return texts
+
+
+def test_messages():
+    found = {}
+    for path in sorted((ROOT / "spelgen").rglob("*.py")):
+        place = path.relative_to(ROOT / "spelgen").as_posix()
+        if not place.startswith(INTERNAL):
+            found |= {f"{place}: {text}": wrong(text) for text in messages(path) if wrong(text)}
+    assert found == {}
+
+
+def test_docstrings_of_the_api():
+    assert {text: wrong(text) for text in api_docs() if wrong(text)} == {}
+
+
+@pytest.mark.parametrize(
+    "path", [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))], ids=lambda x: x.name
+)
+def test_docs(path):
+    text = CODE.sub(" ", path.read_text(encoding="utf-8"))
+    lines = [line.strip("#-*| ") for line in text.splitlines()]
+    assert {line: wrong(line) for line in lines if wrong(line)} == {}
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "templates").glob("*.html.jinja")), ids=lambda x: x.name)
+def test_pages(path):
+    text = re.sub(r"{%.*?%}|{{.*?}}|<[^>]*>", " ", path.read_text(encoding="utf-8"), flags=re.DOTALL)
+    assert {line: wrong(line) for line in text.splitlines() if wrong(line.strip())} == {}
+
+
+def test_the_list_finds_what_it_is_for():
+    assert wrong("held-out samples ask for no more") and wrong("What servos lose")
+    assert not wrong("the arm starts at rest") and not wrong("pass --trust")
