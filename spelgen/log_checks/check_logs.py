@@ -29,9 +29,9 @@ EXAMPLES = 2  # trajectories that are drawn
 def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping | None = None) -> LogReport:
     """Report all about the logs of an arm, read once, one trajectory after another; nothing is repaired or raised.
 
-    What keeps logs from being trained on is among the report's `errors`. mapping: by which they were read, that of
-    the arm's settings unless given; a unit that it declares for torques is not checked. Logged torques go through the arm's
-    input matrix to the joints'. Raises LogError without any trajectory, or with one of another number of joints, and
+    The report's `errors` prevent training. mapping: that of the logs, by default from the arm's settings; a unit that
+    it declares for torques is not checked. The arm's input matrix converts logged torques to those of the joints.
+    Raises LogError without any trajectory, or with one of another number of joints, and
     where an arm's settings say 'input: position', without commands.
     """
     if arm.settings.input == "position":

@@ -193,7 +193,9 @@ def _beyond_limits(coordinate: Coordinate, report: ServoJointReport) -> Iterator
 def _sparse(clocks: Sequence[Clock]) -> Iterator[Diagnostic]:
     for clock in clocks:
         if clock.sample_rate < TUNING.sparse_rate:
-            message = f"{clock.sample_rate:.3g} Hz: below {TUNING.sparse_rate:g} Hz delays and friction are poorly determined"
+            message = (
+                f"{clock.sample_rate:.3g} Hz: delays and friction need {TUNING.sparse_rate:g} Hz or more"
+            )
             yield Diagnostic("warning", "sparse", f"trajectory {clock.name}", None, message)
             return
 

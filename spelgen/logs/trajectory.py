@@ -30,7 +30,7 @@ class Trajectory:
     q, qd: (T, n) joint positions and velocities [rad, rad/s; m, m/s for prismatic joints].
     tau: (T, n) joint torques or forces [Nm; N]. In a simulated log tau[k] is constant from t[k] to t[k+1]; in a
         measured one it is the torque measured at t[k]. (T, 0) where none was logged, beside commands u.
-    u: (T, n) commanded positions [rad; m] of joints that servos move, u[k] constant from t[k] to t[k+1]; None of others.
+    u: (T, n) commanded positions [rad; m] of joints with servos, u[k] constant from t[k] to t[k+1]; None of others.
     name: unique among the trajectories that are used together.
     file: where it was read from, None if it was not.
     declares_units: the file itself, or the mapping it was read by, says in what units its columns are.
