@@ -32,8 +32,8 @@ demo: $(STAMP) ## the whole way on robots/rpr.urdf: inspect, build, simulate, tr
 test: check ## run the checks, then the tests
 	$(BIN)/python -m pytest
 
-fuzz: $(TOOLS) ## URDFs, logs, settings and run folders drawn at random, new ones for MINUTES=20
-	FUZZ_MINUTES=$(MINUTES) $(BIN)/python -m pytest -q tests/test_fuzz.py tests/test_fuzz_files.py
+fuzz: $(TOOLS) ## URDFs, logs, settings, meshes and run folders drawn at random, new ones for MINUTES=20
+	FUZZ_MINUTES=$(MINUTES) $(BIN)/python -m pytest -q -s tests/test_fuzz.py tests/test_fuzz_files.py
 
 check: $(TOOLS) ## format, lint, types, import direction
 	$(BIN)/ruff format --check .

@@ -21,9 +21,9 @@ from spelgen.errors import SpelgenError
 MINUTES = float(
     os.environ.get("FUZZ_MINUTES", "0")
 )  # of all tests that fuzz; 0: the same examples every time
-TESTS = 6  # among which they are shared
-SECONDS = 20
-MEMORY = 2_000_000  # kB
+TESTS = 7  # among which they are shared
+SECONDS = 10
+MEMORY = 1_000_000  # kB beside what the process had before
 
 
 def fuzz(draw: st.SearchStrategy, examples: int, use: Callable[[Any], Any]) -> None:
@@ -40,11 +40,15 @@ def fuzz(draw: st.SearchStrategy, examples: int, use: Callable[[Any], Any]) -> N
     if not MINUTES:
         run(0)
         return
-    number, end = int(time.time()), time.monotonic() + 60 * MINUTES / TESTS
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    first = number = int(time.time())
+    end = time.monotonic() + 60 * MINUTES / TESTS
     while time.monotonic() < end:
         number += 1
         run(number)
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < MEMORY
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < MEMORY
+    assert resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss < 1.1 * MEMORY
+    print(f"\n{(number - first) * examples} examples, seeds {first + 1} to {number}")
 
 
 def answered(use: Callable[[], Any]) -> bool:

@@ -1,6 +1,7 @@
 """Logs and options as strangers send them: an answer, or one error that is ours; no warning of NumPy, no waiting."""
 
 import io
+import re
 import struct
 import time
 import zipfile
@@ -11,8 +12,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 import pytest
+import torch
 
 from spelgen.building import build
+from spelgen.emission.loading import load_module
 from spelgen.errors import LogError, SettingsError, SpelgenError
 from spelgen.exporting.exported import readme
 from spelgen.fitting.fit import fit
@@ -20,6 +23,7 @@ from spelgen.loaded_arm import load_arm
 from spelgen.log_checks.check_logs import check_logs
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
+from spelgen.pipeline import generate
 from spelgen.settings.fits import MomentumFit, Rollout, make_config
 
 JOINTS = ("joint1", "joint2")
@@ -145,3 +149,47 @@ def test_an_impossible_learning_rate_is_told_without_words_of_pydantic():
     with pytest.raises(SettingsError) as caught:
         make_config(Rollout, {"learning_rate": 1e30})
     assert str(caught.value) == "learning_rate: got 1e+30, expected a number within +-1e+12"
+
+
+@pytest.mark.parametrize("preset", ["spel", "minimal", "hybrid", "phnode"])
+@pytest.mark.parametrize("robot", ["two_link", "rpr"])
+def test_an_arm_of_1e_12_kg_gives_numbers(robots, tmp_path, preset, robot):
+    text = re.sub(r'<mass value="[^"]*"', '<mass value="1e-12"', (robots / f"{robot}.urdf").read_text())
+    text = re.sub(r'(i[xyz]{2})="([^"]*)"', lambda x: f'{x[1]}="{float(x[2]) * 1e-12:.3g}"', text)
+    (tmp_path / "arm.urdf").write_text(text)
+    model = build(tmp_path / "arm.urdf", preset, width=8, depth=1)
+    q = torch.linspace(-1, 1, 5 * model.n, dtype=torch.float64).view(5, model.n)
+    with torch.no_grad():
+        assert (torch.linalg.eigvalsh(model.mass_matrix(q)) > 0).all()
+        assert model.forward_dynamics(q, q, q).isfinite().all()
+
+
+# up to which standard deviation of all weights M stays positive definite, in double and in single precision
+DEFINITE = {
+    "spel": (100.0, 30.0),
+    "minimal": (100.0, 30.0),
+    "spel-kan": (100.0, 10.0),
+    "hybrid": (10.0, 3.0),
+    "closed-form": (10.0, 3.0),
+    "phnode": (0.3, 0.3),
+}
+
+
+@pytest.mark.parametrize("robot", ["two_link", "rpr", "six_dof"])
+@pytest.mark.parametrize("preset", DEFINITE)
+def test_the_mass_matrix_is_positive_definite_as_far_as_the_docs_say(robots, preset, robot):
+    source = generate(robots / f"{robot}.urdf", preset, width=16, depth=1)
+    for dtype, deviation in zip((torch.float64, torch.float32), DEFINITE[preset], strict=True):
+        generator = torch.Generator().manual_seed(0)
+        for _ in range(8):
+            model = load_module(source)
+            with torch.no_grad():
+                for weights in model.parameters():
+                    weights.copy_(
+                        deviation * torch.randn(weights.shape, generator=generator, dtype=torch.float64)
+                    )
+                model.to(dtype)
+                q = 4 * torch.rand(300, model.n, generator=generator).to(dtype) - 2
+                mass = model.mass_matrix(q)
+                assert mass.isfinite().all()
+                assert not torch.linalg.cholesky_ex(mass).info.any()

@@ -52,6 +52,7 @@ class Likelihood:
         # a Gaussian deviates by 1.4826 times its median; a table under the arm is not in the median
         scale = torch.maximum(1.4826 * errors.abs().flatten(0, 1).median(dim=0).values, noise)
         robust = errors / (1 + (errors / scale).square() / 4)
+        span = min(span, robust.shape[1])  # of windows of a second no block is longer
         # errors that say the same add up: the variance of their sum is so many times that of a sample
         blocks = robust[:, : robust.shape[1] // span * span].unflatten(1, (-1, span))
         of_sums = blocks.sum(dim=2).square().mean(dim=(0, 1))
