@@ -177,7 +177,7 @@ def test_friction_at_a_standstill_has_its_slope(emitted):
     near(slope, model.dissipation(q, still).diagonal(dim1=-2, dim2=-1))
     away = torch.full_like(q, 1e-3)  # where the formula is another branch
     torque = model.friction(away, model.gravity(q), constants)
-    dry = constants.coulomb + constants.load_dependence * model.gravity(q).abs()
+    dry = constants.coulomb + constants.load_dependence * torch.hypot(model.gravity(q), constants.least_load)
     dry = dry + constants.stribeck * (-((away / constants.stribeck_velocity) ** 2)).exp()
     saturating = constants.saturation * (away / constants.saturation_velocity).tanh()
     dry = dry * (away / constants.coulomb_smoothing_velocity).tanh()

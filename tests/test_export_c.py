@@ -14,14 +14,15 @@ from typer.testing import CliRunner
 from spelgen.building import build
 from spelgen.cli.main import app
 from spelgen.errors import RunError
-from spelgen.exporting import friction_expressions
+from spelgen.exporting import friction_expressions, parity
 from spelgen.exporting.c_export import c_files
 from spelgen.exporting.c_library import CLibrary, compile_object, link_library, write_c
-from spelgen.exporting.casadi_export import export_casadi
+from spelgen.exporting.casadi_export import called_by_state, export_casadi
 from spelgen.exporting.describe import identifier
 from spelgen.exporting.description import Bristles
 from spelgen.exporting.entry_points import ENTRY_POINTS
 from spelgen.exporting.export import export
+from spelgen.exporting.model_expressions import expression_function
 from spelgen.exporting.parity import check_parity, random_inputs
 from spelgen.exporting.trained import Trained
 from spelgen.loaded_arm import load_arm
@@ -60,8 +61,23 @@ def test_c_gives_what_the_model_gives(case, program, flags, compiled):
     library = library.rename(folder / f"{program}{len(flags)}.so")  # ctypes keeps what it has loaded by name
     kind, tolerance = (np.float32, 1e-5) if flags else (np.float64, 1e-12)
     called = CLibrary(library, model, kind)
-    parity = check_parity(called, trained, NAMES, tolerance, dtype=kind)
-    assert set(parity.differences) == set(NAMES)
+    found = check_parity(called, trained, NAMES, tolerance, dtype=kind)
+    assert set(found.differences) == set(NAMES)
+
+
+def test_derivatives_at_right_angles_are_the_models(monkeypatch):
+    """There gravity's torques vanish up to rounding, whose sign is no backend's to choose; bristles are bent."""
+
+    def at_right_angles(*arguments):
+        inputs = random_inputs(*arguments)
+        corners = np.pi / 2 * np.round(2 * inputs["q"] / np.pi)
+        return inputs | {"q": corners, "z": 1e-4 * np.sign(inputs["z"])}
+
+    monkeypatch.setattr(parity, "random_inputs", at_right_angles)
+    trained = Trained(moved_model("six_dof", "closed-form"), arm_of("six_dof"))
+    name = "inverse_dynamics_derivatives"
+    function = expression_function(ENTRY_POINTS[name], trained.described)
+    check_parity(called_by_state({name: function}), trained, [name], 1e-9)
 
 
 @needs_gcc
@@ -188,7 +204,7 @@ BRISTLES = Bristles(np.array([[0.01, 0.1], [0.02, 0.3]]), np.array([[0.3, 0.7], 
 
 
 def test_bristles_follow_their_law_along_a_displacement():
-    """z' = qd - |qd| z / reach, integrated in small steps, there and back."""
+    """z' = qd up to the reach, integrated in small steps, there and back."""
     z, dq = ca.SX.sym("z", 4), ca.SX.sym("dq", 2)
     step = ca.Function("step", [z, dq], [friction_expressions.bristle_step(BRISTLES, z, dq)])
     found, small, steps, reach = np.zeros(4), np.zeros(4), 4000, BRISTLES.reach.ravel()
@@ -196,8 +212,8 @@ def test_bristles_follow_their_law_along_a_displacement():
         found = step(found, moved).full()[:, 0]
         d = np.repeat(moved / steps, 2)
         for _ in range(steps):
-            small = small + d - np.abs(d) * small / reach
-    np.testing.assert_allclose(found, small, rtol=1e-3)
+            small = small + d * (np.sign(d) * small < reach)
+    np.testing.assert_allclose(found, small, atol=1e-4)
     assert (np.abs(found) <= reach).all()
 
 
@@ -212,7 +228,7 @@ def test_c_carries_frictions_memory(tmp_path):
     given = random_inputs(model.coordinates, 5, 4)
     law, qd = model.friction, given["qd"]
     dry = law.coulomb + law.stribeck * np.exp(-((qd / law.stribeck_velocity) ** 2))
-    dry += law.load_dependence * np.abs(called("gravity", given)["gravity"])
+    dry += law.load_dependence * np.hypot(called("gravity", given)["gravity"], law.least_load)
     straight = called("friction", given | {"z": np.zeros((5, 4))})["friction"]
     bent = (BRISTLES.fractions / BRISTLES.reach * given["z"].reshape(5, 2, 2)).sum(axis=-1)
     np.testing.assert_allclose(called("friction", given)["friction"], straight + dry * bent)

@@ -48,36 +48,38 @@ def bristle_reach(model: Any) -> BristleReach:
 def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
     """z, (T, n, K) [rad, m], along the path q (T, n), straight at its start.
 
-    Between samples drives go one way, which is exact: z' is linear in the displacement.
+    Between samples drives go one way, for which ``runtime.bristles`` is exact.
     """
-    moved = np.diff(encoded(q), axis=0, prepend=q[:1])
-    moved = (moved if bristles.motors is None else moved @ bristles.motors.T)[..., None]  # (T, n, 1)
-    reach = bristles.values
-    decay = np.exp(-np.abs(moved) / reach)
-    added = np.sign(moved) * reach * (1 - decay)
-    # z[k] = kept[k] z[k - 1] + added[k]: pairs are joined, then fours, ...
-    shift = 1
-    while shift < len(q):
-        added[shift:] += decay[shift:] * added[:-shift]
-        decay[shift:] *= decay[:-shift].copy()
-        shift *= 2
-    bends: np.ndarray = added
-    return bends
+    path = encoded(q)
+    if bristles.motors is not None:
+        path = path @ bristles.motors.T
+    elements = path[..., None]
+    # a bristle bends from where it stands to where the drive is, and stands where its reach dragged it
+    bent = elements - dragged(elements, bristles.values)
+    return np.clip(bent, -bristles.values, bristles.values)  # without the last digit's rounding
 
 
 def encoded(q: np.ndarray) -> np.ndarray:
     """The path (T, n) without the jitter of encoders: it follows q out of a band of a step to both sides."""
     step = encoder_step(q)
-    if not step.any():
-        return q
-    low, high = q - step, q + step  # clamping to a band after a band is clamping to one
+    return dragged(q, step) if step.any() else q
+
+
+def dragged(path: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """The way of what a path (T, ...) drags along as soon as it is further away than the reach; at its start at first.
+
+    It is the play operator (Brokate and Sprekels, Hysteresis and Phase Transitions, 1996), in log2 T passes.
+    """
+    low, high = path - reach, path + reach
+    start = np.broadcast_to(path[:1], low.shape)
+    # clamping to a band after a band is clamping to one: pairs are joined, then fours, ...
     shift = 1
-    while shift < len(q):
+    while shift < len(path):
         earlier, later = slice(None, -shift), slice(shift, None)
         clamped = [np.clip(x[earlier], low[later], high[later]) for x in (low, high)]
         low[later], high[later] = clamped
         shift *= 2
-    result: np.ndarray = np.clip(np.broadcast_to(q[:1], q.shape), low, high)
+    result: np.ndarray = np.clip(start, low, high)
     return result
 
 

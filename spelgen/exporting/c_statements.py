@@ -17,13 +17,13 @@ _FORMS = {
     ca.OP_COS: "COS({0})",
     ca.OP_TANH: "TANH({0})",
     ca.OP_EXP: "EXP({0})",
-    ca.OP_FABS: "FABS({0})",
-    ca.OP_SIGN: "SIGN({0})",
     ca.OP_ADD: "{0} + {1}",
     ca.OP_SUB: "{0} - {1}",
     ca.OP_MUL: "{0} * {1}",
     ca.OP_DIV: "{0} / {1}",
-    ca.OP_FMAX: "FMAX({0}, {1})",
+    ca.OP_FMAX: "MAX({0}, {1})",
+    ca.OP_FMIN: "MIN({0}, {1})",
+    ca.OP_SQRT: "SQRT({0})",
 }
 
 

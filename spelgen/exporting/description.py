@@ -32,6 +32,7 @@ class FrictionLaw:
     stribeck_velocity: np.ndarray
     coulomb_smoothing_velocity: np.ndarray
     load_dependence: np.ndarray
+    least_load: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)

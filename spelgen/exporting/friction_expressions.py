@@ -12,8 +12,8 @@ def law_torque(law: FrictionLaw, qd: ca.SX, gravity: ca.SX, direction: ca.SX) ->
 
     direction: of dry friction, from -1 to 1.
     """
-    load = law.load_dependence * ca.fabs(gravity)
-    dry = ca.SX(law.coulomb) + load
+    load = ca.sqrt(gravity**2 + law.least_load**2)
+    dry = law.coulomb + law.load_dependence * load
     # CasADi would not see that zero times an exponential is zero
     if law.stribeck.any():
         fading = ca.exp(-((qd / law.stribeck_velocity) ** 2))
@@ -46,11 +46,9 @@ def sliding_bristles(bristles: Bristles, law: FrictionLaw, qd: ca.SX) -> ca.SX:
 
 
 def bristle_step(bristles: Bristles, z: ca.SX, dq: ca.SX) -> ca.SX:
-    """Return z after a displacement dq: the solution of z' = qd - |qd| z / reach along it."""
-    moved = _by_element(bristles, dq)
+    """Return z after a displacement dq one way: it sticks up to the reach."""
     reach = bristles.reach.ravel()
-    end = ca.sign(moved) * reach
-    z_next: ca.SX = end + (z - end) * ca.exp(-ca.fabs(moved) / reach)
+    z_next: ca.SX = ca.fmin(ca.fmax(z + _by_element(bristles, dq), -reach), reach)
     return z_next
 
 

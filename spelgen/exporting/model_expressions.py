@@ -180,9 +180,7 @@ class ModelExpressions:
         torque: ca.SX = servos.kp * error - servos.kd * self.qd
         for joint in np.flatnonzero(np.isfinite(servos.limit)).tolist():
             limit = servos.limit[joint]
-            # by maxima alone: C's fmin would be one function more
-            lowered = -ca.fmax(-torque[joint], -limit)
-            torque[joint] = ca.fmax(lowered, -limit)
+            torque[joint] = ca.fmin(ca.fmax(torque[joint], -limit), limit)
         return torque
 
     def _force_derivatives(self) -> tuple[ca.SX, ca.SX]:

@@ -17,6 +17,9 @@ STRIBECK_VELOCITY = 0.03  # where that has faded
 SMOOTHING_VELOCITY = 0.006  # over which dry friction turns around
 SATURATION_VELOCITY = 0.2  # where viscous friction begins to grow more slowly
 LOAD_DEPENDENCE = 0.03  # dry friction by gravity torque
+# below this fraction of usual friction a gravity torque's size is rounded off: at right angles it passes
+# zero, where |x| has no derivative
+LEAST_LOAD = 0.01
 
 
 class FrictionConstants(NamedTuple):
@@ -30,6 +33,7 @@ class FrictionConstants(NamedTuple):
     stribeck_velocity: Tensor  # [rad/s, m/s]
     coulomb_smoothing_velocity: Tensor  # [rad/s, m/s]
     load_dependence: Tensor  # dry friction by gravity torque
+    least_load: Tensor  # [Nm, N]
     bristle_fractions: Tensor  # of dry friction, (n, K); a joint's add up to one
 
 
@@ -37,7 +41,8 @@ class FrictionLaws(nn.Module):
     """Friction which resists whatever the weights are: they are logarithms.
 
     viscous qd + saturation tanh(qd / saturation_velocity)
-    + (coulomb + stribeck exp(-(qd / stribeck_velocity)^2) + load_dependence |gravity torque|) direction.
+    + (coulomb + stribeck exp(-(qd / stribeck_velocity)^2) + load_dependence load) direction,
+    with the load sqrt(gravity torque^2 + least_load^2).
 
     The direction, from -1 to 1, is that of the bristles, sum of fraction z / reach; without them, or
     where nothing is known of the way here, tanh(qd / coulomb_smoothing_velocity).
@@ -94,6 +99,7 @@ class FrictionLaws(nn.Module):
             * speed
             * (1 if smoothing is None else smoothing.exp()),
             load_dependence=LOAD_DEPENDENCE * size.sign() * self.raw_load_dependence.exp(),
+            least_load=LEAST_LOAD * torch.where(size > 0, size, 1.0),
             bristle_fractions=self.bristles.reach if fractions is None else fractions.softmax(dim=-1),
         )
 
@@ -134,7 +140,8 @@ class FrictionLaws(nn.Module):
     def dry(qd: Tensor, gravity: Tensor, c: FrictionConstants) -> Tensor:
         """The size of dry friction, (..., n) [Nm, N]."""
         slow = (-((qd / c.stribeck_velocity) ** 2)).exp()
-        return c.coulomb + c.stribeck * slow + c.load_dependence * gravity.abs()
+        load = (gravity**2 + c.least_load**2).sqrt()
+        return c.coulomb + c.stribeck * slow + c.load_dependence * load
 
 
 def tanh_ratio(x: Tensor) -> Tensor:
