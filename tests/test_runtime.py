@@ -230,7 +230,8 @@ def test_friction_laws_resist_and_read_as_what_they_are():
     gravity = torch.tensor([3.0, -4.0, 5.0], dtype=torch.float64)
     fast = 1e3 * torch.ones(3, dtype=torch.float64)
     expected = constants.viscous * 1e3 + constants.saturation + constants.coulomb
-    near(laws(fast, gravity, constants), expected + constants.load_dependence * torch.hypot(gravity, constants.least_load))
+    load = torch.hypot(gravity, constants.least_load)
+    near(laws(fast, gravity, constants), expected + constants.load_dependence * load)
     qd = draw(100, 3)
     assert (laws(qd, gravity, constants) * qd >= 0).all()
     near(laws(-qd, gravity, constants), -laws(qd, gravity, constants))
