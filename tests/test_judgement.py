@@ -1,0 +1,167 @@
+"""What decides whether a part, a law or a figure is accepted: each test fails where that judgement is left out."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from spelgen.building import build
+from spelgen.fitting import residual_fit, torque_fit, torque_objective
+from spelgen.fitting.residual_fit import select_residuals
+from spelgen.fitting.servo import laws
+from spelgen.fitting.servo.parameters import ServoParameters
+from spelgen.fitting.torque_jacobian import ResidualSamples
+from spelgen.fitting.torque_objective import fit_torques
+from spelgen.fitting.urdf_regularizer import UrdfRegularizer
+from spelgen.fitting.window_problem import WindowProblem
+from spelgen.fleet import jobs
+from spelgen.identification.least_squares import deviations
+from spelgen.settings.fits import Rollout, TorqueFit
+
+
+@pytest.fixture
+def hybrid(robots):
+    """A model of bodies with functions of joints, and no networks: these take longer."""
+    model = build(robots / "two_link.urdf", "hybrid", width=8)
+    model.residual_potential = model.residual_mass = None
+    return model
+
+
+def samples(missing: torch.Tensor, q: torch.Tensor) -> ResidualSamples:
+    still = torch.zeros_like(q)
+    return ResidualSamples(q, still, still, missing, torch.ones_like(q))
+
+
+def test_what_the_samples_of_one_stretch_say_is_judged_on_others(hybrid):
+    """The first joint moves slowly through its range, and what is missed is another constant on each way."""
+    levels = torch.randn(10, 1, generator=torch.Generator().manual_seed(3)).double()
+    missing = levels.repeat_interleave(200, dim=0) * torch.tensor([[1.0, 0.0]]).double()
+    q = torch.stack([torch.linspace(-2, 2, 2000), torch.zeros(2000)], dim=1).double()
+    # a function of q explains nearly all of it, and nothing where it was not fitted
+    assert select_residuals(hybrid, samples(missing, q), 1.0) == []
+
+
+def test_a_gain_in_one_of_ten_stretches_is_luck(hybrid):
+    t = torch.linspace(0, 200, 4000).double()
+    q = torch.stack([torch.sin(t), torch.zeros_like(t)], dim=1)
+    everywhere = torch.stack([torch.sin(q[:, 0]), torch.zeros_like(t)], dim=1)
+    found = select_residuals(hybrid, samples(everywhere, q), 1.0)
+    assert {residual.joint for residual in found} == {0}
+    # in one stretch it is so, in the others the torque is nearly nothing: held out it gains in one at most
+    once = everywhere * (torch.arange(4000) < 400).unsqueeze(-1)
+    noise = torch.randn(4000, 2, generator=torch.Generator().manual_seed(0)).double()
+    noise[:, 1] = 0.0
+    assert select_residuals(hybrid, samples(0.3 * once + noise, q), 1.0) == []
+
+
+def test_gains_have_to_be_beyond_their_own_scatter():
+    squares = torch.ones(10).double()
+    steady = torch.full((10,), 0.9).double()
+    assert residual_fit._significant_gain(squares, steady + 0.001 * torch.arange(10)) == pytest.approx(0.0955)
+    lucky = torch.tensor([0.1] + [1.0] * 9).double()
+    assert residual_fit._significant_gain(squares, lucky) is None
+
+
+def test_samples_that_err_alike_count_once():
+    """Each sample twenty times, with errors that are the same, says what it says once."""
+    draw = torch.Generator().manual_seed(0)
+    x = torch.randn(300, 4, generator=draw).double()
+    y = x @ torch.tensor([0.1, 0.0, -0.2, 0.3]).double() + torch.randn(300, generator=draw).double()
+    groups = torch.zeros(4)
+
+    def weights(times: int) -> torch.Tensor:
+        sums = residual_fit._Sums.of(x.repeat_interleave(times, dim=0), y.repeat_interleave(times))
+        return residual_fit._most_probable(sums, groups, float(times))
+
+    torch.testing.assert_close(weights(20), weights(1), rtol=1e-6, atol=1e-9)
+    assert (
+        weights(1) - torch.linalg.lstsq(x, y).solution
+    ).abs().max() > 1e-3  # drawn to nothing by the prior
+
+
+def test_intervals_of_errors_that_last_are_wider():
+    """White errors, each of which stays for ten samples: the standard deviation counts as sqrt(10) times that."""
+    white = np.random.default_rng(0).normal(size=(4000, 2))
+    lasting = white.repeat(10, axis=0)
+    np.testing.assert_allclose(deviations([white], 2), 1.0, rtol=0.15)
+    np.testing.assert_allclose(deviations([lasting], 2), np.sqrt(10), rtol=0.15)
+
+
+def test_the_evidence_counts_errors_that_last_once(monkeypatch):
+    """Half the noise is worth log 2 for each independent sample of each joint, and not for each sample."""
+    problem = SimpleNamespace(
+        free=torch.tensor([True]), start=torch.zeros(1).double(), precision=torch.eye(1).double(),
+        covariance=torch.eye(1).double(), count=2000, noise=torch.ones(2).double(),
+    )  # fmt: skip
+    first = torque_fit.TorqueProblem._evidence(problem, problem.start)
+    problem.noise = problem.noise / 2
+    gained = torque_fit.TorqueProblem._evidence(problem, problem.start) - first
+    assert gained < 0.5 * 2000 * 2 * np.log(2)
+
+
+def test_a_law_of_servos_is_worth_more_than_luck(monkeypatch):
+    """A law that lowers the cost by 1, which a chance does once in six times, is not taken; one of 10 is."""
+    rows = {laws.DEAD_ZONE: 0, laws.STRIBECK: 1}
+    without = ServoParameters(torch.ones(2, 1), torch.zeros(0), 0.0, torch.zeros(2, 1, dtype=torch.bool))
+    law = ServoParameters(torch.ones(2, 1), torch.zeros(0), 0.0, torch.tensor([[True], [False]]))
+
+    class Problem:
+        rows = SimpleNamespace(row=lambda name: rows[name])
+
+        def residuals(self, x: ServoParameters) -> None:
+            return None
+
+        def joint_costs(self, x: ServoParameters, errors: None) -> torch.Tensor:
+            return torch.tensor([100.0])
+
+    for gain, taken in ((1.0, False), (10.0, True)):
+        cost = torch.tensor([100.0 - gain])
+        monkeypatch.setattr(laws, "_joint_minima", lambda problem, x, cost=cost: (x, cost.clone()))
+        assert bool(laws._most_probable(Problem(), without, [law]).active.any()) == taken
+
+
+def test_straying_from_the_urdf_costs_what_the_docs_say(robots, monkeypatch):
+    """Mean squared deviations of M's variation and of gravity, relative to their sizes, times the weight: once."""
+    draw = torch.Generator().manual_seed(0)
+    mass = torch.randn(50, 2, 2, generator=draw).double()
+    gravity = torch.randn(50, 2, generator=draw).double()
+    regularizer = UrdfRegularizer(
+        torch.zeros(50, 2), torch.eye(2).double(), torch.zeros(50, 2, 2).double(), torch.zeros(50, 2).double(),
+        torch.full((2,), 2.0).double(),
+    )  # fmt: skip
+    model = SimpleNamespace(mass_matrix=lambda q: mass, gravity=lambda q: gravity)
+    varied = (mass - mass.mean(dim=0)).numpy()
+    expected = np.square(varied).sum() / 50 / 2 + np.square(gravity.numpy() / 2).mean()
+    assert float(regularizer.loss(model)) == pytest.approx(expected)
+    windows = SimpleNamespace(regularizer=regularizer, model=model, config=Rollout(urdf_weight=0.7))
+    assert float(WindowProblem.penalty(windows)) == pytest.approx(0.7 * expected)
+    penalties = []
+
+    def fit_networks(model, samples, decay, penalty, evaluations):
+        penalties.append(float(penalty()))
+        return 0
+
+    monkeypatch.setattr(torque_objective, "fit_networks", fit_networks)
+    networks = SimpleNamespace(mass_matrix=model.mass_matrix, gravity=model.gravity, named_modules=lambda: [])
+    monkeypatch.setattr(torque_objective, "has_rigid_bodies", lambda model: False)
+    fit_torques(networks, SimpleNamespace(seen=1, count=1), TorqueFit(urdf_weight=0.7), regularizer)
+    assert penalties == [pytest.approx(0.7 * expected)]
+
+
+def test_each_job_of_a_fleet_trains_with_its_own_seed(robots, tmp_path, monkeypatch):
+    seeds = []
+
+    def train(module, data, folder, config=None, **options):
+        seeds.append(options["seed"])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(jobs, "train", train)
+    for seed in (0, 1, 5):
+        job = jobs.Job(
+            robot="a", preset="spel", seed=seed, split=0, folder=tmp_path / str(seed), urdf=robots / "two_link.urdf",
+            train=(), test=(), data="x", design="spel", width=4, depth=1,
+        )  # fmt: skip
+        with pytest.raises(KeyboardInterrupt):
+            jobs.run_job(job)
+    assert seeds == [0, 1, 5]
