@@ -6,19 +6,15 @@ jvp in their place, as a user who knows torch would write it; and as `phnode`, w
 Six joints, 256 windows of 5 samples, hidden layers of 64 units, rk4 with one step from sample to sample, forward
 and backward (the update of the weights is left out). Medians of repeats, taken in turns in one run, on one thread.
 "bound" is the part of a step that keeps M positive definite: what the step gains where M is taken as it comes.
-PHNODE as published gets its windows in four parts: in one its graph needs 9 GB and takes as long. Then the same
-presets with their right-hand side compiled, each with a cold cache; what compiling costs, in s.
+PHNODE as published gets its windows in four parts: in one its graph needs 9 GB and takes as long.
 """
 
 from __future__ import annotations
 
 import copy
 import math
-import os
-import shutil
 import statistics
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -34,7 +30,6 @@ from published_phnode import ByJvp, Published
 
 from spelgen.building import build
 from spelgen.design import Design
-from spelgen.fitting.compiled import Compiled
 from spelgen.fitting.rollout import position_difference
 
 if TYPE_CHECKING:
@@ -214,23 +209,6 @@ def main() -> None:
             f"{name:13} {1e3 * step:6.1f} ms {bound:>7} {alone:16} {slow['published'] / step:12.0f}"
             f" {slow['with jvp'] / step:12.1f} {fast / step:10.1f} {count:11}       {sizes(model)}"
         )
-    if shutil.which("g++"):
-        print_compiled(models, data, {name: median(times) for name, times in steps.items()})
-
-
-def print_compiled(models: dict[str, EmittedModel], data: Data, plain: dict[str, float]) -> None:
-    """Print what compiling brings and costs."""
-    print(f"\n{'compiled':12}      step    gain  compiling")
-    for name, model in models.items():
-        with tempfile.TemporaryDirectory() as folder:
-            os.environ["TORCHINDUCTOR_CACHE_DIR"] = folder
-            torch._dynamo.reset()  # as in a process of its own
-            ready = Compiled(model)
-            compiling = seconds(lambda ready=ready: training_step(ready, data))
-            step = statistics.median(
-                seconds(lambda ready=ready: training_step(ready, data)) for _ in range(REPEATS)
-            )
-        print(f"{name:13} {1e3 * step:6.1f} ms {plain[name] / step:6.2f}x {compiling:8.1f} s", flush=True)
 
 
 if __name__ == "__main__":

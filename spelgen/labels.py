@@ -48,10 +48,10 @@ def axes_told(joints: Sequence[int]) -> str:
 
 def listed(names: Sequence[str]) -> str:
     """Return ``a``, or ``a, b and c``."""
-    *others, last = names
-    if not others:
+    *preceding, last = names
+    if not preceding:
         return last
-    return f"{', '.join(others)} and {last}"
+    return f"{', '.join(preceding)} and {last}"
 
 
 def printable(text: str, allowed: str = "") -> str:

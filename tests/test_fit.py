@@ -103,7 +103,7 @@ def test_what_was_used_is_recorded_and_nothing_else(tmp_path):
     assert found.record["objective"] == "rollout"
     assert found.record["config"] == {
         "window": 5, "stride": 1, "momentum_steps": 0, "optimizer": "lbfgs", "weight_decay": 2e-5,
-        "urdf_weight": 1.0, "epochs": 1, "patience": 60, "solver": "rk4", "compile": False,
+        "urdf_weight": 1.0, "epochs": 1, "patience": 60, "solver": "rk4",
     }  # fmt: skip
     assert found.record["preprocessing"] == {"cutoff": None, "decimation": 1, "gap": 4.0}
     json.dumps(found.record)

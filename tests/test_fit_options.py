@@ -20,7 +20,6 @@ VALUES = {
     "prior": {"bodies": 1.0}, "adapt": "friction", "evaluations": 40, "weight_decay": 0.1, "urdf_weight": 0.5,
     "window": 7, "stride": 2, "momentum_steps": 10, "optimizer": "adamw", "batch": 16, "learning_rate": 0.01,
     "max_minutes": 2.0, "torque_first": True, "epochs": 3, "patience": 2, "solver": "rk4", "substeps": 2,
-    "compile": True,
 }  # fmt: skip
 OF_CLOSED_FORM = {"torque": {"prior"}, "rollout": {"torque_first"}}
 OF_NETWORKS = {"torque": {"evaluations", "weight_decay", "urdf_weight"}}
@@ -28,7 +27,7 @@ OF_NETWORKS = {"torque": {"evaluations", "weight_decay", "urdf_weight"}}
 
 def test_every_option_has_a_value_here_and_a_place_in_the_settings():
     assert OWNERS.keys() == VALUES.keys()
-    in_a_file = OWNERS.keys() - {"adapt", "compile"}  # of one run, not of a robot
+    in_a_file = OWNERS.keys() - {"adapt"}  # of one run, not of a robot
     assert in_a_file <= TrainingSettings.model_fields.keys()
     beside = {"objective", "cutoff", "decimation", "gap", "validation_fraction", "seed"}
     assert TrainingSettings.model_fields.keys() == in_a_file | beside

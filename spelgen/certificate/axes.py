@@ -45,7 +45,7 @@ class Axes:
         self._configurations = [_configuration(arm, generator) for _ in range(_CONFIGURATIONS)]
 
     def parallel(self, a: int, b: int) -> bool:
-        return all(_are_parallel(at.axes[a], at.axes[b]) for at in self._configurations)
+        return all(_are_parallel(pose.axes[a], pose.axes[b]) for pose in self._configurations)
 
     def perpendicular(self, a: int, b: int) -> bool:
         return self._cosines(a, b) == {0}
@@ -54,14 +54,14 @@ class Axes:
         return len(self._cosines(a, b)) == 1
 
     def _cosines(self, a: int, b: int) -> set[Fraction]:
-        return {dot(at.axes[a], at.axes[b]) for at in self._configurations}
+        return {dot(pose.axes[a], pose.axes[b]) for pose in self._configurations}
 
     def same_line(self, a: int, b: int) -> bool:
         if not self.parallel(a, b):
             return False
-        for at in self._configurations:
-            lever = summed(at.origins[a], scaled(Fraction(-1), at.origins[b]))
-            if not _are_parallel(lever, at.axes[a]):
+        for pose in self._configurations:
+            lever = summed(pose.origins[a], scaled(Fraction(-1), pose.origins[b]))
+            if not _are_parallel(lever, pose.axes[a]):
                 return False
         return True
 
@@ -87,14 +87,14 @@ class Axes:
         """Whether no joint moves the mass behind ``slider`` across the plane of the two directions."""
         if not all(self.slides[turner + 1 : slider]):
             return False  # a turn between the two may turn the plane
-        for at in self._configurations:
-            normal = _cross(at.axes[slider], at.axes[turner])
+        for pose in self._configurations:
+            normal = _cross(pose.axes[slider], pose.axes[turner])
             for joint in range(turner + 1, len(self.slides)):
                 if joint == slider:
                     continue
-                if self.slides[joint] and dot(at.axes[joint], normal):
+                if self.slides[joint] and dot(pose.axes[joint], normal):
                     return False
-                if not self.slides[joint] and not _are_parallel(at.axes[joint], normal):
+                if not self.slides[joint] and not _are_parallel(pose.axes[joint], normal):
                     return False
         return True
 
@@ -130,10 +130,10 @@ class Axes:
 
     def lifts_nothing(self, joint: int) -> bool:
         """Whether the joint slides level, or turns about the vertical."""
-        for at in self._configurations:
-            if self.slides[joint] and dot(at.axes[joint], self.arm.gravity):
+        for pose in self._configurations:
+            if self.slides[joint] and dot(pose.axes[joint], self.arm.gravity):
                 return False
-            if not self.slides[joint] and not _are_parallel(at.axes[joint], self.arm.gravity):
+            if not self.slides[joint] and not _are_parallel(pose.axes[joint], self.arm.gravity):
                 return False
         return True
 

@@ -72,7 +72,7 @@ class _Words:
         """Yield zeros along an axis by the joint that slides, right angles by a joint many have, then the others."""
         along: dict[int, list[Entry]] = {}
         across: list[Entry] = []
-        others: list[Entry] = []
+        unexplained: list[Entry] = []
         for entry in self.structure.entries:
             if entry.kind != "zero":
                 continue
@@ -82,7 +82,7 @@ class _Words:
             elif self._slide_across(entry):
                 across.append(entry)
             else:
-                others.append(entry)
+                unexplained.append(entry)
         for slider, group in sorted(along.items()):
             axes = axes_told(_other_joints(group, slider))
             yield _zero(
@@ -97,7 +97,7 @@ class _Words:
             across = [entry for entry in across if entry not in group]
             which = joints_told(_other_joints(group, common))
             yield _zero(group, f"joint {common + 1} slides at right angles to {which}")
-        for reason, group in self._by_reason(others, reasons.balance_reason):
+        for reason, group in self._by_reason(unexplained, reasons.balance_reason):
             yield _zero(group, reason)
 
     def _slides_along(self, entry: Entry) -> int | None:

@@ -50,9 +50,9 @@ def latex(formulas: Formulas) -> str:
 def _aligned(rows: Iterable[tuple[Symbol, Expr]]) -> Iterable[str]:
     printer = Latex()
     for name, expression in rows:
-        first, *others = printer.lines(expression, f"{printer.whole(name)} &= ", _LATEX_WIDTH)
+        first, *following = printer.lines(expression, f"{printer.whole(name)} &= ", _LATEX_WIDTH)
         yield first
-        for line in others:
+        for line in following:
             yield rf"    &\quad {line.strip()}"
 
 

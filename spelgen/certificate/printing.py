@@ -57,8 +57,8 @@ class _AsBuilt(Printer):  # type: ignore[misc]  # SymPy has no types
         return f"+{_FIXED}{text}"
 
     def _print_Add(self, expression: Add, order: str | None = None) -> str:
-        first, *others = [self._print(term) for term in expression.args]
-        return " ".join([first, *map(self._signed, others)])
+        first, *following = [self._print(term) for term in expression.args]
+        return " ".join([first, *map(self._signed, following)])
 
     def _print_Mul(self, expression: Mul) -> str:
         number, factors = expression.as_coeff_mul()

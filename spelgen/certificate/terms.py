@@ -102,9 +102,9 @@ def bracketed(terms: Terms) -> tuple[fmpq, Terms]:
     """
     if len(terms) < 2:
         return fmpq(1), terms
-    first, *others = terms.values()
+    first, *following = terms.values()
     outside = fmpq(1)
-    if all(abs(value) == abs(first) for value in others):
+    if all(abs(value) == abs(first) for value in following):
         outside = abs(first)
     if first < 0:
         outside = -outside

@@ -149,8 +149,8 @@ def _dependence(case: _Case) -> Check:
                 against.unseen.append(f"{pair} is not seen to move")
             if not expected[joint, index] and size > TUNING.rounding:
                 against.unexpected.append(f"{pair} moves by {size_text(size)}")
-    others = size_text(moves[~expected].max(initial=0))
-    result = f"no joint moves another entry by more than {others} of its scale"
+    largest = size_text(moves[~expected].max(initial=0))
+    result = f"no joint moves another entry by more than {largest} of its scale"
     if expected.any():
         weakest = size_text(moves[expected].min())
         result = f"the weakest moves its entry by {weakest} of its scale; {result}"

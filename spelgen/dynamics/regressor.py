@@ -6,18 +6,30 @@ Newton-Euler in body frames (Khalil and Dombre, Modeling, Identification and Con
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations_with_replacement
 
 import numpy as np
 
 from spelgen.arm.arm import Arm, Body
 
-_CROSS = np.zeros((3, 3, 3))  # _CROSS @ b applied to a, summed over the last axes, is a x b
-for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-    _CROSS[_i, _j, _k], _CROSS[_i, _k, _j] = 1.0, -1.0
 
-_TENSOR = np.zeros((3, 3, 6))  # the tensor's entries by its six components
-for _component, (_i, _j) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))):
-    _TENSOR[_i, _j, _component] = _TENSOR[_j, _i, _component] = 1.0
+def _cross_table() -> np.ndarray:
+    """Return the table, (3, 3, 3), that is @ b applied to a, summed over the last axes, a x b."""
+    table = np.zeros((3, 3, 3))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        table[i, j, k], table[i, k, j] = 1.0, -1.0
+    return table
+
+
+def _tensor_table() -> np.ndarray:
+    """Return a symmetric tensor's entries by its six components, (3, 3, 6)."""
+    table = np.zeros((3, 3, 6))
+    for component, (i, j) in enumerate(combinations_with_replacement(range(3), 2)):
+        table[i, j, component] = table[j, i, component] = 1.0
+    return table
+
+
+_CROSS, _TENSOR = _cross_table(), _tensor_table()
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,15 +57,15 @@ def regressor(arm: Arm, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.nd
         states.append(_moved(arm, body, states, q, qd, qdd))
         force, moment = _wrench(states[index])
         columns = result[:, :, 10 * index : 10 * index + 10]
-        at = index
-        while at >= 0:
-            link = arm.bodies[at]
+        carrier = index
+        while carrier >= 0:
+            link = arm.bodies[carrier]
             along = moment if link.kind == "revolute" else force
             columns[:, link.coordinate] += float(link.multiplier) * along[:, 2]
-            state = states[at]
+            state = states[carrier]
             force, moment = state.rotation @ force, state.rotation @ moment
             moment = moment + _crossing(state.position) @ force
-            at = link.parent
+            carrier = link.parent
     return result
 
 

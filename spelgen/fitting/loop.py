@@ -24,7 +24,6 @@ from spelgen.settings.fits import Rollout
 from spelgen.settings.tuning.fitting import LoopTuning
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
     from spelgen.fitting.objective import Status
 
 TUNING = LoopTuning()
@@ -38,8 +37,7 @@ PLAIN = (
 class TrainingLoop:
     """The changing state of one fit; `state` is all of it, so a resumed run repeats the same numbers.
 
-    config: a resolved one. stepped: what steps are taken with, the same weights, compiled maybe. seconds: what was
-    spent before, of the allowed time. folder: of the run, for messages.
+    config: a resolved one. seconds: what was spent before, of the allowed time. folder: of the run, for messages.
 
     What stands beside rigid bodies and was not selected before rests until the bodies are done, for short windows are
     explained by it too, and worse. It then moves from the best weights so far, and stays where validation says so.
@@ -52,12 +50,11 @@ class TrainingLoop:
         config: Rollout,
         *,
         seed: int = 0,
-        stepped: EmittedModel | None = None,
         seconds: float = 0.0,
         folder: Path | None = None,
     ) -> None:
         self.problem, self.validation, self.config = problem, validation, config
-        self.model, self.stepped = problem.model, stepped or problem.model
+        self.model = problem.model
         self.seed, self.folder = seed, folder
         self.generator = torch.Generator().manual_seed(seed)
         self.resting, self.stage_from, self.stage_epoch = idle_residuals(self.model), 0.0, 0
@@ -100,7 +97,7 @@ class TrainingLoop:
 
     def _rollout_loss(self, windows: Windows) -> torch.Tensor:
         scales, solver = self.problem.scales, self.config.solver
-        return rollout_loss(self.stepped, windows, scales, self.substeps, solver) + self.problem.penalty()
+        return rollout_loss(self.model, windows, scales, self.substeps, solver) + self.problem.penalty()
 
     def _end(self) -> Status | None:
         if self.epoch >= self.config.epochs or self.optimizer.stalled:

@@ -17,7 +17,7 @@ Content = dict[str, Any]
 """What a file of a run folder holds, by key: JSON, or what torch saves."""
 
 Schema = TypeVar("Schema", bound=BaseModel)
-MAY_CHANGE = ("epochs", "patience", "max_minutes", "compile")  # between a run and its resumption
+MAY_CHANGE = ("epochs", "patience", "max_minutes")  # between a run and its resumption
 
 
 class Record(BaseModel):

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
 PARTS: dict[Adaptation, tuple[str, ...]] = {
-    "load": ("mass.", "potential."),
-    "friction": ("friction.",),
-    "unit": ("",),
+    "load": ("mass", "potential"),
+    "friction": ("friction",),
+    "unit": (),
 }
 """The parts of a model whose weights an adaptation moves; a unit's are all."""
 BLOCK = 2**16  # samples in memory with all that their gradient needs
@@ -64,7 +64,9 @@ def adapt_networks(
 
     weight_decay: of half the sum of squared changes, so that what these samples do not show stays as it was.
     """
-    moving = {name: x for name, x in model.named_parameters() if name.startswith(PARTS[adapt])}
+    parts = [getattr(model, part) for part in PARTS[adapt]] or [model]
+    chosen = {id(weight) for part in parts if part is not None for weight in part.parameters()}
+    moving = {name: weight for name, weight in model.named_parameters() if id(weight) in chosen}
     before = {name: x.detach().clone() for name, x in moving.items()}
 
     def changed() -> torch.Tensor | float:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, ClassVar
 
 from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.errors import Diagnostic, LogError
-from spelgen.fitting.compiled import compiled
 from spelgen.fitting.dataset import TrainingData
 from spelgen.fitting.loop import TrainingLoop
 from spelgen.fitting.momentum import momentum_stage
@@ -23,7 +22,6 @@ from spelgen.logs.rates import SLOWEST
 from spelgen.settings.fits import MomentumFit, Rollout, TorqueFit, WindowConfig
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
     from spelgen.fitting.progress import TrainingProgress
 
 
@@ -149,7 +147,6 @@ class RolloutObjective:
         request, config = self.request, self.config
         notes: list[Diagnostic] = []
         model = request.model
-        stepped = self._compiled(notes)
         # towards the URDF as the model has it before any fit, in a resumed run too
         regularizer = regularizer_of(request, self.data, config.urdf_weight, notes)
         if torque_first:
@@ -168,7 +165,6 @@ class RolloutObjective:
             validation,
             config,
             seed=request.seed,
-            stepped=stepped,
             seconds=time.monotonic() - request.began,
             folder=request.folder,
         )
@@ -182,16 +178,3 @@ class RolloutObjective:
             f"no torque fit: no log that moves has {SLOWEST:g} Hz for a second; windows alone are fitted"
         )
         return [Diagnostic("warning", "no-torque-fit", "logs", None, message)]
-
-    def _compiled(self, notes: list[Diagnostic]) -> EmittedModel:
-        """Return the model as steps on windows use it, compiled where that is asked for."""
-        if not self.config.compile:
-            return self.request.model
-        start, device = time.monotonic(), self.request.device
-        windows = self.data.training  # as steps take them, so that shapes are compiled for once
-        if self.config.batch is not None:
-            windows = windows[: self.config.batch]
-        model = compiled(self.request.model.to(device), windows.to(device), self.data.scales.to(device))
-        message = f"right-hand side compiled in {time.monotonic() - start:.0f} s"
-        notes.append(Diagnostic("info", "compiled", "training", None, message))
-        return model

@@ -181,7 +181,6 @@ class Rollout(OnWindows):
     `momentum_steps` as of `MomentumFit`, kept where they help. Then windows are predicted by `solver`: rk4 with
     `substeps` per sample interval (None: as many as the robot needs) or dopri5 of torchdiffeq.
     epochs: passes over all windows, at most. patience: epochs without a better validation loss before the end.
-    compile: the right-hand side, by torch; needs a C++ compiler.
     """
 
     objective: ClassVar[Objective] = "rollout"
@@ -192,7 +191,6 @@ class Rollout(OnWindows):
     patience: Count = 60
     solver: Solver = "rk4"
     substeps: Substeps | None = None
-    compile: bool = False
 
 
 class ServoFit(FitConfig):

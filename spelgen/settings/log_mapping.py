@@ -25,11 +25,12 @@ PLAIN = {
 }
 """Columns as spelgen itself writes them."""
 
-TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_MILLI = 1e-3
+TIMES = {unit: _MILLI**power for power, unit in enumerate(("s", "ms", "us", "ns"))}
 ANGLES = {"rad": 1.0, "deg": pi / 180, "turns": 2 * pi}
-LENGTHS = {"m": 1.0, "mm": 1e-3}
+LENGTHS = {"m": 1.0, "mm": _MILLI}
 RATES = {"rpm": 2 * pi / 60, **{f"{name}/s": value for name, value in {**ANGLES, **LENGTHS}.items()}}
-EFFORTS = {"Nm": 1.0, "mNm": 1e-3, "N": 1.0, "A": 1.0, "mA": 1e-3}
+EFFORTS = dict.fromkeys(("Nm", "N", "A"), 1.0) | dict.fromkeys(("mNm", "mA"), _MILLI)
 CURRENTS = ("A", "mA")
 COUNTS = ("counts", "counts/s")
 ONLY = {  # units that a joint of this kind cannot have

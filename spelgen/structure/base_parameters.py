@@ -125,10 +125,10 @@ def _row(element: np.ndarray | int, parameters: int) -> np.ndarray:
     return np.full(parameters, fmpq(0))
 
 
-def _solved(left: np.ndarray, right: np.ndarray) -> list[list[fmpq]]:
+def _solved(matrix: np.ndarray, right: np.ndarray) -> list[list[fmpq]]:
     if not right.size:
-        return [[] for _ in left]
-    return fmpq_mat(left.tolist()).solve(fmpq_mat(right.tolist())).table()
+        return [[] for _ in matrix]
+    return fmpq_mat(matrix.tolist()).solve(fmpq_mat(right.tolist())).table()
 
 
 def _rational(number: Fraction) -> fmpq:

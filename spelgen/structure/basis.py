@@ -19,7 +19,7 @@ import numpy as np
 
 from spelgen.settings.tuning.structure import StructureTuning
 from spelgen.structure import field
-from spelgen.structure.spans import Spans
+from spelgen.structure.sampling import Spans
 
 TUNING = StructureTuning()
 
@@ -68,26 +68,26 @@ def smallest_form(spans: Spans) -> tuple[tuple[Output, ...], tuple[Constant, ...
         Output(r.joints, _weights(spans, r.weights, r.values), _weights(spans, row, row_values))
         for r, row, row_values in zip(readings, basis, basis_values, strict=True)
     )
-    rest = field.difference(spans.mass, field.product(field.product(spans.mass, weights.T), basis))
+    constant = field.difference(spans.mass, field.product(field.product(spans.mass, weights.T), basis))
     rest_values = spans.float_mass - spans.float_mass @ values.T @ basis_values
-    return outputs, _constants(spans, readings, (rest, rest_values), (basis, basis_values))
+    return outputs, _constants(spans, readings, (constant, rest_values), (basis, basis_values))
 
 
 def _constants(
     spans: Spans,
     readings: list[_Reading],
-    rest: tuple[np.ndarray, np.ndarray],
+    constant: tuple[np.ndarray, np.ndarray],
     basis: tuple[np.ndarray, np.ndarray],
 ) -> tuple[Constant, ...]:
     """Return a basis of what the outputs leave of W; entries that are constant themselves are the first choice for a
     constant.
     """
     order = sorted(range(len(spans.keys)), key=lambda index: (len(spans.entry_joints[index]), -index))
-    echelon = field.row_basis(rest[0][:, order])
+    echelon = field.row_basis(constant[0][:, order])
     bound = [order[pivot] for pivot in field.pivots(echelon)]
     rows = np.zeros_like(echelon)
     rows[:, order] = echelon
-    row_values = _solved(rest[1][:, bound], rest[1])
+    row_values = _solved(constant[1][:, bound], constant[1])
     constants = []
     for pivot, row, values in zip(bound, rows, row_values, strict=True):
         # c is the entry at the pivot less what the outputs put there
@@ -169,11 +169,11 @@ def _single(spans: Spans, index: int) -> tuple[np.ndarray, np.ndarray]:
     return weights, weights.astype(float)
 
 
-def _solved(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return the least-squares solution X of left X = right, both tall."""
-    width = left.shape[1]
+def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Return the least-squares solution X of matrix X = right, both tall."""
+    width = matrix.shape[1]
     # the triangular factor holds all there is to know, and is small
-    factor = np.asarray(np.linalg.qr(np.concatenate([left, right], axis=1), mode="r"))
+    factor = np.asarray(np.linalg.qr(np.concatenate([matrix, right], axis=1), mode="r"))
     result: np.ndarray = np.linalg.lstsq(factor[:, :width], factor[:, width:], rcond=None)[0]
     return result
 

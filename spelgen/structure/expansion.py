@@ -30,29 +30,29 @@ class Deferred:
         self.action = action
         self.operands = operands
 
-    def __add__(self, other: Deferred | int) -> Deferred:
+    def __add__(self, operand: Deferred | int) -> Deferred:
         # zeros are common, and what is not written down need not be carried out
-        if isinstance(other, int) and other == 0:
+        if isinstance(operand, int) and operand == 0:
             return self
-        return Deferred("add", self, other)
+        return Deferred("add", self, operand)
 
     __radd__ = __add__
 
     def __neg__(self) -> Deferred:
         return Deferred("multiply", self, -1)
 
-    def __sub__(self, other: Deferred | int) -> Deferred:
-        return self + -other
+    def __sub__(self, operand: Deferred | int) -> Deferred:
+        return self + -operand
 
-    def __rsub__(self, other: int) -> Deferred:
-        return -self + other
+    def __rsub__(self, operand: int) -> Deferred:
+        return -self + operand
 
-    def __mul__(self, other: Deferred | int) -> Deferred | int:
-        if isinstance(other, int) and other == 0:
+    def __mul__(self, operand: Deferred | int) -> Deferred | int:
+        if isinstance(operand, int) and operand == 0:
             return 0
-        if isinstance(other, int) and other == 1:
+        if isinstance(operand, int) and operand == 1:
             return self
-        return Deferred("multiply", self, other)
+        return Deferred("multiply", self, operand)
 
     __rmul__ = __mul__
 

@@ -13,10 +13,20 @@ from fractions import Fraction
 import numpy as np
 from flint import fmpz_mat, nmod_mat
 
-PRIME = 2**61 - 1
+_EXPONENT = 61  # of a Mersenne prime: remainders are sums of shifted bits
+
+
+def _ones(count: int) -> int:
+    """Return the integer of so many binary ones."""
+    return (1 << count) - 1
+
+
+PRIME = _ones(_EXPONENT)
 _P = np.uint64(PRIME)
-_BITS_61, _BITS_31, _BITS_30 = np.uint64(61), np.uint64(31), np.uint64(30)
-_LOW_31, _LOW_30 = np.uint64(2**31 - 1), np.uint64(2**30 - 1)
+_LOWER = _EXPONENT // 2
+_UPPER = _EXPONENT - _LOWER  # bits of the halves whose products fit into 64 bits
+_BITS_61, _BITS_31, _BITS_30 = np.uint64(_EXPONENT), np.uint64(_UPPER), np.uint64(_LOWER)
+_LOW_31, _LOW_30 = np.uint64(_ones(_UPPER)), np.uint64(_ones(_LOWER))
 
 
 class Residues:
@@ -27,31 +37,31 @@ class Residues:
     def __init__(self, values: np.ndarray):
         self.values = values
 
-    def __add__(self, other: Residues | int) -> Residues:
-        if isinstance(other, int) and other == 0:
+    def __add__(self, operand: Residues | int) -> Residues:
+        if isinstance(operand, int) and operand == 0:
             return self
-        return Residues(_folded(self.values + _values(other)))
+        return Residues(_folded(self.values + _values(operand)))
 
     __radd__ = __add__
 
     def __neg__(self) -> Residues:
         return Residues(_folded(_P - self.values))
 
-    def __sub__(self, other: Residues | int) -> Residues:
-        if isinstance(other, int) and other == 0:
+    def __sub__(self, operand: Residues | int) -> Residues:
+        if isinstance(operand, int) and operand == 0:
             return self
-        return Residues(_folded(self.values + (_P - _values(other))))
+        return Residues(_folded(self.values + (_P - _values(operand))))
 
-    def __rsub__(self, other: int) -> Residues:
-        return -self + other
+    def __rsub__(self, operand: int) -> Residues:
+        return -self + operand
 
-    def __mul__(self, other: Residues | int) -> Residues | int:
-        if isinstance(other, int):
-            if other in (0, 1):
-                return self if other else 0
-            if other == 2:
+    def __mul__(self, operand: Residues | int) -> Residues | int:
+        if isinstance(operand, int):
+            if operand in (0, 1):
+                return self if operand else 0
+            if operand == 2:
                 return Residues(_folded(self.values + self.values))
-        return Residues(_product(self.values, _values(other)))
+        return Residues(_product(self.values, _values(operand)))
 
     __rmul__ = __mul__
 
@@ -136,14 +146,14 @@ class Independent:
 
     def add(self, vector: np.ndarray) -> bool:
         """Take ``vector`` in, unless it depends on those already there; whether it was."""
-        rest = difference(vector, combined(self.rows.T, vector[self._pivots]))
-        support = np.flatnonzero(rest)
+        remainder = difference(vector, combined(self.rows.T, vector[self._pivots]))
+        support = np.flatnonzero(remainder)
         if not len(support):
             return False
         pivot = int(support[0])
-        row = _product(rest, np.uint64(pow(int(rest[pivot]), -1, PRIME)))
-        others = difference(self.rows, _product(self.rows[:, pivot, None], row))
-        self.rows = np.concatenate([others, row[None]])
+        row = _product(remainder, np.uint64(pow(int(remainder[pivot]), -1, PRIME)))
+        cleared = difference(self.rows, _product(self.rows[:, pivot, None], row))
+        self.rows = np.concatenate([cleared, row[None]])
         self._pivots.append(pivot)
         return True
 
@@ -165,8 +175,8 @@ def _array(matrix: nmod_mat, rows: int | None = None) -> np.ndarray:
     return np.fromiter(entries, dtype=np.uint64, count=height * width).reshape(height, width)
 
 
-def _values(other: Residues | int) -> np.ndarray | np.uint64:
-    return other.values if isinstance(other, Residues) else np.uint64(other % PRIME)
+def _values(operand: Residues | int) -> np.ndarray | np.uint64:
+    return operand.values if isinstance(operand, Residues) else np.uint64(operand % PRIME)
 
 
 def _folded(values: np.ndarray) -> np.ndarray:

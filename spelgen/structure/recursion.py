@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import combinations_with_replacement
 from typing import Any
 
 from spelgen.arm.arm import Arm, Body
@@ -25,7 +26,7 @@ Terms = tuple[tuple[int, Element], ...]
 PARAMETERS = ("m", "hx", "hy", "hz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
 """Names of a body's ten inertial parameters, in their order."""
 
-TENSOR = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+TENSOR = tuple(combinations_with_replacement(range(3), 2))
 """Order of the six tensor components of a ten-vector: Ixx, Ixy, Ixz, Iyy, Iyz, Izz."""
 
 

@@ -19,8 +19,7 @@ from spelgen.errors import ArmError
 from spelgen.spec import Assume
 from spelgen.structure import field
 from spelgen.structure.basis import Constant, Output, smallest_form
-from spelgen.structure.sampling import regressor_rows
-from spelgen.structure.spans import Spans
+from spelgen.structure.sampling import Spans, regressor_rows
 
 
 @dataclass(frozen=True)
