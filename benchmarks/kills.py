@@ -50,7 +50,7 @@ def main() -> None:
         write_logs(folder / "train.parquet", simulate(arm, trajectories=4).train, joints)
         source = generate(arm, "closed-form") if asked.servos else generate(arm, "spel", width=4, depth=1)
         (folder / "module.py").write_text(source)
-        options = ["--quiet", "--robot", str(urdf)] + ([] if asked.servos else ADAMW)
+        options = ["--set", "progress=false", "--robot", str(urdf)] + ([] if asked.servos else ADAMW)
         epochs = str(20 + 16 * kills)  # of some 0.2 s: more than are done before the last kill
         always = [] if asked.servos else ["--set", f"epochs={epochs}", "--set", f"patience={epochs}"]
 

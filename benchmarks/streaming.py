@@ -47,7 +47,7 @@ def main() -> None:
         print(f"log: {size / 1e9:.2f} GB of numbers, written in {time.monotonic() - since:.0f} s")
         source = generate(URDF, preset=chosen.preset, width=32)
         (folder / "module.py").write_text(source, encoding="utf-8")
-        command = ["train", "module.py", "--data", "train.parquet", "-o", "run", "--quiet"]
+        command = ["train", "module.py", "--data", "train.parquet", "-o", "run", "--set", "progress=false"]
         command += ["--robot", str(URDF), "--objective", "torque"]
         since = time.monotonic()
         subprocess.run([sys.executable, "-m", "spelgen", *command], cwd=folder, check=True)

@@ -38,7 +38,8 @@ def test_a_run_and_its_logs_may_be_elsewhere(robots, tmp_path, memory):
         "epochs=2",
         "--set",
         "momentum_steps=0",
-        "--quiet",
+        "--set",
+        "progress=false",
         "--robot",
         str(robots / "two_link.urdf"),
     ]

@@ -12,11 +12,13 @@ from typer.testing import CliRunner
 from spelgen.arm.actuation import Drives
 from spelgen.cli.main import app
 from spelgen.dynamics.regressor import regressor, urdf_parameters
-from spelgen.errors import LogError, SpelgenErrors
+from spelgen.errors import LogError, SpelgenError, SpelgenErrors
+from spelgen.identification.drive_hints import drive_problem, find_coupling
+from spelgen.identification.drive_samples import DriveLog
 from spelgen.loaded_arm import load_arm
 from spelgen.log_checks import check_logs as check_logs_room
 from spelgen.log_checks import robot_checks
-from spelgen.log_checks.check_logs import check_logs, require_possible_torques
+from spelgen.log_checks.check_logs import check_logs, require_sound_logs
 from spelgen.log_checks.statistics import noise_level, quantisation_step, statistics
 from spelgen.logs import checks, chunks
 from spelgen.logs.read import write_logs
@@ -124,11 +126,11 @@ def test_torques_of_another_sense_or_unit_are_errors_before_anything_is_fitted(l
     (error,) = check_logs(wrong, loaded).errors
     assert str(error).startswith(where)
     with pytest.raises(LogError) as caught:
-        require_possible_torques(wrong, loaded)
+        require_sound_logs(wrong, loaded)
     assert str(caught.value) == str(error)
     said = LogMapping.model_validate({"units": {"tau": "Nm"}})
     assert bool(check_logs(wrong, loaded, said).errors) == (case == "sign")
-    require_possible_torques([log], loaded)
+    require_sound_logs([log], loaded)
 
 
 def test_torques_beyond_all_drives_are_errors(loaded, arm, log):
@@ -140,7 +142,7 @@ def test_torques_beyond_all_drives_are_errors(loaded, arm, log):
     with pytest.raises(
         SpelgenErrors, match=r"times what the drive can give, expected Nm or N at the joint; write 'un"
     ):
-        require_possible_torques([wrong], weak)
+        require_sound_logs([wrong], weak)
 
 
 def test_limits_overrun_are_said(loaded, arm, log):
@@ -307,3 +309,65 @@ def test_real_arms_are_believed(shared):
     assert (result.errors, result.findings) == ((), ())
     assert [joint.steps["q"] for joint in result.joints] == pytest.approx([1e-4] * 6)
     assert [joint.gravity.explained > 0.9 for joint in result.joints[1:3]] == [True, True]
+
+
+WRONG_TORQUES = {
+    "all negated": (lambda tau: -tau, "torque-sense"),
+    "first negated": (lambda tau: tau * [-1, 1, 1], "torque-sense"),
+    "swapped": (lambda tau: tau[:, [0, 2, 1]], "torque-order"),
+    "zero": (np.zeros_like, "no-torques"),
+    "dropouts": (lambda tau: np.where(np.arange(len(tau))[:, None] % 500 == 40, 0.0, tau), "dropouts"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_TORQUES)
+def test_torques_that_cannot_be_are_refused_unless_accepted(loaded, log, case):
+    change, code = WRONG_TORQUES[case]
+    wrong = replace(log, tau=change(log.tau))
+    with pytest.raises(SpelgenError) as caught:
+        require_sound_logs([wrong], loaded)
+    assert f"--accept {code}" in str(caught.value)
+    if case == "swapped":
+        assert "coupl" not in str(caught.value)
+    accepting = LogMapping.model_validate({"accept": [code]})
+    require_sound_logs([replace(wrong, accepted=(code,))], loaded, accepting)
+
+
+def test_times_in_milliseconds_are_refused(loaded, log):
+    with pytest.raises(SpelgenError) as caught:
+        require_sound_logs([replace(log, t=1000 * log.t)], loaded)
+    assert str(caught.value) == (
+        "trajectory motion, joint 'joint1': got a sample every 9.99 s, expected times in seconds; write "
+        "'units: {t: ms}' (us, ns) under 'logs' in the robot's YAML; --accept time-unit if it is right"
+    )
+
+
+def test_gravity_of_another_mounting_is_refused(robots, tmp_path, log):
+    (tmp_path / "arm.urdf").write_bytes((robots / "rpr.urdf").read_bytes())
+    (tmp_path / "arm.yaml").write_text("gravity: [0, 0, 9.81]\n")
+    with pytest.raises(SpelgenError, match="the gravity of this mounting"):
+        require_sound_logs([log], load_arm(tmp_path / "arm.urdf"))
+
+
+def test_a_quantised_signal_and_a_stop_are_told(loaded, arm, log):
+    tau = log.tau.copy()
+    step = np.ptp(tau[:, 0]) / 4
+    tau[:, 0] = step * np.round(tau[:, 0] / step)
+    q = log.q.copy()
+    q[:, 2] = np.minimum(q[:, 2] + arm.coordinates[2].upper - q[:, 2].max(), arm.coordinates[2].upper)
+    codes = {x.code for x in check_logs([replace(log, tau=tau, q=q)], loaded).findings}
+    assert {"coarse", "at-a-stop"} <= codes
+
+
+def test_no_coupling_is_found_by_luck(loaded, log):
+    """Torques that no parameters explain: of all couplings one is the best, and none is told."""
+    for seed in range(10):
+        noise = np.random.default_rng(seed).standard_normal(log.tau.shape).cumsum(axis=0)
+        problem = drive_problem(loaded, drive_log(replace(log, tau=noise)))
+        assert find_coupling(problem) is None
+
+
+def drive_log(log):
+    collected = DriveLog(np.eye(3))
+    collected.add(log)
+    return collected

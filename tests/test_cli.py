@@ -195,7 +195,9 @@ def test_unreadable_logs(spelgen, robots, tmp_path, content, told):
     if content is not None:
         (tmp_path / "logs.csv").write_text(content)
     before = everything(tmp_path)
-    assert refused(spelgen("train", "rpr_spel.py", "--data", "logs.csv", "--quiet")).startswith(told)
+    assert refused(
+        spelgen("train", "rpr_spel.py", "--data", "logs.csv", "--set", "progress=false")
+    ).startswith(told)
     assert everything(tmp_path) == before
 
 

@@ -129,7 +129,7 @@ def test_the_command_line_names_the_flag(robots, tmp_path):
     logs, module = tmp_path / "train.parquet", tmp_path / "rpr.py"
     write_logs(logs, motions(), JOINTS)
     module.write_text(generate(robots / "rpr.urdf", preset="closed-form"))
-    data = ("--data", logs, "-o", tmp_path / "run", "--quiet")
+    data = ("--data", logs, "-o", tmp_path / "run", "--set", "progress=false")
     told = refused(module, *data, "--objective", "torque", "--set", "learning_rate=0.1")
     assert (
         told == "Error: --set learning_rate: belongs to the objectives momentum and rollout, this fits torque"
@@ -160,12 +160,23 @@ def test_a_run_goes_on_with_its_own_options(tmp_path):
         str(logs),
         "-o",
         str(run),
-        "--quiet",
+        "--set",
+        "progress=false",
         "--set",
         "momentum_steps=20",
     ]
     assert CliRunner().invoke(app, [*begin, "--set", "epochs=1", "--set", "window=6"]).exit_code == 0
-    again = ["train", str(STAND_IN), "--data", str(logs), "-o", str(run), "--quiet", "--resume"]
+    again = [
+        "train",
+        str(STAND_IN),
+        "--data",
+        str(logs),
+        "-o",
+        str(run),
+        "--set",
+        "progress=false",
+        "--resume",
+    ]
     assert CliRunner().invoke(app, [*again, "--set", "epochs=2"]).output.startswith("finished after 2 epochs")
     assert refused(*again[1:], "--set", "evaluations=40").startswith("Error: --set evaluations: belongs to")
     done = CliRunner().invoke(app, [*again, "--set", "window=7"])

@@ -16,7 +16,7 @@ import pytest
 
 from spelgen.errors import LogError, SettingsError, SpelgenErrors
 from spelgen.loaded_arm import load_arm
-from spelgen.logs import formats, npz
+from spelgen.logs import checks, formats, npz
 from spelgen.logs.chunks import scan
 from spelgen.logs.formats import FORMATS
 from spelgen.logs.read import read_logs, write_logs
@@ -82,7 +82,7 @@ def test_units_signs_offsets_and_gains_are_applied(tmp_path):
     path = parquet(tmp_path / "robot.parquet", log)
     (found,) = read_logs([path], JOINTS, mapping=LogMapping.model_validate(text))
     check(found, "robot", rtol=1e-12)
-    assert found.declares_units
+    assert "degrees" in found.accepted
 
 
 def test_prismatic_counts_are_metres(tmp_path):
@@ -650,3 +650,74 @@ def test_no_column_of_another_joint_is_offered(tmp_path):
         with pytest.raises(LogError, match="missing column effort_3") as caught:
             read_logs(path, asked, {"columns": names})
         assert "rename the column '" not in str(caught.value)
+
+
+def joint_states(order=("b", "a")):
+    """Lines as `ros2 topic echo --csv` writes them, at 100 Hz."""
+    lines = []
+    for k in range(50):
+        values = {"a": (0.01 * k, 1.0, 5.0 + 0.1 * k), "b": (-0.02 * k, -2.0, 7.0)}
+        cells = [str(1_700_000_000 + k // 100), str(10_000_000 * (k % 100)), "base", *order]
+        for field in range(3):
+            cells += [f"{values[joint][field]:.6f}" for joint in order]
+        lines.append(",".join(cells))
+    return lines
+
+
+def test_what_ros2_topic_echo_writes_is_read(tmp_path):
+    (tmp_path / "log.csv").write_text("\n".join(joint_states()) + "\n")
+    (log,) = read_logs([tmp_path / "log.csv"], ("a", "b"))
+    np.testing.assert_allclose(log.t - log.t[0], 0.01 * np.arange(50), atol=1e-9)
+    np.testing.assert_allclose(log.q[:, 1], -0.02 * np.arange(50), atol=1e-9)
+    np.testing.assert_allclose(log.tau[:, 0], 5.0 + 0.1 * np.arange(50), atol=1e-9)
+    # the gripper that is logged beside the arm is left out
+    (arm_alone,) = read_logs([tmp_path / "log.csv"], ("a",))
+    assert arm_alone.q.shape == (50, 1)
+
+
+def test_a_headerless_csv_is_called_that(tmp_path):
+    (tmp_path / "log.csv").write_text("0.00,0.1,0.2,0.3\n0.01,0.1,0.2,0.3\n")
+    with pytest.raises(LogError) as caught:
+        read_logs([tmp_path / "log.csv"], ("a",))
+    assert "log.csv:1: got numbers in the first line (0.00, 0.1, 0.2, ...), expected a header" in str(
+        caught.value
+    )
+
+
+def test_rows_out_of_order_repeated_rows_and_dates_are_mended(tmp_path):
+    t = 1.7e9 + 0.01 * np.arange(200)
+    columns = {"t": t, "q_a": np.sin(t), "qd_a": np.cos(t), "tau_a": -np.sin(t)}
+    order = np.arange(200)
+    order[[50, 51]] = 51, 50
+    order = np.insert(order, 100, [100, 100])
+    table = pa.table({name: values[order] for name, values in columns.items()})
+    pa.parquet.write_table(table, tmp_path / "log.parquet")
+    (log,) = read_logs([tmp_path / "log.parquet"], ("a",))
+    np.testing.assert_allclose(log.q[:, 0], np.sin(t), atol=1e-6)
+    assert 0 <= log.t[0] < 1
+    notes = [x.message for x in checks.check([log], ("a",), ("revolute",)) if x.code == "repaired"]
+    assert notes == [
+        "1 times before that of the row above: the rows were sorted",
+        "2 rows with the time of the row before were left out",
+    ]
+
+
+def test_dropouts_are_left_out_where_that_is_asked_for(tmp_path):
+    t = 0.01 * np.arange(200)
+    q = 1 + 0.3 * np.sin(t)
+    q[[40, 41, 120]] = 0
+    pa.parquet.write_table(
+        pa.table({"t": t, "q_a": q, "qd_a": 0.3 * np.cos(t), "tau_a": q}), tmp_path / "log.parquet"
+    )
+    (log,) = read_logs([tmp_path / "log.parquet"], ("a",))
+    with pytest.raises(LogError, match="falls to 0 for a moment at t = 0"):
+        checks.check([log], ("a",), ("revolute",))
+    (mended,) = read_logs([tmp_path / "log.parquet"], ("a",), {"dropouts": "dropped"})
+    assert len(mended) == 197
+    assert [x.code for x in checks.check([mended], ("a",), ("revolute",))] == ["repaired"]
+
+
+def test_a_joint_that_is_not_logged_is_named_with_what_to_write(tmp_path):
+    (tmp_path / "log.csv").write_text("t,q_a,qd_a,tau_a\n0,0,0,0\n0.1,0,0,0\n")
+    with pytest.raises(LogError, match="moving_joints"):
+        read_logs([tmp_path / "log.csv"], ("a", "gripper"))

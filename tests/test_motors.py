@@ -184,7 +184,7 @@ def recorded(arm, logged_at, ratio, late=0.0):
         tau = np.linalg.solve(speeds.T, tau.T).T
     tau = tau + 0.02 * tau.std(axis=0) * rng.normal(size=tau.shape)
     tau = np.stack([np.interp(t - late, t, column) for column in tau.T], axis=1)
-    return Trajectory(t, q, qd, tau, "motion", declares_units=True)
+    return Trajectory(t, q, qd, tau, "motion", accepted=("degrees",))
 
 
 @pytest.fixture(scope="module")

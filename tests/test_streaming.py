@@ -16,6 +16,7 @@ from spelgen.logs import chunks
 from spelgen.logs.chunks import large_files, scan
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs, write_logs
+from spelgen.logs.tables import UNIT_CODES
 from spelgen.logs.trajectory import QUANTITIES, Trajectory
 from spelgen.settings.fits import Rollout
 from spelgen.settings.log_mapping import LogMapping
@@ -60,7 +61,7 @@ def test_parts_hold_the_samples_of_the_recordings(log):
     for expected, (part, scanned) in zip(read_logs([log], JOINTS), found, strict=True):
         loaded = part.load()
         assert same(scanned, expected) and same(loaded, expected)
-        assert (loaded.name, loaded.file, loaded.declares_units) == (part.name, log, True)
+        assert (loaded.name, loaded.file, loaded.accepted) == (part.name, log, UNIT_CODES)
 
 
 def test_long_recordings_are_several_parts(log, monkeypatch):

@@ -329,7 +329,7 @@ def run(emitted, robots, tmp_path_factory):
     robot = str(robots / "two_link.urdf")
     build_ = ["build", robot, "--preset", "closed-form", "-o", str(folder / "arm.py")]
     fitting = ["train", str(folder / "arm.py"), "--robot", robot, "--data", str(folder / "logs.parquet")]
-    fitting += ["-o", str(folder / "run"), "--quiet"]
+    fitting += ["-o", str(folder / "run"), "--set", "progress=false"]
     for command in (build_, fitting):
         done = CliRunner().invoke(app, command)
         assert done.exit_code == 0, done.output
@@ -362,7 +362,7 @@ def test_a_run_is_adapted_to_a_load(run, emitted, tmp_path):
     seen = recorded(loaded, 5.0, 0.01, seed=3)
     write(tmp_path / "loaded.parquet", [seen], arm)
     command = ["train", "--from", str(folder / "run"), "--data", str(tmp_path / "loaded.parquet")]
-    done = CliRunner().invoke(app, [*command, "-o", str(tmp_path / "adapted"), "--quiet"])
+    done = CliRunner().invoke(app, [*command, "-o", str(tmp_path / "adapted"), "--set", "progress=false"])
     assert done.exit_code == 0, done.output
     before, after = (
         torch.load(x / "model.pt", weights_only=True) for x in (folder / "run", tmp_path / "adapted")
@@ -420,7 +420,7 @@ def test_a_run_is_adapted_to_another_day_or_unit(run, emitted, tmp_path, adapt):
         "--set",
         f"adapt={adapt}",
     ]
-    done = CliRunner().invoke(app, [*command, "-o", str(tmp_path / "adapted"), "--quiet"])
+    done = CliRunner().invoke(app, [*command, "-o", str(tmp_path / "adapted"), "--set", "progress=false"])
     assert done.exit_code == 0, done.output
     before, after = (
         torch.load(x / "model.pt", weights_only=True) for x in (folder / "run", tmp_path / "adapted")
@@ -479,7 +479,7 @@ def test_adapt_belongs_to_a_run_and_to_torques(run, tmp_path):
 
 def test_the_same_logs_give_the_same_weights(run, tmp_path):
     folder, _, fitting = run
-    again = [*fitting[:-3], "-o", str(tmp_path / "again"), "--quiet"]
+    again = [*fitting[:-4], "-o", str(tmp_path / "again"), "--set", "progress=false"]
     assert CliRunner().invoke(app, again).exit_code == 0
     first, second = (
         torch.load(x / "model.pt", weights_only=True) for x in (folder / "run", tmp_path / "again")

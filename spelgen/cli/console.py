@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import functools
 import inspect
+import json
 import os
 import sys
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, NoReturn
@@ -130,6 +131,15 @@ def note(text: str) -> None:
 def note_diagnostic(diagnostic: Diagnostic) -> None:
     """Print a warning or a remark of an analysis to stderr."""
     note(f"{diagnostic.severity}: {diagnostic.where}: {diagnostic.message}")
+
+
+def answer(form: str, record: Mapping[str, object], *lines: str) -> None:
+    """Print the result of a command: its lines for people, or its record as one line of JSON."""
+    if form == "json":
+        print(json.dumps(record, default=str))
+        return
+    for line in lines:
+        say(line)
 
 
 def deliver(text: str, output: Path | None) -> None:

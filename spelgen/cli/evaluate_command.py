@@ -3,16 +3,45 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from spelgen.baselines.names import MODEL
 from spelgen.cli import options
-from spelgen.cli.console import deliver, note_diagnostic, say
+from spelgen.cli.console import deliver, note, note_diagnostic, say
 from spelgen.cli.options import Data, Filter, Mapping, MoreData, Output, Run, Trust
 
+if TYPE_CHECKING:
+    from spelgen.evaluation.results import Results
+
 Format = Literal["text", "json", "csv"]
+MISSED = 3  # exit code: usage errors are 2
+
+
+def _torque_nmse(results: Results) -> float | None:
+    summary = results.torque.get(MODEL)
+    return None if summary is None else summary.mean_nmse
+
+
+def _worst_joint_nmse(results: Results) -> float | None:
+    summary = results.torque.get(MODEL)
+    known = [] if summary is None else [value for value in summary.joint_nmse if value is not None]
+    return max(known, default=None)
+
+
+def _rollout_rms(results: Results) -> float | None:
+    return results.horizons[-1].errors[MODEL].mean_relative_rms if results.horizons else None
+
+
+FIGURES: dict[str, Callable[[Results], float | None]] = {
+    "torque.nmse": _torque_nmse,
+    "joint.nmse": _worst_joint_nmse,
+    "rollout.rms": _rollout_rms,
+}
+"""The model's torque nMSE, that of its worst joint, and the relative error after the longest rollout."""
 
 
 def evaluate(
@@ -23,6 +52,13 @@ def evaluate(
     filter: Filter = None,
     format: Annotated[Format | None, options.result_format()] = None,
     output: Output = None,
+    limit: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="FIGURE=MAX",
+            help=f"Exit with {MISSED} if a figure is larger: {', '.join(FIGURES)}; once for each.",
+        ),
+    ] = None,
     trust: Trust = False,
 ) -> None:
     """Evaluate a trained run and its baselines on test logs.
@@ -30,6 +66,7 @@ def evaluate(
     The result is also written to evaluation.json in the run folder.
     """
     paths = options.logs(data, extra_logs)
+    limits = [_limit(text) for text in limit or []]
     import torch
 
     from spelgen.evaluation.evaluate import evaluate as evaluate_model
@@ -59,6 +96,33 @@ def evaluate(
         deliver(json.dumps(record) + "\n", output)
     else:
         deliver(results.text() + "\n", output)
+    missed = [line for name, largest in limits if (line := _missed(results, name, largest))]
+    for line in missed:
+        note(line)
+    if missed:
+        raise typer.Exit(MISSED)
+
+
+def _limit(text: str) -> tuple[str, float]:
+    """Return `torque.nmse=0.01` as a name and a number. A usage error for anything else."""
+    name, _, largest = text.partition("=")
+    try:
+        if name in FIGURES:
+            return name, float(largest)
+    except ValueError:
+        pass
+    raise typer.BadParameter(
+        f"{text!r} is not FIGURE=MAX with one of {', '.join(FIGURES)}", param_hint="'--limit'"
+    )
+
+
+def _missed(results: Results, name: str, largest: float) -> str | None:
+    """Return how a figure exceeds its limit; None where it does not. A figure that is not known does."""
+    value = FIGURES[name](results)
+    if value is not None and value <= largest:
+        return None
+    shown = "not known" if value is None else f"{value:.4g}"
+    return f"limit exceeded: {name} is {shown}, expected at most {largest:g}"
 
 
 def report(

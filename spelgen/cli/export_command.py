@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 from spelgen.cli import options
-from spelgen.cli.console import say
-from spelgen.cli.options import Force, Trust
+from spelgen.cli.console import answer
+from spelgen.cli.options import Force, TextOrJson, Trust
 from spelgen.exporting.exported import Format
 
 
@@ -21,6 +21,7 @@ def export(
     to: Annotated[Format, typer.Option(help="Export format.")] = "urdf",
     force: Force = False,
     trust: Trust = False,
+    format: TextOrJson = "text",
 ) -> None:
     """Export a trained model to other tools. Each export is compared with the model before it is written.
 
@@ -35,7 +36,6 @@ def export(
     require_fitting(to, output)
     options.require_free(output, force=force)
     result = export_run(load_run(run, trust=trust), to)
-    for path in result.write(output, force=force):
-        say(f"wrote {path}")
-    for line in result.summary:
-        say(line)
+    files = [str(path) for path in result.write(output, force=force)]
+    lines = [f"wrote {path}" for path in files]
+    answer(format, {"files": files, "summary": result.summary}, *lines, *result.summary)

@@ -9,7 +9,18 @@ import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import deliver, note_diagnostic
-from spelgen.cli.options import AngleTolerance, Data, Filter, Joints, Mapping, MoreData, Output, Robot, Tip
+from spelgen.cli.options import (
+    Accept,
+    AngleTolerance,
+    Data,
+    Filter,
+    Joints,
+    Mapping,
+    MoreData,
+    Output,
+    Robot,
+    Tip,
+)
 from spelgen.errors import OptionError
 
 Format = Literal["text", "json", "html"]
@@ -47,6 +58,7 @@ def identify(
             "(hysteresis).",
         ),
     ] = None,
+    accept: Accept = None,
     format: Annotated[Format | None, options.result_format()] = None,
     output: Output = None,
 ) -> None:
@@ -56,7 +68,7 @@ def identify(
     from spelgen.identification.identify import identify as identify_arm
     from spelgen.identification.method import LeastSquares
     from spelgen.loaded_arm import load_arm
-    from spelgen.log_checks.check_logs import require_possible_torques
+    from spelgen.log_checks.check_logs import require_sound_logs
     from spelgen.logs.arm_mapping import log_source
     from spelgen.logs.preprocessing import Preprocessing
     from spelgen.logs.read import read_logs
@@ -70,9 +82,11 @@ def identify(
     except OptionError as error:
         raise typer.BadParameter(error.got, param_hint=f"'--{error.element}'") from None
     arm = load_arm(robot, options.names(joints), tip, angle_tolerance)
-    logs = read_logs(paths, arm, mapping, role="train")
+    log_mapping = options.accepting(log_source(arm, mapping).mapping, accept)
+    logs = read_logs(paths, arm, log_mapping, role="train")
     # least squares would fit wrong units without a word
-    require_possible_torques(logs, arm, log_source(arm, mapping).mapping)
+    for diagnostic in require_sound_logs(logs, arm, log_mapping):
+        note_diagnostic(diagnostic)
     result = identify_arm(arm, logs, method, preprocessing=Preprocessing(cutoff=filter))
     for diagnostic in result.diagnostics:
         note_diagnostic(diagnostic)

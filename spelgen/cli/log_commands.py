@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from spelgen.cli import options
-from spelgen.cli.console import FAILED, note, progress_bar, refuse_warnings, say
-from spelgen.cli.options import AngleTolerance, Force, Joints, Mapping, Robot, Strict, Tip
+from spelgen.cli.console import FAILED, answer, note, progress_bar, refuse_warnings, say
+from spelgen.cli.options import Accept, AngleTolerance, Force, Joints, Mapping, Robot, Strict, TextOrJson, Tip
 from spelgen.errors import SpelgenError, SpelgenErrors
 from spelgen.files import write_text
 
@@ -41,6 +41,7 @@ def excite(
     trials: Annotated[int, typer.Option(min=1, help="Candidates of the search, beside random ones.")] = 100,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the search.")] = 0,
     force: Force = False,
+    format: TextOrJson = "text",
 ) -> None:
     """Propose an excitation trajectory to identify inertial parameters and friction.
 
@@ -63,8 +64,8 @@ def excite(
             seed=seed,
             progress=progress,
         )
-    say(motion.text())
-    say(f"wrote {write_text(output, motion.csv())}")
+    path = write_text(output, motion.csv())
+    answer(format, {"wrote": str(path)} | motion.to_dict(), motion.text(), f"wrote {path}")
 
 
 def logs(
@@ -83,6 +84,7 @@ def logs(
         typer.Option(help="Write a mapping drafted from the column names and values of the first log."),
     ] = None,
     force: Force = False,
+    accept: Accept = None,
     strict: Strict = False,
 ) -> None:
     """Check logs against the robot, and report their contents.
@@ -99,7 +101,8 @@ def logs(
     if suggest is not None:
         options.require_free(suggest, force=force)
         mapping = _suggested(paths, arm, suggest)
-    result = check_logs(stream_logs(paths, arm, mapping), arm, log_source(arm, mapping).mapping)
+    log_mapping = options.accepting(log_source(arm, mapping).mapping, accept)
+    result = check_logs(stream_logs(paths, arm, log_mapping), arm, log_mapping)
     if format == "text":
         say(result.text())
     else:

@@ -2,16 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from spelgen.cli import options
-from spelgen.cli.console import FAILED, note, say
-from spelgen.cli.options import AngleTolerance, Assumption, Force, Joints, Module, Robot, RobotOption, Tip
+from spelgen.cli.console import FAILED, answer, note, say
+from spelgen.cli.options import (
+    AngleTolerance,
+    Assumption,
+    Force,
+    Joints,
+    Module,
+    Robot,
+    RobotOption,
+    TextOrJson,
+    Tip,
+)
 from spelgen.design import PRESET_NAMES, Net
 from spelgen.files import write_text
+from spelgen.spec import parse_facts
 
 
 def init(
@@ -63,6 +75,7 @@ def build(
         ),
     ] = None,
     force: Force = False,
+    format: TextOrJson = "text",
 ) -> None:
     """Write the PyTorch module tailored to an arm."""
     # before the URDF is read, which takes longest
@@ -78,11 +91,12 @@ def build(
     path = output or Path(f"{robot.stem}_spel.py")
     source = generate(arm, preset, net=net, width=width, depth=depth, assume=assume, module=path)
     # the same text: nothing is replaced, and its date stays
-    if path.is_file() and path.read_bytes() == source.encode():
-        say(f"{path} is up to date")
-        return
-    options.require_free(path, force=force)
-    say(f"wrote {write_text(path, source)}")
+    is_new = not path.is_file() or path.read_bytes() != source.encode()
+    line = f"{path} is up to date"
+    if is_new:
+        options.require_free(path, force=force)
+        line = f"wrote {write_text(path, source)}"
+    answer(format, {"module": str(path), "new": is_new} | asdict(parse_facts(source)), line)
 
 
 def check(module: Module, robot: RobotOption = None) -> None:

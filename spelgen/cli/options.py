@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Literal, get_args
 import typer
 from typer.models import OptionInfo
 
-from spelgen.errors import SpelgenError
+from spelgen.errors import SpelgenError, suggestion
+from spelgen.settings.log_mapping import Accepted
 from spelgen.spec import Assume
 
 if TYPE_CHECKING:
@@ -78,6 +79,13 @@ Mapping = Annotated[
         help="YAML file with column names and units of the logs; see docs/logs.md.",
     ),
 ]
+Accept = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--accept", metavar="CODE", help="Use logs with this error, which names its code; once for each."
+    ),
+]
+TextOrJson = Annotated[Literal["text", "json"], typer.Option("--format", help="Of the result on stdout.")]
 Filter = Annotated[
     float | None,
     typer.Option(
@@ -166,6 +174,16 @@ def mapping(file: Path | None, urdf: Path | None, joints: Sequence[str]) -> LogM
     if urdf is not None and has_urdf:
         return load_settings(urdf).logs
     return None
+
+
+def accepting(mapping: LogMapping, codes: Sequence[str] | None) -> LogMapping:
+    """Return the mapping that accepts these errors too. A usage error for an unknown code."""
+    for code in codes or ():
+        if code not in get_args(Accepted):
+            hint = suggestion(code, get_args(Accepted))
+            raise typer.BadParameter(f"unknown code {code!r}; {hint}", param_hint="'--accept'")
+    accepted = dict.fromkeys((*mapping.accept, *(codes or ())))
+    return mapping.model_copy(update={"accept": tuple(accepted)})
 
 
 def require_free(path: Path, *, force: bool) -> None:

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from spelgen.cli import options
-from spelgen.cli.console import INTERRUPTED, note, say
-from spelgen.cli.options import Data, Force, Mapping, MoreData, RobotOption, Trust
+from spelgen.cli.console import INTERRUPTED, answer, note
+from spelgen.cli.options import Accept, Data, Force, Mapping, MoreData, RobotOption, TextOrJson, Trust
 from spelgen.cli.train_settings import (
     TIME_LIMIT,
     Machine,
@@ -22,14 +22,14 @@ from spelgen.cli.train_settings import (
     read_assignments,
     resumed_run,
 )
-from spelgen.errors import ModuleError, OptionError
+from spelgen.errors import Diagnostic, ModuleError, OptionError
 from spelgen.settings.fits import Objective, Rollout
+from spelgen.settings.log_mapping import LogMapping
 from spelgen.spec import read_facts
 
 if TYPE_CHECKING:
     from spelgen.fitting.fitted import Fit
     from spelgen.logs.trajectory import Trajectory
-    from spelgen.settings.log_mapping import LogMapping
 
 
 TrainModule = Annotated[
@@ -61,7 +61,6 @@ Assignments = Annotated[
     ),
 ]
 MaxMinutes = Annotated[float | None, typer.Option(min=0.0, help="Time limit of fits to windows.")]
-Quiet = Annotated[bool, typer.Option("--quiet", help="Show no progress.")]
 
 
 def train(
@@ -78,7 +77,8 @@ def train(
     objective: ObjectiveName = None,
     assignments: Assignments = None,
     max_minutes: MaxMinutes = None,
-    quiet: Quiet = False,
+    accept: Accept = None,
+    format: TextOrJson = "text",
 ) -> None:
     """Fit a module to logs.
 
@@ -108,6 +108,8 @@ def train(
         urdf = robot or _unchanged_urdf(module)
         start = new_run(module, urdf, request)
     log_mapping = options.mapping(mapping, urdf, read_facts(start.module).joints) or start.mapping
+    if accept:
+        log_mapping = options.accepting(log_mapping or LogMapping(), accept)
     machine = Machine.model_validate({name: values[name] for name in Machine.model_fields if name in values})
     # torch is imported where it is needed: --help and mistakes are answered at once
     from spelgen.fitting.fit import RunOptions
@@ -118,7 +120,7 @@ def train(
         threads=machine.threads,
         resume=resume,
         force=force,
-        progress=not quiet,
+        progress=machine.progress,
         mapping=log_mapping,
         began=start_time,
     )
@@ -134,24 +136,32 @@ def train(
             validation=start.validation,
             seed=start.seed,
             trust=trust,
-            require=_torque_check(urdf, start.module, log_mapping),
+            require=_log_check(urdf, start.module, log_mapping),
             options=run_options,
         )
     except OptionError as error:
         raise UsageError(f"{_spelled(error.option)}: {error.got}") from error
-    _tell(fit, folder, paths, resume=resume)
+    _tell(fit, folder, paths, format, resume=resume)
 
 
-def _tell(fit: Fit, folder: Path, paths: Sequence[Path], *, resume: bool) -> None:
+def _tell(fit: Fit, folder: Path, paths: Sequence[Path], format: str, *, resume: bool) -> None:
     """Print how the fit ended, and keep the baselines of a new run; exit with 130 if it was interrupted."""
     interrupted = fit.status == "interrupted"
     if not resume and not interrupted:
         from spelgen.baselines.keep import keep_baseline
 
         keep_baseline(folder, paths)
-    for line in _outcome(fit):
-        say(line)
-    say(f"run folder: {folder}")
+    record = {
+        "run": str(folder),
+        "status": fit.status,
+        "objective": fit.config.objective,
+        "steps": fit.steps,
+        "epochs": fit.epochs,
+        "seconds": fit.seconds,
+        "validation_loss": fit.best_validation,
+        "findings": [finding.to_dict() for finding in fit.diagnostics],
+    }
+    answer(format, record, *_outcome(fit), f"run folder: {folder}")
     if interrupted:
         note("the best model so far is in the run folder; resume it by --resume")
         raise typer.Exit(INTERRUPTED)
@@ -206,19 +216,17 @@ def _default_folder(module: Path, resume: bool) -> Path:
     return Path("runs") / module.stem
 
 
-def _torque_check(
+def _log_check(
     urdf: Path | None, module: Path, mapping: LogMapping | None
-) -> Callable[[Sequence[Trajectory]], None] | None:
-    """Return what raises LogError for logs whose torques cannot be those of the arm; None: nothing to check."""
+) -> Callable[[Sequence[Trajectory]], list[Diagnostic]] | None:
+    """Return what checks logs beside the arm, as `spelgen logs` does; None: the arm is not known."""
     if urdf is None:
         return None
     from spelgen.loaded_arm import arm_of_module
-    from spelgen.log_checks.check_logs import require_possible_torques
+    from spelgen.log_checks.check_logs import require_sound_logs
 
     arm = arm_of_module(read_facts(module), urdf)
-    if arm.settings.input == "position":
-        return None
-    return lambda logs: require_possible_torques(logs, arm, mapping)
+    return lambda logs: require_sound_logs(logs, arm, mapping)
 
 
 def _module_of_run(source: Path, robot: Path | None) -> tuple[Path, Path | None]:

@@ -36,10 +36,11 @@ class UsageError(typer.BadParameter):
 
 
 class Machine(Group):
-    """Where a fit runs: a device of torch, and how many threads it uses."""
+    """Where a fit runs: a device of torch, how many threads it uses, and whether it shows its progress."""
 
     device: str = "cpu"
     threads: Count = 1
+    progress: bool = True
 
 
 def _groups_by_key() -> dict[str, type[Group]]:

@@ -31,20 +31,22 @@ class TorqueErrors:
         by_trajectory = np.nanmean(self.nmse, axis=1)
         nmse = dict(zip(self.trajectories, finite(by_trajectory), strict=True))
         (mean,) = finite(by_trajectory.mean(keepdims=True))
-        return TorqueSummary(nmse, mean, finite(self.rmse.mean(axis=0)))
+        by_joint = finite(np.nanmean(self.nmse, axis=0))
+        return TorqueSummary(nmse, mean, finite(self.rmse.mean(axis=0)), by_joint)
 
 
 @dataclass(frozen=True)
 class TorqueSummary:
     """Errors of the inverse dynamics of one predictor by the protocol of `dynamics_samples`.
 
-    nmse: per trajectory, mean over joints. mean_nmse: mean over trajectories. rmse: per joint [Nm, N], mean
-    over trajectories.
+    nmse: per trajectory, mean over joints. mean_nmse: mean over trajectories. rmse [Nm, N], joint_nmse: per
+    joint, mean over trajectories.
     """
 
     nmse: dict[str, float | None]
     mean_nmse: float | None
     rmse: tuple[float | None, ...]
+    joint_nmse: tuple[float | None, ...] = ()
 
 
 def torque_errors(dynamics: Any, samples: Sequence[DynamicsSamples]) -> TorqueErrors:

@@ -54,6 +54,19 @@ class Excitation:
             paragraphs.append(textwrap.fill(summary, WIDTH, subsequent_indent="  "))
         return "\n\n".join(paragraphs)
 
+    def to_dict(self) -> dict[str, object]:
+        """Return what `text` says as numbers; None for efforts that are not known."""
+        efforts = [None if np.isnan(effort) else float(effort) for effort in self.efforts]
+        return {
+            "robot": self.arm.name,
+            "duration": float(self.motion.t[-1]),
+            "samples": len(self.motion.t),
+            "parameters": self.parameters,
+            "condition": self.condition,
+            "random_condition": self.first,
+            "efforts": efforts,
+        }
+
     def listing(self) -> Listing:
         """Return the ranges that the joints move in."""
         motion, rows = self.motion, []

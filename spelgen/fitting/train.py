@@ -45,7 +45,7 @@ def train(
     validation: float | None = None,
     seed: int | None = None,
     trust: bool = False,
-    require: Callable[[Sequence[Trajectory]], None] | None = None,
+    require: Callable[[Sequence[Trajectory]], list[Diagnostic]] | None = None,
     options: RunOptions = QUIET,
 ) -> Fit:
     """Fit the emitted module to the logs and leave a run folder (see `RunFolder`); see `fit`.
@@ -53,9 +53,9 @@ def train(
     urdf: the robot the module was built from, for the regularizer and the baselines of `evaluate`; by default the file
     of that name beside the module. source: a run whose module and weights are where the fit starts. trust: the module
     of a run folder is run whatever it is (see `RunFolder.load_module`). config: may also be a function that chooses.
-    require: raises where it finds logs wrong, before anything is fitted; logs larger than memory are not shown to it.
-    validation: 0.25 by default, seed: 0. What is not said of a run that is resumed is as before, and logs are read as
-    spelgen writes them where ``options`` has no mapping.
+    require: raises where it finds logs wrong, before anything is fitted, or returns what it finds; logs larger than
+    memory are not shown to it. validation: 0.25 by default, seed: 0. What is not said of a run that is resumed is as
+    before, and logs are read as spelgen writes them where ``options`` has no mapping.
     Raises ModuleError, LogError, and RunError when the folder holds a run or cannot be resumed with this.
     """
     run, module = RunFolder(Path(folder)), Path(module)
@@ -76,7 +76,7 @@ def train(
     chosen = config(model, None) if callable(config) else config  # before logs, which may take long to read
     logs = open_logs(model, data, options.mapping, preprocessing)
     if require is not None and not isinstance(logs, LargeLogs):
-        require(logs)
+        notes += require(logs)
     if chosen is None and callable(config):
         chosen = config(model, sample_rates(logs))
     return fit(

@@ -7,13 +7,15 @@ explained better, in blocks of time that the parameters were not fitted to?
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import combinations
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from scipy.optimize import minimize_scalar
+from scipy.stats import t as student
 
 from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Arm
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
 TUNING = DriveHintTuning()
 FRICTION = FrictionModel(coulomb_smoothing_velocity=IdentificationTuning().moving)
 RATIOS = (1.0, -1.0, 0.4, -0.4, 2.5, -2.5)  # that begin the search: each covers half of it to twice
+DISSIPATIVE = [FRICTION.effects.index(name) for name in ("viscous", "coulomb")]
 NEGLIGIBLE = IdentificationTuning().negligible
 
 LoggedAt = Literal["joints", "motors"]
@@ -49,12 +52,25 @@ class Coupling:
     logged_at: LoggedAt
 
 
-def drive_hints(arm: LoadedArm, log: DriveLog, mapping: LogMapping) -> list[Diagnostic]:
-    """Return what the logs show of drives that the sidecar does not say: at most one thing, the coupling first."""
-    samples, drives = log.samples(), arm.actuation.drives()
+@dataclass(frozen=True)
+class WrongTorque:
+    """Say why the torques of a joint cannot be right: `code` of what may be accepted, `got` in an error."""
+
+    joint: int
+    code: str
+    got: str
+
+
+def drive_problem(arm: LoadedArm, log: DriveLog) -> DriveProblem | None:
+    """Return least squares of the joint torques that were collected; None where there are too few samples."""
+    samples = log.samples()
     if samples is None:
-        return []
-    problem = make_problem(arm.arm, samples, drives.speeds)
+        return None
+    return make_problem(arm.arm, samples, arm.actuation.drives().speeds)
+
+
+def drive_hints(arm: LoadedArm, problem: DriveProblem, mapping: LogMapping) -> list[Diagnostic]:
+    """Return what the logs show of drives that the sidecar does not say: at most one thing, the coupling first."""
     coupled = find_coupling(problem)
     if coupled is not None:
         return [_coupling_hint(arm, *coupled)]
@@ -138,6 +154,44 @@ def held_out_errors(rows: np.ndarray, tau: np.ndarray) -> np.ndarray:
     return np.stack(errors)
 
 
+def find_wrong_torques(problem: DriveProblem, joints: Sequence[str]) -> list[WrongTorque]:
+    """Return what is surely wrong with the torques of joints: two of them swapped, one of the other sign."""
+    count = len(joints)
+    changes = {(k, k): f"torques of the opposite sign (tau of {name!r})" for k, name in enumerate(joints)}
+    for k, other in combinations(range(count), 2):
+        changes[k, other] = f"the torques of {joints[other]!r}, and that joint has those of {joints[k]!r}"
+    logged = held_out_errors(problem.rows, problem.tau)
+    results: list[tuple[float, WrongTorque]] = []
+    for (k, other), got in changes.items():
+        tau = problem.tau.copy()
+        tau[:, [k, other]] = tau[:, [other, k]] if k != other else -tau[:, [k, other]]
+        changed = held_out_errors(problem.rows, tau)
+        if _is_sure(logged.mean(axis=1), changed.mean(axis=1), TUNING.wrong_gain, len(changes)):
+            code = "torque-sense" if k == other else "torque-order"
+            results.append((float(changed.mean()), WrongTorque(k, code, got)))
+    if results:
+        return [min(results, key=lambda result: result[0])[1]]
+    return _against_motion(problem)
+
+
+def _against_motion(problem: DriveProblem) -> list[WrongTorque]:
+    """Return the joints whose friction would push them on: all signs may be wrong together, which rows alone allow."""
+    rows, tau, speed = problem.rows, problem.tau, problem.samples.qd
+    unit = np.where(_varies(tau), tau.std(axis=0), 1.0)
+    flat = (rows / unit[:, None]).reshape(-1, rows.shape[2])
+    parameters = np.linalg.lstsq(flat, (tau / unit).ravel(), rcond=NEGLIGIBLE)[0]
+    results = []
+    for k in range(tau.shape[1]):
+        own = np.flatnonzero((problem.drive_of == k) & np.isin(problem.effect_of, DISSIPATIVE))
+        friction = rows[:, k, own] @ parameters[own]
+        size = float(np.sqrt(np.square(friction).mean()))
+        power = float((friction * speed[:, k]).mean()) / max(size * float(speed[:, k].std()), NEGLIGIBLE)
+        if power < -TUNING.opposed and size > TUNING.opposed * unit[k]:
+            got = f"friction that drives the joint on (correlation of friction and velocity {power:.2g})"
+            results.append(WrongTorque(k, "torque-sense", got))
+    return results
+
+
 def find_torque_delay(problem: DriveProblem) -> tuple[float, float] | None:
     """Return how much later torques are logged than they act [s], and what is left of the squared error if mended.
 
@@ -158,7 +212,7 @@ def find_torque_delay(problem: DriveProblem) -> tuple[float, float] | None:
     moved = (1 - fraction) * tau[earlier] + fraction * tau[earlier + 1]
     logged = held_out_errors(problem.rows, tau[NO_DELAY]).mean(axis=1)
     mended = held_out_errors(problem.rows, moved).mean(axis=1)
-    if not _is_sure(logged, mended, TUNING.delay_gain):
+    if not _is_sure(logged, mended, TUNING.delay_gain, len(DELAYS)):
         return None
     return float(delay), float(mended.mean() / logged.mean())
 
@@ -183,7 +237,7 @@ def find_coupling(problem: DriveProblem) -> tuple[Coupling, float] | None:
         separate = plain[:, pair].mean(axis=1)
         coupling = _with_best_ratio(problem, candidate)
         coupled = held_out_errors(problem.coupled_rows(coupling), problem.tau)[:, pair].mean(axis=1)
-        if _is_sure(separate, coupled, TUNING.coupling_gain):
+        if _is_sure(separate, coupled, TUNING.coupling_gain, len(cost)):
             results.append((coupling, float(coupled.mean() / separate.mean())))
     return min(results, key=lambda result: result[1], default=None)
 
@@ -219,13 +273,15 @@ def _with_best_ratio(problem: DriveProblem, start: Coupling) -> Coupling:
     return coupled(round(float(best.x), 3))
 
 
-def _is_sure(logged: np.ndarray, mended: np.ndarray, gain: float) -> bool:
-    """Whether errors by block (B,) fell to this part of what they were, and not by luck."""
+def _is_sure(logged: np.ndarray, mended: np.ndarray, gain: float, candidates: int) -> bool:
+    """Whether errors by block (B,) fell to this part of what they were, and not as the luckiest of some candidates."""
     if mended.min() <= 0 or mended.mean() >= gain * logged.mean():
         return False
     ratios = np.log(logged / mended)  # by factors: a block that is hard to tell counts as any other
     standard_error = ratios.std(ddof=1) / np.sqrt(len(ratios))
-    return bool(ratios.mean() > TUNING.standard_errors * standard_error)
+    # of hundreds of couplings one is always better by chance (Bonferroni's bound)
+    needed = float(student.isf(TUNING.chance / candidates, len(ratios) - 1))
+    return bool(ratios.mean() > needed * standard_error)
 
 
 def _varies(tau: np.ndarray) -> np.ndarray:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from spelgen.arm.arm import Coordinate
 from spelgen.errors import Diagnostic, LogError, SpelgenError, collect
-from spelgen.identification.drive_hints import drive_hints
+from spelgen.identification.drive_hints import DriveProblem, drive_hints, drive_problem, find_wrong_torques
 from spelgen.identification.drive_samples import DriveLog
 from spelgen.log_checks.check_servo_logs import check_servo_logs
 from spelgen.log_checks.gravity import GravityFit, StateSamples, fit_gravity, state_samples
@@ -17,21 +18,28 @@ from spelgen.log_checks.report import JointReport, LogReport, range_fraction
 from spelgen.log_checks.robot_checks import CHECKS, JointEvidence
 from spelgen.log_checks.statistics import Statistics, common_step, statistics
 from spelgen.logs.checks import Finding, clock_diagnostics, findings, run_checks, summarised
+from spelgen.logs.tables import UNIT_CODES
 from spelgen.logs.trajectory import QUANTITIES, Trajectory, require_joints, require_torques
 
 if TYPE_CHECKING:
     from spelgen.loaded_arm import LoadedArm
     from spelgen.settings.log_mapping import LogMapping
 
+SENSE = next(check for check in CHECKS if check.code == "torque-sense")
+ORDER = replace(
+    SENSE, code="torque-order", expected="its own", do="change the names of the columns under 'logs'"
+)
+WRONG_TORQUES = {"torque-sense": SENSE, "torque-order": ORDER}
+ABOUT_ARM = {check.code for check in CHECKS} | {"torque-delay", "coupled-motors"}
 EXAMPLES = 2  # trajectories that are drawn
 
 
 def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping | None = None) -> LogReport:
     """Report all about the logs of an arm, read once, one trajectory after another; nothing is repaired or raised.
 
-    The report's `errors` prevent training. mapping: that of the logs, by default from the arm's settings; a unit that
-    it declares for torques is not checked. The arm's input matrix converts logged torques to those of the joints.
-    Raises LogError without any trajectory, or with one of another number of joints, and
+    The report's `errors` prevent training. mapping: that of the logs, by default from the arm's settings; units that
+    it declares and errors that it accepts are not checked. The arm's input matrix converts logged torques to those of
+    the joints. Raises LogError without any trajectory, or with one of another number of joints, and
     where an arm's settings say 'input: position', without commands.
     """
     if arm.settings.input == "position":
@@ -45,18 +53,22 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping |
     examples: list[Trajectory] = []
     notes: list[Diagnostic] = []
     odd: list[Finding] = []
+    declared_codes: list[set[str]] = []
     for trajectory in logs:
         require_joints(trajectory, joints)
         require_torques([trajectory])
         measured.append(statistics(trajectory))
         samples.append(state_samples(trajectory, inputs))
         drives.add(trajectory)
+        declared_codes.append(set(trajectory.accepted))
         odd += findings(trajectory, joints, kinds, measured[-1].agreement)
         notes += clock_diagnostics(trajectory)
         if len(examples) < EXAMPLES:
             examples.append(trajectory)
     if not measured:
         raise LogError("no trajectory", expected="at least one")
+    # what files declare by themselves holds where all of them do
+    accepted = set(mapping.accept) | set.intersection(*declared_codes)
     summaries, errors = summarised(odd, joints, len(measured))
     notes += summaries
     reports = []
@@ -65,13 +77,18 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping |
     ):
         report = _joint_report(index, coordinate, gravity, measured)
         reports.append(report)
-        evidence = _evidence(coordinate, report.low, report.high, gravity, mapping)
-        robot_notes, robot_errors = _against_robot(evidence)
+        evidence = JointEvidence(coordinate, report.low, report.high, gravity, report.steps)
+        declared = mapping.unit("tau", coordinate.name) is not None
+        robot_notes, robot_errors = _against_robot(evidence, accepted | set(UNIT_CODES if declared else ()))
         notes += robot_notes
         errors += robot_errors
-    # of torques that are wrong, hints about drives would be wrong too
-    if not errors:
-        notes += drive_hints(arm, drives, mapping)
+    problem = drive_problem(arm, drives)
+    is_odd = any(note.code == "velocity-is-no-derivative" for note in notes)
+    # beside wrong velocities friction is wrong too, and of wrong torques hints about drives would be wrong
+    if problem is not None and not errors and not is_odd:
+        errors += _wrong_torques(problem, joints, accepted)
+        if not errors:
+            notes += drive_hints(arm, problem, mapping)
     return LogReport(
         robot=arm.arm.name,
         files=len({x.clock.file for x in measured} - {None}),
@@ -83,46 +100,41 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping |
     )
 
 
-def require_possible_torques(
+def require_sound_logs(
     logs: Sequence[Trajectory], arm: LoadedArm, mapping: LogMapping | None = None
-) -> None:
-    """Raise LogError where the torques of logs cannot be an arm's, before anything is fitted to them."""
-    require_torques(logs)
-    mapping = mapping or arm.settings.logs
-    inputs = arm.actuation.matrix()
-    fits = fit_gravity(arm.arm, [state_samples(trajectory, inputs) for trajectory in logs])
-    errors: list[SpelgenError] = []
-    for index, (coordinate, gravity) in enumerate(zip(arm.arm.coordinates, fits, strict=True)):
-        low, high = {}, {}
-        for name in QUANTITIES:
-            low[name] = min(float(getattr(x, name)[:, index].min()) for x in logs)
-            high[name] = max(float(getattr(x, name)[:, index].max()) for x in logs)
-        errors += _against_robot(_evidence(coordinate, low, high, gravity, mapping))[1]
-    collect(errors)
+) -> list[Diagnostic]:
+    """Return what `check_logs` finds of logs beside their arm; raise LogError where they cannot be trained on."""
+    report = check_logs(logs, arm, mapping)
+    collect(report.errors)
+    # a fit itself tells what logs show without the arm
+    return [note for note in report.findings if note.code in ABOUT_ARM]
 
 
-def _evidence(
-    coordinate: Coordinate,
-    low: dict[str, float],
-    high: dict[str, float],
-    gravity: GravityFit,
-    mapping: LogMapping,
-) -> JointEvidence:
-    declared = mapping.unit("tau", coordinate.name) is not None
-    return JointEvidence(coordinate, low, high, gravity, declared)
-
-
-def _against_robot(evidence: JointEvidence) -> tuple[list[Diagnostic], list[LogError]]:
+def _against_robot(
+    evidence: JointEvidence, accepted: Collection[str]
+) -> tuple[list[Diagnostic], list[LogError]]:
     """Return what the checks against the robot find of one joint: notes, and why it cannot be trained on."""
     notes: list[Diagnostic] = []
     errors: list[LogError] = []
     where = f"joint {evidence.coordinate.name!r}"
-    for check, message in run_checks(CHECKS, evidence):
+    for check, message in run_checks(CHECKS, evidence, accepted):
         if check.severity == "error":
             errors.append(check.error(message, f"{where}, tau"))
         else:
             notes.append(check.diagnostic(message, where))
     return notes, errors
+
+
+def _wrong_torques(
+    problem: DriveProblem, joints: Sequence[str], accepted: Collection[str]
+) -> list[SpelgenError]:
+    """Return the errors that least squares of all joints finds in their torques."""
+    errors: list[SpelgenError] = []
+    for wrong in find_wrong_torques(problem, joints):
+        if wrong.code not in accepted:
+            check = WRONG_TORQUES[wrong.code]
+            errors.append(check.error(wrong.got, f"joint {joints[wrong.joint]!r}, tau"))
+    return errors
 
 
 def _joint_report(

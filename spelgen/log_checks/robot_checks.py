@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from spelgen.arm.arm import Coordinate
 from spelgen.log_checks.gravity import GravityFit
 from spelgen.logs.checks import Check
+from spelgen.logs.trajectory import QUANTITIES
 from spelgen.settings.tuning.log_checks import LogCheckTuning
 
 TUNING = LogCheckTuning()
@@ -19,14 +20,14 @@ TORQUE_ERRORS = ("torque-sense", "torque-unit", "torque-beyond-drive")
 class JointEvidence:
     """Hold what all trajectories show of one joint: the subject of the checks against the robot.
 
-    low, high: of q, qd and tau. declared: the mapping says the unit of torques, so their size is believed.
+    low, high: of q, qd and tau. steps: between the levels of quantised signals among them, None of others.
     """
 
     coordinate: Coordinate
     low: dict[str, float]
     high: dict[str, float]
     gravity: GravityFit
-    declared: bool
+    steps: dict[str, float | None]
 
     def largest(self, quantity: str) -> float:
         """Return the largest size of "q", "qd" or "tau"."""
@@ -88,7 +89,7 @@ def find_wrong_sense(joint: JointEvidence) -> str | None:
 def find_wrong_unit(joint: JointEvidence) -> str | None:
     """Find torques that certainly move with gravity, by a factor that only another unit has."""
     fit = joint.gravity_in_torque()
-    if fit is None or joint.declared or fit[1] <= TUNING.agreement:
+    if fit is None or fit[1] <= TUNING.agreement:
         return None
     if 1 / TUNING.impossible_factor < fit[0] < TUNING.impossible_factor:
         return None
@@ -98,10 +99,36 @@ def find_wrong_unit(joint: JointEvidence) -> str | None:
 def find_beyond_drive(joint: JointEvidence) -> str | None:
     """Find torques that no drive of the joint's effort limit gives."""
     limit, largest = joint.coordinate.effort or 0.0, joint.largest("tau")
-    # who says the unit is believed: a limit in a URDF may be a placeholder
-    if joint.declared or limit <= 0 or largest <= TUNING.beyond_drives * limit:
+    if limit <= 0 or largest <= TUNING.beyond_drives * limit:
         return None
     return f"up to {largest:.4g}, {largest / limit:.3g} times what the drive can give"
+
+
+def find_coarse(joint: JointEvidence) -> str | None:
+    """Find signals that are quantised to steps of their own size."""
+    for name in QUANTITIES:
+        step, width = joint.steps[name], joint.high[name] - joint.low[name]
+        if step is not None and width < TUNING.levels * step:
+            return (
+                f"{name} has steps of {step:.3g} in a range of {width:.3g}: what is smaller than a step, friction and "
+                f"inertia of this joint among it, is not in the log"
+            )
+    return None
+
+
+def find_stop(joint: JointEvidence) -> str | None:
+    """Find joints that reach a limit: the torque of a stop is none of the drive's."""
+    if joint.coordinate.continuous:
+        return None
+    for limit, reached in (
+        (joint.coordinate.lower, joint.low["q"]),
+        (joint.coordinate.upper, joint.high["q"]),
+    ):
+        if limit is not None and abs(reached - limit) <= TUNING.limit_rounding:
+            return (
+                f"q reaches its limit {limit:.4g}: at a stop the torque says nothing; leave such motion out"
+            )
+    return None
 
 
 def find_no_gravity(joint: JointEvidence) -> str | None:
@@ -150,6 +177,8 @@ CHECKS: list[Check[JointEvidence]] = [
     Check("beyond-position-limit", "warning", find_position_above),
     Check("beyond-velocity-limit", "warning", find_speed_above),
     Check("beyond-effort-limit", "warning", find_effort_above),
+    Check("at-a-stop", "warning", find_stop),
+    Check("coarse", "warning", find_coarse),
     Check("torque-without-gravity", "warning", find_no_gravity, unless=TORQUE_ERRORS),
     Check("torque-against-gravity", "warning", find_against_gravity, unless=TORQUE_ERRORS),
     Check("torque-scale", "warning", find_unusual_scale, unless=TORQUE_ERRORS),

@@ -6,7 +6,7 @@ so that logs need not lie in memory together. `log_checks` has the checks that t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,10 +17,13 @@ import numpy as np
 from spelgen.errors import Diagnostic, LogError, SpelgenError, collect
 from spelgen.logs.rates import is_dense, shows_accelerations
 from spelgen.logs.trajectory import Trajectory, gap_ends, split_at_gaps
+from spelgen.logs.values import is_dropout
+from spelgen.settings.log_mapping import TIMES
 from spelgen.settings.tuning.log_checks import LogCheckTuning
 
 TUNING = LogCheckTuning()
 DEGREES = 180.0 / np.pi
+SLOWEST_STEP = 0.5  # [s] no arm is sampled more slowly than at 2 Hz
 TURNS = 4 * np.pi  # [rad] no revolute joint turns further, so what does is in degrees
 
 Subject = TypeVar("Subject")
@@ -45,7 +48,8 @@ class Check(Generic[Subject]):
 
     def error(self, message: str, element: str, file: Path | None = None) -> LogError:
         """Return the finding of an error as it is raised."""
-        return LogError(message, file=file, element=element, expected=self.expected, do=self.do)
+        do = f"{self.do}; --accept {self.code} if it is right"
+        return LogError(message, file=file, element=element, expected=self.expected, do=do)
 
     def diagnostic(self, message: str, where: str) -> Diagnostic:
         """Return the finding of a remark or a warning."""
@@ -53,13 +57,15 @@ class Check(Generic[Subject]):
         return Diagnostic(self.severity, self.code, where, None, message)
 
 
-def run_checks(checks: Iterable[Check[Subject]], subject: Subject) -> list[tuple[Check[Subject], str]]:
-    """Return the checks that find something odd, with their messages."""
+def run_checks(
+    checks: Iterable[Check[Subject]], subject: Subject, accepted: Collection[str] = ()
+) -> list[tuple[Check[Subject], str]]:
+    """Return the checks that find something odd, with their messages; accepted: codes that are passed over."""
     results: list[tuple[Check[Subject], str]] = []
     codes: set[str] = set()
     for check in checks:
         # one cause, one message: degrees are no derivatives either
-        if not codes.isdisjoint(check.unless):
+        if check.code in accepted or not codes.isdisjoint(check.unless):
             continue
         message = check.find(subject)
         if message is not None:
@@ -135,8 +141,8 @@ def is_factor(value: float, unit: float) -> bool:
 
 
 def find_degrees(signals: JointSignals) -> str | None:
-    """Find revolute joints that look recorded in degrees, unless units are declared."""
-    if signals.kind != "revolute" or signals.trajectory.declares_units:
+    """Find revolute joints that look recorded in degrees."""
+    if signals.kind != "revolute":
         return None
     factor, correlation = signals.factor, signals.correlation
     if correlation is not None and correlation > TUNING.agreement:
@@ -163,6 +169,42 @@ def find_frozen(signals: JointSignals) -> str | None:
     return None
 
 
+def find_time_unit(signals: JointSignals) -> str | None:
+    """Find times that are not in seconds: no arm is sampled more slowly than at 2 Hz, and q changes as fast as qd."""
+    steps = np.diff(signals.trajectory.t)
+    if steps.size and np.median(steps) > SLOWEST_STEP:
+        # told once, and not of each joint
+        return None if signals.index else f"a sample every {np.median(steps):.3g} s"
+    if signals.correlation is None or signals.correlation <= TUNING.agreement:
+        return None
+    for unit, seconds in TIMES.items():
+        if unit != "s" and is_factor(signals.factor, seconds):
+            return f"q that changes {signals.factor:.3g} times as fast as qd says: times in {unit}"
+    return None
+
+
+def find_dropouts(signals: JointSignals) -> str | None:
+    """Find moments at which the position or the torque falls to 0 and comes back."""
+    for name in ("q", "tau"):
+        values = getattr(signals.trajectory, name)
+        if not values.size:
+            continue
+        rows = np.flatnonzero(is_dropout(values[:, signals.index]))
+        if rows.size:
+            t = signals.trajectory.t[rows[0]]
+            return f"{name} that falls to 0 for a moment at t = {t:.4g} s ({rows.size} such samples)"
+    return None
+
+
+def find_no_torques(signals: JointSignals) -> str | None:
+    """Find recordings in which every joint's torque is 0 all the time."""
+    trajectory = signals.trajectory
+    # told once, and not of each joint
+    if signals.index or not trajectory.tau.size or trajectory.tau.any() or not np.ptp(trajectory.q):
+        return None
+    return "torques that are all 0 while the arm moves"
+
+
 def find_wrong_velocity(signals: JointSignals) -> str | None:
     """Find velocities that are not the positions' derivative, and say what else they may be."""
     factor, correlation = signals.factor, signals.correlation
@@ -183,10 +225,6 @@ def _velocity_advice(signals: JointSignals, correlation: float) -> str:
             return f"it fits q of joint {joint!r}"
     if abs(signals.factor + 1) <= 1 - TUNING.agreement:
         return "its sign is the opposite of that of q"
-    if correlation > TUNING.agreement:
-        for unit, seconds in (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9)):
-            if is_factor(signals.factor, seconds):
-                return f"are the times in {unit}?"
     return "check units, signs and the order of the joints"
 
 
@@ -215,8 +253,22 @@ CHECKS: list[Check[JointSignals]] = [
         "frozen", "error", find_frozen, expected="columns that belong together",
         do="check the logger, and the names of the columns",
     ),
-    Check("velocity-is-no-derivative", "warning", find_wrong_velocity, unless=("degrees",)),
-    Check("constant-torque", "warning", find_constant_torque, everywhere=True),
+    Check(
+        "time-unit", "error", find_time_unit, unless=("degrees", "frozen"), expected="times in seconds",
+        do="write 'units: {t: ms}' (us, ns) under 'logs' in the robot's YAML",
+    ),
+    Check(
+        "dropouts", "error", find_dropouts, expected="signals without holes",
+        do="write 'dropouts: dropped' under 'logs' in the robot's YAML to leave out those rows",
+    ),
+    Check(
+        "no-torques", "error", find_no_torques, everywhere=True, expected="the torques that moved it",
+        do="check the names of the columns and the logger",
+    ),
+    Check(
+        "velocity-is-no-derivative", "warning", find_wrong_velocity, unless=("degrees", "time-unit", "dropouts"),
+    ),
+    Check("constant-torque", "warning", find_constant_torque, unless=("no-torques",), everywhere=True),
     Check("joint-at-rest", "info", find_rest, unless=("frozen",), everywhere=True),
 ]  # fmt: skip
 
@@ -261,6 +313,8 @@ def clock_diagnostics(trajectory: Trajectory) -> list[Diagnostic]:
         longest = np.diff(trajectory.t).max()
         message = f"{gaps} gaps in time, up to {longest:.3g} s long; no window crosses one"
         notes.append(Diagnostic("info", "gap", where, None, message))
+    for repair in trajectory.repairs:
+        notes.append(Diagnostic("warning", "repaired", where, None, repair))
     rate = trajectory.sample_rate
     if trajectory.u is None and shows_accelerations(rate) and not is_dense(rate):
         message = (
@@ -282,7 +336,8 @@ def findings(
         agreement = velocity_agreement(trajectory)
     results = []
     for index, (joint, kind) in enumerate(zip(joints, joint_types, strict=True)):
-        for odd, message in run_checks(CHECKS, JointSignals(trajectory, index, joints, kind, agreement)):
+        signals = JointSignals(trajectory, index, joints, kind, agreement)
+        for odd, message in run_checks(CHECKS, signals, trajectory.accepted):
             results.append(Finding(odd, trajectory.name, trajectory.file, joint, message))
     return results
 

@@ -7,11 +7,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pyarrow as pa
+import pyarrow.compute
 import pyarrow.csv
 
+from spelgen.errors import LogError
+from spelgen.logs.bags import FIELDS
 from spelgen.logs.tables import LogFormat, LogTable, reading, table_layout
-from spelgen.settings.log_mapping import LogMapping
+from spelgen.settings.log_mapping import PLAIN, LogMapping
 
+STAMP = ("sec", "nanosec")  # of a message's header
 HEAD = 2**16  # bytes from which encoding, delimiter and decimal point are detected
 
 
@@ -30,16 +34,54 @@ def csv_columns(file: Path) -> pa.Table:
         encoding, head = _decoded_head(file)
         names, _, rows = head.partition("\n")
         delimiter = max(",;\t", key=names.count)
+        header = None
+        if _is_number(names.split(delimiter)[0]):
+            header = _joint_state_header(names.split(delimiter), file)
         decimal_point = "."
         if delimiter != "," and re.search(rf"(^|{delimiter}) *-?\d+,\d", rows, re.MULTILINE):
             decimal_point = ","
         table = pa.csv.read_csv(
             file,
-            pa.csv.ReadOptions(encoding=encoding),
+            pa.csv.ReadOptions(encoding=encoding, column_names=header),
             pa.csv.ParseOptions(delimiter=delimiter),
             pa.csv.ConvertOptions(decimal_point=decimal_point),
         )
-    return table.rename_columns([name.strip() for name in table.column_names])
+    if header is None:
+        return table.rename_columns([name.strip() for name in table.column_names])
+    seconds, nanoseconds = (table[name].cast(pa.int64()) for name in STAMP)
+    times = pa.compute.add(pa.compute.multiply(seconds, 1_000_000_000), nanoseconds)
+    return table.append_column(PLAIN["t"], times.cast(pa.duration("ns")))
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _joint_state_header(cells: Sequence[str], file: Path) -> list[str]:
+    """Return names for the columns of joint states as `ros2 topic echo --csv` writes them, which has no header.
+
+    Raises LogError for any other file that begins with numbers.
+    """
+    names: list[str] = []
+    for cell in cells[len(STAMP) + 1 :]:
+        if _is_number(cell):
+            break
+        names.append(cell)
+    values = len(cells) - len(STAMP) - 1 - len(names)
+    if not names or values % len(names) or not 0 < values // len(names) <= len(FIELDS):
+        raise LogError(
+            f"numbers in the first line ({', '.join(cells[:3])}, ...)", file=file, line=1,
+            expected="a header: the names of the columns",
+            do="write one, t,q_<joint>,...,qd_<joint>,...,tau_<joint>,... for example",
+        )  # fmt: skip
+    header = [*STAMP, "frame_id", *(f"name_{name}" for name in names)]
+    for quantity in list(FIELDS)[: values // len(names)]:
+        header += [PLAIN[quantity].replace("{joint}", name) for name in names]
+    return header
 
 
 def _decoded_head(file: Path) -> tuple[str, str]:

@@ -18,7 +18,7 @@ from spelgen.logs.formats import read_tables
 from spelgen.logs.log_files import log_files
 from spelgen.logs.tables import UNITS, UNITS_KEY, LogTable
 from spelgen.logs.trajectory import Trajectory, require_joints
-from spelgen.logs.values import clock_start, make_trajectory, require_increasing_times, values_in_si
+from spelgen.logs.values import clock_start, in_time_order, make_trajectory, values_in_si
 
 ROW_GROUP = 2**16  # rows written together: logs larger than memory are read by row groups
 
@@ -97,8 +97,8 @@ def _trajectories(log: LogTable, file: Path) -> list[Trajectory]:
     data = values_in_si(log.table, log.layout, file, clock_start(log.table[times]))
     trajectories = []
     for name, rows in _recordings(log, file.stem):
-        require_increasing_times(data[rows, 0], rows, file, times)
-        trajectories.append(make_trajectory(data[rows], log.layout, name, file))
+        values, repairs = in_time_order(data[rows], rows, log.layout, file)
+        trajectories.append(make_trajectory(values, log.layout, name, file, repairs))
     return trajectories
 
 

@@ -21,6 +21,7 @@ from spelgen.settings.log_mapping import TIMES, LogMapping
 
 LISTED = 12  # columns that a message names
 UNITS_KEY = b"units"  # in a Parquet file's metadata: the file declares its units
+UNIT_CODES = ("degrees", "time-unit", "torque-unit", "torque-beyond-drive")  # that a declared unit answers
 UNITS = b"t s, q rad or m, qd rad/s or m/s, tau Nm or N"  # what spelgen itself declares
 
 # Arrow, NumPy and zipfile raise all of these for damaged files
@@ -34,14 +35,14 @@ class Layout:
     """Say where the quantities of an arm stand in a log, and how they are measured.
 
     columns: of t, then of q, qd and tau by joint; without qd where velocities are to be differentiated. labels: the
-    column that splits the log into recordings, None without. declares_units: the file or the mapping says units.
+    column that splits the log into recordings, None without. accepted: see `Trajectory`.
     """
 
     columns: tuple[str, ...]
     labels: str | None
     joints: tuple[str, ...]
     mapping: LogMapping
-    declares_units: bool
+    accepted: tuple[str, ...]
 
     @cached_property
     def units(self) -> tuple[np.ndarray, np.ndarray]:
@@ -118,9 +119,12 @@ def make_layout(
     declared: bool = False,
 ) -> Layout:
     """Return a layout. declared: the file itself says what its units are."""
-    if not declared:
-        declared = all(mapping.unit("q", joint) for joint in joints)
-    return Layout(tuple(columns), labels, tuple(joints), mapping, declared)
+    accepted: tuple[str, ...] = mapping.accept
+    if declared:
+        accepted += UNIT_CODES
+    elif all(mapping.unit("q", joint) for joint in joints):
+        accepted += ("degrees",)
+    return Layout(tuple(columns), labels, tuple(joints), mapping, accepted)
 
 
 def list_element(name: str, columns: Collection[str]) -> tuple[str, int] | None:
@@ -183,6 +187,16 @@ def _advice(
     for quantity in wanted_quantities(mapping):
         for joint in joints:
             owners[mapping.column(quantity, joint)] = (quantity, joint)
+    bare = [
+        joint
+        for joint in joints
+        if all(mapping.column(x, joint) in missing for x in wanted_quantities(mapping))
+    ]
+    if bare and len(bare) < len(joints):
+        return (
+            f"nothing was logged of {', '.join(bare)}: say which joints are the arm's, by --tip, --joints, or 'tip' or "
+            "'moving_joints' in the robot's YAML, or map its columns under 'logs'"
+        )
     quantities = {owners.get(name, ("", ""))[0] for name in missing}
     # the usual gap of loggers, and the only one with a remedy of its own
     if quantities == {"qd"}:

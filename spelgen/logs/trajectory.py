@@ -33,7 +33,8 @@ class Trajectory:
     u: (T, n) commanded positions [rad; m] of joints with servos, u[k] constant from t[k] to t[k+1]; None of others.
     name: unique among the trajectories that are used together.
     file: where it was read from, None if it was not.
-    declares_units: the file itself, or the mapping it was read by, says in what units its columns are.
+    accepted: codes of checks (see `spelgen.logs.checks`) that are not made of it: what they would find is right.
+    repairs: what was mended when it was read.
     Raises LogError where shapes do not fit, a number is not finite or larger than any arm has, or times do not
     increase.
     """
@@ -44,8 +45,9 @@ class Trajectory:
     tau: np.ndarray
     name: str = "trajectory"
     file: Path | None = None
-    declares_units: bool = False
+    accepted: tuple[str, ...] = ()
     u: np.ndarray | None = None
+    repairs: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for column in ("t", *self.quantities):

@@ -17,11 +17,11 @@ from spelgen.settings.log_mapping import TIMES
 from spelgen.settings.tuning.logs import LogTuning
 
 TUNING = LogTuning()
-EXACT = 2**53  # whole numbers up to here are exact as floating-point numbers
+LONGEST = 1e8  # in whatever unit of time: no recording begins so late on a clock of its own
 
 
 def clock_start(times: pa.ChunkedArray | pa.Array) -> int:
-    """Return from where times count: the first one of a clock too wide for floating-point numbers, else 0."""
+    """Return from where times count: the first one of a clock that shows the date, else 0."""
     first = times[:1]
     try:
         nanoseconds = _nanoseconds(first)
@@ -29,8 +29,11 @@ def clock_start(times: pa.ChunkedArray | pa.Array) -> int:
         return 0  # told of by `_times`, which knows the file
     if nanoseconds is not None:
         return nanoseconds[0].as_py() or 0
-    start = first[0].as_py() if pa.types.is_integer(first.type) else None
-    return start if start and abs(start) > EXACT else 0
+    if not (pa.types.is_integer(first.type) or pa.types.is_floating(first.type)):
+        return 0
+    start = first[0].as_py()
+    # seconds since 1970 leave floating-point numbers no digits for what follows
+    return int(start) if start is not None and LONGEST < abs(start) < np.inf else 0
 
 
 def values_in_si(
@@ -55,9 +58,16 @@ def column_values(table: pa.Table, name: str, file: Path) -> np.ndarray:
     return _floats(_column(table, name), name, file, 0)
 
 
-def make_trajectory(data: np.ndarray, layout: Layout, name: str, file: Path) -> Trajectory:
+def make_trajectory(
+    data: np.ndarray, layout: Layout, name: str, file: Path, repairs: tuple[str, ...] = ()
+) -> Trajectory:
     """Return a trajectory of these rows (T, C) in SI units, velocities differentiated where there are none."""
     quantities = wanted_quantities(layout.mapping)
+    if layout.mapping.dropouts == "dropped":
+        holes = np.any([is_dropout(column) for column in data[:, 1:].T], axis=0)
+        if holes.any():
+            data = data[~holes]
+            repairs += (f"{holes.sum()} rows in which a signal fell to 0 were left out",)
     t = data[:, 0]
     signals = dict(zip(quantities, np.split(data[:, 1:], len(quantities), axis=1), strict=True))
     q = signals["q"]
@@ -65,7 +75,24 @@ def make_trajectory(data: np.ndarray, layout: Layout, name: str, file: Path) -> 
     tau = np.zeros((len(t), 0))
     if "tau" in signals:
         tau = earlier(t, signals["tau"], layout.mapping.torque_delay)
-    return Trajectory(t, q, qd, tau, name, file, layout.declares_units, signals.get("u"))
+    return Trajectory(t, q, qd, tau, name, file, layout.accepted, signals.get("u"), repairs)
+
+
+def is_dropout(values: np.ndarray) -> np.ndarray:
+    """Whether each sample (T,) is exactly 0 between samples that are far from 0: what loggers write for no value."""
+    dropout = np.zeros(len(values), bool)
+    edges = np.diff((values == 0).astype(int))
+    starts, stops = np.flatnonzero(edges > 0) + 1, np.flatnonzero(edges < 0) + 1
+    if not starts.size:
+        return dropout
+    steps = np.abs(np.diff(values[values != 0]))
+    usual = np.median(steps[steps > 0]) if steps.any() else np.inf
+    for start in starts.tolist():
+        stop = int(stops[stops > start].min(initial=len(values)))
+        # a signal that passes through 0 comes near it first
+        if stop < len(values) and min(abs(values[start - 1]), abs(values[stop])) > TUNING.dropout * usual:
+            dropout[start:stop] = True
+    return dropout
 
 
 def _differentiated(t: np.ndarray, q: np.ndarray) -> np.ndarray:
@@ -184,6 +211,46 @@ def _require_possible(data: np.ndarray, columns: Sequence[str], file: Path, firs
         file=file, line=_line(file, row + first), element=f"row {row + first + 1}, column {columns[column]}",
         expected=expected, do=do,
     )  # fmt: skip
+
+
+def in_time_order(
+    data: np.ndarray, rows: np.ndarray, layout: Layout, file: Path
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return values (T, C) of these rows of a file with increasing times, and what was mended for that.
+
+    Rows are sorted where positions become smoother by it, and of rows of one time the first is taken. Raises LogError
+    for a clock that begins anew, or that is too coarse.
+    """
+    t = data[:, 0]
+    repairs: tuple[str, ...] = ()
+    late = np.flatnonzero(np.diff(t) < 0)
+    if late.size:
+        ordered = data[np.argsort(t, kind="stable")]
+        positions = slice(1, 1 + len(layout.joints))
+        # two recordings in one file would be interleaved by sorting
+        if _roughness(ordered[:, positions]) > _roughness(data[:, positions]):
+            require_increasing_times(t, rows, file, layout.columns[0])
+        data = ordered
+        repairs += (f"{late.size} times before that of the row above: the rows were sorted",)
+    is_repeat = np.diff(data[:, 0], prepend=-np.inf) == 0
+    repeats = int(is_repeat.sum())
+    if 2 * repeats > len(data):
+        raise LogError(
+            f"{repeats} of {len(data)} rows with the time of another row", file=file,
+            element=f"column {layout.columns[0]}", expected="a time for each row",
+            do="log times with more digits, or split recordings by a column 'trajectory'",
+        )  # fmt: skip
+    if repeats:
+        data = data[~is_repeat]
+        repairs += (f"{repeats} rows with the time of the row before were left out",)
+    return data, repairs
+
+
+def _roughness(positions: np.ndarray) -> float:
+    """Return the way that joints go from row to row, each relative to its range."""
+    ranges = np.ptp(positions, axis=0)
+    way = np.abs(np.diff(positions, axis=0)).sum(axis=0)
+    return float((way / np.where(ranges > 0, ranges, 1.0)).sum())
 
 
 def require_increasing_times(t: np.ndarray, rows: np.ndarray, file: Path, column: str) -> None:

@@ -40,6 +40,19 @@ ONLY = {  # units that a joint of this kind cannot have
 
 LONGEST_DELAY = 1.0  # s
 
+Accepted = Literal[
+    "degrees",
+    "frozen",
+    "time-unit",
+    "dropouts",
+    "no-torques",
+    "torque-sense",
+    "torque-unit",
+    "torque-beyond-drive",
+    "torque-order",
+]
+"""Errors of `spelgen logs` that someone who knows better can accept, by their codes."""
+
 Time = Literal["s", "ms", "us", "ns"]
 Position = Literal["rad", "deg", "turns", "counts", "m", "mm"]
 Velocity = Literal["rad/s", "deg/s", "turns/s", "rpm", "counts/s", "m/s", "mm/s"]
@@ -113,6 +126,8 @@ class LogMapping(Group):
     input: "position" where joints are commanded positions: u is read, and neither qd nor tau are.
     topic: of the ROS 2 bag, where it holds several with joint states. velocity: "differentiated" where the
     log has none. torque_delay: how much later than positions a log shows torques [s], see what `spelgen logs` suggests.
+    accept: codes of errors in logs that are right as they are. dropouts: "dropped" leaves out rows in which a signal
+    fell to 0 for a moment.
     Files that spelgen wrote itself are read as they are, whatever stands here.
     """
 
@@ -123,6 +138,8 @@ class LogMapping(Group):
     velocity: Literal["logged", "differentiated"] = "logged"
     torque_delay: Annotated[Number, Field(ge=-LONGEST_DELAY, le=LONGEST_DELAY)] = 0.0
     joints: dict[str, JointLog] = Field(default={})
+    accept: tuple[Accepted, ...] = ()
+    dropouts: Literal["kept", "dropped"] = "kept"
 
     def joint(self, name: str) -> JointLog:
         """Return how a joint is logged, by its URDF name."""

@@ -34,5 +34,11 @@ class DriveHintTuning:
     refined: int = 4  # couplings whose ratio is searched for
     delay_gain: float = 0.8  # of the squared error, what is left at most where a delay is worth telling
     coupling_gain: float = 0.5  # likewise of a coupling; that of the TX40's wrist leaves 0.05
-    standard_errors: float = 2.82  # over blocks, of a gain that is no luck: 1 in 400, as of what enters a fit
+    wrong_gain: float = (
+        0.25  # likewise of a swapped or negated torque; recorded arms lose a factor of 4 by either
+    )
+    opposed: float = (
+        0.25  # of a torque's deviation, of 1: friction this large that drives a joint on is no friction
+    )
+    chance: float = 1 / 400  # that any candidate is taken by luck, as of what enters a fit
     simple_ratio: float = 0.02  # of the squared error, what a ratio of small numbers may cost

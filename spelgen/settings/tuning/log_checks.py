@@ -20,4 +20,5 @@ class LogCheckTuning:
     impossible_factor: float = 10.0  # times the URDF's gravity torque, which only another unit has
     beyond_drives: float = 20.0  # times its effort limit, which no drive gives in whatever unit
     gravity_samples: int = 400  # of one trajectory; friction and gravity change slowly
+    levels: float = 10.0  # of a quantised signal: fewer say little of its size
     step_tolerance: float = 0.05  # of a step, and of the levels of a signal, that may be off a quantised grid

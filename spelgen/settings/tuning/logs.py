@@ -13,6 +13,9 @@ class LogTuning:
     chunk_samples: int = 2**16  # of a streamed log held at once: of 7 joints 12 MB, as windows 53 MB
     npz_bytes: int = 2**30  # unpacked at most from one NPZ archive, which zeros pack a thousandfold
     largest_value: float = 1e9  # [rad, rad/s, Nm; m, m/s, N] no arm has more: what is beyond is a wrong unit
+    dropout: float = (
+        20.0  # [usual steps] next to which a signal's 0 is no value: smooth signals come nearer first
+    )
     gap: float = 4.0  # [median steps] a longer step is a hole; jitter of USB loggers stays below 3
     automatic_cutoff: float = 8.0  # [Hz] rigid-body motion lies below, ripple and quantisation above (UR10e)
     dense_rate: float = (
