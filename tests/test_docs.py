@@ -1,10 +1,13 @@
 """What the docs show is what happens: on every page, console and Python blocks run in their order.
 
-In a ```console block a line `$ COMMAND` is followed by what it prints; `pytest --update` writes that anew. ```text
-blocks and indented ones are not run: they show long runs, or no commands.
+In a ```console block a line `$ COMMAND` is followed by what it prints, and an ```output block follows the Python block
+that prints it; `pytest --update` writes both anew. ```text blocks and indented ones are not run: they show long runs,
+or no commands. A tutorial is a notebook as well, of the same cells.
 """
 
 import contextlib
+import io
+import json
 import re
 import shlex
 import shutil
@@ -19,10 +22,15 @@ ROOT = Path(__file__).parents[1]
 PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")])
 FILE = re.compile(r"`((?:[a-z][a-z_]*/)+(?:[a-z][a-z_]*(?:\.[a-z]+)+)?)(?:::\w+)?`")
 BLOCK = re.compile(r"^```(console|python)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+CELL = re.compile(r"^```python\n(.*?)^```\n(?:\n```output\n(.*?)^```\n)?", re.MULTILINE | re.DOTALL)
+SLOW = {"tutorial_servo.md"}
+TUTORIALS = sorted((ROOT / "docs").glob("tutorial_*.md"))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_examples(page, tmp_path, monkeypatch, request):
+    if page.name in SLOW and not request.config.getoption("--update"):
+        pytest.skip("a fit of half a minute; --update runs it")
     shutil.copytree(ROOT / "robots", tmp_path / "robots")
     monkeypatch.syspath_prepend(tmp_path)
     text, names = page.read_text(encoding="utf-8"), {"__name__": "example"}
@@ -31,12 +39,48 @@ def test_examples(page, tmp_path, monkeypatch, request):
         if language == "console":
             happened = happened.replace(block, run_commands(block, tmp_path))
         else:
-            with contextlib.chdir(tmp_path):
+            printed = io.StringIO()
+            with contextlib.chdir(tmp_path), contextlib.redirect_stdout(printed):
                 exec(compile(block, str(page), "exec"), names)
+            if page in TUTORIALS:
+                happened = happened.replace(cell(text, block), cell("", block, printed.getvalue()))
     if request.config.getoption("--update"):
         page.write_text(happened, encoding="utf-8")
     else:
         assert text == happened
+
+
+def cell(text: str, block: str, output: str = "") -> str:
+    """The block with its output: as it stands in the text, or else as it should be."""
+    for match in CELL.finditer(text):
+        if match[1] == block:
+            return match[0]
+    return f"```python\n{block}```\n" + (f"\n```output\n{output}```\n" if output else "")
+
+
+def notebook(page: Path) -> str:
+    """The page as a notebook: prose as Markdown cells, blocks with their outputs as code cells."""
+    text, cells, end = page.read_text(encoding="utf-8"), [], 0
+    for match in CELL.finditer(text):
+        cells.append({"cell_type": "markdown", "source": text[end : match.start()].strip()})
+        output = {"output_type": "stream", "name": "stdout", "text": match[2]}
+        outputs = [output] if match[2] else []
+        code = {"cell_type": "code", "execution_count": len(cells), "outputs": outputs}
+        cells.append(code | {"source": match[1].rstrip("\n")})
+        end = match.end()
+    cells.append({"cell_type": "markdown", "source": text[end:].strip()})
+    cells = [{"id": f"cell-{k}", "metadata": {}} | x for k, x in enumerate(cells) if x["source"]]
+    kernel = {"kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"}}
+    book = {"cells": cells, "metadata": kernel, "nbformat": 4, "nbformat_minor": 5}
+    return json.dumps(book, indent=1, sort_keys=True) + "\n"
+
+
+@pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.name)
+def test_tutorials_are_notebooks(page, request):
+    path = page.with_suffix(".ipynb")
+    if request.config.getoption("--update"):
+        path.write_text(notebook(page), encoding="utf-8")
+    assert path.read_text(encoding="utf-8") == notebook(page)
 
 
 def run_commands(block: str, folder: Path) -> str:
