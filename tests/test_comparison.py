@@ -25,11 +25,11 @@ from spelgen.emission.loading import load_module
 from spelgen.errors import RunError
 from spelgen.evaluation import invariants
 from spelgen.fitting.rollout import roll_out
-from spelgen.fleet.tasks import run_here
 from spelgen.logs.read import Trajectory, read_logs
 from spelgen.logs.windows import cut_windows, joined
 from spelgen.render.comparison_page import write_comparison
 from spelgen.settings.tuning.evaluation import EvaluationTuning
+from spelgen.tasks import run_here
 from spelgen.urdf.read import read_urdf
 
 CHOSEN = [variant for variant in VARIANTS if variant.name in ("phnode", "hybrid")]

@@ -15,11 +15,11 @@ from spelgen.fleet.fleet import run_fleet
 from spelgen.fleet.prepare import Preparation, prepare
 from spelgen.fleet.ranking import fleet_listings, winners
 from spelgen.fleet.schema import FleetRobot, load_fleet
-from spelgen.fleet.tasks import run_here, workers
 from spelgen.loaded_arm import load_arm
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.render.fleet_page import write_fleet
 from spelgen.simulation.simulate import simulate
+from spelgen.tasks import run_here, workers
 
 QUICK = {"presets": ["spel"], "width": 4, "depth": 1, "training": {"epochs": 2, "momentum_steps": 0}}
 

@@ -18,7 +18,7 @@ CARRIED = {"__future__", "collections", "functools", "math", "torch", "typing"}
 
 # A folder (or a file at the top) may import only from itself and from what stands above it.
 ROWS = """
-version errors files labels listing templates runtime
+version errors files labels listing tasks templates runtime
 settings urdf arm design spec
 structure dynamics
 certificate emission logs

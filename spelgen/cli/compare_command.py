@@ -52,8 +52,8 @@ def compare(
     from spelgen.comparison.formatting import comparison_tables
     from spelgen.comparison.runs import run_study, time_steps
     from spelgen.comparison.study import VARIANTS, ablation_variants, prepare_study
-    from spelgen.fleet.tasks import workers
     from spelgen.render.comparison_page import write_comparison
+    from spelgen.tasks import workers
 
     # before logs are simulated
     if urdf_error is not None and steps is not None:

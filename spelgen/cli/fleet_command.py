@@ -37,8 +37,8 @@ def fleet(
     from spelgen.fleet.fleet import run_fleet
     from spelgen.fleet.ranking import fleet_listings
     from spelgen.fleet.schema import load_fleet
-    from spelgen.fleet.tasks import workers
     from spelgen.render.fleet_page import write_fleet
+    from spelgen.tasks import workers
 
     settings = load_fleet(file)
     # workers have folders of their own: paths must not depend on them

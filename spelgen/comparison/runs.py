@@ -20,12 +20,12 @@ from spelgen.fitting.fit import RunOptions
 from spelgen.fitting.rollout import LossScales, loss_scales
 from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.fitting.train import train
-from spelgen.fleet.tasks import RunTasks
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import cut_windows
 from spelgen.settings.fits import DEFAULTS, Rollout
 from spelgen.spec import read_facts
+from spelgen.tasks import RunTasks
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel

@@ -56,7 +56,8 @@ def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
     elements = path[..., None]
     # a bristle bends from where it stands to where the drive is, and stands where its reach dragged it
     bent = elements - dragged(elements, bristles.values)
-    return np.clip(bent, -bristles.values, bristles.values)  # without the last digit's rounding
+    bends: np.ndarray = np.clip(bent, -bristles.values, bristles.values)  # without the last digit's rounding
+    return bends
 
 
 def encoded(q: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from spelgen.files import write_json
 from spelgen.fleet.jobs import Job, RunResult, run_job
 from spelgen.fleet.prepare import Preparation, PreparedArm, prepare
 from spelgen.fleet.schema import Fleet
-from spelgen.fleet.tasks import RunTasks
+from spelgen.tasks import RunTasks
 
 SCHEMA = 1
 

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
 from math import cos, lcm, sin, tan
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from spelgen.arm.arm import Arm
 from spelgen.settings.tuning.structure import StructureTuning
-from spelgen.spec import Assume
 from spelgen.structure import field
 from spelgen.structure.field import (
     PRIME,
@@ -28,6 +28,9 @@ from spelgen.structure.field import (
     residue,
 )
 from spelgen.structure.recursion import Element, Motion, energies, triangle
+
+if TYPE_CHECKING:
+    from spelgen.spec import Assume
 
 Ten = Sequence[Element]
 TUNING = StructureTuning()

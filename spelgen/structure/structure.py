@@ -12,14 +12,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from spelgen.arm.arm import Arm
 from spelgen.errors import ArmError
-from spelgen.spec import Assume
 from spelgen.structure import field
 from spelgen.structure.basis import Constant, Output, smallest_form
 from spelgen.structure.sampling import Spans, regressor_rows
+
+if TYPE_CHECKING:
+    from spelgen.spec import Assume
 
 
 @dataclass(frozen=True)
