@@ -41,8 +41,8 @@ from spelgen.fitting.torque_fit import fit_torque
 from spelgen.identification.friction import FrictionModel
 from spelgen.identification.identify import least_squares
 from spelgen.identification.method import LeastSquares
-from spelgen.identification.samples import DynamicsSamples
 from spelgen.loaded_arm import load_arm
+from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.logs.trajectory import Trajectory
 
 Torque = Callable[..., np.ndarray]

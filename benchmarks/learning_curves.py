@@ -36,8 +36,8 @@ from spelgen.fitting.torque_networks import fit_networks
 from spelgen.identification.friction import FrictionModel
 from spelgen.identification.identify import least_squares
 from spelgen.identification.method import LeastSquares
-from spelgen.identification.samples import DynamicsSamples
 from spelgen.loaded_arm import load_arm
+from spelgen.logs.dynamics_samples import DynamicsSamples
 
 ROBOTS = Path(__file__).parents[1] / "robots"
 SECONDS = (2.0, 20.0, 200.0)

@@ -34,8 +34,8 @@ from spelgen.identification.friction import FrictionModel
 from spelgen.identification.identification import Identification
 from spelgen.identification.identify import least_squares
 from spelgen.identification.method import LeastSquares
-from spelgen.identification.samples import DynamicsSamples, dynamics_samples
 from spelgen.loaded_arm import load_arm
+from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory

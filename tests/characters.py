@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from spelgen.identification.samples import DynamicsSamples
+from spelgen.logs.dynamics_samples import DynamicsSamples
 
 # the data fix a gravity of 3 m/s^2 for links of 1 m, and nothing else of it
 URDF = """<robot name="planar">

@@ -24,8 +24,8 @@ from spelgen.evaluation.rollout import rollout
 from spelgen.evaluation.subject import read_test_logs
 from spelgen.evaluation.torque import torque_errors
 from spelgen.fitting.train import train
-from spelgen.identification.samples import dynamics_samples
 from spelgen.loaded_arm import load_arm
+from spelgen.logs.dynamics_samples import dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.windows import Windows, cut_windows

@@ -11,8 +11,8 @@ from spelgen.fitting.rollout import loss_scales, momentum_loss, roll_out
 from spelgen.identification.friction import FrictionModel
 from spelgen.identification.identify import least_squares
 from spelgen.identification.method import LeastSquares
-from spelgen.identification.samples import DynamicsSamples
 from spelgen.loaded_arm import load_arm
+from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
 from spelgen.runtime.bristles import Bristles

@@ -15,8 +15,8 @@ from spelgen.identification.friction import FrictionModel
 from spelgen.identification.identify import columns, least_squares
 from spelgen.identification.least_squares import correlation_time
 from spelgen.identification.method import LeastSquares
-from spelgen.identification.samples import DynamicsSamples, dynamics_samples
 from spelgen.loaded_arm import load_arm
+from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.pipeline import inspect
 from spelgen.structure.pseudo_inertia import (

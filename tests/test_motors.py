@@ -19,9 +19,9 @@ from spelgen.fitting.torque_jacobian import TorqueJacobian
 from spelgen.fitting.torque_samples import TorqueSamples
 from spelgen.identification.identify import identify, least_squares
 from spelgen.identification.method import LeastSquares
-from spelgen.identification.samples import DynamicsSamples, dynamics_samples
 from spelgen.loaded_arm import load_arm
 from spelgen.log_checks.check_logs import check_logs
+from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.pipeline import generate, inspect

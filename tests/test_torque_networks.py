@@ -7,7 +7,7 @@ from spelgen.fitting import torque_networks
 from spelgen.fitting.objectives import default_objective
 from spelgen.fitting.torque_networks import fit_networks
 from spelgen.fitting.torque_samples import TorqueSamples
-from spelgen.identification.samples import DynamicsSamples
+from spelgen.logs.dynamics_samples import DynamicsSamples
 
 
 def recorded(model, seed, count=150):

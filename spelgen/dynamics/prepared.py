@@ -163,14 +163,14 @@ class PreparedModel:
             raise ValueError("no tip: give model.prepared(tip=spelgen.tip_kinematics(arm))")
         return self._tip
 
-    def _at(self, q: Tensor) -> Any:
+    def _at(self, q: Tensor) -> object:
         return self._dynamics.configuration(q, self._weights)
 
-    def _mass_and_bias(self, pose: Any, qd: Tensor) -> tuple[Tensor, Tensor]:
+    def _mass_and_bias(self, pose: object, qd: Tensor) -> tuple[Tensor, Tensor]:
         mass, residuals = self._dynamics.mass_at(pose, self._weights)
         return mass, self._dynamics.nonlinear_at(pose, qd, residuals, self._weights)
 
-    def _friction(self, pose: Any, qd: Tensor, z: Tensor | None) -> Tensor:
+    def _friction(self, pose: object, qd: Tensor, z: Tensor | None) -> Tensor:
         past = (z,) if self.elements else ()
         torque: Tensor = self._dynamics.friction_at(pose, qd, self._weights, *past)
         return torque

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeGuard
 
 import torch
 
@@ -45,19 +45,33 @@ class PortHamiltonianDynamics(RigidDynamics, Protocol):
     ``prepared`` is what ``prepare`` gave: all that depends on the weights alone.
     """
 
-    def prepare(self, definite: bool = True) -> Any:
+    def prepare(self, definite: bool = True) -> object:
         """What many evaluations with the same weights share."""
 
-    def momentum(self, q: Tensor, qd: Tensor, prepared: Any = None) -> Tensor:
+    def momentum(self, q: Tensor, qd: Tensor, prepared: object = None) -> Tensor:
         """p, (..., n)."""
 
-    def velocity(self, q: Tensor, p: Tensor, prepared: Any = None) -> Tensor:
+    def velocity(self, q: Tensor, p: Tensor, prepared: object = None) -> Tensor:
         """qd, (..., n)."""
 
     def port_hamiltonian_rhs(
-        self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Any, *state: Tensor | None
+        self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: object, *state: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         """q' and p', (..., n), under the inputs tau; without, of the arm left to itself."""
+
+
+class FrictionState(Protocol):
+    """Friction that depends on the state z of bristles, (..., n, elements) [rad, m]."""
+
+    elements: int
+    motors: Tensor  # C: the drives' speeds are C qd, (n, n)
+    friction: Any  # the laws, see `runtime.friction_laws`
+
+    def memory(self, qd: Tensor) -> Tensor:
+        """Return z of joints that have long gone the way of qd."""
+
+    def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
+        """Return z after joints went one way by (..., n)."""
 
 
 def has_rigid_bodies(model: object) -> bool:
@@ -70,7 +84,7 @@ def has_residuals(model: object) -> bool:
     return getattr(model, "residual_mass", None) is not None
 
 
-def has_friction_state(model: object) -> bool:
+def has_friction_state(model: object) -> TypeGuard[FrictionState]:
     """Return whether the model's friction depends on the state z of bristles, which all calls then take last."""
     return getattr(model, "elements", 0) > 0
 
@@ -85,23 +99,21 @@ def has_momentum(dynamics: object) -> bool:
     return hasattr(dynamics, "momentum")
 
 
-def sliding_memory(dynamics: Any, qd: Tensor) -> Tensor:
+def sliding_memory(dynamics: object, qd: Tensor) -> Tensor:
     """z, (..., n, K), of joints that have long gone the way of qd."""
     if not has_friction_state(dynamics):
         return qd.unsqueeze(-1)[..., :0]
-    z: Tensor = dynamics.memory(qd)
-    return z
+    return dynamics.memory(qd)
 
 
-def memory_after(dynamics: Any, z: Tensor, displacement: Tensor) -> Tensor:
+def memory_after(dynamics: object, z: Tensor, displacement: Tensor) -> Tensor:
     """z after joints went one way by (..., n)."""
     if not z.shape[-1] or not has_friction_state(dynamics):
         return z
-    moved: Tensor = dynamics.memory_after(z, displacement)
-    return moved
+    return dynamics.memory_after(z, displacement)
 
 
-def memory_along(dynamics: Any, q: Tensor, qd: Tensor, z: Tensor | None = None) -> Tensor:
+def memory_along(dynamics: object, q: Tensor, qd: Tensor, z: Tensor | None = None) -> Tensor:
     """z, (W, K, n, elements), along the samples q and qd, (W, K, n), each straight to the next.
 
     It starts at z, (W, n, elements), by default as of joints that have long gone the way of the first qd.
@@ -112,7 +124,7 @@ def memory_along(dynamics: Any, q: Tensor, qd: Tensor, z: Tensor | None = None) 
     return torch.stack(states, dim=1)
 
 
-def known_past(dynamics: Any, z: Tensor | None) -> tuple[Tensor, ...]:
+def known_past(dynamics: object, z: Tensor | None) -> tuple[Tensor, ...]:
     """z as what to give to these dynamics last, where they have a use for it."""
     return (z,) if z is not None and has_friction_state(dynamics) else ()
 

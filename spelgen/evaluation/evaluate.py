@@ -21,8 +21,8 @@ from spelgen.evaluation.subject import Subject, subject
 from spelgen.evaluation.torque import TorqueSummary, torque_errors
 from spelgen.evaluation.traces import motion_traces, replay_traces
 from spelgen.fitting.rollout import choose_substeps, loss_scales
-from spelgen.identification.samples import dynamics_samples
 from spelgen.logs.checks import check
+from spelgen.logs.dynamics_samples import dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, require_joints, require_torques
 from spelgen.settings.tuning.evaluation import EvaluationTuning

@@ -11,7 +11,7 @@ import torch
 
 from spelgen.dynamics.protocol import known_past
 from spelgen.evaluation.plain import finite
-from spelgen.identification.samples import DynamicsSamples
+from spelgen.logs.dynamics_samples import DynamicsSamples
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from spelgen.dynamics.bristles import bristles_along
 from spelgen.dynamics.protocol import known_past
 from spelgen.evaluation.horizons import JudgedLogs
 from spelgen.evaluation.plain import Rows, Series, rows, series
-from spelgen.identification.samples import FREQUENCY, dynamics_samples
+from spelgen.logs.dynamics_samples import FREQUENCY, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.rates import shows_accelerations
 from spelgen.logs.trajectory import Trajectory

@@ -13,12 +13,13 @@ from scipy.optimize import nnls
 from torch import Tensor
 
 from spelgen.arm.arm import Arm
-from spelgen.building import build
 from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.dynamics.residuals import without_residuals
+from spelgen.emission.loading import load_module
 from spelgen.exporting.parity import usual_speeds
 from spelgen.fitting.optimizers import minimise
 from spelgen.loaded_arm import LoadedArm
+from spelgen.pipeline import generate
 from spelgen.settings.tuning.exporting import TUNING
 from spelgen.structure.nominal import working_range
 
@@ -111,7 +112,7 @@ def _nearest_bodies(model: EmittedModel, arm: LoadedArm, q: Tensor) -> EmittedMo
 
     Where these leave a body's parameters open it keeps the URDF's.
     """
-    bodies = build(arm, "closed-form")
+    bodies = load_module(generate(arm, "closed-form"))
     # light joints at the tip count as much as heavy ones at the base
     whitening = torch.linalg.inv(torch.linalg.cholesky(model.mass_matrix(q).mean(dim=0)))
     mass = whitening @ model.mass_matrix(q) @ whitening.mT

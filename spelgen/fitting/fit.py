@@ -20,7 +20,7 @@ from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.run_lock import locked
 from spelgen.fitting.run_record import require_same
 from spelgen.fitting.streaming import LargeLogs
-from spelgen.identification.samples import SHORTEST
+from spelgen.logs.dynamics_samples import SHORTEST
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.fits import FitConfig

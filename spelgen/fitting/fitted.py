@@ -18,8 +18,8 @@ from spelgen.fitting.objective import Status
 from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.fitting.run_lock import locked
 from spelgen.fitting.run_record import Content, recorded_config
-from spelgen.identification.samples import dynamics_samples
 from spelgen.listing import Listing
+from spelgen.logs.dynamics_samples import dynamics_samples
 from spelgen.logs.filtering import low_pass
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.rates import SLOWEST

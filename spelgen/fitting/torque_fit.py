@@ -28,7 +28,7 @@ from spelgen.fitting.levenberg_marquardt import NormalEquations, SolverState, le
 from spelgen.fitting.residual_fit import SelectedResidual, refit_residuals, select_residuals
 from spelgen.fitting.torque_jacobian import TUNING, TorqueJacobian
 from spelgen.fitting.torque_samples import TorqueSamples
-from spelgen.identification.samples import DynamicsSamples
+from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.settings.fits import Adaptation, GaussianPrior
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ import torch
 
 from spelgen.fitting.optimizers import minimise_sum
 from spelgen.fitting.torque_samples import Block, TorqueSamples
-from spelgen.identification.samples import DynamicsSamples
+from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.settings.fits import DEFAULTS, Adaptation
 
 if TYPE_CHECKING:

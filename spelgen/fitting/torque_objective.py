@@ -21,7 +21,7 @@ from spelgen.fitting.torque_samples import TorqueSamples
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer
 from spelgen.fitting.validation import Validation
 from spelgen.fitting.window_problem import measure
-from spelgen.identification.samples import DynamicsSamples, dynamics_samples
+from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.rates import SLOWEST
 from spelgen.settings.fits import TorqueFit
 

@@ -9,7 +9,7 @@ from typing import IO
 import numpy as np
 import torch
 
-from spelgen.identification.samples import DynamicsSamples
+from spelgen.logs.dynamics_samples import DynamicsSamples
 
 Block = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 """q, qd, qdd and tau, (T, n), and z, (T, n, K)."""

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from spelgen.identification.samples import TUNING, dynamics_samples
+from spelgen.logs.dynamics_samples import TUNING, dynamics_samples
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.values import earlier
 

@@ -19,9 +19,9 @@ from spelgen.identification.identification import Identification
 from spelgen.identification.least_squares import Columns, Solution, Triangles, deviations, reduce, solve
 from spelgen.identification.method import LeastSquares
 from spelgen.identification.prior import gaussian_prior
-from spelgen.identification.samples import SHORTEST, DynamicsSamples, dynamics_samples
 from spelgen.loaded_arm import LoadedArm, load_arm
 from spelgen.logs.checks import check
+from spelgen.logs.dynamics_samples import SHORTEST, DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.rates import SLOWEST
 from spelgen.logs.trajectory import Trajectory, require_joints, require_torques

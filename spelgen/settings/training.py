@@ -44,7 +44,7 @@ class TrainingSettings(Group):
 
     @field_validator("*")
     @classmethod
-    def _belongs(cls, value: Any, info: ValidationInfo) -> Any:
+    def _belongs(cls, value: object, info: ValidationInfo) -> object:
         objective, owners = info.data.get("objective"), OWNERS.get(str(info.field_name))
         if objective and owners and objective not in owners:
             raise ValueError(
