@@ -53,6 +53,30 @@ def read_bytes(
 
 
 @contextmanager
+def limited_memory(size: int) -> Iterator[None]:
+    """Let the process take at most so many bytes more: what unpacks to no end then raises MemoryError.
+
+    For readers of others that believe what a file says of its size; without effect where the system is not Linux.
+    """
+    try:
+        import resource
+
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+    except (ImportError, OSError):
+        yield
+        return
+    before, largest = resource.getrlimit(resource.RLIMIT_AS)
+    allowed = pages * resource.getpagesize() + size
+    if largest != resource.RLIM_INFINITY:
+        allowed = min(allowed, largest)
+    resource.setrlimit(resource.RLIMIT_AS, (allowed, largest))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (before, largest))
+
+
+@contextmanager
 def replacing(path: Path | str) -> Iterator[Path]:
     """Yield a hidden neighbour to write to, which in the end takes the place of `path`, also through a power cut.
 

@@ -2,7 +2,9 @@
 
 import io
 import re
+import resource
 import struct
+import sys
 import time
 import zipfile
 from collections.abc import Callable
@@ -21,6 +23,7 @@ from spelgen.exporting.exported import readme
 from spelgen.fitting.fit import fit
 from spelgen.loaded_arm import load_arm
 from spelgen.log_checks.check_logs import check_logs
+from spelgen.logs import bags
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.pipeline import generate
@@ -193,3 +196,20 @@ def test_the_mass_matrix_is_positive_definite_as_far_as_the_docs_say(robots, pre
                 mass = model.mass_matrix(q)
                 assert mass.isfinite().all()
                 assert not torch.linalg.cholesky_ex(mass).info.any()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="memory is limited on Linux alone")
+def test_a_bag_that_unpacks_to_no_end_is_refused(tmp_path, monkeypatch):
+    """A chunk of 400 MB of zeros, which zstd packs to 40 kB, where the process may take 200 MB more."""
+    rosbag2 = pytest.importorskip("rosbags.rosbag2")
+    writer = rosbag2.Writer(tmp_path / "bag", version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
+    writer.set_compression(rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD)
+    with writer:
+        topic = writer.add_connection("/joint_states", bags.MESSAGE, msgdef="float64 x\n", rihs01="x")
+        writer.write(topic, 1, bytes(400_000_000))
+    assert sum(path.stat().st_size for path in (tmp_path / "bag").iterdir()) < 1_000_000
+    limits = resource.getrlimit(resource.RLIMIT_AS)
+    monkeypatch.setattr(bags, "MEMORY", 200_000_000)
+    with pytest.raises(LogError, match="an unreadable ROS 2 bag"):
+        read_logs(tmp_path / "bag", JOINTS)
+    assert resource.getrlimit(resource.RLIMIT_AS) == limits

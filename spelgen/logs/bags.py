@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from spelgen.errors import LogError
-from spelgen.files import require_regular_file
+from spelgen.files import limited_memory, require_regular_file
 from spelgen.logs.tables import LogFormat, LogTable, make_layout, table_layout, wanted_quantities
 from spelgen.settings.log_mapping import PLAIN, LogMapping
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 SUFFIXES = (".mcap", ".db3")
 MESSAGE = "sensor_msgs/msg/JointState"
+MEMORY = 2**29  # bytes beside what the messages of a bag take
 FIELDS = {"q": "position", "qd": "velocity", "tau": "effort"}
 
 
@@ -117,13 +118,17 @@ def _messages(path: Path, topic: str | None) -> Iterator[tuple[int, JointState]]
             expected="the package rosbags to read it",
             do="pip install 'spelgen[ros]'",
         ) from error
+    size = path.stat().st_size
     for file in path.rglob("*"):
         if not file.is_dir():
             # rosbags opens whatever the folder holds
             require_regular_file(file, LogError, "files in the folder of a ROS 2 bag")
+            size += file.stat().st_size
     store = get_typestore(Stores.ROS2_HUMBLE)
     with ExitStack() as stack:
         try:
+            # rosbags unpacks a chunk whole, however large it gets; messages as arrays take ten times their bytes
+            stack.enter_context(limited_memory(MEMORY + 20 * size))
             reader = stack.enter_context(Reader(path))
             by_header = None
             for _, recorded, raw in reader.messages(_connections(reader, topic, path)):
