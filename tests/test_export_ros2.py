@@ -27,8 +27,10 @@ int main()
   q[0] = 0.3; q[1] = -0.7; qd[0] = 0.5; qd[1] = -1.1; qdd[0] = 2.0; qdd[1] = 1.0;
   const auto M = solver->getInertiaMatrix(q);
   for (int i = 0; i < 2; ++i) { std::printf("%.17g %.17g\n", M(i, 0), M(i, 1)); }
+  Eigen::VectorXd there = q;
+  there[0] -= 2e-4; there[1] += 3e-3;
   for (const auto & row : {solver->getCoriolisVector(q, qd), solver->getGravityVector(q),
-        solver->getFrictionVector(qd), solver->getTorques(q, qd, qdd)}) {
+        solver->getFrictionVector(qd), solver->getTorques(q, qd, qdd), solver->getTorques(there, qd, qdd)}) {
     std::printf("%.17g %.17g\n", row[0], row[1]);
   }
   try { solver->getGravityVector(few); } catch (const std::invalid_argument & error) { std::puts(error.what()); }
@@ -91,15 +93,29 @@ def test_the_plugin_gives_what_the_model_gives(package, tmp_path):
     told = driver_lines(binary)
     assert told.pop() == "two_link has 2 joints, got 1 values"
     q, qd, qdd = (torch.tensor(x, dtype=torch.float64) for x in ([0.3, -0.7], [0.5, -1.1], [2.0, 1.0]))
+    moved = torch.tensor([-2e-4, 3e-3], dtype=torch.float64)
     expected = [
         *model.mass_matrix(q),
         model.nonlinear_effects(q, qd) - model.gravity(q),
         model.gravity(q),
         model.friction_torque(torch.zeros_like(q), qd),
         model.inverse_dynamics(q, qd, qdd),
+        # against the way that the first velocity bent the bristles
+        model.inverse_dynamics(q + moved, qd, qdd, model.memory_after(model.memory(qd), moved)),
     ]
     found = np.array([[float(x) for x in line.split()] for line in told])
     np.testing.assert_allclose(found, torch.stack(expected).numpy(), rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="no g++ on this machine")
+def test_it_builds_against_the_header_of_older_interfaces(package, tmp_path):
+    """inverse_dynamics_solver 0.1.1 calls it .h."""
+    _, folder = package
+    stubs = shutil.copytree(STUBS, tmp_path / "stubs")
+    header = stubs / "inverse_dynamics_solver" / "inverse_dynamics_solver.hpp"
+    header.rename(header.with_suffix(".h"))
+    source = folder / "src" / "solver.cpp"
+    run("g++", "-std=c++17", "-Wall", "-Wextra", "-Werror", "-fsyntax-only", f"-I{stubs}", source)
 
 
 @pytest.mark.skipif(
