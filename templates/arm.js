@@ -62,11 +62,12 @@ const arm = (() => {
     const part = Math.min(1, Math.max(0, (state.time - t[k]) / (t[k + 1] - t[k] || 1)));
     return rows[k].map((x, j) => (x === null || rows[k + 1][j] === null ? NaN : x + part * (rows[k + 1][j] - x)));
   };
-  const polygons = (q, eye, paint) => {
+  const polygons = (q, eye, paint, moving) => {
     const middle = scene.motions[state.motion].middle;
     const found = [];
     frames(q).forEach(({ R, p }, index) => {
       const link = scene.links[index];
+      if (moving && carried(link) < 0) return;
       const flat = link.v.map((v) => {
         const w = apply(R, v);
         return apply(eye, w.map((x, k) => x + p[k] - middle[k]));
@@ -114,7 +115,7 @@ const arm = (() => {
     const pale = (link, shade) => css(mix(ink.model, [255, 255, 255], 0.3 * shade), 0.34);
     const nearer = (a, b) => a.depth - b.depth;
     const drawn = polygons(q, eye, measured).sort(nearer);
-    if (there && there.every(Number.isFinite)) drawn.push(...polygons(there, eye, pale).sort(nearer));
+    if (there && there.every(Number.isFinite)) drawn.push(...polygons(there, eye, pale, true).sort(nearer));
     context.setTransform(dense, 0, 0, dense, 0, 0);
     context.clearRect(0, 0, wide, high);
     context.lineJoin = "round";

@@ -33,7 +33,7 @@ M21 = Izz2 + hx2*cos(q2) - hy2*sin(q2)
 M22 = Izz2
 V = 9.81*(hx1R*sin(q1) + hy1*cos(q1) + hx2*sin(q1 + q2) + hy2*cos(q1 + q2))
 
-V is given up to a constant.
+V is determined up to a constant.
 
 Base parameters, and the URDF's values
   Izz1R = Izz1 + m2 [2.25]

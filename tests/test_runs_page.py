@@ -32,7 +32,7 @@ def test_runs_stand_side_by_side_and_the_better_one_is_named(run, tmp_path):  # 
     (better / "evaluation.json").write_text(json.dumps(changed))
     text = " ".join(" ".join(Page(render_runs([run, better])).text).split())
     assert (
-        "better predicts best over 1 s (0.00615 of the motion missed) and run has the least torque error"
+        "better has the smallest rollout error over 1 s (0.00615 of the motion) and run has the smallest torque error"
         in text
     )
     result = CliRunner().invoke(app, ["report", str(run), str(better), "-o", str(tmp_path / "both.html")])
@@ -50,7 +50,7 @@ def test_runs_of_servos_are_compared_by_what_they_replay(run, tmp_path):  # noqa
         changed = EVALUATION | {"horizons": [], "torque": {}, "replays": [replay]}
         (folder / "evaluation.json").write_text(json.dumps(changed))
     text = " ".join(" ".join(Page(render_runs([run, better])).text).split())
-    assert "better follows commands best, whole log (6 mrad" in text
+    assert "better has the smallest error with commands replayed, whole log (6 mrad" in text
     assert "b 8 6 mean of all 8 6" in text and " a 8" not in text
 
 

@@ -53,7 +53,7 @@ def _entry(formula: Formula) -> dict[str, object]:
 def _notes(formulas: Formulas) -> list[str]:
     notes = []
     if any(row.place is None for row in formulas.rows):
-        notes.append("V is given up to a constant.")
+        notes.append("V is determined up to a constant.")
     for row in formulas.unwritten:
         # one example does: the first that can be had at all
         if row.terms is not None and row.terms <= WRITABLE:

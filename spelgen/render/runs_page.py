@@ -105,18 +105,20 @@ def _verdict(runs: Sequence[EvaluatedRun]) -> str:
         best = _best(_horizon_errors(runs, horizon, "mean_relative_rms"))
         if best:
             sentences.append(
-                f"{best[1]} predicts best over {horizon} ({number(best[0])} of the motion missed)"
+                f"{best[1]} has the smallest rollout error over {horizon} ({number(best[0])} of the motion)"
             )
     best = _best(_torque_errors(runs))
     if best:
-        sentences.append(f"{best[1]} has the least torque error (nMSE {number(best[0])})")
+        sentences.append(f"{best[1]} has the smallest torque error (nMSE {number(best[0])})")
     for replay in _common(runs, "replays")[:1]:
         best = _best(_replay_errors(runs, replay))
         if best:
             unit = thousandths(runs[0].facts.joint_types)
-            sentences.append(f"{best[1]} follows commands best, {replay} ({number(best[0])} {unit} off)")
+            sentences.append(
+                f"{best[1]} has the smallest error with commands replayed, {replay} ({number(best[0])} {unit})"
+            )
     if not sentences:
-        return "These runs share nothing that was measured."
+        return "These runs have no common horizons or logs."
     return f"{listed(sentences)}."
 
 

@@ -183,7 +183,7 @@ def servo_summary(config: ServoRecord) -> FitSummary | None:
     record = config["servo"]
     listing = servo_listing(record)
     listing = replace(listing, note=f"{listing.note} {open_text(record)}.")
-    return FitSummary(servo_text(record), listing, (delay_text(record), "from commands to what they do"))
+    return FitSummary(servo_text(record), listing, (delay_text(record), "delay of the commands"))
 
 
 def servo_text(record: ServoRecord) -> str:
@@ -216,15 +216,15 @@ def servo_listing(record: ServoRecord) -> Listing:
         rows.append((joint["joint"], number(joint["kp"]["value"]), *cells))
     head = ["joint", "kp [Nm/rad]"]
     head += [f"{LABELS[column]} [{UNITS.get(column, 'rad, m')}]" for column in columns]
-    return Listing("Servos", tuple(head), tuple(rows), f"Ratios are {ABOUT}.")
+    return Listing("Servos", tuple(head), tuple(rows), f"All columns but kp are {ABOUT}.")
 
 
 def open_text(record: ServoRecord) -> str:
     """Return what the logs leave open."""
     _, undetermined = identifiability(record["joints"])
     if not undetermined:
-        return "all of these are determined"
-    return f"not determined by these logs: {', '.join(undetermined)}"
+        return "All ratios are determined"
+    return f"Not determined by these logs: {', '.join(undetermined)}"
 
 
 def identifiability(joints: Sequence[JointRecord]) -> tuple[list[str], list[str]]:
