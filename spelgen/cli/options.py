@@ -85,7 +85,9 @@ Accept = Annotated[
         "--accept", metavar="CODE", help="Use logs with this error, which names its code; once for each."
     ),
 ]
-TextOrJson = Annotated[Literal["text", "json"], typer.Option("--format", help="Of the result on stdout.")]
+TextOrJson = Annotated[
+    Literal["text", "json"], typer.Option("--format", help="Format of the result on stdout.")
+]
 Filter = Annotated[
     float | None,
     typer.Option(

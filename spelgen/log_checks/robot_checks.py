@@ -125,9 +125,7 @@ def find_stop(joint: JointEvidence) -> str | None:
         (joint.coordinate.upper, joint.high["q"]),
     ):
         if limit is not None and abs(reached - limit) <= TUNING.limit_rounding:
-            return (
-                f"q reaches its limit {limit:.4g}: at a stop the torque says nothing; leave such motion out"
-            )
+            return f"q reaches its limit {limit:.4g}: contact with the stop changes the torque; remove such motion"
     return None
 
 

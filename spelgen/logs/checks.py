@@ -259,7 +259,7 @@ CHECKS: list[Check[JointSignals]] = [
     ),
     Check(
         "dropouts", "error", find_dropouts, expected="signals without holes",
-        do="write 'dropouts: dropped' under 'logs' in the robot's YAML to leave out those rows",
+        do="write 'dropouts: dropped' under 'logs' in the robot's YAML to drop those rows",
     ),
     Check(
         "no-torques", "error", find_no_torques, everywhere=True, expected="the torques that moved it",
