@@ -237,6 +237,21 @@ def test_c_carries_frictions_memory(tmp_path):
     np.testing.assert_allclose(slid, BRISTLES.reach * direction[..., None])
 
 
+@needs_gcc
+def test_in_single_precision_a_joint_that_creeps_moves_its_bristles(tmp_path):
+    """1e-6 rad/s at 1 kHz: near its reach of 0.1 rad a bristle in float would stay, or move by seven times as much."""
+    model = Trained(moved_model("two_link", "closed-form"), arm_of("two_link")).described
+    source = write_c(model, tmp_path)
+    library = link_library(compile_object(source, "gcc", f"-D{model.name.upper()}_FLOAT"), "gcc")
+    called = CLibrary(library, model, np.float32)
+    assert model.bristles is not None
+    z = start = 0.6 * model.bristles.reach.reshape(1, -1)
+    given = {"q": np.zeros((1, 2)), "dq": np.full((1, 2), 1e-9)}
+    for _ in range(200):
+        z = called("friction_step", given | {"z": z})["z_next"]
+    np.testing.assert_allclose(z - start, 200e-9, rtol=0.01)
+
+
 def test_export_needs_the_run_folder_alone(tmp_path):
     run = run_folder("two_link", "closed-form", tmp_path)
     told = CliRunner().invoke(app, ["export", str(run.path), "--to", "casadi", "-o", str(tmp_path / "out")])

@@ -103,17 +103,21 @@ class CLibrary:
         function.restype = None
         arrays: list[np.ndarray] = []
         for key in entry.inputs:
-            arrays.append(np.ascontiguousarray(inputs[key], dtype=self._dtype))
+            arrays.append(np.ascontiguousarray(inputs[key], dtype=self._kind(key)))
         outputs: dict[str, np.ndarray] = {}
         for key in entry.output_names:
             # NaN: what the function does not write is noticed
             shape = (states, *self._shape(name, key))
-            outputs[key] = np.full(shape, np.nan, self._dtype)
+            outputs[key] = np.full(shape, np.nan, self._kind(key))
         arrays += outputs.values()
         for state in range(states):
             rows = [array[state : state + 1] for array in arrays]
             function(*(row.ctypes.data_as(ctypes.c_void_p) for row in rows))
         return {key: value.astype(np.float64) for key, value in outputs.items()}
+
+    def _kind(self, name: str) -> type:
+        """Return the type of an input or output: friction's memory is double in any case."""
+        return np.float64 if name in ("z", "z_next", "z_start") else self._dtype
 
     def _shape(self, entry: str, output: str) -> tuple[int, ...]:
         n, memory = self._model.n, self._model.memory

@@ -93,7 +93,9 @@ def _entry(model: TrainedModel, entry: EntryPoint) -> CEntry:
     unused = [name for name in (*entry.inputs, *entry.output_names) if not re.search(rf"\b{name}\b", text)]
     body = [f"(void){name};" for name in unused] + calls + lines
     if residuals or variables:
-        body.insert(0, f"real {', '.join((*residuals, *variables))};")
+        # in single precision a small displacement would be lost beside what z is already
+        kind = "double" if entry.name == "friction_step" else "real"
+        body.insert(0, f"{kind} {', '.join((*residuals, *variables))};")
     # (rows) of a vector, (rows, columns) of a matrix
     shapes = []
     for k, (name, unit) in enumerate(entry.outputs):
@@ -118,10 +120,10 @@ def _signature(model: TrainedModel, entry: EntryPoint, function: ca.Function) ->
     parameters: list[str] = []
     for name in entry.inputs:
         # NULL where friction has no memory: no array of C is empty
-        parameters.append(f"const {real} *z" if name == "z" else f"const {real} {name}[{rows}]")
+        parameters.append("const double *z" if name == "z" else f"const {real} {name}[{rows}]")
     for k, name in enumerate(entry.output_names):
         size = function.numel_out(k)
-        parameters.append(f"{real} *{name}" if name.startswith("z_") else f"{real} {name}[{size}]")
+        parameters.append(f"double *{name}" if name.startswith("z_") else f"{real} {name}[{size}]")
     text = f"void {model.name}_{entry.name}({', '.join(parameters)})"
     # lines end after a parameter: other spaces do not break
     text = text.replace(" ", "\xa0").replace(",\xa0", ", ")
