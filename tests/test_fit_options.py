@@ -6,8 +6,10 @@ import pytest
 from pydantic import ValidationError
 from typer.testing import CliRunner
 
+from spelgen.building import build
 from spelgen.cli.main import app
 from spelgen.errors import OptionError, SettingsError
+from spelgen.fitting.fit import fit
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import write_logs
 from spelgen.pipeline import generate
@@ -185,3 +187,11 @@ def test_a_run_goes_on_with_its_own_options(tmp_path):
     done = CliRunner().invoke(app, [*again, "--objective", "momentum"])
     assert done.exit_code == 1
     assert "objective momentum instead of rollout" in done.stderr
+
+
+def test_a_name_in_place_of_a_configuration_is_told(robots):
+    model = build(robots / "two_link.urdf", "closed-form")
+    with pytest.raises(
+        SettingsError, match=r"got 'torque' as the configuration of a fit, expected spelgen\.Torq"
+    ):
+        fit(model, [], "torque")

@@ -23,7 +23,7 @@ from spelgen.cli.train_settings import (
     resumed_run,
 )
 from spelgen.errors import Diagnostic, ModuleError, OptionError
-from spelgen.settings.fits import Objective, Rollout
+from spelgen.settings.fits import Objective, Rollout, WindowConfig
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.spec import read_facts
 
@@ -172,18 +172,18 @@ def _outcome(fit: Fit) -> tuple[str, str]:
     from spelgen.fitting.objectives import fit_summary
 
     config, loss = fit.config, f"validation loss {fit.best_validation:.3g}"
+    reason = ""
+    if fit.status == "out of time" and isinstance(config, WindowConfig):
+        reason = f": --max-minutes {config.max_minutes or 0:g} is over"
     if not isinstance(config, Rollout):  # windows only judge
         summary = fit_summary(fit.record)
         if summary is not None:
             loss = summary.text
         elif not fit.record["validation_windows"]:
             loss = f"{fit.steps} steps were taken"
-        return f"{fit.status}: {config.objective} fitted in {fit.seconds:.0f} s", loss
-    reason = ""
+        return f"{fit.status}: {config.objective} fitted in {fit.seconds:.0f} s{reason}", loss
     if fit.status == "stopped early":
         reason = f": no better validation loss since epoch {fit.best_epoch}"
-    elif fit.status == "out of time":
-        reason = f": --max-minutes {config.max_minutes or 0:g} is over"
     elif fit.status == "finished" and fit.epochs >= config.epochs:
         reason = ": all epochs are run"
     elif fit.status == "finished":

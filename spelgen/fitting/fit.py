@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from spelgen.dynamics.protocol import has_rigid_bodies
-from spelgen.errors import Diagnostic, RunError
+from spelgen.errors import Diagnostic, RunError, SettingsError
 from spelgen.files import write_json
 from spelgen.fitting.fitted import Fit, load_run
 from spelgen.fitting.objective import FitRequest, Logs, Objective, Status, record_of
@@ -93,6 +93,11 @@ def fit(
     logs = [logs] if isinstance(logs, Trajectory) else logs
     if config is None:
         config = default_config(model, sample_rates(logs))
+    if not isinstance(config, FitConfig):
+        raise SettingsError(
+            f"{config!r} as the configuration of a fit",
+            expected="spelgen.TorqueFit(), MomentumFit(), Rollout() or ServoFit()",
+        )
     config.require(rigid_bodies=has_rigid_bodies(model))
     urdf = run.urdf if run is not None and options.resume else _urdf(arm)
     request = FitRequest(

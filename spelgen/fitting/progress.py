@@ -26,7 +26,7 @@ class TrainingProgress:
             TimeRemainingColumn(),
         )
         self._bar = Progress(*columns, TextColumn("{task.fields[state]}"), console=self._console)
-        self._task = self._bar.add_task("training", total=None, state="")
+        self._task = self._bar.add_task("training", total=None, visible=False, state="")
         self._said = ""  # of the stage that goes on, where there is no terminal
 
     def __enter__(self) -> TrainingProgress:
@@ -50,7 +50,12 @@ class TrainingProgress:
     def momentum(self, step: int, steps: int, loss: float) -> None:
         """Show how far the momentum steps are."""
         self._bar.update(
-            self._task, description="momentum", completed=step, total=steps, state=f"loss {loss:.3g}"
+            self._task,
+            description="momentum",
+            completed=step,
+            total=steps,
+            visible=True,
+            state=f"loss {loss:.3g}",
         )
         self._said = f"momentum: {step} steps, loss {loss:.3g}"
         if step == steps:
@@ -59,14 +64,16 @@ class TrainingProgress:
     def round(self, number: int, rounds: int, steps: int, rms: float) -> None:
         """Show how far a fit of servos is: the round of so many, steps in all, errors [rad, m]."""
         state = f"{steps} steps, errors {1000 * rms:.3g} mrad"
-        self._bar.update(self._task, description="servos", completed=number, total=rounds, state=state)
+        self._bar.update(
+            self._task, description="servos", completed=number, total=rounds, visible=True, state=state
+        )
         self._said = f"servos: {state}"
 
     def epoch(self, record: Content, epochs: int) -> None:
         """Show one line of metrics.jsonl, of so many epochs at most."""
         if not self._said.startswith("training"):
             self._end_stage()
-            self._bar.reset(self._task, description="training", total=epochs)
+            self._bar.reset(self._task, description="training", total=epochs, visible=True)
         state = f"validation {record['validation']:.3g}, best {record['best']:.3g}"
         self._bar.update(self._task, completed=record["epoch"], state=state)
         rate, plural = record["step"] / record["seconds"], "s" * (record["epoch"] != 1)

@@ -17,7 +17,7 @@ from spelgen.fitting.streaming import LargeLogs
 from spelgen.fitting.torque_logs import prepare_windows, prepared_logs, regularizer_of, require_torque_input
 from spelgen.fitting.torque_objective import fit_torques, torque_samples
 from spelgen.fitting.validation import Validation
-from spelgen.fitting.window_problem import Clock, Measured, WindowProblem, measure
+from spelgen.fitting.window_problem import TUNING, Clock, Measured, WindowProblem, measure
 from spelgen.logs.rates import SLOWEST
 from spelgen.settings.fits import MomentumFit, Rollout, TorqueFit, WindowConfig
 
@@ -73,14 +73,17 @@ class MomentumObjective:
 
     def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
         """See `Objective`."""
+        status: Status = "finished"
         if not self.done and self.config.momentum_steps:
             clock = Clock(self.config.max_minutes, self.seconds)
             seed = self.request.seed
             self.best = momentum_stage(self.problem, self.validation, self.best, clock, progress, seed)
             self.seconds = clock.seconds
+            if clock.fraction(clock.seconds) >= TUNING.momentum_fraction:
+                status = "out of time"
         self.done = True
         save()
-        return "finished"
+        return status
 
     def checkpoint(self) -> Content:
         """See `Objective`."""
