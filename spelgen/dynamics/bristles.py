@@ -17,11 +17,12 @@ class BristleReach:
     """How far the bristles of an arm's drives reach: values, (n, K) [rad, m]; K is 0 where there are none.
 
     motors: C, (n, n), the drives turn by C times what the joints do (see ``Actuation.motor_speeds``); None: each moves
-    its own joint alone.
+    its own joint alone. smoothing_velocity: (n,) [rad/s, m/s], over which dry friction without memory turns around.
     """
 
     values: np.ndarray
     motors: np.ndarray | None = None
+    smoothing_velocity: np.ndarray | None = None
 
     @property
     def elements(self) -> int:
@@ -41,8 +42,9 @@ def bristle_reach(model: Any) -> BristleReach:
     """Of a model."""
     if not has_friction_state(model):
         return BristleReach(np.zeros((model.n, 0)))
-    reach, motors = (x.cpu().double().numpy() for x in (model.friction.bristles.reach, model.motors))
-    return BristleReach(reach, motors)
+    smoothing = model.friction.prepare().coulomb_smoothing_velocity.detach()
+    arrays = [x.cpu().double().numpy() for x in (model.friction.bristles.reach, model.motors, smoothing)]
+    return BristleReach(*arrays)
 
 
 def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
@@ -58,6 +60,15 @@ def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
     bent = elements - dragged(elements, bristles.values)
     bends: np.ndarray = np.clip(bent, -bristles.values, bristles.values)  # without the last digit's rounding
     return bends
+
+
+def direction_along(qd: np.ndarray, bristles: BristleReach) -> np.ndarray | None:
+    """Return the direction (T, n) of dry friction without memory at these velocities; None: its width is not known."""
+    if bristles.smoothing_velocity is None:
+        return None
+    speed = qd if bristles.motors is None else qd @ bristles.motors.T
+    direction: np.ndarray = np.tanh(speed / bristles.smoothing_velocity)
+    return direction
 
 
 def encoded(q: np.ndarray) -> np.ndarray:

@@ -33,6 +33,7 @@ class FrictionLaw:
     coulomb_smoothing_velocity: np.ndarray
     load_dependence: np.ndarray
     least_load: np.ndarray
+    memoryless: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)

@@ -95,11 +95,12 @@ class ModelExpressions:
         # gravity would be computed for nothing
         if law.load_dependence.any():
             load = constant(np.linalg.inv(motors).T) @ self._rigid_gravity
-        if bristles is None:
-            direction = friction_expressions.sliding_direction(law, speed)
-        else:
-            # dry friction follows bristles or velocity, never both
-            direction = friction_expressions.bristle_direction(bristles, self.z)
+        # a joint's dry friction follows velocity or bristles
+        direction = ca.SX.zeros(self.model.n)
+        if law.memoryless.any():
+            direction = law.memoryless * friction_expressions.sliding_direction(law, speed)
+        if bristles is not None:
+            direction += friction_expressions.bristle_direction(bristles, self.z)
         torque = friction_expressions.law_torque(law, speed, load, direction)
         for k, joint in enumerate(self.model.residuals.friction.joints):
             torque[joint] *= ca.exp(self.residuals["factor"][k])

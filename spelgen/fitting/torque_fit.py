@@ -14,6 +14,7 @@ bodies is fitted to what these leave, where it pays (see ``residual_fit``), and 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -73,7 +74,12 @@ def fit_torque(
     if large:
         subset = samples.thinned(TUNING.subset)
     problem = TorqueProblem(TorqueJacobian(model, subset), prior or _default_prior(adapt), adapt)
+    select_memory = adapt is None and model.elements > 0
+    if select_memory:
+        model.friction.memoryless.fill_(1.0)
     state = problem.multistart()
+    if select_memory:
+        state = problem.select_memory(state)
     residuals: list[SelectedResidual] = []
     if adapt is None and has_residuals(model):
         state, residuals = _with_residuals(problem, state, samples.count)
@@ -188,6 +194,28 @@ class TorqueProblem:
         _, (state, self.noise, prior, self.covariance, self.compensated) = max(ways, key=lambda way: way[0])
         self.set_prior(prior)
         return state
+
+    def select_memory(self, state: State) -> State:
+        """Go on from a fit without memory of friction; give bristles to the joints whose samples show memory.
+
+        Bristles turn around after a displacement, and so late: where friction turns around at once, they pass for
+        inertia. Joint by joint the two forms are compared by Schwarz's criterion (Annals of Statistics 6:461, 1978).
+        """
+        laws = self.jacobian.model.friction
+        fitted = self.noise, self.prior, self.covariance.clone()
+        laws.memoryless.fill_(0.0)
+        remembering = self.solve(self.set_samples(state, self.jacobian), TUNING.rounds)
+        independent = self.count / TUNING.correlation_length
+        gain = independent * (state.residuals / remembering.residuals).log()
+        parameters = laws.bristles.reach.shape[1]
+        laws.memoryless.copy_(gain < parameters * math.log(independent))
+        if laws.memoryless.all():
+            self.noise, prior, self.covariance = fitted
+            self.set_prior(prior)
+            return state
+        if laws.memoryless.any():
+            return self.solve(self.set_samples(remembering, self.jacobian), TUNING.rounds)
+        return remembering
 
     def _evidence(self, x: torch.Tensor) -> float:
         """Return the logarithm of the samples' marginal likelihood by Laplace's approximation, but for a constant."""

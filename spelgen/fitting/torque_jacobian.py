@@ -36,6 +36,7 @@ DAILY = ("sizes", "velocities", "load_dependence", "fractions", "offset")  # kin
 class _Samples:
     """Samples (T, n) with the drives' speeds, and the regressors (T, n, 10 B) of torque and of the gravity torque that
     the drives bear. residual: (T, n) torque of what stands beside rigid bodies. factor: (T, n) on friction.
+    direction: (T, n) of dry friction without memory; None: as the speed has it.
     """
 
     q: torch.Tensor
@@ -43,6 +44,7 @@ class _Samples:
     qdd: torch.Tensor
     tau: torch.Tensor
     z: torch.Tensor | None
+    direction: torch.Tensor | None
     speed: torch.Tensor
     regressor: torch.Tensor
     load_regressor: torch.Tensor
@@ -204,7 +206,9 @@ class TorqueJacobian:
         """Return the weights (K,) after a step, which goes straight in the bodies' inertial parameters."""
         change, bodies = self.rigid.named(step), self.rigid.bodies
         weights = self.rigid.named(x + step)
-        weights[bodies] = moved_bodies(self.rigid.named(x)[bodies], change[bodies])
+        moved = moved_bodies(self.rigid.named(x)[bodies], change[bodies])
+        # bodies that stay keep their last digit, too
+        weights[bodies] = torch.where(change[bodies].any(dim=-1, keepdim=True), moved, weights[bodies])
         return torch.cat([weight.flatten() for weight in weights.values()])
 
     def write(self, x: torch.Tensor) -> None:
@@ -223,6 +227,7 @@ class TorqueJacobian:
         q, qd, qdd, tau, z = block
         rest = torch.zeros_like(q)
         model = self.model
+        elements, columns = model.elements, z.shape[-1]
         with torch.no_grad():
             gravity_regressor = regressor_of(model.chain, q, rest, rest)
             return _Samples(
@@ -230,7 +235,8 @@ class TorqueJacobian:
                 qd=qd,
                 qdd=qdd,
                 tau=tau,
-                z=z if z.shape[-1] else None,
+                z=z[..., :elements] if columns else None,
+                direction=z[..., elements] if columns > elements else None,
                 speed=qd @ model.motors.mT,
                 regressor=regressor_of(model.chain, q, qd, qdd),
                 load_regressor=torch.einsum("jm,tjk->tmk", model.loads, gravity_regressor),
@@ -276,7 +282,9 @@ class TorqueJacobian:
     def _friction(self, weights: Weights, samples: _Samples, load: torch.Tensor) -> torch.Tensor:
         """Return friction's torque at the drives (T, n), as its laws alone have it."""
         constants = self._functional.under(weights, lambda model: model.friction.prepare())
-        friction: torch.Tensor = self.model.friction(samples.speed, load, constants, samples.z)
+        friction: torch.Tensor = self.model.friction(
+            samples.speed, load, constants, samples.z, samples.direction
+        )
         return friction
 
     def _missing(self, weights: Weights, samples: _Samples) -> torch.Tensor:
@@ -285,7 +293,8 @@ class TorqueJacobian:
         def missing(model: Any) -> torch.Tensor:
             prepared, parameters = model.prepare(), model.inertial_parameters.flatten()
             load = samples.load_regressor @ parameters
-            friction = samples.factor * model.friction(samples.speed, load, prepared.friction, samples.z)
+            friction = model.friction(samples.speed, load, prepared.friction, samples.z, samples.direction)
+            friction = samples.factor * friction
             force = model.input_force(None, samples.qd, samples.tau, prepared)
             inertial = samples.regressor @ parameters + samples.qdd @ prepared.armature
             difference: torch.Tensor = force - inertial - samples.residual - friction @ model.motors

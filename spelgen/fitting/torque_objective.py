@@ -115,7 +115,8 @@ def torque_samples(model: EmittedModel, data: TrainingData) -> TorqueSamples | N
         for chunk in data.chunks:
             yield from dynamics_samples([chunk.load()], preprocessing=data.preprocessing, reach=reach)
 
-    spooled = TorqueSamples.spooled(stream(), model.n, reach.elements, decimation)
+    columns = reach.elements + (reach.smoothing_velocity is not None)
+    spooled = TorqueSamples.spooled(stream(), model.n, columns, decimation)
     return spooled if spooled.count else None
 
 

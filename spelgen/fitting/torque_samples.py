@@ -12,7 +12,7 @@ import torch
 from spelgen.logs.dynamics_samples import DynamicsSamples
 
 Block = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
-"""q, qd, qdd and tau, (T, n), and z, (T, n, K)."""
+"""q, qd, qdd and tau, (T, n), and z with the direction of friction without memory, (T, n, K or K + 1)."""
 
 
 class TorqueSamples:
@@ -98,4 +98,6 @@ def _columns(samples: DynamicsSamples, decimation: int) -> list[np.ndarray]:
     z = samples.z
     if z is None:
         z = np.zeros((*samples.q.shape, 0))
+    if samples.direction is not None:
+        z = np.concatenate([z, samples.direction[..., None]], axis=2)
     return [column[::decimation] for column in (samples.q, samples.qd, samples.qdd, samples.tau, z)]

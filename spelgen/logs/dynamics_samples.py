@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from spelgen.dynamics.bristles import BristleReach, bristles_along
+from spelgen.dynamics.bristles import BristleReach, bristles_along, direction_along
 from spelgen.logs.filtering import low_pass, low_pass_regular, resample
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.rates import shows_accelerations
@@ -28,6 +28,7 @@ class DynamicsSamples:
     """Hold samples (T, n) of one trajectory: q, qd, qdd [rad, s; m, s] and tau [Nm, N] as logged.
 
     z: (T, n, K) [rad, m], states of friction's bristles from the motion before; None: not known.
+    direction: (T, n) of dry friction without memory, through the same filter as tau; None: not known.
     """
 
     name: str
@@ -36,6 +37,7 @@ class DynamicsSamples:
     qdd: np.ndarray
     tau: np.ndarray
     z: np.ndarray | None = None
+    direction: np.ndarray | None = None
 
 
 def dynamics_samples(
@@ -96,6 +98,9 @@ def _columns(
         z = bristles_along(smooth.q, reach)
         # the torque's steps where joints turn around went through the filter, so must these
         columns.append(z if cutoff is None else low_pass_regular(z, FREQUENCY, cutoff))
+        direction = direction_along(smooth.qd, reach)
+        if direction is not None:
+            columns.append(direction if cutoff is None else low_pass_regular(direction, FREQUENCY, cutoff))
     return [x[selected] for x in columns]
 
 

@@ -34,7 +34,8 @@ class FrictionConstants(NamedTuple):
     coulomb_smoothing_velocity: Tensor  # [rad/s, m/s]
     load_dependence: Tensor  # dry friction by gravity torque
     least_load: Tensor  # [Nm, N]
-    bristle_fractions: Tensor  # of dry friction, (n, K); a joint's add up to one
+    bristle_fractions: Tensor  # of dry friction, (n, K); a joint's add up to one, or are zero
+    memoryless: Tensor  # 1 where dry friction follows velocity alone, 0 where bristles
 
 
 class FrictionLaws(nn.Module):
@@ -44,8 +45,8 @@ class FrictionLaws(nn.Module):
     + (coulomb + stribeck exp(-(qd / stribeck_velocity)^2) + load_dependence load) direction,
     with the load sqrt(gravity torque^2 + least_load^2).
 
-    The direction, from -1 to 1, is that of the bristles, sum of fraction z / reach; without them, or
-    where nothing is known of the way here, tanh(qd / coulomb_smoothing_velocity).
+    The direction, from -1 to 1, is that of the bristles, sum of fraction z / reach; at joints without
+    memory, or where nothing is known of the way here, tanh(qd / coulomb_smoothing_velocity).
     """
 
     kinds = (
@@ -62,6 +63,7 @@ class FrictionLaws(nn.Module):
 
     nominal: Tensor
     speed: Tensor
+    memoryless: Tensor
     raw_coulomb_smoothing_velocity: nn.Parameter | None
     raw_bristle_fractions: nn.Parameter | None
 
@@ -71,6 +73,8 @@ class FrictionLaws(nn.Module):
         self.register_buffer("speed", vector(joints.speed))
         self.bristles = Bristles(reach or [[]] * joints.n)
         start = torch.zeros(joints.n, dtype=torch.float64)
+        # no parameter: a fit to torques compares both forms
+        self.register_buffer("memoryless", torch.full_like(start, 0.0 if reach else 1.0))
         self.raw_viscous = nn.Parameter(start.clone())
         self.raw_saturation = nn.Parameter(start.clone())
         self.raw_saturation_velocity = nn.Parameter(start.clone())
@@ -100,8 +104,12 @@ class FrictionLaws(nn.Module):
             * (1 if smoothing is None else smoothing.exp()),
             load_dependence=LOAD_DEPENDENCE * size.sign() * self.raw_load_dependence.exp(),
             least_load=LEAST_LOAD * torch.where(size > 0, size, 1.0),
-            bristle_fractions=self.bristles.reach if fractions is None else fractions.softmax(dim=-1),
+            bristle_fractions=self.bristles.reach if fractions is None else self._remembered(fractions),
+            memoryless=self.memoryless,
         )
+
+    def _remembered(self, fractions: Tensor) -> Tensor:
+        return fractions.softmax(dim=-1) * (1 - self.memoryless).unsqueeze(-1)
 
     def resistance(self, qd: Tensor, gravity: Tensor, constants: FrictionConstants) -> Tensor:
         """The diagonal of D, (..., n): friction torque by velocity, of joints that slide."""
@@ -110,14 +118,23 @@ class FrictionLaws(nn.Module):
         return self.viscosity(qd, c) + self.dry(qd, gravity, c) * slope
 
     def forward(
-        self, qd: Tensor, gravity: Tensor, constants: FrictionConstants, z: Tensor | None = None
+        self,
+        qd: Tensor,
+        gravity: Tensor,
+        constants: FrictionConstants,
+        z: Tensor | None = None,
+        direction: Tensor | None = None,
     ) -> Tensor:
-        """The friction torque, (..., n) [Nm, N], under this gravity torque, of bristles at z, (..., n, K)."""
+        """The friction torque, (..., n) [Nm, N], under this gravity torque, of bristles at z, (..., n, K).
+
+        direction: (..., n) of joints without memory; None: as qd has it.
+        """
         c = constants
-        if z is None:
+        if direction is None:
             direction = (qd / c.coulomb_smoothing_velocity).tanh()
-        else:
-            direction = (c.bristle_fractions / self.bristles.reach * z).sum(dim=-1)
+        if z is not None:
+            bent = (c.bristle_fractions / self.bristles.reach * z).sum(dim=-1)
+            direction = bent + c.memoryless * direction
         saturating = c.saturation * (qd / c.saturation_velocity).tanh()
         return c.viscous * qd + saturating + self.dry(qd, gravity, c) * direction
 
