@@ -199,16 +199,15 @@ class TorqueProblem:
         """Go on from a fit without memory of friction; give bristles to the joints whose samples show memory.
 
         Bristles turn around after a displacement, and so late: where friction turns around at once, they pass for
-        inertia. Joint by joint the two forms are compared by Schwarz's criterion (Annals of Statistics 6:461, 1978).
+        inertia. Gears remember, so that memory goes only on evidence (Schwarz, Annals of Statistics 6:461, 1978).
         """
         laws = self.jacobian.model.friction
         fitted = self.noise, self.prior, self.covariance.clone()
         laws.memoryless.fill_(0.0)
         remembering = self.solve(self.set_samples(state, self.jacobian), TUNING.rounds)
         independent = self.count / TUNING.correlation_length
-        gain = independent * (state.residuals / remembering.residuals).log()
-        parameters = laws.bristles.reach.shape[1]
-        laws.memoryless.copy_(gain < parameters * math.log(independent))
+        gain = independent * (remembering.residuals / state.residuals).log()
+        laws.memoryless.copy_(gain > laws.bristles.reach.shape[1] * math.log(independent))
         if laws.memoryless.all():
             self.noise, prior, self.covariance = fitted
             self.set_prior(prior)

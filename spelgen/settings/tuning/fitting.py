@@ -68,7 +68,9 @@ class TorqueTuning:
     """Fits of rigid bodies to torques (`fitting.torque_fit`, `fitting.torque_jacobian`, `fitting.body_steps`)."""
 
     decimation: int = 2  # samples at 100 Hz, filtered at 8 Hz: every second one says all that is to be said
-    correlation_length: float = 20.0  # of those, 0.4 s: so many in a row err alike and count once
+    correlation_length: float = (
+        5.0  # samples, 0.1 s: so many in a row err alike and count once; 20 costs 20 % of M(q)
+    )
     rounds: int = 5  # after the first ones, of finding noise and prior anew
     first_rounds: int = 3  # after which it is seen whether friction explains what is missed
     last_rounds: int = 2  # where all but the last digits are fitted
