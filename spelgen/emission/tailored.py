@@ -155,6 +155,11 @@ def _number(value: float) -> str:
     return f"{value:g}" if float(f"{value:g}") == value else repr(value)
 
 
+def _columns(rows: Sequence[object], *names: str) -> dict[str, object]:
+    """Return these attributes of all rows, by name."""
+    return {name: tuple(getattr(row, name) for row in rows) for name in names}
+
+
 def _joints(spec: ModelSpec) -> Call:
     mean = mean_mass(spec) if spec.bodies else ()
     armature = tuple(
@@ -168,10 +173,7 @@ def _joints(spec: ModelSpec) -> Call:
     return call(
         "Joints",
         revolute=tuple(joint.kind == "revolute" for joint in spec.joints),
-        center=tuple(joint.center for joint in spec.joints),
-        reach=tuple(joint.reach for joint in spec.joints),
-        speed=tuple(joint.speed for joint in spec.joints),
-        friction=tuple(joint.friction for joint in spec.joints),
+        **_columns(spec.joints, "center", "reach", "speed", "friction"),
         armature=armature,
         actuated=tuple(joint.actuated for joint in spec.joints),
         **optional,
@@ -181,13 +183,9 @@ def _joints(spec: ModelSpec) -> Call:
 def _rigid_bodies(spec: ModelSpec) -> _Parts:
     bodies = call(
         "Bodies",
-        parent=tuple(body.parent for body in spec.bodies),
-        joint=tuple(body.joint for body in spec.bodies),
+        **_columns(spec.bodies, "parent", "joint"),
         revolute=tuple(body.kind == "revolute" for body in spec.bodies),
-        ratio=tuple(body.ratio for body in spec.bodies),
-        offset=tuple(body.offset for body in spec.bodies),
-        rotation=tuple(body.rotation for body in spec.bodies),
-        position=tuple(body.position for body in spec.bodies),
+        **_columns(spec.bodies, "ratio", "offset", "rotation", "position"),
         inertia=tuple(body.reference for body in spec.bodies),
     )
     reach = tuple(BRISTLE_REACH[x.kind] for x in spec.joints) if spec.design.memory == "bristles" else ()
@@ -248,10 +246,9 @@ def _servo(spec: ModelSpec) -> Call:
     infinite = Code('float("inf")')
     return call(
         "PositionServo",
-        kp=tuple(servo.kp for servo in spec.servos),
-        kd=tuple(servo.kd for servo in spec.servos),
+        **_columns(spec.servos, "kp", "kd"),
         limit=tuple(infinite if servo.limit is None else servo.limit for servo in spec.servos),
-        known=tuple(servo.known for servo in spec.servos),
+        **_columns(spec.servos, "known"),
     )
 
 
