@@ -76,3 +76,13 @@ def test_data_cannot_end_its_element_and_is_the_same_every_time(robots):
     arm = load_arm(robots / "panda.urdf")
     first, again = (arm_section(arm.arm, arm.robot.path) for _ in range(2))
     assert first == again and len(first.data) < 200_000
+
+
+def test_links_that_are_fixed_to_the_arm_are_part_of_the_picture(tmp_path):
+    joint = '<joint name="{0}" type="{1}"><parent link="base"/><child link="{2}"/><axis xyz="0 0 1"/></joint>'
+    links = "".join(f'<link name="{name}"/>' for name in ("base", "arm", "column", "wheel"))
+    joints = joint.format("turn", "continuous", "arm") + joint.format("bolt", "fixed", "column")
+    joints += joint.format("roll", "continuous", "wheel")
+    path = tmp_path / "robot.urdf"
+    path.write_text(f'<robot name="r">{links}{joints}</robot>')
+    assert [link.name for link in scene(path, ["turn"]).links] == ["base", "arm", "column"]
