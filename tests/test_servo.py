@@ -182,7 +182,8 @@ def test_intervals_count_errors_that_are_alike_once():
 
 
 def test_a_known_kp_stays(tmp_path, logs, monkeypatch):
-    monkeypatch.setattr(objective, "TUNING", replace(objective.TUNING, rounds=1, steps=1))
+    monkeypatch.setattr(objective, "TUNING", replace(objective.TUNING, steps=1))
+    monkeypatch.setattr(objective, "ROUNDS", 1)
     settings = "input: position\njoints: {shoulder: {kp: 14.0}}\n"
     model = spelgen.build(write_servo_arm(tmp_path, settings), "closed-form")
     fit = spelgen.fit(model, [x[:100] for x in logs[:2]])

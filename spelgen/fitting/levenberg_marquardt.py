@@ -94,7 +94,7 @@ def levenberg_marquardt(
     for _ in range(max_steps):
         if state.converged:
             return
-        before, after = state, _lower(problem, state)
+        before, after = state, _lower(problem, state, least_gain)
         if after is None:
             yield replace(before, converged=True)
             return
@@ -103,14 +103,16 @@ def levenberg_marquardt(
         yield state
 
 
-def _lower(problem: LeastSquares[Unknowns], state: SolverState[Unknowns]) -> SolverState[Unknowns] | None:
+def _lower(
+    problem: LeastSquares[Unknowns], state: SolverState[Unknowns], least_gain: float
+) -> SolverState[Unknowns] | None:
     """Return the state after one step that lowers the cost; None: none does, or none promises to."""
     normal = problem.normal_equations(state.x, state.residuals)
     damping = state.damping
     for _ in range(TUNING.tries):
         step = normal.step(damping)
         promised = normal.promised(step)
-        if promised < TUNING.least_promise * state.cost:
+        if promised < max(TUNING.least_promise * state.cost, least_gain):
             return None
         after = _best(problem, state, step, promised)
         if after.cost < state.cost:

@@ -1,8 +1,8 @@
-"""Tell how sure parameters are after a fit of servos, by leaving out one window after the other.
+"""Tell how sure parameters are after a fit of servos, by leaving out one stretch of the logs after the other.
 
-Errors of neighbouring samples are alike, and none is what the noise of an encoder would be: so what a window says is
-taken as one observation (the jackknife of a weighted least squares; one step without each window, see Cameron and
-Miller, J. Human Resources 50:317, 2015, CV3). What windows do not determine stays as unsure as the prior.
+Errors of neighbouring samples are alike, and those of one motion are: what a model lacks shows otherwise in another. So
+what a log says is taken as one observation (the jackknife of a weighted least squares; one step without each log, see
+Cameron and Miller, J. Human Resources 50:317, 2015, CV3). What logs do not determine stays as unsure as the prior.
 """
 
 from __future__ import annotations
@@ -13,6 +13,16 @@ from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.settings.tuning.servo import ServoIntervalTuning
 
 TUNING = ServoIntervalTuning()
+
+
+def by_stretch(windows: NormalEquations, stretches: torch.Tensor) -> NormalEquations:
+    """Return the sums of windows' normal equations (W, ...) over the stretches that these are of, (W,)."""
+    count = int(stretches.max()) + 1
+    curvature = windows.curvature.new_zeros(count, *windows.curvature.shape[1:])
+    descent = windows.descent.new_zeros(count, *windows.descent.shape[1:])
+    return NormalEquations(
+        curvature.index_add(0, stretches, windows.curvature), descent.index_add(0, stretches, windows.descent)
+    )
 
 
 def covariance(windows: NormalEquations, precision: torch.Tensor, halved: torch.Tensor) -> torch.Tensor:

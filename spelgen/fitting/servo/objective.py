@@ -21,7 +21,7 @@ from spelgen.errors import Diagnostic, LogError, OptionError
 from spelgen.fitting.dataset import digest
 from spelgen.fitting.levenberg_marquardt import levenberg_marquardt, start
 from spelgen.fitting.objective import FitRequest, PreparedLogs, Status
-from spelgen.fitting.servo.laws import select_laws, without_faint
+from spelgen.fitting.servo.laws import select_dead_zones, without_faint
 from spelgen.fitting.servo.linear_servos import fit_linear_servos
 from spelgen.fitting.servo.parameters import ServoParameters
 from spelgen.fitting.servo.problem import ServoProblem
@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from spelgen.fitting.progress import TrainingProgress
 
 TUNING = ServoSolverTuning()
+ROUNDS = 3  # on few windows with half the steps; on few, with dead zones; on all
 
 
 class ServoObjective:
@@ -91,7 +92,7 @@ class ServoObjective:
         self._start = {name: x.clone() for name, x in model.state_dict().items()}
         self._problem = self._new_problem()
         self._begin_round(self._problem.start)
-        expected = expected_solution(self._problem, self._problem.start)
+        expected = expected_solution(self._problem, self._problem.start, len(self._windows.q))
         determined, undetermined = identifiability(joint_records(self._problem, expected))
         self._problem.write(self._problem.start)
         self._results = {"expected_identifiability": {"determined": determined, "open": undetermined}}
@@ -117,22 +118,25 @@ class ServoObjective:
         """See `Objective`."""
         problem = self._problem
         while True:
-            fine = len(self._rounds) > TUNING.coarse_rounds
-            gain = TUNING.fine_gain if fine else TUNING.gain
+            number = len(self._rounds)
             first = start(problem, self._rounds[-1], steps=self._steps)
-            if len(self._rounds) > 1:  # near the minimum from where the round before ended
+            if number > 1:  # near the minimum from where the round before ended
                 first = replace(first, damping=TUNING.later_damping)
-            for state in levenberg_marquardt(problem, first, max_steps=TUNING.steps, least_gain=gain):
+            for state in levenberg_marquardt(
+                problem,
+                first,
+                max_steps=TUNING.steps,
+                least_gain=TUNING.gain,
+                relative_gain=TUNING.relative_gain,
+            ):
                 rms = float(state.residuals.square().mean().sqrt())
-                progress.round(len(self._rounds), TUNING.rounds, state.steps, rms)
+                progress.round(number, ROUNDS, state.steps, rms)
             x, self._steps = state.x, state.steps
-            if len(self._rounds) == TUNING.rounds:
+            if number == ROUNDS:
                 break
-            # laws are chosen when gains are right: before, errors are those of the gains
-            if len(self._rounds) == TUNING.coarse_rounds:
-                x = select_laws(problem, x)
-            elif fine:
-                x = without_faint(problem, x)
+            # dead zones are chosen when gains are right: before, errors are those of the gains
+            choose = select_dead_zones if number == 1 else without_faint
+            x = choose(problem, x)
             self._begin_round(x)
             save()
         self._finish(x)
@@ -143,11 +147,10 @@ class ServoObjective:
         """Take half as long steps, from which errors of the integration are known, and report the result."""
         problem = self._problem
         problem.windows = replace(self._windows, steps=2 * self._windows.steps)
-        halved = problem.normal_equations(x, problem.residuals(x)).step()
-        x = x.moved(halved)
         problem.nudge = TUNING.last_nudge  # by shorter ones a joint that just slips looks known
-        problem.write(x)
-        record = servo_record(problem, solution(problem, x, halved), x, self._steps)
+        end, solved = solution(problem, x)
+        problem.write(end)
+        record = servo_record(problem, solved, end, self._steps)
         linear = fit_linear_servos(self._windows).to_dict()
         self._results["servo"] = record | {"linear": linear}
         self._take_checkpoint(float(np.sqrt(np.square(record["rms"]).mean())))
@@ -164,14 +167,15 @@ class ServoObjective:
         steps = np.max([encoder_step(log.q) for log in self._logs], axis=0)
         # the standard deviation of an encoder's rounding, at the least of a hundredth of a milliradian
         noise = torch.from_numpy(steps).clamp(min=1e-5) / 12**0.5
-        # while parameters are far off, errors of the integration matter little
-        half = replace(self._windows, steps=-(-self._windows.steps // 2))
-        return ServoProblem(self.request.model, half, noise)
+        return ServoProblem(self.request.model, self._windows.thinned(TUNING.sparse_windows), noise)
 
     def _begin_round(self, x: ServoParameters) -> None:
         problem = self._problem
-        if len(self._rounds) >= TUNING.coarse_rounds:
+        if len(self._rounds) == ROUNDS - 1:
             problem.windows = self._windows
+            problem.linearise(x, problem.windows.path())
+        elif self._rounds:  # the first was near enough with errors of the integration
+            problem.windows = replace(problem.windows, steps=self._windows.steps)
         if self._rounds:
             problem.linearise(x, problem.predicted_path(x))
         problem.weigh(x)

@@ -20,10 +20,8 @@ TUNING = ServoPriorTuning()
 KINDS = ("stiffness", "damping", "armature", "offset")
 FRICTION_KINDS = ("load_dependence", "fractions", "dead_zone")
 DEAD_ZONE = "servo.dead_zone"
-COULOMB, STRIBECK = "friction.raw_coulomb", "friction.raw_stribeck"
-STRIBECK_VELOCITY = "friction.raw_stribeck_velocity"
-# of laws that only some joints have: the values at the others. exp(-12) of the usual friction is none
-INACTIVE = {STRIBECK: -12.0, STRIBECK_VELOCITY: 0.0, DEAD_ZONE: 0.0}
+COULOMB = "friction.raw_coulomb"
+STRIBECK, STRIBECK_VELOCITY = "friction.raw_stribeck", "friction.raw_stribeck_velocity"
 FIXED = 1e-9  # deviation of a parameter that is not fitted
 
 
@@ -31,7 +29,7 @@ FIXED = 1e-9  # deviation of a parameter that is not fitted
 class ServoParameters:
     """Hold parameters of joints (p, n), along directions of the bodies (r,), and the delay [s].
 
-    active: (p, n) whether a joint has the law that a parameter belongs to; where not, the parameter stays.
+    active: (p, n) whether a joint's parameter is fitted: dead zones only where a joint has one.
     """
 
     joints: torch.Tensor
@@ -77,8 +75,7 @@ class ParameterRows:
         self.names: list[str] = []
         for name, width in self._widths.items():
             self.names += width * [name]
-        self._inactive = torch.tensor([INACTIVE.get(name, 0.0) for name in self.names]).double()
-        always = torch.tensor([name not in INACTIVE for name in self.names])
+        always = torch.tensor([name != DEAD_ZONE for name in self.names])
         self.active = always.unsqueeze(-1).expand(-1, model.n)  # (p, n), at the start
         deviations = torch.full((len(self.names), 1), TUNING.logarithm).double()
         deviations[self.row(STRIBECK_VELOCITY)] = TUNING.stribeck_velocity
@@ -90,13 +87,12 @@ class ParameterRows:
         return self.names.index(name)
 
     def read(self) -> torch.Tensor:
-        """Return what the model has, (p, n); 0 of laws that no joint has yet, which is where these start."""
+        """Return what the model has, (p, n)."""
         columns = [x.detach().reshape(self._n, -1).mT for x in self.tensors.values()]
-        return torch.where(self.active, torch.cat(columns), 0.0)
+        return torch.cat(columns)
 
-    def named(self, joints: torch.Tensor, active: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Return (P, p, n) as the model's tensors by name, each (P, 1, n) or (P, 1, n, K); active: (p, n)."""
-        joints = torch.where(active, joints, self._inactive.unsqueeze(-1))
+    def named(self, joints: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Return (P, p, n) as the model's tensors by name, each (P, 1, n) or (P, 1, n, K)."""
         parts = joints.unsqueeze(1).mT.split(list(self._widths.values()), dim=-1)  # (P, 1, n, K)
         named = {}
         for (name, tensor), part in zip(self.tensors.items(), parts, strict=True):
@@ -106,7 +102,7 @@ class ParameterRows:
     def write(self, x: ServoParameters) -> None:
         """Give the model the parameters of its joints."""
         with torch.no_grad():
-            for name, rows in self.named(x.joints.unsqueeze(0), x.active).items():
+            for name, rows in self.named(x.joints.unsqueeze(0)).items():
                 self.tensors[name].copy_(rows[0, 0])
 
     def precision(self, x: ServoParameters) -> torch.Tensor:
@@ -115,10 +111,9 @@ class ParameterRows:
         others = torch.tensor([1.0] * len(x.bodies) + [TUNING.delay]).double()
         return torch.cat([joints.flatten(), others]) ** -2
 
-    def activated(self, x: ServoParameters, *names: str) -> ServoParameters:
-        """Return the parameters with these laws at every joint."""
-        active = x.active.clone()
-        active[[self.row(name) for name in names]] = True
+    def with_dead_zones(self, x: ServoParameters) -> ServoParameters:
+        """Return the parameters with dead zones fitted at every joint."""
+        active = torch.ones_like(x.active)
         return replace(x, active=active)
 
 

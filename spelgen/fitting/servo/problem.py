@@ -136,23 +136,17 @@ class ServoProblem:
 
     def normal_equations(self, x: ServoParameters, errors: torch.Tensor) -> NormalEquations:
         """Return those of all windows and the prior, (k, k) and (k,)."""
-        windows = self.window_equations(x, errors)
+        return self.with_prior(self.window_equations(x, errors), x)
+
+    def with_prior(self, windows: NormalEquations, x: ServoParameters) -> NormalEquations:
+        """Return the sum of windows' normal equations, and the prior's."""
         precision = self.rows.precision(x)
         descent = windows.descent.sum(dim=0) - precision * (x.flat - self.start.flat)
         return NormalEquations(windows.curvature.sum(dim=0) + torch.diag(precision), descent)
 
-    def joint_equations(self, x: ServoParameters, errors: torch.Tensor) -> NormalEquations:
-        """Return those of each joint by itself, with the prior, under what all share, (n, p, p) and (n, p)."""
-        slopes = self._joint_slopes(x, errors).flatten(1, 2).permute(2, 0, 1)  # (n, p, M)
-        weights = self.likelihood.weights(errors).flatten(0, 1).mT.unsqueeze(1)
-        precision = self.rows.precision(x)[: x.joints.numel()].view_as(x.joints).mT
-        descent = (slopes * weights @ errors.flatten(0, 1).mT.unsqueeze(-1)).squeeze(-1)
-        descent = -descent - precision * (x.joints - self.start.joints).mT
-        return NormalEquations((slopes * weights) @ slopes.mT + torch.diag_embed(precision), descent)
-
     def window_equations(self, x: ServoParameters, errors: torch.Tensor) -> NormalEquations:
         """Return those of each window without the prior, (W, k, k) and (W, k)."""
-        joint_slopes, shared_slopes = self._slopes(x, errors)
+        joint_slopes, shared_slopes = self._slopes(x)
         weights = self.likelihood.weights(errors)
         (p, count, _, n), r = joint_slopes.shape, len(shared_slopes)
         curvature = torch.zeros(count, p * n + r, p * n + r).double()
@@ -166,34 +160,25 @@ class ServoProblem:
             descent[:, rows] -= (weighted @ errors[..., joint].unsqueeze(-1)).squeeze(-1)
         return NormalEquations(curvature, descent)
 
-    def _slopes(self, x: ServoParameters, errors: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return those of errors (W, K', n) by joints' parameters (p, W, K', n), and by shared ones (r + 1, ...)."""
-        rows, joints = self._nudged(x)
-        p, r = len(rows), len(x.bodies)
-        joints = torch.cat([joints, x.joints.expand(r + 1, -1, -1)])
-        bodies = torch.cat([x.bodies.expand(p, -1), x.bodies + self.nudge * torch.eye(r + 1, r).double()])
-        commands = self.windows.commands(x.delay).expand(p + r, -1, -1, -1, -1)
-        later = self.windows.commands(x.delay + self.nudge).unsqueeze(0)
-        q, _ = self._rollout(x, joints, bodies, torch.cat([commands, later]))
-        changes = (self._errors(q) - errors) / self.nudge
-        return self._by_row(x, rows, changes[:p]), changes[p:]
+    def _slopes(self, x: ServoParameters) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return those of errors by joints' parameters (p, W, K', n), and by shared ones (r + 1, W, K', n).
 
-    def _joint_slopes(self, x: ServoParameters, errors: torch.Tensor) -> torch.Tensor:
-        """Return those of errors (W, K', n) by joints' parameters alone, (p, W, K', n)."""
-        rows, joints = self._nudged(x)
-        commands = self.windows.commands(x.delay).expand(len(rows), -1, -1, -1, -1)
-        q, _ = self._rollout(x, joints, x.bodies.expand(len(rows), -1), commands)
-        return self._by_row(x, rows, (self._errors(q) - errors) / self.nudge)
-
-    def _nudged(self, x: ServoParameters) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the rows that any joint has, and parameters of which one row after the other is moved, (p', p, n)."""
-        rows = x.active.any(dim=1).nonzero().squeeze(-1)
-        return rows, x.joints + self.nudge * torch.eye(len(x.joints)).double()[rows].unsqueeze(-1)
-
-    def _by_row(self, x: ServoParameters, rows: torch.Tensor, slopes: torch.Tensor) -> torch.Tensor:
-        every = torch.zeros(len(x.joints), *slopes.shape[1:]).double()
-        every[rows] = slopes
-        return every
+        They are finite differences of one rollout, whose first row has the parameters as they are.
+        """
+        rows = x.active.any(dim=1).nonzero().squeeze(-1)  # which any joint has
+        p, r, nudge = len(rows), len(x.bodies), self.nudge
+        joints = x.joints.expand(p + r + 2, -1, -1).clone()
+        joints[torch.arange(p) + 1, rows] += nudge
+        bodies = x.bodies.expand(p + r + 2, -1).clone()
+        bodies[torch.arange(r) + p + 1, torch.arange(r)] += nudge
+        commands = self.windows.commands(x.delay).expand(p + r + 1, -1, -1, -1, -1)
+        later = self.windows.commands(x.delay + nudge).unsqueeze(0)
+        q, _ = self._rollout(joints, bodies, torch.cat([commands, later]))
+        errors = self._errors(q)
+        changes = (errors[1:] - errors[0]) / nudge
+        slopes = torch.zeros(len(x.joints), *changes.shape[1:]).double()
+        slopes[rows] = changes[:p]
+        return slopes, changes[p:]
 
     def _errors(self, q: torch.Tensor) -> torch.Tensor:
         judged = self.windows.settling + 1
@@ -202,13 +187,13 @@ class ServoProblem:
     def _rollout_at(self, x: ServoParameters) -> tuple[torch.Tensor, torch.Tensor]:
         """Return q and qd (1, W, K, n)."""
         commands = self.windows.commands(x.delay)
-        return self._rollout(x, x.joints.unsqueeze(0), x.bodies.unsqueeze(0), commands.unsqueeze(0))
+        return self._rollout(x.joints.unsqueeze(0), x.bodies.unsqueeze(0), commands.unsqueeze(0))
 
     def _rollout(
-        self, x: ServoParameters, joints: torch.Tensor, bodies: torch.Tensor, commands: torch.Tensor
+        self, joints: torch.Tensor, bodies: torch.Tensor, commands: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return q and qd (P, W, K, n) of parameters (P, p, n), (P, r) under commands (P, W, K-1, S, n)."""
-        named = self.rows.named(joints, x.active)
+        named = self.rows.named(joints)
         tensors = {name: tensor.detach() for name, tensor in named.items()}
         with torch.inference_mode():  # small operations, of which each takes a tenth less so
             drives, armature = self._functional.under(tensors, _drives)
@@ -219,7 +204,7 @@ class ServoProblem:
         self, drives: ServoDrives, armature: torch.Tensor, change: torch.Tensor, commands: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         windows, load = self.windows, self.load
-        h = windows.dt.unsqueeze(-1) / windows.steps
+        h = windows.dt.unsqueeze(-1) / commands.shape[3]
         inertia, bias = load.inertia + armature.unsqueeze(-2), load.bias + change
         shape = (len(change), *windows.q[:, 0].shape)
         q, qd = windows.q[:, 0].expand(shape), windows.qd[:, 0].expand(shape)

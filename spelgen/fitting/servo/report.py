@@ -13,7 +13,7 @@ from scipy.special import stdtrit
 from spelgen.fitting.functional_model import FunctionalModel
 from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.objective import FitSummary
-from spelgen.fitting.servo.intervals import TUNING, covariance, identifiable
+from spelgen.fitting.servo.intervals import TUNING, by_stretch, covariance, identifiable
 from spelgen.fitting.servo.laws import sliding_friction
 from spelgen.fitting.servo.parameters import DEAD_ZONE, ServoParameters
 from spelgen.fitting.servo.problem import ServoProblem
@@ -58,8 +58,8 @@ ServoRecord = Mapping[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class ServoSolution:
-    """Hold what windows determine where a fit ended, or begins: their normal equations by window, of dead zones at all
-    joints too, the precision (k,) of the prior, and the covariance (k, k) of the parameters.
+    """Hold what windows determine where a fit ended, or begins: their normal equations by stretch of the logs, of dead
+    zones at all joints too, the precision (k,) of the prior, and the covariance (k, k) of the parameters.
     """
 
     windows: NormalEquations
@@ -72,27 +72,35 @@ class ServoSolution:
         return float(stdtrit(max(1, len(self.windows.curvature) - 1), QUANTILE))
 
 
-def solution(problem: ServoProblem, x: ServoParameters, halved: torch.Tensor) -> ServoSolution:
-    """Return what windows determine at x; halved: (k,) what half as long steps of the rollouts changed at the end."""
+def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters, ServoSolution]:
+    """Return where one more step leads from x, of a fit with longer steps of the rollouts, and what windows determine
+    there; what the step changes is added to the covariance.
+    """
     # a dead zone that a joint does not have makes its dry friction no better known
-    x = problem.rows.activated(x, DEAD_ZONE)
-    windows, precision = problem.window_equations(x, problem.residuals(x)), problem.rows.precision(x)
-    return ServoSolution(windows, precision, covariance(windows, precision, halved))
+    free = problem.rows.with_dead_zones(x)
+    windows = problem.window_equations(free, problem.residuals(x))
+    windows = by_stretch(windows, problem.windows.stretches(TUNING.stretches))
+    precision = problem.rows.precision(free)
+    step = problem.with_prior(windows, x).step()
+    # where the fit ends, the slopes of all windows and of the prior add up to nothing
+    windows = windows._replace(descent=windows.descent - windows.curvature @ step)
+    return x.moved(step), ServoSolution(windows, precision, covariance(windows, precision, step))
 
 
-def expected_solution(problem: ServoProblem, x: ServoParameters) -> ServoSolution:
-    """Return what windows will determine, by the slopes of their errors before the fit, were these errors as small as
+def expected_solution(problem: ServoProblem, x: ServoParameters, count: int) -> ServoSolution:
+    """Return what so many windows will determine, by the slopes of errors before the fit, were these errors as small as
     the first step promises.
     """
-    x = problem.rows.activated(x, DEAD_ZONE)
+    x = problem.rows.with_dead_zones(x)
     errors, precision = problem.residuals(x), problem.rows.precision(x)
     windows, prior = problem.window_equations(x, errors), torch.diag(precision)
     descent = windows.descent.sum(dim=0)
     gain = float(descent @ torch.linalg.solve(windows.curvature.sum(dim=0) + prior, descent))
     squares = float((problem.likelihood.weights(errors) * errors.square()).sum())
     remaining = max(1 - gain / squares, TUNING.least_remaining)
-    # smaller errors weigh more
-    windows = windows._replace(curvature=windows.curvature / remaining)
+    # smaller errors weigh more, and the problem has some of the windows
+    weight = count / len(windows.curvature) / remaining
+    windows = windows._replace(curvature=weight * windows.curvature)
     return ServoSolution(windows, precision, torch.linalg.inv(windows.curvature.sum(dim=0) + prior))
 
 

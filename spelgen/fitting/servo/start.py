@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
 TUNING = ServoStartTuning()
-NONE = -6.0  # logarithm, of the usual size
+NONE, FAINT = -6.0, -2.0  # logarithms, of the usual sizes
 
 
 def start_servos(model: EmittedModel, windows: ServoWindows) -> None:
@@ -56,6 +56,7 @@ def start_servos(model: EmittedModel, windows: ServoWindows) -> None:
         # a drive's viscous friction and kd are one number: kd has it all
         friction.raw_viscous.fill_(NONE)
         friction.raw_saturation.fill_(NONE)
+        friction.raw_stribeck.fill_(FAINT)
         model.raw_offset.copy_((kp * offset / friction.nominal).clamp(-2.0, 2.0))
 
 

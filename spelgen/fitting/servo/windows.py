@@ -6,6 +6,7 @@ motion is a hundredth of a radian away, and as far off is what the arm weighs th
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
@@ -56,6 +57,28 @@ class ServoWindows:
     def rate(self) -> float:
         """Return the sample rate [Hz]."""
         return float(1 / self.dt.mean())
+
+    def thinned(self, count: int) -> ServoWindows:
+        """Return at most so many of the windows, evenly spread, with half the steps."""
+        some = slice(None, None, -(-len(self.q) // count))
+        return ServoWindows(
+            self.parts[some], self.q[some], self.qd[some], self.dt[some], self.settling, -(-self.steps // 2)
+        )
+
+    def stretches(self, count: int) -> torch.Tensor:
+        """Return the number (W,) of the stretch that each window is of: logs, cut into equal parts where there are
+        fewer than so many.
+        """
+        sizes = Counter(log.name for log, _ in self.parts)
+        cuts = -(-count // len(sizes))
+        numbers: dict[tuple[str, int], int] = {}
+        passed: Counter[str] = Counter()
+        result = []
+        for log, _ in self.parts:
+            stretch = log.name, passed[log.name] * cuts // sizes[log.name]
+            passed[log.name] += 1
+            result.append(numbers.setdefault(stretch, len(numbers)))
+        return torch.tensor(result)
 
     def path(self, q: torch.Tensor | None = None, qd: torch.Tensor | None = None) -> Path:
         """Return the measured motion.

@@ -65,16 +65,13 @@ class ServoCostTuning:
 class ServoSolverTuning:
     """Decide when rounds of a fit of servos end."""
 
-    rounds: int = (
-        5  # each with the bodies' load along the motion predicted before; measured: a sixth changes nothing
-    )
-    coarse_rounds: int = 3  # of these, with half of the steps between samples
+    sparse_windows: int = 32  # at most, in all rounds but the last
     steps: int = 12  # of a round at most
-    gain: float = 0.5  # [1] of the cost: a step that gains less ends a coarse round, and a comparison of laws
+    gain: float = 0.1  # [1] of the cost: a step that gains less ends a round, and a comparison of laws
+    relative_gain: float = 1e-3  # [1] likewise, of the cost: where a model's form is wrong costs are high
     later_damping: float = (
         1e-5  # [1] of the first step of a round, after the first round; by 1e-3 kd ends 0.3 % off
     )
-    fine_gain: float = 0.025  # [1] and a fine round
     last_nudge: float = (
         1e-3  # of parameters for the last slopes: by shorter ones a joint that just slips looks known
     )
@@ -84,8 +81,8 @@ class ServoSolverTuning:
 class ServoLawTuning:
     """Decide which joints get a dead zone or friction that falls with velocity."""
 
-    dead_zone_fraction: float = 0.2  # [1] of the static error, that a dead zone makes up to begin with
-    larger_dead_zone_fraction: float = 0.6  # [1] likewise, of the second start
+    dead_zone_fraction: float = 0.4  # [1] of the static error, that a dead zone makes up to begin with
+    steps: int = 6  # of joints by themselves
     significance: float = 3.0  # [1] standard deviations that a law has to be worth
     least_dead_zone: float = 1e-3  # [rad, m] smaller ones are none: a step of a 12-bit encoder is 1.5e-3
 
@@ -94,6 +91,7 @@ class ServoLawTuning:
 class ServoIntervalTuning:
     """Decide what is reported as determined."""
 
+    stretches: int = 6  # [1] of logs at least, each left out once: fewer logs are cut
     variance_inflation: float = (
         50.0  # [1] from which on two effects are one; measured on SO-101s: below 30, above 90
     )
