@@ -1,8 +1,8 @@
 """The objective servo: fit position servos, friction and weight of an arm to what follows its commands.
 
 First least squares on the command error (`start`), then predicted windows (`problem`), in rounds: each takes the
-bodies' load along what has been predicted, and the scale of errors, anew. Before the fine ones joints get the laws that
-they turn out to have (`laws`).
+bodies' load along what has been predicted, and the scale of errors, anew. After the first, joints get the dead zones
+that they turn out to have (`laws`); the last has all windows.
 """
 
 from __future__ import annotations
@@ -151,7 +151,7 @@ class ServoObjective:
         end, solved = solution(problem, x)
         problem.write(end)
         record = servo_record(problem, solved, end, self._steps)
-        linear = fit_linear_servos(self._windows).to_dict()
+        linear = fit_linear_servos(self._windows.thinned(TUNING.sparse_windows)).to_dict()
         self._results["servo"] = record | {"linear": linear}
         self._take_checkpoint(float(np.sqrt(np.square(record["rms"]).mean())))
 

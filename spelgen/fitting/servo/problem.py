@@ -54,6 +54,7 @@ class Likelihood:
         robust = errors / (1 + (errors / scale).square() / 4)
         span = min(span, robust.shape[1])  # of windows of a second no block is longer
         # errors that say the same add up: the variance of their sum is so many times that of a sample
+        span = min(span, errors.shape[1])
         blocks = robust[:, : robust.shape[1] // span * span].unflatten(1, (-1, span))
         of_sums = blocks.sum(dim=2).square().mean(dim=(0, 1))
         of_samples = blocks.square().sum(dim=2).mean(dim=(0, 1))
