@@ -109,9 +109,9 @@ class ServoObjective:
         self._start = state["start"]
         self.request.model.load_state_dict(self._start)
         self._problem = self._new_problem()
+        self._steps = state["steps"]
         for parameters in state["rounds"]:
             self._begin_round(ServoParameters(**parameters))
-        self._steps = checkpoint["step"]
         self._results = {"expected_identifiability": record.get("expected_identifiability")}
 
     def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
@@ -181,6 +181,7 @@ class ServoObjective:
         problem.weigh(x)
         problem.write(x)  # for the checkpoint: an interrupted fit is usable
         self._rounds.append(x)
+        self._first_steps = self._steps
         self._take_checkpoint(float(problem.residuals(x).square().mean().sqrt()))
 
     def _take_checkpoint(self, rms: float) -> None:
@@ -193,7 +194,11 @@ class ServoObjective:
             "best_weights": weights,
             "seconds": time.monotonic() - self._since,
             "substeps": self._windows.steps,
-            "servo": {"start": self._start, "rounds": [vars(x) for x in self._rounds]},
+            "servo": {
+                "start": self._start,
+                "rounds": [vars(x) for x in self._rounds],
+                "steps": self._first_steps,
+            },
         }
 
 
