@@ -21,7 +21,7 @@ from spelgen.log_checks import robot_checks
 from spelgen.log_checks.check_logs import check_logs, require_sound_logs
 from spelgen.log_checks.statistics import noise_level, quantisation_step, statistics
 from spelgen.logs import checks, chunks
-from spelgen.logs.read import write_logs
+from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.render.logs_page import page
 from spelgen.settings.log_mapping import LogMapping
@@ -300,8 +300,6 @@ def test_a_few_samples_are_told_without_judgement(loaded, arm, log):
 
 
 def test_real_arms_are_believed(shared):
-    from spelgen.logs.read import read_logs
-
     logs = shared / "logs" / "ur10e"
     real = load_arm(logs / "ur10e.urdf")
     paths = [path for path in sorted(logs.glob("*.parquet")) if "oad" not in path.stem]
@@ -371,3 +369,9 @@ def drive_log(log):
     collected = DriveLog(np.eye(3))
     collected.add(log)
     return collected
+
+
+def test_a_coupling_of_recorded_logs_is_told_before_a_fit(shared):
+    tx40 = load_arm(shared / "logs" / "tx40" / "tx40.urdf")
+    notes = require_sound_logs(read_logs([shared / "logs" / "tx40"], tx40), tx40)
+    assert [x.where for x in notes if x.code == "coupled-motors"] == ["joint 'joint_6'"]
