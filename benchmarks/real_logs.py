@@ -25,7 +25,7 @@ from characters import TESTS as CHARACTERS
 from characters import read_characters, write_arm
 
 from spelgen.arm.arm import Arm
-from spelgen.baselines.predictor import of_dynamics
+from spelgen.baselines.solver import Solver
 from spelgen.building import build
 from spelgen.dynamics.bristles import BristleReach, reach_of
 from spelgen.evaluation.state_errors import end_errors
@@ -189,9 +189,7 @@ def tested(logs: Sequence[Trajectory], steps: int) -> Windows:
 
 
 def relative_error(dynamics: Any, windows: Windows) -> float:
-    predictor = of_dynamics("", dynamics, SUBSTEPS)
-    with torch.no_grad():
-        predicted = predictor.solver(windows)
+    predicted = Solver(dynamics, SUBSTEPS)(windows)
     found = end_errors(predicted, windows, ("revolute",) * windows.q.shape[-1], None)
     return found.mean_relative_rms or np.nan
 

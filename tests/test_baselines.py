@@ -15,7 +15,6 @@ from spelgen.baselines.rosenbrock import roll_out_stiff
 from spelgen.baselines.solver import accurate_solver
 from spelgen.baselines.urdf import UrdfValues
 from spelgen.cli.main import app
-from spelgen.dynamics.protocol import VelocityState
 from spelgen.dynamics.regressor import regressor, urdf_parameters
 from spelgen.dynamics.regressor_dynamics import RegressorDynamics
 from spelgen.dynamics.rigid_bodies import RigidBodies
@@ -79,25 +78,24 @@ def exact(slider, windows):
 
 def test_damping_far_beyond_an_explicit_step_is_integrated():
     stiff, windows = Slider(1e-3, 5.0), pushed()  # rate 5000 1/s: RK4 at 0.05 s multiplies by 1e7 a step
-    qd = roll_out_stiff(VelocityState(stiff), windows, 1)[1]
+    qd = roll_out_stiff(stiff, windows, 1)[1]
     assert (qd[:, 2:] - exact(stiff, windows)[:, 2:]).abs().max() < 1e-2
 
 
 def test_friction_that_remembers_is_integrated_however_stiff_it_is():
     stiff, windows = Bristled(1e-3, 5.0), pushed(push=1.0)  # less than the 2 N that make it slide
-    q, qd = roll_out_stiff(VelocityState(stiff), windows, 8)
+    q, qd = roll_out_stiff(stiff, windows, 8)
     held = 0.5e-3  # z / reach = displacement / reach = 1 / 2 where it stands
     torch.testing.assert_close(q[0, -1], torch.tensor([held], dtype=torch.float64), atol=1e-7, rtol=0)
     assert qd[0, -1].abs() < 1e-5
     fast = pushed(push=6.0)  # 6 - 2 = 4 N against 5 N s/m
-    assert (roll_out_stiff(VelocityState(stiff), fast, 8)[1][:2, -1] - 0.8).abs().max() < 1e-6
+    assert (roll_out_stiff(stiff, fast, 8)[1][:2, -1] - 0.8).abs().max() < 1e-6
 
 
 def test_the_method_has_order_two():
     slider, windows = Slider(1.0, 1.5), pushed()
     errors = [
-        (roll_out_stiff(VelocityState(slider), windows, steps)[1] - exact(slider, windows)).abs().max()
-        for steps in (2, 4)
+        (roll_out_stiff(slider, windows, steps)[1] - exact(slider, windows)).abs().max() for steps in (2, 4)
     ]
     assert 3.4 < errors[0] / errors[1] < 4.6
 

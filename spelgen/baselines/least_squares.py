@@ -8,7 +8,7 @@ import numpy as np
 
 from spelgen.baselines.baseline import Baseline, JudgedArm
 from spelgen.baselines.names import LEAST_SQUARES, LEAST_SQUARES_WITH_MEMORY
-from spelgen.baselines.predictor import Predictor, of_accurate_dynamics
+from spelgen.baselines.predictor import Predictor, of_dynamics
 from spelgen.baselines.run_arm import run_arm
 from spelgen.errors import LogError
 from spelgen.fitting.run_folder import RunFolder
@@ -55,5 +55,5 @@ class IdentifiedArm(Baseline):
         predictors = []
         for name, (key, friction) in FRICTION.items():
             dynamics = identified_dynamics(arm.arm, friction, np.array(record[key]), arm.actuation.drives())
-            predictors.append(of_accurate_dynamics(name, dynamics, judged.probe))
+            predictors.append(of_dynamics(name, dynamics, judged.probe))
         return predictors

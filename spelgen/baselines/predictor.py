@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from spelgen.baselines.solver import Solver, States, accurate_solver
-from spelgen.dynamics.protocol import RigidDynamics, integrable
-from spelgen.fitting.rollout import roll_out
+from spelgen.baselines.solver import States, accurate_solver
+from spelgen.dynamics.protocol import RigidDynamics
 from spelgen.logs.windows import Windows
 
 
@@ -23,11 +22,6 @@ class Predictor:
     dynamics: RigidDynamics | None = None
 
 
-def of_dynamics(name: str, dynamics: RigidDynamics, substeps: int) -> Predictor:
-    """Return dynamics as a predictor, by so many steps of the classical Runge-Kutta method between samples."""
-    return Predictor(name, Solver(integrable(dynamics), roll_out, substeps), dynamics)
-
-
-def of_accurate_dynamics(name: str, dynamics: RigidDynamics, probe: Windows) -> Predictor:
-    """Return dynamics as a predictor, by the method and the steps that they themselves need on the probe."""
+def of_dynamics(name: str, dynamics: RigidDynamics, probe: Windows) -> Predictor:
+    """Return dynamics as a predictor, by as many steps as they themselves need on the probe."""
     return Predictor(name, accurate_solver(dynamics, probe), dynamics)

@@ -8,86 +8,118 @@ of the dynamics.
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import torch
 from torch import Tensor
 
-from spelgen.dynamics.protocol import (
-    VelocityState,
-    has_friction_state,
-    known_past,
-    memory_after,
-    sliding_memory,
-)
+from spelgen.dynamics.pose import Pose, PoseAt, poses
+from spelgen.dynamics.protocol import has_friction_state, has_momentum, memory_after, sliding_memory
 from spelgen.logs.windows import Windows
+from spelgen.settings.tuning.evaluation import EvaluationTuning
 
+TUNING = EvaluationTuning()
 GAMMA = 1 - 0.5**0.5  # makes the method L-stable
 # steps of the differences that friction is differentiated by
 VELOCITY_STEP = 1e-5  # of a joint's largest velocity
 DISPLACEMENT_STEP = 1e-7  # rad, m
 
 
-def roll_out_stiff(form: VelocityState, windows: Windows, substeps: int) -> tuple[Tensor, Tensor]:
-    """Return positions and velocities (W, K-1, n) predicted for samples 1..K-1 of each window from its sample 0."""
-    q, qd = windows.q[:, 0], windows.qd[:, 0]
-    z = sliding_memory(form.dynamics, qd) if windows.z is None else windows.z
-    positions, velocities = [], []
-    for dt, tau in zip(windows.dt.unbind(1), windows.tau.unbind(1), strict=True):
-        step = dt.unsqueeze(-1) / substeps  # (W, 1)
-        for _ in range(substeps):
-            start = q
-            q, qd = _step(form, q, qd, z, tau, step)
-            z = memory_after(form.dynamics, z, q - start)
-        positions.append(q)
-        velocities.append(qd)
-    return torch.stack(positions, dim=1), torch.stack(velocities, dim=1)
+class _States(NamedTuple):
+    """Windows that are still rolled out: which these are, and where they are."""
+
+    rows: Tensor  # (W',)
+    q: Tensor  # (W', n)
+    qd: Tensor
+    z: Tensor  # (W', n, K)
+    disturbance: Tensor  # (W', n)
 
 
-def _step(
-    form: VelocityState, q: Tensor, qd: Tensor, z: Tensor, tau: Tensor, step: Tensor
+def roll_out_stiff(
+    dynamics: Any, windows: Windows, substeps: int, disturbance: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Take one step of (q, qd), with A = [[0, 1], [-M^-1 K, -M^-1 D]], D = d friction / d qd and, where friction has
-    a state, K = d friction / d q by the way z follows.
+    """Return positions and velocities (W, K-1, n) predicted for samples 1..K-1 of each window from its sample 0.
+
+    disturbance: (W, n), as `observe` finds it. A window whose velocity has left all bounds stops,
+    and is NaN from there.
     """
-    dynamics = form.dynamics
-    mass = torch.as_tensor(dynamics.mass_matrix(q))
-    damping, stiffness = _friction_slopes(form, q, qd, z)
-    h = GAMMA * step
-    matrix = mass + torch.diag_embed(h * damping + h * h * stiffness)
+    q, qd = windows.q[:, 0], windows.qd[:, 0]
+    z = sliding_memory(dynamics, qd) if windows.z is None else windows.z
+    largest = windows.qd.abs().amax(dim=(0, 1))
+    largest = torch.maximum(largest, 1e-3 * largest.max()).clamp(min=1e-2)
+    equations = _Equations(dynamics, VELOCITY_STEP * largest)
+    states = _States(
+        torch.arange(len(q)), q, qd, z, torch.zeros_like(q) if disturbance is None else disturbance
+    )
+    positions = torch.full_like(windows.q[:, 1:], torch.nan)
+    velocities = positions.clone()
+    for k in range(windows.dt.shape[1]):
+        step = windows.dt[states.rows, k].unsqueeze(-1) / substeps  # (W', 1)
+        tau = windows.tau[states.rows, k]
+        for _ in range(substeps):
+            states = equations.step(states, tau, step)
+        inside = (states.qd.abs() <= TUNING.bounds * largest).all(dim=-1) & states.q.isfinite().all(dim=-1)
+        if not inside.all():
+            states = _States(*(x[inside] for x in states))
+        if not len(states.rows):
+            break
+        positions[states.rows, k] = states.q
+        velocities[states.rows, k] = states.qd
+    return positions, velocities
 
-    def solve(velocity: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
-        """Return (1 - h A)^-1 of a state's two halves."""
-        force = (mass @ acceleration.unsqueeze(-1)).squeeze(-1) - h * stiffness * velocity
-        solution, info = torch.linalg.solve_ex(matrix, force)
+
+class _Equations:
+    """M qdd = force of some dynamics, and a step of them. width: (n,) of the differences by velocity."""
+
+    def __init__(self, dynamics: Any, width: Tensor) -> None:
+        self.dynamics, self.width = dynamics, width
+        self.pose_at: PoseAt = poses(dynamics)
+        self.has_momentum = has_momentum(dynamics)
+
+    def step(self, states: _States, tau: Tensor, step: Tensor) -> _States:
+        """Take one step of (q, qd), with A = [[0, 1], [-M^-1 K, -M^-1 D]], D = d friction / d qd and, where friction
+        has a state, K = d friction / d q by the way z follows.
+        """
+        _, q, qd, z, disturbance = states
+        pose = self.pose_at(q)
+        damping, stiffness = self._friction_slopes(pose, qd, z)
+        h = GAMMA * step
+        factors, pivots, _ = torch.linalg.lu_factor_ex(
+            pose.mass + torch.diag_embed(h * damping + h * h * stiffness)
+        )
+
+        def solve(velocity: Tensor, force: Tensor) -> tuple[Tensor, Tensor]:
+            """Return (1 - h A)^-1 of a state's two halves; the mass is in the second."""
+            right = (force - h * stiffness * velocity).unsqueeze(-1)
+            solution = torch.linalg.lu_solve(factors, pivots, right).squeeze(-1)
+            return velocity + h * solution, solution
+
+        v1, a1 = solve(qd, self._force(pose, qd, tau, z, disturbance))
+        q2, qd2 = q + step * v1, qd + step * a1
+        second = self.pose_at(q2)
+        force = self._force(second, qd2, tau, memory_after(self.dynamics, z, q2 - q), disturbance)
         # one singular matrix must not stop the other windows
-        solution = torch.where(info.unsqueeze(-1) == 0, solution, torch.nan)
-        return velocity + h * solution, solution
+        a2 = torch.linalg.solve_ex(second.mass, force)[0] - 2 * a1
+        v2, a2 = solve(qd2 - 2 * v1, (pose.mass @ a2.unsqueeze(-1)).squeeze(-1))
+        end = q + step * (1.5 * v1 + 0.5 * v2)
+        speed = qd + step * (1.5 * a1 + 0.5 * a2)
+        return _States(states.rows, end, speed, memory_after(self.dynamics, z, end - q), disturbance)
 
-    def acceleration(position: Tensor, velocity: Tensor) -> Tensor:
-        past = memory_after(dynamics, z, position - q)
-        return form.port_hamiltonian_rhs(position, velocity, tau, None, past)[1]
+    def _force(self, pose: Pose, qd: Tensor, tau: Tensor, z: Tensor, disturbance: Tensor) -> Tensor:
+        """Return M qdd, (W, n). A disturbance is a force where momenta were observed, else an acceleration."""
+        if not self.has_momentum:
+            disturbance = (pose.mass @ disturbance.unsqueeze(-1)).squeeze(-1)
+        return pose.force(qd, tau, z) + disturbance
 
-    v1, a1 = solve(qd, acceleration(q, qd))
-    q2, qd2 = q + step * v1, qd + step * a1
-    v2, a2 = solve(qd2 - 2 * v1, acceleration(q2, qd2) - 2 * a1)
-    return q + step * (1.5 * v1 + 0.5 * v2), qd + step * (1.5 * a1 + 0.5 * a2)
-
-
-def _friction_slopes(form: VelocityState, q: Tensor, qd: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
-    """Return D and K, (W, n): a joint's friction goes by its own motion."""
-    dynamics = form.dynamics
-
-    def friction(velocity: Tensor, displacement: Tensor) -> Tensor:
-        past = known_past(dynamics, memory_after(dynamics, z, displacement))
-        return torch.as_tensor(dynamics.friction_torque(q, velocity, *past))
-
-    still = torch.zeros_like(q)
-    # central differences: dry friction jumps at standstill
-    width = VELOCITY_STEP * qd.abs().amax(dim=0).clamp(min=1e-3)
-    # friction that falls with velocity is left to the explicit part: its damping would be negative
-    slope = (friction(qd + width, still) - friction(qd - width, still)) / (2 * width)
-    damping = slope.clamp(min=0)
-    if not has_friction_state(dynamics):
-        return damping, torch.zeros_like(damping)
-    # bristles load the way a joint goes
-    way = DISPLACEMENT_STEP * torch.where(qd < 0, -1.0, 1.0).to(q)
-    return damping, ((friction(qd, way) - friction(qd, still)) / way).clamp(min=0)
+    def _friction_slopes(self, pose: Pose, qd: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Return D and K, (W, n): a joint's friction goes by its own motion."""
+        # central differences: dry friction jumps at standstill
+        slope = (pose.friction(qd + self.width, z) - pose.friction(qd - self.width, z)) / (2 * self.width)
+        # friction that falls with velocity is left to the explicit part: its damping would be negative
+        damping = slope.clamp(min=0)
+        if not has_friction_state(self.dynamics):
+            return damping, torch.zeros_like(damping)
+        # bristles load the way a joint goes
+        way = DISPLACEMENT_STEP * torch.where(qd < 0, -1.0, 1.0).to(qd)
+        bent = pose.friction(qd, memory_after(self.dynamics, z, way))
+        return damping, ((bent - pose.friction(qd, z)) / way).clamp(min=0)

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from spelgen.baselines.baseline import Baseline, JudgedArm
 from spelgen.baselines.names import URDF, URDF_WITH_DRIVES
-from spelgen.baselines.predictor import Predictor, of_accurate_dynamics
+from spelgen.baselines.predictor import Predictor, of_dynamics
 from spelgen.errors import Diagnostic
 
 
@@ -22,10 +22,10 @@ class UrdfValues(Baseline):
             from spelgen.dynamics.pinocchio_urdf import has_drives, urdf_dynamics  # an extra
 
             plain = urdf_dynamics(judged.urdf, judged.joints)
-            predictors = [of_accurate_dynamics(URDF, plain, judged.probe)]
+            predictors = [of_dynamics(URDF, plain, judged.probe)]
             if has_drives(judged.urdf, judged.joints):
                 driven = urdf_dynamics(judged.urdf, judged.joints, drives=True)
-                predictors.append(of_accurate_dynamics(URDF_WITH_DRIVES, driven, judged.probe))
+                predictors.append(of_dynamics(URDF_WITH_DRIVES, driven, judged.probe))
         except Exception as error:  # Pinocchio and its parser raise many kinds; the evaluation stands without
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             judged.notes.append(_missing(judged.urdf.name, reason))

@@ -67,8 +67,6 @@ def evaluate(
     """
     paths = options.logs(data, extra_logs)
     limits = [_limit(text) for text in limit or []]
-    import torch
-
     from spelgen.evaluation.evaluate import evaluate as evaluate_model
     from spelgen.evaluation.subject import read_test_logs
     from spelgen.files import write_json
@@ -76,7 +74,6 @@ def evaluate(
     from spelgen.fitting.run_folder import RunFolder
     from spelgen.logs.preprocessing import Preprocessing
 
-    torch.set_num_threads(1)  # matrices are tiny: threads would cost more than they gain
     preprocessing = None
     if filter is not None:
         preprocessing = Preprocessing(cutoff=filter)

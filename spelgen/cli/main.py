@@ -6,6 +6,7 @@ never loads torch.
 
 from __future__ import annotations
 
+import os
 import sys
 from typing import Annotated
 
@@ -75,6 +76,8 @@ def common(
 
 def main() -> None:
     """Entry point of the command `spelgen`."""
+    # read by BLAS and torch when they are loaded: matrices are tiny, and one thread makes runs repeatable
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
     for stream in (sys.stdout, sys.stderr):
         # names from a file may not fit the terminal's encoding
         stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]

@@ -85,7 +85,7 @@ def _measure(
     far = thinned(testing, steps + 1, decimation)
     low = torch.tensor(study.low, dtype=torch.float64)
     high = torch.tensor(study.high, dtype=torch.float64)
-    example = predict_example(of_dynamics(variant, model, substeps), testing, steps, decimation)
+    example = predict_example(of_dynamics(variant, model, far), testing, steps, decimation)
     along = []  # no test trajectory may be long enough
     if example is not None:
         along = model.mass_matrix(torch.tensor(example.q, dtype=torch.float64)).tolist()

@@ -11,6 +11,7 @@ import torch
 from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.arrays import like
+from spelgen.dynamics.pose import Pose
 from spelgen.dynamics.rigid_bodies import RigidBodies
 from spelgen.runtime.bristles import moved_bristles
 
@@ -70,6 +71,20 @@ class RegressorDynamics:
         """qdd, (..., n), under the inputs tau."""
         return self._by_rows(self._forward, q, qd, tau, z=z)
 
+    def at(self, q: torch.Tensor) -> Pose:
+        """Return the equations of motion at q, (T, n), see `pose.poses`."""
+        mass, bias_at = self.bodies.at(q)
+        inputs = torch.from_numpy(self.inputs)
+
+        def friction(qd: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
+            past = z.numpy() if self.elements else None
+            return torch.from_numpy(self.friction(qd.numpy(), past))
+
+        def force(qd: torch.Tensor, tau: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
+            return tau @ inputs.mT - bias_at(qd) - friction(qd, z)
+
+        return Pose(mass + torch.from_numpy(self._reflected()), force, friction)
+
     def memory(self, qd: torch.Tensor) -> torch.Tensor:
         """z, (..., n, K), of drives that have long gone this way."""
         assert self.bristle_reach is not None
@@ -95,7 +110,12 @@ class RegressorDynamics:
     def _mass_and_bias(self, q: np.ndarray, qd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """M, (T, n, n), what the drives add included, and the bodies' torques at steady qd, (T, n)."""
         mass, bias = self.bodies.mass_and_bias(q, qd)
-        return mass + self.motors.T @ (self.armature[:, None] * self.motors), bias
+        return mass + self._reflected(), bias
+
+    def _reflected(self) -> np.ndarray:
+        """What the drives add to M, (n, n)."""
+        added: np.ndarray = self.motors.T @ (self.armature[:, None] * self.motors)
+        return added
 
     def _forward(self, q: np.ndarray, qd: np.ndarray, tau: np.ndarray, z: np.ndarray | None) -> np.ndarray:
         mass, bias = self._mass_and_bias(q, qd)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 
@@ -37,13 +39,19 @@ class RigidBodies:
         ten = torch.from_numpy(np.asarray(parameters, dtype=float)).reshape(-1, PER_BODY)
         self.inertia = block_diagonal(torch.tensordot(ten, inertia_basis(), dims=1))
 
+    def at(self, q: torch.Tensor) -> tuple[torch.Tensor, Callable[[torch.Tensor], torch.Tensor]]:
+        """Return M, (T, n, n), at q, (T, n), and the function that gives Coriolis, centrifugal and gravity torques,
+        (T, n) [Nm, N], there of qd, (T, n).
+        """
+        chain = self.chain.forward(q)
+        momenta = chain.twists @ self.inertia
+        return momenta @ chain.twists.mT, lambda qd: self.chain.steady_torque(chain, qd, momenta)
+
     def mass_and_bias(self, q: np.ndarray, qd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return M, (T, n, n), and Coriolis, centrifugal and gravity torques, (T, n) [Nm, N], at q and qd, (T, n)."""
         with torch.no_grad():
-            chain = self.chain.forward(torch.tensor(q, dtype=torch.float64))
-            momenta = chain.twists @ self.inertia
-            bias = self.chain.steady_torque(chain, torch.tensor(qd, dtype=torch.float64), momenta)
-            return (momenta @ chain.twists.mT).numpy(), bias.numpy()
+            mass, bias_at = self.at(torch.tensor(q, dtype=torch.float64))
+            return mass.numpy(), bias_at(torch.tensor(qd, dtype=torch.float64)).numpy()
 
 
 def _row(values: tuple[object, object, object]) -> Row:

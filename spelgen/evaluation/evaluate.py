@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 from spelgen.baselines.baseline import JudgedArm
 from spelgen.baselines.names import MODEL
-from spelgen.baselines.predictor import Predictor, of_accurate_dynamics, of_dynamics
+from spelgen.baselines.predictor import Predictor, of_dynamics
 from spelgen.baselines.registry import BASELINES
+from spelgen.baselines.solver import accurate_solver
 from spelgen.dynamics.protocol import has_servos
 from spelgen.errors import Diagnostic, LogError
 from spelgen.evaluation.horizons import Horizon, JudgedLogs, Predictions, horizon_lengths, predict
@@ -20,7 +21,6 @@ from spelgen.evaluation.state_errors import TipPosition
 from spelgen.evaluation.subject import Subject, subject
 from spelgen.evaluation.torque import TorqueSummary, torque_errors
 from spelgen.evaluation.traces import motion_traces, replay_traces
-from spelgen.fitting.rollout import choose_substeps, loss_scales
 from spelgen.logs.checks import check
 from spelgen.logs.dynamics_samples import dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
@@ -93,13 +93,12 @@ def _evaluate_torques(
     tests = JudgedLogs(used.pieces(logs, shortest=2), used, judged.reach, types)
     lengths = horizon_lengths(tests, *ahead, notes)
     probe = tests.windows(judged.window - 1, TUNING.probed_model_windows)
-    # the fit has judged its steps on more windows than these: never fewer
-    substeps = choose_substeps(model, probe, loss_scales(probe, types), start=judged.substeps_per_sample)
-    predictors = [of_dynamics(MODEL, model, substeps)]
+    solver = accurate_solver(model, probe)
+    predictors = [Predictor(MODEL, solver, model)]
     for baseline in BASELINES:
         predictors += baseline.predictors(JudgedArm(judged.joints, judged.urdf, judged.run, probe, notes))
     for name, dynamics in others.items():
-        predictors.append(of_accurate_dynamics(name, dynamics, probe))
+        predictors.append(of_dynamics(name, dynamics, probe))
     tip = _tip(judged, notes)
     horizons: list[Horizon] = []
     longest: Predictions | None = None
@@ -114,7 +113,7 @@ def _evaluate_torques(
         joints=tuple(judged.joints),
         trajectories=tuple(trajectory.name for trajectory in logs),
         cutoff=used.cutoff or None,
-        substeps=substeps,
+        substeps=solver.substeps,
         parameters=judged.parameters,
         horizons=tuple(horizons),
         torque=_torque_summaries(predictors, logs, tests),

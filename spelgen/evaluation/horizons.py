@@ -11,6 +11,7 @@ from spelgen.baselines.names import observed
 from spelgen.baselines.predictor import Predictor
 from spelgen.baselines.solver import Solver, States
 from spelgen.dynamics.bristles import BristleReach
+from spelgen.dynamics.protocol import integrable
 from spelgen.errors import Diagnostic
 from spelgen.evaluation.momentum_observer import observe, past_steps, without_past
 from spelgen.evaluation.state_errors import StateErrors, TipPosition, end_errors
@@ -129,7 +130,7 @@ def predict(
             states[predictor.name] = predictor.solver(ahead)
             continue
         with torch.no_grad():
-            started, disturbance = observe(predictor.solver.form, windows, past)
+            started, disturbance = observe(integrable(predictor.solver.dynamics), windows, past)
         states[predictor.name] = predictor.solver(started)
         states[observed(predictor.name)] = predictor.solver(started, disturbance)
     errors = {who: end_errors(state, ahead, logs.joint_types, tip) for who, state in states.items()}

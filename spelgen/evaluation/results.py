@@ -22,11 +22,11 @@ SCHEMA = 6
 class Results:
     """The results of `evaluate`; `to_dict` is evaluation.json.
 
-    cutoff: of the filter on the test logs [Hz], None without. substeps: of rk4 between samples. parameters: trained
-    numbers of the model. torque: by predictor, empty where the logs are too sparse. energy_drift: of the model
-    without input and dissipation over 1 s, integrated to thirteen digits, relative to its kinetic energy; None where
-    the logs never move. traces: the curves behind the figures; those of predictions are the longest horizon's.
-    replays: of commands, of an arm under position servos.
+    cutoff: of the filter on the test logs [Hz], None without. substeps: of the integrator between samples, for the
+    model. parameters: its trained numbers. torque: by predictor, empty where the logs are too sparse. energy_drift: of
+    the model without input and dissipation over 1 s, integrated to thirteen digits, relative to its kinetic energy;
+    None where the logs never move. traces: the curves behind the figures; those of predictions are the longest
+    horizon's. replays: of commands, of an arm under position servos.
     """
 
     robot: str

@@ -37,8 +37,8 @@ WINDOW = 5  # samples of the windows that say how many steps the integrator need
 class Subject:
     """A model with its joints as the URDF and logs name them.
 
-    urdf: its robot's, where known; tip: the link there, None for the last. preprocessing, window, substeps:
-    those of its fit. reach: (n, K) of the bristles that friction remembers with, its own or the usual ones.
+    urdf: its robot's, where known; tip: the link there, None for the last. preprocessing, window: those of its fit.
+    reach: (n, K) of the bristles that friction remembers with, its own or the usual ones.
     trained_on: names of the trajectories that it has seen. run: the folder, where there is one.
     command_followers: fitted to them, what a model of position servos is compared with, by name.
     """
@@ -50,7 +50,6 @@ class Subject:
     tip: str | None = None
     preprocessing: Preprocessing | None = None
     window: int = WINDOW
-    substeps: int = 1
     reach: BristleReach = NO_BRISTLES
     trained_on: frozenset[str] = frozenset()
     run: RunFolder | None = None
@@ -60,14 +59,6 @@ class Subject:
     def parameters(self) -> int:
         """How many numbers of the model are trained."""
         return sum(parameter.numel() for parameter in self.model.parameters())
-
-    @property
-    def substeps_per_sample(self) -> int:
-        """Steps of rk4 in a step of the logs as recorded: samples of the fit's windows may lie farther apart."""
-        decimation = 1
-        if self.preprocessing is not None and self.preprocessing.decimation:
-            decimation = self.preprocessing.decimation
-        return -(-self.substeps // decimation)
 
 
 def subject(judged: EmittedModel | Fit | Path | str, arm: LoadedArm | Path | str | None = None) -> Subject:
@@ -85,7 +76,6 @@ def subject(judged: EmittedModel | Fit | Path | str, arm: LoadedArm | Path | str
         _of_model(judged.model, urdf or judged.urdf),
         preprocessing=judged.preprocessing,
         window=getattr(judged.config, "window", WINDOW),
-        substeps=judged.substeps,
         trained_on=frozenset([*judged.record["training"], *judged.record["validation"]]),
         run=None if judged.folder is None else RunFolder(judged.folder),
         command_followers=_command_followers(judged),

@@ -15,17 +15,17 @@ class EvaluationTuning:
     """[s] 1 / K of the momentum observer (measured: 0.02 to 0.1 s differ by 3 %, UR10e)."""
 
     most_substeps: int = 16
-    """[] of a baseline between samples; a power of two."""
+    """[] of dynamics between samples; a power of two."""
     shortest_step: float = 1e-3
-    """[s] of a baseline: shorter ones are for dynamics that leave all bounds."""
-    explicit_tolerance: float = 2e-3
-    """[] of a baseline's own error, what twice as many steps of RK4 may change."""
-    implicit_tolerance: float = 2e-2
-    """[] the same of the Rosenbrock method, which has order two."""
+    """[s] of dynamics: shorter ones are for those that leave all bounds."""
+    tolerance: float = 5e-2
+    """[] of the error of dynamics, what twice as many steps may change: figures move by a thousandth."""
+    least_error: float = 1e-4
+    """[] of the motion: dynamics are not expected to be better."""
+    bounds: float = 100.0
+    """[] times the largest velocity that was measured: what is faster has left all bounds."""
     probed_windows: int = 16
-    """[] that say in which steps a baseline is integrated."""
-    parts_of_windows: int = 32
-    """[] that are rolled out one by one where numbers blow up; those of a part are lost together."""
+    """[] that say in which steps dynamics are integrated."""
 
     most_windows: int = 2000
     """[] that a horizon is judged on, evenly spread."""
@@ -34,7 +34,7 @@ class EvaluationTuning:
     fewest_windows: int = 100
     """[] as far as there are so many."""
     probed_model_windows: int = 64
-    """[] that say in which steps the model is integrated."""
+    """[] of which the former are taken, and which the energy's drift starts from."""
     explained_for_contacts: float = 0.99
     """[] of the torque's variance; convention of this package, as the next two."""
     explained_for_feed_forward: float = 0.95
