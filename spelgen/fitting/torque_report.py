@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from torch.func import jacrev
+from torch.autograd.functional import jacobian
 
 from spelgen.dynamics.protocol import has_residuals
 from spelgen.errors import Diagnostic
@@ -93,12 +93,13 @@ def _inertia(model: EmittedModel, q: torch.Tensor, covariance: torch.Tensor) -> 
     """Return the mean diagonal of M at q (n,) [kg m^2, kg], and the standard deviations of its logarithm (n,)."""
     functional, weights = FunctionalModel(model), RigidWeights(model).start
 
-    def diagonal(changed: dict[str, torch.Tensor]) -> torch.Tensor:
-        mass: torch.Tensor = functional.under(changed, lambda other: other.mass_matrix(q))
+    def diagonal(*changed: torch.Tensor) -> torch.Tensor:
+        by_name = dict(zip(weights, changed, strict=True))
+        mass: torch.Tensor = functional.under(by_name, lambda other: other.mass_matrix(q))
         return mass.diagonal(dim1=-2, dim2=-1).mean(dim=0)
 
-    value = diagonal(weights).detach()
-    slopes = jacrev(diagonal)(weights)
-    slope = torch.cat([slopes[name].flatten(1).detach() for name in weights], dim=1) / value.unsqueeze(-1)
+    value = diagonal(*weights.values()).detach()
+    slopes = jacobian(diagonal, tuple(weights.values()))
+    slope = torch.cat([by_weight.flatten(1) for by_weight in slopes], dim=1) / value.unsqueeze(-1)
     variance = torch.einsum("jk,kl,jl->j", slope, covariance, slope)
     return value.numpy(), variance.clamp(min=0).sqrt().numpy()

@@ -20,7 +20,7 @@ class EvaluationTuning:
     """[s] of dynamics: shorter ones are for those that leave all bounds."""
     tolerance: float = 5e-2
     """[] of the error of dynamics, what twice as many steps may change: figures move by a thousandth."""
-    least_error: float = 1e-4
+    least_error: float = 2e-5
     """[] of the motion: dynamics are not expected to be better."""
     bounds: float = 100.0
     """[] times the largest velocity that was measured: what is faster has left all bounds."""
