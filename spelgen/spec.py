@@ -216,7 +216,7 @@ class Facts:
 
 def facts_json(spec: ModelSpec) -> str:
     """What the module made from ``spec`` says of itself, as JSON for people and programs."""
-    facts: dict[str, str | int | dict[str, Any]] = {
+    facts: dict[str, object] = {
         "format": MODULE_FORMAT,
         "robot": spec.robot,
         "urdf": spec.urdf,
@@ -229,7 +229,7 @@ def facts_json(spec: ModelSpec) -> str:
     return "{" + ", ".join(items[:3]) + ",\n " + ",\n ".join(items[3:]) + "}"
 
 
-def _filled(value: str | int | dict[str, Any]) -> str:
+def _filled(value: object) -> str:
     """JSON of a value, or of a group on as many lines as it takes, with items kept whole."""
     if not isinstance(value, dict):
         return json.dumps(value)

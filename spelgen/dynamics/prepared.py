@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,6 +12,9 @@ from torch import Tensor
 from spelgen.dynamics.protocol import memory_after, sliding_memory
 from spelgen.dynamics.residuals import without_idle_residuals
 from spelgen.dynamics.runge_kutta import runge_kutta
+
+if TYPE_CHECKING:
+    from spelgen.dynamics.tip import TipKinematics
 
 
 class State(NamedTuple):
@@ -30,7 +33,9 @@ class PreparedModel:
     ``tip_kinematics`` does. elements: K, of friction's memory at a joint.
     """
 
-    def __init__(self, model: Any, tip: Any = None, *, dtype: torch.dtype = torch.float64) -> None:
+    def __init__(
+        self, model: Any, tip: TipKinematics | None = None, *, dtype: torch.dtype = torch.float64
+    ) -> None:
         # networks that give nothing would take most of the time
         model = without_idle_residuals(model).to(dtype=dtype).requires_grad_(False)
         self.n: int = model.n
@@ -158,7 +163,7 @@ class PreparedModel:
             setattr(result, name, compiled)
         return result
 
-    def _kinematics(self) -> Any:
+    def _kinematics(self) -> TipKinematics:
         if self._tip is None:
             raise ValueError("no tip: give model.prepared(tip=spelgen.tip_kinematics(arm))")
         return self._tip

@@ -27,6 +27,7 @@ METHODS = (
 _EXPECTED = "a module written by this version of `spelgen build`"
 
 if TYPE_CHECKING:
+    from spelgen.dynamics.tip import TipKinematics
 
     class EmittedModel(torch.nn.Module):
         """The class ``Model`` of an emitted module, whose own docstrings hold shapes and units."""
@@ -75,7 +76,9 @@ if TYPE_CHECKING:
             prepared: object,
             *state: torch.Tensor | None,
         ) -> tuple[torch.Tensor, torch.Tensor]: ...
-        def prepared(self, tip: Any = None, *, dtype: torch.dtype = torch.float64) -> PreparedModel: ...
+        def prepared(
+            self, tip: TipKinematics | None = None, *, dtype: torch.dtype = torch.float64
+        ) -> PreparedModel: ...
         def to_group(self, q: torch.Tensor) -> list[torch.Tensor]: ...
         def from_group(self, parts: list[torch.Tensor]) -> torch.Tensor: ...
 
@@ -137,6 +140,8 @@ def _page(model: EmittedModel) -> str:
     return f"<pre>{escape(ast.get_docstring(ast.parse(model.source)) or '')}</pre>"
 
 
-def _prepared(model: EmittedModel, tip: Any = None, *, dtype: torch.dtype = torch.float64) -> PreparedModel:
+def _prepared(
+    model: EmittedModel, tip: TipKinematics | None = None, *, dtype: torch.dtype = torch.float64
+) -> PreparedModel:
     """The model as it is now, ready for many calls; see ``PreparedModel``."""
     return PreparedModel(model, tip, dtype=dtype)

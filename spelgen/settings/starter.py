@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 
 class StarterJoint(NamedTuple):
@@ -75,7 +75,7 @@ def starter(urdf: str, joints: Sequence[StarterJoint]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _flow(keys: dict[str, Any]) -> str:
+def _flow(keys: Mapping[str, object]) -> str:
     """Keys and values on one line of YAML."""
     return (
         "{"
