@@ -264,6 +264,19 @@ def test_export_needs_the_run_folder_alone(tmp_path):
     assert "this output exists already" in again.output
 
 
+def test_functions_are_chosen():
+    model, arm = moved_model("two_link", "closed-form"), arm_of("two_link")
+    files = export(model, "casadi", arm=arm).files
+    assert "forward_dynamics.casadi" in files
+    assert not any("derivatives" in name for name in files)
+    name = "inverse_dynamics_derivatives"
+    assert set(export(model, "casadi", arm=arm, entries=[name]).files) == {f"{name}.casadi", "README.md"}
+    with pytest.raises(RunError, match="the function 'inverse', expected one of inverse_dynamics, forward"):
+        export(model, "c", arm=arm, entries=["inverse"])
+    with pytest.raises(RunError, match="functions for --to urdf, expected --to c or casadi"):
+        export(model, "urdf", arm=arm, entries=["gravity"])
+
+
 @pytest.mark.parametrize(
     ("to", "name", "told"),
     [

@@ -19,6 +19,13 @@ def export(
         Path, typer.Option("-o", "--output", metavar="FILE|FOLDER", help="Output file or folder.")
     ],
     to: Annotated[Format, typer.Option(help="Export format.")] = "urdf",
+    entry: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            help="A function to export, for c and casadi; repeatable. Default: all but derivatives.",
+        ),
+    ] = None,
     force: Force = False,
     trust: Trust = False,
     format: TextOrJson = "text",
@@ -35,7 +42,7 @@ def export(
 
     require_fitting(to, output)
     options.require_free(output, force=force)
-    result = export_run(load_run(run, trust=trust), to)
+    result = export_run(load_run(run, trust=trust), to, entries=entry or ())
     files = [str(path) for path in result.write(output, force=force)]
     lines = [f"wrote {path}" for path in files]
     answer(format, {"files": files, "summary": result.summary}, *lines, *result.summary)

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from spelgen.exporting.description import TrainedModel
-from spelgen.exporting.entry_points import EntryPoint, entry_points
+from spelgen.exporting.entry_points import ENTRY_POINTS, EntryPoint, entry_points
 from spelgen.exporting.exported import UNITS, Exported, readme
 from spelgen.exporting.model_expressions import expression_function, residuals_needed
 from spelgen.exporting.parity import Called, Values, check_parity
@@ -27,7 +27,7 @@ def export_casadi(trained: Trained) -> Exported:
     checked = f"Checked when exported, by CasADi {ca.CasadiMeta.version()}: {parity.summary}."
     use = (
         "qdd = casadi.Function.load('forward_dynamics.casadi')(q, qd, tau, z) takes numbers or symbols: "
-        "its derivatives, of any order, are CasADi's; *_derivatives.casadi contain the first derivatives."
+        "its derivatives, of any order, are CasADi's."
     )
     about = f"{UNITS}; z is friction's memory, {model.memory} numbers: casadi.DM(0, 1) where there are none."
     files = {f"{name}.casadi": _saved(function) for name, function in functions.items()}
@@ -40,7 +40,8 @@ def casadi_functions(model: TrainedModel) -> dict[str, ca.Function]:
     functions: dict[str, ca.Function] = {}
     for name, entry in entry_points(model).items():
         if name.endswith("_derivatives") and model.residuals:
-            functions[name] = _derivatives(entry, functions[name.removesuffix("_derivatives")])
+            function = _with_residuals(ENTRY_POINTS[name.removesuffix("_derivatives")], model)
+            functions[name] = _derivatives(entry, function)
         else:
             functions[name] = _with_residuals(entry, model)
     return functions

@@ -137,6 +137,7 @@ class TrainedModel:
     name: for code. inertias: (bodies, 10) about the joints' frames. constant_mass: of rotors and other constants in
     M, (n, n). motors: (n, n), the drives' speeds by the joints', which friction follows. inputs: G, (n, n);
     actuated: (n,), 0 for a passive joint. friction_compensation: (n,) torque that the drives add by velocity, unseen.
+    entries: names of the functions that are written; none for all.
     """
 
     name: str
@@ -160,6 +161,7 @@ class TrainedModel:
     tip: tuple[TipJoint, ...]
     tip_end: np.ndarray
     servos: Servos | None = None
+    entries: tuple[str, ...] = ()
 
     @property
     def n(self) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from spelgen.errors import RunError, suggestion
 from spelgen.exporting.description import TrainedModel
 
 
@@ -95,7 +96,19 @@ SERVO_TORQUE = EntryPoint(
 
 
 def entry_points(model: TrainedModel) -> dict[str, EntryPoint]:
-    """Return the functions of this model, by name."""
-    if model.servos is None:
-        return ENTRY_POINTS
-    return ENTRY_POINTS | {SERVO_TORQUE.name: SERVO_TORQUE}
+    """Return the functions of this model, by name: those that it is to have. Raises RunError for others."""
+    entries = ENTRY_POINTS
+    if model.servos is not None:
+        entries = ENTRY_POINTS | {SERVO_TORQUE.name: SERVO_TORQUE}
+    for name in model.entries:
+        if name not in entries:
+            expected = f"one of {', '.join(entries)}"
+            raise RunError(f"the function {name!r}", expected=expected, do=suggestion(name, entries))
+    if not model.entries:
+        return entries
+    return {name: entry for name, entry in entries.items() if name in model.entries}
+
+
+def without_derivatives(model: TrainedModel) -> tuple[str, ...]:
+    """Return the names of the functions of this model that are exported by default."""
+    return tuple(name for name in entry_points(model) if not name.endswith("_derivatives"))

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from spelgen.errors import RunError, suggestion
+from spelgen.exporting.entry_points import without_derivatives
 from spelgen.exporting.exported import EXPORTERS, Exported, require_fitting
 from spelgen.exporting.trained import Trained
 from spelgen.fitting.fitted import Fit, load_run
@@ -13,6 +16,9 @@ from spelgen.loaded_arm import LoadedArm, arm_of_module
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
+
+_CHOOSE = ("c", "casadi")
+"""The formats of which functions can be chosen."""
 
 
 def export(
@@ -22,14 +28,16 @@ def export(
     *,
     arm: LoadedArm | Path | str | None = None,
     force: bool = False,
+    entries: Sequence[str] = (),
 ) -> Exported:
     """Return a fit, the folder of a run or a model in the format of another tool, written where a path is given.
 
     to: ``urdf``, FILE.urdf with its settings and friction beside it; ``mjcf``, FILE.xml for MuJoCo; ``c``, a folder
     with a C99 header and source; ``ros2``, a colcon package around these; ``casadi``, ``onnx`` and ``torch``, a folder
     with a file for each function. The export is compared with the model first. arm: of ``load_arm`` or the path
-    of a URDF; by default the fit's. Raises RunError where there is no arm, for a preset or a path that does not go with
-    the format, where the comparison fails, and where a file exists and ``force`` is not given.
+    of a URDF; by default the fit's. entries: of c and casadi, names of the functions that are written; by default all
+    but derivatives. Raises RunError where there is no arm, for a preset or a path that does not go with the format,
+    where the comparison fails, and where a file exists and ``force`` is not given.
     """
     if to not in EXPORTERS:
         do = suggestion(to, EXPORTERS)
@@ -43,7 +51,14 @@ def export(
         model, arm = trained.model, arm or trained.urdf
     else:
         model = trained
-    exported = EXPORTERS[to].function()(Trained(model, _loaded(model, arm)))
+    if entries and to not in _CHOOSE:
+        raise RunError(
+            f"functions for --to {to}", expected=f"--to {' or '.join(_CHOOSE)}, which have a choice"
+        )
+    chosen = Trained(model, _loaded(model, arm), tuple(entries))
+    if to in _CHOOSE and not entries:
+        chosen = replace(chosen, entries=without_derivatives(chosen.described))
+    exported = EXPORTERS[to].function()(chosen)
     if path is not None:
         exported.write(path, force=force)
     return exported

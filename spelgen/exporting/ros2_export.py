@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from spelgen.exporting.c_export import c_files
 from spelgen.exporting.exported import UNITS, Exported, readme
 from spelgen.exporting.trained import Trained
 from spelgen.templates import render
+
+_CALLED = (
+    "inverse_dynamics", "mass_matrix", "bias", "gravity", "friction", "friction_step", "friction_memory",
+)  # fmt: skip
+"""The functions that the plugin calls."""
 
 _PLACES = {
     "package.xml": "package.xml",
@@ -17,6 +24,7 @@ _PLACES = {
 
 def export_ros2(trained: Trained) -> Exported:
     """The package. Raises RunError where its C does not give what the model gives."""
+    trained = replace(trained, entries=_CALLED)
     model = trained.described
     sources, checked = c_files(trained)
     package = f"{model.name}_solver"

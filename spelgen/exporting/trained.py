@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -16,15 +16,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Trained:
-    """A trained model of an arm."""
+    """A trained model of an arm. entries: names of the functions to export, for formats of functions; none for all."""
 
     model: EmittedModel
     arm: LoadedArm
+    entries: tuple[str, ...] = ()
 
     @cached_property
     def described(self) -> TrainedModel:
         """The model as plain numbers. Raises RunError for a preset that has no such description."""
-        return describe(self.model, self.arm)
+        return replace(describe(self.model, self.arm), entries=self.entries)
 
     @property
     def robot(self) -> str:
