@@ -91,14 +91,7 @@ def fit(
     began = options.began or time.monotonic()
     run = None if folder is None else RunFolder(Path(folder))
     logs = [logs] if isinstance(logs, Trajectory) else logs
-    if config is None:
-        config = default_config(model, sample_rates(logs))
-    if not isinstance(config, FitConfig):
-        raise SettingsError(
-            f"{config!r} as the configuration of a fit",
-            expected="spelgen.TorqueFit(), MomentumFit(), Rollout() or ServoFit()",
-        )
-    config.require(rigid_bodies=has_rigid_bodies(model))
+    config = _config(model, logs, config)
     urdf = run.urdf if run is not None and options.resume else _urdf(arm)
     request = FitRequest(
         model, logs, config, preprocessing, validation, seed, urdf, options.mapping, options.device,
@@ -146,6 +139,19 @@ def fit(
         urdf=urdf,
         folder=None if run is None else run.path,
     )
+
+
+def _config(model: EmittedModel, logs: Logs, config: FitConfig | None) -> FitConfig:
+    """Return the configuration, by default what suits the model and its logs. Raises what `fit` raises for it."""
+    if config is None:
+        config = default_config(model, sample_rates(logs))
+    if not isinstance(config, FitConfig):
+        raise SettingsError(
+            f"{config!r} as the configuration of a fit",
+            expected="spelgen.TorqueFit(), MomentumFit(), Rollout() or ServoFit()",
+        )
+    config.require(rigid_bodies=has_rigid_bodies(model))
+    return config
 
 
 def sample_rates(logs: Logs) -> list[float]:
