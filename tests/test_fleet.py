@@ -106,7 +106,7 @@ def test_what_is_done_is_not_done_again_and_what_changed_is(fleet, tmp_path):
     assert ranked.rows[-1][0] == "(velocity stays constant)"
     assert {row[0] for row in ranked.rows} >= {"spel", "(URDF)", "(URDF and drives)"}
     page = write_fleet(other, fleet_listings(other), folder / "fleet.html").read_text()
-    assert "Predicts best of 1 arm: spel of 1." in page
+    assert "Smallest error on 1 arm: spel of 1." in page
     assert winners(other) == {"spel": 1}
 
 

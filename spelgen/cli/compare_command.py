@@ -57,9 +57,7 @@ def compare(
 
     # before logs are simulated
     if urdf_error is not None and steps is not None:
-        raise UsageError(
-            "--steps: belongs to models that know kinematics alone, these are trained by defaults"
-        )
+        raise UsageError("--steps: does not apply with --urdf-error, which uses the training defaults")
     variants = {variant.name: variant for variant in (ablation_variants() if ablation else VARIANTS)}
     chosen = list(variants)
     if presets is not None:

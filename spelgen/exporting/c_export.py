@@ -30,7 +30,10 @@ def export_c(trained: Trained) -> Exported:
 def c_files(trained: Trained) -> tuple[dict[str, bytes], str]:
     """Return header and source by name, and a sentence on how they were checked."""
     model, program = trained.described, compiler()
-    sizes, checked = "Sizes are not known: no C compiler was there", "Not checked: no C compiler was there."
+    sizes, checked = (
+        "Sizes were not measured: no C compiler was found",
+        "Not checked: no C compiler was there.",
+    )
     with tempfile.TemporaryDirectory() as folder:
         source = write_c(model, Path(folder))
         content = source.read_bytes()

@@ -29,7 +29,7 @@ def export_casadi(trained: Trained) -> Exported:
         "qdd = casadi.Function.load('forward_dynamics.casadi')(q, qd, tau, z) takes numbers or symbols: "
         "its derivatives, of any order, are CasADi's."
     )
-    about = f"{UNITS}; z is friction's memory, {model.memory} numbers: casadi.DM(0, 1) where there are none."
+    about = f"{UNITS}; z is the friction state, {model.memory} numbers: casadi.DM(0, 1) where there are none."
     files = {f"{name}.casadi": _saved(function) for name, function in functions.items()}
     text = readme(f"Dynamics of {model.robot} in CasADi", use, trained.joint_names, about, checked)
     return Exported("casadi", model.robot, {**files, "README.md": text}, (checked,))

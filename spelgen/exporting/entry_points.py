@@ -47,13 +47,13 @@ _ENTRY_POINTS = (
     EntryPoint("friction", "the torques of friction", ("q", "qd", "z"), (("friction", _TORQUE),)),
     EntryPoint(
         "friction_step",
-        "the memory of friction after each joint moved one way by dq",
+        "the friction state after a displacement dq of each joint",
         ("z", "dq"),
         (("z_next", "rad, m"),),
     ),
     EntryPoint(
         "friction_memory",
-        "the memory of friction of joints that slide at qd for long: to start from",
+        "the initial friction state of joints that have moved at constant qd",
         ("qd",),
         (("z_start", "rad, m"),),
     ),

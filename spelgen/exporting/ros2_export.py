@@ -43,7 +43,7 @@ def export_ros2(trained: Trained) -> Exported:
         f"the plugin is {package}/Solver, for whatever loads an inverse_dynamics_solver::InverseDynamicsSolver."
     )
     about = (
-        f"{UNITS}; getTorques includes friction, whose memory follows the positions of its calls; "
+        f"{UNITS}; getTorques includes friction, whose state follows the positions of its calls; "
         "initialize starts it anew."
     )
     files["README.md"] = readme(f"{model.robot} for ROS 2", use, trained.joint_names, about, checked)

@@ -147,8 +147,8 @@ def _signals(report: LogReport) -> Listing:
         steps = map(joint.steps.get, QUANTITIES)
         rows.append((joint.name, *map(number, noise), *map(number, steps)))
     note = (
-        "noise: standard deviation of what changes from sample to sample, from 50 Hz on; "
-        "step: between the levels of a quantised signal; in the units above."
+        "noise: standard deviation between samples, for sample rates from 50 Hz; step: quantisation step; in the "
+        "units above."
     )
     return Listing("Signals", head, tuple(rows), note)
 
@@ -164,8 +164,8 @@ def _physics(report: LogReport) -> Listing:
         rows.append((joint.name, *velocity, _percent(fit.explained), number(fit.factor if is_seen else None)))
     note = (
         "dq/dt : qd and its correlation are 1 where qd is the derivative of q; gravity in tau: part of tau's "
-        "variance, beside friction and acceleration, that gravity explains; x URDF: how many times the URDF's "
-        "own gravity torque that is."
+        "variance that gravity explains, beside friction and acceleration; x URDF: ratio to the URDF's gravity "
+        "torque."
     )
     return Listing("Physics", head, tuple(rows), note)
 

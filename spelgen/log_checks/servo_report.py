@@ -79,9 +79,9 @@ class ServoLogReport(LogReport):
     def _following(self) -> Listing:
         head = ("joint", "lag", "tracking RMS", "steady-state error", "saturated")
         note = (
-            "lag: by how much positions come after commands; tracking RMS: of the delayed command less the position; "
-            "steady-state error: distance from the command at rest, nine tenths are smaller [mrad, mm]; saturated: "
-            "fraction of the time that kp (u - q) is beyond the effort limit, where the settings say kp."
+            "lag: delay of positions after commands; tracking RMS: delayed command minus position; steady-state error: "
+            "90th percentile of the distance from the command at rest [mrad, mm]; saturated: fraction of time with "
+            "kp (u - q) beyond the effort limit, if kp is set."
         )
         if self.delay is not None:
             ends = dict.fromkeys(f"{1000 * end:.0f}" for end in self.delay)

@@ -19,7 +19,7 @@ def write_fleet(fleet: FleetResults, listings: Sequence[Listing], path: Path) ->
     wins = [f"{name} of {count}" for name, count in winners(fleet).items()]
     text = render_page(
         "fleet.html.jinja",
-        verdict=f"Predicts best of {arms} arm{'s' * (arms > 1)}: {listed(wins)}."
+        verdict=f"Smallest error on {arms} arm{'s' * (arms > 1)}: {listed(wins)}."
         if wins
         else "No run has ended.",
         runs=len(fleet.results),
