@@ -59,6 +59,7 @@ def evaluate(
             help=f"Exit with {MISSED} if a figure is larger: {', '.join(FIGURES)}; once for each.",
         ),
     ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Torque errors alone, without rollouts.")] = False,
     trust: Trust = False,
 ) -> None:
     """Evaluate a trained run and its baselines on test logs.
@@ -79,7 +80,10 @@ def evaluate(
         preprocessing = Preprocessing(cutoff=filter)
     logs = read_test_logs(run, paths, mapping)
     model = load_run(run, trust=trust)
-    results = evaluate_model(model, logs, preprocessing=preprocessing)
+    if quick:
+        results = evaluate_model(model, logs, preprocessing=preprocessing, steps=(), seconds=())
+    else:
+        results = evaluate_model(model, logs, preprocessing=preprocessing)
     record = results.to_dict()
     write_json(RunFolder(run).evaluation, record)
     for diagnostic in results.diagnostics:
