@@ -175,7 +175,10 @@ def find_wrong_torques(problem: DriveProblem, joints: Sequence[str]) -> list[Wro
 
 
 def _against_motion(problem: DriveProblem) -> list[WrongTorque]:
-    """Return the joints whose friction would push them on: all signs may be wrong together, which rows alone allow."""
+    """Return the joints with friction where it drives each of them on: all torques may have the other sign together.
+
+    A joint alone may be driven on by a drive that compensates friction after its torque was measured.
+    """
     rows, tau, speed = problem.rows, problem.tau, problem.samples.qd
     unit = np.where(_varies(tau), tau.std(axis=0), 1.0)
     flat = (rows / unit[:, None]).reshape(-1, rows.shape[2])
@@ -186,9 +189,12 @@ def _against_motion(problem: DriveProblem) -> list[WrongTorque]:
         friction = rows[:, k, own] @ parameters[own]
         size = float(np.sqrt(np.square(friction).mean()))
         power = float((friction * speed[:, k]).mean()) / max(size * float(speed[:, k].std()), NEGLIGIBLE)
-        if power < -TUNING.opposed and size > TUNING.opposed * unit[k]:
-            got = f"friction that drives the joint on (correlation of friction and velocity {power:.2g})"
-            results.append(WrongTorque(k, "torque-sense", got))
+        if size <= TUNING.opposed * unit[k]:
+            continue
+        if power >= -TUNING.opposed:
+            return []
+        got = f"friction that drives the joint on (correlation of friction and velocity {power:.2g})"
+        results.append(WrongTorque(k, "torque-sense", got))
     return results
 
 
