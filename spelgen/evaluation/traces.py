@@ -20,7 +20,7 @@ from spelgen.evaluation.plain import Rows, Series, number, rows, series
 from spelgen.evaluation.replay import Missed
 from spelgen.evaluation.state_errors import TipPosition
 from spelgen.evaluation.torque_traces import TorqueTrace, torque_traces
-from spelgen.fitting.rollout import LossScales, loss_scales, position_difference
+from spelgen.fitting.rollout import AT_REST, LossScales, loss_scales, position_difference
 from spelgen.logs.coverage import coverage
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows
@@ -136,7 +136,8 @@ def motion_traces(
     dynamics = {x.name: x.dynamics for x in predictors if x.dynamics is not None}
     growth: Growth | None = None
     examples: tuple[PredictedExample, ...] = ()
-    if predictions is not None:
+    # errors are relative to the motion: there is none at rest
+    if predictions is not None and predictions.windows.q.diff(dim=1).abs().max() >= AT_REST:
         growth = _growth(predictions, logs.joint_types, tip)
         examples = _examples(predictions, logs.joint_types)
     torques = torque_traces(dynamics, logs)
