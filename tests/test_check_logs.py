@@ -184,8 +184,8 @@ def test_the_page_tells_what_the_text_tells_and_draws_every_joint(loaded, arm, l
     shown = Page(page(result, arm, np.eye(3)))
     assert shown.links == ["data:,", "#top"]
     assert (
-        shown.tags.count("svg") == 2 * 3 * 3 + 2 * 2
-    )  # two trajectories, three joints, three charts; a key each
+        shown.tags.count("svg") == 2 * 3 * 3 + 2 * 3
+    )  # two trajectories, three joints, three charts; three marks in each legend
     told = " ".join(" ".join(shown.text).split())
     assert "1 gaps in time" in told and "<script>alert(1)</script>" in told
     assert "1 gaps in time" in " ".join(result.text().split())
