@@ -25,7 +25,7 @@ demo: $(STAMP) ## the whole way on robots/rpr.urdf: inspect, build, simulate, tr
 	$(BIN)/spelgen inspect robots/rpr.urdf
 	$(BIN)/spelgen build robots/rpr.urdf -o $(DEMO)/rpr_spel.py
 	$(BIN)/spelgen simulate robots/rpr.urdf -o $(DEMO)/logs
-	$(BIN)/spelgen train $(DEMO)/rpr_spel.py --robot robots/rpr.urdf --data $(DEMO)/logs -o $(DEMO)/run --max-minutes 3
+	$(BIN)/spelgen train $(DEMO)/rpr_spel.py --robot robots/rpr.urdf --data $(DEMO)/logs -o $(DEMO)/run --set max_minutes=3
 	$(BIN)/spelgen evaluate $(DEMO)/run --data $(DEMO)/logs
 	$(BIN)/spelgen report $(DEMO)/run
 

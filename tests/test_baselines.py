@@ -160,7 +160,7 @@ def test_least_squares_is_kept_with_a_run_and_stands_in_its_evaluation(robots, t
     module.write_text(generate(robots / "rpr.urdf", "closed-form"), encoding="utf-8")
     logs = ["--data", str(tmp_path / "logs")]
     # whoever sets a limit in time need not know that these logs are fitted in seconds
-    quick = ["--set", "progress=false", "--max-minutes", "5"]
+    quick = ["--set", "progress=false", "--set", "max_minutes=5"]
     for command in (
         ["train", str(module), "--robot", str(robots / "rpr.urdf"), *logs, "-o", str(folder), *quick],
         ["evaluate", str(folder), *logs, "-o", str(tmp_path / "found.csv")],

@@ -230,8 +230,6 @@ def test_command(robots, tmp_path):
     viscous = [x for x in data["base_parameters"] if x["name"].startswith("viscous")]
     assert [x["value"] for x in viscous] == pytest.approx([3.0] * 6, rel=0.1)
     assert all(x["determined"] == "firm" for x in viscous)
-    both = CliRunner().invoke(app, [*base, "--ridge", "0.1", "--prior", "0.5"])
-    assert both.exit_code == 2
 
 
 @pytest.mark.parametrize("seed", range(3))

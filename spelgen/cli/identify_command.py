@@ -40,10 +40,6 @@ def identify(
         Literal["equal", "range", "noise"],
         typer.Option(help="Weights of the joints: equal, by torque range, or by torque noise."),
     ] = "noise",
-    ridge: Annotated[
-        float,
-        typer.Option(min=0.0, help="Ridge penalty on all parameters, relative to the norm of the column."),
-    ] = 0.0,
     prior: Annotated[
         float | None,
         typer.Option(
@@ -78,7 +74,7 @@ def identify(
         if name not in EFFECTS:
             raise typer.BadParameter(f"{name!r} is none of {', '.join(EFFECTS)}", param_hint="'--friction'")
     try:
-        method = LeastSquares(weights, ridge, prior, FrictionModel(**dict.fromkeys(effects, True)))
+        method = LeastSquares(weights, prior=prior, friction=FrictionModel(**dict.fromkeys(effects, True)))
     except OptionError as error:
         raise typer.BadParameter(error.got, param_hint=f"'--{error.element}'") from None
     arm = load_arm(robot, options.names(joints), tip, angle_tolerance)

@@ -60,7 +60,6 @@ Assignments = Annotated[
         help="Set an option of the fit, e.g. epochs=50; repeat it for more options.",
     ),
 ]
-MaxMinutes = Annotated[float | None, typer.Option(min=0.0, help="Time limit of fits to windows.")]
 
 
 def train(
@@ -76,7 +75,6 @@ def train(
     source: Source = None,
     objective: ObjectiveName = None,
     assignments: Assignments = None,
-    max_minutes: MaxMinutes = None,
     accept: Accept = None,
     format: TextOrJson = "text",
 ) -> None:
@@ -85,10 +83,8 @@ def train(
     Defaults come from `training` in the robot's settings; --set takes the same keys, which docs/cli.md lists. A key
     that does not apply to the objective is an error.
     """
-    start_time = time.monotonic()  # --max-minutes counts from here, reading of logs included
+    start_time = time.monotonic()  # max_minutes counts from here, reading of logs included
     values = read_assignments(assignments or [])
-    if max_minutes is not None:
-        values[TIME_LIMIT] = max_minutes
     request = Request(objective, values)
     if source is not None:
         if module is not None:
@@ -174,7 +170,7 @@ def _outcome(fit: Fit) -> tuple[str, str]:
     config, loss = fit.config, f"validation loss {fit.best_validation:.3g}"
     reason = ""
     if fit.status == "out of time" and isinstance(config, WindowConfig):
-        reason = f": --max-minutes {config.max_minutes or 0:g} is over"
+        reason = f": max_minutes={config.max_minutes or 0:g} is over"
     if not isinstance(config, Rollout):  # windows only judge
         summary = fit_summary(fit.record)
         if summary is not None:

@@ -157,7 +157,7 @@ def _new_config(
         defaults[TIME_LIMIT] = options.pop(TIME_LIMIT)
     config = default_config(model, rates or [], options, defaults)
     if TIME_LIMIT in request.values and TIME_LIMIT not in type(config).model_fields:
-        note(f"info: --max-minutes limits fits to windows; these logs are fitted by {config.objective}")
+        note(f"info: max_minutes limits fits to windows; these logs are fitted by {config.objective}")
     return config
 
 
