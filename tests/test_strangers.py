@@ -86,14 +86,14 @@ def csv_of_a_long_name(folder: Path) -> Path:
 COUNTS = np.arange(SAMPLES)
 DATES = "column t: got dates beyond what nanoseconds count"
 LARGE = r"row \d+, column t: got 1e\+300 in SI units .* expected a number below 1e\+24"
-REPEATED = r"row 2, column t: .* \(59 such steps, this is the first\), expected increasing times"
+VANISHING = r"t: got \S+ s after 0 s, expected increasing times"
 REFUSED = {
     "stamps in a far year": (parquet(pa.array(2**62 + COUNTS, pa.timestamp("us"))), DATES),
     "days in a far year": (parquet(pa.array((2**31 - 100 + COUNTS).astype("i4"), pa.date32())), DATES),
     "times of 1e300": (npz(COUNTS * 1e300), LARGE),
     "one time of 1e300": (npz(np.append(COUNTS[:-1] / 60.0, 1e300)), LARGE),
-    "times of 1e-300": (npz(COUNTS * 1e-300), REPEATED),
-    "denormal times": (npz(COUNTS * 5e-324), REPEATED),
+    "times of 1e-300": (npz(COUNTS * 1e-300), VANISHING),
+    "denormal times": (npz(COUNTS * 5e-324), VANISHING),
     "a header of 1e12 samples": (npz_that_says_1e12_samples, r"array t\.npy is larger than the file says"),
     "a name of 400 kB": (csv_of_a_long_name, r"xxx\.\.\. \(\d+ characters\) \.\.\."),
 }
