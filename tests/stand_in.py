@@ -4,7 +4,7 @@ import torch
 from torch import nn
 
 FACTS = """{
-  "format": 2,
+  "format": 3,
   "robot": "stand_in",
   "urdf": "stand_in.urdf",
   "urdf_sha256": "none",

@@ -56,22 +56,6 @@ def test_a_step_of_any_length_is_exact_along_one_way():
     torch.testing.assert_close(parts, bristles.moved(z, way), rtol=1e-12, atol=1e-18)
 
 
-def test_a_joint_that_stiction_holds_does_not_creep():
-    """Under half of dry friction and a load that trembles at 10 Hz, for a minute: stick, as stiction does."""
-    bristles, fractions = Bristles([[1e-4, 1e-3, 1e-2, 1e-1]]), torch.tensor([0.3, 0.3, 0.2, 0.2]).double()
-    way = torch.linspace(-0.02, 0.02, 4001).double()
-    z, positions = torch.zeros(1, 4).double(), [0.0]
-    for turn in range(1200):
-        load = 0.5 + 0.3 * (-1) ** turn
-        held = (bristles.moved(z, way.unsqueeze(-1)) / bristles.reach) @ fractions  # (displacements, 1)
-        # where friction bears the load: it rises with displacement
-        moved = float(np.interp(load, held[:, 0], way))
-        z = bristles.moved(z, torch.tensor([moved]).double())
-        positions.append(positions[-1] + moved)
-    assert positions[1] > 1e-4  # stiction is elastic
-    assert abs(positions[-1] - positions[2]) < 5e-4  # rad; what the interpolation makes of corners
-
-
 def test_load_dependent_friction_is_smooth_at_right_angles():
     laws = FrictionLaws(JOINTS)
     constants = laws.prepare()

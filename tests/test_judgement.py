@@ -103,25 +103,15 @@ def test_the_evidence_counts_errors_that_last_once(monkeypatch):
     assert gained < 0.5 * 2000 * 2 * np.log(2)
 
 
-def test_a_law_of_servos_is_worth_more_than_luck(monkeypatch):
-    """A law that lowers the cost by 1, which a chance does once in six times, is not taken; one of 10 is."""
-    rows = {laws.DEAD_ZONE: 0, laws.STRIBECK: 1}
-    without = ServoParameters(torch.ones(2, 1), torch.zeros(0), 0.0, torch.zeros(2, 1, dtype=torch.bool))
-    law = ServoParameters(torch.ones(2, 1), torch.zeros(0), 0.0, torch.tensor([[True], [False]]))
-
-    class Problem:
-        rows = SimpleNamespace(row=lambda name: rows[name])
-
-        def residuals(self, x: ServoParameters) -> None:
-            return None
-
-        def joint_costs(self, x: ServoParameters, errors: None) -> torch.Tensor:
-            return torch.tensor([100.0])
-
-    for gain, taken in ((1.0, False), (10.0, True)):
-        cost = torch.tensor([100.0 - gain])
-        monkeypatch.setattr(laws, "_joint_minima", lambda problem, x, cost=cost: (x, cost.clone()))
-        assert bool(laws._most_probable(Problem(), without, [law]).active.any()) == taken
+def test_a_dead_zone_of_a_servo_is_worth_more_than_luck(monkeypatch):
+    """A dead zone that lowers the cost by 1, which a chance does once in six times, is not selected; one of 10 is."""
+    without = ServoParameters(torch.ones(1, 1), torch.zeros(0), 0.0, torch.zeros(1, 1, dtype=torch.bool))
+    problem = SimpleNamespace(rows=SimpleNamespace(row=lambda name: 0), weigh=lambda x: None)
+    monkeypatch.setattr(laws, "divided", lambda problem, x, fraction: x)
+    for gain, selected in ((1.0, False), (10.0, True)):
+        costs = iter([torch.tensor([100.0]), torch.tensor([100.0 - gain])])
+        monkeypatch.setattr(laws, "_joint_minima", lambda problem, x, costs=costs: (x, next(costs)))
+        assert bool(laws.select_dead_zones(problem, without).active.any()) == selected
 
 
 def test_straying_from_the_urdf_costs_what_the_docs_say(robots, monkeypatch):

@@ -50,16 +50,22 @@ def bristle_reach(model: Any) -> BristleReach:
 def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
     """z, (T, n, K) [rad, m], along the path q (T, n), straight at its start.
 
-    Between samples drives go one way, for which ``runtime.bristles`` is exact.
+    Between samples drives go one way, which is exact: z' is linear in the displacement.
     """
-    path = encoded(q)
+    moved = np.diff(encoded(q), axis=0, prepend=q[:1])
     if bristles.motors is not None:
-        path = path @ bristles.motors.T
-    elements = path[..., None]
-    # a bristle bends from where it stands to where the drive is, and stands where its reach dragged it
-    bent = elements - dragged(elements, bristles.values)
-    bends: np.ndarray = np.clip(bent, -bristles.values, bristles.values)  # without the last digit's rounding
-    return bends
+        moved = moved @ bristles.motors.T
+    way, reach = moved[..., None], bristles.values
+    decay = np.exp(-np.abs(way) / reach)
+    bent = np.sign(way) * reach * (1 - decay)
+    # z[k] = decay[k] z[k - 1] + bent[k]: pairs are joined, then fours, ...
+    shift = 1
+    while shift < len(q):
+        bent[shift:] += decay[shift:] * bent[:-shift]
+        decay[shift:] *= decay[:-shift].copy()
+        shift *= 2
+    result: np.ndarray = bent
+    return result
 
 
 def direction_along(qd: np.ndarray, bristles: BristleReach) -> np.ndarray | None:

@@ -73,10 +73,8 @@ def advanced(drives: ServoDrives, state: ServoState, u: Tensor, load: Load, h: T
     (q, qd, z), servo, laws = state, drives.servo, drives.laws
     reach, fractions = laws.bristles.reach, drives.friction.bristle_fractions
     dry = laws.dry(qd, load.gravity, drives.friction)
-    # of the way that the velocity makes, the part along which a bristle sticks
-    way = (h * qd).unsqueeze(-1)
-    sticks = ((reach - way.sign() * z) / way.abs().clamp(min=1e-30)).clamp(max=1.0)
-    stiffness = dry * (fractions / reach * sticks).sum(dim=-1)
+    unbent = 1 - qd.sign().unsqueeze(-1) * z / reach  # of each bristle, until it slides
+    stiffness = dry * (fractions / reach * unbent).sum(dim=-1)
     spring = servo.kp * beyond(u - q, servo.dead_zone)
     torque = spring - servo.kd * qd
     free = (torque.abs() < servo.limit).to(q)  # 0 where the servo is saturated: it neither stiffens nor damps

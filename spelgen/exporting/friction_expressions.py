@@ -46,9 +46,11 @@ def sliding_bristles(bristles: Bristles, law: FrictionLaw, qd: ca.SX) -> ca.SX:
 
 
 def bristle_step(bristles: Bristles, z: ca.SX, dq: ca.SX) -> ca.SX:
-    """Return z after a displacement dq one way: it sticks up to the reach."""
+    """Return z after a displacement dq: the solution of z' = qd - |qd| z / reach along it."""
+    moved = _by_element(bristles, dq)
     reach = bristles.reach.ravel()
-    z_next: ca.SX = ca.fmin(ca.fmax(z + _by_element(bristles, dq), -reach), reach)
+    end = ca.sign(moved) * reach
+    z_next: ca.SX = z + (z - end) * ca.expm1(-ca.fabs(moved) / reach)
     return z_next
 
 

@@ -23,7 +23,7 @@ from spelgen.listing import Listing, number
 _LAW = (
     "viscous qd + saturation tanh(qd / saturation_velocity) + (coulomb + stribeck exp(-(qd / stribeck_velocity)^2) "
     "+ load_dependence sqrt(gravity torque^2 + least_load^2)) direction; direction: memoryless tanh(qd / "
-    "coulomb_smoothing_velocity) plus the sum of bristle_fractions z / bristle_reach, with z' = qd up to |z| = "
+    "coulomb_smoothing_velocity) plus the sum of bristle_fractions z / bristle_reach, with z' = qd - |qd| z / "
     "bristle_reach; all of it times a factor that goes with the joint's position, between the two numbers of "
     "position_factor, or one where there are none"
 )

@@ -9,12 +9,11 @@ from torch import Tensor, nn
 
 
 class Bristles(nn.Module):
-    """K elements a joint, which stick up to their reach and slide beyond; z is (..., n, K) [rad, m].
+    """K elements a joint, elastic up to their reach, sliding beyond; z is (..., n, K) [rad, m].
 
-    z' = qd, and zero where |z| is the reach and would grow (Maxwell-slip elements: Lampaert, Al-Bender and
-    Swevers, A Generalized Maxwell-Slip Friction Model, 2003). Oscillations that turn around within the
-    reach close their loops, so that a joint under load does not creep; z follows a displacement exactly,
-    however long it is.
+    z' = qd - |qd| z / reach, whatever the speed: in displacement it is linear, and needs no small
+    steps (Dahl, A Solid Friction Model, 1968; several elements as in Lampaert, Al-Bender and
+    Swevers, A Generalized Maxwell-Slip Friction Model, 2003).
     """
 
     reach: Tensor  # (n, K)
@@ -25,9 +24,7 @@ class Bristles(nn.Module):
 
     def rate(self, qd: Tensor, z: Tensor) -> Tensor:
         """z', (..., n, K)."""
-        velocity = qd.unsqueeze(-1)
-        slides = velocity.sign() * z >= self.reach
-        return torch.where(slides, 0.0, velocity)
+        return qd.unsqueeze(-1) - qd.abs().unsqueeze(-1) * z / self.reach
 
     def moved(self, z: Tensor, displacement: Tensor) -> Tensor:
         """z after joints went one way by (..., n), exactly."""
@@ -36,4 +33,6 @@ class Bristles(nn.Module):
 
 def moved_bristles(z: Tensor, displacement: Tensor, reach: Tensor) -> Tensor:
     """z, (..., n, K), after joints went one way by (..., n), exactly."""
-    return (z + displacement.unsqueeze(-1)).clamp(-reach, reach)
+    end = displacement.sign().unsqueeze(-1) * reach
+    # to all digits of small displacements
+    return z + (z - end) * (-displacement.abs().unsqueeze(-1) / reach).expm1()
