@@ -54,7 +54,8 @@ def test_wheel_holds_all_that_the_package_needs(installed):
 
 
 def test_installed_command_builds_the_same_module(installed, robots, tmp_path):
-    shutil.copy(robots / "rpr.urdf", tmp_path)  # a module names a URDF elsewhere by its way there
+    for path in robots.glob("rpr.*"):  # a module names a URDF elsewhere by its way there
+        shutil.copy(path, tmp_path)
     command = [sys.executable, "-m", "spelgen", "build", "rpr.urdf", "-o", "module.py"]
     subprocess.run(command, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(installed)}, check=True)
     assert (tmp_path / "module.py").read_text(encoding="utf-8") == pipeline.generate(robots / "rpr.urdf")
