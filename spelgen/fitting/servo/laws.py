@@ -24,8 +24,7 @@ TUNING, SOLVER = ServoLawTuning(), ServoSolverTuning()
 
 def select_dead_zones(problem: ServoProblem, x: ServoParameters) -> ServoParameters:
     """Return parameters with the dead zones that the joints turn out to have, which are fitted from then on."""
-    problem.weigh(x)  # by the errors that the round before left, not by those that it began with
-    x, costs = _joint_minima(problem, x)
+    costs = problem.joint_costs(x, problem.residuals(x))
     minimum, joint_costs = _joint_minima(problem, divided(problem, x, TUNING.dead_zone_fraction))
     better = joint_costs + TUNING.significance**2 / 2 < costs  # never where a rollout left all bounds
     joints, active = torch.where(better, minimum.joints, x.joints), x.active.clone()

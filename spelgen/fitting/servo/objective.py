@@ -135,7 +135,7 @@ class ServoObjective:
             if number == ROUNDS:
                 break
             # dead zones are chosen when gains are right: before, errors are those of the gains
-            choose = select_dead_zones if number == ROUNDS - 1 else without_faint
+            choose = select_dead_zones if number == 1 else without_faint
             x = choose(problem, x)
             self._begin_round(x)
             save()
