@@ -106,11 +106,15 @@ def test_the_evidence_counts_errors_that_last_once(monkeypatch):
 def test_a_dead_zone_of_a_servo_is_worth_more_than_luck(monkeypatch):
     """A dead zone that lowers the cost by 1, which a chance does once in six times, is not selected; one of 10 is."""
     without = ServoParameters(torch.ones(1, 1), torch.zeros(0), 0.0, torch.zeros(1, 1, dtype=torch.bool))
-    problem = SimpleNamespace(rows=SimpleNamespace(row=lambda name: 0), weigh=lambda x: None)
+    problem = SimpleNamespace(
+        rows=SimpleNamespace(row=lambda name: 0),
+        residuals=lambda x: None,
+        joint_costs=lambda x, errors: torch.tensor([100.0]),
+    )
     monkeypatch.setattr(laws, "divided", lambda problem, x, fraction: x)
     for gain, selected in ((1.0, False), (10.0, True)):
-        costs = iter([torch.tensor([100.0]), torch.tensor([100.0 - gain])])
-        monkeypatch.setattr(laws, "_joint_minima", lambda problem, x, costs=costs: (x, next(costs)))
+        cost = torch.tensor([100.0 - gain])
+        monkeypatch.setattr(laws, "_joint_minima", lambda problem, x, cost=cost: (x, cost))
         assert bool(laws.select_dead_zones(problem, without).active.any()) == selected
 
 
