@@ -155,30 +155,10 @@ def test_the_command_line_names_the_flag(robots, tmp_path):
 def test_a_run_goes_on_with_its_own_options(tmp_path):
     logs, run = tmp_path / "train.parquet", tmp_path / "run"
     write_logs(logs, motions(), JOINTS)
-    begin = [
-        "train",
-        str(STAND_IN),
-        "--data",
-        str(logs),
-        "-o",
-        str(run),
-        "--set",
-        "progress=false",
-        "--set",
-        "momentum_steps=20",
-    ]
-    assert CliRunner().invoke(app, [*begin, "--set", "epochs=1", "--set", "window=6"]).exit_code == 0
-    again = [
-        "train",
-        str(STAND_IN),
-        "--data",
-        str(logs),
-        "-o",
-        str(run),
-        "--set",
-        "progress=false",
-        "--resume",
-    ]
+    train = ["train", str(STAND_IN), "--data", str(logs), "-o", str(run), "--set", "progress=false"]
+    first = ["--set", "momentum_steps=20", "--set", "epochs=1", "--set", "window=6"]
+    assert CliRunner().invoke(app, [*train, *first]).exit_code == 0
+    again = [*train, "--resume"]
     assert CliRunner().invoke(app, [*again, "--set", "epochs=2"]).output.startswith("finished after 2 epochs")
     assert refused(*again[1:], "--set", "evaluations=40").startswith("Error: --set evaluations: belongs to")
     done = CliRunner().invoke(app, [*again, "--set", "window=7"])

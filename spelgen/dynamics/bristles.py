@@ -80,24 +80,16 @@ def direction_along(qd: np.ndarray, bristles: BristleReach) -> np.ndarray | None
 def encoded(q: np.ndarray) -> np.ndarray:
     """The path (T, n) without the jitter of encoders: it follows q out of a band of a step to both sides."""
     step = encoder_step(q)
-    return dragged(q, step) if step.any() else q
-
-
-def dragged(path: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """The way of what a path (T, ...) drags along as soon as it is further away than the reach; at its start at first.
-
-    It is the play operator (Brokate and Sprekels, Hysteresis and Phase Transitions, 1996), in log2 T passes.
-    """
-    low, high = path - reach, path + reach
-    start = np.broadcast_to(path[:1], low.shape)
-    # clamping to a band after a band is clamping to one: pairs are joined, then fours, ...
+    if not step.any():
+        return q
+    low, high = q - step, q + step  # clamping to a band after a band is clamping to one
     shift = 1
-    while shift < len(path):
+    while shift < len(q):
         earlier, later = slice(None, -shift), slice(shift, None)
         clamped = [np.clip(x[earlier], low[later], high[later]) for x in (low, high)]
         low[later], high[later] = clamped
         shift *= 2
-    result: np.ndarray = np.clip(start, low, high)
+    result: np.ndarray = np.clip(np.broadcast_to(q[:1], q.shape), low, high)
     return result
 
 
