@@ -87,11 +87,13 @@ def is_dropout(values: np.ndarray) -> np.ndarray:
         return dropout
     steps = np.abs(np.diff(values[values != 0]))
     usual = np.median(steps[steps > 0]) if steps.any() else np.inf
-    for start in starts.tolist():
-        stop = int(stops[stops > start].min(initial=len(values)))
-        # a signal that passes through 0 comes near it first
-        if stop < len(values) and min(abs(values[start - 1]), abs(values[stop])) > TUNING.dropout * usual:
-            dropout[start:stop] = True
+    stops = stops[stops > starts[0]]
+    starts = starts[: len(stops)]  # zeros at the end have nothing behind them
+    # a signal that passes through 0 comes near it first
+    nearest = np.minimum(np.abs(values[starts - 1]), np.abs(values[stops]))
+    far = nearest > TUNING.dropout * usual
+    for start, stop in zip(starts[far].tolist(), stops[far].tolist(), strict=True):
+        dropout[start:stop] = True
     return dropout
 
 
