@@ -111,10 +111,26 @@ def corners_that_are_no_numbers(folder: Path) -> str:
     return "m.obj"
 
 
+def gltf_of_triangles_without_corners(folder: Path) -> str:
+    content = json.loads(gltf(INLINE))
+    content["meshes"][0]["primitives"][0]["indices"] = 1
+    content["accessors"].append({"bufferView": 1, "componentType": 5123, "count": 3, "type": "SCALAR"})
+    content["bufferViews"].append(
+        {"buffer": 0, "byteOffset": 12, "byteLength": 6}
+    )  # the second corner: 0, 16256, 0
+    (folder / "m.gltf").write_text(json.dumps(content))
+    return "m.gltf"
+
+
+def triangle_beyond_all_areas(folder: Path) -> str:
+    return plain_obj(folder) + '" scale="1e200 1e200 1e200'
+
+
 DRAWN = (plain_obj, plain_gltf, gltf_with_a_file, obj_whose_material_is_a_pipe)
 LEFT_OUT = (
     pipe, gltf_whose_buffer_is_a_pipe, gltf_whose_buffer_lies_elsewhere, gltf_of_gigabytes, archive_of_gigabytes,
     stl_that_says_more_than_it_has, ply_that_says_more_than_it_has, corners_that_are_no_numbers,
+    gltf_of_triangles_without_corners, triangle_beyond_all_areas,
 )  # fmt: skip
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import null_space
 
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.regressor import regressor
@@ -38,8 +37,7 @@ def servo_rank(arm: Arm) -> ServoRank:
     samples = 2 * (10 * len(arm.bodies) // n + len(PARAMETERS)) + 20
     q, qd, qdd = random.normal(size=(3, samples, n))
     columns = regressor(arm, q, qd, qdd).reshape(samples * n, -1)
-    _, sizes, directions = np.linalg.svd(columns, full_matrices=False)
-    identifiable = directions[sizes > ROUNDING * sizes[0]].T
+    identifiable, _ = _row_and_null_space(columns)
     bodies = columns @ (
         identifiable * random.uniform(0.5, 2.0, identifiable.shape[1])
     )  # of unknowns that are 1
@@ -51,8 +49,8 @@ def servo_rank(arm: Arm) -> ServoRank:
         rows[:, joint, joint, 1:] = drives[:, joint]
     system = np.concatenate([rows.reshape(samples * n, -1), bodies], axis=1)
     size = np.linalg.norm(system, axis=0)
-    null = null_space(system / size, rcond=ROUNDING) / size[:, None]  # (unknowns, d)
-    changes = null[: n * len(PARAMETERS)].reshape(n, len(PARAMETERS), -1)
+    _, null = _row_and_null_space(system / size)
+    changes = (null / size[:, None])[: n * len(PARAMETERS)].reshape(n, len(PARAMETERS), -1)
     changes = changes / np.abs(changes).max()
     groups: list[list[int]] = []
     in_no_ratio = []
@@ -67,3 +65,10 @@ def servo_rank(arm: Arm) -> ServoRank:
         in_no_ratio += [(PARAMETERS[k], joint) for k in np.flatnonzero(apart)]
     in_no_ratio.sort(key=lambda entry: PARAMETERS.index(entry[0]))
     return ServoRank(tuple(map(tuple, groups)), tuple(in_no_ratio))
+
+
+def _row_and_null_space(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return orthonormal bases of both (columns, dimension), of a matrix of more rows than columns."""
+    _, sizes, directions = np.linalg.svd(matrix, full_matrices=False)
+    rank = int((sizes > ROUNDING * sizes[0]).sum())
+    return directions[:rank].T, directions[rank:].T

@@ -61,10 +61,17 @@ def slide(axis: np.ndarray, radius: float) -> list[Trimesh]:
 def visual_shapes(urdf: Path, links: Sequence[str]) -> dict[str, Shape]:
     """Return what the URDF shows of these links, simplified to fit a page; nothing where a mesh is not found."""
     try:
-        meshes = _visual_meshes(urdf, links)
+        with np.errstate(all="ignore"):  # corners may lie anywhere
+            return _simplified(_visual_meshes(urdf, links))
     except Exception:  # what the readers of a dozen mesh formats raise; the page stands without
         return {}
+
+
+def _simplified(meshes: Mapping[str, Trimesh]) -> dict[str, Shape]:
+    """Return the meshes with as many faces as a page bears. Raises where a mesh is without measure."""
     area = sum(mesh.area for mesh in meshes.values()) or 1.0
+    if not np.isfinite(area):
+        raise ValueError("a mesh without an area")
     shapes = {}
     for name, mesh in meshes.items():
         # by size: a fine mesh of a small screw gets no more faces than it shows
