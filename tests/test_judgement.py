@@ -1,5 +1,7 @@
 """What decides whether a part, a law or a figure is accepted: each test fails where that judgement is left out."""
 
+import re
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,7 +10,11 @@ import torch
 
 from spelgen.building import build
 from spelgen.evaluation import invariants
+from spelgen.evaluation.state_errors import end_errors
+from spelgen.exporting.mjcf_file import mjcf_text
+from spelgen.exporting.rigid_body_projection import rigid_body_projection
 from spelgen.fitting import residual_fit, torque_fit, torque_objective
+from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.residual_fit import select_residuals
 from spelgen.fitting.servo import laws
 from spelgen.fitting.servo.parameters import ServoParameters
@@ -18,6 +24,7 @@ from spelgen.fitting.urdf_regularizer import UrdfRegularizer
 from spelgen.fitting.window_problem import WindowProblem
 from spelgen.fleet import jobs
 from spelgen.identification.least_squares import deviations
+from spelgen.loaded_arm import load_arm
 from spelgen.logs.windows import Windows
 from spelgen.settings.fits import Rollout, TorqueFit
 
@@ -62,6 +69,8 @@ def test_gains_have_to_be_beyond_their_own_scatter():
     squares = torch.ones(10).double()
     steady = torch.full((10,), 0.9).double()
     assert residual_fit._significant_gain(squares, steady + 0.001 * torch.arange(10)) == pytest.approx(0.0955)
+    # as sure as can be, and next to nothing: no function is worth that
+    assert residual_fit._significant_gain(squares, 0.9999 * squares) is None
     lucky = torch.tensor([0.1] + [1.0] * 9).double()
     assert residual_fit._significant_gain(squares, lucky) is None
 
@@ -172,6 +181,66 @@ def test_the_cost_of_a_torque_fit_has_the_prior_in_it():
     x, squares = torch.tensor([2.0, 3.0]).double(), torch.tensor([1.0, 8.0]).double()
     expected = (1.0 / 0.25 + 8.0 / 4.0 + (2.0 * 1 + 2 * 0.5 * 3 + 1.0 * 9)) / 2
     assert torque_fit.TorqueProblem.cost(problem, x, squares) == pytest.approx(expected)
+
+
+def test_noise_is_what_each_joint_misses():
+    """Ten times the squares are sqrt(10) times the noise, and no joint's noise is another's."""
+    problem = SimpleNamespace(count=50, range=torch.ones(2).double())
+    noise = []
+    for squares in ([2.0, 8.0], [20.0, 80.0]):
+        torque_fit.TorqueProblem.set_noise(problem, torch.tensor(squares).double())
+        noise.append(problem.noise)
+    torch.testing.assert_close(noise[0][1], 2 * noise[0][0])
+    torch.testing.assert_close(noise[1], 10**0.5 * noise[0])
+
+
+def test_a_joint_of_servos_goes_no_step_uphill():
+    """Residuals arctan 10 x of two joints: a step from 0.3 goes far beyond zero, and is not taken."""
+    seen = []
+
+    def residuals(x):
+        seen.append(x.joints)
+        return (10 * x.joints).atan()
+
+    def normal_equations(x, errors):
+        slope = 10 / (1 + (10 * x.joints).square()).flatten()
+        return NormalEquations(torch.diag(slope.square()), -slope * errors.flatten())
+
+    problem = SimpleNamespace(
+        residuals=residuals,
+        normal_equations=normal_equations,
+        joint_costs=lambda x, errors: errors.square().sum(dim=0) / 2,
+    )
+    start = ServoParameters(
+        torch.tensor([[0.3, 0.05]]).double(), torch.zeros(0), 0.0, torch.ones(1, 2, dtype=torch.bool)
+    )
+    found, costs = laws._joint_minima(problem, start)
+    tried = (10 * torch.cat(seen)).atan().square() / 2
+    assert (tried[1:] > tried[0]).any()  # such steps were tried
+    torch.testing.assert_close(costs, (10 * found.joints[0]).atan().square() / 2)
+    assert (costs < 1e-3).all()
+
+
+def test_friction_of_two_directions_is_their_mean_in_mujoco(robots):
+    """1 Nm forward and 3 Nm backward: a file that has one figure for both says 2."""
+    arm = load_arm(robots / "two_link.urdf")
+    learned = rigid_body_projection(build(arm, "closed-form"), arm)
+    learned = replace(learned, forward=np.array([1.0, 0.5]), backward=np.array([-3.0, -0.5]))
+    text = mjcf_text(learned, np.eye(2), ("tip", 1, np.eye(4))).decode()
+    assert re.findall(r'frictionloss="([^"]*)"', text) == ["2", "0.5"]
+
+
+def test_the_tip_is_missed_by_millimetres():
+    """A joint is predicted 0.003 rad too far, at a radius of 2 m."""
+    q = torch.zeros(4, 3, 1).double()
+    windows = Windows(torch.full((4, 2), 0.01).double(), q, q, torch.zeros(4, 2, 1).double())
+    predicted = torch.full((4, 2, 1), 0.003).double()
+
+    def tip(angle: torch.Tensor) -> torch.Tensor:
+        return 2.0 * torch.cat([angle.cos(), angle.sin(), torch.zeros_like(angle)], dim=-1)
+
+    errors = end_errors((predicted, predicted), windows, ["revolute"], tip)
+    assert errors.tip_mm == pytest.approx(6.0, rel=1e-5)
 
 
 def test_energy_that_only_changes_its_kind_is_no_rise(robots):

@@ -472,6 +472,7 @@ def test_the_learning_rate_rises_and_falls(logs, tmp_path):
     peak = int(np.argmax(rates))
     assert max(rates) == pytest.approx(QUICK.learning_rate, rel=0.01)
     assert peak < 0.05 * len(rates)
+    assert rates[0] < 0.1 * max(rates)
     assert rates[-1] == pytest.approx(0.01 * QUICK.learning_rate, rel=0.1)
 
 
