@@ -3,6 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Units:
+    """Name the units of a joint's quantities; torque: or force. inertia: of its entry on the diagonal of M."""
+
+    position: str
+    velocity: str
+    torque: str
+    inertia: str
+
+
+UNITS = {"revolute": Units("rad", "rad/s", "Nm", "kg m²"), "prismatic": Units("m", "m/s", "N", "kg")}
+"""By a joint's kind."""
+
+
+@dataclass(frozen=True)
+class NamedJoint:
+    """Hold a joint's name and its units."""
+
+    name: str
+    units: Units
+
+    def axis(self, quantity: str) -> str:
+        """Return ``position [rad]``, or likewise of ``velocity`` or ``torque``."""
+        return f"{quantity} [{getattr(self.units, quantity)}]"
+
+
+def named_joints(names: Sequence[str], kinds: Sequence[str]) -> list[NamedJoint]:
+    """Return joints of these kinds."""
+    return [NamedJoint(name, UNITS[kind]) for name, kind in zip(names, kinds, strict=True)]
 
 
 def joint_ranges(joints: tuple[int, ...]) -> str:

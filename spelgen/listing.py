@@ -7,6 +7,7 @@ colours, notebook), so that the same rows give the same text wherever they go.
 from __future__ import annotations
 
 import io
+import math
 import re
 import textwrap
 from dataclasses import dataclass, replace
@@ -163,8 +164,8 @@ def _folded(name: str, width: int) -> str:
 
 
 def number(value: float | None) -> str:
-    """Return three significant digits, whole numbers from 1000 on; a dash for None."""
-    if value is None:
+    """Return three significant digits, whole numbers from 1000 on; a dash for None and for what is not finite."""
+    if value is None or not math.isfinite(value):
         return "-"
     if value == 0 or 1e-3 <= abs(value) < 1e3:
         return f"{value:.3g}"

@@ -14,20 +14,9 @@ from spelgen.exporting.trained import Trained
 from spelgen.loaded_arm import load_arm
 
 
-@pytest.mark.parametrize(("robot", "preset"), [("rpr", "closed-form"), ("scara", "hybrid")])
-def test_onnx_gives_what_the_model_gives(robot, preset):
-    """The check at export time compares every file with the model to 1e-10; here another batch size, by hand."""
-    model = moved_model(robot, preset)
-    found = export(model, "onnx", arm=arm_of(robot))
-    session = onnx_session(found.files["gravity.onnx"])
-    q = torch.linspace(-1, 1, 7 * model.n, dtype=torch.float64).reshape(7, model.n)
-    (gravity,) = session.run(["gravity"], {"q": q.numpy()})
-    np.testing.assert_allclose(gravity, model.gravity(q).numpy(), rtol=1e-9, atol=1e-9)
-    assert len(found.files["README.md"].decode().splitlines()) == 5
-
-
-def test_followers_motors_and_passive_joints_go_along(tmp_path):
-    urdf = tmp_path / "coupled.urdf"
+def coupled_model(folder):
+    """An arm with a follower, motors and a passive joint, and its hybrid, every weight of which has moved."""
+    urdf = folder / "coupled.urdf"
     urdf.write_text(COUPLED)
     urdf.with_suffix(".yaml").write_text(MOTORS)
     arm = load_arm(urdf)
@@ -36,14 +25,28 @@ def test_followers_motors_and_passive_joints_go_along(tmp_path):
         for parameter in model.parameters():
             parameter += 0.1
         model.raw_friction_compensation += 0.3
-    assert "from the torch module" in export(model, "onnx", arm=arm).summary[0]
+    return model.requires_grad_(False), arm
+
+
+def test_onnx_gives_what_the_model_gives(tmp_path):
+    """The check at export time compares every file with the model to 1e-10; here another batch size, by hand."""
+    model, arm = coupled_model(tmp_path)
+    found = export(model, "onnx", arm=arm)
+    assert "from the torch module" in found.summary[0]
+    session = onnx_session(found.files["gravity.onnx"])
+    q = torch.linspace(-1, 1, 7 * model.n, dtype=torch.float64).reshape(7, model.n)
+    (gravity,) = session.run(["gravity"], {"q": q.numpy()})
+    np.testing.assert_allclose(gravity, model.gravity(q).numpy(), rtol=1e-9, atol=1e-9)
+    assert len(found.files["README.md"].decode().splitlines()) == 5
 
 
 def test_the_files_are_plain_onnx_of_equal_bytes():
     """No operator of one runtime alone, no traces of the machine, the same bytes twice; z is flat."""
-    model = moved_model("ur10e", "closed-form").prepared()
-    content = onnx_model(model, "forward_dynamics")
-    assert content == onnx_model(model, "forward_dynamics")
+    trained = Trained(moved_model("two_link", "closed-form"), arm_of("two_link"))
+    prepared = trained.model.prepared()
+    content = onnx_model(prepared, "forward_dynamics")
+    check_parity(called_by_onnx({"forward_dynamics": content}), trained, ["forward_dynamics"], 1e-10)
+    assert content == onnx_model(prepared, "forward_dynamics")
     graph = onnx.load_from_string(content)
     onnx.checker.check_model(graph)
     assert {node.domain for node in graph.graph.node} == {""}

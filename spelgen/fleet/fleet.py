@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from spelgen.errors import RunError, SpelgenError
 from spelgen.files import write_json
@@ -21,16 +21,7 @@ from spelgen.tasks import RunTasks
 SCHEMA = 1
 
 
-class Named(Protocol):
-    """A task with a name for people."""
-
-    @property
-    def name(self) -> str:
-        """Return the name."""
-        ...
-
-
-Task = TypeVar("Task", bound=Named)
+Task = TypeVar("Task", Preparation, Job)
 Result = TypeVar("Result")
 
 
@@ -52,61 +43,54 @@ def run_fleet(fleet: Fleet, folder: Path, run_tasks: RunTasks, note: Callable[[s
     note: hears of each task that ends. A run that fails is left out; started again, it is tried again. Raises RunError
     where no arm has logs that can be used.
     """
-    runner = _Runner(run_tasks, note)
-    arms = _prepare(fleet, folder, runner)
+    progress = _Progress(run_tasks, note)
+    arms = _prepare(fleet, folder, progress)
     # arm by arm, so that the first rankings can be read while the rest runs
-    choices = product(arms.values(), fleet.presets, range(fleet.seeds), range(fleet.splits))
+    choices = product(arms, fleet.presets, range(fleet.seeds), range(fleet.splits))
     jobs = [_job(fleet, folder, *choice) for choice in choices]
-    fleet_results = FleetResults(runner.results(jobs), runner.failures)
+    results = {job.name: job.result() for job in jobs}
+    waiting = [job for job in jobs if results[job.name] is None]
+    for job, result in progress.succeeded("training", run_job, waiting):
+        results[job.name] = result
+    ended = [result for result in results.values() if result is not None]
+    fleet_results = FleetResults(ended, progress.failures)
     write_json(folder / "fleet.json", fleet_results.to_dict())
     return fleet_results
 
 
-class _Runner:
+class _Progress:
     """Run tasks, say how each ended, and keep the failures."""
 
     def __init__(self, run_tasks: RunTasks, note: Callable[[str], None]) -> None:
         self._run_tasks, self._note = run_tasks, note
         self.failures: dict[str, str] = {}
 
-    def outcomes(
+    def succeeded(
         self, phase: str, work: Callable[[Task], Result], tasks: Sequence[Task]
-    ) -> Iterator[tuple[Task, Result | Exception]]:
-        """Yield each task with its result, or the exception it ended with."""
+    ) -> Iterator[tuple[Task, Result]]:
+        """Yield each task that did not fail with its result, as they end."""
         for number, (task, outcome) in enumerate(self._run_tasks(work, tasks), start=1):
-            failure = ""
+            heading = f"{phase} {number}/{len(tasks)}: {task.name}"
             if isinstance(outcome, Exception):
-                failure = f": failed: {one_line(outcome)}"
-            self._note(f"{phase} {number}/{len(tasks)}: {task.name}{failure}")
-            yield task, outcome
-
-    def results(self, jobs: Sequence[Job]) -> list[RunResult]:
-        """Return the results in the order of the jobs, those that are done not run again; failures are kept."""
-        results = {job.name: job.result() for job in jobs}
-        waiting = [job for job in jobs if results[job.name] is None]
-        for job, outcome in self.outcomes("training", run_job, waiting):
-            if isinstance(outcome, Exception):
-                self.failures[job.name] = one_line(outcome)
+                self.failures[task.name] = one_line(outcome)
+                self._note(f"{heading}: failed: {self.failures[task.name]}")
             else:
-                results[job.name] = outcome
-        return [result for result in results.values() if result is not None]
+                self._note(heading)
+                yield task, outcome
 
 
-def _prepare(fleet: Fleet, folder: Path, runner: _Runner) -> dict[str, PreparedArm]:
-    """Return, by name, the arms whose logs are ready. Raises RunError where there is none."""
-    preparations = [
-        Preparation(name, robot, fleet.splits, folder / "logs" / name) for name, robot in fleet.robots.items()
-    ]
+def _prepare(fleet: Fleet, folder: Path, progress: _Progress) -> list[PreparedArm]:
+    """Return the arms whose logs are ready, in the order of the fleet. Raises RunError where there is none."""
+    preparations = []
+    for name, robot in fleet.robots.items():
+        preparations.append(Preparation(name, robot, fleet.splits, folder / "logs" / name))
     arms = {}
-    for preparation, outcome in runner.outcomes("logs", prepare, preparations):
-        if isinstance(outcome, Exception):
-            runner.failures[preparation.name] = one_line(outcome)
-        else:
-            arms[preparation.name] = outcome
+    for preparation, arm in progress.succeeded("logs", prepare, preparations):
+        arms[preparation.name] = arm
     if not arms:
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in runner.failures.items())
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in progress.failures.items())
         raise RunError(f"no arm whose logs can be used ({reasons})")
-    return {name: arms[name] for name in fleet.robots if name in arms}
+    return [arms[name] for name in fleet.robots if name in arms]
 
 
 def _job(fleet: Fleet, folder: Path, arm: PreparedArm, preset: str, seed: int, split: int) -> Job:

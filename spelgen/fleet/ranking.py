@@ -42,10 +42,14 @@ def ranking(robot: str, runs: Sequence[RunResult]) -> Listing:
     for run in runs:
         presets.setdefault(run["preset"], []).append(run)
     horizons = _common(run["errors"] for run in runs)
-    lines = [_model_line(name, of_preset, horizons) for name, of_preset in presets.items()]
+    lines = []
+    for preset, of_preset in presets.items():
+        seconds = statistics.median(run["seconds"] for run in of_preset)
+        facts = (f"{of_preset[0]['parameters']:,}", f"{len(of_preset):,}", number(seconds))
+        lines.append(_Line(preset, _medians(of_preset, MODEL, horizons), facts))
     for name in _common(_predictors(run) for run in runs):
         if name != MODEL:
-            lines.append(_line(f"({name})", runs, name, horizons))
+            lines.append(_Line(f"({name})", _medians(runs, name, horizons)))
     # baselines stand among the models: a model below one of them is not worth its training
     lines.sort(key=lambda line: line.order)
     head = ("", *horizons, "nMSE", "parameters", "runs", "time [s]")
@@ -54,45 +58,34 @@ def ranking(robot: str, runs: Sequence[RunResult]) -> Listing:
 
 @dataclass(frozen=True)
 class _Line:
-    """A model or a baseline: errors by horizon, nMSE of torques; of models parameters, runs and seconds a run."""
+    """A model or a baseline: errors by horizon, then nMSE of torques. facts: parameters, runs and seconds a run."""
 
     name: str
-    errors: tuple[float | None, ...]
-    torque: float | None
-    parameters: int | None = None
-    runs: int | None = None
-    seconds: float | None = None
+    errors: tuple[float, ...]
+    facts: tuple[str, str, str] = ("-", "-", "-")
 
     @property
-    def order(self) -> list[float]:
+    def order(self) -> tuple[float, ...]:
         """Return what lines are sorted by: errors, of the longest horizon first, then of torque."""
-        values = (*reversed(self.errors), self.torque)
-        return [math.inf if value is None else value for value in values]
+        *horizons, torque = self.errors
+        return (*reversed(horizons), torque)
 
     @property
     def row(self) -> tuple[str, ...]:
         """Return the line as text."""
-        values = (*self.errors, self.torque, self.parameters, self.runs, self.seconds)
-        return (self.name, *(_text(value) for value in values))
+        return (self.name, *map(number, self.errors), *self.facts)
 
 
-def _model_line(name: str, runs: Sequence[RunResult], horizons: Sequence[str]) -> _Line:
-    line = _line(name, runs, MODEL, horizons)
-    seconds = _median([run["seconds"] for run in runs])
-    return _Line(name, line.errors, line.torque, runs[0]["parameters"], len(runs), seconds)
-
-
-def _line(name: str, runs: Sequence[RunResult], predictor: str, horizons: Sequence[str]) -> _Line:
-    errors = []
-    for horizon in horizons:
-        errors.append(_median([run["errors"][horizon].get(predictor) for run in runs]))
-    return _Line(name, tuple(errors), _median([run["torque"].get(predictor) for run in runs]))
-
-
-def _median(values: Sequence[float | None]) -> float | None:
-    """Return the median, None where it is not finite; an error that is not finite counts as infinitely bad."""
-    median = statistics.median(math.inf if value is None else value for value in values)
-    return median if math.isfinite(median) else None
+def _medians(runs: Sequence[RunResult], predictor: str, horizons: Sequence[str]) -> tuple[float, ...]:
+    """Return the median error of each horizon, then of torques."""
+    columns = [[run["errors"][horizon].get(predictor) for run in runs] for horizon in horizons]
+    columns.append([run["torque"].get(predictor) for run in runs])
+    medians = []
+    for column in columns:
+        # an error that is not finite counts as infinitely bad
+        errors = [math.inf if error is None else error for error in column]
+        medians.append(statistics.median(errors))
+    return tuple(medians)
 
 
 def _predictors(run: RunResult) -> list[str]:
@@ -116,9 +109,3 @@ def _by_robot(fleet: FleetResults) -> dict[str, list[RunResult]]:
     for run in fleet.results:
         robots.setdefault(run["robot"], []).append(run)
     return robots
-
-
-def _text(value: float | None) -> str:
-    if isinstance(value, int):
-        return f"{value:,}"
-    return number(value)

@@ -6,7 +6,6 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from markupsafe import Markup
@@ -19,7 +18,7 @@ from spelgen.certificate.printing import Text
 from spelgen.labels import entry_name, joint_ranges, joints_in_ranges
 from spelgen.render.page import json_data
 from spelgen.render.plots import Record, numbers
-from spelgen.render.scene import Scene, scene
+from spelgen.render.scene import scene
 from spelgen.settings.tuning.render import TUNING
 from spelgen.structure.structure import Structure
 
@@ -37,6 +36,18 @@ class Cell:
     text: str
     joints: tuple[int, ...]
     explanation: str
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A motion for the script: t [s] and q, (T, n). error: by joint, 1 for the worst colour. predicted: of q."""
+
+    name: str
+    label: str
+    t: Sequence[float]
+    q: Sequence[Sequence[float]]
+    error: Sequence[Sequence[float | None]] | None = None
+    predicted: Sequence[Sequence[float | None]] | None = None
 
 
 @dataclass(frozen=True)
@@ -94,68 +105,52 @@ def arm_section(
     """Return the arm with the motions of an evaluation's traces, or, without, one through its ranges."""
     drawn = scene(urdf, [coordinate.name for coordinate in arm.coordinates])
     motions = _motions(traces or {}) or [_sweep(arm)]
-    for motion in motions:
-        motion |= _view(drawn, motion["q"])
     unseen = _unseen(arm, identified or {})
-    data = drawn.to_dict() | {"motions": motions, "identifiability": unseen}
     colours = []
-    if "error" in motions[0]:
+    if motions[0].error is not None:
         colours.append("error")
     if unseen is not None:
         colours.append("known")
-    return ArmSection(
-        data=json_data(data),
-        motions=tuple(motion["told"] for motion in motions),
-        colours=tuple(colours),
-        has_meshes=drawn.has_meshes,
-    )
+    scripted = []
+    for motion in motions:
+        # a dozen poses of a motion hold its extent well enough
+        poses = motion.q[:: max(1, len(motion.q) // 12)]
+        scripted.append(vars(motion) | drawn.view(poses))
+    data = drawn.to_dict() | {"motions": scripted, "identifiability": unseen}
+    labels = tuple(motion.label for motion in motions)
+    return ArmSection(json_data(data), labels, tuple(colours), drawn.has_meshes)
 
 
-def _view(drawn: Scene, q: Sequence[Sequence[float]]) -> dict[str, object]:
-    """Return the view of a motion for the script [mm]; the ground lies below all links, at the root where they stay
-    above it.
-    """
-    # a dozen poses of a motion hold its extent well enough
-    poses = q[:: max(1, len(q) // 12)]
-    view = drawn.view(poses)
-    ground = 0.0
-    for pose in poses:
-        for _, position in drawn.frames(pose):
-            ground = min(ground, float(position[2]))
-    return {
-        "middle": (1000 * view.middle).round(1).tolist(),
-        "scale": round(view.scale, 2),
-        "ground": round(1000 * ground, 1),
-    }
-
-
-def _motions(traces: Record) -> list[dict[str, Any]]:
+def _motions(traces: Record) -> list[Motion]:
     """Return predictions, coloured by the error of their positions; then torques, coloured by their residual."""
     motions = []
     for example in traces.get("trajectories", ()):
         q, predicted = numbers(example["q"]), numbers(example["predicted_q"])
-        moved = np.ptp(q, axis=0)
+        extent = np.ptp(q, axis=0)
         # a joint that hardly moved is measured by the motion of the others
-        error = np.abs(predicted - q) / np.maximum(moved, 1e-2 * moved.max() + 1e-9)
+        error = np.abs(predicted - q) / np.maximum(extent, 1e-2 * extent.max() + 1e-9)
+        name = f"prediction {example['which']}"
         label = f"{example['which']} prediction beside what was measured ({example['trajectory']})"
-        motions.append(_motion(f"prediction {example['which']}", label, example, error))
-        motions[-1]["predicted"] = example["predicted_q"]
+        colour = _colour(error)
+        motions.append(Motion(name, label, example["t"], example["q"], colour, example["predicted_q"]))
     for trace in traces.get("torques", ()):
         measured, predicted = numbers(trace["measured"]), numbers(trace["predicted"][MODEL])
         error = np.abs(measured - predicted) / np.maximum(measured.std(axis=0), 1e-9)
+        name = f"torque {trace['which']}"
         label = f"residual torque, {trace['which']} trajectory ({trace['trajectory']})"
-        motions.append(_motion(f"torque {trace['which']}", label, trace, error))
+        motions.append(Motion(name, label, trace["t"], trace["q"], _colour(error)))
     return motions
 
 
-def _motion(name: str, label: str, trace: Record, error: np.ndarray) -> dict[str, Any]:
-    """Return a motion for the script; error: (T, n), relative to the motion or to the torque."""
+def _colour(error: np.ndarray) -> list[list[float | None]]:
+    """Return errors, (T, n), relative to the motion or to the torque, by the one of the worst colour."""
     rows = (error / TUNING.worst_error).round(3).astype(object)
     rows[~np.isfinite(error)] = None  # JSON has no NaN
-    return {"name": name, "told": label, "t": trace["t"], "q": trace["q"], "error": rows.tolist()}
+    colours: list[list[float | None]] = rows.tolist()
+    return colours
 
 
-def _sweep(arm: Arm) -> dict[str, Any]:
+def _sweep(arm: Arm) -> Motion:
     """Return a motion of every joint through part of its range, at its own pace."""
     t = np.linspace(0, 12, 121)
     q = np.zeros((len(t), len(arm.coordinates)))
@@ -163,7 +158,7 @@ def _sweep(arm: Arm) -> dict[str, Any]:
         low, high = _range(coordinate)
         q[:, k] = (low + high) / 2 + 0.4 * (high - low) * np.sin(2 * np.pi * t / 12 * (1 + k % 3) + k)
     label = "a motion through the joints' ranges"
-    return {"name": "sweep", "told": label, "t": t.round(3).tolist(), "q": q.round(4).tolist()}
+    return Motion("sweep", label, t.round(3).tolist(), q.round(4).tolist())
 
 
 def _range(coordinate: Coordinate) -> tuple[float, float]:

@@ -7,15 +7,17 @@ tell values from pixels stands in `data-` attributes.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
-from markupsafe import Markup
 
 from spelgen.settings.tuning.render import TUNING
+from spelgen.templates import render
 
 Values = Sequence[float] | np.ndarray
+_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 @dataclass(frozen=True)
@@ -30,55 +32,6 @@ class Margins:
 
 
 MARGINS = Margins()
-
-
-@dataclass(frozen=True, eq=False)
-class Line:
-    """One curve: x and y of equal length, broken where a value is not finite. `style` is its CSS class."""
-
-    label: str
-    x: Values
-    y: Values
-    style: str
-
-
-@dataclass(frozen=True, eq=False)
-class Dots(Line):
-    """Points that nothing connects."""
-
-
-@dataclass(frozen=True, eq=False)
-class Band:
-    """The area between two curves over x."""
-
-    label: str
-    x: Values
-    low: Values
-    high: Values
-    style: str
-
-
-Mark = Line | Band
-
-
-@dataclass(frozen=True)
-class Entry:
-    """A line of a legend: CSS classes of the mark, and its label."""
-
-    style: str
-    label: str
-
-
-@dataclass(frozen=True)
-class Chart:
-    """An SVG element, and the legend of the marks that are visible in it."""
-
-    svg: Markup
-    legend: tuple[Entry, ...]
-
-    def __html__(self) -> str:
-        """Return the element, for templates."""
-        return str(self.svg)
 
 
 @dataclass(frozen=True)
@@ -101,6 +54,11 @@ class Axis:
         pixels: np.ndarray = self.start + fraction * (self.end - self.start)
         return pixels
 
+    def contains(self, values: np.ndarray) -> np.ndarray:
+        """Return which values lie within the axis."""
+        inside: np.ndarray = (values >= self.low) & (values <= self.high)
+        return inside
+
     def ticks(self) -> list[tuple[float, str]]:
         """Return about five round values within the axis, as pixel and label."""
         if self.log:
@@ -113,6 +71,117 @@ class Axis:
     def data(self) -> str:
         """Return first and last pixel, their values and whether it is logarithmic, for a script."""
         return f"{self.start:g} {self.end:g} {self.low:.6g} {self.high:.6g} {int(self.log)}"
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """One curve: x and y of equal length, broken where a value is not finite. `style` is its CSS class."""
+
+    label: str
+    x: Values
+    y: Values
+    style: str
+    kind = "line"
+
+    @property
+    def heights(self) -> tuple[Values, ...]:
+        """Return what the axis of y has to show."""
+        return (self.y,)
+
+    def path(self, x_axis: Axis, y_axis: Axis) -> str:
+        """Return a path in tenths of a pixel, relative steps being shorter."""
+        x, y = _floats(self.x), _floats(self.y)
+        # every so many samples, and the last one, so that the line ends where the data do
+        stride = max(1, math.ceil(len(x) / TUNING.points))
+        rows = np.unique([*range(0, len(x), stride), max(len(x) - 1, 0)])[: len(x)]
+        x, y = x[rows], y[rows]
+        drawable = np.isfinite(x) & np.isfinite(y)
+        if y_axis.log:
+            drawable &= y > 0
+        columns, heights = np.round(10 * x_axis.pixels(x)), np.round(10 * y_axis.pixels(y))
+        steps, pen = [], None
+        for column, height, visible in zip(columns, heights, drawable, strict=True):
+            if not visible:
+                pen = None
+                continue
+            if pen is None:
+                steps.append(f"M{column / 10:g} {height / 10:g}")
+            else:
+                steps.append(f"l{(column - pen[0]) / 10:g} {(height - pen[1]) / 10:g}")
+            pen = column, height
+        return "".join(steps)
+
+
+@dataclass(frozen=True, eq=False)
+class Dots(Line):
+    """Points that nothing connects."""
+
+    kind = "dots"
+
+    def path(self, x_axis: Axis, y_axis: Axis) -> str:
+        """Return lines without length, whose round ends are the dots; those outside are left out."""
+        x, y = _floats(self.x), _floats(self.y)
+        inside = x_axis.contains(x) & y_axis.contains(y)
+        dots = []
+        for column, height in zip(x_axis.pixels(x[inside]), y_axis.pixels(y[inside]), strict=True):
+            dots.append(f"M{column:.1f} {height:.1f}h0")
+        return "".join(dots)
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """The area between two curves over x."""
+
+    label: str
+    x: Values
+    low: Values
+    high: Values
+    style: str
+    kind = "band"
+
+    @property
+    def heights(self) -> tuple[Values, ...]:
+        """Return what the axis of y has to show."""
+        return self.low, self.high
+
+    def path(self, x_axis: Axis, y_axis: Axis) -> str:
+        """Return the outline up to the first value that is not finite; what exceeds the axis ends at its edge."""
+        x, low = _floats(self.x), _floats(self.low)
+        # a prediction that left all bounds has no upper end, but still a lower one
+        high = np.nan_to_num(_floats(self.high), nan=y_axis.high, posinf=y_axis.high)
+        finite = np.isfinite(x) & np.isfinite(low)
+        count = len(x) if finite.all() else int(np.argmin(finite))
+        columns = x_axis.pixels(x[:count])
+        # along the lower curve, and back along the upper one
+        columns = np.concatenate([columns, columns[::-1]])
+        heights = np.concatenate([y_axis.pixels(low[:count]), y_axis.pixels(high[:count])[::-1]])
+        corners = []
+        for column, height in zip(columns, heights, strict=True):
+            corners.append(f"{column:.1f},{height:.1f}")
+        return f"M{' '.join(corners)}Z"
+
+
+Mark = Line | Band
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A line of a legend: CSS classes of the mark, and its label."""
+
+    style: str
+    label: str
+
+
+@dataclass(frozen=True)
+class Chart:
+    """An SVG element, and the legend of the marks that are visible in it."""
+
+    svg: str
+    legend: tuple[Entry, ...]
+
+    def __html__(self) -> str:
+        """Return the element, for templates."""
+        return self.svg
 
 
 def line_chart(
@@ -134,63 +203,49 @@ def line_chart(
     in place of its values'; the chart names the lines beyond them. Without an x_label the x axis has no numbers: those
     of the chart below are its own. Without a finite value the chart says so.
     """
-    x_values, y_values = _finite([mark.x for mark in marks], log_x), _finite(_heights(marks), log)
-    if limits is not None:
-        y_values = np.array(limits)
-    attributes = {"class": "chart", "viewBox": f"0 0 {width} {height}", "role": "img", "aria-label": title}
+    size = {"title": title, "width": width, "height": height}
+    x_values = _finite([mark.x for mark in marks], log_x)
+    y_values = np.array(limits)
+    if limits is None:
+        y_values = _finite(chain.from_iterable(mark.heights for mark in marks), log)
     if not x_values.size or not y_values.size:
-        empty = {"x": width / 2, "y": height / 2, "text-anchor": "middle"}
-        return Chart(element("svg", attributes, element("text", empty, "no finite values to show")), ())
+        return Chart(render("chart.html.jinja", **size, x=None), ())
     bottom = height - (MARGINS.bottom if x_label else MARGINS.bare)
     x_axis = _axis(x_values, MARGINS.start, width - MARGINS.end, pad=0.0, log=log_x)
     # SVG counts pixels downwards: the axis of y starts at the bottom
     y_axis = _axis(y_values, bottom, MARGINS.top, pad=0.0 if limits else 0.06, log=log)
-    attributes |= {"data-x": x_axis.data(), "data-y": y_axis.data()}
-    if motion:
-        attributes["data-motion"] = motion
-    elements = [_frame(x_axis, y_axis, x_label, y_label)]
-    entries, beyond = [], []
-    # lines are drawn last, above all bands and dots
-    for mark in sorted(marks, key=lambda mark: type(mark) is Line):
-        elements.append(_drawn(mark, x_axis, y_axis))
+    drawn, legend, beyond = [], [], []
     for mark in marks:
-        heights = _finite(_heights([mark]), log)
-        if ((heights >= y_axis.low) & (heights <= y_axis.high)).any():
-            entries.append(Entry(f"{_kind(mark)} {mark.style}", mark.label))
-        if type(mark) is Line and ((heights < y_axis.low) | (heights > y_axis.high)).any():
+        entry = Entry(f"{mark.kind} {mark.style}", mark.label)
+        drawn.append((entry, mark.path(x_axis, y_axis)))
+        inside = y_axis.contains(_finite(mark.heights, log))
+        if inside.any():
+            legend.append(entry)
+        if mark.kind == "line" and not inside.all():
             beyond.append(mark.label)
-    if beyond:
-        text = f"partly outside: {', '.join(beyond)}"
-        elements.append(_text(width - MARGINS.end, 14, "end", text, {"class": "label"}))
-    return Chart(element("svg", attributes, Markup("").join(elements)), tuple(entries))
-
-
-def element(tag: str, attributes: Mapping[str, object], content: str = "") -> Markup:
-    """Return an XML element; attributes, and content that is no markup, are escaped."""
-    words = Markup("")
-    for name, value in attributes.items():
-        words += Markup(' {}="{}"').format(name, value)
-    return Markup("<{0}{1}>{2}</{0}>").format(tag, words, content)
-
-
-def _kind(mark: Mark) -> str:
-    return type(mark).__name__.lower()
-
-
-def _heights(marks: Sequence[Mark]) -> list[Values]:
-    heights: list[Values] = []
-    for mark in marks:
-        if isinstance(mark, Band):
-            heights += [mark.low, mark.high]
-        else:
-            heights.append(mark.y)
-    return heights
-
-
-def _finite(columns: Sequence[Values], positive: bool) -> np.ndarray:
-    values: np.ndarray = np.concatenate(
-        [np.zeros(0), *(np.asarray(column, dtype=float) for column in columns)]
+    # lines are drawn last, above all bands and dots
+    drawn.sort(key=lambda mark: mark[0].style.startswith("line"))
+    svg = render(
+        "chart.html.jinja",
+        **size,
+        x=x_axis,
+        y=y_axis,
+        x_label=x_label,
+        y_label=y_label,
+        motion=motion,
+        marks=drawn,
+        beyond=beyond,
     )
+    return Chart(svg, tuple(legend))
+
+
+def _floats(values: Values) -> np.ndarray:
+    return np.asarray(values, dtype=float)
+
+
+def _finite(columns: Iterable[Values], positive: bool) -> np.ndarray:
+    """Return all finite values, or those that a logarithmic axis can show."""
+    values = np.concatenate([np.zeros(0), *map(_floats, columns)])
     values = values[np.isfinite(values)]
     if positive:
         values = values[values > 0]
@@ -229,8 +284,7 @@ def _log_labels(values: Sequence[float]) -> list[str]:
     powers = np.log10(values)
     if not np.allclose(powers, powers.round(), atol=1e-9):
         return [f"{value:.3g}" for value in values]
-    exponent = {"dy": "-5", "class": "power"}
-    return ["10" + element("tspan", exponent, str(round(power))) for power in powers]
+    return [f"10{str(round(power)).translate(_SUPERSCRIPTS)}" for power in powers]
 
 
 def _steps(low: float, high: float) -> tuple[list[float], list[str]]:
@@ -245,77 +299,3 @@ def _steps(low: float, high: float) -> tuple[list[float], list[str]]:
     if decimals > 4 or max(abs(low), abs(high)) >= 1e5:
         return values, [f"{value:.2g}" for value in values]
     return values, [f"{value:.{decimals}f}" for value in values]
-
-
-def _frame(x_axis: Axis, y_axis: Axis, x_label: str, y_label: str) -> Markup:
-    """Return grid, axes and their labels."""
-    start, end, bottom = x_axis.start, x_axis.end, y_axis.start
-    elements = []
-    for y, label in y_axis.ticks():
-        elements.append(element("path", {"class": "grid", "d": f"M{start:.1f} {y:.1f}H{end:.1f}"}))
-        elements.append(_text(start - 7, y + 4, "end", label))
-    elements.append(element("path", {"class": "axis", "d": f"M{start:.1f} {bottom:.1f}H{end:.1f}"}))
-    if x_label:
-        for x, label in x_axis.ticks():
-            elements.append(_text(x, bottom + 16, "middle", label))
-        elements.append(_text((start + end) / 2, bottom + 31, "middle", x_label, {"class": "label"}))
-    # above the frame no number can lie across it
-    elements.append(_text(start, 14, "start", y_label, {"class": "label"}))
-    return Markup("").join(elements)
-
-
-def _text(x: float, y: float, anchor: str, text: str, attributes: Mapping[str, str] | None = None) -> Markup:
-    position = {"x": f"{x:.1f}", "y": f"{y:.1f}", "text-anchor": anchor}
-    return element("text", {**position, **(attributes or {})}, text)
-
-
-def _drawn(mark: Mark, x_axis: Axis, y_axis: Axis) -> Markup:
-    title = element("title", {}, mark.label)
-    if isinstance(mark, Band):
-        return element(
-            "polygon", {"class": f"band {mark.style}", "points": _outline(mark, x_axis, y_axis)}, title
-        )
-    x, y = np.asarray(mark.x, dtype=float), np.asarray(mark.y, dtype=float)
-    if isinstance(mark, Dots):
-        inside = (x >= x_axis.low) & (x <= x_axis.high) & (y >= y_axis.low) & (y <= y_axis.high)
-        points = zip(x_axis.pixels(x[inside]), y_axis.pixels(y[inside]), strict=True)
-        # lines without length, whose round ends are the dots
-        path = "".join(f"M{a:.1f} {b:.1f}h0" for a, b in points)
-        return element("path", {"class": f"dots {mark.style}", "d": path}, title)
-    return element("path", {"class": f"line {mark.style}", "d": _path(x, y, x_axis, y_axis)}, title)
-
-
-def _path(x: np.ndarray, y: np.ndarray, x_axis: Axis, y_axis: Axis) -> str:
-    """Return a path in tenths of a pixel, relative steps being shorter; broken where a value cannot be drawn."""
-    # every so many samples, and the last one, so that the line ends where the data do
-    stride = max(1, math.ceil(len(x) / TUNING.points))
-    rows = np.unique([*range(0, len(x), stride), max(len(x) - 1, 0)])[: len(x)]
-    x, y = x[rows], y[rows]
-    drawable = np.isfinite(x) & np.isfinite(y)
-    if y_axis.log:
-        drawable &= y > 0
-    columns, heights = np.round(10 * x_axis.pixels(x)), np.round(10 * y_axis.pixels(y))
-    steps, pen = [], None
-    for column, height, visible in zip(columns, heights, drawable, strict=True):
-        if not visible:
-            pen = None
-            continue
-        if pen is None:
-            steps.append(f"M{column / 10:g} {height / 10:g}")
-        else:
-            steps.append(f"l{(column - pen[0]) / 10:g} {(height - pen[1]) / 10:g}")
-        pen = column, height
-    return "".join(steps)
-
-
-def _outline(band: Band, x_axis: Axis, y_axis: Axis) -> str:
-    """Return the corners up to the first value that is not finite; what exceeds the axis ends at its edge."""
-    x, low, high = (np.asarray(values, dtype=float) for values in (band.x, band.low, band.high))
-    # a prediction that left all bounds has no upper end, but still a lower one
-    finite = np.isfinite(x) & np.isfinite(low)
-    count = len(x) if finite.all() else int(np.argmin(finite))
-    columns = x_axis.pixels(x[:count])
-    bottom = y_axis.pixels(low[:count])
-    top = y_axis.pixels(np.nan_to_num(high[:count], nan=y_axis.high, posinf=y_axis.high))
-    corners = [*zip(columns, bottom, strict=True), *zip(columns[::-1], top[::-1], strict=True)]
-    return " ".join(f"{a:.1f},{b:.1f}" for a, b in corners)

@@ -15,9 +15,10 @@ from spelgen.comparison.truth import true_mass
 from spelgen.evaluation.tables import Table
 from spelgen.files import write_text
 from spelgen.fitting.run_folder import RunFolder
+from spelgen.labels import named_joints
 from spelgen.render.charts import Chart, Line, Values, line_chart
 from spelgen.render.page import render_page
-from spelgen.render.plots import QUANTITIES, UNITS, Panel, mass_panels, numbers
+from spelgen.render.plots import QUANTITIES, Panel, Row, mass_panels, numbers, stack
 from spelgen.spec import Facts, read_facts
 
 STYLES = ("c1", "c2", "c3", "gravity", "c4", "c5", "c6")
@@ -100,15 +101,15 @@ def _prediction_panels(
 ) -> list[Panel]:
     """Return the first test trajectory of the results: what was measured, and what every variant predicts."""
     measured = next(iter(examples.values()))
+    t = numbers(measured.t)
     panels = []
-    for k, (joint, kind) in enumerate(zip(facts.joints, facts.joint_types, strict=True)):
-        charts = []
-        for (key, quantity), unit in zip(QUANTITIES.items(), UNITS[kind], strict=True):
-            lines = [Line("measured", numbers(measured.t), numbers(getattr(measured, key))[:, k], "truth")]
+    for k, joint in enumerate(named_joints(facts.joints, facts.joint_types)):
+        rows = []
+        for key, quantity in QUANTITIES.items():
+            lines = [Line("measured", t, numbers(getattr(measured, key))[:, k], "truth")]
             for name, example in examples.items():
                 predicted = numbers(getattr(example, f"predicted_{key}"))[:, k]
                 lines.append(Line(name, numbers(example.t), predicted, styles[name]))
-            title = f"{quantity} of {joint}"
-            charts.append(line_chart(lines, title, "t [s]", f"{quantity} [{unit}]", height=170))
-        panels.append(Panel(joint, tuple(charts)))
+            rows.append(Row(lines, f"{quantity} of {joint.name}", joint.axis(quantity), 150))
+        panels.append(stack(joint.name, rows))
     return panels

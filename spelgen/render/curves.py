@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-from spelgen.labels import thousandths
+from spelgen.labels import named_joints, thousandths
 from spelgen.listing import number
 from spelgen.render.charts import Chart
 from spelgen.render.picture import Picture
@@ -38,8 +38,8 @@ class Curves:
     """All that is drawn of an evaluation's traces; None or empty where there is nothing."""
 
     growth: Sequence[Panel] = ()
-    torques: Sequence[Section] = ()
-    trajectories: Sequence[Section] = ()
+    torques: list[Section] = field(default_factory=list)
+    trajectories: list[Section] = field(default_factory=list)
     mass: Sequence[Panel] = ()
     eigenvalues: Chart | None = None
     along: str = ""
@@ -49,38 +49,34 @@ class Curves:
 
 def curves(traces: Record, facts: Facts, picture: Picture) -> Curves:
     """Return all that can be drawn of these traces."""
-    joints, types = facts.joints, facts.joint_types
+    joints = named_joints(facts.joints, facts.joint_types)
     drawn = Curves()
     if traces.get("growth"):
         drawn.growth = growth_charts(traces["growth"])
     torques = traces.get("torques") or []
+    for trace in torques:
+        title = f"{trace['which'].capitalize()} trajectory: {trace['trajectory']}"
+        drawn.torques.append(Section(title, torque_panels(trace, joints)))
     if torques:
-        drawn.torques = [_torques(trace, facts) for trace in torques]
         drawn.energy = energy_chart(torques[0])
-    drawn.trajectories = [_prediction(example, facts) for example in traces.get("trajectories", [])]
+    for example in traces.get("trajectories", []):
+        title = _prediction_title(example, facts)
+        drawn.trajectories.append(Section(title, trajectory_panels(example, joints)))
     mass = traces.get("mass") or {}
     if mass.get("by"):
-        drawn.mass = trace_mass_panels(mass, picture.kinds, types)
+        drawn.mass = trace_mass_panels(mass, picture.kinds, facts.joint_types)
         drawn.eigenvalues = eigenvalue_chart(mass)
         drawn.along = str(mass["trajectory"])
     if traces.get("friction"):
-        drawn.friction = friction_panels(traces["friction"], torques, joints, types)
+        drawn.friction = friction_panels(traces["friction"], torques, joints)
     return drawn
 
 
-def _torques(trace: Record, facts: Facts) -> Section:
-    title = f"{trace['which'].capitalize()} trajectory: {trace['trajectory']}"
-    return Section(title, torque_panels(trace, facts.joints, facts.joint_types))
-
-
-def _prediction(example: Record, facts: Facts) -> Section:
+def _prediction_title(example: Record, facts: Facts) -> str:
     kind, name, error = example["which"].capitalize(), example["trajectory"], example["error"]
-    panels = trajectory_panels(example, facts.joints, facts.joint_types)
     if "u" in example:
-        title = f"{kind} log replayed: {name}, {number(1000 * error)} {thousandths(facts.joint_types)} off"
-        return Section(title, panels)
-    title = f"{kind} prediction: {name}, {example['start']:.3g} s into it, relative error {number(error)}"
-    return Section(title, panels)
+        return f"{kind} log replayed: {name}, {number(1000 * error)} {thousandths(facts.joint_types)} off"
+    return f"{kind} prediction: {name}, {example['start']:.3g} s into it, relative error {number(error)}"
 
 
 def coverage(traces: Record, identified: Record | None, facts: Facts, limits: Limits) -> list[Panel]:
@@ -89,4 +85,4 @@ def coverage(traces: Record, identified: Record | None, facts: Facts, limits: Li
     recorded = {name: covered for name, covered in logs.items() if covered}
     if not recorded:
         return []
-    return coverage_panels(recorded, facts.joints, facts.joint_types, limits)
+    return coverage_panels(recorded, named_joints(facts.joints, facts.joint_types), limits)

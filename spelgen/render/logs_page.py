@@ -8,11 +8,12 @@ import numpy as np
 
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.regressor import regressor, urdf_parameters
+from spelgen.labels import UNITS, NamedJoint
 from spelgen.log_checks.report import LogReport
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
-from spelgen.render.charts import Line, line_chart
+from spelgen.render.charts import Line
 from spelgen.render.page import render_page
-from spelgen.render.plots import FORCE, UNITS, Panel
+from spelgen.render.plots import Panel, Row, stack
 from spelgen.settings.tuning.render import TUNING
 
 
@@ -49,19 +50,13 @@ def charts(log: Trajectory, arm: Arm, inputs: np.ndarray) -> list[Panel]:
             gravity = regressor(arm, q, rest, rest) @ urdf_parameters(arm)  # (T, n)
             quantities["torque"].append(("gravity of the URDF", gravity, "predicted"))
     panels = []
-    for k, joint in enumerate(arm.coordinates):
-        units = dict(zip(("position", "velocity"), UNITS[joint.kind], strict=True)) | {
-            "torque": FORCE[joint.kind]
-        }
-        drawn = []
+    joints = [NamedJoint(joint.name, UNITS[joint.kind]) for joint in arm.coordinates]
+    for k, joint in enumerate(joints):
+        rows = []
         for quantity, columns in quantities.items():
             lines = [Line(label, t, values[:, k], style) for label, values, style in columns]
-            x_label, height = "", 130
-            if quantity == list(quantities)[-1]:  # the time stands below the last chart alone
-                x_label, height = "t [s]", 158
-            title, y_label = f"{quantity} of {joint.name}", f"{quantity} [{units[quantity]}]"
-            drawn.append(line_chart(lines, title, x_label, y_label, height=height))
-        panels.append(Panel(joint.name, tuple(drawn)))
+            rows.append(Row(lines, f"{quantity} of {joint.name}", joint.axis(quantity)))
+        panels.append(stack(joint.name, rows))
     return panels
 
 

@@ -11,11 +11,13 @@ import torch
 from spelgen.dynamics.protocol import has_rigid_bodies, has_servos
 from spelgen.dynamics.regressor import urdf_parameters
 from spelgen.exporting.rigid_body_projection import nearest_friction, sampled_positions
+from spelgen.exporting.urdf_file import about_center
 from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.identification.base_parameters import base_parameters
 from spelgen.identification.friction import FrictionModel
+from spelgen.labels import UNITS, entry_name
 from spelgen.loaded_arm import LoadedArm
-from spelgen.render.plots import FORCE, UNITS, Record, inertia_unit
+from spelgen.render.plots import Record, inertia_unit
 from spelgen.settings.tuning.render import TUNING
 
 if TYPE_CHECKING:
@@ -84,26 +86,29 @@ def base_table(model: EmittedModel | None, arm: LoadedArm, identified: Record) -
     learned = _learned(model, base.combination)
     sure: list[tuple[str, ...]] = []
     unsure: list[tuple[str, ...]] = []
+    head: list[str] = []
     for k, parameter in enumerate(identified["base_parameters"]):
-        of_bodies, value = k < base.bodies, f"{parameter['value']:.4g}"
+        name, of_bodies = parameter["name"], k < base.bodies
+        cells = {"parameter": name, "URDF": ""}
+        if of_bodies and arm.arm.has_inertials:
+            cells["URDF"] = f"{nominal[k]:.4g}"
+        if learned is not None:
+            cells["model"] = ""
+            if of_bodies or name.startswith("armature"):
+                cells["model"] = f"{learned[k]:.4g}"
+        value = f"{parameter['value']:.4g}"
         if parameter["deviation"] is not None:
             value += f" ± {TUNING.interval * parameter['deviation']:.2g}"
-        row = [parameter["name"], f"{nominal[k]:.4g}" if of_bodies and arm.arm.has_inertials else ""]
-        if learned is not None:
-            row.append("")
-            if of_bodies or parameter["name"].startswith("armature"):
-                row[-1] = f"{learned[k]:.4g}"
-        row += [value, parameter["determined"], parameter["formula"].replace(parameter["name"], "", 1)]
-        if parameter["formula"] != parameter["name"]:
-            row[-1] = parameter["formula"]
-        if parameter["determined"] in DETERMINED:
-            sure.append(tuple(row))
-        else:
-            unsure.append(tuple(row))
-    head = ["parameter", "URDF", "least squares, 95 %", "determined", "made of"]
+        cells["least squares, 95 %"] = value
+        cells["determined"] = parameter["determined"]
+        cells["made of"] = ""
+        if parameter["formula"] != name:
+            cells["made of"] = parameter["formula"]
+        head = list(cells)
+        rows = sure if parameter["determined"] in DETERMINED else unsure
+        rows.append(tuple(cells.values()))
     note = "The intervals are those of least squares on the training logs [kg, m, s]"
     if learned is not None:
-        head.insert(2, "model")
         note += (
             "; a value of the model may lie outside its interval because of the prior, or of an effect that least "
             "squares has no column for"
@@ -143,9 +148,9 @@ def _body_table(values: np.ndarray, arm: LoadedArm | None) -> ParameterTable:
     rows = []
     # the URDF below the model, body by body: differences are read down a column
     for k, name in enumerate(names):
-        rows.append((name, "model", *_about_centre(values[k])))
+        rows.append((name, "model", *_about_center(values[k])))
         if nominal is not None:
-            rows.append(("", "URDF", *_about_centre(nominal[k])))
+            rows.append(("", "URDF", *_about_center(nominal[k])))
     return ParameterTable(
         "Masses, centres of mass and inertias",
         ("moves with", "by", "m [kg]", "centre of mass x, y, z [m]", "principal moments about it [kg m²]"),
@@ -155,18 +160,12 @@ def _body_table(values: np.ndarray, arm: LoadedArm | None) -> ParameterTable:
     )
 
 
-def _about_centre(body: np.ndarray) -> tuple[str, str, str]:
+def _about_center(body: np.ndarray) -> tuple[str, str, str]:
     """Return mass, centre of mass and principal moments about it, of ten parameters."""
-    mass = body[0]
-    if mass <= 0:
-        return f"{mass:.4g}", "", ""
-    centre = body[1:4] / mass
-    tensor = np.zeros((3, 3))
-    tensor[np.triu_indices(3)] = body[4:]
-    tensor = np.triu(tensor) + np.triu(tensor, 1).T
-    # Steiner: the parameters are about the joint's frame
-    about = tensor - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
-    return f"{mass:.4g}", _listed(centre), _listed(np.linalg.eigvalsh(about))
+    if body[0] <= 0:
+        return f"{body[0]:.4g}", "", ""
+    mass, center, tensor = about_center(body)
+    return f"{mass:.4g}", _listed(center), _listed(np.linalg.eigvalsh(tensor))
 
 
 def _listed(values: np.ndarray) -> str:
@@ -177,46 +176,34 @@ def _joint_table(model: EmittedModel, arm: LoadedArm | None) -> ParameterTable |
     """Return armature, friction and torque offset of each joint; None of a model without armature."""
     if not hasattr(model, "armature"):
         return None
-    head, columns = ["joint", "armature"], [model.armature.tolist()]
-    units = [tuple(inertia_unit(kind, kind) for kind in model.joint_types)]
-    forces = tuple(FORCE[kind] for kind in model.joint_types)
-    slopes = tuple(f"{FORCE[kind]} s/{UNITS[kind][0]}" for kind in model.joint_types)
-    note, names = "", [f"joint {k + 1}" for k in range(model.n)]
-    if arm is not None:
-        names = [joint.name for joint in arm.arm.coordinates]
-        joints = arm.arm.coordinates
-        if has_rigid_bodies(model):
-            viscous, forward, backward, _ = nearest_friction(arm.arm, model, sampled_positions(arm.arm))
+    rigid = has_rigid_bodies(model)
+    friction = None
+    note = ""
+    if arm is not None and rigid:
+        friction = nearest_friction(arm.arm, model, sampled_positions(arm.arm))
+        note = "Viscous and Coulomb friction are fitted to the model's friction law, as in exports."
+    rows = []
+    for k, kind in enumerate(model.joint_types):
+        units = UNITS[kind]
+        slope = f"{units.torque} s/{units.position}"
+        cells = {"joint": f"joint {k + 1}", "armature": f"{model.armature[k]:.3g} {units.inertia}"}
+        if friction is not None:
+            viscous, forward, backward, _ = friction[:, k]
             # kd of a servo contains its joint's viscous friction
             if not has_servos(model):
-                head.append("viscous")
-                columns.append(viscous)
-                units.append(slopes)
-            head += ["Coulomb, qd > 0", "Coulomb, qd < 0"]
-            columns += [forward, backward]
-            units += [forces, forces]
-            note = "Viscous and Coulomb friction are fitted to the model's friction law, as in exports."
-        head += ["URDF: viscous", "URDF: Coulomb"]
-        columns += [[joint.damping for joint in joints], [joint.friction for joint in joints]]
-        units += [slopes, forces]
-    if has_rigid_bodies(model):
-        head.append("torque offset")
-        columns.append(model.torque_offset.tolist())
-        units.append(forces)
-    rows = []
-    for k, name in enumerate(names):
-        cells = [f"{column[k]:.3g} {unit[k]}" for column, unit in zip(columns, units, strict=True)]
-        rows.append((name, *cells))
-    return ParameterTable("Drives and friction", tuple(head), tuple(rows), note)
-
-
-def constant_basis(mass: Any) -> torch.Tensor:
-    """Return what each constant adds to M, (constants, n, n)."""
-    count = len(mass.raw_constants)
-    functions = torch.zeros(len(getattr(mass, "function_mean", ())), count, dtype=torch.float64)
-    units = torch.eye(count, dtype=torch.float64)
-    basis: torch.Tensor = mass.entries(functions.unbind(), units.unbind())
-    return basis
+                cells["viscous"] = f"{viscous:.3g} {slope}"
+            cells["Coulomb, qd > 0"] = f"{forward:.3g} {units.torque}"
+            cells["Coulomb, qd < 0"] = f"{backward:.3g} {units.torque}"
+        if arm is not None:
+            joint = arm.arm.coordinates[k]
+            cells["joint"] = joint.name
+            cells["URDF: viscous"] = f"{joint.damping:.3g} {slope}"
+            cells["URDF: Coulomb"] = f"{joint.friction:.3g} {units.torque}"
+        if rigid:
+            cells["torque offset"] = f"{model.torque_offset[k]:.3g} {units.torque}"
+        rows.append(cells)
+    head = tuple(rows[0])
+    return ParameterTable("Drives and friction", head, tuple(tuple(cells.values()) for cells in rows), note)
 
 
 def mass_constants(run: RunFolder) -> list[Constant]:
@@ -229,27 +216,30 @@ def mass_constants(run: RunFolder) -> list[Constant]:
     if not hasattr(mass, "constants"):
         return []
     constants = []
-    bases = constant_basis(mass)
-    start: Any = untrained.mass
-    for basis, old, new in zip(bases, start.constants().tolist(), mass.constants().tolist(), strict=True):
-        entries = [(row, column) for row, column in basis.tril().nonzero().tolist()]
-        terms = []
-        for row, column in entries:
-            factor = f"{basis[row, column].item():+.4g}"
-            sign, size = factor[0], factor[1:]
-            entry = f"M{_index(row, column)}"
-            if size != "1":
-                entry = f"{size} {entry}"
-            terms.append(f"{sign} {entry}")
-        row, column = entries[0]
+    values = zip(untrained.mass.constants().tolist(), mass.constants().tolist(), strict=True)
+    for basis, (start, learned) in zip(_constant_basis(mass), values, strict=True):
+        row, column = basis.tril().nonzero()[0].tolist()
         unit = inertia_unit(trained.joint_types[row], trained.joint_types[column])
-        where = " ".join(terms).removeprefix("+ ").replace("- ", "-", terms[0].startswith("-"))
-        constants.append(Constant(where, old, new, unit))
+        constants.append(Constant(_entry_sum(basis), start, learned, unit))
     return constants
 
 
-def _index(row: int, column: int) -> str:
-    """Return `21` for row 1, column 0: the name of an entry of a matrix."""
-    if row < 9:
-        return f"{row + 1}{column + 1}"
-    return f"({row + 1},{column + 1})"
+def _constant_basis(mass: Any) -> torch.Tensor:
+    """Return what each constant adds to M, (constants, n, n)."""
+    count = len(mass.raw_constants)
+    functions = torch.zeros(len(getattr(mass, "function_mean", ())), count, dtype=torch.float64)
+    units = torch.eye(count, dtype=torch.float64)
+    basis: torch.Tensor = mass.entries(functions.unbind(), units.unbind())
+    return basis
+
+
+def _entry_sum(basis: torch.Tensor) -> str:
+    """Return the entries of M's lower triangle with their factors: ``M21 - 0.5 M31``."""
+    text = ""
+    for row, column in basis.tril().nonzero().tolist():
+        factor = f"{basis[row, column].item():+.4g}"
+        text += f" {factor[0]} {factor[1:]} {entry_name(row, column)}"
+    text = text.replace(" 1 ", " ").removeprefix(" + ")
+    if text.startswith(" - "):
+        return f"-{text[3:]}"
+    return text

@@ -18,8 +18,8 @@ from spelgen.baselines.names import (
     URDF_WITH_DRIVES,
     observed,
 )
-from spelgen.labels import entry_name
-from spelgen.render.charts import Band, Chart, Dots, Line, Mark, Values, line_chart
+from spelgen.labels import UNITS, NamedJoint, entry_name
+from spelgen.render.charts import MARGINS, Band, Chart, Dots, Line, Mark, Values, line_chart
 from spelgen.settings.tuning.render import TUNING
 
 Record = Mapping[str, Any]
@@ -27,9 +27,6 @@ Record = Mapping[str, Any]
 Limits = Sequence[tuple[float, float] | None]
 """Lowest and highest position of each joint; None: it has no limits."""
 
-UNITS = {"revolute": ("rad", "rad/s"), "prismatic": ("m", "m/s")}
-FORCE = {"revolute": "Nm", "prismatic": "N"}
-INERTIA_UNITS = {"revolute revolute": "kg m²", "prismatic prismatic": "kg"}
 QUANTITIES = {"q": "position", "qd": "velocity"}
 STYLES = {
     MODEL: "model",
@@ -55,6 +52,27 @@ class Panel:
     charts: tuple[Chart, ...]
 
 
+@dataclass(frozen=True)
+class Row:
+    """A chart of a stack over one time; height: without the numbers of its time [pixels]."""
+
+    lines: Sequence[Line]
+    title: str
+    label: str
+    height: int = 130
+
+
+def stack(name: str, rows: Sequence[Row], motion: str = "") -> Panel:
+    """Return charts above one another; the numbers of the time stand below the last one alone."""
+    charts = []
+    for number, row in enumerate(rows, start=1):
+        time, height = "", row.height
+        if number == len(rows):
+            time, height = "t [s]", row.height + MARGINS.bottom - MARGINS.bare
+        charts.append(line_chart(row.lines, row.title, time, row.label, motion=motion, height=height))
+    return Panel(name, tuple(charts))
+
+
 def style(predictor: str) -> str:
     """Return the CSS class of a predictor's lines."""
     return STYLES.get(predictor, "c6")
@@ -62,7 +80,9 @@ def style(predictor: str) -> str:
 
 def inertia_unit(a: str, b: str) -> str:
     """Return the unit of the entry of M between joints of these types."""
-    return INERTIA_UNITS.get(f"{a} {b}", "kg m")
+    if a == b:
+        return UNITS[a].inertia
+    return "kg m"
 
 
 def numbers(values: object) -> np.ndarray:
@@ -84,23 +104,34 @@ def loss_chart(metrics: Sequence[Record], best_epoch: int) -> Chart:
     return line_chart(lines, "Loss by epoch", "epoch", "loss", log=True, width=560, height=240)
 
 
-def growth_panels(
-    curves: Mapping[str, Mapping[str, tuple[Sequence[float], Record]]],
-    styles: Mapping[str, str],
-    banded: Sequence[str],
-) -> list[Panel]:
-    """Return errors against the horizon [s], relative and of the tip: medians, and of the banded names 10 to 90 %.
+@dataclass(frozen=True)
+class Growth:
+    """The errors of a predictor or of a run at horizons [s]: by measure low, median and high ones.
 
-    curves: by measure and name the horizons, and low, median and high error at each.
+    banded: whether the range from low to high is drawn, 10 to 90 %.
     """
+
+    name: str
+    style: str
+    banded: bool
+    seconds: Sequence[float]
+    errors: Mapping[str, Record]
+
+
+def growth_panels(growths: Sequence[Growth]) -> list[Panel]:
+    """Return errors against the horizon, relative and of the tip."""
     panels = []
     for measure, (title, label) in ERRORS.items():
         marks: list[Mark] = []
-        for name, (seconds, error) in curves.get(measure, {}).items():
-            marks.append(Line(name, seconds, numbers(error["median"]), styles[name]))
-            if name in banded:
+        errors: dict[str, Record] = {}
+        for growth in growths:
+            if measure not in growth.errors:
+                continue
+            error = errors[growth.name] = growth.errors[measure]
+            marks.append(Line(growth.name, growth.seconds, numbers(error["median"]), growth.style))
+            if growth.banded:
                 low, high = numbers(error["low"]), numbers(error["high"])
-                marks.append(Band(f"{name}, 10 to 90 %", seconds, low, high, styles[name]))
+                marks.append(Band(f"{growth.name}, 10 to 90 %", growth.seconds, low, high, growth.style))
         if marks:
             chart = line_chart(
                 marks,
@@ -109,7 +140,7 @@ def growth_panels(
                 label,
                 log=True,
                 log_x=True,
-                limits=_error_limits(curves[measure]),
+                limits=_error_limits(errors),
                 width=520,
                 height=260,
             )
@@ -119,20 +150,22 @@ def growth_panels(
 
 def growth_charts(growth: Record) -> list[Panel]:
     """Return how the errors of all predictors grow with the horizon, with bands of the model and of least squares."""
-    curves = {}
-    for measure in ERRORS:
-        curves[measure] = {name: (growth["seconds"], error) for name, error in growth[measure].items()}
-    styles = {name: style(name) for name in {**growth["relative"], **growth["tip_mm"]}}
-    return growth_panels(curves, styles, (MODEL, LEAST_SQUARES))  # bands of all would hide one another
+    growths = []
+    for name in {**growth["relative"], **growth["tip_mm"]}:
+        errors = {measure: growth[measure][name] for measure in ERRORS if name in growth[measure]}
+        # bands of all would hide one another
+        banded = name in (MODEL, LEAST_SQUARES)
+        growths.append(Growth(name, style(name), banded, growth["seconds"], errors))
+    return growth_panels(growths)
 
 
-def _error_limits(errors: Mapping[str, tuple[Sequence[float], Record]]) -> tuple[float, float] | None:
+def _error_limits(errors: Mapping[str, Record]) -> tuple[float, float] | None:
     """Return limits of medians and the model's band, baselines that are hopeless cut off; None without a model."""
     # pages of several runs have no baselines, and so nothing to cut off
     if MODEL not in errors:
         return None
-    model_errors = _positive([errors[MODEL][1][key] for key in ("low", "high")])
-    medians = _positive([error["median"] for _, error in errors.values()])
+    model_errors = _positive([errors[MODEL]["low"], errors[MODEL]["high"]])
+    medians = _positive([error["median"] for error in errors.values()])
     if not model_errors.size or not medians.size:
         return None
     high = max(model_errors.max(), medians[medians < TUNING.outlier * model_errors.max()].max(initial=0.0))
@@ -145,57 +178,51 @@ def _positive(columns: Sequence[object]) -> np.ndarray:
     return positive
 
 
-def torque_panels(trace: Record, joints: Sequence[str], joint_types: Sequence[str]) -> list[Panel]:
+def torque_panels(trace: Record, joints: Sequence[NamedJoint]) -> list[Panel]:
     """Return by joint measured and predicted torque, the residual, and the components of the prediction."""
-    t, measured, motion = trace["t"], numbers(trace["measured"]), f"torque {trace['which']}"
-    predicted = numbers(trace["predicted"][MODEL])
-    components = {name: numbers(trace["parts"][name]) for name in COMPONENTS}
+    t, measured, predicted = trace["t"], numbers(trace["measured"]), numbers(trace["predicted"][MODEL])
     panels = []
-    for k, (joint, kind) in enumerate(zip(joints, joint_types, strict=True)):
-        unit = FORCE[kind]
+    for k, joint in enumerate(joints):
+        unit = joint.units.torque
         torques = [
             Line("measured", t, measured[:, k], "truth"),
             Line("predicted", t, predicted[:, k], "predicted"),
         ]
-        residual = [Line("residual", t, measured[:, k] - predicted[:, k], "model")]
-        lines = [Line(name, t, torque[:, k], name.lower()) for name, torque in components.items()]
-        charts = (
-            line_chart(torques, f"Torque of {joint}", "", f"torque [{unit}]", motion=motion, height=160),
-            line_chart(residual, f"Residual of {joint}", "", f"residual [{unit}]", motion=motion, height=100),
-            line_chart(
-                lines, f"Components of the torque of {joint}", "t [s]", f"components [{unit}]", motion=motion
-            ),
-        )
-        panels.append(Panel(joint, charts))
+        residual = Line("residual", t, measured[:, k] - predicted[:, k], "model")
+        components = []
+        for name in COMPONENTS:
+            components.append(Line(name, t, numbers(trace["parts"][name])[:, k], name.lower()))
+        rows = [
+            Row(torques, f"Torque of {joint.name}", f"torque [{unit}]", 160),
+            Row([residual], f"Residual of {joint.name}", f"residual [{unit}]", 100),
+            Row(components, f"Components of the torque of {joint.name}", f"components [{unit}]", 162),
+        ]
+        panels.append(stack(joint.name, rows, f"torque {trace['which']}"))
     return panels
 
 
-def trajectory_panels(example: Record, joints: Sequence[str], joint_types: Sequence[str]) -> list[Panel]:
+def trajectory_panels(example: Record, joints: Sequence[NamedJoint]) -> list[Panel]:
     """Return by joint position and, where it is known, velocity: measured, predicted and, of servos, commanded, each
     above the difference of the first two.
     """
-    t, motion = example["t"], f"prediction {example['which']}"
-    keys = [key for key in QUANTITIES if key in example]
+    t = example["t"]
     panels = []
-    for k, (joint, kind) in enumerate(zip(joints, joint_types, strict=True)):
-        charts = []
-        for key, unit in zip(keys, UNITS[kind], strict=False):
-            quantity = QUANTITIES[key]
+    for k, joint in enumerate(joints):
+        rows = []
+        for key, quantity in QUANTITIES.items():
+            if key not in example:
+                continue
             measured, predicted = numbers(example[key])[:, k], numbers(example[f"predicted_{key}"])[:, k]
             lines = [Line("measured", t, measured, "truth"), Line("predicted", t, predicted, "predicted")]
             if "u" in example:
                 lines.insert(0, Line("commanded", t, numbers(example["u"])[:, k], "hold"))
-            error = [Line("error", t, predicted - measured, "model")]
-            title, label, height = f"{quantity} of {joint}", "", 100
-            if key == keys[-1]:  # the time stands below the last chart alone
-                label, height = "t [s]", 128
-            charts.append(line_chart(lines, title, "", f"{quantity} [{unit}]", motion=motion, height=130))
-            charts.append(
-                line_chart(
-                    error, f"Error of the {title}", label, f"error [{unit}]", motion=motion, height=height
-                )
+            title = f"{quantity} of {joint.name}"
+            error = Line("error", t, predicted - measured, "model")
+            rows.append(Row(lines, title, joint.axis(quantity)))
+            rows.append(
+                Row([error], f"Error of the {title}", joint.axis(quantity).replace(quantity, "error"), 100)
             )
-        panels.append(Panel(joint, tuple(charts)))
+        panels.append(stack(joint.name, rows, f"prediction {example['which']}"))
     return panels
 
 
@@ -240,16 +267,14 @@ def eigenvalue_chart(mass: Record) -> Chart:
     return line_chart(lines, "Eigenvalues of M", "t [s]", "eigenvalue of M", log=True, width=520, height=230)
 
 
-def friction_panels(
-    friction: Record, torques: Sequence[Record], joints: Sequence[str], joint_types: Sequence[str]
-) -> list[Panel]:
+def friction_panels(friction: Record, torques: Sequence[Record], joints: Sequence[NamedJoint]) -> list[Panel]:
     """Return by joint friction by velocity, and the loops that measured motion makes of it, measured and by the model.
 
     Measured friction is the torque less that of the model's rigid bodies. A model whose friction has no state makes no
     loop but for load.
     """
     panels = []
-    for k, (joint, kind) in enumerate(zip(joints, joint_types, strict=True)):
+    for k, joint in enumerate(joints):
         dots = friction["measured"][k]
         marks: list[Mark] = [Dots("measured", numbers(dots["qd"]), numbers(dots["torque"]), "truth")]
         # one trajectory is enough: loops of two would cover each other
@@ -264,13 +289,13 @@ def friction_panels(
         model = friction["by"].get(MODEL)
         chart = line_chart(
             marks,
-            f"Friction of {joint}",
-            f"velocity [{UNITS[kind][1]}]",
-            f"friction [{FORCE[kind]}]",
+            f"Friction of {joint.name}",
+            joint.axis("velocity"),
+            f"friction [{joint.units.torque}]",
             limits=_friction_limits(numbers(dots["torque"]), numbers(model[k]) if model else np.zeros(1)),
             height=220,
         )
-        panels.append(Panel(joint, (chart,)))
+        panels.append(Panel(joint.name, (chart,)))
     return panels
 
 
@@ -287,13 +312,13 @@ def _friction_limits(measured: np.ndarray, curve: np.ndarray) -> tuple[float, fl
 
 
 def coverage_panels(
-    by_logs: Mapping[str, Record], joints: Sequence[str], joint_types: Sequence[str], limits: Limits
+    by_logs: Mapping[str, Record], joints: Sequence[NamedJoint], limits: Limits
 ) -> list[Panel]:
     """Return by joint how often positions and velocities occur in the logs named; the joint's limits are marked."""
     panels = []
-    for k, (joint, kind) in enumerate(zip(joints, joint_types, strict=True)):
+    for k, joint in enumerate(joints):
         charts = []
-        for (key, quantity), unit in zip(QUANTITIES.items(), UNITS[kind], strict=True):
+        for key, quantity in QUANTITIES.items():
             bands = [_histogram(name, logs[key][k]) for name, logs in by_logs.items()]
             marks: list[Mark] = list(bands)
             bounds = limits[k]
@@ -305,14 +330,14 @@ def coverage_panels(
             charts.append(
                 line_chart(
                     marks,
-                    f"{quantity} of {joint}",
-                    f"{quantity} [{unit}]",
+                    f"{quantity} of {joint.name}",
+                    joint.axis(quantity),
                     "fraction of samples",
                     width=300,
                     height=130,
                 )
             )
-        panels.append(Panel(joint, tuple(charts)))
+        panels.append(Panel(joint.name, tuple(charts)))
     return panels
 
 

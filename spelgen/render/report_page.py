@@ -17,14 +17,14 @@ from spelgen.evaluation.verdict import Verdict, verdict
 from spelgen.files import write_json, write_text
 from spelgen.fitting.objectives import fit_summary
 from spelgen.fitting.run_folder import RunFolder, trained_model
-from spelgen.labels import entry_name
+from spelgen.labels import UNITS, entry_name
 from spelgen.loaded_arm import LoadedArm
 from spelgen.render.arm_section import LETTERS, Cell, arm_section, matrix
 from spelgen.render.curves import coverage, curves
 from spelgen.render.page import render_page
 from spelgen.render.parameters import body_parameters, mass_constants, parameter_tables
 from spelgen.render.picture import Picture, read_picture
-from spelgen.render.plots import FORCE, UNITS, Limits, Record
+from spelgen.render.plots import Limits, Record
 from spelgen.render.reproduction import commands, files
 from spelgen.render.run_facts import head_numbers, training_facts
 from spelgen.spec import Facts, read_facts
@@ -167,7 +167,6 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
         cells=_cells(run.arm, facts, picture),
         arm=arm,
         units=UNITS,
-        force=FORCE,
         numbers=head_numbers(run.model, config, run.metrics, evaluation),
         verdict=run.verdict,
         config=run.config,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,16 +13,18 @@ from spelgen.evaluation.tables import Table, table
 from spelgen.evaluation.verdict import verdict
 from spelgen.files import write_text
 from spelgen.fitting.run_folder import RunFolder
-from spelgen.labels import listed, thousandths
+from spelgen.labels import listed, named_joints, thousandths
 from spelgen.listing import number
 from spelgen.render.page import render_page
-from spelgen.render.plots import ERRORS, FORCE, Panel, Record, growth_panels
+from spelgen.render.plots import ERRORS, Growth, Panel, Record, growth_panels
 from spelgen.spec import Facts, read_facts
 
 MEASURES = {
     "mean_relative_rms": "Error relative to the motion",
     "tip_mm": "Error of the tip's position [mm]",
 }
+Errors = dict[str, float | None]
+"""By the names of runs."""
 STYLES = ("model", "train", "gravity", "coriolis", "friction", "hold")
 
 
@@ -38,19 +40,20 @@ class EvaluatedRun:
     verdict: str
     evaluation: Record
 
+    def names(self, kind: str) -> list[str]:
+        """Return the names of the horizons, or of the replays, that the run was judged over."""
+        return [judged["name"] for judged in self.evaluation.get(kind, ())]
+
     def errors(self, kind: str, name: str) -> Record:
         """Return the model's errors over a horizon or a replay of this name."""
-        record: Record = next(x["errors"][MODEL] for x in self.evaluation[kind] if x["name"] == name)
-        return record
+        judged: Record = self.evaluation[kind][self.names(kind).index(name)]["errors"][MODEL]
+        return judged
 
-    def torque(self) -> Record | None:
-        """Return the model's errors of torque; None where the logs tell none."""
-        record: Record | None = self.evaluation["torque"].get(MODEL)
-        return record
-
-    def replay_error(self, name: str) -> float:
-        """Return the mean error of positions under the commands of these logs [mrad; mm]."""
-        return 1000 * float(self.errors("replays", name)["mean"])
+    @property
+    def torque(self) -> Record:
+        """Return the model's errors of torque; empty where the logs tell none."""
+        errors: Record = self.evaluation["torque"].get(MODEL, {})
+        return errors
 
 
 def write_runs(folders: Sequence[Path], output: Path) -> Path:
@@ -100,40 +103,28 @@ def _read(folder: Path, name: str, style: str) -> EvaluatedRun:
 
 def _verdict(runs: Sequence[EvaluatedRun]) -> str:
     """Say which run misses least over the longest horizon that all have, which in torque, which under commands."""
-    sentences = []
+    comparisons: list[tuple[str, str, Errors]] = []
     for horizon in _common(runs, "horizons")[-1:]:
-        best = _best(_horizon_errors(runs, horizon, "mean_relative_rms"))
-        if best:
-            sentences.append(
-                f"{best[1]} has the smallest rollout error over {horizon} ({number(best[0])} of the motion)"
-            )
-    best = _best(_torque_errors(runs))
-    if best:
-        sentences.append(f"{best[1]} has the smallest torque error (nMSE {number(best[0])})")
+        errors = _horizon_errors(runs, horizon, "mean_relative_rms")
+        comparisons.append((f"rollout error over {horizon}", "of the motion", errors))
+    comparisons.append(("torque error", "of the variance", _torque_errors(runs)))
     for replay in _common(runs, "replays")[:1]:
-        best = _best(_replay_errors(runs, replay))
-        if best:
-            unit = thousandths(runs[0].facts.joint_types)
-            sentences.append(
-                f"{best[1]} has the smallest error with commands replayed, {replay} ({number(best[0])} {unit})"
-            )
+        unit = thousandths(runs[0].facts.joint_types)
+        comparisons.append((f"error with commands replayed, {replay}", unit, _replay_errors(runs, replay)))
+    sentences = []
+    for quantity, unit, errors in comparisons:
+        finite = [(error, name) for name, error in errors.items() if error is not None]
+        if finite:
+            error, name = min(finite)
+            sentences.append(f"{name} has the smallest {quantity} ({number(error)} {unit})")
     if not sentences:
         return "These runs have no common horizons or logs."
     return f"{listed(sentences)}."
 
 
-def _best(errors: Mapping[str, float | None]) -> tuple[float, str] | None:
-    """Return the smallest error and the name of its run; None where no run has one."""
-    finite = [(error, name) for name, error in errors.items() if error is not None]
-    return min(finite, default=None)
-
-
 def _common(runs: Sequence[EvaluatedRun], kind: str) -> list[str]:
     """Return the names of the horizons, or of the replays, that all runs were judged over."""
-    names = []
-    for run in runs:
-        names.append([x["name"] for x in run.evaluation.get(kind, ())])
-    return _in_all(names)
+    return _in_all([run.names(kind) for run in runs])
 
 
 def _in_all(lists: Sequence[Iterable[str]]) -> list[str]:
@@ -151,43 +142,36 @@ def _tables(runs: Sequence[EvaluatedRun]) -> list[Table]:
         rows = [_horizon_errors(runs, horizon, measure) for horizon in horizons]
         if any(set(row.values()) != {None} for row in rows):  # there is no tip without a URDF
             tables.append(table(title, horizons, rows))
-    tables += _torque_tables(runs)
+    if all(run.torque for run in runs):
+        tables += _torque_tables(runs)
     for replay in _common(runs, "replays"):
         tables.append(_replay_table(runs, replay))
     return tables
 
 
-def _horizon_errors(runs: Sequence[EvaluatedRun], horizon: str, measure: str) -> dict[str, float | None]:
+def _horizon_errors(runs: Sequence[EvaluatedRun], horizon: str, measure: str) -> Errors:
     return {run.name: run.errors("horizons", horizon)[measure] for run in runs}
 
 
-def _torque_errors(runs: Sequence[EvaluatedRun]) -> dict[str, float | None]:
+def _torque_errors(runs: Sequence[EvaluatedRun]) -> Errors:
     """Return the mean nMSE of torques by run, None where its logs tell none."""
-    errors: dict[str, float | None] = {}
-    for run in runs:
-        torque = run.torque()
-        errors[run.name] = None if torque is None else torque["mean_nmse"]
-    return errors
+    return {run.name: run.torque.get("mean_nmse") for run in runs}
 
 
-def _replay_errors(runs: Sequence[EvaluatedRun], replay: str) -> dict[str, float | None]:
-    return {run.name: run.replay_error(replay) for run in runs}
+def _replay_errors(runs: Sequence[EvaluatedRun], replay: str) -> Errors:
+    """Return the mean errors of positions under the commands of these logs [mrad; mm]."""
+    return {run.name: 1000 * run.errors("replays", replay)["mean"] for run in runs}
 
 
 def _torque_tables(runs: Sequence[EvaluatedRun]) -> list[Table]:
     facts = runs[0].facts
-    labels = [f"{joint} [{FORCE[kind]}]" for joint, kind in zip(facts.joints, facts.joint_types, strict=True)]
-    rows: list[dict[str, float | None]] = [{} for _ in labels]
-    same_joints = True
-    for run in runs:
-        torque = run.torque()
-        if torque is None:
-            return []
-        same_joints &= run.facts.joints == facts.joints
-        for row, error in zip(rows, torque["rmse"], strict=False):
-            row[run.name] = error
     tables = [table("Torque error, nMSE", ["mean of all"], [_torque_errors(runs)])]
-    if same_joints:  # joints of other arms have nothing to be compared with
+    # joints of other arms have nothing to be compared with
+    if all(run.facts.joints == facts.joints for run in runs):
+        labels, rows = [], []
+        for k, joint in enumerate(named_joints(facts.joints, facts.joint_types)):
+            labels.append(f"{joint.name} [{joint.units.torque}]")
+            rows.append({run.name: run.torque["rmse"][k] for run in runs})
         tables.append(table("Torque error by joint, RMSE", labels, rows))
     return tables
 
@@ -196,7 +180,7 @@ def _replay_table(runs: Sequence[EvaluatedRun], name: str) -> Table:
     """Return errors of the logs that all runs have replayed, and the mean of each run's own."""
     errors = {run.name: run.errors("replays", name)["trajectories"] for run in runs}
     logs = _in_all(list(errors.values()))
-    rows: list[dict[str, float | None]] = []
+    rows: list[Errors] = []
     for log in logs:
         rows.append({run: 1000 * error[log] for run, error in errors.items()})
     rows.append(_replay_errors(runs, name))
@@ -205,11 +189,14 @@ def _replay_table(runs: Sequence[EvaluatedRun], name: str) -> Table:
 
 
 def _growth(runs: Sequence[EvaluatedRun]) -> list[Panel]:
-    curves: dict[str, dict[str, tuple[Sequence[float], Record]]] = {measure: {} for measure in ERRORS}
+    growths = []
     for run in runs:
         growth = (run.evaluation.get("traces") or {}).get("growth") or {}
-        for measure, by_run in curves.items():
+        errors = {}
+        for measure in ERRORS:
             error = growth.get(measure, {}).get(MODEL)
             if error:
-                by_run[run.name] = growth["seconds"], error
-    return growth_panels(curves, {run.name: run.style for run in runs}, [run.name for run in runs])
+                errors[measure] = error
+        if errors:
+            growths.append(Growth(run.name, run.style, True, growth["seconds"], errors))
+    return growth_panels(growths)

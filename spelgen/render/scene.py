@@ -72,14 +72,6 @@ class SceneLink:
         }
 
 
-@dataclass(frozen=True)
-class View:
-    """What the camera looks at: the middle [m], and pixels per metre."""
-
-    middle: np.ndarray
-    scale: float
-
-
 @dataclass(frozen=True, eq=False)
 class Scene:
     """Links, parents first, and how far the arm reaches [m]. has_meshes: whether the shapes are the file's own."""
@@ -107,24 +99,25 @@ class Scene:
             frames.append((rotation, position))
         return frames
 
-    def triangles(self, q: Sequence[float]) -> np.ndarray:
-        """Return the corners of all triangles at q, (F, 3, 3) [m]."""
-        placed = [np.zeros((0, 3, 3))]
-        for link, (rotation, position) in zip(self.links, self.frames(q), strict=True):
-            vertices = link.shape.vertices @ rotation.T + position
-            placed.append(vertices[link.shape.faces])
-        return np.concatenate(placed)
+    def view(self, poses: Sequence[Sequence[float]]) -> dict[str, object]:
+        """Return how a script shows the arm at all these positions: middle [mm], pixels per metre and ground [mm].
 
-    def view(self, poses: Sequence[Sequence[float]]) -> View:
-        """Return the view that holds the arm at all these positions."""
-        points = np.concatenate([np.zeros((1, 3)), *(self.triangles(q).reshape(-1, 3) for q in poses)])
+        The ground lies below all links, at the root where they stay above it.
+        """
+        points = [np.zeros((1, 3))]
+        ground = 0.0
+        for q in poses:
+            for link, (rotation, position) in zip(self.links, self.frames(q), strict=True):
+                points.append(link.shape.vertices @ rotation.T + position)
+                ground = min(ground, float(position[2]))
         axes = CAMERA.axes()
-        seen = points @ axes.T
+        seen = np.concatenate(points) @ axes.T
         low, high = seen.min(axis=0), seen.max(axis=0)
         across, up, _ = np.maximum(high - low, 1e-6)
+        scale = CAMERA.fill * min(CAMERA.width / across, CAMERA.height / up)
         # the middle of the picture, not of the arm's box: an oblique arm fills the frame too
         middle = (low + high) / 2 @ axes
-        return View(middle, CAMERA.fill * min(CAMERA.width / across, CAMERA.height / up))
+        return {"middle": _mm(middle), "scale": round(scale, 2), "ground": round(1000 * ground, 1)}
 
     def to_dict(self) -> dict[str, object]:
         """Return the scene for a script, in millimetres and short names."""
