@@ -43,6 +43,15 @@ def short_epochs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("spelgen.fitting.window_problem.TUNING", WindowTuning(epoch_steps=4))
 
 
+@pytest.fixture
+def short_torque_fits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fits to torques take two steps a round and few rounds: for tests of what stands around a fit."""
+    from spelgen.settings.tuning.fitting import TorqueTuning
+
+    tuning = TorqueTuning(rounds=1, first_rounds=1, last_rounds=1, longer=1, steps=2)
+    monkeypatch.setattr("spelgen.fitting.torque_fit.TUNING", tuning)
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     """``--update`` writes the golden copies anew."""
     parser.addoption("--update", action="store_true", help="write golden files anew")

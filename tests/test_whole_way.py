@@ -23,7 +23,8 @@ OTHERS = (
     "franka_fr3",
     "iiwa14_drake",
 )
-SHORT = {"trajectories": 2, "duration": 2.4, "sample_rate": 50.0, "test_fraction": 0.5}
+pytestmark = pytest.mark.usefixtures("short_torque_fits")
+SHORT = {"trajectories": 2, "duration": 1.8, "sample_rate": 50.0, "test_fraction": 0.5}
 FEW_STEPS = {"epochs": 1, "momentum_steps": 5}
 
 
@@ -58,7 +59,7 @@ def test_every_robot_here(name, robots, tmp_path, monkeypatch):
     # as it is driven, for a shorter time
     settings.pop("tracking", None)
     driven = "inputs" in settings["simulation"]
-    settings["simulation"] = settings["simulation"] | {"trajectories": 4} if driven else SHORT
+    settings["simulation"] = settings["simulation"] | {"trajectories": 2} if driven else SHORT
     settings["training"] = FEW_STEPS
     whole_way(robots / f"{name}.urdf", tmp_path, settings, monkeypatch, judged=name == "rpr")
 
@@ -73,6 +74,6 @@ def test_a_tip_reaches_every_step(robots, tmp_path, monkeypatch):
     """Not the arm that all commands would choose: its first two joints, as arm.yaml says once."""
     settings = yaml.safe_load((robots / "rpr.yaml").read_text())
     settings |= {"tip": "link2", "training": FEW_STEPS}
-    settings["simulation"]["trajectories"] = 4
+    settings["simulation"]["trajectories"] = 2
     whole_way(robots / "rpr.urdf", tmp_path, settings, monkeypatch)
     assert tuple(read_facts("run/module.py").joints) == ("joint1", "joint2")

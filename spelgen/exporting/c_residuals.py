@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from textwrap import wrap
 
 import numpy as np
+from scipy.interpolate import PPoly
 
 from spelgen.exporting.description import Network, Splines, TrainedModel
 from spelgen.exporting.model_expressions import RESIDUAL
@@ -16,9 +17,6 @@ from spelgen.exporting.residual_expressions import entry_indices, residual_symbo
 from spelgen.templates import render
 
 _WIDTH = 112  # characters of a line
-
-_PIECES = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6
-"""A cubic B-spline's sum on an interval, by powers of s from 0 to 1: of the weights of the four that are not zero."""
 
 _CALLS = (
     (("first", "second"), "mass_jets(q", ("mass", "first", "second")),
@@ -158,15 +156,19 @@ def joint_function_source(model: TrainedModel) -> list[str]:
 
 
 def _pieces(splines: Splines) -> np.ndarray:
-    """Return coefficients by spline, interval and power of s, (splines, S + 3, 4).
+    """Return coefficients by spline, interval and power of s, from 0 to 1 on it, (splines, S + 3, 4).
 
     The intervals begin two spacings before the first middle.
     """
-    # at either end three intervals have fewer than four splines
-    padded = np.pad(splines.weights, ((0, 0), (3, 3)))
-    neighbours = np.lib.stride_tricks.sliding_window_view(padded, 4, axis=1)
-    pieces: np.ndarray = neighbours @ _PIECES.T
-    return pieces
+    # three weights of zero at either end: there the curve comes from zero and goes to it
+    size = splines.weights.shape[1] + 6
+    knots = np.arange(size + 4)
+    pieces = []
+    for weights in splines.weights:
+        curve = PPoly.from_spline((knots, np.pad(weights, 3), 3))
+        # its intervals outside of these have no meaning
+        pieces.append(curve.c[::-1, 3:size].T)
+    return np.array(pieces).reshape(-1, size - 3, 4)
 
 
 def _energies(splines: Splines) -> np.ndarray:

@@ -6,8 +6,6 @@ from collections.abc import Sequence
 
 import casadi as ca
 
-_LARGEST_INTEGER = 1e9  # written without a point
-
 _FORMS = {
     ca.OP_NEG: "-{0}",
     ca.OP_SQ: "{0} * {0}",
@@ -53,17 +51,10 @@ def statements(function: ca.Function, outputs: Sequence[str]) -> tuple[list[str]
         if operation == ca.OP_INPUT:
             value = f"{inputs[reads[0]]}[{reads[1]}]"
         elif operation == ca.OP_CONST:
-            value = _number(function.instruction_constant(k))
+            value = f"R({function.instruction_constant(k)!r})"  # with all its digits
         else:
             value = _FORMS[operation].format(*(f"a{slot}" for slot in reads))
         # a dict keeps the order in which CasADi first writes them
         variables[f"a{writes[0]}"] = None
         lines.append(f"a{writes[0]} = {value};")
     return list(variables), lines
-
-
-def _number(value: float) -> str:
-    """Return a constant with all its digits."""
-    if value == int(value) and abs(value) <= _LARGEST_INTEGER:
-        return f"R({int(value)})"
-    return f"R({value!r})"

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
 _LONGEST_NAME = 40
-_NO_SPLINES = Splines((), np.zeros(0), np.zeros(0), np.zeros((0, 4)))
-_NO_RESIDUALS = Residuals(Encoding(False, np.zeros(0), np.zeros(0)), None, None, _NO_SPLINES, (), _NO_SPLINES)
 
 
 def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
@@ -45,10 +43,10 @@ def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
     tip_link, tip, end = tip_chain(loaded)
     # what does not depend on q is one matrix, whatever it comes from
     constant_mass = array(weights.armature)
-    residuals = _NO_RESIDUALS
+    residuals = _no_residuals()
     if has_residuals(exact):
         constant_mass += array(weights.residual.mass.constant).reshape(exact.n, exact.n)
-        residuals = _residuals(exact, weights)
+        residuals = _residuals(exact)
     return TrainedModel(
         name=identifier(loaded.arm.name),
         robot=loaded.arm.name,
@@ -89,7 +87,7 @@ def array(value: Tensor) -> np.ndarray:
     return values
 
 
-def servos_of(model: Any) -> Servos | None:
+def servos_of(model: EmittedModel) -> Servos | None:
     """Return the position servos of a model, None where it has none."""
     if not has_servos(model):
         return None
@@ -116,20 +114,26 @@ def _bristles(model: Any, weights: Any) -> Bristles | None:
     return Bristles(array(model.friction.bristles.reach), array(weights.friction.bristle_fractions))
 
 
-def _residuals(model: Any, weights: Any) -> Residuals:
+def _no_residuals() -> Residuals:
+    none = Splines((), np.zeros(0), np.zeros(0), np.zeros((0, 4)))
+    return Residuals(Encoding(False, np.zeros(0), np.zeros(0)), None, None, none, (), none)
+
+
+def _residuals(model: EmittedModel) -> Residuals:
     """Return the residuals without those that are zero. Raises RunError for Kolmogorov-Arnold networks."""
     encoding, functions = model.encoding, model.joint_functions
+    weights = model.prepare().residual
     scale = functions.scale.unsqueeze(-1)
-    mass = _network(weights.residual.mass.layers)
+    mass = _network(weights.mass.layers)
     if mass is not None:
-        mass = _tanh_then(mass, array(weights.residual.mass.functions))
+        mass = _tanh_then(mass, array(weights.mass.functions))
     return Residuals(
         encoding=Encoding(encoding.prismatic, array(encoding.center), array(encoding.reach)),
         mass=mass,
-        potential=_network(weights.residual.potential),
-        torque=_splines(functions, scale * functions.raw_torque_splines),
-        ripple=_ripple(functions, scale * functions.revolute * functions.raw_torque_ripple),
-        friction=_splines(functions, functions.friction_logarithms()),
+        potential=_network(weights.potential),
+        torque=_splines(model, scale * functions.raw_torque_splines),
+        ripple=_ripple(model, scale * functions.revolute * functions.raw_torque_ripple),
+        friction=_splines(model, functions.friction_logarithms()),
     )
 
 
@@ -155,7 +159,9 @@ def _tanh_then(network: Network, functions: np.ndarray) -> Network:
     return Network(tuple(weights), tuple(biases))
 
 
-def _splines(functions: Any, weights: Tensor) -> Splines:
+def _splines(model: EmittedModel, weights: Tensor) -> Splines:
+    """Return the sums of splines of the joints that have one."""
+    functions = model.joint_functions
     joints = torch.nonzero(weights.any(dim=1)).flatten().tolist()
     return Splines(
         joints=tuple(joints),
@@ -165,11 +171,11 @@ def _splines(functions: Any, weights: Tensor) -> Splines:
     )
 
 
-def _ripple(functions: Any, weights: Tensor) -> tuple[Harmonics, ...]:
+def _ripple(model: EmittedModel, weights: Tensor) -> tuple[Harmonics, ...]:
     """Return by joint the multiples of a turn, then, where they stand for themselves, those of the motor's turn."""
     ripple: list[Harmonics] = []
     cosines, sines = (array(half) for half in weights.chunk(2, dim=-1))
-    for joint, frequencies in enumerate(array(functions.frequencies)):
+    for joint, frequencies in enumerate(array(model.joint_functions.frequencies)):
         count = len(frequencies)
         # how many follow one another from one on
         regular = int(np.argmin(frequencies == np.arange(1, count + 1))) or count

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from spelgen.arm.arm import Coordinate
-from spelgen.dynamics.protocol import has_friction_state, known_past
 from spelgen.dynamics.tip import TipKinematics, tip_kinematics
 from spelgen.errors import RunError
 from spelgen.exporting.entry_points import ENTRY_POINTS, SERVO_TORQUE
@@ -21,6 +20,15 @@ from spelgen.settings.tuning.exporting import TUNING
 from spelgen.structure.nominal import working_range
 
 _USUAL_SPEED = {"revolute": 1.0, "prismatic": 0.3}  # rad/s, m/s where the URDF names none
+
+_METHODS = {
+    "bias": "nonlinear_effects",
+    "friction": "friction_torque",
+    "friction_step": "memory_after",
+    "friction_memory": "memory",
+    "servo_torque": "servo",
+}
+"""The model's names of entry points, where they are others."""
 
 Values = dict[str, np.ndarray]
 Called = Callable[[str, Values], Mapping[str, np.ndarray]]
@@ -131,96 +139,46 @@ class _Reference:
     def __call__(self, name: str, inputs: Values) -> Values:
         """Return an entry point's outputs, (states, ...), by name."""
         entry = (ENTRY_POINTS | {SERVO_TORQUE.name: SERVO_TORQUE})[name]
-        tensors = [self._tensor(key, inputs[key]) for key in entry.inputs]
-        outputs = getattr(self, name)(*tensors)
-        if isinstance(outputs, Tensor):
-            outputs = (outputs,)
+        tensors: list[Tensor] = []
+        for key in entry.inputs:
+            tensor = torch.from_numpy(inputs[key])
+            if key != "z":
+                tensors.append(tensor)
+            elif self._trained.memory:
+                # joint by joint, as the model has it
+                tensors.append(tensor.unflatten(-1, (self._model.n, -1)))
+        outputs = self._outputs(name, tensors, len(entry.outputs))
         arrays = [output.detach().numpy() for output in outputs]
         return dict(zip(entry.output_names, arrays, strict=True))
 
-    def _tensor(self, name: str, values: np.ndarray) -> Tensor | None:
-        if name != "z":
-            return torch.from_numpy(values)
-        if not values.size:
-            return None
-        return torch.from_numpy(values).reshape(len(values), self._model.n, -1)
+    def _outputs(self, name: str, inputs: list[Tensor], count: int) -> list[Tensor]:
+        if name.endswith("_derivatives"):
+            function = getattr(self._model, name.removesuffix("_derivatives"))
+            return _derivatives(function, inputs, count)
+        if name == "energy":
+            q, qd = inputs
+            kinetic = 0.5 * (self._model.momentum(q, qd) * qd).sum(dim=-1)
+            return [torch.stack([kinetic, self._model.potential_energy(q)], dim=-1)]
+        if name in ("friction_step", "friction_memory"):
+            if not self._trained.memory:
+                return [inputs[0][:, :0]]
+            return [getattr(self._model, _METHODS[name])(*inputs).flatten(-2)]
+        if name in ("tip_pose", "tip_jacobian"):
+            return [getattr(self._tip, name.removeprefix("tip_"))(*inputs)]
+        return [getattr(self._model, _METHODS.get(name, name))(*inputs)]
 
     @cached_property
     def _tip(self) -> TipKinematics:
         return tip_kinematics(self._trained.arm)
 
-    def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None) -> Tensor:
-        return self._model.inverse_dynamics(q, qd, qdd, *known_past(self._model, z))
 
-    def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
-        return self._model.forward_dynamics(q, qd, tau, *known_past(self._model, z))
-
-    def mass_matrix(self, q: Tensor) -> Tensor:
-        return self._model.mass_matrix(q)
-
-    def bias(self, q: Tensor, qd: Tensor) -> Tensor:
-        return self._model.nonlinear_effects(q, qd)
-
-    def gravity(self, q: Tensor) -> Tensor:
-        return self._model.gravity(q)
-
-    def friction(self, q: Tensor, qd: Tensor, z: Tensor | None) -> Tensor:
-        return self._model.friction_torque(q, qd, *known_past(self._model, z))
-
-    def friction_step(self, z: Tensor | None, dq: Tensor) -> Tensor:
-        if z is None:
-            return dq[:, :0]
-        moved: Tensor = self._model.memory_after(z, dq)
-        return moved.flatten(-2)
-
-    def friction_memory(self, qd: Tensor) -> Tensor:
-        if not has_friction_state(self._model):
-            return qd[:, :0]
-        z: Tensor = self._model.memory(qd)
-        return z.flatten(-2)
-
-    def momentum(self, q: Tensor, qd: Tensor) -> Tensor:
-        return self._model.momentum(q, qd)
-
-    def energy(self, q: Tensor, qd: Tensor) -> Tensor:
-        kinetic = 0.5 * (self._model.momentum(q, qd) * qd).sum(dim=-1)
-        return torch.stack([kinetic, self._model.potential_energy(q)], dim=-1)
-
-    def tip_pose(self, q: Tensor) -> Tensor:
-        return self._tip.pose(q)
-
-    def tip_jacobian(self, q: Tensor) -> Tensor:
-        return self._tip.jacobian(q)
-
-    def servo_torque(self, u: Tensor, q: Tensor, qd: Tensor) -> Tensor:
-        torque: Tensor = self._model.servo(u, q, qd)
-        return torque
-
-    def inverse_dynamics_derivatives(
-        self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None
-    ) -> list[Tensor]:
-        return _derivatives(
-            lambda q, qd: self._model.inverse_dynamics(q, qd, qdd, *known_past(self._model, z)), q, qd
-        )
-
-    def forward_dynamics_derivatives(
-        self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None
-    ) -> list[Tensor]:
-        return _derivatives(
-            lambda q, qd, tau: self._model.forward_dynamics(q, qd, tau, *known_past(self._model, z)),
-            q,
-            qd,
-            tau,
-        )
-
-
-def _derivatives(function: Callable[..., Tensor], *inputs: Tensor) -> list[Tensor]:
-    """Return the derivatives by each input, (states, n, n), by automatic differentiation of all states at once.
+def _derivatives(function: Callable[..., Tensor], inputs: list[Tensor], count: int) -> list[Tensor]:
+    """Return the derivatives by the first inputs, (states, n, n), by automatic differentiation of all states at once.
 
     No state has a part in the outputs of another, so that a sum over the states has the derivatives of each.
     """
-    inputs = tuple(x.clone().requires_grad_() for x in inputs)
+    variables = [tensor.clone().requires_grad_() for tensor in inputs[:count]]
     rows = []
-    for output in function(*inputs).sum(dim=0):
-        rows.append(torch.autograd.grad(output, inputs, retain_graph=True, materialize_grads=True))
+    for output in function(*variables, *inputs[count:]).sum(dim=0):
+        rows.append(torch.autograd.grad(output, variables, retain_graph=True, materialize_grads=True))
     return [torch.stack(columns, dim=-2) for columns in zip(*rows, strict=True)]

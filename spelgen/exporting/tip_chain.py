@@ -11,7 +11,6 @@ from spelgen.exporting.description import TipJoint
 from spelgen.loaded_arm import LoadedArm
 
 _ROUNDING = 1e-15  # what cos(pi / 2) leaves of zero
-_Z = np.array([0.0, 0.0, 1.0])
 
 
 def tip_chain(loaded: LoadedArm) -> tuple[str, tuple[TipJoint, ...], np.ndarray]:
@@ -62,8 +61,8 @@ def tip_in_body(loaded: LoadedArm) -> tuple[str, int, np.ndarray]:
 def _locked(joint: TipJoint) -> np.ndarray:
     """Return the motion of a joint that stands at its offset, (4, 4)."""
     if joint.revolute:
-        return _transform(rotation_about(_Z, joint.offset), (0, 0, 0))
-    return _transform(np.eye(3), joint.offset * _Z)
+        return _transform(rotation_about(np.array([0.0, 0.0, 1.0]), joint.offset), (0, 0, 0))
+    return _transform(np.eye(3), (0, 0, joint.offset))
 
 
 def _transform(rotation: object, position: object) -> np.ndarray:

@@ -24,7 +24,7 @@ from spelgen.structure.structure import Structure
 
 LETTERS = {"zero": "0", "constant": "C"}
 KINDS = {"zero": "is always zero", "constant": "is constant"}
-IDENTIFIED = {"alone": 1.0, "in combination": 0.5, "never": 0.0}
+IDENTIFIED = ("never", "in combination", "alone")
 ENTRY = re.compile(r"M\d+(?:,\d+)?")
 
 
@@ -180,8 +180,10 @@ def _unseen(arm: Arm, identified: Record) -> list[float] | None:
     identifiability = identified.get("identifiability")
     if not identifiability:
         return None
-    fractions = [IDENTIFIED.get(x, 0.0) for x in list(identifiability.values())[: 10 * len(arm.bodies)]]
-    unseen = 1 - np.array(fractions).reshape(-1, 10).mean(axis=1)
+    # drives' parameters stand behind those of the bodies, ten each
+    of_bodies = list(identifiability.values())[: 10 * len(arm.bodies)]
+    levels = np.array([IDENTIFIED.index(visibility) for visibility in of_bodies])
+    unseen = 1 - (levels / 2).reshape(-1, 10).mean(axis=1)
     worst = np.zeros(len(arm.coordinates))
     np.maximum.at(worst, [body.coordinate for body in arm.bodies], unseen)
     return list(worst.round(3).tolist())

@@ -245,7 +245,7 @@ def _floats(values: Values) -> np.ndarray:
 
 def _finite(columns: Iterable[Values], positive: bool) -> np.ndarray:
     """Return all finite values, or those that a logarithmic axis can show."""
-    values = np.concatenate([np.zeros(0), *map(_floats, columns)])
+    values: np.ndarray = np.concatenate([np.zeros(0), *map(_floats, columns)])
     values = values[np.isfinite(values)]
     if positive:
         values = values[values > 0]

@@ -13,8 +13,6 @@ from spelgen.render.page import render_page
 if TYPE_CHECKING:
     from spelgen.certificate.formulas import Formulas
 
-_WIDTH = 100  # of the closed forms
-
 
 def page(
     inspection: Inspection,
@@ -30,7 +28,7 @@ def page(
     if closed:  # SymPy is read in only for formulas
         from spelgen.certificate.formula_text import text as written
 
-        text = written(closed, _WIDTH)
+        text = written(closed, width=100)
     return render_page(
         "inspection.html.jinja",
         found=inspection,

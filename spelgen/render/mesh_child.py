@@ -11,7 +11,7 @@ from typing import IO, Any
 
 import numpy as np
 
-MEMORY = 2**30  # bytes
+MEMORY = 1_073_741_824  # bytes
 SECONDS = 8  # of processor time
 LARGEST = 50_000_000  # bytes of a file
 FACES = 2_000_000  # of all files together: more are an archive that unpacks to no end
@@ -46,7 +46,7 @@ def main(paths: list[Path], output: IO[bytes]) -> None:
         resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
     import trimesh
 
-    arrays: dict[str, Any] = {}
+    arrays: dict[str, np.ndarray] = {}
     faces = 0
     for index, path in enumerate(paths):
         kind = path.suffix.lower().lstrip(".")

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from jinja2 import TemplateError
 
@@ -32,7 +32,8 @@ from spelgen.spec import Facts, read_facts
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
-SCHEMA = 1  # of the page as data
+SCHEMA = 1
+"""Of the page as data."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +42,8 @@ class Run:
 
     folder: RunFolder
     facts: Facts
-    config: Mapping[str, Any] | None
-    metrics: list[dict[str, Any]]
+    config: Record | None
+    metrics: Sequence[Record]
     evaluation: Record | None
     identified: Record | None
     arm: LoadedArm | None
@@ -90,10 +91,10 @@ def write_report(
     return write_text(path, render_report(folder, robot))
 
 
-def report_data(folder: Path | str) -> dict[str, Any]:
+def report_data(folder: Path | str) -> Record:
     """Return all that the page shows, for programs: the verdict, the evaluation, least squares, the parameters."""
     run = _read(RunFolder(Path(folder)))
-    data: dict[str, Any] = {"schema": SCHEMA, "verdict": None, "bodies": None}
+    data: dict[str, object] = {"schema": SCHEMA, "verdict": None, "bodies": None}
     if run.verdict is not None:
         data["verdict"] = asdict(run.verdict)
     if run.model is not None:

@@ -15,7 +15,7 @@ from spelgen.settings.fits import CONFIGS
 from spelgen.settings.training import TrainingSettings
 from spelgen.spec import Facts, Options
 
-HASHED = 10**9  # bytes of the largest file whose digest is computed, in some seconds
+HASHED = 1_000_000_000  # bytes of the largest file whose digest is computed, in some seconds
 
 
 @dataclass(frozen=True)
