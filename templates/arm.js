@@ -77,8 +77,10 @@ const arm = (() => {
         const u = [b[0] - a[0], b[1] - a[1], b[2] - a[2]], w = [c[0] - b[0], c[1] - b[1], c[2] - b[2]];
         const n = [u[1] * w[2] - u[2] * w[1], u[2] * w[0] - u[0] * w[2], u[0] * w[1] - u[1] * w[0]];
         const norm = Math.hypot(...n);
-        if (norm === 0 || n[2] <= 0) continue;
-        const shade = Math.max(0, (n[0] * LIGHT[0] + n[1] * LIGHT[1] + n[2] * LIGHT[2]) / norm);
+        // back faces close shells that are open or inside out; through the pale, predicted arm they would show
+        if (norm === 0 || (moving && n[2] <= 0)) continue;
+        const front = n[2] < 0 ? -1 : 1;
+        const shade = Math.max(0, front * (n[0] * LIGHT[0] + n[1] * LIGHT[1] + n[2] * LIGHT[2]) / norm);
         let depth = 0;
         for (const k of face) depth += flat[k][2];
         found.push({ depth: depth / face.length, corners: face.map((k) => flat[k]), colour: paint(link, shade) });

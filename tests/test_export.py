@@ -59,7 +59,7 @@ def test_closed_form_bodies_go_back_exactly(robot, tmp_path):
     mass, load_torque = differences(model, loaded)
     assert mass < 1e-8 * 200
     assert load_torque < 1e-8 * 200
-    assert "bodies: the model's own" in told
+    assert "bodies are those of the model" in told
     assert not [x for x in loaded.robot.diagnostics if x.severity == "warning"]
 
 
@@ -80,7 +80,7 @@ def test_what_stands_beside_bodies_is_told(tmp_path):
     run, model = run_of("two_link", tmp_path, "hybrid", heavier)
     loaded, told = exported(run, tmp_path / "bodies.urdf")
     assert max(differences(model, loaded)) < 1e-8
-    assert "bodies: the model's own" in told
+    assert "bodies are those of the model" in told
     assert "position_factor" not in (tmp_path / "bodies.urdf.friction.yaml").read_text().split("joints:")[1]
     functions = model.joint_functions
     with torch.no_grad():
@@ -88,7 +88,7 @@ def test_what_stands_beside_bodies_is_told(tmp_path):
         functions.raw_torque_ripple[0, 5] = 3.0
         functions.raw_friction_splines += 0.3 * torch.linspace(-1, 1, 34)
     found = export(model, arm=load_arm(ROBOTS / "two_link.urdf"))
-    assert "bodies: its own, without what it has beside them; M differs by" in repr(found)
+    assert "bodies are those of the model without its residual terms; M differs by" in repr(found)
     assert found.urdf.split(b"<dynamics")[0] == (tmp_path / "bodies.urdf").read_bytes().split(b"<dynamics")[0]
     assert found.projection.mass_error > 1e-3
     assert found.projection.gravity_error > 1e-3
@@ -103,7 +103,7 @@ def test_networks_go_back_as_the_nearest_bodies(tmp_path):
     mass, load_torque = differences(model, loaded)
     assert mass > 0.1  # that of an untrained spel is no body's
     assert load_torque < 1e-8
-    assert "bodies: nearest to the model; M differs by" in told
+    assert "bodies are the rigid bodies nearest to the model; M differs by" in told
 
 
 def test_the_models_own_friction_law_lies_beside(tmp_path):
@@ -152,7 +152,7 @@ def test_a_model_in_memory_is_exported_with_its_arm(tmp_path):
     model = build(arm, "closed-form")
     found = export(model, arm=arm)
     assert found.urdf.startswith(b"<?xml")
-    assert "bodies: the model's own" in repr(found)
+    assert "bodies are those of the model" in repr(found)
     assert "Izz2" in found._repr_html_()
     written = [x.name for x in found.write(tmp_path / "arm.urdf")]
     assert written == ["arm.urdf", "arm.yaml", "arm.urdf.friction.yaml", "arm.urdf.README.md"]

@@ -64,13 +64,16 @@ def test_a_joint_that_friction_holds_does_not_creep():
 
 @pytest.mark.parametrize(
     ("preset", "which"),
-    [("hybrid", "its own, without what it has beside them"), ("spel", "nearest to the model")],
+    [
+        ("hybrid", "those of the model without its residual terms"),
+        ("spel", "the rigid bodies nearest to the model"),
+    ],
 )
 def test_what_mujoco_has_no_words_for_is_told(preset, which, tmp_path):
     run = run_folder("two_link", preset, tmp_path)
     told = CliRunner().invoke(app, ["export", str(run.path), "--to", "mjcf", "-o", str(tmp_path / "arm.xml")])
     assert told.exit_code == 0, told.output
-    assert f"bodies: {which}; M differs by" in told.output.replace("\n", " ")
+    assert f"bodies are {which}; M differs by" in told.output.replace("\n", " ")
     assert "by MuJoCo" in told.output
     assert mujoco.MjModel.from_xml_path(str(tmp_path / "arm.xml")).nv == 2
     assert len((tmp_path / "arm.xml.README.md").read_text().splitlines()) == 5

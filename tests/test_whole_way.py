@@ -1,6 +1,8 @@
 """The way of a newcomer, with the defaults of each command: every robot here, and arms of others."""
 
 import json
+import re
+import shlex
 from pathlib import Path
 
 import pytest
@@ -77,3 +79,23 @@ def test_a_tip_reaches_every_step(robots, tmp_path, monkeypatch):
     settings["simulation"]["trajectories"] = 2
     whole_way(robots / "rpr.urdf", tmp_path, settings, monkeypatch)
     assert tuple(read_facts("run/module.py").joints) == ("joint1", "joint2")
+
+
+def test_commands_that_the_readme_shows(robots, tmp_path, monkeypatch):
+    """Its block of use, as it stands there: arm.urdf and two folders of logs are what a reader brings."""
+    settings = yaml.safe_load((robots / "two_link.yaml").read_text())
+    settings |= {"simulation": SHORT, "training": FEW_STEPS}
+    (tmp_path / "arm.urdf").write_bytes((robots / "two_link.urdf").read_bytes())
+    (tmp_path / "arm.yaml").write_text(yaml.safe_dump(settings))
+    monkeypatch.chdir(tmp_path)
+    for folder, seed in (("LOGS", 1), ("TEST_LOGS", 2)):
+        spelgen("simulate", "arm.urdf", "-o", folder, "--seed", seed)
+    readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+    commands = re.findall(r"^    spelgen ([^#\n]+)", readme, re.MULTILINE)
+    assert [shlex.split(command)[0] for command in commands] == [
+        *("excite", "logs", "build", "train", "evaluate", "report", "export")
+    ]
+    for command in commands:
+        spelgen(*shlex.split(command))
+    assert {"motion.csv", "arm.py", "run", "arm_c"} <= {path.name for path in tmp_path.iterdir()}
+    assert Path("run/report.html").exists()

@@ -13,7 +13,7 @@ from spelgen.urdf.robot import Joint, Robot
 
 # names of vendors' grippers: what is behind such a joint is no part of the arm
 _GRIPPER = re.compile(r"gripper|finger|thumb|knuckle|(?:^|[^a-z])jaws?(?:[^a-z]|$)", re.IGNORECASE)
-_CHOOSE = "choose one with --tip LINK or --joints A,B,..."
+_CHOOSE = "choose one with --tip LINK or --joints A,B,..., or write tip or moving_joints into the settings"
 
 
 @dataclass(frozen=True)

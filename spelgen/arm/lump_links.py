@@ -123,14 +123,18 @@ def _lumped_remarks(moved: Sequence[Moved]) -> Iterator[Diagnostic]:
 
 
 def _locked_remarks(following: Mapping[str, Follow], held: Sequence[Joint]) -> Iterator[Diagnostic]:
+    # a humanoid has thirty of them: one remark for all
+    outside = [joint for joint in held if joint.moves and joint.mimic is None]
+    if outside:
+        names = ", ".join(repr(joint.name) for joint in outside)
+        message = f"locked at 0, not part of the chain: {names}"
+        yield Diagnostic("info", "locked-joint", "joints", outside[0].line, message)
     for joint in held:
-        if joint.type == "fixed":
+        if joint.type == "fixed" or joint in outside:
             continue
         followed = following[joint.name]
         if joint.mimic is not None:
             message = f"follows {followed.leader.name!r}: locked at {float(followed.offset):g}"
-        elif joint.moves:
-            message = "not part of the chain: locked at 0"
         else:
             message = f"a {joint.type} joint off the chain: locked at its origin"
         yield _info("locked-joint", joint, message)

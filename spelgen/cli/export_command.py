@@ -18,7 +18,9 @@ def export(
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="FILE|FOLDER", help="Output file or folder.")
     ],
-    to: Annotated[Format, typer.Option(help="Export format.")] = "urdf",
+    to: Annotated[
+        Format | None, typer.Option(help="Export format. Default: by the extension of the output.")
+    ] = None,
     entry: Annotated[
         list[str] | None,
         typer.Option(
@@ -37,9 +39,11 @@ def export(
     onnx, torch: a file for each function.
     """
     from spelgen.exporting.export import export as export_run
-    from spelgen.exporting.exported import require_fitting
+    from spelgen.exporting.exported import format_by_extension, require_fitting
     from spelgen.fitting.fitted import load_run
 
+    if to is None:
+        to = format_by_extension(output)
     require_fitting(to, output)
     options.require_free(output, force=force)
     result = export_run(load_run(run, trust=trust), to, entries=entry or ())

@@ -94,7 +94,7 @@ def verdict(results: Results, identified: Mapping[str, Any] | None = None, limit
         else:
             because.append(f"{detail[0].upper()}{detail[1:]}.")
     because += [
-        f"It {listed(uses.proofs)}.",
+        f"The model {listed(uses.proofs)}.",
         _constant_velocity(results),
         worst.proof,
         _better_baselines(results),

@@ -90,6 +90,14 @@ class Exported:
         return f"<Exported {self.robot!r} to {self.to}: {'; '.join(self.summary)}>"
 
 
+def format_by_extension(path: Path) -> str:
+    """Return the format whose files have this extension. Raises RunError where there is none."""
+    for name, exporter in EXPORTERS.items():
+        if exporter.suffix and exporter.suffix == path.suffix:
+            return name
+    raise RunError(f"the name {path.name!r}", expected="FILE.urdf, FILE.xml or --to FORMAT")
+
+
 def require_fitting(to: str, path: Path) -> None:
     """Raise RunError for a path whose extension contradicts the format."""
     expected = None

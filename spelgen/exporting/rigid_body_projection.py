@@ -64,16 +64,18 @@ class RigidBodyProjection:
     @property
     def summary(self) -> tuple[str, str]:
         """How near bodies and friction are to the model's, a sentence each."""
-        bodies = "bodies: the model's own"
+        bodies = "bodies are those of the model"
         if not self.own or self.mass_error or self.gravity_error:
-            which = "nearest to the model"
+            which = "the rigid bodies nearest to the model"
             if self.own:
-                which = "its own, without what it has beside them"
+                which = "those of the model without its residual terms"
             errors = f"M differs by {self.mass_error:.1%}, gravity by {self.gravity_error:.1%}"
-            bodies = f"bodies: {which}; {errors}"
-        joints = zip(self.arm.arm.coordinates, self.friction_error, strict=True)
-        missed = ", ".join(f"{joint.name} {error:.0%}" for joint, error in joints)
-        return bodies, f"friction as viscous + Coulomb, which misses of the model's: {missed}"
+            bodies = f"bodies are {which}; {errors}"
+        worst = int(np.argmax(self.friction_error))
+        joint = self.arm.arm.coordinates[worst]
+        friction = "friction is written as viscous and Coulomb friction"
+        error = f"it differs from the model's by up to {self.friction_error[worst]:.0%} ({joint.name})"
+        return bodies, f"{friction}; {error}"
 
 
 def rigid_body_projection(model: EmittedModel, arm: LoadedArm) -> RigidBodyProjection:

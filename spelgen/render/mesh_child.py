@@ -53,6 +53,8 @@ def main(paths: list[Path], output: IO[bytes]) -> None:
         content = io.BytesIO(read(path))
         neighbours: Any = Neighbours(path.parent)
         mesh: Any = trimesh.load(content, file_type=kind, resolver=neighbours, force="mesh")
+        # files give each triangle or patch corners of its own: apart, they would tear when they are simplified
+        mesh.merge_vertices(merge_tex=True, merge_norm=True)
         faces += len(mesh.faces)
         if not len(mesh.faces) or faces > FACES or not np.isfinite(mesh.vertices).all():
             raise ValueError(f"{path}: none or too many triangles, or corners that are no numbers")

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 
 from spelgen.errors import Diagnostic, SettingsError, collect
 from spelgen.settings.comparison import ComparisonSettings
@@ -62,6 +62,13 @@ class Settings(Group):
     training: TrainingSettings = TrainingSettings()
     comparison: ComparisonSettings = ComparisonSettings()
     logs: LogMapping = LogMapping()
+
+    @field_validator("joints", mode="before")
+    @classmethod
+    def _by_name(cls, joints: object) -> object:
+        if isinstance(joints, list):
+            raise ValueError("settings by the name of a joint; `moving_joints` lists the joints that move")
+        return joints
 
     @model_validator(mode="after")
     def _drives(self) -> Settings:
