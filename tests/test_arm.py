@@ -110,7 +110,8 @@ class TestChain:
                 {},
                 "FILE: got 2 chains of 1 joints: one to the link '1' (a ... a) and one to the link '2' "
                 "(b ... b), "
-                "expected one longest chain; choose one with --tip LINK or --joints A,B,..., or write tip or moving_joints into the settings",
+                "expected one longest chain; choose one with --tip LINK or --joints A,B,..., "
+                "or write tip or moving_joints into the settings",
             ),
             ({"joints": ["aa"]}, "FILE: no joint is named 'aa'; did you mean 'a'?"),
             (
