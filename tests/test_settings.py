@@ -123,7 +123,11 @@ def test_settings_do_not_change(urdf):
             "first, then the highest",
         ),
         ("joints:\n  2: {}", "arm.yaml:2: joints.2: got 2, expected a name; write it in quotes"),
-        ("joints: [a]", "arm.yaml:1: joints: got ['a'], expected keys with values"),
+        (
+            "joints: [a]",
+            "arm.yaml:1: joints: got ['a'], expected settings by the name of a joint; "
+            "`moving_joints` lists the joints that move",
+        ),
         ("joints:\n  a: 5", "arm.yaml:2: joints.a: got 5, expected keys with values"),
         ("42", "arm.yaml:1: got 42, expected keys with values"),
         (

@@ -73,7 +73,7 @@ def find_effort_above(joint: JointEvidence) -> str | None:
 
 
 def _above(name: str, value: float, limit: float | None, unit: str) -> str | None:
-    if not limit or value <= limit * (1 + TUNING.limit_rounding):
+    if not limit or value <= limit * (1 + TUNING.limit_noise):
         return None
     return f"{name} up to {value:.4g} {unit}, the limit is {limit:.4g}"
 

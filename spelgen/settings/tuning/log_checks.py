@@ -13,7 +13,8 @@ class LogCheckTuning:
     drift: float = 0.05  # [rad, m] that qd must say a joint moved, before a constant q is called frozen
     agreement: float = 0.9  # correlation from which two signals are one; their factor may differ by the rest
     unit_factor: float = 1.25  # a factor this near to that of a unit is that of the unit
-    limit_rounding: float = 0.01  # [rad, m, of a limit] a limit overrun by less is noise or an offset
+    limit_rounding: float = 1e-3  # [rad, m] a position limit overrun by less is rounding
+    limit_noise: float = 0.01  # of a velocity or effort limit: overrun by less is noise of the signal
     loaded: float = 0.2  # deviation of gravity's torque, of the torque's: from here it must be seen (UR10e)
     seen: float = 0.7  # correlation from which on gravity is in the torque; below what lacks to 1 it is not
     unusual_factor: float = 5.0  # times the URDF's gravity torque: inertials are wrong, but not like this
