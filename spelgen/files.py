@@ -15,7 +15,7 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from spelgen.errors import SpelgenError
 
@@ -50,6 +50,17 @@ def read_bytes(
         reason = getattr(problem, "strerror", None) or str(problem)
         raise error(f"cannot be read ({reason})", file=path) from None
     raise error(f"a file of {size} bytes", file=path, expected=f"at most {largest}", do=do)
+
+
+def read_json(path: Path, error: type[SpelgenError]) -> dict[str, Any]:
+    """Return the object in a JSON file. Raises ``error`` where it is absent, broken or another value."""
+    try:
+        content = json.loads(read_bytes(path, error))
+    except (ValueError, RecursionError) as problem:
+        raise error(f"broken JSON ({problem})", file=path) from problem
+    if not isinstance(content, dict):
+        raise error(f"{type(content).__name__} in JSON", file=path, expected="an object")
+    return content
 
 
 @contextmanager

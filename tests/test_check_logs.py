@@ -331,6 +331,22 @@ def test_torques_that_cannot_be_are_refused_unless_accepted(loaded, log, case):
     require_sound_logs([replace(wrong, accepted=(code,))], loaded, accepting)
 
 
+@pytest.mark.parametrize("rate", [20, 200])
+def test_negated_torques_of_an_arm_without_gravity_are_refused(robots, rate):
+    """M11 of two_link became a tenth of what it is, at 20 Hz, where no accelerations can be filtered."""
+    flat = load_arm(robots / "two_link.urdf")
+    t = np.arange(0.0, 20.0, 1.0 / rate)
+    q = np.stack([np.sin(1.3 * t), np.cos(2 * t) + 0.3 * np.sin(0.7 * t)], axis=1)
+    qd = np.gradient(q, t, axis=0)
+    torque = regressor(flat.arm, q, qd, np.gradient(qd, t, axis=0)) @ urdf_parameters(flat.arm)
+    right = Trajectory(t, q, qd, torque + 0.3 * qd, "motion")
+    assert check_logs([right], flat).errors == ()
+    # a drive that compensates more than its friction is no drive of the opposite sign
+    assert check_logs([replace(right, tau=torque - 0.3 * qd)], flat).errors == ()
+    (error,) = check_logs([replace(right, tau=-right.tau)], flat).errors
+    assert "act against acceleration" in str(error) and "--accept torque-sense" in str(error)
+
+
 def test_times_in_milliseconds_are_refused(loaded, log):
     with pytest.raises(SpelgenError) as caught:
         require_sound_logs([replace(log, t=1000 * log.t)], loaded)

@@ -1,6 +1,7 @@
 """Logs and options as strangers send them: an answer, or one error that is ours; no warning of NumPy, no waiting."""
 
 import io
+import os
 import re
 import resource
 import struct
@@ -17,8 +18,9 @@ import pytest
 import torch
 
 from spelgen.building import build
+from spelgen.comparison.results import RunResult
 from spelgen.emission.loading import load_module
-from spelgen.errors import LogError, SettingsError, SpelgenError
+from spelgen.errors import LogError, RunError, SettingsError, SpelgenError
 from spelgen.exporting.exported import readme
 from spelgen.fitting.fit import fit
 from spelgen.loaded_arm import load_arm
@@ -106,6 +108,23 @@ def test_logs_that_are_none_are_told_in_our_words(tmp_path, arm, case):
     with pytest.raises(LogError, match=message) as caught:
         check_logs(read_logs(make(tmp_path), arm), arm)
     assert len(str(caught.value)) < 5000
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"{", "broken JSON"), (b"\xff", "broken JSON"), (b"[" * 100_000, "broken JSON"), (b"[]", "list in JSON"),
+        (b"{}", "other values than a result has"), (None, "no regular file"),
+    ],
+)  # fmt: skip
+def test_results_of_a_comparison_that_are_none_are_refused(tmp_path, content, message):
+    path = tmp_path / "result.json"
+    if content is None:
+        os.mkfifo(path)
+    else:
+        path.write_bytes(content)
+    with pytest.raises(RunError, match=message):
+        RunResult.read(path)
 
 
 @pytest.mark.filterwarnings("error")

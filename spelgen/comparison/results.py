@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from spelgen.comparison.metrics import Prediction, Sizes
+from spelgen.errors import RunError
 from spelgen.evaluation.invariants import Invariants
 from spelgen.evaluation.plain import Rows, Series
-from spelgen.files import write_json
+from spelgen.files import read_json, write_json
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,10 @@ class RunResult:
 
     @classmethod
     def read(cls, path: Path) -> RunResult:
-        """Read what `save` wrote."""
-        from pydantic import TypeAdapter  # slow to import
+        """Read what `save` wrote. Raises RunError."""
+        from pydantic import TypeAdapter, ValidationError  # slow to import
 
-        return TypeAdapter(cls).validate_python(json.loads(path.read_text(encoding="utf-8")))
+        try:
+            return TypeAdapter(cls).validate_python(read_json(path, RunError))
+        except ValidationError as error:
+            raise RunError("other values than a result has", file=path, do="remove it") from error

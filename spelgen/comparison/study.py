@@ -20,7 +20,7 @@ from spelgen.comparison.known_urdf import with_wrong_inertials, without_inertial
 from spelgen.comparison.results import RunResult
 from spelgen.design import Design, Net, Preset, load_design
 from spelgen.errors import RunError, SettingsError
-from spelgen.files import write_json, write_text
+from spelgen.files import read_json, write_json, write_text
 from spelgen.fitting.window_problem import TUNING
 from spelgen.loaded_arm import LoadedArm, load_arm
 from spelgen.logs.preprocessing import Preprocessing
@@ -229,7 +229,7 @@ def _is_same_study(folder: Path, description: dict[str, object]) -> bool:
     path = folder / "study.json"
     if not path.exists():
         return False
-    if json.loads(path.read_text(encoding="utf-8")) != json.loads(json.dumps(description)):
+    if read_json(path, RunError) != json.loads(json.dumps(description)):
         raise RunError(
             "a comparison with other settings", file=path, do="--force begins anew, -o names another folder"
         )

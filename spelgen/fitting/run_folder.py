@@ -15,7 +15,16 @@ import torch
 
 from spelgen.emission.loading import has_run, load_module
 from spelgen.errors import RunError
-from spelgen.files import local, naming, read_bytes, remove, require_regular_file, sent, write_bytes
+from spelgen.files import (
+    local,
+    naming,
+    read_bytes,
+    read_json,
+    remove,
+    require_regular_file,
+    sent,
+    write_bytes,
+)
 from spelgen.fitting.run_record import Checkpoint, Content, Epoch, require, require_record
 from spelgen.spec import read_source
 from spelgen.urdf.document import urdf_bytes
@@ -157,13 +166,7 @@ class RunFolder:
             raise RunError(
                 "no such run", file=self.path, expected=f"a folder with {path.name}", do="spelgen train"
             )
-        try:
-            found = json.loads(_text(path))
-        except (ValueError, RecursionError) as error:
-            raise RunError(f"broken JSON ({error})", file=path) from error
-        if not isinstance(found, dict):
-            raise RunError(f"{type(found).__name__} in JSON", file=path, expected="an object")
-        return found
+        return read_json(path, RunError)
 
     def read_config(self) -> Content:
         """What config.json says. Raises RunError when it is absent, broken, or lacks what every run has."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,9 +12,10 @@ import torch
 
 from spelgen.baselines.keep import keep_baseline
 from spelgen.dynamics.protocol import has_rigid_bodies
+from spelgen.errors import RunError
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.evaluation.subject import read_test_logs
-from spelgen.files import write_json, write_text
+from spelgen.files import read_bytes, read_json, write_json, write_text
 from spelgen.fitting.fit import RunOptions
 from spelgen.fitting.fitted import load_run
 from spelgen.fitting.objectives import default_config
@@ -75,7 +75,7 @@ class Job(Group):
         """Return a digest of all that the result follows from."""
         design = self.design
         if Path(design).suffix:
-            design = Path(design).read_text(encoding="utf-8")
+            design = read_bytes(Path(design), RunError).decode("utf-8", "replace")
         # where files lie does not change a result; `data` is the digest of what is in them
         content = self.model_dump_json(exclude={"folder", "train", "test"}, exclude_unset=True)
         return hashlib.sha256(f"{__version__} {design} {content}".encode()).hexdigest()[:16]
@@ -85,10 +85,8 @@ class Job(Group):
         path = self.folder / "result.json"
         if not path.is_file():
             return None
-        result: RunResult = json.loads(path.read_text(encoding="utf-8"))
-        if result.get("key") != self.key:
-            return None
-        return result
+        result = read_json(path, RunError)
+        return result if result.get("key") == self.key else None
 
 
 def run_job(job: Job) -> RunResult:
@@ -138,7 +136,7 @@ def run_job(job: Job) -> RunResult:
 def _remove_foreign_run(job: Job, run: RunFolder) -> None:
     """Take away the run of another job, one with other settings for example."""
     owner = job.folder / "job.json"
-    if owner.is_file() and json.loads(owner.read_text(encoding="utf-8")) == {"key": job.key}:
+    if owner.is_file() and read_json(owner, RunError) == {"key": job.key}:
         return
     run.config.unlink(missing_ok=True)  # without it the folder is no run
     write_json(owner, {"key": job.key})

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from spelgen.errors import LogError, SpelgenError, collect
-from spelgen.files import write_json
+from spelgen.errors import LogError, RunError, SpelgenError, collect
+from spelgen.files import read_json, write_json
 from spelgen.fleet.schema import FleetRobot
 from spelgen.loaded_arm import LoadedArm, load_arm
 from spelgen.logs.chunks import large_files
@@ -71,7 +71,7 @@ def prepare(preparation: Preparation) -> PreparedArm:
     ]
     # written last: a folder without it holds logs that were cut off
     record = folder / "prepared.json"
-    if not record.exists() or json.loads(record.read_text(encoding="utf-8")) != {"key": key}:
+    if not record.exists() or read_json(record, RunError) != {"key": key}:
         record.unlink(missing_ok=True)
         for split_paths, split in zip(paths, _splits(robot, arm, mapping, splits, element), strict=True):
             for path, trajectories in zip(split_paths, split, strict=True):

@@ -32,9 +32,8 @@ if TYPE_CHECKING:
 
 TUNING = DriveHintTuning()
 FRICTION = FrictionModel(coulomb_smoothing_velocity=IdentificationTuning().moving)
-RATIOS = (1.0, -1.0, 0.4, -0.4, 2.5, -2.5)  # that begin the search: each covers half of it to twice
-DISSIPATIVE = [FRICTION.effects.index(name) for name in ("viscous", "coulomb")]
 NEGLIGIBLE = IdentificationTuning().negligible
+RATIOS = (1.0, -1.0, 0.4, -0.4, 2.5, -2.5)  # that begin the search: each covers half of it to twice
 
 LoggedAt = Literal["joints", "motors"]
 
@@ -169,33 +168,8 @@ def find_wrong_torques(problem: DriveProblem, joints: Sequence[str]) -> list[Wro
         if _is_sure(logged.mean(axis=1), changed.mean(axis=1), TUNING.wrong_gain, len(changes)):
             code = "torque-sense" if k == other else "torque-order"
             results.append((float(changed.mean()), WrongTorque(k, code, got)))
-    if results:
-        return [min(results, key=lambda result: result[0])[1]]
-    return _against_motion(problem)
-
-
-def _against_motion(problem: DriveProblem) -> list[WrongTorque]:
-    """Return the joints with friction where it drives each of them on: all torques may have the other sign together.
-
-    A joint alone may be driven on by a drive that compensates friction after its torque was measured.
-    """
-    rows, tau, speed = problem.rows, problem.tau, problem.samples.qd
-    unit = np.where(_varies(tau), tau.std(axis=0), 1.0)
-    flat = (rows / unit[:, None]).reshape(-1, rows.shape[2])
-    parameters = np.linalg.lstsq(flat, (tau / unit).ravel(), rcond=NEGLIGIBLE)[0]
-    results = []
-    for k in range(tau.shape[1]):
-        own = np.flatnonzero((problem.drive_of == k) & np.isin(problem.effect_of, DISSIPATIVE))
-        friction = rows[:, k, own] @ parameters[own]
-        size = float(np.sqrt(np.square(friction).mean()))
-        power = float((friction * speed[:, k]).mean()) / max(size * float(speed[:, k].std()), NEGLIGIBLE)
-        if size <= TUNING.opposed * unit[k]:
-            continue
-        if power >= -TUNING.opposed:
-            return []
-        got = f"friction that drives the joint on (correlation of friction and velocity {power:.2g})"
-        results.append(WrongTorque(k, "torque-sense", got))
-    return results
+    # of several changes the best is told
+    return [result for _, result in sorted(results, key=lambda result: result[0])[:1]]
 
 
 def find_torque_delay(problem: DriveProblem) -> tuple[float, float] | None:

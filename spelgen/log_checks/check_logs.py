@@ -13,7 +13,13 @@ from spelgen.errors import Diagnostic, LogError, SpelgenError, collect
 from spelgen.identification.drive_hints import DriveProblem, drive_hints, drive_problem, find_wrong_torques
 from spelgen.identification.drive_samples import DriveLog
 from spelgen.log_checks.check_servo_logs import check_servo_logs
-from spelgen.log_checks.gravity import GravityFit, StateSamples, fit_gravity, state_samples
+from spelgen.log_checks.gravity import (
+    GravityFit,
+    StateSamples,
+    find_opposed_inertia,
+    fit_gravity,
+    state_samples,
+)
 from spelgen.log_checks.report import JointReport, LogReport, range_fraction
 from spelgen.log_checks.robot_checks import CHECKS, JointEvidence
 from spelgen.log_checks.statistics import Statistics, common_step, statistics
@@ -85,6 +91,10 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping |
     problem = drive_problem(arm, drives)
     is_odd = any(note.code == "velocity-is-no-derivative" for note in notes)
     # beside wrong velocities friction is wrong too, and of wrong torques hints about drives would be wrong
+    if not errors and not is_odd:
+        opposed = find_opposed_inertia(arm.arm, samples, arm.actuation.drives().speeds)
+        if opposed is not None and SENSE.code not in accepted:
+            errors.append(SENSE.error(opposed, "tau"))
     if problem is not None and not errors and not is_odd:
         errors += _wrong_torques(problem, joints, accepted)
         if not errors:

@@ -1,4 +1,4 @@
-"""Tell whether the logged torque moves with gravity: joint by joint, with motion and friction taken out."""
+"""Tell whether logged torques move with gravity, joint by joint, and whether all together act against inertia."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from scipy.linalg import orth
 
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.regressor import regressor, urdf_parameters
+from spelgen.identification.base_parameters import base_parameters
+from spelgen.identification.friction import FrictionModel
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.settings.tuning.log_checks import LogCheckTuning
 
@@ -61,14 +63,10 @@ def state_samples(trajectory: Trajectory, inputs: np.ndarray) -> StateSamples:
 
 def fit_gravity(arm: Arm, samples: Sequence[StateSamples]) -> list[GravityFit]:
     """Return by joint what gravity explains of the torques of these samples."""
-    q, qd, qdd, tau = (
-        np.concatenate([getattr(x, name) for x in samples]) for name in ("q", "qd", "qdd", "tau")
-    )
+    q, qd, qdd, tau = _thinned(samples)
     # fewer cannot tell gravity from friction
     if len(q) < TUNING.gravity_samples / 4:
         return [GravityFit()] * q.shape[1]
-    stride = -(-len(q) // MOST)
-    q, qd, qdd, tau = (x[::stride] for x in (q, qd, qdd, tau))
     still = np.zeros_like(q)
     rows = regressor(arm, q, still, still)  # (S, n, 10 B)
     has_inertials = any(body.inertia for body in arm.bodies)
@@ -81,6 +79,44 @@ def fit_gravity(arm: Arm, samples: Sequence[StateSamples]) -> list[GravityFit]:
         motion = np.stack([np.ones(len(q)), speed, coulomb, qdd[:, joint]], axis=1)
         fits.append(_fit(tau[:, joint], motion, rows[:, joint], None if load is None else load[:, joint]))
     return fits
+
+
+def find_opposed_inertia(arm: Arm, samples: Sequence[StateSamples], speeds: np.ndarray) -> str | None:
+    """Find torques that all have the opposite sign: by least squares the mass matrix then is negative.
+
+    speeds: C, (n, n), of the motors. Friction does not tell: a drive may compensate it after its torque was measured.
+    """
+    friction = FrictionModel(coulomb_smoothing_velocity=COULOMB_VELOCITY)
+    columns = base_parameters(arm, friction, speeds).columns
+    q, qd, qdd, tau = _thinned(samples)
+    unit = tau.std(axis=0)
+    if len(q) < TUNING.gravity_samples / 4 or not unit.all():
+        return None
+
+    def rows(accelerations: np.ndarray) -> np.ndarray:
+        bodies = regressor(arm, q, qd, accelerations)
+        drives = friction.columns(qd, accelerations, None, speeds)
+        return np.concatenate([bodies, drives], axis=2)[..., columns]
+
+    moving = rows(qdd)
+    flat = (moving / unit[:, None]).reshape(-1, len(columns))
+    parameters = np.linalg.lstsq(flat, (tau / unit).ravel(), rcond=DEPENDENT)[0]
+    inertia = (moving - rows(np.zeros_like(qdd))) @ parameters
+    if not (inertia.std(axis=0) > TUNING.loaded * unit).any():
+        return None
+    product = (inertia * qdd).sum(axis=1)  # qdd^T M qdd
+    if product.sum() >= -TUNING.opposed * np.abs(product).sum():
+        return None
+    return "torques of all joints that act against acceleration"
+
+
+def _thinned(samples: Sequence[StateSamples]) -> list[np.ndarray]:
+    """Return q, qd, qdd and tau of all trajectories together, each (S, n)."""
+    signals = []
+    for name in ("q", "qd", "qdd", "tau"):
+        values = np.concatenate([getattr(x, name) for x in samples])
+        signals.append(values[:: -(-len(values) // MOST) or 1])
+    return signals
 
 
 def _fit(tau: np.ndarray, motion: np.ndarray, columns: np.ndarray, load: np.ndarray | None) -> GravityFit:

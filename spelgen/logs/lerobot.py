@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
 from spelgen.errors import LogError
-from spelgen.files import read_bytes, require_regular_file
+from spelgen.files import read_json, require_regular_file
 from spelgen.logs.parquet_files import read_parquet
 from spelgen.logs.tables import LogFormat, LogTable
 from spelgen.settings.log_mapping import JointLog, LogMapping
@@ -61,7 +60,7 @@ def dataset_mapping(folder: Path, joints: Sequence[str], mapping: LogMapping) ->
 def _motor_names(folder: Path, feature: str) -> list[str]:
     """Return the motors' names of a feature, without LeRobot's ending."""
     try:
-        info = json.loads(read_bytes(folder / INFO, LogError))
+        info = read_json(folder / INFO, LogError)
         groups = info["features"][feature]["names"]
         if not isinstance(groups, dict):
             groups = {"motors": groups or []}  # LeRobot writes a list, or a group of lists
@@ -69,7 +68,7 @@ def _motor_names(folder: Path, feature: str) -> list[str]:
         for names in groups.values():
             motors += [str(name).removesuffix(ENDING) for name in names]
         return motors
-    except (ValueError, KeyError, TypeError, AttributeError, OSError, RecursionError) as error:
+    except (KeyError, TypeError, AttributeError) as error:
         raise LogError(
             f"no names of {feature} ({type(error).__name__})", file=folder / INFO,
             expected='"features", with the motors\' "names", as LeRobot 3 writes them',

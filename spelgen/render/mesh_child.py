@@ -11,6 +11,9 @@ from typing import IO, Any
 
 import numpy as np
 
+from spelgen.errors import SpelgenError
+from spelgen.files import read_bytes
+
 MEMORY = 1_073_741_824  # bytes
 SECONDS = 8  # of processor time
 LARGEST = 50_000_000  # bytes of a file
@@ -24,17 +27,10 @@ class Neighbours:
         self._folder = folder
 
     def get(self, name: str) -> bytes:
-        """Return what a file holds. Raises ValueError."""
-        return read(self._folder / Path(name.strip()).name)
+        """Return what a file holds. Raises SpelgenError."""
+        return read_bytes(self._folder / Path(name.strip()).name, SpelgenError, largest=LARGEST)
 
     __getitem__ = get
-
-
-def read(path: Path) -> bytes:
-    """Return what a regular file holds. Raises ValueError: a pipe may never end."""
-    if not path.is_file() or path.stat().st_size > LARGEST:
-        raise ValueError(f"{path}: no regular file of at most {LARGEST} bytes")
-    return path.read_bytes()
 
 
 def main(paths: list[Path], output: IO[bytes]) -> None:
@@ -50,7 +46,7 @@ def main(paths: list[Path], output: IO[bytes]) -> None:
     faces = 0
     for index, path in enumerate(paths):
         kind = path.suffix.lower().lstrip(".")
-        content = io.BytesIO(read(path))
+        content = io.BytesIO(read_bytes(path, SpelgenError, largest=LARGEST))
         neighbours: Any = Neighbours(path.parent)
         mesh: Any = trimesh.load(content, file_type=kind, resolver=neighbours, force="mesh")
         # files give each triangle or patch corners of its own: apart, they would tear when they are simplified

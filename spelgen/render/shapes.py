@@ -119,7 +119,7 @@ def _read_meshes(files: Mapping[str, Path]) -> dict[str, Trimesh]:
 
     if not files:
         return {}
-    command = [sys.executable, "-P", mesh_child.__file__, *map(str, files.values())]
+    command = [sys.executable, "-P", "-m", mesh_child.__name__, *map(str, files.values())]
     # a file may say that it is a thousand times as large as it is, or name one that never ends
     run = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=60, check=True)
     arrays = np.load(io.BytesIO(run.stdout))

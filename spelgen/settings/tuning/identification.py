@@ -37,8 +37,5 @@ class DriveHintTuning:
     wrong_gain: float = (
         0.25  # likewise of a swapped or negated torque; recorded arms lose a factor of 4 by either
     )
-    opposed: float = (
-        0.25  # of a torque's deviation, of 1: friction this large that drives a joint on is no friction
-    )
     chance: float = 1 / 400  # that any candidate is taken by luck, as of what enters a fit
     simple_ratio: float = 0.02  # of the squared error, what a ratio of small numbers may cost
