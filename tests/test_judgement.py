@@ -51,6 +51,25 @@ def test_what_the_samples_of_one_stretch_say_is_judged_on_others(hybrid):
     assert select_residuals(hybrid, samples(missing, q), 1.0) == []
 
 
+def test_neighbours_of_what_is_held_out_are_not_fitted_to(hybrid):
+    """As above, but each constant lasts over the border of two tenths: the half on one side tells of the other."""
+    levels = torch.randn(11, 1, generator=torch.Generator().manual_seed(3)).double()
+    missing = levels.repeat_interleave(200, dim=0)[100:2100] * torch.tensor([[1.0, 0.0]]).double()
+    q = torch.stack([torch.linspace(-2, 2, 2000), torch.zeros(2000)], dim=1).double()
+    assert select_residuals(hybrid, samples(missing, q), 20.0) == []
+
+
+def test_what_the_first_half_shows_has_to_hold_in_the_last(hybrid):
+    """All tenths gain by the mean of both halves; the last loses by what the first half shows."""
+    t = torch.linspace(0, 200, 4000).double()
+    q = torch.stack([torch.sin(t), torch.zeros_like(t)], dim=1)
+    missing = torch.stack([torch.sin(q[:, 0]), torch.zeros_like(t)], dim=1)
+    for later, selected in ((0.45, 0), (0.75, 1)):
+        missing[2000:] = later * torch.sin(q[2000:])
+        found = select_residuals(hybrid, samples(missing, q), 1.0)
+        assert len(found) == selected
+
+
 def test_a_gain_in_one_of_ten_stretches_is_luck(hybrid):
     t = torch.linspace(0, 200, 4000).double()
     q = torch.stack([torch.sin(t), torch.zeros_like(t)], dim=1)

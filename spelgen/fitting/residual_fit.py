@@ -1,16 +1,19 @@
 """What stands beside rigid bodies, fitted to the torque that they miss: selected by cross-validation.
 
-Each part is fitted without every tenth of the samples in turn and judged on that tenth: it is selected where the tenths
-as a whole gain, beyond luck. Functions of one joint are linear in their weights, which are found with their scale by
-maximising the marginal likelihood (MacKay, Neural Computation 4:415, 1992); networks of several joints are found by
-L-BFGS from a normal distribution of their weights.
+A function of one joint is fitted without each tenth of the samples in turn, and without a gap beside it, since errors
+of neighbours are alike. It is selected where the tenths as a whole gain, beyond luck, and where the last half of the
+samples gains by it, too, after a fit of it and of those before it to the first half: one motion often repeats what
+another does not. Networks of several joints are judged on the last half alone. Functions are linear in their weights,
+which are found with their scale by maximising the marginal likelihood (MacKay, Neural Computation 4:415, 1992);
+networks are found by L-BFGS from a normal distribution of their weights.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import torch
@@ -23,6 +26,7 @@ from spelgen.settings.tuning.fitting import ResidualTuning
 
 TUNING = ResidualTuning()
 
+EVERY = slice(None)
 FRICTION = "raw_friction_splines"
 WIDEST = 0.99 * LARGEST  # weights of friction's logarithm: beyond, the model's own are infinite
 
@@ -69,21 +73,14 @@ class _Candidate:
         with torch.no_grad():
             functions.get_parameter(self.parameter)[self.joint] = weights / self.scale
 
-    def chunks(self) -> Iterator[_Candidate]:
-        """Yield the same of each tenth of the samples."""
-        features = self.features.chunk(TUNING.folds)
+    def torque(self, weights: torch.Tensor, rows: slice = EVERY) -> torch.Tensor:
+        """Return what they add to these samples (T,)."""
+        features = self.features[rows]
         if self.friction is None:
-            yield from (replace(self, features=chunk) for chunk in features)
-            return
-        for chunk, friction in zip(features, self.friction.chunk(TUNING.folds), strict=True):
-            yield replace(self, features=chunk, friction=friction)
-
-    def torque(self, weights: torch.Tensor) -> torch.Tensor:
-        """Return what they add (T,)."""
-        if self.friction is None:
-            return self.features @ weights
-        logarithm = (self.features @ weights.clamp(-WIDEST, WIDEST)) / self.friction
-        return self.friction * logarithm.nan_to_num().expm1()
+            return features @ weights
+        friction = self.friction[rows]
+        logarithm = (features @ weights.clamp(-WIDEST, WIDEST)) / friction
+        return friction * logarithm.nan_to_num().expm1()
 
     def target(self, missing: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
         """Return what of the missing torque (T, n) the function could be (T,)."""
@@ -93,15 +90,23 @@ class _Candidate:
 
 def select_residuals(model: Any, samples: ResidualSamples, correlation: float) -> list[SelectedResidual]:
     """Give the model all parts that held-out samples gain by; return these. correlation: samples that err alike."""
+    first, last = _halves(len(samples.q), correlation)
+    if first.stop < last.start - first.stop:  # the gap leaves next to nothing of so few samples
+        return []
     noise, missing, selected = _noise(samples.missing), samples.missing, []
+    missing_early = samples.missing  # by the same parts, fitted to the first half
     for candidate in _candidates(model, samples):
-        target = candidate.target(missing, noise)
+        target, target_early = candidate.target(missing, noise), candidate.target(missing_early, noise)
         gain = _held_out_gain(candidate, target, correlation)
         if gain is None:
+            continue
+        torque_early = candidate.torque(_fit_candidate(candidate, target_early, correlation, first))
+        if (target_early - torque_early)[last].square().sum() >= target_early[last].square().sum():
             continue
         weights = _fit_candidate(candidate, target, correlation)
         candidate.write(model.joint_functions, weights)
         missing = missing - candidate.torque(weights).unsqueeze(-1) * candidate.force
+        missing_early = missing_early - torque_early.unsqueeze(-1) * candidate.force
         selected.append(SelectedResidual(candidate.parameter, candidate.joint, gain))
     return [*selected, *_select_networks(model, samples._replace(missing=missing), correlation)]
 
@@ -171,19 +176,31 @@ class _Sums(NamedTuple):
         return _Sums(gram, moment, self.square - other.square, self.samples - other.samples)
 
 
+def _halves(count: int, correlation: float) -> tuple[slice, slice]:
+    """Return the first half of the samples without the gap before the last half, and the last half."""
+    middle = count // 2
+    return slice(0, max(0, middle - round(TUNING.gap * correlation))), slice(middle, count)
+
+
+def _blocks(rows: slice) -> list[slice]:
+    """Return as many blocks of these samples as there are folds."""
+    edges = torch.linspace(rows.start, rows.stop, TUNING.folds + 1).long().tolist()
+    return [slice(start, stop) for start, stop in pairwise(edges)]
+
+
 def _held_out_gain(candidate: _Candidate, target: torch.Tensor, correlation: float) -> float | None:
     """Return the fraction of the target's squares that is explained where it was not seen; None: no more than luck
     explains.
     """
-    folds = list(zip(candidate.chunks(), target.chunk(TUNING.folds), strict=True))
-    everything = _Sums.of(candidate.features, target)
+    everything, gap = _Sums.of(candidate.features, target), round(TUNING.gap * correlation)
     squares, missed = [], []
-    for fold, y in folds:
-        held_out = _Sums.of(fold.features, y)
-        weights = _most_probable(everything.without(held_out), candidate.groups, correlation)
-        squares.append(held_out.square)
-        missed.append(float((y - fold.torque(weights)).square().sum()))
-    return _significant_gain(torch.tensor(squares).double(), torch.tensor(missed).double())
+    for block in _blocks(slice(0, len(target))):
+        near = slice(max(0, block.start - gap), block.stop + gap)
+        fitted_to = everything.without(_Sums.of(candidate.features[near], target[near]))
+        weights = _most_probable(fitted_to, candidate.groups, correlation)
+        squares.append(target[block].square().sum())
+        missed.append((target[block] - candidate.torque(weights, block)).square().sum())
+    return _significant_gain(torch.stack(squares), torch.stack(missed))
 
 
 def _significant_gain(squares: torch.Tensor, missed: torch.Tensor) -> float | None:
@@ -198,9 +215,11 @@ def _significant_gain(squares: torch.Tensor, missed: torch.Tensor) -> float | No
     return fraction if fraction > TUNING.least_gain else None
 
 
-def _fit_candidate(candidate: _Candidate, target: torch.Tensor, correlation: float) -> torch.Tensor:
-    """Return the most probable weights (P,) after all samples."""
-    return _most_probable(_Sums.of(candidate.features, target), candidate.groups, correlation)
+def _fit_candidate(
+    candidate: _Candidate, target: torch.Tensor, correlation: float, rows: slice = EVERY
+) -> torch.Tensor:
+    """Return the most probable weights (P,) after these samples."""
+    return _most_probable(_Sums.of(candidate.features[rows], target[rows]), candidate.groups, correlation)
 
 
 def _most_probable(sums: _Sums, groups: torch.Tensor, correlation: float) -> torch.Tensor:
@@ -246,35 +265,35 @@ def _select_networks(model: Any, samples: ResidualSamples, correlation: float) -
 def _fit_network(
     model: Any, network: torch.nn.Module, samples: ResidualSamples, correlation: float
 ) -> float | None:
-    """Fit one network where that pays on held-out samples, else leave it as it is; return the gain there."""
+    """Fit one network where that pays on the last half of the samples after a fit to the first, else leave it as it is;
+    return the gain there.
+    """
     start, noise = copy.deepcopy(network.state_dict()), _noise(samples.missing)
     with torch.no_grad():
         present = _network_torque(model, samples)
-    blocks = torch.arange(len(samples.q)) * TUNING.folds // len(samples.q)
 
-    def loss(rows: torch.Tensor) -> Callable[[], torch.Tensor]:
+    def fit(rows: slice) -> None:
         chosen = ResidualSamples(*(column[rows] for column in samples))
 
         def cost() -> torch.Tensor:
             error = chosen.missing - _network_torque(model, chosen) + present[rows]
             return 0.5 * (error / noise).square().sum() / correlation
 
-        return cost
-
-    missed = torch.zeros(TUNING.folds).double()
-    for fold in range(TUNING.network_folds):
-        held_out = blocks % TUNING.network_folds == fold
         network.load_state_dict(start)
-        minimise(network, loss(~held_out), TUNING.network_evaluations, weight_decay=1.0)
-        with torch.no_grad():
-            error = (samples.missing - _network_torque(model, samples) + present) / noise
-        missed.index_add_(0, blocks[held_out], error[held_out].square().sum(dim=1))
-    squares = torch.zeros(TUNING.folds).double()
-    squares.index_add_(0, blocks, (samples.missing / noise).square().sum(dim=1))
-    gain = _significant_gain(squares, missed)
+        minimise(network, cost, TUNING.network_evaluations, weight_decay=1.0)
+
+    first, last = _halves(len(samples.q), correlation)
+    fit(first)
+    with torch.no_grad():
+        error = samples.missing - _network_torque(model, samples) + present
+    squares, missed = [], []
+    for block in _blocks(last):
+        squares.append((samples.missing[block] / noise).square().sum())
+        missed.append((error[block] / noise).square().sum())
+    gain = _significant_gain(torch.stack(squares), torch.stack(missed))
     network.load_state_dict(start)
     if gain is not None:
-        minimise(network, loss(blocks >= 0), TUNING.network_evaluations, weight_decay=1.0)
+        fit(EVERY)
     model.zero_grad(set_to_none=True)
     return gain
 

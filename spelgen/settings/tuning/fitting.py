@@ -113,6 +113,7 @@ class ResidualTuning:
     """Selection of what stands beside rigid bodies (`fitting.residual_fit`)."""
 
     folds: int = 10  # blocks of samples that are held out in turn
+    gap: float = 5.0  # [1] of the samples that err alike, 0.5 s: left out between fitted and held-out samples
     standard_errors: float = (
         2.82  # of a block's mean gain: 1 % of luck, by Student's t of nine degrees of freedom
     )
@@ -120,7 +121,6 @@ class ResidualTuning:
     rounds: int = 30  # of the marginal likelihood's fixed point, at most
     converged: float = 1e-3  # [1] relative change of the noise
     network_samples: int = 2**12  # that networks are fitted to
-    network_folds: int = 2  # a network is fitted this often to be judged
     network_evaluations: int = 100  # of its loss
 
 
