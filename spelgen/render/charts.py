@@ -223,8 +223,8 @@ def line_chart(
             legend.append(entry)
         if mark.kind == "line" and not inside.all():
             beyond.append(mark.label)
-    # lines are drawn last, above all bands and dots
-    drawn.sort(key=lambda mark: mark[0].style.startswith("line"))
+    # lines are drawn above bands and dots, the model's above those of baselines that it agrees with
+    drawn.sort(key=lambda mark: (mark[0].style.startswith("line"), mark[0].style == "line model"))
     svg = render(
         "chart.html.jinja",
         **size,
