@@ -45,7 +45,7 @@ def compare(
     address: Address = None,
     force: Force = False,
 ) -> None:
-    """Train every preset on the same simulated logs, and compare the results.
+    """Train every preset on the same simulated logs and compare.
 
     The same command resumes an interrupted comparison.
     """

@@ -28,7 +28,7 @@ def fleet(
     ] = None,
     address: Address = None,
 ) -> None:
-    """Train and evaluate every preset on every arm, on all cores or a Ray cluster.
+    """Train and evaluate every preset on every arm, in parallel.
 
     The same command resumes an interrupted fleet.
     """

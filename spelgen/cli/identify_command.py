@@ -58,7 +58,7 @@ def identify(
     format: Annotated[Format | None, options.result_format()] = None,
     output: Output = None,
 ) -> None:
-    """Identify an arm's base parameters, friction and armature from logs by least squares."""
+    """Identify base parameters and friction by least squares."""
     paths = options.logs(data, extra_logs)
     from spelgen.identification.friction import FrictionModel
     from spelgen.identification.identify import identify as identify_arm

@@ -43,7 +43,7 @@ def excite(
     force: Force = False,
     format: TextOrJson = "text",
 ) -> None:
-    """Propose an excitation trajectory to identify inertial parameters and friction.
+    """Propose an excitation trajectory for identification.
 
     Collisions are not checked.
     """

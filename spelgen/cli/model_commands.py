@@ -38,7 +38,7 @@ def init(
     ] = None,
     force: Force = False,
 ) -> None:
-    """Write a commented file of settings for an arm: drives, gravity, logs, simulation."""
+    """Write a commented file of settings for an arm."""
     from spelgen.arm.arm import make_arm
     from spelgen.settings.starter import StarterJoint, starter
     from spelgen.urdf.read import read_urdf
