@@ -405,7 +405,7 @@ def test_bare_command_shows_the_help(spelgen):
     assert spelgen().stdout == spelgen("-h").stdout == spelgen("--help").stdout
 
 
-def test_help_shows_whole_sentences():
+def test_help_shows_whole_sentences(spelgen):
     commands = spelgen("--help").stdout.partition("Commands:\n")[2].splitlines()
     assert len(commands) == 14
     assert all(line.endswith(".") and not line.endswith("...") for line in commands)
