@@ -75,7 +75,7 @@ def mechanisms() -> list[Mechanism]:
         Mechanism("priors that yield", ((torque_fit, "most_probable", keep_prior),)),
         Mechanism("friction compensated unseen", tuned(torque_jacobian, compensation_explained=NEVER)),
         Mechanism("every second sample alone", tuned(torque_jacobian, decimation=1)),
-        Mechanism("a subset of large logs first", tuned(torque_jacobian, large=2**40)),
+        Mechanism("few samples first", tuned(torque_jacobian, subset=2**40)),
         Mechanism("steps in the bodies' parameters", tuned(levenberg_marquardt, kept_promise=-NEVER)),
         Mechanism("turns of bodies and residuals", tuned(torque_jacobian, turns=1)),
         Mechanism("residuals beside rigid bodies", tuned(residual_fit, standard_errors=NEVER)),

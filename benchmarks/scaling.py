@@ -1,26 +1,34 @@
-"""How a training step grows with joints and with windows: windows a second, and memory of the gradient's graph.
+"""How fits grow with joints, samples and windows.
 
     python benchmarks/scaling.py [--device cuda]
 
-Chains of 2 to 12 turning joints whose axes alternate, windows of 5 samples, rk4 with one step from sample to sample,
-forward and backward in double precision, one thread. Medians. The last column is the exponent with which the time of a
-window grows from the arm of half as many joints.
+Two tables, of chains of turning joints whose axes alternate, one thread. First fits of closed-form models to torques
+at 100 Hz: processor time and peak memory of a process of its own, for 10,000 and 1,000,000 samples and for 8 and 16
+joints. Then steps on windows of 5 samples, rk4 with one step from sample to sample, forward and backward in double
+precision: windows a second, memory of the gradient's graph, and the exponent with which the time of a window grows from
+the arm of half as many joints. Medians.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
+import resource
 import statistics
+import subprocess
+import sys
 import tempfile
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 
 from spelgen.building import build
+from spelgen.fitting.fit import fit
 from spelgen.fitting.rollout import loss_scales, rollout_loss
+from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows
 
 if TYPE_CHECKING:
@@ -28,6 +36,7 @@ if TYPE_CHECKING:
 
 JOINTS, BATCHES, SAMPLES, STEP = (2, 3, 4, 6, 8, 12), (16, 64, 256, 1024), 5, 0.01
 REPEATS = 5
+FREQUENCIES = (0.05, 0.5)  # [Hz] of the motion that torques are fitted on
 LINK = """<link name="l{k}"><inertial><origin xyz="0.1 0.02 0.2"/><mass value="{mass}"/>
 <inertia ixx="0.02" iyy="0.02" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
 JOINT = """<joint name="j{k}" type="revolute"><parent link="l{before}"/><child link="l{k}"/><origin xyz="0 0 0.3"/>
@@ -35,12 +44,70 @@ JOINT = """<joint name="j{k}" type="revolute"><parent link="l{before}"/><child l
 
 
 def main() -> None:
-    """Print a row for each preset and number of joints."""
+    """Print both tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--presets", default="closed-form,phnode,spel")
+    parser.add_argument("--fit", nargs=2, type=int, metavar=("JOINTS", "SAMPLES"), help="one fit alone")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
+    if arguments.fit:
+        print(*measured_fit(*arguments.fit))
+        return
+    compare_fits()
+    compare_steps(arguments)
+
+
+def compare_fits() -> None:
+    """Print what fits to torques cost, beside what is asked."""
+    costs = {}
+    for joints, samples in ((6, 10_000), (6, 1_000_000), (8, 20_000), (16, 20_000)):
+        command = [sys.executable, __file__, "--fit", str(joints), str(samples)]
+        seconds, gigabytes = subprocess.run(
+            command, check=True, capture_output=True, text=True
+        ).stdout.split()
+        costs[joints, samples] = float(seconds)
+        print(f"{joints:3} joints, {samples:9,} samples: {float(seconds):6.1f} s, {gigabytes} GB", flush=True)
+    more_samples = costs[6, 1_000_000] / costs[6, 10_000]
+    more_joints = costs[16, 20_000] / costs[8, 20_000]
+    print(f"100 times the samples take {more_samples:.1f} times as long, goal 12")
+    print(f"16 joints take {more_joints:.1f} times as long as 8, goal 3")
+
+
+def measured_fit(joints: int, samples: int) -> tuple[str, str]:
+    """Return the processor time [s] of a fit, and the peak memory of this process [GB]."""
+    urdf = _urdf(joints)
+    log = _recorded(build(urdf, "closed-form"), samples)
+    since = time.process_time()
+    fit(build(urdf, "closed-form"), log)
+    seconds = time.process_time() - since
+    return f"{seconds:.1f}", f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f}"
+
+
+def _recorded(model: EmittedModel, samples: int) -> Trajectory:
+    """Return a smooth motion with the torques of an arm that differs from the model, and noise."""
+    generator = np.random.default_rng(0)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter += torch.from_numpy(generator.normal(0, 0.2, parameter.shape))
+    shape = (5, model.n)
+    speed = 2 * np.pi * generator.uniform(*FREQUENCIES, shape)
+    phase, size = generator.uniform(0, 2 * np.pi, shape), generator.uniform(0.1, 0.4, shape)
+    t = 0.01 * np.arange(samples)
+    blocks = []
+    for part in np.array_split(t, -(-samples // 10_000)):
+        angle = speed * part[:, None, None] + phase
+        waves = size * np.sin(angle), size * speed * np.cos(angle), -size * speed**2 * np.sin(angle)
+        q, qd, qdd = (torch.from_numpy(wave.sum(axis=1)) for wave in waves)
+        with torch.no_grad():
+            blocks.append((q, qd, model.inverse_dynamics(q, qd, qdd)))
+    q, qd, tau = (torch.cat(column).numpy() for column in zip(*blocks, strict=True))
+    noise = 0.02 * tau.std(axis=0) * generator.normal(size=tau.shape)
+    return Trajectory(t=t, q=q, qd=qd, tau=tau + noise)
+
+
+def compare_steps(arguments: argparse.Namespace) -> None:
+    """Print a row for each preset and number of joints."""
     heads = "".join(f"{batch:>9}" for batch in BATCHES)
     print(f"{'windows/s at a batch of':24}{heads}  kB/window  exponent")
     for preset in arguments.presets.split(","):

@@ -12,7 +12,7 @@ from spelgen.dynamics.regressor import regressor, urdf_parameters
 from spelgen.errors import ArmError, LogError
 from spelgen.identification.base_parameters import base_parameters
 from spelgen.identification.friction import FrictionModel
-from spelgen.identification.identify import columns, least_squares
+from spelgen.identification.identify import least_squares
 from spelgen.identification.least_squares import correlation_time
 from spelgen.identification.method import LeastSquares
 from spelgen.loaded_arm import load_arm
@@ -79,6 +79,11 @@ def test_base_parameters_are_those_of_inspect(robots, robot):
     assert "armature1" not in base.names
     assert base.identifiability()["armature1"] == "in combination"
     assert base.identifiability()["viscous1"] == "alone"
+
+
+def columns(arm, friction, q, qd, qdd):
+    """The whole regressor: the bodies' columns, then those of friction and drives."""
+    return np.concatenate([regressor(arm, q, qd, qdd), friction.columns(qd, qdd)], axis=2)
 
 
 @pytest.mark.parametrize("robot", ROBOTS)

@@ -113,10 +113,10 @@ def test_the_fit_knows_that_a_motor_moves_both_joints(wrist):
     _, tau = on_motors(*motion, arm, np.ones(6), np.ones(6))
     model = module.Model(seed=1)
     z = bristles_along(moved(module, 4.0)[0], bristle_reach(model))[::40]
-    jacobian = TorqueJacobian(model, TorqueSamples.held([DynamicsSamples("x", *motion, tau, z)]))
-    everything, noise = torch.ones_like(jacobian.start, dtype=torch.bool), torch.ones(6).double()
+    jacobian = TorqueJacobian(model, TorqueSamples.of([DynamicsSamples("x", *motion, tau, z)]))
+    noise = torch.ones(6).double()
     x = jacobian.start + 0.1 * torch.randn(len(jacobian.start), generator=torch.Generator().manual_seed(0))
-    _, slope = jacobian.normal_equations(x, noise, everything)
+    _, slope = jacobian.normal_equations(x, noise)
     for k in range(len(x)):
         step = torch.zeros_like(x)
         step[k] = 1e-5

@@ -23,8 +23,9 @@ from spelgen.fitting.fit import fit
 from spelgen.fitting.gaussian_prior import ADAPTED, adapted_kinds, covariance, most_probable
 from spelgen.fitting.objectives import default_objective
 from spelgen.fitting.residual_fit import FRICTION, select_residuals
+from spelgen.fitting.rigid_weights import RIGID, RigidWeights
 from spelgen.fitting.torque_fit import fit_torque
-from spelgen.fitting.torque_jacobian import RIGID, ResidualSamples, RigidWeights
+from spelgen.fitting.torque_jacobian import ResidualSamples
 from spelgen.fitting.torque_networks import adapt_networks
 from spelgen.fitting.torque_report import torque_notes
 from spelgen.fitting.torque_samples import TorqueSamples
@@ -169,7 +170,7 @@ def test_a_urdf_that_is_wrong_is_given_up_and_that_is_said(emitted):
     assert nmse(found, test) < 0.5 * nmse(fixed, test)
     right = fit_torque(module.Model(), [recorded(module.Model(), 3.0, 0.02, seed=1)])
     assert right.prior.bodies < 0.35
-    samples = TorqueSamples.held(few)
+    samples = TorqueSamples.of(few)
     told = [next(torque_notes(found, samples, each)).message for each in (wrong, right)]
     assert told == [
         f"prior standard deviation of URDF inertias: factor {np.exp(2 * each.prior.bodies):.2g}"
@@ -224,7 +225,7 @@ def test_a_drive_that_compensates_friction_unseen_is_found_out(emitted):
     assert value[4].item() == pytest.approx(known[4].item(), rel=0.15)
     assert value[[0, 1, 2, 3, 5]].abs().max() == 0
     assert nmse(found, recorded(true, 10.0, 0.0, seed=9)) < 5e-3
-    notes = {note.code: note for note in torque_notes(found, TorqueSamples.held(logs), fit)}
+    notes = {note.code: note for note in torque_notes(found, TorqueSamples.of(logs), fit)}
     assert f"{found.joint_names[4]} {value[4].item():.3g} Nm s/rad" in notes["friction-compensated"].message
 
 
@@ -266,7 +267,7 @@ def test_slow_logs_are_told_to_say_little_of_inertia(emitted):
         with torch.no_grad():
             tau = true.inverse_dynamics(*(torch.from_numpy(x) for x in (q, qd, qdd))).numpy()
         tau = tau + 0.05 * tau.std(0) * np.random.default_rng(0).normal(size=tau.shape)
-        samples, found = TorqueSamples.held([DynamicsSamples(name, q, qd, qdd, tau)]), module.Model()
+        samples, found = TorqueSamples.of([DynamicsSamples(name, q, qd, qdd, tau)]), module.Model()
         fit = fit_torque(found, samples)
         codes[name] = {note.code for note in torque_notes(found, samples, fit)}
     assert codes["quick"] == {"urdf-prior"}
@@ -282,16 +283,11 @@ def at_once(emitted):
     return samples, whole, fit_torque(whole, samples)
 
 
-@pytest.mark.parametrize("held", [True, False])
-@pytest.mark.parametrize("on_disk", [True, False])
-def test_blocks_give_what_all_at_once_gives(emitted, at_once, monkeypatch, held, on_disk):
-    """Of blocks that leave a rest, with regressors kept or computed anew, in memory or in a temporary file."""
+def test_blocks_give_what_all_at_once_gives(emitted, at_once, monkeypatch):
+    """Of blocks that leave a rest."""
     (samples, whole, expected), parts = at_once, emitted["rpr"][0].Model()
-    tuning = TorqueTuning(block=64, cached_bytes=1e12 if held else 0)
-    monkeypatch.setattr(torque_jacobian, "TUNING", tuning)
-    table = (
-        TorqueSamples.spooled(iter(samples), 3, decimation=2) if on_disk else TorqueSamples.held(samples, 2)
-    )
+    monkeypatch.setattr(torque_jacobian, "TUNING", TorqueTuning(block=64))
+    table = TorqueSamples.of(iter(samples), 2)
     assert (table.count, table.seen, len(list(table.blocks(64)))) == (450, 900, 8)
     found = fit_torque(parts, table)
     assert found.steps == expected.steps
@@ -534,12 +530,12 @@ def test_few_of_very_many_samples_come_near_first(emitted, monkeypatch):
     samples = [recorded(drawn(module, seed=2, deviation=0.3), 6.0, 0.05, seed=seed) for seed in range(3)]
     plain, quick = module.Model(), module.Model()
     expected = fit_torque(plain, samples)
-    monkeypatch.setattr(torque_fit, "TUNING", TorqueTuning(large=500, subset=300))
+    monkeypatch.setattr(torque_fit, "TUNING", TorqueTuning(subset=300))
     found = fit_torque(quick, samples)
     assert found.steps != expected.steps
     assert found.cost == pytest.approx(expected.cost, rel=1e-3)
     np.testing.assert_allclose(found.residual, expected.residual, rtol=1e-3)
-    few = TorqueSamples.held(samples, 2).thinned(300)
+    few = TorqueSamples.of(samples, 2).thinned(300)
     assert (few.count, len(next(few.blocks(1000))[0])) == (300, 300)
 
 

@@ -59,7 +59,7 @@ def test_blocks_give_what_all_at_once_gives(tmp_path, monkeypatch):
     penalty = lambda model: lambda: 1e-3 * model.mass.raw_constants.square().sum()  # noqa: E731
     fit_networks(whole, samples, 1e-6, penalty(whole), evaluations=20)
     monkeypatch.setattr(torque_networks, "BLOCK", 128)
-    fit_networks(parts, TorqueSamples.spooled(samples, 2), 1e-6, penalty(parts), evaluations=20)
+    fit_networks(parts, TorqueSamples.of(samples), 1e-6, penalty(parts), evaluations=20)
     for name, value in whole.state_dict().items():
         torch.testing.assert_close(parts.state_dict()[name], value, rtol=1e-5, atol=1e-7)
 

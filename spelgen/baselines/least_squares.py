@@ -14,7 +14,7 @@ from spelgen.errors import LogError
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.identification.friction import FrictionModel
 from spelgen.identification.identification import identified_dynamics
-from spelgen.identification.identify import identify
+from spelgen.identification.identify import identify_by
 from spelgen.identification.method import LeastSquares
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
@@ -33,13 +33,12 @@ class IdentifiedArm(Baseline):
         self, run: RunFolder, logs: Sequence[Trajectory], preprocessing: Preprocessing
     ) -> dict[str, object]:
         """Return the parameters with what is known of them; {} where logs are too sparse for accelerations."""
-        arm = run_arm(run)
-        fits = {}
+        methods = [LeastSquares(friction=friction) for _, friction in FRICTION.values()]
         try:
-            for key, friction in FRICTION.values():
-                fits[key] = identify(arm, logs, LeastSquares(friction=friction), preprocessing=preprocessing)
+            found = identify_by(run_arm(run), logs, methods, preprocessing)
         except (LogError, np.linalg.LinAlgError):
             return {}
+        fits = {key: fit for (key, _), fit in zip(FRICTION.values(), found, strict=True)}
         # numbers and their intervals are those of the usual friction; with memory only the parameters are kept
         parameters = {key: fit.parameters.tolist() for key, fit in fits.items()}
         return {**fits["parameters"].to_dict(), **parameters}

@@ -212,4 +212,4 @@ class TrainingLoop:
         self.model.load_state_dict(state["model"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.generator.set_state(state["generator"])
-        self.history = history[: self.epoch]
+        self.history[:] = history[: self.epoch]

@@ -88,9 +88,11 @@ class Objective(Protocol):
     """
 
     name: ClassVar[str]
+    follows_commands: ClassVar[bool]
+    """Whether it is for arms under position servos, whose logs have commands, or for logs of torques."""
 
     def __init__(self, request: FitRequest) -> None:
-        """Raise OptionError for a config or a model that this objective is not for."""
+        """Begin with a model that this objective is for, and a config of its own."""
 
     @property
     def history(self) -> list[Content]:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from spelgen.dynamics.protocol import has_rigid_bodies, has_servos
+from spelgen.errors import OptionError
 from spelgen.fitting.objective import FitRequest, FitSummary, Objective
+from spelgen.fitting.run_record import Content
 from spelgen.fitting.servo.objective import ServoObjective
 from spelgen.fitting.servo.report import servo_summary
 from spelgen.fitting.torque_objective import TorqueObjective
@@ -25,11 +27,11 @@ OBJECTIVES: dict[str, type[Objective]] = {
 }
 
 
-SUMMARIES: dict[str, Callable[[Mapping[str, Any]], FitSummary | None]] = {ServoObjective.name: servo_summary}
+SUMMARIES: dict[str, Callable[[Content], FitSummary | None]] = {ServoObjective.name: servo_summary}
 """What an objective says of a run's config.json, where it determines more than a model."""
 
 
-def fit_summary(record: Mapping[str, Any]) -> FitSummary | None:
+def fit_summary(record: Content) -> FitSummary | None:
     """Return what a fit determined, None where its objective has nothing to say, or is not over."""
     summary = SUMMARIES.get(record.get("objective", ""))
     return None if summary is None else summary(record)
@@ -37,7 +39,14 @@ def fit_summary(record: Mapping[str, Any]) -> FitSummary | None:
 
 def objective_of(request: FitRequest) -> Objective:
     """Return the objective of a request. Raises OptionError where it is not for this model."""
-    return OBJECTIVES[request.config.objective](request)
+    name = request.config.objective
+    objective = OBJECTIVES[name]
+    if has_servos(request.model) and not objective.follows_commands:
+        message = f"{name} belongs to logs of torques, this arm has position servos"
+        raise OptionError("objective", message)
+    if objective.follows_commands and not has_servos(request.model):
+        raise OptionError("objective", f"{name} belongs to arms with 'input: position' in their settings")
+    return objective(request)
 
 
 def default_objective(model: EmittedModel, rates: Sequence[float]) -> str:

@@ -12,6 +12,7 @@ from typing import Any, Protocol
 
 import torch
 
+from spelgen.fitting.run_record import Content
 from spelgen.logs.windows import Windows
 from spelgen.settings.tuning.fitting import OptimizerTuning
 
@@ -36,9 +37,9 @@ class WindowOptimizer(Protocol):
         """
         ...
 
-    def state_dict(self) -> dict[str, Any]: ...
+    def state_dict(self) -> Content: ...
 
-    def load_state_dict(self, state: dict[str, Any]) -> None: ...
+    def load_state_dict(self, state: Content) -> None: ...
 
 
 class MiniBatchAdamW:
@@ -86,11 +87,11 @@ class MiniBatchAdamW:
         self._optimizer.step()
         return value.detach() + 0.0 * norm
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> Content:
         """All that a resumed run needs."""
         return self._optimizer.state_dict()
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: Content) -> None:
         """Go on from a ``state_dict``."""
         self._optimizer.load_state_dict(state)
 
@@ -165,7 +166,7 @@ class LBFGS:
     def _penalty(self) -> torch.Tensor | float:
         return 0.5 * self._decay * sum(weight.square().sum() for weight in self._weights)
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> Content:
         """All that a resumed run needs."""
         return {
             "optimizer": self._optimizer.state_dict(),
@@ -173,7 +174,7 @@ class LBFGS:
             "waits": self._waits,
         }
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: Content) -> None:
         """Go on from a ``state_dict``."""
         self._optimizer.load_state_dict(state["optimizer"])
         self._last, self._waits = state["reached"], state["waits"]

@@ -272,7 +272,7 @@ def _fit_network(
     with torch.no_grad():
         present = _network_torque(model, samples)
 
-    def fit(rows: slice) -> None:
+    def fit(rows: slice, evaluations: int) -> None:
         chosen = ResidualSamples(*(column[rows] for column in samples))
 
         def cost() -> torch.Tensor:
@@ -280,20 +280,24 @@ def _fit_network(
             return 0.5 * (error / noise).square().sum() / correlation
 
         network.load_state_dict(start)
-        minimise(network, cost, TUNING.network_evaluations, weight_decay=1.0)
+        minimise(network, cost, evaluations, weight_decay=1.0)
 
     first, last = _halves(len(samples.q), correlation)
-    fit(first)
-    with torch.no_grad():
-        error = samples.missing - _network_torque(model, samples) + present
-    squares, missed = [], []
-    for block in _blocks(last):
-        squares.append((samples.missing[block] / noise).square().sum())
-        missed.append((error[block] / noise).square().sum())
-    gain = _significant_gain(torch.stack(squares), torch.stack(missed))
+    # most networks explain nothing, which few evaluations show
+    for evaluations in (TUNING.network_first_look, TUNING.network_evaluations):
+        fit(first, evaluations)
+        with torch.no_grad():
+            error = samples.missing - _network_torque(model, samples) + present
+        squares, missed = [], []
+        for block in _blocks(last):
+            squares.append((samples.missing[block] / noise).square().sum())
+            missed.append((error[block] / noise).square().sum())
+        gain = _significant_gain(torch.stack(squares), torch.stack(missed))
+        if sum(missed) >= sum(squares):
+            break
     network.load_state_dict(start)
     if gain is not None:
-        fit(EVERY)
+        fit(EVERY, TUNING.network_evaluations)
     model.zero_grad(set_to_none=True)
     return gain
 

@@ -69,10 +69,9 @@ def fit_torque(
     as it is, and so does the prior of a load (see ``TorqueFit``).
     """
     if not isinstance(samples, TorqueSamples):
-        samples = TorqueSamples.held(samples, TUNING.decimation)
-    subset, large = samples, samples.count > TUNING.large
-    if large:
-        subset = samples.thinned(TUNING.subset)
+        samples = TorqueSamples.of(samples, TUNING.decimation)
+    samples = samples.thinned(_most_samples(model))
+    subset = samples.thinned(TUNING.subset)
     problem = TorqueProblem(TorqueJacobian(model, subset), prior or _default_prior(adapt), adapt)
     select_memory = adapt is None and model.elements > 0
     if select_memory:
@@ -82,11 +81,10 @@ def fit_torque(
         state = problem.select_memory(state)
     residuals: list[SelectedResidual] = []
     if adapt is None and has_residuals(model):
-        state, residuals = _with_residuals(problem, state, samples.count)
-    if large:  # a subset of many samples came near, all of them finish
-        state = problem.set_samples(state, TorqueJacobian(model, samples))
-        state = problem.solve(state, TUNING.last_rounds)
-    problem.jacobian.write(state.x)
+        state, residuals = _with_residuals(problem, state, samples.thinned(TUNING.residual_samples))
+    if problem.jacobian.samples is not samples:  # few samples came near, all of them finish
+        state = problem.refine(state, samples)
+    problem.jacobian.rigid.write(state.x)
     rms = (state.residuals / samples.count).sqrt() / problem.jacobian.per_gain(state.x)
     return TorqueSolution(
         residual=rms.numpy(),
@@ -99,6 +97,12 @@ def fit_torque(
     )
 
 
+def _most_samples(model: EmittedModel) -> int:
+    """Return how many samples there may be: their two regressors stay in memory from step to step."""
+    numbers = 2 * model.n * model.inertial_parameters.numel()
+    return max(TUNING.subset, int(TUNING.regressor_bytes / (8 * numbers)))
+
+
 def _default_prior(adapt: Adaptation | None) -> GaussianPrior:
     if adapt is None:
         return GaussianPrior()
@@ -109,19 +113,21 @@ def _default_prior(adapt: Adaptation | None) -> GaussianPrior:
     }[adapt]
 
 
-def _with_residuals(problem: TorqueProblem, state: State, count: int) -> tuple[State, list[SelectedResidual]]:
-    """Select what stands beside rigid bodies, and fit both in turn. count: of samples that the subset is of."""
-    model, samples = problem.jacobian.model, problem.jacobian.samples
-    correlation = max(1.0, TUNING.correlation_length * samples.count / count)
-    problem.jacobian.write(state.x)
+def _with_residuals(
+    problem: TorqueProblem, state: State, samples: TorqueSamples
+) -> tuple[State, list[SelectedResidual]]:
+    """Select what stands beside rigid bodies, and fit both in turn."""
+    model = problem.jacobian.model
+    if samples is not problem.jacobian.samples:
+        state = problem.refine(state, samples)
+    correlation = problem.correlation
+    problem.jacobian.rigid.write(state.x)
     residuals = select_residuals(model, problem.jacobian.residual_samples(state.x), correlation)
     if not residuals:
         return state, residuals
     for _ in range(TUNING.turns):
-        state = problem.set_samples(state, TorqueJacobian(model, samples))
-        problem.set_noise(state.residuals)
-        state = problem.solve(state, TUNING.last_rounds)
-        problem.jacobian.write(state.x)
+        state = problem.refine(state, samples)
+        problem.jacobian.rigid.write(state.x)
         refit_residuals(model, problem.jacobian.residual_samples(state.x), residuals, correlation)
     return problem.set_samples(state, TorqueJacobian(model, samples)), residuals
 
@@ -145,6 +151,7 @@ class TorqueProblem:
 
     def _use(self, jacobian: TorqueJacobian) -> None:
         self.jacobian, self.count = jacobian, jacobian.samples.count
+        self.correlation = max(1.0, TUNING.correlation_length / jacobian.samples.step)
         deviation = jacobian.torque_deviation()
         self.range = torch.maximum(deviation, 1e-3 * deviation.max())
 
@@ -152,6 +159,12 @@ class TorqueProblem:
         """Go on from a state with other samples."""
         self._use(jacobian)
         return replace(state, residuals=jacobian.squares(state.x))
+
+    def refine(self, state: State, samples: TorqueSamples) -> State:
+        """Go on from a fit near by with other samples, or beside other residuals: only the last digits are fitted."""
+        state = self.set_samples(state, TorqueJacobian(self.jacobian.model, samples))
+        self.set_noise(state.residuals)
+        return self.solve(state, TUNING.last_rounds)
 
     def set_prior(self, prior: GaussianPrior) -> None:
         """Go on with another prior."""
@@ -165,18 +178,18 @@ class TorqueProblem:
         largest: (n,) noise where the start may be far off: torques that are not explained yet are no noise.
         """
         rms = torch.maximum((squares / self.count).sqrt(), TUNING.least_noise * self.range)
-        self.noise = TUNING.correlation_length**0.5 * rms
+        self.noise = self.correlation**0.5 * rms
         if largest is not None:
             self.noise = torch.minimum(self.noise, largest)
 
     def _first_noise(self) -> torch.Tensor:
-        result: torch.Tensor = TUNING.correlation_length**0.5 * TUNING.first_noise * self.range
+        result: torch.Tensor = self.correlation**0.5 * TUNING.first_noise * self.range
         return result
 
     @property
     def free(self) -> torch.Tensor:
         """Which weights (K,) move."""
-        return self.jacobian.free(self.adapt, self.compensated)
+        return self.jacobian.rigid.free(self.adapt, self.compensated)
 
     def multistart(self) -> State:
         """As `solve`, all rounds from the start; the more probable of two ways where the first leaves much.
@@ -205,7 +218,7 @@ class TorqueProblem:
         fitted = self.noise, self.prior, self.covariance.clone()
         laws.memoryless.fill_(0.0)
         remembering = self.solve(self.set_samples(state, self.jacobian), TUNING.rounds)
-        independent = self.count / TUNING.correlation_length
+        independent = self.count / self.correlation
         gain = independent * (remembering.residuals / state.residuals).log()
         laws.memoryless.copy_(gain > laws.bristles.reach.shape[1] * math.log(independent))
         if laws.memoryless.all():
@@ -220,7 +233,7 @@ class TorqueProblem:
         """Return the logarithm of the samples' marginal likelihood by Laplace's approximation, but for a constant."""
         free, away = self.free, x - self.start
         prior, posterior = self.precision[free][:, free], self.covariance[free][:, free]
-        count = self.count / TUNING.correlation_length
+        count = self.count / self.correlation
         missed = count * self.noise.log().sum() + away @ self.precision @ away / 2
         return float((prior.logdet() + posterior.logdet()) / 2 - missed)
 
@@ -244,7 +257,7 @@ class TorqueProblem:
         its torque was measured, does.
         """
         slope, explained, size = self.jacobian.by_velocity(x)
-        count = self.count / TUNING.correlation_length
+        count = self.count / self.correlation
         significant = explained * count > TUNING.compensation_deviations**2 * (1 - explained)
         # milliseconds between torque and motion look alike, but smaller
         visible = size > TUNING.compensation_visible * self.range
@@ -285,10 +298,10 @@ class TorqueProblem:
     def normal_equations(self, x: torch.Tensor, residuals: torch.Tensor) -> NormalEquations:
         """Return them by the weights that move."""
         free = self.free
-        curvature, descent = self.jacobian.normal_equations(x, self.noise, free)
+        curvature, descent = self.jacobian.normal_equations(x, self.noise)
         away = self.precision @ (x - self.start)
-        self.curvature = curvature + self.precision[free][:, free]
-        return NormalEquations(self.curvature, descent - away[free])
+        self.curvature = (curvature + self.precision)[free][:, free]
+        return NormalEquations(self.curvature, (descent - away)[free])
 
     def moved(self, x: torch.Tensor, step: torch.Tensor) -> Iterator[torch.Tensor]:
         """Yield where a step leads, straight in the weights or in the bodies' parameters."""

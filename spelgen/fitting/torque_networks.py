@@ -37,9 +37,9 @@ def fit_networks(
     else is to be small, the distance from a URDF for one.
     """
     if not isinstance(samples, TorqueSamples):
-        samples = TorqueSamples.held(samples)
+        samples = TorqueSamples.of(samples)
     count, joints = samples.count, samples.joints
-    scale = samples.torque_deviation(torch.eye(joints).double(), BLOCK)
+    scale = samples.columns.tau.std(dim=0)
     scale = torch.maximum(scale, 1e-2 * scale.amax())
 
     def missed(block: tuple[int, Block]) -> torch.Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from itertools import chain
 from typing import TYPE_CHECKING, ClassVar
 
 from spelgen.dynamics.bristles import bristle_reach
@@ -12,9 +13,10 @@ from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.dataset import TrainingData
 from spelgen.fitting.objective import FitRequest, PreparedLogs, Status
 from spelgen.fitting.run_record import Content
+from spelgen.fitting.streaming import LargeLogs
 from spelgen.fitting.torque_fit import fit_torque
 from spelgen.fitting.torque_jacobian import TUNING
-from spelgen.fitting.torque_logs import prepare_windows, prepared_logs, regularizer_of, require_torque_input
+from spelgen.fitting.torque_logs import TorqueLogObjective
 from spelgen.fitting.torque_networks import adapt_networks, fit_networks
 from spelgen.fitting.torque_report import torque_notes
 from spelgen.fitting.torque_samples import TorqueSamples
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
     from spelgen.fitting.progress import TrainingProgress
 
+SAMPLES = 5  # of a window that the model is measured on
 MOVED = {
     "load": "a load at the tip alone fitted",
     "friction": "friction and torque offsets alone fitted",
@@ -36,26 +39,28 @@ MOVED = {
 }
 
 
-class TorqueObjective:
+class TorqueObjective(TorqueLogObjective):
     """All is done in `begin`, before there is a run folder: a fit to torques takes seconds to minutes."""
 
     name: ClassVar[str] = "torque"
 
     def __init__(self, request: FitRequest) -> None:
-        require_torque_input(request.model, request.config)
+        super().__init__(request)
         assert isinstance(request.config, TorqueFit)
-        self.request, self.config = request, request.config
-        self.history: list[Content] = []
+        self.config = request.config
         self._checkpoint: Content = {}
 
     def prepare(self) -> PreparedLogs:
         """See `Objective`."""
-        self.data = prepare_windows(self.request)
-        return prepared_logs(self.request, self.data, self.config)
+        stride = 1
+        if not isinstance(self.request.logs, LargeLogs):  # windows only measure the model: few are enough
+            stride = -(-sum(map(len, self.request.logs)) // TUNING.windows)
+        self.data = self._cut_windows(SAMPLES, stride)
+        return self._prepared(self.data, self.config)
 
     def begin(self) -> list[Diagnostic]:
         """Fit the model. Raises LogError where no log is sampled densely enough for accelerations."""
-        model = self.request.model
+        model = self.model
         notes: list[Diagnostic] = []
         samples = torque_samples(model, self.data)
         if samples is None:
@@ -67,7 +72,7 @@ class TorqueObjective:
             )
         regularizer = None
         if not has_rigid_bodies(model):  # the torques of rigid bodies have a prior of their own
-            regularizer = regularizer_of(self.request, self.data, self.config.urdf_weight, notes)
+            regularizer = self._regularizer(self.data, self.config.urdf_weight, notes)
         notes += fit_torques(model, samples, self.config, regularizer)
         measured = measure(model, Validation(model, self.data, self.request.device))
         self._checkpoint = {
@@ -83,7 +88,7 @@ class TorqueObjective:
 
     def resume(self, checkpoint: Content, history: list[Content], record: Content) -> None:
         """Take the model as it was fitted."""
-        self.request.model.load_state_dict(checkpoint["best_weights"])
+        self.model.load_state_dict(checkpoint["best_weights"])
         self._checkpoint = checkpoint
 
     def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
@@ -94,30 +99,26 @@ class TorqueObjective:
         """See `Objective`."""
         return self._checkpoint
 
-    def results(self) -> dict[str, object]:
-        """Return nothing: notes tell how it went."""
-        return {}
-
 
 def torque_samples(model: EmittedModel, data: TrainingData) -> TorqueSamples | None:
     """Return the samples of all logs, those of validation included; None: no log has samples that move, and densely.
 
-    Of logs larger than memory they lie in a temporary file.
+    Of logs larger than memory, of which a chunk is read at a time, they are as many as memory holds, evenly spread.
     """
     decimation, reach = 1, bristle_reach(model)
     if has_rigid_bodies(model):
         decimation = TUNING.decimation
-    if not data.chunks:
-        samples = dynamics_samples(data.recordings, preprocessing=data.preprocessing, reach=reach)
-        return TorqueSamples.held(samples, decimation) if any(len(x.q) for x in samples) else None
+    rows = sum(chunk.stop - chunk.first for chunk in data.chunks)
+    decimation = max(decimation, -(-rows // TUNING.in_memory))
 
-    def stream() -> Iterator[DynamicsSamples]:
-        for chunk in data.chunks:
-            yield from dynamics_samples([chunk.load()], preprocessing=data.preprocessing, reach=reach)
+    def moving() -> Iterator[DynamicsSamples]:
+        for recording in chain(data.recordings, (chunk.load() for chunk in data.chunks)):
+            samples = dynamics_samples([recording], preprocessing=data.preprocessing, reach=reach)
+            yield from (x for x in samples if len(x.q))
 
-    columns = reach.elements + (reach.smoothing_velocity is not None)
-    spooled = TorqueSamples.spooled(stream(), model.n, columns, decimation)
-    return spooled if spooled.count else None
+    samples = moving()
+    first = next(samples, None)
+    return None if first is None else TorqueSamples.of(chain([first], samples), decimation)
 
 
 def fit_torques(

@@ -12,9 +12,8 @@ from torch.autograd.functional import jacobian
 from spelgen.dynamics.protocol import has_residuals
 from spelgen.errors import Diagnostic
 from spelgen.fitting.functional_model import FunctionalModel
+from spelgen.fitting.rigid_weights import RigidWeights
 from spelgen.fitting.torque_fit import TorqueSolution
-from spelgen.fitting.torque_jacobian import TUNING as TORQUES
-from spelgen.fitting.torque_jacobian import RigidWeights
 from spelgen.fitting.torque_samples import TorqueSamples
 from spelgen.settings.tuning.fitting import TorqueReportTuning
 
@@ -45,9 +44,8 @@ def torque_notes(
         yield _compensation(model, solution, names)
     if has_residuals(model):
         yield Diagnostic("info", "residuals", "model", None, _selected(solution, names))
-    first = next(samples.blocks(TORQUES.block))
-    step = max(1, len(first[0]) // TUNING.positions)
-    q, qdd = first[0][::step], first[2][::step]
+    looked_at = samples.thinned(TUNING.positions).columns
+    q, qdd = looked_at.q, looked_at.qdd
     inertia, deviation = _inertia(model, q, solution.covariance)
     undetermined = deviation > TUNING.undetermined
     if undetermined.any():

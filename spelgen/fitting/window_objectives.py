@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, ClassVar
 
 from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.errors import Diagnostic, LogError
-from spelgen.fitting.dataset import TrainingData
 from spelgen.fitting.loop import TrainingLoop
 from spelgen.fitting.momentum import momentum_stage
 from spelgen.fitting.objective import FitRequest, PreparedLogs, Status
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.streaming import LargeLogs
-from spelgen.fitting.torque_logs import prepare_windows, prepared_logs, regularizer_of, require_torque_input
+from spelgen.fitting.torque_logs import TorqueLogObjective
 from spelgen.fitting.torque_objective import fit_torques, torque_samples
 from spelgen.fitting.validation import Validation
 from spelgen.fitting.window_problem import TUNING, Clock, Measured, WindowProblem, measure
@@ -25,41 +24,43 @@ if TYPE_CHECKING:
     from spelgen.fitting.progress import TrainingProgress
 
 
-def _prepare(request: FitRequest, config: WindowConfig) -> TrainingData:
-    if isinstance(request.logs, LargeLogs):
-        raise LogError(
-            "logs larger than memory",
-            expected="fewer logs, for example every tenth file",
-            do="or fit torques, which read them in chunks: the objective torque",
-        )
-    return prepare_windows(request, config.window, config.stride)
+class WindowObjective(TorqueLogObjective):
+    """An objective that fits windows, all of which are in memory."""
 
-
-class MomentumObjective:
-    """Steps on the weak form alone, kept where they predict validation windows better."""
-
-    name: ClassVar[str] = "momentum"
+    config: WindowConfig  # resolved by `prepare`
 
     def __init__(self, request: FitRequest) -> None:
-        require_torque_input(request.model, request.config)
-        assert isinstance(request.config, MomentumFit)
-        self.request, self.config = request, request.config
-        self.history: list[Content] = []
+        super().__init__(request)
+        assert isinstance(request.config, WindowConfig)
+        self.config = request.config
 
     def prepare(self) -> PreparedLogs:
         """See `Objective`."""
-        self.data = _prepare(self.request, self.config)
+        if isinstance(self.request.logs, LargeLogs):
+            raise LogError(
+                "logs larger than memory",
+                expected="fewer logs, for example every tenth file",
+                do="or fit torques, which read them in chunks: the objective torque",
+            )
+        self.data = self._cut_windows(self.config.window, self.config.stride)
         self.config = self.config.resolved(self.data.size)
-        return prepared_logs(self.request, self.data, self.config)
+        return self._prepared(self.data, self.config)
+
+
+class MomentumObjective(WindowObjective):
+    """Steps on the weak form alone, kept where they predict validation windows better."""
+
+    name: ClassVar[str] = "momentum"
+    config: MomentumFit
 
     def begin(self) -> list[Diagnostic]:
         """Measure the model as it is."""
         request = self.request
         notes: list[Diagnostic] = []
-        regularizer = regularizer_of(request, self.data, self.config.urdf_weight, notes)
-        self.problem = WindowProblem(request.model, self.data, self.config, request.device, regularizer)
-        self.validation = Validation(request.model, self.data, request.device, batch=self.problem.batch)
-        self.best = measure(request.model, self.validation)
+        regularizer = self._regularizer(self.data, self.config.urdf_weight, notes)
+        self.problem = WindowProblem(self.model, self.data, self.config, request.device, regularizer)
+        self.validation = Validation(self.model, self.data, request.device, batch=self.problem.batch)
+        self.best = measure(self.model, self.validation)
         self.seconds = time.monotonic() - request.began
         self.done = False
         return notes
@@ -67,7 +68,7 @@ class MomentumObjective:
     def resume(self, checkpoint: Content, history: list[Content], record: Content) -> None:
         """Go on from the weights so far; steps that were not all taken start again."""
         self.begin()
-        self.request.model.load_state_dict(checkpoint["best_weights"])
+        self.model.load_state_dict(checkpoint["best_weights"])
         self.best = Measured(checkpoint["substeps"], checkpoint["best_loss"], checkpoint["best_weights"])
         self.seconds, self.done = checkpoint["seconds"], checkpoint["momentum_done"]
 
@@ -98,35 +99,16 @@ class MomentumObjective:
             "momentum_done": self.done,
         }
 
-    def results(self) -> dict[str, object]:
-        """Return nothing more."""
-        return {}
 
-
-class RolloutObjective:
+class RolloutObjective(WindowObjective):
     """Torques first, of rigid bodies; then momentum; then predicted windows, epoch by epoch."""
 
     name: ClassVar[str] = "rollout"
-
-    def __init__(self, request: FitRequest) -> None:
-        require_torque_input(request.model, request.config)
-        assert isinstance(request.config, Rollout)
-        self.request, self.config = request, request.config
-
-    @property
-    def history(self) -> list[Content]:
-        """A record for each epoch."""
-        return self.loop.history
-
-    def prepare(self) -> PreparedLogs:
-        """See `Objective`."""
-        self.data = _prepare(self.request, self.config)
-        self.config = self.config.resolved(self.data.size)
-        return prepared_logs(self.request, self.data, self.config)
+    config: Rollout
 
     def begin(self) -> list[Diagnostic]:
         """Fit torques, and measure the model then."""
-        return self._start(torque_first=self.config.torque_first and has_rigid_bodies(self.request.model))
+        return self._start(torque_first=self.config.torque_first and has_rigid_bodies(self.model))
 
     def resume(self, checkpoint: Content, history: list[Content], record: Content) -> None:
         """Go on from the last whole epoch."""
@@ -141,17 +123,13 @@ class RolloutObjective:
         """See `Objective`."""
         return self.loop.state()
 
-    def results(self) -> dict[str, object]:
-        """Return nothing more: the history tells."""
-        return {}
-
     def _start(self, *, torque_first: bool) -> list[Diagnostic]:
         """Make the loop; return what there is to tell."""
         request, config = self.request, self.config
         notes: list[Diagnostic] = []
-        model = request.model
+        model = self.model
         # towards the URDF as the model has it before any fit, in a resumed run too
-        regularizer = regularizer_of(request, self.data, config.urdf_weight, notes)
+        regularizer = self._regularizer(self.data, config.urdf_weight, notes)
         if torque_first:
             notes += self._torque_stage()
         problem = WindowProblem(model, self.data, config, request.device, regularizer)
@@ -171,12 +149,13 @@ class RolloutObjective:
             seconds=time.monotonic() - request.began,
             folder=request.folder,
         )
+        self.history = self.loop.history
         return notes
 
     def _torque_stage(self) -> list[Diagnostic]:
-        samples = torque_samples(self.request.model, self.data)
+        samples = torque_samples(self.model, self.data)
         if samples is not None:
-            return fit_torques(self.request.model, samples, TorqueFit())
+            return fit_torques(self.model, samples, TorqueFit())
         message = (
             f"no torque fit: no log that moves has {SLOWEST:g} Hz for a second; windows alone are fitted"
         )

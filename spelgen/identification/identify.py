@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -46,24 +47,33 @@ def identify(
     """
     arm = arm if isinstance(arm, LoadedArm) else load_arm(arm)
     logs = [logs] if isinstance(logs, Trajectory) else logs
+    return identify_by(arm, logs, [method or LeastSquares()], preprocessing or Preprocessing())[0]
+
+
+def identify_by(
+    arm: LoadedArm, logs: Sequence[Trajectory], methods: Sequence[LeastSquares], preprocessing: Preprocessing
+) -> list[Identification]:
+    """Return what each method makes of the same logs, which are filtered once; see `identify`."""
     joints = [c.name for c in arm.arm.coordinates]
     kinds = [c.kind for c in arm.arm.coordinates]
     for trajectory in logs:
         require_joints(trajectory, joints)
     require_torques(logs)
     notes = check(logs, joints, kinds)
-    method = method or LeastSquares()
     drives = arm.actuation.drives()
-    reach = reach_of(kinds, drives.speeds) if method.friction.memory else None
-    samples = dynamics_samples(logs, preprocessing=preprocessing or Preprocessing(), reach=reach)
+    reach = None
+    if any(method.friction.memory for method in methods):
+        reach = reach_of(kinds, drives.speeds)
+    samples = dynamics_samples(logs, preprocessing=preprocessing, reach=reach)
     unused = sorted({x.name for x in logs} - {x.name for x in samples})
     if unused:
         message = f"sampled too slowly or too short for accelerations: {', '.join(unused)}"
         notes.append(Diagnostic("warning", "no-accelerations", "logs", None, message))
     # samples of motors' torques: the regressor's rows are joints'
     at_joints = [replace(x, tau=x.tau @ drives.inputs.T) for x in samples]
-    identification = least_squares(arm.arm, at_joints, method, drives)
-    return replace(identification, diagnostics=tuple(notes))
+    bodies = _BodyRows(arm.arm, at_joints)
+    found = [_least_squares(bodies, method, drives) for method in methods]
+    return [replace(identification, diagnostics=tuple(notes)) for identification in found]
 
 
 def least_squares(
@@ -76,49 +86,61 @@ def least_squares(
 
     drives: those whose friction and armature are fitted; None: each moves its own joint alone.
     """
-    method = method or LeastSquares()
-    if not any(len(x.q) for x in samples):
+    return _least_squares(_BodyRows(arm, samples), method or LeastSquares(), drives)
+
+
+def _least_squares(bodies: _BodyRows, method: LeastSquares, drives: Drives | None) -> Identification:
+    if not any(len(x.q) for x in bodies.samples):
         raise LogError(
             "no samples to identify from",
             expected=f"motion sampled at {SLOWEST:g} Hz or faster, {SHORTEST:g} s without a gap at least",
         )
-    rows = _Rows(arm, samples, method.friction, None if drives is None else drives.speeds)
+    rows = _Rows(bodies, method.friction, None if drives is None else drives.speeds)
     triangles = reduce(rows.blocks())
-    base = base_parameters(arm, method.friction, rows.motors)
-    fit = _fit(_problem(arm, base, triangles, method), rows, method)
+    base = base_parameters(bodies.arm, method.friction, rows.motors)
+    fit = _fit(_problem(bodies.arm, base, triangles, method), rows, method)
     return replace(_result(rows, method, base, fit), drives=drives)
 
 
-def columns(
-    arm: Arm,
-    friction: FrictionModel,
-    q: np.ndarray,
-    qd: np.ndarray,
-    qdd: np.ndarray,
-    z: np.ndarray | None = None,
-    motors: np.ndarray | None = None,
-) -> np.ndarray:
-    """Return the whole regressor (T, n, 10 B + e n): the bodies', then that of friction and drives."""
-    bent = None if z is None else z / reach_of([x.kind for x in arm.coordinates]).values
-    return np.concatenate([regressor(arm, q, qd, qdd), friction.columns(qd, qdd, bent, motors)], axis=2)
-
-
 @dataclass(frozen=True, eq=False)
-class _Rows:
-    """Give the equations of samples, a block in memory at a time. motors: joints' velocities to the drives', (n, n)."""
+class _BodyRows:
+    """Give the bodies' regressor of samples, block by block: the same whatever the friction."""
 
     arm: Arm
     samples: Sequence[DynamicsSamples]
-    friction: FrictionModel
-    motors: np.ndarray | None
 
-    def blocks(self) -> Iterator[Columns]:
+    def blocks(self) -> Iterator[tuple[DynamicsSamples, np.ndarray]]:
+        """Yield blocks of samples with their regressor (T, n, 10 B), kept from pass to pass where memory allows."""
+        return iter(self._few) if self._few is not None else self._computed()
+
+    @cached_property
+    def _few(self) -> list[tuple[DynamicsSamples, np.ndarray]] | None:
+        count = sum(x.q.size for x in self.samples) * 10 * len(self.arm.bodies)
+        return list(self._computed()) if 8 * count <= TUNING.regressor_bytes else None
+
+    def _computed(self) -> Iterator[tuple[DynamicsSamples, np.ndarray]]:
         for x in self.samples:
             for start in range(0, len(x.q), BLOCK):
                 rows = slice(start, start + BLOCK)
                 z = None if x.z is None else x.z[rows]
-                motion = x.q[rows], x.qd[rows], x.qdd[rows]
-                yield columns(self.arm, self.friction, *motion, z, self.motors), x.tau[rows]
+                block = DynamicsSamples(x.name, x.q[rows], x.qd[rows], x.qdd[rows], x.tau[rows], z)
+                yield block, regressor(self.arm, block.q, block.qd, block.qdd)
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Give the equations of samples, a block at a time. motors: joints' velocities to the drives', (n, n)."""
+
+    bodies: _BodyRows
+    friction: FrictionModel
+    motors: np.ndarray | None
+
+    def blocks(self) -> Iterator[Columns]:
+        reach = reach_of([x.kind for x in self.bodies.arm.coordinates]).values
+        for block, bodies in self.bodies.blocks():
+            bent = None if block.z is None else block.z / reach
+            drives = self.friction.columns(block.qd, block.qdd, bent, self.motors)
+            yield np.concatenate([bodies, drives], axis=2), block.tau
 
     def residuals(self, parameters: np.ndarray) -> list[np.ndarray]:
         return [regressors @ parameters - tau for regressors, tau in self.blocks()]
@@ -201,7 +223,7 @@ def _result(rows: _Rows, method: LeastSquares, base: BaseParameters, fit: _Fit) 
     squares = triangles.squares(solution.parameters) / triangles.count
     is_regularised = method.prior is not None or method.ridge > 0
     return Identification(
-        arm=rows.arm,
+        arm=rows.bodies.arm,
         method=method,
         base=base,
         parameters=solution.parameters,
@@ -211,6 +233,6 @@ def _result(rows: _Rows, method: LeastSquares, base: BaseParameters, fit: _Fit) 
         unseen=0 if is_regularised else basis.shape[1] - solution.rank,
         residual=np.sqrt(squares),
         nmse=squares / np.where(triangles.deviation > 0, triangles.deviation, np.nan) ** 2,
-        trajectories=tuple(x.name for x in rows.samples),
+        trajectories=tuple(x.name for x in rows.bodies.samples),
         samples=triangles.count,
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -83,6 +84,7 @@ def fit_linear_servos(windows: ServoWindows) -> LinearServos:
     q, qd = windows.q.numpy(), windows.qd.numpy()
     measured, dt = q[:, 1:], float(windows.dt.mean())
 
+    @lru_cache(maxsize=8)  # slopes move one unknown at a time, and the delay is but one of them
     def commands(delay: float) -> np.ndarray:
         return windows.commands(delay).mean(dim=2).numpy()
 

@@ -10,17 +10,17 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import torch
 
 from spelgen.dynamics.bristles import encoder_step
-from spelgen.dynamics.protocol import has_servos
-from spelgen.errors import Diagnostic, LogError, OptionError
+from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.dataset import digest
 from spelgen.fitting.levenberg_marquardt import levenberg_marquardt, start
 from spelgen.fitting.objective import FitRequest, PreparedLogs, Status
+from spelgen.fitting.run_record import Content
 from spelgen.fitting.servo.laws import select_dead_zones, without_faint
 from spelgen.fitting.servo.linear_servos import fit_linear_servos
 from spelgen.fitting.servo.parameters import ServoParameters
@@ -57,12 +57,11 @@ class ServoObjective:
     """
 
     name: ClassVar[str] = "servo"
+    follows_commands: ClassVar[bool] = True
 
     def __init__(self, request: FitRequest) -> None:
-        if not has_servos(request.model):
-            raise OptionError("objective", "servo belongs to arms with 'input: position' in their settings")
         self.request = request
-        self.history: list[dict[str, Any]] = []
+        self.history: list[Content] = []
         self._results: dict[str, object] = {}
         self._rounds: list[ServoParameters] = []  # where they began
         self._steps = 0
@@ -100,9 +99,7 @@ class ServoObjective:
         text = expected_text(determined, undetermined, known_kp=known_kp)
         return [Diagnostic("info", "identifiability", "logs", None, text)]
 
-    def resume(
-        self, checkpoint: dict[str, Any], history: list[dict[str, Any]], record: dict[str, Any]
-    ) -> None:
+    def resume(self, checkpoint: Content, history: list[Content], record: Content) -> None:
         """Go on from the beginning of the last round."""
         self._since = time.monotonic() - checkpoint["seconds"]
         state = checkpoint["servo"]
@@ -155,7 +152,7 @@ class ServoObjective:
         self._results["servo"] = record | {"linear": linear}
         self._take_checkpoint(float(np.sqrt(np.square(record["rms"]).mean())))
 
-    def checkpoint(self) -> dict[str, Any]:
+    def checkpoint(self) -> Content:
         """Return that of the last round's beginning, or of the end."""
         return self._checkpoint
 

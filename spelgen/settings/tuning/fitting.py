@@ -79,8 +79,9 @@ class TorqueTuning:
     steps: int = 5  # at most in a round
     gain: float = 1e-4  # [1] of the cost: a step that gains less ends a round
     turns: int = 3  # of rigid bodies and what stands beside them
-    large: int = 2**15  # samples; of more, a subset is fitted first
-    subset: int = 2**14  # samples
+    subset: int = 2**10  # samples, evenly spread, that come near; all of them finish
+    windows: int = 2**12  # at most, of 5 samples, on which the model is measured after the fit
+    residual_samples: int = 2**14  # that what stands beside rigid bodies is selected on
     first_noise: float = 0.1  # [1] of a joint's torque range
     least_noise: float = (
         1e-4  # [1] of it: noise-free samples are fitted to four digits of their torque's range
@@ -93,7 +94,8 @@ class TorqueTuning:
         0.05  # [1] of the torque's deviation: delays of milliseconds look alike, but smaller
     )
     block: int = 2**13  # samples at a time: of seven joints some 100 MB with their derivatives
-    cached_bytes: float = 2e8  # [B] of regressors, up to which they are kept from pass to pass
+    regressor_bytes: float = 4e8  # [B] of regressors: 70,000 samples of six joints; of more, every so many
+    in_memory: int = 2**18  # samples of logs larger than memory: 140 MB of six joints
     body_step: float = 0.3  # [1] of the way to the border of the possible bodies, at most in a step
     # about a run that is adapted: nothing is known of a load before
     prior_of_load: GaussianPrior = field(default_factory=lambda: GaussianPrior(bodies=10.0))
@@ -121,6 +123,7 @@ class ResidualTuning:
     rounds: int = 30  # of the marginal likelihood's fixed point, at most
     converged: float = 1e-3  # [1] relative change of the noise
     network_samples: int = 2**12  # that networks are fitted to
+    network_first_look: int = 20  # evaluations of its loss: a network that then explains nothing is left out
     network_evaluations: int = 100  # of its loss
 
 

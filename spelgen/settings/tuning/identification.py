@@ -19,6 +19,7 @@ class IdentificationTuning:
     friction_of_torque: float = 0.1  # of a torque's deviation, where the URDF names no effort; a prior's
     friction_width: float = 10.0  # times the guess: how far friction and armature may be from it; a prior's
     usual_speed: float = 2.0  # [rad/s, m/s] where the URDF names none; a prior's
+    regressor_bytes: float = 2e8  # [B] of regressors, up to which they are kept from pass to pass
     well_posed: float = 30.0  # condition number up to which errors are hardly amplified
     acceptable: float = 300.0  # condition number up to which parameters can be told apart
     firm: float = 0.05  # of a value, the deviation up to which it is firm
