@@ -123,7 +123,7 @@ def test_the_evidence_counts_errors_that_last_once(monkeypatch):
     """Half the noise is worth log 2 for each independent sample of each joint, and not for each sample."""
     problem = SimpleNamespace(
         free=torch.tensor([True]), start=torch.zeros(1).double(), precision=torch.eye(1).double(),
-        covariance=torch.eye(1).double(), count=2000, noise=torch.ones(2).double(),
+        covariance=torch.eye(1).double(), count=2000, correlation=5.0, noise=torch.ones(2).double(),
     )  # fmt: skip
     first = torque_fit.TorqueProblem._evidence(problem, problem.start)
     problem.noise = problem.noise / 2
@@ -204,7 +204,7 @@ def test_the_cost_of_a_torque_fit_has_the_prior_in_it():
 
 def test_noise_is_what_each_joint_misses():
     """Ten times the squares are sqrt(10) times the noise, and no joint's noise is another's."""
-    problem = SimpleNamespace(count=50, range=torch.ones(2).double())
+    problem = SimpleNamespace(count=50, correlation=5.0, range=torch.ones(2).double())
     noise = []
     for squares in ([2.0, 8.0], [20.0, 80.0]):
         torque_fit.TorqueProblem.set_noise(problem, torch.tensor(squares).double())

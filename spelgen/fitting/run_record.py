@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -15,6 +16,8 @@ from spelgen.settings.values import Count, NonNegative, Positive, Whole
 
 Content = dict[str, Any]
 """What a file of a run folder holds, by key: JSON, or what torch saves."""
+Record = Mapping[str, Any]
+"""The same, only read."""
 
 Schema = TypeVar("Schema", bound=BaseModel)
 MAY_CHANGE = ("epochs", "patience", "max_minutes")  # between a run and its resumption

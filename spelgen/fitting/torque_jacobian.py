@@ -281,7 +281,8 @@ class TorqueJacobian:
             parameters = self._inertial_parameters({**weights, self.rigid.bodies: bodies})
         each = torch.eye(10).double().unsqueeze(1).expand(-1, len(bodies), -1)
         (slopes,) = gradient(parameters, bodies, each, is_grads_batched=True, materialize_grads=True)
-        return torch.block_diag(*slopes.transpose(0, 1))
+        result: torch.Tensor = torch.block_diag(*slopes.transpose(0, 1))
+        return result
 
 
 def _colours(coupled: torch.Tensor) -> list[int]:
