@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from spelgen.dynamics.protocol import has_rigid_bodies, has_servos
 from spelgen.errors import OptionError
 from spelgen.fitting.objective import FitRequest, FitSummary, Objective
-from spelgen.fitting.run_record import Record
+from spelgen.fitting.run_record import ReadContent
 from spelgen.fitting.servo.objective import ServoObjective
 from spelgen.fitting.servo.report import servo_summary
 from spelgen.fitting.torque_objective import TorqueObjective
@@ -27,11 +27,11 @@ OBJECTIVES: dict[str, type[Objective]] = {
 }
 
 
-SUMMARIES: dict[str, Callable[[Record], FitSummary | None]] = {ServoObjective.name: servo_summary}
+SUMMARIES: dict[str, Callable[[ReadContent], FitSummary | None]] = {ServoObjective.name: servo_summary}
 """What an objective says of a run's config.json, where it determines more than a model."""
 
 
-def fit_summary(record: Record) -> FitSummary | None:
+def fit_summary(record: ReadContent) -> FitSummary | None:
     """Return what a fit determined, None where its objective has nothing to say, or is not over."""
     summary = SUMMARIES.get(record.get("objective", ""))
     return None if summary is None else summary(record)

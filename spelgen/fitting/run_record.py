@@ -16,7 +16,7 @@ from spelgen.settings.values import Count, NonNegative, Positive, Whole
 
 Content = dict[str, Any]
 """What a file of a run folder holds, by key: JSON, or what torch saves."""
-Record = Mapping[str, Any]
+ReadContent = Mapping[str, Any]
 """The same, only read."""
 
 Schema = TypeVar("Schema", bound=BaseModel)
