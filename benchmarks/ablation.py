@@ -30,11 +30,15 @@ import truth
 from real_logs import first, mean, samples_of, torque_of
 
 import spelgen
-from spelgen.fitting import levenberg_marquardt, residual_fit, torque_fit, torque_jacobian, torque_objective
-from spelgen.fitting.torque_fit import fit_torque
+from spelgen.fitting import levenberg_marquardt
+from spelgen.fitting.torque import jacobian as torque_jacobian
+from spelgen.fitting.torque import objective as torque_objective
+from spelgen.fitting.torque import problem as torque_problem
+from spelgen.fitting.torque import residuals as residual_fit
+from spelgen.fitting.torque.fit import fit_torque
 
 NEVER = float("inf")
-READERS = (torque_fit, torque_jacobian, torque_objective, residual_fit, levenberg_marquardt)
+READERS = (torque_problem, torque_jacobian, torque_objective, residual_fit, levenberg_marquardt)
 SIMULATED = (
     truth.PANDA,
     replace(truth.PANDA, number=1_000_001, friction="bristles", seconds=20.0),
@@ -72,7 +76,7 @@ def mechanisms() -> list[Mechanism]:
         Mechanism("correlated errors (20 samples)", tuned(torque_jacobian, correlation_length=1.0)),
         Mechanism("a second way with little noise", tuned(torque_jacobian, first_noise=1e6)),
         Mechanism("more rounds while noise falls", tuned(torque_jacobian, longer=1)),
-        Mechanism("priors that yield", ((torque_fit, "most_probable", keep_prior),)),
+        Mechanism("priors that yield", ((torque_problem, "most_probable", keep_prior),)),
         Mechanism("friction compensated unseen", tuned(torque_jacobian, compensation_explained=NEVER)),
         Mechanism("every second sample alone", tuned(torque_jacobian, decimation=1)),
         Mechanism("few samples first", tuned(torque_jacobian, subset=2**40)),

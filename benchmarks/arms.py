@@ -37,7 +37,7 @@ from spelgen.baselines.names import CONSTANT_VELOCITY, MODEL, observed
 from spelgen.building import build
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.dynamics.pinocchio_urdf import has_drives, urdf_dynamics
-from spelgen.fitting.torque_fit import fit_torque
+from spelgen.fitting.torque.fit import fit_torque
 from spelgen.identification.friction import FrictionModel
 from spelgen.identification.identify import least_squares
 from spelgen.identification.method import LeastSquares

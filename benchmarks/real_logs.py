@@ -29,7 +29,7 @@ from spelgen.baselines.solver import Solver
 from spelgen.building import build
 from spelgen.dynamics.bristles import BristleReach, reach_of
 from spelgen.evaluation.state_errors import end_errors
-from spelgen.fitting.torque_fit import fit_torque
+from spelgen.fitting.torque.fit import fit_torque
 from spelgen.identification.friction import FrictionModel
 from spelgen.identification.identification import Identification
 from spelgen.identification.identify import least_squares

@@ -36,7 +36,7 @@ import spelgen
 from spelgen.dynamics.bristles import bristle_reach
 from spelgen.dynamics.protocol import memory_along
 from spelgen.errors import SpelgenError
-from spelgen.fitting.torque_fit import fit_torque
+from spelgen.fitting.torque.fit import fit_torque
 from spelgen.logs.dynamics_samples import dynamics_samples
 
 FRICTIONS = ("none", "coulomb", "stribeck", "bristles", "load", "asymmetric")

@@ -40,7 +40,7 @@ def short_epochs(monkeypatch: pytest.MonkeyPatch) -> None:
     """Epochs of few windows take four steps: for tests of what stands around a fit."""
     from spelgen.settings.tuning.fitting import WindowTuning
 
-    monkeypatch.setattr("spelgen.fitting.window_problem.TUNING", WindowTuning(epoch_steps=4))
+    monkeypatch.setattr("spelgen.fitting.window.problem.TUNING", WindowTuning(epoch_steps=4))
 
 
 @pytest.fixture
@@ -49,7 +49,7 @@ def short_torque_fits(monkeypatch: pytest.MonkeyPatch) -> None:
     from spelgen.settings.tuning.fitting import TorqueTuning
 
     tuning = TorqueTuning(rounds=1, first_rounds=1, last_rounds=1, longer=1, steps=2)
-    monkeypatch.setattr("spelgen.fitting.torque_fit.TUNING", tuning)
+    monkeypatch.setattr("spelgen.fitting.torque.problem.TUNING", tuning)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

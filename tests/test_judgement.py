@@ -13,15 +13,17 @@ from spelgen.evaluation import invariants
 from spelgen.evaluation.state_errors import end_errors
 from spelgen.exporting.mjcf_file import mjcf_text
 from spelgen.exporting.rigid_body_projection import rigid_body_projection
-from spelgen.fitting import residual_fit, torque_fit, torque_objective
 from spelgen.fitting.levenberg_marquardt import NormalEquations
-from spelgen.fitting.residual_fit import select_residuals
 from spelgen.fitting.servo import laws
 from spelgen.fitting.servo.parameters import ServoParameters
-from spelgen.fitting.torque_jacobian import ResidualSamples
-from spelgen.fitting.torque_objective import fit_torques
+from spelgen.fitting.torque import objective as torque_objective
+from spelgen.fitting.torque import problem as torque_problem
+from spelgen.fitting.torque import residuals as residual_fit
+from spelgen.fitting.torque.jacobian import ResidualSamples
+from spelgen.fitting.torque.objective import fit_torques
+from spelgen.fitting.torque.residuals import select_residuals
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer
-from spelgen.fitting.window_problem import WindowProblem
+from spelgen.fitting.window.problem import WindowProblem
 from spelgen.fleet import jobs
 from spelgen.identification.least_squares import deviations
 from spelgen.loaded_arm import load_arm
@@ -125,9 +127,9 @@ def test_the_evidence_counts_errors_that_last_once(monkeypatch):
         free=torch.tensor([True]), start=torch.zeros(1).double(), precision=torch.eye(1).double(),
         covariance=torch.eye(1).double(), count=2000, correlation=5.0, noise=torch.ones(2).double(),
     )  # fmt: skip
-    first = torque_fit.TorqueProblem._evidence(problem, problem.start)
+    first = torque_problem.TorqueProblem._evidence(problem, problem.start)
     problem.noise = problem.noise / 2
-    gained = torque_fit.TorqueProblem._evidence(problem, problem.start) - first
+    gained = torque_problem.TorqueProblem._evidence(problem, problem.start) - first
     assert gained < 0.5 * 2000 * 2 * np.log(2)
 
 
@@ -199,7 +201,7 @@ def test_the_cost_of_a_torque_fit_has_the_prior_in_it():
     )
     x, squares = torch.tensor([2.0, 3.0]).double(), torch.tensor([1.0, 8.0]).double()
     expected = (1.0 / 0.25 + 8.0 / 4.0 + (2.0 * 1 + 2 * 0.5 * 3 + 1.0 * 9)) / 2
-    assert torque_fit.TorqueProblem.cost(problem, x, squares) == pytest.approx(expected)
+    assert torque_problem.TorqueProblem.cost(problem, x, squares) == pytest.approx(expected)
 
 
 def test_noise_is_what_each_joint_misses():
@@ -207,7 +209,7 @@ def test_noise_is_what_each_joint_misses():
     problem = SimpleNamespace(count=50, correlation=5.0, range=torch.ones(2).double())
     noise = []
     for squares in ([2.0, 8.0], [20.0, 80.0]):
-        torque_fit.TorqueProblem.set_noise(problem, torch.tensor(squares).double())
+        torque_problem.TorqueProblem.set_noise(problem, torch.tensor(squares).double())
         noise.append(problem.noise)
     torch.testing.assert_close(noise[0][1], 2 * noise[0][0])
     torch.testing.assert_close(noise[1], 10**0.5 * noise[0])

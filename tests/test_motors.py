@@ -14,9 +14,9 @@ from spelgen.arm.actuation import motor_speeds
 from spelgen.building import build
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.dynamics.regressor import regressor, urdf_parameters
-from spelgen.fitting.torque_fit import fit_torque
-from spelgen.fitting.torque_jacobian import TorqueJacobian
-from spelgen.fitting.torque_samples import TorqueSamples
+from spelgen.fitting.torque.fit import fit_torque
+from spelgen.fitting.torque.jacobian import TorqueJacobian
+from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.identification.identify import identify, least_squares
 from spelgen.identification.method import LeastSquares
 from spelgen.loaded_arm import load_arm

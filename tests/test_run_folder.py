@@ -21,12 +21,13 @@ from spelgen.cli.main import app
 from spelgen.errors import LogError, ModuleError, RunError
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.exporting.export import export
-from spelgen.fitting import loop, window_problem
 from spelgen.fitting.fit import RunOptions
 from spelgen.fitting.fitted import load_run
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.run_lock import locked
 from spelgen.fitting.train import train
+from spelgen.fitting.window import loop
+from spelgen.fitting.window import problem as window_problem
 from spelgen.logs import chunks
 from spelgen.logs.read import write_logs
 from spelgen.logs.trajectory import Trajectory

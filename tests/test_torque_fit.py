@@ -17,18 +17,19 @@ from spelgen.building import build
 from spelgen.cli.main import app
 from spelgen.emission.loading import load_module
 from spelgen.errors import LogError
-from spelgen.fitting import torque_fit, torque_jacobian
-from spelgen.fitting.body_steps import moved_bodies
 from spelgen.fitting.fit import fit
-from spelgen.fitting.gaussian_prior import ADAPTED, adapted_kinds, covariance, most_probable
 from spelgen.fitting.objectives import default_objective
-from spelgen.fitting.residual_fit import FRICTION, select_residuals
-from spelgen.fitting.rigid_weights import RIGID, RigidWeights
-from spelgen.fitting.torque_fit import fit_torque
-from spelgen.fitting.torque_jacobian import ResidualSamples
-from spelgen.fitting.torque_networks import adapt_networks
-from spelgen.fitting.torque_report import torque_notes
-from spelgen.fitting.torque_samples import TorqueSamples
+from spelgen.fitting.torque import fit as torque_fit
+from spelgen.fitting.torque import jacobian as torque_jacobian
+from spelgen.fitting.torque.body_steps import moved_bodies
+from spelgen.fitting.torque.fit import fit_torque
+from spelgen.fitting.torque.jacobian import ResidualSamples
+from spelgen.fitting.torque.networks import adapt_networks
+from spelgen.fitting.torque.prior import ADAPTED, adapted_kinds, covariance, most_probable
+from spelgen.fitting.torque.report import torque_notes
+from spelgen.fitting.torque.residuals import FRICTION, select_residuals
+from spelgen.fitting.torque.samples import TorqueSamples
+from spelgen.fitting.torque.weights import RIGID, RigidWeights
 from spelgen.fitting.train import train
 from spelgen.loaded_arm import load_arm
 from spelgen.logs import chunks

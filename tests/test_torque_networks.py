@@ -3,10 +3,10 @@
 import torch
 from emitted import NETWORKS, built, import_source
 
-from spelgen.fitting import torque_networks
 from spelgen.fitting.objectives import default_objective
-from spelgen.fitting.torque_networks import fit_networks
-from spelgen.fitting.torque_samples import TorqueSamples
+from spelgen.fitting.torque import networks as torque_networks
+from spelgen.fitting.torque.networks import fit_networks
+from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.logs.dynamics_samples import DynamicsSamples
 
 

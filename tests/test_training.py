@@ -24,7 +24,6 @@ from spelgen.evaluation.evaluate import evaluate
 from spelgen.evaluation.subject import read_test_logs
 from spelgen.fitting.dataset import TrainingData, prepare_data
 from spelgen.fitting.fit import RunOptions
-from spelgen.fitting.loop import TrainingLoop
 from spelgen.fitting.optimizers import LBFGS, MiniBatchAdamW
 from spelgen.fitting.progress import TrainingProgress
 from spelgen.fitting.rollout import (
@@ -38,7 +37,8 @@ from spelgen.fitting.rollout import (
 )
 from spelgen.fitting.train import train
 from spelgen.fitting.validation import Validation
-from spelgen.fitting.window_problem import WindowProblem
+from spelgen.fitting.window.loop import TrainingLoop
+from spelgen.fitting.window.problem import WindowProblem
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.windows import Windows, cut_windows
@@ -242,7 +242,7 @@ class Interrupted(TrainingProgress):
 
 @pytest.mark.parametrize(("optimizer", "steps"), [("adamw", 20), ("lbfgs", 3)])
 def test_resuming_repeats_what_would_have_been(logs, tmp_path, monkeypatch, optimizer, steps):
-    monkeypatch.setattr("spelgen.fitting.window_problem.TUNING", WindowTuning(epoch_steps=steps))
+    monkeypatch.setattr("spelgen.fitting.window.problem.TUNING", WindowTuning(epoch_steps=steps))
     config = quick(optimizer=optimizer, momentum_steps=20 if optimizer == "adamw" else 0)
     straight, broken = tmp_path / "straight", tmp_path / "broken"
     train(STAND_IN, [logs], straight, config)
@@ -288,7 +288,7 @@ def test_numbers_that_blow_up_are_rolled_back_at_half_the_rate(logs, tmp_path, m
         calls.append(torch.is_grad_enabled())
         return loss * math.nan if sum(calls) == 25 and calls[-1] else loss
 
-    monkeypatch.setattr("spelgen.fitting.loop.rollout_loss", blown_up_once)
+    monkeypatch.setattr("spelgen.fitting.window.loop.rollout_loss", blown_up_once)
     result = train(STAND_IN, [logs], tmp_path / "run", QUICK)
     records = lines(tmp_path / "run")
     assert result.status == "finished"
@@ -304,7 +304,7 @@ def test_numbers_that_never_recover_end_the_run(logs, tmp_path, monkeypatch, opt
         loss = rollout_loss(model, windows, scales, substeps)
         return loss * math.nan if torch.is_grad_enabled() else loss
 
-    monkeypatch.setattr("spelgen.fitting.loop.rollout_loss", blown_up)
+    monkeypatch.setattr("spelgen.fitting.window.loop.rollout_loss", blown_up)
     with pytest.raises(RunError) as caught:
         train(STAND_IN, [logs], tmp_path / "run", quick(optimizer=optimizer))
     assert str(caught.value) == (
@@ -562,7 +562,7 @@ def test_the_allowed_time_is_kept_within_an_epoch(logs, monkeypatch):
     """An epoch of a million steps of 20 ms would take hours: by a clock that only steps move."""
     now = [100.0]
     monkeypatch.setattr(
-        "spelgen.fitting.window_problem.time", types.SimpleNamespace(monotonic=lambda: now[0])
+        "spelgen.fitting.window.problem.time", types.SimpleNamespace(monotonic=lambda: now[0])
     )
     run = MiniBatchAdamW.run
 

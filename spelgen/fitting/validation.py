@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
@@ -10,6 +12,7 @@ import torch
 from spelgen.fitting.dataset import TrainingData
 from spelgen.fitting.rollout import TUNING as INTEGRATION
 from spelgen.fitting.rollout import choose_substeps, integration_error, rollout_loss
+from spelgen.fitting.run_record import Content
 from spelgen.settings.fits import DEFAULTS, Solver
 from spelgen.settings.tuning.fitting import ValidationTuning
 
@@ -67,3 +70,18 @@ class Validation:
         if integration_error(self.model, self.probe, self.scales, present) <= INTEGRATION.fraction:
             return present
         return choose_substeps(self.model, self.probe, self.scales, start=2 * present)
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """A model's weights, the integrator's steps that they need between samples, and their validation loss."""
+
+    substeps: int
+    loss: float
+    weights: Content
+
+
+def measure(model: EmittedModel, validation: Validation) -> Measured:
+    """Return what validation says of a model as it is."""
+    substeps = validation.substeps()
+    return Measured(substeps, validation.loss(substeps), copy.deepcopy(model.state_dict()))

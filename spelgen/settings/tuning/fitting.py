@@ -34,7 +34,7 @@ class ValidationTuning:
 
 @dataclass(frozen=True)
 class WindowTuning:
-    """Steps on windows (`fitting.window_problem`, `fitting.momentum`)."""
+    """Steps on windows (`fitting.window.problem`, `fitting.window.momentum`)."""
 
     epoch_steps: int = 20  # at least; few windows are passed over several times between validations
     warm_up: float = 0.02  # [1] of all steps, over which the learning rate rises
@@ -45,7 +45,7 @@ class WindowTuning:
 
 @dataclass(frozen=True)
 class LoopTuning:
-    """Epochs of predicted windows (`fitting.loop`)."""
+    """Epochs of predicted windows (`fitting.window.loop`)."""
 
     first_stage: float = 0.8  # [1] of all steps or minutes, at most, while residuals of rigid bodies rest
     second_patience: int = 3  # epochs: residuals that belong to the arm soon help
@@ -65,7 +65,7 @@ DAY_TO_DAY = {
 
 @dataclass(frozen=True)
 class TorqueTuning:
-    """Fits of rigid bodies to torques (`fitting.torque_fit`, `fitting.torque_jacobian`, `fitting.body_steps`)."""
+    """Fits of rigid bodies to torques (`fitting.torque`)."""
 
     decimation: int = 2  # samples at 100 Hz, filtered at 8 Hz: every second one says all that is to be said
     correlation_length: float = (
@@ -112,7 +112,7 @@ class TorqueTuning:
 
 @dataclass(frozen=True)
 class ResidualTuning:
-    """Selection of what stands beside rigid bodies (`fitting.residual_fit`)."""
+    """Selection of what stands beside rigid bodies (`fitting.torque.residuals`)."""
 
     folds: int = 10  # blocks of samples that are held out in turn
     gap: float = 5.0  # [1] of the samples that err alike, 0.5 s: left out between fitted and held-out samples
@@ -129,7 +129,7 @@ class ResidualTuning:
 
 @dataclass(frozen=True)
 class TorqueReportTuning:
-    """When a fit to torques warns (`fitting.torque_report`)."""
+    """When a fit to torques warns (`fitting.torque.report`)."""
 
     undetermined: float = (
         0.5  # [1] relative standard deviation from which on logs do not determine an inertia

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import copy
 import math
 import time
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
 
 from spelgen.fitting.dataset import TrainingData
 from spelgen.fitting.optimizers import LBFGS, MiniBatchAdamW, WindowOptimizer
-from spelgen.fitting.run_record import Content
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer
-from spelgen.fitting.validation import Validation
 from spelgen.settings.fits import DEFAULTS, WindowConfig
 from spelgen.settings.tuning.fitting import WindowTuning
 
@@ -41,21 +37,6 @@ class Clock:
         if math.isinf(self.allowed):
             return 0.0
         return math.inf if not self.allowed else seconds / self.allowed
-
-
-@dataclass(frozen=True, eq=False)
-class Measured:
-    """A model's weights, the integrator's steps that they need between samples, and their validation loss."""
-
-    substeps: int
-    loss: float
-    weights: Content
-
-
-def measure(model: EmittedModel, validation: Validation) -> Measured:
-    """Return what validation says of a model as it is."""
-    substeps = validation.substeps()
-    return Measured(substeps, validation.loss(substeps), copy.deepcopy(model.state_dict()))
 
 
 class WindowProblem:

@@ -14,15 +14,14 @@ from spelgen.fitting.dataset import TrainingData
 from spelgen.fitting.objective import FitRequest, PreparedLogs, Status
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.streaming import LargeLogs
-from spelgen.fitting.torque_fit import fit_torque
-from spelgen.fitting.torque_jacobian import TUNING
+from spelgen.fitting.torque.fit import fit_torque
+from spelgen.fitting.torque.jacobian import TUNING
+from spelgen.fitting.torque.networks import adapt_networks, fit_networks
+from spelgen.fitting.torque.report import torque_notes
+from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque_logs import TorqueLogObjective
-from spelgen.fitting.torque_networks import adapt_networks, fit_networks
-from spelgen.fitting.torque_report import torque_notes
-from spelgen.fitting.torque_samples import TorqueSamples
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer
-from spelgen.fitting.validation import Validation
-from spelgen.fitting.window_problem import measure
+from spelgen.fitting.validation import Validation, measure
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.rates import SLOWEST
 from spelgen.settings.fits import TorqueFit

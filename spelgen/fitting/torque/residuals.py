@@ -20,7 +20,7 @@ import torch
 
 from spelgen.dynamics.residuals import residual_torque
 from spelgen.fitting.optimizers import minimise
-from spelgen.fitting.torque_jacobian import ResidualSamples
+from spelgen.fitting.torque.jacobian import ResidualSamples
 from spelgen.runtime.joint_functions import LARGEST
 from spelgen.settings.tuning.fitting import ResidualTuning
 

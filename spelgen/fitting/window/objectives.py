@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, ClassVar
 
 from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.errors import Diagnostic, LogError
-from spelgen.fitting.loop import TrainingLoop
-from spelgen.fitting.momentum import momentum_stage
 from spelgen.fitting.objective import FitRequest, PreparedLogs, Status
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.streaming import LargeLogs
+from spelgen.fitting.torque.objective import fit_torques, torque_samples
 from spelgen.fitting.torque_logs import TorqueLogObjective
-from spelgen.fitting.torque_objective import fit_torques, torque_samples
-from spelgen.fitting.validation import Validation
-from spelgen.fitting.window_problem import TUNING, Clock, Measured, WindowProblem, measure
+from spelgen.fitting.validation import Measured, Validation, measure
+from spelgen.fitting.window.loop import TrainingLoop
+from spelgen.fitting.window.momentum import momentum_stage
+from spelgen.fitting.window.problem import TUNING, Clock, WindowProblem
 from spelgen.logs.rates import SLOWEST
 from spelgen.settings.fits import MomentumFit, Rollout, TorqueFit, WindowConfig
 

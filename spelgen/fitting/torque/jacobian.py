@@ -10,10 +10,10 @@ from torch.autograd import grad as gradient
 
 from spelgen.dynamics.body_regressor import regressor_of
 from spelgen.dynamics.residuals import friction_factor, residual_torque
-from spelgen.fitting.body_steps import moved_bodies
 from spelgen.fitting.functional_model import FunctionalModel, Weights
-from spelgen.fitting.rigid_weights import RigidWeights
-from spelgen.fitting.torque_samples import Block, TorqueSamples
+from spelgen.fitting.torque.body_steps import moved_bodies
+from spelgen.fitting.torque.samples import Block, TorqueSamples
+from spelgen.fitting.torque.weights import RigidWeights
 from spelgen.settings.tuning.fitting import TorqueTuning
 
 if TYPE_CHECKING:

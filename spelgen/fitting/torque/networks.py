@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from spelgen.fitting.optimizers import minimise_sum
-from spelgen.fitting.torque_samples import Block, TorqueSamples
+from spelgen.fitting.torque.samples import Block, TorqueSamples
 from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.settings.fits import DEFAULTS, Adaptation
 

@@ -12,9 +12,9 @@ from torch.autograd.functional import jacobian
 from spelgen.dynamics.protocol import has_residuals
 from spelgen.errors import Diagnostic
 from spelgen.fitting.functional_model import FunctionalModel
-from spelgen.fitting.rigid_weights import RigidWeights
-from spelgen.fitting.torque_fit import TorqueSolution
-from spelgen.fitting.torque_samples import TorqueSamples
+from spelgen.fitting.torque.fit import TorqueSolution
+from spelgen.fitting.torque.samples import TorqueSamples
+from spelgen.fitting.torque.weights import RigidWeights
 from spelgen.settings.tuning.fitting import TorqueReportTuning
 
 if TYPE_CHECKING:

@@ -12,13 +12,13 @@ import torch
 
 from spelgen.dynamics.residuals import idle_residuals
 from spelgen.errors import RunError
-from spelgen.fitting.momentum import momentum_stage
 from spelgen.fitting.optimizers import WindowOptimizer
 from spelgen.fitting.progress import TrainingProgress
 from spelgen.fitting.rollout import rollout_loss
 from spelgen.fitting.run_record import Content
-from spelgen.fitting.validation import Validation
-from spelgen.fitting.window_problem import Clock, Measured, WindowProblem, measure
+from spelgen.fitting.validation import Measured, Validation, measure
+from spelgen.fitting.window.momentum import momentum_stage
+from spelgen.fitting.window.problem import Clock, WindowProblem
 from spelgen.logs.windows import Windows
 from spelgen.settings.fits import Rollout
 from spelgen.settings.tuning.fitting import LoopTuning

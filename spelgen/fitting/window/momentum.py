@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import torch
 
 from spelgen.fitting.rollout import momentum_loss
-from spelgen.fitting.window_problem import TUNING, Clock, Measured, WindowProblem, measure
+from spelgen.fitting.validation import Measured, measure
+from spelgen.fitting.window.problem import TUNING, Clock, WindowProblem
 from spelgen.logs.windows import Windows
 
 if TYPE_CHECKING:

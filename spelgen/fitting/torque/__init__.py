@@ -1,0 +1,1 @@
+"""Fit inverse dynamics to the torques of logs."""

@@ -1,0 +1,118 @@
+"""Fit rigid bodies to torques: their most probable weights, by Levenberg-Marquardt steps.
+
+Few samples come near, all of them finish. What a model has beside rigid bodies is fitted to what these leave, where it
+pays (see ``residuals``), and then both in turn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from spelgen.dynamics.protocol import has_residuals
+from spelgen.fitting.torque.jacobian import TUNING, TorqueJacobian
+from spelgen.fitting.torque.problem import State, TorqueProblem
+from spelgen.fitting.torque.residuals import SelectedResidual, refit_residuals, select_residuals
+from spelgen.fitting.torque.samples import TorqueSamples
+from spelgen.logs.dynamics_samples import DynamicsSamples
+from spelgen.settings.fits import Adaptation, GaussianPrior
+
+if TYPE_CHECKING:
+    from spelgen.emission.loading import EmittedModel
+
+
+@dataclass(frozen=True, eq=False)
+class TorqueSolution:
+    """How a fit ended.
+
+    residual: (n,) root mean square of the torque that is missed [Nm, N]. prior: as the fit found it. covariance: of the
+    weights after the fit (K, K), zero for those that did not move. compensated: (n,) joints whose drives add torque
+    that is not measured. residuals: what was selected beside rigid bodies.
+    """
+
+    residual: np.ndarray
+    steps: int
+    cost: float
+    prior: GaussianPrior
+    covariance: torch.Tensor
+    compensated: np.ndarray
+    residuals: tuple[SelectedResidual, ...]
+
+
+def fit_torque(
+    model: EmittedModel,
+    samples: TorqueSamples | Sequence[DynamicsSamples],
+    prior: GaussianPrior | None = None,
+    adapt: Adaptation | None = None,
+) -> TorqueSolution:
+    """Set the weights of a closed-form ``model`` to the most probable ones after ``samples`` (torques as logged).
+
+    The prior is centred on the weights as they are. ``adapt``: these move alone, what stands beside rigid bodies stays
+    as it is, and so does the prior of a load (see ``TorqueFit``).
+    """
+    if not isinstance(samples, TorqueSamples):
+        samples = TorqueSamples.of(samples, TUNING.decimation)
+    samples = samples.thinned(_most_samples(model))
+    subset = samples.thinned(TUNING.subset)
+    problem = TorqueProblem(TorqueJacobian(model, subset), prior or _default_prior(adapt), adapt)
+    select_memory = adapt is None and model.elements > 0
+    if select_memory:
+        model.friction.memoryless.fill_(1.0)
+    state = problem.multistart()
+    if select_memory:
+        state = problem.select_memory(state)
+    residuals: list[SelectedResidual] = []
+    if adapt is None and has_residuals(model):
+        state, residuals = _with_residuals(problem, state, samples.thinned(TUNING.residual_samples))
+    if problem.jacobian.samples is not samples:  # few samples came near, all of them finish
+        state = problem.refine(state, samples)
+    problem.jacobian.rigid.write(state.x)
+    rms = (state.residuals / samples.count).sqrt() / problem.jacobian.per_gain(state.x)
+    return TorqueSolution(
+        residual=rms.numpy(),
+        steps=state.steps,
+        cost=state.cost,
+        prior=problem.prior,
+        covariance=problem.covariance,
+        compensated=problem.compensated.numpy(),
+        residuals=tuple(residuals),
+    )
+
+
+def _most_samples(model: EmittedModel) -> int:
+    """Return how many samples there may be: their two regressors stay in memory from step to step."""
+    numbers = 2 * model.n * model.inertial_parameters.numel()
+    return max(TUNING.subset, int(TUNING.regressor_bytes / (8 * numbers)))
+
+
+def _default_prior(adapt: Adaptation | None) -> GaussianPrior:
+    if adapt is None:
+        return GaussianPrior()
+    return {
+        "load": TUNING.prior_of_load,
+        "friction": TUNING.prior_of_friction,
+        "unit": TUNING.prior_of_unit,
+    }[adapt]
+
+
+def _with_residuals(
+    problem: TorqueProblem, state: State, samples: TorqueSamples
+) -> tuple[State, list[SelectedResidual]]:
+    """Select what stands beside rigid bodies, and fit both in turn."""
+    model = problem.jacobian.model
+    if samples is not problem.jacobian.samples:
+        state = problem.refine(state, samples)
+    correlation = problem.correlation
+    problem.jacobian.rigid.write(state.x)
+    residuals = select_residuals(model, problem.jacobian.residual_samples(state.x), correlation)
+    if not residuals:
+        return state, residuals
+    for _ in range(TUNING.turns):
+        state = problem.refine(state, samples)
+        problem.jacobian.rigid.write(state.x)
+        refit_residuals(model, problem.jacobian.residual_samples(state.x), residuals, correlation)
+    return problem.set_samples(state, TorqueJacobian(model, samples)), residuals

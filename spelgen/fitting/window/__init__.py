@@ -1,0 +1,1 @@
+"""Fit windows of logs: the weak form of the equations, and rollouts."""
