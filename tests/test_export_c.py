@@ -273,7 +273,7 @@ def test_functions_are_chosen():
     assert set(export(model, "casadi", arm=arm, entries=[name]).files) == {f"{name}.casadi", "README.md"}
     with pytest.raises(RunError, match="the function 'inverse', expected one of inverse_dynamics, forward"):
         export(model, "c", arm=arm, entries=["inverse"])
-    with pytest.raises(RunError, match="functions for --to urdf, expected --to c or casadi"):
+    with pytest.raises(RunError, match="functions for --to urdf, expected --to c, casadi, onnx and torch"):
         export(model, "urdf", arm=arm, entries=["gravity"])
 
 

@@ -240,7 +240,7 @@ def test_the_tour_on_an_arm_with_a_joint_that_follows(tmp_path):
     """From a URDF to a saved run, networks and rigid bodies, with the regularizer towards the URDF."""
     (tmp_path / "followed.urdf").write_text(FOLLOWED)
     arm = spelgen.load_arm(tmp_path / "followed.urdf")
-    logs = spelgen.simulate(arm, trajectories=4, duration=1.5)
+    logs = spelgen.simulate(arm, trajectories=3, duration=1.0)
     for preset, config in (
         ("hybrid", Rollout(epochs=1, momentum_steps=20)),
         ("closed-form", Rollout(epochs=1, momentum_steps=0)),

@@ -26,7 +26,7 @@ OTHERS = (
     "iiwa14_drake",
 )
 pytestmark = pytest.mark.usefixtures("short_torque_fits")
-SHORT = {"trajectories": 2, "duration": 1.8, "sample_rate": 50.0, "test_fraction": 0.5}
+SHORT = {"trajectories": 2, "duration": 2.4, "sample_rate": 50.0, "test_fraction": 0.5}
 FEW_STEPS = {"epochs": 1, "momentum_steps": 5}
 
 

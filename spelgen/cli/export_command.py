@@ -25,7 +25,7 @@ def export(
         list[str] | None,
         typer.Option(
             metavar="NAME",
-            help="A function to export, for c and casadi; repeatable. Default: all but derivatives.",
+            help="A function to export, for c, casadi, onnx and torch; repeatable. Default: all but derivatives.",
         ),
     ] = None,
     force: Force = False,

@@ -23,6 +23,7 @@ _FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror")
 
 def compiler() -> str | None:
     """Return the C compiler of this machine, gcc before others; None without one."""
+    # gcc first: it measures the stack as well
     for name in ("gcc", "clang", "cc"):
         program = shutil.which(name)
         if program:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from spelgen.errors import RunError, suggestion
@@ -100,13 +101,20 @@ def entry_points(model: TrainedModel) -> dict[str, EntryPoint]:
     entries = ENTRY_POINTS
     if model.servos is not None:
         entries = ENTRY_POINTS | {SERVO_TORQUE.name: SERVO_TORQUE}
-    for name in model.entries:
-        if name not in entries:
-            expected = f"one of {', '.join(entries)}"
-            raise RunError(f"the function {name!r}", expected=expected, do=suggestion(name, entries))
-    if not model.entries:
-        return entries
-    return {name: entry for name, entry in entries.items() if name in model.entries}
+    return {name: entries[name] for name in chosen(model.entries, entries)}
+
+
+def chosen(names: Sequence[str], functions: Iterable[str]) -> list[str]:
+    """Return which of the functions are named, all where none is. Raises RunError for other names."""
+    known = list(functions)
+    for name in names:
+        if name not in known:
+            expected = f"one of {', '.join(known)}"
+            raise RunError(f"the function {name!r}", expected=expected, do=suggestion(name, known))
+    if not names:
+        return known
+    # in their own order: the same choice gives the same files
+    return [name for name in known if name in names]
 
 
 def without_derivatives(model: TrainedModel) -> tuple[str, ...]:

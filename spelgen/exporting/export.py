@@ -12,13 +12,16 @@ from spelgen.exporting.entry_points import without_derivatives
 from spelgen.exporting.exported import EXPORTERS, Exported, require_fitting
 from spelgen.exporting.trained import Trained
 from spelgen.fitting.fitted import Fit, load_run
+from spelgen.labels import listed
 from spelgen.loaded_arm import LoadedArm, arm_of_module
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
-_CHOOSE = ("c", "casadi")
+_CHOOSE = ("c", "casadi", "onnx", "torch")
 """The formats of which functions can be chosen."""
+_DERIVATIVES = ("c", "casadi")
+"""Those that have derivatives as well, which are written where they are named."""
 
 
 def export(
@@ -35,13 +38,14 @@ def export(
     to: ``urdf``, FILE.urdf with its settings and friction beside it; ``mjcf``, FILE.xml for MuJoCo; ``c``, a folder
     with a C99 header and source; ``ros2``, a colcon package around these; ``casadi``, ``onnx`` and ``torch``, a folder
     with a file for each function. The export is compared with the model first. arm: of ``load_arm`` or the path
-    of a URDF; by default the fit's. entries: of c and casadi, names of the functions that are written; by default all
-    but derivatives. Raises RunError where there is no arm, for a preset or a path that does not go with the format,
-    where the comparison fails, and where a file exists and ``force`` is not given.
+    of a URDF; by default the fit's. entries: of c, casadi, onnx and torch, names of the functions that are written; by
+    default all but derivatives. Raises RunError where there is no arm, for a preset or a path that does not go with the
+    format, where the comparison fails, and where a file exists and ``force`` is not given.
     """
     if to not in EXPORTERS:
         do = suggestion(to, EXPORTERS)
         raise RunError(f"the format {to!r}", expected=f"one of {', '.join(EXPORTERS)}", do=do)
+    # before a run is loaded and exported, which takes seconds
     if path is not None:
         require_fitting(to, Path(path))
     if isinstance(trained, str | Path):
@@ -52,11 +56,10 @@ def export(
     else:
         model = trained
     if entries and to not in _CHOOSE:
-        raise RunError(
-            f"functions for --to {to}", expected=f"--to {' or '.join(_CHOOSE)}, which have a choice"
-        )
+        raise RunError(f"functions for --to {to}", expected=f"--to {listed(_CHOOSE)}, which have a choice")
     chosen = Trained(model, _loaded(model, arm), tuple(entries))
-    if to in _CHOOSE and not entries:
+    # derivatives are two thirds of the code, and few need them
+    if to in _DERIVATIVES and not entries:
         chosen = replace(chosen, entries=without_derivatives(chosen.described))
     exported = EXPORTERS[to].function()(chosen)
     if path is not None:

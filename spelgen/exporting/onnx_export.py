@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from spelgen.dynamics.prepared import PreparedModel
+from spelgen.exporting.entry_points import chosen
 from spelgen.exporting.exported import UNITS, Exported, readme
 from spelgen.exporting.parity import Called, Values, check_parity
 from spelgen.exporting.torch_programs import PROGRAMS, export_program, program_inputs, program_output
@@ -26,8 +27,8 @@ from spelgen.settings.tuning.exporting import TUNING
 def export_onnx(trained: Trained) -> Exported:
     """Return an .onnx for each entry point. Raises RunError where ONNX Runtime and the model differ."""
     model = trained.model.prepared()
-    files = {name: onnx_model(model, name) for name in PROGRAMS}
-    parity = check_parity(called_by_onnx(files), trained, list(PROGRAMS), TUNING.onnx_tolerance)
+    files = {name: onnx_model(model, name) for name in chosen(trained.entries, PROGRAMS)}
+    parity = check_parity(called_by_onnx(files), trained, list(files), TUNING.onnx_tolerance)
     checked = f"Checked when exported, by ONNX Runtime {onnxruntime.__version__}: {parity.summary}."
     use = (
         "onnxruntime.InferenceSession('forward_dynamics.onnx').run(['qdd'], {'q': q, 'qd': qd, 'tau': tau}), "
@@ -35,7 +36,7 @@ def export_onnx(trained: Trained) -> Exported:
     )
     size = model.n * model.elements
     memory = f"; z, friction's memory, is (batch, {size})" if size else ""
-    about = f"{UNITS}{memory}; one file an entry point: {', '.join(PROGRAMS)}."
+    about = f"{UNITS}{memory}; one file an entry point: {', '.join(files)}."
     text = readme(f"Dynamics of {trained.robot} in ONNX", use, trained.joint_names, about, checked)
     contents = {f"{name}.onnx": content for name, content in files.items()}
     return Exported("onnx", trained.robot, {**contents, "README.md": text}, (checked,))

@@ -9,6 +9,7 @@ import torch
 from safetensors.torch import save
 
 from spelgen.dynamics.prepared import PreparedModel
+from spelgen.exporting.entry_points import chosen
 from spelgen.exporting.exported import UNITS, Exported, readme
 from spelgen.exporting.parity import Called, Values, check_parity
 from spelgen.exporting.torch_programs import PROGRAMS, export_program, program_inputs, program_output
@@ -19,8 +20,8 @@ from spelgen.settings.tuning.exporting import TUNING
 def export_torch(trained: Trained) -> Exported:
     """Return a .pt2 for each entry point, and model.safetensors. Raises RunError where they differ from the model."""
     model = trained.model.prepared()
-    files = {f"{name}.pt2": _saved(export_program(model, name)) for name in PROGRAMS}
-    parity = check_parity(_called_by_torch(files, model), trained, list(PROGRAMS), TUNING.tolerance)
+    programs = {name: _saved(export_program(model, name)) for name in chosen(trained.entries, PROGRAMS)}
+    parity = check_parity(_called_by_torch(programs, model), trained, list(programs), TUNING.tolerance)
     checked = f"Checked when exported, by torch {torch.__version__}: {parity.summary}."
     # clones: some tables of an emitted module stand in two places
     weights = {key: x.cpu().contiguous().clone() for key, x in trained.model.state_dict().items()}
@@ -30,6 +31,7 @@ def export_torch(trained: Trained) -> Exported:
         "model.safetensors contains the trained weights by the names of the emitted module."
     )
     about = f"{UNITS}; the programs take no gradients by the weights."
+    files = {f"{name}.pt2": content for name, content in programs.items()}
     files["model.safetensors"] = save(weights)
     files["README.md"] = readme(
         f"Dynamics of {trained.robot} in torch", use, trained.joint_names, about, checked
@@ -46,7 +48,7 @@ def _saved(program: torch.export.ExportedProgram) -> bytes:
 
 
 def _called_by_torch(files: dict[str, bytes], model: PreparedModel) -> Called:
-    programs = {name: torch.export.load(io.BytesIO(files[f"{name}.pt2"])).module() for name in PROGRAMS}
+    programs = {name: torch.export.load(io.BytesIO(content)).module() for name, content in files.items()}
 
     def called(name: str, inputs: Values) -> Values:
         tensors = {key: torch.from_numpy(value) for key, value in inputs.items()}

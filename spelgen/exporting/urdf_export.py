@@ -89,6 +89,7 @@ def _friction_text(trained: Trained, projection: RigidBodyProjection) -> str:
         joint: dict[str, object] = {
             "viscous_coulomb": {"viscous": rounded(projection.viscous[index]), "coulomb": coulomb}
         }
+        # a law of several constants has no place in a URDF
         if constants:
             joint["law"] = {key: _plain(values[index]) for key, values in constants.items()}
         if servos is not None:

@@ -26,6 +26,7 @@ STYLES = ("c1", "c2", "c3", "gravity", "c4", "c5", "c6")
 
 def write_comparison(study: Study, tables: Sequence[Table]) -> Path:
     """Write comparison.html into the study's folder; return its path."""
+    # one seed stands for all: the lines of several would cover one another
     results = [result for result in study.results() if result.seed == 0]
     styles = dict(zip([result.variant for result in results], STYLES, strict=False))
     facts = read_facts(study.module(study.variants[0]))
@@ -83,6 +84,7 @@ def _mass_panels(
         if result.example is None:
             continue
         if example is None:
+            # the logs are the same for all, and so is their first motion
             example = result.example
             q = torch.tensor(example.q, dtype=torch.float64)
             masses["true"] = true_mass(study.source, q).tolist()

@@ -58,6 +58,7 @@ def curves(traces: Record, facts: Facts, picture: Picture) -> Curves:
         title = f"{trace['which'].capitalize()} trajectory: {trace['trajectory']}"
         drawn.torques.append(Section(title, torque_panels(trace, joints)))
     if torques:
+        # one trajectory is enough to see where energy goes
         drawn.energy = energy_chart(torques[0])
     for example in traces.get("trajectories", []):
         title = _prediction_title(example, facts)

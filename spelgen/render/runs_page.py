@@ -64,6 +64,7 @@ def write_runs(folders: Sequence[Path], output: Path) -> Path:
 def render_runs(folders: Sequence[Path]) -> str:
     """Return the page as HTML."""
     runs = []
+    # a seventh run has the style of the first again
     for folder, name, style in zip(folders, _names(folders), STYLES * len(folders), strict=False):
         runs.append(_read(folder, name, style))
     return render_page(
@@ -104,6 +105,7 @@ def _read(folder: Path, name: str, style: str) -> EvaluatedRun:
 def _verdict(runs: Sequence[EvaluatedRun]) -> str:
     """Say which run misses least over the longest horizon that all have, which in torque, which under commands."""
     comparisons: list[tuple[str, str, Errors]] = []
+    # the longest horizon is the hardest
     for horizon in _common(runs, "horizons")[-1:]:
         errors = _horizon_errors(runs, horizon, "mean_relative_rms")
         comparisons.append((f"rollout error over {horizon}", "of the motion", errors))

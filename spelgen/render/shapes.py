@@ -95,21 +95,24 @@ def _visual_meshes(urdf: Path, links: Sequence[str]) -> dict[str, Any]:
     model = yourdfpy.URDF.load(
         str(urdf), build_scene_graph=False, load_meshes=False, build_collision_scene_graph=False
     )
-    visuals = [x for link in model.robot.links if link.name in links for x in link.visuals]
-    named = [x.geometry.mesh for x in visuals if x.geometry.mesh is not None]
-    files = _read_meshes({mesh.filename: Path(model._filename_handler(mesh.filename)) for mesh in named})
+    shown = [link for link in model.robot.links if link.name in links and link.visuals]
+    paths = {}
+    for link in shown:
+        for visual in link.visuals:
+            mesh = visual.geometry.mesh
+            if mesh is not None:
+                paths[mesh.filename] = Path(model._filename_handler(mesh.filename))
+    # all at once: to start a process takes longer than to read a mesh
+    files = _read_meshes(paths)
     by_link = {}
-    for link in model.robot.links:
+    for link in shown:
         meshes = []
         for visual in link.visuals:
-            if link.name not in links:
-                break
-            mesh = _mesh(visual.geometry, files)
+            shape = _mesh(visual.geometry, files)
             if visual.origin is not None:
-                mesh.apply_transform(visual.origin)
-            meshes.append(mesh)
-        if meshes:
-            by_link[link.name] = trimesh.util.concatenate(meshes)
+                shape.apply_transform(visual.origin)
+            meshes.append(shape)
+        by_link[link.name] = trimesh.util.concatenate(meshes)
     return by_link
 
 
