@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -112,7 +113,7 @@ def run_job(job: Job) -> RunResult:
     if resume:
         fit = train(run.module, job.train, job.folder, **common)
     else:
-        config = _ConfigChoice(training)
+        config = partial(_config, training)
         fit = train(_module(job), job.train, job.folder, config, urdf=job.urdf, **common)
     # a worker that is asked to end leaves a checkpoint, from which the next one goes on
     if fit.status == "interrupted":
@@ -155,21 +156,19 @@ def _training(job: Job) -> TrainingSettings:
     return load_settings(job.urdf).training.model_copy(update=fleet)
 
 
-class _ConfigChoice:
-    """Choose the objective that is asked for, or that suits the model and its logs, with its own options."""
-
-    def __init__(self, training: TrainingSettings) -> None:
-        self._training = training
-
-    def __call__(self, model: EmittedModel, rates: Sequence[float] | None) -> FitConfig | None:
-        rigid_bodies, objective = has_rigid_bodies(model), self._training.objective
-        if objective is not None and not (rigid_bodies and objective == "momentum"):
-            return fit_config(
-                objective, rigid_bodies=rigid_bodies, options={}, defaults=self._training.options
-            )
-        if rates is None and rigid_bodies:
-            return None  # the logs decide
-        return default_config(model, rates or [], {}, self._training.options)
+def _config(
+    training: TrainingSettings, model: EmittedModel, rates: Sequence[float] | None
+) -> FitConfig | None:
+    """Return the objective that is asked for, or that suits the model and its logs, with its own options."""
+    rigid_bodies = has_rigid_bodies(model)
+    # rigid bodies are not fitted to momenta: a fleet of several presets asks for these where they are
+    if training.objective is not None and not (rigid_bodies and training.objective == "momentum"):
+        return fit_config(
+            training.objective, rigid_bodies=rigid_bodies, options={}, defaults=training.options
+        )
+    if rates is None and rigid_bodies:
+        return None  # the logs decide
+    return default_config(model, rates or [], {}, training.options)
 
 
 def _judged(job: Job, run: RunFolder) -> RunResult:

@@ -42,7 +42,7 @@ def main(paths: list[Path], output: IO[bytes]) -> None:
         resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
     import trimesh
 
-    arrays: dict[str, np.ndarray] = {}
+    arrays: dict[str, Any] = {}
     faces = 0
     for index, path in enumerate(paths):
         kind = path.suffix.lower().lstrip(".")
