@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from spelgen.arm.actuation import Drives
 from spelgen.cli.main import app
 from spelgen.dynamics.regressor import regressor, urdf_parameters
 from spelgen.errors import LogError, SpelgenError, SpelgenErrors
+from spelgen.identification import drive_samples
 from spelgen.identification.drive_hints import drive_problem, find_coupling
 from spelgen.identification.drive_samples import DriveLog
 from spelgen.loaded_arm import load_arm
@@ -379,6 +381,25 @@ def test_no_coupling_is_found_by_luck(loaded, log):
         noise = np.random.default_rng(seed).standard_normal(log.tau.shape).cumsum(axis=0)
         problem = drive_problem(loaded, drive_log(replace(log, tau=noise)))
         assert find_coupling(problem) is None
+
+
+def test_of_many_trajectories_an_even_part_is_filtered(monkeypatch):
+    """A long log is read in chunks: to filter each of them for every delay took minutes of a log of 10^7 samples."""
+    filtered = []
+
+    def unfiltered(moved):
+        filtered.append(moved[0].name)
+        return [SimpleNamespace(q=x.q, qd=x.qd, qdd=x.qd, tau=x.tau) for x in moved]
+
+    monkeypatch.setattr(drive_samples, "dynamics_samples", unfiltered)
+    collected = DriveLog(np.eye(1))
+    t = np.arange(0.0, 6.0, 0.02)
+    for number in range(100):
+        q = np.sin(t)[:, None] + 10.0 * number
+        collected.add(Trajectory(t, q, np.cos(t)[:, None], q, str(number)))
+    assert len(filtered) < 50
+    steps = np.diff(np.unique(collected.samples().q.round(-1)))
+    assert steps.max() <= 1.5 * steps.min()
 
 
 def drive_log(log):

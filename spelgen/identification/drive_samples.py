@@ -16,6 +16,7 @@ DELAYS = (
 )  # [s] loggers and field buses are late by less; a filter of 8 Hz bends at 20 ms
 NO_DELAY = int(np.abs(DELAYS).argmin())
 MOST, FEWEST = 1500, 400  # samples: six joints have some 70 parameters
+MANY = 8  # trajectories: of more, whole ones are left out
 
 
 class DriveSamples(NamedTuple):
@@ -32,17 +33,24 @@ class DriveSamples(NamedTuple):
 
 
 class DriveLog:
-    """Collect samples of one trajectory after another, thinned evenly to at most twice `MOST`."""
+    """Collect samples of one trajectory after another, thinned evenly to at most twice `MOST`.
+
+    Of many trajectories only every second, fourth, ... is looked at: to filter all of a long log takes minutes.
+    """
 
     def __init__(self, inputs: np.ndarray) -> None:
         """inputs: G, (n, n)."""
         self._inputs = inputs
         self._samples: list[DriveSamples] = []
-        self._every = 1
+        self._every = self._step = 1
+        self._number = 0
 
     def add(self, trajectory: Trajectory) -> None:
         """Take in a trajectory, if it is dense and long enough for accelerations."""
         if trajectory.duration < TUNING.shortest_piece:  # most of ten thousand short motions, at no cost
+            return
+        self._number += 1
+        if self._number % self._step:
             return
         joint_torque = trajectory.tau @ self._inputs.T
         moved = []
@@ -54,8 +62,12 @@ class DriveLog:
         motion, tau = samples[0], np.stack([x.tau for x in samples])
         self._samples.append(DriveSamples(motion.q, motion.qd, motion.qdd, tau).thinned(self._every))
         while sum(len(x.q) for x in self._samples) > 2 * MOST:
-            self._samples = [x.thinned(2) for x in self._samples]
-            self._every *= 2
+            if len(self._samples) > MANY:
+                self._samples = self._samples[1::2]
+                self._step *= 2
+            else:
+                self._samples = [x.thinned(2) for x in self._samples]
+                self._every *= 2
 
     def samples(self) -> DriveSamples | None:
         """Return all together; None where there are too few to tell anything."""
