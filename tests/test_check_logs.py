@@ -375,6 +375,17 @@ def test_a_quantised_signal_and_a_stop_are_told(loaded, arm, log):
     assert {"coarse", "at-a-stop"} <= codes
 
 
+@pytest.mark.parametrize("samples_held", [1, 20])
+def test_commands_on_round_levels_are_not_quantised(samples_held):
+    random = np.random.default_rng(0)
+    assert np.isnan(quantisation_step(np.repeat(random.integers(-2, 3, 100), samples_held).astype(float)))
+    swing = 2.4 * np.sin(np.arange(2000) / 40)
+    assert quantisation_step(np.round(swing)) == 1.0
+    assert quantisation_step(np.round(swing + 0.4 * random.standard_normal(2000))) == 1.0
+    # a slow logger repeats values, and they are quantised all the same
+    assert quantisation_step(np.repeat(np.round(swing[::5]), 5)) == 1.0
+
+
 def test_no_coupling_is_found_by_luck(loaded, log):
     """Torques that no parameters explain: of all couplings one is the best, and none is told."""
     for seed in range(10):

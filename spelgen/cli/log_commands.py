@@ -81,7 +81,7 @@ def logs(
     ] = None,
     suggest: Annotated[
         Path | None,
-        typer.Option(help="Write a mapping drafted from the column names and values of the first log."),
+        typer.Option(help="Write a mapping drafted from the column names of the first log."),
     ] = None,
     force: Force = False,
     accept: Accept = None,
@@ -127,8 +127,7 @@ def _suggested(paths: list[Path], arm: LoadedArm, file: Path) -> Path:
     errors: list[SpelgenError] = []
     logs = log_files(paths, None, errors)
     collect(errors)
-    coordinates = arm.arm.coordinates
-    suggestion = suggest_mapping(logs[0], [x.name for x in coordinates], [x.kind for x in coordinates])
+    suggestion = suggest_mapping(logs[0], [x.name for x in arm.arm.coordinates])
     say(f"wrote {write_text(file, suggestion.text)}; check it, then pass it by --mapping")
     if suggestion.missing:
         note(f"no column was found for {', '.join(suggestion.missing)}; write their names into {file}")

@@ -112,9 +112,16 @@ def quantisation_step(values: np.ndarray) -> float:
     # over a hundred steps rounding adds up to what whole steps are told by
     near = differences[differences < 100 * step] / step
     is_whole = np.abs(near - np.round(near)) < TUNING.step_tolerance
-    if len(near) < 3 or is_whole.mean() <= 1 - TUNING.step_tolerance:
+    if len(near) < 3 or is_whole.mean() <= 1 - TUNING.step_tolerance or _is_commanded(values, step):
         return float("nan")
     return step
+
+
+def _is_commanded(values: np.ndarray, step: float) -> bool:
+    """Whether a signal (T,) of few levels jumps between them, as commands on round numbers do."""
+    changes = np.abs(np.diff(values))
+    # a smooth signal passes such wide levels one after the other
+    return bool(np.ptp(values) < TUNING.levels * step and changes[changes > 0].mean() > 1.5 * step)
 
 
 def common_step(steps: Sequence[float]) -> float | None:

@@ -1,4 +1,4 @@
-"""Stream Parquet logs larger than memory: once from end to end, then chunk by chunk, any of them at any time."""
+"""Read Parquet logs larger than memory chunk by chunk, any of them at any time."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -38,10 +37,6 @@ class ParquetLog:
     start: int
     stamp: tuple[int, int]
 
-    def values(self, batch: pa.RecordBatch, row: int) -> np.ndarray:
-        """Return what a batch from this row on holds (T, C), in SI units."""
-        return values_in_si(batch, self.layout, self.file, self.start, row)
-
 
 @dataclass(frozen=True)
 class Chunk:
@@ -53,35 +48,30 @@ class Chunk:
     stop: int
 
     def load(self) -> Trajectory:
-        """Return the chunk's samples, the same as `scan` gave. Raises LogError where the file has changed."""
+        """Return the chunk's samples. Raises LogError where the file has changed, or times do not increase."""
+        file, layout = self.log.file, self.log.layout
         # rows of another file under the same name would be fitted without a word
-        if _stamp(self.log.file) != self.log.stamp:
-            raise LogError(
-                "a file that has changed since it was first read", file=self.log.file, do="start a new run"
-            )
-        source = _source(self.log.file)
+        if _stamp(file) != self.log.stamp:
+            raise LogError("a file that has changed since it was first read", file=file, do="start a new run")
+        source = _source(file)
         groups, row = _row_groups(source, self.first, self.stop)
         stretches = []
         for batch in source.iter_batches(ROW_GROUP, row_groups=groups, columns=list(self.log.stored)):
             low, high = max(self.first - row, 0), min(self.stop - row, batch.num_rows)
             if low < high:
-                stretches.append(self.log.values(batch.slice(low, high - low), row + low))
+                rows = batch.slice(low, high - low)
+                stretches.append(values_in_si(rows, layout, file, self.log.start, row + low))
             row += batch.num_rows
             if row >= self.stop:
                 break
-        return self.trajectory(np.concatenate(stretches))
+        data = np.concatenate(stretches)
+        self.require_increasing(data[:, 0], self.first)
+        return make_trajectory(data, layout, self.name, file)
 
-    def trajectory(self, data: np.ndarray) -> Trajectory:
-        """Return its samples, from their values (T, C) in SI units."""
-        return make_trajectory(data, self.log.layout, self.name, self.log.file)
-
-
-class Recording(NamedTuple):
-    """Name the rows of one recording in a file."""
-
-    name: str
-    first: int
-    stop: int
+    def require_increasing(self, t: np.ndarray, first: int) -> None:
+        """Raise LogError unless times, of the rows from `first` on, increase."""
+        rows = np.arange(first, first + len(t))
+        require_increasing_times(t, rows, self.log.file, self.log.layout.columns[0])
 
 
 def large_files(
@@ -134,7 +124,7 @@ def scan(
     mapping: LogMapping | None = None,
     joint_types: Sequence[str] | None = None,
 ) -> Iterator[tuple[Chunk, Trajectory]]:
-    """Yield every chunk with its samples, read once in the files' order; the caller keeps what it needs of them.
+    """Yield every chunk with its samples, in the files' order; the caller keeps what it needs of them.
 
     A longer recording is several chunks. Raises LogError and SettingsError as `read_logs` does.
     """
@@ -145,16 +135,14 @@ def scan(
     for file in files:
         log = _open_log(file, joints, mapping)
         stem = file.stem if stems[file.stem] == 1 else str(file)
-        last = ("", -np.inf)  # recording and time of the last sample
-        for chunk, recording, data in _chunks(log, stem, len(files) > 1):
-            t = data[:, 0]
-            # times must increase across the border between chunks, too
-            if last[0] == recording:
-                t = np.concatenate([[last[1]], t])
-            rows = np.arange(chunk.stop - len(t), chunk.stop)
-            require_increasing_times(t, rows, file, log.layout.columns[0])
-            last = (recording, t[-1])
-            yield chunk, chunk.trajectory(data)
+        for recording in _recordings(log, stem, len(files) > 1):
+            latest = -np.inf
+            for chunk in _cut(recording):
+                trajectory = chunk.load()
+                # times must increase across the border between chunks, too
+                chunk.require_increasing(np.array([latest, trajectory.t[0]]), chunk.first - 1)
+                latest = trajectory.t[-1]
+                yield chunk, trajectory
 
 
 def _open_log(file: Path, joints: Sequence[str], mapping: LogMapping) -> ParquetLog:
@@ -170,38 +158,25 @@ def _open_log(file: Path, joints: Sequence[str], mapping: LogMapping) -> Parquet
     return ParquetLog(file, layout, tuple(stored), clock_start(head.column(0)), stamp)
 
 
-def _chunks(log: ParquetLog, stem: str, several_files: bool) -> Iterator[tuple[Chunk, str, np.ndarray]]:
-    """Yield each chunk of a file with the name of its recording and its values."""
-    batches = _source(log.file).iter_batches(ROW_GROUP, columns=list(log.stored))
-    # values that were read and belong to no chunk yet, from row `first` on
-    pending, first = np.zeros((0, len(log.layout.columns))), 0
-    for recording in _recordings(log, stem, several_files):
-        for name, start, stop in _cut(recording):
-            while first + len(pending) < stop:
-                pending, first = pending[start - first :], start
-                batch = next(batches)
-                pending = np.concatenate([pending, log.values(batch, first + len(pending))])
-            yield Chunk(name, log, start, stop), recording.name, pending[start - first : stop - first]
-
-
-def _cut(recording: Recording) -> Iterator[Recording]:
+def _cut(recording: Chunk) -> Iterator[Chunk]:
     """Yield the chunks of a recording, numbered where there are several."""
     size = TUNING.chunk_samples
+    if recording.stop - recording.first <= size:
+        yield recording
+        return
     for number, first in enumerate(range(recording.first, recording.stop, size), start=1):
-        name = recording.name
-        if recording.stop - recording.first > size:
-            name = f"{name} [{number}]"
-        yield Recording(name, first, min(first + size, recording.stop))
+        stop = min(first + size, recording.stop)
+        yield replace(recording, name=f"{recording.name} [{number}]", first=first, stop=stop)
 
 
-def _recordings(log: ParquetLog, stem: str, several_files: bool) -> list[Recording]:
-    """Return each recording of a file. Raises LogError where the rows of one do not lie together."""
+def _recordings(log: ParquetLog, stem: str, several_files: bool) -> list[Chunk]:
+    """Return each recording of a file, uncut. Raises LogError where the rows of one do not lie together."""
     if log.layout.labels is None:
-        return [Recording(stem, 0, _source(log.file).metadata.num_rows)]
-    recordings: list[Recording] = []
+        return [Chunk(stem, log, 0, _source(log.file).metadata.num_rows)]
+    recordings: list[Chunk] = []
     labels: set[str] = set()
     start = 0
-    for label, stop in _label_runs(log):
+    for label, stop in _label_runs(log.file, log.layout.labels):
         if label in labels:
             raise LogError(
                 f"trajectory {label} once more, after others", file=log.file,
@@ -209,20 +184,19 @@ def _recordings(log: ParquetLog, stem: str, several_files: bool) -> list[Recordi
                 expected="its rows together, in a log too large for memory", do="sort the rows",
             )  # fmt: skip
         labels.add(label)
-        recordings.append(Recording(f"{stem}/{label}" if several_files else label, start, stop))
+        recordings.append(Chunk(f"{stem}/{label}" if several_files else label, log, start, stop))
         start = stop
     return recordings
 
 
-def _label_runs(log: ParquetLog) -> list[tuple[str, int]]:
+def _label_runs(file: Path, column: str) -> list[tuple[str, int]]:
     """Return each run of equal labels, in the rows' order, with the row at which it ends."""
     runs: list[tuple[str, int]] = []
     row = 0
-    for batch in _source(log.file).iter_batches(ROW_GROUP, columns=[log.layout.labels]):
+    for batch in _source(file).iter_batches(ROW_GROUP, columns=[column]):
         # runs, and not rows: a label repeats a million times
         encoded = pa.compute.run_end_encode(batch.column(0).cast(pa.string()))
-        ends = encoded.run_ends.to_pylist()
-        for value, end in zip(encoded.values.to_pylist(), ends, strict=True):
+        for value, end in zip(encoded.values.to_pylist(), encoded.run_ends.to_pylist(), strict=True):
             label = str(value)
             if runs and runs[-1][0] == label:
                 runs.pop()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +14,10 @@ from spelgen.errors import LogError
 from spelgen.logs.tables import (
     LogFormat,
     LogTable,
-    list_element,
-    make_layout,
     missing_columns,
     reading,
+    stored_columns,
+    table_layout,
     wanted_quantities,
 )
 from spelgen.settings.log_mapping import LogMapping
@@ -92,12 +93,8 @@ def npz_columns(file: Path) -> pa.Table:
             if array.ndim in (1, 2):
                 arrays[name] = array
     samples = max(map(len, arrays.values()), default=0)
-    columns: dict[str, np.ndarray | list[object]] = {}
     with reading(file):
-        for name, array in arrays.items():
-            if len(array) == samples:
-                values = _arrow_compatible(array)
-                columns[name] = values.tolist() if values.ndim == 2 else values
+        columns = {name: _arrow_column(array) for name, array in arrays.items() if len(array) == samples}
         return pa.table(columns)
 
 
@@ -120,88 +117,70 @@ def _trajectory_text(pattern: str, name: str) -> str | None:
 
 
 def _table(
-    text: str | None, arrays: NpzArrays, file: Path, joints: Sequence[str], mapping: LogMapping
+    recording: str | None, arrays: NpzArrays, file: Path, joints: Sequence[str], mapping: LogMapping
 ) -> LogTable:
-    """Return the table of one recording, whose name is the text."""
-    times, labels = mapping.columns.t, mapping.columns.trajectory
-    names = [times]
-    columns: dict[str, np.ndarray] = {}
-    if times in arrays:
-        columns[times] = arrays[times]
-    for quantity in wanted_quantities(mapping):
-        for index in range(len(joints)):
-            name, values = _joint_column(arrays, quantity, index, joints, mapping, file)
-            names.append(name)
-            if values is not None:
-                columns[name] = values
-    missing = [name for name in names if name not in columns]
-    if missing:
-        raise missing_columns(missing, list(arrays), file, mapping, joints)
-    _require_samples(columns, file)
-    has_labels = text is None and labels in arrays
-    if has_labels:
-        columns[labels] = arrays[labels]
-    with reading(file):
-        table = pa.table({name: _arrow_compatible(array) for name, array in columns.items()})
-    return LogTable(text, table, make_layout(names, labels if has_labels else None, joints, mapping))
-
-
-def _joint_column(
-    arrays: NpzArrays, quantity: str, index: int, joints: Sequence[str], mapping: LogMapping, file: Path
-) -> tuple[str, np.ndarray | None]:
-    """Return name and values (T,) of a joint's column: of a matrix `q` (T, n), else an array of its own."""
-    name = mapping.column(quantity, joints[index])
-    pattern: str = getattr(mapping.columns, quantity)
-    matrix = pattern.replace("{joint}", "").rstrip("_")
-    if matrix in arrays and arrays[matrix].ndim == 2:
-        column = _matrix_column(arrays, index, mapping.log_name(joints[index]), matrix, len(joints), file)
-        return f"{matrix}[:, {column}]", arrays[matrix][:, column]
-    if name in arrays:
-        return name, arrays[name]
-    element = list_element(name, list(arrays))
-    if element is not None:
-        array = arrays[element[0]]
-        if array.ndim == 2 and element[1] < array.shape[1]:
-            return name, array[:, element[1]]
-    return name, None
-
-
-def _arrow_compatible(array: np.ndarray) -> np.ndarray:
-    """Return the array in a type that Arrow knows: this machine's byte order, at most double precision."""
-    # Arrow refuses half and extended precision, and the other byte order
-    if array.dtype.kind == "f":
-        return array.astype(float)
-    return array.astype(array.dtype.newbyteorder("="))
-
-
-def _matrix_column(arrays: NpzArrays, index: int, name: str, matrix: str, joints: int, file: Path) -> int:
-    """Return a joint's column of a matrix: as the array `joints` says, else in the order of the arm's joints."""
-    width = arrays[matrix].shape[1]
-    if JOINT_NAMES not in arrays:
-        if width != joints:
-            raise LogError(
-                f"{width} columns", file=file, element=f"array {matrix}",
-                expected=f"{joints}, one for each joint", do=f"name them by an array {JOINT_NAMES!r}",
-            )  # fmt: skip
-        return index
-    names = [str(x) for x in arrays[JOINT_NAMES].ravel()]
-    if name not in names or len(names) != width:
-        raise LogError(
-            f"the joints {', '.join(names)}", file=file, element=f"array {JOINT_NAMES}",
-            expected=f"{name} among the names of the {width} columns of {matrix}",
-        )  # fmt: skip
-    return names.index(name)
-
-
-def _require_samples(columns: Mapping[str, np.ndarray], file: Path) -> None:
-    """Raise LogError unless all columns have the shape of the first, which are the times."""
-    times = next(iter(columns.values()))
-    for name, array in columns.items():
-        if array.ndim != 1 or array.shape != times.shape:
+    """Return the table of one recording of the archive, or of the only one."""
+    mapping = _with_matrices(arrays, file, joints, mapping)
+    # names alone: to learn an array's type is to read it
+    schema = pa.schema([(name, pa.null()) for name in arrays])
+    layout = table_layout(schema, joints, mapping, file)
+    if recording is not None:
+        layout = replace(layout, labels=None)
+    columns: dict[str, pa.Array] = {}
+    samples = arrays[layout.columns[0]].shape
+    for name in stored_columns(layout, schema.names):
+        array = arrays[name]
+        if array.shape[:1] != samples or array.ndim > 2 or (array.ndim == 2 and name in layout.columns):
             raise LogError(
                 f"an array of shape {array.shape}", file=file, element=f"array {name}",
-                expected=f"a value for each of the {times.shape[0] if times.shape else 0} times",
+                expected=f"a value for each of the {samples[0] if samples else 0} times",
             )  # fmt: skip
+        with reading(file):
+            columns[name] = _arrow_column(array)
+    return LogTable(recording, pa.table(columns), layout)
+
+
+def _with_matrices(arrays: NpzArrays, file: Path, joints: Sequence[str], mapping: LogMapping) -> LogMapping:
+    """Return the mapping in which a joint's column is that of a matrix `q` (T, n), where the archive has one."""
+    logged = {joint: mapping.joint(joint) for joint in joints}
+    for quantity in wanted_quantities(mapping):
+        pattern: str = getattr(mapping.columns, quantity)
+        matrix = pattern.replace("{joint}", "").rstrip("_")
+        if matrix not in arrays or arrays[matrix].ndim != 2:
+            continue
+        names = [mapping.log_name(joint) for joint in joints]
+        for joint, column in zip(joints, _matrix_columns(arrays, matrix, names, file), strict=True):
+            columns = logged[joint].columns.model_copy(update={quantity: f"{matrix}[{column}]"})
+            logged[joint] = logged[joint].model_copy(update={"columns": columns})
+    return mapping.model_copy(update={"joints": logged})
+
+
+def _matrix_columns(arrays: NpzArrays, matrix: str, joints: Sequence[str], file: Path) -> list[int]:
+    """Return the joints' columns of a matrix: as the array `joints` says, else in the order of the arm's joints."""
+    width = arrays[matrix].shape[1]
+    if JOINT_NAMES not in arrays:
+        if width != len(joints):
+            raise LogError(
+                f"{width} columns", file=file, element=f"array {matrix}",
+                expected=f"{len(joints)}, one for each joint", do=f"name them by an array {JOINT_NAMES!r}",
+            )  # fmt: skip
+        return list(range(width))
+    names = [str(x) for x in arrays[JOINT_NAMES].ravel()]
+    for joint in joints:
+        if joint not in names or len(names) != width:
+            raise LogError(
+                f"the joints {', '.join(names)}", file=file, element=f"array {JOINT_NAMES}",
+                expected=f"{joint} among the names of the {width} columns of {matrix}",
+            )  # fmt: skip
+    return [names.index(joint) for joint in joints]
+
+
+def _arrow_column(array: np.ndarray) -> pa.Array:
+    """Return an array as a column, of a matrix a column of its rows."""
+    # Arrow refuses half and extended precision, and the other byte order
+    wide = float if array.dtype.kind == "f" else array.dtype.newbyteorder("=")
+    values = pa.array(array.astype(wide).ravel())
+    return pa.FixedSizeListArray.from_arrays(values, array.shape[1]) if array.ndim == 2 else values
 
 
 NPZ = LogFormat(read_npz, suffixes=(".npz",), columns=npz_columns)

@@ -19,7 +19,7 @@ from spelgen.errors import LogError, shortened
 from spelgen.logs.trajectory import QUANTITIES
 from spelgen.settings.log_mapping import TIMES, LogMapping
 
-LISTED = 12  # columns that a message names
+LISTED = 5  # columns that a message names: enough to see how they are named
 UNITS_KEY = b"units"  # in a Parquet file's metadata: the file declares its units
 UNIT_CODES = ("degrees", "time-unit", "torque-unit", "torque-beyond-drive")  # that a declared unit answers
 UNITS = b"t s, q rad or m, qd rad/s or m/s, tau Nm or N"  # what spelgen itself declares
