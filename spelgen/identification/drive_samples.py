@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from spelgen.logs.dynamics_samples import TUNING, dynamics_samples
+from spelgen.logs.recording import earlier
 from spelgen.logs.trajectory import Trajectory
-from spelgen.logs.values import earlier
 
 DELAYS = (
     np.arange(-60, 61, 10) * 1e-3

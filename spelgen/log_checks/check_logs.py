@@ -6,8 +6,6 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from spelgen.arm.arm import Coordinate
 from spelgen.errors import Diagnostic, LogError, SpelgenError, collect
 from spelgen.identification.drive_hints import DriveProblem, drive_hints, drive_problem, find_wrong_torques
@@ -22,10 +20,10 @@ from spelgen.log_checks.gravity import (
 )
 from spelgen.log_checks.report import JointReport, LogReport, range_fraction
 from spelgen.log_checks.robot_checks import CHECKS, JointEvidence
-from spelgen.log_checks.statistics import Statistics, common_step, statistics
+from spelgen.log_checks.statistics import Statistics, joint_statistics, statistics
 from spelgen.logs.checks import Finding, clock_diagnostics, findings, run_checks, summarised
 from spelgen.logs.tables import UNIT_CODES
-from spelgen.logs.trajectory import QUANTITIES, Trajectory, require_joints, require_torques
+from spelgen.logs.trajectory import Trajectory, require_joints, require_torques
 
 if TYPE_CHECKING:
     from spelgen.loaded_arm import LoadedArm
@@ -83,7 +81,7 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping |
     ):
         report = _joint_report(index, coordinate, gravity, measured)
         reports.append(report)
-        evidence = JointEvidence(coordinate, report.low, report.high, gravity, report.steps)
+        evidence = JointEvidence(coordinate, report.low, report.high, report.steps, gravity)
         declared = mapping.unit("tau", coordinate.name) is not None
         robot_notes, robot_errors = _against_robot(evidence, accepted | set(UNIT_CODES if declared else ()))
         notes += robot_notes
@@ -151,27 +149,18 @@ def _joint_report(
     index: int, coordinate: Coordinate, gravity: GravityFit, measured: Sequence[Statistics]
 ) -> JointReport:
     """Put together what all trajectories show of one joint."""
-    low, high = {}, {}
-    noise: dict[str, float] = {}
-    steps: dict[str, float | None] = {}
-    noisy = [x.noise for x in measured if x.noise is not None]
-    for name in QUANTITIES:
-        low[name] = min(float(x.low[name][index]) for x in measured)
-        high[name] = max(float(x.high[name][index]) for x in measured)
-        steps[name] = common_step([x.steps[name][index] for x in measured])
-        if noisy:
-            noise[name] = float(np.median([x[name][index] for x in noisy]))
+    signals = joint_statistics(index, measured)
     agreement = measured[0].agreement
     for other in measured[1:]:
         agreement += other.agreement
     return JointReport(
         name=coordinate.name,
         kind=coordinate.kind,
-        low=low,
-        high=high,
-        range_fraction=range_fraction(coordinate, low["q"], high["q"]),
-        noise=noise or None,
-        steps=steps,
+        low=signals.low,
+        high=signals.high,
+        range_fraction=range_fraction(coordinate, signals.low["q"], signals.high["q"]),
+        noise=signals.noise or None,
+        steps=signals.steps,
         velocity_factor=agreement.factor(index) if agreement.xx[index] > 0 else None,
         velocity_correlation=agreement.correlation(index),
         gravity=gravity,

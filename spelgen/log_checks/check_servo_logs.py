@@ -7,27 +7,28 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from spelgen.arm.arm import Coordinate
 from spelgen.errors import Diagnostic, LogError
 from spelgen.log_checks.following import DELAYS, NO_DELAY, TUNING, Following, measure_following
+from spelgen.log_checks.gravity import GravityFit
 from spelgen.log_checks.report import range_fraction
+from spelgen.log_checks.robot_checks import POSITION_CHECKS, JointEvidence
 from spelgen.log_checks.servo_report import ServoJointReport, ServoLogReport
-from spelgen.log_checks.statistics import (
-    Clock,
-    clock_of,
-    common_step,
-    noise_level,
-    quantisation_step,
+from spelgen.log_checks.statistics import Clock, JointStatistics, joint_statistics, statistics
+from spelgen.logs.checks import (
+    DEGREES,
+    Finding,
+    clock_diagnostics,
+    findings,
+    is_factor,
+    run_checks,
+    summarised,
 )
-from spelgen.logs.checks import DEGREES, Finding, clock_diagnostics, findings, summarised
-from spelgen.logs.rates import is_dense
 from spelgen.logs.trajectory import Trajectory, require_commands, require_joints
 
 if TYPE_CHECKING:
     from spelgen.loaded_arm import LoadedArm
 
 EXAMPLES = 2  # trajectories that are drawn
-ROUNDING = 1e-3  # rad, m by which rounding overruns a limit
 
 
 def check_servo_logs(logs: Iterable[Trajectory], arm: LoadedArm) -> ServoLogReport:
@@ -47,16 +48,21 @@ def check_servo_logs(logs: Iterable[Trajectory], arm: LoadedArm) -> ServoLogRepo
     summaries, errors = summarised(odd, joints, len(logs))
     notes += summaries
     following = measure_following(logs, _saturation(arm))
-    clocks = [clock_of(log) for log in logs]
+    measured = [statistics(log) for log in logs]
+    clocks = [x.clock for x in measured]
     reports = []
     for k, coordinate in enumerate(coordinates):
-        report = _joint(arm, k, logs, following)
+        signals = joint_statistics(k, measured)
+        report = _joint(arm, k, signals, following)
         reports.append(report)
         wrong = _wrong_command(k, joints, following)
         if wrong is None:
             # some loggers write measured positions in place of commands
             copied = all(np.array_equal(log.q[:, k], require_commands(log)[:, k]) for log in logs)
-            notes += [*_odd_command(k, report, following, copied=copied), *_beyond_limits(coordinate, report)]
+            notes += _odd_command(k, report, following, copied=copied)
+            evidence = JointEvidence(coordinate, signals.low, signals.high, signals.steps, GravityFit())
+            for check, message in run_checks(POSITION_CHECKS, evidence):
+                notes.append(check.diagnostic(message, f"joint {coordinate.name!r}"))
         else:
             errors.append(wrong)
     notes += _sparse(clocks)
@@ -83,10 +89,8 @@ def _saturation(arm: LoadedArm) -> np.ndarray:
     return distances
 
 
-def _joint(arm: LoadedArm, k: int, logs: Sequence[Trajectory], following: Following) -> ServoJointReport:
+def _joint(arm: LoadedArm, k: int, signals: JointStatistics, following: Following) -> ServoJointReport:
     coordinate = arm.arm.coordinates[k]
-    positions = [log.q[:, k] for log in logs]
-    commands = [require_commands(log)[:, k] for log in logs]
     delay, lag = NO_DELAY, None
     if following.moves[k]:
         delay = following.best_delay(k, k)
@@ -97,39 +101,19 @@ def _joint(arm: LoadedArm, k: int, logs: Sequence[Trajectory], following: Follow
         steady_state_error = float(np.quantile(np.abs(following.steady_state_errors[k]), 0.9))
     if arm.settings.joint(coordinate.name).kp is not None:
         saturated = float(following.saturated[k])
-    q, u = _ends(positions), _ends(commands)
     return ServoJointReport(
         name=coordinate.name,
         kind=coordinate.kind,
-        q=q,
-        u=u,
-        range_fraction=range_fraction(coordinate, *q),
-        noise=_noise(logs, k),
-        steps={
-            "q": common_step(list(map(quantisation_step, positions))),
-            "u": common_step(list(map(quantisation_step, commands))),
-        },
+        q=(signals.low["q"], signals.high["q"]),
+        u=(signals.low["u"], signals.high["u"]),
+        range_fraction=range_fraction(coordinate, signals.low["q"], signals.high["q"]),
+        noise=signals.noise.get("q"),
+        steps=signals.steps,
         lag=lag,
         tracking_rms=float(following.tracking_rms[delay, k]),
         steady_state_error=steady_state_error,
         saturated=saturated,
     )
-
-
-def _ends(signals: Sequence[np.ndarray]) -> tuple[float, float]:
-    joined = np.concatenate(signals)
-    return float(joined.min()), float(joined.max())
-
-
-def _noise(logs: Sequence[Trajectory], k: int) -> float | None:
-    """Return the standard deviation of the position's noise, None where logs are too sparse to tell."""
-    levels = []
-    for log in logs:
-        if is_dense(log.sample_rate) and len(log) > 8:
-            levels.append(noise_level(log.t, log.q[:, [k]]))
-    if not levels:
-        return None
-    return float(np.median(levels))
 
 
 def _wrong_command(k: int, joints: Sequence[str], following: Following) -> LogError | None:
@@ -139,7 +123,7 @@ def _wrong_command(k: int, joints: Sequence[str], following: Following) -> LogEr
     where, delay = f"joint {joints[k]!r}", following.best_delay(k, k)
     correlation, gain = float(following.correlation[delay, k, k]), float(following.gain[delay, k, k])
     # a servo follows its command to a fifth, unless one of the two is in degrees
-    in_degrees = 0.8 < gain * DEGREES < 1.25 or 0.8 < gain / DEGREES < 1.25
+    in_degrees = is_factor(gain, DEGREES) or is_factor(gain, 1 / DEGREES)
     if correlation > TUNING.follows and in_degrees:
         got = f"positions that move {gain:.3g} times as far as commands (180/pi is 57.3)"
         do = "write 'units' of q and u under 'logs' in the robot's YAML"
@@ -175,19 +159,6 @@ def _odd_command(
     elif DELAYS[delay] < 0:
         message = f"positions come {-1000 * DELAYS[delay]:.0f} ms before commands: are rows shifted?"
         yield _warning("ahead-of-command", report.name, message)
-
-
-def _beyond_limits(coordinate: Coordinate, report: ServoJointReport) -> Iterator[Diagnostic]:
-    """Yield where positions and commands go beyond the URDF's limits."""
-    if coordinate.continuous:
-        return
-    for name, (low, high) in (("q", report.q), ("u", report.u)):
-        if coordinate.lower is not None and low < coordinate.lower - ROUNDING:
-            message = f"{name} down to {low:.4g}, the limit is {coordinate.lower:.4g}"
-            yield _warning("beyond-position-limit", report.name, message)
-        if coordinate.upper is not None and high > coordinate.upper + ROUNDING:
-            message = f"{name} up to {high:.4g}, the limit is {coordinate.upper:.4g}"
-            yield _warning("beyond-position-limit", report.name, message)
 
 
 def _sparse(clocks: Sequence[Clock]) -> Iterator[Diagnostic]:

@@ -20,14 +20,15 @@ TORQUE_ERRORS = ("torque-sense", "torque-unit", "torque-beyond-drive")
 class JointEvidence:
     """Hold what all trajectories show of one joint: the subject of the checks against the robot.
 
-    low, high: of q, qd and tau. steps: between the levels of quantised signals among them, None of others.
+    low, high: of q, qd and tau, or of q, qd and commands u. steps: between the levels of quantised signals among them,
+    None of others.
     """
 
     coordinate: Coordinate
     low: dict[str, float]
     high: dict[str, float]
-    gravity: GravityFit
     steps: dict[str, float | None]
+    gravity: GravityFit
 
     def largest(self, quantity: str) -> float:
         """Return the largest size of "q", "qd" or "tau"."""
@@ -44,22 +45,22 @@ class JointEvidence:
         return fit.factor, fit.correlation
 
 
-def find_position_below(joint: JointEvidence) -> str | None:
-    """Find positions below the lower limit."""
-    lower = joint.coordinate.lower
-    if joint.coordinate.continuous or lower is None or joint.low["q"] >= lower - TUNING.limit_rounding:
+def find_beyond_limits(joint: JointEvidence) -> str | None:
+    """Find positions, measured or commanded, beyond the limits."""
+    coordinate, findings = joint.coordinate, []
+    if coordinate.continuous:
         return None
-    unit = UNITS[joint.coordinate.kind][0]
-    return f"q down to {joint.low['q']:.4g} {unit}, the limit is {lower:.4g}"
-
-
-def find_position_above(joint: JointEvidence) -> str | None:
-    """Find positions above the upper limit."""
-    upper = joint.coordinate.upper
-    if joint.coordinate.continuous or upper is None or joint.high["q"] <= upper + TUNING.limit_rounding:
-        return None
-    unit = UNITS[joint.coordinate.kind][0]
-    return f"q up to {joint.high['q']:.4g} {unit}, the limit is {upper:.4g}"
+    unit = UNITS[coordinate.kind][0]
+    for name in ("q", "u"):
+        if name not in joint.low:
+            continue
+        low, high = joint.low[name], joint.high[name]
+        # a limit overrun by less is the rounding of a logger
+        if coordinate.lower is not None and low < coordinate.lower - TUNING.limit_rounding:
+            findings.append(f"{name} down to {low:.4g} {unit}, the limit is {coordinate.lower:.4g}")
+        if coordinate.upper is not None and high > coordinate.upper + TUNING.limit_rounding:
+            findings.append(f"{name} up to {high:.4g} {unit}, the limit is {coordinate.upper:.4g}")
+    return "; ".join(findings) or None
 
 
 def find_speed_above(joint: JointEvidence) -> str | None:
@@ -161,6 +162,8 @@ def find_unusual_scale(joint: JointEvidence) -> str | None:
     )
 
 
+# these need no torques: of arms under position servos, too
+POSITION_CHECKS = [Check("beyond-position-limit", "warning", find_beyond_limits)]
 CHECKS: list[Check[JointEvidence]] = [
     Check(
         "torque-sense", "error", find_wrong_sense, expected="the URDF's sense",
@@ -171,8 +174,7 @@ CHECKS: list[Check[JointEvidence]] = [
         "torque-beyond-drive", "error", find_beyond_drive, unless=("torque-sense", "torque-unit"),
         expected="Nm or N at the joint", do=SAY_UNIT,
     ),
-    Check("beyond-position-limit", "warning", find_position_below),
-    Check("beyond-position-limit", "warning", find_position_above),
+    *POSITION_CHECKS,
     Check("beyond-velocity-limit", "warning", find_speed_above),
     Check("beyond-effort-limit", "warning", find_effort_above),
     Check("at-a-stop", "warning", find_stop),

@@ -10,7 +10,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from spelgen.logs.checks import VelocityAgreement, velocity_agreement
 from spelgen.logs.rates import is_dense
-from spelgen.logs.trajectory import GAP, QUANTITIES, Trajectory
+from spelgen.logs.trajectory import GAP, Trajectory
 from spelgen.settings.tuning.log_checks import LogCheckTuning
 
 TUNING = LogCheckTuning()
@@ -38,17 +38,27 @@ class Clock:
 class Statistics:
     """One trajectory of n joints.
 
-    low, high: of q, qd and tau, each (n,). noise: of q, qd and tau (n,), standard deviation of what changes from
-    sample to sample; None where the log is too sparse to tell. steps: of the quantised signals among them (n,),
+    low, high: of its quantities (see `Trajectory`), each (n,). noise: of these (n,), standard deviation of what changes
+    from sample to sample; empty where the log is too sparse to tell. steps: of the quantised signals among them (n,),
     NaN where a signal is not.
     """
 
     clock: Clock
     low: dict[str, np.ndarray]
     high: dict[str, np.ndarray]
-    noise: dict[str, np.ndarray] | None
+    noise: dict[str, np.ndarray]
     steps: dict[str, np.ndarray]
     agreement: VelocityAgreement
+
+
+@dataclass(frozen=True)
+class JointStatistics:
+    """One joint over all trajectories: the same as numbers; a step is None where most trajectories have none."""
+
+    low: dict[str, float]
+    high: dict[str, float]
+    noise: dict[str, float]
+    steps: dict[str, float | None]
 
 
 def statistics(trajectory: Trajectory) -> Statistics:
@@ -56,14 +66,27 @@ def statistics(trajectory: Trajectory) -> Statistics:
     low, high, noise, steps = {}, {}, {}, {}
     # third differences of sparse motion are motion
     dense = is_dense(trajectory.sample_rate) and len(trajectory) > 8
-    for name in QUANTITIES:
+    for name in trajectory.quantities:
         signals: np.ndarray = getattr(trajectory, name)
         low[name], high[name] = signals.min(axis=0), signals.max(axis=0)
         steps[name] = np.array([quantisation_step(column) for column in signals.T])
         if dense:
             noise[name] = noise_level(trajectory.t, signals)
     agreement = velocity_agreement(trajectory)
-    return Statistics(clock_of(trajectory), low, high, noise or None, steps, agreement)
+    return Statistics(clock_of(trajectory), low, high, noise, steps, agreement)
+
+
+def joint_statistics(index: int, measured: Sequence[Statistics]) -> JointStatistics:
+    """Put together what all trajectories show of the signals of one joint."""
+    low, high, noise, steps = {}, {}, {}, {}
+    noisy = [x.noise for x in measured if x.noise]
+    for name in measured[0].low:
+        low[name] = min(float(x.low[name][index]) for x in measured)
+        high[name] = max(float(x.high[name][index]) for x in measured)
+        steps[name] = _common_step([x.steps[name][index] for x in measured])
+        if noisy:
+            noise[name] = float(np.median([x[name][index] for x in noisy]))
+    return JointStatistics(low, high, noise, steps)
 
 
 def clock_of(trajectory: Trajectory) -> Clock:
@@ -124,7 +147,7 @@ def _is_commanded(values: np.ndarray, step: float) -> bool:
     return bool(np.ptp(values) < TUNING.levels * step and changes[changes > 0].mean() > 1.5 * step)
 
 
-def common_step(steps: Sequence[float]) -> float | None:
+def _common_step(steps: Sequence[float]) -> float | None:
     """Return the step of most trajectories, where the signal is quantised in most of them."""
     finite = [step for step in steps if np.isfinite(step)]
     return float(np.median(finite)) if 2 * len(finite) > len(steps) else None

@@ -16,8 +16,8 @@ import numpy as np
 
 from spelgen.errors import Diagnostic, LogError, SpelgenError, collect
 from spelgen.logs.rates import is_dense, shows_accelerations
+from spelgen.logs.recording import is_dropout
 from spelgen.logs.trajectory import Trajectory, gap_ends, split_at_gaps
-from spelgen.logs.values import is_dropout
 from spelgen.settings.log_mapping import TIMES
 from spelgen.settings.tuning.log_checks import LogCheckTuning
 

@@ -14,11 +14,13 @@ import pyarrow.parquet
 from spelgen.errors import LogError, SpelgenError, collect
 from spelgen.files import replacing
 from spelgen.logs.arm_mapping import GivenMapping, LoggedArm, log_source
+from spelgen.logs.clock import clock_start, in_time_order
 from spelgen.logs.formats import read_tables
 from spelgen.logs.log_files import log_files
+from spelgen.logs.recording import make_trajectory
 from spelgen.logs.tables import UNITS, UNITS_KEY, LogTable
 from spelgen.logs.trajectory import Trajectory, require_joints
-from spelgen.logs.values import clock_start, in_time_order, make_trajectory, values_in_si
+from spelgen.logs.values import values_in_si
 
 ROW_GROUP = 2**16  # rows written together: logs larger than memory are read by row groups
 
