@@ -165,7 +165,7 @@ def test_noise_and_steps_are_those_put_in(log):
         assert quantisation_step(np.round(log.q[:, 0] / step) * step) == pytest.approx(step, rel=1e-6)
     assert np.isnan(quantisation_step(noisy.q[:, 0]))
     assert np.isnan(quantisation_step(np.ones(100)))
-    assert statistics(log[::4]).noise is None
+    assert not statistics(log[::4]).noise
 
 
 def test_what_cannot_be_trained_on_is_an_error_not_the_end(loaded, arm, log):
