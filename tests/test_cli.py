@@ -1,7 +1,6 @@
 """The command line as a user meets it: exit codes, one clear line per error, nothing half-written."""
 
 import contextlib
-import io
 import json
 import os
 import re
@@ -451,23 +450,6 @@ def test_what_may_have_been_meant_is_told(spelgen, words, told):
 @pytest.mark.parametrize("command", COMMANDS)
 def test_values_have_names_that_people_read(spelgen, command):
     assert not re.search(r"--\S+ <|\{|INTEGER|list\[", spelgen(command, "-h").stdout)
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "coloured"), [("X", "", True), ("NO_COLOR", "1", False), ("TERM", "dumb", False)]
-)
-def test_help_is_coloured_on_terminals_alone(spelgen, monkeypatch, name, value, coloured):
-    plain = spelgen("train", "-h").stdout
-    monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.delenv("NO_COLOR", raising=False)
-    monkeypatch.setenv(name, value)
-    terminal = type("Terminal", (io.StringIO,), {"isatty": lambda stream: True})()
-    monkeypatch.setattr(sys, "stdout", terminal)
-    with pytest.raises(SystemExit):
-        app(["train", "-h"], prog_name="spelgen")
-    shown = terminal.getvalue()
-    assert ("\x1b[" in shown) == coloured
-    assert re.sub(r"\x1b\[\d*m", "", shown).split() == plain.replace("Usage: root", "Usage: spelgen").split()
 
 
 def test_completion_completes_commands_options_and_choices():

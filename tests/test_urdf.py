@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from spelgen.arm.arm import make_arm
 from spelgen.errors import ArmError, SpelgenError
-from spelgen.urdf.read import Inertial, Joint, Mimic, Transmission, read_urdf
+from spelgen.urdf.read import read_urdf
+from spelgen.urdf.robot import Inertial, Joint, Mimic, Transmission
 
 LINKS = '<link name="base"/>\n<link name="arm"/>\n'
 JOINT = (

@@ -84,6 +84,7 @@ def motor_speeds(inputs: np.ndarray) -> np.ndarray:
     By the same power, each motor's in the units of the joint that it moves most: C is the identity where each moves
     its own joint alone. A joint without a motor stands for its own.
     """
+    # power is the same on both sides: tau_m . speed_m = tau . qd makes C the transpose of G, up to units
     largest = np.take_along_axis(inputs, np.abs(inputs).argmax(axis=0)[None], axis=0)
     passive = largest == 0
     speeds: np.ndarray = (inputs / np.where(passive, 1.0, largest)).T + np.diag(passive[0].astype(float))
@@ -117,6 +118,7 @@ def _undriven(robot: Robot, settings: Settings, driven: Sequence[str]) -> Iterat
     transmitted: set[str] = set()
     for transmission in robot.transmissions:
         transmitted.update(transmission.joint_names)
+    # most URDFs have no transmissions at all: their absence says nothing
     if transmitted.isdisjoint(driven):
         return
     for name in driven:
@@ -131,6 +133,7 @@ def _geared(robot: Robot, settings: Settings, name: str, index: int) -> InputEnt
     gear: float | None = joint.gear
     if "gear" not in joint.model_fields_set:
         gear = _reduction(robot, name)
+    # a gain that nobody knows is learned from the logs rather than assumed to be 1
     if gear is None:
         return InputEntry(index, index, "gain", 1.0)
     if joint.gain == "trained":
@@ -144,6 +147,7 @@ def _reduction(robot: Robot, name: str) -> float | None:
         if _SIMPLE in transmission.type and transmission.joint_names == [name]:
             collect(transmission.errors)
             reductions = [reduction for _, reduction in transmission.actuators if reduction]
+            # two actuators on one joint share the load in a way that no file says
             if len(reductions) == 1:
                 return reductions[0]
     return None
@@ -156,6 +160,7 @@ def _couplings(robot: Robot, settings: Settings, joints: Sequence[str]) -> list[
     errors = []
     for coupling in settings.couplings:
         locked = [name for name in coupling.joints if name not in joints]
+        # a coupling of locked joints alone concerns another part of the robot
         if len(locked) < len(coupling.joints):
             errors += [_locked(name, joints) for name in locked]
             coupled.update(coupling.joints)

@@ -54,6 +54,7 @@ class AngleRounding:
 
     def axis(self, joint: Joint) -> np.ndarray:
         """Return the joint's axis as a unit vector in the joint's frame, (3,)."""
+        # axes in files are often longer than one, 0 0 -1.0001 for example
         unit: np.ndarray = np.array(joint.axis) / np.linalg.norm(joint.axis)
         if self.tolerance == 0.0:
             return unit
@@ -97,6 +98,7 @@ class AngleRounding:
                 changes.append(f"{angle:.10g} is taken as {_in_pi(special)}")
         if changes:
             self._note("snapped-angle", where, line, "; ".join(changes))
+        # most origins do not turn: None saves a product of exact matrices
         if not any(rounded):
             return None
         return rotation_from_rpy(rounded)

@@ -78,6 +78,16 @@ class Arm:
     locked: tuple[str, ...]
 
     @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the coordinates, as in the URDF."""
+        return tuple(coordinate.name for coordinate in self.coordinates)
+
+    @property
+    def joint_types(self) -> tuple[Kind, ...]:
+        """Whether each coordinate turns or slides."""
+        return tuple(coordinate.kind for coordinate in self.coordinates)
+
+    @property
     def has_inertials(self) -> bool:
         """Whether every body has an inertial with mass."""
         return all(body.inertia is not None and body.inertia[0] > 0 for body in self.bodies)
@@ -101,12 +111,14 @@ def make_arm(
     if not 0 <= angle_tolerance < pi / 4:
         got = f"an angle tolerance of {angle_tolerance:g} rad"
         raise ArmError(got, expected="at least 0 and less than pi/4 (0.785)")
+    # the choice may raise: nothing is placed or made exact before
     chain = choose_chain(robot, joints, tip)
     _require_small(robot, chain)
     lumped = lump_links(robot, chain, angle_tolerance)
     # all bodies of one coordinate move with it, so bodies are found by their leader
     indices = {joint.name: index for index, joint in enumerate(chain.joints)}
     locked = {joint.name for joint in lumped.held if joint.type != "fixed"}
+    # exact, so that a horizontal joint has no gravity torque at all and not one of 1e-17
     x, y, z = (exact(float(value)) for value in gravity)
     return Arm(
         name=robot.name,

@@ -50,6 +50,7 @@ def choose_chain(robot: Robot, joints: Sequence[str] | None, tip: str | None) ->
     if not chain.joints:
         expected = "a serial chain of joints"
         raise ArmError("no joint that moves by itself", file=robot.told_as, expected=expected)
+    # a base that floats has six more coordinates, and M would depend on all of them
     _refuse_free_joints(robot, chain.joints[-1])
     return chain
 
@@ -60,6 +61,7 @@ def follows(robot: Robot) -> dict[str, Follow]:
     for joint in robot.joints:
         followers = []
         leader = joint
+        # a loop and no recursion: mimic joints may follow one another hundreds deep
         while leader.name not in result and leader.mimic is not None:
             followers.append((leader.name, leader.mimic))
             leader = robot.joint[leader.mimic.joint]
@@ -102,6 +104,7 @@ def _named(robot: Robot, names: Sequence[str]) -> tuple[Joint, ...]:
             raise ArmError(f"the joint {name!r} twice", file=robot.told_as, expected="each joint once")
     if not chosen:
         return ()
+    # a path through the deepest joint passes all others, or they lie on another branch
     deepest = max(chosen, key=lambda joint: len(robot.path_to(joint.child)))
     ordered = tuple(joint for joint in robot.path_to(deepest.child) if joint in chosen)
     for joint in chosen:
@@ -112,6 +115,7 @@ def _named(robot: Robot, names: Sequence[str]) -> tuple[Joint, ...]:
                 line=joint.line,
                 expected="joints on one path from the root",
             )
+    # columns of logs follow the order that is given: silently sorting would permute them
     if list(ordered) != chosen:
         raise ArmError(
             f"the joints in the order {','.join(names)}",
@@ -156,10 +160,12 @@ def _longest(robot: Robot) -> Chain:
         return Chain(())
     if len(longest) == 1:
         return Chain(longest[0])
+    # two jaws make two chains of one length, and neither is the arm
     if _is_parallel_gripper(longest):
         jaws = ", ".join(repr(chain[-1].name) for chain in longest)
         message = f"{jaws} slide side by side at the end of the chain: taken as a gripper's and locked"
         return Chain(longest[0][:-1], (_remark(longest[0][-1], "info", message),))
+    # an effort of 0 marks joints that nothing drives
     driven = [chain for chain in longest if all(joint.effort != 0 for joint in chain)]
     if len(driven) == 1:
         message = (

@@ -41,6 +41,7 @@ class LumpedLinks:
 def lump_links(robot: Robot, chain: Chain, angle_tolerance: float) -> LumpedLinks:
     """Return the robot with the chain's joints and their followers moving, and all others held."""
     rounding = AngleRounding(angle_tolerance)
+    # parents first: a link is placed in the frame of the body that carries it
     placement = Placement(robot.root, rounding)
     following = follows(robot)
     leaders = {joint.name for joint in chain.joints}
@@ -51,6 +52,7 @@ def lump_links(robot: Robot, chain: Chain, angle_tolerance: float) -> LumpedLink
         if joint.moves and followed.leader.name in leaders and followed.multiplier:
             poses.append((joint, placement.move(joint)))
         else:
+            # a follower whose leader is held stands at its offset, all other joints at 0
             held.append(joint)
             placement.hold(joint, float(followed.offset) if joint.moves else 0.0)
     moved = []
@@ -78,6 +80,7 @@ def _chain_first(robot: Robot, chain: Chain) -> list[Joint]:
 def _lumps(robot: Robot, placement: Placement, count: int) -> list[list[Link]]:
     """Return the links with an inertial that each body carries; what the root carries never moves."""
     lumps: list[list[Link]] = [[] for _ in range(count)]
+    # what the root carries never moves, and a link without inertial adds nothing
     for link in robot.links:
         body = placement.frames[link.name].body
         if body >= 0 and link.inertial is not None:

@@ -91,6 +91,7 @@ class Placement:
     def move(self, joint: Joint) -> Pose:
         """Place a moving joint and its child, which start a body; bodies are numbered by order of calls."""
         frame = self._joint_origin(joint)
+        # the recursion knows joints about z alone: other axes are turned into it here
         aligning = alignment(self._rounding.axis(joint))
         aligned = frame.composed @ aligning
         rotation = self._in_body(frame.body, aligned)
@@ -101,6 +102,7 @@ class Placement:
             self._stretches.append((*stretch, _StretchFrame(aligned, product(stretch[-1].exact, rotation))))
             composed = frame.composed
         else:
+            # a revolute joint turns by any angle: what comes behind it no longer adds up with what was before
             self._stretches.append((_STRAIGHT,))
             composed = aligning.T
         self.frames[joint.child] = Frame(body, composed, self._in_body(body, composed), ZERO)

@@ -114,6 +114,7 @@ def exact_rotation(rotation: np.ndarray) -> Matrix:
     """
     ratios = _quaternion_ratios(rotation)
     candidate = IDENTITY
+    # the shortest fractions that are near enough keep exact arithmetic fast
     for bound in TUNING.denominators:
         w, x, y, z = (Fraction(ratio).limit_denominator(bound) for ratio in ratios)
         candidate = _rotation_of(w, x, y, z)

@@ -90,7 +90,7 @@ def fit_position_actuators(
     )
     if servos is None or len(arm.arm.bodies) > n or (bodies.motors != np.eye(n)).any():
         return None
-    names, tip = tuple(x.name for x in arm.arm.coordinates), tip_in_body(arm)
+    names, tip = arm.arm.joint_names, tip_in_body(arm)
 
     def mjcf(kp: np.ndarray, kv: np.ndarray, armature: np.ndarray, dry: np.ndarray) -> str:
         # kv takes a joint's damping too: they are one number but where the torque is limited

@@ -57,6 +57,7 @@ def multiple_angles(powers: Sequence[tuple[Expr, int, int]]) -> list[tuple[Facto
             coefficient *= number
             if multiple:
                 multiples.append((multiple, angle))
+        # odd powers leave gaps in the spectrum
         if coefficient == 0:
             continue
         if not multiples:

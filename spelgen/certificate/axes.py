@@ -41,6 +41,7 @@ class Axes:
     def __init__(self, arm: Arm):
         self.arm = arm
         self.slides = [body.kind == "prismatic" for body in arm.bodies]
+        # fixed, so that a report is the same every time
         generator = random.Random(0)
         self._configurations = [_configuration(arm, generator) for _ in range(_CONFIGURATIONS)]
 
@@ -67,6 +68,7 @@ class Axes:
 
     def opposed(self, a: int, b: int) -> bool:
         """Whether the two point against each other, for axes that are always parallel."""
+        # parallel unit vectors have a cosine of 1 or -1, at every configuration the same
         return max(self._cosines(a, b)) < 0
 
     def move_alike(self, a: int, b: int) -> bool:

@@ -43,6 +43,7 @@ class Fact:
 
 def facts(arm: Arm, structure: Structure) -> tuple[Fact, ...]:
     """Return what holds of M and V at all configurations, with the reason where geometry gives a simple one."""
+    # mimic joints move several bodies at once, of which the sentences about two axes do not hold
     axes = None
     if is_plain(arm):
         axes = Axes(arm)
@@ -173,6 +174,7 @@ class _Words:
         if not self.structure.potential:
             yield Fact("V is zero", "It needs no network", self._reason(reasons.potential_reason))
             return
+        # joints with one reason make one sentence
         groups: dict[Reason, list[int]] = {}
         for joint in range(len(self.structure.joints)):
             if joint not in self.structure.potential:

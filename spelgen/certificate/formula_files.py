@@ -60,6 +60,7 @@ def sympy_source(formulas: Formulas) -> str:
     """Return the text of the file for SymPy."""
     n = len(formulas.q)
     body = _table("entries", {str(place): entry for place, entry in formulas.entries.items()})
+    # a matrix with holes would be wrong without a word
     if formulas.mass_matrix is not None:
         body.append(f"M = Matrix({n}, {n}, lambda i, j: entries[max(i, j) + 1, min(i, j) + 1])")
     body.append("")
@@ -80,6 +81,7 @@ def _table(name: str, rows: Mapping[str, Expr] | Mapping[Symbol, Expr]) -> list[
 def _beginning(formulas: Formulas, body: str) -> list[str]:
     """Return comments, imports of what ``body`` uses, and the symbols."""
     imported = ["Symbol"]
+    # an import that is not used would fail the linters of whoever takes the file
     for name in ("Add", "Float", "Matrix", "Rational", "cos", "sin"):
         if f"{name}(" in body:
             imported.append(name)
@@ -102,7 +104,7 @@ def _comments(formulas: Formulas) -> list[str]:
     lines = [f"Robot {json.dumps(arm.name)}, for {formulas.trusted}."]
     for number, coordinate in enumerate(arm.coordinates, start=1):
         lines.append(f"q{number}: {json.dumps(coordinate.name)}")
-    if [body.name for body in arm.bodies] != [coordinate.name for coordinate in arm.coordinates]:
+    if tuple(body.name for body in arm.bodies) != arm.joint_names:
         for number, body in enumerate(arm.bodies, start=1):
             lines.append(f"body {number}: {json.dumps(body.name)}")
     for row in formulas.unwritten:

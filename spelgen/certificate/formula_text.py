@@ -32,6 +32,7 @@ def to_dict(formulas: Formulas) -> dict[str, object]:
     printer = Text()
     base = []
     for symbol, definition in formulas.base_parameters.items():
+        # JSON has no fractions: programs get the nearest double
         value = formulas.values.get(symbol)
         if value is not None:
             value = float(value)
@@ -76,6 +77,7 @@ def _parameters(formulas: Formulas, width: int) -> list[str]:
         value = ""
         if symbol in values:
             value = f" [{float(values[symbol]):.6g}]"
+        # a parameter that stands for itself alone needs no equation
         if definition.is_Symbol:
             lines.append(f"  {symbol.name}{value}")
         else:

@@ -167,6 +167,7 @@ def formulas(
         budget = TUNING.budget
     if longest is None:
         longest = READABLE if entry is None else WRITABLE
+    # recursion and base parameters serve all entries: they are worked out once
     writer = _Writer(arm, structure)
     total = TUNING.budget
     rows: list[Formula] = []
@@ -175,6 +176,7 @@ def formulas(
         total -= allowance.left
         rows.insert(0, writer.formula(place, longest, allowance))
         total += allowance.left
+    # of one entry, parameters that it does not contain would only puzzle a reader
     base = writer.base
     if entry is not None:
         base = _named_in(rows, base)
@@ -219,6 +221,7 @@ class _Writer:
             return Formula(place, None, None)
         if self._at_urdf_values:
             polynomials = self._without_vanishing(polynomials)
+        # counted before shortening: how short a sum gets depends on the heuristics
         terms = sum(len(polynomial) for polynomial in polynomials)
         if terms > longest:
             return Formula(place, terms, None)
@@ -245,6 +248,7 @@ class _Writer:
     def _without_vanishing(self, polynomials: Sequence[fmpq_mpoly]) -> list[fmpq_mpoly]:
         """Leave out the monomials whose coefficient is zero for the URDF's values."""
         context = self._expansion.context
+        # under `inertials` the parameters have values, and a monomial may cancel between them
         total = context.from_dict({})
         for base, polynomial in zip(self.base, polynomials, strict=True):
             total += _rational(base.value or Fraction(0)) * polynomial

@@ -56,7 +56,7 @@ class Inspection:
             "robot": self.arm.name,
             "assume": structure.assume,
             "joints": list(structure.joints),
-            "joint_types": [coordinate.kind for coordinate in self.arm.coordinates],
+            "joint_types": list(self.arm.joint_types),
             "mass_matrix": {
                 "entries": [self._entry(entry) for entry in structure.entries],
                 "outputs": len(structure.outputs),
@@ -113,6 +113,7 @@ class Inspection:
 
     def _input_matrix(self) -> dict[str, object]:
         n = len(self.structure.joints)
+        # programs read every entry of G, also those that are zero
         known = {(entry.row, entry.column): entry for entry in self.actuation.entries}
         entries = []
         for row in range(n):
@@ -134,8 +135,10 @@ class Inspection:
 
     def _servo_needs(self) -> str:
         """Return what logs of positions determine, by the rank of their equations."""
+        # positions alone do not fix the scale of torques: kp, mass and friction may all be doubled
         rank = servo_rank(self.arm)
         text = f"{POSITION}; logs of positions determine inertia, weight and friction in ratio to kp only"
+        # one number in SI units then sets the scale of the whole arm
         if len(rank.groups) == 1:
             text += ": one known kp, mass or load determines all"
         else:
@@ -153,6 +156,7 @@ class Inspection:
         needs = ["fixed"]
         if self.input == "position":
             needs = [self._servo_needs()]
+        # logs hold motor torques then, which a model must convert to those of the joints
         if not self.actuation.direct:
             needs = ["motor torques"]
             for kind, meaning in (("fixed", "gear known"), ("gain", "gain trained"), ("coupled", "coupled")):
@@ -175,6 +179,7 @@ class Inspection:
     def _joint_table(self) -> str:
         lines = ["Joints"]
         for index, coordinate in enumerate(self.arm.coordinates):
+            # names come from a file: control characters would move the cursor
             name = textwrap.shorten(printable(coordinate.name), 36, placeholder="...") or '""'
             line = f"  {index + 1:>2}  {name:<36}  {coordinate.kind:<9}  {reach(coordinate)}"
             if index in self.structure.passive:
@@ -189,6 +194,7 @@ class Inspection:
         """Return the lower triangle of M with each entry's joints, or by letters where that is too wide."""
         cells = self._cells()
         text = _triangle(cells, len(self.structure.joints))
+        # an arm of ten joints needs more than 80 columns: then letters must do
         if max(map(len, text)) <= width:
             return "\n".join(["Mass matrix: joints each entry depends on; C constant, 0 always zero", *text])
         for place, cell in cells.items():
@@ -200,6 +206,7 @@ class Inspection:
     def needs(self) -> dict[str, str]:
         """Return what a model of M(q), V(q) and G needs, in words, and the number of base parameters."""
         structure = self.structure
+        # outputs that read the same joints are one network: said together
         counts: dict[tuple[int, ...], int] = {}
         for output in structure.outputs:
             counts[output.joints] = counts.get(output.joints, 0) + 1

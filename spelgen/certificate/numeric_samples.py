@@ -68,6 +68,7 @@ def draw(arm: Arm, count: int, rng: np.random.Generator, *, random_inertials: bo
                 q[block - 1] = moved[block - 1]
             mass[block, sample] = dynamics.mass_matrix(q)
             potential[block, sample] = _potential_energy(dynamics, q)
+    # entries mix kilograms and kilogram square metres: each is judged in its own unit
     diagonal = np.abs(np.diagonal(mass, axis1=2, axis2=3)).mean(axis=(0, 1))
     scale = np.sqrt(np.outer(diagonal, diagonal))[rows, columns]
     scale[scale == 0] = 1.0
@@ -77,6 +78,7 @@ def draw(arm: Arm, count: int, rng: np.random.Generator, *, random_inertials: bo
 
 def regressor(arm: Arm, rng: np.random.Generator) -> np.ndarray:
     """Return rows of the inverse-dynamics regressor at random q, qd, qdd, (rows, 10 bodies)."""
+    # a regressor does not depend on inertials: any possible ones will do
     dynamics = arm_dynamics(with_random_inertias(arm, rng), Settings())
     n, bodies = len(arm.coordinates), len(arm.bodies)
     rows = []
@@ -92,6 +94,7 @@ def regressor(arm: Arm, rng: np.random.Generator) -> np.ndarray:
 
 def _positions(arm: Arm, rng: np.random.Generator) -> np.ndarray:
     turns = np.array([coordinate.kind == "revolute" for coordinate in arm.coordinates])
+    # beyond limits, too: the structure holds at every configuration
     reach = np.where(turns, np.pi, 1.0)
     return rng.uniform(-reach, reach)
 

@@ -37,6 +37,7 @@ def constant_reason(axes: Axes, structure: Structure, entry: Entry) -> str | Non
 
 
 def _diagonal_reason(axes: Axes, structure: Structure, joint: int) -> str | None:
+    # joints before this one move all that it carries as one piece, which changes no inertia
     behind = range(joint + 1, len(axes.slides))
     if axes.slides[joint]:
         return "for a sliding joint the entry is the mass that it carries"
@@ -69,6 +70,7 @@ def balance_reason(axes: Axes, structure: Structure, entry: Entry) -> str | None
 
 def equality_reason(axes: Axes, structure: Structure, entries: Sequence[tuple[int, int]]) -> str | None:
     """Return why entries of one row are equal: their columns' joints move alike what the row's joint carries."""
+    # entries of different rows belong to different masses: no simple reason makes these equal
     if len({row for row, _ in entries}) > 1:
         return None
     columns = sorted(column for _, column in entries)
@@ -89,6 +91,7 @@ def idle_reason(axes: Axes, structure: Structure, joint: int) -> str | None:
     """Return why M does not depend on ``joint``."""
     if joint == 0:
         return "it moves the whole arm as one piece"
+    # M is the same from whatever the base: a joint that commutes with all before it may count as the first
     nearer = list(range(joint))
     if all(axes.commute(joint, other) for other in nearer):
         return f"it does not move {axes_told(nearer)}, as if it moved the whole arm"

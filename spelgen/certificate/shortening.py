@@ -46,6 +46,7 @@ class Shortener:
         if len(polynomial) > TUNING.most_terms_shortened:
             return plain
         candidates = [plain]
+        # s^2 for 1 - c^2 often merges two terms, and never changes the value
         squares_of_sines = self._with_sines_squared(polynomial)
         if len(squares_of_sines) < len(polynomial):
             candidates.append(self._expanded(squares_of_sines))
@@ -99,6 +100,7 @@ class Shortener:
         runs = self._turning(polynomial)
         for run in runs:
             yield self._with_multiple_angles(polynomial, [run])
+        # with one run the line above yielded the same already
         if len(runs) != 1:
             yield self._with_multiple_angles(polynomial, runs)
 

@@ -102,6 +102,7 @@ def bracketed(terms: Terms) -> tuple[fmpq, Terms]:
     """
     if len(terms) < 2:
         return fmpq(1), terms
+    # the sign of the first term goes outside, so that no bracket begins with a minus
     first, *following = terms.values()
     outside = fmpq(1)
     if all(abs(value) == abs(first) for value in following):
@@ -140,6 +141,7 @@ def grouped(functions: Sequence[tuple[Symbol, Terms]]) -> Expr:
     constant = (((), fmpq(1)),)
     for unit, members in sorted(groups.items(), key=lambda group: group[0] != constant):  # constants first
         total |= _group(dict(unit), members)
+    # a common factor before the sum: 2*(a + b) is shorter than 2*a + 2*b
     size = abs(bracketed(total)[0])
     if size == 1:
         return expression(total)

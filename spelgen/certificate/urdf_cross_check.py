@@ -76,12 +76,13 @@ def urdf_cross_check(robot: Robot, arm: Arm, *, samples: int = 6, seed: int = 0)
 
 
 def _yourdfpy_readings(robot: Robot, arm: Arm, samples: int, seed: int) -> Iterator[_Reading]:
+    # the same bytes, or the comparison would prove nothing
     data = robot.path.read_bytes()
     if hashlib.sha256(data).hexdigest() != robot.digest:
         raise ValueError("the file has changed since it was read")
     model = _yourdfpy_model(data)
     rng = np.random.default_rng(seed)
-    names = [coordinate.name for coordinate in arm.coordinates]
+    names = arm.joint_names
     spans = np.array([pi if coordinate.kind == "revolute" else 0.5 for coordinate in arm.coordinates])
     for _ in range(samples):
         q = rng.uniform(-1, 1, len(names)) * spans
@@ -102,6 +103,7 @@ def _yourdfpy_model(data: bytes) -> URDF:
     logger.setLevel(logging.CRITICAL)  # it warns of what read_urdf has said already
     try:
         parsed = yourdfpy.URDF.load(BytesIO(data), build_scene_graph=False, load_meshes=False).robot
+        # yourdfpy resolves one level of mimic joints only
         followers = {joint.name for joint in parsed.joints if joint.mimic is not None}
         for joint in parsed.joints:
             if joint.mimic is not None and joint.mimic.joint in followers:
@@ -109,6 +111,7 @@ def _yourdfpy_model(data: bytes) -> URDF:
             if joint.axis is not None:
                 # a prismatic joint would move by the axis as it is written, however long
                 joint.axis = joint.axis / (np.linalg.norm(joint.axis) or 1.0)
+        # meshes are not needed, and most machines do not have them
         for link in parsed.links:
             link.visuals, link.collisions = [], []
         return yourdfpy.URDF(parsed, build_scene_graph=True, load_meshes=False)
@@ -139,6 +142,7 @@ def _load(robot: Robot, arm: Arm, model: URDF, joint: Joint, origin: np.ndarray)
         # errors grow with the way to the link, not with how far it is in the end
         way = sum(np.linalg.norm(held.xyz) for held in _held_between(robot, joint, name))
         reach = max(reach, float(way + np.linalg.norm(frame[:3, 3])))
+    # a tensor larger than the lever explains sets the scale of its own errors
     if second_moment > mass * reach**2 and mass > 0:
         reach = (second_moment / mass) ** 0.5
     return _Load(pseudo, mass or 1.0, reach or 1.0)

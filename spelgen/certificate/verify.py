@@ -64,6 +64,7 @@ class _Case:
     def rank_check(self, fact: str, rows: np.ndarray, derived: int) -> Check:
         """Return a check of a rank, with the gap between the singular values that decides it."""
         rank, sizes = _rank(rows)
+        # a rank is believed by its gap: the reader sees both sides of it
         gap = []
         for number in (rank, rank + 1):
             if 0 < number <= len(sizes):
@@ -91,8 +92,10 @@ def verify(robot: Robot, arm: Arm, structure: Structure, *, samples: int = 0, se
             raise
         problem = "the numerical proof needs the package pinocchio, which is not installed"
         raise SpelgenError(problem, do="pip install 'spelgen[simulate]'") from None
+    # a rank r shows in r samples; the spare ones would show a larger rank
     count = max(samples, len(structure.entries) + _SPARE)
     rng = np.random.default_rng(seed)
+    # a structure for any inertial values is tested with inertials that no URDF has
     free = structure.assume == "kinematics"
     drawn = numeric_samples.draw(arm, count, rng, random_inertials=free)
     case = _Case(structure, drawn, _is_fine(arm, structure))

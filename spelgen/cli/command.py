@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import re
-import sys
 from difflib import get_close_matches
 from pathlib import Path
 from types import NoneType
@@ -19,9 +17,6 @@ if TYPE_CHECKING:
 
 UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 METAVARS: dict[object, str] = {int: "N", float: "X", str: "TEXT", Path: "FILE"}
-BOLD, CYAN, PLAIN = "\x1b[1m", "\x1b[36m", "\x1b[0m"
-HEADING = re.compile(r"^(\w+:)", re.MULTILINE)
-ENTRY = re.compile(r"^(  (?:-\S*(?:,? \S+)*|[a-z]\S*))(?=  |$)", re.MULTILINE)
 
 
 def name_values(annotation: object) -> None:
@@ -36,25 +31,18 @@ def name_values(annotation: object) -> None:
             info.metavar = METAVARS.get(kind) or "|".join(map(str, get_args(kind)))
 
 
-def is_coloured() -> bool:
-    """Return whether stdout is a terminal that shows colours, and NO_COLOR is not set (no-color.org)."""
-    return sys.stdout.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
-
-
 class _Readable:
     """Common behaviour of a command and of the group of all commands, in front of typer's class."""
 
     params: list[Any]
 
     def get_help(self, ctx: Context) -> str:
-        """Return the help, coloured on terminals."""
+        """Return the help."""
         for parameter in self.params:
+            # typer prints the type of an argument behind its name, which reads as one word too many
             if isinstance(parameter, TyperArgument):
                 vars(parameter)["display_type"] = lambda ctx: ""  # an argument's name says its type
         text: str = super().get_help(ctx)  # type: ignore[misc]
-        if is_coloured():
-            text = HEADING.sub(rf"{BOLD}\1{PLAIN}", text)
-            text = ENTRY.sub(rf"{CYAN}\1{PLAIN}", text)
         return text
 
     def collect_usage_pieces(self, ctx: Context) -> list[str]:
@@ -82,10 +70,12 @@ class Group(_Readable, TyperGroup):  # type: ignore[misc]
 
 def _suggest(error: Any) -> None:
     """Add to the message of a usage error the option or the choice that may have been meant."""
+    # click lists all that is similar: one suggestion is enough
     nearest = list(getattr(error, "possibilities", None) or [])[:1]
     if nearest:
         error.possibilities = []
     error.message = error.message.replace("Value error, ", "")
+    # click has no suggestion for values of a choice, which are misspelt as often as options
     choice = re.fullmatch(r"'(.*)' is not one of (.*)\.", error.message, re.DOTALL)
     if choice:
         choices = re.findall(r"'([^']*)'", choice[2])

@@ -79,6 +79,7 @@ def compare(
             force=force,
             progress=progress,
         )
+    # workers start after the logs exist: each reads the same files
     with workers(jobs, address) as run_tasks:
         run_study(study, run_tasks, note=note)
     tables = comparison_tables(list(study.results()), time_steps(study), study.settings.published)

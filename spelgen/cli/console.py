@@ -84,6 +84,7 @@ def fail(error: BaseException, *, debug: bool = False) -> NoReturn:
     if debug:
         traceback.print_exception(error)
     if isinstance(error, KeyboardInterrupt):
+        # no traceback: whoever pressed Ctrl-C knows why it ended
         note("interrupted")
         raise typer.Exit(INTERRUPTED)
     note(_message(error, debug))
@@ -99,6 +100,7 @@ def _message(error: BaseException, debug: bool) -> str:
             return (
                 f"this needs the package {error.name}, which is not installed; pip install 'spelgen[{extra}]'"
             )
+    # disks that are full and folders without permission are no defects of spelgen
     if isinstance(error, OSError) and error.filename is not None:
         return f"{os.fsdecode(error.filename)}: {(error.strerror or type(error).__name__).lower()}"
     if isinstance(error, OSError) and error.strerror:

@@ -28,6 +28,7 @@ def _torque_nmse(results: Results) -> float | None:
 
 def _worst_joint_nmse(results: Results) -> float | None:
     summary = results.torque.get(MODEL)
+    # a joint whose torque never changes has no nMSE
     known = [] if summary is None else [value for value in summary.joint_nmse if value is not None]
     return max(known, default=None)
 
@@ -66,6 +67,7 @@ def evaluate(
 
     The result is also written to evaluation.json in the run folder.
     """
+    # a misspelt limit is refused before minutes of rollouts
     paths = options.logs(data, extra_logs)
     limits = [_limit(text) for text in limit or []]
     from spelgen.evaluation.evaluate import evaluate as evaluate_model
@@ -85,6 +87,7 @@ def evaluate(
     else:
         results = evaluate_model(model, logs, preprocessing=preprocessing)
     record = results.to_dict()
+    # before anything is printed: a closed pipe must not lose the result
     write_json(RunFolder(run).evaluation, record)
     for diagnostic in results.diagnostics:
         note_diagnostic(diagnostic)
@@ -97,6 +100,7 @@ def evaluate(
         deliver(json.dumps(record) + "\n", output)
     else:
         deliver(results.text() + "\n", output)
+    # after the result, so that a script that failed still has the figures
     missed = [line for name, largest in limits if (line := _missed(results, name, largest))]
     for line in missed:
         note(line)

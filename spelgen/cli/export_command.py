@@ -44,6 +44,7 @@ def export(
 
     if to is None:
         to = format_by_extension(output)
+    # names and free places are checked before the model is loaded, which takes seconds
     require_fitting(to, output)
     options.require_free(output, force=force)
     result = export_run(load_run(run, trust=trust), to, entries=entry or ())

@@ -45,11 +45,13 @@ def fleet(
     folder = (output or Path("fleets") / file.stem).absolute()
     # of a container or a job of a scheduler, which may own fewer cores than the machine has
     count = jobs or len(os.sched_getaffinity(0))
+    # two fleets in one folder would overwrite the runs of one another
     with locked(folder), termination_as_interrupt(), workers(count, address, settings.gpus) as run_tasks:
         results = run_fleet(settings, folder, run_tasks, note)
     listings = fleet_listings(results)
     for listing in listings:
         say(listing.text() + "\n")
     say(f"wrote {write_fleet(results, listings, folder / 'fleet.html')}")
+    # the page is written all the same: what failed is on it
     if results.failures:
         raise typer.Exit(FAILED)

@@ -78,6 +78,7 @@ def identify(
     except OptionError as error:
         raise typer.BadParameter(error.got, param_hint=f"'--{error.element}'") from None
     arm = load_arm(robot, options.names(joints), tip, angle_tolerance)
+    # codes are accepted for this command alone; the sidecar holds those for always
     log_mapping = options.accepting(log_source(arm, mapping).mapping, accept)
     logs = read_logs(paths, arm, log_mapping, role="train")
     # least squares would fit wrong units without a word
@@ -86,6 +87,7 @@ def identify(
     result = identify_arm(arm, logs, method, preprocessing=Preprocessing(cutoff=filter))
     for diagnostic in result.diagnostics:
         note_diagnostic(diagnostic)
+    # pages and charts are imported where they are asked for
     chosen = options.choose_format(format, output, Format)
     if chosen == "html":
         from spelgen.render.identification_page import page

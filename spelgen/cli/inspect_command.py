@@ -52,6 +52,7 @@ def inspect(
 
         longest = WRITABLE if chosen in ("json", "sympy") else None
         closed = inspection.closed_forms(chosen_entry, longest=longest)
+    # the result comes first; --strict and a failed proof only decide the exit code
     deliver(_text(chosen, inspection, closed, proof, arm.robot.path), output)
     if strict:
         warnings = [x for x in inspection.diagnostics if x.severity == "warning"]

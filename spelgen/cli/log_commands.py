@@ -97,6 +97,7 @@ def logs(
     from spelgen.logs.chunks import stream_logs
     from spelgen.render.logs_page import page
 
+    # the URDF says which joints a mapping must name
     arm = load_arm(robot, options.names(joints), tip, angle_tolerance)
     if suggest is not None:
         options.require_free(suggest, force=force)
@@ -107,6 +108,7 @@ def logs(
         say(result.text())
     else:
         say(json.dumps(result.to_dict(), indent=2))
+    # also of logs with errors: a picture often shows what is wrong
     if html is not None:
         note(f"wrote {write_text(html, page(result, arm.arm, arm.actuation.matrix()))}")
     if result.errors:
@@ -127,7 +129,7 @@ def _suggested(paths: list[Path], arm: LoadedArm, file: Path) -> Path:
     errors: list[SpelgenError] = []
     logs = log_files(paths, None, errors)
     collect(errors)
-    suggestion = suggest_mapping(logs[0], [x.name for x in arm.arm.coordinates])
+    suggestion = suggest_mapping(logs[0], arm.arm.joint_names)
     say(f"wrote {write_text(file, suggestion.text)}; check it, then pass it by --mapping")
     if suggestion.missing:
         note(f"no column was found for {', '.join(suggestion.missing)}; write their names into {file}")

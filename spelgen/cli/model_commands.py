@@ -45,6 +45,7 @@ def init(
 
     path = output or robot.with_suffix(".yaml")
     options.require_free(path, force=force)
+    # without the sidecar, which this command is about to write
     arm = make_arm(read_urdf(robot), joints=options.names(joints), tip=tip)
     drives = [StarterJoint(x.name, x.kind, x.damping, x.friction) for x in arm.coordinates]
     say(f"wrote {write_text(path, starter(robot.name, drives))}")
@@ -82,6 +83,7 @@ def build(
     if preset not in PRESET_NAMES and Path(preset).suffix not in (".yaml", ".yml"):
         message = f"{preset!r} is none of {', '.join(PRESET_NAMES)}, nor a YAML file"
         raise typer.BadParameter(message, param_hint="'--preset'")
+    # an option without effect would pass for one that was applied
     if net is not None and preset == "closed-form":
         raise typer.BadParameter("closed-form has no networks", param_hint="'--net'")
     from spelgen.loaded_arm import load_arm

@@ -126,6 +126,7 @@ def choose_format(format: str | None, output: Path | None, formats: object) -> s
     """Return the format named, else the one of these (a Literal) that the output's suffix means, else text."""
     if format is not None:
         return format
+    # `-o page.html` means HTML: to say so twice would be tedious
     meant = SUFFIXES.get(output.suffix.lower()) if output else None
     if meant in get_args(formats):
         return str(meant)
@@ -181,9 +182,11 @@ def mapping(file: Path | None, urdf: Path | None, joints: Sequence[str]) -> LogM
 def accepting(mapping: LogMapping, codes: Sequence[str] | None) -> LogMapping:
     """Return the mapping that accepts these errors too. A usage error for an unknown code."""
     for code in codes or ():
+        # a misspelt code would silently accept nothing
         if code not in get_args(Accepted):
             hint = suggestion(code, get_args(Accepted))
             raise typer.BadParameter(f"unknown code {code!r}; {hint}", param_hint="'--accept'")
+    # a dict keeps the order, so that the same command writes the same record
     accepted = dict.fromkeys((*mapping.accept, *(codes or ())))
     return mapping.model_copy(update={"accept": tuple(accepted)})
 

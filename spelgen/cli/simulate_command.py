@@ -36,7 +36,7 @@ def simulate(
         options.require_free(path, force=force)
     with progress_bar("simulating") as progress:
         logs = simulate_arm(arm, seed=seed, progress=progress)
-    names = [coordinate.name for coordinate in arm.arm.coordinates]
+    names = arm.arm.joint_names
     for path, trajectories in zip(paths.values(), (logs.train, logs.test), strict=True):
         if trajectories:
             write_logs(path, trajectories, names)

@@ -84,6 +84,7 @@ def train(
     that does not apply to the objective is an error.
     """
     start_time = time.monotonic()  # max_minutes counts from here, reading of logs included
+    # before anything is read: a misspelt key costs no time
     values = read_assignments(assignments or [])
     request = Request(objective, values)
     if source is not None:
@@ -106,6 +107,7 @@ def train(
     log_mapping = options.mapping(mapping, urdf, read_facts(start.module).joints) or start.mapping
     if accept:
         log_mapping = options.accepting(log_mapping or LogMapping(), accept)
+    # where a fit runs is no part of what is fitted, and not recorded with it
     machine = Machine.model_validate({name: values[name] for name in Machine.model_fields if name in values})
     # torch is imported where it is needed: --help and mistakes are answered at once
     from spelgen.fitting.fit import RunOptions
@@ -142,6 +144,7 @@ def train(
 
 def _tell(fit: Fit, folder: Path, paths: Sequence[Path], format: str, *, resume: bool) -> None:
     """Print how the fit ended, and keep the baselines of a new run; exit with 130 if it was interrupted."""
+    # a resumed run has its baselines already, and an interrupted one is not finished
     interrupted = fit.status == "interrupted"
     if not resume and not interrupted:
         from spelgen.baselines.keep import keep_baseline
@@ -207,6 +210,7 @@ def _spelled(option: str) -> str:
 
 
 def _default_folder(module: Path, resume: bool) -> Path:
+    # `train RUN --resume` names the folder where a module stands otherwise
     if resume and module.is_dir():
         return module
     return Path("runs") / module.stem
@@ -246,6 +250,7 @@ def _unchanged_urdf(module: Path) -> Path | None:
         path = find_urdf(module, facts.urdf)
     except ModuleError:
         return None
+    # settings and limits of a changed URDF would belong to another arm
     if hashlib.sha256(urdf_bytes(path)).hexdigest() != facts.urdf_sha256:
         return None
     return path

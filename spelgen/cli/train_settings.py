@@ -49,6 +49,7 @@ def _groups_by_key() -> dict[str, type[Group]]:
     groups: list[type[Group]] = [*CONFIGS.values(), TrainingSettings, Machine]
     for group in groups:
         for name in group.model_fields:
+            # several objectives share options: the first that has one checks its value
             keys.setdefault(name, group)
     del keys["objective"]  # an option of its own
     return keys
@@ -124,6 +125,7 @@ def new_run(module: Path, urdf: Path | None, request: Request) -> Start:
     from spelgen.logs.preprocessing import Preprocessing
     from spelgen.settings.settings import load_settings
 
+    # without a URDF there is no sidecar that could hold defaults
     settings = TrainingSettings()
     if urdf is not None:
         settings = load_settings(urdf).training
@@ -172,6 +174,7 @@ def resumed_run(folder: Path, request: Request) -> Start:
 
     run = RunFolder(folder)
     record = run.read_config()
+    # those logs were in memory of another program
     if record["validation_fraction"] is None and record["validation"]:
         raise RunError(
             "a run whose validation logs were passed from Python",

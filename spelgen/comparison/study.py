@@ -240,7 +240,7 @@ def _write_logs(study: Study, loaded: LoadedArm, progress: Callable[[int, int], 
     from spelgen.simulation.simulate import simulate
 
     result = simulate(loaded, progress=progress)
-    names = [coordinate.name for coordinate in loaded.arm.coordinates]
+    names = loaded.arm.joint_names
     training = [_beginning(trajectory, study.settings.first) for trajectory in result.train]
     study.logs.mkdir(parents=True, exist_ok=True)
     write_logs(study.logs / "train.parquet", training, names)

@@ -66,7 +66,7 @@ def tip_kinematics(
     if isinstance(arm, str | Path):
         robot, names = read_urdf(Path(arm)), list(joints or ())
     else:
-        robot, names = arm.robot, [coordinate.name for coordinate in arm.arm.coordinates]
+        robot, names = arm.robot, arm.arm.joint_names
         link = link or arm.tip
     if not names:
         raise ValueError("no joints are named")

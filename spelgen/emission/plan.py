@@ -58,7 +58,7 @@ def plan_model(
     everything = tuple(range(len(arm.coordinates)))
     sizes = nominal(arm, structure)
     inertias = nominal_inertias(arm, sizes.from_urdf)
-    identifiers = _identifiers([coordinate.name for coordinate in arm.coordinates])
+    identifiers = _identifiers(arm.joint_names)
     x, y, z = (float(g) for g in arm.gravity)
     return ModelSpec(
         robot=arm.name,

@@ -15,7 +15,7 @@ _ROUNDING = 1e-15  # what cos(pi / 2) leaves of zero
 
 def tip_chain(loaded: LoadedArm) -> tuple[str, tuple[TipJoint, ...], np.ndarray]:
     """Return the tip's link, the joints on the way to it, and the pose of the tip behind the last, (4, 4)."""
-    names = [joint.name for joint in loaded.arm.coordinates]
+    names = loaded.arm.joint_names
     link = loaded.tip or last_link(loaded.robot, names)
     # followers move as their leaders do; what is no coordinate is locked at zero
     constraint = mimic_constraint(loaded.robot, names)

@@ -35,7 +35,7 @@ class Trained:
     @property
     def joint_names(self) -> tuple[str, ...]:
         """The names of the joints in the URDF."""
-        return tuple(joint.name for joint in self.arm.arm.coordinates)
+        return self.arm.arm.joint_names
 
     @property
     def memory(self) -> int:

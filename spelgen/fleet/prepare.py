@@ -60,7 +60,7 @@ def prepare(preparation: Preparation) -> PreparedArm:
     # reading logs takes longer than asking for their times of change
     chain = (arm.robot.digest, robot.joints, robot.tip)
     key = _digest(*chain, settings, mapping.model_dump_json(exclude_unset=True), _stamps(robot), splits)
-    names = [coordinate.name for coordinate in arm.arm.coordinates]
+    names = arm.arm.joint_names
     element = f"robots.{preparation.name}.data"
     if robot.data and large_files(robot.data, names):
         if splits > 1:

@@ -282,7 +282,7 @@ def _delay_hint(mapping: LogMapping, late: float, remaining: float) -> Diagnosti
 
 def _coupling_hint(arm: LoadedArm, coupling: Coupling, remaining: float) -> Diagnostic:
     """Return a coupling that the logs show, in the sidecar's words."""
-    names = [c.name for c in arm.arm.coordinates]
+    names = arm.arm.joint_names
     pair = [coupling.moved_by, coupling.joint]
     matrix = _coupled_inputs(arm.actuation.drives(), coupling)[np.ix_(pair, pair)]
     joints = json.dumps([names[k] for k in pair])

@@ -75,7 +75,7 @@ class Identification:
 
     def to_dict(self) -> dict[str, object]:
         """Return the JSON form, a public contract."""
-        joints = [coordinate.name for coordinate in self.arm.coordinates]
+        joints = self.arm.joint_names
         friction = self.method.friction
         return {
             "schema": SCHEMA,
@@ -193,7 +193,7 @@ def identified_dynamics(
     n, inertial = len(arm.coordinates), 10 * len(arm.bodies)
     constants = parameters[inertial:].reshape(-1, n)
     motors = None if drives is None else drives.speeds
-    reach = reach_of([x.kind for x in arm.coordinates]).values if friction.memory else None
+    reach = reach_of(arm.joint_types).values if friction.memory else None
 
     def torque(qd: np.ndarray, z: np.ndarray | None) -> np.ndarray:
         bent = None if z is None or reach is None else z / reach

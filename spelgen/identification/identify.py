@@ -54,8 +54,8 @@ def identify_by(
     arm: LoadedArm, logs: Sequence[Trajectory], methods: Sequence[LeastSquares], preprocessing: Preprocessing
 ) -> list[Identification]:
     """Return what each method makes of the same logs, which are filtered once; see `identify`."""
-    joints = [c.name for c in arm.arm.coordinates]
-    kinds = [c.kind for c in arm.arm.coordinates]
+    joints = arm.arm.joint_names
+    kinds = arm.arm.joint_types
     for trajectory in logs:
         require_joints(trajectory, joints)
     require_torques(logs)

@@ -18,7 +18,7 @@ from spelgen.log_checks.gravity import (
     fit_gravity,
     state_samples,
 )
-from spelgen.log_checks.report import JointReport, LogReport, range_fraction
+from spelgen.log_checks.report import EXAMPLES, JointReport, LogReport, range_fraction
 from spelgen.log_checks.robot_checks import CHECKS, JointEvidence
 from spelgen.log_checks.statistics import Statistics, joint_statistics, statistics
 from spelgen.logs.checks import Finding, clock_diagnostics, findings, run_checks, summarised
@@ -35,7 +35,6 @@ ORDER = replace(
 )
 WRONG_TORQUES = {"torque-sense": SENSE, "torque-order": ORDER}
 ABOUT_ARM = {check.code for check in CHECKS} | {"torque-delay", "coupled-motors"}
-EXAMPLES = 2  # trajectories that are drawn
 
 
 def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping | None = None) -> LogReport:
@@ -50,7 +49,7 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping |
         return check_servo_logs(logs, arm)
     mapping = mapping or arm.settings.logs
     coordinates, inputs = arm.arm.coordinates, arm.actuation.matrix()
-    joints, kinds = [c.name for c in coordinates], [c.kind for c in coordinates]
+    joints, kinds = arm.arm.joint_names, arm.arm.joint_types
     drives = DriveLog(inputs)
     measured: list[Statistics] = []
     samples: list[StateSamples] = []
@@ -58,6 +57,7 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping |
     notes: list[Diagnostic] = []
     odd: list[Finding] = []
     declared_codes: list[set[str]] = []
+    # one after another: a stream of logs may be larger than memory
     for trajectory in logs:
         require_joints(trajectory, joints)
         require_torques([trajectory])
@@ -82,6 +82,7 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping |
         report = _joint_report(index, coordinate, gravity, measured)
         reports.append(report)
         evidence = JointEvidence(coordinate, report.low, report.high, report.steps, gravity)
+        # a unit that somebody wrote down is taken as right
         declared = mapping.unit("tau", coordinate.name) is not None
         robot_notes, robot_errors = _against_robot(evidence, accepted | set(UNIT_CODES if declared else ()))
         notes += robot_notes

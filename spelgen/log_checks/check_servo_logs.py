@@ -10,7 +10,7 @@ import numpy as np
 from spelgen.errors import Diagnostic, LogError
 from spelgen.log_checks.following import DELAYS, NO_DELAY, TUNING, Following, measure_following
 from spelgen.log_checks.gravity import GravityFit
-from spelgen.log_checks.report import range_fraction
+from spelgen.log_checks.report import EXAMPLES, range_fraction
 from spelgen.log_checks.robot_checks import POSITION_CHECKS, JointEvidence
 from spelgen.log_checks.servo_report import ServoJointReport, ServoLogReport
 from spelgen.log_checks.statistics import Clock, JointStatistics, joint_statistics, statistics
@@ -28,13 +28,11 @@ from spelgen.logs.trajectory import Trajectory, require_commands, require_joints
 if TYPE_CHECKING:
     from spelgen.loaded_arm import LoadedArm
 
-EXAMPLES = 2  # trajectories that are drawn
-
 
 def check_servo_logs(logs: Iterable[Trajectory], arm: LoadedArm) -> ServoLogReport:
     """Report all about logs of commanded positions; nothing is repaired or raised but what `check_logs` raises."""
     coordinates = arm.arm.coordinates
-    joints, kinds = [c.name for c in coordinates], [c.kind for c in coordinates]
+    joints, kinds = arm.arm.joint_names, arm.arm.joint_types
     logs = list(logs)
     if not logs:
         raise LogError("no trajectory", expected="at least one")
@@ -118,6 +116,7 @@ def _joint(arm: LoadedArm, k: int, signals: JointStatistics, following: Followin
 
 def _wrong_command(k: int, joints: Sequence[str], following: Following) -> LogError | None:
     """Return why a command cannot be that of its joint, None where it can."""
+    # what does not move follows nothing, and proves nothing wrong
     if not following.moves[k]:
         return None
     where, delay = f"joint {joints[k]!r}", following.best_delay(k, k)
@@ -163,6 +162,7 @@ def _odd_command(
 
 def _sparse(clocks: Sequence[Clock]) -> Iterator[Diagnostic]:
     for clock in clocks:
+        # said once: logs of one robot have one rate
         if clock.sample_rate < TUNING.sparse_rate:
             message = (
                 f"{clock.sample_rate:.3g} Hz: delays and friction need {TUNING.sparse_rate:g} Hz or more"

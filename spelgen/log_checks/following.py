@@ -51,6 +51,7 @@ def measure_following(logs: Sequence[Trajectory], saturation: np.ndarray) -> Fol
         pieces += [piece for piece in split_at_gaps(log) if len(piece) >= FILTER_SAMPLES]
     n = len(saturation)
     q = _joined([_midpoints(piece.q) for piece in pieces], n)
+    # means differ by the static error, which is no matter of delay
     q_centred = q - _mean(q)
     q_std = np.sqrt(_mean(q_centred**2))
     correlation, gain = np.zeros((2, len(DELAYS), n, n))

@@ -14,6 +14,7 @@ from spelgen.logs.trajectory import QUANTITIES, Trajectory
 from spelgen.settings.tuning.log_checks import LogCheckTuning
 
 TUNING = LogCheckTuning()
+EXAMPLES = 2  # trajectories that a page draws
 SHOWN = 20  # trajectories that a terminal and a notebook show
 _UNITS = {"revolute": "rad, rad/s, Nm", "prismatic": "m, m/s, N"}
 
@@ -118,6 +119,7 @@ def clock_table(report: LogReport, limit: int | None) -> Listing:
     """Return when samples were taken; of trajectories at most `limit`."""
     head = ("trajectory", "samples", "duration", "sample rate", "jitter", "gaps", "longest")
     rows = []
+    # a data set of a thousand episodes would fill the terminal
     for clock in report.trajectories[:limit]:
         longest = f"{clock.longest_gap:.3g} s" if clock.gaps else "-"
         duration, rate = f"{clock.duration:.4g} s", f"{clock.sample_rate:.4g} Hz"

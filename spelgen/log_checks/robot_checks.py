@@ -99,6 +99,7 @@ def find_wrong_unit(joint: JointEvidence) -> str | None:
 
 def find_beyond_drive(joint: JointEvidence) -> str | None:
     """Find torques that no drive of the joint's effort limit gives."""
+    # URDFs without knowledge of the drive write an effort of 0
     limit, largest = joint.coordinate.effort or 0.0, joint.largest("tau")
     if limit <= 0 or largest <= TUNING.beyond_drives * limit:
         return None
@@ -108,6 +109,7 @@ def find_beyond_drive(joint: JointEvidence) -> str | None:
 def find_coarse(joint: JointEvidence) -> str | None:
     """Find signals that are quantised to steps of their own size."""
     for name in QUANTITIES:
+        # a step alone says little: 0.01 Nm is fine for a shoulder and all there is for a wrist
         step, width = joint.steps[name], joint.high[name] - joint.low[name]
         if step is not None and width < TUNING.levels * step:
             return (

@@ -83,6 +83,7 @@ class ServoLogReport(LogReport):
             "90th percentile of the distance from the command at rest [mrad, mm]; saturated: fraction of time with "
             "kp (u - q) beyond the effort limit, if kp is set."
         )
+        # between these delays residuals are alike: one number would claim more than logs show
         if self.delay is not None:
             ends = dict.fromkeys(f"{1000 * end:.0f}" for end in self.delay)
             note = f"Commands act after {' to '.join(ends)} ms. {note}"

@@ -79,6 +79,7 @@ def statistics(trajectory: Trajectory) -> Statistics:
 def joint_statistics(index: int, measured: Sequence[Statistics]) -> JointStatistics:
     """Put together what all trajectories show of the signals of one joint."""
     low, high, noise, steps = {}, {}, {}, {}
+    # the median, since one trajectory with contacts would set the noise of all
     noisy = [x.noise for x in measured if x.noise]
     for name in measured[0].low:
         low[name] = min(float(x.low[name][index]) for x in measured)

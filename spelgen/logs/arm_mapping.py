@@ -25,18 +25,13 @@ class NamedJoint(Protocol):
     def name(self) -> str: ...
 
 
-class Coordinate(NamedJoint, Protocol):
-    """Hold a joint that moves. kind: "revolute" or "prismatic"."""
-
-    @property
-    def kind(self) -> str: ...
-
-
 class Coordinates(Protocol):
-    """Hold the joints that move, as an arm does."""
+    """Hold the joints that move, as an arm does. joint_types: "revolute" or "prismatic"."""
 
     @property
-    def coordinates(self) -> Sequence[Coordinate]: ...
+    def joint_names(self) -> Sequence[str]: ...
+    @property
+    def joint_types(self) -> Sequence[str]: ...
 
 
 class Joints(Protocol):
@@ -82,12 +77,11 @@ class LogSource(NamedTuple):
 def log_source(arm: LoggedArm, mapping: GivenMapping = None) -> LogSource:
     """Return what `read_logs` was given. Raises LogError for what is no arm, SettingsError for a wrong mapping."""
     if isinstance(arm, DescribedArm):
-        coordinates = arm.arm.coordinates
         if mapping is None:
             mapping = arm.settings.logs
-        joints = tuple(x.name for x in coordinates)
-        joint_types = tuple(x.kind for x in coordinates)
-        return LogSource(joints, joint_types, _mapping(mapping, [x.name for x in arm.robot.joints]))
+        all_joints = [joint.name for joint in arm.robot.joints]
+        joints, joint_types = tuple(arm.arm.joint_names), tuple(arm.arm.joint_types)
+        return LogSource(joints, joint_types, _mapping(mapping, all_joints))
     if isinstance(arm, JointNames):
         joints = logged_joints(arm)
         return LogSource(joints, tuple(arm.joint_types), _mapping(mapping, joints))

@@ -103,7 +103,7 @@ def arm_section(
     arm: Arm, urdf: Path, traces: Record | None = None, identified: Record | None = None
 ) -> ArmSection:
     """Return the arm with the motions of an evaluation's traces, or, without, one through its ranges."""
-    drawn = scene(urdf, [coordinate.name for coordinate in arm.coordinates])
+    drawn = scene(urdf, arm.joint_names)
     motions = _motions(traces or {}) or [_sweep(arm)]
     unseen = _unseen(arm, identified or {})
     colours = []

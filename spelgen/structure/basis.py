@@ -61,6 +61,7 @@ def smallest_form(spans: Spans) -> tuple[tuple[Output, ...], tuple[Constant, ...
     entries = len(spans.keys)
     weights = np.array([r.weights for r in readings], dtype=np.uint64).reshape(-1, entries)
     values = np.array([r.values for r in readings]).reshape(-1, entries)
+    # B is fixed by f_j = 1 and all other outputs 0: the inverse of what the read-outs see of U
     basis = field.product(field.inverse(field.product(spans.varying, weights.T)), spans.varying)
     changes = spans.float_changes(frozenset(range(spans.n)))
     basis_values = _solved(changes @ values.T, changes)
@@ -68,6 +69,7 @@ def smallest_form(spans: Spans) -> tuple[tuple[Output, ...], tuple[Constant, ...
         Output(r.joints, _weights(spans, r.weights, r.values), _weights(spans, row, row_values))
         for r, row, row_values in zip(readings, basis, basis_values, strict=True)
     )
+    # what the outputs do not explain cannot vary, so its span is that of the constants
     constant = field.difference(spans.mass, field.product(field.product(spans.mass, weights.T), basis))
     rest_values = spans.float_mass - spans.float_mass @ values.T @ basis_values
     return outputs, _constants(spans, readings, (constant, rest_values), (basis, basis_values))
@@ -82,6 +84,7 @@ def _constants(
     """Return a basis of what the outputs leave of W; entries that are constant themselves are the first choice for a
     constant.
     """
+    # pivots fall on the first columns, so entries that read least become the constants
     order = sorted(range(len(spans.keys)), key=lambda index: (len(spans.entry_joints[index]), -index))
     echelon = field.row_basis(constant[0][:, order])
     bound = [order[pivot] for pivot in field.pivots(echelon)]
@@ -108,6 +111,7 @@ def _readings(spans: Spans) -> Iterator[_Reading]:
     for joints in _joint_sets(spans):
         outside = field.row_basis(spans.outside(joints))
         kernel = field.null_space(outside)
+        # rank of the union less what is chosen: how many outputs this set of joints still adds
         missing = 0
         if len(kernel):
             missing = field.rank(np.concatenate([chosen.rows, kernel])) - len(chosen.rows)
@@ -125,6 +129,7 @@ def _joint_sets(spans: Spans) -> Iterator[frozenset[int]]:
     active = [k for k in range(spans.n) if len(spans.change_bases[k])]
     for position in reversed(range(len(active))):
         first, later = active[position], active[position + 1 :]
+        # small sets first: a matroid lets the greedy choice be the best one
         for size in range(len(later) + 1):
             if spans.n <= TUNING.all_subsets_up_to:
                 for tail in combinations(later, size):

@@ -93,6 +93,7 @@ def difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def row_basis(rows: np.ndarray) -> np.ndarray:
     """The reduced row echelon form of (m, n) ``rows`` without its zero rows, (rank, n)."""
+    # FLINT refuses matrices without rows or columns
     if not rows.size:
         return rows[:0]
     reduced, rank = _matrix(rows).rref()

@@ -47,6 +47,7 @@ class Nominal:
 
 def nominal(arm: Arm, structure: Structure) -> Nominal:
     """Return nominal sizes of ``arm`` in terms of ``structure``'s outputs and constants."""
+    # a fixed seed: these numbers stand in the emitted source, which must not change
     rng = np.random.default_rng(0)
     ranges = [working_range(coordinate) for coordinate in arm.coordinates]
     q = np.stack([rng.uniform(lower, upper, TUNING.points) for lower, upper in ranges], axis=-1)
@@ -55,6 +56,7 @@ def nominal(arm: Arm, structure: Structure) -> Nominal:
     means = mass.mean(axis=0)
     rows, columns = np.tril_indices(len(ranges))
     diagonal = rows == columns
+    # an entry off the diagonal is at most this, as M is positive definite (Cauchy and Schwarz)
     typical = np.sqrt(means[diagonal][rows] * means[diagonal][columns])
     output_reads = _matrix(structure, [output.reads for output in structure.outputs])
     constant_reads = _matrix(structure, [constant.reads for constant in structure.constants])
@@ -119,6 +121,7 @@ def _default_inertia(arm: Arm, index: int) -> list[float]:
     for body in reversed(arm.bodies):
         if body.parent == index:
             center = np.array(body.translation, dtype=float) / 2
+    # a centre on the axis would give the joint no gravity and no coupling at all
     if np.linalg.norm(center) < gyration:
         center = np.array([gyration, 0.0, gyration])
     tensor = (gyration**2 + center @ center) * np.eye(3) - np.outer(center, center)
@@ -133,6 +136,7 @@ def _least_eigenvalue(mass: np.ndarray, mean: np.ndarray, n: int) -> float:
     samples, reference = matrices[:-1], matrices[-1]
     if np.linalg.eigvalsh(reference)[0] <= 0:
         return 0.0
+    # relative to the mean M: eigenvalues of M itself mix kilograms and kilogram square metres
     whitening = np.linalg.inv(np.linalg.cholesky(reference))
     eigenvalues = np.linalg.eigvalsh(whitening @ samples @ whitening.T)
     return float(eigenvalues.min())

@@ -26,6 +26,7 @@ def pseudo_inertia(parameters: np.ndarray) -> np.ndarray:
     rows, columns = np.triu_indices(3)
     tensor[..., rows, columns] = tensor[..., columns, rows] = values[..., 4:]
     pseudo = np.zeros((*values.shape[:-1], 4, 4))
+    # second moments of mass from the tensor: I = tr(S) 1 - S
     pseudo[..., :3, :3] = _trace(tensor) / 2 * np.eye(3) - tensor
     pseudo[..., :3, 3] = pseudo[..., 3, :3] = values[..., 1:4]
     pseudo[..., 3, 3] = values[..., 0]
@@ -52,6 +53,7 @@ def reference_factor(parameters: np.ndarray) -> tuple[np.ndarray, bool]:
     For one that is not, J is the nearest that is, its least eigenvalues raised.
     """
     pseudo = pseudo_inertia(parameters)
+    # URDFs with impossible inertias still need a start: the nearest possible body
     values, vectors = np.linalg.eigh(pseudo)
     least = TUNING.least_pseudo_eigenvalue * values[-1]
     possible = bool(values[0] > least * TUNING.least_pseudo_eigenvalue)
@@ -65,6 +67,7 @@ def sensitivity(factor: np.ndarray) -> np.ndarray:
     columns = []
     for row, column in LOWER:
         change = np.zeros((4, 4))
+        # d(T T^T) at T = 1 is the change and its transpose
         change[row, column] = 1.0
         columns.append(parameters_of(factor @ (change + change.T) @ factor.T))
     return np.stack(columns, axis=-1)

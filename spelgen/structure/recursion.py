@@ -103,6 +103,7 @@ def energies(
             total = _sum(total, moved)
         else:
             composites[body.parent] = _sum(composites[body.parent], moved)
+    # V = -g . (m c) summed over all bodies: the composite at the root holds the sum
     gravity = _terms(arm.gravity, number)
     return Energies(mass, -_dot(gravity, total.moment))
 
@@ -142,6 +143,7 @@ def _add_entry(
     if multiplier != 1:
         entry = number(multiplier) * entry
     row, column = max(first.coordinate, second.coordinate), min(first.coordinate, second.coordinate)
+    # two bodies of one coordinate meet twice on its diagonal: once as row, once as column
     twice = first is not second and row == column
     mass[row, column] = mass[row, column] + (entry + entry if twice else entry)
 

@@ -68,6 +68,7 @@ def field_samples(arm: Arm, assume: Assume, samples: int, seed: int = 0) -> Samp
         moved = (Residues(_one_moved(x, index, blocks)) for x in (c, s, value))
         positions.append(Position(*moved))
     inertias: list[Ten]
+    # what holds for random inertial values of each sample holds for any of them
     if assume == "kinematics":
         inertias = [
             [Residues(np.tile(random_residues(rng, (samples,)), blocks)) for _ in range(10)]
@@ -101,6 +102,7 @@ def regressor_rows(arm: Arm, points: int, seed: int = 1) -> np.ndarray:
     rows = np.stack(
         [_residue_values(e, points * parameters).reshape(points, parameters) for e in elements], axis=1
     )
+    # V counts up to a constant: its first row is where it counts from
     rows[:, -1] = difference(rows[:, -1], rows[0, -1])
     return rows.reshape(-1, parameters)
 
@@ -176,6 +178,7 @@ def base_denominators(arm: Arm) -> list[int]:
 def _turned(c: Element, s: Element, turns: int) -> tuple[Element, Element]:
     """Return cosine and sine of ``turns`` times an angle, by repeated doubling."""
     result: tuple[Element, Element] = (1, 0)
+    # cos and sin of multiples by squaring, as mimic joints may turn twenty times as far
     for bit in bin(abs(turns))[2:]:
         x, y = result
         result = (x * x - y * y, 2 * (x * y))

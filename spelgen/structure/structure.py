@@ -70,11 +70,12 @@ def derive(arm: Arm, assume: Assume = "kinematics") -> Structure:
             expected="an <inertial> on every moving body",
             do="use --assume kinematics, which needs none",
         )
+    # every question below is a rank or a zero of these samples
     spans = Spans(arm, assume)
     outputs, constants = smallest_form(spans)
     return Structure(
         assume=assume,
-        joints=tuple(coordinate.name for coordinate in arm.coordinates),
+        joints=arm.joint_names,
         entries=tuple(_entry(spans, index) for index in range(len(spans.keys))),
         outputs=outputs,
         constants=constants,

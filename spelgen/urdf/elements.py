@@ -36,6 +36,7 @@ def read_name(notes: Notes, element: etree._Element) -> str | None:
         got = "no name" if name is None else "an empty name"
         notes.error(element.sourceline, f"<{element.tag}>", got, "a name", 'add name="..."')
         return None
+    # names go into error messages, file names and the emitted source
     if len(name) > MAX_NAME:
         got = f"a name of {len(name)} characters"
         notes.error(element.sourceline, f"<{element.tag}>", got, f"at most {MAX_NAME}")
@@ -52,6 +53,7 @@ def read_link(notes: Notes, element: etree._Element) -> Link | None:
     if name is None:
         return None
     where = f"link {name!r}"
+    # URDF allows one; parsers of ROS take the first, so the structure must come from the same
     inertials = element.findall("inertial")
     if len(inertials) > 1:
         message = f"{len(inertials)} <inertial> elements: the first is taken, the others are ignored"
@@ -62,6 +64,7 @@ def read_link(notes: Notes, element: etree._Element) -> Link | None:
 
 def _read_inertial(notes: Notes, element: etree._Element, where: str) -> Inertial | None:
     mass_element = first_child(notes, element, "mass", where)
+    # all parts are read before any is refused: one run then names every defect
     com, rpy = _read_origin(notes, element, where)
     tensor = _read_tensor(notes, element, where)
     if mass_element is None:
@@ -80,11 +83,13 @@ def _read_inertial(notes: Notes, element: etree._Element, where: str) -> Inertia
 def _read_tensor(notes: Notes, element: etree._Element, where: str) -> Tensor:
     inertia = first_child(notes, element, "inertia", where)
     if inertia is None:
+        # vendors ship expanded xacro with a macro call left in place of the tensor
         instead = next((e.tag for e in element.iterchildren(etree.Element) if "inertia" in e.tag), None)
         hint = f" (<{instead}> is a xacro macro that was not expanded)" if instead else ""
         message = f"no <inertia>: read as a point mass{hint}"
         notes.warn(element.sourceline, "inertial-without-inertia", where, message)
         return (0.0,) * 6
+    # products of inertia are 0 where absent, moments have no sensible default
     missing = [key for key in _DIAGONAL if key not in inertia.attrib]
     if missing:
         got = f"no {', '.join(missing)}"
@@ -122,6 +127,7 @@ def read_joint(notes: Notes, element: etree._Element) -> Joint | None:
 
 
 def _read_end(notes: Notes, element: etree._Element, tag: str, where: str) -> str | None:
+    # two parents would make the tree a graph, so neither is taken
     ends = element.findall(tag)
     link = ends[0].get("link") if ends else None
     if len(ends) != 1 or not link:
@@ -145,6 +151,7 @@ def _read_axis(notes: Notes, element: etree._Element, kind: str | None, where: s
         return _NO_AXIS
     before = len(notes.errors)
     xyz = read_triple(notes, axis, "xyz", f"{where} axis", _NO_AXIS)
+    # an axis that is no direction cannot be normalised; an unusable number was reported already
     if kind in MOVING and len(notes.errors) == before and max(map(abs, xyz)) < 1e-9:
         got = f"the axis {axis.get('xyz')!r}"
         notes.error(
@@ -162,6 +169,7 @@ def _read_limit(notes: Notes, element: etree._Element, kind: str | None, where: 
         return _NO_LIMITS
     keys = ["lower", "upper", "effort", "velocity"]
     if kind == "continuous":
+        # lower and upper of a continuous joint mean nothing, whatever is written
         keys = ["effort", "velocity"]
     missing = [key for key in keys if key not in limit.attrib]
     if missing and kind in MOVING:
@@ -169,6 +177,7 @@ def _read_limit(notes: Notes, element: etree._Element, kind: str | None, where: 
         notes.warn(limit.sourceline, "incomplete-limit", where, message)
     values: dict[str, float | None] = {}
     for key in keys:
+        # exporters write 1e38 and the like for "no limit"
         values[key] = read_number(notes, limit, key, f"{where} limit", bounded=False)
     return values.get("lower"), values.get("upper"), values["effort"], values["velocity"]
 
@@ -192,6 +201,7 @@ def _read_mimic(notes: Notes, element: etree._Element, where: str) -> Mimic | No
     if not joint:
         notes.error(mimic.sourceline, where, "no joint", 'joint="..." naming the joint to follow')
         return None
+    # an explicit multiplier of 0 holds the joint still: only an absent one means 1
     multiplier = read_number(notes, mimic, "multiplier", where)
     if multiplier is None:
         multiplier = 1.0
@@ -218,6 +228,7 @@ def read_transmission(notes: Notes, element: etree._Element, joints: Sequence[st
     """
     name = element.get("name") or ""
     where = f"transmission {name!r}"
+    # most logs hold joint torques: a broken transmission must not refuse an arm that needs none
     own = Notes(notes.path)
     driven = []
     for joint in element.findall("joint"):

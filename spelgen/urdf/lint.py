@@ -37,6 +37,7 @@ def _lint_inertial(link: Link, inertial: Inertial) -> Iterator[Diagnostic]:
         if inertial.mass > 0:
             yield _warning("zero-inertia", where, line, "the inertia tensor is zero: a point mass")
         return
+    # the unit matrix passes every test of a possible body, and is what templates begin with
     if tensor == (1.0, 0.0, 0.0, 1.0, 0.0, 1.0):
         yield _warning("placeholder-inertial", where, line, "the tensor is the unit matrix: a placeholder")
     smallest, middle, largest = _principal_moments(inertial)
@@ -45,6 +46,7 @@ def _lint_inertial(link: Link, inertial: Inertial) -> Iterator[Diagnostic]:
             f"the inertia tensor is not positive semidefinite: its least principal moment is {smallest:.3g}"
         )
         yield _warning("non-psd-inertia", where, line, message)
+    # each moment is a sum of two of three second moments, none of which is negative
     elif smallest + middle < largest * (1 - _ROUNDING):
         inequality = f"{smallest:.3g} + {middle:.3g} < {largest:.3g}"
         message = f"no mass distribution has these principal moments: {inequality}"
@@ -67,6 +69,7 @@ def _lint_placeholders(robot: Robot) -> Iterator[Diagnostic]:
             lines.setdefault(link.inertial.tensor, []).append(link.inertial.line)
             total += 1
     repeated = max(lines.values(), key=len, default=[])
+    # two links may well be alike, three of one tensor are copies
     if len(repeated) > total / 2 and len(repeated) >= 3:
         message = f"{len(repeated)} of {total} links have the same inertia tensor: perhaps placeholders"
         yield _warning("placeholder-inertial", "robot", repeated[0], message)
@@ -80,6 +83,7 @@ def _lint_joints(robot: Robot) -> Iterator[Diagnostic]:
 
 def _lint_joint(joint: Joint) -> Iterator[Diagnostic]:
     where = f"joint {joint.name!r}"
+    # negative friction would drive the arm: simulations with it diverge
     for name, value in (("damping", joint.damping), ("friction", joint.friction)):
         if value < 0:
             message = f"{name} is {value:g}: it would add energy"
@@ -89,6 +93,7 @@ def _lint_joint(joint: Joint) -> Iterator[Diagnostic]:
         yield _warning(
             "non-unit-axis", f"{where} axis", joint.line, f"its length is {length:.6g}: normalised"
         )
+    # kept as written: which of the two is wrong nobody can tell
     if joint.lower is not None and joint.upper is not None and joint.lower > joint.upper:
         message = f"lower {joint.lower:g} is above upper {joint.upper:g}: perhaps the two were swapped"
         yield _warning("lower-above-upper", f"{where} limit", joint.line, message)
@@ -104,6 +109,7 @@ def _lint_groups(robot: Robot) -> Iterator[Diagnostic]:
     for joint in robot.joints:
         if not joint.moves:
             continue
+        # frames without mass are usual; a joint that moves no mass at all has a singular M
         inertials = [link.inertial for link in _rigid_group(robot, joint.child) if link.inertial is not None]
         line = robot.link[joint.child].line
         if not inertials:

@@ -14,10 +14,8 @@ from spelgen.errors import Diagnostic, collect, suggestion
 from spelgen.urdf.document import read_document
 from spelgen.urdf.elements import read_joint, read_link, read_name, read_transmission
 from spelgen.urdf.lint import lint
-from spelgen.urdf.robot import Inertial, Joint, Link, Mimic, Robot, Transmission
+from spelgen.urdf.robot import Joint, Link, Robot
 from spelgen.urdf.values import Notes
-
-__all__ = ["Inertial", "Joint", "Link", "Mimic", "Robot", "Transmission", "read_urdf"]
 
 MAX_LINKS = 2000
 Part = TypeVar("Part", Link, Joint)
@@ -32,6 +30,7 @@ def read_urdf(path: Path) -> Robot:
     Raises ``UrdfError``, or ``SpelgenErrors`` with all that was found, where the file is missing or is not
     one well-formed tree of links and joints.
     """
+    # bytes are read once: digest and tree then speak of the same file
     document = read_document(path)
     notes = Notes(document.path)
     if document.path != path:
@@ -45,6 +44,7 @@ def read_urdf(path: Path) -> Robot:
         message = f"{len(document.leftovers)} <xacro:property> elements were left behind by xacro: ignored"
         notes.warn(document.leftovers[0], "unexpanded-xacro", "robot", message)
     links = _read_links(notes, root)
+    # direct children alone: Gazebo and transmissions have elements of the same names deeper down
     joints = _unique(notes, [read_joint(notes, element) for element in root.findall("joint")])
     _check_ends(notes, links, joints)
     _check_mimics(notes, joints)
@@ -56,6 +56,7 @@ def read_urdf(path: Path) -> Robot:
     tops: list[str] = []
     if not notes.errors:
         tops = _check_tree(notes, root, links, joints)
+    # by line, so that a user mends the file from top to bottom
     collect(sorted(notes.errors, key=lambda error: error.line or 0))
     robot = Robot(
         name=name,
@@ -91,6 +92,7 @@ def _robot_name(notes: Notes, root: etree._Element) -> str:
 
 def _read_links(notes: Notes, root: etree._Element) -> list[Link]:
     elements = root.findall("link")
+    # all that follows grows at least linearly with the links, and no arm has a tenth of these
     if len(elements) > MAX_LINKS:
         notes.error(root.sourceline, "<robot>", f"{len(elements)} links", f"at most {MAX_LINKS}")
         collect(notes.errors)

@@ -141,6 +141,7 @@ class Robot:
     def joints_from_root(self) -> tuple[Joint, ...]:
         """All joints, parents before their children, depth first in file order."""
         ordered: list[Joint] = []
+        # a stack, since a hostile file may be nested deeper than Python recurses
         pending = list(reversed(self.joints_below[self.root]))
         while pending:
             joint = pending.pop()
@@ -150,6 +151,7 @@ class Robot:
 
     def path_to(self, link: str) -> tuple[Joint, ...]:
         """The joints from the root to ``link``, in that order."""
+        # from the link upwards: each link has one joint above it, but many below
         path: list[Joint] = []
         while link in self.joint_above:
             path.append(self.joint_above[link])

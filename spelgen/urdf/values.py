@@ -47,6 +47,7 @@ class Notes:
 def first_child(notes: Notes, element: etree._Element, tag: str, where: str) -> etree._Element | None:
     """The first child of that tag; repeated ones are said."""
     children = element.findall(tag)
+    # parsers differ in which of them they take: the user must know
     if len(children) > 1:
         message = f"{len(children)} <{tag}> elements: the first is taken, the others are ignored"
         notes.warn(children[1].sourceline, "repeated-element", where, message)
@@ -57,6 +58,7 @@ def read_triple(
     notes: Notes, element: etree._Element, key: str, where: str, default: Vector = (0.0, 0.0, 0.0)
 ) -> Vector:
     """Three numbers; the default where the attribute is absent or, with an error noted, unusable."""
+    # URDF gives a default to every absent triple: no origin is the identity
     text = element.get(key)
     if text is None:
         return default
@@ -92,6 +94,7 @@ def _parsed(
     if "${" in text or "$(" in text:
         note_unexpanded(notes, element, where, text)
         return None
+    # float() takes nan, inf, 1_000 and Arabic digits, which no other reader of URDF does
     words = text.split()
     expected = _COUNTS[count]
     if len(words) != count:
@@ -107,6 +110,7 @@ def _parsed(
             hint = "separate numbers by spaces" if "," in word else None
             notes.error(element.sourceline, where, repr(word), f"{expected} in decimal notation", hint)
             return None
+    # a size beyond MAX_MAGNITUDE would overflow as soon as two of them are multiplied
     values = [float(word) for word in words]
     if not all(isfinite(value) and (not bounded or abs(value) <= MAX_MAGNITUDE) for value in values):
         bound = f"within +-{MAX_MAGNITUDE:g}" if bounded else "within the range of a float"
