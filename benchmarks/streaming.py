@@ -24,8 +24,8 @@ import pyarrow.parquet
 
 from spelgen.dynamics.regressor import regressor, urdf_parameters
 from spelgen.loaded_arm import load_arm
-from spelgen.logs.read import ROW_GROUP
 from spelgen.pipeline import generate
+from spelgen.settings.tuning.logs import LogTuning
 
 ROOT = Path(__file__).parents[1]
 URDF = ROOT / "robots" / "panda.urdf"
@@ -77,7 +77,7 @@ def write_log(path: Path, least: float) -> int:
             columns |= {f"{quantity}_{joint}": noisy[:, k] for k, joint in enumerate(names)}
         table = pa.table(columns)
         writer = writer or pa.parquet.ParquetWriter(path, table.schema)
-        writer.write_table(table, row_group_size=ROW_GROUP)
+        writer.write_table(table, row_group_size=LogTuning().chunk_samples)
     if writer is not None:
         writer.close()
     return count * width * BLOCK

@@ -143,8 +143,7 @@ def test_windows_are_not_streamed(log, tmp_path):
 
 @pytest.mark.parametrize("group", [4096, 800_000])
 def test_a_log_is_never_in_memory_as_a_whole(tmp_path, monkeypatch, group):
-    monkeypatch.setattr(chunks, "TUNING", replace(chunks.TUNING, chunk_samples=65536))
-    monkeypatch.setattr(chunks, "ROW_GROUP", 4096)
+    monkeypatch.setattr(chunks, "TUNING", replace(chunks.TUNING, chunk_samples=16384))
     random = np.random.default_rng(0)
     columns = {name: random.standard_normal(800_000) for name in ("q_a", "qd_a", "tau_a")}
     table = pa.table({"t": np.arange(800_000.0), **columns})

@@ -43,7 +43,7 @@ class AngleRounding:
         """Return the inertia tensor [kg m2], without products of inertia that are a computation's rounding error."""
         xx, xy, xz, yy, yz, zz = inertial.tensor
         if self.tolerance:
-            noise = TUNING.tensor_noise * max(abs(xx), abs(yy), abs(zz))
+            noise = TUNING.zero_noise * max(abs(xx), abs(yy), abs(zz))
             products = np.array((xy, xz, yz))
             products[np.abs(products) < noise] = 0.0
             if (xy, xz, yz) != tuple(products):

@@ -119,10 +119,10 @@ def make_arm(
     indices = {joint.name: index for index, joint in enumerate(chain.joints)}
     locked = {joint.name for joint in lumped.held if joint.type != "fixed"}
     # exact, so that a horizontal joint has no gravity torque at all and not one of 1e-17
-    x, y, z = (exact(float(value)) for value in gravity)
+    x, y, z = map(exact, map(float, gravity))
     return Arm(
         name=robot.name,
-        coordinates=tuple(_coordinate(joint) for joint in chain.joints),
+        coordinates=tuple(map(_coordinate, chain.joints)),
         bodies=tuple(_body(moved, indices[moved.followed.leader.name]) for moved in lumped.moved),
         gravity=(x, y, z),
         diagnostics=lumped.diagnostics,

@@ -40,7 +40,7 @@ class Axes:
 
     def __init__(self, arm: Arm):
         self.arm = arm
-        self.slides = [body.kind == "prismatic" for body in arm.bodies]
+        self.slides = [kind == "prismatic" for kind in arm.joint_types]
         # fixed, so that a report is the same every time
         generator = random.Random(0)
         self._configurations = [_configuration(arm, generator) for _ in range(_CONFIGURATIONS)]

@@ -5,6 +5,7 @@ A reason is given only where the arm's exact geometry proves it (``reasons``).
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from fractions import Fraction
@@ -92,8 +93,10 @@ class _Words:
             )
         while across:
             # one sentence for the joint in most entries that are left; of several, the nearest to the root
-            joints = [joint for entry in across for joint in (entry.row, entry.column)]
-            common = max(sorted(set(joints)), key=joints.count)
+            joints: Counter[int] = Counter()
+            for entry in across:
+                joints.update((entry.row, entry.column))
+            common = max(sorted(joints), key=joints.__getitem__)
             group = [entry for entry in across if common in (entry.row, entry.column)]
             across = [entry for entry in across if entry not in group]
             which = joints_told(_other_joints(group, common))
@@ -115,8 +118,8 @@ class _Words:
         return axes is not None and axes.slides[a] and axes.slides[b] and axes.perpendicular(a, b)
 
     def constants(self) -> Iterator[Fact]:
-        entries = [entry for entry in self.structure.entries if entry.kind == "constant"]
-        for reason, group in self._by_reason(entries, reasons.constant_reason):
+        constant = [entry for entry in self.structure.entries if entry.kind == "constant"]
+        for reason, group in self._by_reason(constant, reasons.constant_reason):
             means = "They need numbers, no network"
             if len(group) == 1:
                 means = "It needs a number, no network"

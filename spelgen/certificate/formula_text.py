@@ -37,7 +37,7 @@ def to_dict(formulas: Formulas) -> dict[str, object]:
         if value is not None:
             value = float(value)
         base.append({"name": symbol.name, "definition": printer.whole(definition), "value": value})
-    return {"entries": [_entry(row) for row in formulas.rows], "base_parameters": base}
+    return {"entries": list(map(_entry, formulas.rows)), "base_parameters": base}
 
 
 def _entry(formula: Formula) -> dict[str, object]:

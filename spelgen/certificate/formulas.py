@@ -82,7 +82,7 @@ class Formulas:
     @property
     def q(self) -> tuple[Symbol, ...]:
         """The joints' positions [rad, m]."""
-        return tuple(coordinate(joint) for joint in range(len(self.arm.coordinates)))
+        return tuple(map(coordinate, range(len(self.arm.coordinates))))
 
     @cached_property
     def entries(self) -> dict[tuple[int, int], Expr]:
@@ -222,7 +222,7 @@ class _Writer:
         if self._at_urdf_values:
             polynomials = self._without_vanishing(polynomials)
         # counted before shortening: how short a sum gets depends on the heuristics
-        terms = sum(len(polynomial) for polynomial in polynomials)
+        terms = sum(map(len, polynomials))
         if terms > longest:
             return Formula(place, terms, None)
         functions = []

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-from spelgen.arm.actuation import Actuation
+from spelgen.arm.actuation import Actuation, InputEntry
 from spelgen.arm.arm import Arm, Coordinate
 from spelgen.certificate.facts import Fact, facts
 from spelgen.dynamics.servo_rank import servo_rank
@@ -58,7 +58,7 @@ class Inspection:
             "joints": list(structure.joints),
             "joint_types": list(self.arm.joint_types),
             "mass_matrix": {
-                "entries": [self._entry(entry) for entry in structure.entries],
+                "entries": list(map(self._entry, structure.entries)),
                 "outputs": len(structure.outputs),
                 "constants": len(structure.constants),
                 "output_joints": [self._names(output.joints) for output in structure.outputs],
@@ -69,8 +69,8 @@ class Inspection:
             },
             "input_matrix": self._input_matrix(),
             "base_parameters": structure.base_parameter_count,
-            "facts": [fact.to_dict() for fact in self.facts],
-            "diagnostics": [diagnostic.to_dict() for diagnostic in self.diagnostics],
+            "facts": list(map(Fact.to_dict, self.facts)),
+            "diagnostics": list(map(Diagnostic.to_dict, self.diagnostics)),
         }
 
     def text(self, width: int = 80) -> str:
@@ -92,9 +92,11 @@ class Inspection:
         cells = self._cells()
         rows = []
         for row, name in enumerate(self.structure.joints):
-            # M is symmetric: above the diagonal stand the entries below it
-            entries = [cells[max(row, column), min(row, column)] for column in range(n)]
-            rows.append((f"{row + 1} {name}", *entries))
+            line = [f"{row + 1} {name}"]
+            for column in range(n):
+                # M is symmetric: above the diagonal stand the entries below it
+                line.append(cells[max(row, column), min(row, column)])
+            rows.append(tuple(line))
         title = f"{self.arm.name}: mass matrix; joints each entry depends on, C constant, 0 always zero"
         head = ("", *map(str, range(1, n + 1)))
         note = "; ".join(f"{name}: {need}" for name, need in self.needs().items())
@@ -128,7 +130,7 @@ class Inspection:
         rank = servo_rank(self.arm)
         return {
             "input": "position",
-            "kp_in_ratio": [self._names(group) for group in rank.groups],
+            "kp_in_ratio": list(map(self._names, rank.groups)),
             "with_inertia_only": [f"{name} of {self.structure.joints[joint]}" for name, joint in rank.open],
             "entries": entries,
         }
@@ -142,8 +144,8 @@ class Inspection:
         if len(rank.groups) == 1:
             text += ": one known kp, mass or load determines all"
         else:
-            groups = [joints_in_ranges(group) for group in rank.groups]
-            text += f": one known kp, mass or load determines those of {' or of '.join(groups)}"
+            groups = " or of ".join(map(joints_in_ranges, rank.groups))
+            text += f": one known kp, mass or load determines those of {groups}"
         undetermined: dict[str, list[int]] = {}
         for name, joint in rank.open:
             undetermined.setdefault(name, []).append(joint)
@@ -160,12 +162,11 @@ class Inspection:
         if not self.actuation.direct:
             needs = ["motor torques"]
             for kind, meaning in (("fixed", "gear known"), ("gain", "gain trained"), ("coupled", "coupled")):
-                joints = {entry.row for entry in self.actuation.entries if entry.kind == kind}
-                if joints:
-                    needs.append(f"{meaning} at {joints_in_ranges(tuple(sorted(joints)))}")
+                entries = [entry for entry in self.actuation.entries if entry.kind == kind]
+                if entries:
+                    needs.append(f"{meaning} at {_rows(entries)}")
         if self.actuation.couplings:
-            joints = {entry.row for entry in self.actuation.couplings}
-            needs.append(f"motors coupled at {joints_in_ranges(tuple(sorted(joints)))}")
+            needs.append(f"motors coupled at {_rows(self.actuation.couplings)}")
         if self.structure.passive:
             needs.append(f"{joints_in_ranges(self.structure.passive)} without a drive")
         return ", ".join(needs)
@@ -232,15 +233,23 @@ class Inspection:
         return "\n".join(lines)
 
 
+def _rows(entries: Iterable[InputEntry]) -> str:
+    """Return the joints on which the torques of these entries of G act."""
+    return joints_in_ranges(tuple(sorted({entry.row for entry in entries})))
+
+
 def _triangle(cells: dict[tuple[int, int], str], n: int) -> list[str]:
     """Return the rows of a lower triangle, its columns aligned."""
-    lines = [f"  {row + 1:>2}" for row in range(n)]
-    for column in range(n):
-        texts = [cells[row, column] for row in range(column, n)]
-        width = max(map(len, texts))
-        for row, text in enumerate(texts, start=column):
-            lines[row] += f"  {text:<{width}}"
-    return [line.rstrip() for line in lines]
+    lines: list[str] = []
+    widths = [0] * n
+    for (_, column), text in cells.items():
+        widths[column] = max(widths[column], len(text))
+    for row in range(n):
+        line = f"  {row + 1:>2}"
+        for column in range(row + 1):
+            line += f"  {cells[row, column]:<{widths[column]}}"
+        lines.append(line)
+    return list(map(str.rstrip, lines))
 
 
 def _indented(title: str, paragraphs: Iterable[str], width: int) -> str:

@@ -93,7 +93,7 @@ def regressor(arm: Arm, rng: np.random.Generator) -> np.ndarray:
 
 
 def _positions(arm: Arm, rng: np.random.Generator) -> np.ndarray:
-    turns = np.array([coordinate.kind == "revolute" for coordinate in arm.coordinates])
+    turns = np.array(arm.joint_types) == "revolute"
     # beyond limits, too: the structure holds at every configuration
     reach = np.where(turns, np.pi, 1.0)
     return rng.uniform(-reach, reach)
@@ -106,8 +106,8 @@ def _potential_energy(dynamics: PinocchioDynamics, q: np.ndarray) -> float:
 
 def with_random_inertias(arm: Arm, rng: np.random.Generator) -> Arm:
     """Return the arm with the inertia of a possible rigid body, drawn anew, on every joint."""
-    lengths = [np.linalg.norm(np.array(body.translation, dtype=float)) for body in arm.bodies]
-    size = float(np.mean(lengths)) or 1.0
+    translations = np.array([body.translation for body in arm.bodies], dtype=float)
+    size = float(np.linalg.norm(translations, axis=1).mean()) or 1.0
     return replace(arm, bodies=tuple(_random_body(body, size, rng) for body in arm.bodies))
 
 
@@ -115,4 +115,4 @@ def _random_body(body: Body, size: float, rng: np.random.Generator) -> Body:
     # any positive definite pseudo-inertia is that of a possible body; lengths are of the arm's size
     factor = rng.normal(size=(4, 4)) * np.array([[size], [size], [size], [1.0]])
     inertia = parameters_of(factor @ factor.T)
-    return replace(body, inertia=tuple(Fraction(float(x)) for x in inertia))
+    return replace(body, inertia=tuple(map(Fraction, inertia.tolist())))

@@ -57,7 +57,7 @@ class _AsBuilt(Printer):  # type: ignore[misc]  # SymPy has no types
         return f"+{_FIXED}{text}"
 
     def _print_Add(self, expression: Add, order: str | None = None) -> str:
-        first, *following = [self._print(term) for term in expression.args]
+        first, *following = map(self._print, expression.args)
         return " ".join([first, *map(self._signed, following)])
 
     def _print_Mul(self, expression: Mul) -> str:

@@ -260,10 +260,14 @@ def _rounding_angle(path: Sequence[Joint], rounded: Roundings, link: Link | None
 
 
 def _rounded_by(angles: Sequence[float], message: str) -> float:
-    return sum(_to_special(angle) for angle in angles if f"{angle:.10g} is taken as" in message)
+    total = 0.0
+    for angle in angles:
+        if f"{angle:.10g} is taken as" in message:
+            total += _to_special(angle)
+    return total
 
 
 def _to_special(angle: float) -> float:
     """Return the distance [rad] to the nearest angle that the reader may have taken instead."""
-    steps = [pi / divisor for divisor in (2, *GEOMETRY.fine_divisors)]
-    return min(abs(angle - round(angle / step) * step) for step in steps)
+    steps = pi / np.array((2, *GEOMETRY.fine_divisors))
+    return float(np.abs(angle - np.round(angle / steps) * steps).min())

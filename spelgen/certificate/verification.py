@@ -66,7 +66,7 @@ class Verification:
             "means": self.means,
             "samples": self.samples,
             "seed": self.seed,
-            "checks": [check.to_dict() for check in self.checks],
+            "checks": list(map(Check.to_dict, self.checks)),
         }
 
     def text(self, width: int = 80) -> str:

@@ -7,8 +7,9 @@ program (``urdf_cross_check``).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from math import inf
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -61,6 +62,26 @@ class _Case:
             return Check(fact, derived, "; ".join(contradictions), "undecided")
         return Check(fact, derived, "; ".join(contradictions), "differs")
 
+    def movement_check(
+        self, fact: str, derived: str, verb: str, rows: Iterable[tuple[str, float, bool]], rounding: float
+    ) -> Check:
+        """Return a check of sizes: (what, its size relative to its scale, whether it must be more than rounding)."""
+        against = _Contradictions()
+        largest, weakest = 0.0, inf
+        for name, size, expected in rows:
+            if expected:
+                weakest = min(weakest, size)
+                if size <= rounding:
+                    against.unseen.append(f"{name} is not seen to")
+            else:
+                largest = max(largest, size)
+                if size > rounding:
+                    against.unexpected.append(f"{name} {verb} {size_text(size)}")
+        result = f"what should be zero is at most {size_text(largest)} of its scale"
+        if weakest < inf:
+            result = f"what should move does by at least {size_text(weakest)} of its scale, {result}"
+        return self.check(fact, derived, result, against)
+
     def rank_check(self, fact: str, rows: np.ndarray, derived: int) -> Check:
         """Return a check of a rank, with the gap between the singular values that decides it."""
         rank, sizes = _rank(rows)
@@ -101,7 +122,7 @@ def verify(robot: Robot, arm: Arm, structure: Structure, *, samples: int = 0, se
     case = _Case(structure, drawn, _is_fine(arm, structure))
     regressor = numeric_samples.regressor(arm, rng)
     checks = (
-        *_fixed_entries(case),
+        *_zeros(case),
         _dependence(case),
         *_smallest_form(case),
         *_ranks(case),
@@ -116,57 +137,39 @@ def verify(robot: Robot, arm: Arm, structure: Structure, *, samples: int = 0, se
     return Verification(means, count, seed, checks)
 
 
-def _fixed_entries(case: _Case) -> Iterator[Check]:
-    """Check that what is always zero is zero, and what is constant does not change."""
-    values = np.abs(case.samples.mass).max(axis=(0, 1))
-    moves = np.abs(case.samples.changes).max(axis=(0, 1))
-    for kind, sizes, verb in (("zero", values, "reaches"), ("constant", moves, "changes by")):
-        names = []
-        largest = 0.0
-        against = _Contradictions()
-        for entry, size in zip(case.structure.entries, sizes.tolist(), strict=True):
-            if entry.kind == kind:
-                name = entry_name(entry.row, entry.column)
-                names.append(name)
-                largest = max(largest, size)
-                if size > TUNING.rounding:
-                    against.unexpected.append(f"{name} {verb} {size_text(size)}")
-        if names:
-            derived = ", ".join(names)
-            if len(names) > 8:
-                derived = f"{len(names)} entries"
-            result = f"none {verb} more than {size_text(largest)} of its scale"
-            yield case.check(f"{kind} entries", derived, result, against)
+def _zeros(case: _Case) -> Iterator[Check]:
+    """Check that what is always zero is zero."""
+    sizes = np.abs(case.samples.mass).max(axis=(0, 1)).tolist()
+    rows = []
+    for entry, size in zip(case.structure.entries, sizes, strict=True):
+        if entry.kind == "zero":
+            rows.append((entry_name(entry.row, entry.column), size, False))
+    if rows:
+        derived = ", ".join(name for name, _, _ in rows)
+        if len(rows) > 8:
+            derived = f"{len(rows)} entries"
+        yield case.movement_check("zero entries", derived, "reaches", rows, TUNING.rounding)
 
 
 def _dependence(case: _Case) -> Check:
-    """Check that every joint that an entry depends on moves it, and no other does."""
+    """Check that every joint that an entry depends on moves it, and no other does; a constant one no joint moves."""
     moves = np.abs(case.samples.changes).max(axis=1)  # (n, entries)
-    expected = np.zeros(moves.shape, dtype=bool)
-    against = _Contradictions()
-    for index, entry in enumerate(case.structure.entries):
-        expected[list(entry.joints), index] = True
-        for joint, size in enumerate(moves[:, index].tolist()):
-            pair = f"{entry_name(entry.row, entry.column)} with joint {joint + 1}"
-            if expected[joint, index] and size <= TUNING.rounding:
-                against.unseen.append(f"{pair} is not seen to move")
-            if not expected[joint, index] and size > TUNING.rounding:
-                against.unexpected.append(f"{pair} moves by {size_text(size)}")
-    largest = size_text(moves[~expected].max(initial=0))
-    result = f"no joint moves another entry by more than {largest} of its scale"
-    if expected.any():
-        weakest = size_text(moves[expected].min())
-        result = f"the weakest moves its entry by {weakest} of its scale; {result}"
-    derived = f"{expected.sum()} of the {expected.size} pairs of a joint and an entry"
-    return case.check("dependence on joints", derived, result, against)
+    rows = []
+    pairs = 0
+    for entry, sizes in zip(case.structure.entries, moves.T.tolist(), strict=True):
+        pairs += len(entry.joints)
+        for joint, size in enumerate(sizes):
+            name = f"{entry_name(entry.row, entry.column)} with joint {joint + 1}"
+            rows.append((name, size, joint in entry.joints))
+    derived = f"{pairs} of the {len(rows)} pairs of an entry and a joint"
+    return case.movement_check("dependence on joints", derived, "moves by", rows, TUNING.rounding)
 
 
 def _smallest_form(case: _Case) -> Iterator[Check]:
     """Check that M = sum c A + sum f B gives M back, that no f moves with a joint it does not read, no c with any."""
     structure, samples = case.structure, case.samples
     rebuilt = np.zeros_like(samples.mass)
-    largest = 0.0
-    against = _Contradictions()
+    rows = []
     terms: list[Output | Constant] = [*structure.outputs, *structure.constants]
     for term in terms:
         reads = samples.row(term.reads)
@@ -174,24 +177,18 @@ def _smallest_form(case: _Case) -> Iterator[Check]:
         rebuilt += values[..., None] * samples.row(term.basis) / samples.scale
         # relative to what the sum would be if nothing cancelled
         moves = np.abs(values[1:] - values[0]).max(axis=1) / (np.abs(reads) @ samples.scale)
-        if isinstance(term, Output):
+        name = "a constant"
+        if isinstance(term, Output) and term.joints:
+            name = f"an output of {joints_in_ranges(term.joints)}"
             moves[list(term.joints)] = 0.0
-        size = float(moves.max())
-        largest = max(largest, size)
-        if size > TUNING.form_rounding:
-            name = "a constant"
-            if isinstance(term, Output) and term.joints:
-                name = f"an output of {joints_in_ranges(term.joints)}"
-            against.unexpected.append(f"{name} moves by {size_text(size)} with another joint")
+        rows.append((name, float(moves.max()), False))
     residual = float(np.abs(rebuilt - samples.mass).max(initial=0.0))
-    result = f"off by {size_text(residual)} of an entry's scale at most"
-    wrong = _Contradictions()
-    if residual > TUNING.form_rounding:
-        wrong.unexpected.append(f"M {result}")
     derived = f"{len(structure.outputs)} outputs and {len(structure.constants)} constants give M"
-    yield case.check("smallest form", derived, result, wrong)
-    result = f"no other joint moves one by more than {size_text(largest)} of its scale"
-    yield case.check("joints of outputs and constants", "as said for each", result, against)
+    yield case.movement_check(
+        "smallest form", derived, "is off by", [("M", residual, False)], TUNING.form_rounding
+    )
+    fact = "joints of outputs and constants"
+    yield case.movement_check(fact, "as said for each", "moves by", rows, TUNING.form_rounding)
 
 
 def _ranks(case: _Case) -> Iterator[Check]:
@@ -219,22 +216,14 @@ def _ranks(case: _Case) -> Iterator[Check]:
 def _potential(case: _Case) -> Check:
     """Check that V depends on the joints it should, and on no others."""
     potential = case.samples.potential
-    moves = np.abs(potential[1:] - potential[0]).max(axis=1)
     joints = case.structure.potential
-    against = _Contradictions()
-    largest = 0.0
-    for joint, size in enumerate(moves.tolist()):
-        if joint in joints and size <= TUNING.rounding:
-            against.unseen.append(f"joint {joint + 1} is not seen to move it")
-        if joint not in joints:
-            largest = max(largest, size)
-            if size > TUNING.rounding:
-                against.unexpected.append(f"joint {joint + 1} moves it by {size_text(size)}")
-    result = f"any other joint moves it by {size_text(largest)} of its size at most"
+    rows = []
+    for joint, size in enumerate(np.abs(potential[1:] - potential[0]).max(axis=1).tolist()):
+        rows.append((f"joint {joint + 1}", size, joint in joints))
     derived = "no joint"
     if joints:
         derived = joints_in_ranges(joints)
-    return case.check("potential energy", derived, result, against)
+    return case.movement_check("potential energy", derived, "moves it by", rows, TUNING.rounding)
 
 
 def _rank(rows: np.ndarray) -> tuple[int, np.ndarray]:

@@ -24,9 +24,12 @@ from spelgen.logs.checks import (
     summarised,
 )
 from spelgen.logs.trajectory import Trajectory, require_commands, require_joints
+from spelgen.settings.tuning.log_checks import LogCheckTuning
 
 if TYPE_CHECKING:
     from spelgen.loaded_arm import LoadedArm
+
+FOLLOWS = LogCheckTuning().agreement
 
 
 def check_servo_logs(logs: Iterable[Trajectory], arm: LoadedArm) -> ServoLogReport:
@@ -46,7 +49,7 @@ def check_servo_logs(logs: Iterable[Trajectory], arm: LoadedArm) -> ServoLogRepo
     summaries, errors = summarised(odd, joints, len(logs))
     notes += summaries
     following = measure_following(logs, _saturation(arm))
-    measured = [statistics(log) for log in logs]
+    measured = list(map(statistics, logs))
     clocks = [x.clock for x in measured]
     reports = []
     for k, coordinate in enumerate(coordinates):
@@ -123,17 +126,17 @@ def _wrong_command(k: int, joints: Sequence[str], following: Following) -> LogEr
     correlation, gain = float(following.correlation[delay, k, k]), float(following.gain[delay, k, k])
     # a servo follows its command to a fifth, unless one of the two is in degrees
     in_degrees = is_factor(gain, DEGREES) or is_factor(gain, 1 / DEGREES)
-    if correlation > TUNING.follows and in_degrees:
+    if correlation > FOLLOWS and in_degrees:
         got = f"positions that move {gain:.3g} times as far as commands (180/pi is 57.3)"
         do = "write 'units' of q and u under 'logs' in the robot's YAML"
         return LogError(got, element=where, expected="both in radians", do=do)
-    if correlation < -TUNING.follows:
+    if correlation < -FOLLOWS:
         got = f"positions that move against commands (correlation {correlation:.2g})"
         return LogError(got, element=where, expected="one sense", do="check the signs of q and u")
     if correlation < TUNING.ignores:
         for other, name in enumerate(joints):
             delay = following.best_delay(k, other)
-            if other != k and following.correlation[delay, k, other] > TUNING.follows:
+            if other != k and following.correlation[delay, k, other] > FOLLOWS:
                 got = f"a command that joint {name!r} follows, and this one does not"
                 do = "check the names of the columns"
                 return LogError(got, element=where, expected="its own command", do=do)

@@ -11,9 +11,11 @@ from scipy.optimize import nnls
 from spelgen.logs.commands import delayed_commands
 from spelgen.logs.smoothing import derivative
 from spelgen.logs.trajectory import Trajectory, require_commands, split_at_gaps
+from spelgen.settings.tuning.identification import IdentificationTuning
 from spelgen.settings.tuning.servo import ServoLogTuning
 
 TUNING = ServoLogTuning()
+MOVING = IdentificationTuning().moving
 DELAYS = (
     np.arange(TUNING.earliest_delay, TUNING.latest_delay + 1e-9, TUNING.delay_step).round(9) + 0.0
 )  # no -0
@@ -87,16 +89,15 @@ def _delay(pieces: Sequence[Trajectory], moves: np.ndarray) -> tuple[float, floa
     moving = np.flatnonzero(moves)
     if not len(moving):
         return None
-    columns = np.concatenate([_retarding_motion(piece) for piece in pieces])  # (T, n, 3)
+    columns = np.concatenate(list(map(_retarding_motion, pieces)))  # (T, n, 3)
     columns = columns - columns.mean(axis=0)
     delays = DELAYS[DELAYS > -1e-9]
     log_residuals = np.zeros((len(delays), len(moving)))
     for k, delay in enumerate(delays.tolist()):
         # one filter over all of an equation changes nothing of what it says
-        errors = [
-            derivative(_commands(piece, delay) - _midpoints(piece.q), piece.sample_rate, 0)
-            for piece in pieces
-        ]
+        errors = []
+        for piece in pieces:
+            errors.append(derivative(_commands(piece, delay) - _midpoints(piece.q), piece.sample_rate, 0))
         command_error = np.concatenate(errors)
         command_error = command_error - command_error.mean(axis=0)
         for place, joint in enumerate(moving.tolist()):
@@ -112,7 +113,7 @@ def _retarding_motion(piece: Trajectory) -> np.ndarray:
     rate = piece.sample_rate
     velocity = np.gradient(derivative(piece.q, rate, 0), piece.t, axis=0)
     acceleration = np.gradient(velocity, piece.t, axis=0)
-    direction = np.tanh(np.gradient(piece.q, piece.t, axis=0) / TUNING.rest_velocity)
+    direction = np.tanh(np.gradient(piece.q, piece.t, axis=0) / MOVING)
     columns = np.stack([velocity, acceleration, derivative(direction, rate, 0)], axis=-1)
     return _midpoints(columns)
 
@@ -124,12 +125,12 @@ def _resting_errors(pieces: Sequence[Trajectory], n: int) -> list[np.ndarray]:
         u = require_commands(piece)[:-1]
         velocity = np.gradient(derivative(piece.q, piece.sample_rate, 0), piece.t, axis=0)[1:]
         span = max(1, round(TUNING.rest_time * piece.sample_rate))
-        rests = (u == np.roll(u, span, axis=0)) & (np.abs(velocity) < TUNING.rest_velocity)
+        rests = (u == np.roll(u, span, axis=0)) & (np.abs(velocity) < MOVING)
         rests[:span] = False
         command_error = u - _midpoints(piece.q)
         for joint in range(n):
             errors[joint].append(command_error[rests[:, joint], joint])
-    return [np.concatenate(joint_errors) for joint_errors in errors]
+    return list(map(np.concatenate, errors))
 
 
 def _commands(piece: Trajectory, delay: float) -> np.ndarray:

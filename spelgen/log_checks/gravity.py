@@ -13,11 +13,12 @@ from spelgen.dynamics.regressor import regressor, urdf_parameters
 from spelgen.identification.base_parameters import base_parameters
 from spelgen.identification.friction import FrictionModel
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
+from spelgen.settings.tuning.identification import IdentificationTuning
 from spelgen.settings.tuning.log_checks import LogCheckTuning
 
 TUNING = LogCheckTuning()
 MOST = 15 * TUNING.gravity_samples  # of all trajectories
-COULOMB_VELOCITY = 0.02  # [rad/s, m/s] where a tanh has risen to three quarters of dry friction
+MOVING = IdentificationTuning().moving
 DEPENDENT = 1e-8  # of its own size: what is left of a column that others span
 
 
@@ -58,7 +59,7 @@ def state_samples(trajectory: Trajectory, inputs: np.ndarray) -> StateSamples:
     for piece in pieces:
         qdd = np.gradient(piece.qd, piece.t, axis=0)
         columns.append([x[::stride] for x in (piece.q, piece.qd, qdd, piece.tau @ inputs.T)])
-    return StateSamples(*(np.concatenate(arrays) for arrays in zip(*columns, strict=True)))
+    return StateSamples(*map(np.concatenate, zip(*columns, strict=True)))
 
 
 def fit_gravity(arm: Arm, samples: Sequence[StateSamples]) -> list[GravityFit]:
@@ -75,7 +76,7 @@ def fit_gravity(arm: Arm, samples: Sequence[StateSamples]) -> list[GravityFit]:
     fits = []
     for joint in range(q.shape[1]):
         speed = qd[:, joint]
-        coulomb = np.tanh(speed / COULOMB_VELOCITY)
+        coulomb = np.tanh(speed / MOVING)
         motion = np.stack([np.ones(len(q)), speed, coulomb, qdd[:, joint]], axis=1)
         fits.append(_fit(tau[:, joint], motion, rows[:, joint], None if load is None else load[:, joint]))
     return fits

@@ -78,7 +78,7 @@ class LogReport:
             "trajectories": list(map(asdict, self.trajectories)),
             "joints": list(map(asdict, self.joints)),
             "errors": list(map(str, self.errors)),
-            "findings": [finding.to_dict() for finding in self.findings],
+            "findings": list(map(Diagnostic.to_dict, self.findings)),
         }
 
     def heading(self) -> str:
@@ -97,7 +97,7 @@ class LogReport:
 
     def text(self) -> str:
         """Return the report for a terminal, in 80 columns; the errors are not in it."""
-        paragraphs = [self.heading(), *(table.text() for table in self.listings(SHOWN))]
+        paragraphs = [self.heading(), *map(Listing.text, self.listings(SHOWN))]
         if self.findings:
             paragraphs.append("\n".join(["Findings", *map(_wrapped, self.findings)]))
         else:
@@ -109,10 +109,13 @@ class LogReport:
         return f"<LogReport {self.heading()}; {warnings}, {_counted(len(self.errors), 'error', 'errors')}>"
 
     def _repr_html_(self) -> str:
-        lines: list[tuple[str, ...]] = [(x.severity, x.where, x.message) for x in self.findings]
-        lines += [("error", "", str(error)) for error in self.errors]
+        lines: list[tuple[str, ...]] = []
+        for finding in self.findings:
+            lines.append((finding.severity, finding.where, finding.message))
+        for error in self.errors:
+            lines.append(("error", "", str(error)))
         table = Listing(self.heading(), ("", "where", "what"), tuple(lines), left=(0, 1, 2))
-        return "".join(x.html() for x in (table, *self.listings(SHOWN)))
+        return "".join(map(Listing.html, (table, *self.listings(SHOWN))))
 
 
 def clock_table(report: LogReport, limit: int | None) -> Listing:

@@ -59,7 +59,7 @@ class ServoLogReport(LogReport):
 
     def to_dict(self) -> dict[str, object]:
         """Return the JSON form, as of logs of torques but for the joints."""
-        return super().to_dict() | {"delay": self.delay, "joints": [asdict(joint) for joint in self.servos]}
+        return super().to_dict() | {"delay": self.delay, "joints": list(map(asdict, self.servos))}
 
     def listings(self, most: int | None = None) -> list[Listing]:
         """Return all tables; of trajectories at most `most`."""
@@ -73,7 +73,7 @@ class ServoLogReport(LogReport):
             "range: how much of the joint's was visited; u: commanded positions; noise: of q, standard deviation of "
             "what changes from sample to sample, from 50 Hz on; step: between the levels of a quantised signal."
         )
-        rows = tuple(joint.signals() for joint in self.servos)
+        rows = tuple(map(ServoJointReport.signals, self.servos))
         return Listing(f"Positions and commands [{units}]", head, rows, note)
 
     def _following(self) -> Listing:
@@ -87,7 +87,7 @@ class ServoLogReport(LogReport):
         if self.delay is not None:
             ends = dict.fromkeys(f"{1000 * end:.0f}" for end in self.delay)
             note = f"Commands act after {' to '.join(ends)} ms. {note}"
-        return Listing("Following", head, tuple(joint.following() for joint in self.servos), note)
+        return Listing("Following", head, tuple(map(ServoJointReport.following, self.servos)), note)
 
 
 def _format(value: float | None, factor: float, form: str, unit: str = "") -> str:

@@ -17,7 +17,7 @@ from spelgen.logs.arm_mapping import GivenMapping, LoggedArm, log_source
 from spelgen.logs.clock import clock_start, require_increasing_times
 from spelgen.logs.log_files import log_files
 from spelgen.logs.parquet_files import PARQUET
-from spelgen.logs.read import ROW_GROUP, read_logs
+from spelgen.logs.read import read_logs
 from spelgen.logs.recording import make_trajectory
 from spelgen.logs.tables import Layout, reading, stored_columns, table_layout
 from spelgen.logs.trajectory import Trajectory
@@ -26,7 +26,6 @@ from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.tuning.logs import LogTuning
 
 TUNING = LogTuning()
-BUFFER = 2**16  # bytes read ahead of each column
 
 
 @dataclass(frozen=True)
@@ -58,7 +57,9 @@ class Chunk:
         source = _source(file)
         groups, row = _row_groups(source, self.first, self.stop)
         stretches = []
-        for batch in source.iter_batches(ROW_GROUP, row_groups=groups, columns=list(self.log.stored)):
+        for batch in source.iter_batches(
+            TUNING.chunk_samples, row_groups=groups, columns=list(self.log.stored)
+        ):
             low, high = max(self.first - row, 0), min(self.stop - row, batch.num_rows)
             if low < high:
                 rows = batch.slice(low, high - low)
@@ -195,7 +196,7 @@ def _label_runs(file: Path, column: str) -> list[tuple[str, int]]:
     """Return each run of equal labels, in the rows' order, with the row at which it ends."""
     runs: list[tuple[str, int]] = []
     row = 0
-    for batch in _source(file).iter_batches(ROW_GROUP, columns=[column]):
+    for batch in _source(file).iter_batches(TUNING.chunk_samples, columns=[column]):
         # runs, and not rows: a label repeats a million times
         encoded = pa.compute.run_end_encode(batch.column(0).cast(pa.string()))
         for value, end in zip(encoded.values.to_pylist(), encoded.run_ends.to_pylist(), strict=True):
@@ -215,7 +216,7 @@ def _stamp(file: Path) -> tuple[int, int]:
 
 def _source(file: Path) -> pa.parquet.ParquetFile:
     """Open a file to be read page by page: by default pyarrow keeps all row groups, and a row group at once."""
-    return pa.parquet.ParquetFile(file, pre_buffer=False, buffer_size=BUFFER)
+    return pa.parquet.ParquetFile(file, pre_buffer=False, buffer_size=2**16)
 
 
 def _row_groups(source: pa.parquet.ParquetFile, first: int, stop: int) -> tuple[list[int], int]:

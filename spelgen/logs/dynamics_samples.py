@@ -63,7 +63,7 @@ def dynamics_samples(
         if not pieces:
             continue
         columns = [_columns(piece, pauses, preprocessing, reach) for piece in pieces]
-        joined = [np.concatenate(arrays) for arrays in zip(*columns, strict=True)]
+        joined = map(np.concatenate, zip(*columns, strict=True))
         samples.append(DynamicsSamples(trajectory.name, *joined))
     return samples
 

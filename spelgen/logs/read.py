@@ -21,8 +21,9 @@ from spelgen.logs.recording import make_trajectory
 from spelgen.logs.tables import UNITS, UNITS_KEY, LogTable
 from spelgen.logs.trajectory import Trajectory, require_joints
 from spelgen.logs.values import values_in_si
+from spelgen.settings.tuning.logs import LogTuning
 
-ROW_GROUP = 2**16  # rows written together: logs larger than memory are read by row groups
+TUNING = LogTuning()
 
 
 def read_logs(
@@ -87,7 +88,8 @@ def write_logs(path: Path | str, trajectories: Sequence[Trajectory], arm: Logged
         if path.suffix == ".csv":
             pa.csv.write_csv(table, unfinished)
         else:
-            pa.parquet.write_table(table, unfinished, row_group_size=ROW_GROUP)
+            # as many rows together as a chunk of a log larger than memory has: a chunk then is one read
+            pa.parquet.write_table(table, unfinished, row_group_size=TUNING.chunk_samples)
     return path
 
 

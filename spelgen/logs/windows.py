@@ -57,7 +57,7 @@ def thinned(windows: Windows, count: int) -> Windows:
 
 def joined(batches: Sequence[Windows]) -> Windows:
     """Return one batch of all windows, in order."""
-    columns = zip(*(x.columns() for x in batches), strict=True)
+    columns = zip(*map(Windows.columns, batches), strict=True)
     return Windows(*map(torch.cat, columns))
 
 
@@ -90,7 +90,7 @@ def cut_windows(
             batches.append(_cut(piece, window, stride, decimation, measured, reach))
     if not batches:
         raise LogError(f"no trajectory of {span + 1} samples", expected="one window")
-    columns = [np.concatenate(arrays) for arrays in zip(*batches, strict=True)]
+    columns = map(np.concatenate, zip(*batches, strict=True))
     return Windows(*map(torch.from_numpy, columns))
 
 

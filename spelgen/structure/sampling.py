@@ -65,17 +65,16 @@ def field_samples(arm: Arm, assume: Assume, samples: int, seed: int = 0) -> Samp
         # itself
         c, s = random_circle_points(rng, 2 * samples)
         value = random_residues(rng, (2 * samples,))
-        moved = (Residues(_one_moved(x, index, blocks)) for x in (c, s, value))
-        positions.append(Position(*moved))
+        c, s, value = (Residues(_one_moved(x, index, blocks)) for x in (c, s, value))
+        positions.append(Position(c, s, value))
     inertias: list[Ten]
     # what holds for random inertial values of each sample holds for any of them
     if assume == "kinematics":
-        inertias = [
-            [Residues(np.tile(random_residues(rng, (samples,)), blocks)) for _ in range(10)]
-            for _ in arm.bodies
-        ]
+        inertias = []
+        for _ in arm.bodies:
+            inertias.append([Residues(np.tile(random_residues(rng, (samples,)), blocks)) for _ in range(10)])
     else:
-        inertias = [[residue(x) for x in body.inertia or (Fraction(0),) * 10] for body in arm.bodies]
+        inertias = [list(map(residue, body.inertia or (Fraction(0),) * 10)) for body in arm.bodies]
     result = energies(arm, motions(arm, positions, residue), inertias, residue)
     entries = [_residue_values(result.mass[key], blocks * samples) for key in triangle(n)]
     potential = _residue_values(result.potential, blocks * samples)
@@ -99,9 +98,10 @@ def regressor_rows(arm: Arm, points: int, seed: int = 1) -> np.ndarray:
     inertias = [[Residues(unit[10 * body + i]) for i in range(10)] for body in range(len(arm.bodies))]
     result = energies(arm, motions(arm, positions, residue), inertias, residue)
     elements = [result.mass[key] for key in triangle(n)] + [result.potential]
-    rows = np.stack(
-        [_residue_values(e, points * parameters).reshape(points, parameters) for e in elements], axis=1
-    )
+    blocks = []
+    for element in elements:
+        blocks.append(_residue_values(element, points * parameters).reshape(points, parameters))
+    rows = np.stack(blocks, axis=1)
     # V counts up to a constant: its first row is where it counts from
     rows[:, -1] = difference(rows[:, -1], rows[0, -1])
     return rows.reshape(-1, parameters)
@@ -116,7 +116,7 @@ def float_samples(arm: Arm, assume: Assume, samples: int, seed: int = 2) -> Samp
     if assume == "kinematics":
         inertias = [[np.tile(rng.normal(size=samples), blocks) for _ in range(10)] for _ in arm.bodies]
     else:
-        inertias = [[float(x) for x in body.inertia or (0,) * 10] for body in arm.bodies]
+        inertias = [list(map(float, body.inertia or (0,) * 10)) for body in arm.bodies]
     mass, potential = float_energies(arm, np.stack(q, axis=-1), inertias)
     return _blocks(list(mass.T), potential, blocks)
 
@@ -124,10 +124,9 @@ def float_samples(arm: Arm, assume: Assume, samples: int, seed: int = 2) -> Samp
 def float_energies(arm: Arm, q: np.ndarray, inertias: Sequence[Ten]) -> tuple[np.ndarray, np.ndarray]:
     """Return lower triangles of M, (points, n(n+1)/2), and V [J], (points,), at ``q`` (points, n) [rad, m]."""
     bases = base_denominators(arm)
-    positions = [
-        Position(np.cos(value / base), np.sin(value / base), value)
-        for value, base in zip(q.T, bases, strict=True)
-    ]
+    positions = []
+    for value, base in zip(q.T, bases, strict=True):
+        positions.append(Position(np.cos(value / base), np.sin(value / base), value))
     result = energies(arm, motions(arm, positions, float), inertias, float)
     points = len(q)
     mass = np.stack([np.broadcast_to(result.mass[key], points) for key in triangle(q.shape[1])], axis=-1)
@@ -151,7 +150,7 @@ def motions(arm: Arm, positions: Sequence[Position], number: Callable[[Fraction]
             turns = int(body.multiplier * bases[body.coordinate])
             c, s = _turned(position.cos, position.sin, turns)
             if body.offset:
-                c0, s0 = (number(x) for x in circle_point(body.offset))
+                c0, s0 = map(number, circle_point(body.offset))
                 c, s = c0 * c - s0 * s, s0 * c + c0 * s
             moved.append(Motion(c, s))
     return moved
@@ -235,7 +234,7 @@ class Spans:
     @cached_property
     def change_bases(self) -> list[np.ndarray]:
         """Echelon bases of T_k, by joint."""
-        return [field.row_basis(change) for change in self.changes]
+        return list(map(field.row_basis, self.changes))
 
     @cached_property
     def order(self) -> list[int]:

@@ -111,7 +111,7 @@ def _parsed(
             notes.error(element.sourceline, where, repr(word), f"{expected} in decimal notation", hint)
             return None
     # a size beyond MAX_MAGNITUDE would overflow as soon as two of them are multiplied
-    values = [float(word) for word in words]
+    values = list(map(float, words))
     if not all(isfinite(value) and (not bounded or abs(value) <= MAX_MAGNITUDE) for value in values):
         bound = f"within +-{MAX_MAGNITUDE:g}" if bounded else "within the range of a float"
         notes.error(element.sourceline, where, repr(text), f"{expected} {bound}")

@@ -15,11 +15,10 @@ class GeometryTuning:
     fine_divisors: tuple[int, ...] = (12, 8, 5)  # of pi: the special angles on CAD drawings of the 189 arms
     offset_noise: float = 1e-9  # [m] below it an offset is 0: what composed rotations leave
     axis_noise: float = 1e-3  # of a unit axis: a component below it is 0, as CAD exporters print three digits
-    tensor_noise: float = (
-        1e-12  # of the largest moment: a smaller product of inertia is rounding of a program
-    )
     notable: float = 1e-9  # [rad, 1] a smaller change of an angle or axis is not worth a remark
-    zero_noise: float = 1e-12  # of a rotation's element: smaller is rounding of float64, and stands for 0
+    zero_noise: float = (
+        1e-12  # of a rotation's element, of the largest moment: smaller is rounding and means 0
+    )
     rotation_error: float = 1e-11  # [rad] of a rational rotation: thousands of times below any calibration
     denominators: tuple[int, ...] = (10**7, 10**10, 10**13)  # tried in turn, the shortest fractions first
     eighth: float = 0.7  # [rad] just below pi/4: at an edge of an eighth no usual angle lies
