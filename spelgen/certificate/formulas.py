@@ -12,7 +12,7 @@ from fractions import Fraction
 from functools import cached_property
 from typing import Literal
 
-from flint import fmpq, fmpq_mpoly
+from flint import fmpq_mpoly
 from sympy import Expr, Matrix, Rational, Symbol
 
 from spelgen.arm.arm import Arm
@@ -23,7 +23,7 @@ from spelgen.errors import SpelgenError
 from spelgen.labels import entry_name
 from spelgen.listing import Listing
 from spelgen.settings.tuning.structure import CertificateTuning
-from spelgen.structure.base_parameters import BaseParameter, base_parameters, parameter_name
+from spelgen.structure.base_parameters import BaseParameter, base_parameters, parameter_name, rational
 from spelgen.structure.expansion import Budget, Expansion, TooLarge
 from spelgen.structure.recursion import triangle
 from spelgen.structure.structure import Structure
@@ -115,7 +115,7 @@ class Formulas:
         for base in self.base:
             terms = {}
             for index, coefficient in base.weights:
-                terms[parameter(parameter_name(index)),] = _rational(coefficient)
+                terms[parameter(parameter_name(index)),] = rational(coefficient)
             definitions[parameter(base.name)] = expression(terms)
         return definitions
 
@@ -251,13 +251,9 @@ class _Writer:
         # under `inertials` the parameters have values, and a monomial may cancel between them
         total = context.from_dict({})
         for base, polynomial in zip(self.base, polynomials, strict=True):
-            total += _rational(base.value or Fraction(0)) * polynomial
+            total += rational(base.value or Fraction(0)) * polynomial
         result = []
         for polynomial in polynomials:
             terms = {monomial: value for monomial, value in polynomial.terms() if total[monomial] != 0}
             result.append(context.from_dict(terms))
         return result
-
-
-def _rational(number: Fraction) -> fmpq:
-    return fmpq(number.numerator, number.denominator)

@@ -16,9 +16,7 @@ from spelgen.arm.arm import Arm, Body
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
 from spelgen.settings.settings import Settings
-from spelgen.structure.basis import Weights
 from spelgen.structure.pseudo_inertia import parameters_of
-from spelgen.structure.recursion import triangle
 
 ENGINE = f"Pinocchio {pin.__version__}"
 
@@ -40,14 +38,6 @@ class NumericSamples:
         """How M changes when one coordinate moves, (n, samples, n(n+1)/2)."""
         result: np.ndarray = self.mass[1:] - self.mass[0]
         return result
-
-    def row(self, weights: Weights) -> np.ndarray:
-        """Return weights of entries of M as a row (n(n+1)/2,)."""
-        entries = triangle(len(self.mass) - 1)
-        row = np.zeros(len(entries))
-        for i, j, value in weights:
-            row[entries.index((i, j))] = float(value)
-        return row
 
 
 def draw(arm: Arm, count: int, rng: np.random.Generator, *, random_inertials: bool) -> NumericSamples:

@@ -20,7 +20,7 @@ from spelgen.certificate.verification import Check, Verification, size_text
 from spelgen.errors import SpelgenError
 from spelgen.labels import entry_name, joints_in_ranges
 from spelgen.settings.tuning.structure import CertificateTuning
-from spelgen.structure.basis import Constant, Output
+from spelgen.structure.basis import Constant, Output, row_of
 from spelgen.structure.structure import Structure
 from spelgen.urdf.robot import Robot
 
@@ -168,13 +168,14 @@ def _dependence(case: _Case) -> Check:
 def _smallest_form(case: _Case) -> Iterator[Check]:
     """Check that M = sum c A + sum f B gives M back, that no f moves with a joint it does not read, no c with any."""
     structure, samples = case.structure, case.samples
+    n = len(structure.joints)
     rebuilt = np.zeros_like(samples.mass)
     rows = []
     terms: list[Output | Constant] = [*structure.outputs, *structure.constants]
     for term in terms:
-        reads = samples.row(term.reads)
+        reads = row_of(term.reads, n)
         values = samples.mass @ (reads * samples.scale)
-        rebuilt += values[..., None] * samples.row(term.basis) / samples.scale
+        rebuilt += values[..., None] * row_of(term.basis, n) / samples.scale
         # relative to what the sum would be if nothing cancelled
         moves = np.abs(values[1:] - values[0]).max(axis=1) / (np.abs(reads) @ samples.scale)
         name = "a constant"

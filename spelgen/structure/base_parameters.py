@@ -110,7 +110,7 @@ def _rows(arm: Arm, generator: random.Random) -> np.ndarray:
     units = np.full((parameters, parameters), fmpq(0))
     np.fill_diagonal(units, fmpq(1))
     inertias = [list(units[10 * body : 10 * body + 10]) for body in range(len(arm.bodies))]
-    result = energies(arm, motions(arm, positions, _rational), inertias, _rational)
+    result = energies(arm, motions(arm, positions, rational), inertias, rational)
     rows = np.full((n * (n + 1) // 2 + 1, parameters), fmpq(0))
     for row, key in enumerate(triangle(n)):
         rows[row] = _row(result.mass[key], parameters)
@@ -131,7 +131,8 @@ def _solved(matrix: np.ndarray, right: np.ndarray) -> list[list[fmpq]]:
     return fmpq_mat(matrix.tolist()).solve(fmpq_mat(right.tolist())).table()
 
 
-def _rational(number: Fraction) -> fmpq:
+def rational(number: Fraction) -> fmpq:
+    """Return the number in FLINT's exact arithmetic."""
     return fmpq(number.numerator, number.denominator)
 
 

@@ -27,6 +27,14 @@ Weights = tuple[tuple[int, int, Fraction], ...]
 """A sparse symmetric matrix by its lower triangle: (row, column, value), 0-based."""
 
 
+def row_of(weights: Weights, n: int) -> np.ndarray:
+    """Return weights of M's entries, of n joints, as a row (n(n+1)/2,) over its lower triangle."""
+    row = np.zeros(n * (n + 1) // 2)
+    for i, j, value in weights:
+        row[i * (i + 1) // 2 + j] = float(value)
+    return row
+
+
 @dataclass(frozen=True)
 class Output:
     """Hold one function f(q) of ``joints`` that is left open: f = sum of ``reads`` x M, and it enters M through

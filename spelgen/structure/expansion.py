@@ -14,6 +14,7 @@ from typing import TypeAlias
 from flint import Ordering, fmpq, fmpq_mpoly, fmpq_mpoly_ctx
 
 from spelgen.arm.arm import Arm
+from spelgen.structure.base_parameters import rational
 from spelgen.structure.recursion import energies
 from spelgen.structure.sampling import Position, motions
 
@@ -139,4 +140,4 @@ def _terms(value: Value) -> int:
 
 
 def _number(value: Fraction) -> Deferred:
-    return Deferred("constant", fmpq(value.numerator, value.denominator))
+    return Deferred("constant", rational(value))

@@ -6,7 +6,6 @@ replaced by one-kilogram links.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from math import floor, log10, pi
 
@@ -14,8 +13,7 @@ import numpy as np
 
 from spelgen.arm.arm import Arm, Coordinate
 from spelgen.settings.tuning.structure import StructureTuning
-from spelgen.structure.basis import Weights
-from spelgen.structure.recursion import triangle
+from spelgen.structure.basis import row_of
 from spelgen.structure.sampling import float_energies
 from spelgen.structure.structure import Structure
 
@@ -58,8 +56,13 @@ def nominal(arm: Arm, structure: Structure) -> Nominal:
     diagonal = rows == columns
     # an entry off the diagonal is at most this, as M is positive definite (Cauchy and Schwarz)
     typical = np.sqrt(means[diagonal][rows] * means[diagonal][columns])
-    output_reads = _matrix(structure, [output.reads for output in structure.outputs])
-    constant_reads = _matrix(structure, [constant.reads for constant in structure.constants])
+    n = len(ranges)
+    output_reads = np.zeros((len(structure.outputs), len(means)))
+    for index, output in enumerate(structure.outputs):
+        output_reads[index] = row_of(output.reads, n)
+    constant_reads = np.zeros((len(structure.constants), len(means)))
+    for index, constant in enumerate(structure.constants):
+        constant_reads[index] = row_of(constant.reads, n)
     outputs = mass @ output_reads.T
     constants = constant_reads @ means
     # an output that the nominal values hardly move still moves by a part of the entries it enters
@@ -77,7 +80,7 @@ def nominal(arm: Arm, structure: Structure) -> Nominal:
         joint_torque=_rounded(np.hypot(torque, inertial)),
         mass_sensitivities=_sensitivities(_mass_changes(arm, q, inertias, typical)),
         potential_sensitivities=_sensitivities(torque),
-        least_eigenvalue=_round(_least_eigenvalue(mass, means, len(ranges)), _DIGITS),
+        least_eigenvalue=_round(_least_eigenvalue(mass, means, n), _DIGITS),
         from_urdf=from_urdf,
     )
 
@@ -176,16 +179,6 @@ def _sensitivities(sizes: np.ndarray) -> tuple[float, ...]:
     if sizes.max() <= 0:
         return (1.0,) * len(sizes)
     return _rounded(np.maximum(sizes / sizes.max(), TUNING.least_sensitivity), 3)
-
-
-def _matrix(structure: Structure, reads: Sequence[Weights]) -> np.ndarray:
-    """Return weightings of M's entries as rows over its lower triangle."""
-    keys = triangle(len(structure.joints))
-    matrix = np.zeros((len(reads), len(keys)))
-    for row, weights in enumerate(reads):
-        for i, j, value in weights:
-            matrix[row, keys.index((i, j))] = float(value)
-    return matrix
 
 
 def _rounded(values: np.ndarray, digits: int = _DIGITS, least: float = 1e-12) -> tuple[float, ...]:
