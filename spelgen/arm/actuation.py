@@ -101,8 +101,10 @@ def derive_actuation(robot: Robot, settings: Settings, joints: Sequence[str]) ->
     remarks = tuple(_undriven(robot, settings, driven))
     couplings = _couplings(robot, settings, joints)
     if settings.torque == "joint":
-        entries = [InputEntry(joints.index(name), joints.index(name), "fixed", 1.0) for name in driven]
-        return Actuation(len(joints), tuple(entries), remarks, tuple(couplings))
+        direct: list[InputEntry] = []
+        for name in driven:
+            direct.append(InputEntry(joints.index(name), joints.index(name), "fixed", 1.0))
+        return Actuation(len(joints), tuple(direct), remarks, tuple(couplings))
     entries = list(couplings)
     coupled = {entry.row for entry in couplings}
     for name in driven:
@@ -162,7 +164,8 @@ def _couplings(robot: Robot, settings: Settings, joints: Sequence[str]) -> list[
         locked = [name for name in coupling.joints if name not in joints]
         # a coupling of locked joints alone concerns another part of the robot
         if len(locked) < len(coupling.joints):
-            errors += [_locked(name, joints) for name in locked]
+            for name in locked:
+                errors.append(_locked(name, joints))
             coupled.update(coupling.joints)
             if not locked:
                 entries += _block(joints, coupling.joints, coupling.matrix)
@@ -185,7 +188,7 @@ def _locked(name: str, joints: Sequence[str]) -> SettingsError:
 def _is_differential(transmission: Transmission, free: Collection[str]) -> bool:
     names = transmission.joint_names
     pair = len(names) == len(transmission.actuators) == 2
-    return _DIFFERENTIAL in transmission.type and pair and all(name in free for name in names)
+    return _DIFFERENTIAL in transmission.type and pair and set(names) <= set(free)
 
 
 def _differential(transmission: Transmission) -> tuple[tuple[float, float], ...]:

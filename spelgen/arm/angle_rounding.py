@@ -91,7 +91,7 @@ class AngleRounding:
     def _rotation(self, rpy: Sequence[float], where: str, line: int) -> np.ndarray | None:
         if not any(rpy):
             return None
-        rounded = [rounded_angle(angle, self.tolerance) for angle in rpy]
+        rounded = list(map(self.angle, rpy))
         changes = []
         for angle, special in zip(rpy, rounded, strict=True):
             if abs(special - angle) > TUNING.notable:

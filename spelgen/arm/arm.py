@@ -116,14 +116,17 @@ def make_arm(
     _require_small(robot, chain)
     lumped = lump_links(robot, chain, angle_tolerance)
     # all bodies of one coordinate move with it, so bodies are found by their leader
-    indices = {joint.name: index for index, joint in enumerate(chain.joints)}
+    leaders = [joint.name for joint in chain.joints]
     locked = {joint.name for joint in lumped.held if joint.type != "fixed"}
+    bodies = []
+    for moved in lumped.moved:
+        bodies.append(_body(moved, leaders.index(moved.followed.leader.name)))
     # exact, so that a horizontal joint has no gravity torque at all and not one of 1e-17
     x, y, z = map(exact, map(float, gravity))
     return Arm(
         name=robot.name,
         coordinates=tuple(map(_coordinate, chain.joints)),
-        bodies=tuple(_body(moved, indices[moved.followed.leader.name]) for moved in lumped.moved),
+        bodies=tuple(bodies),
         gravity=(x, y, z),
         diagnostics=lumped.diagnostics,
         locked=tuple(joint.name for joint in robot.joints if joint.name in locked),
@@ -137,8 +140,9 @@ def _require_small(robot: Robot, chain: Chain) -> None:
         do = "choose fewer with --joints or --tip"
         raise ArmError(f"{moving} joints", file=robot.told_as, expected=f"at most {MOST_JOINTS}", do=do)
     leaders = {joint.name for joint in chain.joints}
-    followed = [follow.leader.name for follow in follows(robot).values()]
-    following = sum(name in leaders for name in followed) - moving
+    following = -moving  # each joint of the chain follows itself
+    for follow in follows(robot).values():
+        following += follow.leader.name in leaders
     if following > MOST_FOLLOWERS:
         got = f"{following} joints that follow others by <mimic>"
         raise ArmError(got, file=robot.told_as, expected=f"at most {MOST_FOLLOWERS}", do="fix some of them")

@@ -80,7 +80,7 @@ def _moves_by_itself(joint: Joint) -> bool:
 
 
 def _independent(joints: Iterable[Joint]) -> tuple[Joint, ...]:
-    return tuple(joint for joint in joints if _moves_by_itself(joint))
+    return tuple(filter(_moves_by_itself, joints))
 
 
 def _refuse_free_joints(robot: Robot, last: Joint) -> None:
@@ -154,7 +154,7 @@ def _up_to(robot: Robot, tip: str) -> tuple[Joint, ...]:
 def _longest(robot: Robot) -> Chain:
     """Return the longest chain; of several of one length, the one that something certain speaks for."""
     chains = _chains(robot)
-    length = max((len(chain) for chain in chains), default=0)
+    length = max(map(len, chains), default=0)
     longest = [chain for chain in chains if len(chain) == length]
     if not longest:
         return Chain(())

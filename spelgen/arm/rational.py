@@ -185,7 +185,7 @@ def _turn(axis: int, cosine: float, sine: float) -> Matrix:
 
 def turn_about(axis: int, cosine: Fraction, sine: Fraction) -> Matrix:
     """Return the rotation about the coordinate axis 0, 1 or 2 by the angle of this cosine and sine."""
-    rows = [list(row) for row in IDENTITY]
+    rows = list(map(list, IDENTITY))
     first, second = (axis + 1) % 3, (axis + 2) % 3
     rows[first][first] = rows[second][second] = cosine
     rows[first][second] = -sine
@@ -222,8 +222,8 @@ def product(a: Matrix, b: Matrix) -> Matrix:
     """Return the matrix product a b."""
     if a == IDENTITY:
         return b
-    first, second, third = (rotated(a, column) for column in transposed(b))
-    return transposed((first, second, third))
+    x, y, z = transposed(b)
+    return transposed((rotated(a, x), rotated(a, y), rotated(a, z)))
 
 
 def rotated(a: Matrix, vector: Vector) -> Vector:

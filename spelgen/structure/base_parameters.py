@@ -49,7 +49,9 @@ def parameter_name(index: int) -> str:
 @lru_cache(maxsize=16)  # of one arm they are asked for by least squares, logs and closed forms
 def base_parameters(arm: Arm, count: int) -> tuple[BaseParameter, ...]:
     """Return the ``count`` base parameters of ``arm``, by body from the root."""
-    order = [10 * body + PARAMETERS.index(name) for body in range(len(arm.bodies)) for name in _PREFERRED]
+    order: list[int] = []
+    for body in range(len(arm.bodies)):
+        order += [10 * body + PARAMETERS.index(name) for name in _PREFERRED]
     rows = np.concatenate(list(_enough_rows(arm, count)))[:, order]
     residues = _residues(rows)
     # which parameters are independent shows in the prime field; the coefficients are then solved for exactly
@@ -138,7 +140,7 @@ def rational(number: Fraction) -> fmpq:
 
 def _residues(rows: np.ndarray) -> np.ndarray:
     """Return rational numbers as elements of the prime field."""
-    residues = [_residue(number) for number in rows.ravel().tolist()]
+    residues = list(map(_residue, rows.ravel().tolist()))
     return np.array(residues, dtype=np.uint64).reshape(rows.shape)
 
 

@@ -73,14 +73,14 @@ def smallest_form(spans: Spans) -> tuple[tuple[Output, ...], tuple[Constant, ...
     basis = field.product(field.inverse(field.product(spans.varying, weights.T)), spans.varying)
     changes = spans.float_changes(frozenset(range(spans.n)))
     basis_values = _solved(changes @ values.T, changes)
-    outputs = tuple(
-        Output(r.joints, _weights(spans, r.weights, r.values), _weights(spans, row, row_values))
-        for r, row, row_values in zip(readings, basis, basis_values, strict=True)
-    )
+    outputs = []
+    for r, row, row_values in zip(readings, basis, basis_values, strict=True):
+        reads = _weights(spans, r.weights, r.values)
+        outputs.append(Output(r.joints, reads, _weights(spans, row, row_values)))
     # what the outputs do not explain cannot vary, so its span is that of the constants
     constant = field.difference(spans.mass, field.product(field.product(spans.mass, weights.T), basis))
     rest_values = spans.float_mass - spans.float_mass @ values.T @ basis_values
-    return outputs, _constants(spans, readings, (constant, rest_values), (basis, basis_values))
+    return tuple(outputs), _constants(spans, readings, (constant, rest_values), (basis, basis_values))
 
 
 def _constants(
@@ -192,10 +192,10 @@ def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 
 def _weights(spans: Spans, exact: np.ndarray, values: np.ndarray) -> Weights:
-    return tuple(
-        (*spans.keys[index], _fraction(int(exact[index]), float(values[index])))
-        for index in np.flatnonzero(exact)
-    )
+    weights = []
+    for index in np.flatnonzero(exact).tolist():
+        weights.append((*spans.keys[index], _fraction(int(exact[index]), float(values[index]))))
+    return tuple(weights)
 
 
 def _fraction(element: int, value: float) -> Fraction:

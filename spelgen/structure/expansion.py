@@ -80,14 +80,16 @@ class Expansion:
 
     def __init__(self, arm: Arm):
         n = len(arm.coordinates)
-        names = [f"{letter}{k + 1}" for k in range(n) for letter in "csq"]
+        names: list[str] = []
+        for k in range(n):
+            names += (f"c{k + 1}", f"s{k + 1}", f"q{k + 1}")
         self.context = fmpq_mpoly_ctx.get(names, Ordering.lex)
         variables = [Deferred("constant", x) for x in self.context.gens()]
         self._parameters = [Deferred("parameter", index) for index in range(10 * len(arm.bodies))]
-        positions = [Position(*variables[3 * k : 3 * k + 3]) for k in range(n)]
-        inertias: list[Sequence[Deferred]] = [
-            self._parameters[10 * body : 10 * body + 10] for body in range(len(arm.bodies))
-        ]
+        positions = list(map(Position, variables[::3], variables[1::3], variables[2::3]))
+        inertias: list[Sequence[Deferred]] = []
+        for body in range(len(arm.bodies)):
+            inertias.append(self._parameters[10 * body : 10 * body + 10])
         self.written = energies(arm, motions(arm, positions, _number), inertias, _number)
 
     def polynomial(self, element: Deferred | int, parameter: int, budget: Budget) -> fmpq_mpoly:

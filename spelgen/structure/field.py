@@ -78,11 +78,12 @@ def random_residues(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndar
 
 def random_circle_points(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
     """``count`` random solutions (c, s) of c^2 + s^2 = 1, by the rational half-angle parameter."""
-    tangents = [int(t) for t in random_residues(rng, (count,))]
-    # 1 + t^2 is never 0: -1 has no square root modulo a prime of the form 4k + 3
-    inverses = [pow(1 + t * t, -1, PRIME) for t in tangents]
-    cosines = [(1 - t * t) * inverse % PRIME for t, inverse in zip(tangents, inverses, strict=True)]
-    sines = [2 * t * inverse % PRIME for t, inverse in zip(tangents, inverses, strict=True)]
+    cosines, sines = [], []
+    for t in random_residues(rng, (count,)).tolist():
+        # 1 + t^2 is never 0: -1 has no square root modulo a prime of the form 4k + 3
+        inverse = pow(1 + t * t, -1, PRIME)
+        cosines.append((1 - t * t) * inverse % PRIME)
+        sines.append(2 * t * inverse % PRIME)
     return np.array(cosines, dtype=np.uint64), np.array(sines, dtype=np.uint64)
 
 

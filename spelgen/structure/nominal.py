@@ -47,7 +47,7 @@ def nominal(arm: Arm, structure: Structure) -> Nominal:
     """Return nominal sizes of ``arm`` in terms of ``structure``'s outputs and constants."""
     # a fixed seed: these numbers stand in the emitted source, which must not change
     rng = np.random.default_rng(0)
-    ranges = [working_range(coordinate) for coordinate in arm.coordinates]
+    ranges = list(map(working_range, arm.coordinates))
     q = np.stack([rng.uniform(lower, upper, TUNING.points) for lower, upper in ranges], axis=-1)
     mass, from_urdf = _mass_samples(arm, q)
     inertias = nominal_inertias(arm, from_urdf)

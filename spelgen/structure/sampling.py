@@ -93,9 +93,11 @@ def regressor_rows(arm: Arm, points: int, seed: int = 1) -> np.ndarray:
     for _ in range(n):
         c, s = random_circle_points(rng, points)
         value = random_residues(rng, (points,))
-        positions.append(Position(*(Residues(np.repeat(x, parameters)) for x in (c, s, value))))
+        c, s, value = (Residues(np.repeat(x, parameters)) for x in (c, s, value))
+        positions.append(Position(c, s, value))
     unit = np.tile(np.eye(parameters, dtype=np.uint64), (1, points))
-    inertias = [[Residues(unit[10 * body + i]) for i in range(10)] for body in range(len(arm.bodies))]
+    units = list(map(Residues, unit))
+    inertias = [units[10 * body : 10 * body + 10] for body in range(len(arm.bodies))]
     result = energies(arm, motions(arm, positions, residue), inertias, residue)
     elements = [result.mass[key] for key in triangle(n)] + [result.potential]
     blocks = []

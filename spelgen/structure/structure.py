@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import compress
 from typing import TYPE_CHECKING, Literal
 
 from spelgen.arm.arm import Arm
@@ -79,7 +80,7 @@ def derive(arm: Arm, assume: Assume = "kinematics") -> Structure:
         entries=tuple(_entry(spans, index) for index in range(len(spans.keys))),
         outputs=outputs,
         constants=constants,
-        potential=tuple(k for k in range(spans.n) if spans.potential_changes[k]),
+        potential=tuple(compress(range(spans.n), spans.potential_changes)),
         passive=tuple(k for k, coordinate in enumerate(arm.coordinates) if coordinate.passive),
         base_parameter_count=base_parameter_count(arm),
     )
