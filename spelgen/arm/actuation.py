@@ -97,6 +97,7 @@ def derive_actuation(robot: Robot, settings: Settings, joints: Sequence[str]) ->
     Raises SettingsError for couplings with locked joints, UrdfError for a transmission that is needed and
     has unusable numbers.
     """
+    # the row of a passive joint stays zero: no torque of a log acts on it
     driven = [name for name in joints if settings.joint(name).actuated]
     remarks = tuple(_undriven(robot, settings, driven))
     couplings = _couplings(robot, settings, joints)

@@ -135,6 +135,7 @@ def make_arm(
 
 def _require_small(robot: Robot, chain: Chain) -> None:
     """Refuse what would take more than seconds, before any of it is done."""
+    # M of 16 joints has 136 entries, each over ten parameters of 16 bodies
     moving = len(chain.joints)
     if moving > MOST_JOINTS:
         do = "choose fewer with --joints or --tip"

@@ -128,6 +128,7 @@ def _named(robot: Robot, names: Sequence[str]) -> tuple[Joint, ...]:
 
 def _usable(robot: Robot, name: str) -> Joint:
     """Return the joint of this name, which must move by itself."""
+    # each mistake has an answer of its own: misspelt, a follower, or fixed
     joint = robot.joint.get(name)
     if joint is None:
         names = [joint.name for joint in _independent(robot.joints)]

@@ -110,6 +110,7 @@ class Placement:
 
     def inertia(self, link: Link, inertial: Inertial) -> TenVector:
         """Return the link's (m, m c, I) about its body's origin, in the body's frame (parallel-axis theorem)."""
+        # about the body origin, in which M and V are linear in all ten parameters
         offset, turn = self._rounding.inertial_origin(link, inertial)
         frame = self._turned(self.frames[link.name], self._offset(self.frames[link.name], offset), turn)
         mass = exact(inertial.mass)

@@ -163,6 +163,7 @@ class _Words:
 
     def idle_joints(self) -> Iterator[Fact]:
         """Yield joints that no entry of M depends on."""
+        # what no network reads is the most useful fact: an input less
         read: set[int] = set()
         for entry in self.structure.entries:
             read.update(entry.joints)

@@ -167,6 +167,7 @@ class Inspection:
                     needs.append(f"{meaning} at {_rows(entries)}")
         if self.actuation.couplings:
             needs.append(f"motors coupled at {_rows(self.actuation.couplings)}")
+        # a joint without a drive has no input, so friction alone explains its torque
         if self.structure.passive:
             needs.append(f"{joints_in_ranges(self.structure.passive)} without a drive")
         return ", ".join(needs)

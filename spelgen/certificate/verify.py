@@ -199,6 +199,7 @@ def _ranks(case: _Case) -> Iterator[Check]:
     yield case.rank_check("outputs", changes.reshape(-1, width), outputs)
     together = outputs + len(structure.constants)
     yield case.rank_check("outputs and constants together", case.samples.mass[0], together)
+    # networks near the tip should read few joints: this count is what the greedy choice maximises
     against = _Contradictions()
     for first in range(1, len(structure.joints)):
         # all outputs but those that the joints before the first one move

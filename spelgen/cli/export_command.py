@@ -48,6 +48,7 @@ def export(
     require_fitting(to, output)
     options.require_free(output, force=force)
     result = export_run(load_run(run, trust=trust), to, entries=entry or ())
+    # all or nothing: a failed parity check above has left no file
     files = [str(path) for path in result.write(output, force=force)]
     lines = [f"wrote {path}" for path in files]
     answer(format, {"files": files, "summary": result.summary}, *lines, *result.summary)

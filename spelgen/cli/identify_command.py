@@ -69,6 +69,7 @@ def identify(
     from spelgen.logs.preprocessing import Preprocessing
     from spelgen.logs.read import read_logs
 
+    # names and no flags: effects combine in any way
     effects = options.names(friction) or []
     for name in effects:
         if name not in EFFECTS:

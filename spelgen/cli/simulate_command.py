@@ -36,6 +36,7 @@ def simulate(
         options.require_free(path, force=force)
     with progress_bar("simulating") as progress:
         logs = simulate_arm(arm, seed=seed, progress=progress)
+    # logs are written in SI units under the URDF names: no mapping is needed to read them
     names = arm.arm.joint_names
     for path, trajectories in zip(paths.values(), (logs.train, logs.test), strict=True):
         if trajectories:

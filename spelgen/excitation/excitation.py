@@ -48,6 +48,7 @@ class Excitation:
         paragraphs = [head, self.listing().text()]
         if (self.efforts > 1).any():
             paragraphs.append("warning: effort limits are overrun: no motion was found that keeps them")
+        # a guessed limit may be wrong for this robot: the user is to set it
         lacking = [c.name for c in self.arm.coordinates if not c.velocity]
         if lacking:
             summary = f"no velocity limit, 1 rad/s or 0.25 m/s taken: {', '.join(lacking)}"

@@ -75,7 +75,7 @@ class Identification:
 
     def to_dict(self) -> dict[str, object]:
         """Return the JSON form, a public contract."""
-        joints = self.arm.joint_names
+        joints = list(self.arm.joint_names)
         friction = self.method.friction
         return {
             "schema": SCHEMA,

@@ -113,6 +113,7 @@ def require_sound_logs(
     logs: Sequence[Trajectory], arm: LoadedArm, mapping: LogMapping | None = None
 ) -> list[Diagnostic]:
     """Return what `check_logs` finds of logs beside their arm; raise LogError where they cannot be trained on."""
+    # the same checks as the command, so that a fit refuses what `spelgen logs` refuses
     report = check_logs(logs, arm, mapping)
     collect(report.errors)
     # a fit itself tells what logs show without the arm

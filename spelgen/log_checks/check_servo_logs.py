@@ -122,6 +122,7 @@ def _wrong_command(k: int, joints: Sequence[str], following: Following) -> LogEr
     # what does not move follows nothing, and proves nothing wrong
     if not following.moves[k]:
         return None
+    # judged at the delay at which the two are most alike: a slow servo is no wrong one
     where, delay = f"joint {joints[k]!r}", following.best_delay(k, k)
     correlation, gain = float(following.correlation[delay, k, k]), float(following.gain[delay, k, k])
     # a servo follows its command to a fifth, unless one of the two is in degrees
@@ -133,6 +134,7 @@ def _wrong_command(k: int, joints: Sequence[str], following: Following) -> LogEr
     if correlation < -FOLLOWS:
         got = f"positions that move against commands (correlation {correlation:.2g})"
         return LogError(got, element=where, expected="one sense", do="check the signs of q and u")
+    # swapped columns: another joint follows this command
     if correlation < TUNING.ignores:
         for other, name in enumerate(joints):
             delay = following.best_delay(k, other)

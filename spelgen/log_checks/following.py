@@ -120,6 +120,7 @@ def _retarding_motion(piece: Trajectory) -> np.ndarray:
 
 def _resting_errors(pieces: Sequence[Trajectory], n: int) -> list[np.ndarray]:
     """Return the distances u - q of each joint while it and its command rest."""
+    # a joint that never rests has no error, and an empty array says so
     errors = [[np.zeros(0)] for _ in range(n)]
     for piece in pieces:
         u = require_commands(piece)[:-1]

@@ -196,5 +196,6 @@ def range_fraction(coordinate: Coordinate, low: float, high: float) -> float | N
     """Return the part of a joint's range that lies between these positions; None where it has no range."""
     if coordinate.continuous or coordinate.lower is None or coordinate.upper is None:
         return None
+    # limits of a URDF may be equal or swapped
     width = coordinate.upper - coordinate.lower
     return (high - low) / width if width > 0 else None

@@ -57,6 +57,7 @@ def base_parameters(arm: Arm, count: int) -> tuple[BaseParameter, ...]:
     # which parameters are independent shows in the prime field; the coefficients are then solved for exactly
     bound = field.pivots(field.row_basis(residues))
     independent_rows = field.pivots(field.row_basis(residues[:, bound].T))
+    # parameters of zero columns move nothing: no base parameter contains them
     moving = np.flatnonzero(residues.any(axis=0)).tolist()
     free = [column for column in moving if column not in bound]
     coefficients = _solved(rows[np.ix_(independent_rows, bound)], rows[np.ix_(independent_rows, free)])

@@ -49,6 +49,7 @@ def nominal(arm: Arm, structure: Structure) -> Nominal:
     rng = np.random.default_rng(0)
     ranges = list(map(working_range, arm.coordinates))
     q = np.stack([rng.uniform(lower, upper, TUNING.points) for lower, upper in ranges], axis=-1)
+    # over the workspace: at zero position many couplings happen to vanish
     mass, from_urdf = _mass_samples(arm, q)
     inertias = nominal_inertias(arm, from_urdf)
     means = mass.mean(axis=0)

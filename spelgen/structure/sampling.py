@@ -160,6 +160,7 @@ def motions(arm: Arm, positions: Sequence[Position], number: Callable[[Fraction]
 
 def circle_point(angle: float) -> tuple[Fraction, Fraction]:
     """Return the cosine and sine of an angle [rad], as a rational point of the circle within 1e-13 of it."""
+    # tan(angle / 2) has a pole at pi, and right angles are meant exactly
     if abs(cos(angle)) < 1e-12 or abs(sin(angle)) < 1e-12:
         return Fraction(round(cos(angle))), Fraction(round(sin(angle)))
     t = Fraction(tan(angle / 2)).limit_denominator(10**7)

@@ -102,6 +102,7 @@ def base_parameter_count(arm: Arm) -> int:
 
 
 def _entry(spans: Spans, index: int) -> Entry:
+    # zero at random points of a field of 2e18 elements is zero everywhere, all but surely
     row, column = spans.keys[index]
     if not spans.mass[:, index].any():
         return Entry(row, column, "zero")

@@ -198,6 +198,7 @@ def _read_mimic(notes: Notes, element: etree._Element, where: str) -> Mimic | No
         return None
     where = f"{where} mimic"
     joint = mimic.get("joint")
+    # a follower of nothing cannot be placed at all, so this is no warning
     if not joint:
         notes.error(mimic.sourceline, where, "no joint", 'joint="..." naming the joint to follow')
         return None
@@ -244,5 +245,6 @@ def read_transmission(notes: Notes, element: etree._Element, joints: Sequence[st
         for actuator in element.findall("actuator")
     )
     _warn_instead(notes, own)
+    # ROS 1 writes an element, some exporters an attribute
     kind = (element.findtext("type") or element.get("type") or "").strip()
     return Transmission(name, kind, tuple(driven), actuators, element.sourceline, tuple(own.errors))

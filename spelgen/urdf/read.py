@@ -49,6 +49,7 @@ def read_urdf(path: Path) -> Robot:
     _check_ends(notes, links, joints)
     _check_mimics(notes, joints)
     joint_names = [joint.name for joint in joints]
+    # after the joints, whose names they must use
     transmissions = [
         read_transmission(notes, element, joint_names) for element in root.findall("transmission")
     ]
