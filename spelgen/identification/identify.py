@@ -136,7 +136,7 @@ class _Rows:
     motors: np.ndarray | None
 
     def blocks(self) -> Iterator[Columns]:
-        reach = reach_of([x.kind for x in self.bodies.arm.coordinates]).values
+        reach = reach_of(self.bodies.arm.joint_types).values
         for block, bodies in self.bodies.blocks():
             bent = None if block.z is None else block.z / reach
             drives = self.friction.columns(block.qd, block.qdd, bent, self.motors)

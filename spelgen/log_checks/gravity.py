@@ -87,7 +87,7 @@ def find_opposed_inertia(arm: Arm, samples: Sequence[StateSamples], speeds: np.n
 
     speeds: C, (n, n), of the motors. Friction does not tell: a drive may compensate it after its torque was measured.
     """
-    friction = FrictionModel(coulomb_smoothing_velocity=COULOMB_VELOCITY)
+    friction = FrictionModel(coulomb_smoothing_velocity=MOVING)
     columns = base_parameters(arm, friction, speeds).columns
     q, qd, qdd, tau = _thinned(samples)
     unit = tau.std(axis=0)
