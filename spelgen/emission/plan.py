@@ -169,7 +169,7 @@ def _friction(coordinate: Coordinate, sizes: Nominal, index: int) -> float:
     return _FRICTION_OF_TORQUE * max(sizes.joint_torque[index], 0.01 * max(sizes.joint_torque))
 
 
-def _identifiers(names: list[str]) -> list[str]:
+def _identifiers(names: Sequence[str]) -> list[str]:
     """Unique ASCII identifiers, recognisable where the name allows it."""
     used: set[str] = set()
     identifiers = []

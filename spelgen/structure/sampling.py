@@ -65,8 +65,8 @@ def field_samples(arm: Arm, assume: Assume, samples: int, seed: int = 0) -> Samp
         # itself
         c, s = random_circle_points(rng, 2 * samples)
         value = random_residues(rng, (2 * samples,))
-        c, s, value = (Residues(_one_moved(x, index, blocks)) for x in (c, s, value))
-        positions.append(Position(c, s, value))
+        moved = [Residues(_one_moved(x, index, blocks)) for x in (c, s, value)]
+        positions.append(Position(*moved))
     inertias: list[Ten]
     # what holds for random inertial values of each sample holds for any of them
     if assume == "kinematics":
@@ -93,8 +93,8 @@ def regressor_rows(arm: Arm, points: int, seed: int = 1) -> np.ndarray:
     for _ in range(n):
         c, s = random_circle_points(rng, points)
         value = random_residues(rng, (points,))
-        c, s, value = (Residues(np.repeat(x, parameters)) for x in (c, s, value))
-        positions.append(Position(c, s, value))
+        repeated = [Residues(np.repeat(x, parameters)) for x in (c, s, value)]
+        positions.append(Position(*repeated))
     unit = np.tile(np.eye(parameters, dtype=np.uint64), (1, points))
     units = list(map(Residues, unit))
     inertias = [units[10 * body : 10 * body + 10] for body in range(len(arm.bodies))]
