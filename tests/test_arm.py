@@ -70,6 +70,12 @@ class TestChain:
         assert arm.locked == ("side",)
         assert "locked-joint" in codes(arm)
 
+    def test_joints_outside_the_chain_are_one_remark(self, robot):
+        sides = [joint(f"side{k}", "0", f"s{k}") for k in range(9)]
+        arm = make_arm(robot(joint("a", "0", "1"), joint("b", "1", "2"), *sides))
+        (remark,) = [diagnostic for diagnostic in arm.diagnostics if diagnostic.code == "locked-joint"]
+        assert all(repr(f"side{k}") in remark.message for k in range(9))
+
     def test_tips_behind_fixed_joints_are_one_chain(self, robot):
         tips = joint("t", "1", "tool", "fixed"), joint("f", "1", "flange", "fixed")
         assert names(make_arm(robot(joint("a", "0", "1"), *tips))) == ["a"]

@@ -156,6 +156,14 @@ def test_limits_overrun_are_said(loaded, arm, log):
     assert told == [f"q up to {upper + 0.01:.4g} m, the limit is {upper:.4g}"]
 
 
+@pytest.mark.parametrize(("over", "codes"), [(1.005, set()), (1.05, {"beyond-velocity-limit"})])
+def test_noise_at_the_velocity_limit_is_no_finding(loaded, arm, log, over, codes):
+    first, *others = arm.coordinates
+    first = replace(first, velocity=np.abs(log.qd[:, 0]).max() / over)
+    slower = replace(loaded, arm=replace(arm, coordinates=(first, *others)))
+    assert {x.code for x in check_logs([log], slower).findings if "velocity" in x.code} == codes
+
+
 def test_noise_and_steps_are_those_put_in(log):
     random = np.random.default_rng(2)
     noisy = replace(log, q=log.q + 1e-3 * random.standard_normal(log.q.shape))

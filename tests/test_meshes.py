@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from spelgen.render.scene import scene
 
@@ -18,6 +19,22 @@ ARM = """<robot name="r"><link name="a"/><link name="b"><visual><geometry><mesh 
 </link><joint name="j" type="continuous"><parent link="a"/><child link="b"/><axis xyz="0 1 0"/></joint></robot>"""
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
 MANY = 400_000_000  # 4.8 GB as corners of three numbers
+
+
+def test_triangles_without_common_corners_stay_one_surface(tmp_path):
+    """A file may give each triangle corners of its own, as STL does: a simplified ball has no holes."""
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=0.1)
+    apart = trimesh.Trimesh(
+        ball.triangles.reshape(-1, 3), np.arange(3 * len(ball.faces)).reshape(-1, 3), process=False
+    )
+    (tmp_path / "m.obj").write_text(trimesh.exchange.obj.export_obj(apart, include_normals=True))
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_text(ARM.replace("FILE", "m.obj"))
+    (shape,) = [link.shape for link in scene(urdf, ["j"]).links if link.name == "b"]
+    drawn = trimesh.Trimesh(shape.vertices, shape.faces, process=False)
+    assert len(drawn.faces) < 0.5 * len(ball.faces)
+    assert drawn.is_watertight
+    assert drawn.area == pytest.approx(ball.area, rel=0.02)
 
 
 def gltf(buffer: dict[str, object], count: int = 3, view: int | None = 0) -> str:
