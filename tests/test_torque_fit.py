@@ -342,7 +342,8 @@ def test_train_fits_torques_and_leaves_a_run(run, emitted):
         emitted["two_link"][0].Model(), fresh
     )  # friction, filtered at 8 Hz, differs
     write(folder / "test.parquet", [recorded(true, 1.2, 0.01, seed=8)], emitted["two_link"][1])
-    done = CliRunner().invoke(app, ["evaluate", str(folder / "run"), "--data", str(folder / "test.parquet")])
+    judging = ["evaluate", str(folder / "run"), "--data", str(folder / "test.parquet"), "--quick"]
+    done = CliRunner().invoke(app, judging)
     assert done.exit_code == 0, done.output
     result = json.loads((folder / "run" / "evaluation.json").read_text(encoding="utf-8"))
     assert result["torque"]["model"]["mean_nmse"] < 5e-3
@@ -509,6 +510,7 @@ def test_two_seconds_of_a_real_arm_beat_least_squares(shared, tmp_path):
     assert np.mean([nmse(model, sample) for sample in samples]) < 0.03  # the best quick prior: 0.057 of nine
 
 
+@pytest.mark.usefixtures("short_torque_fits")
 def test_a_log_larger_than_memory_is_fitted_to_torques(emitted, robots, tmp_path, monkeypatch):
     """To the very weights that the same recordings give in memory."""
     module, arm = emitted["two_link"]
