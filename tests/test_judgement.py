@@ -58,7 +58,10 @@ def test_neighbours_of_what_is_held_out_are_not_fitted_to(hybrid):
     levels = torch.randn(11, 1, generator=torch.Generator().manual_seed(3)).double()
     missing = levels.repeat_interleave(200, dim=0)[100:2100] * torch.tensor([[1.0, 0.0]]).double()
     q = torch.stack([torch.linspace(-2, 2, 2000), torch.zeros(2000)], dim=1).double()
-    assert select_residuals(hybrid, samples(missing, q), 20.0) == []
+    missed = samples(missing, q)
+    spline = next(residual_fit._candidates(hybrid, missed))
+    assert residual_fit._held_out_gain(spline, missing[:, 0], 20.0) is None
+    assert select_residuals(hybrid, missed, 20.0) == []
 
 
 def test_what_the_first_half_shows_has_to_hold_in_the_last(hybrid):
@@ -262,6 +265,26 @@ def test_the_tip_is_missed_by_millimetres():
 
     errors = end_errors((predicted, predicted), windows, ["revolute"], tip)
     assert errors.tip_mm == pytest.approx(6.0, rel=1e-5)
+
+
+def test_friction_forgets_on_evidence_alone():
+    """Without memory of friction the samples of both joints are more probable: by luck, and by far."""
+    friction = SimpleNamespace(memoryless=torch.ones(2), bristles=SimpleNamespace(reach=torch.ones(2, 4)))
+    independent, gains = 2000 / 20, torch.tensor([1.0, 200.0])
+    state = SimpleNamespace(residuals=torch.ones(2))
+    remembering = SimpleNamespace(residuals=(gains / independent).exp())
+    problem = SimpleNamespace(
+        jacobian=SimpleNamespace(model=SimpleNamespace(friction=friction)),
+        noise=None,
+        prior=None,
+        covariance=torch.eye(1),
+        count=2000,
+        correlation=20.0,
+        set_samples=lambda state, jacobian: state,
+        solve=lambda state, rounds: remembering,
+    )
+    torque_problem.TorqueProblem.select_memory(problem, state)
+    assert friction.memoryless.tolist() == [0.0, 1.0]
 
 
 def test_energy_that_only_changes_its_kind_is_no_rise(robots):
