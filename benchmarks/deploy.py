@@ -42,7 +42,7 @@ from spelgen.loaded_arm import load_arm
 ROBOTS = Path(__file__).parents[1] / "robots"
 ARMS = ("two_link", "rpr", "scara", "six_dof", "ur10e", "panda")
 PRESETS = ("closed-form", "hybrid")
-RESIDUALS = ("joint_functions.", "residual_")
+RESIDUALS = "residuals."
 STATES = 10_000
 CALLS = 50  # of which the clock sees the sum: it ticks in tens of nanoseconds
 FLAGS = ("-O2",)

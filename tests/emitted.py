@@ -92,13 +92,13 @@ def randomise(model: nn.Module, seed: int, deviation: float | None = None) -> No
     generator = torch.Generator().manual_seed(seed)
     for name, parameter in model.named_parameters():
         draw = torch.randn(parameter.shape, dtype=parameter.dtype, generator=generator)
-        if name.endswith("rotors.raw"):
+        if name.endswith("raw_armature"):
             parameter.data = draw
         elif deviation is not None:
             parameter.data = deviation * draw
-        elif "joint_functions" in name or "residual_mass.raw" in name:
+        elif "residuals.raw" in name:
             parameter.data = 0.3 * draw
-        elif "network" in name or "potential." in name:
+        elif "network" in name or "potential." in name or "residuals.mass." in name:
             # a Kolmogorov-Arnold network has a grid of weights for each input
             inputs = parameter[0].numel() if parameter.dim() == 3 else parameter.shape[-1]
             parameter.data = draw * inputs**-0.5
@@ -106,7 +106,8 @@ def randomise(model: nn.Module, seed: int, deviation: float | None = None) -> No
 
 def network_inputs(model: nn.Module, q: torch.Tensor) -> torch.Tensor:
     """What the networks of a model read of q, (..., encoded)."""
-    encoded: torch.Tensor = model.encoding(q)
+    owner = getattr(model, "residuals", model)
+    encoded: torch.Tensor = owner.encoding(q)
     return encoded
 
 
@@ -120,9 +121,7 @@ def outputs_alone(network: nn.Module, encoded: torch.Tensor) -> torch.Tensor:
 
 def bounded(model: nn.Module, q: torch.Tensor) -> torch.Tensor:
     """Where, (...), M would not be positive definite by itself."""
-    prepared = model.prepare()
-    residuals = model.mass_at(model.configuration(q, prepared), prepared)[1]
-    part: torch.Tensor = residuals[1]
+    part: torch.Tensor = model.at(q).intermediates[1]
     return part < 1
 
 
@@ -181,7 +180,7 @@ def exact_model(robot: str, folder: Path) -> nn.Module:
     module = import_source(source, folder / f"{robot}_exact.py")
     model = frictionless(module.Model())
     mass = model.mass
-    mass.rotors.nominal.zero_()
+    mass.nominal_armature.zero_()
     true = polynomials(_loaded(robot).arm, inertials=True)
     if structure.outputs:
         functions = [true.combination(output.reads) for output in structure.outputs]

@@ -12,11 +12,13 @@ from typing import Protocol
 
 import torch
 
+from spelgen.dynamics.lie_group import from_group
+
 
 class GroupModel(Protocol):
     """What the view needs of an emitted module; see its docstrings for shapes."""
 
-    def from_group(self, parts: list[torch.Tensor]) -> torch.Tensor: ...
+    joint_types: tuple[str, ...]
 
     def hamiltonian(self, q: torch.Tensor, p: torch.Tensor) -> torch.Tensor: ...
 
@@ -60,9 +62,9 @@ def group_rates(
     with torch.enable_grad():
         places = [part.detach().requires_grad_() for part in parts]
         momenta = p.detach().requires_grad_()
-        energy = model.hamiltonian(model.from_group(places), momenta[..., 2])
+        energy = model.hamiltonian(from_group(model.joint_types, places), momenta[..., 2])
         *slopes, velocity = torch.autograd.grad(energy.sum(), (*places, momenta), materialize_grads=True)
-    q, qd = model.from_group(list(parts)), velocity[..., 2]
+    q, qd = from_group(model.joint_types, list(parts)), velocity[..., 2]
     moving = model.input_matrix(q) @ tau.unsqueeze(-1) - model.dissipation(q, qd) @ qd.unsqueeze(-1)
     rates, forces = [], []
     for i, (part, slope) in enumerate(zip(parts, slopes, strict=True)):

@@ -1,10 +1,12 @@
 """A hand-written two-joint planar arm with the interface of an emitted module, small enough to check by eye."""
 
+from typing import NamedTuple
+
 import torch
 from torch import nn
 
 FACTS = """{
-  "format": 3,
+  "format": 4,
   "robot": "stand_in",
   "urdf": "stand_in.urdf",
   "urdf_sha256": "none",
@@ -12,6 +14,13 @@ FACTS = """{
   "options": {},
   "joints": {"shoulder": "revolute", "elbow": "revolute"}
 }"""
+
+
+class Pose(NamedTuple):
+    """What depends on q alone: q itself and M."""
+
+    q: torch.Tensor
+    mass: torch.Tensor
 
 
 class Model(nn.Module):
@@ -100,33 +109,26 @@ class Model(nn.Module):
         return self
 
     def configuration(self, q, prepared):
-        return q
+        return Pose(q, self.mass_matrix(q))
 
-    def mass_at(self, at, prepared):
-        return self.mass_matrix(at), None
+    def nonlinear_at(self, pose, qd):
+        return self.nonlinear_effects(pose.q, qd)
 
-    def lagrangian_gradient(self, at, qd, residuals, prepared):
-        return self._kinetic_slope(at, qd) - self.gravity(at)
+    def lagrangian_gradient(self, pose, qd):
+        return self._kinetic_slope(pose.q, qd) - self.gravity(pose.q)
 
-    def friction_at(self, at, qd, prepared, z=None):
-        return self.friction_torque(at, qd)
+    def friction_at(self, pose, qd, z=None):
+        return self.friction_torque(pose.q, qd)
 
-    def input_force(self, at, qd, tau, prepared):
+    def input_force(self, pose, qd, tau):
         return tau
 
     def port_hamiltonian_rhs(self, q, p, tau, prepared, z=None):
         qd = self.velocity(q, p)
-        pd = self.lagrangian_gradient(q, qd, None, None) - self.friction_torque(q, qd)
+        pd = self._kinetic_slope(q, qd) - self.gravity(q) - self.friction_torque(q, qd)
         return qd, pd if tau is None else pd + tau
 
     def forward(self, t, state):
         q, p, *inputs = state.split(2, dim=-1)
         rates = self.port_hamiltonian_rhs(q, p, inputs[0] if inputs else None, None)
         return torch.cat([*rates, *map(torch.zeros_like, inputs)], -1)
-
-    def to_group(self, q):
-        c, s, o, i = q.cos(), q.sin(), torch.zeros_like(q), torch.ones_like(q)
-        return list(torch.stack([c, -s, o, s, c, o, o, o, i], -1).unflatten(-1, (3, 3)).unbind(-3))
-
-    def from_group(self, parts):
-        return torch.stack([torch.atan2(part[..., 1, 0], part[..., 0, 0]) for part in parts], -1)

@@ -59,7 +59,7 @@ def drawn(module, seed, deviation=0.5):
 def rigid(module):
     """The untrained model without friction and armature."""
     model = module.Model()
-    model.rotors.nominal.zero_()
+    model.nominal_armature.zero_()
     model.friction.nominal.zero_()
     return model.requires_grad_(False)
 

@@ -35,7 +35,7 @@ def exported(run, path):
 
 def heavier(model):
     random = torch.Generator().manual_seed(0)
-    for parameter in (model.bodies.raw, model.rotors.raw):
+    for parameter in (model.bodies.raw, model.raw_armature):
         parameter += 0.2 * torch.randn(parameter.shape, dtype=torch.float64, generator=random)
     model.friction.raw_coulomb += 0.5
 
@@ -82,9 +82,9 @@ def test_what_stands_beside_bodies_is_told(tmp_path):
     assert max(differences(model, loaded)) < 1e-8
     assert "bodies are those of the model" in told
     assert "position_factor" not in (tmp_path / "bodies.urdf.friction.yaml").read_text().split("joints:")[1]
-    functions = model.joint_functions
+    functions = model.residuals
     with torch.no_grad():
-        model.residual_mass.raw_constants += 0.5
+        model.residuals.raw_constants += 0.5
         functions.raw_torque_ripple[0, 5] = 3.0
         functions.raw_friction_splines += 0.3 * torch.linspace(-1, 1, 34)
     found = export(model, arm=load_arm(ROBOTS / "two_link.urdf"))

@@ -103,7 +103,7 @@ def test_coupled_motors_turn_by_several_joints(torque, tmp_path):
     arm = load_arm(urdf)
     model = build(arm, "closed-form")
     with torch.no_grad():
-        model.rotors.raw += 0.5
+        model.raw_armature += 0.5
     found = export(model, "mjcf", arm=arm)  # compared with the model before it is given
     simulated = mujoco.MjModel.from_xml_string(found.files[".xml"].decode())
     assert simulated.nu == 6

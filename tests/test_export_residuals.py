@@ -19,14 +19,14 @@ from spelgen.exporting.trained import Trained
 
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc on this machine")
 PARTS = {
-    "springs": "joint_functions.raw_torque_splines",
-    "ripple": "joint_functions.raw_torque_ripple",
-    "friction": "joint_functions.raw_friction_splines",
-    "constants": "residual_mass.raw_constants",
-    "mass": "residual_mass.network",
-    "potential": "residual_potential",
+    "springs": "residuals.raw_torque_splines",
+    "ripple": "residuals.raw_torque_ripple",
+    "friction": "residuals.raw_friction_splines",
+    "constants": "residuals.raw_constants",
+    "mass": "residuals.mass.",
+    "potential": "residuals.potential.",
 }
-RESIDUALS = ("joint_functions.", "residual_")
+RESIDUALS = "residuals."
 
 
 def with_parts(robot, *parts, net=None):
@@ -88,7 +88,7 @@ def test_each_part_goes_alone(parts, tmp_path):
 
 def test_a_function_of_one_joint_stays_with_it():
     model = with_parts("scara")
-    functions = model.joint_functions
+    functions = model.residuals
     functions.raw_torque_splines[1, 20] = 1.0
     functions.raw_torque_ripple[0, [2, 65]] = torch.tensor([1.0, 2.0], dtype=torch.float64)  # twice the gear
     functions.raw_torque_ripple[2, 3] = 1.0  # of a prismatic joint: no turns, no ripple
@@ -104,7 +104,7 @@ def test_a_function_of_one_joint_stays_with_it():
 def test_splines_at_their_ends_and_beyond(tmp_path):
     """On knots, where the range ends, far outside: by C and CasADi as by torch, and slopes as torch has them."""
     model = with_parts("two_link", "springs", "friction")
-    described, functions = describe(model, arm_of("two_link")), model.joint_functions
+    described, functions = describe(model, arm_of("two_link")), model.residuals
     center, spacing = functions.middles.mean(dim=1), functions.spacing.flatten()
     knots = center + spacing * torch.arange(-19.5, 20, 0.5, dtype=torch.float64)[:, None]
     q = torch.cat([knots, torch.tensor([[50.0, -50.0], [1e6, -1e6]], dtype=torch.float64)]).contiguous()
@@ -131,7 +131,7 @@ def test_splines_at_their_ends_and_beyond(tmp_path):
 def test_kolmogorov_arnold_networks_are_refused_unless_zero():
     model = with_parts("two_link", net="kan")
     assert not describe(model, arm_of("two_link")).residuals
-    model.residual_mass.network.weights[-1].add_(0.1)
+    model.residuals.mass.weights[-1].add_(0.1)
     with pytest.raises(
         RunError, match="Kolmogorov-Arnold networks beside rigid bodies, expected closed-form"
     ):

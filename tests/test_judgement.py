@@ -35,7 +35,7 @@ from spelgen.settings.fits import Rollout, TorqueFit
 def hybrid(robots):
     """A model of bodies with functions of joints, and no networks: these take longer."""
     model = build(robots / "two_link.urdf", "hybrid", width=8)
-    model.residual_potential = model.residual_mass = None
+    model.residuals.potential = model.residuals.mass = None
     return model
 
 

@@ -22,6 +22,7 @@ from emitted import (
     randomise,
 )
 
+from spelgen.dynamics.lie_group import from_group, to_group
 from spelgen.dynamics.runge_kutta import runge_kutta
 from spelgen.settings.settings import load_settings
 
@@ -115,10 +116,9 @@ def test_mass_matrix_is_positive_definite_for_any_weights(robot, tmp_path):
         for draw in range(100):
             randomise(model, seed=draw, deviation=30.0)
             q = 8 * torch.rand(10_000, model.n, dtype=torch.float64, generator=generator) - 4
-            prepared = model.prepare()
-            mass, residuals = model.mass_at(model.configuration(q, prepared), prepared)
-            assert not torch.linalg.cholesky_ex(mass).info.any()
-            needed += (residuals[1] < 1).any().item()
+            pose = model.at(q)
+            assert not torch.linalg.cholesky_ex(pose.mass).info.any()
+            needed += (pose.intermediates[1] < 1).any().item()
     assert needed > 50, "the draws were to need the bound"
 
 
@@ -128,7 +128,7 @@ def test_bound_keeps_zeros_and_relations_and_is_nothing_at_nominal_values(robot,
     structure = built(robot)[1]
     q = states(model.n, 200)[0]
     part = model.mass
-    part.rotors.nominal.zero_()
+    part.nominal_armature.zero_()
     mass = model.mass_matrix(q).detach()
     for entry in structure.entries:
         if entry.kind == "zero":
@@ -152,7 +152,7 @@ def test_outputs_read_their_own_joints_only(robot, tmp_path):
     """Moving any other joint leaves an output's bits unchanged, and its own joints move it."""
     model = random_model(robot, tmp_path, seed=2)
     q = states(model.n, 50)[0]
-    network = model.residual_mass.network
+    network = model.residuals.mass
     before = outputs_alone(network, network_inputs(model, q))
     for joint in range(model.n):
         moved = q.clone()
@@ -166,7 +166,7 @@ def test_outputs_read_their_own_joints_only(robot, tmp_path):
 def test_energy_stays_without_input_and_dissipation(robot, tmp_path):
     """Random weights, Runge-Kutta with 2.5 ms over 2 s: relative drift of H below 1e-8."""
     model = frictionless(random_model(robot, tmp_path, seed=0))
-    for weight in model.joint_functions.parameters():
+    for weight in model.residuals.parameters(recurse=False):
         weight.data.zero_()  # ripple of 66 waves in a turn takes shorter steps
     at, qd, _, _ = (0.25 * x for x in states(model.n, 4))
     with torch.no_grad():
@@ -208,7 +208,7 @@ def test_any_batch_shape(robot, batch, tmp_path):
             model.velocity(q, qd),
             model.forward_dynamics(q, qd, tau),
             model.inverse_dynamics(q, qd, tau),
-            model.from_group(model.to_group(q)),
+            from_group(model.joint_types, to_group(model.joint_types, q)),
         ],
         (n, n): [model.mass_matrix(q), model.dissipation(q, qd), model.input_matrix(q)],
         (): [model.potential_energy(q), model.hamiltonian(q, qd)],
@@ -224,11 +224,11 @@ def test_group_view_round_trips_and_stays_orthogonal(tmp_path):
     model = random_model("rpr", tmp_path, seed=0)
     q = states(3, 100)[0]
     q[:, [0, 2]] = (q[:, [0, 2]] + torch.pi) % (2 * torch.pi) - torch.pi
-    parts = model.to_group(q)
+    parts = to_group(model.joint_types, q)
     assert [tuple(part.shape[1:]) for part in parts] == [(3, 3), (3,), (3, 3)]
     for rotation in (parts[0], parts[2]):
         assert (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64)).abs().max() < 1e-15
-    assert torch.allclose(model.from_group(parts), q, atol=1e-14)
+    assert torch.allclose(from_group(model.joint_types, parts), q, atol=1e-14)
 
 
 def test_held_input_moves_the_momentum(tmp_path):

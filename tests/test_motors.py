@@ -137,7 +137,7 @@ def test_energy_and_memory_are_those_of_the_motors(wrist):
         assert torch.linalg.eigvalsh(dissipation).min() >= 0
         assert dissipation[:, 4, 5].abs().min() > 0
         before = model.mass_matrix(q)
-        model.rotors.raw[5] += 1.0
+        model.raw_armature[5] += 1.0
         more = (model.mass_matrix(q) - before)[0] / (1 - np.exp(-1)) / model.armature[5]
         torch.testing.assert_close(more[4:, 4:], torch.from_numpy(np.outer(SPEEDS[1], SPEEDS[1])))
         assert more[:4].abs().max() < 1e-12

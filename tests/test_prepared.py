@@ -113,7 +113,7 @@ def test_what_is_zero_takes_no_time():
     q, qd, x = states(4)
     assert not has_residuals(model.prepared()._dynamics)
     torch.testing.assert_close(model.prepared().forward_dynamics(q, qd, x), model.forward_dynamics(q, qd, x))
-    model.joint_functions.raw_torque_splines[1] += 1.0
-    assert model.prepared()._dynamics.residual_mass.network is None
-    assert model.residual_mass.network is not None
+    model.residuals.raw_torque_splines[1] += 1.0
+    assert model.prepared()._dynamics.residuals.mass is None
+    assert model.residuals.mass is not None
     torch.testing.assert_close(model.prepared().forward_dynamics(q, qd, x), model.forward_dynamics(q, qd, x))

@@ -23,6 +23,7 @@ from published_phnode import ByJvp, Published
 from test_model import bias
 
 from spelgen.design import Preset, load_design
+from spelgen.dynamics.lie_group import to_group
 from spelgen.dynamics.protocol import has_friction_state
 from spelgen.fitting.rollout import position_difference
 from spelgen.loaded_arm import load_arm
@@ -142,7 +143,7 @@ def test_kan_outputs_read_their_own_joints_only(robot, tmp_path):
     model = random_model(robot, tmp_path, seed=2, net="kan")
     outputs = built(robot, net="kan")[1].outputs
     q = states(model.n)[0]
-    network = model.residual_mass.network
+    network = model.residuals.mass
     before = outputs_alone(network, network_inputs(model, q))
     for joint in range(model.n):
         moved = q.clone()
@@ -175,7 +176,7 @@ def test_networks_read_rotation_matrices(net, part, tmp_path):
     owner = random_model("rpr", tmp_path, seed=5, preset="phnode", net=net)
     model, encoding = owner.get_submodule(part), owner.encoding
     q = states(3)[0]
-    parts = owner.to_group(q)
+    parts = to_group(owner.joint_types, q)
     parts[1] = (parts[1] - encoding.center[1] * torch.tensor([0, 0, 1.0], dtype=q.dtype)) / encoding.reach[1]
     layer = torch.cat([part.reshape(len(q), -1) for part in parts], dim=-1)
     count = len(model.weights)
@@ -199,7 +200,7 @@ def test_reduced_model_is_the_port_hamiltonian_system_on_rotations(robot, preset
     model = random_model(robot, tmp_path, seed=6, preset=preset, net=net, design=design)
     n = model.n
     q, p, _, tau = states(n)
-    parts = model.to_group(q)
+    parts = to_group(model.joint_types, q)
     rates, forces = group_rates(model, parts, torch.nn.functional.pad(p.unsqueeze(-1), (2, 0)), tau)
     qd, force, _ = model(torch.zeros(()), torch.cat([q, p, tau], dim=-1)).chunk(3, dim=-1)
     near(forces[..., 2], force)
@@ -221,8 +222,8 @@ def test_phnode_is_its_three_axis_model_held_by_bearings(net, tmp_path):
     q, qd, _, _ = states(n)
 
     def inverse_mass(at: torch.Tensor) -> torch.Tensor:
-        prepared = model.prepare()
-        return model.mass.inverse(model.configuration(at, prepared), prepared.mass)
+        pose = model.at(at)
+        return model.mass.inverse(pose.encoded, pose.prepared.mass)
 
     inverse = inverse_mass(q).detach()
     assert torch.linalg.eigvalsh(inverse)[:, 0].min() > 0

@@ -149,7 +149,7 @@ def test_structure_picture_is_the_modules(run):
 
 def test_learned_constants_are_those_of_the_weights(run):
     state = torch.load(run / "model.pt", weights_only=True)
-    state["rotors.raw"] += math.log(3.0)
+    state["raw_armature"] += math.log(3.0)
     torch.save(state, run / "model.pt")
     page = render_report(run)
     for start in load_module(run / "module.py").armature.tolist():

@@ -21,12 +21,11 @@ from spelgen.emission.bundle import bundle, load_runtime, names_in
 from spelgen.emission.unit_joints import hidden_units
 from spelgen.runtime.encoding import JointEncoding, joint_input, lie_group_input
 from spelgen.runtime.friction_laws import FrictionLaws, tanh_ratio
-from spelgen.runtime.joint_functions import HARMONICS, SPLINES, JointFunctions
 from spelgen.runtime.joints import Joints, vector
 from spelgen.runtime.masked_kan import MaskedKAN
 from spelgen.runtime.masked_mlp import MaskedMLP
 from spelgen.runtime.regularisation import PositiveDefiniteBound
-from spelgen.runtime.residual_mass import ResidualMass
+from spelgen.runtime.residual_terms import HARMONICS, SPLINES, ResidualTerms
 from spelgen.runtime.rigid_body import Bodies, InertialParameters, pseudo_inertia
 from spelgen.runtime.symmetric import symmetric
 
@@ -108,72 +107,74 @@ def test_units_are_shared_out_by_how_many_outputs_read_the_same_joints():
     assert len(crowded) == 18, "each group keeps its least"
 
 
-def test_joint_functions_are_a_gradient_and_vanish_outside_the_range():
-    functions = JointFunctions(JOINTS._replace(friction=(1.0, 2.0, 0.5), gear=(1.0, 10.0, 101.0)))
-    for weight in functions.parameters():
-        weight.data = draw(*weight.shape, seed=weight.numel())
-    q = draw(50, 3)
-    gradient = vjp(lambda at: functions.energy(at).sum(), q)[1](torch.ones((), dtype=torch.float64))[0]
-    torque, factor = functions(q, functions.prepare())
-    near(torque, gradient, 1e-10)
-    assert (factor > 0).all()
+def entries(f, c):
+    """M of two functions and a constant."""
+    return symmetric([f[0]], [f[0] - 2 * f[1], c[0]], [0, f[1], 3 * f[1]])
+
+
+def residual_terms(joints: Joints = JOINTS, size: float = 0.0, *, networks: bool = True) -> ResidualTerms:
+    """Residual terms whose weights are normal numbers of this size."""
+    generator = torch.Generator().manual_seed(0)
+    inputs, outputs = joint_input(joints, (0, 1, 2), (1.0, 1.0, 1.0)), [(0, 1), (2,)]
+    hidden = hidden_units(outputs, width=8)
+    mass = potential = None
+    if networks:
+        mass = MaskedMLP(inputs, (hidden, hidden, outputs), generator)
+        potential = MaskedMLP(inputs, (hidden, [(0, 1, 2)]), generator)
+    terms = ResidualTerms(joints, entries, 2, 1, mass, potential, scale=2.0)
+    for weight in terms.parameters():
+        weight.data = size * draw(*weight.shape, seed=weight.numel())
+    return terms
+
+
+def test_residual_terms_are_a_gradient_and_vanish_outside_the_range():
+    joints = JOINTS._replace(friction=(1.0, 2.0, 0.5), gear=(1.0, 10.0, 101.0))
+    terms, armature = residual_terms(joints, 1.0), torch.diag(vector((0.1, 20.0, 3.0)))
+    q, qd = draw(50, 3), draw(50, 3, seed=1)
+    weights = terms.prepare(armature)
+    pose = terms.at(q, weights)
+    assert (pose.friction > 0).all()
+
+    def added(at: Tensor) -> Tensor:
+        """1/2 qd^T R qd - V."""
+        mass = terms.at(at, weights).mass
+        return 0.5 * torch.einsum("ti,tij,tj->", qd, mass, qd) - terms.energy(at, weights).sum()
+
+    gradient = vjp(added, q)[1](torch.ones((), dtype=torch.float64))[0]
+    near(terms.gradient(pose, qd), gradient, 1e-10)
+    rate = jvp(lambda at: terms.at(at, weights).mass, (q,), (qd,))[1]
+    near(terms.nonlinear(pose, qd), torch.einsum("tij,tj->ti", rate, qd) - gradient, 1e-10)
     inside = torch.linspace(-3, 3, 20, dtype=torch.float64)[:, None] * torch.tensor([0.9, 0.075, 0.6])
     inside = inside + torch.tensor(JOINTS.center)
-    near(functions.splines(inside).sum(dim=-1), torch.ones(20, 3).double(), 1e-12)
+    near(terms.splines(inside).sum(dim=-1), torch.ones(20, 3).double(), 1e-12)
     far = 100 * torch.ones(1, 3, dtype=torch.float64)
-    near(functions.splines(far), torch.zeros(1, 3, SPLINES).double())
-    assert not functions.ripple(q)[:, 1].any(), "a prismatic joint has no turns"
-    near(functions.ripple(q)[:, 2, HARMONICS + 1], (202 * q[:, 2]).cos())
+    near(terms.splines(far), torch.zeros(1, 3, SPLINES).double())
+    assert not terms.ripple(q)[:, 1].any(), "a prismatic joint has no turns"
+    near(terms.ripple(q)[:, 2, HARMONICS + 1], (202 * q[:, 2]).cos())
 
 
 def test_friction_stays_between_a_tenth_and_ten_times_for_all_weights():
-    functions, q = JointFunctions(JOINTS), draw(50, 3)
+    terms, q, armature = residual_terms(networks=False), draw(50, 3), torch.diag(vector((0.1, 20.0, 3.0)))
     for size in (0.01, 1.0, 1e6):
-        functions.raw_friction_splines.data = size * draw(*functions.raw_friction_splines.shape)
-        factor = functions(q, functions.prepare())[1].detach()
+        terms.raw_friction_splines.data = size * draw(*terms.raw_friction_splines.shape)
+        factor = terms.at(q, terms.prepare(armature)).friction.detach()
         assert (factor > 0.1 - 1e-12).all() and (factor < 10 + 1e-12).all()
     assert factor.min() < 0.2 and factor.max() > 5
 
 
 def test_residual_of_m_never_takes_more_than_the_armature():
-    def entries(f, c):
-        return symmetric([f[0]], [f[0] - 2 * f[1], c[0]], [0, f[1], 3 * f[1]])
-
-    encoding = JointEncoding(JOINTS)
-    outputs = [(0, 1), (2,)]
-    hidden = hidden_units(outputs, width=8)
-    inputs = joint_input(JOINTS, (0, 1, 2), (1.0, 1.0, 1.0))
-    mass = ResidualMass(
-        JOINTS, entries, 2, 1, MaskedMLP(inputs, (hidden, hidden, outputs), torch.Generator().manual_seed(0))
-    )
     motors = torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.8], [0.0, -0.7, 1.2]], dtype=torch.float64)
-    encoded, qd, qdd = encoding(draw(200, 3)), draw(200, 3, seed=1), draw(200, 3, seed=2)
     for armature in (
         torch.diag(vector((0.1, 20.0, 3.0))),
         motors.mT @ torch.diag(vector((1.0, 0.2, 5.0))) @ motors,
     ):
+        least = torch.linalg.eigvalsh(armature)[0]
         for size in (1.0, 1e3):
-            for weight in mass.parameters():
-                weight.data = size * draw(*weight.shape, seed=weight.numel())
-            prepared = mass.prepare(armature)
-            residual, kept = mass(encoded, prepared)
+            terms = residual_terms(size=size)
+            residual = terms.at(draw(200, 3), terms.prepare(armature)).mass
             near(residual, residual.mT)
             assert residual.abs().max() > 1e-3
-            assert (
-                torch.linalg.eigvalsh(armature + residual).min() > 0.05 * torch.linalg.eigvalsh(armature)[0]
-            )
-    for weight in mass.parameters():
-        weight.data = draw(*weight.shape, seed=weight.numel())
-    prepared = mass.prepare(armature)
-    kept = mass(encoded, prepared)[1]
-    moved, by_encoded = mass.coriolis(qdd @ draw(3, 9), qd, kept)
-    rate = jvp(lambda x: mass(x, prepared)[0], (encoded,), (qdd @ draw(3, 9),))[1]
-    near(moved, torch.einsum("tij,tj->ti", rate, qd))
-    near(by_encoded, mass.kinetic_vjp(encoded, qd, kept), 0)
-    kinetic = lambda x: 0.5 * torch.einsum("ti,tij,tj->", qd, mass(x, prepared)[0], qd)  # noqa: E731
-    near(
-        mass.kinetic_vjp(encoded, qd, kept), vjp(kinetic, encoded)[1](torch.ones((), dtype=torch.float64))[0]
-    )
+            assert torch.linalg.eigvalsh(armature + residual).min() > 0.05 * least
 
 
 def test_entries_of_a_symmetric_matrix():
@@ -371,3 +372,25 @@ def test_every_weight_says_what_it_stands_for():
         "raw_friction_compensation",
     )
     assert table["friction.network.weights.0"].kind == "network"
+
+
+@pytest.mark.parametrize("preset", ["closed-form", "minimal"])
+def test_what_is_no_state_is_refused_with_what_to_pass(preset):
+    """Arrays, another precision, and shapes that do not go together, by whatever is called."""
+    model = build(arm_of("rpr"), preset)
+    q = draw(5, 3)
+    for call in (model.inverse_dynamics, model.forward_dynamics):
+        with pytest.raises(TypeError, match=r"got ndarray, expected a tensor of torch.float64 .*as_tensor\("):
+            call(q.numpy(), q.numpy(), q.numpy())
+        with pytest.raises(TypeError, match=r"got torch.float32, expected a tensor of torch.float64"):
+            call(q, q.float(), q)
+        with pytest.raises(
+            ValueError, match=r"got shapes \(5, 3\) and \(3,\) and \(5, 3\), expected \(..., 3\)"
+        ):
+            call(q, q[0], q)
+        with pytest.raises(ValueError, match=r"got shapes \(5, 2\) and"):
+            call(q[:, :2], q, q)
+    with pytest.raises(TypeError, match="got list"):
+        model.mass_matrix([0.0, 0.0, 0.0])
+    with pytest.raises(ValueError, match=r"got shapes \(3,\) and \(2,\)"):
+        model(torch.zeros(()), draw(5))

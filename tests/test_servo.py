@@ -343,7 +343,7 @@ def test_what_does_not_belong_together_is_told(arm, logs, robots):
 def moved(model, seconds, count=1):
     """Logs of the whole arm in small steps, where the commands of both joints jump at once."""
     with torch.no_grad():
-        model.rotors.raw.copy_((torch.tensor(TRUTH.armature) / model.armature).log())
+        model.raw_armature.copy_((torch.tensor(TRUTH.armature) / model.armature).log())
         model.servo.delay.fill_(TRUTH.delay)
     t, every = np.arange(0.0, seconds, 0.0025), 8  # of which logs have one in so many
     u = np.random.default_rng(0).uniform(-0.4, 0.4, (count, int(2 * seconds), 2)).repeat(200, axis=1)

@@ -32,7 +32,7 @@ def test_another_arms_torques_are_met(tmp_path):
     true, model = module.Model(seed=0), module.Model(seed=1)
     with torch.no_grad():
         true.mass.raw_constants *= 1.5
-        true.mass.rotors.raw += 0.5
+        true.mass.raw_armature += 0.5
         true.friction.raw_viscous += 1.0
     start = missed(model, recorded(true, 7))
     steps = fit_networks(model, [recorded(true, 5), recorded(true, 6)], 1e-6, evaluations=500)

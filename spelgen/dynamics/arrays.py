@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, TypeVar, cast
 
 import numpy as np
 
+if TYPE_CHECKING:
+    from torch import Tensor
 
-def on_arrays(function: Callable[..., np.ndarray], *states: Any) -> Any:
-    """``function`` of states (..., n), which are arrays or tensors of batches that go together; what it gives is of
-    their kind.
+Array = TypeVar("Array")
+"""numpy.ndarray or torch.Tensor: a result is of the kind of the arguments."""
 
-    Says ``new_tensor``, so that what imports this needs no torch.
-    """
+
+def on_arrays(function: Callable[..., np.ndarray], *states: Array) -> Array:
+    """Return ``function`` of states (..., n), arrays or tensors of batches that go together, as their kind."""
     first = states[0]
     if isinstance(first, np.ndarray) and first.ndim == 1:
-        return function(*states)
-    rows = np.broadcast_arrays(*(np.asarray(x) for x in states))
+        return cast("Array", function(*states))
+    rows = np.broadcast_arrays(*map(np.asarray, states))
     return like(function(*rows), first)
 
 
-def like(result: np.ndarray, like_this: Any) -> Any:
-    """``found`` as the array or tensor that ``given`` is."""
-    return result if isinstance(like_this, np.ndarray) else like_this.new_tensor(result)
+def like(result: np.ndarray, pattern: Array) -> Array:
+    """Return ``result`` as the array or tensor that ``pattern`` is; by a method, so that arrays need no torch."""
+    if isinstance(pattern, np.ndarray):
+        return cast("Array", result)
+    return cast("Array", cast("Tensor", pattern).new_tensor(result))

@@ -8,16 +8,12 @@ K is constant, so it adds no velocity terms; it is a permutation unless joints f
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar
 
 import numpy as np
 import pinocchio as pin
 
-from spelgen.dynamics.arrays import on_arrays
+from spelgen.dynamics.arrays import Array, on_arrays
 from spelgen.dynamics.constraint import Constraint
-
-Array = TypeVar("Array")
-"""numpy.ndarray or torch.Tensor: what is returned is of the kind of what is given."""
 
 
 class PinocchioDynamics:
@@ -58,33 +54,27 @@ class PinocchioDynamics:
 
     def mass_matrix(self, q: Array) -> Array:
         """M, (..., n, n) [kg m^2, kg m, kg]."""
-        result: Array = on_arrays(self._mass, q)
-        return result
+        return on_arrays(self._mass, q)
 
     def nonlinear_effects(self, q: Array, qd: Array) -> Array:
         """Coriolis, centrifugal and gravity torques, (..., n) [Nm, N]."""
-        result: Array = on_arrays(self._effects, q, qd)
-        return result
+        return on_arrays(self._effects, q, qd)
 
     def gravity(self, q: Array) -> Array:
         """dV/dq, (..., n) [Nm, N]."""
-        result: Array = on_arrays(lambda q: self._effects(q, np.zeros_like(q)), q)
-        return result
+        return on_arrays(lambda q: self._effects(q, np.zeros_like(q)), q)
 
     def friction_torque(self, q: Array, qd: Array) -> Array:
         """What friction takes, (..., n) [Nm, N]."""
-        result: Array = on_arrays(lambda _, velocity: self._lost(velocity), q, qd)
-        return result
+        return on_arrays(lambda _, velocity: self._lost(velocity), q, qd)
 
     def forward_dynamics(self, q: Array, qd: Array, tau: Array) -> Array:
         """qdd, (..., n), under the inputs tau."""
-        result: Array = on_arrays(self._forward, q, qd, tau)
-        return result
+        return on_arrays(self._forward, q, qd, tau)
 
     def inverse_dynamics(self, q: Array, qd: Array, qdd: Array) -> Array:
         """The inputs, (..., n), that make qdd; those of a passive joint are the torques that it lacks."""
-        result: Array = on_arrays(self._inverse, q, qd, qdd)
-        return result
+        return on_arrays(self._inverse, q, qd, qdd)
 
     def configuration(self, q: np.ndarray) -> np.ndarray:
         """Pinocchio's configuration (..., nq) at q (..., n)."""

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from spelgen.dynamics.protocol import known_past
+from spelgen.dynamics.protocol import PortHamiltonianDynamics, has_momentum, has_poses, known_past
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,33 +29,24 @@ PoseAt = Callable[[Tensor], Pose]
 
 def poses(dynamics: Any) -> PoseAt:
     """Return what gives these dynamics at positions; weights must not change meanwhile."""
-    if hasattr(dynamics, "nonlinear_at"):  # an emitted model
-        return _of_weights(dynamics, dynamics.prepare())
-    if hasattr(dynamics, "at"):
-        pose_at: PoseAt = dynamics.at
-        return pose_at
+    if has_momentum(dynamics):
+        return partial(_of_weights, dynamics, dynamics.prepare())
+    if has_poses(dynamics):
+        return dynamics.pose_at
     return lambda q: _of_any(dynamics, q)
 
 
-def _of_weights(model: Any, prepared: Any) -> PoseAt:
-    """Return the poses of an emitted model."""
+def _of_weights(model: PortHamiltonianDynamics, prepared: object, q: Tensor) -> Pose:
+    """Return the pose of an emitted model."""
+    pose = model.configuration(q, prepared)
 
-    def pose_at(q: Tensor) -> Pose:
-        pose = model.configuration(q, prepared)
-        mass, residuals = model.mass_at(pose, prepared)
+    def friction(qd: Tensor, z: Tensor) -> Tensor:
+        return model.friction_at(pose, qd, *known_past(model, z))
 
-        def friction(qd: Tensor, z: Tensor) -> Tensor:
-            torque: Tensor = model.friction_at(pose, qd, prepared, *known_past(model, z))
-            return torque
+    def force(qd: Tensor, tau: Tensor, z: Tensor) -> Tensor:
+        return model.input_force(pose, qd, tau) - model.nonlinear_at(pose, qd) - friction(qd, z)
 
-        def force(qd: Tensor, tau: Tensor, z: Tensor) -> Tensor:
-            steady = model.nonlinear_at(pose, qd, residuals, prepared)
-            left: Tensor = model.input_force(pose, qd, tau, prepared) - steady
-            return left - friction(qd, z)
-
-        return Pose(mass, force, friction)
-
-    return pose_at
+    return Pose(pose.mass, force, friction)
 
 
 def _of_any(dynamics: Any, q: Tensor) -> Pose:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import torch
 from torch import Tensor
 
-from spelgen.dynamics.protocol import memory_after, sliding_memory
+from spelgen.dynamics.pose import poses
+from spelgen.dynamics.protocol import PortHamiltonianDynamics, known_past, memory_after, sliding_memory
 from spelgen.dynamics.residuals import without_idle_residuals
 from spelgen.dynamics.runge_kutta import runge_kutta
 
@@ -34,64 +35,57 @@ class PreparedModel:
     """
 
     def __init__(
-        self, model: Any, tip: TipKinematics | None = None, *, dtype: torch.dtype = torch.float64
+        self,
+        model: PortHamiltonianDynamics,
+        tip: TipKinematics | None = None,
+        *,
+        dtype: torch.dtype = torch.float64,
     ) -> None:
         # networks that give nothing would take most of the time
-        model = without_idle_residuals(model).to(dtype=dtype).requires_grad_(False)
-        self.n: int = model.n
-        self._dynamics, self._weights, self._tip = model, model.prepare(), tip
-        self.elements: int = model.elements
+        reduced = without_idle_residuals(model)
+        cast("torch.nn.Module", reduced).to(dtype=dtype).requires_grad_(False)
+        self._model = reduced
+        self._weights, self._tip = reduced.prepare(), tip
+        self.n: int = reduced.n
+        self.elements: int = reduced.elements
 
     def mass_matrix(self, q: Tensor) -> Tensor:
         """M(q), (..., n, n) [kg m^2, kg m, kg]."""
-        mass: Tensor = self._dynamics.mass_at(self._at(q), self._weights)[0]
-        return mass
+        return self._model.mass_matrix(q, prepared=self._weights)
 
     def gravity(self, q: Tensor) -> Tensor:
         """dV/dq, (..., n) [Nm, N]."""
-        torque: Tensor = self._dynamics.gravity_at(self._at(q), self._weights)
-        return torque
+        return self._model.gravity(q, prepared=self._weights)
 
     def bias(self, q: Tensor, qd: Tensor) -> Tensor:
         """Coriolis, centrifugal and gravity torque, (..., n) [Nm, N]."""
-        return self._mass_and_bias(self._at(q), qd)[1]
+        return self._model.nonlinear_effects(q, qd, prepared=self._weights)
 
     def friction_torque(self, q: Tensor, qd: Tensor, z: Tensor | None = None) -> Tensor:
         """What friction takes, (..., n) [Nm, N]."""
-        return self._friction(self._at(q), qd, z)
+        return self._model.friction_torque(q, qd, *known_past(self._model, z), prepared=self._weights)
 
     def memory(self, qd: Tensor) -> Tensor:
         """Friction's memory z, (..., n, K), of joints that have long gone the way of qd: zero at rest."""
-        return sliding_memory(self._dynamics, qd)
+        return sliding_memory(self._model, qd)
 
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
         """qdd, (..., n), under the input tau."""
-        mass, force = self._mass_and_force(q, qd, tau, z)
-        result: Tensor = torch.linalg.solve(mass, force.unsqueeze(-1))
-        return result.squeeze(-1)
+        return self._model.forward_dynamics(q, qd, tau, *known_past(self._model, z), prepared=self._weights)
 
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None = None) -> Tensor:
         """The input, (..., n), that gives qdd."""
-        pose = self._at(q)
-        mass, bias = self._mass_and_bias(pose, qd)
-        force = (mass @ qdd.unsqueeze(-1)).squeeze(-1) + bias
-        force = force + self._friction(pose, qd, z)
-        tau: Tensor = self._dynamics.input_torque(pose, qd, force, self._weights)
-        return tau
+        return self._model.inverse_dynamics(q, qd, qdd, *known_past(self._model, z), prepared=self._weights)
 
     def momentum(self, q: Tensor, qd: Tensor) -> Tensor:
         """p = M(q) qd, (..., n) [Nm s, N s]."""
-        return (self.mass_matrix(q) @ qd.unsqueeze(-1)).squeeze(-1)
+        return self._model.momentum(q, qd, prepared=self._weights)
 
     def momentum_rate(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
         """p', (..., n) [Nm, N], under the input tau: what a momentum observer compares with."""
-        pose, weights = self._at(q), self._weights
-        residuals = self._dynamics.mass_at(pose, weights)[1]
-        force: Tensor = self._dynamics.lagrangian_gradient(pose, qd, residuals, weights)
-        result: Tensor = (
-            force + self._dynamics.input_force(pose, qd, tau, weights) - self._friction(pose, qd, z)
-        )
-        return result
+        past = known_past(self._model, z)
+        p = self.momentum(q, qd)
+        return self._model.port_hamiltonian_rhs(q, p, tau, self._weights, *past)[1]
 
     def step(
         self, q: Tensor, qd: Tensor, tau: Tensor, dt: float, z: Tensor | None = None, *, substeps: int = 1
@@ -168,29 +162,11 @@ class PreparedModel:
             raise ValueError("no tip: give model.prepared(tip=spelgen.tip_kinematics(arm))")
         return self._tip
 
-    def _at(self, q: Tensor) -> object:
-        return self._dynamics.configuration(q, self._weights)
-
-    def _mass_and_bias(self, pose: object, qd: Tensor) -> tuple[Tensor, Tensor]:
-        mass, residuals = self._dynamics.mass_at(pose, self._weights)
-        return mass, self._dynamics.nonlinear_at(pose, qd, residuals, self._weights)
-
-    def _friction(self, pose: object, qd: Tensor, z: Tensor | None) -> Tensor:
-        past = (z,) if self.elements else ()
-        torque: Tensor = self._dynamics.friction_at(pose, qd, self._weights, *past)
-        return torque
-
-    def _mass_and_force(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None) -> tuple[Tensor, Tensor]:
-        pose = self._at(q)
-        mass, bias = self._mass_and_bias(pose, qd)
-        force = self._dynamics.input_force(pose, qd, tau, self._weights) - bias
-        return mass, force - self._friction(pose, qd, z)
-
-    def _differentiable(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
+    def _differentiable(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor) -> Tensor:
         """``forward_dynamics`` by the inverse: vmap of a forward derivative of linalg.solve is wrong in torch 2.13."""
-        mass, force = self._mass_and_force(q, qd, tau, z)
-        result: Tensor = torch.linalg.inv(mass) @ force
-        return result
+        pose = poses(self._model)(q)
+        inverse: Tensor = torch.linalg.inv(pose.mass)
+        return inverse @ pose.force(qd, tau, z)
 
     def _stepped(
         self, accelerations: Callable[..., Tensor], start: State, tau: Tensor, dt: float, substeps: int
@@ -199,8 +175,8 @@ class PreparedModel:
         for _ in range(substeps):
 
             def rhs(moved: Tensor, speed: Tensor, q: Tensor = q, z: Tensor = z) -> tuple[Tensor, Tensor]:
-                return speed, accelerations(q + moved, speed, tau, memory_after(self._dynamics, z, moved))
+                return speed, accelerations(q + moved, speed, tau, memory_after(self._model, z, moved))
 
             moved, qd, _ = runge_kutta(rhs, qd, dt / substeps)
-            q, z = q + moved, memory_after(self._dynamics, z, moved)
+            q, z = q + moved, memory_after(self._model, z, moved)
         return State(q, qd, z)

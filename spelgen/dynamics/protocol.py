@@ -9,6 +9,8 @@ import torch
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from spelgen.dynamics.pose import Pose
+
 
 class RigidDynamics(Protocol):
     """M(q) qdd + h(q, qd) + friction(q, qd) = G tau of n joints; q, qd, qdd, tau are (..., n).
@@ -42,11 +44,40 @@ class RigidDynamics(Protocol):
 class PortHamiltonianDynamics(RigidDynamics, Protocol):
     """Dynamics with momenta p = M(q) qd as their state, as emitted modules have them.
 
-    ``prepared`` is what ``prepare`` gave: all that depends on the weights alone.
+    prepared: what ``prepare`` gave, all that depends on the weights alone. state: z of bristles (see ``FrictionState``)
+    where friction has any. pose: what ``configuration`` gave, all that depends on q; its ``mass`` is M.
     """
 
-    def prepare(self, definite: bool = True) -> object:
+    joint_names: tuple[str, ...]
+    joint_types: tuple[str, ...]
+    elements: int
+
+    def prepare(self, definite: bool = True) -> Any:
         """What many evaluations with the same weights share."""
+
+    def mass_matrix(self, q: Tensor, prepared: object = None) -> Tensor:
+        """M, (..., n, n), armature included."""
+
+    def gravity(self, q: Tensor, prepared: object = None) -> Tensor:
+        """dV/dq, (..., n)."""
+
+    def nonlinear_effects(self, q: Tensor, qd: Tensor, prepared: object = None) -> Tensor:
+        """Coriolis, centrifugal and gravity torques without friction, (..., n)."""
+
+    def friction_torque(
+        self, q: Tensor, qd: Tensor, *state: Tensor | None, prepared: object = None
+    ) -> Tensor:
+        """What friction takes, (..., n)."""
+
+    def forward_dynamics(
+        self, q: Tensor, qd: Tensor, tau: Tensor, *state: Tensor | None, prepared: object = None
+    ) -> Tensor:
+        """qdd, (..., n), under the inputs tau."""
+
+    def inverse_dynamics(
+        self, q: Tensor, qd: Tensor, qdd: Tensor, *state: Tensor | None, prepared: object = None
+    ) -> Tensor:
+        """The inputs, (..., n), that make qdd."""
 
     def momentum(self, q: Tensor, qd: Tensor, prepared: object = None) -> Tensor:
         """p, (..., n)."""
@@ -58,6 +89,34 @@ class PortHamiltonianDynamics(RigidDynamics, Protocol):
         self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: object, *state: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         """q' and p', (..., n), under the inputs tau; without, of the arm left to itself."""
+
+    def configuration(self, q: Tensor, prepared: object) -> Any:
+        """The pose at q."""
+
+    def nonlinear_at(self, pose: Any, qd: Tensor) -> Tensor:
+        """``nonlinear_effects`` at a pose."""
+
+    def lagrangian_gradient(self, pose: Any, qd: Tensor) -> Tensor:
+        """d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
+
+    def friction_at(self, pose: Any, qd: Tensor, *state: Tensor | None) -> Tensor:
+        """``friction_torque`` at a pose."""
+
+    def input_force(self, pose: Any, qd: Tensor, tau: Tensor) -> Tensor:
+        """G tau, (..., n)."""
+
+
+class PosedDynamics(Protocol):
+    """Dynamics that work out once what depends on positions alone."""
+
+    def pose_at(self, q: Tensor) -> Pose:
+        """Return the equations of motion at q, (W, n)."""
+
+
+class ResidualModel(PortHamiltonianDynamics, Protocol):
+    """A model with functions of joints and networks beside its rigid bodies; None where they were taken off."""
+
+    residuals: Any  # see `runtime.residual_terms`
 
 
 class FrictionState(Protocol):
@@ -79,9 +138,9 @@ def has_rigid_bodies(model: object) -> bool:
     return hasattr(model, "inertial_parameters")
 
 
-def has_residuals(model: object) -> bool:
+def has_residuals(model: object) -> TypeGuard[ResidualModel]:
     """Return whether a model has functions of joints and networks beside its rigid bodies."""
-    return getattr(model, "residual_mass", None) is not None
+    return getattr(model, "residuals", None) is not None
 
 
 def has_friction_state(model: object) -> TypeGuard[FrictionState]:
@@ -94,9 +153,14 @@ def has_servos(model: object) -> bool:
     return hasattr(model, "servo")
 
 
-def has_momentum(dynamics: object) -> bool:
+def has_momentum(dynamics: object) -> TypeGuard[PortHamiltonianDynamics]:
     """Return whether momenta can be its state (see ``PortHamiltonianDynamics``)."""
     return hasattr(dynamics, "momentum")
+
+
+def has_poses(dynamics: object) -> TypeGuard[PosedDynamics]:
+    """Return whether dynamics work out once what depends on positions alone."""
+    return hasattr(dynamics, "pose_at")
 
 
 def sliding_memory(dynamics: object, qd: Tensor) -> Tensor:

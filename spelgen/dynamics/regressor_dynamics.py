@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar
 
 import numpy as np
 import torch
 
 from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Arm
-from spelgen.dynamics.arrays import like
+from spelgen.dynamics.arrays import Array, like
 from spelgen.dynamics.pose import Pose
 from spelgen.dynamics.rigid_bodies import RigidBodies
 from spelgen.runtime.bristles import moved_bristles
-
-Array = TypeVar("Array")
-"""numpy.ndarray or torch.Tensor: what is returned is of the kind of what is given."""
 
 
 class RegressorDynamics:
@@ -71,7 +67,7 @@ class RegressorDynamics:
         """qdd, (..., n), under the inputs tau."""
         return self._by_rows(self._forward, q, qd, tau, z=z)
 
-    def at(self, q: torch.Tensor) -> Pose:
+    def pose_at(self, q: torch.Tensor) -> Pose:
         """Return the equations of motion at q, (T, n), see `pose.poses`."""
         mass, bias_at = self.bodies.at(q)
         inputs = torch.from_numpy(self.inputs)
@@ -137,5 +133,4 @@ class RegressorDynamics:
         rows = np.broadcast_arrays(*(np.asarray(x) for x in states))
         past = None if z is None else np.asarray(z).reshape(-1, self.n, np.asarray(z).shape[-1])
         result = function(*(x.reshape(-1, self.n) for x in rows), past)
-        value: Array = like(result.reshape(*rows[0].shape[:-1], *result.shape[1:]), states[0])
-        return value
+        return like(result.reshape(*rows[0].shape[:-1], *result.shape[1:]), states[0])

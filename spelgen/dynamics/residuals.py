@@ -3,77 +3,72 @@
 from __future__ import annotations
 
 import copy
-from typing import Any
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
 from spelgen.dynamics.protocol import has_residuals
+from spelgen.runtime.masked_kan import MaskedKAN
+from spelgen.runtime.masked_mlp import MaskedMLP
+
+Model = TypeVar("Model")
+
+NETWORKS = ("mass", "potential")  # of residual terms, by attribute
 
 
-def idle_residuals(model: Any) -> list[str]:
+def idle_residuals(model: object) -> list[str]:
     """Return the names of a model's parameters of residuals that add nothing to it as it is."""
     if not has_residuals(model):
         return []
-    modules = [("joint_functions", model.joint_functions), ("residual_mass", model.residual_mass)]
-    idle = [
-        f"{owner}.{name}"
-        for owner, module in modules
-        for name, x in module.named_parameters(recurse=False)
-        if not x.any()
-    ]
-    networks = {
-        "residual_mass.network": model.residual_mass.network,
-        "residual_potential": model.residual_potential,
-    }
-    for owner, network in networks.items():
-        if network is not None and _is_idle(network):
-            idle += [f"{owner}.{name}" for name, _ in network.named_parameters()]
-    return idle
+    terms = model.residuals
+    idle = [name for name, weights in terms.named_parameters(recurse=False) if not weights.any()]
+    for part in NETWORKS:
+        if _is_idle(getattr(terms, part)):
+            idle += [name for name, _ in terms.named_parameters() if name.startswith(f"{part}.")]
+    return [f"residuals.{name}" for name in idle]
 
 
-def without_residuals(model: Any) -> Any:
+def without_residuals(model: Model) -> Model:
     """Return a copy of the model that is its rigid bodies alone."""
     alone = copy.deepcopy(model)
     if has_residuals(alone):
-        alone.joint_functions = alone.residual_mass = alone.residual_potential = None
+        alone.residuals = None
     return alone
 
 
-def without_idle_residuals(model: Any) -> Any:
+def without_idle_residuals(model: Model) -> Model:
     """Return a copy of the model without residuals that give nothing, for weights that change no more."""
-    if not has_residuals(model):
-        return copy.deepcopy(model)
-    mass, potential, functions = model.residual_mass, model.residual_potential, model.joint_functions
-    mass_is_idle = mass.network is None or _is_idle(mass.network)
-    potential_is_idle = potential is None or _is_idle(potential)
-    weights = [mass.raw_constants, *functions.parameters()]
-    if mass_is_idle and potential_is_idle and not any(bool(x.any()) for x in weights):
-        return without_residuals(model)
     reduced = copy.deepcopy(model)
-    if mass_is_idle:
-        reduced.residual_mass.network = None
-    if potential_is_idle:
-        reduced.residual_potential = None
+    if not has_residuals(reduced):
+        return reduced
+    terms = reduced.residuals
+    for part in NETWORKS:
+        if _is_idle(getattr(terms, part)):
+            setattr(terms, part, None)
+    if not any(bool(weights.any()) for weights in terms.parameters()):
+        reduced.residuals = None
     return reduced
 
 
-def _is_idle(network: Any) -> bool:
-    return not any(bool(layers[-1].any()) for layers in (network.weights, network.biases))
+def _is_idle(network: MaskedMLP | MaskedKAN | None) -> bool:
+    """Return whether a network gives zero for all inputs, as none at all does."""
+    return network is None or not (network.weights[-1].any() or network.biases[-1].any())
 
 
-def residual_torque(model: Any, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
+def residual_torque(model: object, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
     """Return the torque (..., n) [Nm, N] that residuals of M and V take; zero without any."""
     if not has_residuals(model):
         return torch.zeros_like(q)
-    torque: Tensor = model.residual_torque(q, qd, qdd, model.prepare())
+    terms = model.residuals
+    pose = terms.at(q, model.prepare().residual)
+    torque: Tensor = (pose.mass @ qdd.unsqueeze(-1)).squeeze(-1) + terms.nonlinear(pose, qd)
     return torque
 
 
-def friction_factor(model: Any, q: Tensor) -> Tensor:
+def friction_factor(model: object, q: Tensor) -> Tensor:
     """Return how much more friction (..., n) the drives have at q than their laws say; one without residuals."""
     if not has_residuals(model):
         return torch.ones_like(q)
-    functions = model.joint_functions
-    factor: Tensor = functions.forward(q, functions.prepare())[1]
+    factor: Tensor = model.residuals.at(q, model.prepare().residual).friction
     return factor

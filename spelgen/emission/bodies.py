@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from spelgen.arm.arm import Arm, Body
+from spelgen.arm.arm import Arm
 from spelgen.arm.rational import Vector
 from spelgen.spec import BodySpec, Triple
 from spelgen.structure.pseudo_inertia import parameters_of, reference_factor
@@ -18,29 +18,35 @@ _LIGHT = 0.01  # of the heaviest body's mass: a body that is said to weigh nothi
 def body_specs(arm: Arm, inertias: Sequence[Sequence[float]]) -> tuple[BodySpec, ...]:
     """The bodies of ``arm`` that have these ten inertial parameters each, impossible ones made possible."""
     heaviest = max(float(ten[0]) for ten in inertias)
-    return tuple(
-        BodySpec(
+    specs = []
+    for index, (body, ten) in enumerate(zip(arm.bodies, inertias, strict=True)):
+        first, second, third = map(_floats, body.rotation)
+        spec = BodySpec(
             parent=body.parent,
             joint=body.coordinate,
             kind=body.kind,
             ratio=float(body.multiplier),
             offset=body.offset,
-            rotation=(_floats(body.rotation[0]), _floats(body.rotation[1]), _floats(body.rotation[2])),
+            rotation=(first, second, third),
             position=_floats(body.translation),
             reference=_possible(arm, index, ten, heaviest),
         )
-        for index, (body, ten) in enumerate(zip(arm.bodies, inertias, strict=True))
-    )
+        specs.append(spec)
+    return tuple(specs)
 
 
 def _possible(arm: Arm, index: int, ten: Sequence[float], heaviest: float) -> tuple[float, ...]:
-    values = np.array([float(f"{float(x):.{_DIGITS}g}") for x in ten])
+    values = _rounded(ten, _DIGITS)
     if values[0] <= 0:
         values = _light_ball(_reach(arm, index), _LIGHT * heaviest)
     factor, possible = reference_factor(values)
     if not possible:
-        values = np.array([float(f"{x:.6g}") for x in parameters_of(factor @ factor.T)])
-    return tuple(float(x) for x in values)
+        values = _rounded(parameters_of(factor @ factor.T), 6)
+    return tuple(values.tolist())
+
+
+def _rounded(values: Iterable[float], digits: int) -> np.ndarray:
+    return np.array([float(f"{float(value):.{digits}g}") for value in values])
 
 
 def _light_ball(radius: float, mass: float) -> np.ndarray:
@@ -50,10 +56,13 @@ def _light_ball(radius: float, mass: float) -> np.ndarray:
 
 def _reach(arm: Arm, index: int) -> float:
     """The distance [m] to the next joint; 0.1 where there is none."""
-    following: list[Body] = [body for body in arm.bodies if body.parent == index]
-    return max([float(np.linalg.norm(_floats(body.translation))) for body in following] + [0.1])
+    reach = 0.1
+    for body in arm.bodies:
+        if body.parent == index:
+            reach = max(reach, float(np.linalg.norm(_floats(body.translation))))
+    return reach
 
 
 def _floats(values: Vector) -> Triple:
-    x, y, z = (float(value) for value in values)
+    x, y, z = map(float, values)
     return x, y, z

@@ -35,16 +35,16 @@ def bundle(tailored: str) -> tuple[str, str]:
     runtime = load_runtime()
     tree = ast.parse(tailored)
     # a kind of part, such as Network, is in a module the class of its own part
-    defined_here = {_defined(node) for node in tree.body}
+    defined_here = set(map(_defined, tree.body))
     used = names_in(tree)
-    waiting = list(used)
-    while waiting:
-        name = waiting.pop()
+    pending = list(used)
+    while pending:
+        name = pending.pop()
         if name in defined_here or name not in runtime.definitions:
             continue
         new = runtime.definitions[name].uses - used
         used |= new
-        waiting += new
+        pending += new
     texts = []
     for name, definition in runtime.definitions.items():
         if name in used and name not in defined_here:
@@ -55,22 +55,24 @@ def bundle(tailored: str) -> tuple[str, str]:
 @cache
 def load_runtime() -> Runtime:
     """Read the runtime's source."""
-    folder = files("spelgen") / "runtime"
-    texts = {
-        path.name.removesuffix(".py"): path.read_text(encoding="utf-8")
-        for path in sorted(folder.iterdir(), key=lambda path: path.name)
-        if path.name.endswith(".py") and path.name != "__init__.py"
-    }
-    trees = {name: ast.parse(text) for name, text in texts.items()}
-    definitions: dict[str, Definition] = {}
-    imports: dict[str, str] = {}
-    for name in TopologicalSorter({name: _needs(tree) for name, tree in trees.items()}).static_order():
+    texts: dict[str, str] = {}
+    trees: dict[str, ast.Module] = {}
+    order: TopologicalSorter[str] = TopologicalSorter()
+    for path in sorted((files("spelgen") / "runtime").iterdir(), key=lambda path: path.name):
+        name = path.name.removesuffix(".py")
+        if path.name.endswith(".py") and name != "__init__":
+            texts[name] = path.read_text(encoding="utf-8")
+            trees[name] = ast.parse(texts[name])
+            order.add(name, *_needs(trees[name]))
+    runtime = Runtime({}, {})
+    for name in order.static_order():
         for node in trees[name].body:
             if isinstance(node, ast.Import | ast.ImportFrom):
-                imports |= _bound(node)
+                runtime.imports.update(_bound(node))
             elif (defined := _defined(node)) is not None:
-                definitions[defined] = Definition(_text(node, texts[name]), frozenset(names_in(node)))
-    return Runtime(definitions, imports)
+                uses = frozenset(names_in(node))
+                runtime.definitions[defined] = Definition(_text(node, texts[name]), uses)
+    return runtime
 
 
 def names_in(tree: ast.AST) -> set[str]:
@@ -80,22 +82,28 @@ def names_in(tree: ast.AST) -> set[str]:
 
 def _needs(tree: ast.Module) -> list[str]:
     """The runtime files that a file imports from, in a stable order."""
-    modules = [node.module for node in tree.body if isinstance(node, ast.ImportFrom) and node.module]
-    return sorted(module.removeprefix(_OURS) for module in modules if module.startswith(_OURS))
+    needs = []
+    for node in tree.body:
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(_OURS):
+            needs.append((node.module or "").removeprefix(_OURS))
+    return sorted(needs)
 
 
 def _bound(node: ast.Import | ast.ImportFrom) -> dict[str, str]:
-    """What an import of something outside the runtime binds."""
-    if isinstance(node, ast.Import):
-        return {
-            alias.asname or alias.name: f"import {alias.name}"
-            + (f" as {alias.asname}" if alias.asname else "")
-            for alias in node.names
-        }
-    module = node.module or ""
-    if module.startswith(_OURS) or module == "__future__":
-        return {}
-    return {alias.name: f"from {module} import" for alias in node.names}
+    """What an import of something outside the runtime binds: the statement, by name."""
+    start = ""
+    if isinstance(node, ast.ImportFrom):
+        module = node.module or ""
+        if module.startswith(_OURS) or module == "__future__":
+            return {}
+        start = f"from {module} "
+    bound = {}
+    for alias in node.names:
+        statement = f"{start}import {alias.name}"
+        if alias.asname:
+            statement += f" as {alias.asname}"
+        bound[alias.asname or alias.name] = statement
+    return bound
 
 
 def _defined(node: ast.stmt) -> str | None:
@@ -108,10 +116,9 @@ def _defined(node: ast.stmt) -> str | None:
 
 
 def _text(node: ast.stmt, source: str) -> str:
-    """A statement's lines, with decorators and with the comment right above it."""
+    """A statement's lines, with the comment right above it; no definition of the runtime has a decorator."""
     lines = source.splitlines()
-    decorators = getattr(node, "decorator_list", [])
-    first = min([node.lineno, *(node_above.lineno for node_above in decorators)]) - 1
+    first = node.lineno - 1
     while first and lines[first - 1].startswith("#"):
         first -= 1
     return "\n".join(lines[first : node.end_lineno])
@@ -119,16 +126,17 @@ def _text(node: ast.stmt, source: str) -> str:
 
 def _imports(used: Iterable[str], imports: dict[str, str]) -> str:
     """The imports of the used names, the standard library's first, then torch's, sorted as an import sorter does."""
-    members: dict[str, list[str]] = {}
-    plain = []
-    for name in sorted(used):
-        statement = imports.get(name)
-        if statement is None:
-            continue
-        if statement.startswith("from "):
-            members.setdefault(statement, []).append(name)
+    plain: set[str] = set()
+    members: dict[str, str] = {}
+    for name in sorted(set(imports).intersection(used)):
+        module, _, imported = imports[name].partition(" import ")
+        if not imported:
+            plain.add(imports[name])
+        elif module in members:
+            members[module] += f", {imported}"
         else:
-            plain.append(statement)
-    lines = [*sorted(plain), *(f"{start} {', '.join(names)}" for start, names in sorted(members.items()))]
-    groups = [[line for line in lines if ("torch" in line) == torch] for torch in (False, True)]
-    return "\n\n".join("\n".join(group) for group in groups if group)
+            members[module] = f"{module} import {imported}"
+    groups: dict[bool, list[str]] = {False: [], True: []}
+    for statement in [*sorted(plain), *sorted(members.values())]:
+        groups["torch" in statement].append(statement)
+    return "\n\n".join("\n".join(group) for group in groups.values() if group)

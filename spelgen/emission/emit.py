@@ -73,7 +73,7 @@ _SERVO: tuple[Value, ...] = (
 _ARMATURE: Value = (
     "armature",
     "Armature, the drives' part of M's diagonal, (n,) [kg m^2, kg].",
-    "self.mass.rotors.forward()",
+    "self.mass.armature()",
 )
 _VISCOUS: Value = (
     "viscous",

@@ -22,20 +22,17 @@ from spelgen.spec import Facts, parse_facts, read_source
 METHODS = (
     "mass_matrix", "potential_energy", "gravity", "nonlinear_effects", "friction_torque", "dissipation",
     "input_matrix", "momentum", "velocity", "hamiltonian", "forward_dynamics", "inverse_dynamics", "forward",
-    "prepare", "port_hamiltonian_rhs", "to_group", "from_group",
+    "prepare", "port_hamiltonian_rhs",
 )  # fmt: skip
 _EXPECTED = "a module written by this version of `spelgen build`"
 
 if TYPE_CHECKING:
+    from spelgen.dynamics.protocol import PortHamiltonianDynamics
     from spelgen.dynamics.tip import TipKinematics
 
-    class EmittedModel(torch.nn.Module):
+    class EmittedModel(torch.nn.Module, PortHamiltonianDynamics):
         """The class ``Model`` of an emitted module, whose own docstrings hold shapes and units."""
 
-        n: int
-        joint_names: tuple[str, ...]
-        joint_types: tuple[str, ...]
-        elements: int
         source: str
         """The module's text, as it was loaded."""
         facts: Facts
@@ -46,41 +43,16 @@ if TYPE_CHECKING:
         friction: Any
 
         def __getattr__(self, name: str) -> Any: ...  # what a preset has beside this
-        def mass_matrix(self, q: torch.Tensor, prepared: object = None) -> torch.Tensor: ...
         def potential_energy(self, q: torch.Tensor) -> torch.Tensor: ...
-        def gravity(self, q: torch.Tensor) -> torch.Tensor: ...
-        def nonlinear_effects(self, q: torch.Tensor, qd: torch.Tensor) -> torch.Tensor: ...
-        def friction_torque(
-            self, q: torch.Tensor, qd: torch.Tensor, z: torch.Tensor | None = None
-        ) -> torch.Tensor: ...
         def dissipation(self, q: torch.Tensor, qd: torch.Tensor) -> torch.Tensor: ...
         def input_matrix(self, q: torch.Tensor) -> torch.Tensor: ...
-        def momentum(self, q: torch.Tensor, qd: torch.Tensor, prepared: object = None) -> torch.Tensor: ...
-        def velocity(self, q: torch.Tensor, p: torch.Tensor, prepared: object = None) -> torch.Tensor: ...
         def hamiltonian(
             self, q: torch.Tensor, p: torch.Tensor, z: torch.Tensor | None = None
         ) -> torch.Tensor: ...
-        def forward_dynamics(
-            self, q: torch.Tensor, qd: torch.Tensor, tau: torch.Tensor, z: torch.Tensor | None = None
-        ) -> torch.Tensor: ...
-        def inverse_dynamics(
-            self, q: torch.Tensor, qd: torch.Tensor, qdd: torch.Tensor, z: torch.Tensor | None = None
-        ) -> torch.Tensor: ...
         def forward(self, t: torch.Tensor, state: torch.Tensor) -> torch.Tensor: ...
-        def prepare(self, definite: bool = True) -> Any: ...
-        def port_hamiltonian_rhs(
-            self,
-            q: torch.Tensor,
-            p: torch.Tensor,
-            tau: torch.Tensor | None,
-            prepared: object,
-            *state: torch.Tensor | None,
-        ) -> tuple[torch.Tensor, torch.Tensor]: ...
         def prepared(
             self, tip: TipKinematics | None = None, *, dtype: torch.dtype = torch.float64
         ) -> PreparedModel: ...
-        def to_group(self, q: torch.Tensor) -> list[torch.Tensor]: ...
-        def from_group(self, parts: list[torch.Tensor]) -> torch.Tensor: ...
 
 
 def load_module(module: str | Path, *, seed: int = 0) -> EmittedModel:

@@ -11,11 +11,11 @@ import numpy as np
 
 from spelgen.arm.actuation import Actuation
 from spelgen.arm.arm import Arm, Coordinate
-from spelgen.design import load_design
+from spelgen.design import Design, load_design
 from spelgen.emission.bodies import body_specs
 from spelgen.errors import SettingsError
 from spelgen.settings.joint import JointSettings
-from spelgen.spec import ConstantSpec, Entries, JointSpec, ModelSpec, Options, OutputSpec, ServoSpec
+from spelgen.spec import BodySpec, ConstantSpec, Entries, JointSpec, ModelSpec, Options, OutputSpec, ServoSpec
 from spelgen.structure.basis import Weights
 from spelgen.structure.nominal import Nominal, nominal, nominal_inertias, working_range
 from spelgen.structure.structure import Structure
@@ -48,7 +48,6 @@ def plan_model(
     ``drives``: what is known of the joints' motors and gears; where no rotor inertia is, one is guessed.
     ``servos``: whether positions are commanded. Raises SettingsError where the design has no friction that remembers.
     """
-    settings_of = drives or {}
     design = load_design(options.design or options.preset, options.net)
     if servos and design.memory == "none":
         raise SettingsError(
@@ -57,51 +56,68 @@ def plan_model(
         )  # fmt: skip
     everything = tuple(range(len(arm.coordinates)))
     sizes = nominal(arm, structure)
-    inertias = nominal_inertias(arm, sizes.from_urdf)
     identifiers = _identifiers(arm.joint_names)
+    joints, servo_specs = [], []
+    for index, coordinate in enumerate(arm.coordinates):
+        drive = (drives or {}).get(coordinate.name, JointSettings())
+        joints.append(_joint(coordinate, identifiers[index], sizes, index, drive))
+        if servos:
+            servo_specs.append(_servo(coordinate, drive))
+    inputs = []
+    if not actuation.direct:
+        for entry in actuation.entries:
+            inputs.append((entry.row, entry.column, entry.value, entry.kind == "gain"))
+    bodies: tuple[BodySpec, ...] = ()
+    if design.mass == "closed-form":
+        bodies = body_specs(arm, nominal_inertias(arm, sizes.from_urdf))
+    net = design.net
+    if net == "none":
+        net = None
+    potential = structure.potential
+    if design.potential == "dense":
+        potential = everything
     x, y, z = (float(g) for g in arm.gravity)
     return ModelSpec(
         robot=arm.name,
         urdf=urdf,
         urdf_sha256=urdf_sha256,
         gravity=(x, y, z),
-        options=replace(options, net=None if design.net == "none" else design.net),
+        options=replace(options, net=net),
         design=design,
-        joints=tuple(
-            _joint(coordinate, identifiers[k], sizes, k, settings_of.get(coordinate.name, JointSettings()))
-            for k, coordinate in enumerate(arm.coordinates)
-        ),
+        joints=tuple(joints),
         entries=tuple((e.row, e.column, e.kind, e.joints) for e in structure.entries),
-        outputs=tuple(
-            OutputSpec(
-                everything if design.encoding == "lie-group" else output.joints,
-                _floats(output.basis),
-                center,
-                scale,
-            )
-            for output, center, scale in zip(
-                structure.outputs, sizes.output_means, sizes.output_scales, strict=True
-            )
-        ),
-        constants=tuple(
-            ConstantSpec(_floats(constant.basis), start, scale)
-            for constant, start, scale in zip(
-                structure.constants, sizes.constants, sizes.constant_scales, strict=True
-            )
-        ),
-        potential=everything if design.potential == "dense" else structure.potential,
+        outputs=_outputs(structure, sizes, design),
+        constants=_constants(structure, sizes),
+        potential=potential,
         potential_scale=sizes.potential_scale,
         margin=float(f"{max(_MARGIN * sizes.least_eigenvalue, 1e-4):.0e}"),
         started_from_urdf=sizes.from_urdf,
-        bodies=body_specs(arm, inertias) if design.mass == "closed-form" else (),
-        inputs=()
-        if actuation.direct
-        else tuple((x.row, x.column, x.value, x.kind == "gain") for x in actuation.entries),
+        bodies=bodies,
+        inputs=tuple(inputs),
         motor_speeds=_motor_speeds(actuation),
-        servos=tuple(_servo(x, settings_of.get(x.name, JointSettings())) for x in arm.coordinates)
-        if servos
-        else (),
+        servos=tuple(servo_specs),
     )
+
+
+def _outputs(structure: Structure, sizes: Nominal, design: Design) -> tuple[OutputSpec, ...]:
+    """The functions of M, each with the joints that it reads, its mean and its scale."""
+    outputs = []
+    for output, mean, scale in zip(structure.outputs, sizes.output_means, sizes.output_scales, strict=True):
+        joints = output.joints
+        if design.encoding == "lie-group":
+            joints = tuple(range(len(sizes.mass_sensitivities)))
+        outputs.append(OutputSpec(joints, _floats(output.basis), mean, scale))
+    return tuple(outputs)
+
+
+def _constants(structure: Structure, sizes: Nominal) -> tuple[ConstantSpec, ...]:
+    """The constants of M, each with its start and its unit."""
+    constants = []
+    for constant, start, scale in zip(
+        structure.constants, sizes.constants, sizes.constant_scales, strict=True
+    ):
+        constants.append(ConstantSpec(_floats(constant.basis), start, scale))
+    return tuple(constants)
 
 
 def _motor_speeds(actuation: Actuation) -> tuple[tuple[float, ...], ...]:
@@ -116,16 +132,20 @@ def _joint(
     coordinate: Coordinate, identifier: str, sizes: Nominal, index: int, drive: JointSettings
 ) -> JointSpec:
     low, high = working_range(coordinate)
-    speed = coordinate.velocity if coordinate.velocity and coordinate.velocity <= _LARGEST_SPEED else None
+    lower, upper, speed = coordinate.lower, coordinate.upper, coordinate.velocity
+    if coordinate.continuous:
+        lower = upper = None
+    if not speed or speed > _LARGEST_SPEED:
+        speed = _DEFAULT_SPEED[coordinate.kind]
     return JointSpec(
         name=coordinate.name,
         identifier=identifier,
         kind=coordinate.kind,
-        lower=None if coordinate.continuous else coordinate.lower,
-        upper=None if coordinate.continuous else coordinate.upper,
+        lower=lower,
+        upper=upper,
         center=float(f"{(low + high) / 2:.6g}"),
         reach=float(f"{(high - low) / 2:.6g}"),
-        speed=speed or _DEFAULT_SPEED[coordinate.kind],
+        speed=speed,
         friction=float(f"{_friction(coordinate, sizes, index):.3g}"),
         armature=float(f"{drive.rotor_inertia * drive.gear**2 or guessed_armature(coordinate):.3g}"),
         gear=drive.gear,
@@ -137,7 +157,9 @@ def _joint(
 
 def _servo(coordinate: Coordinate, drive: JointSettings) -> ServoSpec:
     """The servo of a joint: one that nothing is known of gives its full effort half a unit from its command."""
-    effort = coordinate.effort if coordinate.effort and coordinate.effort <= _LARGEST_EFFORT else None
+    effort = coordinate.effort
+    if not effort or effort > _LARGEST_EFFORT:
+        effort = None
     kp = drive.kp or float(f"{(effort or _EFFORT) / _FULL_EFFORT_AT:.3g}")
     return ServoSpec(kp, drive.kp is not None, float(f"{_SERVO_LAG * kp:.3g}"), effort)
 
@@ -154,8 +176,9 @@ def guessed_armature(coordinate: Coordinate) -> float:
 
 def guessed_friction(coordinate: Coordinate) -> float | None:
     """A share of the drive's effort [Nm, N]; None where the URDF names no believable one."""
-    usable = coordinate.effort and coordinate.effort <= _LARGEST_EFFORT
-    return _FRICTION_OF_EFFORT * coordinate.effort if coordinate.effort and usable else None
+    if not coordinate.effort or coordinate.effort > _LARGEST_EFFORT:
+        return None
+    return _FRICTION_OF_EFFORT * coordinate.effort
 
 
 def _friction(coordinate: Coordinate, sizes: Nominal, index: int) -> float:

@@ -5,28 +5,28 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
+import numpy as np
+
 
 def hidden_units(
     outputs: Sequence[tuple[int, ...]], width: int, fewest: int = 1
 ) -> tuple[tuple[int, ...], ...]:
     """Return the joints that each unit of a hidden layer may read, for outputs that read these joints.
 
-    A hidden layer has ``width`` units, shared out in proportion to how many outputs read the same joints, ``least`` or
+    A hidden layer has ``width`` units, shared out in proportion to how many outputs read the same joints, ``fewest`` or
     more for each such group.
     """
     counts = Counter(outputs)
     groups = sorted(counts, key=lambda joints: (len(joints), joints))
-    ideal = [width * counts[joints] / len(outputs) for joints in groups]
-    units = [max(fewest, round(size)) for size in ideal]
+    ideal = width * np.array([counts[joints] for joints in groups]) / len(outputs)
+    units = np.maximum(fewest, ideal.round().astype(int))
     # rounding may have added or removed a unit or two: the groups that gained most give, those that lost most take
-    while sum(units) > width and max(units) > fewest:
-        gains = [number - size for number, size in zip(units, ideal, strict=True)]
-        reducible = [k for k, number in enumerate(units) if number > fewest]
-        units[max(reducible, key=lambda k: gains[k])] -= 1
-    while sum(units) < width:
-        losses = [size - number for number, size in zip(units, ideal, strict=True)]
-        units[losses.index(max(losses))] += 1
+    while units.sum() > width and units.max() > fewest:
+        gains = np.where(units > fewest, units - ideal, -np.inf)
+        units[gains.argmax()] -= 1
+    while units.sum() < width:
+        units[(ideal - units).argmax()] += 1
     layer: list[tuple[int, ...]] = []
-    for joints, number in zip(groups, units, strict=True):
+    for joints, number in zip(groups, units.tolist(), strict=True):
         layer += [joints] * number
     return tuple(layer)

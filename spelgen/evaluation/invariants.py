@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torchdiffeq import odeint
 
+from spelgen.dynamics.lie_group import to_group
 from spelgen.evaluation.rollout import rollout
 from spelgen.logs.windows import Windows
 from spelgen.settings.tuning.evaluation import EvaluationTuning
@@ -61,7 +62,7 @@ def _free_motion(model: EmittedModel, windows: Windows) -> tuple[float, float | 
     q, qd = rollout(model, q, qd, no_input, 1e-3)
     q, qd = q[:, 1:], qd[:, 1:]
     orthogonality = 0.0
-    for part, kind in zip(model.to_group(q[:, -1]), model.joint_types, strict=True):
+    for part, kind in zip(to_group(model.joint_types, q[:, -1]), model.joint_types, strict=True):
         if kind == "revolute":
             away = (part @ part.mT - torch.eye(3, dtype=q.dtype)).abs().max()
             orthogonality = max(orthogonality, away.item())
@@ -87,10 +88,9 @@ class _Undamped:
             raise _TooStiff
         model = self._model
         q, p = state.chunk(2, dim=-1)
-        kinematics = model.configuration(q, self._cache)
-        mass, residuals = model.mass_at(kinematics, self._cache)
-        qd = torch.linalg.solve(mass, p)
-        return torch.cat([qd, model.lagrangian_gradient(kinematics, qd, residuals, self._cache)], dim=-1)
+        pose = model.configuration(q, self._cache)
+        qd = torch.linalg.solve(pose.mass, p)
+        return torch.cat([qd, model.lagrangian_gradient(pose, qd)], dim=-1)
 
 
 def energy_drift(model: EmittedModel, windows: Windows) -> float | None:

@@ -11,7 +11,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spelgen.dynamics.protocol import has_friction_state, has_residuals, has_rigid_bodies, has_servos
+from spelgen.dynamics.protocol import (
+    ResidualModel,
+    has_friction_state,
+    has_residuals,
+    has_rigid_bodies,
+    has_servos,
+)
 from spelgen.errors import RunError
 from spelgen.exporting.description import (
     Bristles,
@@ -29,6 +35,8 @@ from spelgen.loaded_arm import LoadedArm
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
+    from spelgen.runtime.parts import Layers
+    from spelgen.runtime.residual_terms import ResidualTerms
 
 _LONGEST_NAME = 40
 
@@ -45,7 +53,7 @@ def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
     constant_mass = array(weights.armature)
     residuals = _no_residuals()
     if has_residuals(exact):
-        constant_mass += array(weights.residual.mass.constant).reshape(exact.n, exact.n)
+        constant_mass += array(weights.residual.constant).reshape(exact.n, exact.n)
         residuals = _residuals(exact)
     return TrainedModel(
         name=identifier(loaded.arm.name),
@@ -119,30 +127,30 @@ def _no_residuals() -> Residuals:
     return Residuals(Encoding(False, np.zeros(0), np.zeros(0)), None, None, none, (), none)
 
 
-def _residuals(model: EmittedModel) -> Residuals:
+def _residuals(model: ResidualModel) -> Residuals:
     """Return the residuals without those that are zero. Raises RunError for Kolmogorov-Arnold networks."""
-    encoding, functions = model.encoding, model.joint_functions
-    weights = model.prepare().residual
-    scale = functions.scale.unsqueeze(-1)
-    mass = _network(weights.mass.layers)
+    terms, weights = model.residuals, model.prepare().residual
+    mass = _network(terms.mass, weights.mass)
     if mass is not None:
-        mass = _tanh_then(mass, array(weights.mass.functions))
+        mass = _tanh_then(mass, array(weights.functions))
     return Residuals(
-        encoding=Encoding(encoding.prismatic, array(encoding.center), array(encoding.reach)),
+        encoding=Encoding(
+            terms.encoding.prismatic, array(terms.encoding.center), array(terms.encoding.reach)
+        ),
         mass=mass,
-        potential=_network(weights.potential),
-        torque=_splines(model, scale * functions.raw_torque_splines),
-        ripple=_ripple(model, scale * functions.revolute * functions.raw_torque_ripple),
-        friction=_splines(model, functions.friction_logarithms()),
+        potential=_network(terms.potential, weights.potential),
+        torque=_splines(terms, terms.unit * terms.raw_torque_splines),
+        ripple=_ripple(terms, weights.ripple),
+        friction=_splines(terms, terms.friction_logarithms()),
     )
 
 
-def _network(layers: Any) -> Network | None:
+def _network(network: object, layers: Layers | None) -> Network | None:
     """Return a network, None where there is none or its last layer is zero."""
     if layers is None or not (layers.weights[-1].any() or layers.biases[-1].any()):
         return None
     # an emitted module brings classes of its own
-    if type(layers).__name__ != "MLPLayers":
+    if type(network).__name__ != "MaskedMLP":
         raise _unsupported("Kolmogorov-Arnold networks beside rigid bodies")
     return Network(tuple(map(array, layers.weights)), tuple(map(array, layers.biases)))
 
@@ -159,23 +167,22 @@ def _tanh_then(network: Network, functions: np.ndarray) -> Network:
     return Network(tuple(weights), tuple(biases))
 
 
-def _splines(model: EmittedModel, weights: Tensor) -> Splines:
+def _splines(terms: ResidualTerms, weights: Tensor) -> Splines:
     """Return the sums of splines of the joints that have one."""
-    functions = model.joint_functions
     joints = torch.nonzero(weights.any(dim=1)).flatten().tolist()
     return Splines(
         joints=tuple(joints),
-        center=array(functions.middles[joints].mean(dim=-1)),
-        spacing=array(functions.spacing[joints, 0]),
+        center=array(terms.middles[joints].mean(dim=-1)),
+        spacing=array(terms.spacing[joints, 0]),
         weights=array(weights[joints]),
     )
 
 
-def _ripple(model: EmittedModel, weights: Tensor) -> tuple[Harmonics, ...]:
+def _ripple(terms: ResidualTerms, weights: Tensor) -> tuple[Harmonics, ...]:
     """Return by joint the multiples of a turn, then, where they stand for themselves, those of the motor's turn."""
     ripple: list[Harmonics] = []
     cosines, sines = (array(half) for half in weights.chunk(2, dim=-1))
-    for joint, frequencies in enumerate(array(model.joint_functions.frequencies)):
+    for joint, frequencies in enumerate(array(terms.frequencies)):
         count = len(frequencies)
         # how many follow one another from one on
         regular = int(np.argmin(frequencies == np.arange(1, count + 1))) or count

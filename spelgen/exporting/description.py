@@ -74,7 +74,7 @@ class Encoding:
 
 @dataclass(frozen=True, eq=False)
 class Splines:
-    """Sums of cubic B-splines, one for each of some joints, as in ``runtime.joint_functions``.
+    """Sums of cubic B-splines, one for each of some joints, as in ``runtime.residual_terms``.
 
     The k-th of S splines is 2/3 high at center + spacing (k - (S - 1) / 2); weights: (joints, S).
     """

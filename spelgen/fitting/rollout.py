@@ -165,13 +165,12 @@ def momentum_loss(model: EmittedModel, windows: Windows, scales: LossScales) -> 
     # velocities are measured, so M need not be positive definite on the way; kept so, descent stops where it is not
     prepared = model.prepare(definite=False)
     at = dynamics.configuration(q, prepared)
-    mass, residuals = dynamics.mass_at(at, prepared)
-    p = (mass @ qd.unsqueeze(-1)).squeeze(-1)
-    force = dynamics.lagrangian_gradient(at, qd, residuals, prepared)
+    p = (at.mass @ qd.unsqueeze(-1)).squeeze(-1)
+    force = dynamics.lagrangian_gradient(at, qd)
     past = known_past(model, memory_along(model, q, qd, windows.z))
-    force = force - dynamics.friction_at(at, qd, prepared, *past)
+    force = force - dynamics.friction_at(at, qd, *past)
     driven = [
-        dynamics.input_force(at, qd, torch.cat(held, dim=1), prepared)
+        dynamics.input_force(at, qd, torch.cat(held, dim=1))
         for held in ((tau, tau[:, -1:]), (tau[:, :1], tau))  # over the interval after each sample, and before
     ]
     mean = (force[:, :-1] + driven[0][:, :-1] + force[:, 1:] + driven[1][:, 1:]) / 2

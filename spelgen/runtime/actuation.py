@@ -6,8 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from spelgen.runtime.joints import Joints
-from spelgen.runtime.network_dynamics import NetworkDynamics, NetworkPrepared
-from spelgen.runtime.parts import Friction, Mass, Network, Pose, Prepared
+from spelgen.runtime.network_dynamics import NetworkDynamics, NetworkPose, NetworkPrepared
+from spelgen.runtime.parts import Friction, Mass, Network, Pose
 from spelgen.runtime.port_hamiltonian import PortHamiltonian, solved
 
 
@@ -44,11 +44,11 @@ class MotorInput(PortHamiltonian):
         """Return G, (..., n, n)."""
         return self.gains().expand(*q.shape, -1)
 
-    def input_force(self, pose: Pose, qd: Tensor, tau: Tensor, prepared: Prepared) -> Tensor:
+    def input_force(self, pose: Pose, qd: Tensor, tau: Tensor) -> Tensor:
         """Return G tau, (..., n) [Nm, N]."""
         return tau @ self.gains().mT
 
-    def input_torque(self, pose: Pose, qd: Tensor, force: Tensor, prepared: Prepared) -> Tensor:
+    def input_torque(self, pose: Pose, qd: Tensor, force: Tensor) -> Tensor:
         """Return the inputs, (..., n), that make this force; a passive joint shows the torque it lacks."""
         return solved(self.gains() + torch.diag(1 - self.actuated), force)
 
@@ -74,15 +74,18 @@ class DenseInput(NetworkDynamics):
         layers = self.input_network.prepare(self.moving, self.moving.sum(dim=1))
         return super().prepare(definite)._replace(input=layers)
 
+    def _gains(self, pose: NetworkPose) -> Tensor:
+        """Return the diagonal of G, (..., n)."""
+        return self.input_network.forward(pose.encoded, pose.prepared.input)[0]
+
     def input_matrix(self, q: Tensor) -> Tensor:
         """Return G(q), (..., n, n), diagonal."""
-        pose, prepared = self.at(q)
-        return torch.diag_embed(self.input_network.forward(pose, prepared.input)[0])
+        return torch.diag_embed(self._gains(self.at(q)))
 
-    def input_force(self, pose: Tensor, qd: Tensor, tau: Tensor, prepared: NetworkPrepared) -> Tensor:
+    def input_force(self, pose: NetworkPose, qd: Tensor, tau: Tensor) -> Tensor:
         """Return G(q) tau, (..., n)."""
-        return self.input_network.forward(pose, prepared.input)[0] * tau
+        return self._gains(pose) * tau
 
-    def input_torque(self, pose: Tensor, qd: Tensor, force: Tensor, prepared: NetworkPrepared) -> Tensor:
+    def input_torque(self, pose: NetworkPose, qd: Tensor, force: Tensor) -> Tensor:
         """Return the inputs, (..., n), that make this force."""
-        return force / self.input_network.forward(pose, prepared.input)[0]
+        return force / self._gains(pose)

@@ -52,12 +52,12 @@ class BodyChain(nn.Module):
         self.carried = nn.Buffer(carriers.repeat_interleave(6, dim=1))
         # acceleration of the base that stands for gravity, (6,)
         self.base = nn.Buffer(vector((0, 0, 0, *(-g for g in gravity))))
-        self.ratios = nn.Buffer(ratios)  # displacements by q, (bodies, n)
-        self.single = torch.equal(ratios, torch.eye(n).double())  # no joint moves several bodies
+        # displacements are ratios q + offset, (bodies, n) and (bodies,)
+        self.ratios, self.offset = nn.Buffer(ratios), nn.Buffer(vector(bodies.offset))
 
     def forward(self, q: Tensor) -> Chain:
         """The bodies at q, (..., n)."""
-        value = self._by_bodies(q)
+        value = q @ self.ratios.mT + self.offset
         features = torch.cat([value.cos(), value.sin(), value], dim=-1)
         relative = blocks(F.linear(features, self.table, self.fixed), 6, 6).unbind(dim=-3)
         placed: list[Tensor] = []
@@ -65,22 +65,17 @@ class BodyChain(nn.Module):
             placed.append(relative[index] if parent < 0 else placed[parent] @ relative[index])
         frames = torch.cat(placed, dim=-1)
         axes = (frames @ self.reading).roll(3, dims=-2)
-        twists = (axes.mT @ frames) * self.carried
-        twists = twists if self.single else self.ratios.mT @ twists
+        twists = self.ratios.mT @ ((axes.mT @ frames) * self.carried)
         return Chain(frames, axes, twists, combined(self.base, frames))
-
-    def _by_bodies(self, joints: Tensor) -> Tensor:
-        """What is given by joint, (..., n), for the bodies that they move, (..., bodies)."""
-        return joints if self.single else joints @ self.ratios.mT
 
     def turning(self, pose: Chain, qd: Tensor) -> tuple[Tensor, Tensor]:
         """The bodies' twists, and how these turn the bodies' axes; in the base's frame, (..., 6, bodies)."""
-        twists = (pose.axes * self._by_bodies(qd).unsqueeze(-2)) @ self.carriers
+        twists = (pose.axes * (qd @ self.ratios.mT).unsqueeze(-2)) @ self.carriers
         return twists, crossed(twists, pose.axes)
 
     def accelerations(self, pose: Chain, qd: Tensor, turning: Tensor) -> Tensor:
         """The bodies' accelerations at steady qd, gravity taken as one, (..., 6 bodies)."""
-        steady = (turning * self._by_bodies(qd).unsqueeze(-2)) @ self.carriers
+        steady = (turning * (qd @ self.ratios.mT).unsqueeze(-2)) @ self.carriers
         bodies = blocks(pose.frames, 6) * steady.unsqueeze(-1)
         return bodies.sum(dim=-3).flatten(-2) + pose.weight
 
@@ -90,8 +85,7 @@ class BodyChain(nn.Module):
 
     def by_joints(self, axes: Tensor, wrenches: Tensor) -> Tensor:
         """What joints feel along ``axes`` of wrenches on all that they carry, (..., n)."""
-        felt = (axes * (wrenches @ self.carriers.mT)).sum(dim=-2)
-        return felt if self.single else felt @ self.ratios
+        return (axes * (wrenches @ self.carriers.mT)).sum(dim=-2) @ self.ratios
 
     def steady_torque(self, pose: Chain, qd: Tensor, momenta: Tensor) -> Tensor:
         """Return the torque that holds qd steady, (..., n), by Newton and Euler.

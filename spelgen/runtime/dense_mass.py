@@ -11,13 +11,13 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from spelgen.runtime.joints import Joints, vector
-from spelgen.runtime.parts import Layers, Network, NetworkResiduals
+from spelgen.runtime.parts import Intermediates, Layers, Network
 
 
-class DenseResiduals(NamedTuple):
+class DenseIntermediates(NamedTuple):
     """What M's derivatives need of the work done for M."""
 
-    network: NetworkResiduals
+    network: Intermediates
     factor: Tensor  # U
     moved: Tensor  # U^-1 A, with A the moving columns of C^-1
     scale: Tensor  # e
@@ -89,29 +89,29 @@ class DenseMass(nn.Module):
         solution: Tensor = torch.linalg.solve_triangular(factor, right, upper=upper, unitriangular=True)
         return solution
 
-    def forward(self, encoded: Tensor, prepared: Layers) -> tuple[Tensor, DenseResiduals]:
+    def forward(self, encoded: Tensor, prepared: Layers) -> tuple[Tensor, DenseIntermediates]:
         """M(q), and what its derivatives need."""
-        raw, residuals = self.network.forward(encoded, prepared)
+        raw, intermediates = self.network.forward(encoded, prepared)
         factor, scale = self._factor(raw)
         moved = self._unit_solved(factor, self.moving)
         mass = moved.mT @ (moved / scale.unsqueeze(-1))
-        return mass, DenseResiduals(residuals, factor, moved, scale)
+        return mass, DenseIntermediates(intermediates, factor, moved, scale)
 
-    def kinetic_vjp(self, encoded: Tensor, qd: Tensor, residuals: DenseResiduals) -> Tensor:
+    def kinetic_vjp(self, qd: Tensor, intermediates: DenseIntermediates) -> Tensor:
         """The derivative of 1/2 qd^T M(q) qd by the encoding."""
-        _, factor, moved, scale = residuals
+        _, factor, moved, scale = intermediates
         speed = moved @ qd.unsqueeze(-1)
         momentum = speed / scale.unsqueeze(-1)
         by_factor = -self._unit_solved(factor.mT, momentum, upper=True) @ speed.mT
         by_entry = by_factor.flatten(-2).index_select(-1, self.below)
         by_scale = 0.5 * momentum.squeeze(-1) ** 2 * torch.expm1(-scale)
         cotangent = torch.cat([by_entry, by_scale], dim=-1)
-        return self.network.vjp(residuals.network, cotangent)
+        return self.network.vjp(intermediates.network, cotangent)
 
-    def jvp(self, rate: Tensor, residuals: DenseResiduals) -> Tensor:
+    def jvp(self, rate: Tensor, intermediates: DenseIntermediates) -> Tensor:
         """dM/dt, (..., n, n), where the encoding changes at this rate."""
-        _, factor, moved, scale = residuals
-        pushed = self.network.jvp(residuals.network, rate)
+        _, factor, moved, scale = intermediates
+        pushed = self.network.jvp(intermediates.network, rate)
         entries, raw_rate = pushed.tensor_split((len(self.below),), dim=-1)
         turned = self._unit_solved(factor, self._lower(entries) @ moved)
         by_factor = moved.mT @ (turned / scale.unsqueeze(-1))

@@ -6,9 +6,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from spelgen.runtime.armature import Armature
 from spelgen.runtime.joints import Joints, Pairs, vector
-from spelgen.runtime.parts import Layers, Network, NetworkResiduals
+from spelgen.runtime.parts import Intermediates, Layers, Network
 from spelgen.runtime.regularisation import PositiveDefiniteBound
 from spelgen.runtime.symmetric import Entries
 
@@ -21,7 +20,10 @@ class DerivedMass(nn.Module):
     towards that mean (see PositiveDefiniteBound): M is positive definite for all q and weights.
     """
 
-    kinds = (("raw_constants", "mass_constants", "kg m^2, kg m, kg"),)
+    kinds = (
+        ("raw_constants", "mass_constants", "kg m^2, kg m, kg"),
+        ("raw_armature", "armature", "kg m^2, kg"),
+    )
 
     def __init__(
         self,
@@ -33,12 +35,18 @@ class DerivedMass(nn.Module):
         margin: float,
     ) -> None:
         super().__init__()
-        self.entries, self.network, self.rotors = entries, network, Armature(joints)
+        self.entries, self.network = entries, network
         self.constant_scale = nn.Buffer(vector(unit for _, unit in constants))
         self.function_mean = nn.Buffer(vector(mean for mean, _ in functions))
         self.function_scale = nn.Buffer(vector(scale for _, scale in functions))
         self.raw_constants = nn.Parameter(vector(start / unit for start, unit in constants))
+        self.nominal_armature = nn.Buffer(vector(joints.armature))
+        self.raw_armature = nn.Parameter(torch.zeros(joints.n, dtype=torch.float64))  # its logarithm
         self.bound = PositiveDefiniteBound(self._by_outputs()[-1].detach(), margin)
+
+    def armature(self) -> Tensor:
+        """Return the drives' part of M's diagonal, (n,) [kg m^2, kg]."""
+        return self.nominal_armature * self.raw_armature.exp()
 
     def constants(self) -> Tensor:
         """Return the constants of M, (constants,), in their units."""
@@ -53,32 +61,30 @@ class DerivedMass(nn.Module):
     def prepare(self, definite: bool = True) -> tuple[Layers, bool]:
         """Return the network's layers, which give M's entries; ``definite``: keep M positive definite."""
         rows = self._by_outputs()
-        offset = rows[-1] + torch.diag(self.rotors.forward())
+        offset = rows[-1] + torch.diag(self.armature())
         return self.network.prepare(rows[:-1].flatten(1).mT, offset.flatten()), definite
-
-    def _square(self, rows: Tensor) -> Tensor:
-        """(..., n n) as (..., n, n)."""
-        return rows.reshape(*rows.shape[:-1], *self.bound.center.shape)
 
     def forward(
         self, encoded: Tensor, prepared: tuple[Layers, bool]
-    ) -> tuple[Tensor, tuple[NetworkResiduals, Tensor]]:
+    ) -> tuple[Tensor, tuple[Intermediates, Tensor]]:
         """Return M(q), what the network's derivatives need, and how much of its changes M takes."""
         layers, definite = prepared
-        rows, residuals = self.network.forward(encoded, layers)
-        mass = self._square(rows)
-        mass, fraction = self.bound.forward(mass) if definite else (mass, torch.ones_like(mass[..., 0, 0]))
-        return mass, (residuals, fraction)
+        rows, intermediates = self.network.forward(encoded, layers)
+        mass = rows.reshape(*rows.shape[:-1], *self.bound.center.shape)
+        if definite:
+            mass, fraction = self.bound.forward(mass)
+        else:
+            fraction = torch.ones_like(mass[..., 0, 0])
+        return mass, (intermediates, fraction)
 
-    def kinetic_vjp(self, encoded: Tensor, qd: Tensor, residuals: tuple[NetworkResiduals, Tensor]) -> Tensor:
+    def kinetic_vjp(self, qd: Tensor, intermediates: tuple[Intermediates, Tensor]) -> Tensor:
         """Return the derivative of 1/2 qd^T M(q) qd by the encoding."""
-        network, fraction = residuals
+        network, fraction = intermediates
         half = 0.5 * fraction.unsqueeze(-1) * qd
-        by_encoded: Tensor = self.network.vjp(network, (half.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2))
-        return by_encoded
+        return self.network.vjp(network, (half.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2))
 
-    def jvp(self, rate: Tensor, residuals: tuple[NetworkResiduals, Tensor]) -> Tensor:
+    def jvp(self, rate: Tensor, intermediates: tuple[Intermediates, Tensor]) -> Tensor:
         """Return dM/dt, (..., n, n), where the encoding changes at this rate."""
-        network, fraction = residuals
-        moved: Tensor = fraction[..., None, None] * self._square(self.network.jvp(network, rate))
-        return moved
+        network, fraction = intermediates
+        rows = fraction.unsqueeze(-1) * self.network.jvp(network, rate)
+        return rows.reshape(*rows.shape[:-1], *self.bound.center.shape)

@@ -10,16 +10,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from spelgen.runtime.encoding import NetworkInput, joint_mask
+from spelgen.runtime.parts import Layers
 
 GRID = 4  # bumps on an edge
 SPACING = 2 / (GRID - 1)
-
-
-class KANLayers(NamedTuple):
-    """A network's weights made ready for many states; see ``MaskedKAN.prepare``."""
-
-    weights: tuple[Tensor, ...]
-    biases: tuple[Tensor, ...]
 
 
 class Bumps(NamedTuple):
@@ -29,7 +23,7 @@ class Bumps(NamedTuple):
     height: Tensor
 
 
-KANResiduals = tuple[tuple[Bumps, ...], tuple[Tensor, ...], KANLayers]
+KANIntermediates = tuple[tuple[Bumps, ...], tuple[Tensor, ...], Layers]
 
 
 class MaskedKAN(nn.Module):
@@ -71,20 +65,20 @@ class MaskedKAN(nn.Module):
             below = units
         nn.init.zeros_(self.weights[-1])  # so that nothing is learned yet
 
-    def prepare(self, output_map: Tensor, offset: Tensor) -> KANLayers:
+    def prepare(self, output_map: Tensor, offset: Tensor) -> Layers:
         """The weights for the encoding as it is, and for offset + output_map y in place of y."""
         weights = [(w * self.get_buffer(f"mask{i}")).flatten(1) for i, w in enumerate(self.weights)]
         biases = list(self.biases)
         biases[0] = biases[0] + weights[0] @ self.offset
         weights[0] = weights[0] @ self.matrix
         weights[-1], biases[-1] = output_map @ weights[-1], offset + output_map @ biases[-1]
-        return KANLayers(tuple(weights), tuple(biases))
+        return Layers(tuple(weights), tuple(biases))
 
     def _bumps(self, value: Tensor) -> Bumps:
         distance = (value / SPACING).unsqueeze(-1) - self.grid
         return Bumps(distance, torch.exp(-distance * distance))
 
-    def forward(self, encoded: Tensor, layers: KANLayers) -> tuple[Tensor, KANResiduals]:
+    def forward(self, encoded: Tensor, layers: Layers) -> tuple[Tensor, KANIntermediates]:
         """offset + output_map y, (..., rows); and what ``vjp`` and ``jvp`` need."""
         bumps, hidden = [self._bumps(encoded)], []
         for weight, bias in zip(layers.weights[:-1], layers.biases, strict=False):
@@ -93,9 +87,9 @@ class MaskedKAN(nn.Module):
         y = F.linear(bumps[-1].height.flatten(-2), layers.weights[-1], layers.biases[-1])
         return y, (tuple(bumps), tuple(hidden), layers)
 
-    def vjp(self, residuals: KANResiduals, cotangent: Tensor) -> Tensor:
+    def vjp(self, intermediates: KANIntermediates, cotangent: Tensor) -> Tensor:
         """The reverse sweep: cotangent, (..., rows), times d/d encoded; (..., encoded)."""
-        bumps, hidden, layers = residuals
+        bumps, hidden, layers = intermediates
         layer = self._bumps_vjp(bumps[-1], cotangent @ layers.weights[-1])
         for index in reversed(range(len(hidden))):
             layer = layer * (1 - hidden[index] * hidden[index])
@@ -106,9 +100,9 @@ class MaskedKAN(nn.Module):
         cotangent = cotangent.reshape(*cotangent.shape[:-1], *bumps.distance.shape[-2:])
         return (-2 / SPACING) * (bumps.distance * bumps.height * cotangent).sum(dim=-1)
 
-    def jvp(self, residuals: KANResiduals, tangent: Tensor) -> Tensor:
+    def jvp(self, intermediates: KANIntermediates, tangent: Tensor) -> Tensor:
         """The forward sweep: d/d encoded times the encoding's tangent; (..., rows)."""
-        bumps, hidden, layers = residuals
+        bumps, hidden, layers = intermediates
         for index, weight in enumerate(layers.weights):
             slopes = bumps[index].distance * bumps[index].height
             tangent = F.linear((-2 / SPACING) * (slopes * tangent.unsqueeze(-1)).flatten(-2), weight)

@@ -3,23 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from spelgen.runtime.encoding import NetworkInput, joint_mask
+from spelgen.runtime.parts import Layers
 
-
-class MLPLayers(NamedTuple):
-    """A network's weights made ready for many states; see ``MaskedMLP.prepare``."""
-
-    weights: tuple[Tensor, ...]
-    biases: tuple[Tensor, ...]
-
-
-MLPResiduals = tuple[tuple[Tensor, ...], MLPLayers]
+MLPIntermediates = tuple[tuple[Tensor, ...], Layers]  # the hidden layers, and the weights
 
 
 def sigmoid_vjp(cotangent: Tensor, value: Tensor) -> Tensor:
@@ -57,7 +49,7 @@ class MaskedMLP(nn.Module):
             below = units
         nn.init.zeros_(self.weights[-1])  # so that nothing is learned yet
 
-    def prepare(self, output_map: Tensor, offset: Tensor) -> MLPLayers:
+    def prepare(self, output_map: Tensor, offset: Tensor) -> Layers:
         """The weights for the encoding as it is, and for offset + output_map y in place of y.
 
         tanh x is computed as 2 sigmoid(2 x) - 1, which takes a fraction of the time.
@@ -73,9 +65,9 @@ class MaskedMLP(nn.Module):
             biases.append(2 * bias)
         weights[-1] = 0.5 * output_map @ weights[-1]
         biases[-1] = offset + 0.5 * output_map @ biases[-1]
-        return MLPLayers(tuple(weights), tuple(biases))
+        return Layers(tuple(weights), tuple(biases))
 
-    def forward(self, encoded: Tensor, layers: MLPLayers) -> tuple[Tensor, MLPResiduals]:
+    def forward(self, encoded: Tensor, layers: Layers) -> tuple[Tensor, MLPIntermediates]:
         """offset + output_map y, (..., rows); and what ``vjp`` and ``jvp`` need."""
         layer, hidden = encoded, []
         for weight, bias in zip(layers.weights[:-1], layers.biases, strict=False):
@@ -83,17 +75,17 @@ class MaskedMLP(nn.Module):
             hidden.append(layer)
         return F.linear(layer, layers.weights[-1], layers.biases[-1]), (tuple(hidden), layers)
 
-    def vjp(self, residuals: MLPResiduals, cotangent: Tensor) -> Tensor:
+    def vjp(self, intermediates: MLPIntermediates, cotangent: Tensor) -> Tensor:
         """The reverse sweep: cotangent, (..., rows), times d/d encoded; (..., encoded)."""
-        hidden, layers = residuals
+        hidden, layers = intermediates
         layer = cotangent @ layers.weights[-1]
         for weight, value in zip(reversed(layers.weights[:-1]), reversed(hidden), strict=True):
             layer = sigmoid_vjp(layer, value) @ weight
         return layer
 
-    def jvp(self, residuals: MLPResiduals, tangent: Tensor) -> Tensor:
+    def jvp(self, intermediates: MLPIntermediates, tangent: Tensor) -> Tensor:
         """The forward sweep: d/d encoded times the encoding's tangent; (..., rows)."""
-        hidden, layers = residuals
+        hidden, layers = intermediates
         for weight, value in zip(layers.weights[:-1], hidden, strict=True):
             tangent = sigmoid_vjp(F.linear(tangent, weight), value)
         return F.linear(tangent, layers.weights[-1])

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from spelgen.runtime.joints import Joints, vector
-from spelgen.runtime.parts import MassResiduals, Pose, Prepared
+from spelgen.runtime.parts import Pose, Prepared
 
 
 def solved(matrix: Tensor, right: Tensor) -> Tensor:
@@ -27,8 +27,6 @@ def applied(matrix: Tensor, vector: Tensor) -> Tensor:
 
 def combined(weights: Tensor, rows: Tensor) -> Tensor:
     """Return the sum of weighted rows, weights^T rows, (..., m)."""
-    if weights.dim() == 1:
-        return weights @ rows
     return (weights.unsqueeze(-2) @ rows).squeeze(-2)
 
 
@@ -37,7 +35,7 @@ class PortHamiltonian(nn.Module):
 
     The port-Hamiltonian form (van der Schaft and Jeltsema, Port-Hamiltonian Systems Theory, 2014).
     Shapes: q, qd, qdd, tau and p are (..., n). ``prepared`` is what ``prepare`` gave: all that
-    depends on the weights alone. ``pose`` is what ``configuration`` gave: all that depends on q alone.
+    depends on the weights alone. ``pose`` is what ``at`` gave: all that depends on q, M as ``mass``.
     """
 
     n: int
@@ -46,123 +44,102 @@ class PortHamiltonian(nn.Module):
     elements = 0  # K, the numbers of friction's state at a joint
     # networks and rigid bodies have these each of their own
     prepare: Callable[..., Prepared]
-    configuration: Callable[[Tensor, Prepared], Pose]  # of q
-    mass_at: Callable[[Pose, Prepared], tuple[Tensor, MassResiduals]]  # M, and what its derivatives need
-    energy_at: Callable[[Pose, Prepared], Tensor]  # V, (...) [J]
-    gravity_at: Callable[[Pose, Prepared], Tensor]  # dV/dq
-    # d/dq of 1/2 qd^T M qd - V; then the Coriolis, centrifugal and gravity torque
-    lagrangian_gradient: Callable[[Pose, Tensor, MassResiduals, Prepared], Tensor]
-    nonlinear_at: Callable[[Pose, Tensor, MassResiduals, Prepared], Tensor]
+    configuration: Callable[[Tensor, Prepared], Pose]
+    potential_energy: Callable[[Tensor], Tensor]  # V, (...) [J]
+    gravity_at: Callable[[Pose], Tensor]  # dV/dq
+    lagrangian_gradient: Callable[[Pose, Tensor], Tensor]  # d/dq of 1/2 qd^T M qd - V
+    nonlinear_at: Callable[[Pose, Tensor], Tensor]  # Coriolis, centrifugal and gravity torque
     friction_at: Callable[..., Tensor]  # D(q, qd) qd
-    dissipation_at: Callable[[Pose, Tensor, Prepared], Tensor]  # D, (..., n, n)
 
     def __init__(self, joints: Joints) -> None:
         super().__init__()
         # 1 where a joint is driven, 0 where it is passive
         self.actuated = nn.Buffer(vector(float(x) for x in joints.actuated))
 
-    def at(self, q: Tensor, prepared: Prepared | None = None) -> tuple[Pose, Prepared]:
-        """Return the pose at q, and what depends on the weights alone."""
-        prepared = self.prepare() if prepared is None else prepared
-        return self.configuration(q, prepared), prepared
+    def at(self, q: Tensor, *others: Tensor, prepared: Prepared | None = None) -> Pose:
+        """Return the pose at q. Raises TypeError and ValueError where a vector is not as q and the weights."""
+        expected = self.actuated.dtype
+        for x in (q, *others):
+            if not isinstance(x, Tensor) or x.dtype != expected:
+                kind = x.dtype if isinstance(x, Tensor) else type(x).__name__
+                advice = f"pass torch.as_tensor(x, dtype={expected})"
+                raise TypeError(f"got {kind}, expected a tensor of {expected} like the weights; {advice}")
+            if x.shape != (*q.shape[:-1], self.n):
+                shapes = " and ".join(str(tuple(each.shape)) for each in (q, *others))
+                advice = "pass states side by side, the joints last"
+                raise ValueError(f"got shapes {shapes}, expected (..., {self.n}) of all alike; {advice}")
+        return self.configuration(q, self.prepare() if prepared is None else prepared)
 
     def mass_matrix(self, q: Tensor, prepared: Prepared | None = None) -> Tensor:
         """Return M(q), (..., n, n) [kg m^2, kg m, kg]."""
-        return self.mass_at(*self.at(q, prepared))[0]
+        mass: Tensor = self.at(q, prepared=prepared).mass
+        return mass
 
-    def potential_energy(self, q: Tensor) -> Tensor:
-        """Return V(q), (...) [J]."""
-        return self.energy_at(*self.at(q))
-
-    def gravity(self, q: Tensor) -> Tensor:
+    def gravity(self, q: Tensor, prepared: Prepared | None = None) -> Tensor:
         """Return dV/dq, (..., n) [Nm, N]."""
-        return self.gravity_at(*self.at(q))
+        return self.gravity_at(self.at(q, prepared=prepared))
 
-    def nonlinear_effects(self, q: Tensor, qd: Tensor) -> Tensor:
+    def nonlinear_effects(self, q: Tensor, qd: Tensor, prepared: Prepared | None = None) -> Tensor:
         """Return the Coriolis, centrifugal and gravity torque, (..., n) [Nm, N]."""
-        pose, prepared = self.at(q)
-        return self.nonlinear_at(pose, qd, self.mass_at(pose, prepared)[1], prepared)
+        return self.nonlinear_at(self.at(q, qd, prepared=prepared), qd)
 
-    def friction_torque(self, q: Tensor, qd: Tensor, *state: Tensor | None) -> Tensor:
+    def friction_torque(
+        self, q: Tensor, qd: Tensor, *state: Tensor | None, prepared: Prepared | None = None
+    ) -> Tensor:
         """Return D(q, qd) qd, (..., n) [Nm, N]."""
-        pose, prepared = self.at(q)
-        return self.friction_at(pose, qd, prepared, *state)
-
-    def dissipation(self, q: Tensor, qd: Tensor) -> Tensor:
-        """Return D(q, qd), (..., n, n) [Nm s/rad, N s/m]."""
-        pose, prepared = self.at(q)
-        return self.dissipation_at(pose, qd, prepared)
+        return self.friction_at(self.at(q, qd, prepared=prepared), qd, *state)
 
     def input_matrix(self, q: Tensor) -> Tensor:
         """Return G(q), (..., n, n): an input is the torque of its own joint, none of a passive one."""
         return torch.diag(self.actuated).expand(*q.shape, -1)
 
-    def input_force(self, pose: Pose, qd: Tensor, tau: Tensor, prepared: Prepared) -> Tensor:
+    def input_force(self, pose: Pose, qd: Tensor, tau: Tensor) -> Tensor:
         """Return G tau, (..., n) [Nm, N]."""
         return self.actuated * tau
 
-    def input_torque(self, pose: Pose, qd: Tensor, force: Tensor, prepared: Prepared) -> Tensor:
+    def input_torque(self, pose: Pose, qd: Tensor, force: Tensor) -> Tensor:
         """Return the tau, (..., n), that makes this force; a passive joint shows the torque it lacks."""
         return force
 
     def momentum(self, q: Tensor, qd: Tensor, prepared: Prepared | None = None) -> Tensor:
         """Return p = M(q) qd, (..., n)."""
-        return applied(self.mass_matrix(q, prepared), qd)
+        return applied(self.at(q, qd, prepared=prepared).mass, qd)
 
     def velocity(self, q: Tensor, p: Tensor, prepared: Prepared | None = None) -> Tensor:
         """Return qd = M(q)^-1 p, (..., n)."""
-        return solved(self.mass_matrix(q, prepared), p)
+        return solved(self.at(q, p, prepared=prepared).mass, p)
 
     def hamiltonian(self, q: Tensor, p: Tensor) -> Tensor:
         """Return H, (...) [J]."""
         return 0.5 * (p * self.velocity(q, p)).sum(dim=-1) + self.potential_energy(q)
 
-    def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, *state: Tensor | None) -> Tensor:
+    def forward_dynamics(
+        self, q: Tensor, qd: Tensor, tau: Tensor, *state: Tensor | None, prepared: Prepared | None = None
+    ) -> Tensor:
         """Return qdd, (..., n), under the input tau."""
-        pose, prepared = self.at(q)
-        mass, residuals = self.mass_at(pose, prepared)
-        force = self.input_force(pose, qd, tau, prepared) - self.nonlinear_at(pose, qd, residuals, prepared)
-        return solved(mass, force - self.friction_at(pose, qd, prepared, *state))
+        pose = self.at(q, qd, tau, prepared=prepared)
+        force = self.input_force(pose, qd, tau) - self.nonlinear_at(pose, qd)
+        return solved(pose.mass, force - self.friction_at(pose, qd, *state))
 
-    def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor, *state: Tensor | None) -> Tensor:
+    def inverse_dynamics(
+        self, q: Tensor, qd: Tensor, qdd: Tensor, *state: Tensor | None, prepared: Prepared | None = None
+    ) -> Tensor:
         """Return the input tau, (..., n), that gives qdd."""
-        pose, prepared = self.at(q)
-        mass, residuals = self.mass_at(pose, prepared)
-        force = applied(mass, qdd) + self.nonlinear_at(pose, qd, residuals, prepared)
-        return self.input_torque(pose, qd, force + self.friction_at(pose, qd, prepared, *state), prepared)
+        pose = self.at(q, qd, qdd, prepared=prepared)
+        force = applied(pose.mass, qdd) + self.nonlinear_at(pose, qd)
+        return self.input_torque(pose, qd, force + self.friction_at(pose, qd, *state))
 
     def port_hamiltonian_rhs(
         self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Prepared, *state: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         """Return q' and p', (..., n), under the input tau; without one, of the arm left to itself."""
-        pose = self.configuration(q, prepared)
-        mass, residuals = self.mass_at(pose, prepared)
-        qd = solved(mass, p)
-        force = self.lagrangian_gradient(pose, qd, residuals, prepared)
-        force = force - self.friction_at(pose, qd, prepared, *state)
-        return qd, force if tau is None else force + self.input_force(pose, qd, tau, prepared)
+        pose = self.at(q, p, p if tau is None else tau, prepared=prepared)
+        qd = solved(pose.mass, p)
+        force = self.lagrangian_gradient(pose, qd) - self.friction_at(pose, qd, *state)
+        return qd, force if tau is None else force + self.input_force(pose, qd, tau)
 
     def forward(self, t: Tensor, state: Tensor) -> Tensor:
         """Return the rate of (q, p), (..., 2 n), or of (q, p, tau), where tau is held."""
         q, p, tau = state.tensor_split((self.n, 2 * self.n), dim=-1)
         qd, force = self.port_hamiltonian_rhs(q, p, tau if tau.shape[-1] else None, self.prepare())
         return torch.cat([qd, force, torch.zeros_like(tau)], dim=-1)
-
-    def to_group(self, q: Tensor) -> list[Tensor]:
-        """Return, by joint, R in SO(3), (..., 3, 3), or r in R^3, (..., 3), if prismatic; z is its axis."""
-        zero, one = torch.zeros_like(q), torch.ones_like(q)
-        rows = [q.cos(), -q.sin(), zero, q.sin(), q.cos(), zero, zero, zero, one]
-        rotations = torch.stack(rows, dim=-1).reshape(*q.shape, 3, 3).unbind(dim=-3)
-        positions = torch.stack([zero, zero, q], dim=-1).unbind(dim=-2)
-        pairs = zip(self.joint_types, rotations, positions, strict=True)
-        return [rotation if kind == "revolute" else position for kind, rotation, position in pairs]
-
-    def from_group(self, elements: list[Tensor]) -> Tensor:
-        """Return q, (..., n), with angles in [-pi, pi]; the inverse of ``to_group``."""
-        values = []
-        for kind, element in zip(self.joint_types, elements, strict=True):
-            if kind == "revolute":
-                values.append(torch.atan2(element[..., 1, 0], element[..., 0, 0]))
-            else:
-                values.append(element[..., 2])
-        return torch.stack(values, dim=-1)

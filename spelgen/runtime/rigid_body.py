@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import torch
@@ -37,14 +36,14 @@ def skew(a: Tensor) -> Tensor:
 
 
 def motion_table(bodies: Bodies) -> tuple[Tensor, Tensor]:
-    """Return what takes cos, sin and value of all q to what takes rows of twists from parents' frames.
+    """Return what takes cos, sin and value of displacements to what takes rows of twists from parents' frames.
 
-    (36 bodies, 3 bodies), and what is added, (36 bodies,). The displacements' offsets are in both.
+    (36 bodies, 3 bodies), and what is added, (36 bodies,).
     """
     count, turn = len(bodies.parent), skew(vector((0, 0, 1)))
     by_term = torch.zeros(count, 6, 6, 3, count, dtype=torch.float64)
     fixed = torch.zeros(count, 6, 6, dtype=torch.float64)
-    for index, (revolute, offset) in enumerate(zip(bodies.revolute, bodies.offset, strict=True)):
+    for index, revolute in enumerate(bodies.revolute):
         # (w, v) at the frame of a body that has not moved
         rotation = torch.stack([vector(row) for row in bodies.rotation[index]]).mT
         start = block_diagonal(rotation.expand(2, 3, 3)).clone()
@@ -57,9 +56,6 @@ def motion_table(bodies: Bodies) -> tuple[Tensor, Tensor]:
             constant = constant - terms[0]
         else:
             terms[2, 3:, :3] = -turn
-        start = (
-            constant + math.cos(offset) * terms[0] + math.sin(offset) * terms[1] + offset * terms[2]
-        ) @ start
         by_term[index, :, :, :, index] = (terms @ start).permute(2, 1, 0)
         fixed[index] = (constant @ start).mT
     return by_term.reshape(36 * count, 3 * count), fixed.flatten()

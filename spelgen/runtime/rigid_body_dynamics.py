@@ -7,11 +7,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from spelgen.runtime.armature import Armature
 from spelgen.runtime.body_chain import BodyChain, Chain
 from spelgen.runtime.friction_laws import FrictionConstants, FrictionLaws
-from spelgen.runtime.joints import Joints, Rows
-from spelgen.runtime.parts import MassResiduals
+from spelgen.runtime.joints import Joints, Rows, vector
 from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied, combined
 from spelgen.runtime.rigid_body import Bodies, InertialParameters, Row, block_diagonal, inertia_basis
 
@@ -22,17 +20,18 @@ class RigidPrepared(NamedTuple):
     inertia: Tensor  # spatial inertias on the diagonal, (6 bodies, 6 bodies)
     armature: Tensor  # what the rotors add to M, (n, n)
     friction: FrictionConstants
-    offset: Tensor  # what the measured torque shows without any, (n,)
-    compensation: Tensor  # what the drives add by velocity, unseen, (n,)
     residual: Any = None  # of what a model has beside rigid bodies
 
 
 class Motion(NamedTuple):
-    """What is computed of a position alone."""
+    """What depends on q alone."""
 
     chain: Chain
     momenta: Tensor  # of the chain's twists, by joint velocity, (..., n, 6 bodies)
+    mass: Tensor  # M(q), (..., n, n)
     gravity: Tensor  # dV/dq of the bodies, (..., n)
+    prepared: RigidPrepared
+    varied: Tensor | float = 1.0  # how much more friction there is than the laws', (..., n)
     residual: Any = None  # of what a model has beside rigid bodies
 
 
@@ -44,6 +43,7 @@ class RigidBodyDynamics(PortHamiltonian):
     """
 
     kinds = (
+        ("raw_armature", "armature", "kg m^2, kg"),
         ("raw_offset", "offset", "Nm, N"),
         ("raw_friction_compensation", "friction_compensation", "Nm s/rad, N s/m"),
     )
@@ -52,20 +52,21 @@ class RigidBodyDynamics(PortHamiltonian):
         self, joints: Joints, bodies: Bodies, gravity: Row, reach: Rows = (), motors: Rows = ()
     ) -> None:
         super().__init__(joints)
+        zeros = torch.zeros(joints.n, dtype=torch.float64)
         self.elements = len(reach[0]) if reach else 0
         self.chain = BodyChain(joints.n, bodies, gravity)
         self.basis = nn.Buffer(inertia_basis())
-        self.bodies, self.rotors = InertialParameters(bodies), Armature(joints)
-        self.friction = FrictionLaws(joints, reach)
-        self.coupled = len(motors) > 0  # each drive moves its own joint alone where they are not given
-        identity = torch.eye(joints.n, dtype=torch.float64)
-        # C: the drives' speeds are C qd, (n, n)
-        self.motors = nn.Buffer(torch.tensor(motors).to(identity) if motors else identity)
-        self.loads = nn.Buffer(torch.linalg.inv(self.motors))  # its inverse
+        self.bodies, self.friction = InertialParameters(bodies), FrictionLaws(joints, reach)
+        self.nominal_armature = nn.Buffer(vector(joints.armature))
+        self.raw_armature = nn.Parameter(zeros.clone())  # its logarithm
+        # C, (n, n), and its inverse; each drive moves its own joint alone where it is not given
+        rows = [vector(row) for row in motors]
+        self.motors = nn.Buffer(torch.stack(rows) if rows else torch.eye(joints.n).double())
+        self.loads = nn.Buffer(torch.linalg.inv(self.motors))
         # of the measured torque, in units of the joints' usual friction
-        self.raw_offset = nn.Parameter(torch.zeros(joints.n, dtype=torch.float64))
+        self.raw_offset = nn.Parameter(zeros.clone())
         # in units of usual friction at usual speed; no parameter: only a fit to torques may find one
-        self.raw_friction_compensation = nn.Buffer(torch.zeros(joints.n, dtype=torch.float64))
+        self.raw_friction_compensation = nn.Buffer(zeros)
 
     @property
     def inertial_parameters(self) -> Tensor:
@@ -75,7 +76,7 @@ class RigidBodyDynamics(PortHamiltonian):
     @property
     def armature(self) -> Tensor:
         """Armature, the drives' part of M's diagonal, (n,) [kg m^2, kg]."""
-        return self.rotors.forward()
+        return self.nominal_armature * self.raw_armature.exp()
 
     @property
     def viscous(self) -> Tensor:
@@ -101,30 +102,25 @@ class RigidBodyDynamics(PortHamiltonian):
         """Return all that depends on the weights alone; holds until they change."""
         inertia = block_diagonal(torch.tensordot(self.inertial_parameters, self.basis, dims=1))
         armature = self.motors.mT @ (self.armature.unsqueeze(-1) * self.motors)
-        drives = self.friction.prepare(), self.torque_offset, self.friction_compensation
-        return RigidPrepared(inertia, armature, *drives)
+        return RigidPrepared(inertia, armature, self.friction.prepare())
 
     def configuration(self, q: Tensor, prepared: RigidPrepared) -> Motion:
-        """Return how the bodies may move at q, and what they weigh there."""
+        """Return what depends on q alone."""
         chain = self.chain.forward(q)
         momenta = chain.twists @ prepared.inertia
-        return Motion(chain, momenta, applied(momenta, chain.weight))
+        mass = momenta @ chain.twists.mT + prepared.armature
+        return Motion(chain, momenta, mass, applied(momenta, chain.weight), prepared)
 
-    def mass_at(self, pose: Motion, prepared: RigidPrepared) -> tuple[Tensor, MassResiduals]:
-        """Return M(q), (..., n, n)."""
-        return pose.momenta @ pose.chain.twists.mT + prepared.armature, None
-
-    def energy_at(self, pose: Motion, prepared: RigidPrepared) -> Tensor:
+    def potential_energy(self, q: Tensor) -> Tensor:
         """Return V(q), (...) [J]; zero for a mass at the base's origin."""
-        return self.chain.energy(pose.chain, prepared.inertia)
+        pose: Motion = self.at(q)
+        return self.chain.energy(pose.chain, pose.prepared.inertia)
 
-    def gravity_at(self, pose: Motion, prepared: RigidPrepared) -> Tensor:
+    def gravity_at(self, pose: Motion) -> Tensor:
         """Return dV/dq, (..., n) [Nm, N]."""
         return pose.gravity
 
-    def lagrangian_gradient(
-        self, pose: Motion, qd: Tensor, residuals: MassResiduals, prepared: RigidPrepared
-    ) -> Tensor:
+    def lagrangian_gradient(self, pose: Motion, qd: Tensor) -> Tensor:
         """Return d/dq of 1/2 qd^T M(q) qd - V(q), (..., n).
 
         The kinetic part: the momentum of all that a joint carries, by what its displacement adds to
@@ -133,27 +129,22 @@ class RigidBodyDynamics(PortHamiltonian):
         momenta = self.chain.at_base(pose.chain, combined(qd, pose.momenta))
         return self.chain.by_joints(self.chain.turning(pose.chain, qd)[1], momenta) - pose.gravity
 
-    def nonlinear_at(
-        self, pose: Motion, qd: Tensor, residuals: MassResiduals, prepared: RigidPrepared
-    ) -> Tensor:
+    def nonlinear_at(self, pose: Motion, qd: Tensor) -> Tensor:
         """Return the torque that holds qd steady without friction, (..., n), by Newton and Euler."""
         return self.chain.steady_torque(pose.chain, qd, pose.momenta)
 
-    def _varied(self, friction: Tensor, pose: Motion) -> Tensor:
-        """The laws' friction of the drives as it is at this position, (..., n)."""
-        return friction
-
-    def _by_motors(self, joints: Tensor, matrix: Tensor) -> Tensor:
-        """Rows times a matrix that is the identity where each motor moves its own joint alone."""
-        return joints @ matrix if self.coupled else joints
-
-    def friction_at(
-        self, pose: Motion, qd: Tensor, prepared: RigidPrepared, z: Tensor | None = None
-    ) -> Tensor:
+    def friction_at(self, pose: Motion, qd: Tensor, z: Tensor | None = None) -> Tensor:
         """Return the friction torque C^T f(C qd), (..., n) [Nm, N]."""
-        speeds, loads = self._by_motors(qd, self.motors.mT), self._by_motors(pose.gravity, self.loads)
-        torque = self.friction.forward(speeds, loads, prepared.friction, z)
-        return self._by_motors(self._varied(torque, pose), self.motors)
+        loads = pose.gravity @ self.loads
+        torque = self.friction.forward(qd @ self.motors.mT, loads, pose.prepared.friction, z)
+        return (pose.varied * torque) @ self.motors
+
+    def dissipation(self, q: Tensor, qd: Tensor) -> Tensor:
+        """Return D(q, qd), (..., n, n) [Nm s/rad, N s/m], diagonal where each drive moves its own joint."""
+        pose: Motion = self.at(q, qd)
+        loads = pose.gravity @ self.loads
+        resistance = self.friction.resistance(qd @ self.motors.mT, loads, pose.prepared.friction)
+        return self.motors.mT @ ((pose.varied * resistance).unsqueeze(-1) * self.motors)
 
     def hamiltonian(self, q: Tensor, p: Tensor, z: Tensor | None = None) -> Tensor:
         """Return H, (...) [J]."""
@@ -182,19 +173,11 @@ class RigidBodyDynamics(PortHamiltonian):
         rate = self.friction.bristles.rate(qd @ self.motors.mT, z).flatten(-2)
         return torch.cat([qd, force, rate, torch.zeros_like(tau)], dim=-1)
 
-    def dissipation_at(self, pose: Motion, qd: Tensor, prepared: RigidPrepared) -> Tensor:
-        """Return D(q, qd), (..., n, n), diagonal where each drive moves its own joint alone."""
-        resistance = self.friction.resistance(
-            qd @ self.motors.mT, pose.gravity @ self.loads, prepared.friction
-        )
-        return self.motors.mT @ (self._varied(resistance, pose).unsqueeze(-1) * self.motors)
-
-    def input_force(self, pose: Motion, qd: Tensor, tau: Tensor, prepared: RigidPrepared) -> Tensor:
+    def input_force(self, pose: Motion | None, qd: Tensor, tau: Tensor) -> Tensor:
         """Return G (tau - torque offset) + friction compensation qd, (..., n) [Nm, N]."""
-        force = super().input_force(pose, qd, tau - prepared.offset, prepared)
-        return force + prepared.compensation * qd
+        return super().input_force(pose, qd, tau - self.torque_offset) + self.friction_compensation * qd
 
-    def input_torque(self, pose: Motion, qd: Tensor, force: Tensor, prepared: RigidPrepared) -> Tensor:
+    def input_torque(self, pose: Motion, qd: Tensor, force: Tensor) -> Tensor:
         """Return the tau, (..., n), that is measured while the drives make this force."""
-        measured = force - prepared.compensation * qd
-        return super().input_torque(pose, qd, measured, prepared) + prepared.offset
+        measured = force - self.friction_compensation * qd
+        return super().input_torque(pose, qd, measured) + self.torque_offset

@@ -28,7 +28,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-FACTS = r"""{"format": 3, "robot": "rpr", "urdf": "rpr.urdf",
+FACTS = r"""{"format": 4, "robot": "rpr", "urdf": "rpr.urdf",
  "urdf_sha256": "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d",
  "spec_sha256": "765da56814f8b95376bd87633bc5dfaec8f5161fa9db5448b6d7d871c48b3080",
  "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,
@@ -47,7 +47,7 @@ def mass_entries(f: Sequence[Tensor], c: Sequence[Tensor]) -> Tensor:
     return symmetric([f3], [f1, c2], [f2, 0, c1])
 
 
-def make_parts(seed: int) -> tuple[Joints, Bodies, Row, Rows, Rows, ResidualMass, Network, float]:
+def make_parts(seed: int) -> tuple[Joints, Bodies, Row, Rows, Rows, ResidualTerms]:
     """Return what this arm's `Model` is made of, with random weights of this seed."""
     joints = Joints(
         revolute=(True, False, True), center=(0.0, 0.7875, 0.0), reach=(2.96706, 0.4825, 2.96706),
@@ -75,17 +75,18 @@ def make_parts(seed: int) -> tuple[Joints, Bodies, Row, Rows, Rows, ResidualMass
     network = Network(
         joint_input(joints, (1, 2), (0.02, 1.0, 0.518)), (mass_hidden, mass_hidden, mass_outputs), generator
     )
-    mass = ResidualMass(joints, mass_entries, 3, 2, network)
     potential_outputs = ((2,),)
     potential_hidden = ((2,),) * 32
     potential = Network(
         joint_input(joints, (2,), (0.02, 0.02, 1.0)), (potential_hidden, potential_hidden, potential_outputs),
         generator,
     )  # fmt: skip
+    residuals = ResidualTerms(
+        joints, mass_entries, functions=3, constants=2, network=network, potential=potential, scale=0.703291
+    )
     return (
         joints, bodies, (0.0, 0.0, -9.81),
-        ((0.0001, 0.001, 0.01, 0.1), (1e-05, 0.0001, 0.001, 0.01), (0.0001, 0.001, 0.01, 0.1)), (), mass,
-        potential, 0.703291,
+        ((0.0001, 0.001, 0.01, 0.1), (1e-05, 0.0001, 0.001, 0.01), (0.0001, 0.001, 0.01, 0.1)), (), residuals,
     )  # fmt: skip
 
 
@@ -94,11 +95,8 @@ def make_parts(seed: int) -> tuple[Joints, Bodies, Row, Rows, Rows, ResidualMass
 
 # what the parts of this arm's model are
 Network = MaskedMLP
-Layers = MLPLayers
-NetworkResiduals = MLPResiduals
 Pose = Motion
 Prepared = RigidPrepared
-MassResiduals = FunctionResiduals | None
 
 
 class Model(ResidualDynamics):

@@ -26,7 +26,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-FACTS = r"""{"format": 3, "robot": "rpr", "urdf": "rpr.urdf",
+FACTS = r"""{"format": 4, "robot": "rpr", "urdf": "rpr.urdf",
  "urdf_sha256": "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d",
  "spec_sha256": "78e16dc7ad67f88500d19ab13a555f327d630ef495be053e71cb4ca2d0ce6f84",
  "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,
@@ -78,15 +78,10 @@ def make_parts(seed: int) -> tuple[Joints, Mass, Network, float, Friction]:
 
 # what the parts of this arm's model are
 Network = MaskedMLP
-Layers = MLPLayers
-NetworkResiduals = MLPResiduals
-Pose = Tensor
+Pose = NetworkPose
 Prepared = NetworkPrepared
 Mass = DerivedMass
-MassPrepared = tuple[MLPLayers, bool]
-MassResiduals = tuple[MLPResiduals, Tensor]
 Friction = JointFriction
-FrictionPrepared = FrictionLayers
 
 
 class Model(NetworkDynamics):
@@ -107,7 +102,7 @@ class Model(NetworkDynamics):
     @property
     def armature(self) -> Tensor:
         """Armature, the drives' part of M's diagonal, (n,) [kg m^2, kg]."""
-        value: Tensor = self.mass.rotors.forward()
+        value: Tensor = self.mass.armature()
         return value
 
     @property

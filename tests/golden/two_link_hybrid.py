@@ -26,7 +26,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-FACTS = r"""{"format": 3, "robot": "two_link", "urdf": "two_link.urdf",
+FACTS = r"""{"format": 4, "robot": "two_link", "urdf": "two_link.urdf",
  "urdf_sha256": "d5393c842e189b72219c5ce02e115de571a94cd406b48898ea64b5431a395232",
  "spec_sha256": "cf4c44ab15d7ac790beed5add4bf06756e7ac55956487a16b62ea4abe6154142",
  "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,
@@ -46,7 +46,7 @@ def mass_entries(f: Sequence[Tensor], c: Sequence[Tensor]) -> Tensor:
     return symmetric([m11], [f1, c1])
 
 
-def make_parts(seed: int) -> tuple[Joints, Bodies, Row, Rows, Rows, ResidualMass, Network, float]:
+def make_parts(seed: int) -> tuple[Joints, Bodies, Row, Rows, Rows, ResidualTerms]:
     """Return what this arm's `Model` is made of, with random weights of this seed."""
     joints = Joints(
         revolute=(True, True), center=(0.0, 0.0), reach=(3.14159, 3.14159), speed=(10.0, 10.0),
@@ -70,16 +70,18 @@ def make_parts(seed: int) -> tuple[Joints, Bodies, Row, Rows, Rows, ResidualMass
     network = Network(
         joint_input(joints, (1,), (0.02, 1.0)), (mass_hidden, mass_hidden, mass_outputs), generator
     )
-    mass = ResidualMass(joints, mass_entries, 1, 2, network)
     potential_outputs = ((0, 1),)
     potential_hidden = ((0, 1),) * 32
     potential = Network(
         joint_input(joints, (0, 1), (1.0, 0.307)), (potential_hidden, potential_hidden, potential_outputs),
         generator,
     )  # fmt: skip
+    residuals = ResidualTerms(
+        joints, mass_entries, functions=1, constants=2, network=network, potential=potential, scale=10.8194
+    )
     return (
-        joints, bodies, (0.0, -9.81, 0.0), ((0.0001, 0.001, 0.01, 0.1), (0.0001, 0.001, 0.01, 0.1)), (), mass,
-        potential, 10.8194,
+        joints, bodies, (0.0, -9.81, 0.0), ((0.0001, 0.001, 0.01, 0.1), (0.0001, 0.001, 0.01, 0.1)), (),
+        residuals,
     )  # fmt: skip
 
 
@@ -88,11 +90,8 @@ def make_parts(seed: int) -> tuple[Joints, Bodies, Row, Rows, Rows, ResidualMass
 
 # what the parts of this arm's model are
 Network = MaskedMLP
-Layers = MLPLayers
-NetworkResiduals = MLPResiduals
 Pose = Motion
 Prepared = RigidPrepared
-MassResiduals = FunctionResiduals | None
 
 
 class Model(ResidualDynamics):

@@ -51,7 +51,7 @@ def start_servos(model: EmittedModel, windows: ServoWindows) -> None:
         servo.raw_kp.copy_(factor.log())
         servo.raw_kd.copy_((kp * damping.clamp(min=least**2) / servo.nominal_kd).log())
         armature = torch.maximum(kp * inertia - load.inertia.mean(dim=(0, 1)), least**3 * kp)
-        model.rotors.raw.copy_((armature / model.rotors.nominal).log())
+        model.raw_armature.copy_((armature / model.nominal_armature).log())
         friction.raw_coulomb.copy_((kp * dry / friction.nominal).clamp(min=least).log())
         # a drive's viscous friction and kd are one number: kd has it all
         friction.raw_viscous.fill_(NONE)

@@ -154,11 +154,11 @@ def body_load(model: EmittedModel, path: Path, directions: torch.Tensor) -> Body
         flat = [x.flatten(0, 1).split(BLOCK) for x in path]
         for q, qd, qdd in zip(*flat, strict=True):
             at = model.configuration(q, prepared)
-            mass, residuals = model.mass_at(at, prepared)
+            mass = at.mass
             inertia = mass.diagonal(dim1=-2, dim2=-1) - armature
             coupling = (mass @ qdd.unsqueeze(-1)).squeeze(-1) - (inertia + armature) * qdd
-            bias = model.nonlinear_at(at, qd, residuals, prepared) + coupling
+            bias = model.nonlinear_at(at, qd) + coupling
             slopes = regressor_of(model.chain, q, qd, qdd) @ directions
-            blocks.append(BodyLoad(inertia, bias, model.gravity_at(at, prepared), slopes))
+            blocks.append(BodyLoad(inertia, bias, model.gravity_at(at), slopes))
     shape = path.q.shape[:2]
     return BodyLoad(*(torch.cat(columns).unflatten(0, shape) for columns in zip(*blocks, strict=True)))

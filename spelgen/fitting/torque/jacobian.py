@@ -234,7 +234,7 @@ class TorqueJacobian:
             load = samples.load_regressor @ parameters
             friction = model.friction(samples.speed, load, prepared.friction, samples.z, samples.direction)
             friction = samples.factor * friction
-            force = model.input_force(None, qd, tau, prepared)
+            force = model.input_force(None, qd, tau)
             inertial = samples.regressor @ parameters + qdd @ prepared.armature
             difference: torch.Tensor = force - inertial - samples.residual - friction @ model.motors
             return difference

@@ -21,7 +21,7 @@ import torch
 from spelgen.dynamics.residuals import residual_torque
 from spelgen.fitting.optimizers import minimise
 from spelgen.fitting.torque.jacobian import ResidualSamples
-from spelgen.runtime.joint_functions import LARGEST
+from spelgen.runtime.residual_terms import LARGEST
 from spelgen.settings.tuning.fitting import ResidualTuning
 
 TUNING = ResidualTuning()
@@ -104,7 +104,7 @@ def select_residuals(model: Any, samples: ResidualSamples, correlation: float) -
         if (target_early - torque_early)[last].square().sum() >= target_early[last].square().sum():
             continue
         weights = _fit_candidate(candidate, target, correlation)
-        candidate.write(model.joint_functions, weights)
+        candidate.write(model.residuals, weights)
         missing = missing - candidate.torque(weights).unsqueeze(-1) * candidate.force
         missing_early = missing_early - torque_early.unsqueeze(-1) * candidate.force
         selected.append(SelectedResidual(candidate.parameter, candidate.joint, gain))
@@ -115,7 +115,7 @@ def refit_residuals(
     model: Any, samples: ResidualSamples, selected: Sequence[SelectedResidual], correlation: float
 ) -> None:
     """Fit the selected functions of single joints anew, beside what else has changed since."""
-    noise, missing, functions = _noise(samples.missing), samples.missing, model.joint_functions
+    noise, missing, functions = _noise(samples.missing), samples.missing, model.residuals
     chosen = {(residual.name, residual.joint) for residual in selected}
     for candidate in _candidates(model, samples):
         if (candidate.parameter, candidate.joint) not in chosen:
@@ -130,17 +130,17 @@ def refit_residuals(
 
 def _candidates(model: Any, samples: ResidualSamples) -> Iterator[_Candidate]:
     """Yield what could be selected: smooth torques first, then friction that varies, then ripple."""
-    functions, motors = model.joint_functions, model.motors
+    functions, motors = model.residuals, model.motors
     with torch.no_grad():
         splines, ripple = functions.splines(samples.q), functions.ripple(samples.q)
-    joints = torch.eye(len(motors)).to(motors)
+    joints, unit = torch.eye(len(motors)).to(motors), functions.unit.flatten()
     common = torch.zeros(splines.shape[-1])
     pairs = torch.arange(ripple.shape[-1] // 2).repeat(2)
     varied = splines * samples.friction.unsqueeze(-1)
     kinds = (
-        ("raw_torque_splines", splines, functions.scale, joints, common),
+        ("raw_torque_splines", splines, unit, joints, common),
         (FRICTION, varied, torch.ones(len(motors)), motors, common),
-        ("raw_torque_ripple", ripple, functions.scale, joints, pairs),
+        ("raw_torque_ripple", ripple, unit, joints, pairs),
     )
     for parameter, features, scale, force, groups in kinds:
         for joint in range(len(motors)):
@@ -250,11 +250,14 @@ def _select_networks(model: Any, samples: ResidualSamples, correlation: float) -
     """Select the potential's network, then that of the mass matrix."""
     step = -(-len(samples.q) // TUNING.network_samples)
     subset = ResidualSamples(*(column[::step] for column in samples))
-    for name in ("residual_potential", "residual_mass"):
-        network = getattr(model, name)
-        if network is None:
-            continue
-        gain = _fit_network(model, network, subset, max(1.0, correlation / step))
+    terms = model.residuals
+    networks = {"residual_potential": list(terms.potential.parameters()) if terms.potential else []}
+    networks["residual_mass"] = [terms.raw_constants, *(terms.mass.parameters() if terms.mass else ())]
+    for name, weights in networks.items():
+        gain = None
+        if weights:
+            network = torch.nn.ParameterList(weights)
+            gain = _fit_network(model, network, subset, max(1.0, correlation / step))
         if gain is None:
             continue
         with torch.no_grad():
