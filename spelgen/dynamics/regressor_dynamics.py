@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Arm
@@ -13,6 +14,7 @@ from spelgen.dynamics.arrays import Array, like
 from spelgen.dynamics.pose import Pose
 from spelgen.dynamics.rigid_bodies import RigidBodies
 from spelgen.runtime.bristles import moved_bristles
+from spelgen.runtime.port_hamiltonian import applied, solved
 
 
 class RegressorDynamics:
@@ -32,10 +34,12 @@ class RegressorDynamics:
         drives: Drives | None = None,
         bristle_reach: np.ndarray | None = None,
     ) -> None:
-        self.bodies, self.armature, self.friction = RigidBodies(arm, parameters), armature, friction
+        self.bodies, self.friction = RigidBodies(arm, parameters), friction
+        self.armature = torch.tensor(armature, dtype=torch.float64)
         self.bristle_reach = None if bristle_reach is None else torch.from_numpy(bristle_reach)
         alone = np.eye(len(armature))
-        self.inputs, self.motors = drives or Drives(alone, alone)
+        inputs, motors = drives or Drives(alone, alone)
+        self.inputs, self.motors = torch.from_numpy(inputs), torch.from_numpy(motors)
 
     @property
     def n(self) -> int:
@@ -49,88 +53,79 @@ class RegressorDynamics:
 
     def mass_matrix(self, q: Array) -> Array:
         """M, (..., n, n) [kg m^2, kg m, kg]."""
-        return self._by_rows(lambda position, _: self._mass_and_bias(position, 0 * position)[0], q)
+        return self._by_rows(lambda position, _: self.pose_at(position).mass, q)
 
     def gravity(self, q: Array) -> Array:
         """dV/dq, (..., n) [Nm, N]."""
-        return self._by_rows(lambda position, _: self._mass_and_bias(position, 0 * position)[1], q)
+        return self._by_rows(lambda position, _: self.bodies.at(position)[1](0 * position), q)
 
     def nonlinear_effects(self, q: Array, qd: Array) -> Array:
         """Coriolis, centrifugal and gravity torques, (..., n) [Nm, N]."""
-        return self._by_rows(lambda position, speed, _: self._mass_and_bias(position, speed)[1], q, qd)
+        return self._by_rows(lambda position, speed, _: self.bodies.at(position)[1](speed), q, qd)
 
     def friction_torque(self, q: Array, qd: Array, z: Array | None = None) -> Array:
         """What friction takes, and what the measured torque shows without any, (..., n) [Nm, N]."""
-        return self._by_rows(lambda _, speed, past: self.friction(speed, past), q, qd, z=z)
+        return self._by_rows(lambda _, speed, past: self._friction(speed, past), q, qd, z=z)
 
     def forward_dynamics(self, q: Array, qd: Array, tau: Array, z: Array | None = None) -> Array:
         """qdd, (..., n), under the inputs tau."""
-        return self._by_rows(self._forward, q, qd, tau, z=z)
 
-    def pose_at(self, q: torch.Tensor) -> Pose:
-        """Return the equations of motion at q, (T, n), see `pose.poses`."""
-        mass, bias_at = self.bodies.at(q)
-        inputs = torch.from_numpy(self.inputs)
+        def forward(position: Tensor, speed: Tensor, torque: Tensor, past: Tensor | None) -> Tensor:
+            pose = self.pose_at(position)
+            return solved(pose.mass, pose.force(speed, torque, past))
 
-        def friction(qd: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
-            past = z.numpy() if self.elements else None
-            return torch.from_numpy(self.friction(qd.numpy(), past))
-
-        def force(qd: torch.Tensor, tau: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
-            return tau @ inputs.mT - bias_at(qd) - friction(qd, z)
-
-        return Pose(mass + torch.from_numpy(self._reflected()), force, friction)
-
-    def memory(self, qd: torch.Tensor) -> torch.Tensor:
-        """z, (..., n, K), of drives that have long gone this way."""
-        assert self.bristle_reach is not None
-        return self._driven(qd).sign().unsqueeze(-1) * self.bristle_reach
-
-    def memory_after(self, z: torch.Tensor, displacement: torch.Tensor) -> torch.Tensor:
-        """z after joints went one way by (..., n)."""
-        assert self.bristle_reach is not None
-        return moved_bristles(z, self._driven(displacement), self.bristle_reach)
+        return self._by_rows(forward, q, qd, tau, z=z)
 
     def inverse_dynamics(self, q: Array, qd: Array, qdd: Array, z: Array | None = None) -> Array:
         """The inputs, (..., n), that make qdd; those of a passive joint are the torques that it lacks."""
-        return self._by_rows(self._inverse, q, qd, qdd, z=z)
+
+        def inverse(*states: Tensor | None) -> Tensor:
+            passive = (self.inputs == 0).all(dim=1).double()
+            return solved(self.inputs + torch.diag(passive), self._joint_torque(*states))
+
+        return self._by_rows(inverse, q, qd, qdd, z=z)
 
     def joint_torque(self, q: Array, qd: Array, qdd: Array, z: Array | None = None) -> Array:
         """What all joints, passive ones too, need for qdd, (..., n) [Nm, N]."""
-        return self._by_rows(self._torque, q, qd, qdd, z=z)
+        return self._by_rows(self._joint_torque, q, qd, qdd, z=z)
 
-    def _driven(self, joints: torch.Tensor) -> torch.Tensor:
-        """Of the drives, (..., n)."""
-        return joints @ torch.from_numpy(self.motors.T).to(joints)
+    def pose_at(self, q: Tensor) -> Pose:
+        """Return the equations of motion at q, (T, n), see `pose.poses`."""
+        mass, bias_at = self.bodies.at(q)
 
-    def _mass_and_bias(self, q: np.ndarray, qd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """M, (T, n, n), what the drives add included, and the bodies' torques at steady qd, (T, n)."""
-        mass, bias = self.bodies.mass_and_bias(q, qd)
-        return mass + self._reflected(), bias
+        def force(qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
+            return tau @ self.inputs.mT - bias_at(qd) - self._friction(qd, z)
 
-    def _reflected(self) -> np.ndarray:
-        """What the drives add to M, (n, n)."""
-        added: np.ndarray = self.motors.T @ (self.armature[:, None] * self.motors)
-        return added
+        return Pose(mass + self.motors.mT @ torch.diag(self.armature) @ self.motors, force, self._friction)
 
-    def _forward(self, q: np.ndarray, qd: np.ndarray, tau: np.ndarray, z: np.ndarray | None) -> np.ndarray:
-        mass, bias = self._mass_and_bias(q, qd)
-        force = tau @ self.inputs.T - bias - self.friction(qd, z)
-        return np.linalg.solve(mass, force[..., None])[..., 0]
+    def memory(self, qd: Tensor) -> Tensor:
+        """z, (..., n, K), of drives that have long gone this way."""
+        assert self.bristle_reach is not None
+        return (qd @ self.motors.mT.to(qd)).sign().unsqueeze(-1) * self.bristle_reach
 
-    def _torque(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, z: np.ndarray | None) -> np.ndarray:
-        mass, bias = self._mass_and_bias(q, qd)
-        result: np.ndarray = (mass @ qdd[..., None])[..., 0] + bias + self.friction(qd, z)
-        return result
+    def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
+        """z after joints went one way by (..., n)."""
+        assert self.bristle_reach is not None
+        return moved_bristles(z, displacement @ self.motors.mT.to(displacement), self.bristle_reach)
 
-    def _inverse(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, z: np.ndarray | None) -> np.ndarray:
-        force = self._torque(q, qd, qdd, z)
-        moved = self.inputs + np.diag(~self.inputs.any(axis=1)).astype(float)
-        return np.linalg.solve(moved, force.T).T
+    def _friction(self, qd: Tensor, z: Tensor | None) -> Tensor:
+        past = None
+        if z is not None and self.elements:
+            past = z.numpy()
+        return torch.from_numpy(self.friction(qd.numpy(), past))
 
-    def _by_rows(self, function: Callable[..., np.ndarray], *states: Array, z: Array | None = None) -> Array:
+    def _joint_torque(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None) -> Tensor:
+        still = torch.zeros_like(qdd)
+        pose = self.pose_at(q)
+        return applied(pose.mass, qdd) - pose.force(qd, still, z)
+
+    def _by_rows(self, function: Callable[..., Tensor], *states: Array, z: Array | None = None) -> Array:
         """``function`` of states (T, n), and z (T, n, K) or None, for states (..., n)."""
-        rows = np.broadcast_arrays(*(np.asarray(x) for x in states))
-        past = None if z is None else np.asarray(z).reshape(-1, self.n, np.asarray(z).shape[-1])
-        result = function(*(x.reshape(-1, self.n) for x in rows), past)
+        rows = np.broadcast_arrays(*map(np.asarray, states))
+        past = None
+        if z is not None:
+            past = torch.tensor(np.asarray(z)).flatten(0, -3)
+        with torch.no_grad():
+            flat = [torch.tensor(x.reshape(-1, self.n), dtype=torch.float64) for x in rows]
+            result = function(*flat, past).numpy()
         return like(result.reshape(*rows[0].shape[:-1], *result.shape[1:]), states[0])

@@ -47,12 +47,6 @@ class RigidBodies:
         momenta = chain.twists @ self.inertia
         return momenta @ chain.twists.mT, lambda qd: self.chain.steady_torque(chain, qd, momenta)
 
-    def mass_and_bias(self, q: np.ndarray, qd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return M, (T, n, n), and Coriolis, centrifugal and gravity torques, (T, n) [Nm, N], at q and qd, (T, n)."""
-        with torch.no_grad():
-            mass, bias_at = self.at(torch.tensor(q, dtype=torch.float64))
-            return mass.numpy(), bias_at(torch.tensor(qd, dtype=torch.float64)).numpy()
-
 
 def _row(values: tuple[object, object, object]) -> Row:
     x, y, z = (float(value) for value in values)  # type: ignore[arg-type]
