@@ -20,8 +20,8 @@ class Pose:
     """
 
     mass: Tensor
-    force: Callable[[Tensor, Tensor, Tensor], Tensor]
-    friction: Callable[[Tensor, Tensor], Tensor]
+    force: Callable[[Tensor, Tensor, Tensor | None], Tensor]
+    friction: Callable[[Tensor, Tensor | None], Tensor]
 
 
 PoseAt = Callable[[Tensor], Pose]
@@ -40,10 +40,10 @@ def _of_weights(model: PortHamiltonianDynamics, prepared: object, q: Tensor) -> 
     """Return the pose of an emitted model."""
     pose = model.configuration(q, prepared)
 
-    def friction(qd: Tensor, z: Tensor) -> Tensor:
+    def friction(qd: Tensor, z: Tensor | None) -> Tensor:
         return model.friction_at(pose, qd, *known_past(model, z))
 
-    def force(qd: Tensor, tau: Tensor, z: Tensor) -> Tensor:
+    def force(qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
         return model.input_force(pose, qd, tau) - model.nonlinear_at(pose, qd) - friction(qd, z)
 
     return Pose(pose.mass, force, friction)
@@ -52,10 +52,10 @@ def _of_weights(model: PortHamiltonianDynamics, prepared: object, q: Tensor) -> 
 def _of_any(dynamics: Any, q: Tensor) -> Pose:
     mass = torch.as_tensor(dynamics.mass_matrix(q))
 
-    def friction(qd: Tensor, z: Tensor) -> Tensor:
+    def friction(qd: Tensor, z: Tensor | None) -> Tensor:
         return torch.as_tensor(dynamics.friction_torque(q, qd, *known_past(dynamics, z)))
 
-    def force(qd: Tensor, tau: Tensor, z: Tensor) -> Tensor:
+    def force(qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
         qdd = torch.as_tensor(dynamics.forward_dynamics(q, qd, tau, *known_past(dynamics, z)))
         return (mass @ qdd.unsqueeze(-1)).squeeze(-1)
 

@@ -79,9 +79,10 @@ class RegressorDynamics:
     def inverse_dynamics(self, q: Array, qd: Array, qdd: Array, z: Array | None = None) -> Array:
         """The inputs, (..., n), that make qdd; those of a passive joint are the torques that it lacks."""
 
-        def inverse(*states: Tensor | None) -> Tensor:
+        def inverse(position: Tensor, speed: Tensor, rise: Tensor, past: Tensor | None) -> Tensor:
             passive = (self.inputs == 0).all(dim=1).double()
-            return solved(self.inputs + torch.diag(passive), self._joint_torque(*states))
+            torque = self._joint_torque(position, speed, rise, past)
+            return solved(self.inputs + torch.diag(passive), torque)
 
         return self._by_rows(inverse, q, qd, qdd, z=z)
 

@@ -70,9 +70,6 @@ def plan_model(
     bodies: tuple[BodySpec, ...] = ()
     if design.mass == "closed-form":
         bodies = body_specs(arm, nominal_inertias(arm, sizes.from_urdf))
-    net = design.net
-    if net == "none":
-        net = None
     potential = structure.potential
     if design.potential == "dense":
         potential = everything
@@ -82,7 +79,7 @@ def plan_model(
         urdf=urdf,
         urdf_sha256=urdf_sha256,
         gravity=(x, y, z),
-        options=replace(options, net=net),
+        options=replace(options, net=None if design.net == "none" else design.net),
         design=design,
         joints=tuple(joints),
         entries=tuple((e.row, e.column, e.kind, e.joints) for e in structure.entries),

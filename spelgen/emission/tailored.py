@@ -14,7 +14,7 @@ from spelgen.design import BRISTLE_REACH
 from spelgen.emission.source import WIDTH, Call, Code, assignment, call, laid_out
 from spelgen.emission.unit_joints import hidden_units
 from spelgen.labels import entry_name, joint_ranges
-from spelgen.spec import BodySpec, JointSpec, ModelSpec
+from spelgen.spec import BodySpec, ConstantSpec, JointSpec, ModelSpec, OutputSpec
 
 _LEAST_UNITS = 4
 _LEAST_KAN_UNITS = 2
@@ -100,7 +100,8 @@ def mass_entries(spec: ModelSpec) -> str:
     if spec.design.mass != "derived" and (not spec.bodies or spec.design.net == "none"):
         return ""
     cells: defaultdict[tuple[int, int], list[tuple[float, str]]] = defaultdict(list)
-    for letter, terms in (("f", spec.outputs), ("c", spec.constants)):
+    functions: Sequence[OutputSpec | ConstantSpec] = spec.outputs
+    for letter, terms in (("f", functions), ("c", spec.constants)):
         for number, term in enumerate(terms, start=1):
             for row, column, factor in term.basis:
                 cells[row, column].append((factor, f"{letter}{number}"))
