@@ -32,7 +32,7 @@ class NetworkPose(NamedTuple):
 
 
 class NetworkDynamics(PortHamiltonian):
-    """M and D of these parts; V is a network's, in units of ``scale`` [J]; without one gravity does no work."""
+    """M and D of these parts; V is a network's, in units of ``scale`` [J], or zero where there is none."""
 
     def __init__(
         self, joints: Joints, mass: Mass, potential: Network | None, scale: float, friction: Friction

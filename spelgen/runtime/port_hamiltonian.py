@@ -57,7 +57,7 @@ class PortHamiltonian(nn.Module):
         self.actuated = nn.Buffer(vector(float(x) for x in joints.actuated))
 
     def at(self, q: Tensor, *others: Tensor, prepared: Prepared | None = None) -> Pose:
-        """Return the pose at q. Raises TypeError and ValueError where a vector is not as q and the weights."""
+        """Return the pose at q. Raises TypeError or ValueError for vectors not as q and the weights."""
         expected = self.actuated.dtype
         for x in (q, *others):
             if not isinstance(x, Tensor) or x.dtype != expected:

@@ -159,7 +159,7 @@ class ResidualTerms(nn.Module):
         return ResidualPose(encoded, torque, friction.exp(), mass, slope, intermediates, weights)
 
     def energy(self, q: Tensor, weights: ResidualWeights) -> Tensor:
-        """Return what is added to V, (...) [J]; of a spline, which ends where the range does, half on either side."""
+        """Return what is added to V, (...) [J]; a spline's part is zero in its middle."""
         distance = self._places(q)
         away = distance.abs()
         step = 0.5 - (2 - away).relu() ** 4 / 24 + (1 - away).relu() ** 4 / 6
@@ -196,7 +196,7 @@ class ResidualTerms(nn.Module):
         return self._cubes(q) / 6
 
     def ripple(self, q: Tensor) -> Tensor:
-        """Return cosines, then sines of frequency times q, (..., n, 2 HARMONICS + 4), zero for a prismatic joint."""
+        """Return cosines, then sines of frequency times q, (..., n, 2 HARMONICS + 4); zero if prismatic."""
         return self._waves(q) * self.revolute
 
     def _waves(self, q: Tensor) -> Tensor:

@@ -36,7 +36,7 @@ def skew(a: Tensor) -> Tensor:
 
 
 def motion_table(bodies: Bodies) -> tuple[Tensor, Tensor]:
-    """Return what takes cos, sin and value of displacements to what takes rows of twists from parents' frames.
+    """Return what takes cos, sin and value of displacements to what takes twists from parents' frames.
 
     (36 bodies, 3 bodies), and what is added, (36 bodies,).
     """

@@ -173,7 +173,7 @@ class RigidBodyDynamics(PortHamiltonian):
         rate = self.friction.bristles.rate(qd @ self.motors.mT, z).flatten(-2)
         return torch.cat([qd, force, rate, torch.zeros_like(tau)], dim=-1)
 
-    def input_force(self, pose: Motion | None, qd: Tensor, tau: Tensor) -> Tensor:
+    def input_force(self, pose: Motion, qd: Tensor, tau: Tensor) -> Tensor:
         """Return G (tau - torque offset) + friction compensation qd, (..., n) [Nm, N]."""
         return super().input_force(pose, qd, tau - self.torque_offset) + self.friction_compensation * qd
 
