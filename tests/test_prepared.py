@@ -111,9 +111,9 @@ def test_what_is_zero_takes_no_time():
     """Without residuals hybrid is prepared as the bodies alone; with them it is not, and neither changes the model."""
     model = build(arm_of("rpr"), "hybrid").requires_grad_(False)
     q, qd, x = states(4)
-    assert not has_residuals(model.prepared()._dynamics)
+    assert not has_residuals(model.prepared()._model)
     torch.testing.assert_close(model.prepared().forward_dynamics(q, qd, x), model.forward_dynamics(q, qd, x))
     model.residuals.raw_torque_splines[1] += 1.0
-    assert model.prepared()._dynamics.residuals.mass is None
+    assert model.prepared()._model.residuals.mass is None
     assert model.residuals.mass is not None
     torch.testing.assert_close(model.prepared().forward_dynamics(q, qd, x), model.forward_dynamics(q, qd, x))
