@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, TypeVar, cast
+from typing import Protocol, TypeVar, cast
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from torch import Tensor
-
 Array = TypeVar("Array")
 """numpy.ndarray or torch.Tensor: a result is of the kind of the arguments."""
+
+
+class Tensor(Protocol):
+    """What is needed of a torch.Tensor: what imports this knows no torch."""
+
+    def new_tensor(self, data: np.ndarray) -> object:
+        """Return a tensor of this one's type."""
 
 
 def on_arrays(function: Callable[..., np.ndarray], *states: Array) -> Array:
@@ -24,7 +28,7 @@ def on_arrays(function: Callable[..., np.ndarray], *states: Array) -> Array:
 
 
 def like(result: np.ndarray, pattern: Array) -> Array:
-    """Return ``result`` as the array or tensor that ``pattern`` is; by a method, so that arrays need no torch."""
+    """Return ``result`` as the array or tensor that ``pattern`` is."""
     if isinstance(pattern, np.ndarray):
         return cast("Array", result)
     return cast("Array", cast("Tensor", pattern).new_tensor(result))
