@@ -40,7 +40,7 @@ def latex(formulas: Formulas) -> str:
         if not definition.is_Symbol:
             definitions.append((name, definition))
     lines = ["% Closed forms of a serial arm's mass matrix and potential energy, by spelgen; needs amsmath."]
-    lines += [f"% {line}" for line in _comments(formulas)]
+    lines += _comments(formulas, "%")
     for equations in (rows, definitions):
         if equations:
             lines += [r"\begin{align*}", " \\\\\n".join(_aligned(equations)), r"\end{align*}"]
@@ -59,7 +59,7 @@ def _aligned(rows: Iterable[tuple[Symbol, Expr]]) -> Iterable[str]:
 def sympy_source(formulas: Formulas) -> str:
     """Return the text of the file for SymPy."""
     n = len(formulas.q)
-    body = _table("entries", {str(place): entry for place, entry in formulas.entries.items()})
+    body = _table("entries", formulas.entries)
     # a matrix with holes would be wrong without a word
     if formulas.mass_matrix is not None:
         body.append(f"M = Matrix({n}, {n}, lambda i, j: entries[max(i, j) + 1, min(i, j) + 1])")
@@ -71,7 +71,7 @@ def sympy_source(formulas: Formulas) -> str:
     return "\n".join([_HEAD, *_beginning(formulas, "\n".join(body)), *body]) + "\n"
 
 
-def _table(name: str, rows: Mapping[str, Expr] | Mapping[Symbol, Expr]) -> list[str]:
+def _table(name: str, rows: Mapping[tuple[int, int], Expr] | Mapping[Symbol, Expr]) -> list[str]:
     lines = [f"{name} = {{"]
     for key, expression in rows.items():
         lines += Python().lines(expression, f"    {key}: ", _PYTHON_WIDTH, end=",")
@@ -90,23 +90,22 @@ def _beginning(formulas: Formulas, body: str) -> list[str]:
         inertial.update(symbol.name for symbol in definition.free_symbols)
     positions = [symbol.name for symbol in formulas.q]
     bases = [base.name for base in formulas.base]
-    lines = [f"# {line}" for line in _comments(formulas)]
-    lines += ["", f"from sympy import {', '.join(sorted(imported))}", ""]
+    lines = [*_comments(formulas, "#"), "", f"from sympy import {', '.join(sorted(imported))}", ""]
     for name in dict.fromkeys([*positions, *sorted(inertial), *bases]):
         lines.append(f'{name} = Symbol("{name}", real=True)')
     # the last comma makes a tuple of one position too
     return [*lines, f"q = ({', '.join(positions)}{',' * (len(positions) == 1)})", ""]
 
 
-def _comments(formulas: Formulas) -> list[str]:
+def _comments(formulas: Formulas, mark: str) -> list[str]:
     """Return which robot, joints and bodies the numbers in the names stand for."""
     arm = formulas.arm
-    lines = [f"Robot {json.dumps(arm.name)}, for {formulas.trusted}."]
+    lines = [f"{mark} Robot {json.dumps(arm.name)}, for {formulas.trusted}."]
     for number, coordinate in enumerate(arm.coordinates, start=1):
-        lines.append(f"q{number}: {json.dumps(coordinate.name)}")
+        lines.append(f"{mark} q{number}: {json.dumps(coordinate.name)}")
     if tuple(body.name for body in arm.bodies) != arm.joint_names:
         for number, body in enumerate(arm.bodies, start=1):
-            lines.append(f"body {number}: {json.dumps(body.name)}")
+            lines.append(f"{mark} body {number}: {json.dumps(body.name)}")
     for row in formulas.unwritten:
-        lines.append(f"{row.name}: {row.omission}")
+        lines.append(f"{mark} {row.name}: {row.omission}")
     return lines

@@ -71,9 +71,9 @@ def balance_reason(axes: Axes, structure: Structure, entry: Entry) -> str | None
 def equality_reason(axes: Axes, structure: Structure, entries: Sequence[tuple[int, int]]) -> str | None:
     """Return why entries of one row are equal: their columns' joints move alike what the row's joint carries."""
     # entries of different rows belong to different masses: no simple reason makes these equal
-    if len({row for row, _ in entries}) > 1:
+    rows, columns = map(sorted, zip(*entries, strict=True))
+    if rows[0] != rows[-1]:
         return None
-    columns = sorted(column for _, column in entries)
     if all(axes.move_alike(columns[0], column) for column in columns[1:]):
         if axes.slides[columns[0]]:
             return f"{joints_told(columns)} slide along one direction"

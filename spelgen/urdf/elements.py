@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from lxml import etree
 
 from spelgen.errors import suggestion
+from spelgen.settings.values import MAX_MAGNITUDE
 from spelgen.urdf.robot import MOVING, Inertial, Joint, Link, Mimic, Tensor, Transmission, Vector
 from spelgen.urdf.values import (
-    MAX_MAGNITUDE,
     Notes,
     first_child,
     note_unexpanded,
@@ -141,8 +141,8 @@ def _read_origin(notes: Notes, element: etree._Element, where: str) -> tuple[Vec
     origin = first_child(notes, element, "origin", where)
     if origin is None:
         return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    xyz, rpy = (read_triple(notes, origin, key, f"{where} origin") for key in ("xyz", "rpy"))
-    return xyz, rpy
+    where = f"{where} origin"
+    return read_triple(notes, origin, "xyz", where), read_triple(notes, origin, "rpy", where)
 
 
 def _read_axis(notes: Notes, element: etree._Element, kind: str | None, where: str) -> Vector:
@@ -186,10 +186,9 @@ def _read_dynamics(notes: Notes, element: etree._Element, where: str) -> tuple[f
     dynamics = first_child(notes, element, "dynamics", where)
     if dynamics is None:
         return 0.0, 0.0
-    damping, friction = (
-        read_number(notes, dynamics, key, f"{where} dynamics") or 0.0 for key in ("damping", "friction")
-    )
-    return damping, friction
+    where = f"{where} dynamics"
+    damping = read_number(notes, dynamics, "damping", where)
+    return damping or 0.0, read_number(notes, dynamics, "friction", where) or 0.0
 
 
 def _read_mimic(notes: Notes, element: etree._Element, where: str) -> Mimic | None:
@@ -240,11 +239,11 @@ def read_transmission(notes: Notes, element: etree._Element, joints: Sequence[st
             continue
         reduction = read_text_number(own, joint, "mechanicalReduction", where)
         driven.append((joint_name, reduction, read_text_number(own, joint, "offset", where)))
-    actuators = tuple(
-        (actuator.get("name") or "", read_text_number(own, actuator, "mechanicalReduction", where))
-        for actuator in element.findall("actuator")
-    )
+    actuators = []
+    for actuator in element.findall("actuator"):
+        reduction = read_text_number(own, actuator, "mechanicalReduction", where)
+        actuators.append((actuator.get("name") or "", reduction))
     _warn_instead(notes, own)
     # ROS 1 writes an element, some exporters an attribute
     kind = (element.findtext("type") or element.get("type") or "").strip()
-    return Transmission(name, kind, tuple(driven), actuators, element.sourceline, tuple(own.errors))
+    return Transmission(name, kind, tuple(driven), tuple(actuators), element.sourceline, tuple(own.errors))

@@ -50,9 +50,9 @@ def read_urdf(path: Path) -> Robot:
     _check_mimics(notes, joints)
     joint_names = [joint.name for joint in joints]
     # after the joints, whose names they must use
-    transmissions = [
-        read_transmission(notes, element, joint_names) for element in root.findall("transmission")
-    ]
+    transmissions = []
+    for element in root.findall("transmission"):
+        transmissions.append(read_transmission(notes, element, joint_names))
     # a joint that could not be read leaves false roots behind, so these are sought in a sound file only
     tops: list[str] = []
     if not notes.errors:
