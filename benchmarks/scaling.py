@@ -19,6 +19,8 @@ import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -77,16 +79,19 @@ def compare_fits() -> None:
 def measured_fit(joints: int, samples: int) -> tuple[str, str]:
     """Return the processor time [s] of a fit, and the peak memory of this process [GB]."""
     urdf = _urdf(joints)
-    log = _recorded(build(urdf, "closed-form"), samples)
+    # in another process, whose memory is not counted
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        log = pool.submit(_recorded, urdf, samples).result()
     since = time.process_time()
     fit(build(urdf, "closed-form"), log)
     seconds = time.process_time() - since
     return f"{seconds:.1f}", f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f}"
 
 
-def _recorded(model: EmittedModel, samples: int) -> Trajectory:
-    """Return a smooth motion with the torques of an arm that differs from the model, and noise."""
-    generator = np.random.default_rng(0)
+def _recorded(urdf: Path, samples: int) -> Trajectory:
+    """Return a smooth motion with the torques of an arm that differs from the URDF's, and noise."""
+    torch.set_num_threads(1)
+    model, generator = build(urdf, "closed-form"), np.random.default_rng(0)
     with torch.no_grad():
         for parameter in model.parameters():
             parameter += torch.from_numpy(generator.normal(0, 0.2, parameter.shape))

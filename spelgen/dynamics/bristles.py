@@ -31,6 +31,9 @@ class BristleReach:
 
 
 NO_BRISTLES = BristleReach(np.zeros((0, 0)))
+BLOCK = (
+    2**14
+)  # samples in one pass, whose number of operations grows with its length times the logarithm of it
 
 
 def reach_of(kinds: Sequence[str], motors: np.ndarray | None = None) -> BristleReach:
@@ -55,17 +58,26 @@ def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
     moved = np.diff(encoded(q), axis=0, prepend=q[:1])
     if bristles.motors is not None:
         moved = moved @ bristles.motors.T
-    way, reach = moved[..., None], bristles.values
+    z = np.empty((*q.shape, bristles.values.shape[-1]))
+    state = np.zeros(z.shape[1:])
+    for start in range(0, len(q), BLOCK):
+        block = z[start : start + BLOCK]
+        block[:] = _bent_along(moved[start : start + BLOCK, :, None], bristles.values, state)
+        state = block[-1]
+    return z
+
+
+def _bent_along(way: np.ndarray, reach: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Return z, (T, n, K), along displacements (T, n, 1) from z = start (n, K)."""
     decay = np.exp(-np.abs(way) / reach)
-    bent = np.sign(way) * reach * (1 - decay)
+    bent: np.ndarray = np.sign(way) * reach * (1 - decay)
     # z[k] = decay[k] z[k - 1] + bent[k]: pairs are joined, then fours, ...
     shift = 1
-    while shift < len(q):
+    while shift < len(way):
         bent[shift:] += decay[shift:] * bent[:-shift]
         decay[shift:] *= decay[:-shift].copy()
         shift *= 2
-    result: np.ndarray = bent
-    return result
+    return bent + decay * start
 
 
 def direction_along(qd: np.ndarray, bristles: BristleReach) -> np.ndarray | None:

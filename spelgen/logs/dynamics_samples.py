@@ -63,7 +63,9 @@ def dynamics_samples(
         if not pieces:
             continue
         columns = [_columns(piece, pauses, preprocessing, reach) for piece in pieces]
-        joined = map(np.concatenate, zip(*columns, strict=True))
+        joined = columns[0]  # hours of motion without a hole are not copied
+        if len(columns) > 1:
+            joined = list(map(np.concatenate, zip(*columns, strict=True)))
         samples.append(DynamicsSamples(trajectory.name, *joined))
     return samples
 
@@ -97,11 +99,14 @@ def _columns(
     if reach is not None and reach.elements:
         z = bristles_along(smooth.q, reach)
         # the torque's steps where joints turn around went through the filter, so must these
-        columns.append(z if cutoff is None else low_pass_regular(z, FREQUENCY, cutoff))
+        if cutoff is not None:
+            for joint in range(z.shape[1]):  # the filter copies what it gets several times
+                z[:, joint] = low_pass_regular(z[:, joint], FREQUENCY, cutoff)
+        columns.append(z)
         direction = direction_along(smooth.qd, reach)
         if direction is not None:
             columns.append(direction if cutoff is None else low_pass_regular(direction, FREQUENCY, cutoff))
-    return [x[selected] for x in columns]
+    return columns if selected.all() else [x[selected] for x in columns]
 
 
 def _at_common_rate(piece: Trajectory, cutoff: float | None) -> Trajectory:
