@@ -25,6 +25,7 @@ from spelgen.exporting.exported import readme
 from spelgen.fitting.fit import fit
 from spelgen.loaded_arm import load_arm
 from spelgen.log_checks.check_logs import check_logs
+from spelgen.log_checks.gravity import find_opposed_inertia, state_samples
 from spelgen.logs import bags
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
@@ -94,6 +95,7 @@ REFUSED = {
     "days in a far year": (parquet(pa.array((2**31 - 100 + COUNTS).astype("i4"), pa.date32())), DATES),
     "times of 1e300": (npz(COUNTS * 1e300), LARGE),
     "one time of 1e300": (npz(np.append(COUNTS[:-1] / 60.0, 1e300)), LARGE),
+    "times from -1.7e308 to 1.7e308": (npz(np.where(COUNTS, 1.7e308, -1.7e308)), "t: got"),
     "times of 1e-300": (npz(COUNTS * 1e-300), VANISHING),
     "denormal times": (npz(COUNTS * 5e-324), VANISHING),
     "a header of 1e12 samples": (npz_that_says_1e12_samples, r"array t\.npy is larger than the file says"),
@@ -108,6 +110,13 @@ def test_logs_that_are_none_are_told_in_our_words(tmp_path, arm, case):
     with pytest.raises(LogError, match=message) as caught:
         check_logs(read_logs(make(tmp_path), arm), arm)
     assert len(str(caught.value)) < 5000
+
+
+@pytest.mark.filterwarnings("error")
+def test_two_samples_are_too_few_to_judge(arm):
+    q = np.array([[0.1, 0.2], [0.3, 0.5]])
+    samples = state_samples(Trajectory(np.array([0.0, 0.1]), q, q, q, "two"), np.eye(2))
+    assert find_opposed_inertia(arm.arm, [samples], np.eye(2)) is None
 
 
 @pytest.mark.parametrize(

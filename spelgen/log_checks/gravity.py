@@ -90,9 +90,9 @@ def find_opposed_inertia(arm: Arm, samples: Sequence[StateSamples], speeds: np.n
     friction = FrictionModel(coulomb_smoothing_velocity=MOVING)
     columns = base_parameters(arm, friction, speeds).columns
     q, qd, qdd, tau = _thinned(samples)
-    unit = tau.std(axis=0)
-    if len(q) < TUNING.gravity_samples / 4 or not unit.all():
+    if len(q) < TUNING.gravity_samples / 4 or not np.ptp(tau, axis=0).all():
         return None
+    unit = tau.std(axis=0)
 
     def rows(accelerations: np.ndarray) -> np.ndarray:
         bodies = regressor(arm, q, qd, accelerations)

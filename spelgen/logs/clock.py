@@ -50,7 +50,8 @@ def times_from(
         counts: np.ndarray = nanoseconds.to_numpy()
         return np.asarray((counts - start) * 1e-9 / TIMES[layout.mapping.units.t])
     if start and nanoseconds is None and not times.null_count:
-        return np.asarray(times.to_numpy() - start, dtype=float)
+        with np.errstate(over="ignore"):  # infinite times are refused below
+            return np.asarray(times.to_numpy() - start, dtype=float)
     return floats(times, name, file, row)
 
 
