@@ -15,6 +15,8 @@ from spelgen.runtime.joints import Joints, vector
 STRIBECK = 0.3  # dry friction that only slow motion has
 STRIBECK_VELOCITY = 0.03  # where that has faded
 SMOOTHING_VELOCITY = 0.006  # over which dry friction turns around
+# the same of joints whose friction has no memory though others' has: a wider turn looks like memory
+SHARP_VELOCITY = 0.001
 SATURATION_VELOCITY = 0.2  # where viscous friction begins to grow more slowly
 LOAD_DEPENDENCE = 0.03  # dry friction by gravity torque
 # below this fraction of usual friction a gravity torque's size is rounded off: at right angles it passes
@@ -99,9 +101,8 @@ class FrictionLaws(nn.Module):
             coulomb=size * self.raw_coulomb.exp(),
             stribeck=STRIBECK * size * self.raw_stribeck.exp(),
             stribeck_velocity=STRIBECK_VELOCITY * speed * self.raw_stribeck_velocity.exp(),
-            coulomb_smoothing_velocity=SMOOTHING_VELOCITY
-            * speed
-            * (1 if smoothing is None else smoothing.exp()),
+            coulomb_smoothing_velocity=speed
+            * (SHARP_VELOCITY if smoothing is None else SMOOTHING_VELOCITY * smoothing.exp()),
             load_dependence=LOAD_DEPENDENCE * size.sign() * self.raw_load_dependence.exp(),
             least_load=LEAST_LOAD * torch.where(size > 0, size, 1.0),
             bristle_fractions=self.bristles.reach if fractions is None else self._remembered(fractions),
