@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 from spelgen.version import __version__
 
 if TYPE_CHECKING:
-    from spelgen.baselines.keep import keep_baseline
     from spelgen.building import build
     from spelgen.certificate.inspection import Inspection
     from spelgen.design import Design
@@ -14,6 +13,7 @@ if TYPE_CHECKING:
     from spelgen.emission.loading import load_module
     from spelgen.errors import SpelgenError
     from spelgen.evaluation.evaluate import evaluate
+    from spelgen.evaluation.keep import keep_baseline
     from spelgen.evaluation.results import Results
     from spelgen.evaluation.rollout import rollout
     from spelgen.excitation.design import excite
@@ -52,7 +52,7 @@ _HOME = {
     "excite": "excitation.design",
     "identify": "identification.identify",
     "LeastSquares": "identification.method",
-    "keep_baseline": "baselines.keep",
+    "keep_baseline": "evaluation.keep",
     "FrictionModel": "identification.friction",
     "Identification": "identification.identification",
     "fit": "fitting.fit",

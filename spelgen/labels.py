@@ -86,6 +86,16 @@ def listed(names: Sequence[str]) -> str:
     return f"{', '.join(preceding)} and {last}"
 
 
+def share(fraction: float, whole: str = "") -> str:
+    """Return ``5 % of the motion``, and ``13.6 times the motion`` of what exceeds the whole."""
+    if fraction > 1:
+        return f"{fraction:.3g} times {whole}".rstrip()
+    # four digits of what is nearly all
+    digits = 4 if 0.99 <= fraction < 1 else 3
+    percent = f"{100 * fraction:.{digits}g} %"
+    return f"{percent} of {whole}" if whole else percent
+
+
 def printable(text: str, allowed: str = "") -> str:
     """Return text from a file, with what could steer a terminal made visible, but for the characters ``allowed``."""
     characters = []

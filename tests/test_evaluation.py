@@ -1,7 +1,6 @@
 """Evaluation: baselines against exact solutions, errors that mean what they say, results that are valid JSON."""
 
 import json
-import math
 from pathlib import Path
 
 import numpy as np
@@ -22,10 +21,10 @@ from spelgen.evaluation.evaluate import evaluate
 from spelgen.evaluation.invariants import energy_drift
 from spelgen.evaluation.rollout import rollout
 from spelgen.evaluation.subject import read_test_logs
-from spelgen.evaluation.torque import torque_errors
+from spelgen.evaluation.torque import coarse_torques, torque_errors
 from spelgen.fitting.train import train
 from spelgen.loaded_arm import load_arm
-from spelgen.logs.dynamics_samples import dynamics_samples
+from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.windows import Windows, cut_windows
@@ -172,7 +171,11 @@ def test_the_true_model_is_perfect_and_its_baseline_is_not(run):
 
 
 def test_errors_are_those_of_the_last_sample(run):
-    result = evaluated(run, run.parent / "logs", steps=(3,), seconds=())
+    told = []
+    result = evaluated(
+        run, run.parent / "logs", steps=(3,), seconds=(), progress=lambda *stage: told.append(stage)
+    )
+    assert told == [(0, 1, "predicting 3 steps ahead")]
     windows = cut_windows(read_logs([run.parent / "logs"], JOINTS, role="test"), 6, measured=False)
     error = windows.qd[:, 2] - windows.qd[:, 5]  # after two steps for the observer
     found = result.horizons[0].errors["velocity stays constant"]
@@ -190,7 +193,7 @@ def test_the_same_run_and_logs_give_the_same_file(run):
     assert files[0] == files[1]
     assert "stand_in on 4 test trajectories; * marks the best of a row" in shown.stdout
     found = json.loads(files[0], parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
-    assert found["schema"] == 6
+    assert found["schema"] == 7
     shown = found["traces"]["trajectories"]
     assert [x["which"] for x in shown] == ["typical", "worst"]
     assert len(shown[0]["q"]) == len(shown[0]["t"]) == 21 and len(shown[0]["q"][0]) == 2
@@ -344,12 +347,41 @@ class Torques:
 def test_torque_errors_by_the_protocol():
     (samples,) = dynamics_samples([moving()])
     exact = torque_errors(Torques(lambda q, qd, qdd: torch.stack([qdd[:, 0], 0 * qdd[:, 1]], -1)), [samples])
-    assert exact.nmse[0, 0] < 1e-3  # the ends of the filter remain
-    assert math.isnan(exact.nmse[0, 1])  # a torque that never varies has nothing to explain
+    assert exact.joint_nmse[0] < 1e-3  # the ends of the filter remain
+    assert exact.joint_nmse[1] is None  # a torque that never varies has nothing to explain
     tau = torch.from_numpy(samples.tau)
     offset = torque_errors(Torques(lambda q, qd, qdd: tau + torch.tensor([1.0, 2.0])), [samples])
-    np.testing.assert_allclose(offset.rmse, [[1.0, 2.0]], rtol=1e-12)
-    np.testing.assert_allclose(offset.nmse[0, 0], 1 / samples.tau[:, 0].var(), rtol=1e-12)
+    np.testing.assert_allclose(offset.rmse, [1.0, 2.0], rtol=1e-12)
+    np.testing.assert_allclose(offset.joint_nmse[0], 1 / samples.tau[:, 0].var(), rtol=1e-12)
+    infinite = torque_errors(Torques(lambda q, qd, qdd: tau / 0), [samples])
+    assert infinite.mean_nmse is None
+
+
+def test_torque_errors_are_pooled_over_samples_with_pauses_and_without():
+    """A short log that hardly varies has a large nMSE of its own, and weighs no more than its samples."""
+    random = np.random.default_rng(0)
+    samples = []
+    for name, count, size in (("long", 400, 10.0), ("short", 50, 0.1)):
+        motion = random.standard_normal((count, 2))
+        motion[: count // 5] = 0.001  # stands still
+        tau = size * random.standard_normal((count, 2))
+        samples.append(DynamicsSamples(name, motion, motion, motion, tau))
+    found = torque_errors(Torques(lambda q, qd, qdd: torch.zeros_like(q) + 0.2), samples)
+    tau = np.concatenate([x.tau for x in samples])
+    moves = np.concatenate([np.abs(x.qd).max(axis=1) > 0.02 for x in samples])
+    pooled = ((tau[moves] - 0.2) ** 2).mean(axis=0) / tau[moves].var(axis=0)
+    np.testing.assert_allclose(found.joint_nmse, pooled, rtol=1e-12)
+    assert found.mean_nmse == pytest.approx(pooled.mean())
+    assert found.nmse_with_pauses == pytest.approx((((tau - 0.2) ** 2).mean(axis=0) / tau.var(axis=0)).mean())
+    np.testing.assert_allclose(found.rmse, np.sqrt(((tau[moves] - 0.2) ** 2).mean(axis=0)))
+    assert found.nmse["short"] > 4 and found.mean_nmse < 1.1
+
+
+def test_torques_in_steps_of_their_own_size_are_found():
+    t, random = np.arange(2000) / 100, np.random.default_rng(1)
+    tau = np.stack([np.sin(t), 2 * np.sin(3 * t)], axis=1) + 0.01 * random.standard_normal((2000, 2))
+    log = Trajectory(t, tau, tau, np.stack([np.round(tau[:, 0] / 0.5) * 0.5, tau[:, 1]], axis=1), "coarse")
+    assert coarse_torques([log], ["a", "b"]) == {"a": pytest.approx(0.5)}
 
 
 def test_only_moving_samples_of_dense_logs_count():
@@ -372,7 +404,8 @@ def test_the_ur10e_urdf_has_its_known_torque_error(shared):
     samples = dynamics_samples(read_logs(sorted(paths), UR10E))
     assert len(samples) == 9
     dynamics = urdf_dynamics(folder / "ur10e.urdf", UR10E)
-    assert torque_errors(dynamics, samples).nmse.mean() == pytest.approx(0.67, abs=0.005)
+    found = torque_errors(dynamics, samples)
+    assert np.mean(list(found.nmse.values())) == pytest.approx(0.67, abs=0.005)
 
 
 def test_logs_that_never_move_have_no_torque_errors(robots):

@@ -98,7 +98,7 @@ def test_a_baseline(robots, monkeypatch, log):
 
             return [Predictor("stands still", still)]
 
-    for user in ("spelgen.evaluation.evaluate", "spelgen.baselines.keep"):
+    for user in ("spelgen.evaluation.evaluate", "spelgen.evaluation.keep"):
         monkeypatch.setattr(f"{user}.BASELINES", (*registry.BASELINES, StandsStill()))
     results = spelgen.evaluate(spelgen.build(load_arm(robots / "two_link.urdf"), "spel", width=4), log)
     error = results.horizons[-1].errors["stands still"].mean_relative_rms

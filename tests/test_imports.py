@@ -25,8 +25,7 @@ certificate emission logs
 loaded_arm pipeline building trust
 identification log_checks excitation
 fitting simulation
-exporting
-baselines
+exporting baselines
 evaluation
 fleet comparison render
 cli __init__ __main__

@@ -16,12 +16,12 @@ from servo_arm import COM, GRAVITY, MASS, STRIBECK_VELOCITY, Servos, servo_logs,
 from typer.testing import CliRunner
 
 import spelgen
-from spelgen.baselines.keep import read_followers
 from spelgen.baselines.names import DELAYED_COMMAND, LINEAR_SERVOS, POSITION_ACTUATORS
 from spelgen.cli.main import app
 from spelgen.dynamics.servo_rank import servo_rank
 from spelgen.dynamics.servo_rollout import replayed
 from spelgen.errors import LogError, OptionError, RunError, SettingsError
+from spelgen.evaluation.keep import read_followers
 from spelgen.files import write_json
 from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.run_folder import RunFolder

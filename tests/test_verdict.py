@@ -1,9 +1,12 @@
 """The verdict of a report: computed from the figures, each word of it."""
 
+from dataclasses import replace
+
 import pytest
 
 from spelgen.evaluation.results import Results
 from spelgen.evaluation.verdict import verdict
+from spelgen.labels import share
 
 JOINTS = ["a", "b"]
 
@@ -20,7 +23,7 @@ def evaluation(relative=0.05, nmse=0.004, traces=None, seen=False, **others):
     for k, (name, factor) in enumerate((("1 step", 0.5), ("1 s", 1.0))):
         by_predictor = {"model": errors(relative * factor)} | {who: errors(x) for who, x in others.items()}
         horizons.append({"name": name, "steps": k + 1, "seconds": 1.0, "windows": 9, "errors": by_predictor})
-    torque = {"model": {"nmse": {}, "mean_nmse": nmse, "rmse": [1.0, 1.0]}}
+    torque = {"model": {"nmse": {}, "mean_nmse": nmse, "rmse": [1.0, 1.0], "joint_nmse": [None, nmse]}}
     return results(horizons, torque, traces, seen)
 
 
@@ -66,7 +69,7 @@ def test_what_it_is_good_for_follows_the_figures(relative, nmse, said):
 
 def test_figures_and_better_baselines_are_told():
     told = verdict(evaluation(0.05, 0.004, squares=0.03)).because
-    assert "explains 99.6 % of the variance" in told and "misses 5 % of the motion after 1 s" in told
+    assert "explains 99.6 % of the variance" in told and "is off by 5 % of the motion after 1 s" in told
     assert "But squares is better after 1 s." in told
 
 
@@ -77,6 +80,32 @@ def test_figures_and_better_baselines_are_told():
 ])  # fmt: skip
 def test_where_it_fails_follows_the_residuals(slow, fast, place):
     assert verdict(evaluation(traces=torques(slow, fast))).sentence.endswith(place)
+
+
+def of_torques(by_joint, steps=None):
+    mean = sum(by_joint) / len(by_joint)
+    judged = results(
+        [], {"model": {"nmse": {}, "mean_nmse": mean, "rmse": [1.0, 1.0], "joint_nmse": by_joint}}
+    )
+    return verdict(replace(judged, torque_steps=steps or {}))
+
+
+def test_a_good_mean_does_not_hide_a_bad_joint():
+    bad, good = of_torques([0.001, 0.2]), of_torques([0.001, 0.004])
+    assert bad.sentence == ("Good enough for gravity compensation, not for feed-forward control; worst at b.")
+    assert "explains 90 % of the variance of the torques (80 % at b)" in bad.because
+    assert "contact detection" in good.sentence
+
+
+def test_a_joint_that_is_logged_in_coarse_steps_is_not_judged():
+    assert "contact detection; worst at a" in of_torques([0.001, 0.2], {"b": 1.0}).sentence
+    assert of_torques([0.3, 0.2], {"b": 1.0, "a": 2.0}).sentence == "Not accurate enough yet."
+
+
+def test_errors_above_the_whole_are_times_of_it():
+    assert share(0.0123, "the motion") == "1.23 % of the motion"
+    assert share(13.6, "the motion") == "13.6 times the motion"
+    assert (share(0.9964), share(1.0), share(2.0)) == ("99.64 %", "100 %", "2 times")
 
 
 def test_what_to_record_follows_what_the_logs_cover():

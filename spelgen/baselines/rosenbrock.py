@@ -120,6 +120,6 @@ class _Equations:
         if not has_friction_state(self.dynamics):
             return damping, torch.zeros_like(damping)
         # bristles load the way a joint goes
-        way = DISPLACEMENT_STEP * torch.where(qd < 0, -1.0, 1.0).to(qd)
-        bent = pose.friction(qd, memory_after(self.dynamics, z, way))
-        return damping, ((bent - pose.friction(qd, z)) / way).clamp(min=0)
+        displacement = DISPLACEMENT_STEP * torch.where(qd < 0, -1.0, 1.0).to(qd)
+        bent = pose.friction(qd, memory_after(self.dynamics, z, displacement))
+        return damping, ((bent - pose.friction(qd, z)) / displacement).clamp(min=0)

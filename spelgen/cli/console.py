@@ -110,14 +110,16 @@ def _message(error: BaseException, debug: bool) -> str:
 
 
 @contextmanager
-def progress_bar(title: str) -> Iterator[Callable[[int, int], None]]:
-    """Show a bar on stderr, where that is a terminal; give a function to call with (done, all)."""
+def progress_bar(title: str) -> Iterator[Callable[..., None]]:
+    """Show a bar on stderr, where that is a terminal; give a function to call with (done, all), and with a title of
+    what runs now.
+    """
     from rich.console import Console
     from rich.progress import Progress
 
     with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty(), transient=True) as bar:
         task = bar.add_task(title, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
+        yield lambda done, total, now=title: bar.update(task, completed=done, total=total, description=now)
 
 
 def say(text: str) -> None:

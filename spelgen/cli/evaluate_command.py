@@ -11,7 +11,7 @@ import typer
 
 from spelgen.baselines.names import MODEL
 from spelgen.cli import options
-from spelgen.cli.console import deliver, note, note_diagnostic, say
+from spelgen.cli.console import deliver, note, note_diagnostic, progress_bar, say
 from spelgen.cli.options import Data, Filter, Mapping, MoreData, Output, Run, Trust
 
 if TYPE_CHECKING:
@@ -70,6 +70,7 @@ def evaluate(
     # a misspelt limit is refused before minutes of rollouts
     paths = options.logs(data, extra_logs)
     limits = [_limit(text) for text in limit or []]
+    from spelgen.evaluation.evaluate import SECONDS, STEPS
     from spelgen.evaluation.evaluate import evaluate as evaluate_model
     from spelgen.evaluation.subject import read_test_logs
     from spelgen.files import write_json
@@ -82,10 +83,11 @@ def evaluate(
         preprocessing = Preprocessing(cutoff=filter)
     logs = read_test_logs(run, paths, mapping)
     model = load_run(run, trust=trust)
-    if quick:
-        results = evaluate_model(model, logs, preprocessing=preprocessing, steps=(), seconds=())
-    else:
-        results = evaluate_model(model, logs, preprocessing=preprocessing)
+    steps, seconds = ((), ()) if quick else (STEPS, SECONDS)
+    with progress_bar("evaluating") as progress:
+        results = evaluate_model(
+            model, logs, preprocessing=preprocessing, steps=steps, seconds=seconds, progress=progress
+        )
     record = results.to_dict()
     # before anything is printed: a closed pipe must not lose the result
     write_json(RunFolder(run).evaluation, record)

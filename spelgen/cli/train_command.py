@@ -147,7 +147,7 @@ def _tell(fit: Fit, folder: Path, paths: Sequence[Path], format: str, *, resume:
     # a resumed run has its baselines already, and an interrupted one is not finished
     interrupted = fit.status == "interrupted"
     if not resume and not interrupted:
-        from spelgen.baselines.keep import keep_baseline
+        from spelgen.evaluation.keep import keep_baseline
 
         keep_baseline(folder, paths)
     record = {

@@ -38,8 +38,8 @@ def with_wrong_inertials(robot: Path, error: float) -> bytes:
         origin = inertial.find("origin")
         if origin is None:
             origin = etree.SubElement(inertial, "origin")
-        at = [float(x) for x in origin.get("xyz", "0 0 0").split()]
-        origin.set("xyz", " ".join(repr(float(x)) for x in np.add(at, size * moved)))
+        center = [float(x) for x in origin.get("xyz", "0 0 0").split()]
+        origin.set("xyz", " ".join(repr(float(x)) for x in np.add(center, size * moved)))
     return _written(tree)
 
 

@@ -66,8 +66,8 @@ def sizes(model: EmittedModel) -> Sizes:
     """Return how many numbers the model's networks give and read, and how many are trained."""
     beside = "residual_" if has_residuals(model) else ""  # rigid bodies
     outputs = []
-    for part in (f"{beside}mass", "friction", "input_network", f"{beside}potential"):
-        network = _network(model, part)
+    for name in (f"{beside}mass", "friction", "input_network", f"{beside}potential"):
+        network = _network(model, name)
         outputs.append(0 if network is None else len(network.biases[-1]))
     if _network(model, "friction") is None:
         outputs[1] = model.n  # a function of each joint's own
@@ -77,9 +77,9 @@ def sizes(model: EmittedModel) -> Sizes:
     return Sizes((outputs[0], outputs[1], outputs[2], outputs[3]), inputs, parameters)
 
 
-def _network(model: EmittedModel, part: str) -> Any:
+def _network(model: EmittedModel, name: str) -> Any:
     """Return the network of a part of the model; None where it has no such part or that has none."""
-    owner = getattr(model, part, None)
+    owner = getattr(model, name, None)
     return owner if hasattr(owner, "biases") else getattr(owner, "network", None)
 
 

@@ -8,19 +8,8 @@ from pathlib import Path
 from spelgen.comparison.metrics import Prediction, Sizes
 from spelgen.errors import RunError
 from spelgen.evaluation.invariants import Invariants
-from spelgen.evaluation.plain import Rows, Series
+from spelgen.evaluation.traces import PredictedMotion
 from spelgen.files import read_json, write_json
-
-
-@dataclass(frozen=True)
-class Example:
-    """A predicted piece of a test trajectory, (T, n), from its first sample; t counts from there [s]."""
-
-    t: Series
-    q: Rows
-    qd: Rows
-    predicted_q: Rows
-    predicted_qd: Rows
 
 
 @dataclass(frozen=True)
@@ -48,7 +37,7 @@ class RunResult:
     prediction: Prediction
     invariants: Invariants
     mass: LearnedMass
-    example: Example | None
+    example: PredictedMotion | None
 
     def save(self, path: Path) -> None:
         """Write it as JSON."""

@@ -10,12 +10,12 @@ import torch
 
 from spelgen.baselines.predictor import Predictor, of_dynamics
 from spelgen.comparison.metrics import predict, sizes, step_seconds, thinned
-from spelgen.comparison.results import Example, LearnedMass, RunResult
+from spelgen.comparison.results import LearnedMass, RunResult
 from spelgen.comparison.study import Study, Variant
 from spelgen.comparison.truth import mass_error, true_mass
 from spelgen.emission.loading import load_module
 from spelgen.evaluation.invariants import invariants
-from spelgen.evaluation.plain import finite_rows
+from spelgen.evaluation.traces import PredictedMotion, predicted_motion
 from spelgen.fitting.fit import RunOptions
 from spelgen.fitting.rollout import LossScales, loss_scales
 from spelgen.fitting.run_folder import RunFolder, trained_model
@@ -50,9 +50,9 @@ def run_study(study: Study, run_tasks: RunTasks, *, note: Callable[[str], None])
             raise result
         done += 1
         loss = result.prediction.loss
-        shown = "not finite" if loss is None else f"{loss:.3g}"
+        loss_text = "not finite" if loss is None else f"{loss:.3g}"
         took = f"{result.seconds:.0f} s"
-        note(f"{done}/{count} {variant.name}, seed {seed}: prediction loss {shown}, {took}")
+        note(f"{done}/{count} {variant.name}, seed {seed}: prediction loss {loss_text}, {took}")
 
 
 def _run(study: Study, task: tuple[Variant, int]) -> RunResult:
@@ -107,7 +107,7 @@ def _measure(
 
 def predict_example(
     predictor: Predictor, logs: Sequence[Trajectory], steps: int, decimation: int
-) -> Example | None:
+) -> PredictedMotion | None:
     """Predict `steps` steps of `decimation` samples in the middle of the first log that is long enough."""
     span = steps * decimation
     for log in logs:
@@ -117,12 +117,7 @@ def predict_example(
             window = cut_windows(
                 [log[start : start + span + 1]], steps + 1, decimation=decimation, measured=False
             )
-            q, qd = predictor.solver(window)
-            t = torch.cat([window.dt.new_zeros(1), window.dt[0].cumsum(dim=0)])
-            predicted_q = torch.cat([window.q[0, :1], q[0]])
-            predicted_qd = torch.cat([window.qd[0, :1], qd[0]])
-            motion = (finite_rows(x) for x in (window.q[0], window.qd[0], predicted_q, predicted_qd))
-            return Example(t.tolist(), *motion)
+            return predicted_motion(window, predictor.solver(window))
     return None
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,8 +20,8 @@ from spelgen.evaluation.replay import replays
 from spelgen.evaluation.results import Results
 from spelgen.evaluation.state_errors import TipPosition
 from spelgen.evaluation.subject import Subject, subject
-from spelgen.evaluation.torque import TorqueSummary, torque_errors
-from spelgen.evaluation.traces import motion_traces, replay_traces
+from spelgen.evaluation.torque import TorqueErrors, coarse_torques, torque_errors
+from spelgen.evaluation.traces import Traces, motion_traces, replay_traces
 from spelgen.logs.checks import check
 from spelgen.logs.dynamics_samples import dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
@@ -34,6 +35,9 @@ if TYPE_CHECKING:
     from spelgen.loaded_arm import LoadedArm
 
 TUNING = EvaluationTuning()
+STEPS: Sequence[int] = (1, 10)
+SECONDS: Sequence[float] = (1.0,)
+Progress = Callable[[int, int, str], None]
 
 
 def evaluate(
@@ -43,8 +47,9 @@ def evaluate(
     arm: LoadedArm | Path | str | None = None,
     baselines: Mapping[str, RigidDynamics] | None = None,
     preprocessing: Preprocessing | None = None,
-    steps: Sequence[int] = (1, 10),
-    seconds: Sequence[float] = (1.0,),
+    steps: Sequence[int] = STEPS,
+    seconds: Sequence[float] = SECONDS,
+    progress: Progress | None = None,
 ) -> Results:
     """Predict the states and torques of test logs and measure the errors.
 
@@ -52,7 +57,8 @@ def evaluate(
     the fit's: it gives the URDF as a baseline, and errors of the tip. baselines: other dynamics to be judged beside
     those of `baselines.registry` and what the fit's folder keeps, by name, e.g. ``{"truth": identify(...).dynamics}``.
     preprocessing: of states and torques; by default as the model was fitted. steps, seconds: horizons in samples and in
-    time; those longer than every trajectory are omitted, with a note.
+    time; those longer than every trajectory are omitted, with a note. progress: called with the rollouts that are done,
+    all of them, and the name of the next one.
     All that has dynamics is judged open loop, and with the constant disturbance that a momentum observer finds before a
     prediction starts (see `momentum_observer.py`). The result is deterministic. Raises LogError.
     """
@@ -73,16 +79,17 @@ def evaluate(
                 "baselines that take torques", expected="none: the model is one of position servos"
             )
         return _evaluate_servos(judged, logs, notes)
-    return _evaluate_torques(judged, logs, notes, baselines or {}, preprocessing, (steps, seconds))
+    return _evaluate_torques(judged, logs, notes, baselines or {}, preprocessing, (steps, seconds), progress)
 
 
 def _evaluate_torques(
     judged: Subject,
     logs: Sequence[Trajectory],
     notes: list[Diagnostic],
-    others: Mapping[str, RigidDynamics],
+    more_dynamics: Mapping[str, RigidDynamics],
     preprocessing: Preprocessing | None,
     ahead: tuple[Sequence[int], Sequence[float]],
+    progress: Progress | None,
 ) -> Results:
     require_torques(logs)
     model, types = judged.model, judged.model.joint_types
@@ -97,45 +104,71 @@ def _evaluate_torques(
     predictors = [Predictor(MODEL, solver, model)]
     for baseline in BASELINES:
         predictors += baseline.predictors(JudgedArm(judged.joints, judged.urdf, judged.run, probe, notes))
-    for name, dynamics in others.items():
+    for name, dynamics in more_dynamics.items():
         predictors.append(of_dynamics(name, dynamics, probe))
     tip = _tip(judged, notes)
     horizons: list[Horizon] = []
     longest: Predictions | None = None
     for name, k in lengths.items():
+        if progress is not None:
+            progress(len(horizons), len(lengths), f"predicting {name} ahead")
         horizon, predictions = predict(name, k, tests, predictors, tip, notes)
         # the curves of the longest horizon show the shorter ones on their way
-        if all(k > other.steps for other in horizons):
+        if all(k > shorter.steps for shorter in horizons):
             longest = predictions
         horizons.append(horizon)
-    return Results(
-        robot=judged.robot,
-        joints=tuple(judged.joints),
-        trajectories=tuple(trajectory.name for trajectory in logs),
+    torque = _torque_errors(predictors, logs, tests)
+    steps = _coarse_torques(logs, judged, notes) if torque else {}
+    return replace(
+        _results(judged, logs, motion_traces(predictors, tests, longest, tip), notes),
         cutoff=used.cutoff or None,
         substeps=solver.substeps,
-        parameters=judged.parameters,
         horizons=tuple(horizons),
-        torque=_torque_summaries(predictors, logs, tests),
+        torque=torque,
+        torque_steps=steps,
         energy_drift=energy_drift(model, probe),
-        traces=motion_traces(predictors, tests, longest, tip),
-        diagnostics=tuple(notes),
-        joint_types=tuple(types),
     )
 
 
-def _torque_summaries(
+def _results(
+    judged: Subject, logs: Sequence[Trajectory], traces: Traces, notes: Sequence[Diagnostic]
+) -> Results:
+    """Return results that name the arm and the logs, without figures."""
+    return Results(
+        robot=judged.robot,
+        joints=tuple(judged.joints),
+        joint_types=tuple(judged.model.joint_types),
+        trajectories=tuple(trajectory.name for trajectory in logs),
+        parameters=judged.parameters,
+        diagnostics=tuple(notes),
+        traces=traces,
+    )
+
+
+def _torque_errors(
     predictors: Sequence[Predictor], logs: Sequence[Trajectory], tests: JudgedLogs
-) -> dict[str, TorqueSummary]:
+) -> dict[str, TorqueErrors]:
     """Return those of all that has dynamics, where logs move and are dense enough for accelerations."""
-    moving = dynamics_samples(logs, preprocessing=tests.used, reach=tests.reach)
-    samples = [sample for sample in moving if len(sample.q)]
-    summaries: dict[str, TorqueSummary] = {}
+    all_samples = dynamics_samples(logs, pauses=True, preprocessing=tests.used, reach=tests.reach)
+    samples = [sample for sample in all_samples if len(sample.q)]
+    errors: dict[str, TorqueErrors] = {}
     if samples:
         for predictor in predictors:
             if predictor.dynamics is not None:
-                summaries[predictor.name] = torque_errors(predictor.dynamics, samples).summary()
-    return summaries
+                errors[predictor.name] = torque_errors(predictor.dynamics, samples)
+    return errors
+
+
+def _coarse_torques(logs: Sequence[Trajectory], judged: Subject, notes: list[Diagnostic]) -> dict[str, float]:
+    """Return the steps of joints whose torque is logged in steps of its own size, and note them."""
+    steps = coarse_torques(logs, judged.joints)
+    for joint, step in steps.items():
+        message = (
+            f"the torque of {joint} is logged in steps of {step:.3g}, as large as the torque itself: "
+            "its error is that of the log, and the verdict leaves this joint out"
+        )
+        notes.append(Diagnostic("warning", "coarse-torque", "logs", None, message))
+    return steps
 
 
 def _evaluate_servos(judged: Subject, logs: Sequence[Trajectory], notes: list[Diagnostic]) -> Results:
@@ -147,21 +180,7 @@ def _evaluate_servos(judged: Subject, logs: Sequence[Trajectory], notes: list[Di
             expected="u: the model is one of position servos",
         )
     errors, missed = replays(judged.model, logs, judged.command_followers, notes)
-    return Results(
-        robot=judged.robot,
-        joints=tuple(judged.joints),
-        trajectories=tuple(trajectory.name for trajectory in logs),
-        cutoff=None,
-        substeps=1,
-        parameters=judged.parameters,
-        horizons=(),
-        torque={},
-        energy_drift=None,
-        traces=replay_traces(missed),
-        diagnostics=tuple(notes),
-        joint_types=tuple(judged.model.joint_types),
-        replays=errors,
-    )
+    return replace(_results(judged, logs, replay_traces(missed), notes), replays=errors)
 
 
 def _tip(judged: Subject, notes: list[Diagnostic]) -> TipPosition | None:

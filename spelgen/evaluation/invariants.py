@@ -41,8 +41,8 @@ def invariants(model: EmittedModel, windows: Windows, low: Tensor, high: Tensor)
     """Measure them over q in low..high (n,), and from the windows' first states."""
     with torch.no_grad():
         orthogonality, rise = _free_motion(model, windows)
-        least = _least_eigenvalue(model, low, high)
-    return Invariants(least, orthogonality, rise, energy_drift(model, windows))
+        smallest = _least_eigenvalue(model, low, high)
+    return Invariants(smallest, orthogonality, rise, energy_drift(model, windows))
 
 
 def _least_eigenvalue(model: EmittedModel, low: Tensor, high: Tensor) -> float:
@@ -50,8 +50,8 @@ def _least_eigenvalue(model: EmittedModel, low: Tensor, high: Tensor) -> float:
     generator = torch.Generator().manual_seed(0)
     count = TUNING.sampled_positions
     q = low + (high - low) * torch.rand(count, len(low), dtype=low.dtype, generator=generator)
-    parts = q.chunk(10)  # all at once would take gigabytes
-    eigenvalues = torch.cat([torch.linalg.eigvalsh(model.mass_matrix(part)) for part in parts])
+    chunks = q.chunk(10)  # all at once would take gigabytes
+    eigenvalues = torch.cat([torch.linalg.eigvalsh(model.mass_matrix(chunk)) for chunk in chunks])
     return (eigenvalues.min() / eigenvalues.mean().abs()).item()
 
 

@@ -31,8 +31,3 @@ def rows(values: np.ndarray | torch.Tensor) -> Rows:
 def finite(values: np.ndarray | torch.Tensor) -> tuple[float | None, ...]:
     """Return (T,) as a tuple of exact numbers; None where not finite."""
     return tuple(x if math.isfinite(x) else None for x in values.tolist())
-
-
-def finite_rows(values: np.ndarray | torch.Tensor) -> Rows:
-    """Return (T, n) likewise, as a list of lists."""
-    return [list(finite(row)) for row in values]

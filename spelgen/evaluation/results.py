@@ -1,58 +1,19 @@
-"""The results of an evaluation: for people, notebooks, and as evaluation.json."""
+"""The results of an evaluation: its figures as people read them, in a terminal and in a notebook."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from html import escape
 
 from spelgen.baselines.names import MODEL
-from spelgen.errors import Diagnostic
-from spelgen.evaluation.horizons import Horizon
-from spelgen.evaluation.replay import Replay
+from spelgen.evaluation.figures import Figures
 from spelgen.evaluation.tables import result_tables
-from spelgen.evaluation.torque import TorqueSummary
-from spelgen.evaluation.traces import Traces
 from spelgen.evaluation.verdict import verdict
-
-SCHEMA = 6
 
 
 @dataclass(frozen=True, repr=False)
-class Results:
-    """The results of `evaluate`; `to_dict` is evaluation.json.
-
-    cutoff: of the filter on the test logs [Hz], None without. substeps: of the integrator between samples, for the
-    model. parameters: its trained numbers. torque: by predictor, empty where the logs are too sparse. energy_drift: of
-    the model without input and dissipation over 1 s, integrated to thirteen digits, relative to its kinetic energy;
-    None where the logs never move. traces: the curves behind the figures; those of predictions are the longest
-    horizon's. replays: of commands, of an arm under position servos.
-    """
-
-    robot: str
-    joints: tuple[str, ...]
-    trajectories: tuple[str, ...]
-    cutoff: float | None
-    substeps: int
-    parameters: int
-    horizons: tuple[Horizon, ...]
-    torque: dict[str, TorqueSummary]
-    energy_drift: float | None
-    diagnostics: tuple[Diagnostic, ...]
-    traces: Traces
-    joint_types: tuple[str, ...]
-    replays: tuple[Replay, ...] = ()
-
-    def to_dict(self) -> dict[str, object]:
-        """Return the JSON form, versioned by `schema`."""
-        return {"schema": SCHEMA} | asdict(self)
-
-    @classmethod
-    def from_dict(cls, record: Mapping[str, object]) -> Results:
-        """Return what `to_dict` gave. Raises ValueError where it is something else."""
-        from pydantic import TypeAdapter  # slow to import
-
-        return TypeAdapter(cls).validate_python(record)
+class Results(Figures):
+    """Show the figures of `evaluate` as tables."""
 
     def text(self) -> str:
         """Return every table for a terminal, the best of each row starred."""

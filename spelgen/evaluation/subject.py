@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 import torch
 
 from spelgen.baselines.baseline import CommandFollower
-from spelgen.baselines.keep import read_followers
 from spelgen.baselines.names import DELAYED_COMMAND, LINEAR_SERVOS
 from spelgen.dynamics.bristles import NO_BRISTLES, BristleReach, bristle_reach, reach_of
+from spelgen.evaluation.keep import read_followers
 from spelgen.fitting.fitted import Fit, load_run
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.servo.linear_servos import DelayedCommand, LinearServos
@@ -86,9 +86,9 @@ def _command_followers(fit: Fit) -> dict[str, CommandFollower]:
     """Return the baselines that a fit of position servos leaves in its record and its folder."""
     if "servo" not in fit.record:
         return {}
-    kept = {} if fit.folder is None else read_followers(RunFolder(fit.folder))
+    followers = {} if fit.folder is None else read_followers(RunFolder(fit.folder))
     servos = LinearServos.from_dict(fit.record["servo"]["linear"])
-    return {**kept, LINEAR_SERVOS: servos, DELAYED_COMMAND: DelayedCommand(servos.late)}
+    return {**followers, LINEAR_SERVOS: servos, DELAYED_COMMAND: DelayedCommand(servos.late)}
 
 
 def _of_model(model: EmittedModel, urdf: Path | str | None) -> Subject:

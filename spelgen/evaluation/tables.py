@@ -11,7 +11,7 @@ from spelgen.labels import thousandths
 from spelgen.listing import Listing, number
 
 if TYPE_CHECKING:
-    from spelgen.evaluation.results import Results
+    from spelgen.evaluation.figures import Figures
 
 OBSERVER = (
     "+ observer: with the constant disturbance that a momentum observer estimates from the 0.1 s before; "
@@ -79,18 +79,18 @@ def table(title: str, labels: Sequence[str], rows: Iterable[Numbers], note: str 
 
 
 def _cells(row: Numbers, columns: Iterable[str]) -> tuple[Cell, ...]:
-    least = None
+    smallest = None
     if len(row) > 1:  # alone it would be the best of nothing
-        least = min((value for value in row.values() if value is not None), default=None)
+        smallest = min((value for value in row.values() if value is not None), default=None)
     cells = []
     for name in columns:
         value = row.get(name)
         text = number(value) if name in row else ""
-        cells.append(Cell(text, best=value is not None and value == least))
+        cells.append(Cell(text, best=value is not None and value == smallest))
     return tuple(cells)
 
 
-def result_tables(results: Results) -> list[Table]:
+def result_tables(results: Figures) -> list[Table]:
     """Return the tables of an evaluation: commands replayed, errors by horizon and by joint, torques."""
     tables = [*_replay_tables(results), *_horizon_tables(results), *_torque_tables(results)]
     return [_without_empty_columns(table) for table in tables]
@@ -98,12 +98,12 @@ def result_tables(results: Results) -> list[Table]:
 
 def _without_empty_columns(table: Table) -> Table:
     """Return the table without baselines whose cells are all dashes or empty."""
-    kept = []
+    filled = []
     for k, name in enumerate(table.columns):
         if name == MODEL or any(row.cells[k].text not in ("", "-") for row in table.rows):
-            kept.append(k)
-    rows = [Row(row.label, tuple(row.cells[k] for k in kept)) for row in table.rows]
-    return replace(table, columns=tuple(table.columns[k] for k in kept), rows=tuple(rows))
+            filled.append(k)
+    rows = [Row(row.label, tuple(row.cells[k] for k in filled)) for row in table.rows]
+    return replace(table, columns=tuple(table.columns[k] for k in filled), rows=tuple(rows))
 
 
 def _values(errors: Mapping[str, Errors], value: Callable[[Errors], Value]) -> dict[str, Value]:
@@ -111,7 +111,7 @@ def _values(errors: Mapping[str, Errors], value: Callable[[Errors], Value]) -> d
     return {name: value(of_predictor) for name, of_predictor in errors.items()}
 
 
-def _horizon_tables(results: Results) -> list[Table]:
+def _horizon_tables(results: Figures) -> list[Table]:
     if not results.horizons:
         return []
     heads, relative, tips, note = [], [], [], ""
@@ -136,18 +136,31 @@ def _horizon_tables(results: Results) -> list[Table]:
     return tables
 
 
-def _torque_tables(results: Results) -> list[Table]:
-    if not results.torque:
+def _torque_tables(results: Figures) -> list[Table]:
+    torque = results.torque
+    if not torque:
         return []
-    mean = _values(results.torque, lambda x: x.mean_nmse)
-    by_joint = _values(results.torque, lambda x: x.rmse)
+    rows = {
+        "mean of joints": _values(torque, lambda x: x.mean_nmse),
+        "with pauses": _values(torque, lambda x: x.nmse_with_pauses),
+        "worst joint": _values(torque, lambda x: _largest(x.joint_nmse)),
+    }
+    by_joint = _by_joint(results, "Torque error by joint, RMSE{}", TORQUE, _values(torque, lambda x: x.rmse))
+    if results.torque_steps:
+        by_joint = replace(
+            by_joint, note=f"logged in steps of their own size: {', '.join(results.torque_steps)}"
+        )
     return [
-        table("Torque error of the inverse dynamics", ["nMSE, mean of all"], [mean]),
-        _by_joint(results, "Torque error by joint, RMSE{}", TORQUE, by_joint),
+        table("Torque error of the inverse dynamics, nMSE over all test samples", list(rows), rows.values()),
+        by_joint,
     ]
 
 
-def _replay_tables(results: Results) -> list[Table]:
+def _largest(values: Sequence[float | None]) -> float | None:
+    return max((value for value in values if value is not None), default=None)
+
+
+def _replay_tables(results: Figures) -> list[Table]:
     """Return those of commands replayed: by trajectory and by joint."""
     tables, unit = [], thousandths(results.joint_types)
     for replay in results.replays:
@@ -166,7 +179,7 @@ def _replay_tables(results: Results) -> list[Table]:
 
 
 def _by_joint(
-    results: Results, title: str, quantity: int, values: Mapping[str, Sequence[float | None]]
+    results: Figures, title: str, quantity: int, values: Mapping[str, Sequence[float | None]]
 ) -> Table:
     """Return a row for each joint; the unit stands in the title where all have the same, else beside each joint."""
     units = [UNITS[kind][quantity] for kind in results.joint_types]

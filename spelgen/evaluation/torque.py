@@ -11,54 +11,75 @@ import torch
 
 from spelgen.dynamics.protocol import known_past
 from spelgen.evaluation.plain import finite
-from spelgen.logs.dynamics_samples import DynamicsSamples
+from spelgen.log_checks.statistics import common_step, quantisation_step
+from spelgen.logs.dynamics_samples import DynamicsSamples, is_moving
+from spelgen.logs.trajectory import Trajectory
+from spelgen.settings.tuning.log_checks import LogCheckTuning
+
+LEVELS = LogCheckTuning().levels
 
 
 @dataclass(frozen=True)
 class TorqueErrors:
-    """Errors of one predictor: nmse and rmse per trajectory and joint, (trajectories, n).
-
-    nmse: mean squared error / variance of the torque, NaN where the torque never varies. rmse: [Nm, N].
-    """
-
-    trajectories: tuple[str, ...]
-    nmse: np.ndarray
-    rmse: np.ndarray
-
-    def summary(self) -> TorqueSummary:
-        """Return means over joints and trajectories."""
-        # a joint whose torque never varies has no nMSE, and says nothing
-        by_trajectory = np.nanmean(self.nmse, axis=1)
-        nmse = dict(zip(self.trajectories, finite(by_trajectory), strict=True))
-        (mean,) = finite(by_trajectory.mean(keepdims=True))
-        by_joint = finite(np.nanmean(self.nmse, axis=0))
-        return TorqueSummary(nmse, mean, finite(self.rmse.mean(axis=0)), by_joint)
-
-
-@dataclass(frozen=True)
-class TorqueSummary:
     """Errors of the inverse dynamics of one predictor by the protocol of `dynamics_samples`.
 
-    nmse: per trajectory, mean over joints. mean_nmse: mean over trajectories. rmse [Nm, N], joint_nmse: per
-    joint, mean over trajectories.
+    An nMSE is the mean squared error by the variance of the torque. nmse: of each trajectory, mean over joints. All
+    others are pooled over the samples of all trajectories, so that a log that is short or hardly moves weighs no more
+    than its samples. joint_nmse, rmse [Nm, N]: by joint, None where the torque never varies. mean_nmse: mean over
+    joints. nmse_with_pauses: the same with the pauses between motions.
     """
 
     nmse: dict[str, float | None]
     mean_nmse: float | None
     rmse: tuple[float | None, ...]
     joint_nmse: tuple[float | None, ...] = ()
+    nmse_with_pauses: float | None = None
 
 
 def torque_errors(dynamics: Any, samples: Sequence[DynamicsSamples]) -> TorqueErrors:
-    """Return the errors of an inverse dynamics on these samples."""
-    nmse, rmse = [], []
+    """Return the errors of an inverse dynamics on these samples, of which those of pauses count apart."""
+    residuals, torques, moving, by_trajectory = [], [], [], {}
     for sample in samples:
-        q, qd, qdd, tau = map(torch.from_numpy, (sample.q, sample.qd, sample.qdd, sample.tau))
+        q, qd, qdd = map(torch.from_numpy, (sample.q, sample.qd, sample.qdd))
         z = None if sample.z is None else torch.from_numpy(sample.z)
         with torch.no_grad():
             predicted = dynamics.inverse_dynamics(q, qd, qdd, *known_past(dynamics, z))
-        squares = (predicted - tau).square().mean(dim=0).numpy()
-        variance = sample.tau.var(axis=0)
-        nmse.append(np.divide(squares, variance, out=np.full_like(squares, np.nan), where=variance > 0))
-        rmse.append(np.sqrt(squares))
-    return TorqueErrors(tuple(sample.name for sample in samples), np.array(nmse), np.array(rmse))
+        residual, rows = predicted.numpy() - sample.tau, is_moving(sample.qd)
+        by_trajectory[sample.name] = _mean(_nmse(residual[rows], sample.tau[rows]))
+        residuals.append(residual)
+        torques.append(sample.tau)
+        moving.append(rows)
+    residual, torque, rows = map(np.concatenate, (residuals, torques, moving))
+    by_joint = _nmse(residual[rows], torque[rows])
+    return TorqueErrors(
+        nmse=by_trajectory,
+        mean_nmse=_mean(by_joint),
+        rmse=finite(np.sqrt(np.square(residual[rows]).mean(axis=0))),
+        joint_nmse=finite(by_joint),
+        nmse_with_pauses=_mean(_nmse(residual, torque)),
+    )
+
+
+def _nmse(residual: np.ndarray, torque: np.ndarray) -> np.ndarray:
+    """Return the nMSE of each joint, (T, n) -> (n,): NaN where the torque never varies."""
+    variance = torque.var(axis=0)
+    # a prediction that is not finite must not pass for a torque that says nothing
+    squares = np.nan_to_num(np.square(residual).mean(axis=0), nan=np.inf, posinf=np.inf)
+    return np.divide(squares, variance, out=np.full_like(variance, np.nan), where=variance > 0)
+
+
+def _mean(nmse: np.ndarray) -> float | None:
+    """Return the mean over joints whose torque varies; None where none does or an error is not finite."""
+    varying = nmse[~np.isnan(nmse)]
+    return finite(varying.mean(keepdims=True))[0] if varying.size else None
+
+
+def coarse_torques(logs: Sequence[Trajectory], joints: Sequence[str]) -> dict[str, float]:
+    """Return by name the steps [Nm, N] of torques that are logged in steps of their own size."""
+    steps = {}
+    for k, joint in enumerate(joints):
+        step = common_step([quantisation_step(log.tau[:, k]) for log in logs])
+        low, high = min(log.tau[:, k].min() for log in logs), max(log.tau[:, k].max() for log in logs)
+        if step is not None and high - low < LEVELS * step:
+            steps[joint] = step
+    return steps

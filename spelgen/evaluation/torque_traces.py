@@ -98,8 +98,8 @@ def _motion(piece: Trajectory, logs: JudgedLogs) -> Motion | None:
     t = columns[0] - columns[0][0]
     count = min(len(t), int(np.searchsorted(t, SECONDS)) + 1)
     start = (len(t) - count) // 2  # logs begin and end at rest
-    part = slice(start, start + count)
-    tensors = [torch.from_numpy(np.ascontiguousarray(x[part])) for x in (t - t[start], *columns[1:])]
+    span = slice(start, start + count)
+    tensors = [torch.from_numpy(np.ascontiguousarray(x[span])) for x in (t - t[start], *columns[1:])]
     return Motion(*tensors)
 
 

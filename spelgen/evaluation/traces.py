@@ -15,6 +15,7 @@ from torch import Tensor
 
 from spelgen.baselines.names import MODEL, is_drawn
 from spelgen.baselines.predictor import Predictor
+from spelgen.baselines.solver import States
 from spelgen.evaluation.horizons import JudgedLogs, Predictions
 from spelgen.evaluation.plain import Rows, Series, number, rows, series
 from spelgen.evaluation.replay import Missed
@@ -53,18 +54,24 @@ class Growth:
 
 
 @dataclass(frozen=True)
-class PredictedExample:
-    """A prediction of the model, of middle ("typical") or largest ("worst") error, and what was measured; (T, n)."""
+class PredictedMotion:
+    """A predicted piece of a trajectory beside what was measured, (T, n); t counts from its first sample [s]."""
 
-    which: str
-    trajectory: str
-    start: float | None
-    error: float | None
     t: Series
     q: Rows
     qd: Rows
     predicted_q: Rows
     predicted_qd: Rows
+
+
+@dataclass(frozen=True)
+class PredictedExample(PredictedMotion):
+    """A prediction of the model, of middle ("typical") or largest ("worst") error, that starts at this time [s]."""
+
+    which: str
+    trajectory: str
+    start: float | None
+    error: float | None
 
 
 @dataclass(frozen=True)
@@ -201,7 +208,7 @@ def _growth(predictions: Predictions, joint_types: Sequence[str], tip: TipPositi
 
 
 def _relative_errors(
-    states: tuple[Tensor, Tensor], windows: Windows, scales: LossScales, joint_types: Sequence[str]
+    states: States, windows: Windows, scales: LossScales, joint_types: Sequence[str]
 ) -> Tensor:
     """Return the root mean square over joints of errors in units of the motion, (W, K-1)."""
     q, qd = states
@@ -218,28 +225,30 @@ def _quantiles(values: Tensor) -> Quantiles:
 
 
 def _examples(predictions: Predictions, joint_types: Sequence[str]) -> tuple[PredictedExample, ...]:
-    windows, (q, qd) = predictions.windows, predictions.states[MODEL]
-    scales = loss_scales(windows, joint_types)
-    errors = _relative_errors((q, qd), windows, scales, joint_types)[:, -1]
-    stride = -(-q.shape[1] // SHOWN)
+    windows, states = predictions.windows, predictions.states[MODEL]
+    errors = _relative_errors(states, windows, loss_scales(windows, joint_types), joint_types)[:, -1]
+    stride = -(-windows.dt.shape[1] // SHOWN)
     examples = []
     for which, k in _typical_and_worst(errors).items():
         piece, first = predictions.starts[k]
-        t = torch.cat([windows.dt.new_zeros(1), windows.dt[k].cumsum(dim=0)])
+        start, error = number(piece.t[first] - piece.t[0]), number(errors[k].item())
+        motion = predicted_motion(windows, states, k, stride)
         examples.append(
-            PredictedExample(
-                which,
-                piece.name,
-                number(piece.t[first] - piece.t[0]),
-                number(errors[k].item()),
-                series(t[::stride]),
-                rows(windows.q[k][::stride]),
-                rows(windows.qd[k][::stride]),
-                rows(torch.cat([windows.q[k, :1], q[k]])[::stride]),
-                rows(torch.cat([windows.qd[k, :1], qd[k]])[::stride]),
-            )
+            PredictedExample(**vars(motion), which=which, trajectory=piece.name, start=start, error=error)
         )
     return tuple(examples)
+
+
+def predicted_motion(windows: Windows, states: States, k: int = 0, stride: int = 1) -> PredictedMotion:
+    """Return window k with what was predicted of it."""
+    predicted_q, predicted_qd = states
+    return PredictedMotion(
+        t=series(torch.cat([windows.dt.new_zeros(1), windows.dt[k].cumsum(dim=0)])[::stride]),
+        q=rows(windows.q[k][::stride]),
+        qd=rows(windows.qd[k][::stride]),
+        predicted_q=rows(torch.cat([windows.q[k, :1], predicted_q[k]])[::stride]),
+        predicted_qd=rows(torch.cat([windows.qd[k, :1], predicted_qd[k]])[::stride]),
+    )
 
 
 def _mass_trace(

@@ -5,18 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from spelgen.baselines.names import CONSTANT_VELOCITY, MODEL, URDF_WITH_DRIVES, observed
 from spelgen.errors import shortened
-from spelgen.labels import listed, thousandths
+from spelgen.labels import listed, share, thousandths
 from spelgen.listing import number
 from spelgen.settings.tuning.evaluation import EvaluationTuning
 
 if TYPE_CHECKING:
-    from spelgen.evaluation.results import Results
+    from spelgen.evaluation.figures import Figures
     from spelgen.evaluation.state_errors import StateErrors
 
 TUNING = EvaluationTuning()
@@ -62,7 +63,7 @@ class _Recommendation:
     reason: str
 
 
-def verdict(results: Results, identified: Mapping[str, Any] | None = None, limits: Limits = ()) -> Verdict:
+def verdict(results: Figures, identified: Mapping[str, Any] | None = None, limits: Limits = ()) -> Verdict:
     """Judge an evaluation. identified: least_squares.json, of the training logs. limits: of the joints."""
     uses = _Uses()
     _judge_torques(results, uses)
@@ -100,14 +101,17 @@ def verdict(results: Results, identified: Mapping[str, Any] | None = None, limit
         _better_baselines(results),
     ]
     because += [f"{recommendation.reason}." for recommendation in recommendations]
-    return Verdict(f"{sentence}.", " ".join(part for part in because if part))
+    return Verdict(f"{sentence}.", " ".join(statement for statement in because if statement))
 
 
-def _judge_torques(results: Results, uses: _Uses) -> None:
-    summary = results.torque.get(MODEL)
-    if summary is None or summary.mean_nmse is None:
+def _judge_torques(results: Figures, uses: _Uses) -> None:
+    """Judge by the joint whose torque is explained least: a mean hides it."""
+    torque = results.torque.get(MODEL)
+    if torque is None or torque.mean_nmse is None:
         return
-    explained = 1 - summary.mean_nmse  # coefficient of determination
+    worst = _worst_torque(results)
+    unexplained = torque.mean_nmse if worst is None else worst[1]
+    explained = 1 - unexplained  # coefficient of determination
     if explained >= TUNING.explained_for_contacts:
         uses.good += ["feed-forward control", "contact detection"]
     elif explained >= TUNING.explained_for_feed_forward:
@@ -118,11 +122,28 @@ def _judge_torques(results: Results, uses: _Uses) -> None:
         uses.bad.append("feed-forward control")
     else:
         uses.bad.append("control")
-    amount = _percent(explained) if explained > 0 else "none"
-    uses.proofs.append(f"explains {amount} of the variance of the torques")
+    proof = f"explains {_explained(torque.mean_nmse)} of the variance of the torques"
+    if worst is not None and _explained(worst[1]) != _explained(torque.mean_nmse):
+        proof += f" ({_explained(worst[1])} at {worst[0]})"
+    uses.proofs.append(proof)
 
 
-def _judge_motion(results: Results, uses: _Uses) -> None:
+def _explained(nmse: float) -> str:
+    return share(1 - nmse) if nmse < 1 else "none"
+
+
+def _worst_torque(results: Figures) -> tuple[str, float] | None:
+    """Return the joint of the model's largest nMSE, and this; of joints whose torque is not logged in coarse steps."""
+    torque = results.torque.get(MODEL)
+    errors: dict[str, float] = {}
+    if torque is not None:
+        for joint, error in zip(results.joints, torque.joint_nmse, strict=False):
+            if error is not None and joint not in results.torque_steps:
+                errors[joint] = error
+    return max(errors.items(), key=itemgetter(1), default=None)
+
+
+def _judge_motion(results: Figures, uses: _Uses) -> None:
     # a long horizon may blow up where a short one tells something
     finite = [x for x in results.horizons if x.errors[MODEL].mean_relative_rms is not None]
     if not finite:
@@ -141,27 +162,26 @@ def _judge_motion(results: Results, uses: _Uses) -> None:
         uses.bad.append(f"simulation {last.name} ahead")
         if holding <= TUNING.rough_prediction:
             uses.good.append(f"prediction {last.name} ahead with a momentum observer")
-    away = ""
+    proof = f"is off by {share(error, 'the motion')} after {last.name}"
     tip = last.errors[MODEL].tip_mm
     if tip is not None:
-        away = f", {number(tip)} mm at the tip"
-    if error <= 1:
-        uses.proofs.append(f"misses {_percent(error)} of the motion after {last.name}{away}")
-    else:
-        uses.proofs.append(f"is off by {error:.3g} times the motion after {last.name}{away}")
+        proof += f", {number(tip)} mm at the tip"
+    uses.proofs.append(proof)
 
 
-def _judge_replays(results: Results, uses: _Uses) -> None:
+def _judge_replays(results: Figures, uses: _Uses) -> None:
     if not results.replays:
         return
     replay = results.replays[0]
-    own = replay.errors[MODEL].mean  # of whole logs: windows forgive what drifts
-    if own == min(errors.mean for errors in replay.errors.values()):
+    model_error = replay.errors[MODEL].mean  # of whole logs: windows forgive what drifts
+    if model_error == min(errors.mean for errors in replay.errors.values()):
         uses.good.append("simulation from commands")
     else:
         uses.bad.append("simulation from commands")
     unit = thousandths(results.joint_types)
-    uses.proofs.append(f"misses {1000 * own:.3g} {unit} of the positions that follow commands, {replay.name}")
+    uses.proofs.append(
+        f"misses {1000 * model_error:.3g} {unit} of the positions that follow commands, {replay.name}"
+    )
 
 
 def _relative(errors: StateErrors | None) -> float:
@@ -171,12 +191,12 @@ def _relative(errors: StateErrors | None) -> float:
     return errors.mean_relative_rms
 
 
-def _constant_velocity(results: Results) -> str:
+def _constant_velocity(results: Figures) -> str:
     """Say at which times ahead a constant velocity is better than the model, with an observer and without."""
     times = []
     for horizon in results.horizons:
-        own = min(_relative(horizon.errors.get(name)) for name in (MODEL, observed(MODEL)))
-        if _relative(horizon.errors.get(CONSTANT_VELOCITY)) < own:
+        model_error = min(_relative(horizon.errors.get(name)) for name in (MODEL, observed(MODEL)))
+        if _relative(horizon.errors.get(CONSTANT_VELOCITY)) < model_error:
             times.append(horizon.name)
     if not times:
         return ""
@@ -185,7 +205,7 @@ def _constant_velocity(results: Results) -> str:
     )
 
 
-def _better_baselines(results: Results) -> str:
+def _better_baselines(results: Figures) -> str:
     """Say which other baselines are better, at what."""
     better: dict[str, list[str]] = {}
     for horizon in results.horizons:
@@ -206,10 +226,14 @@ def _better_baselines(results: Results) -> str:
     return f"But {listed([f'{name} is better {listed(where)}' for name, where in better.items()])}."
 
 
-def _worst_joint(results: Results) -> _Failure:
+def _worst_joint(results: Figures) -> _Failure:
     """Return the joint whose torque is explained least, else the one whose motion is."""
-    if results.traces.torques:
-        return _worst_torque(results)
+    worst = _worst_torque(results)
+    if worst is not None:
+        joint, error = worst
+        amount = share(math.sqrt(error), "the torque's standard deviation")
+        proof = f"At {joint} the torque residual is {amount}."
+        return _Failure(joint, _slow_or_fast(results, results.joints.index(joint)), proof)
     if not results.horizons:
         return _Failure()
     last = results.horizons[-1]
@@ -217,38 +241,36 @@ def _worst_joint(results: Results) -> _Failure:
     if not errors or None in errors:
         return _Failure()
     k = int(np.argmax(np.array(errors, dtype=float)))
-    amount = _percent(float(errors[k] or 0))
+    amount = share(float(errors[k] or 0), "the motion")
     joint = results.joints[k]
-    return _Failure(joint, "", f"At {joint} the error after {last.name} is {amount} of the motion.")
+    return _Failure(joint, "", f"At {joint} the error after {last.name} is {amount}.")
 
 
-def _worst_torque(results: Results) -> _Failure:
+def _slow_or_fast(results: Figures, k: int) -> str:
+    """Return at which speed of joint k the residuals of its torque are larger, where they differ."""
     traces = results.traces.torques
-    measured = np.concatenate([np.array(trace.measured, dtype=float) for trace in traces])  # (T, n)
-    predicted = np.concatenate([np.array(trace.predicted[MODEL], dtype=float) for trace in traces])
-    qd = np.concatenate([np.array(trace.qd, dtype=float) for trace in traces])
-    residual = measured - predicted
-    deviation = np.nanstd(measured, axis=0)
-    # a joint whose torque never varies has nothing to explain
-    ratios = np.sqrt(np.nanmean(residual**2, axis=0)) / np.where(deviation > 0, deviation, math.inf)
-    k = int(np.nanargmax(ratios))
-    joint, when = results.joints[k], ""
-    slow = np.abs(qd[:, k]) < TUNING.slow * np.nanmax(np.abs(qd[:, k]))
+    if not traces:
+        return ""
+    residuals, speeds = [], []
+    for trace in traces:
+        measured, predicted = (
+            np.array(x, dtype=float)[:, k] for x in (trace.measured, trace.predicted[MODEL])
+        )
+        residuals.append(measured - predicted)
+        speeds.append(np.abs(np.array(trace.qd, dtype=float)[:, k]))
+    residual, speed = np.concatenate(residuals), np.concatenate(speeds)
+    slow = speed < TUNING.slow * np.nanmax(speed)
     # a handful of samples tells no root mean square
-    if 5 < slow.sum() < len(slow) - 5:
-        size_slow, size_fast = (np.sqrt(np.nanmean(residual[x, k] ** 2)) for x in (slow, ~slow))
-        if size_slow > TUNING.uneven * size_fast:
-            when = f" {STANDSTILL}"
-        elif size_fast > TUNING.uneven * size_slow:
-            when = " at speed"
-    amount = _percent(float(ratios[k]))
-    return _Failure(
-        joint, when, f"At {joint} the torque residual is {amount} of the torque's standard deviation."
-    )
+    if not 5 < slow.sum() < len(slow) - 5:
+        return ""
+    size_slow, size_fast = (np.sqrt(np.nanmean(residual[rows] ** 2)) for rows in (slow, ~slow))
+    if size_slow > TUNING.uneven * size_fast:
+        return f" {STANDSTILL}"
+    return " at speed" if size_fast > TUNING.uneven * size_slow else ""
 
 
 def _recommendations(
-    results: Results, identified: Mapping[str, Any], limits: Limits, worst: _Failure
+    results: Figures, identified: Mapping[str, Any], limits: Limits, worst: _Failure
 ) -> list[_Recommendation]:
     """Return what to record, the most useful first."""
     recommendations = []
@@ -271,7 +293,7 @@ def _recommendations(
     if fractions:
         joint = min(fractions, key=fractions.__getitem__)
         if fractions[joint] < TUNING.narrow_range:
-            reason = f"{joint} has moved over {_percent(fractions[joint])} of its range"
+            reason = f"{joint} has moved over {share(fractions[joint], 'its range')}"
             recommend(f"wider motion of {joint}", reason)
     base = identified.get("base_parameters", ())
     weak = [parameter for parameter in base if parameter["determined"] in ("weak", "may be zero")]
@@ -294,17 +316,11 @@ def _range_fractions(trained: Mapping[str, Any], joints: Sequence[str], limits: 
 
 def _outside(trained: Mapping[str, Any], tested: Mapping[str, Any], joints: Sequence[str]) -> list[str]:
     """Return where the test logs go beyond the training logs by a tenth of these."""
-    places = []
+    exceeded = []
     for quantity, word in (("q", "positions"), ("qd", "velocities")):
         ranges = zip(joints, trained.get(quantity, ()), tested.get(quantity, ()), strict=False)
         for name, inner, outer in ranges:
             room = 0.1 * (inner["high"] - inner["low"])
             if outer["low"] < inner["low"] - room or outer["high"] > inner["high"] + room:
-                places.append(f"{word} of {name}")
-    return places
-
-
-def _percent(fraction: float) -> str:
-    """Return three digits, and four of what is nearly all."""
-    digits = 4 if 0.99 <= fraction < 1 else 3
-    return f"{100 * fraction:.{digits}g} %"
+                exceeded.append(f"{word} of {name}")
+    return exceeded

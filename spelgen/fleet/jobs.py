@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from spelgen.baselines.keep import keep_baseline
 from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.errors import RunError
 from spelgen.evaluation.evaluate import evaluate
+from spelgen.evaluation.keep import keep_baseline
 from spelgen.evaluation.subject import read_test_logs
 from spelgen.files import read_bytes, read_json, write_json, write_text
 from spelgen.fitting.fit import RunOptions

@@ -91,7 +91,7 @@ def _columns(
     cutoff = preprocessing.acceleration_cutoff
     smooth = _at_common_rate(piece, cutoff)
     qdd = np.gradient(smooth.qd, smooth.t, axis=0)
-    selected = (np.abs(smooth.qd) > TUNING.moving).any(axis=1)
+    selected = is_moving(smooth.qd)
     if pauses and selected.any():
         moving = np.flatnonzero(selected)
         selected[moving[0] : moving[-1]] = True
@@ -107,6 +107,11 @@ def _columns(
         if direction is not None:
             columns.append(direction if cutoff is None else low_pass_regular(direction, FREQUENCY, cutoff))
     return columns if selected.all() else [x[selected] for x in columns]
+
+
+def is_moving(qd: np.ndarray) -> np.ndarray:
+    """Return in which samples some joint moves, (T,)."""
+    return np.asarray((np.abs(qd) > TUNING.moving).any(axis=1))
 
 
 def _at_common_rate(piece: Trajectory, cutoff: float | None) -> Trajectory:

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from spelgen.comparison.results import Example, RunResult
+from spelgen.comparison.results import RunResult
 from spelgen.comparison.study import Study
 from spelgen.comparison.truth import true_mass
 from spelgen.evaluation.tables import Table
+from spelgen.evaluation.traces import PredictedMotion
 from spelgen.files import write_text
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.labels import named_joints
@@ -99,7 +100,7 @@ def _mass_panels(
 
 
 def _prediction_panels(
-    examples: Mapping[str, Example], styles: Mapping[str, str], facts: Facts
+    examples: Mapping[str, PredictedMotion], styles: Mapping[str, str], facts: Facts
 ) -> list[Panel]:
     """Return the first test trajectory of the results: what was measured, and what every variant predicts."""
     measured = next(iter(examples.values()))

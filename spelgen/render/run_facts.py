@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from spelgen.baselines.names import MODEL
 from spelgen.fitting.objectives import fit_summary
-from spelgen.labels import thousandths
+from spelgen.labels import share, thousandths
 from spelgen.listing import number
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.render.charts import Chart
@@ -42,14 +42,14 @@ def head_numbers(
     figures = []
     torque = evaluation.get("torque", {}).get(MODEL)
     if torque and torque["mean_nmse"] is not None:
-        value = f"{100 * torque['mean_nmse']:.3g} %"
-        figures.append(Number(value, "of the torque variance is unexplained (nMSE)"))
+        value = share(torque["mean_nmse"])
+        figures.append(Number(value, "torque error relative to its variance (nMSE)"))
     # the longest horizon is the hardest, and what a simulation needs
     for horizon in evaluation.get("horizons", ())[-1:]:
         error = horizon["errors"][MODEL]
         if error["mean_relative_rms"] is not None:
             figures.append(
-                Number(_fraction(error["mean_relative_rms"]), f"rollout error after {horizon['name']}")
+                Number(share(error["mean_relative_rms"], "motion"), f"rollout error after {horizon['name']}")
             )
         if error["tip_mm"] is not None:
             figures.append(Number(f"{number(error['tip_mm'])} mm", f"tip error after {horizon['name']}"))
@@ -100,13 +100,6 @@ def training_facts(config: Record, metrics: Sequence[Record], identified: Record
         facts["start"] = f"{options['momentum_steps']:,} steps on the momentum along the logs"
     settings = {key.replace("_", " "): str(value) for key, value in options.items() if value is not None}
     return Training(chart, facts, settings)
-
-
-def _fraction(error: float) -> str:
-    """Return an error relative to the motion."""
-    if error < 10:
-        return f"{100 * error:.3g} %"
-    return f"{error:,.0f} x motion"
 
 
 def _names(trajectories: Sequence[str]) -> str:

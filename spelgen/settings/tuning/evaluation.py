@@ -27,9 +27,9 @@ class EvaluationTuning:
     probed_windows: int = 16
     """[] that say in which steps dynamics are integrated."""
 
-    most_windows: int = 2000
+    most_windows: int = 1000
     """[] that a horizon is judged on, evenly spread."""
-    most_predicted_steps: int = 40_000
+    most_predicted_steps: int = 10_000
     """[] of a predictor over a horizon: fewer windows where they are long, but not fewer than the next."""
     fewest_windows: int = 100
     """[] as far as there are so many."""

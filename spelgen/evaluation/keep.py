@@ -46,14 +46,14 @@ def keep_baseline(folder: Path | str, logs: Iterable[Path | str] | Sequence[Traj
         trajectories += opened
     if not run.urdf.exists():  # without an arm there is nothing to identify
         return
-    kept: dict[str, object] = {"coverage": coverage(trajectories)}
+    baselines: dict[str, object] = {"coverage": coverage(trajectories)}
     preprocessing = Preprocessing(**record["preprocessing"])
     if record["objective"] == "servo":
-        kept |= _fit_position_actuators(run, trajectories, preprocessing)
+        baselines |= _fit_position_actuators(run, trajectories, preprocessing)
     else:
         for baseline in BASELINES:
-            kept |= baseline.fit(run, trajectories, preprocessing)
-    write_json(run.baseline, kept)
+            baselines |= baseline.fit(run, trajectories, preprocessing)
+    write_json(run.baseline, baselines)
 
 
 def _fit_position_actuators(
@@ -61,7 +61,7 @@ def _fit_position_actuators(
 ) -> dict[str, object]:
     if not _has_mujoco():
         return {}
-    from spelgen.baselines.position_actuators import TUNING, fit_position_actuators
+    from spelgen.evaluation.position_actuators import TUNING, fit_position_actuators
 
     windows = servo_windows(trajectories, preprocessing, TUNING.windows)
     actuators = fit_position_actuators(run_arm(run), windows, trained_model(run))
@@ -82,7 +82,7 @@ def read_followers(run: RunFolder) -> dict[str, CommandFollower]:
     record = run.read_json(path) if path.exists() else {}
     if "position_actuators" not in record or not _has_mujoco():
         return {}
-    from spelgen.baselines.position_actuators import PositionActuators
+    from spelgen.evaluation.position_actuators import PositionActuators
 
     try:
         return {POSITION_ACTUATORS: PositionActuators.from_dict(record["position_actuators"])}
