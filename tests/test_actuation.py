@@ -209,8 +209,9 @@ def test_the_simulation_moves_joints_by_motors(coupled):
         update={"simulation": loaded.settings.simulation.model_copy(update=short)}
     )
     assert np.array_equal(loaded.actuation.matrix(), G.numpy())
-    log = random_inputs(loaded.arm, settings, loaded.actuation.matrix()).train[0]
-    engine, friction = arm_dynamics(loaded.arm, settings), make_friction(loaded.arm, settings)
+    drives = loaded.actuation.drives()
+    log = random_inputs(loaded.arm, settings, drives).train[0]
+    engine, friction = arm_dynamics(loaded.arm, settings), make_friction(loaded.arm, settings, drives.speeds)
     q, qd = log.q[0], log.qd[0]
     for _ in range(5000):  # explicit Euler over the first interval, 10 us a step
         qdd = engine.forward_dynamics(q, qd, G.numpy() @ log.tau[0] - friction(qd))

@@ -127,6 +127,18 @@ class TestFriction:
         assert (np.diff(torque[:, 0]) >= -1e-15).all() or torque.max() <= 0.2
         assert np.abs(np.diff(torque[:, 0], 2)).max() < 1e-6
 
+    def test_where_two_motors_move_two_joints_friction_is_that_of_the_motors(self):
+        """A differential: motors turn by the sum and the difference, and brake by their own directions."""
+        joints = [coordinate(damping=0.3, friction=0.2), coordinate("b", damping=0.1, friction=0.4)]
+        bodies = [
+            body(name, parent=k - 1, coordinate=k, inertia=point(1, 0.1)) for k, name in enumerate("ab")
+        ]
+        friction = make_friction(arm(joints, bodies), Settings(), np.array([[1.0, 1.0], [1.0, -1.0]]))
+        first, second = 0.3 * 5.0 + 0.2, 0.1 * -1.0 - 0.4  # of the motors, at 5 and -1 rad/s
+        np.testing.assert_allclose(
+            friction(np.array([2.0, 3.0])), [first + second, first - second], rtol=1e-12
+        )
+
     def test_a_joint_the_sidecar_does_not_list_has_the_friction_of_its_urdf(self):
         rail = slider(damping=0.3, friction=0.2)
         assert make_friction(rail, Settings())(np.array([10.0])) == pytest.approx([3.2])

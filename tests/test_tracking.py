@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from spelgen.arm.actuation import Drives
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.errors import SettingsError, SpelgenErrors
 from spelgen.loaded_arm import load_arm
@@ -185,7 +186,9 @@ def test_motors_behind_gears_get_their_share_and_a_passive_joint_none():
     bodies = [body(name, parent=k - 1, coordinate=k, inertia=point(1, 0.1)) for k, name in enumerate("ab")]
     two = arm(joints, bodies, gravity=(0, -9.81, 0))
     settings = changed(Settings(), trajectories=1, duration=0.4, sample_rate=500.0, test_fraction=0.0)
-    plain, geared = (track(two, settings, np.diag([gear, 0.0])).train[0] for gear in (1.0, 20.0))
+    plain, geared = (
+        track(two, settings, Drives(np.diag([gear, 0.0]), np.eye(2))).train[0] for gear in (1.0, 20.0)
+    )
     np.testing.assert_allclose(geared.tau, plain.tau / 20, atol=1e-9)
     np.testing.assert_allclose(geared.q, plain.q, atol=1e-9)
     assert not plain.tau[:, 1].any()

@@ -14,28 +14,36 @@ from spelgen.settings.settings import Settings
 
 @dataclass(frozen=True, eq=False)
 class Friction:
-    """Friction of n joints, each array (n,), in Nm and rad/s, N and m/s for prismatic joints.
+    """Friction of n drives, each array (n,), in Nm and rad/s, N and m/s for prismatic joints.
 
-    forward, backward: Coulomb torque for qd > 0 (not negative) and for qd < 0 (not positive).
-    smoothing_velocity: width of the tanh in place of Coulomb friction's jump.
+    forward, backward: Coulomb torque for speeds > 0 (not negative) and for speeds < 0 (not positive).
+    smoothing_velocity: width of the tanh in place of Coulomb friction's jump. speeds: C, (n, n), the drives' speeds are
+    C qd (see `motor_speeds`); None: each moves its own joint alone.
     """
 
     viscous: np.ndarray
     forward: np.ndarray
     backward: np.ndarray
     smoothing_velocity: float
+    speeds: np.ndarray | None = None
 
     def __call__(self, qd: np.ndarray) -> np.ndarray:
-        """Return the torque (..., n) that friction takes at velocity qd (..., n):
+        """Return the torque (..., n) at the joints that friction takes at velocity qd (..., n), C^T of the drives':
 
-            viscous qd + s (forward - backward)/2 + s^2 (forward + backward)/2,    s = tanh(qd / smoothing_velocity)
+            viscous v + s (forward - backward)/2 + s^2 (forward + backward)/2,    s = tanh(v / smoothing_velocity)
 
         The last two terms tend to `forward` and `backward` on the two sides. All is smooth, 0 at rest, and
-        never drives: its product with qd is not negative.
+        never drives: its product with the speed v = C qd is not negative.
         """
-        s = np.tanh(qd / self.smoothing_velocity)
-        torque: np.ndarray = self.viscous * qd + s * (self._odd + s * self._even)
-        return torque
+        v = qd if self.speeds is None else qd @ self.speeds.T
+        s = np.tanh(v / self.smoothing_velocity)
+        torque: np.ndarray = self.viscous * v + s * (self._odd + s * self._even)
+        return torque if self.speeds is None else torque @ self.speeds
+
+    def damping_at_rest(self) -> np.ndarray:
+        """Return the largest slope of friction by velocity, (n, n)."""
+        damping = np.diag(self.viscous + self._odd / self.smoothing_velocity)
+        return damping if self.speeds is None else self.speeds.T @ damping @ self.speeds
 
     @cached_property
     def _odd(self) -> np.ndarray:
@@ -47,18 +55,23 @@ class Friction:
 
     @cached_property
     def widths(self) -> np.ndarray:
-        """Velocity (n,) within which the friction of each joint jumps, infinite where it does not."""
+        """Speed (n,) within which the friction of each drive jumps, infinite where it does not."""
         return np.where(self.forward > self.backward, self.smoothing_velocity, np.inf)
 
 
-def make_friction(arm: Arm, settings: Settings) -> Friction:
-    """Return the friction of the arm: a joint's settings where it has some, else its URDF's <dynamics>."""
+def make_friction(arm: Arm, settings: Settings, speeds: np.ndarray | None = None) -> Friction:
+    """Return the friction of the arm: a joint's settings where it has some, else its URDF's <dynamics>.
+
+    speeds: C (n, n) of the drives. Where they move several joints, a joint's friction is that of its drive, as in the
+    models.
+    """
     joints = [_losses(coordinate, settings) for coordinate in arm.coordinates]
     return Friction(
         viscous=np.array([joint.viscous for joint in joints]),
         forward=np.array([joint.coulomb[0] for joint in joints]),
         backward=np.array([joint.coulomb[1] for joint in joints]),
         smoothing_velocity=settings.simulation.coulomb_smoothing_velocity,
+        speeds=None if speeds is None or np.array_equal(speeds, np.eye(len(speeds))) else speeds,
     )
 
 

@@ -69,9 +69,8 @@ def rollout(
 
 def _decay(dynamics: PinocchioDynamics, friction: Friction, q: np.ndarray) -> float:
     """Return how fast friction stops joints near rest [1/s]: the largest eigenvalue of M^-1 d friction / d qd."""
-    slope = friction.viscous + (friction.forward - friction.backward) / (2 * friction.smoothing_velocity)
     try:
-        rates = np.linalg.eigvals(np.linalg.solve(dynamics.mass_matrix(q), np.diag(slope)))
+        rates = np.linalg.eigvals(np.linalg.solve(dynamics.mass_matrix(q), friction.damping_at_rest()))
     except np.linalg.LinAlgError:  # no M: the integration will say so
         return 0.0
     return float(np.abs(rates).max(initial=0.0))

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Arm, Coordinate
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.errors import SettingsError, collect
@@ -19,20 +20,20 @@ from spelgen.simulation.simulated_logs import SimulatedLogs
 def random_inputs(
     arm: Arm,
     settings: Settings,
-    input_matrix: np.ndarray | None = None,
+    drives: Drives | None = None,
     *,
     progress: Callable[[int, int], None] | None = None,
 ) -> SimulatedLogs:
     """Return random-input trajectories of the arm by `settings.simulation`; same settings, same logs.
 
     Each starts at rest at a random position and has round(duration * sample_rate) + 1 samples; tau[k] acts from t[k]
-    to t[k+1]. input_matrix: G (n, n), where the torques drawn and logged are those of motors; the joints get
-    G tau. progress: called with (trajectories done, all) after each one.
+    to t[k+1]. drives: where the torques drawn and logged are those of motors, the joints get G tau, and friction is
+    the motors'. progress: called with (trajectories done, all) after each one.
     Raises ArmError without inertials, SettingsError for a joint without a range of initial positions, and
     RunError when the motion cannot be integrated.
     """
     protocol = settings.simulation
-    dynamics, friction = arm_dynamics(arm, settings), make_friction(arm, settings)
+    dynamics, friction = arm_dynamics(arm, settings), make_friction(arm, settings, drives and drives.speeds)
     lowest, highest = initial_range(arm, settings)
     torques = [_torques(coordinate, settings) for coordinate in arm.coordinates]
     t = np.arange(round(protocol.duration * protocol.sample_rate) + 1) / protocol.sample_rate
@@ -43,7 +44,7 @@ def random_inputs(
         random = np.random.default_rng(seed)
         start = np.concatenate([random.uniform(lowest, highest), np.zeros(lowest.size)])
         tau = np.stack([random.choice(choices, size=t.size) for choices in torques], axis=1)
-        effect = tau if input_matrix is None else tau @ input_matrix.T
+        effect = tau if drives is None else tau @ drives.inputs.T
         states = rollout(dynamics, friction, start, t, effect)
         errors.append(np.abs(states - rollout(dynamics, friction, start, t, effect, looser=LOOSER)).max())
         q, qd = np.split(states, 2, axis=1)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.logs.trajectory import Trajectory
@@ -25,7 +26,7 @@ EFFORT, LAG = 5.0, 0.05  # Nm, s: of a servo of which nothing is said
 def servo_motions(
     arm: Arm,
     settings: Settings,
-    input_matrix: np.ndarray | None = None,
+    drives: Drives | None = None,
     *,
     progress: Callable[[int, int], None] | None = None,
 ) -> SimulatedLogs:

@@ -51,7 +51,7 @@ def simulate(
     changed = _changed(arm.settings.simulation, changes)
     settings = _controlled(arm.settings.model_copy(update={"simulation": changed}))
     run = servo_motions if settings.input == "position" else PROTOCOLS[settings.simulation.protocol]
-    return run(arm.arm, settings, arm.actuation.matrix(), progress=progress)
+    return run(arm.arm, settings, arm.actuation.drives(), progress=progress)
 
 
 def _controlled(settings: Settings) -> Settings:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
@@ -59,7 +60,7 @@ class Recording:
 def track(
     arm: Arm,
     settings: Settings,
-    input_matrix: np.ndarray | None = None,
+    drives: Drives | None = None,
     *,
     progress: Callable[[int, int], None] | None = None,
 ) -> SimulatedLogs:
@@ -71,8 +72,8 @@ def track(
     recordings under the same torques, as for `random_inputs`.
     """
     protocol = settings.simulation
-    dynamics, friction = arm_dynamics(arm, settings), make_friction(arm, settings)
-    inputs = np.eye(len(arm.coordinates)) if input_matrix is None else input_matrix
+    dynamics, friction = arm_dynamics(arm, settings), make_friction(arm, settings, drives and drives.speeds)
+    inputs = np.eye(len(arm.coordinates)) if drives is None else drives.inputs
     middle = np.mean(initial_range(arm, settings), axis=0)
     ticks = np.arange(_ticks(settings)) * (1.0 / settings.tracking.control_rate)
     train, test, errors = [], [], []
