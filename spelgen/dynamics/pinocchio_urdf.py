@@ -45,13 +45,17 @@ def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) ->
             index = model.joints[model.getJointId(name)].idx_v
             model.armature[index] = by_joint[name].rotor_inertia * by_joint[name].gear ** 2
 
-    def friction(qd: np.ndarray) -> np.ndarray:
-        s = np.tanh(qd / COULOMB_SMOOTHING_VELOCITY)
-        lost: np.ndarray = damping * qd + s * ((forward - backward) + s * (forward + backward)) / 2
-        return lost
+    motors = derive_actuation(robot, settings, joints).drives()
+    # a file's own friction is the joints', that of drives the motors'
+    speeds = motors.speeds if drives else np.eye(len(joints))
 
-    inputs = derive_actuation(robot, settings, joints).matrix()
-    return PinocchioDynamics(model, constraint, friction, inputs)
+    def friction(qd: np.ndarray) -> np.ndarray:
+        v = qd @ speeds.T
+        s = np.tanh(v / COULOMB_SMOOTHING_VELOCITY)
+        lost: np.ndarray = damping * v + s * ((forward - backward) + s * (forward + backward)) / 2
+        return lost @ speeds
+
+    return PinocchioDynamics(model, constraint, friction, motors.inputs)
 
 
 def has_drives(urdf: Path, joints: Sequence[str]) -> bool:
