@@ -40,11 +40,6 @@ class Friction:
         torque: np.ndarray = self.viscous * v + s * (self._odd + s * self._even)
         return torque if self.speeds is None else torque @ self.speeds
 
-    def damping_at_rest(self) -> np.ndarray:
-        """Return the largest slope of friction by velocity, (n, n)."""
-        damping = np.diag(self.viscous + self._odd / self.smoothing_velocity)
-        return damping if self.speeds is None else self.speeds.T @ damping @ self.speeds
-
     @cached_property
     def _odd(self) -> np.ndarray:
         return np.asarray(0.5 * (self.forward - self.backward))
@@ -52,11 +47,6 @@ class Friction:
     @cached_property
     def _even(self) -> np.ndarray:
         return np.asarray(0.5 * (self.forward + self.backward))
-
-    @cached_property
-    def widths(self) -> np.ndarray:
-        """Speed (n,) within which the friction of each drive jumps, infinite where it does not."""
-        return np.where(self.forward > self.backward, self.smoothing_velocity, np.inf)
 
 
 def make_friction(arm: Arm, settings: Settings, speeds: np.ndarray | None = None) -> Friction:

@@ -23,7 +23,7 @@ from spelgen.settings.settings import Settings
 from spelgen.settings.simulation import TrackingSettings
 from spelgen.settings.tuning.simulation import SimulationTuning
 from spelgen.simulation.friction import Friction, make_friction
-from spelgen.simulation.integration import LOOSER, SEEN, rollout
+from spelgen.simulation.integration import LOOSER, rollout
 from spelgen.simulation.paths import paths
 from spelgen.simulation.random_inputs import initial_range
 from spelgen.simulation.simulated_logs import SimulatedLogs
@@ -107,7 +107,7 @@ def _integration_error(
     largest = 0.0
     for start in range(0, len(recording.t) - 1, TUNING.stretch):
         rows = slice(start, start + TUNING.stretch + 1)
-        looser = SEEN * LOOSER**0.5
+        looser = TUNING.seen_loosening * LOOSER**0.5
         again = rollout(dynamics, friction, recording.states[start], recording.t[rows], effect[rows], looser)
         largest = max(largest, float(np.abs(recording.states[rows] - again).max()))
     return largest
@@ -177,7 +177,8 @@ def record(
             effort = computed_torque(dynamics, friction, target, seen, lag, omega)
         tau = to_motors @ effort
         t = k * tick + np.arange(samples + 1) / settings.simulation.sample_rate
-        passed = rollout(dynamics, friction, state, t, np.tile(inputs @ tau, (samples + 1, 1)), SEEN)
+        torque = np.tile(inputs @ tau, (samples + 1, 1))
+        passed = rollout(dynamics, friction, state, t, torque, TUNING.seen_loosening)
         states.append(passed[:-1])
         torques.append(np.tile(tau, (samples, 1)))
         state = passed[-1]
