@@ -53,7 +53,8 @@ def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) ->
         v = qd @ speeds.T
         s = np.tanh(v / COULOMB_SMOOTHING_VELOCITY)
         lost: np.ndarray = damping * v + s * ((forward - backward) + s * (forward + backward)) / 2
-        return lost @ speeds
+        at_joints: np.ndarray = lost @ speeds
+        return at_joints
 
     return PinocchioDynamics(model, constraint, friction, motors.inputs)
 

@@ -26,7 +26,7 @@ class SimulationTuning:
     rtol: float = 1e-13  # of integration: as exact as floating-point numbers allow
     atol: float = 1e-14  # [rad, rad/s] likewise
     most_steps: int = 100_000  # while a torque is held: what takes more will not end
-    seen_loosening: float = 1000.0  # of tolerances where encoders see the motion: 1e-10 is enough
+    seen_loosening: float = 100.0  # of tolerances where encoders see the motion: 1e-11 is enough
     check_loosening: float = 100.0  # of tolerances, of the integration that the first is compared with
     used_range: float = 0.7  # of a joint's range and of its speed limit, where nothing is said
     stretch: int = 32  # [samples] over which integration is checked: falling arms carry differences away
