@@ -11,7 +11,7 @@ import torch
 
 from spelgen.dynamics.protocol import known_past
 from spelgen.evaluation.plain import finite
-from spelgen.log_checks.statistics import common_step, quantisation_step
+from spelgen.log_checks.statistics import quantisation_step
 from spelgen.logs.dynamics_samples import DynamicsSamples, is_moving
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.tuning.log_checks import LogCheckTuning
@@ -78,8 +78,9 @@ def coarse_torques(logs: Sequence[Trajectory], joints: Sequence[str]) -> dict[st
     """Return by name the steps [Nm, N] of torques that are logged in steps of their own size."""
     steps = {}
     for k, joint in enumerate(joints):
-        step = common_step([quantisation_step(log.tau[:, k]) for log in logs])
-        low, high = min(log.tau[:, k].min() for log in logs), max(log.tau[:, k].max() for log in logs)
-        if step is not None and high - low < LEVELS * step:
+        # infinite where a log is not quantised: most of them must be
+        step = float(np.median(np.nan_to_num([quantisation_step(log.tau[:, k]) for log in logs], nan=np.inf)))
+        torque = np.concatenate([log.tau[:, k] for log in logs])
+        if np.isfinite(step) and np.ptp(torque) < LEVELS * step:
             steps[joint] = step
     return steps
