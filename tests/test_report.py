@@ -122,7 +122,7 @@ def test_numbers_are_those_of_the_run(run):
     assert "0.0123" in text and "0.8 mm" in text
     assert "Good enough for feed-forward control, contact detection" in text
     assert "simulation 1 s ahead; worst at joint1" in text
-    assert "It explains 99 % of the variance of the torques and is off by 1.23 % of the motion" in text
+    assert "The model explains 99 % of the variance of the torques and is off by 1.23 % of the motion" in text
     assert "But URDF is better after 1 step." in text
     assert "34 for training, 17 for validation" in text
     assert "8.0e-10" in text
