@@ -169,7 +169,7 @@ def latency(robot: str = "ur10e") -> None:
         time_c(model, beside_casadi=preset == "closed-form")
         if preset == "closed-form":
             zero, one = np.zeros(model.n), np.ones(model.n)
-            none = FrictionLaw(zero, zero, one, zero, zero, one, one, zero)
+            none = FrictionLaw(zero, zero, one, zero, zero, one, one, zero, one, zero)
             print(f"{preset}, C, rigid bodies alone")
             time_c(replace(model, friction=none, bristles=None), beside_casadi=True)
         prepared = each.model.prepared()

@@ -6,7 +6,7 @@ import torch
 from torch import nn
 
 FACTS = """{
-  "format": 4,
+  "format": 5,
   "robot": "stand_in",
   "urdf": "stand_in.urdf",
   "urdf_sha256": "none",

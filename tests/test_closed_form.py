@@ -175,12 +175,12 @@ def test_friction_at_a_standstill_has_its_slope(emitted):
     still = torch.zeros_like(q).requires_grad_()
     (slope,) = torch.autograd.grad(model.friction(still, model.gravity(q), constants).sum(), still)
     near(slope, model.dissipation(q, still).diagonal(dim1=-2, dim2=-1))
-    away = torch.full_like(q, 1e-3)  # where the formula is another branch
+    away = torch.full_like(q, 1e-3)
     torque = model.friction(away, model.gravity(q), constants)
     dry = constants.coulomb + constants.load_dependence * torch.hypot(model.gravity(q), constants.least_load)
-    dry = dry + constants.stribeck * (-((away / constants.stribeck_velocity) ** 2)).exp()
-    saturating = constants.saturation * (away / constants.saturation_velocity).tanh()
-    dry = dry * (away / constants.coulomb_smoothing_velocity).tanh()
+    dry = dry + constants.stribeck / (1 + (away / constants.stribeck_velocity) ** 2)
+    saturating = constants.saturation * away / (away**2 + constants.saturation_velocity**2).sqrt()
+    dry = dry * away / (away**2 + constants.coulomb_smoothing_velocity**2).sqrt()
     near(torque, constants.viscous * away + saturating + dry)
 
 

@@ -20,7 +20,7 @@ from spelgen.dynamics.protocol import has_friction_state, sliding_memory
 from spelgen.emission.bundle import bundle, load_runtime, names_in
 from spelgen.emission.unit_joints import hidden_units
 from spelgen.runtime.encoding import JointEncoding, joint_input, lie_group_input
-from spelgen.runtime.friction_laws import FrictionLaws, tanh_ratio
+from spelgen.runtime.friction_laws import FrictionLaws, turned
 from spelgen.runtime.joints import Joints, vector
 from spelgen.runtime.masked_kan import MaskedKAN
 from spelgen.runtime.masked_mlp import MaskedMLP
@@ -30,6 +30,12 @@ from spelgen.runtime.rigid_body import Bodies, InertialParameters, pseudo_inerti
 from spelgen.runtime.symmetric import symmetric
 
 NUMBERS = Path(__file__).parent / "golden" / "numbers.json"
+FIRST_STAGE = (  # friction's laws then: |gravity torque|, tanh and exp
+    ("LEAST_LOAD = 0.01", "LEAST_LOAD = 0.0"),
+    ("velocity * torch.rsqrt(velocity * velocity + width**2)", "(velocity / width).tanh()"),
+    ("1 / (1 + (qd / c.stribeck_velocity).square())", "(-((qd / c.stribeck_velocity) ** 2)).exp()"),
+    ("torch.rsqrt(qd * qd + c.saturation_velocity**2)", "(qd / c.saturation_velocity).tanh() / qd"),
+)
 PRESETS = (
     ("hybrid", "mlp"),
     ("hybrid", "kan"),
@@ -230,15 +236,17 @@ def test_friction_laws_resist_and_read_as_what_they_are():
     near(constants.coulomb, torch.tensor([1.0, 2.0, 0.0], dtype=torch.float64))
     gravity = torch.tensor([3.0, -4.0, 5.0], dtype=torch.float64)
     fast = 1e3 * torch.ones(3, dtype=torch.float64)
-    expected = constants.viscous * 1e3 + constants.saturation + constants.coulomb
-    load = torch.hypot(gravity, constants.least_load)
-    near(laws(fast, gravity, constants), expected + constants.load_dependence * load)
+    dry = constants.coulomb + constants.load_dependence * torch.hypot(gravity, constants.least_load)
+    dry += constants.stribeck / (1 + (fast / constants.stribeck_velocity) ** 2)
+    expected = constants.viscous * fast + dry * turned(fast, constants.coulomb_smoothing_velocity)
+    expected += constants.saturation * turned(fast, constants.saturation_velocity)
+    near(laws(fast, gravity, constants), expected)
+    assert expected.allclose(constants.viscous * fast + constants.saturation + dry, rtol=0, atol=1e-6)
     qd = draw(100, 3)
     assert (laws(qd, gravity, constants) * qd >= 0).all()
     near(laws(-qd, gravity, constants), -laws(qd, gravity, constants))
-    x = torch.tensor([0.0, 1e-9, 1e-4, 0.3, -2.0], dtype=torch.float64)
-    near(tanh_ratio(x)[1:], x[1:].tanh() / x[1:])
-    assert tanh_ratio(x)[0] == 1
+    x = torch.tensor([0.0, 1e-9, 0.75, -4e9], dtype=torch.float64)
+    near(turned(x, torch.ones(4)), torch.tensor([0.0, 1e-9, 0.6, -1.0], dtype=torch.float64))
 
 
 def test_a_module_takes_what_it_uses_as_it_stands():
@@ -335,7 +343,8 @@ def test_numbers_are_those_of_the_first_stage(case, tmp_path):
     design = load_design("closed-form") if preset == "closed-form" else None
     design = design and replace(design, memory="none")
     source = built(robot, preset=preset, net=None if net == "default" else net, design=design)[0]
-    source = source.replace("LEAST_LOAD = 0.01", "LEAST_LOAD = 0.0")  # the first stage had |gravity torque|
+    for now, first in FIRST_STAGE:
+        source = source.replace(now, first)
     model = import_source(source, tmp_path / f"{robot}_numbers.py").Model(seed=3)
     generator = torch.Generator().manual_seed(1)
     q, qd, tau = (torch.randn(model.n, generator=generator, dtype=torch.float64) for _ in range(3))

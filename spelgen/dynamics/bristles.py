@@ -7,9 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 
 from spelgen.design import BRISTLE_REACH
 from spelgen.dynamics.protocol import has_friction_state
+from spelgen.runtime.bristles import moved_bristles
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,31 +55,42 @@ def bristle_reach(model: Any) -> BristleReach:
 def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
     """z, (T, n, K) [rad, m], along the path q (T, n), straight at its start.
 
-    Between samples drives go one way, which is exact: z' is linear in the displacement.
+    While a drive goes one way, z follows from where it turned around: only turns come one after another.
     """
-    moved = np.diff(encoded(q), axis=0, prepend=q[:1])
+    path = encoded(q)
     if bristles.motors is not None:
-        moved = moved @ bristles.motors.T
-    z = np.empty((*q.shape, bristles.values.shape[-1]))
-    state = np.zeros(z.shape[1:])
+        path = path @ bristles.motors.T
+    corners, latest = turning_points(path)
+    drives, reach = np.arange(path.shape[1]), torch.from_numpy(bristles.values)
+    turned_at = np.take_along_axis(path, corners, axis=0)
+    at_corners = [torch.zeros_like(reach)]
+    for way in torch.from_numpy(np.diff(turned_at, axis=0)):
+        at_corners.append(moved_bristles(at_corners[-1], way, reach))
+    turned_with, z = torch.stack(at_corners), np.empty((*q.shape, bristles.elements))
     for start in range(0, len(q), BLOCK):
-        block = z[start : start + BLOCK]
-        block[:] = _bent_along(moved[start : start + BLOCK, :, None], bristles.values, state)
-        state = block[-1]
+        block = slice(start, start + BLOCK)
+        corner = latest[block], drives
+        moved = torch.from_numpy(path[block] - turned_at[corner])
+        z[block] = moved_bristles(turned_with[corner], moved, reach).numpy()
     return z
 
 
-def _bent_along(way: np.ndarray, reach: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Return z, (T, n, K), along displacements (T, n, 1) from z = start (n, K)."""
-    decay = np.exp(-np.abs(way) / reach)
-    bent: np.ndarray = np.sign(way) * reach * (1 - decay)
-    # z[k] = decay[k] z[k - 1] + bent[k]: pairs are joined, then fours, ...
-    shift = 1
-    while shift < len(way):
-        bent[shift:] += decay[shift:] * bent[:-shift]
-        decay[shift:] *= decay[:-shift].copy()
-        shift *= 2
-    return bent + decay * start
+def turning_points(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the samples (R, n) at which the columns of a path (T, n) begin and turn around, and which of these is the
+    latest, (T, n), at each sample.
+    """
+    steps = np.diff(path, axis=0, prepend=path[:1])
+    # where a drive stands still it goes on as it went
+    moving = np.where(steps != 0, np.arange(len(path))[:, None], 0)
+    direction = np.sign(np.take_along_axis(steps, np.maximum.accumulate(moving, axis=0), axis=0))
+    turns = np.zeros(path.shape, dtype=bool)
+    turns[1:] = direction[1:] * direction[:-1] < 0
+    latest = turns.cumsum(axis=0)
+    # drives that turn around less often than others have zeros at the end, which are the latest of no sample
+    corners = np.zeros((latest.max(initial=0) + 1, path.shape[1]), dtype=int)
+    samples, drives = np.nonzero(turns)
+    corners[latest[samples, drives], drives] = samples - 1
+    return corners, latest
 
 
 def direction_along(qd: np.ndarray, bristles: BristleReach) -> np.ndarray | None:
@@ -85,7 +98,7 @@ def direction_along(qd: np.ndarray, bristles: BristleReach) -> np.ndarray | None
     if bristles.smoothing_velocity is None:
         return None
     speed = qd if bristles.motors is None else qd @ bristles.motors.T
-    direction: np.ndarray = np.tanh(speed / bristles.smoothing_velocity)
+    direction: np.ndarray = speed / np.hypot(speed, bristles.smoothing_velocity)
     return direction
 
 

@@ -73,8 +73,7 @@ def advanced(drives: ServoDrives, state: ServoState, u: Tensor, load: Load, h: T
     (q, qd, z), servo, laws = state, drives.servo, drives.laws
     reach, fractions = laws.bristles.reach, drives.friction.bristle_fractions
     dry = laws.dry(qd, load.gravity, drives.friction)
-    unbent = 1 - qd.sign().unsqueeze(-1) * z / reach  # of each bristle, until it slides
-    stiffness = dry * (fractions / reach * unbent).sum(dim=-1)
+    stiffness = dry * (fractions / reach * laws.bristles.slope(qd, z)).sum(dim=-1)
     spring = servo.kp * beyond(u - q, servo.dead_zone)
     torque = spring - servo.kd * qd
     free = (torque.abs() < servo.limit).to(q)  # 0 where the servo is saturated: it neither stiffens nor damps

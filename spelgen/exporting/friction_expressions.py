@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import casadi as ca
+import numpy as np
 
 from spelgen.exporting.description import Bristles, FrictionLaw
+from spelgen.runtime.bristles import STICKING
 
 
 def law_torque(law: FrictionLaw, qd: ca.SX, gravity: ca.SX, direction: ca.SX) -> ca.SX:
@@ -14,43 +16,44 @@ def law_torque(law: FrictionLaw, qd: ca.SX, gravity: ca.SX, direction: ca.SX) ->
     """
     load = ca.sqrt(gravity**2 + law.least_load**2)
     dry = law.coulomb + law.load_dependence * load
-    # CasADi would not see that zero times an exponential is zero
-    if law.stribeck.any():
-        fading = ca.exp(-((qd / law.stribeck_velocity) ** 2))
-        dry = dry + law.stribeck * fading
-    viscous = law.viscous * qd
-    saturating = law.saturation * ca.tanh(qd / law.saturation_velocity)
-    torque: ca.SX = viscous + saturating + dry * direction
+    width = law.stribeck_velocity**2
+    dry += law.stribeck * width / (width + qd**2)
+    torque: ca.SX = law.viscous * qd + law.saturation * turned(qd, law.saturation_velocity) + dry * direction
     return torque
 
 
-def sliding_direction(law: FrictionLaw, qd: ca.SX) -> ca.SX:
-    """Return the direction of dry friction of joints that slide at qd for long, (n, 1)."""
-    return ca.tanh(qd / law.coulomb_smoothing_velocity)
+def turned(velocity: ca.SX, width: np.ndarray) -> ca.SX:
+    """Return a direction from -1 to 1 that turns around over this width of velocities, (n, 1)."""
+    return velocity / ca.sqrt(velocity**2 + width**2)
 
 
 def bristle_direction(bristles: Bristles, z: ca.SX) -> ca.SX:
     """Return the sum of fraction z / reach over a joint's elements, (n, 1); z: joint by joint, (n K, 1)."""
     n, count = bristles.reach.shape
-    stiffness = bristles.fractions / bristles.reach
-    bent = z * stiffness.ravel()
+    bent = z * (bristles.fractions / bristles.reach).ravel()
     # CasADi reshapes column by column: a joint's elements are a column
-    result: ca.SX = ca.sum1(ca.reshape(bent, count, n)).T
-    return result
+    direction: ca.SX = ca.sum1(ca.reshape(bent, count, n)).T
+    return direction
 
 
 def sliding_bristles(bristles: Bristles, law: FrictionLaw, qd: ca.SX) -> ca.SX:
     """Return z of joints that slide at qd for long, (n K, 1)."""
-    z: ca.SX = _by_element(bristles, sliding_direction(law, qd)) * bristles.reach.ravel()
+    z: ca.SX = _by_element(bristles, turned(qd, law.coulomb_smoothing_velocity)) * bristles.reach.ravel()
     return z
 
 
 def bristle_step(bristles: Bristles, z: ca.SX, dq: ca.SX) -> ca.SX:
-    """Return z after a displacement dq: the solution of z' = qd - |qd| z / reach along it."""
-    moved = _by_element(bristles, dq)
-    reach = bristles.reach.ravel()
-    end = ca.sign(moved) * reach
-    z_next: ca.SX = z + (z - end) * ca.expm1(-ca.fabs(moved) / reach)
+    """Return z after a displacement dq: the solution of ``runtime.bristles`` along it."""
+    way, reach = _by_element(bristles, dq), bristles.reach.ravel()
+    moved = ca.fabs(way)
+    # no branch; which sign a zero has is no matter, for nothing is added then
+    direction = ca.copysign(1, way)
+    bent = direction * z
+    elastic = ca.fmin(moved, ca.fmax(STICKING * reach - bent, 0))
+    unbent = reach - bent - elastic
+    # the constant is one number in the program: a multiplication takes a fraction of the time of a division
+    yielding = (moved - elastic) * unbent * ((1 - STICKING) * reach) ** -2
+    z_next: ca.SX = z + direction * (elastic + unbent * yielding / (1 + yielding))
     return z_next
 
 

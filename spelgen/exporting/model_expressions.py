@@ -98,7 +98,8 @@ class ModelExpressions:
         # a joint's dry friction follows velocity or bristles
         direction = ca.SX.zeros(self.model.n)
         if law.memoryless.any():
-            direction = ca.SX(law.memoryless) * friction_expressions.sliding_direction(law, speed)
+            sliding = friction_expressions.turned(speed, law.coulomb_smoothing_velocity)
+            direction = ca.SX(law.memoryless) * sliding
         if bristles is not None:
             direction += friction_expressions.bristle_direction(bristles, self.z)
         torque = friction_expressions.law_torque(law, speed, load, direction)

@@ -7,13 +7,16 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+STICKING = 0.7  # of a bristle's reach: as far as it bends before it yields
+
 
 class Bristles(nn.Module):
-    """K elements a joint, elastic up to their reach, sliding beyond; z is (..., n, K) [rad, m].
+    """K elements a joint, elastic at first, sliding in the end; z is (..., n, K) [rad, m].
 
-    z' = qd - |qd| z / reach, whatever the speed: in displacement it is linear, and needs no small
-    steps (Dahl, A Solid Friction Model, 1968; several elements as in Lampaert, Al-Bender and
-    Swevers, A Generalized Maxwell-Slip Friction Model, 2003).
+    z' = qd, but where |z| grows beyond STICKING reach, qd ((1 - |z| / reach) / (1 - STICKING))^2,
+    whatever the speed. What is elastic closes its loops: a held joint does not creep (Dupont, Hayward,
+    Armstrong and Altpeter, Single State Elastoplastic Friction Models, 2002). The square is Dahl's
+    (A Solid Friction Model, 1968, with the exponent 2): the way has a solution of one division.
     """
 
     reach: Tensor  # (n, K)
@@ -22,9 +25,14 @@ class Bristles(nn.Module):
         super().__init__()
         self.register_buffer("reach", torch.tensor(reach, dtype=torch.float64))
 
+    def slope(self, qd: Tensor, z: Tensor) -> Tensor:
+        """dz/dq, (..., n, K), from 0 to 1, of joints that go the way of qd."""
+        bent = qd.sign().unsqueeze(-1) * z / self.reach
+        return ((1 - bent) / (1 - STICKING)).clamp(max=1.0).square()
+
     def rate(self, qd: Tensor, z: Tensor) -> Tensor:
         """z', (..., n, K)."""
-        return qd.unsqueeze(-1) - qd.abs().unsqueeze(-1) * z / self.reach
+        return qd.unsqueeze(-1) * self.slope(qd, z)
 
     def moved(self, z: Tensor, displacement: Tensor) -> Tensor:
         """z after joints went one way by (..., n), exactly."""
@@ -33,6 +41,10 @@ class Bristles(nn.Module):
 
 def moved_bristles(z: Tensor, displacement: Tensor, reach: Tensor) -> Tensor:
     """z, (..., n, K), after joints went one way by (..., n), exactly."""
-    end = displacement.sign().unsqueeze(-1) * reach
-    # to all digits of small displacements
-    return z + (z - end) * (-displacement.abs().unsqueeze(-1) / reach).expm1()
+    direction = displacement.sign().unsqueeze(-1)
+    moved, bent = displacement.abs().unsqueeze(-1), direction * z
+    elastic = torch.minimum(moved, (STICKING * reach - bent).clamp(min=0.0))
+    unbent = reach - bent - elastic
+    yielding = (moved - elastic) * unbent / ((1 - STICKING) * reach) ** 2
+    # what is added to z stands alone: beside the reach small displacements would be lost
+    return z + direction * (elastic + unbent * yielding / (1 + yielding))

