@@ -364,6 +364,7 @@ def test_every_weight_says_what_it_stands_for():
     """Fits, exports and reports find weights by kind: a part that declares nothing would pass for a network."""
     networks = (
         "network.",
+        "residuals.mass.",
         "potential.",
         "friction.weight",
         "friction.bias",
