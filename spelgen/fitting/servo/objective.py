@@ -122,7 +122,7 @@ class ServoObjective:
             for state in levenberg_marquardt(
                 problem,
                 first,
-                max_steps=TUNING.steps,
+                max_steps=TUNING.steps if number < ROUNDS else TUNING.last_steps,
                 least_gain=TUNING.gain,
                 relative_gain=TUNING.relative_gain,
             ):

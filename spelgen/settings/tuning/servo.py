@@ -65,6 +65,7 @@ class ServoSolverTuning:
 
     sparse_windows: int = 32  # at most, in all rounds but the last
     steps: int = 12  # of a round at most
+    last_steps: int = 2  # of the last round, on all windows: it starts near the minimum of few
     gain: float = 0.1  # [1] of the cost: a step that gains less ends a round, and a comparison of laws
     relative_gain: float = 1e-3  # [1] likewise, of the cost: where a model's form is wrong costs are high
     later_damping: float = (
