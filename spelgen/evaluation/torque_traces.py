@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from spelgen.baselines.names import MODEL
-from spelgen.dynamics.bristles import bristles_along
+from spelgen.dynamics.bristles import bristles_along, direction_along
 from spelgen.dynamics.protocol import known_past
 from spelgen.evaluation.horizons import JudgedLogs
 from spelgen.evaluation.plain import Rows, Series, rows, series
@@ -50,7 +50,10 @@ class TorqueTrace:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """What was measured at T times; z: the state of friction, with which it came there."""
+    """What was measured at T times; z: the state of friction, with which it came there.
+
+    direction: (T, n) of dry friction without memory, filtered as tau was.
+    """
 
     t: Tensor
     q: Tensor
@@ -58,6 +61,7 @@ class Motion:
     qdd: Tensor
     tau: Tensor
     z: Tensor
+    direction: Tensor
 
 
 def torque_traces(dynamics: Mapping[str, RigidDynamics], logs: JudgedLogs) -> tuple[TorqueTrace, ...]:
@@ -84,7 +88,7 @@ def torque_traces(dynamics: Mapping[str, RigidDynamics], logs: JudgedLogs) -> tu
 
 
 def _inverse_dynamics(dynamics: Any, motion: Motion) -> Tensor:
-    torque = dynamics.inverse_dynamics(motion.q, motion.qd, motion.qdd, *known_past(dynamics, motion.z))
+    torque = dynamics.inverse_dynamics(motion.q, motion.qd, motion.qdd, *known_past(dynamics, motion.z, motion.direction))
     return torch.as_tensor(torque)
 
 
@@ -111,10 +115,12 @@ def _dense_columns(piece: Trajectory, logs: JudgedLogs) -> tuple[np.ndarray, ...
     if not samples or len(samples[0].q) < 2:
         return None
     moving = samples[0]
-    z = moving.z
+    z, direction = moving.z, moving.direction
     if z is None:
         z = np.zeros((*moving.q.shape, 0))
-    return np.arange(len(moving.q)) / FREQUENCY, moving.q, moving.qd, moving.qdd, moving.tau, z
+    if direction is None:  # friction without a state takes none
+        direction = np.sign(moving.qd)
+    return np.arange(len(moving.q)) / FREQUENCY, moving.q, moving.qd, moving.qdd, moving.tau, z, direction
 
 
 def _sparse_columns(piece: Trajectory, logs: JudgedLogs) -> tuple[np.ndarray, ...]:
@@ -127,11 +133,14 @@ def _sparse_columns(piece: Trajectory, logs: JudgedLogs) -> tuple[np.ndarray, ..
     if logs.used.filtered:
         # measured at its sample: a filter has no delay
         tau = (piece.tau[1:] + piece.tau[:-1]) / 2
-    return t, q, qd, np.diff(piece.qd, axis=0) / np.diff(piece.t)[:, None], tau, z
+    direction = direction_along(qd, logs.reach)
+    if direction is None:  # friction without a state takes none
+        direction = np.sign(qd)
+    return t, q, qd, np.diff(piece.qd, axis=0) / np.diff(piece.t)[:, None], tau, z, direction
 
 
 def _trace(which: str, name: str, dynamics: Mapping[str, RigidDynamics], motion: Motion) -> TorqueTrace:
-    t, q, qd, z = motion.t, motion.q, motion.qd, motion.z
+    t, q, qd = motion.t, motion.q, motion.qd
     model: Any = dynamics[MODEL]
     inputs = torch.eye(q.shape[-1], dtype=q.dtype)
     with torch.no_grad():
@@ -147,7 +156,7 @@ def _trace(which: str, name: str, dynamics: Mapping[str, RigidDynamics], motion:
             "inertia": (torch.as_tensor(model.mass_matrix(q)) @ motion.qdd.unsqueeze(-1)).squeeze(-1),
             "Coriolis": torch.as_tensor(model.nonlinear_effects(q, qd)) - gravity,
             "gravity": gravity,
-            "friction": torch.as_tensor(model.friction_torque(q, qd, *known_past(model, z))),
+            "friction": torch.as_tensor(model.friction_torque(q, qd, *known_past(model, motion.z, motion.direction))),
         }
     energy = _energy(t, qd, measured, predicted[MODEL], parts)
     stride = -(-len(t) // SHOWN)

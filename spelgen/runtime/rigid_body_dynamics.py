@@ -133,10 +133,10 @@ class RigidBodyDynamics(PortHamiltonian):
         """Return the torque that holds qd steady without friction, (..., n), by Newton and Euler."""
         return self.chain.steady_torque(pose.chain, qd, pose.momenta)
 
-    def friction_at(self, pose: Motion, qd: Tensor, z: Tensor | None = None) -> Tensor:
-        """Return the friction torque C^T f(C qd), (..., n) [Nm, N]."""
+    def friction_at(self, pose: Motion, qd: Tensor, *state: Tensor | None) -> Tensor:
+        """Return the friction torque C^T f(C qd), (..., n) [Nm, N]. state: z, and a direction as `friction` takes it."""
         loads = pose.gravity @ self.loads
-        torque = self.friction.forward(qd @ self.motors.mT, loads, pose.prepared.friction, z)
+        torque = self.friction.forward(qd @ self.motors.mT, loads, pose.prepared.friction, *state)
         return (pose.varied * torque) @ self.motors
 
     def dissipation(self, q: Tensor, qd: Tensor) -> Tensor:
