@@ -42,8 +42,9 @@ def torque_errors(dynamics: Any, samples: Sequence[DynamicsSamples]) -> TorqueEr
     for sample in samples:
         q, qd, qdd = map(torch.from_numpy, (sample.q, sample.qd, sample.qdd))
         z = None if sample.z is None else torch.from_numpy(sample.z)
+        direction = None if sample.direction is None else torch.from_numpy(sample.direction)
         with torch.no_grad():
-            predicted = dynamics.inverse_dynamics(q, qd, qdd, *known_past(dynamics, z))
+            predicted = dynamics.inverse_dynamics(q, qd, qdd, *known_past(dynamics, z, direction))
         residual, rows = predicted.numpy() - sample.tau, is_moving(sample.qd)
         by_trajectory[sample.name] = _mean(_nmse(residual[rows], sample.tau[rows]))
         residuals.append(residual)
