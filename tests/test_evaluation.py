@@ -1,6 +1,7 @@
 """Evaluation: baselines against exact solutions, errors that mean what they say, results that are valid JSON."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from spelgen.baselines.constant_velocity import hold_velocity
 from spelgen.baselines.names import observed
 from spelgen.building import build
 from spelgen.cli import evaluate_command
+from spelgen.dynamics.bristles import bristle_reach
 from spelgen.dynamics.pinocchio_urdf import urdf_dynamics
 from spelgen.dynamics.tip import tip_kinematics
 from spelgen.emission.loading import load_module
@@ -375,6 +377,24 @@ def test_torque_errors_are_pooled_over_samples_with_pauses_and_without():
     assert found.nmse_with_pauses == pytest.approx((((tau - 0.2) ** 2).mean(axis=0) / tau.var(axis=0)).mean())
     np.testing.assert_allclose(found.rmse, np.sqrt(((tau[moves] - 0.2) ** 2).mean(axis=0)))
     assert found.nmse["short"] > 4 and found.mean_nmse < 1.1
+
+
+def test_steps_of_dry_friction_are_filtered_as_the_torque_is(robots):
+    """A joint without memory turns its friction around at once; the filter of the logs makes that a slope."""
+    model = build(robots / "two_link.urdf", preset="closed-form")
+    model.friction.memoryless.fill_(1.0)
+    with torch.no_grad():
+        model.friction.raw_coulomb += 1.0  # so that steps are most of the torque
+    t = np.arange(2000) / 200
+    frequencies = 2 * np.pi * np.array([0.4, 0.7])
+    phase = frequencies * t[:, None]
+    q, qd, qdd = np.sin(phase), frequencies * np.cos(phase), -(frequencies**2) * np.sin(phase)
+    with torch.no_grad():
+        tau = model.inverse_dynamics(*map(torch.from_numpy, (q, qd, qdd))).numpy()
+    samples = dynamics_samples([Trajectory(t, q, qd, tau)], reach=bristle_reach(model))
+    assert torque_errors(model, samples).mean_nmse < 1e-5
+    unfiltered = [replace(x, direction=None) for x in samples]
+    assert torque_errors(model, unfiltered).mean_nmse > 1e-3
 
 
 def test_torques_in_steps_of_their_own_size_are_found():

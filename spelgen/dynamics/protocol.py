@@ -188,9 +188,7 @@ def memory_along(dynamics: object, q: Tensor, qd: Tensor, z: Tensor | None = Non
     return torch.stack(states, dim=1)
 
 
-def known_past(
-    dynamics: object, z: Tensor | None, direction: Tensor | None = None
-) -> tuple[Tensor, ...]:
+def known_past(dynamics: object, z: Tensor | None, direction: Tensor | None = None) -> tuple[Tensor, ...]:
     """z as what to give to these dynamics last, where they have a use for it.
 
     direction: (..., n) of dry friction without memory, where tau was filtered: its steps must be, too.

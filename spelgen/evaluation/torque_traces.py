@@ -88,7 +88,9 @@ def torque_traces(dynamics: Mapping[str, RigidDynamics], logs: JudgedLogs) -> tu
 
 
 def _inverse_dynamics(dynamics: Any, motion: Motion) -> Tensor:
-    torque = dynamics.inverse_dynamics(motion.q, motion.qd, motion.qdd, *known_past(dynamics, motion.z, motion.direction))
+    torque = dynamics.inverse_dynamics(
+        motion.q, motion.qd, motion.qdd, *known_past(dynamics, motion.z, motion.direction)
+    )
     return torch.as_tensor(torque)
 
 
@@ -156,7 +158,9 @@ def _trace(which: str, name: str, dynamics: Mapping[str, RigidDynamics], motion:
             "inertia": (torch.as_tensor(model.mass_matrix(q)) @ motion.qdd.unsqueeze(-1)).squeeze(-1),
             "Coriolis": torch.as_tensor(model.nonlinear_effects(q, qd)) - gravity,
             "gravity": gravity,
-            "friction": torch.as_tensor(model.friction_torque(q, qd, *known_past(model, motion.z, motion.direction))),
+            "friction": torch.as_tensor(
+                model.friction_torque(q, qd, *known_past(model, motion.z, motion.direction))
+            ),
         }
     energy = _energy(t, qd, measured, predicted[MODEL], parts)
     stride = -(-len(t) // SHOWN)
