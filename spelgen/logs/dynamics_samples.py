@@ -105,7 +105,9 @@ def _columns(
         columns.append(z)
         direction = direction_along(smooth.qd, reach)
         if direction is not None:
-            columns.append(direction if cutoff is None else low_pass_regular(direction, FREQUENCY, cutoff))
+            if cutoff is not None:  # the filter gives a reversed view, which torch does not take
+                direction = low_pass_regular(direction, FREQUENCY, cutoff).copy()
+            columns.append(direction)
     return columns if selected.all() else [x[selected] for x in columns]
 
 

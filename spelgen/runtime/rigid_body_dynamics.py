@@ -134,7 +134,7 @@ class RigidBodyDynamics(PortHamiltonian):
         return self.chain.steady_torque(pose.chain, qd, pose.momenta)
 
     def friction_at(self, pose: Motion, qd: Tensor, *state: Tensor | None) -> Tensor:
-        """Return the friction torque C^T f(C qd), (..., n) [Nm, N]. state: z, and a direction as `friction` takes it."""
+        """Return the friction torque C^T f(C qd), (..., n) [Nm, N]; state: z and direction of `friction`."""
         loads = pose.gravity @ self.loads
         torque = self.friction.forward(qd @ self.motors.mT, loads, pose.prepared.friction, *state)
         return (pose.varied * torque) @ self.motors
