@@ -392,9 +392,10 @@ def test_steps_of_dry_friction_are_filtered_as_the_torque_is(robots):
     with torch.no_grad():
         tau = model.inverse_dynamics(*map(torch.from_numpy, (q, qd, qdd))).numpy()
     samples = dynamics_samples([Trajectory(t, q, qd, tau)], reach=bristle_reach(model))
-    assert torque_errors(model, samples).mean_nmse < 1e-4
+    error = torque_errors(model, samples).mean_nmse
+    assert error < 1e-4
     unfiltered = [replace(x, direction=None) for x in samples]
-    assert torque_errors(model, unfiltered).mean_nmse > 1e-3
+    assert torque_errors(model, unfiltered).mean_nmse > 10 * error
 
 
 def test_torques_in_steps_of_their_own_size_are_found():

@@ -66,7 +66,8 @@ def _nmse(residual: np.ndarray, torque: np.ndarray) -> np.ndarray:
     variance = torque.var(axis=0)
     # a prediction that is not finite must not pass for a torque that says nothing
     squares = np.nan_to_num(np.square(residual).mean(axis=0), nan=np.inf, posinf=np.inf)
-    return np.divide(squares, variance, out=np.full_like(variance, np.nan), where=variance > 0)
+    nmse: np.ndarray = np.divide(squares, variance, out=np.full_like(variance, np.nan), where=variance > 0)
+    return nmse
 
 
 def _mean(nmse: np.ndarray) -> float | None:
