@@ -204,7 +204,7 @@ BRISTLES = Bristles(np.array([[0.01, 0.1], [0.02, 0.3]]), np.array([[0.3, 0.7], 
 
 
 def test_bristles_follow_their_law_along_a_displacement():
-    """z' = qd, beyond 0.7 of the reach times ((1 - |z| / reach) / 0.3)^2, in small steps, there and back."""
+    """z' = qd - |qd| z / reach, integrated in small steps, there and back."""
     z, dq = ca.SX.sym("z", 4), ca.SX.sym("dq", 2)
     step = ca.Function("step", [z, dq], [friction_expressions.bristle_step(BRISTLES, z, dq)])
     found, small, steps, reach = np.zeros(4), np.zeros(4), 4000, BRISTLES.reach.ravel()
@@ -212,7 +212,7 @@ def test_bristles_follow_their_law_along_a_displacement():
         found = step(found, moved).full()[:, 0]
         d = np.repeat(moved / steps, 2)
         for _ in range(steps):
-            small = small + d * np.minimum(1.0, (1 - np.sign(d) * small / reach) / 0.3) ** 2
+            small = small + d - np.abs(d) * small / reach
     np.testing.assert_allclose(found, small, rtol=1e-3)
     assert (np.abs(found) <= reach).all()
 
@@ -227,7 +227,7 @@ def test_c_carries_frictions_memory(tmp_path):
     called = CLibrary(link_library(compile_object(source, "gcc"), "gcc"), model)
     given = random_inputs(model.coordinates, 5, 4)
     law, qd = model.friction, given["qd"]
-    dry = law.coulomb + law.stribeck / (1 + (qd / law.stribeck_velocity) ** 2)
+    dry = law.coulomb + law.stribeck / (1 + (qd / law.stribeck_velocity) ** 2 / 16) ** 16
     dry += law.load_dependence * np.hypot(called("gravity", given)["gravity"], law.least_load)
     straight = called("friction", given | {"z": np.zeros((5, 4))})["friction"]
     bent = (BRISTLES.fractions / BRISTLES.reach * given["z"].reshape(5, 2, 2)).sum(axis=-1)
@@ -245,11 +245,11 @@ def test_in_single_precision_a_joint_that_creeps_moves_its_bristles(tmp_path):
     library = link_library(compile_object(source, "gcc", f"-D{model.name.upper()}_FLOAT"), "gcc")
     called = CLibrary(library, model, np.float32)
     assert model.bristles is not None
-    z = start = 0.8 * model.bristles.reach.reshape(1, -1)
+    z = start = 0.6 * model.bristles.reach.reshape(1, -1)
     given = {"q": np.zeros((1, 2)), "dq": np.full((1, 2), 1e-9)}
     for _ in range(200):
         z = called("friction_step", given | {"z": z})["z_next"]
-    np.testing.assert_allclose(z - start, (0.2 / 0.3) ** 2 * 200e-9, rtol=0.01)
+    np.testing.assert_allclose(z - start, 0.4 * 200e-9, rtol=0.01)
 
 
 def test_export_needs_the_run_folder_alone(tmp_path):

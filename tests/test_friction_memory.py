@@ -56,23 +56,6 @@ def test_a_step_of_any_length_is_exact_along_one_way():
     torch.testing.assert_close(parts, bristles.moved(z, way), rtol=1e-12, atol=1e-18)
 
 
-def test_a_joint_that_stiction_holds_does_not_creep():
-    """Under 0.3 of dry friction and a load that trembles by 0.1 at 10 Hz, for a minute: it settles, and stays."""
-    bristles, fractions = Bristles([[1e-4, 1e-3, 1e-2, 1e-1]]), torch.tensor([0.3, 0.3, 0.2, 0.2]).double()
-    way = torch.linspace(-0.01, 0.01, 2001).double()
-    z, positions = torch.zeros(1, 4).double(), [0.0]
-    for turn in range(1200):
-        load = 0.3 + 0.1 * (-1) ** turn
-        friction = (bristles.moved(z, way.unsqueeze(-1)) / bristles.reach) @ fractions  # (displacements, 1)
-        # where friction bears the load: it rises with displacement
-        moved = float(np.interp(load, friction[:, 0], way))
-        z = bristles.moved(z, torch.tensor([moved]).double())
-        positions.append(positions[-1] + moved)
-    assert positions[1] > 1e-4  # stiction is elastic
-    assert abs(positions[100] - positions[2]) < 5e-4  # rad; Dahl's law: 3.5e-3
-    assert abs(positions[1200] - positions[100]) < 1e-4  # Dahl's law: 3e-2
-
-
 def test_load_dependent_friction_is_smooth_at_right_angles():
     laws = FrictionLaws(JOINTS)
     constants = laws.prepare()

@@ -64,20 +64,22 @@ def predict(model: EmittedModel, windows: Windows, substeps: int) -> Prediction:
 
 def sizes(model: EmittedModel) -> Sizes:
     """Return how many numbers the model's networks give and read, and how many are trained."""
-    beside = "residual_" if has_residuals(model) else ""  # rigid bodies
+    energies: Any = model.residuals if has_residuals(model) else model  # beside rigid bodies
+    mass = _network(energies, "mass")
+    networks = (
+        mass, _network(model, "friction"), _network(model, "input_network"), _network(energies, "potential")
+    )  # fmt: skip
     outputs = []
-    for name in (f"{beside}mass", "friction", "input_network", f"{beside}potential"):
-        network = _network(model, name)
+    for network in networks:
         outputs.append(0 if network is None else len(network.biases[-1]))
     if _network(model, "friction") is None:
         outputs[1] = model.n  # a function of each joint's own
-    mass = _network(model, f"{beside}mass")
     inputs = 0 if mass is None else int(mass.weights[0].shape[1])
     parameters = sum(parameter.numel() for parameter in model.parameters())
     return Sizes((outputs[0], outputs[1], outputs[2], outputs[3]), inputs, parameters)
 
 
-def _network(model: EmittedModel, name: str) -> Any:
+def _network(model: Any, name: str) -> Any:
     """Return the network of a part of the model; None where it has no such part or that has none."""
     owner = getattr(model, name, None)
     return owner if hasattr(owner, "biases") else getattr(owner, "network", None)

@@ -47,8 +47,8 @@ def bristle_reach(model: Any) -> BristleReach:
     """Of a model."""
     if not has_friction_state(model):
         return BristleReach(np.zeros((model.n, 0)))
-    smoothing = model.friction.prepare().coulomb_smoothing_velocity.detach()
-    arrays = [x.cpu().double().numpy() for x in (model.friction.bristles.reach, model.motors, smoothing)]
+    tensors = (model.friction.bristles.reach, model.motors, model.friction.sharp_velocity)
+    arrays = [x.detach().cpu().double().numpy() for x in tensors]
     return BristleReach(*arrays)
 
 

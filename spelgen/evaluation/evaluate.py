@@ -165,7 +165,7 @@ def _coarse_torques(logs: Sequence[Trajectory], judged: Subject, notes: list[Dia
     for joint, step in steps.items():
         message = (
             f"the torque of {joint} is logged in steps of {step:.3g}, as large as the torque itself: "
-            "its error is that of the log, and the verdict leaves this joint out"
+            "its error is that of the log, and the verdict omits this joint"
         )
         notes.append(Diagnostic("warning", "coarse-torque", "logs", None, message))
     return steps

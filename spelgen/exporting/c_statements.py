@@ -14,6 +14,7 @@ _FORMS = {
     ca.OP_SIN: "SIN({0})",
     ca.OP_COS: "COS({0})",
     ca.OP_EXP: "EXP({0})",
+    ca.OP_EXPM1: "EXPM1({0})",
     ca.OP_FABS: "FABS({0})",
     ca.OP_COPYSIGN: "copysign({0}, {1})",
     ca.OP_ADD: "{0} + {1}",

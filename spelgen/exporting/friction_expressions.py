@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
+from itertools import pairwise
+
 import casadi as ca
 import numpy as np
 
 from spelgen.exporting.description import Bristles, FrictionLaw
-from spelgen.runtime.bristles import STICKING
 
 
 def law_torque(law: FrictionLaw, qd: ca.SX, gravity: ca.SX, direction: ca.SX) -> ca.SX:
@@ -16,8 +18,10 @@ def law_torque(law: FrictionLaw, qd: ca.SX, gravity: ca.SX, direction: ca.SX) ->
     """
     load = ca.sqrt(gravity**2 + law.least_load**2)
     dry = law.coulomb + law.load_dependence * load
-    width = law.stribeck_velocity**2
-    dry += law.stribeck * width / (width + qd**2)
+    slow = 1 / (1 + (qd / (4 * law.stribeck_velocity)) ** 2)
+    for _ in range(4):  # to the power of 16
+        slow = slow * slow
+    dry += law.stribeck * slow
     torque: ca.SX = law.viscous * qd + law.saturation * turned(qd, law.saturation_velocity) + dry * direction
     return torque
 
@@ -43,18 +47,34 @@ def sliding_bristles(bristles: Bristles, law: FrictionLaw, qd: ca.SX) -> ca.SX:
 
 
 def bristle_step(bristles: Bristles, z: ca.SX, dq: ca.SX) -> ca.SX:
-    """Return z after a displacement dq: the solution of ``runtime.bristles`` along it."""
-    way, reach = _by_element(bristles, dq), bristles.reach.ravel()
-    moved = ca.fabs(way)
+    """Return z after a displacement dq: the solution of z' = qd - |qd| z / reach along it."""
+    decays = []
+    for joint, reach in enumerate(bristles.reach):
+        moved = ca.fabs(dq[joint])
+        by_element = [ca.expm1(-moved / reach[-1])]
+        for longer, shorter in pairwise(reach[::-1]):
+            ratio = round(longer / shorter)
+            decay = ca.expm1(-moved / shorter)
+            if math.isclose(longer, ratio * shorter, rel_tol=1e-12):
+                # one exponential a joint: a power of it takes a fraction of the time
+                decay = _raised(by_element[0], ratio)
+            by_element.insert(0, decay)
+        decays += by_element
     # no branch; which sign a zero has is no matter, for nothing is added then
-    direction = ca.copysign(1, way)
-    bent = direction * z
-    elastic = ca.fmin(moved, ca.fmax(STICKING * reach - bent, 0))
-    unbent = reach - bent - elastic
-    # the constant is one number in the program: a multiplication takes a fraction of the time of a division
-    yielding = (moved - elastic) * unbent * ((1 - STICKING) * reach) ** -2
-    z_next: ca.SX = z + direction * (elastic + unbent * yielding / (1 + yielding))
+    end = ca.copysign(1, _by_element(bristles, dq)) * bristles.reach.ravel()
+    z_next: ca.SX = z + (z - end) * ca.vertcat(*decays)
     return z_next
+
+
+def _raised(decay: ca.SX, power: int) -> ca.SX:
+    """Return (1 + decay)^power - 1 to all digits of small decays."""
+    result = ca.SX(0)
+    while power:
+        if power % 2:
+            result = result + decay + result * decay
+        decay = decay * (2 + decay)
+        power //= 2
+    return result
 
 
 def _by_element(bristles: Bristles, values: ca.SX) -> ca.SX:

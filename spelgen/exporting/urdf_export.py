@@ -19,14 +19,13 @@ from spelgen.exporting.rigid_body_projection import (
 from spelgen.exporting.trained import Trained
 from spelgen.exporting.urdf_file import rounded, settings_text, urdf_text
 from spelgen.listing import Listing, number
-from spelgen.runtime.bristles import STICKING
 
 _LAW = (
-    "viscous qd + saturation turned(qd, saturation_velocity) + (coulomb + stribeck / (1 + (qd / stribeck_velocity)^2) "
-    "+ load_dependence sqrt(gravity torque^2 + least_load^2)) direction, with turned(x, width) = x / sqrt(x^2 + "
-    "width^2); direction: memoryless turned(qd, coulomb_smoothing_velocity) plus the sum of bristle_fractions bent, "
-    f"with bent = z / bristle_reach and z' = qd, but where |bent| grows beyond {STICKING}, qd ((1 - |bent|) / "
-    f"(1 - {STICKING}))^2; all of it times a factor that goes with the joint's position, between the two numbers of "
+    "viscous qd + saturation turned(qd, saturation_velocity) + (coulomb + stribeck / "
+    "(1 + (qd / stribeck_velocity)^2 / 16)^16 + load_dependence sqrt(gravity torque^2 + least_load^2)) direction, "
+    "with turned(x, width) = x / sqrt(x^2 + width^2); direction: memoryless turned(qd, coulomb_smoothing_velocity) "
+    "plus the sum of bristle_fractions z / bristle_reach, with z' = qd - |qd| z / bristle_reach; "
+    "all of it times a factor that goes with the joint's position, between the two numbers of "
     "position_factor, or one where there are none"
 )
 _SERVO = "clip(kp (u - q) - kd qd, -limit, limit), u commanded `delay` [s] before"

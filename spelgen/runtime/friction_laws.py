@@ -44,13 +44,13 @@ class FrictionLaws(nn.Module):
     """Friction which resists whatever the weights are: they are logarithms.
 
     viscous qd + saturation turned(qd, saturation_velocity)
-    + (coulomb + stribeck / (1 + (qd / stribeck_velocity)^2) + load_dependence load) direction,
+    + (coulomb + stribeck / (1 + (qd / stribeck_velocity)^2 / 16)^16 + load_dependence load) direction,
     with the load sqrt(gravity torque^2 + least_load^2) and turned(x, width) = x / sqrt(x^2 + width^2).
 
     The direction, from -1 to 1, is that of the bristles, sum of fraction z / reach; at joints without
     memory, or where nothing is known of the way here, turned(qd, coulomb_smoothing_velocity).
-    No law has an exponential: a control loop has them in a third of the time (the Stribeck effect of
-    Hess and Soom, Friction at a Lubricated Line Contact, 1990).
+    No law has an exponential: a control loop has them in a third of the time. The Stribeck effect is the
+    Gaussian of Armstrong-Helouvry (Control of Machines with Friction, 1991) to 1 %.
     """
 
     kinds = (
@@ -92,10 +92,16 @@ class FrictionLaws(nn.Module):
         fractions = nn.Parameter(torch.zeros_like(self.bristles.reach)) if reach else None
         self.register_parameter("raw_bristle_fractions", fractions)
 
+    @property
+    def sharp_velocity(self) -> Tensor:
+        """Over which dry friction turns around, (n,), where a joint has no memory though others have."""
+        return SHARP_VELOCITY * self.speed
+
     def prepare(self) -> FrictionConstants:
         """The constants, in their units."""
         size, speed = self.nominal, self.speed
         smoothing, fractions = self.raw_coulomb_smoothing_velocity, self.raw_bristle_fractions
+        turn = torch.where(self.memoryless > 0, self.sharp_velocity, SMOOTHING_VELOCITY * speed)
         return FrictionConstants(
             viscous=size / speed * self.raw_viscous.exp(),
             saturation=size * self.raw_saturation.exp(),
@@ -103,8 +109,9 @@ class FrictionLaws(nn.Module):
             coulomb=size * self.raw_coulomb.exp(),
             stribeck=STRIBECK * size * self.raw_stribeck.exp(),
             stribeck_velocity=STRIBECK_VELOCITY * speed * self.raw_stribeck_velocity.exp(),
-            coulomb_smoothing_velocity=speed
-            * (SHARP_VELOCITY if smoothing is None else SMOOTHING_VELOCITY * smoothing.exp()),
+            coulomb_smoothing_velocity=turn
+            if smoothing is None
+            else SMOOTHING_VELOCITY * speed * smoothing.exp(),
             load_dependence=LOAD_DEPENDENCE * size.sign() * self.raw_load_dependence.exp(),
             least_load=LEAST_LOAD * torch.where(size > 0, size, 1.0),
             bristle_fractions=self.bristles.reach if fractions is None else self._remembered(fractions),
@@ -158,7 +165,7 @@ class FrictionLaws(nn.Module):
     @staticmethod
     def dry(qd: Tensor, gravity: Tensor, c: FrictionConstants) -> Tensor:
         """The size of dry friction, (..., n) [Nm, N]."""
-        slow = 1 / (1 + (qd / c.stribeck_velocity).square())
+        slow = (1 + (qd / c.stribeck_velocity).square() / 16).pow(-16)
         load = (gravity.square() + c.least_load**2).sqrt()
         return c.coulomb + c.stribeck * slow + c.load_dependence * load
 
