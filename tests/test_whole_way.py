@@ -64,7 +64,7 @@ def test_every_robot_here(name, robots, tmp_path, monkeypatch):
     driven = "inputs" in settings["simulation"]
     settings["simulation"] = settings["simulation"] | {"trajectories": 2} if driven else SHORT
     settings["training"] = FEW_STEPS
-    whole_way(robots / f"{name}.urdf", tmp_path, settings, monkeypatch, judged=name == "rpr")
+    whole_way(robots / f"{name}.urdf", tmp_path, settings, monkeypatch, judged=driven)
 
 
 @pytest.mark.parametrize("name", OTHERS)
