@@ -267,21 +267,24 @@ def test_the_tip_is_missed_by_millimetres():
     assert errors.tip_mm == pytest.approx(6.0, rel=1e-5)
 
 
-def test_friction_has_memory_where_bristles_explain_more():
-    """Of three joints the bristles leave the first less torque, the second more; the third has the same twice."""
-    friction = SimpleNamespace(memoryless=torch.zeros(3), bristles=SimpleNamespace(reach=torch.ones(3, 4)))
-    state = SimpleNamespace(residuals=torch.tensor([1.0, 1.0, 1.0]))
-    remembering = SimpleNamespace(residuals=torch.tensor([0.99, 1.01, 1.0]))
+def test_friction_forgets_on_evidence_alone():
+    """Without memory of friction the samples of both joints are more probable: by luck, and by far."""
+    friction = SimpleNamespace(memoryless=torch.ones(2), bristles=SimpleNamespace(reach=torch.ones(2, 4)))
+    independent, gains = 2000 / 20, torch.tensor([1.0, 200.0])
+    state = SimpleNamespace(residuals=torch.ones(2))
+    remembering = SimpleNamespace(residuals=(gains / independent).exp())
     problem = SimpleNamespace(
         jacobian=SimpleNamespace(model=SimpleNamespace(friction=friction)),
         noise=None,
         prior=None,
         covariance=torch.eye(1),
+        count=2000,
+        correlation=20.0,
         set_samples=lambda state, jacobian: state,
         solve=lambda state, rounds: remembering,
     )
     torque_problem.TorqueProblem.select_memory(problem, state)
-    assert friction.memoryless.tolist() == [0.0, 1.0, 0.0]
+    assert friction.memoryless.tolist() == [0.0, 1.0]
 
 
 def test_energy_that_only_changes_its_kind_is_no_rise(robots):

@@ -12,6 +12,8 @@ is what is left of its torque, found in rounds, and so is how far the start is t
 
 from __future__ import annotations
 
+import math
+
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -112,13 +114,15 @@ class TorqueProblem:
         """Go on from a fit without memory of friction; give bristles to the joints whose samples show memory.
 
         Bristles turn around after a displacement, and so late: where friction turns around at once, they pass for
-        inertia. Gears remember: that bristles have more weights is not held against them.
+        inertia. Gears remember, so that memory goes only on evidence (Schwarz, Annals of Statistics 6:461, 1978).
         """
         laws = self.jacobian.model.friction
         fitted = self.noise, self.prior, self.covariance.clone()
         laws.memoryless.fill_(0.0)
         remembering = self.solve(self.set_samples(state, self.jacobian), TUNING.rounds)
-        laws.memoryless.copy_(state.residuals < remembering.residuals)
+        independent = self.count / self.correlation
+        gain = independent * (remembering.residuals / state.residuals).log()
+        laws.memoryless.copy_(gain > laws.bristles.reach.shape[1] * math.log(independent))
         if laws.memoryless.all():
             self.noise, prior, self.covariance = fitted
             self.set_prior(prior)
