@@ -13,7 +13,6 @@ is what is left of its torque, found in rounds, and so is how far the start is t
 from __future__ import annotations
 
 import math
-
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING
