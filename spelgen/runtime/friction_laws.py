@@ -101,7 +101,6 @@ class FrictionLaws(nn.Module):
         """The constants, in their units."""
         size, speed = self.nominal, self.speed
         smoothing, fractions = self.raw_coulomb_smoothing_velocity, self.raw_bristle_fractions
-        turn = torch.where(self.memoryless > 0, self.sharp_velocity, SMOOTHING_VELOCITY * speed)
         return FrictionConstants(
             viscous=size / speed * self.raw_viscous.exp(),
             saturation=size * self.raw_saturation.exp(),
@@ -109,7 +108,7 @@ class FrictionLaws(nn.Module):
             coulomb=size * self.raw_coulomb.exp(),
             stribeck=STRIBECK * size * self.raw_stribeck.exp(),
             stribeck_velocity=STRIBECK_VELOCITY * speed * self.raw_stribeck_velocity.exp(),
-            coulomb_smoothing_velocity=turn
+            coulomb_smoothing_velocity=self.sharp_velocity
             if smoothing is None
             else SMOOTHING_VELOCITY * speed * smoothing.exp(),
             load_dependence=LOAD_DEPENDENCE * size.sign() * self.raw_load_dependence.exp(),
@@ -149,8 +148,9 @@ class FrictionLaws(nn.Module):
 
     def sliding(self, qd: Tensor) -> Tensor:
         """The bristles z, (..., n, K), of joints that have long gone this way."""
-        direction = turned(qd, self.prepare().coulomb_smoothing_velocity)
-        return direction.unsqueeze(-1) * self.bristles.reach
+        # exactly bent as far as they go beyond the width: a rest of the way would be a stiff transient
+        part = (qd / self.prepare().coulomb_smoothing_velocity).clamp(-1.0, 1.0)
+        return (part * (3 - part.square()) / 2).unsqueeze(-1) * self.bristles.reach
 
     def stored_energy(self, z: Tensor, constants: FrictionConstants) -> Tensor:
         """What the bristles of Coulomb friction give back, (...) [J]."""
