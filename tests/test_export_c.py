@@ -233,8 +233,7 @@ def test_c_carries_frictions_memory(tmp_path):
     bent = (BRISTLES.fractions / BRISTLES.reach * given["z"].reshape(5, 2, 2)).sum(axis=-1)
     np.testing.assert_allclose(called("friction", given)["friction"], straight + dry * bent)
     slid = called("friction_memory", given)["z_start"].reshape(5, 2, 2)
-    part = np.clip(qd / law.coulomb_smoothing_velocity, -1, 1)
-    direction = part * (3 - part**2) / 2
+    direction = np.tanh(qd / law.coulomb_smoothing_velocity)
     np.testing.assert_allclose(slid, BRISTLES.reach * direction[..., None])
 
 

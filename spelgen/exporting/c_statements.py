@@ -13,6 +13,7 @@ _FORMS = {
     ca.OP_INV: "R(1) / {0}",
     ca.OP_SIN: "SIN({0})",
     ca.OP_COS: "COS({0})",
+    ca.OP_TANH: "tanh({0})",
     ca.OP_EXP: "EXP({0})",
     ca.OP_EXPM1: "EXPM1({0})",
     ca.OP_FABS: "FABS({0})",

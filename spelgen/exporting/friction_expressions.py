@@ -42,8 +42,8 @@ def bristle_direction(bristles: Bristles, z: ca.SX) -> ca.SX:
 
 def sliding_bristles(bristles: Bristles, law: FrictionLaw, qd: ca.SX) -> ca.SX:
     """Return z of joints that slide at qd for long, (n K, 1)."""
-    part = ca.fmax(ca.fmin(qd / law.coulomb_smoothing_velocity, 1), -1)
-    z: ca.SX = _by_element(bristles, part * (3 - part**2) / 2) * bristles.reach.ravel()
+    direction = ca.tanh(qd / law.coulomb_smoothing_velocity)
+    z: ca.SX = _by_element(bristles, direction) * bristles.reach.ravel()
     return z
 
 

@@ -148,9 +148,9 @@ class FrictionLaws(nn.Module):
 
     def sliding(self, qd: Tensor) -> Tensor:
         """The bristles z, (..., n, K), of joints that have long gone this way."""
-        # exactly bent as far as they go beyond the width: a rest of the way would be a stiff transient
-        part = (qd / self.prepare().coulomb_smoothing_velocity).clamp(-1.0, 1.0)
-        return (part * (3 - part.square()) / 2).unsqueeze(-1) * self.bristles.reach
+        # bent as far as they go a few widths on: the rest of an algebraic turn would be a stiff transient
+        direction = (qd / self.prepare().coulomb_smoothing_velocity).tanh()
+        return direction.unsqueeze(-1) * self.bristles.reach
 
     def stored_energy(self, z: Tensor, constants: FrictionConstants) -> Tensor:
         """What the bristles of Coulomb friction give back, (...) [J]."""
