@@ -33,9 +33,7 @@ class BristleReach:
 
 
 NO_BRISTLES = BristleReach(np.zeros((0, 0)))
-BLOCK = (
-    2**14
-)  # samples in one pass, whose number of operations grows with its length times the logarithm of it
+BLOCK = 2**14  # samples moved at a time: several arrays of a block's size are in memory
 
 
 def reach_of(kinds: Sequence[str], motors: np.ndarray | None = None) -> BristleReach:

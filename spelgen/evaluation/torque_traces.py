@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 SECONDS = 10.0  # of a trace
 SHOWN = 240  # samples of it
+Columns = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]
+"""t, q, qd, qdd, tau, z, and the direction of dry friction; None: as qd has it."""
 
 
 @dataclass(frozen=True)
@@ -96,20 +98,23 @@ def _inverse_dynamics(dynamics: Any, motion: Motion) -> Tensor:
 
 def _motion(piece: Trajectory, logs: JudgedLogs) -> Motion | None:
     """Return up to ten seconds from the middle of what moves; None where nothing does."""
-    columns: tuple[np.ndarray, ...] | None = _sparse_columns(piece, logs)
+    columns: Columns | None = _sparse_columns(piece, logs)
     if shows_accelerations(piece.sample_rate):
         columns = _dense_columns(piece, logs)
     if columns is None:
         return None
-    t = columns[0] - columns[0][0]
+    t, q, qd, qdd, tau, z, direction = columns
+    if direction is None:  # friction without a state takes none
+        direction = np.sign(qd)
+    t = t - t[0]
     count = min(len(t), int(np.searchsorted(t, SECONDS)) + 1)
     start = (len(t) - count) // 2  # logs begin and end at rest
     span = slice(start, start + count)
-    tensors = [torch.from_numpy(np.ascontiguousarray(x[span])) for x in (t - t[start], *columns[1:])]
+    tensors = [torch.from_numpy(np.ascontiguousarray(x[span])) for x in (t - t[start], q, qd, qdd, tau, z, direction)]
     return Motion(*tensors)
 
 
-def _dense_columns(piece: Trajectory, logs: JudgedLogs) -> tuple[np.ndarray, ...] | None:
+def _dense_columns(piece: Trajectory, logs: JudgedLogs) -> Columns | None:
     used = logs.used
     if used.filtered:  # pieces are so already
         used = Preprocessing(cutoff=0, gap=used.gap)
@@ -120,12 +125,10 @@ def _dense_columns(piece: Trajectory, logs: JudgedLogs) -> tuple[np.ndarray, ...
     z, direction = moving.z, moving.direction
     if z is None:
         z = np.zeros((*moving.q.shape, 0))
-    if direction is None:  # friction without a state takes none
-        direction = np.sign(moving.qd)
     return np.arange(len(moving.q)) / FREQUENCY, moving.q, moving.qd, moving.qdd, moving.tau, z, direction
 
 
-def _sparse_columns(piece: Trajectory, logs: JudgedLogs) -> tuple[np.ndarray, ...]:
+def _sparse_columns(piece: Trajectory, logs: JudgedLogs) -> Columns:
     """Return the differences from sample to sample, at the middle of each step, and the torque that acted then."""
     z = np.zeros((*piece.q.shape, 0))
     if logs.reach.elements:
@@ -135,10 +138,8 @@ def _sparse_columns(piece: Trajectory, logs: JudgedLogs) -> tuple[np.ndarray, ..
     if logs.used.filtered:
         # measured at its sample: a filter has no delay
         tau = (piece.tau[1:] + piece.tau[:-1]) / 2
-    direction = direction_along(qd, logs.reach)
-    if direction is None:  # friction without a state takes none
-        direction = np.sign(qd)
-    return t, q, qd, np.diff(piece.qd, axis=0) / np.diff(piece.t)[:, None], tau, z, direction
+    qdd = np.diff(piece.qd, axis=0) / np.diff(piece.t)[:, None]
+    return t, q, qd, qdd, tau, z, direction_along(qd, logs.reach)
 
 
 def _trace(which: str, name: str, dynamics: Mapping[str, RigidDynamics], motion: Motion) -> TorqueTrace:

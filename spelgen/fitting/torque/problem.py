@@ -15,7 +15,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import torch
 
@@ -25,9 +24,6 @@ from spelgen.fitting.torque.jacobian import TUNING, TorqueJacobian
 from spelgen.fitting.torque.prior import adapted_kinds, covariance, most_probable
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.settings.fits import Adaptation, GaussianPrior
-
-if TYPE_CHECKING:
-    pass
 
 State = SolverState[torch.Tensor]
 """Weights (K,); as residuals the sums of squares of the torque that they miss (n,)."""
