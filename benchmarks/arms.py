@@ -27,7 +27,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from motions import smooth_motion
-from real_logs import RIDGES, TESTS, TRAINING, after, first, mean, read, samples_of, torque_of
+from real_logs import RIDGES, TESTS, TRAINING, after, first, mean, read, ridge, samples_of, torque_of
 from torch import Tensor, nn
 from torch.func import grad, jvp
 
@@ -96,7 +96,7 @@ def table(cases: Iterator[Case]) -> None:
             of_the_urdf(urdf, arm),
             network(training),
             deep_lagrangian(training),
-            ridge(arm, training),
+            best_ridge(arm, training),
             plain,
             network(training, plain),
             least_squares(arm, training, memory).torque,
@@ -194,14 +194,14 @@ def of_the_urdf(urdf: Path, arm: Arm) -> Torque:
     return lambda q, qd, qdd, z=None: dynamics.inverse_dynamics(*map(torch.from_numpy, (q, qd, qdd))).numpy()
 
 
-def ridge(arm: Arm, training: Sequence[DynamicsSamples]) -> Torque:
+def best_ridge(arm: Arm, training: Sequence[DynamicsSamples]) -> Torque:
     """Least squares with the penalty that meets held-out blocks best."""
     seen, held = ([part(x, out) for x in training] for out in (False, True))
 
     def missed(size: float) -> float:
-        return mean(least_squares(arm, seen, LeastSquares("range", ridge=size)).torque, held)
+        return mean(ridge(arm, seen, size), held)
 
-    return least_squares(arm, training, LeastSquares("range", ridge=min(RIDGES, key=missed))).torque
+    return ridge(arm, training, min(RIDGES, key=missed))
 
 
 def part(x: DynamicsSamples, out: bool) -> DynamicsSamples:

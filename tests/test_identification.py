@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from spelgen.cli.main import app
 from spelgen.dynamics.regressor import regressor, urdf_parameters
-from spelgen.errors import ArmError, LogError
+from spelgen.errors import LogError
 from spelgen.identification.base_parameters import base_parameters
 from spelgen.identification.friction import FrictionModel
 from spelgen.identification.identify import least_squares
@@ -19,13 +19,7 @@ from spelgen.loaded_arm import load_arm
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.pipeline import inspect
-from spelgen.structure.pseudo_inertia import (
-    LOWER,
-    parameters_of,
-    pseudo_inertia,
-    reference_factor,
-    sensitivity,
-)
+from spelgen.structure.pseudo_inertia import parameters_of, pseudo_inertia, reference_factor
 
 ROBOTS = ("two_link", "rpr", "scara", "six_dof", "ur10e", "panda")
 
@@ -174,17 +168,6 @@ def test_correlated_errors_count_for_less():
     assert correlation_time([slow])[0] == pytest.approx((1 + 0.8) / (1 - 0.8), rel=0.2)
 
 
-def test_a_prior_helps_where_the_motion_is_short(robots):
-    arm = load_arm(robots / "six_dof.urdf").arm
-    samples, _ = excited(arm, 1.0, noise=0.1)
-    fresh, _ = excited(arm, seed=3)
-    error = {}
-    for prior in (None, 0.2):
-        found = least_squares(arm, [samples], LeastSquares(prior=prior))
-        error[prior] = np.square(found.torque(fresh.q, fresh.qd, fresh.qdd) - fresh.tau).mean()
-    assert error[0.2] < 0.5 * error[None]
-
-
 def test_what_motion_does_not_show_is_said(robots):
     arm = load_arm(robots / "six_dof.urdf").arm
     samples, _ = excited(arm)
@@ -200,18 +183,6 @@ def test_errors_tell_what_is_missing(robots):
     arm = load_arm(robots / "two_link.urdf").arm
     with pytest.raises(LogError, match="24 Hz"):
         least_squares(arm, [], LeastSquares())
-
-
-def test_a_prior_needs_inertials(robots, tmp_path):
-    text = (robots / "two_link.urdf").read_text(encoding="utf-8")
-    start, end = (
-        text.index("<inertial>", text.index("link2")),
-        text.rindex("</inertial>") + len("</inertial>"),
-    )
-    (tmp_path / "bare.urdf").write_text(text[:start] + text[end:], encoding="utf-8")
-    arm = load_arm(tmp_path / "bare.urdf").arm
-    with pytest.raises(ArmError, match="no inertials behind the joints"):
-        least_squares(arm, [excited(load_arm(robots / "two_link.urdf").arm)[0]], LeastSquares(prior=0.5))
 
 
 def trajectory(arm, **options):
@@ -231,7 +202,7 @@ def test_command(robots, tmp_path):
     assert "Condition number" in shown.stdout
     again = CliRunner().invoke(app, [*base, "--format", "json"])
     data = json.loads(again.stdout)
-    assert data["schema"] == 2
+    assert data["schema"] == 3
     viscous = [x for x in data["base_parameters"] if x["name"].startswith("viscous")]
     assert [x["value"] for x in viscous] == pytest.approx([3.0] * 6, rel=0.1)
     assert all(x["determined"] == "firm" for x in viscous)
@@ -245,14 +216,8 @@ def test_pseudo_inertia_is_pinocchios(seed):
     matrix = pin.PseudoInertia.FromDynamicParameters(theirs).toMatrix()
     np.testing.assert_allclose(pseudo_inertia(ten), matrix, atol=1e-12)
     np.testing.assert_allclose(parameters_of(pseudo_inertia(ten)), ten, atol=1e-12)
-    factor, possible = reference_factor(ten)
+    _, possible = reference_factor(ten)
     assert possible
-    step = 1e-6
-    for k, (row, column) in enumerate(LOWER):
-        change = np.eye(4)
-        change[row, column] += step
-        moved = parameters_of(factor @ change @ change.T @ factor.T)
-        np.testing.assert_allclose((moved - ten) / step, sensitivity(factor)[:, k], atol=1e-4)
 
 
 def test_an_impossible_body_is_replaced_by_the_nearest_possible_one():

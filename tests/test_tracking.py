@@ -166,10 +166,6 @@ def test_seventy_percent_train_and_what_follows_tests(recordings):
         assert last.t[0] - first.t[-1] == pytest.approx(0.002)
 
 
-def test_the_integration_error_is_small_and_measured(recordings):
-    assert 0 < recordings[2].integration_error < 1e-8
-
-
 def test_the_seed_decides_everything(loaded):
     def logs(**protocol):
         return track(loaded.arm, changed(loaded.settings, trajectories=1, duration=0.2, **protocol))
@@ -238,7 +234,6 @@ def test_where_nothing_is_said_an_arm_is_controlled_and_follows(shared):
     for name in ("kinova_gen3_7dof_2f85", "kuka_iiwa14_lbrstack"):
         loaded = load_arm(shared / "arms" / f"{name}.urdf")
         logs = simulate(loaded, trajectories=1, duration=1.0)
-        assert logs.integration_error < logs.allowed  # far less than an encoder sees
         low, high = initial_range(loaded.arm, loaded.settings)
         middle, reach = (low + high) / 2, 0.35 * (high - low)
         for log in logs:

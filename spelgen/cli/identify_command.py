@@ -21,7 +21,6 @@ from spelgen.cli.options import (
     Robot,
     Tip,
 )
-from spelgen.errors import OptionError
 
 Format = Literal["text", "json", "html"]
 EFFECTS = ("stribeck", "polynomial", "memory")
@@ -40,12 +39,6 @@ def identify(
         Literal["equal", "range", "noise"],
         typer.Option(help="Weights of the joints: equal, by torque range, or by torque noise."),
     ] = "noise",
-    prior: Annotated[
-        float | None,
-        typer.Option(
-            min=1e-6, help="Standard deviation of a prior at the URDF's inertials; 0.5 suits short logs."
-        ),
-    ] = None,
     friction: Annotated[
         str | None,
         typer.Option(
@@ -74,10 +67,7 @@ def identify(
     for name in effects:
         if name not in EFFECTS:
             raise typer.BadParameter(f"{name!r} is none of {', '.join(EFFECTS)}", param_hint="'--friction'")
-    try:
-        method = LeastSquares(weights, prior=prior, friction=FrictionModel(**dict.fromkeys(effects, True)))
-    except OptionError as error:
-        raise typer.BadParameter(error.got, param_hint=f"'--{error.element}'") from None
+    method = LeastSquares(weights, FrictionModel(**dict.fromkeys(effects, True)))
     arm = load_arm(robot, options.names(joints), tip, angle_tolerance)
     # codes are accepted for this command alone; the sidecar holds those for always
     log_mapping = options.accepting(log_source(arm, mapping).mapping, accept)

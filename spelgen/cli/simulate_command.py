@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from spelgen.cli import options
-from spelgen.cli.console import note, progress_bar, say
+from spelgen.cli.console import progress_bar, say
 from spelgen.cli.options import AngleTolerance, Force, Joints, Robot, Tip
 
 
@@ -42,6 +42,3 @@ def simulate(
         if trajectories:
             write_logs(path, trajectories, names)
             say(f"wrote {path}: {len(trajectories)} trajectories, {sum(map(len, trajectories))} samples")
-    say(f"largest integration error: {logs.integration_error:.1e} [rad, rad/s; m, m/s]")
-    if logs.integration_error > logs.allowed:
-        note(f"warning: more than {logs.allowed:g}; do not take these logs as a reference")

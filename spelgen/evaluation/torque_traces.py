@@ -110,7 +110,9 @@ def _motion(piece: Trajectory, logs: JudgedLogs) -> Motion | None:
     count = min(len(t), int(np.searchsorted(t, SECONDS)) + 1)
     start = (len(t) - count) // 2  # logs begin and end at rest
     span = slice(start, start + count)
-    tensors = [torch.from_numpy(np.ascontiguousarray(x[span])) for x in (t - t[start], q, qd, qdd, tau, z, direction)]
+    tensors = [
+        torch.from_numpy(np.ascontiguousarray(x[span])) for x in (t - t[start], q, qd, qdd, tau, z, direction)
+    ]
     return Motion(*tensors)
 
 

@@ -21,7 +21,7 @@ from spelgen.listing import WIDTH, Listing
 from spelgen.settings.tuning.identification import IdentificationTuning
 
 TUNING = IdentificationTuning()
-SCHEMA = 2
+SCHEMA = 3
 DETERMINED = ("firm", "fair", "weak", "may be zero")
 _UNIT = {"revolute": "Nm", "prismatic": "N"}
 _WEIGHTED = {
@@ -35,7 +35,7 @@ _WEIGHTED = {
 class Identification:
     """Result of least squares for an arm with n joints and K parameters, r of them base parameters.
 
-    parameters: (K,), whose torque is the fit's; without prior those outside the base are zero. values, deviations:
+    parameters: (K,), whose torque is the fit's; those outside the base are zero. values, deviations:
     (r,) of the base parameters. condition: of the regressor (columns of length one, joints weighted). unseen:
     directions of the base parameters that these logs do not excite. residual: (n,) root mean square [Nm, N];
     nmse: (n,) its square by the torque's variance. drives: between logged torques and joints; None: nothing is.
@@ -86,8 +86,6 @@ class Identification:
             "samples": self.samples,
             "method": {
                 "weights": self.method.weights,
-                "ridge": self.method.ridge,
-                "prior": self.method.prior,
                 "coulomb_smoothing_velocity": friction.coulomb_smoothing_velocity,
                 "effects": list(friction.effects),
             },
@@ -161,10 +159,6 @@ class Identification:
         """Return what was fitted to what."""
         count, drives = len(self.trajectories), len(self.base) - self.base.bodies
         weighted = _WEIGHTED[self.method.weights]
-        if self.method.ridge:
-            weighted += f", ridge {self.method.ridge:g}"
-        if self.method.prior is not None:
-            weighted += f", with the URDF as prior ({self.method.prior:g})"
         return (
             f"{self.arm.name}: {self.base.bodies} base parameters of the bodies and {drives} of friction and drives, "
             f"from {self.samples} samples of {count} trajector{'y' if count == 1 else 'ies'}, {weighted}."
@@ -176,7 +170,7 @@ class Identification:
             directions = f"{self.unseen} direction{'s' * (self.unseen > 1)}"
             conditioned = (
                 f"The logs do not excite {directions} of the base parameters: those values are arbitrary; excite "
-                "the arm more, or give --prior."
+                "the arm more, or train the preset closed-form, which has a prior at the URDF."
             )
         else:
             verdict = _conditioned(self.condition)

@@ -19,7 +19,6 @@ from spelgen.identification.friction import FrictionModel
 from spelgen.identification.identification import Identification
 from spelgen.identification.least_squares import Columns, Solution, Triangles, deviations, reduce, solve
 from spelgen.identification.method import LeastSquares
-from spelgen.identification.prior import gaussian_prior
 from spelgen.loaded_arm import LoadedArm, load_arm
 from spelgen.logs.checks import check
 from spelgen.logs.dynamics_samples import SHORTEST, DynamicsSamples, dynamics_samples
@@ -42,8 +41,7 @@ def identify(
     """Fit base parameters, friction and armature of ``arm`` to the torques in ``logs``.
 
     arm: of ``load_arm``, or the path of a URDF. Torques of motors are taken to the joints' by its input matrix.
-    preprocessing: its filter and gap. Raises LogError for logs that cannot be used, ArmError for a prior without
-    inertials.
+    preprocessing: its filter and gap. Raises LogError for logs that cannot be used.
     """
     arm = arm if isinstance(arm, LoadedArm) else load_arm(arm)
     logs = [logs] if isinstance(logs, Trajectory) else logs
@@ -96,9 +94,9 @@ def _least_squares(bodies: _BodyRows, method: LeastSquares, drives: Drives | Non
             expected=f"motion sampled at {SLOWEST:g} Hz or faster, {SHORTEST:g} s without a gap at least",
         )
     rows = _Rows(bodies, method.friction, None if drives is None else drives.speeds)
-    triangles = reduce(rows.blocks())
     base = base_parameters(bodies.arm, method.friction, rows.motors)
-    fit = _fit(_problem(bodies.arm, base, triangles, method), rows, method)
+    # each base parameter stands for the parameter that it is named after
+    fit = _fit(rows, base.columns, method)
     return replace(_result(rows, method, base, fit), drives=drives)
 
 
@@ -147,81 +145,49 @@ class _Rows:
 
 
 @dataclass(frozen=True, eq=False)
-class _Problem:
-    """Say which parameters are fitted: x = start + basis z. penalty: of z; ridge: of it, times its column."""
-
-    triangles: Triangles
-    start: np.ndarray
-    basis: np.ndarray
-    penalty: np.ndarray | None = None
-    ridge: float = 0.0
-
-    def solve(self, weights: np.ndarray) -> Solution:
-        penalty = self.penalty
-        if self.ridge:
-            rows = (self.triangles.factors * weights[:, None, None])[..., :-1]
-            length = np.sqrt(np.square(rows).sum(axis=(0, 1)))
-            penalty = np.sqrt(self.ridge) * np.where(length > 0, length, 1.0)
-        return solve(self.triangles, weights, self.basis, self.start, penalty)
-
-
-def _problem(arm: Arm, base: BaseParameters, triangles: Triangles, method: LeastSquares) -> _Problem:
-    count = triangles.factors.shape[2] - 1
-    if method.prior is not None:
-        prior = gaussian_prior(arm, method.friction, triangles.deviation, method.prior)
-        return _Problem(triangles, prior.mean, prior.basis, penalty=1.0 / prior.deviation)
-    if method.ridge:
-        return _Problem(triangles, np.zeros(count), np.eye(count), ridge=method.ridge)
-    # each base parameter stands for the parameter that it is named after
-    return _Problem(triangles, np.zeros(count), np.eye(count)[:, base.columns])
-
-
-@dataclass(frozen=True, eq=False)
 class _Fit:
     """Hold a solution, its weights (n,), and the errors that it leaves: standard deviations (n,) as if independent."""
 
-    problem: _Problem
+    triangles: Triangles
     solution: Solution
     weights: np.ndarray
     noise: np.ndarray
 
     def covariance(self) -> np.ndarray:
-        """Return that of z, for errors as large as they turned out to be, whatever the weights were."""
+        """Return that of the fitted parameters, for errors as large as they are, whatever the weights were."""
         variance = np.square(self.weights**2 * self.noise)
         # the sandwich of weights that need not be the inverse of what the errors turned out to be
-        rows = self.problem.triangles.factors[..., :-1] @ self.problem.basis
+        rows = self.triangles.factors[..., self.solution.columns]
         inner = np.einsum("j,jka,jkb->ab", variance, rows, rows)
-        if self.problem.penalty is not None:
-            inner = inner + np.diag(self.problem.penalty**2)
         return np.asarray(self.solution.covariance @ inner @ self.solution.covariance)
 
 
-def _fit(problem: _Problem, rows: _Rows, method: LeastSquares) -> _Fit:
-    """Solve a problem; with the weights "noise" again, each joint weighted by what was left of its torque."""
-    deviation = problem.triangles.deviation
+def _fit(rows: _Rows, columns: np.ndarray, method: LeastSquares) -> _Fit:
+    """Fit the parameters of these columns; with the weights "noise" again, by what was left of each joint's torque."""
+    triangles = reduce(rows.blocks())
+    deviation = triangles.deviation
     # a joint whose torque never changes must not weigh everything
     torque_range = np.maximum(deviation, 1e-3 * deviation.max())
     weights = np.ones_like(torque_range) if method.weights == "equal" else 1.0 / torque_range
-    fit = _weighted_fit(problem, rows, weights, torque_range)
-    if method.weights == "noise":
-        for _ in range(TUNING.rounds):
-            fit = _weighted_fit(problem, rows, 1.0 / fit.noise, torque_range)
-    return fit
+    rounds = TUNING.rounds if method.weights == "noise" else 0
+    for _ in range(rounds):
+        noise = _noise(rows, solve(triangles, weights, columns), torque_range)
+        weights = 1.0 / noise
+    solution = solve(triangles, weights, columns)
+    return _Fit(triangles, solution, weights, _noise(rows, solution, torque_range))
 
 
-def _weighted_fit(problem: _Problem, rows: _Rows, weights: np.ndarray, torque_range: np.ndarray) -> _Fit:
-    solution = problem.solve(weights)
-    parameters = solution.rank if problem.penalty is None else 0
-    noise = deviations(rows.residuals(solution.parameters), parameters)
-    return _Fit(problem, solution, weights, np.maximum(noise, TUNING.least_noise * torque_range))
+def _noise(rows: _Rows, solution: Solution, torque_range: np.ndarray) -> np.ndarray:
+    """Return the standard deviations (n,) of the errors that a solution leaves."""
+    noise = deviations(rows.residuals(solution.parameters), solution.rank)
+    return np.asarray(np.maximum(noise, TUNING.least_noise * torque_range))
 
 
 def _result(rows: _Rows, method: LeastSquares, base: BaseParameters, fit: _Fit) -> Identification:
-    triangles, solution, basis = fit.problem.triangles, fit.solution, fit.problem.basis
-    covariance = basis @ fit.covariance() @ basis.T
-    of_base = base.combination @ covariance @ base.combination.T
+    triangles, solution = fit.triangles, fit.solution
+    combination = base.combination[:, base.columns]
+    of_base = combination @ fit.covariance() @ combination.T
     squares = triangles.squares(solution.parameters) / triangles.count
-    is_regularised = method.prior is not None or method.ridge > 0
     return Identification(
         arm=rows.bodies.arm,
         method=method,
@@ -230,7 +196,7 @@ def _result(rows: _Rows, method: LeastSquares, base: BaseParameters, fit: _Fit) 
         values=base.combination @ solution.parameters,
         deviations=np.sqrt(np.diag(of_base)),
         condition=solution.condition,
-        unseen=0 if is_regularised else basis.shape[1] - solution.rank,
+        unseen=len(base) - solution.rank,
         residual=np.sqrt(squares),
         nmse=squares / np.where(triangles.deviation > 0, triangles.deviation, np.nan) ** 2,
         trajectories=tuple(x.name for x in rows.bodies.samples),

@@ -1,4 +1,4 @@
-"""Solve least squares on torques: n small triangles hold all that a weighting or prior needs of the logs."""
+"""Solve least squares on torques: n small triangles hold all that a weighting needs of the logs."""
 
 from __future__ import annotations
 
@@ -54,47 +54,37 @@ def reduce(blocks: Iterable[Columns]) -> Triangles:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Parameters x = start + basis z of least squares.
+    """Parameters (K,) of least squares, of which those of some columns (r,) were fitted and the others are zero.
 
-    coordinates: z (r,). covariance: of z (r, r), where the weights are the inverse standard deviations of
-    independent errors. condition: of the regressor with columns of length one; rank: directions that it shows.
+    covariance: of the fitted ones (r, r), where the weights are the inverse standard deviations of independent errors.
+    condition: of the regressor with columns of length one; rank: directions that it shows.
     """
 
     parameters: np.ndarray
-    coordinates: np.ndarray
+    columns: np.ndarray
     covariance: np.ndarray
     condition: float
     rank: int
 
 
-def solve(
-    triangles: Triangles,
-    weights: np.ndarray,
-    basis: np.ndarray,
-    start: np.ndarray | None = None,
-    penalty: np.ndarray | None = None,
-) -> Solution:
-    """Return the x = start + basis z with the least weighted squares and the least |penalty * z|^2.
+def solve(triangles: Triangles, weights: np.ndarray, columns: np.ndarray) -> Solution:
+    """Return the parameters of these columns (r,) with the least weighted squares; weights (n,) by joint.
 
-    weights (n,) by joint, basis (K, r), start (K,), penalty (r,): the inverse standard deviations of a Gaussian
-    prior on z around zero. Without penalty, directions that the samples do not show stay at zero.
+    Directions that the samples do not show stay at zero.
     """
-    if start is None:
-        start = np.zeros(len(basis))
-    weighted = (triangles.factors * weights[:, None, None]).reshape(-1, len(basis) + 1)
-    rows, target = weighted[:, :-1] @ basis, weighted[:, -1] - weighted[:, :-1] @ start
-    if penalty is not None:
-        rows = np.concatenate([rows, np.diag(penalty)])
-        target = np.concatenate([target, np.zeros(len(penalty))])
+    weighted = triangles.factors * weights[:, None, None]
+    weighted = weighted.reshape(-1, weighted.shape[2])
+    rows, target = weighted[:, columns], weighted[:, -1]
     length = np.linalg.norm(rows, axis=0)
     length[length == 0] = 1.0
     u, values, vt = np.linalg.svd(rows / length, full_matrices=False)
     rank = int((values > TUNING.negligible * values[0]).sum())
     # numpy's lstsq gives neither the covariance nor the pseudo-inverse that it takes
     root = vt[:rank].T / values[:rank] / length[:, None]
-    z = root @ (u[:, :rank].T @ target)
+    parameters = np.zeros(weighted.shape[1] - 1)
+    parameters[columns] = root @ (u[:, :rank].T @ target)
     condition = float(values[0] / values[-1]) if rank == len(values) else float("inf")
-    return Solution(start + basis @ z, z, root @ root.T, condition, rank)
+    return Solution(parameters, columns, root @ root.T, condition, rank)
 
 
 def deviations(residuals: Sequence[np.ndarray], parameters: int) -> np.ndarray:

@@ -19,7 +19,6 @@ from spelgen.settings.tuning.simulation import SimulationTuning
 from spelgen.simulation.friction import Friction
 
 TUNING = SimulationTuning()
-LOOSER = TUNING.check_loosening
 
 
 def rollout(

@@ -43,16 +43,14 @@ def servo_motions(
     logs: list[Trajectory] = []
     for number, seed in enumerate(np.random.SeedSequence(protocol.seed).spawn(protocol.trajectories)):
         u = middle + width * _commands(np.random.default_rng(seed), t, len(middle))
-        q = servos.positions(t, u, TUNING.step)
-        if not number:
-            error = float(np.abs(q - servos.positions(t, u, 2 * TUNING.step)).max())
+        q = servos.positions(t, u)
         q = np.round(q / encoder) * encoder
         qd, tau = np.gradient(q, t, axis=0), np.zeros((len(t), 0))
         logs.append(Trajectory(t, q, qd, tau, f"traj_{number:02d}", u=u))
         if progress is not None:
             progress(number + 1, protocol.trajectories)
     trained = len(logs) - min(round(protocol.test_fraction * len(logs)), len(logs) - 1)
-    return SimulatedLogs(logs[:trained], logs[trained:], error, TUNING.allowed_error)
+    return SimulatedLogs(logs[:trained], logs[trained:])
 
 
 def _commands(random: np.random.Generator, t: np.ndarray, n: int) -> np.ndarray:
@@ -72,7 +70,7 @@ class SimulatedServos:
     arm: Arm
     settings: Settings
 
-    def positions(self, t: np.ndarray, u: np.ndarray, longest: float) -> np.ndarray:
+    def positions(self, t: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Return positions (T, n) from rest at the first command: semi-implicit Euler, dry friction as impulses.
 
         The impulse of a joint's dry friction is the one that stops it, or else its largest one (projected Gauss-Seidel,
@@ -85,7 +83,7 @@ class SimulatedServos:
             kp[joint] = self.settings.joint(coordinate.name).kp or kp[joint]
         kd = LAG * kp
         interval = t[1] - t[0]
-        steps = int(np.ceil(interval / longest))
+        steps = int(np.ceil(interval / TUNING.step))
         h, late = interval / steps, round(self.settings.simulation.delay * steps / interval)
         damping = np.diag(h / 2 * (kd + friction.viscous))  # at a step's middle, as the positions are
         impulses = -h * np.stack([friction.forward, friction.backward])

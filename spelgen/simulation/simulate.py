@@ -35,7 +35,7 @@ def simulate(
     seed: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> SimulatedLogs:
-    """Return simulated logs of the arm: all trajectories in a list, `train` and `test` apart, and how exact they are.
+    """Return simulated logs of the arm: all trajectories in a list, `train` and `test` apart.
 
     What is not given is as `simulation` in the settings beside the URDF says: how many trajectories, of which
     duration [s] and sample rate [Hz], the part kept for testing, the seed. Same arguments, same logs. progress:

@@ -1,4 +1,4 @@
-"""Hold what a simulation gives: its trajectories, which of them are for training, and how exact they are."""
+"""Hold what a simulation gives: its trajectories, and which of them are for training."""
 
 from __future__ import annotations
 
@@ -6,31 +6,16 @@ from collections.abc import Sequence
 
 from spelgen.logs.trajectory import Trajectory, trajectory_listing
 
-EXACT = 1e-8  # [rad, rad/s; m, m/s]
-
 
 class SimulatedLogs(list[Trajectory]):
-    """Simulated trajectories, those for training first, then those for testing.
+    """Hold simulated trajectories, those for training (`train`) first, then those for testing (`test`)."""
 
-    train, test: the two parts. integration_error: largest difference of any logged q or qd [rad, rad/s; m, m/s] to
-    the same trajectory integrated with 100 times larger tolerances; the error of what is logged is smaller still.
-    allowed: the largest with which these logs are a reference.
-    """
-
-    def __init__(
-        self,
-        train: Sequence[Trajectory],
-        test: Sequence[Trajectory],
-        integration_error: float,
-        allowed: float = EXACT,
-    ) -> None:
+    def __init__(self, train: Sequence[Trajectory], test: Sequence[Trajectory]) -> None:
         super().__init__([*train, *test])
         self.train, self.test = tuple(train), tuple(test)
-        self.integration_error, self.allowed = integration_error, allowed
 
     def __repr__(self) -> str:
-        summary = f"{len(self.train)} to train, {len(self.test)} to test"
-        return f"<SimulatedLogs: {summary}, integration error {self.integration_error:.1e}>"
+        return f"<SimulatedLogs: {len(self.train)} to train, {len(self.test)} to test>"
 
     def _repr_html_(self) -> str:
         return trajectory_listing(self).html()

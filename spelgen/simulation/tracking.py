@@ -23,7 +23,7 @@ from spelgen.settings.settings import Settings
 from spelgen.settings.simulation import TrackingSettings
 from spelgen.settings.tuning.simulation import SimulationTuning
 from spelgen.simulation.friction import Friction, make_friction
-from spelgen.simulation.integration import LOOSER, rollout
+from spelgen.simulation.integration import rollout
 from spelgen.simulation.paths import paths
 from spelgen.simulation.random_inputs import initial_range
 from spelgen.simulation.simulated_logs import SimulatedLogs
@@ -68,23 +68,20 @@ def track(
 
     Every recording has its own gains, and its own phases or place to begin. The last `test_fraction` of each is
     for testing. Logged are positions from the encoders after a zero-phase low-pass, velocities by central
-    differences of these, and the motors' torques. Arguments, errors and the integration error, here over whole
-    recordings under the same torques, as for `random_inputs`.
+    differences of these, and the motors' torques. Arguments and errors as for `random_inputs`.
     """
     protocol = settings.simulation
     dynamics, friction = arm_dynamics(arm, settings), make_friction(arm, settings, drives and drives.speeds)
     inputs = np.eye(len(arm.coordinates)) if drives is None else drives.inputs
     middle = np.mean(initial_range(arm, settings), axis=0)
     ticks = np.arange(_ticks(settings)) * (1.0 / settings.tracking.control_rate)
-    train, test, errors = [], [], []
+    train, test = [], []
     for number, path in enumerate(paths(arm, settings, ticks)):
         bandwidth = settings.tracking.bandwidths[number % len(settings.tracking.bandwidths)]
         # what a joint feels when the others are free
         inertia = 1 / np.diag(np.linalg.inv(dynamics.mass_matrix(middle)))
         gains = tuned_gains(inertia, bandwidth)
         recording = record(dynamics, friction, inputs, path, gains, settings, 2 * np.pi * bandwidth)
-        effect = recording.tau @ inputs.T
-        errors.append(_integration_error(dynamics, friction, recording, effect))
         log = measured(recording, settings.tracking, f"traj_{number:02d}")
         cut = max(1, len(log) - round(protocol.test_fraction * len(log)))
         train.append(log[:cut])
@@ -92,25 +89,7 @@ def track(
             test.append(replace(log[cut:], name=f"{log.name}_end"))
         if progress is not None:
             progress(number + 1, protocol.trajectories)
-    return SimulatedLogs(
-        train, test, float(max(errors)), allowed=TUNING.unseen * settings.tracking.resolution
-    )
-
-
-def _integration_error(
-    dynamics: PinocchioDynamics, friction: Friction, recording: Recording, effect: np.ndarray
-) -> float:
-    """Return the largest difference to looser integration, begun anew every few samples.
-
-    An arm that falls when nobody controls it carries any difference away.
-    """
-    largest = 0.0
-    for start in range(0, len(recording.t) - 1, TUNING.stretch):
-        rows = slice(start, start + TUNING.stretch + 1)
-        looser = TUNING.seen_loosening * LOOSER**0.5
-        again = rollout(dynamics, friction, recording.states[start], recording.t[rows], effect[rows], looser)
-        largest = max(largest, float(np.abs(recording.states[rows] - again).max()))
-    return largest
+    return SimulatedLogs(train, test)
 
 
 def tuned_gains(inertia: np.ndarray, bandwidth: float) -> Gains:

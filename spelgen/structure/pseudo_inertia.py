@@ -1,10 +1,7 @@
-"""Keep inertial parameters physically consistent: the 4 x 4 pseudo-inertia of a body and its log-Cholesky coordinates.
+"""Keep inertial parameters physically consistent, by the 4 x 4 pseudo-inertia of a body.
 
 A body's ten parameters are those of some distribution of mass exactly where J = [[S, h], [h^T, m]] with
-S = tr(I)/2 1 - I is positive definite (Wensing, Kim and Slotine, IEEE RA-L 3:60, 2018). Here J = C T T^T C^T, with
-C the Cholesky factor of a reference body and T lower triangular, its diagonal exponentials of coordinates: every
-choice of ten numbers is a possible body (Rucker and Wensing, IEEE RA-L 7:4352, 2022), zero is the reference, and
-to first order the distance from it is that of the affine-invariant metric, which knows no units and no frames.
+S = tr(I)/2 1 - I is positive definite (Wensing, Kim and Slotine, IEEE RA-L 3:60, 2018).
 """
 
 from __future__ import annotations
@@ -12,9 +9,6 @@ from __future__ import annotations
 import numpy as np
 
 from spelgen.settings.tuning.structure import StructureTuning
-
-LOWER = tuple((row, column) for row in range(4) for column in range(row + 1))
-"""Where the ten coordinates stand in T."""
 
 TUNING = StructureTuning()
 
@@ -60,14 +54,3 @@ def reference_factor(parameters: np.ndarray) -> tuple[np.ndarray, bool]:
     if not possible:
         pseudo = (vectors * np.maximum(values, least)) @ vectors.T
     return np.linalg.cholesky(pseudo), possible
-
-
-def sensitivity(factor: np.ndarray) -> np.ndarray:
-    """Return d(m, h, I) / d(coordinates) at the reference body, (10, 10)."""
-    columns = []
-    for row, column in LOWER:
-        change = np.zeros((4, 4))
-        # d(T T^T) at T = 1 is the change and its transpose
-        change[row, column] = 1.0
-        columns.append(parameters_of(factor @ (change + change.T) @ factor.T))
-    return np.stack(columns, axis=-1)

@@ -16,9 +16,6 @@ class IdentificationTuning:
     least_noise: float = 0.02  # of a joint's torque range: few samples may be fitted better than deserved
     largest_lag: int = 500  # [samples] over which residuals are followed in time: 5 s
     negligible: float = 1e-10  # of the largest singular value: a direction in which the samples say nothing
-    friction_of_torque: float = 0.1  # of a torque's deviation, where the URDF names no effort; a prior's
-    friction_width: float = 10.0  # times the guess: how far friction and armature may be from it; a prior's
-    usual_speed: float = 2.0  # [rad/s, m/s] where the URDF names none; a prior's
     regressor_bytes: float = 2e8  # [B] of regressors, up to which they are kept from pass to pass
     well_posed: float = 30.0  # condition number up to which errors are hardly amplified
     acceptable: float = 300.0  # condition number up to which parameters can be told apart

@@ -137,4 +137,3 @@ class ServoSimulationTuning:
     held_level: float = 2.0  # [s] between jumps of the commands
     lowest_frequency: float = 0.05  # [Hz] of the commands' sines
     highest_frequency: float = 1.2  # [Hz] above it servos of hobby arms hardly follow
-    allowed_error: float = 5e-3  # [rad, m] joints that stick or not by a hair are that far apart

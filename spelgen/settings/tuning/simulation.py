@@ -27,8 +27,5 @@ class SimulationTuning:
     atol: float = 1e-14  # [rad, rad/s] likewise
     most_steps: int = 100_000  # while a torque is held: what takes more will not end
     seen_loosening: float = 100.0  # of tolerances where encoders see the motion: 1e-11 is enough
-    check_loosening: float = 100.0  # of tolerances, of the integration that the first is compared with
     used_range: float = 0.7  # of a joint's range and of its speed limit, where nothing is said
-    stretch: int = 32  # [samples] over which integration is checked: falling arms carry differences away
-    unseen: float = 0.01  # of an encoder's step: an error of integration that nobody sees
     integral_gain: float = 0.2  # of the PID: a tenth of what makes a joint without friction unstable
