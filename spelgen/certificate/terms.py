@@ -40,40 +40,9 @@ def expression(terms: Terms) -> Expr:
     return Add(*products, evaluate=False)
 
 
-def length(terms: Terms) -> float:
-    """Return how long a sum is to read, about one for every symbol."""
-    total = 0.0
-    for factors, value in terms.items():
-        total += 1.0
-        if abs(value) == 1 and factors:
-            total -= 0.7  # no number is written, only the sign
-        for factor in factors:
-            total += _length(factor)
-    return total
-
-
-@lru_cache(4096)
-def _length(part: Expr) -> float:
-    """Return the length of a number, symbol, power, bracket, or function of a sum of angles.
-
-    Signs, powers and brackets count as a third of a symbol, a cosine's letters and each of its angles as half.
-    """
-    if part.is_Number:
-        return 0.7
-    if part.is_Symbol:
-        return 1.0
-    if part.is_Pow:
-        return 0.3 + _length(part.base)
-    if part.is_Add:
-        return 0.3 + sum(0.3 + _length(term) for term in part.args)
-    if part.is_Mul:
-        return sum(_length(factor) for factor in part.args if factor != -1)
-    total = 0.5
-    for angle in Add.make_args(part.args[0]):
-        total += 0.5
-        if abs(angle.as_coeff_Mul()[0]) != 1:
-            total += 0.25
-    return total
+def length(terms: Terms) -> int:
+    """Return how long a sum is to read: its terms and their factors, a bracket counting as one."""
+    return len(terms) + sum(map(len, terms))
 
 
 @lru_cache(4096)

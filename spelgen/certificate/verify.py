@@ -1,8 +1,8 @@
 """Check the derived facts once more, by numbers: Pinocchio at random configurations and random inertials.
 
 Under ``kinematics`` every sample has inertial values of its own; under ``inertials`` all have the URDF's.
-Nothing of the derivation is used but the Arm; that the file says what the Arm says is checked by another
-program (``urdf_cross_check``).
+Nothing of the derivation is used but the Arm; that the file says what the Arm says is checked by
+Pinocchio's own reader (``urdf_cross_check``).
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ def verify(robot: Robot, arm: Arm, structure: Structure, *, samples: int = 0, se
     inertials = "the URDF's inertial values"
     if free:
         inertials = "inertial values of its own"
-    means = f"{numeric_samples.ENGINE} and yourdfpy at {count} random configurations, each with {inertials}"
+    means = f"{numeric_samples.ENGINE} at {count} random configurations, each with {inertials}"
     return Verification(means, count, seed, checks)
 
 

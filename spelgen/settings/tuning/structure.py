@@ -37,7 +37,6 @@ class CertificateTuning:
     entry_budget: int = 300_000  # multiplications of terms for one entry, about 0.3 s
     budget: int = 2_000_000  # multiplications of terms for all entries of an arm, about 2 s
     most_terms_shortened: int = 60  # of a function; shortening longer ones takes seconds and they stay long
-    ways_collected: int = 3  # the shortest ways to write a function, of which common factors are taken out
     rounding: float = 1e-12  # of its scale: a smaller number of a check is rounding; what is measured is told
     form_rounding: float = 1e-6  # the same for the smallest form, whose long fractions are doubles
     fine: float = 1e-3  # an arm with smaller nonzero numbers may have products that vanish in rounding
