@@ -7,8 +7,8 @@ Pinocchio's own reader (``urdf_cross_check``).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from math import inf
 from typing import TYPE_CHECKING
 
@@ -16,8 +16,8 @@ import numpy as np
 
 from spelgen.arm.arm import Arm
 from spelgen.certificate.urdf_cross_check import urdf_cross_check
-from spelgen.certificate.verification import Check, Verification, size_text
-from spelgen.errors import SpelgenError
+from spelgen.certificate.verification import Check, Verdict, Verification, size_text
+from spelgen.errors import SpelgenError, shortened
 from spelgen.labels import entry_name, joints_in_ranges
 from spelgen.settings.tuning.structure import CertificateTuning
 from spelgen.structure.basis import Constant, Output, row_of
@@ -31,18 +31,6 @@ TUNING = CertificateTuning()
 _SPARE = 6  # samples more than a rank can be: they would show a larger one
 
 
-@dataclass
-class _Contradictions:
-    """Gather what was found against what was derived.
-
-    unexpected: moves where nothing should. unseen: does not move where something should, which is no contradiction
-    where an arm has numbers so small that their products can vanish in rounding.
-    """
-
-    unexpected: list[str] = field(default_factory=list)
-    unseen: list[str] = field(default_factory=list)
-
-
 @dataclass(frozen=True)
 class _Case:
     """Hold what is checked, and the samples that do it; ``is_fine``: numbers may vanish in rounding."""
@@ -51,36 +39,41 @@ class _Case:
     samples: NumericSamples
     is_fine: bool
 
-    def check(self, fact: str, derived: str, result: str, against: _Contradictions) -> Check:
-        """Return a check that names up to four of the contradictions."""
-        contradictions = [*against.unexpected, *against.unseen]
+    def check(
+        self, fact: str, derived: str, result: str, unexpected: Sequence[str], unseen: Sequence[str]
+    ) -> Check:
+        """Return a check that names up to four contradictions.
+
+        unexpected: what moves where nothing should. unseen: what does not move where something should, which is no
+        contradiction where an arm has numbers so small that their products can vanish in rounding.
+        """
+        contradictions = [*unexpected, *unseen]
         if not contradictions:
             return Check(fact, derived, result, "agrees")
-        if len(contradictions) > 4:
-            contradictions[4:] = [f"and {len(contradictions) - 4} more"]
-        if self.is_fine and not against.unexpected:
-            return Check(fact, derived, "; ".join(contradictions), "undecided")
-        return Check(fact, derived, "; ".join(contradictions), "differs")
+        verdict: Verdict = "differs"
+        if self.is_fine and not unexpected:
+            verdict = "undecided"
+        return Check(fact, derived, shortened(contradictions, 4), verdict)
 
     def movement_check(
         self, fact: str, derived: str, verb: str, rows: Iterable[tuple[str, float, bool]], rounding: float
     ) -> Check:
         """Return a check of sizes: (what, its size relative to its scale, whether it must be more than rounding)."""
-        against = _Contradictions()
+        unexpected, unseen = [], []
         largest, weakest = 0.0, inf
         for name, size, expected in rows:
             if expected:
                 weakest = min(weakest, size)
-                if size <= rounding:
-                    against.unseen.append(f"{name} is not seen to")
             else:
                 largest = max(largest, size)
-                if size > rounding:
-                    against.unexpected.append(f"{name} {verb} {size_text(size)}")
+            if expected and size <= rounding:
+                unseen.append(f"{name} is not seen to")
+            if not expected and size > rounding:
+                unexpected.append(f"{name} {verb} {size_text(size)}")
         result = f"what should be zero is at most {size_text(largest)} of its scale"
         if weakest < inf:
             result = f"what should move does by at least {size_text(weakest)} of its scale, {result}"
-        return self.check(fact, derived, result, against)
+        return self.check(fact, derived, result, unexpected, unseen)
 
     def rank_check(self, fact: str, rows: np.ndarray, derived: int) -> Check:
         """Return a check of a rank, with the gap between the singular values that decides it."""
@@ -90,15 +83,10 @@ class _Case:
         for number in (rank, rank + 1):
             if 0 < number <= len(sizes):
                 gap.append(f"number {number} is {size_text(sizes[number - 1])}")
-        result = f"{rank} by singular values"
-        if gap:
-            result += f" ({' and '.join(gap)} of the first)"
-        against = _Contradictions()
-        if rank > derived:
-            against.unexpected.append(result)
-        if rank < derived:
-            against.unseen.append(result)
-        return self.check(fact, str(derived), result, against)
+        result = f"{rank} by singular values ({' and '.join(gap)} of the first)"
+        return self.check(
+            fact, str(derived), result, [result] * (rank > derived), [result] * (rank < derived)
+        )
 
 
 def verify(robot: Robot, arm: Arm, structure: Structure, *, samples: int = 0, seed: int = 0) -> Verification:
@@ -145,9 +133,7 @@ def _zeros(case: _Case) -> Iterator[Check]:
         if entry.kind == "zero":
             rows.append((entry_name(entry.row, entry.column), size, False))
     if rows:
-        derived = ", ".join(name for name, _, _ in rows)
-        if len(rows) > 8:
-            derived = f"{len(rows)} entries"
+        derived = shortened([name for name, _, _ in rows], 8)
         yield case.movement_check("zero entries", derived, "reaches", rows, TUNING.rounding)
 
 
@@ -200,19 +186,20 @@ def _ranks(case: _Case) -> Iterator[Check]:
     together = outputs + len(structure.constants)
     yield case.rank_check("outputs and constants together", case.samples.mass[0], together)
     # networks near the tip should read few joints: this count is what the greedy choice maximises
-    against = _Contradictions()
+    unexpected, unseen = [], []
+    counts = [str(outputs)]
     for first in range(1, len(structure.joints)):
         # all outputs but those that the joints before the first one move
         without = outputs - _rank(changes[:first].reshape(-1, width))[0]
         derived = structure.outputs_from(first)
+        counts.append(str(derived))
         text = f"from joint {first + 1} on {without} by singular values"
         if without < derived:
-            against.unexpected.append(text)
+            unexpected.append(text)
         if without > derived:
-            against.unseen.append(text)  # a change that is not seen leaves more outputs over
-    counts = ", ".join(str(structure.outputs_from(first)) for first in range(len(structure.joints)))
+            unseen.append(text)  # a change that is not seen leaves more outputs over
     fact = "outputs without the first 0, 1, ... joints"
-    yield case.check(fact, counts, "the same by singular values", against)
+    yield case.check(fact, ", ".join(counts), "the same by singular values", unexpected, unseen)
 
 
 def _potential(case: _Case) -> Check:
