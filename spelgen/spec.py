@@ -169,36 +169,17 @@ class ModelSpec:
     """Of joints that are commanded positions."""
 
     def to_json(self) -> str:
-        """Canonical JSON; ``from_json`` gives the same spec back."""
+        """Canonical JSON."""
         plain = asdict(self)
         for name in ("servos", "motor_speeds"):  # arms without keep the digest of before there were such
             if not plain[name]:
                 del plain[name]
         return json.dumps(plain, sort_keys=True, ensure_ascii=True)
 
-    @classmethod
-    def from_json(cls, text: str) -> ModelSpec:
-        """The spec that ``to_json`` wrote."""
-        data = _tupled(json.loads(text))
-        data["options"] = _options(data["options"])
-        data["design"] = Design(**data["design"])
-        data["joints"] = tuple(JointSpec(**joint) for joint in data["joints"])
-        data["outputs"] = tuple(OutputSpec(**output) for output in data["outputs"])
-        data["bodies"] = tuple(BodySpec(**body) for body in data["bodies"])
-        data["servos"] = tuple(ServoSpec(**servo) for servo in data.get("servos", ()))
-        data["constants"] = tuple(ConstantSpec(**constant) for constant in data["constants"])
-        return cls(**data)
-
     @property
     def sha256(self) -> str:
         """Digest of the canonical JSON."""
         return hashlib.sha256(self.to_json().encode()).hexdigest()
-
-
-def _tupled(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _tupled(item) for key, item in value.items()}
-    return tuple(_tupled(item) for item in value) if isinstance(value, list) else value
 
 
 @dataclass(frozen=True)
@@ -301,11 +282,6 @@ def _no_facts(problem: Exception, file: Path | None) -> ModuleError:
         expected="a module written by this version of `spelgen build`",
         do="build it again, or check the path",
     )
-
-
-def _options(record: dict[str, Any]) -> Options:
-    design = record.get("design")
-    return Options(**(record | {"design": design and Design(**design)}))
 
 
 def _texts(tree: ast.Module, name: str) -> Iterator[str]:

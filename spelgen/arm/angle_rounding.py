@@ -9,7 +9,7 @@ from math import pi
 
 import numpy as np
 
-from spelgen.arm.rational import Tensor, Vector, bounded, exact, rotation_from_rpy, rounded_angle
+from spelgen.arm.rational import bounded, exact, rotation_from_rpy, rounded_angle
 from spelgen.errors import Diagnostic
 from spelgen.settings.tuning.structure import GeometryTuning
 from spelgen.urdf.robot import Inertial, Joint, Link
@@ -28,19 +28,19 @@ class AngleRounding:
     tolerance: float
     diagnostics: list[Diagnostic] = field(default_factory=list)
 
-    def joint_origin(self, joint: Joint) -> tuple[Vector, np.ndarray | None]:
+    def joint_origin(self, joint: Joint) -> tuple[np.ndarray, np.ndarray | None]:
         """Return position [m] and rotation (3, 3) of a joint in its parent link's frame; None for no rotation."""
         where = f"joint {joint.name!r} origin"
         return self._offset(joint.xyz, where, joint.line), self._rotation(joint.rpy, where, joint.line)
 
-    def inertial_origin(self, link: Link, inertial: Inertial) -> tuple[Vector, np.ndarray | None]:
+    def inertial_origin(self, link: Link, inertial: Inertial) -> tuple[np.ndarray, np.ndarray | None]:
         """Return position [m] and rotation (3, 3) of an inertial in its link's frame; None for no rotation."""
         where = f"link {link.name!r} inertial origin"
         offset = self._offset(inertial.com, where, inertial.line)
         return offset, self._rotation(inertial.rpy, where, inertial.line)
 
-    def tensor(self, link: Link, inertial: Inertial) -> Tensor:
-        """Return the inertia tensor [kg m2], without products of inertia that are a computation's rounding error."""
+    def tensor(self, link: Link, inertial: Inertial) -> np.ndarray:
+        """Return the exact tensor (3, 3) [kg m2], without products of inertia that are a computation's rounding."""
         xx, xy, xz, yy, yz, zz = inertial.tensor
         if self.tolerance:
             noise = TUNING.zero_noise * max(abs(xx), abs(yy), abs(zz))
@@ -50,7 +50,9 @@ class AngleRounding:
                 message = f"{_vector_text((xy, xz, yz))} kg m2 is taken as {_vector_text(products)}"
                 self._note("snapped-inertia", f"link {link.name!r} inertial products", inertial.line, message)
             xy, xz, yz = products.tolist()
-        return exact(xx), exact(xy), exact(xz), exact(yy), exact(yz), exact(zz)
+        rows = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]
+        tensor: np.ndarray = np.vectorize(exact, otypes=[object])(rows)
+        return tensor
 
     def axis(self, joint: Joint) -> np.ndarray:
         """Return the joint's axis as a unit vector in the joint's frame, (3,)."""
@@ -69,21 +71,18 @@ class AngleRounding:
         """Return an angle [rad] whose rounding is not worth a diagnostic: a constant offset of a mimic joint."""
         return rounded_angle(angle, self.tolerance)
 
-    def position(self, vector: Vector) -> Vector:
+    def position(self, vector: np.ndarray) -> np.ndarray:
         """Return a composed position [m] without the noise that rounded rotations leave in it."""
         noise = 0.0
         if self.tolerance:
             noise = TUNING.offset_noise
-        rounded = [Fraction(0)] * 3
-        for axis, value in enumerate(vector):
-            if abs(value) >= noise:
-                rounded[axis] = bounded(value)
-        return rounded[0], rounded[1], rounded[2]
+        rounded = [bounded(value) if abs(value) >= noise else Fraction(0) for value in vector]
+        return np.array(rounded)
 
-    def _offset(self, offset: Sequence[float], where: str, line: int) -> Vector:
-        x, y, z = map(exact, offset)
-        rounded = self.position((x, y, z))
-        if rounded != (x, y, z):
+    def _offset(self, offset: Sequence[float], where: str, line: int) -> np.ndarray:
+        written = np.array(list(map(exact, offset)))
+        rounded = self.position(written)
+        if (rounded != written).any():
             message = f"{_vector_text(offset)} m is taken as {_vector_text(rounded)}"
             self._note("snapped-offset", where, line, message)
         return rounded
@@ -122,5 +121,5 @@ def _in_pi(angle: float) -> str:
     return text
 
 
-def _vector_text(values: Sequence[float] | Vector | np.ndarray) -> str:
+def _vector_text(values: Sequence[float] | np.ndarray) -> str:
     return "(" + ", ".join(f"{float(value):.6g}" for value in values) + ")"

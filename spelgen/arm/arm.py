@@ -11,7 +11,7 @@ from typing import Literal
 from spelgen.arm.chain import Chain, choose_chain, follows
 from spelgen.arm.lump_links import Moved, lump_links
 from spelgen.arm.placement import TenVector
-from spelgen.arm.rational import Matrix, Vector, exact
+from spelgen.arm.rational import Matrix, Vector, as_matrix, as_vector, exact
 from spelgen.errors import ArmError, Diagnostic
 from spelgen.urdf.robot import Joint, Robot
 
@@ -157,8 +157,8 @@ def _body(moved: Moved, coordinate: int) -> Body:
         coordinate=coordinate,
         multiplier=moved.followed.multiplier,
         offset=float(moved.followed.offset),
-        rotation=moved.pose.rotation,
-        translation=moved.pose.translation,
+        rotation=as_matrix(moved.pose.rotation),
+        translation=as_vector(moved.pose.translation),
         inertia=moved.inertia,
     )
 

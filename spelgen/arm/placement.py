@@ -13,29 +13,13 @@ from fractions import Fraction
 import numpy as np
 
 from spelgen.arm.angle_rounding import AngleRounding
-from spelgen.arm.rational import (
-    IDENTITY,
-    ZERO,
-    Matrix,
-    Vector,
-    alignment,
-    exact,
-    exact_rotation,
-    lost_zeros,
-    product,
-    rotated,
-    rotated_tensor,
-    rotation_about,
-    scaled,
-    summed,
-    transposed,
-)
+from spelgen.arm.rational import IDENTITY, ZERO, alignment, exact, exact_rotation, lost_zeros, rotation_about
 from spelgen.urdf.robot import Inertial, Joint, Link
 
 TenVector = tuple[Fraction, ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Frame:
     """Hold a link's frame at zero position, in the frame of the body it moves with (-1: the root link).
 
@@ -45,28 +29,28 @@ class Frame:
 
     body: int
     composed: np.ndarray
-    rotation: Matrix
-    position: Vector
+    rotation: np.ndarray
+    position: np.ndarray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _StretchFrame:
     """Hold a frame's rotation in the frame of the last revolute body before it, (3, 3) float64 and rational."""
 
     composed: np.ndarray
-    exact: Matrix
+    exact: np.ndarray
 
 
 _STRAIGHT = _StretchFrame(np.eye(3), IDENTITY)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Pose:
     """Hold a joint's own frame, with +z along its axis, in the frame of the body ``parent``."""
 
     parent: int
-    rotation: Matrix
-    translation: Vector
+    rotation: np.ndarray
+    translation: np.ndarray
 
 
 class Placement:
@@ -99,7 +83,7 @@ class Placement:
         if joint.type == "prismatic":
             # a slide turns nothing, so angles before and after it still add up
             stretch = self._stretches[frame.body + 1]
-            self._stretches.append((*stretch, _StretchFrame(aligned, product(stretch[-1].exact, rotation))))
+            self._stretches.append((*stretch, _StretchFrame(aligned, stretch[-1].exact @ rotation)))
             composed = frame.composed
         else:
             # a revolute joint turns by any angle: what comes behind it no longer adds up with what was before
@@ -114,47 +98,42 @@ class Placement:
         offset, turn = self._rounding.inertial_origin(link, inertial)
         frame = self._turned(self.frames[link.name], self._offset(self.frames[link.name], offset), turn)
         mass = exact(inertial.mass)
-        x, y, z = frame.position
-        hx, hy, hz = scaled(mass, frame.position)
-        xx, xy, xz, yy, yz, zz = rotated_tensor(frame.rotation, self._rounding.tensor(link, inertial))
-        return (
-            *(mass, hx, hy, hz),
-            *(xx + hy * y + hz * z, xy - hx * y, xz - hx * z),
-            *(yy + hx * x + hz * z, yz - hy * z, zz + hx * x + hy * y),
-        )
+        center = frame.position
+        tensor = frame.rotation @ self._rounding.tensor(link, inertial) @ frame.rotation.T
+        tensor = tensor + mass * (center @ center * IDENTITY - np.outer(center, center))
+        return (mass, *mass * center, *tensor[np.triu_indices(3)])
 
     def _joint_origin(self, joint: Joint) -> Frame:
         frame = self.frames[joint.parent]
         offset, turn = self._rounding.joint_origin(joint)
         return self._turned(frame, self._offset(frame, offset), turn)
 
-    def _offset(self, frame: Frame, offset: Vector) -> Vector:
-        return self._rounding.position(summed(frame.position, rotated(frame.rotation, offset)))
+    def _offset(self, frame: Frame, offset: np.ndarray) -> np.ndarray:
+        return self._rounding.position(frame.position + frame.rotation @ offset)
 
     def _slid(self, frame: Frame, axis: np.ndarray, value: float) -> Frame:
-        x, y, z = map(exact, axis.tolist())
-        position = self._offset(frame, scaled(exact(value), (x, y, z)))
+        position = self._offset(frame, exact(value) * np.array(list(map(exact, axis.tolist()))))
         return Frame(frame.body, frame.composed, frame.rotation, position)
 
-    def _turned(self, frame: Frame, position: Vector, turn: np.ndarray | None) -> Frame:
+    def _turned(self, frame: Frame, position: np.ndarray, turn: np.ndarray | None) -> Frame:
         """Return ``frame`` turned by ``turn`` (3, 3), None for not at all, and at ``position``."""
         if turn is None:
             return Frame(frame.body, frame.composed, frame.rotation, position)
         composed = frame.composed @ turn
         return Frame(frame.body, composed, self._in_body(frame.body, composed), position)
 
-    def _seen_from_both(self, rotation: Matrix, position: Vector) -> Vector:
+    def _seen_from_both(self, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
         """Return the position of a joint without noise in its parent's frame nor, where both can be, in its own.
 
         An offset of (0.1, 0.1, 0) goes exactly along an axis of 45 degrees, but not along a rational one.
         """
-        in_own_frame = self._rounding.position(rotated(transposed(rotation), position))
-        moved = self._rounding.position(rotated(rotation, in_own_frame))
-        if rotated(transposed(rotation), moved) == in_own_frame:
+        in_own_frame = self._rounding.position(rotation.T @ position)
+        moved = self._rounding.position(rotation @ in_own_frame)
+        if np.array_equal(rotation.T @ moved, in_own_frame):
             return moved
         return position
 
-    def _in_body(self, body: int, composed: np.ndarray) -> Matrix:
+    def _in_body(self, body: int, composed: np.ndarray) -> np.ndarray:
         """Return the exact rotation in the body's frame of what is turned by ``composed`` in its stretch's.
 
         It is made rational in that frame of the stretch in which it then keeps most zeros seen from all of them: an
@@ -164,19 +143,19 @@ class Placement:
         best = IDENTITY
         fewest: int | None = None
         for frame in stretch:
-            candidate = product(frame.exact, exact_rotation(frame.composed.T @ composed))
+            candidate = frame.exact @ exact_rotation(frame.composed.T @ composed)
             lost = _zeros_lost(stretch, composed, candidate)
             if fewest is None or lost < fewest:
                 best, fewest = candidate, lost
             if not lost:
                 break
-        return product(transposed(stretch[-1].exact), best)
+        rotation: np.ndarray = stretch[-1].exact.T @ best
+        return rotation
 
 
-def _zeros_lost(stretch: tuple[_StretchFrame, ...], composed: np.ndarray, candidate: Matrix) -> int:
+def _zeros_lost(stretch: tuple[_StretchFrame, ...], composed: np.ndarray, candidate: np.ndarray) -> int:
     """Count the zeros, seen from the frames of a stretch, that a rational rotation has lost."""
     lost = 0
     for frame in stretch:
-        seen = product(transposed(frame.exact), candidate)
-        lost += lost_zeros(seen, frame.composed.T @ composed)
+        lost += lost_zeros(frame.exact.T @ candidate, frame.composed.T @ composed)
     return lost

@@ -1,4 +1,4 @@
-"""Exact rotations and vectors over the rationals, and how a measured angle becomes one of them."""
+"""Exact rotations and vectors, arrays of fractions, and how a measured angle becomes one of them."""
 
 from __future__ import annotations
 
@@ -12,14 +12,11 @@ from spelgen.settings.tuning.structure import GeometryTuning
 
 Vector = tuple[Fraction, Fraction, Fraction]
 Matrix = tuple[Vector, Vector, Vector]
-Tensor = tuple[Fraction, Fraction, Fraction, Fraction, Fraction, Fraction]
 
 TUNING = GeometryTuning()
 
-_ZERO = Fraction(0)
-_ONE = Fraction(1)
-IDENTITY: Matrix = ((_ONE, _ZERO, _ZERO), (_ZERO, _ONE, _ZERO), (_ZERO, _ZERO, _ONE))
-ZERO: Vector = (_ZERO, _ZERO, _ZERO)
+IDENTITY = np.array([[Fraction(int(row == column)) for column in range(3)] for row in range(3)])
+ZERO = np.array([Fraction(0)] * 3)
 
 
 def exact(value: float) -> Fraction:
@@ -105,7 +102,7 @@ def _coordinate_alignment(index: int, sign: float) -> np.ndarray:
     return np.stack([last, following, axis], axis=1)
 
 
-def exact_rotation(rotation: np.ndarray) -> Matrix:
+def exact_rotation(rotation: np.ndarray) -> np.ndarray:
     """Return a rational rotation within 1e-11 of a float64 one, exactly orthogonal, with zeros where it has zeros.
 
     The unit quaternion is divided by its largest component and each ratio replaced by a nearby fraction; the
@@ -116,9 +113,8 @@ def exact_rotation(rotation: np.ndarray) -> Matrix:
     candidate = IDENTITY
     # the shortest fractions that are near enough keep exact arithmetic fast
     for bound in TUNING.denominators:
-        w, x, y, z = (Fraction(ratio).limit_denominator(bound) for ratio in ratios)
-        candidate = _rotation_of(w, x, y, z)
-        if np.abs(np.array(candidate, dtype=float) - rotation).max() < TUNING.rotation_error:
+        candidate = _rotation_of([Fraction(ratio).limit_denominator(bound) for ratio in ratios])
+        if np.abs(candidate.astype(float) - rotation).max() < TUNING.rotation_error:
             break
     if not lost_zeros(candidate, rotation):
         return candidate
@@ -144,32 +140,28 @@ def _quaternion_ratios(rotation: np.ndarray) -> list[float]:
     return components
 
 
-def lost_zeros(candidate: Matrix, rotation: np.ndarray) -> int:
+def lost_zeros(candidate: np.ndarray, rotation: np.ndarray) -> int:
     """Return how many zeros of a float64 rotation are none in the rational ``candidate``."""
-    lost = 0
-    for row, column in np.argwhere(np.abs(rotation) < TUNING.zero_noise).tolist():
-        if candidate[row][column]:
-            lost += 1
-    return lost
+    return int(np.count_nonzero(candidate[np.abs(rotation) < TUNING.zero_noise]))
 
 
-def _rotation_with_zero(rotation: np.ndarray, row: int, column: int) -> Matrix:
+def _rotation_with_zero(rotation: np.ndarray, row: int, column: int) -> np.ndarray:
     """Return the rational rotation near a float64 one of which this element is zero: a turn about axis ``row``,
     a signed permutation, and a turn about axis ``column``, so that the other zeros are those of the turns.
     """
     first = _turn(row, rotation[(row + 1) % 3, column], rotation[(row + 2) % 3, column])
     last = _turn(column, rotation[row, (column + 1) % 3], -rotation[row, (column + 2) % 3])
-    between = np.array(first, dtype=float).T @ rotation @ np.array(last, dtype=float).T
-    x, y, z = ((Fraction(a), Fraction(b), Fraction(c)) for a, b, c in np.rint(between).astype(int).tolist())
-    return product(product(first, (x, y, z)), last)
+    between = np.rint(first.T.astype(float) @ rotation @ last.T.astype(float)).astype(int)
+    result: np.ndarray = first @ between @ last
+    return result
 
 
-def _turn(axis: int, cosine: float, sine: float) -> Matrix:
+def _turn(axis: int, cosine: float, sine: float) -> np.ndarray:
     """Return the rational rotation about a coordinate axis by the angle of this cosine and sine."""
     # reduced to one eighth, so that 45 and 135 degrees are a right angle apart; no usual angle is on an edge
     quarter, angle = divmod(atan2(sine, cosine) + TUNING.eighth, pi / 2)
     tangent = tan((angle - TUNING.eighth) / 2)
-    t = _ZERO
+    t = Fraction(0)
     if abs(tangent) >= TUNING.zero_noise:
         for bound in TUNING.denominators:
             t = Fraction(tangent).limit_denominator(bound)
@@ -183,79 +175,35 @@ def _turn(axis: int, cosine: float, sine: float) -> Matrix:
     return turn_about(axis, c, s)
 
 
-def turn_about(axis: int, cosine: Fraction, sine: Fraction) -> Matrix:
+def turn_about(axis: int, cosine: Fraction, sine: Fraction) -> np.ndarray:
     """Return the rotation about the coordinate axis 0, 1 or 2 by the angle of this cosine and sine."""
-    rows = list(map(list, IDENTITY))
+    rotation = IDENTITY.copy()
     first, second = (axis + 1) % 3, (axis + 2) % 3
-    rows[first][first] = rows[second][second] = cosine
-    rows[first][second] = -sine
-    rows[second][first] = sine
-    x, y, z = ((a, b, c) for a, b, c in rows)
+    rotation[first, first] = rotation[second, second] = cosine
+    rotation[first, second] = -sine
+    rotation[second, first] = sine
+    return rotation
+
+
+def _rotation_of(quaternion: Sequence[Fraction]) -> np.ndarray:
+    """Return the rotation of a quaternion (w, x, y, z) of any length (Euler-Rodrigues)."""
+    # over one denominator, whole numbers do: fractions are costly
+    common = lcm(*(component.denominator for component in quaternion))
+    w, x, y, z = (int(component * common) for component in quaternion)
+    v = np.array([x, y, z], dtype=object)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=object)
+    # R = 1 + (2 w [v]x + 2 [v]x [v]x) / (w^2 + v.v)
+    turned: np.ndarray = IDENTITY + 2 * (w * cross + cross @ cross) * Fraction(1, w * w + v @ v)
+    return turned
+
+
+def as_vector(values: np.ndarray) -> Vector:
+    """Return three fractions as a tuple, which can be a part of a key."""
+    x, y, z = values
     return x, y, z
 
 
-def _rotation_of(w: Fraction, x: Fraction, y: Fraction, z: Fraction) -> Matrix:
-    """Return the rotation of a quaternion of any length (Euler-Rodrigues)."""
-    # over one denominator, whole numbers do: fractions are costly
-    common = lcm(w.denominator, x.denominator, y.denominator, z.denominator)
-    v = [int(component * common) for component in (x, y, z)]
-    scalar = int(w * common)
-    norm = scalar * scalar + v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
-    # R = (w^2 - v.v) 1 + 2 v v^T + 2 w [v]x, over the norm
-    rows = [[2 * a * b for b in v] for a in v]
-    for axis in range(3):
-        following, last = (axis + 1) % 3, (axis + 2) % 3
-        rows[axis][axis] += 2 * scalar * scalar - norm
-        rows[last][following] += 2 * scalar * v[axis]
-        rows[following][last] -= 2 * scalar * v[axis]
-    first, second, third = ((Fraction(a, norm), Fraction(b, norm), Fraction(c, norm)) for a, b, c in rows)
-    return first, second, third
-
-
-def transposed(a: Matrix) -> Matrix:
-    """Return the transpose, which is a rotation's inverse."""
-    first, second, third = zip(*a, strict=True)
-    return first, second, third
-
-
-def product(a: Matrix, b: Matrix) -> Matrix:
-    """Return the matrix product a b."""
-    if a == IDENTITY:
-        return b
-    x, y, z = transposed(b)
-    return transposed((rotated(a, x), rotated(a, y), rotated(a, z)))
-
-
-def rotated(a: Matrix, vector: Vector) -> Vector:
-    """Return the product of a matrix and a vector."""
-    return dot(a[0], vector), dot(a[1], vector), dot(a[2], vector)
-
-
-def summed(a: Vector, b: Vector) -> Vector:
-    """Return the sum of two vectors."""
-    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
-
-
-def scaled(factor: Fraction, vector: Vector) -> Vector:
-    """Return a vector times a number."""
-    return factor * vector[0], factor * vector[1], factor * vector[2]
-
-
-def rotated_tensor(a: Matrix, tensor: Tensor) -> Tensor:
-    """Return a T a^T of a symmetric tensor (xx, xy, xz, yy, yz, zz)."""
-    if a == IDENTITY:
-        return tensor
-    xx, xy, xz, yy, yz, zz = tensor
-    half = product(a, ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
-    x, y, z = product(half, transposed(a))
-    return *x, y[1], y[2], z[2]
-
-
-def dot(a: Vector, b: Vector) -> Fraction:
-    """Return the scalar product."""
-    total = _ZERO
-    for x, y in zip(a, b, strict=True):
-        # zeros are common here, and skipping them is what makes exact arithmetic cheap
-        if x and y:
-            total += x * y
-    return total
+def as_matrix(rows: np.ndarray) -> Matrix:
+    """Return nine fractions as tuples."""
+    x, y, z = map(as_vector, rows)
+    return x, y, z

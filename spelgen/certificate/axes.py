@@ -12,8 +12,10 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
 
+import numpy as np
+
 from spelgen.arm.arm import Arm
-from spelgen.arm.rational import IDENTITY, ZERO, Vector, dot, product, rotated, scaled, summed, turn_about
+from spelgen.arm.rational import IDENTITY, ZERO, turn_about
 
 _CONFIGURATIONS = 2
 _GRID = 10**6
@@ -31,8 +33,8 @@ def is_plain(arm: Arm) -> bool:
 class _Configuration:
     """Hold the directions and origins of all axes in the root's frame, at one configuration."""
 
-    axes: list[Vector]
-    origins: list[Vector]
+    axes: list[np.ndarray]
+    origins: list[np.ndarray]
 
 
 class Axes:
@@ -55,16 +57,13 @@ class Axes:
         return len(self._cosines(a, b)) == 1
 
     def _cosines(self, a: int, b: int) -> set[Fraction]:
-        return {dot(pose.axes[a], pose.axes[b]) for pose in self._configurations}
+        return {pose.axes[a] @ pose.axes[b] for pose in self._configurations}
 
     def same_line(self, a: int, b: int) -> bool:
         if not self.parallel(a, b):
             return False
-        for pose in self._configurations:
-            lever = summed(pose.origins[a], scaled(Fraction(-1), pose.origins[b]))
-            if not _are_parallel(lever, pose.axes[a]):
-                return False
-        return True
+        levers = [(pose.origins[a] - pose.origins[b], pose.axes[a]) for pose in self._configurations]
+        return all(_are_parallel(lever, axis) for lever, axis in levers)
 
     def opposed(self, a: int, b: int) -> bool:
         """Whether the two point against each other, for axes that are always parallel."""
@@ -90,11 +89,11 @@ class Axes:
         if not all(self.slides[turner + 1 : slider]):
             return False  # a turn between the two may turn the plane
         for pose in self._configurations:
-            normal = _cross(pose.axes[slider], pose.axes[turner])
+            normal = np.cross(pose.axes[slider], pose.axes[turner])
             for joint in range(turner + 1, len(self.slides)):
                 if joint == slider:
                     continue
-                if self.slides[joint] and dot(pose.axes[joint], normal):
+                if self.slides[joint] and pose.axes[joint] @ normal:
                     return False
                 if not self.slides[joint] and not _are_parallel(pose.axes[joint], normal):
                     return False
@@ -132,10 +131,11 @@ class Axes:
 
     def lifts_nothing(self, joint: int) -> bool:
         """Whether the joint slides level, or turns about the vertical."""
+        gravity = np.array(self.arm.gravity)
         for pose in self._configurations:
-            if self.slides[joint] and dot(pose.axes[joint], self.arm.gravity):
+            if self.slides[joint] and pose.axes[joint] @ gravity:
                 return False
-            if not self.slides[joint] and not _are_parallel(pose.axes[joint], self.arm.gravity):
+            if not self.slides[joint] and not _are_parallel(pose.axes[joint], gravity):
                 return False
         return True
 
@@ -145,24 +145,20 @@ def _configuration(arm: Arm, generator: random.Random) -> _Configuration:
     axes, origins = [], []
     rotation, origin = IDENTITY, ZERO
     for body in arm.bodies:
-        origin = summed(origin, rotated(rotation, body.translation))
-        rotation = product(rotation, body.rotation)
-        axis = (rotation[0][2], rotation[1][2], rotation[2][2])
+        origin = origin + rotation @ np.array(body.translation)
+        rotation = rotation @ np.array(body.rotation)
+        axis = rotation[:, 2]
         axes.append(axis)
         origins.append(origin)
         t = Fraction(generator.randrange(1, _GRID), generator.randrange(1, _GRID))
         if body.kind == "prismatic":
-            origin = summed(origin, scaled(t, axis))
+            origin = origin + t * axis
         else:
             # t is the tangent of half the angle: so cosine and sine are rational too
             norm = 1 + t * t
-            rotation = product(rotation, turn_about(2, (1 - t * t) / norm, 2 * t / norm))
+            rotation = rotation @ turn_about(2, (1 - t * t) / norm, 2 * t / norm)
     return _Configuration(axes, origins)
 
 
-def _cross(a: Vector, b: Vector) -> Vector:
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-def _are_parallel(a: Vector, b: Vector) -> bool:
-    return _cross(a, b) == ZERO
+def _are_parallel(a: np.ndarray, b: np.ndarray) -> bool:
+    return not np.cross(a, b).any()

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from spelgen.arm.rational import ZERO
 from spelgen.certificate.axes import Axes
 from spelgen.labels import axes_told, entry_name, joints_told
 from spelgen.structure.structure import Entry, Structure
@@ -114,7 +113,7 @@ def weightless_reason(axes: Axes, structure: Structure, joint: int) -> str | Non
 
 def potential_reason(axes: Axes, structure: Structure) -> str | None:
     """Return why V is zero."""
-    if axes.arm.gravity == ZERO:
+    if not any(axes.arm.gravity):
         return "so is gravity"
     if all(axes.lifts_nothing(joint) for joint in range(len(structure.joints))):
         return "every joint turns about gravity's direction or slides across it, which lifts nothing"
