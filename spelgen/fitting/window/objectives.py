@@ -138,7 +138,6 @@ class RolloutObjective(WindowObjective):
             self.data,
             request.device,
             batch=problem.batch,
-            solver=config.solver,
             substeps=config.substeps,
         )
         self.loop = TrainingLoop(
