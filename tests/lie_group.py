@@ -12,7 +12,29 @@ from typing import Protocol
 
 import torch
 
-from spelgen.dynamics.lie_group import from_group
+
+def to_group(joint_types: Sequence[str], q: torch.Tensor) -> list[torch.Tensor]:
+    """Return, by joint, R in SO(3), (..., 3, 3), or r in R^3, (..., 3) [m], if prismatic, of q, (..., n)."""
+    zero, one = torch.zeros_like(q), torch.ones_like(q)
+    rows = [q.cos(), -q.sin(), zero, q.sin(), q.cos(), zero, zero, zero, one]
+    rotations = torch.stack(rows, dim=-1).reshape(*q.shape, 3, 3)
+    positions = torch.stack([zero, zero, q], dim=-1)
+    elements = []
+    for joint, kind in enumerate(joint_types):
+        view = rotations if kind == "revolute" else positions
+        elements.append(view.select(q.dim() - 1, joint))
+    return elements
+
+
+def from_group(joint_types: Sequence[str], elements: Sequence[torch.Tensor]) -> torch.Tensor:
+    """Return q, (..., n), with angles in [-pi, pi]; the inverse of ``to_group``."""
+    values = []
+    for kind, element in zip(joint_types, elements, strict=True):
+        if kind == "revolute":
+            values.append(torch.atan2(element[..., 1, 0], element[..., 0, 0]))
+        else:
+            values.append(element[..., 2])
+    return torch.stack(values, dim=-1)
 
 
 class GroupModel(Protocol):

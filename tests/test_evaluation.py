@@ -167,9 +167,13 @@ def test_the_true_model_is_perfect_and_its_baseline_is_not(run):
         assert horizon.seconds == pytest.approx(horizon.steps / 20)
         assert horizon.errors["model"].mean_relative_rms < 1e-4
         assert horizon.errors["velocity stays constant"].mean_relative_rms > 0.3
-    assert result.energy_drift < 1e-9
     assert result.parameters == 7
     assert result.torque == {}  # 20 Hz is too sparse for accelerations
+
+
+def test_without_rollouts_logs_too_sparse_for_torques_are_an_error(run):
+    with pytest.raises(LogError, match=r"torques need accelerations, .*24 Hz or more.*; leave --quick out"):
+        evaluated(run, run.parent / "logs", steps=(), seconds=())
 
 
 def test_errors_are_those_of_the_last_sample(run):

@@ -22,9 +22,9 @@ from emitted import (
     randomise,
 )
 
-from spelgen.dynamics.lie_group import from_group, to_group
 from spelgen.dynamics.runge_kutta import runge_kutta
 from spelgen.settings.settings import load_settings
+from tests.lie_group import from_group, to_group
 
 STATES = 25
 

@@ -23,12 +23,12 @@ from published_phnode import ByJvp, Published
 from test_model import bias
 
 from spelgen.design import Preset, load_design
-from spelgen.dynamics.lie_group import to_group
 from spelgen.dynamics.protocol import has_friction_state
 from spelgen.fitting.rollout import position_difference
 from spelgen.loaded_arm import load_arm
 from spelgen.pipeline import generate, make_spec
 from spelgen.spec import Options
+from tests.lie_group import to_group
 
 ROOT = Path(__file__).parents[1]
 PRESETS = [("phnode", "mlp"), ("phnode", "kan"), ("spel", "mlp"), ("spel-kan", "kan"), ("hybrid", "kan")]

@@ -63,7 +63,6 @@ EVALUATION = {
                     "URDF": errors(None)}},
     ],
     "torque": {"model": {"nmse": {}, "mean_nmse": 0.01, "rmse": [1.0, 2.0, 3.0]}},
-    "energy_drift": 8e-10,
     "joint_types": ["revolute", "prismatic", "revolute"],
     "diagnostics": [{"severity": "info", "code": "x", "where": "logs", "line": None,
                      "message": "<b>said</b>"}],

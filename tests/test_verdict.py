@@ -38,7 +38,7 @@ def results(horizons, torque, traces=None, seen=False):
     return Results.from_dict(
         {
             "robot": "arm", "joints": JOINTS, "joint_types": ["revolute"] * 2, "trajectories": ["x"], "cutoff": None,
-            "substeps": 1, "parameters": 1, "horizons": horizons, "torque": torque, "energy_drift": None,
+            "substeps": 1, "parameters": 1, "horizons": horizons, "torque": torque,
             "diagnostics": [note] * seen, "traces": {"coverage": {}} | (traces or {}),
         }
     )  # fmt: skip

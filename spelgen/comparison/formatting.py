@@ -37,7 +37,6 @@ PUBLISHED = {
 """By label, fields of `PublishedFigures`."""
 INVARIANTS: dict[str, tuple[Quantity, Callable[[list[float]], float]]] = {
     "least eigenvalue of M / mean": (lambda run: run.invariants.least_eigenvalue, min),
-    "|R R^T - I|, 10,000 steps": (lambda run: run.invariants.orthogonality, max),
     "rise of energy, no input": (lambda run: run.invariants.energy_rise, max),
     "energy drift, no friction": (lambda run: run.invariants.energy_drift, max),
 }

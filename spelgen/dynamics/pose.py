@@ -10,7 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from spelgen.dynamics.protocol import PortHamiltonianDynamics, has_momentum, has_poses, known_past
+from spelgen.dynamics.protocol import has_momentum, has_poses, known_past
+from spelgen.runtime.port_hamiltonian import PortHamiltonian
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +37,7 @@ def poses(dynamics: Any) -> PoseAt:
     return lambda q: _of_any(dynamics, q)
 
 
-def _of_weights(model: PortHamiltonianDynamics, prepared: object, q: Tensor) -> Pose:
+def _of_weights(model: PortHamiltonian, prepared: object, q: Tensor) -> Pose:
     """Return the pose of an emitted model."""
     pose = model.configuration(q, prepared)
 

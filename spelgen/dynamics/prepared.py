@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple, cast
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
 from spelgen.dynamics.pose import poses
-from spelgen.dynamics.protocol import PortHamiltonianDynamics, known_past, memory_after, sliding_memory
+from spelgen.dynamics.protocol import known_past, memory_after, sliding_memory
 from spelgen.dynamics.residuals import without_idle_residuals
 from spelgen.dynamics.runge_kutta import runge_kutta
+from spelgen.runtime.port_hamiltonian import PortHamiltonian
 
 if TYPE_CHECKING:
     from spelgen.dynamics.tip import TipKinematics
@@ -36,14 +37,14 @@ class PreparedModel:
 
     def __init__(
         self,
-        model: PortHamiltonianDynamics,
+        model: PortHamiltonian,
         tip: TipKinematics | None = None,
         *,
         dtype: torch.dtype = torch.float64,
     ) -> None:
         # networks that give nothing would take most of the time
         reduced = without_idle_residuals(model)
-        cast("torch.nn.Module", reduced).to(dtype=dtype).requires_grad_(False)
+        reduced.to(dtype=dtype).requires_grad_(False)
         self._model = reduced
         self._weights, self._tip = reduced.prepare(), tip
         self.n: int = reduced.n

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeGuard
 
 import torch
 
+from spelgen.runtime.port_hamiltonian import PortHamiltonian
+
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -41,71 +43,6 @@ class RigidDynamics(Protocol):
         """The inputs, (..., n), that make qdd; those of a passive joint are the torques that it lacks."""
 
 
-class PortHamiltonianDynamics(RigidDynamics, Protocol):
-    """Dynamics with momenta p = M(q) qd as their state, as emitted modules have them.
-
-    prepared: what ``prepare`` gave, all that depends on the weights alone. state: z of bristles (see ``FrictionState``)
-    where friction has any. pose: what ``configuration`` gave, all that depends on q; its ``mass`` is M.
-    """
-
-    joint_names: tuple[str, ...]
-    joint_types: tuple[str, ...]
-    elements: int
-
-    def prepare(self, definite: bool = True) -> Any:
-        """What many evaluations with the same weights share."""
-
-    def mass_matrix(self, q: Tensor, prepared: object = None) -> Tensor:
-        """M, (..., n, n), armature included."""
-
-    def gravity(self, q: Tensor, prepared: object = None) -> Tensor:
-        """dV/dq, (..., n)."""
-
-    def nonlinear_effects(self, q: Tensor, qd: Tensor, prepared: object = None) -> Tensor:
-        """Coriolis, centrifugal and gravity torques without friction, (..., n)."""
-
-    def friction_torque(
-        self, q: Tensor, qd: Tensor, *state: Tensor | None, prepared: object = None
-    ) -> Tensor:
-        """What friction takes, (..., n)."""
-
-    def forward_dynamics(
-        self, q: Tensor, qd: Tensor, tau: Tensor, *state: Tensor | None, prepared: object = None
-    ) -> Tensor:
-        """qdd, (..., n), under the inputs tau."""
-
-    def inverse_dynamics(
-        self, q: Tensor, qd: Tensor, qdd: Tensor, *state: Tensor | None, prepared: object = None
-    ) -> Tensor:
-        """The inputs, (..., n), that make qdd."""
-
-    def momentum(self, q: Tensor, qd: Tensor, prepared: object = None) -> Tensor:
-        """p, (..., n)."""
-
-    def velocity(self, q: Tensor, p: Tensor, prepared: object = None) -> Tensor:
-        """qd, (..., n)."""
-
-    def port_hamiltonian_rhs(
-        self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: object, *state: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
-        """q' and p', (..., n), under the inputs tau; without, of the arm left to itself."""
-
-    def configuration(self, q: Tensor, prepared: object) -> Any:
-        """The pose at q."""
-
-    def nonlinear_at(self, pose: Any, qd: Tensor) -> Tensor:
-        """``nonlinear_effects`` at a pose."""
-
-    def lagrangian_gradient(self, pose: Any, qd: Tensor) -> Tensor:
-        """d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
-
-    def friction_at(self, pose: Any, qd: Tensor, *state: Tensor | None) -> Tensor:
-        """``friction_torque`` at a pose."""
-
-    def input_force(self, pose: Any, qd: Tensor, tau: Tensor) -> Tensor:
-        """G tau, (..., n)."""
-
-
 class PosedDynamics(Protocol):
     """Dynamics that work out once what depends on positions alone."""
 
@@ -113,7 +50,7 @@ class PosedDynamics(Protocol):
         """Return the equations of motion at q, (W, n)."""
 
 
-class ResidualModel(PortHamiltonianDynamics, Protocol):
+class ResidualModel(PortHamiltonian):
     """A model with functions of joints and networks beside its rigid bodies; None where they were taken off."""
 
     residuals: Any  # see `runtime.residual_terms`
@@ -153,8 +90,8 @@ def has_servos(model: object) -> bool:
     return hasattr(model, "servo")
 
 
-def has_momentum(dynamics: object) -> TypeGuard[PortHamiltonianDynamics]:
-    """Return whether momenta can be its state (see ``PortHamiltonianDynamics``)."""
+def has_momentum(dynamics: object) -> TypeGuard[PortHamiltonian]:
+    """Return whether momenta can be its state (see ``PortHamiltonian``)."""
     return hasattr(dynamics, "momentum")
 
 

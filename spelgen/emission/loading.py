@@ -27,10 +27,10 @@ METHODS = (
 _EXPECTED = "a module written by this version of `spelgen build`"
 
 if TYPE_CHECKING:
-    from spelgen.dynamics.protocol import PortHamiltonianDynamics
     from spelgen.dynamics.tip import TipKinematics
+    from spelgen.runtime.port_hamiltonian import PortHamiltonian
 
-    class EmittedModel(torch.nn.Module, PortHamiltonianDynamics):
+    class EmittedModel(PortHamiltonian):
         """The class ``Model`` of an emitted module, whose own docstrings hold shapes and units."""
 
         source: str
@@ -43,13 +43,6 @@ if TYPE_CHECKING:
         friction: Any
 
         def __getattr__(self, name: str) -> Any: ...  # what a preset has beside this
-        def potential_energy(self, q: torch.Tensor) -> torch.Tensor: ...
-        def dissipation(self, q: torch.Tensor, qd: torch.Tensor) -> torch.Tensor: ...
-        def input_matrix(self, q: torch.Tensor) -> torch.Tensor: ...
-        def hamiltonian(
-            self, q: torch.Tensor, p: torch.Tensor, z: torch.Tensor | None = None
-        ) -> torch.Tensor: ...
-        def forward(self, t: torch.Tensor, state: torch.Tensor) -> torch.Tensor: ...
         def prepared(
             self, tip: TipKinematics | None = None, *, dtype: torch.dtype = torch.float64
         ) -> PreparedModel: ...

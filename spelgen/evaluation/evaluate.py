@@ -15,7 +15,6 @@ from spelgen.baselines.solver import accurate_solver
 from spelgen.dynamics.protocol import has_servos
 from spelgen.errors import Diagnostic, LogError
 from spelgen.evaluation.horizons import Horizon, JudgedLogs, Predictions, horizon_lengths, predict
-from spelgen.evaluation.invariants import energy_drift
 from spelgen.evaluation.replay import replays
 from spelgen.evaluation.results import Results
 from spelgen.evaluation.state_errors import TipPosition
@@ -23,8 +22,9 @@ from spelgen.evaluation.subject import Subject, subject
 from spelgen.evaluation.torque import TorqueErrors, coarse_torques, torque_errors
 from spelgen.evaluation.traces import Traces, motion_traces, replay_traces
 from spelgen.logs.checks import check
-from spelgen.logs.dynamics_samples import dynamics_samples
+from spelgen.logs.dynamics_samples import SHORTEST, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
+from spelgen.logs.rates import SLOWEST
 from spelgen.logs.trajectory import Trajectory, require_joints, require_torques
 from spelgen.settings.tuning.evaluation import EvaluationTuning
 
@@ -118,6 +118,12 @@ def _evaluate_torques(
             longest = predictions
         horizons.append(horizon)
     torque = _torque_errors(predictors, logs, tests)
+    if not horizons and not torque:
+        raise LogError(
+            "no figure: no rollout is evaluated, and torques need accelerations, which these logs do not show",
+            expected=f"motion at {SLOWEST:g} Hz or more, {SHORTEST:g} s without a gap",
+            do="leave --quick out",
+        )
     steps = _coarse_torques(logs, judged, notes) if torque else {}
     return replace(
         _results(judged, logs, motion_traces(predictors, tests, longest, tip), notes),
@@ -126,7 +132,6 @@ def _evaluate_torques(
         horizons=tuple(horizons),
         torque=torque,
         torque_steps=steps,
-        energy_drift=energy_drift(model, probe),
     )
 
 

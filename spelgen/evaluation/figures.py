@@ -12,7 +12,7 @@ from spelgen.evaluation.replay import Replay
 from spelgen.evaluation.torque import TorqueErrors
 from spelgen.evaluation.traces import Traces
 
-SCHEMA = 7
+SCHEMA = 8
 
 
 @dataclass(frozen=True, repr=False)
@@ -20,11 +20,9 @@ class Figures:
     """Hold what `evaluate` measures; `to_dict` is evaluation.json.
 
     cutoff: of the filter on the test logs [Hz], None without. substeps: of the integrator between samples, for the
-    model. parameters: its trained numbers. torque: by predictor, empty where the logs are too sparse. energy_drift: of
-    the model without input and dissipation over 1 s, integrated to thirteen digits, relative to its kinetic energy;
-    None where the logs never move. traces: the curves behind the figures; those of predictions are the longest
-    horizon's. replays: of commands, of an arm under position servos. torque_steps: of joints whose torque is logged
-    in steps of its own size, by name [Nm, N].
+    model. parameters: its trained numbers. torque: by predictor, empty where the logs are too sparse. traces: the
+    curves behind the figures; those of predictions are the longest horizon's. replays: of commands, of an arm under
+    position servos. torque_steps: of joints whose torque is logged in steps of its own size, by name [Nm, N].
     """
 
     robot: str
@@ -39,7 +37,6 @@ class Figures:
     horizons: tuple[Horizon, ...] = ()
     torque: dict[str, TorqueErrors] = field(default_factory=dict)
     torque_steps: dict[str, float] = field(default_factory=dict)
-    energy_drift: float | None = None
     replays: tuple[Replay, ...] = ()
 
     def to_dict(self) -> dict[str, object]:

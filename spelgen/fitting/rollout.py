@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from spelgen.dynamics.protocol import (
-    PortHamiltonianDynamics,
     known_past,
     memory_after,
     memory_along,
@@ -20,6 +19,7 @@ from spelgen.dynamics.protocol import (
 from spelgen.dynamics.runge_kutta import runge_kutta
 from spelgen.errors import LogError
 from spelgen.logs.windows import Windows
+from spelgen.runtime.port_hamiltonian import PortHamiltonian
 from spelgen.settings.tuning.fitting import IntegrationTuning
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ AT_REST = 1e-6  # [rad, m] finer than encoders
 
 
 def roll_out(
-    model: PortHamiltonianDynamics, windows: Windows, substeps: int = 1
+    model: PortHamiltonian, windows: Windows, substeps: int = 1
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return positions and velocities (W, K-1, n) predicted for samples 1..K-1 of each window from its sample 0.
 
@@ -57,7 +57,7 @@ def roll_out(
 
 
 def _rhs(
-    model: PortHamiltonianDynamics,
+    model: PortHamiltonian,
     q: torch.Tensor,
     z: torch.Tensor,
     tau: torch.Tensor,
