@@ -155,7 +155,7 @@ def test_least_squares_is_kept_with_a_run_and_stands_in_its_evaluation(robots, t
         q = sum(0.1 * np.sin(x) for x in waves).T + np.array([0, 0.3, 0])
         qd = sum(0.1 * (k + 1) * np.cos(x) for k, x in enumerate(waves)).T
         qdd = sum(-0.1 * (k + 1) ** 2 * np.sin(x) for k, x in enumerate(waves)).T
-        tau = bodies.inverse_dynamics(q, qd, qdd)
+        tau = bodies.inverse_dynamics(*map(torch.from_numpy, (q, qd, qdd))).numpy()
         write_logs(tmp_path / "logs" / f"{role}.parquet", [Trajectory(t=t, q=q, qd=qd, tau=tau)], names)
     module, folder = tmp_path / "rpr.py", tmp_path / "run"
     module.write_text(generate(robots / "rpr.urdf", "closed-form"), encoding="utf-8")

@@ -23,12 +23,7 @@ def on_arrays(function: Callable[..., np.ndarray], *states: Array) -> Array:
     first = states[0]
     if isinstance(first, np.ndarray) and first.ndim == 1:
         return cast("Array", function(*states))
-    rows = np.broadcast_arrays(*map(np.asarray, states))
-    return like(function(*rows), first)
-
-
-def like(result: np.ndarray, pattern: Array) -> Array:
-    """Return ``result`` as the array or tensor that ``pattern`` is."""
-    if isinstance(pattern, np.ndarray):
+    result = function(*np.broadcast_arrays(*map(np.asarray, states)))
+    if isinstance(first, np.ndarray):
         return cast("Array", result)
-    return cast("Array", cast("Tensor", pattern).new_tensor(result))
+    return cast("Array", cast("Tensor", first).new_tensor(result))

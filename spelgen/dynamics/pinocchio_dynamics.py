@@ -42,10 +42,8 @@ class PinocchioDynamics:
         self._circles = circles
         self._lines = np.array(lines, dtype=np.int64).reshape(-1, 2)
         self._plain = not circles and model.nq == model.nv == len(lines)
-        identity = np.array_equal(self.jacobian.T @ self.jacobian, np.eye(self.n))
-        self._direct = model.nv == self.n and identity and not self.offset.any()
         # coordinates are the model's joints in its order: products with the identity took longer than `aba` itself
-        self._same = self._direct and np.array_equal(self.jacobian, np.eye(self.n))
+        self._same = np.array_equal(self.jacobian, np.eye(self.n)) and not self.offset.any()
 
     @property
     def n(self) -> int:
@@ -117,13 +115,9 @@ class PinocchioDynamics:
         force = tau if self.inputs is None else tau @ self.inputs.T
         if self.friction is not None:
             force = force - self.friction(qd)
-        if not self._direct:
-            return _solved(self._mass(q), force - self._effects(q, qd))
         if self._same:  # a copy, for Pinocchio writes over what it gave
             return np.array(self._by_joint(pin.aba, self.configuration(q), qd, force))
-        by_joint = (x @ self.jacobian.T for x in (qd, force))
-        result: np.ndarray = self._by_joint(pin.aba, self.configuration(q), *by_joint) @ self.jacobian
-        return result
+        return _solved(self._mass(q), force - self._effects(q, qd))
 
     def _inverse(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
         by_joint = (x @ self.jacobian.T for x in (qd, qdd))

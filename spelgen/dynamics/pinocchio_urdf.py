@@ -10,6 +10,7 @@ import pinocchio as pin
 
 from spelgen.arm.actuation import derive_actuation
 from spelgen.dynamics.constraint import mimic_constraint
+from spelgen.dynamics.joint_friction import Friction
 from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
 from spelgen.settings.settings import load_settings
 from spelgen.urdf.document import urdf_bytes
@@ -47,15 +48,8 @@ def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) ->
 
     motors = derive_actuation(robot, settings, joints).drives()
     # a file's own friction is the joints', that of drives the motors'
-    speeds = motors.speeds if drives else np.eye(len(joints))
-
-    def friction(qd: np.ndarray) -> np.ndarray:
-        v = qd @ speeds.T
-        s = np.tanh(v / COULOMB_SMOOTHING_VELOCITY)
-        lost: np.ndarray = damping * v + s * ((forward - backward) + s * (forward + backward)) / 2
-        at_joints: np.ndarray = lost @ speeds
-        return at_joints
-
+    speeds = motors.speeds if drives else None
+    friction = Friction(damping, forward, backward, COULOMB_SMOOTHING_VELOCITY, speeds)
     return PinocchioDynamics(model, constraint, friction, motors.inputs)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
@@ -10,7 +11,6 @@ from torch import Tensor
 
 from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Arm
-from spelgen.dynamics.arrays import Array, like
 from spelgen.dynamics.pose import Pose
 from spelgen.dynamics.rigid_bodies import RigidBodies
 from spelgen.runtime.bristles import moved_bristles
@@ -51,53 +51,50 @@ class RegressorDynamics:
         """K, of friction's memory at a joint."""
         return 0 if self.bristle_reach is None else self.bristle_reach.shape[1]
 
-    def mass_matrix(self, q: Array) -> Array:
+    def mass_matrix(self, q: Tensor) -> Tensor:
         """M, (..., n, n) [kg m^2, kg m, kg]."""
-        return self._by_rows(lambda position, _: self.pose_at(position).mass, q)
+        return self.pose_at(q).mass
 
-    def gravity(self, q: Array) -> Array:
+    def gravity(self, q: Tensor) -> Tensor:
         """dV/dq, (..., n) [Nm, N]."""
-        return self._by_rows(lambda position, _: self.bodies.at(position)[1](0 * position), q)
+        return self.nonlinear_effects(q, torch.zeros_like(q))
 
-    def nonlinear_effects(self, q: Array, qd: Array) -> Array:
+    def nonlinear_effects(self, q: Tensor, qd: Tensor) -> Tensor:
         """Coriolis, centrifugal and gravity torques, (..., n) [Nm, N]."""
-        return self._by_rows(lambda position, speed, _: self.bodies.at(position)[1](speed), q, qd)
+        _, bias_at = self.bodies.at(q)
+        return bias_at(qd)
 
-    def friction_torque(self, q: Array, qd: Array, z: Array | None = None) -> Array:
+    def friction_torque(self, q: Tensor, qd: Tensor, z: Tensor | None = None) -> Tensor:
         """What friction takes, and what the measured torque shows without any, (..., n) [Nm, N]."""
-        return self._by_rows(lambda _, speed, past: self._friction(speed, past), q, qd, z=z)
+        past = None
+        if z is not None and self.elements:
+            past = z.numpy()
+        return torch.from_numpy(self.friction(qd.numpy(), past))
 
-    def forward_dynamics(self, q: Array, qd: Array, tau: Array, z: Array | None = None) -> Array:
+    def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
         """qdd, (..., n), under the inputs tau."""
+        pose = self.pose_at(q)
+        return solved(pose.mass, pose.force(qd, tau, z))
 
-        def forward(position: Tensor, speed: Tensor, torque: Tensor, past: Tensor | None) -> Tensor:
-            pose = self.pose_at(position)
-            return solved(pose.mass, pose.force(speed, torque, past))
-
-        return self._by_rows(forward, q, qd, tau, z=z)
-
-    def inverse_dynamics(self, q: Array, qd: Array, qdd: Array, z: Array | None = None) -> Array:
+    def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None = None) -> Tensor:
         """The inputs, (..., n), that make qdd; those of a passive joint are the torques that it lacks."""
+        passive = (self.inputs == 0).all(dim=1).double()
+        return solved(self.inputs + torch.diag(passive), self.joint_torque(q, qd, qdd, z))
 
-        def inverse(position: Tensor, speed: Tensor, rise: Tensor, past: Tensor | None) -> Tensor:
-            passive = (self.inputs == 0).all(dim=1).double()
-            torque = self._joint_torque(position, speed, rise, past)
-            return solved(self.inputs + torch.diag(passive), torque)
-
-        return self._by_rows(inverse, q, qd, qdd, z=z)
-
-    def joint_torque(self, q: Array, qd: Array, qdd: Array, z: Array | None = None) -> Array:
+    def joint_torque(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None = None) -> Tensor:
         """What all joints, passive ones too, need for qdd, (..., n) [Nm, N]."""
-        return self._by_rows(self._joint_torque, q, qd, qdd, z=z)
+        pose = self.pose_at(q)
+        return applied(pose.mass, qdd) - pose.force(qd, torch.zeros_like(qdd), z)
 
     def pose_at(self, q: Tensor) -> Pose:
         """Return the equations of motion at q, (T, n), see `pose.poses`."""
         mass, bias_at = self.bodies.at(q)
 
         def force(qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
-            return tau @ self.inputs.mT - bias_at(qd) - self._friction(qd, z)
+            return tau @ self.inputs.mT - bias_at(qd) - self.friction_torque(q, qd, z)
 
-        return Pose(mass + self.motors.mT @ torch.diag(self.armature) @ self.motors, force, self._friction)
+        mass = mass + self.motors.mT @ torch.diag(self.armature) @ self.motors
+        return Pose(mass, force, partial(self.friction_torque, q))
 
     def memory(self, qd: Tensor) -> Tensor:
         """z, (..., n, K), of drives that have long gone this way."""
@@ -108,25 +105,3 @@ class RegressorDynamics:
         """z after joints went one way by (..., n)."""
         assert self.bristle_reach is not None
         return moved_bristles(z, displacement @ self.motors.mT.to(displacement), self.bristle_reach)
-
-    def _friction(self, qd: Tensor, z: Tensor | None) -> Tensor:
-        past = None
-        if z is not None and self.elements:
-            past = z.numpy()
-        return torch.from_numpy(self.friction(qd.numpy(), past))
-
-    def _joint_torque(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None) -> Tensor:
-        still = torch.zeros_like(qdd)
-        pose = self.pose_at(q)
-        return applied(pose.mass, qdd) - pose.force(qd, still, z)
-
-    def _by_rows(self, function: Callable[..., Tensor], *states: Array, z: Array | None = None) -> Array:
-        """``function`` of states (T, n), and z (T, n, K) or None, for states (..., n)."""
-        rows = np.broadcast_arrays(*map(np.asarray, states))
-        past = None
-        if z is not None:
-            past = torch.tensor(np.asarray(z)).flatten(0, -3)
-        with torch.no_grad():
-            flat = [torch.tensor(x.reshape(-1, self.n), dtype=torch.float64) for x in rows]
-            result = function(*flat, past).numpy()
-        return like(result.reshape(*rows[0].shape[:-1], *result.shape[1:]), states[0])

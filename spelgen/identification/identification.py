@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import torch
 
 from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Arm
@@ -65,8 +66,9 @@ class Identification:
         self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, z: np.ndarray | None = None
     ) -> np.ndarray:
         """Return joint torques (T, n) of the identified arm; z: friction's memory (T, n, K)."""
-        tau: np.ndarray = self.dynamics.joint_torque(q, qd, qdd, z)
-        return tau
+        past = None if z is None else torch.from_numpy(z)
+        position, speed, rise = map(torch.from_numpy, (q, qd, qdd))
+        return self.dynamics.joint_torque(position, speed, rise, past).numpy()
 
     @property
     def determined(self) -> tuple[str, ...]:

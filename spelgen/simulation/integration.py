@@ -13,10 +13,10 @@ from itertools import pairwise
 import numpy as np
 from scipy.integrate import ODEintWarning, odeint
 
+from spelgen.dynamics.joint_friction import Friction
 from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
 from spelgen.errors import RunError
 from spelgen.settings.tuning.simulation import SimulationTuning
-from spelgen.simulation.friction import Friction
 
 TUNING = SimulationTuning()
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Arm
+from spelgen.dynamics.joint_friction import Friction
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
 from spelgen.errors import SettingsError
@@ -22,7 +23,7 @@ from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.settings import Settings
 from spelgen.settings.simulation import TrackingSettings
 from spelgen.settings.tuning.simulation import SimulationTuning
-from spelgen.simulation.friction import Friction, make_friction
+from spelgen.simulation.friction import make_friction
 from spelgen.simulation.integration import rollout
 from spelgen.simulation.paths import paths
 from spelgen.simulation.random_inputs import initial_range
