@@ -97,7 +97,7 @@ def test_the_gradient_is_that_of_the_criterion(robots, robot):
     trajectory = ExcitationTrajectory(10.0, 3, motion_bounds(arm, 0.9, 0.7))
     criterion = Criterion(arm, trajectory)
     parameters = np.random.default_rng(4).standard_normal(trajectory.size)
-    overran = np.nanmax(np.abs(criterion.efforts(criterion.motion(parameters)))) > 1
+    overran = np.nanmax(np.abs(criterion.efforts(criterion.states(parameters)))) > 1
     assert overran == (robot == "rpr")
     value, gradient = criterion.value_and_gradient(parameters)
     assert value == pytest.approx(criterion.value(parameters), rel=1e-12)

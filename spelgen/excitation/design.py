@@ -7,6 +7,7 @@ from math import inf, isfinite
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 from scipy.optimize import minimize
 
 from spelgen.errors import SettingsError
@@ -53,14 +54,14 @@ def excite(
     starts = np.random.default_rng(seed).standard_normal((TUNING.starts, trajectory.size))
     best = _improved(criterion, min(starts, key=criterion.value), trials, progress)
     motion = trajectory.motion(best, np.linspace(0.0, duration, round(duration * sample_rate) + 1))
-    first = criterion.motion(starts[0])
+    first, states = criterion.states(starts[0]), torch.from_numpy(np.stack([motion.q, motion.qd, motion.qdd]))
     return Excitation(
         arm=arm.arm,
         motion=motion,
         parameters=len(criterion.columns),
         first=criterion.condition(first),
-        condition=criterion.condition(criterion.motion(best)),
-        efforts=np.abs(criterion.efforts(motion)).max(axis=0),
+        condition=criterion.condition(criterion.states(best)),
+        efforts=np.abs(criterion.efforts(states)).max(axis=0),
         first_efforts=np.abs(criterion.efforts(first)).max(axis=0),
     )
 

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from math import cos, pi
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from spelgen.arm.arm import Arm, Coordinate
 from spelgen.errors import ArmError, SpelgenError, collect
@@ -118,47 +120,59 @@ class ExcitationTrajectory:
         return self.joints * (2 * self.harmonics + 2)
 
     def motion(self, parameters: np.ndarray, t: np.ndarray) -> Motion:
-        """Return the motion of these parameters at these times (T,).
+        """Return the motion of these parameters at these times (T,)."""
+        q, qd, qdd = self.states(torch.from_numpy(parameters), torch.from_numpy(t)).numpy()
+        return Motion(t, q, qd, qdd)
+
+    def states(self, parameters: Tensor, t: Tensor) -> Tensor:
+        """Return q, qd and qdd at these times (T,), (3, T, n).
 
         The bounds hold at every time, not at these alone: between the points of a grid a series of H harmonics
         exceeds them by less than 1 / cos(pi / density) (Ehlich and Zeller, Math. Z. 86:41, 1964).
         """
         coefficients, offsets = self._coefficients(parameters)
-        grid = self._signals(coefficients, np.linspace(0.0, self.duration, DENSITY * self.harmonics + 1))
-        middle, half = (grid[0].max(axis=0) + grid[0].min(axis=0)) / 2, np.ptp(grid[0], axis=0) / 2 / BETWEEN
-        low, high, fastest = middle - half, middle + half, np.abs(grid[1]).max(axis=0) / BETWEEN
-        room = self.bounds.high - self.bounds.low
+        points = torch.linspace(0.0, self.duration, DENSITY * self.harmonics + 1, dtype=torch.float64)
+        positions, velocities, _ = self._signals(coefficients, points)
+        highest, lowest = positions.amax(dim=0), positions.amin(dim=0)
+        middle, half = (highest + lowest) / 2, (highest - lowest) / 2 / BETWEEN
+        fastest = velocities.abs().amax(dim=0) / BETWEEN
+        low, speed = torch.from_numpy(self.bounds.low), torch.from_numpy(self.bounds.speed)
+        room = torch.from_numpy(self.bounds.high) - low
         # by construction, and not by penalty: every parameter vector is a motion that keeps the limits
-        largest = np.minimum(room / (high - low), self.bounds.speed / fastest)
-        size = largest * self.amplitude_fractions(parameters)
-        free = room - size * (high - low)  # how far the whole motion can be moved
-        start = self.bounds.low - size * low + free * (1 + np.tanh(offsets)) / 2
-        q, qd, qdd = (size * x for x in self._signals(coefficients, t))
-        return Motion(t, start + q, qd, qdd)
+        largest = torch.minimum(room / (2 * half), speed / fastest)
+        size = largest * (-self.given_away(parameters)).exp()
+        free = room - 2 * size * half  # how far the whole motion can be moved
+        start = low - size * (middle - half) + free * (1 + offsets.tanh()) / 2
+        q, qd, qdd = size * self._signals(coefficients, t)
+        return torch.stack([start + q, qd, qdd])
 
-    def amplitude_fractions(self, parameters: np.ndarray) -> np.ndarray:
-        """Return the part of its largest amplitude that each joint has, (n,)."""
-        return np.exp(-(parameters.reshape(self.joints, -1)[:, -1] ** 2) / 4)
+    def given_away(self, parameters: Tensor) -> Tensor:
+        """Return minus the logarithm of the part of its largest amplitude that each joint has, (n,)."""
+        return parameters.reshape(self.joints, -1)[:, -1].square() / 4
 
-    def _coefficients(self, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _coefficients(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
         """Return coefficients (2, H, n) of sines and cosines, and offsets (n,)."""
         rows = parameters.reshape(self.joints, 2 * self.harmonics + 2)
-        sines_cosines = rows[:, :-2].reshape(self.joints, 2, self.harmonics).transpose(1, 2, 0)
-        k = np.arange(1, self.harmonics + 1, dtype=float)
+        sines_cosines = rows[:, :-2].reshape(self.joints, 2, self.harmonics).permute(1, 2, 0)
+        k = self._numbers()
         at_rest = []
         for coefficients, power in zip(sines_cosines, (k, k**2), strict=True):
-            along = power / np.linalg.norm(power)
-            at_rest.append(coefficients - np.outer(along, along @ coefficients))
-        return np.stack(at_rest), rows[:, -2]
+            along = power / power.norm()
+            at_rest.append(coefficients - torch.outer(along, along @ coefficients))
+        return torch.stack(at_rest), rows[:, -2]
 
-    def _signals(self, coefficients: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return position, velocity and acceleration (T, n) of amplitude one."""
-        frequencies = np.arange(1, self.harmonics + 1) * 2 * pi / self.duration  # angular
-        sine, cosine = np.sin(t[:, None] * frequencies), np.cos(t[:, None] * frequencies)  # (T, H)
+    def _signals(self, coefficients: Tensor, t: Tensor) -> Tensor:
+        """Return position, velocity and acceleration (3, T, n) of amplitude one."""
+        frequencies = self._numbers() * 2 * pi / self.duration  # angular
+        angles = torch.outer(t, frequencies)
+        sine, cosine = angles.sin(), angles.cos()  # (T, H)
         a, b = coefficients
         first, second = frequencies[:, None], (frequencies**2)[:, None]
-        return (
-            sine @ a + cosine @ b,
-            cosine @ (first * a) - sine @ (first * b),
-            -sine @ (second * a) - cosine @ (second * b),
-        )
+        position = sine @ a + cosine @ b
+        velocity = cosine @ (first * a) - sine @ (first * b)
+        acceleration = -sine @ (second * a) - cosine @ (second * b)
+        return torch.stack([position, velocity, acceleration])
+
+    def _numbers(self) -> Tensor:
+        """Return 1 .. H."""
+        return torch.arange(1, self.harmonics + 1, dtype=torch.float64)
