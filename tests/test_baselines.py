@@ -185,6 +185,6 @@ def test_least_squares_is_kept_with_a_run_and_stands_in_its_evaluation(robots, t
     energy = {name: np.array(x) for name, x in trace["energy"].items()}
     left = energy["work of the drives"] - energy["stored"] - energy["friction"] - energy["not explained"]
     assert np.abs(left).max() < 1e-3
-    assert "torque nMSE" in (tmp_path / "found.csv").read_text()
+    assert "nMSE over all test samples" in (tmp_path / "found.csv").read_text()
     page = (folder / "report.html").read_text(encoding="utf-8")
     assert "Base parameters" in page and "without epochs" in page and "Masses, centres of mass" in page

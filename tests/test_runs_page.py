@@ -65,11 +65,11 @@ def test_the_table_holds_every_figure_once_with_its_unit():
     assert tuple(head) == HEAD
     found = {tuple(row[:-1]): row[-1] for row in rows}
     assert len(found) == len(rows)
-    assert found["q RMS", "m", "1.0", "joint2", "", "model"] == "0.02"
-    assert found["tip RMS", "mm", "1.0", "", "", "velocity stays constant"] == "26.0"
-    assert found["relative RMS", "1", "1.0", "", "", "URDF"] == ""
-    assert found["torque RMSE", "N", "", "joint2", "", "model"] == "2.0"
-    assert found["relative error, 50 % of the starts", "1", "1.0", "", "", "model"] == "0.3"
+    assert found["Position error after 1 s", "joint2 [m]", "model"] == "0.02"
+    assert found["Error of the tip's position [mm]", "1 s", "velocity stays constant"] == "26.0"
+    relative = "Error relative to the motion (0: none, 1: as if the arm had stood still)"
+    assert found[relative, "1 s", "URDF"] == ""
+    assert found["Torque error by joint, RMSE", "joint2 [N]", "model"] == "2.0"
 
 
 def test_an_identification_is_a_page_that_tells_what_the_text_tells(robots):

@@ -23,10 +23,14 @@ POSITION, VELOCITY, TORQUE = range(3)  # in these
 
 @dataclass(frozen=True)
 class Cell:
-    """A number as text; `best`: the smallest of its row, where there is something to compare it with."""
+    """A number as text; `best`: the smallest of its row, where there is something to compare it with.
+
+    value: all its digits; None where it is not known.
+    """
 
     text: str
     best: bool = False
+    value: float | None = None
 
 
 @dataclass(frozen=True)
@@ -86,7 +90,7 @@ def _cells(row: Numbers, columns: Iterable[str]) -> tuple[Cell, ...]:
     for name in columns:
         value = row.get(name)
         text = number(value) if name in row else ""
-        cells.append(Cell(text, best=value is not None and value == smallest))
+        cells.append(Cell(text, value is not None and value == smallest, value))
     return tuple(cells)
 
 

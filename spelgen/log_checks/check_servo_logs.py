@@ -76,7 +76,6 @@ def check_servo_logs(logs: Iterable[Trajectory], arm: LoadedArm) -> ServoLogRepo
         errors=tuple(errors),
         examples=tuple(logs[:EXAMPLES]),
         servos=tuple(reports),
-        delay=following.delay,
     )
 
 

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import nnls
 
 from spelgen.logs.commands import delayed_commands
 from spelgen.logs.smoothing import derivative
@@ -29,15 +28,14 @@ class Following:
 
     moves: (n,) whether the command moves. correlation, gain: (D, n, n) of the command of one joint with the position of
     another, and how far that moves by the command. tracking_rms: (D, n) root mean square of u - q [rad, m].
-    delay: the ends [s] between which commands act, None where no command moves. steady_state_errors: of each joint, the
-    distances u - q while command and joint rest. saturated: (n,) fraction of the samples at its torque limit.
+    steady_state_errors: of each joint, the distances u - q while command and joint rest. saturated: (n,) fraction of
+    the samples at its torque limit.
     """
 
     moves: np.ndarray
     correlation: np.ndarray
     gain: np.ndarray
     tracking_rms: np.ndarray
-    delay: tuple[float, float] | None
     steady_state_errors: list[np.ndarray]
     saturated: np.ndarray
 
@@ -74,48 +72,9 @@ def measure_following(logs: Sequence[Trajectory], saturation: np.ndarray) -> Fol
         correlation=correlation,
         gain=gain,
         tracking_rms=tracking_rms,
-        delay=_delay(pieces, moves),
         steady_state_errors=_resting_errors(pieces, n),
         saturated=_mean(np.abs(commands - q) > saturation),
     )
-
-
-def _delay(pieces: Sequence[Trajectory], moves: np.ndarray) -> tuple[float, float] | None:
-    """Find between which delays [s] commands act, None where no command moves.
-
-    Velocity, acceleration and dry friction only hold a joint back, so u - q is a sum of them with coefficients that are
-    not negative; delays are alike where this sum leaves the same, but for `equal_delays`.
-    """
-    moving = np.flatnonzero(moves)
-    if not len(moving):
-        return None
-    columns = np.concatenate(list(map(_retarding_motion, pieces)))  # (T, n, 3)
-    columns = columns - columns.mean(axis=0)
-    delays = DELAYS[DELAYS > -1e-9]
-    log_residuals = np.zeros((len(delays), len(moving)))
-    for k, delay in enumerate(delays.tolist()):
-        # one filter over all of an equation changes nothing of what it says
-        errors = []
-        for piece in pieces:
-            errors.append(derivative(_commands(piece, delay) - _midpoints(piece.q), piece.sample_rate, 0))
-        command_error = np.concatenate(errors)
-        command_error = command_error - command_error.mean(axis=0)
-        for place, joint in enumerate(moving.tolist()):
-            _, residual = nnls(columns[:, joint], command_error[:, joint])
-            log_residuals[k, place] = np.log(max(residual**2, 1e-12))
-    cost = log_residuals.mean(axis=1)
-    alike = delays[cost < cost.min() + TUNING.equal_delays]
-    return float(alike.min()), float(alike.max())
-
-
-def _retarding_motion(piece: Trajectory) -> np.ndarray:
-    """Return velocity, acceleration and the sense of motion between samples, (T - 1, n, 3), all smoothed alike."""
-    rate = piece.sample_rate
-    velocity = np.gradient(derivative(piece.q, rate, 0), piece.t, axis=0)
-    acceleration = np.gradient(velocity, piece.t, axis=0)
-    direction = np.tanh(np.gradient(piece.q, piece.t, axis=0) / MOVING)
-    columns = np.stack([velocity, acceleration, derivative(direction, rate, 0)], axis=-1)
-    return _midpoints(columns)
 
 
 def _resting_errors(pieces: Sequence[Trajectory], n: int) -> list[np.ndarray]:

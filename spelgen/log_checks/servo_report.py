@@ -52,14 +52,13 @@ class ServoJointReport:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ServoLogReport(LogReport):
-    """Report logs of commanded positions. delay: the ends between which commands act [s], None where none moves."""
+    """Report logs of commanded positions."""
 
     servos: tuple[ServoJointReport, ...] = ()
-    delay: tuple[float, float] | None = None
 
     def to_dict(self) -> dict[str, object]:
         """Return the JSON form, as of logs of torques but for the joints."""
-        return super().to_dict() | {"delay": self.delay, "joints": list(map(asdict, self.servos))}
+        return super().to_dict() | {"joints": list(map(asdict, self.servos))}
 
     def listings(self, most: int | None = None) -> list[Listing]:
         """Return all tables; of trajectories at most `most`."""
@@ -83,10 +82,6 @@ class ServoLogReport(LogReport):
             "90th percentile of the distance from the command at rest [mrad, mm]; saturated: fraction of time with "
             "kp (u - q) beyond the effort limit, if kp is set."
         )
-        # between these delays residuals are alike: one number would claim more than logs show
-        if self.delay is not None:
-            ends = dict.fromkeys(f"{1000 * end:.0f}" for end in self.delay)
-            note = f"Commands act after {' to '.join(ends)} ms. {note}"
         return Listing("Following", head, tuple(map(ServoJointReport.following, self.servos)), note)
 
 

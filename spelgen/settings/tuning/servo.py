@@ -20,7 +20,6 @@ class ServoLogTuning:
     latest_delay: float = 0.4  # [s] of every delay that is searched; measured: cheap servos stay below 0.2
     delay_step: float = 0.01  # [s] half a sample at 50 Hz
     rest_time: float = 0.25  # [s] a command rests so long before its joint can rest; measured on an SO-101
-    equal_delays: float = 0.1  # log of a mean square error: delays less apart explain the command error alike
     idle_command: float = 1e-2  # [rad, m] standard deviation below which a command does not move
     ignores: float = 0.5  # correlation below which a position does not follow its command
     sparse_rate: float = 20.0  # [Hz] below it delays and friction are not seen
