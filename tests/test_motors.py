@@ -85,8 +85,11 @@ def test_least_squares_finds_friction_and_rotors_of_coupled_motors(wrist):
         tau, measured = on_motors(*fresh, arm, strength, armature)
         errors.append(np.square(found.torque(*fresh) - tau).mean(axis=0) / tau.var(axis=0))
         if drives is not None:
-            np.testing.assert_allclose(found.dynamics.inverse_dynamics(*fresh), measured, atol=1e-6)
-            qdd = found.dynamics.forward_dynamics(fresh[0][:20], fresh[1][:20], measured[:20])
+            np.testing.assert_allclose(
+                found.dynamics.inverse_dynamics(*map(torch.from_numpy, fresh)), measured, atol=1e-6
+            )
+            states = [torch.from_numpy(x[:20]) for x in (fresh[0], fresh[1], measured)]
+            qdd = found.dynamics.forward_dynamics(*states)
             np.testing.assert_allclose(qdd, fresh[2][:20], atol=1e-5)
     assert errors[0].max() < 1e-10
     assert errors[1][4:].min() > 1e-2

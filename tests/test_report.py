@@ -124,7 +124,6 @@ def test_numbers_are_those_of_the_run(run):
     assert "The model explains 99 % of the variance of the torques and is off by 1.23 % of the motion" in text
     assert "But URDF is better after 1 step." in text
     assert "34 for training, 17 for validation" in text
-    assert "8.0e-10" in text
     assert "--objective rollout --set seed=7 --set epochs=30 --set cutoff=8.0 --set decimation=1" in text
     assert "2,000 steps on the momentum" in text
 
