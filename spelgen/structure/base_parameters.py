@@ -88,15 +88,14 @@ def _value(arm: Arm, weights: list[tuple[int, Fraction]]) -> Fraction | None:
 def _enough_rows(arm: Arm, count: int) -> list[np.ndarray]:
     """Return coefficient rows at as many random configurations as it takes to have rank ``count``."""
     generator = random.Random(0)
-    independent = field.Independent(10 * len(arm.bodies))
     reference = _rows(arm, generator)[-1]
     blocks: list[np.ndarray] = []
-    while len(independent.rows) < count:
+    residues = np.zeros((0, 10 * len(arm.bodies)), dtype=np.uint64)
+    while field.rank(residues) < count:
         rows = _rows(arm, generator)
         rows[-1] = rows[-1] - reference  # a constant part of V moves nothing
-        for row in _residues(rows):
-            independent.add(row)
         blocks.append(rows)
+        residues = np.concatenate([residues, _residues(rows)])
     return blocks
 
 

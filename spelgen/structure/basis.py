@@ -115,19 +115,21 @@ def _constants(
 
 def _readings(spans: Spans) -> Iterator[_Reading]:
     """Yield independent read-outs that together fix every change of M."""
-    chosen, tried = field.Independent(len(spans.varying)), set[int]()
+    chosen = np.zeros((0, len(spans.varying)), dtype=np.uint64)
+    tried: set[int] = set()
     for joints in _joint_sets(spans):
         outside = field.row_basis(spans.outside(joints))
         kernel = field.null_space(outside)
         # rank of the union less what is chosen: how many outputs this set of joints still adds
         missing = 0
         if len(kernel):
-            missing = field.rank(np.concatenate([chosen.rows, kernel])) - len(chosen.rows)
+            missing = field.rank(np.concatenate([chosen, kernel])) - len(chosen)
         candidates = _candidates(spans, joints, outside, tried)
         while missing:
             weights, values = next(candidates)
-            support = np.flatnonzero(weights)
-            if chosen.add(field.combined(spans.varying[:, support], weights[support])):
+            extended = np.concatenate([chosen, field.product(weights[None], spans.varying.T)])
+            if field.rank(extended) == len(extended):
+                chosen = extended
                 missing -= 1
                 yield _Reading(tuple(sorted(joints)), weights, values)
 

@@ -132,34 +132,6 @@ def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return _array(_matrix(a) * _matrix(b))
 
 
-def combined(columns: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """``columns`` (m, k) times ``weights`` (k,) in the field, for m and k that are small: faster than ``product``."""
-    return _summed(_product(columns, weights))
-
-
-class Independent:
-    """Independent vectors of length ``width``, gathered one by one; ``rows`` span them, each 1 at a pivot of its own
-    where all others are 0.
-    """
-
-    def __init__(self, width: int):
-        self.rows = np.zeros((0, width), dtype=np.uint64)
-        self._pivots: list[int] = []
-
-    def add(self, vector: np.ndarray) -> bool:
-        """Take ``vector`` in, unless it depends on those already there; whether it was."""
-        remainder = difference(vector, combined(self.rows.T, vector[self._pivots]))
-        support = np.flatnonzero(remainder)
-        if not len(support):
-            return False
-        pivot = int(support[0])
-        row = _product(remainder, np.uint64(pow(int(remainder[pivot]), -1, PRIME)))
-        cleared = difference(self.rows, _product(self.rows[:, pivot, None], row))
-        self.rows = np.concatenate([cleared, row[None]])
-        self._pivots.append(pivot)
-        return True
-
-
 def inverse(square: np.ndarray) -> np.ndarray:
     """The inverse of a regular matrix in the field."""
     return _array(_matrix(square).inv()) if square.size else square
@@ -184,13 +156,6 @@ def _values(operand: Residues | int) -> np.ndarray | np.uint64:
 def _folded(values: np.ndarray) -> np.ndarray:
     """Numbers below 2^62 brought below the prime."""
     return np.where(values >= _P, values - _P, values)
-
-
-def _summed(values: np.ndarray) -> np.ndarray:
-    """Sums over the last axis modulo 2^61 - 1, of fewer than 2^30 numbers."""
-    low, high = (values & _LOW_31).sum(axis=-1), (values >> _BITS_31).sum(axis=-1)
-    total = (high >> _BITS_30) + ((high & _LOW_30) << _BITS_31) + low
-    return _folded((total & _P) + (total >> _BITS_61))
 
 
 def _product(a: np.ndarray, b: np.ndarray | np.uint64) -> np.ndarray:
