@@ -15,21 +15,11 @@ from spelgen.design import Design, load_design
 from spelgen.emission.bodies import body_specs
 from spelgen.errors import SettingsError
 from spelgen.settings.joint import JointSettings
+from spelgen.settings.tuning.emission import TUNING
 from spelgen.spec import BodySpec, ConstantSpec, Entries, JointSpec, ModelSpec, Options, OutputSpec, ServoSpec
 from spelgen.structure.basis import Weights
 from spelgen.structure.nominal import Nominal, nominal, nominal_inertias, working_range
 from spelgen.structure.structure import Structure
-
-_MARGIN = 0.1
-_FRICTION_OF_EFFORT = 0.02
-_FRICTION_OF_TORQUE = 0.1
-_LARGEST_EFFORT = 1e4  # Nm, N: what stands above is a placeholder
-_LARGEST_SPEED = 100.0  # rad/s, m/s: likewise
-_RISE = 0.02  # s
-_EFFORT = 5.0  # Nm, N: of a servo of which nothing is said
-_FULL_EFFORT_AT = 0.5  # rad, m: from the command
-_SERVO_LAG = 0.05  # s
-_DEFAULT_SPEED = {"revolute": 2.0, "prismatic": 0.5}  # rad/s, m/s
 
 
 def plan_model(
@@ -87,7 +77,7 @@ def plan_model(
         constants=_constants(structure, sizes),
         potential=potential,
         potential_scale=sizes.potential_scale,
-        margin=float(f"{max(_MARGIN * sizes.least_eigenvalue, 1e-4):.0e}"),
+        margin=float(f"{max(TUNING.margin * sizes.least_eigenvalue, 1e-4):.0e}"),
         started_from_urdf=sizes.from_urdf,
         bodies=bodies,
         inputs=tuple(inputs),
@@ -132,8 +122,8 @@ def _joint(
     lower, upper, speed = coordinate.lower, coordinate.upper, coordinate.velocity
     if coordinate.continuous:
         lower = upper = None
-    if not speed or speed > _LARGEST_SPEED:
-        speed = _DEFAULT_SPEED[coordinate.kind]
+    if not speed or speed > TUNING.largest_speed:
+        speed = TUNING.usual_turning if coordinate.kind == "revolute" else TUNING.usual_sliding
     return JointSpec(
         name=coordinate.name,
         identifier=identifier,
@@ -144,7 +134,7 @@ def _joint(
         reach=float(f"{(high - low) / 2:.6g}"),
         speed=speed,
         friction=float(f"{_friction(coordinate, sizes, index):.3g}"),
-        armature=float(f"{drive.rotor_inertia * drive.gear**2 or guessed_armature(coordinate):.3g}"),
+        armature=float(f"{drive.rotor_inertia * drive.gear**2 or _guessed_armature(coordinate):.3g}"),
         gear=drive.gear,
         mass_sensitivity=sizes.mass_sensitivities[index],
         potential_sensitivity=sizes.potential_sensitivities[index],
@@ -155,38 +145,30 @@ def _joint(
 def _servo(coordinate: Coordinate, drive: JointSettings) -> ServoSpec:
     """The servo of a joint: one that nothing is known of gives its full effort half a unit from its command."""
     effort = coordinate.effort
-    if not effort or effort > _LARGEST_EFFORT:
+    if not effort or effort > TUNING.largest_effort:
         effort = None
-    kp = drive.kp or float(f"{(effort or _EFFORT) / _FULL_EFFORT_AT:.3g}")
-    return ServoSpec(kp, drive.kp is not None, float(f"{_SERVO_LAG * kp:.3g}"), effort)
+    kp = drive.kp or float(f"{(effort or TUNING.servo_effort) / TUNING.full_effort_at:.3g}")
+    return ServoSpec(kp, drive.kp is not None, float(f"{TUNING.servo_lag * kp:.3g}"), effort)
 
 
-def guessed_armature(coordinate: Coordinate) -> float:
-    """A geared drive's own inertia: such that its full effort takes ``_RISE`` seconds to reach its full
+def _guessed_armature(coordinate: Coordinate) -> float:
+    """A geared drive's own inertia: such that its full effort takes ``rise`` seconds to reach its full
     speed.
     """
     effort, speed = coordinate.effort, coordinate.velocity
-    if not effort or not speed or effort > _LARGEST_EFFORT or speed > _LARGEST_SPEED:
+    if not effort or not speed or effort > TUNING.largest_effort or speed > TUNING.largest_speed:
         return 0.0
-    return _RISE * effort / speed
-
-
-def guessed_friction(coordinate: Coordinate) -> float | None:
-    """A share of the drive's effort [Nm, N]; None where the URDF names no believable one."""
-    if not coordinate.effort or coordinate.effort > _LARGEST_EFFORT:
-        return None
-    return _FRICTION_OF_EFFORT * coordinate.effort
+    return TUNING.rise * effort / speed
 
 
 def _friction(coordinate: Coordinate, sizes: Nominal, index: int) -> float:
-    """The size of friction to start from: a share of the drive's effort, or of the torques the nominal arm
-    needs.
+    """The size of friction to start from [Nm, N]: a share of the drive's effort where the URDF names a believable
+    one, or of the torques that the nominal arm needs.
     """
-    friction = guessed_friction(coordinate)
-    if friction is not None:
-        return friction
+    if coordinate.effort and coordinate.effort <= TUNING.largest_effort:
+        return TUNING.friction_of_effort * coordinate.effort
     # a wrist may need next to no torque by itself, but its gear rubs like its neighbour's
-    return _FRICTION_OF_TORQUE * max(sizes.joint_torque[index], 0.01 * max(sizes.joint_torque))
+    return TUNING.friction_of_torque * max(sizes.joint_torque[index], 0.01 * max(sizes.joint_torque))
 
 
 def _identifiers(names: Sequence[str]) -> list[str]:

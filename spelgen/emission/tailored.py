@@ -14,14 +14,9 @@ from spelgen.design import BRISTLE_REACH
 from spelgen.emission.source import WIDTH, Call, Code, assignment, call, laid_out
 from spelgen.emission.unit_joints import hidden_units
 from spelgen.labels import entry_name, joint_ranges
+from spelgen.settings.tuning.emission import TUNING
 from spelgen.spec import BodySpec, ConstantSpec, JointSpec, ModelSpec, OutputSpec
 
-_LEAST_UNITS = 4
-_LEAST_KAN_UNITS = 2
-_KAN_FRACTION = 0.25
-_POTENTIAL_FRACTION = 0.5
-_POSITION_SENSITIVITY = 0.1
-_LEAST_ARMATURE = 0.01
 _FRICTION_AXES = {"dense-n": 1, "dense-3n": 3}
 _UNPACKED = 10  # names on a line
 _GENERATOR = Code("torch.Generator().manual_seed(seed)")
@@ -129,7 +124,7 @@ def names(target: str, values: Iterable[str]) -> str:
 def units(spec: ModelSpec) -> int:
     """Units in a hidden layer; those of a Kolmogorov-Arnold network have a grid of numbers on every edge."""
     width = spec.options.width
-    return width if spec.design.net == "mlp" else max(_LEAST_UNITS, round(_KAN_FRACTION * width))
+    return width if spec.design.net == "mlp" else max(TUNING.least_units, round(TUNING.kan_fraction * width))
 
 
 def _function_comments(spec: ModelSpec) -> list[str]:
@@ -218,7 +213,7 @@ def _known_armature(spec: ModelSpec) -> tuple[float, ...]:
     """What the drives add to M: one that nothing is known of still has somewhere to start."""
     mean, armature = mean_mass(spec), []
     for k, joint in enumerate(spec.joints):
-        armature.append(joint.armature or float(f"{_LEAST_ARMATURE * mean[k][k]:.3g}"))
+        armature.append(joint.armature or float(f"{TUNING.least_armature * mean[k][k]:.3g}"))
     return tuple(armature)
 
 
@@ -336,9 +331,9 @@ def _mass(body: _Body, spec: ModelSpec) -> Code:
 
 def _mass_network(body: _Body, spec: ModelSpec) -> Code:
     """Add the network of M's functions, which reads the joints that they depend on."""
-    fewest = _LEAST_UNITS
+    fewest = TUNING.least_units
     if spec.design.net == "kan":
-        fewest = _LEAST_KAN_UNITS
+        fewest = TUNING.least_kan_units
     outputs = tuple(map(attrgetter("joints"), spec.outputs))
     read = tuple(sorted(set().union(*outputs)))
     if spec.design.encoding == "lie-group":
@@ -349,7 +344,7 @@ def _mass_network(body: _Body, spec: ModelSpec) -> Code:
 
 def _potential(body: _Body, spec: ModelSpec) -> Code:
     sensitivity = _columns(spec.joints, "potential_sensitivity")["potential_sensitivity"]
-    width = max(_LEAST_UNITS, round(_POTENTIAL_FRACTION * units(spec)))
+    width = max(TUNING.least_units, round(TUNING.potential_fraction * units(spec)))
     outputs = (spec.potential,)
     return _network(
         body, spec, "potential", outputs, spec.potential, sensitivity, width=width, name="potential"
@@ -388,7 +383,7 @@ def _friction(body: _Body, spec: ModelSpec) -> Code:
     n, axes = len(spec.joints), _FRICTION_AXES[spec.design.dissipation]
     rows = axes * n
     outputs = (_all(spec),) * (rows * (rows + 1) // 2)
-    sensitivity = (_POSITION_SENSITIVITY,) * n
+    sensitivity = (TUNING.position_sensitivity,) * n
     network = _network(body, spec, "friction", outputs, _all(spec), sensitivity, axes=axes)
     return body.let("friction", call("DenseFriction", Code("joints"), network, axes=axes))
 
