@@ -10,8 +10,8 @@ from scipy.linalg import orth
 
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.regressor import regressor, urdf_parameters
-from spelgen.identification.base_parameters import base_parameters
-from spelgen.identification.friction import FrictionModel
+from spelgen.identification.drive_hints import make_problem
+from spelgen.identification.drive_samples import DriveSamples
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.settings.tuning.identification import IdentificationTuning
 from spelgen.settings.tuning.log_checks import LogCheckTuning
@@ -87,22 +87,15 @@ def find_opposed_inertia(arm: Arm, samples: Sequence[StateSamples], speeds: np.n
 
     speeds: C, (n, n), of the motors. Friction does not tell: a drive may compensate it after its torque was measured.
     """
-    friction = FrictionModel(coulomb_smoothing_velocity=MOVING)
-    columns = base_parameters(arm, friction, speeds).columns
     q, qd, qdd, tau = _thinned(samples)
     if len(q) < TUNING.gravity_samples / 4 or not np.ptp(tau, axis=0).all():
         return None
     unit = tau.std(axis=0)
-
-    def rows(accelerations: np.ndarray) -> np.ndarray:
-        bodies = regressor(arm, q, qd, accelerations)
-        drives = friction.columns(qd, accelerations, None, speeds)
-        return np.concatenate([bodies, drives], axis=2)[..., columns]
-
-    moving = rows(qdd)
-    flat = (moving / unit[:, None]).reshape(-1, len(columns))
+    moving = make_problem(arm, DriveSamples(q, qd, qdd, tau[None]), speeds).rows
+    steady = make_problem(arm, DriveSamples(q, qd, np.zeros_like(qdd), tau[None]), speeds).rows
+    flat = (moving / unit[:, None]).reshape(tau.size, -1)
     parameters = np.linalg.lstsq(flat, (tau / unit).ravel(), rcond=DEPENDENT)[0]
-    inertia = (moving - rows(np.zeros_like(qdd))) @ parameters
+    inertia = (moving - steady) @ parameters
     if not (inertia.std(axis=0) > TUNING.loaded * unit).any():
         return None
     product = (inertia * qdd).sum(axis=1)  # qdd^T M qdd

@@ -14,31 +14,19 @@ from spelgen.settings.messages import explain
 from spelgen.settings.settings import Settings, load_mapping
 from spelgen.settings.yaml_document import Document
 from spelgen.spec import logged_joints
+from spelgen.urdf.robot import Robot
 
 GivenMapping = LogMapping | Mapping[str, object] | Path | str | None
 
 
-class NamedJoint(Protocol):
-    """Hold a joint as a URDF or an arm has it."""
-
-    @property
-    def name(self) -> str: ...
-
-
-class Coordinates(Protocol):
-    """Hold the joints that move, as an arm does. joint_types: "revolute" or "prismatic"."""
+@runtime_checkable
+class JointNames(Protocol):
+    """Hold the joints whose logs are read, as an arm and a module do. joint_types: "revolute" or "prismatic"."""
 
     @property
     def joint_names(self) -> Sequence[str]: ...
     @property
     def joint_types(self) -> Sequence[str]: ...
-
-
-class Joints(Protocol):
-    """Hold all joints, as a robot of a URDF does."""
-
-    @property
-    def joints(self) -> Sequence[NamedJoint]: ...
 
 
 @runtime_checkable
@@ -46,21 +34,11 @@ class DescribedArm(Protocol):
     """Hold what of a loaded arm says how its logs are named."""
 
     @property
-    def arm(self) -> Coordinates: ...
+    def arm(self) -> JointNames: ...
     @property
-    def robot(self) -> Joints: ...
+    def robot(self) -> Robot: ...
     @property
     def settings(self) -> Settings: ...
-
-
-@runtime_checkable
-class JointNames(Protocol):
-    """Hold what of a module says whose logs it takes."""
-
-    @property
-    def joint_names(self) -> Sequence[str]: ...
-    @property
-    def joint_types(self) -> Sequence[str]: ...
 
 
 LoggedArm = DescribedArm | JointNames | Sequence[str]
