@@ -41,7 +41,7 @@ SYMBOLIC = {"sympy", "flint", "spelgen.arm", "spelgen.structure"}
 PLAIN = {"spelgen.arm.actuation"}  # G by the files, without the exact arithmetic of its room
 ROOMS_THAT_DERIVE = ("urdf.", "arm.", "structure.", "emission.", "certificate.")
 DERIVES = [x for x in LAYERS if x.startswith(ROOMS_THAT_DERIVE) and x != "emission.loading"]
-OF_A_RUN = {f"render.{name}" for name in ("charts", "plots", "picture", "page", "scene")}
+OF_A_RUN = {f"render.{name}" for name in ("charts", "plots", "page", "scene")}
 FITS = [x for x in LAYERS if x.startswith(("logs.", "fitting."))]  # evaluation has least squares beside it
 NEVER = {
     "spec": {"sympy", "flint", "torch"},

@@ -26,6 +26,7 @@ def traces(name):
     wave = [[math.sin(3 * x)] * 3 for x in t]
     near = [[y[0] + 0.05 * x] * 3 for x, y in zip(t, wave, strict=True)]
     both, one = {"model": wave, "URDF": near}, [row[0] for row in wave]
+    entries = [one] * 4 + [[0.0] * len(one), one]  # M32 is always zero
     grown = {"low": [0.1, 0.1], "median": [0.2, 0.3], "high": [0.4, None]}
     covered = {"low": -1.0, "high": 1.0, "counts": [1] * 24}
     return {
@@ -37,7 +38,7 @@ def traces(name):
                      "without_friction": wave, "predicted": both,
                      "parts": dict.fromkeys(("inertia", "Coriolis", "gravity", "friction"), wave),
                      "energy": dict.fromkeys(("work of the drives", "stored", "friction", "not explained"), one)}],
-        "mass": {"trajectory": name, "t": t, "by": {"model": {"entries": [one] * 6, "eigenvalues": [one] * 3}}},
+        "mass": {"trajectory": name, "t": t, "by": {"model": {"entries": entries, "eigenvalues": [one] * 3}}},
         "friction": {"qd": [[-1, 0, 1]] * 3, "by": {"model": [[-2, 0, 2]] * 3},
                      "measured": [{"qd": [-1, 1], "torque": [-2, 2]}] * 3},
     }  # fmt: skip
@@ -139,7 +140,8 @@ def test_best_of_each_row_is_marked(run):
     assert re.findall(r'class="n( best)?">', rows[0]) == ["", "", " best"]
 
 
-def test_structure_picture_is_the_modules(run):
+def test_structure_is_the_arms(run, robots):
+    (run / "robot.urdf").write_bytes((robots / "rpr.urdf").read_bytes())
     kinds = re.findall(r'<td class="(zero|constant|varying)"', render_report(run))
     v, c, z = "varying", "constant", "zero"
     assert kinds == [v, v, v, v, c, z, v, z, c]

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from spelgen.labels import named_joints, thousandths
 from spelgen.listing import number
 from spelgen.render.charts import Chart
-from spelgen.render.picture import Picture
 from spelgen.render.plots import (
     Limits,
     Panel,
@@ -47,7 +46,7 @@ class Curves:
     energy: Chart | None = None
 
 
-def curves(traces: Record, facts: Facts, picture: Picture) -> Curves:
+def curves(traces: Record, facts: Facts) -> Curves:
     """Return all that can be drawn of these traces."""
     joints = named_joints(facts.joints, facts.joint_types)
     drawn = Curves()
@@ -65,7 +64,7 @@ def curves(traces: Record, facts: Facts, picture: Picture) -> Curves:
         drawn.trajectories.append(Section(title, trajectory_panels(example, joints)))
     mass = traces.get("mass") or {}
     if mass.get("by"):
-        drawn.mass = trace_mass_panels(mass, picture.kinds, facts.joint_types)
+        drawn.mass = trace_mass_panels(mass, facts.joint_types)
         drawn.eigenvalues = eigenvalue_chart(mass)
         drawn.along = str(mass["trajectory"])
     if traces.get("friction"):

@@ -243,16 +243,17 @@ def mass_panels(
     return panels
 
 
-def trace_mass_panels(
-    mass: Record, kinds: Sequence[Sequence[str]], joint_types: Sequence[str]
-) -> list[Panel]:
-    """Return the entries of M that are not always zero, by the model and its baselines. kinds: of each entry."""
+def trace_mass_panels(mass: Record, joint_types: Sequence[str]) -> list[Panel]:
+    """Return the entries of M that are not zero along a trajectory, by the model and its baselines."""
     entries = {}
     # the lower triangle, row by row, as the trace lists it
     rows, columns = np.tril_indices(len(joint_types))
+    largest = max(np.nanmax(np.abs(numbers(trace["entries"]))) for trace in mass["by"].values())
     for number, (i, j) in enumerate(zip(rows.tolist(), columns.tolist(), strict=True)):
-        if kinds[i][j] != "zero":
-            entries[i, j] = {name: x["entries"][number] for name, x in mass["by"].items()}
+        by_name = {name: numbers(trace["entries"][number]) for name, trace in mass["by"].items()}
+        # rounding leaves some of what is always zero
+        if any((np.abs(entry) > TUNING.zero * largest).any() for entry in by_name.values()):
+            entries[i, j] = by_name
     styles = {name: style(name) for name in mass["by"]}
     return mass_panels(mass["t"], entries, styles, joint_types)
 

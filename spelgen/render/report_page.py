@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,13 +18,12 @@ from spelgen.evaluation.verdict import Verdict, verdict
 from spelgen.files import write_json, write_text
 from spelgen.fitting.objectives import fit_summary
 from spelgen.fitting.run_folder import RunFolder, trained_model
-from spelgen.labels import UNITS, entry_name
+from spelgen.labels import UNITS
 from spelgen.loaded_arm import LoadedArm
-from spelgen.render.arm_section import LETTERS, Cell, arm_section, matrix
+from spelgen.render.arm_section import arm_section, matrix
 from spelgen.render.curves import coverage, curves
 from spelgen.render.page import render_page
 from spelgen.render.parameters import body_parameters, mass_constants, parameter_tables
-from spelgen.render.picture import Picture, read_picture
 from spelgen.render.plots import Limits, Record
 from spelgen.render.reproduction import commands, files
 from spelgen.render.run_facts import head_numbers, training_facts
@@ -151,8 +151,8 @@ def _json(folder: RunFolder, path: Path) -> Record | None:
 
 def _rendered(run: Run, robot: Path | str | None) -> str:
     facts, config, evaluation = run.facts, run.config or {}, run.evaluation or {}
-    picture, traces = read_picture(run.folder.module), evaluation.get("traces") or {}
-    arm, training, tables, constants = None, None, [], []
+    traces = evaluation.get("traces") or {}
+    arm, cells, training, tables, constants = None, None, None, [], []
     if config:
         training = training_facts(config, run.metrics, run.identified)
     if run.results is not None:
@@ -161,11 +161,12 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
         constants = mass_constants(run.folder)
     if run.arm is not None:
         arm = arm_section(run.arm.arm, Path(robot or run.arm.robot.path), traces, run.identified)
+        cells = matrix(run.arm.arm, run.arm.structure_for(facts.options.assume))
     return render_page(
         "report.html.jinja",
         facts=facts,
-        picture=picture,
-        cells=_cells(run.arm, facts, picture),
+        about=_about(run.folder.module),
+        cells=cells,
         arm=arm,
         units=UNITS,
         numbers=head_numbers(run.model, config, run.metrics, evaluation),
@@ -174,7 +175,7 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
         training=training,
         evaluation=run.evaluation,
         tables=tables,
-        curves=curves(traces, facts, picture),
+        curves=curves(traces, facts),
         coverage=coverage(traces, run.identified, facts, run.limits),
         trained=run.model is not None,
         constants=constants,
@@ -186,19 +187,7 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
     )
 
 
-def _cells(arm: LoadedArm | None, facts: Facts, picture: Picture) -> list[list[Cell]]:
-    """Return M with reasons where the model's structure is the arm's own, else as the module's docstring has it."""
-    if arm is not None:
-        derived = matrix(arm.arm, arm.structure_for(facts.options.assume))
-        kinds = []
-        for cells in derived:
-            kinds.append([cell.kind for cell in cells])
-        if kinds == picture.kinds:  # a dense preset keeps nothing of the arm's structure
-            return derived
-    pictured: list[list[Cell]] = []
-    for i, row in enumerate(picture.rows):
-        pictured.append([])
-        for j, entry in enumerate(row):
-            name, text = entry_name(max(i, j), min(i, j)), LETTERS.get(entry.kind, entry.joints)
-            pictured[-1].append(Cell(entry.kind, text, (), f"{name}: {entry.kind}"))
-    return pictured
+def _about(module: Path) -> str:
+    """Return the sentences about the model in the docstring of its module."""
+    docstring = ast.get_docstring(ast.parse(module.read_bytes())) or ""
+    return " ".join(docstring.split("\n\n")[1].split())
