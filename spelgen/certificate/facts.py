@@ -5,7 +5,6 @@ A reason is given only where the arm's exact geometry proves it (``reasons``).
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from fractions import Fraction
@@ -71,9 +70,11 @@ class _Words:
         return why(self.axes, self.structure, *subject)
 
     def zeros(self) -> Iterator[Fact]:
-        """Yield zeros along an axis by the joint that slides, right angles by a joint many have, then the others."""
+        """Yield zeros along an axis by the joint that slides, right angles by the joint nearer to the root, then the
+        others.
+        """
         along: dict[int, list[Entry]] = {}
-        across: list[Entry] = []
+        across: dict[int, list[Entry]] = {}
         unexplained: list[Entry] = []
         for entry in self.structure.entries:
             if entry.kind != "zero":
@@ -82,7 +83,7 @@ class _Words:
             if slider is not None:
                 along.setdefault(slider, []).append(entry)
             elif self._slide_across(entry):
-                across.append(entry)
+                across.setdefault(entry.column, []).append(entry)
             else:
                 unexplained.append(entry)
         for slider, group in sorted(along.items()):
@@ -91,16 +92,9 @@ class _Words:
                 group,
                 f"joint {slider + 1} slides along {axes}, and what turns about an axis never moves along it",
             )
-        while across:
-            # one sentence for the joint in most entries that are left; of several, the nearest to the root
-            joints: Counter[int] = Counter()
-            for entry in across:
-                joints.update((entry.row, entry.column))
-            common = max(sorted(joints), key=joints.__getitem__)
-            group = [entry for entry in across if common in (entry.row, entry.column)]
-            across = [entry for entry in across if entry not in group]
-            which = joints_told(_other_joints(group, common))
-            yield _zero(group, f"joint {common + 1} slides at right angles to {which}")
+        for joint, group in sorted(across.items()):
+            which = joints_told(_other_joints(group, joint))
+            yield _zero(group, f"joint {joint + 1} slides at right angles to {which}")
         for reason, group in self._by_reason(unexplained, reasons.balance_reason):
             yield _zero(group, reason)
 

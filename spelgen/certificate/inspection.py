@@ -5,6 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import product
 from typing import TYPE_CHECKING, Literal
 
 from spelgen.arm.actuation import Actuation, InputEntry
@@ -75,7 +76,7 @@ class Inspection:
 
     def text(self, width: int = 80) -> str:
         """Return a report for a terminal ``width`` columns wide."""
-        paragraphs = [self._heading(), self._joint_table(), self._matrix(width), self._needs(width)]
+        paragraphs = [self._heading(), self._joint_table(), self._matrix(), self._needs(width)]
         if self.facts:
             paragraphs.append(_indented("In words", map(str, self.facts), width))
         if self.diagnostics:
@@ -116,15 +117,11 @@ class Inspection:
     def _input_matrix(self) -> dict[str, object]:
         n = len(self.structure.joints)
         # programs read every entry of G, also those that are zero
-        known = {(entry.row, entry.column): entry for entry in self.actuation.entries}
-        entries = []
-        for row in range(n):
-            for column in range(n):
-                cell: dict[str, object] = {"row": row + 1, "col": column + 1, "kind": "zero", "value": 0.0}
-                if (row, column) in known:
-                    cell["kind"] = known[row, column].kind
-                    cell["value"] = known[row, column].value
-                entries.append(cell)
+        values = {(entry.row, entry.column): (entry.kind, entry.value) for entry in self.actuation.entries}
+        entries: list[dict[str, object]] = []
+        for row, column in product(range(n), repeat=2):
+            kind, value = values.get((row, column), ("zero", 0.0))
+            entries.append({"row": row + 1, "col": column + 1, "kind": kind, "value": value})
         if self.input == "torque":
             return {"entries": entries}
         rank = servo_rank(self.arm)
@@ -192,18 +189,10 @@ class Inspection:
     def _cells(self) -> dict[tuple[int, int], str]:
         return {(entry.row, entry.column): _cell(entry) for entry in self.structure.entries}
 
-    def _matrix(self, width: int) -> str:
-        """Return the lower triangle of M with each entry's joints, or by letters where that is too wide."""
-        cells = self._cells()
-        text = _triangle(cells, len(self.structure.joints))
-        # an arm of ten joints needs more than 80 columns: then letters must do
-        if max(map(len, text)) <= width:
-            return "\n".join(["Mass matrix: joints each entry depends on; C constant, 0 always zero", *text])
-        for place, cell in cells.items():
-            if cell not in ("0", "C"):
-                cells[place] = "x"
-        text = _triangle(cells, len(self.structure.joints))
-        return "\n".join(["Mass matrix: x varies, C constant, 0 always zero", *text])
+    def _matrix(self) -> str:
+        """Return the lower triangle of M with each entry's joints."""
+        lines = _triangle(self._cells(), len(self.structure.joints))
+        return "\n".join(["Mass matrix: joints each entry depends on; C constant, 0 always zero", *lines])
 
     def needs(self) -> dict[str, str]:
         """Return what a model of M(q), V(q) and G needs, in words, and the number of base parameters."""
