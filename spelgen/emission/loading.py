@@ -36,11 +36,6 @@ if TYPE_CHECKING:
         source: str
         """The module's text, as it was loaded."""
         facts: Facts
-        # of models that have them: see `dynamics.protocol`
-        armature: torch.Tensor
-        inertial_parameters: torch.Tensor
-        torque_offset: torch.Tensor
-        friction: Any
 
         def __getattr__(self, name: str) -> Any: ...  # what a preset has beside this
         def prepared(
