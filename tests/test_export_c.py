@@ -225,7 +225,7 @@ def test_c_carries_frictions_memory(tmp_path):
     source = write_c(model, tmp_path)
     assert "#define TWO_LINK_NZ 4" in source.with_suffix(".h").read_text()
     called = CLibrary(link_library(compile_object(source, "gcc"), "gcc"), model)
-    given = random_inputs(model.coordinates, 5, 4)
+    given = random_inputs(model.arm.coordinates, 5, 4)
     law, qd = model.friction, given["qd"]
     dry = law.coulomb + law.stribeck / (1 + (qd / law.stribeck_velocity) ** 2 / 16) ** 16
     dry += law.load_dependence * np.hypot(called("gravity", given)["gravity"], law.least_load)

@@ -31,8 +31,8 @@ def export_casadi(trained: Trained) -> Exported:
     )
     about = f"{UNITS}; z is the friction state, {model.memory} numbers: casadi.DM(0, 1) where there are none."
     files = {f"{name}.casadi": _saved(function) for name, function in functions.items()}
-    text = readme(f"Dynamics of {model.robot} in CasADi", use, trained.joint_names, about, checked)
-    return Exported("casadi", model.robot, {**files, "README.md": text}, (checked,))
+    text = readme(f"Dynamics of {trained.robot} in CasADi", use, trained.joint_names, about, checked)
+    return Exported("casadi", trained.robot, {**files, "README.md": text}, (checked,))
 
 
 def casadi_functions(model: TrainedModel) -> dict[str, ca.Function]:

@@ -57,12 +57,9 @@ def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
         residuals = _residuals(exact)
     return TrainedModel(
         name=identifier(loaded.arm.name),
-        robot=loaded.arm.name,
+        arm=loaded.arm,
         preset=preset,
-        coordinates=loaded.arm.coordinates,
         identifiers=tuple(model.joint_names),
-        gravity=np.array(loaded.arm.gravity, dtype=float),
-        bodies=loaded.arm.bodies,
         inertias=array(exact.inertial_parameters),
         constant_mass=constant_mass,
         motors=array(exact.motors),

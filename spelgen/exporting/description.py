@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spelgen.arm.arm import Body, Coordinate
+from spelgen.arm.arm import Arm
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,12 +141,9 @@ class TrainedModel:
     """
 
     name: str
-    robot: str
+    arm: Arm
     preset: str
-    coordinates: tuple[Coordinate, ...]
     identifiers: tuple[str, ...]
-    gravity: np.ndarray
-    bodies: tuple[Body, ...]
     inertias: np.ndarray
     constant_mass: np.ndarray
     motors: np.ndarray
@@ -166,7 +163,7 @@ class TrainedModel:
     @property
     def n(self) -> int:
         """How many joints."""
-        return len(self.coordinates)
+        return len(self.arm.coordinates)
 
     @property
     def memory(self) -> int:

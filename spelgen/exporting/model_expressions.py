@@ -17,7 +17,7 @@ from spelgen.exporting.residual_expressions import (
     symbol_slopes,
     symmetric,
 )
-from spelgen.exporting.rigid_expressions import RigidExpressions, constant
+from spelgen.exporting.rigid_expressions import RigidExpressions, constant, mass_and_potential
 from spelgen.exporting.tip_expressions import tip_expressions
 
 RESIDUAL = "residual_"
@@ -44,8 +44,8 @@ class ModelExpressions:
         self._rest = ca.SX(self.n, 1)
 
     @cached_property
-    def _composite(self) -> tuple[ca.SX, ca.SX]:
-        return self._rigid.mass_and_moment()
+    def _rigid_energies(self) -> tuple[ca.SX, ca.SX]:
+        return mass_and_potential(self.model, self.q)
 
     @cached_property
     def _added_mass(self) -> ca.SX:
@@ -55,7 +55,7 @@ class ModelExpressions:
 
     @cached_property
     def mass_matrix(self) -> ca.SX:
-        return self._composite[0] + self._added_mass
+        return self._rigid_energies[0] + self._added_mass
 
     @cached_property
     def _rigid_gravity(self) -> ca.SX:
@@ -158,7 +158,7 @@ class ModelExpressions:
 
     @property
     def energy(self) -> ca.SX:
-        potential = -ca.dot(self.model.gravity, self._composite[1])
+        potential = self._rigid_energies[1]
         for name in ("energy", "torque_energy"):
             if self.residuals[name].numel():
                 potential = potential + self.residuals[name]

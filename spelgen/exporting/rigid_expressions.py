@@ -1,7 +1,7 @@
-"""Rigid bodies as CasADi expressions: recursive Newton-Euler, and composite bodies for the mass matrix.
+"""Rigid bodies as CasADi expressions: torques by recursive Newton-Euler, M and V by the structure's own recursion.
 
 Each body is seen in its joint's frame, whose z the joint turns about or slides along (Featherstone, Rigid Body Dynamics
-Algorithms, 2008, sections 5.3 and 6.2, in the classical form of Khalil and Dombre, 2002, section 9.5). CasADi leaves
+Algorithms, 2008, section 5.3, in the classical form of Khalil and Dombre, 2002, section 9.5). CasADi leaves
 out what is structurally zero: zeros of the geometry, and velocities that are given as ``ca.SX(n, 1)``.
 """
 
@@ -13,6 +13,8 @@ import casadi as ca
 import numpy as np
 
 from spelgen.exporting.description import TrainedModel
+from spelgen.structure.recursion import energies
+from spelgen.structure.sampling import Position, base_denominators, motions
 
 _Z = ca.sparsify(ca.DM([0, 0, 1]))
 
@@ -36,17 +38,6 @@ class _Link:
     moment: ca.SX
     inertia: ca.SX
 
-    def along_axis(self, force: ca.SX, torque: ca.SX) -> ca.SX:
-        """Return what a wrench on the body asks of its joint's coordinate [Nm, N]."""
-        if self.revolute:
-            return self.ratio * torque[2]
-        return self.ratio * force[2]
-
-    def in_parent(self, force: ca.SX, torque: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Return a wrench in the parent's frame, about its origin."""
-        force = self.rotation @ force
-        return force, self.rotation @ torque + ca.cross(self.position, force)
-
 
 @dataclass(frozen=True, eq=False)
 class _Motion:
@@ -68,8 +59,8 @@ class RigidExpressions:
     def __init__(self, model: TrainedModel, q: ca.SX) -> None:
         self.n = model.n
         # in place of gravity the base accelerates upwards
-        self._base = _Motion(ca.SX(3, 1), ca.SX(3, 1), ca.SX(-model.gravity))
-        self._links = [_link(model, index, q) for index in range(len(model.bodies))]
+        self._base = _Motion(ca.SX(3, 1), ca.SX(3, 1), ca.SX(-np.array(model.arm.gravity, dtype=float)))
+        self._links = [_link(model, index, q) for index in range(len(model.arm.bodies))]
 
     def torque(self, qd: ca.SX, qdd: ca.SX) -> ca.SX:
         """Return the torques of this motion in gravity, (n, 1) [Nm, N]."""
@@ -91,64 +82,29 @@ class RigidExpressions:
         joint_torques = ca.SX(self.n, 1)
         # children stand behind their parents
         for index in reversed(range(len(self._links))):
-            link = self._links[index]
+            link, force, torque = self._links[index], forces[index], torques[index]
+            along_axis = torque[2] if link.revolute else force[2]
             # several bodies share a joint where one follows another
-            joint_torques[link.joint] += link.along_axis(forces[index], torques[index])
+            joint_torques[link.joint] += link.ratio * along_axis
             if link.parent >= 0:
-                force, torque = link.in_parent(forces[index], torques[index])
-                forces[link.parent] = forces[link.parent] + force
-                torques[link.parent] = torques[link.parent] + torque
+                force = link.rotation @ force
+                forces[link.parent] += force
+                torques[link.parent] += link.rotation @ torque + ca.cross(link.position, force)
         return joint_torques
 
-    def mass_and_moment(self) -> tuple[ca.SX, ca.SX]:
-        """Return M, (n, n), and the first moment of all bodies in the base's frame, (3, 1) [kg m]."""
-        mass = [link.mass for link in self._links]
-        moment = [link.moment for link in self._links]
-        inertia = [link.inertia for link in self._links]
-        matrix = ca.SX(self.n, self.n)
-        total = ca.SX(3, 1)
-        for index in reversed(range(len(self._links))):
-            link = self._links[index]
-            # the wrench on all that the joint carries, by a unit acceleration of it
-            if link.revolute:
-                force = ca.cross(_Z, moment[index])
-                torque = inertia[index] @ _Z
-            else:
-                force = mass[index] * _Z
-                torque = ca.cross(moment[index], _Z)
-            self._add_column(matrix, index, link.ratio * force, link.ratio * torque)
-            m = mass[index]
-            p = link.position
-            turned = link.rotation @ moment[index]
-            parent = link.parent
-            if parent < 0:
-                total = total + turned + m * p
-                continue
-            # the parallel axis theorem for a frame that is not at the centre of mass
-            shift = p @ turned.T
-            size = m * ca.dot(p, p) + 2 * ca.trace(shift)
-            moved = link.rotation @ inertia[index] @ link.rotation.T
-            moved = moved + size * ca.SX.eye(3) - m * (p @ p.T) - shift - shift.T
-            # one expression for both triangles: half of the work
-            inertia[parent] = inertia[parent] + ca.tril2symm(ca.tril(moved))
-            moment[parent] = moment[parent] + turned + m * p
-            mass[parent] = mass[parent] + m
-        return matrix, total
 
-    def _add_column(self, matrix: ca.SX, index: int, force: ca.SX, torque: ca.SX) -> None:
-        """Add the wrench of a body's own joint, accelerated by one, to that joint's column of M and to its row."""
-        # M is symmetric: a row is the column
-        column = self._links[index].joint
-        # bodies that do not carry this one feel nothing of it
-        ancestor = index
-        while ancestor >= 0:
-            link = self._links[ancestor]
-            value = link.along_axis(force, torque)
-            matrix[link.joint, column] += value
-            if ancestor != index:
-                matrix[column, link.joint] += value
-            force, torque = link.in_parent(force, torque)
-            ancestor = link.parent
+def mass_and_potential(model: TrainedModel, q: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Return M, (n, n), and V [J] of the rigid bodies: the recursion of the structure, over CasADi's scalars."""
+    positions = []
+    for joint, base in enumerate(base_denominators(model.arm)):
+        angle = q[joint] / base
+        positions.append(Position(ca.cos(angle), ca.sin(angle), q[joint]))
+    result = energies(model.arm, motions(model.arm, positions, float), model.inertias.tolist(), float)
+    mass = ca.SX(model.n, model.n)
+    for (row, column), entry in result.mass.items():
+        # one expression for both triangles: half of the work
+        mass[row, column] = mass[column, row] = entry
+    return mass, ca.SX(result.potential)
 
 
 def _moved(link: _Link, carrier: _Motion, speed: ca.SX, acceleration: ca.SX) -> _Motion:
@@ -164,7 +120,7 @@ def _moved(link: _Link, carrier: _Motion, speed: ca.SX, acceleration: ca.SX) -> 
 
 
 def _link(model: TrainedModel, index: int, q: ca.SX) -> _Link:
-    body = model.bodies[index]
+    body = model.arm.bodies[index]
     m, x, y, z, xx, xy, xz, yy, yz, zz = model.inertias[index]
     ratio = float(body.multiplier)
     revolute = body.kind == "revolute"

@@ -46,5 +46,5 @@ def export_ros2(trained: Trained) -> Exported:
         f"{UNITS}; getTorques includes friction, whose state follows the positions of its calls; "
         "initialize starts it anew."
     )
-    files["README.md"] = readme(f"{model.robot} for ROS 2", use, trained.joint_names, about, checked)
-    return Exported("ros2", model.robot, files, (checked,))
+    files["README.md"] = readme(f"{trained.robot} for ROS 2", use, trained.joint_names, about, checked)
+    return Exported("ros2", trained.robot, files, (checked,))
