@@ -8,7 +8,7 @@ from pathlib import Path
 from spelgen.exporting.c_library import CLibrary, compile_object, compiler, link_library, measured, write_c
 from spelgen.exporting.c_source import c_entries, c_header
 from spelgen.exporting.entry_points import entry_points
-from spelgen.exporting.exported import UNITS, Exported, readme
+from spelgen.exporting.exported import Exported, folder_export
 from spelgen.exporting.parity import check_parity
 from spelgen.exporting.trained import Trained
 from spelgen.settings.tuning.exporting import TUNING
@@ -22,9 +22,8 @@ def export_c(trained: Trained) -> Exported:
         f"Add {name}.h and {name}.c to a program and link libm (cc -std=c99 -O2 -c {name}.c); "
         "nothing is allocated or kept, so every function may be called from any thread."
     )
-    about = f"{UNITS}; matrices row by row; z is friction's memory, {name}_friction_step moves it along."
-    text = readme(f"Dynamics of {trained.robot} in C99", use, trained.joint_names, about, checked)
-    return Exported("c", trained.robot, {**files, "README.md": text}, (checked,))
+    about = f"matrices row by row; z is friction's memory, {name}_friction_step moves it along."
+    return folder_export(trained, "c", "in C99", files, use=use, about=about, checked=checked)
 
 
 def c_files(trained: Trained) -> tuple[dict[str, bytes], str]:

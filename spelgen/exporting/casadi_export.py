@@ -11,7 +11,7 @@ import numpy as np
 
 from spelgen.exporting.description import TrainedModel
 from spelgen.exporting.entry_points import ENTRY_POINTS, EntryPoint, entry_points
-from spelgen.exporting.exported import UNITS, Exported, readme
+from spelgen.exporting.exported import Exported, folder_export
 from spelgen.exporting.model_expressions import expression_function, residuals_needed
 from spelgen.exporting.parity import Called, Values, check_parity
 from spelgen.exporting.residual_expressions import residual_values
@@ -29,10 +29,9 @@ def export_casadi(trained: Trained) -> Exported:
         "qdd = casadi.Function.load('forward_dynamics.casadi')(q, qd, tau, z) takes numbers or symbols: "
         "its derivatives, of any order, are CasADi's."
     )
-    about = f"{UNITS}; z is the friction state, {model.memory} numbers: casadi.DM(0, 1) where there are none."
+    about = f"z is the friction state, {model.memory} numbers: casadi.DM(0, 1) where there are none."
     files = {f"{name}.casadi": _saved(function) for name, function in functions.items()}
-    text = readme(f"Dynamics of {trained.robot} in CasADi", use, trained.joint_names, about, checked)
-    return Exported("casadi", trained.robot, {**files, "README.md": text}, (checked,))
+    return folder_export(trained, "casadi", "in CasADi", files, use=use, about=about, checked=checked)
 
 
 def casadi_functions(model: TrainedModel) -> dict[str, ca.Function]:

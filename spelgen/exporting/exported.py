@@ -115,6 +115,15 @@ def require_fitting(to: str, path: Path) -> None:
     raise RunError(f"the name {path.name!r} for --to {to}", expected=expected, do=advice)
 
 
+def folder_export(
+    trained: Trained, to: str, tool: str, files: Mapping[str, bytes], *, use: str, about: str, checked: str
+) -> Exported:
+    """Return an export of several files, with a README beside them; ``about``: what stands behind the units."""
+    title = f"Dynamics of {trained.robot} {tool}"
+    text = readme(title, use, trained.joint_names, f"{UNITS}; {about}", checked)
+    return Exported(to, trained.robot, {**files, "README.md": text}, (checked,))
+
+
 def readme(title: str, use: str, joints: Sequence[str], conventions: str, checked: str) -> bytes:
     """Return the five lines beside an export: title, use, joints in their order, conventions, result of the check."""
     # names come from a file that anyone may have written

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from spelgen.dynamics.prepared import PreparedModel
 from spelgen.exporting.entry_points import chosen
-from spelgen.exporting.exported import UNITS, Exported, readme
+from spelgen.exporting.exported import Exported, folder_export
 from spelgen.exporting.parity import Called, Values, check_parity
 from spelgen.exporting.torch_programs import PROGRAMS, export_program, program_inputs, program_output
 from spelgen.exporting.trained import Trained
@@ -35,11 +35,11 @@ def export_onnx(trained: Trained) -> Exported:
         "float64 (batch, n), any batch."
     )
     size = model.n * model.elements
-    memory = f"; z, friction's memory, is (batch, {size})" if size else ""
-    about = f"{UNITS}{memory}; one file an entry point: {', '.join(files)}."
-    text = readme(f"Dynamics of {trained.robot} in ONNX", use, trained.joint_names, about, checked)
+    about = f"one file an entry point: {', '.join(files)}."
+    if size:
+        about = f"z, friction's memory, is (batch, {size}); {about}"
     contents = {f"{name}.onnx": content for name, content in files.items()}
-    return Exported("onnx", trained.robot, {**contents, "README.md": text}, (checked,))
+    return folder_export(trained, "onnx", "in ONNX", contents, use=use, about=about, checked=checked)
 
 
 def onnx_model(model: PreparedModel, name: str) -> bytes:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from spelgen.exporting.c_export import c_files
-from spelgen.exporting.exported import UNITS, Exported, readme
+from spelgen.exporting.exported import Exported, folder_export
 from spelgen.exporting.trained import Trained
 from spelgen.templates import render
 
@@ -43,8 +43,7 @@ def export_ros2(trained: Trained) -> Exported:
         f"the plugin is {package}/Solver, for whatever loads an inverse_dynamics_solver::InverseDynamicsSolver."
     )
     about = (
-        f"{UNITS}; getTorques includes friction, whose state follows the positions of its calls; "
+        "getTorques includes friction, whose state follows the positions of its calls; "
         "initialize starts it anew."
     )
-    files["README.md"] = readme(f"{trained.robot} for ROS 2", use, trained.joint_names, about, checked)
-    return Exported("ros2", trained.robot, files, (checked,))
+    return folder_export(trained, "ros2", "for ROS 2", files, use=use, about=about, checked=checked)

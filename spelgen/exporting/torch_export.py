@@ -10,7 +10,7 @@ from safetensors.torch import save
 
 from spelgen.dynamics.prepared import PreparedModel
 from spelgen.exporting.entry_points import chosen
-from spelgen.exporting.exported import UNITS, Exported, readme
+from spelgen.exporting.exported import Exported, folder_export
 from spelgen.exporting.parity import Called, Values, check_parity
 from spelgen.exporting.torch_programs import PROGRAMS, export_program, program_inputs, program_output
 from spelgen.exporting.trained import Trained
@@ -30,13 +30,10 @@ def export_torch(trained: Trained) -> Exported:
         "(batch, n, K), where friction has a memory; "
         "model.safetensors contains the trained weights by the names of the emitted module."
     )
-    about = f"{UNITS}; the programs take no gradients by the weights."
+    about = "the programs take no gradients by the weights."
     files = {f"{name}.pt2": content for name, content in programs.items()}
     files["model.safetensors"] = save(weights)
-    files["README.md"] = readme(
-        f"Dynamics of {trained.robot} in torch", use, trained.joint_names, about, checked
-    )
-    return Exported("torch", trained.robot, files, (checked,))
+    return folder_export(trained, "torch", "in torch", files, use=use, about=about, checked=checked)
 
 
 def _saved(program: torch.export.ExportedProgram) -> bytes:
