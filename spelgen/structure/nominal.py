@@ -150,8 +150,8 @@ def _gravity_torque(arm: Arm, q: np.ndarray, inertias: list[list[float]]) -> np.
     """Return the root mean square of dV/dq by coordinate."""
     step = 1e-4  # [rad, m] central differences: errors of 1e-8 do, these are sizes
     shifts = step * np.eye(q.shape[1])[:, None]
-    _, forward = _energies_of_each(arm, q + shifts, inertias)
-    _, backward = _energies_of_each(arm, q - shifts, inertias)
+    _, forward = float_energies(arm, q + shifts, inertias)
+    _, backward = float_energies(arm, q - shifts, inertias)
     slopes = (forward - backward) / (2 * step)
     result: np.ndarray = np.sqrt((slopes**2).mean(axis=1))
     return result
@@ -163,16 +163,9 @@ def _mass_changes(arm: Arm, q: np.ndarray, inertias: list[list[float]], typical:
     moved = np.stack([q] * q.shape[1])
     for index in range(q.shape[1]):
         moved[index, :, index] = np.roll(q[:, index], 1)  # to where it stands in another sample
-    mass, _ = _energies_of_each(arm, moved, inertias)
+    mass, _ = float_energies(arm, moved, inertias)
     result: np.ndarray = np.sqrt((((mass - base) / typical) ** 2).mean(axis=(1, 2)))
     return result
-
-
-def _energies_of_each(arm: Arm, q: np.ndarray, inertias: list[list[float]]) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``float_energies`` of sets (n, points, n) of positions, (n, points, n(n+1)/2) and (n, points)."""
-    # in one call: what the recursion does is the same for one point and for a thousand
-    mass, potential = float_energies(arm, q.reshape(-1, q.shape[-1]), inertias)
-    return mass.reshape(*q.shape[:2], -1), potential.reshape(q.shape[:2])
 
 
 def _sensitivities(sizes: np.ndarray) -> tuple[float, ...]:

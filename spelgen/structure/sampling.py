@@ -58,27 +58,26 @@ class Position:
 def field_samples(arm: Arm, assume: Assume, samples: int, seed: int = 0) -> Samples:
     """Return samples in the field of 2^61 - 1; under ``kinematics`` every sample has inertial parameters of its own."""
     rng = np.random.default_rng(seed)
-    n, blocks = len(arm.coordinates), 1 + len(arm.coordinates)
+    n = len(arm.coordinates)
     positions = []
     for index in range(n):
         # an angle's cosine and sine and a sliding distance are independent as functions, so each is drawn for
         # itself
         c, s = random_circle_points(rng, 2 * samples)
         value = random_residues(rng, (2 * samples,))
-        moved = [Residues(_one_moved(x, index, blocks)) for x in (c, s, value)]
+        moved = [Residues(_one_moved(x, index, 1 + n)) for x in (c, s, value)]
         positions.append(Position(*moved))
-    inertias: list[Ten]
-    # what holds for random inertial values of each sample holds for any of them
-    if assume == "kinematics":
-        inertias = []
-        for _ in arm.bodies:
-            inertias.append([Residues(np.tile(random_residues(rng, (samples,)), blocks)) for _ in range(10)])
-    else:
-        inertias = [list(map(residue, body.inertia or (Fraction(0),) * 10)) for body in arm.bodies]
+    inertias: list[Ten] = []
+    for body in arm.bodies:
+        # what holds for random inertial values of each sample holds for any of them
+        if assume == "kinematics":
+            inertias.append([Residues(random_residues(rng, (samples,))) for _ in range(10)])
+        else:
+            inertias.append(list(map(residue, body.inertia or (Fraction(0),) * 10)))
     result = energies(arm, motions(arm, positions, residue), inertias, residue)
-    entries = [_residue_values(result.mass[key], blocks * samples) for key in triangle(n)]
-    potential = _residue_values(result.potential, blocks * samples)
-    return _blocks(entries, potential, blocks)
+    shape = (1 + n, samples)
+    entries = [_residue_values(result.mass[key], shape) for key in triangle(n)]
+    return Samples(np.stack(entries, axis=-1), _residue_values(result.potential, shape))
 
 
 def regressor_rows(arm: Arm, points: int, seed: int = 1) -> np.ndarray:
@@ -93,17 +92,14 @@ def regressor_rows(arm: Arm, points: int, seed: int = 1) -> np.ndarray:
     for _ in range(n):
         c, s = random_circle_points(rng, points)
         value = random_residues(rng, (points,))
-        repeated = [Residues(np.repeat(x, parameters)) for x in (c, s, value)]
-        positions.append(Position(*repeated))
-    unit = np.tile(np.eye(parameters, dtype=np.uint64), (1, points))
-    units = list(map(Residues, unit))
+        columns = [Residues(x[:, None]) for x in (c, s, value)]
+        positions.append(Position(*columns))
+    # one parameter is 1 and all others are 0, for each of them at every point
+    units = list(map(Residues, np.eye(parameters, dtype=np.uint64)))
     inertias = [units[10 * body : 10 * body + 10] for body in range(len(arm.bodies))]
     result = energies(arm, motions(arm, positions, residue), inertias, residue)
     elements = [result.mass[key] for key in triangle(n)] + [result.potential]
-    blocks = []
-    for element in elements:
-        blocks.append(_residue_values(element, points * parameters).reshape(points, parameters))
-    rows = np.stack(blocks, axis=1)
+    rows = np.stack([_residue_values(element, (points, parameters)) for element in elements], axis=1)
     # V counts up to a constant: its first row is where it counts from
     rows[:, -1] = difference(rows[:, -1], rows[0, -1])
     return rows.reshape(-1, parameters)
@@ -112,27 +108,27 @@ def regressor_rows(arm: Arm, points: int, seed: int = 1) -> np.ndarray:
 def float_samples(arm: Arm, assume: Assume, samples: int, seed: int = 2) -> Samples:
     """Return the same kind of samples in double precision."""
     rng = np.random.default_rng(seed)
-    n, blocks = len(arm.coordinates), 1 + len(arm.coordinates)
-    q = [_one_moved(rng.uniform(-3.0, 3.0, 2 * samples), index, blocks) for index in range(n)]
-    inertias: list[Ten]
-    if assume == "kinematics":
-        inertias = [[np.tile(rng.normal(size=samples), blocks) for _ in range(10)] for _ in arm.bodies]
-    else:
-        inertias = [list(map(float, body.inertia or (0,) * 10)) for body in arm.bodies]
-    mass, potential = float_energies(arm, np.stack(q, axis=-1), inertias)
-    return _blocks(list(mass.T), potential, blocks)
+    n = len(arm.coordinates)
+    q = [_one_moved(rng.uniform(-3.0, 3.0, 2 * samples), index, 1 + n) for index in range(n)]
+    inertias: list[Ten] = []
+    for body in arm.bodies:
+        if assume == "kinematics":
+            inertias.append([rng.normal(size=samples) for _ in range(10)])
+        else:
+            inertias.append(list(map(float, body.inertia or (0,) * 10)))
+    return Samples(*float_energies(arm, np.stack(q, axis=-1), inertias))
 
 
 def float_energies(arm: Arm, q: np.ndarray, inertias: Sequence[Ten]) -> tuple[np.ndarray, np.ndarray]:
-    """Return lower triangles of M, (points, n(n+1)/2), and V [J], (points,), at ``q`` (points, n) [rad, m]."""
-    bases = base_denominators(arm)
+    """Return lower triangles of M, (..., n(n+1)/2), and V [J], (...), at ``q`` (..., n) [rad, m]."""
     positions = []
-    for value, base in zip(q.T, bases, strict=True):
+    for index, base in enumerate(base_denominators(arm)):
+        value = q[..., index]
         positions.append(Position(np.cos(value / base), np.sin(value / base), value))
     result = energies(arm, motions(arm, positions, float), inertias, float)
-    points = len(q)
-    mass = np.stack([np.broadcast_to(result.mass[key], points) for key in triangle(q.shape[1])], axis=-1)
-    return mass.astype(float), np.broadcast_to(result.potential, points).astype(float)
+    shape = q.shape[:-1]
+    entries = [np.broadcast_to(result.mass[key], shape) for key in triangle(q.shape[-1])]
+    return np.stack(entries, axis=-1).astype(float), np.broadcast_to(result.potential, shape).astype(float)
 
 
 def motions(arm: Arm, positions: Sequence[Position], number: Callable[[Fraction], Element]) -> list[Motion]:
@@ -197,18 +193,14 @@ def _one_moved(values: np.ndarray, index: int, blocks: int) -> np.ndarray:
     base, moved = np.split(values, 2)
     result = np.tile(base, (blocks, 1))
     result[index + 1] = moved
-    return result.ravel()
+    return result
 
 
-def _residue_values(element: Residues | int, count: int) -> np.ndarray:
+def _residue_values(element: Residues | int, shape: tuple[int, ...]) -> np.ndarray:
+    """Return an element of the ring as an array of this shape; what is the same for all samples has fewer numbers."""
     if isinstance(element, Residues):
-        return element.values
-    return np.full(count, element % PRIME, dtype=np.uint64)
-
-
-def _blocks(entries: list[np.ndarray], potential: np.ndarray, blocks: int) -> Samples:
-    mass = np.stack(entries, axis=-1)
-    return Samples(mass.reshape(blocks, -1, len(entries)), potential.reshape(blocks, -1))
+        return np.broadcast_to(element.values, shape)
+    return np.full(shape, element % PRIME, dtype=np.uint64)
 
 
 class Spans:
