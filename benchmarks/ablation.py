@@ -74,7 +74,7 @@ def mechanisms() -> list[Mechanism]:
     """All that are switched off."""
     return [
         Mechanism("correlated errors (20 samples)", tuned(torque_jacobian, correlation_length=1.0)),
-        Mechanism("a second way with little noise", tuned(torque_jacobian, first_noise=1e6)),
+        Mechanism("steps under the noise of least squares", tuned(torque_jacobian, first_steps=0)),
         Mechanism("more rounds while noise falls", tuned(torque_jacobian, longer=1)),
         Mechanism("priors that yield", ((torque_problem, "most_probable", keep_prior),)),
         Mechanism("friction compensated unseen", tuned(torque_jacobian, compensation_explained=NEVER)),

@@ -48,7 +48,7 @@ def short_torque_fits(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fits to torques take two steps a round and few rounds: for tests of what stands around a fit."""
     from spelgen.settings.tuning.fitting import TorqueTuning
 
-    tuning = TorqueTuning(rounds=1, first_rounds=1, last_rounds=1, longer=1, steps=2)
+    tuning = TorqueTuning(rounds=1, first_steps=2, last_rounds=1, longer=1, steps=2)
     monkeypatch.setattr("spelgen.fitting.torque.problem.TUNING", tuning)
 
 

@@ -16,6 +16,7 @@ from spelgen.exporting.rigid_body_projection import rigid_body_projection
 from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.servo import laws
 from spelgen.fitting.servo.parameters import ServoParameters
+from spelgen.fitting.torque import jacobian as torque_jacobian
 from spelgen.fitting.torque import objective as torque_objective
 from spelgen.fitting.torque import problem as torque_problem
 from spelgen.fitting.torque import residuals as residual_fit
@@ -124,16 +125,30 @@ def test_intervals_of_errors_that_last_are_wider():
     np.testing.assert_allclose(deviations([lasting], 2), np.sqrt(10), rtol=0.15)
 
 
-def test_the_evidence_counts_errors_that_last_once(monkeypatch):
-    """Half the noise is worth log 2 for each independent sample of each joint, and not for each sample."""
-    problem = SimpleNamespace(
-        free=torch.tensor([True]), start=torch.zeros(1).double(), precision=torch.eye(1).double(),
-        covariance=torch.eye(1).double(), count=2000, correlation=5.0, noise=torch.ones(2).double(),
-    )  # fmt: skip
-    first = torque_problem.TorqueProblem._evidence(problem, problem.start)
-    problem.noise = problem.noise / 2
-    gained = torque_problem.TorqueProblem._evidence(problem, problem.start) - first
-    assert gained < 0.5 * 2000 * 2 * np.log(2)
+@pytest.mark.parametrize("correlation", [1.0, 5.0])
+def test_the_first_noise_is_that_of_least_squares(correlation):
+    """Of two joints, one with three weights of its own: what is missed, with a sample fewer for every weight, and with
+    more where errors last.
+    """
+    draw = torch.Generator().manual_seed(0)
+    count, deviations = 400, torch.tensor([0.5, 0.01]).double()
+    x = torch.randn(count, 3, generator=draw).double()
+    measured = deviations * torch.randn(count, 2, generator=draw).double()
+    measured[:, 0] += 7.0 * x[:, 1]  # nothing of it is missed
+    jacobian = object.__new__(torque_jacobian.TorqueJacobian)
+    jacobian.samples = SimpleNamespace(joints=2)
+    slopes = ((0, torch.arange(3), x, measured[:, 0]), (1, torch.arange(0), x[:, :0], measured[:, 1]))
+    jacobian._slopes = lambda _: slopes
+    problem = object.__new__(torque_problem.TorqueProblem)
+    problem.jacobian, problem.count, problem.correlation = jacobian, count, correlation
+    problem.range, problem.start = torch.ones(2).double(), torch.zeros(3).double()
+    jacobian.rigid = SimpleNamespace(free=lambda *_: torch.ones(3, dtype=torch.bool))
+    problem.adapt = problem.compensated = None
+    problem._set_least_squares_noise(problem.start)
+    solution = torch.linalg.lstsq(x, measured[:, :1]).solution
+    missed = [(measured[:, 0] - (x @ solution)[:, 0]).square().sum(), measured[:, 1].square().sum()]
+    expected = torch.stack(missed) / (count - correlation * torch.tensor([3.0, 0.0]).double())
+    torch.testing.assert_close(problem.noise, (correlation * expected).sqrt(), rtol=1e-6, atol=0)
 
 
 def test_a_dead_zone_of_a_servo_is_worth_more_than_luck(monkeypatch):
@@ -270,8 +285,8 @@ def test_the_tip_is_missed_by_millimetres():
 def test_friction_forgets_on_evidence_alone():
     """Without memory of friction the samples of both joints are more probable: by luck, and by far."""
     friction = SimpleNamespace(memoryless=torch.ones(2), bristles=SimpleNamespace(reach=torch.ones(2, 4)))
-    independent, gains = 2000 / 20, torch.tensor([1.0, 200.0])
-    state = SimpleNamespace(residuals=torch.ones(2))
+    independent, gains = 2000 / 20, torch.tensor([1.0, 20.0])
+    state = SimpleNamespace(residuals=torch.ones(2), x=None, steps=0)
     remembering = SimpleNamespace(residuals=(gains / independent).exp())
     problem = SimpleNamespace(
         jacobian=SimpleNamespace(model=SimpleNamespace(friction=friction)),
@@ -281,6 +296,7 @@ def test_friction_forgets_on_evidence_alone():
         count=2000,
         correlation=20.0,
         set_samples=lambda state, jacobian: state,
+        _first_fit=lambda x, steps: state,
         solve=lambda state, rounds: remembering,
     )
     torque_problem.TorqueProblem.select_memory(problem, state)

@@ -62,7 +62,7 @@ def fit_torque(
     select_memory = adapt is None and model.elements > 0
     if select_memory:
         model.friction.memoryless.fill_(1.0)
-    state = problem.multistart()
+    state = problem.solve_from_start()
     if select_memory:
         state = problem.select_memory(state)
     residuals: list[SelectedResidual] = []

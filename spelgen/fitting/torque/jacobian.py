@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
 TUNING = TorqueTuning()
+LOGARITHMS = ("armature", "sizes", "load_dependence")
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +49,13 @@ class ResidualSamples(NamedTuple):
     qdd: torch.Tensor
     missing: torch.Tensor
     friction: torch.Tensor
+
+
+class LeastSquaresFit(NamedTuple):
+    """The sums of squares (n,) of the torque that least squares miss, and how many weights a torque determines (n,)."""
+
+    squares: torch.Tensor
+    weights: torch.Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,23 +108,39 @@ class TorqueJacobian:
 
     def normal_equations(self, x: torch.Tensor, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return J^T J (K, K) and J^T r (K,) of the missing torque r, in units of ``noise`` (n,)."""
-        weights = self.rigid.named(x)
         curvature, descent = torch.zeros(len(x), len(x)).double(), torch.zeros(len(x)).double()
-        by_body = self._directions.of_weight < 0
+        for joint, columns, slope, missing in self._slopes(x):
+            slope = slope / noise[joint]
+            curvature[columns[:, None], columns] += slope.mT @ slope
+            descent[columns] += slope.mT @ (missing / noise[joint])
+        return curvature, descent
+
+    def least_squares(self, x: torch.Tensor, noise: torch.Tensor, free: torch.Tensor) -> LeastSquaresFit:
+        """Return what least squares by the free weights (K,) leave of torques that are taken as linear about x (K,)."""
+        curvature, descent = self.normal_equations(x, noise)
+        inverse = torch.zeros_like(curvature)
+        inverse[free[:, None] & free] = _pseudo_inverse(curvature[free][:, free]).flatten()
+        step = inverse @ descent
+        squares, weights = torch.zeros(2, self.samples.joints).double()
+        for joint, columns, slope, missing in self._slopes(x):
+            squares[joint] += (missing - slope @ step[columns]).square().sum()
+            weights[joint] += ((slope @ inverse[columns[:, None], columns]) * slope).sum() / noise[joint] ** 2
+        return LeastSquaresFit(squares, weights)
+
+    def _slopes(self, x: torch.Tensor) -> Iterator[tuple[int, torch.Tensor, torch.Tensor, torch.Tensor]]:
+        """Yield block by block each joint, the weights (C,) that move its torque, J (T, C) and what is missing (T,)."""
+        weights, by_body = self.rigid.named(x), self._directions.of_weight < 0
         for block in self._blocks:
             missing, changes = self._joint_slope(weights, block)
             bodies = self._body_slope(weights, block)
-            for joint, unit in enumerate(noise.tolist()):
+            for joint in range(self.samples.joints):
                 # of the weights of joints, few move this one's torque: the others' columns are zero
                 own = self._directions.moves[:, joint]
                 slope = torch.cat(
                     [bodies[:, joint], changes[self._directions.of_weight[own], :, joint].mT], 1
                 )
-                slope = slope / unit
                 columns = torch.cat([by_body.nonzero()[:, 0], own.nonzero()[:, 0]])
-                curvature[columns[:, None], columns] += slope.mT @ slope
-                descent[columns] += slope.mT @ (missing[:, joint] / unit)
-        return curvature, descent
+                yield joint, columns, slope, missing[:, joint]
 
     def residual_samples(self, x: torch.Tensor) -> ResidualSamples:
         """Return what these weights leave of the torque, of all samples."""
@@ -151,9 +176,15 @@ class TorqueJacobian:
         return slope, slope * products / squares.clamp(min=1e-300), size
 
     def moved(self, x: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
-        """Return the weights (K,) after a step, which goes straight in the bodies' inertial parameters."""
+        """Return the weights (K,) after a step, which goes straight where torques do: in the bodies' inertial
+        parameters, and in what grows of the quantities whose logarithms are weights.
+        """
         change, bodies = self.rigid.named(step), self.rigid.bodies
         weights = self.rigid.named(x + step)
+        for name in self.rigid.of_kind(*LOGARITHMS):
+            weights[name] = (
+                weights[name] - change[name] + torch.minimum(change[name], change[name].clamp(min=0).log1p())
+            )
         moved = moved_bodies(self.rigid.named(x)[bodies], change[bodies])
         # bodies that stay keep their last digit, too
         weights[bodies] = torch.where(change[bodies].any(dim=-1, keepdim=True), moved, weights[bodies])
@@ -295,3 +326,14 @@ def _colours(coupled: torch.Tensor) -> list[int]:
             colour += 1
         colours.append(colour)
     return colours
+
+
+def _pseudo_inverse(curvature: torch.Tensor) -> torch.Tensor:
+    """Return the inverse (K, K) of a curvature in the directions that samples show."""
+    diagonal = curvature.diagonal()
+    scale = torch.where(diagonal > TUNING.seen * diagonal.max(), diagonal, torch.inf).rsqrt()
+    values, vectors = torch.linalg.eigh(curvature * scale * scale[:, None])
+    seen = values > TUNING.seen * values.max()
+    vectors = vectors[:, seen] * scale[:, None]
+    inverse: torch.Tensor = vectors / values[seen] @ vectors.mT
+    return inverse

@@ -12,7 +12,6 @@ is what is left of its torque, found in rounds, and so is how far the start is t
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -43,8 +42,8 @@ class TorqueProblem:
         self.covariance = torch.zeros(len(self.start), len(self.start)).double()
         self.kinds = adapted_kinds(rigid.start, rigid.kinds)
         self._use(jacobian)
-        self.noise = self._first_noise()
         self.set_prior(prior)
+        self.noise = self.correlation**0.5 * self.range
 
     def _use(self, jacobian: TorqueJacobian) -> None:
         self.jacobian, self.count = jacobian, jacobian.samples.count
@@ -69,55 +68,58 @@ class TorqueProblem:
         rigid = self.jacobian.rigid
         self.precision = torch.linalg.inv(covariance(prior, rigid.start, rigid.kinds))
 
-    def set_noise(self, squares: torch.Tensor, largest: torch.Tensor | None = None) -> None:
-        """Take for noise what is missed: sums of squares (n,). This is the one place of the noise model.
-
-        largest: (n,) noise where the start may be far off: torques that are not explained yet are no noise.
-        """
+    def set_noise(self, squares: torch.Tensor) -> None:
+        """Take for noise what is missed: sums of squares (n,). This is the one place of the noise model."""
         rms = torch.maximum((squares / self.count).sqrt(), TUNING.least_noise * self.range)
         self.noise = self.correlation**0.5 * rms
-        if largest is not None:
-            self.noise = torch.minimum(self.noise, largest)
 
-    def _first_noise(self) -> torch.Tensor:
-        result: torch.Tensor = self.correlation**0.5 * TUNING.first_noise * self.range
-        return result
+    def _set_least_squares_noise(self, x: torch.Tensor) -> None:
+        """Take for noise what least squares miss, which no prior holds; of torques that are linear about x (K,)."""
+        self.noise = self.correlation**0.5 * self.range
+        for _ in range(TUNING.least_squares_rounds):
+            squares, weights = self.jacobian.least_squares(x, self.noise, self.free)
+            # of errors that last, a weight takes as many samples
+            determined = (self.correlation * weights / self.count).clamp(max=TUNING.most_determined)
+            self.set_noise(squares / (1 - determined))
+
+    def _first_fit(self, x: torch.Tensor, steps: int) -> State:
+        """Return the end of all steps from weights x (K,), under the noise of least squares.
+
+        Bodies that are far off leave much of the torque, which is taken for noise, and noise asks for no better bodies.
+        """
+        self._set_least_squares_noise(x)
+        squares = self.jacobian.squares(x)
+        state = State(x, squares, self.cost(x, squares), DAMPING.first, steps)
+        for step in levenberg_marquardt(self, state, max_steps=TUNING.first_steps, relative_gain=TUNING.gain):
+            state = step
+        return state
 
     @property
     def free(self) -> torch.Tensor:
         """Which weights (K,) move."""
         return self.jacobian.rigid.free(self.adapt, self.compensated)
 
-    def multistart(self) -> State:
-        """As `solve`, all rounds from the start; the more probable of two ways where the first leaves much.
-
-        Bodies that are far off leave much of the torque, which is taken for noise, and noise asks for no better bodies:
-        on the second way there is little noise until the fit is near.
+    def solve_from_start(self) -> State:
+        """As `solve`, all rounds from the start; from there anew while further joints want a compensation, for what a
+        fit made of their torque without one leads astray.
         """
-        first_noise, ways = self._first_noise(), []
-        for largest in (None, first_noise):
-            state = self.solve(self._initial_fit(first_noise, largest), TUNING.rounds)
-            fitted = (state, self.noise, self.prior, self.covariance.clone(), self.compensated)
-            ways.append((self._evidence(state.x), fitted))
-            if (self.noise <= first_noise).all():
-                break
-        _, (state, self.noise, prior, self.covariance, self.compensated) = max(ways, key=lambda way: way[0])
-        self.set_prior(prior)
-        return state
+        state = self._first_fit(self.start, 0)
+        while self.adapt is None and self._compensate(state.x):
+            state = self._first_fit(self.start, state.steps)
+        return self.solve(state, TUNING.rounds)
 
     def select_memory(self, state: State) -> State:
         """Go on from a fit without memory of friction; give bristles to the joints whose samples show memory.
 
         Bristles turn around after a displacement, and so late: where friction turns around at once, they pass for
-        inertia. Gears remember, so that memory goes only on evidence (Schwarz, Annals of Statistics 6:461, 1978).
+        inertia. Gears remember, so that memory goes only on evidence.
         """
         laws = self.jacobian.model.friction
         fitted = self.noise, self.prior, self.covariance.clone()
         laws.memoryless.fill_(0.0)
-        remembering = self.solve(self.set_samples(state, self.jacobian), TUNING.rounds)
-        independent = self.count / self.correlation
-        gain = independent * (remembering.residuals / state.residuals).log()
-        laws.memoryless.copy_(gain > laws.bristles.reach.shape[1] * math.log(independent))
+        remembering = self.solve(self._first_fit(state.x, state.steps), TUNING.rounds)
+        evidence = self.count / self.correlation * (remembering.residuals / state.residuals).log()
+        laws.memoryless.copy_(evidence > TUNING.memory_evidence)
         if laws.memoryless.all():
             self.noise, prior, self.covariance = fitted
             self.set_prior(prior)
@@ -125,27 +127,6 @@ class TorqueProblem:
         if laws.memoryless.any():
             return self.solve(self.set_samples(remembering, self.jacobian), TUNING.rounds)
         return remembering
-
-    def _evidence(self, x: torch.Tensor) -> float:
-        """Return the logarithm of the samples' marginal likelihood by Laplace's approximation, but for a constant."""
-        free, away = self.free, x - self.start
-        prior, posterior = self.precision[free][:, free], self.covariance[free][:, free]
-        count = self.count / self.correlation
-        missed = count * self.noise.log().sum() + away @ self.precision @ away / 2
-        return float((prior.logdet() + posterior.logdet()) / 2 - missed)
-
-    def _initial_fit(self, noise: torch.Tensor, largest: torch.Tensor | None) -> State:
-        """As `solve`, some rounds from the start; from there anew while further joints want a compensation, for what
-        a fit made of their torque without one leads astray.
-        """
-        state = State(self.start, self.jacobian.squares(self.start), float("inf"), DAMPING.first)
-        while True:
-            self.set_prior(self.guess)
-            self.noise = noise
-            end = self.solve(state, TUNING.first_rounds, largest)
-            if self.adapt is not None or not self._compensate(end.x):
-                return end
-            state = replace(state, steps=end.steps)
 
     def _compensate(self, x: torch.Tensor) -> bool:
         """Give a compensation to further joints that want one; return whether there are such.
@@ -163,17 +144,14 @@ class TorqueProblem:
         self.compensated = self.compensated | further
         return bool(further.any())
 
-    def solve(self, state: State, rounds: int, largest: torch.Tensor | None = None) -> State:
-        """Take steps in rounds, after each of which noise and prior are found anew; more rounds while much is gained.
-
-        largest: see `set_noise`.
-        """
+    def solve(self, state: State, rounds: int) -> State:
+        """Take steps in rounds, after each of which noise and prior are found anew, while much is gained."""
         for number in range(TUNING.longer * rounds):
             state = replace(state, cost=self.cost(state.x, state.residuals), converged=False)
             for step in levenberg_marquardt(self, state, max_steps=TUNING.steps, relative_gain=TUNING.gain):
                 state = step
             previous = self.noise
-            self.set_noise(state.residuals, largest)
+            self.set_noise(state.residuals)
             free = self.free
             self.covariance[free[:, None] & free] = torch.linalg.inv(self.curvature).flatten()
             if self.adapt != "load":

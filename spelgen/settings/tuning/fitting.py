@@ -72,7 +72,10 @@ class TorqueTuning:
         5.0  # samples, 0.1 s: so many in a row err alike and count once; 20 costs 20 % of M(q)
     )
     rounds: int = 5  # after the first ones, of finding noise and prior anew
-    first_rounds: int = 3  # after which it is seen whether friction explains what is missed
+    first_steps: int = 60  # at most, before noise and prior are found
+    # twice the logarithm of a likelihood ratio: strong evidence (Kass and Raftery, J. Am. Stat. Assoc. 90:773, 1995)
+    memory_evidence: float = 6.0
+    least_squares_rounds: int = 3  # of finding the noise of least squares
     last_rounds: int = 2  # where all but the last digits are fitted
     longer: int = 4  # times as many rounds at most, while some joint's noise falls
     noise_settled: float = 0.98  # [1] noise by that of the round before: what falls by less is settled
@@ -82,7 +85,8 @@ class TorqueTuning:
     subset: int = 2**10  # samples, evenly spread, that come near; all of them finish
     windows: int = 2**12  # at most, of 5 samples, on which the model is measured after the fit
     residual_samples: int = 2**14  # that what stands beside rigid bodies is selected on
-    first_noise: float = 0.1  # [1] of a joint's torque range
+    seen: float = 1e-10  # [1] of the largest curvature: directions with less are not seen in the samples
+    most_determined: float = 0.9  # [1] of the samples, that least squares can take for weights
     least_noise: float = (
         1e-4  # [1] of it: noise-free samples are fitted to four digits of their torque's range
     )
