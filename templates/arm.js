@@ -6,7 +6,7 @@ const arm = (() => {
   if (!canvas || !told) return null;
   const scene = JSON.parse(told.textContent);
   const context = canvas.getContext("2d");
-  const state = { motion: 0, time: 0, playing: false, yaw: scene.yaw, pitch: scene.pitch, lit: null };
+  const state = { motion: 0, time: 0, playing: false, yaw: 2.3, pitch: 0.36, lit: null };
   state.colour = scene.motions[0].error ? "error" : "known";
   const LIGHT = [-0.352, 0.624, 0.704];
   let ink = {};
@@ -53,6 +53,29 @@ const arm = (() => {
     const c = Math.cos(state.yaw), s = Math.sin(state.yaw), cp = Math.cos(state.pitch), sp = Math.sin(state.pitch);
     return [-c, s, 0, -s * sp, -c * sp, cp, s * cp, c * cp, sp];
   };
+
+  // where a motion is shown: its middle and the ground below all links [mm], pixels per metre
+  const view = (motion) => {
+    const eye = camera(), low = [0, 0, 0], high = [0, 0, 0];
+    let ground = 0;
+    // a dozen poses hold the extent of a motion well enough
+    const stride = Math.max(1, Math.floor(motion.q.length / 12));
+    for (let row = 0; row < motion.q.length; row += stride) frames(motion.q[row]).forEach(({ R, p }, index) => {
+      ground = Math.min(ground, p[2]);
+      for (const v of scene.links[index].v) {
+        const w = apply(R, v);
+        apply(eye, w.map((x, k) => x + p[k])).forEach((x, k) => {
+          low[k] = Math.min(low[k], x);
+          high[k] = Math.max(high[k], x);
+        });
+      }
+    });
+    const scale = 860 * Math.min(640 / (high[0] - low[0] || 1), 420 / (high[1] - low[1] || 1));
+    // the middle of the picture, not of the arm's box: an oblique arm fills the frame too
+    const [x, y, z] = low.map((least, k) => (least + high[k]) / 2);
+    return { middle: [0, 1, 2].map((k) => eye[k] * x + eye[3 + k] * y + eye[6 + k] * z), scale, ground };
+  };
+  for (const motion of scene.motions) Object.assign(motion, view(motion));
 
   // the row of a motion at the present time, between its samples
   const at = (motion, rows) => {

@@ -12,6 +12,21 @@ from spelgen.render.report_page import write_report
 
 pytestmark = pytest.mark.skipif(executable() is None, reason="no Chromium is installed")
 ACTIVE = "document.activeElement"
+EXTENT = """(() => {
+  const canvas = document.querySelector("canvas.arm"), pen = CanvasRenderingContext2D.prototype;
+  const { beginPath, lineTo, fill } = pen;
+  let path = [], corners = [];
+  pen.beginPath = function () { path = []; beginPath.call(this); };
+  pen.lineTo = function (x, y) {
+    path.push([x / canvas.clientWidth, y / canvas.clientHeight]);
+    lineTo.call(this, x, y);
+  };
+  pen.fill = function () { corners.push(...path); fill.call(this); };
+  window.dispatchEvent(new Event("resize"));
+  Object.assign(pen, { beginPath, lineTo, fill });
+  return [0, 1].flatMap((k) => [Math.min, Math.max].map((end) => end(...corners.map((corner) => corner[k]))));
+})()"""
+"""Left, right, upper and lower end of the faces that the arm is drawn of, by the size of its frame."""
 
 
 @pytest.fixture(scope="module")
@@ -79,6 +94,14 @@ def test_keys_lead_through_the_mass_matrix_and_light_its_joints(browser, pages):
     assert browser.run(told).startswith("M22 is constant.")
     assert browser.run(f"{ACTIVE}.classList.contains('lit') && {ACTIVE}.tabIndex === 0")
     assert browser.run("document.querySelector('canvas.arm').toDataURL()") != before
+
+
+def test_the_arm_fills_its_frame(browser, pages):
+    for path in pages:
+        browser.open(path)
+        left, right, top, bottom = browser.run(EXTENT)
+        assert 0.0 < left < right < 1.0 and 0.0 < top < bottom < 1.0
+        assert max(right - left, bottom - top) > 0.3  # the frame is as large as the whole motion needs
 
 
 def test_keys_turn_the_arm_and_play_its_motion(browser, pages):

@@ -111,12 +111,7 @@ def arm_section(
         colours.append("error")
     if unseen is not None:
         colours.append("known")
-    scripted = []
-    for motion in motions:
-        # a dozen poses of a motion hold its extent well enough
-        poses = motion.q[:: max(1, len(motion.q) // 12)]
-        scripted.append(vars(motion) | drawn.view(poses))
-    data = drawn.to_dict() | {"motions": scripted, "identifiability": unseen}
+    data = drawn.to_dict() | {"motions": list(map(vars, motions)), "identifiability": unseen}
     labels = tuple(motion.label for motion in motions)
     return ArmSection(json_data(data), labels, tuple(colours), drawn.has_meshes)
 

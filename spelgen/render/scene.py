@@ -20,25 +20,6 @@ from spelgen.urdf.read import read_urdf
 from spelgen.urdf.robot import Joint, Robot
 
 
-@dataclass(frozen=True)
-class Camera:
-    """Direction of the camera [rad], size of the picture and the fraction of it that the arm fills."""
-
-    yaw: float = 2.3
-    pitch: float = 0.36
-    width: int = 640
-    height: int = 420
-    fill: float = 0.86
-
-    def axes(self) -> np.ndarray:
-        """Return what takes the root's axes to right, up and towards the eye, (3, 3)."""
-        c, s, cp, sp = np.cos(self.yaw), np.sin(self.yaw), np.cos(self.pitch), np.sin(self.pitch)
-        return np.array([[-c, s, 0], [-s * sp, -c * sp, cp], [s * cp, c * cp, sp]])
-
-
-CAMERA = Camera()
-
-
 @dataclass(frozen=True, eq=False)
 class SceneLink:
     """A link, and the joint that carries it: it stands at rotation (3, 3) and position (3,) in its parent's frame and
@@ -80,49 +61,10 @@ class Scene:
     reach: float
     has_meshes: bool
 
-    def frames(self, q: Sequence[float]) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return where the links stand at q: rotation (3, 3) and position (3,) of each."""
-        frames: list[tuple[np.ndarray, np.ndarray]] = []
-        for link in self.links:
-            rotation, position = np.eye(3), np.zeros(3)
-            if link.parent >= 0:
-                rotation, position = frames[link.parent]
-            position = position + rotation @ link.position
-            rotation = rotation @ link.rotation
-            value = link.offset
-            if link.joint >= 0:
-                value += link.ratio * q[link.joint]
-            if link.slides:
-                position = position + rotation @ link.axis * value
-            else:
-                rotation = rotation @ Rotation.from_rotvec(value * link.axis).as_matrix()
-            frames.append((rotation, position))
-        return frames
-
-    def view(self, poses: Sequence[Sequence[float]]) -> dict[str, object]:
-        """Return how a script shows the arm at all these positions: middle [mm], pixels per metre and ground [mm].
-
-        The ground lies below all links, at the root where they stay above it.
-        """
-        points = [np.zeros((1, 3))]
-        ground = 0.0
-        for q in poses:
-            for link, (rotation, position) in zip(self.links, self.frames(q), strict=True):
-                points.append(link.shape.vertices @ rotation.T + position)
-                ground = min(ground, float(position[2]))
-        axes = CAMERA.axes()
-        seen = np.concatenate(points) @ axes.T
-        low, high = seen.min(axis=0), seen.max(axis=0)
-        across, up, _ = np.maximum(high - low, 1e-6)
-        scale = CAMERA.fill * min(CAMERA.width / across, CAMERA.height / up)
-        # the middle of the picture, not of the arm's box: an oblique arm fills the frame too
-        middle = (low + high) / 2 @ axes
-        return {"middle": _mm(middle), "scale": round(scale, 2), "ground": round(1000 * ground, 1)}
-
     def to_dict(self) -> dict[str, object]:
         """Return the scene for a script, in millimetres and short names."""
         links = [link.to_dict() for link in self.links]
-        return {"reach": round(1000 * self.reach), "yaw": CAMERA.yaw, "pitch": CAMERA.pitch, "links": links}
+        return {"reach": round(1000 * self.reach), "links": links}
 
 
 def scene(urdf: Path, joints: Sequence[str]) -> Scene:
