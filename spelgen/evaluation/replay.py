@@ -100,46 +100,52 @@ def replays(
             code, message = "baseline", f"{name}: {baselines[name].about}"
         notes.append(Diagnostic("info", code, "logs", None, message))
     predictors = {MODEL: ServoModel(model), **baselines}
-    logs_from_rest = [(piece, slice(0, len(piece))) for piece in pieces]
     # logs begin before the arm moves; within them windows begin in motion
+    logs_from_rest: list[LogRows] = [(piece, slice(0, len(piece))) for piece in pieces]
     q = np.stack([piece.q[0] for piece in pieces])
-    errors = _errors(predictors, logs_from_rest, q, np.zeros_like(q))
-    results = [Replay("whole log", _summaries(logs_from_rest, errors))]
+    whole, missed = _replay("whole log", predictors, logs_from_rest, q, np.zeros_like(q))
+    results = [whole]
     if windows:
         smooth_velocities = {id(piece): velocities(piece) for piece in pieces}
         q = np.stack([log.q[rows.start] for log, rows in windows])
         qd = np.stack([smooth_velocities[id(log)][rows.start] for log, rows in windows])
-        summaries = _summaries(windows, _errors(predictors, windows, q, qd))
-        results.append(Replay(f"windows of {WINDOW:g} s", summaries))
-    return tuple(results), list(zip(pieces, errors[MODEL], strict=True))
+        results.append(_replay(f"windows of {WINDOW:g} s", predictors, windows, q, qd)[0])
+    return tuple(results), list(zip(pieces, missed, strict=True))
 
 
-Errors = dict[str, list[np.ndarray]]
-"""By predictor, predicted less measured positions of each part, (K, n)."""
+def _replay(
+    name: str,
+    predictors: Mapping[str, CommandFollower],
+    parts: Sequence[LogRows],
+    q: np.ndarray,
+    qd: np.ndarray,
+) -> tuple[Replay, list[np.ndarray]]:
+    """Return how wrong each predictor is, and the model's errors."""
+    errors, summaries = {}, {}
+    for predictor, follower in predictors.items():
+        errors[predictor] = _errors(follower, parts, q, qd)
+        summaries[predictor] = _summary(parts, errors[predictor])
+    return Replay(name, summaries), errors[MODEL]
 
 
 def _errors(
-    predictors: Mapping[str, CommandFollower], parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray
-) -> Errors:
-    measured = [log.q[rows][1:] for log, rows in parts]
-    errors: Errors = {}
-    for name, predictor in predictors.items():
-        predicted = predictor.positions(parts, q, qd)
-        errors[name] = [x - y for x, y in zip(predicted, measured, strict=True)]
+    predictor: CommandFollower, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray
+) -> list[np.ndarray]:
+    """Return predicted less measured positions of each part, (K, n)."""
+    errors = []
+    for (log, rows), predicted in zip(parts, predictor.positions(parts, q, qd), strict=True):
+        errors.append(predicted - log.q[rows][1:])
     return errors
 
 
-def _summaries(parts: Sequence[LogRows], errors: Errors) -> dict[str, ReplayErrors]:
-    names = [log.name for log, _ in parts]
-    return {predictor: _summary(names, part_errors) for predictor, part_errors in errors.items()}
-
-
-def _summary(names: Sequence[str], errors: Sequence[np.ndarray]) -> ReplayErrors:
+def _summary(parts: Sequence[LogRows], errors: Sequence[np.ndarray]) -> ReplayErrors:
     # a log with gaps is several pieces of one name
-    by_name: dict[str, list[np.ndarray]] = {name: [] for name in names}
-    for name, error in zip(names, errors, strict=True):
-        by_name[name].append(error)
-    trajectories = {name: float(_rms(np.concatenate(parts), None)) for name, parts in by_name.items()}
+    by_name: dict[str, list[np.ndarray]] = {}
+    for (log, _), error in zip(parts, errors, strict=True):
+        by_name.setdefault(log.name, []).append(error)
+    trajectories = {}
+    for name, pieces in by_name.items():
+        trajectories[name] = float(_rms(np.concatenate(pieces), None))
     joints = _rms(np.concatenate(errors), 0)
     return ReplayErrors(trajectories, float(np.mean(list(trajectories.values()))), tuple(joints.tolist()))
 

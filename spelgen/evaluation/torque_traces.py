@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
 SECONDS = 10.0  # of a trace
 SHOWN = 240  # samples of it
-Columns = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]
-"""t, q, qd, qdd, tau, z, and the direction of dry friction; None: as qd has it."""
 
 
 @dataclass(frozen=True)
@@ -98,25 +96,19 @@ def _inverse_dynamics(dynamics: Any, motion: Motion) -> Tensor:
 
 def _motion(piece: Trajectory, logs: JudgedLogs) -> Motion | None:
     """Return up to ten seconds from the middle of what moves; None where nothing does."""
-    columns: Columns | None = _sparse_columns(piece, logs)
+    motion: Motion | None = _sparse_motion(piece, logs)
     if shows_accelerations(piece.sample_rate):
-        columns = _dense_columns(piece, logs)
-    if columns is None:
+        motion = _dense_motion(piece, logs)
+    if motion is None:
         return None
-    t, q, qd, qdd, tau, z, direction = columns
-    if direction is None:  # friction without a state takes none
-        direction = np.sign(qd)
-    t = t - t[0]
-    count = min(len(t), int(np.searchsorted(t, SECONDS)) + 1)
+    t = motion.t - motion.t[0]
+    count = min(len(t), int(torch.searchsorted(t, SECONDS)) + 1)
     start = (len(t) - count) // 2  # logs begin and end at rest
     span = slice(start, start + count)
-    tensors = [
-        torch.from_numpy(np.ascontiguousarray(x[span])) for x in (t - t[start], q, qd, qdd, tau, z, direction)
-    ]
-    return Motion(*tensors)
+    return Motion(t[span] - t[start], *(x[span] for x in list(vars(motion).values())[1:]))
 
 
-def _dense_columns(piece: Trajectory, logs: JudgedLogs) -> Columns | None:
+def _dense_motion(piece: Trajectory, logs: JudgedLogs) -> Motion | None:
     used = logs.used
     if used.filtered:  # pieces are so already
         used = Preprocessing(cutoff=0, gap=used.gap)
@@ -124,24 +116,47 @@ def _dense_columns(piece: Trajectory, logs: JudgedLogs) -> Columns | None:
     if not samples or len(samples[0].q) < 2:
         return None
     moving = samples[0]
-    z, direction = moving.z, moving.direction
-    if z is None:
-        z = np.zeros((*moving.q.shape, 0))
-    return np.arange(len(moving.q)) / FREQUENCY, moving.q, moving.qd, moving.qdd, moving.tau, z, direction
+    t = np.arange(len(moving.q)) / FREQUENCY
+    return _tensors(t, moving.q, moving.qd, moving.qdd, moving.tau, moving.z, moving.direction)
 
 
-def _sparse_columns(piece: Trajectory, logs: JudgedLogs) -> Columns:
+def _sparse_motion(piece: Trajectory, logs: JudgedLogs) -> Motion:
     """Return the differences from sample to sample, at the middle of each step, and the torque that acted then."""
-    z = np.zeros((*piece.q.shape, 0))
+    z = None
     if logs.reach.elements:
-        z = bristles_along(piece.q, logs.reach)
-    t, q, qd, z = ((x[1:] + x[:-1]) / 2 for x in (piece.t, piece.q, piece.qd, z))
+        z = _midpoints(bristles_along(piece.q, logs.reach))
     tau = piece.tau[:-1]  # held from its sample on, as simulators apply it
     if logs.used.filtered:
         # measured at its sample: a filter has no delay
-        tau = (piece.tau[1:] + piece.tau[:-1]) / 2
+        tau = _midpoints(piece.tau)
+    qd = _midpoints(piece.qd)
     qdd = np.diff(piece.qd, axis=0) / np.diff(piece.t)[:, None]
-    return t, q, qd, qdd, tau, z, direction_along(qd, logs.reach)
+    return _tensors(
+        _midpoints(piece.t), _midpoints(piece.q), qd, qdd, tau, z, direction_along(qd, logs.reach)
+    )
+
+
+def _midpoints(x: np.ndarray) -> np.ndarray:
+    middle: np.ndarray = (x[1:] + x[:-1]) / 2
+    return middle
+
+
+def _tensors(
+    t: np.ndarray,
+    q: np.ndarray,
+    qd: np.ndarray,
+    qdd: np.ndarray,
+    tau: np.ndarray,
+    z: np.ndarray | None,
+    direction: np.ndarray | None,
+) -> Motion:
+    """Return the motion; friction without a state takes no direction but that of qd."""
+    if z is None:
+        z = np.zeros((*q.shape, 0))
+    if direction is None:
+        direction = np.sign(qd)
+    arrays = map(np.ascontiguousarray, (t, q, qd, qdd, tau, z, direction))
+    return Motion(*map(torch.from_numpy, arrays))
 
 
 def _trace(which: str, name: str, dynamics: Mapping[str, RigidDynamics], motion: Motion) -> TorqueTrace:
