@@ -20,9 +20,6 @@ from spelgen.settings.tuning.evaluation import EvaluationTuning
 
 TUNING = EvaluationTuning()
 GAMMA = 1 - 0.5**0.5  # makes the method L-stable
-# steps of the differences that friction is differentiated by
-VELOCITY_STEP = 1e-5  # of a joint's largest velocity
-DISPLACEMENT_STEP = 1e-7  # rad, m
 
 
 class _States(NamedTuple):
@@ -47,7 +44,7 @@ def roll_out_stiff(
     z = sliding_memory(dynamics, qd) if windows.z is None else windows.z
     largest = windows.qd.abs().amax(dim=(0, 1))
     largest = torch.maximum(largest, 1e-3 * largest.max()).clamp(min=1e-2)
-    equations = _Equations(dynamics, VELOCITY_STEP * largest)
+    equations = _Equations(dynamics, TUNING.velocity_step * largest)
     states = _States(
         torch.arange(len(q)), q, qd, z, torch.zeros_like(q) if disturbance is None else disturbance
     )
@@ -120,6 +117,6 @@ class _Equations:
         if not has_friction_state(self.dynamics):
             return damping, torch.zeros_like(damping)
         # bristles load the way a joint goes
-        displacement = DISPLACEMENT_STEP * torch.where(qd < 0, -1.0, 1.0).to(qd)
+        displacement = TUNING.displacement_step * torch.where(qd < 0, -1.0, 1.0).to(qd)
         bent = pose.friction(qd, memory_after(self.dynamics, z, displacement))
         return damping, ((bent - pose.friction(qd, z)) / displacement).clamp(min=0)

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 from lxml import etree
 
-SEED = 0
-MASSLESS = 1e-9  # kg: links of no more than this stay as they are
+from spelgen.settings.tuning.comparison import ComparisonTuning
+
+TUNING = ComparisonTuning()
 
 
 def without_inertials(robot: Path) -> bytes:
@@ -23,12 +24,12 @@ def with_wrong_inertials(robot: Path, error: float) -> bytes:
     Masses and inertias by factors exp(error N(0, 1)): 0.3 is 30 %, 1 a factor of e; drawn anew for each link, the same
     ones in every call.
     """
-    tree, rng = _plain(robot, ("dynamics", "visual", "collision")), np.random.default_rng(SEED)
+    tree, rng = _plain(robot, ("dynamics", "visual", "collision")), np.random.default_rng(TUNING.seed)
     for inertial in tree.findall(".//link/inertial"):
         by_mass, by_inertia = np.exp(error * rng.normal(size=2))
         moved = error * rng.normal(size=3)
         mass, tensor = inertial.find("mass"), inertial.find("inertia")
-        if mass is None or tensor is None or float(mass.get("value", "0")) <= MASSLESS:
+        if mass is None or tensor is None or float(mass.get("value", "0")) <= TUNING.massless:
             continue
         trace = sum(float(tensor.get(name, "0")) for name in ("ixx", "iyy", "izz"))
         size = np.sqrt(max(trace, 0.0) / 2 / float(mass.get("value", "0")))  # about that of the body

@@ -15,12 +15,12 @@ from spelgen.evaluation.plain import finite
 from spelgen.fitting.rollout import LossScales, position_difference, roll_out, rollout_loss
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
+from spelgen.settings.tuning.comparison import ComparisonTuning
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
-MOST_WINDOWS = 512
-TIMED_STEPS = 9
+TUNING = ComparisonTuning()
 
 
 @dataclass(frozen=True)
@@ -46,9 +46,9 @@ class Sizes:
 
 
 def thinned(pieces: Sequence[Trajectory], samples: int, decimation: int) -> Windows:
-    """At most about ``MOST_WINDOWS`` windows, evenly spread, a multiple of ``decimation`` samples apart."""
+    """At most about so many windows, evenly spread, a multiple of ``decimation`` samples apart."""
     starts = sum(max(0, len(x) - (samples - 1) * decimation) for x in pieces)
-    stride = -(-max(1, -(-starts // MOST_WINDOWS)) // decimation) * decimation
+    stride = -(-max(1, -(-starts // TUNING.windows)) // decimation) * decimation
     return cut_windows(pieces, samples, stride, decimation, measured=False)
 
 
@@ -89,7 +89,7 @@ def step_seconds(model: EmittedModel, windows: Windows, scales: LossScales, subs
     """Return the median time of a training step on these windows, without the update of the weights [s]."""
     times = []
     # the median: other programs run beside
-    for _ in range(TIMED_STEPS):
+    for _ in range(TUNING.timed_steps):
         start = time.perf_counter()
         model.zero_grad()
         torch.autograd.backward(rollout_loss(model, windows, scales, substeps))

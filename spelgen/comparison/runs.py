@@ -24,13 +24,14 @@ from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import cut_windows
 from spelgen.settings.fits import DEFAULTS, Rollout
+from spelgen.settings.tuning.comparison import ComparisonTuning
 from spelgen.spec import read_facts
 from spelgen.tasks import RunTasks
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
-HORIZON = 1.0  # s, over which trajectories are predicted
+TUNING = ComparisonTuning()
 
 
 def run_study(study: Study, run_tasks: RunTasks, *, note: Callable[[str], None]) -> None:
@@ -81,7 +82,7 @@ def _measure(
     decimation = study.preprocessing.decimation or 1
     training = read_logs([study.logs], joints, role="train")
     testing = read_logs([study.logs], joints, role="test")
-    steps = round(HORIZON / (decimation * float(testing[0].t[1] - testing[0].t[0])))
+    steps = round(TUNING.horizon / (decimation * float(testing[0].t[1] - testing[0].t[0])))
     far = thinned(testing, steps + 1, decimation)
     low = torch.tensor(study.low, dtype=torch.float64)
     high = torch.tensor(study.high, dtype=torch.float64)

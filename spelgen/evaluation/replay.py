@@ -16,11 +16,12 @@ from spelgen.errors import Diagnostic
 from spelgen.logs.commands import LogRows, delayed_commands, steps_between
 from spelgen.logs.smoothing import velocities
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
+from spelgen.settings.tuning.evaluation import EvaluationTuning
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
-WINDOW = 1.0  # s, of the replays that start anew again and again
+TUNING = EvaluationTuning()
 MISSING = {
     LINEAR_SERVOS: ("no-linear-servos", "no linear servos to compare with: they are fitted by `train`"),
     POSITION_ACTUATORS: (
@@ -83,7 +84,7 @@ def replays(
     baselines: Mapping[str, CommandFollower],
     notes: list[Diagnostic],
 ) -> tuple[tuple[Replay, ...], list[Missed]]:
-    """Replay whole logs, and windows of `WINDOW` one after another, by the model and the baselines.
+    """Replay whole logs, and windows of a second one after another, by the model and the baselines.
 
     Returns these, and what the model misses of whole logs. Notes say what the baselines are, or that there are none.
     """
@@ -92,7 +93,7 @@ def replays(
         pieces += [piece for piece in split_at_gaps(log) if len(piece) > 2]
     windows: list[LogRows] = []
     for piece in pieces:
-        length = round(WINDOW * piece.sample_rate) + 1
+        length = round(TUNING.replay_window * piece.sample_rate) + 1
         starts = range(0, len(piece) - length + 1, length - 1)
         windows += [(piece, slice(start, start + length)) for start in starts]
     for name, (code, message) in MISSING.items():
@@ -109,7 +110,7 @@ def replays(
         smooth_velocities = {id(piece): velocities(piece) for piece in pieces}
         q = np.stack([log.q[rows.start] for log, rows in windows])
         qd = np.stack([smooth_velocities[id(log)][rows.start] for log, rows in windows])
-        results.append(_replay(f"windows of {WINDOW:g} s", predictors, windows, q, qd)[0])
+        results.append(_replay(f"windows of {TUNING.replay_window:g} s", predictors, windows, q, qd)[0])
     return tuple(results), list(zip(pieces, missed, strict=True))
 
 

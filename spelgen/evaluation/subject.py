@@ -23,6 +23,7 @@ from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.settings import load_mapping
+from spelgen.settings.tuning.evaluation import EvaluationTuning
 from spelgen.spec import logged_joints, read_facts
 from spelgen.urdf.read import read_urdf
 
@@ -30,7 +31,8 @@ if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
     from spelgen.loaded_arm import LoadedArm
 
-WINDOW = 5  # samples of the windows that say how many steps the integrator needs
+
+TUNING = EvaluationTuning()
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ class Subject:
     urdf: Path | None = None
     tip: str | None = None
     preprocessing: Preprocessing | None = None
-    window: int = WINDOW
+    window: int = TUNING.model_window
     reach: BristleReach = NO_BRISTLES
     trained_on: frozenset[str] = frozenset()
     run: RunFolder | None = None
@@ -75,7 +77,7 @@ def subject(judged: EmittedModel | Fit | Path | str, arm: LoadedArm | Path | str
     return replace(
         _of_model(judged.model, urdf or judged.urdf),
         preprocessing=judged.preprocessing,
-        window=getattr(judged.config, "window", WINDOW),
+        window=getattr(judged.config, "window", TUNING.model_window),
         trained_on=frozenset([*judged.record["training"], *judged.record["validation"]]),
         run=None if judged.folder is None else RunFolder(judged.folder),
         command_followers=_command_followers(judged),

@@ -20,12 +20,12 @@ from spelgen.logs.dynamics_samples import FREQUENCY, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.rates import shows_accelerations
 from spelgen.logs.trajectory import Trajectory
+from spelgen.settings.tuning.evaluation import TraceTuning
 
 if TYPE_CHECKING:
     from spelgen.dynamics.protocol import RigidDynamics
 
-SECONDS = 10.0  # of a trace
-SHOWN = 240  # samples of it
+TUNING = TraceTuning()
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def _motion(piece: Trajectory, logs: JudgedLogs) -> Motion | None:
     if motion is None:
         return None
     t = motion.t - motion.t[0]
-    count = min(len(t), int(torch.searchsorted(t, SECONDS)) + 1)
+    count = min(len(t), int(torch.searchsorted(t, TUNING.torque_seconds)) + 1)
     start = (len(t) - count) // 2  # logs begin and end at rest
     span = slice(start, start + count)
     return Motion(t[span] - t[start], *(x[span] for x in list(vars(motion).values())[1:]))
@@ -181,7 +181,7 @@ def _trace(which: str, name: str, dynamics: Mapping[str, RigidDynamics], motion:
             ),
         }
     energy = _energy(t, qd, measured, predicted[MODEL], parts)
-    stride = -(-len(t) // SHOWN)
+    stride = -(-len(t) // TUNING.samples)
     return TorqueTrace(
         which,
         name,

@@ -25,13 +25,12 @@ from spelgen.fitting.rollout import AT_REST, LossScales, loss_scales, position_d
 from spelgen.logs.coverage import coverage
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows
+from spelgen.settings.tuning.evaluation import TraceTuning
 
 if TYPE_CHECKING:
     from spelgen.dynamics.protocol import RigidDynamics
 
-TIMES = 24  # of an error's growth
-SHOWN = 240  # samples of a predicted trajectory
-SHOWN_OF_LOG = 600  # of a whole log
+TUNING = TraceTuning()
 
 
 @dataclass(frozen=True)
@@ -165,7 +164,7 @@ def replay_traces(missed: Sequence[Missed]) -> Traces:
     for which, k in _typical_and_worst(torch.tensor(errors)).items():
         log, error = missed[k]
         assert log.u is not None  # a log without commands cannot be replayed
-        stride = -(-len(log) // SHOWN_OF_LOG)
+        stride = -(-len(log) // TUNING.log_samples)
         predicted = np.concatenate([log.q[:1], log.q[1:] + error])
         examples.append(
             ReplayedExample(
@@ -192,7 +191,7 @@ def _growth(predictions: Predictions, joint_types: Sequence[str], tip: TipPositi
     windows = predictions.windows
     steps = windows.dt.shape[1]
     # errors grow by orders of magnitude: as many points for the first tenth as for the last
-    times = np.unique(np.geomspace(1, steps, TIMES).round().astype(int)) - 1
+    times = np.unique(np.geomspace(1, steps, TUNING.times).round().astype(int)) - 1
     scales = loss_scales(windows, joint_types)
     relative, tips = {}, {}
     for name, states in predictions.states.items():
@@ -227,7 +226,7 @@ def _quantiles(values: Tensor) -> Quantiles:
 def _examples(predictions: Predictions, joint_types: Sequence[str]) -> tuple[PredictedExample, ...]:
     windows, states = predictions.windows, predictions.states[MODEL]
     errors = _relative_errors(states, windows, loss_scales(windows, joint_types), joint_types)[:, -1]
-    stride = -(-windows.dt.shape[1] // SHOWN)
+    stride = -(-windows.dt.shape[1] // TUNING.samples)
     examples = []
     for which, k in _typical_and_worst(errors).items():
         piece, first = predictions.starts[k]
@@ -258,7 +257,7 @@ def _mass_trace(
     if not trajectories:
         return None
     along = trajectories[0]
-    stride = -(-len(along.t) // SHOWN)
+    stride = -(-len(along.t) // TUNING.samples)
     q = torch.tensor(along.q, dtype=torch.float64)[::stride]
     row, column = torch.tril_indices(q.shape[-1], q.shape[-1])
     curves = {}

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
 TUNING = EvaluationTuning()
 SEEN = "tested-on-training-data"
-HEADLINE = 20  # words
-SIMULATED = 1e-3  # relative error below which a URDF is the model that made the logs
 STANDSTILL = "near standstill"
 EXCITE = "(as spelgen excite proposes)"
 Limits = Sequence[tuple[float, float] | None]
@@ -90,7 +88,7 @@ def verdict(results: Figures, identified: Mapping[str, Any] | None = None, limit
     for detail in details:
         longer = f"{sentence}; {detail}"
         # a headline is read at a glance
-        if len(longer.split()) <= HEADLINE:
+        if len(longer.split()) <= TUNING.headline:
             sentence = longer
         else:
             because.append(f"{detail[0].upper()}{detail[1:]}.")
@@ -221,7 +219,7 @@ def _better_baselines(results: Figures) -> str:
     if not better:
         return ""
     drives = [results.horizons[-1].errors.get(URDF_WITH_DRIVES)] if results.horizons else []
-    if any(_relative(errors) < SIMULATED for errors in drives):
+    if any(_relative(errors) < TUNING.simulated for errors in drives):
         return f"{URDF_WITH_DRIVES} reproduces these logs: it is the model that simulated them."
     return f"But {listed([f'{name} is better {listed(where)}' for name, where in better.items()])}."
 

@@ -18,12 +18,11 @@ from spelgen.errors import ArmError, SpelgenError, collect
 from spelgen.settings.tuning.simulation import ExcitationTuning
 from spelgen.urdf.robot import Joint
 
-DENSITY = 40  # points of a grid for each harmonic
-BETWEEN = cos(pi / DENSITY)  # of a series' largest value, what a grid shows at least
+BETWEEN = cos(pi / ExcitationTuning().grid)  # of a series' largest value, what a grid shows at least
 TUNING = ExcitationTuning()
 # where the URDF names no limit, and for endless joints: [rad/s, m/s], and [rad, m] to both sides of 0
-SPEEDS = {"revolute": TUNING.usual_speed, "prismatic": TUNING.usual_speed / 4}
-REACHES = {"revolute": pi, "prismatic": 0.5}
+SPEEDS = {"revolute": TUNING.usual_speed, "prismatic": TUNING.sliding_speed}
+REACHES = {"revolute": pi, "prismatic": TUNING.sliding_reach}
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +130,7 @@ class ExcitationTrajectory:
         exceeds them by less than 1 / cos(pi / density) (Ehlich and Zeller, Math. Z. 86:41, 1964).
         """
         coefficients, offsets = self._coefficients(parameters)
-        points = torch.linspace(0.0, self.duration, DENSITY * self.harmonics + 1, dtype=torch.float64)
+        points = torch.linspace(0.0, self.duration, TUNING.grid * self.harmonics + 1, dtype=torch.float64)
         positions, velocities, _ = self._signals(coefficients, points)
         highest, lowest = positions.amax(dim=0), positions.amin(dim=0)
         middle, half = (highest + lowest) / 2, (highest - lowest) / 2 / BETWEEN

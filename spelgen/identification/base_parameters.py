@@ -14,12 +14,12 @@ import numpy as np
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.regressor import regressor
 from spelgen.identification.friction import BRISTLES, FrictionModel
+from spelgen.settings.tuning.identification import IdentificationTuning
 from spelgen.structure.base_parameters import base_parameters as body_base_parameters
 from spelgen.structure.base_parameters import parameter_name
 from spelgen.structure.structure import base_parameter_count
 
-DEPENDENT = 1e-9  # of its own length: what is left of a column that others span
-ROUNDING = 1e-8  # of the largest coefficient
+TUNING = IdentificationTuning()
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ def base_parameters(
         for k, weight in parameter.weights:
             combination[row, k] = float(weight)
     drives = np.linalg.lstsq(columns[:, chosen], columns[:, inertial:], rcond=None)[0]
-    drives[np.abs(drives) < ROUNDING * np.abs(drives).max(initial=1.0)] = 0.0
+    drives[np.abs(drives) < TUNING.rounding * np.abs(drives).max(initial=1.0)] = 0.0
     combination[:, inertial:] = drives
     base_names = [parameter.name for parameter in exact] + [names[k] for k in chosen[len(exact) :]]
     return BaseParameters(tuple(base_names), np.array(chosen), combination, tuple(names), len(exact))
@@ -86,7 +86,7 @@ def _chosen_columns(columns: np.ndarray, exact: list[int], inertial: int) -> lis
         for _ in range(2):  # once more takes away what rounding left
             remainder = remainder - basis @ (basis.T @ remainder)
         length = float(np.linalg.norm(remainder))
-        if length > DEPENDENT * max(float(np.linalg.norm(columns[:, k])), 1.0):
+        if length > TUNING.dependent * max(float(np.linalg.norm(columns[:, k])), 1.0):
             chosen.append(k)
             basis = np.column_stack([basis, remainder / length])
     return chosen

@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 TUNING = DriveHintTuning()
 FRICTION = FrictionModel(coulomb_smoothing_velocity=IdentificationTuning().moving)
 NEGLIGIBLE = IdentificationTuning().negligible
-RATIOS = (1.0, -1.0, 0.4, -0.4, 2.5, -2.5)  # that begin the search: each covers half of it to twice
 
 LoggedAt = Literal["joints", "motors"]
 
@@ -229,7 +228,7 @@ def _candidates(problem: DriveProblem) -> Iterator[Coupling]:
     for joint in free:
         for moved_by in free:
             if joint != moved_by:
-                for ratio in RATIOS:
+                for ratio in TUNING.ratios:
                     yield Coupling(joint, moved_by, ratio, "joints")
                     yield Coupling(joint, moved_by, ratio, "motors")
 

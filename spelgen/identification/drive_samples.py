@@ -10,13 +10,11 @@ import numpy as np
 from spelgen.logs.dynamics_samples import TUNING, dynamics_samples
 from spelgen.logs.recording import earlier
 from spelgen.logs.trajectory import Trajectory
+from spelgen.settings.tuning.identification import DriveHintTuning
 
-DELAYS = (
-    np.arange(-60, 61, 10) * 1e-3
-)  # [s] loggers and field buses are late by less; a filter of 8 Hz bends at 20 ms
+HINTS = DriveHintTuning()
+DELAYS = np.array(HINTS.delays)
 NO_DELAY = int(np.abs(DELAYS).argmin())
-MOST, FEWEST = 1500, 400  # samples: six joints have some 70 parameters
-MANY = 8  # trajectories: of more, whole ones are left out
 
 
 class DriveSamples(NamedTuple):
@@ -33,7 +31,7 @@ class DriveSamples(NamedTuple):
 
 
 class DriveLog:
-    """Collect samples of one trajectory after another, thinned evenly to at most twice `MOST`.
+    """Collect samples of one trajectory after another, thinned evenly to at most twice `DriveHintTuning.samples`.
 
     Of many trajectories only every second, fourth, ... is looked at: to filter all of a long log takes minutes.
     """
@@ -61,8 +59,8 @@ class DriveLog:
             return
         motion, tau = samples[0], np.stack([x.tau for x in samples])
         self._samples.append(DriveSamples(motion.q, motion.qd, motion.qdd, tau).thinned(self._every))
-        while sum(len(x.q) for x in self._samples) > 2 * MOST:
-            if len(self._samples) > MANY:
+        while sum(len(x.q) for x in self._samples) > 2 * HINTS.samples:
+            if len(self._samples) > HINTS.trajectories:
                 self._samples = self._samples[1::2]
                 self._step *= 2
             else:
@@ -72,8 +70,8 @@ class DriveLog:
     def samples(self) -> DriveSamples | None:
         """Return all together; None where there are too few to tell anything."""
         count = sum(len(x.q) for x in self._samples)
-        if count < FEWEST:
+        if count < HINTS.fewest_samples:
             return None
         q, qd, qdd = (np.concatenate([x[k] for x in self._samples]) for k in range(3))
         tau = np.concatenate([x.tau for x in self._samples], axis=1)
-        return DriveSamples(q, qd, qdd, tau).thinned(-(-count // MOST))
+        return DriveSamples(q, qd, qdd, tau).thinned(-(-count // HINTS.samples))

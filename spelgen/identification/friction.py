@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from spelgen.design import BRISTLE_REACH
+from spelgen.settings.tuning.identification import IdentificationTuning
 
 BRISTLES = tuple(f"bristle {k + 1}, joint " for k in range(len(BRISTLE_REACH["revolute"])))
-STRIBECK_VELOCITY = 0.1  # [rad/s, m/s] at which the extra dry friction of slow motion has fallen to 1/e
+STRIBECK_VELOCITY = IdentificationTuning().stribeck_velocity
 
 
 @dataclass(frozen=True)

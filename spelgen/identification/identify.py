@@ -28,7 +28,6 @@ from spelgen.logs.trajectory import Trajectory, require_joints, require_torques
 from spelgen.settings.tuning.identification import IdentificationTuning
 
 TUNING = IdentificationTuning()
-BLOCK = 2000  # samples in memory at a time
 
 
 def identify(
@@ -118,8 +117,8 @@ class _BodyRows:
 
     def _computed(self) -> Iterator[tuple[DynamicsSamples, np.ndarray]]:
         for x in self.samples:
-            for start in range(0, len(x.q), BLOCK):
-                rows = slice(start, start + BLOCK)
+            for start in range(0, len(x.q), TUNING.block):
+                rows = slice(start, start + TUNING.block)
                 z = None if x.z is None else x.z[rows]
                 block = DynamicsSamples(x.name, x.q[rows], x.qd[rows], x.qdd[rows], x.tau[rows], z)
                 yield block, regressor(self.arm, block.q, block.qd, block.qdd)

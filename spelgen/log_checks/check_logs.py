@@ -18,7 +18,7 @@ from spelgen.log_checks.gravity import (
     fit_gravity,
     state_samples,
 )
-from spelgen.log_checks.report import EXAMPLES, JointReport, LogReport, range_fraction
+from spelgen.log_checks.report import TUNING, JointReport, LogReport, range_fraction
 from spelgen.log_checks.robot_checks import CHECKS, JointEvidence
 from spelgen.log_checks.statistics import Statistics, joint_statistics, statistics
 from spelgen.logs.checks import Finding, clock_diagnostics, findings, run_checks, summarised
@@ -67,7 +67,7 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping |
         declared_codes.append(set(trajectory.accepted))
         odd += findings(trajectory, joints, kinds, measured[-1].agreement)
         notes += clock_diagnostics(trajectory)
-        if len(examples) < EXAMPLES:
+        if len(examples) < TUNING.examples:
             examples.append(trajectory)
     if not measured:
         raise LogError("no trajectory", expected="at least one")

@@ -10,7 +10,7 @@ import numpy as np
 from spelgen.errors import Diagnostic, LogError
 from spelgen.log_checks.following import DELAYS, NO_DELAY, TUNING, Following, measure_following
 from spelgen.log_checks.gravity import GravityFit
-from spelgen.log_checks.report import EXAMPLES, range_fraction
+from spelgen.log_checks.report import range_fraction
 from spelgen.log_checks.robot_checks import POSITION_CHECKS, JointEvidence
 from spelgen.log_checks.servo_report import ServoJointReport, ServoLogReport
 from spelgen.log_checks.statistics import Clock, JointStatistics, joint_statistics, statistics
@@ -29,7 +29,8 @@ from spelgen.settings.tuning.log_checks import LogCheckTuning
 if TYPE_CHECKING:
     from spelgen.loaded_arm import LoadedArm
 
-FOLLOWS = LogCheckTuning().agreement
+CHECKS = LogCheckTuning()
+FOLLOWS = CHECKS.agreement
 
 
 def check_servo_logs(logs: Iterable[Trajectory], arm: LoadedArm) -> ServoLogReport:
@@ -74,7 +75,7 @@ def check_servo_logs(logs: Iterable[Trajectory], arm: LoadedArm) -> ServoLogRepo
         joints=(),
         findings=tuple(notes),
         errors=tuple(errors),
-        examples=tuple(logs[:EXAMPLES]),
+        examples=tuple(logs[: CHECKS.examples]),
         servos=tuple(reports),
     )
 

@@ -17,9 +17,7 @@ from spelgen.settings.tuning.identification import IdentificationTuning
 from spelgen.settings.tuning.log_checks import LogCheckTuning
 
 TUNING = LogCheckTuning()
-MOST = 15 * TUNING.gravity_samples  # of all trajectories
 MOVING = IdentificationTuning().moving
-DEPENDENT = 1e-8  # of its own size: what is left of a column that others span
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +92,7 @@ def find_opposed_inertia(arm: Arm, samples: Sequence[StateSamples], speeds: np.n
     moving = make_problem(arm, DriveSamples(q, qd, qdd, tau[None]), speeds).rows
     steady = make_problem(arm, DriveSamples(q, qd, np.zeros_like(qdd), tau[None]), speeds).rows
     flat = (moving / unit[:, None]).reshape(tau.size, -1)
-    parameters = np.linalg.lstsq(flat, (tau / unit).ravel(), rcond=DEPENDENT)[0]
+    parameters = np.linalg.lstsq(flat, (tau / unit).ravel(), rcond=TUNING.dependent)[0]
     inertia = (moving - steady) @ parameters
     if not (inertia.std(axis=0) > TUNING.loaded * unit).any():
         return None
@@ -109,7 +107,7 @@ def _thinned(samples: Sequence[StateSamples]) -> list[np.ndarray]:
     signals = []
     for name in ("q", "qd", "qdd", "tau"):
         values = np.concatenate([getattr(x, name) for x in samples])
-        signals.append(values[:: -(-len(values) // MOST) or 1])
+        signals.append(values[:: -(-len(values) // TUNING.all_gravity_samples) or 1])
     return signals
 
 
@@ -118,7 +116,7 @@ def _fit(tau: np.ndarray, motion: np.ndarray, columns: np.ndarray, load: np.ndar
     remainder = _without(motion, tau)
     gravity = _without(motion, columns)
     largest = max(1.0, float(np.abs(columns).max(initial=0.0)))
-    gravity = gravity[:, np.linalg.norm(gravity, axis=0) > DEPENDENT * largest * np.sqrt(len(tau))]
+    gravity = gravity[:, np.linalg.norm(gravity, axis=0) > TUNING.dependent * largest * np.sqrt(len(tau))]
     # a vertical axis, or a motor that was off
     if not gravity.shape[1] or _is_rounding(remainder, tau):
         return GravityFit()
@@ -136,11 +134,11 @@ def _fit(tau: np.ndarray, motion: np.ndarray, columns: np.ndarray, load: np.ndar
 
 def _is_rounding(remainder: np.ndarray, values: np.ndarray) -> bool:
     """Whether what is left of values is no more than rounding: of a constant torque, say."""
-    return float(np.linalg.norm(remainder)) <= DEPENDENT * float(np.linalg.norm(values))
+    return float(np.linalg.norm(remainder)) <= TUNING.dependent * float(np.linalg.norm(values))
 
 
 def _without(columns: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return what of the values (S,) or (S, K) no combination of the columns (S, C) explains."""
-    basis = orth(columns, rcond=DEPENDENT)
+    basis = orth(columns, rcond=TUNING.dependent)
     remainder: np.ndarray = values - basis @ (basis.T @ values)
     return remainder

@@ -14,8 +14,6 @@ from spelgen.logs.trajectory import QUANTITIES, Trajectory
 from spelgen.settings.tuning.log_checks import LogCheckTuning
 
 TUNING = LogCheckTuning()
-EXAMPLES = 2  # trajectories that a page draws
-SHOWN = 20  # trajectories that a terminal and a notebook show
 _UNITS = {"revolute": "rad, rad/s, Nm", "prismatic": "m, m/s, N"}
 
 
@@ -97,7 +95,7 @@ class LogReport:
 
     def text(self) -> str:
         """Return the report for a terminal, in 80 columns; the errors are not in it."""
-        paragraphs = [self.heading(), *map(Listing.text, self.listings(SHOWN))]
+        paragraphs = [self.heading(), *map(Listing.text, self.listings(TUNING.shown))]
         if self.findings:
             paragraphs.append("\n".join(["Findings", *map(_wrapped, self.findings)]))
         else:
@@ -115,7 +113,7 @@ class LogReport:
         for error in self.errors:
             lines.append(("error", "", str(error)))
         table = Listing(self.heading(), ("", "where", "what"), tuple(lines), left=(0, 1, 2))
-        return "".join(map(Listing.html, (table, *self.listings(SHOWN))))
+        return "".join(map(Listing.html, (table, *self.listings(TUNING.shown))))
 
 
 def clock_table(report: LogReport, limit: int | None) -> Listing:

@@ -23,7 +23,6 @@ from spelgen.settings.tuning.log_checks import LogCheckTuning
 
 TUNING = LogCheckTuning()
 DEGREES = 180.0 / np.pi
-SLOWEST_STEP = 0.5  # [s] no arm is sampled more slowly than at 2 Hz
 TURNS = 4 * np.pi  # [rad] no revolute joint turns further, so what does is in degrees
 
 Subject = TypeVar("Subject")
@@ -172,7 +171,7 @@ def find_frozen(signals: JointSignals) -> str | None:
 def find_time_unit(signals: JointSignals) -> str | None:
     """Find times that are not in seconds: no arm is sampled more slowly than at 2 Hz, and q changes as fast as qd."""
     steps = np.diff(signals.trajectory.t)
-    if steps.size and np.median(steps) > SLOWEST_STEP:
+    if steps.size and np.median(steps) > TUNING.slowest_step:
         # told once, and not of each joint
         return None if signals.index else f"a sample every {np.median(steps):.3g} s"
     if signals.correlation is None or signals.correlation <= TUNING.agreement:

@@ -10,10 +10,10 @@ import pyarrow as pa
 from spelgen.errors import LogError
 from spelgen.logs.columns import column, floats, line_of
 from spelgen.logs.tables import Layout
-from spelgen.logs.trajectory import SHORTEST
 from spelgen.settings.log_mapping import TIMES
+from spelgen.settings.tuning.logs import LogTuning
 
-LONGEST = 1e8  # in whatever unit of time: no recording begins so late on a clock of its own
+TUNING = LogTuning()
 
 
 def clock_start(times: pa.ChunkedArray | pa.Array) -> int:
@@ -29,7 +29,7 @@ def clock_start(times: pa.ChunkedArray | pa.Array) -> int:
         return 0
     start = first[0].as_py()
     # seconds since 1970 leave floating-point numbers no digits for what follows
-    return int(start) if start is not None and LONGEST < abs(start) < np.inf else 0
+    return int(start) if start is not None and TUNING.longest_clock < abs(start) < np.inf else 0
 
 
 def times_from(
@@ -110,7 +110,7 @@ def _roughness(positions: np.ndarray) -> float:
 
 def require_increasing_times(t: np.ndarray, rows: np.ndarray, file: Path, column: str) -> None:
     """Raise LogError unless times (T,), of these rows of the file, increase."""
-    backward = np.flatnonzero(np.diff(t) < SHORTEST)
+    backward = np.flatnonzero(np.diff(t) < TUNING.shortest_step)
     if backward.size:
         k = int(backward[0])
         raise LogError(

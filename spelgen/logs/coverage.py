@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from spelgen.logs.trajectory import Trajectory
+from spelgen.settings.tuning.logs import LogTuning
 
-BINS = 24  # bars of a chart
+TUNING = LogTuning()
 
 
 def coverage(logs: Sequence[Trajectory]) -> dict[str, object]:
@@ -18,7 +19,7 @@ def coverage(logs: Sequence[Trajectory]) -> dict[str, object]:
         values = np.concatenate([getattr(log, name) for log in logs])
         joints = []
         for column in values.T:
-            counts = np.histogram(column, BINS)[0].tolist()
+            counts = np.histogram(column, TUNING.bins)[0].tolist()
             joints.append({"low": _rounded(column.min()), "high": _rounded(column.max()), "counts": counts})
         result[name] = joints
     return result

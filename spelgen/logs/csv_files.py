@@ -14,9 +14,10 @@ from spelgen.errors import LogError
 from spelgen.logs.bags import FIELDS
 from spelgen.logs.tables import LogFormat, LogTable, reading, table_layout
 from spelgen.settings.log_mapping import PLAIN, LogMapping
+from spelgen.settings.tuning.logs import LogTuning
 
 STAMP = ("sec", "nanosec")  # of a message's header
-HEAD = 2**16  # bytes from which encoding, delimiter and decimal point are detected
+TUNING = LogTuning()
 
 
 def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
@@ -87,11 +88,11 @@ def _joint_state_header(cells: Sequence[str], file: Path) -> list[str]:
 def _decoded_head(file: Path) -> tuple[str, str]:
     """Return the encoding and the first characters of a file."""
     with file.open("rb") as source:
-        head = source.read(HEAD)
+        head = source.read(TUNING.csv_head)
     if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return "utf-16", head.decode("utf-16", "ignore")
     # a head cut off in the middle of a character is still UTF-8
-    errors = "strict" if len(head) < HEAD else "ignore"
+    errors = "strict" if len(head) < TUNING.csv_head else "ignore"
     try:
         return "utf-8", head.decode("utf-8", errors)
     except UnicodeDecodeError:

@@ -16,7 +16,8 @@ import pyarrow as pa
 
 from spelgen.errors import LogError, shortened
 from spelgen.logs.formats import FORMATS, format_of
-from spelgen.logs.tables import LISTED, names_joint
+from spelgen.logs.tables import names_joint
+from spelgen.settings.tuning.logs import LogTuning
 
 WORDS = {
     "t": {"t", "time", "times", "timestamp", "stamp", "clock", "ms", "us", "ns", "sec", "secs", "seconds", "millis"},
@@ -67,7 +68,7 @@ def suggest_mapping(file: Path, joints: Sequence[str]) -> Suggestion:
     columns = _columns(log_format.columns(file))
     times = [column for column in columns if column.quantity == "t"]
     if not times:
-        names = shortened([column.name for column in columns], LISTED)
+        names = shortened([column.name for column in columns], LogTuning().listed)
         raise LogError(f"only the columns {names}", file=file, expected="one of times, called t or time")
     # `time` before `timestamp_of_receipt`: what has the fewest words is the plain clock
     clock = min(times, key=lambda column: len(column.words))

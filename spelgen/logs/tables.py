@@ -18,8 +18,8 @@ import pyarrow as pa
 from spelgen.errors import LogError, shortened
 from spelgen.logs.trajectory import QUANTITIES
 from spelgen.settings.log_mapping import TIMES, LogMapping
+from spelgen.settings.tuning.logs import LogTuning
 
-LISTED = 5  # columns that a message names: enough to see how they are named
 UNITS_KEY = b"units"  # in a Parquet file's metadata: the file declares its units
 UNIT_CODES = ("degrees", "time-unit", "torque-unit", "torque-beyond-drive")  # that a declared unit answers
 UNITS = b"t s, q rad or m, qd rad/s or m/s, tau Nm or N"  # what spelgen itself declares
@@ -173,8 +173,8 @@ def missing_columns(
     for quantity in wanted_quantities(mapping):
         expected.append(getattr(mapping.columns, quantity).replace("{joint}", "<joint>"))
     return LogError(
-        f"only the columns {shortened(list(columns), LISTED)}", file=file,
-        element=f"missing column{'s' * (len(missing) > 1)} {shortened(missing, LISTED)}",
+        f"only the columns {shortened(list(columns), LogTuning().listed)}", file=file,
+        element=f"missing column{'s' * (len(missing) > 1)} {shortened(missing, LogTuning().listed)}",
         expected=", ".join(expected), do=_advice(missing, columns, mapping, joints),
     )  # fmt: skip
 

@@ -16,10 +16,6 @@ from spelgen.settings.tuning.logs import LogTuning
 TUNING = LogTuning()
 QUANTITIES = ("q", "qd", "tau")
 GAP = TUNING.gap
-SHORTEST, LATEST = (
-    1e-15,
-    1e24,
-)  # [s] step and time that a log can have: fourth powers of them are still numbers
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -54,10 +50,10 @@ class Trajectory:
             # frozen, and still from lists and tensors
             object.__setattr__(self, column, self._as_array(column))
         self._require_shapes()
-        self._require_possible("t", np.abs(self.t) < LATEST)
+        self._require_possible("t", np.abs(self.t) < TUNING.latest)
         for column in self.quantities:
             self._require_possible(column, np.abs(getattr(self, column)) < TUNING.largest_value)
-        backward = np.flatnonzero(np.diff(self.t) < SHORTEST)
+        backward = np.flatnonzero(np.diff(self.t) < TUNING.shortest_step)
         if backward.size:
             k = backward[0]
             raise self._error("t", f"{self.t[k + 1]:g} s after {self.t[k]:g} s", "increasing times")
@@ -127,7 +123,7 @@ class Trajectory:
         value = getattr(self, column)[row]
         expected = "finite numbers"
         if np.isfinite(value).all():
-            expected = f"numbers below {LATEST if column == 't' else TUNING.largest_value:g}"
+            expected = f"numbers below {TUNING.latest if column == 't' else TUNING.largest_value:g}"
         raise self._error(column, f"{value.tolist()} at sample {row}", expected)
 
     def _error(self, column: str, got: str, expected: str) -> LogError:

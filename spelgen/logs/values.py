@@ -12,7 +12,6 @@ from spelgen.errors import LogError
 from spelgen.logs.clock import times_from
 from spelgen.logs.columns import column, floats, line_of
 from spelgen.logs.tables import Layout
-from spelgen.logs.trajectory import LATEST
 from spelgen.settings.tuning.logs import LogTuning
 
 TUNING = LogTuning()
@@ -38,7 +37,7 @@ def values_in_si(
 def _require_possible(data: np.ndarray, columns: Sequence[str], file: Path, first: int) -> None:
     """Raise LogError where data (T, C) in SI units, from row `first` of the file on, is no number or far too large."""
     bad = ~np.isfinite(data)
-    largest = np.array([LATEST] + [TUNING.largest_value] * (len(columns) - 1))
+    largest = np.array([TUNING.latest] + [TUNING.largest_value] * (len(columns) - 1))
     bad |= ~(np.abs(data) < largest)
     if not bad.any():
         return

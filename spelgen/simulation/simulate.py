@@ -12,6 +12,7 @@ from spelgen.errors import collect
 from spelgen.settings.messages import explain
 from spelgen.settings.settings import Settings
 from spelgen.settings.simulation import ControlledSimulation, ServoSimulation, SimulationSettings
+from spelgen.settings.tuning.simulation import SimulationTuning
 from spelgen.settings.yaml_document import Document
 from spelgen.simulation.random_inputs import random_inputs
 from spelgen.simulation.servo_motions import servo_motions
@@ -21,7 +22,7 @@ from spelgen.simulation.tracking import track
 if TYPE_CHECKING:
     from spelgen.loaded_arm import LoadedArm
 
-CONTROL_RATE = 125.0  # [Hz] about
+CONTROL_RATE = SimulationTuning().control_rate
 PROTOCOLS = {"random-inputs": random_inputs, "tracking": track}
 
 

@@ -60,3 +60,30 @@ class EvaluationTuning:
     """[] that motion without input starts from."""
     drift_calls: int = 30_000
     """[] of the dynamics, after which they are too stiff to be integrated to thirteen digits."""
+
+    headline: int = 20
+    """[words] of a verdict's sentence: it is read at a glance."""
+    simulated: float = 1e-3
+    """[] relative error below which a URDF is the model that made the logs."""
+    velocity_step: float = 1e-5
+    """[] of a joint's largest velocity: differences that friction is differentiated by."""
+    displacement_step: float = 1e-7
+    """[rad, m] likewise, of bristles."""
+    model_window: int = 5
+    """[samples] of the windows that say in which steps a model is integrated, where its fit had none."""
+    replay_window: float = 1.0
+    """[s] of replays that start anew again and again."""
+
+
+@dataclass(frozen=True)
+class TraceTuning:
+    """The numbers of curves behind the figures: what a page can show."""
+
+    torque_seconds: float = 10.0
+    """[s] of torques along a log."""
+    samples: int = 240
+    """[] of a curve along a log or a prediction."""
+    log_samples: int = 600
+    """[] of a whole log that is replayed."""
+    times: int = 24
+    """[] at which the growth of errors is shown."""

@@ -21,6 +21,12 @@ class IdentificationTuning:
     acceptable: float = 300.0  # condition number up to which parameters can be told apart
     firm: float = 0.05  # of a value, the deviation up to which it is firm
     fair: float = 0.2  # likewise fair; above, up to the value itself, weak
+    stribeck_velocity: float = (
+        0.1  # [rad/s, m/s] at which the extra dry friction of slow motion has fallen to 1/e
+    )
+    block: int = 2000  # samples in memory at a time
+    dependent: float = 1e-9  # of its own length: what is left of a column that others span
+    rounding: float = 1e-8  # of the largest coefficient of a base parameter: smaller ones are none
 
 
 @dataclass(frozen=True)
@@ -37,3 +43,12 @@ class DriveHintTuning:
     )
     chance: float = 1 / 400  # that any candidate is taken by luck, as of what enters a fit
     simple_ratio: float = 0.02  # of the squared error, what a ratio of small numbers may cost
+    # that begin the search for couplings: each covers half of it to twice
+    ratios: tuple[float, ...] = (1.0, -1.0, 0.4, -0.4, 2.5, -2.5)
+    # [s] loggers and field buses are late by less; a filter of 8 Hz bends at 20 ms
+    delays: tuple[float, ...] = (
+        -0.06, -0.05, -0.04, -0.03, -0.02, -0.01, 0.0, 0.01, 0.02, 0.03, 0.04, 0.05, 0.06
+    )  # fmt: skip
+    samples: int = 1500  # that are kept: six joints have some 70 parameters
+    fewest_samples: int = 400  # that hints and errors need
+    trajectories: int = 8  # of more, whole ones are left out

@@ -26,3 +26,8 @@ class LogCheckTuning:
     gravity_samples: int = 400  # of one trajectory; friction and gravity change slowly
     levels: float = 10.0  # of a quantised signal: fewer say little of its size
     step_tolerance: float = 0.05  # of a step, and of the levels of a signal, that may be off a quantised grid
+    all_gravity_samples: int = 6000  # of all trajectories together
+    dependent: float = 1e-8  # of its own size: what is left of a column that others span
+    examples: int = 2  # trajectories that a page draws
+    shown: int = 20  # trajectories that a terminal and a notebook show
+    slowest_step: float = 0.5  # [s] no arm is sampled more slowly than at 2 Hz

@@ -25,3 +25,9 @@ class LogTuning:
     filter_order: int = 4  # of the Butterworth low-pass, run both ways: as in the logs' published protocols
     samples_per_period: int = 3  # of the cutoff's period that windows keep; two are Nyquist's bound
     derivative_span: float = 0.18  # [s] of the cubic through encoder positions (SO-101: noise against lag)
+    longest_clock: float = 1e8  # in whatever unit of time: no recording begins so late on a clock of its own
+    bins: int = 24  # bars of a chart of what logs cover
+    csv_head: int = 2**16  # [bytes] from which encoding, delimiter and decimal point are detected
+    listed: int = 5  # columns that a message names: enough to see how they are named
+    shortest_step: float = 1e-15  # [s] that a log can have: fourth powers of it are still numbers
+    latest: float = 1e24  # [s] likewise, of a time

@@ -16,7 +16,10 @@ class ExcitationTuning:
     samples_per_harmonic: int = 12  # of a motion that is tried
     penalty: float = 50.0  # on the squared part of an effort limit that a sample overruns
     effort: float = 0.9  # of the effort limits: friction comes on top of what the URDF says
-    usual_speed: float = 1.0  # [rad/s] where the URDF names no limit; of sliding joints a quarter of it [m/s]
+    usual_speed: float = 1.0  # [rad/s] where the URDF names no limit
+    grid: int = 40  # points for each harmonic, between which a motion keeps its limits
+    sliding_speed: float = 0.25  # [m/s] likewise, of sliding joints
+    sliding_reach: float = 0.5  # [m] to both sides of 0, of sliding joints without limits
 
 
 @dataclass(frozen=True)
@@ -29,3 +32,4 @@ class SimulationTuning:
     seen_loosening: float = 100.0  # of tolerances where encoders see the motion: 1e-11 is enough
     used_range: float = 0.7  # of a joint's range and of its speed limit, where nothing is said
     integral_gain: float = 0.2  # of the PID: a tenth of what makes a joint without friction unstable
+    control_rate: float = 125.0  # [Hz] about, where nothing is said of the controllers
