@@ -7,7 +7,7 @@ import statistics
 from collections.abc import Callable, Mapping, Sequence
 
 from spelgen.comparison.results import RunResult
-from spelgen.evaluation.tables import Cell, Row, Table, table
+from spelgen.evaluation.tables import Cell, Row, Table, known, table
 from spelgen.listing import number
 from spelgen.settings.comparison import PublishedFigures
 
@@ -104,7 +104,7 @@ def _invariants(runs: Runs) -> Table:
     for label, (quantity, worst) in INVARIANTS.items():
         cells = []
         for of_seeds in runs.values():
-            values = [value for run in of_seeds if (value := quantity(run)) is not None]
+            values = known(map(quantity, of_seeds))
             all_finite = len(values) == len(of_seeds)
             cells.append(Cell(number(worst(values) if all_finite else None)))
         rows.append(Row(label, tuple(cells)))
@@ -120,9 +120,12 @@ def _ratio(baseline: float | None, median: float | None) -> Cell:
 
 def _median(runs: Sequence[RunResult], quantity: Quantity) -> float | None:
     """Return that over seeds; a run that is not finite counts as infinitely bad."""
-    values = [quantity(run) for run in runs]
-    # infinite and not left out: a variant that blows up in one seed of two is no better than the other seed
-    middle = statistics.median(math.inf if value is None else value for value in values)
+    values = []
+    for run in runs:
+        value = quantity(run)
+        # infinite and not left out: a variant that blows up in one seed of two is no better than the other seed
+        values.append(math.inf if value is None else value)
+    middle = statistics.median(values)
     return middle if math.isfinite(middle) else None
 
 
@@ -131,8 +134,10 @@ def _row(label: str, values: Mapping[str, float | None], form: str | None = None
     (row,) = table("", [label], [values]).rows
     if form is None:
         return row
-    cells = zip(values.values(), row.cells, strict=True)
-    return Row(label, tuple(Cell(form.format(value), cell.best) for value, cell in cells))
+    cells = []
+    for value, cell in zip(values.values(), row.cells, strict=True):
+        cells.append(Cell(form.format(value), cell.best))
+    return Row(label, tuple(cells))
 
 
 def _published(

@@ -58,8 +58,10 @@ class Table:
         """Return the same as text."""
         lines = []
         for row in self.rows:
-            stars = [cell.text + (" *" if cell.best else "  ") for cell in row.cells]
-            lines.append((row.label, *stars))
+            texts = [row.label]
+            for cell in row.cells:
+                texts.append(f"{cell.text} *" if cell.best else f"{cell.text}  ")
+            lines.append(tuple(texts))
         head = ("", *(f"{name}  " for name in self.columns))
         return Listing(self.title, head, tuple(lines), self.note)
 
@@ -85,7 +87,7 @@ def table(title: str, labels: Sequence[str], rows: Iterable[Numbers], note: str 
 def _cells(row: Numbers, columns: Iterable[str]) -> tuple[Cell, ...]:
     smallest = None
     if len(row) > 1:  # alone it would be the best of nothing
-        smallest = min((value for value in row.values() if value is not None), default=None)
+        smallest = min(known(row.values()), default=None)
     cells = []
     for name in columns:
         value = row.get(name)
@@ -97,17 +99,21 @@ def _cells(row: Numbers, columns: Iterable[str]) -> tuple[Cell, ...]:
 def result_tables(results: Figures) -> list[Table]:
     """Return the tables of an evaluation: commands replayed, errors by horizon and by joint, torques."""
     tables = [*_replay_tables(results), *_horizon_tables(results), *_torque_tables(results)]
-    return [_without_empty_columns(table) for table in tables]
+    return list(map(_without_empty_columns, tables))
 
 
 def _without_empty_columns(table: Table) -> Table:
     """Return the table without baselines whose cells are all dashes or empty."""
-    filled = []
-    for k, name in enumerate(table.columns):
-        if name == MODEL or any(row.cells[k].text not in ("", "-") for row in table.rows):
-            filled.append(k)
-    rows = [Row(row.label, tuple(row.cells[k] for k in filled)) for row in table.rows]
-    return replace(table, columns=tuple(table.columns[k] for k in filled), rows=tuple(rows))
+    filled: set[int] = {table.columns.index(MODEL)} if MODEL in table.columns else set()
+    for row in table.rows:
+        for k, cell in enumerate(row.cells):
+            if cell.text not in ("", "-"):
+                filled.add(k)
+    chosen = sorted(filled)
+    rows = []
+    for row in table.rows:
+        rows.append(Row(row.label, tuple(row.cells[k] for k in chosen)))
+    return replace(table, columns=tuple(table.columns[k] for k in chosen), rows=tuple(rows))
 
 
 def _values(errors: Mapping[str, Errors], value: Callable[[Errors], Value]) -> dict[str, Value]:
@@ -131,7 +137,7 @@ def _horizon_tables(results: Figures) -> list[Table]:
     title = "Error relative to the motion (0: none, 1: as if the arm had stood still)"
     tables = [table(title, heads, relative, note)]
     # no tip is known without a URDF
-    if any(value is not None for row in tips for value in row.values()):
+    if any(known(row.values()) for row in tips):
         tables.append(table("Error of the tip's position [mm]", heads, tips))
     last = results.horizons[-1].errors
     positions, velocities = _values(last, lambda x: x.q), _values(last, lambda x: x.qd)
@@ -161,7 +167,12 @@ def _torque_tables(results: Figures) -> list[Table]:
 
 
 def _largest(values: Sequence[float | None]) -> float | None:
-    return max((value for value in values if value is not None), default=None)
+    return max(known(values), default=None)
+
+
+def known(values: Iterable[float | None]) -> list[float]:
+    """Return the values that are known."""
+    return [value for value in values if value is not None]
 
 
 def _replay_tables(results: Figures) -> list[Table]:

@@ -207,21 +207,24 @@ def _better_baselines(results: Figures) -> str:
     """Say which other baselines are better, at what."""
     better: dict[str, list[str]] = {}
     for horizon in results.horizons:
-        errors = {name: _relative(x) for name, x in horizon.errors.items() if name != CONSTANT_VELOCITY}
+        errors = {name: _relative(x) for name, x in horizon.errors.items()}
+        errors.pop(CONSTANT_VELOCITY, None)
         best = min(errors, key=errors.__getitem__)
         if errors[best] < min(errors[MODEL], errors.get(observed(MODEL), math.inf)):
             better.setdefault(best, []).append(f"after {horizon.name}")
     torque = {name: x.mean_nmse for name, x in results.torque.items() if x.mean_nmse is not None}
-    if MODEL in torque:
-        best = min(torque, key=torque.__getitem__)
-        if best != MODEL:
-            better.setdefault(best, []).append("in torque")
+    best = min(torque, key=torque.__getitem__, default=MODEL)
+    if MODEL in torque and best != MODEL:
+        better.setdefault(best, []).append("in torque")
     if not better:
         return ""
     drives = [results.horizons[-1].errors.get(URDF_WITH_DRIVES)] if results.horizons else []
     if any(_relative(errors) < TUNING.simulated for errors in drives):
         return f"{URDF_WITH_DRIVES} reproduces these logs: it is the model that simulated them."
-    return f"But {listed([f'{name} is better {listed(where)}' for name, where in better.items()])}."
+    statements = []
+    for name, occasions in better.items():
+        statements.append(f"{name} is better {listed(occasions)}")
+    return f"But {listed(statements)}."
 
 
 def _worst_joint(results: Figures) -> _Failure:

@@ -42,6 +42,12 @@ class WindowOptimizer(Protocol):
     def load_state_dict(self, state: Content) -> None: ...
 
 
+def _moving(model: torch.nn.Module) -> tuple[list[torch.nn.Parameter], list[torch.nn.Parameter]]:
+    """Return the parameters that require a gradient, and those of them that are weights, which may decay."""
+    parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
+    return parameters, [parameter for parameter in parameters if parameter.dim() > 1]
+
+
 class MiniBatchAdamW:
     """AdamW on batches in random order; single numbers (constants, viscous friction) learn faster than weights
     and do not decay.
@@ -50,9 +56,8 @@ class MiniBatchAdamW:
     def __init__(
         self, model: torch.nn.Module, batch: int, weight_decay: float, generator: torch.Generator
     ) -> None:
-        self._parameters = [x for x in model.parameters() if x.requires_grad]
+        self._parameters, weights = _moving(model)
         self._batch, self._generator = batch, generator
-        weights = [parameter for parameter in self._parameters if parameter.dim() > 1]
         numbers = [parameter for parameter in self._parameters if parameter.dim() <= 1]
         self._optimizer = torch.optim.AdamW(
             [
@@ -104,8 +109,7 @@ class LBFGS:
     """
 
     def __init__(self, model: torch.nn.Module, weight_decay: float) -> None:
-        self._parameters = [x for x in model.parameters() if x.requires_grad]
-        self._weights = [parameter for parameter in self._parameters if parameter.dim() > 1]
+        self._parameters, self._weights = _moving(model)
         self._decay, self._finite = weight_decay, True
         self._waits, self._last = 0, (math.inf, math.inf)  # loss, and with the penalty
         self._optimizer = torch.optim.LBFGS(

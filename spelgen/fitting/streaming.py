@@ -71,21 +71,22 @@ def prepare_streamed(
     resolved = preprocessing.resolved(contents.rates)
     cutting = WindowCutting(choice.window, choice.stride, resolved, choice.reach)
     counts = [sum(map(cutting.count, pieces)) for pieces in contents.pieces]
-    usable = [index for index, count in enumerate(counts) if count]
-    training, validating = _split(usable, cutting, choice)
-    windows = _sample([contents.chunks[k] for k in training], cutting)
+    usable = np.flatnonzero(counts).tolist()
+    chosen = _split(usable, cutting, choice)
+    training, validating = ([contents.chunks[k] for k in numbers] for numbers in chosen)
+    windows = _sample(training, cutting)
     message = (
         f"larger than memory: read in {len(contents.chunks)} chunks; validation on {len(validating)} chunks, "
         f"{len(contents.chunks) - len(usable)} have no window"
     )
     return TrainingData(
         training=windows,
-        validation=_sample([contents.chunks[k] for k in validating], cutting),
-        size=sum(counts[k] for k in training),
+        validation=_sample(validating, cutting),
+        size=int(np.take(counts, chosen[0]).sum()),
         scales=loss_scales(windows, logs.joint_types),
         preprocessing=resolved,
-        training_names=tuple(contents.chunks[k].name for k in training),
-        validation_names=tuple(contents.chunks[k].name for k in validating),
+        training_names=tuple(chunk.name for chunk in training),
+        validation_names=tuple(chunk.name for chunk in validating),
         diagnostics=(
             *contents.notes,
             *resolved.diagnostics,
@@ -136,6 +137,6 @@ def _read_once(logs: LargeLogs) -> LogContents:
     notes, errors = summarised(problems, logs.joints, len(chunks))
     collect(errors)
     # the last samples of a recording may be a chunk of their own, too short to tell a rate
-    lengths = [sum(lengths) for lengths in pieces]
-    reliable = [rate for rate, length in zip(rates, lengths, strict=True) if length > max(lengths) / 10]
+    lengths = np.array(list(map(sum, pieces)))
+    reliable = np.array(rates)[lengths > lengths.max() / 10].tolist()
     return LogContents(chunks, reliable, [*clock_notes[:1], *notes], numbers.hexdigest(), pieces)

@@ -18,10 +18,14 @@ MEASURE = "relative RMS after each time (0: no error, 1: as if the arm had stood
 
 def fleet_listings(fleet: FleetResults) -> list[Listing]:
     """Return all tables of a fleet's report."""
-    tables = [ranking(robot, runs) for robot, runs in _by_robot(fleet).items()]
+    tables = []
+    for robot, runs in _by_robot(fleet).items():
+        tables.append(ranking(robot, runs))
     if fleet.failures:
-        rows = tuple((f"{name}: {reason}",) for name, reason in fleet.failures.items())
-        tables.append(Listing("Failed runs; the same command runs them again", ("",), rows))
+        rows = []
+        for name, reason in fleet.failures.items():
+            rows.append((f"{name}: {reason}",))
+        tables.append(Listing("Failed runs; the same command runs them again", ("",), tuple(rows)))
     return tables
 
 
@@ -29,8 +33,8 @@ def winners(fleet: FleetResults) -> dict[str, int]:
     """Return of how many arms each model is the best, the one that wins most first."""
     wins: dict[str, int] = {}
     for robot, runs in _by_robot(fleet).items():
-        names = [row[0] for row in ranking(robot, runs).rows if not row[0].startswith("(")]
-        wins[names[0]] = wins.get(names[0], 0) + 1
+        name = next(row[0] for row in ranking(robot, runs).rows if not row[0].startswith("("))
+        wins[name] = wins.get(name, 0) + 1
     return dict(sorted(wins.items(), key=lambda item: -item[1]))
 
 
@@ -78,14 +82,16 @@ class _Line:
 
 def _medians(runs: Sequence[RunResult], predictor: str, horizons: Sequence[str]) -> tuple[float, ...]:
     """Return the median error of each horizon, then of torques."""
-    columns = [[run["errors"][horizon].get(predictor) for run in runs] for horizon in horizons]
-    columns.append([run["torque"].get(predictor) for run in runs])
-    medians = []
-    for column in columns:
-        # an error that is not finite counts as infinitely bad
-        errors = [math.inf if error is None else error for error in column]
-        medians.append(statistics.median(errors))
-    return tuple(medians)
+    columns: dict[str, list[float]] = {}
+    for run in runs:
+        errors = dict.fromkeys(horizons)
+        for horizon in horizons:
+            errors[horizon] = run["errors"][horizon].get(predictor)
+        errors["torque"] = run["torque"].get(predictor)
+        for name, error in errors.items():
+            # an error that is not finite counts as infinitely bad
+            columns.setdefault(name, []).append(math.inf if error is None else error)
+    return tuple(map(statistics.median, columns.values()))
 
 
 def _predictors(run: RunResult) -> list[str]:

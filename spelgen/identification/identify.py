@@ -69,8 +69,10 @@ def identify_by(
     # samples of motors' torques: the regressor's rows are joints'
     at_joints = [replace(x, tau=x.tau @ drives.inputs.T) for x in samples]
     bodies = _BodyRows(arm.arm, at_joints)
-    found = [_least_squares(bodies, method, drives) for method in methods]
-    return [replace(identification, diagnostics=tuple(notes)) for identification in found]
+    results = []
+    for method in methods:
+        results.append(replace(_least_squares(bodies, method, drives), diagnostics=tuple(notes)))
+    return results
 
 
 def least_squares(
