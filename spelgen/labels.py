@@ -86,6 +86,13 @@ def listed(names: Sequence[str]) -> str:
     return f"{', '.join(preceding)} and {last}"
 
 
+def counted(count: int, noun: str) -> str:
+    """Return ``1 joint``, or ``2 joints``."""
+    if count == 1:
+        return f"1 {noun}"
+    return f"{count} {noun}s"
+
+
 def share(fraction: float, whole: str = "") -> str:
     """Return ``5 % of the motion``, and ``13.6 times the motion`` of what exceeds the whole."""
     if fraction > 1:

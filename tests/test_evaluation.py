@@ -172,7 +172,7 @@ def test_the_true_model_is_perfect_and_its_baseline_is_not(run):
 
 
 def test_without_rollouts_logs_too_sparse_for_torques_are_an_error(run):
-    with pytest.raises(LogError, match=r"torques need accelerations, .*24 Hz or more.*; leave --quick out"):
+    with pytest.raises(LogError, match=r"torques need accelerations, .*24 Hz or more.*; omit --quick"):
         evaluated(run, run.parent / "logs", steps=(), seconds=())
 
 

@@ -13,7 +13,7 @@ from spelgen.arm.arm import Arm, Coordinate
 from spelgen.certificate.facts import Fact, facts
 from spelgen.dynamics.servo_rank import servo_rank
 from spelgen.errors import Diagnostic
-from spelgen.labels import joint_ranges, joints_in_ranges, printable
+from spelgen.labels import counted, joint_ranges, joints_in_ranges, printable
 from spelgen.listing import Listing
 from spelgen.structure.structure import Entry, Structure
 
@@ -201,7 +201,9 @@ class Inspection:
         counts: dict[tuple[int, ...], int] = {}
         for output in structure.outputs:
             counts[output.joints] = counts.get(output.joints, 0) + 1
-        mass = f"{_many(len(structure.outputs), 'output')} and {_many(len(structure.constants), 'constant')}"
+        mass = (
+            f"{counted(len(structure.outputs), 'output')} and {counted(len(structure.constants), 'constant')}"
+        )
         mass += f" make all {len(structure.entries)} entries"
         if counts:
             groups = [f"{count} of {joints_in_ranges(joints)}" for joints, count in counts.items()]
@@ -274,9 +276,3 @@ def _cell(entry: Entry) -> str:
     if entry.kind == "constant":
         return "C"
     return "0"
-
-
-def _many(count: int, noun: str) -> str:
-    if count == 1:
-        return f"1 {noun}"
-    return f"{count} {noun}s"

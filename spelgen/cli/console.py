@@ -18,7 +18,7 @@ import typer
 from spelgen.cli.command import name_values
 from spelgen.errors import Diagnostic, SpelgenError
 from spelgen.files import local, with_addresses, write_text
-from spelgen.labels import printable
+from spelgen.labels import counted, printable
 
 FAILED = 1
 INTERRUPTED = 130  # 128 + SIGINT, as shells count
@@ -157,5 +157,5 @@ def deliver(text: str, output: Path | None) -> None:
 def refuse_warnings(subject: str, count: int) -> None:
     """Exit with 1 if there are warnings and --strict allows none."""
     if count:
-        note(f"{subject}{count} warning{'s' * (count > 1)}, and --strict allows none")
+        note(f"{subject}{counted(count, 'warning')}, and --strict allows none")
         raise typer.Exit(FAILED)

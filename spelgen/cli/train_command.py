@@ -23,6 +23,7 @@ from spelgen.cli.train_settings import (
     resumed_run,
 )
 from spelgen.errors import Diagnostic, ModuleError, OptionError
+from spelgen.labels import counted
 from spelgen.settings.fits import Objective, Rollout, WindowConfig
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.spec import read_facts
@@ -187,8 +188,7 @@ def _outcome(fit: Fit) -> tuple[str, str]:
         reason = ": all epochs are run"
     elif fit.status == "finished":
         reason = ": no way further down"
-    epochs = f"{fit.epochs} epoch{'s' * (fit.epochs != 1)}"
-    end = f"{fit.status} after {epochs}, {fit.steps} steps, {fit.seconds:.0f} s{reason}"
+    end = f"{fit.status} after {counted(fit.epochs, 'epoch')}, {fit.steps} steps, {fit.seconds:.0f} s{reason}"
     return end, f"best {loss}, at epoch {fit.best_epoch}"
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 
-from spelgen.labels import joint_ranges
+from spelgen.labels import counted, joint_ranges, joints_in_ranges
 from spelgen.spec import ModelSpec
 
 _UNITS = {"revolute": "rad, Nm", "prismatic": "m, N"}
@@ -12,7 +12,7 @@ _UNITS = {"revolute": "rad, Nm", "prismatic": "m, N"}
 
 def title(spec: ModelSpec) -> str:
     """The module in a line."""
-    joints = _counted(len(spec.joints), "joint")
+    joints = counted(len(spec.joints), "joint")
     return f"Port-Hamiltonian model of an arm with {joints}, written by `spelgen build`."
 
 
@@ -24,16 +24,10 @@ def class_summary(spec: ModelSpec) -> str:
     return f"The arm's dynamics: {_mass(spec)}{beside}."
 
 
-def _counted(count: int, noun: str) -> str:
-    if count == 1:
-        return f"{count} {noun}"
-    return f"{count} {noun}s"
-
-
 def _mass(spec: ModelSpec) -> str:
     """Return what M is made of."""
     if spec.bodies:
-        count = _counted(len(spec.bodies), "rigid body").replace("bodys", "bodies")
+        count = counted(len(spec.bodies), "rigid body").replace("bodys", "bodies")
         return f"{count} with trained inertial parameters"
     if spec.design.mass == "dense-3n":
         rows = 3 * len(spec.joints)
@@ -42,8 +36,8 @@ def _mass(spec: ModelSpec) -> str:
 
 
 def _functions(spec: ModelSpec) -> str:
-    functions = _counted(len(spec.outputs), "learned function")
-    return f"{functions} of q and {_counted(len(spec.constants), 'constant')}"
+    functions = counted(len(spec.outputs), "learned function")
+    return f"{functions} of q and {counted(len(spec.constants), 'constant')}"
 
 
 def summary(spec: ModelSpec) -> str:
@@ -54,10 +48,7 @@ def summary(spec: ModelSpec) -> str:
         text += f";\nresidual networks: {_functions(spec)} in M"
     text += ".\n"
     if spec.potential:
-        noun = "joint"
-        if len(spec.potential) > 1:
-            noun = "joints"
-        text += f"The potential energy depends on {noun} {joint_ranges(spec.potential)}.\n"
+        text += f"The potential energy depends on {joints_in_ranges(spec.potential)}.\n"
     else:
         text += "Gravity does no work on it.\n"
     if spec.servos:

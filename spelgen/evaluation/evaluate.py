@@ -123,7 +123,7 @@ def _evaluate_torques(
         raise LogError(
             "no figure: no rollout is evaluated, and torques need accelerations, which these logs do not show",
             expected=f"motion at {SLOWEST:g} Hz or more, {SHORTEST:g} s without a gap",
-            do="leave --quick out",
+            do="omit --quick",
         )
     steps = _coarse_torques(logs, judged, notes) if torque else {}
     return replace(

@@ -61,11 +61,8 @@ class Axis:
 
     def ticks(self) -> list[tuple[float, str]]:
         """Return about five round values within the axis, as pixel and label."""
-        if self.log:
-            values = _decades(self.low, self.high)
-            labels = _log_labels(values)
-        else:
-            values, labels = _steps(self.low, self.high)
+        steps = _log_steps if self.log else _steps
+        values, labels = steps(self.low, self.high)
         return list(zip(self.pixels(np.array(values)).tolist(), labels, strict=True))
 
     def data(self) -> str:
@@ -266,25 +263,19 @@ def _axis(values: np.ndarray, start: float, end: float, *, pad: float, log: bool
     return Axis(low - room, high + room, start, end)
 
 
-def _decades(low: float, high: float) -> list[float]:
+def _log_steps(low: float, high: float) -> tuple[list[float], list[str]]:
     """Return powers of ten, or 1, 2 and 5 times these where there are fewer than three."""
     first, last = math.ceil(math.log10(low) - 1e-9), math.floor(math.log10(high) + 1e-9)
-    powers = [10.0**k for k in range(first, last + 1, max(1, math.ceil((last - first + 1) / 5)))]
+    powers = range(first, last + 1, max(1, (last - first) // 5 + 1))
     if len(powers) >= 3:
-        return powers
-    fine = np.outer(10.0 ** np.arange(first - 1, last + 1), [1, 2, 5]).ravel()
-    fine = fine[(fine >= low) & (fine <= high)]
-    if len(fine) >= 3:
-        return list(fine)
-    return list(np.geomspace(low, high, 4))
-
-
-def _log_labels(values: Sequence[float]) -> list[str]:
-    """Return 10 with an exponent where all values are powers of ten."""
-    powers = np.log10(values)
-    if not np.allclose(powers, powers.round(), atol=1e-9):
-        return [f"{value:.3g}" for value in values]
-    return [f"10{str(round(power)).translate(_SUPERSCRIPTS)}" for power in powers]
+        return [10.0**power for power in powers], [
+            f"10{str(power).translate(_SUPERSCRIPTS)}" for power in powers
+        ]
+    values = np.outer(10.0 ** np.arange(first - 1, last + 1), [1, 2, 5]).ravel()
+    values = values[(values >= low) & (values <= high)]
+    if len(values) < 3:
+        values = np.geomspace(low, high, 4)
+    return values.tolist(), [f"{value:.3g}" for value in values]
 
 
 def _steps(low: float, high: float) -> tuple[list[float], list[str]]:

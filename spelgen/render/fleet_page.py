@@ -8,7 +8,7 @@ from pathlib import Path
 from spelgen.files import write_text
 from spelgen.fleet.fleet import FleetResults
 from spelgen.fleet.ranking import winners
-from spelgen.labels import listed
+from spelgen.labels import counted, listed
 from spelgen.listing import Listing
 from spelgen.render.page import render_page
 
@@ -19,9 +19,7 @@ def write_fleet(fleet: FleetResults, listings: Sequence[Listing], path: Path) ->
     wins = [f"{name} of {count}" for name, count in winners(fleet).items()]
     text = render_page(
         "fleet.html.jinja",
-        verdict=f"Smallest error on {arms} arm{'s' * (arms > 1)}: {listed(wins)}."
-        if wins
-        else "No run has ended.",
+        verdict=f"Smallest error on {counted(arms, 'arm')}: {listed(wins)}." if wins else "No run has ended.",
         runs=len(fleet.results),
         failures=len(fleet.failures),
         listings=listings,
