@@ -136,7 +136,8 @@ class FrictionLaws(nn.Module):
     ) -> Tensor:
         """The friction torque, (..., n) [Nm, N], under this gravity torque, of bristles at z, (..., n, K).
 
-        direction: (..., n) of joints without memory; None: as qd has it.
+        z: None where nothing is known of the way here; all joints are then without memory.
+        direction: (..., n) of joints without memory; None: that of qd.
         """
         c = constants
         if direction is None:
@@ -147,7 +148,10 @@ class FrictionLaws(nn.Module):
         return self.viscosity(qd, c) * qd + self.dry(qd, gravity, c) * direction
 
     def sliding(self, qd: Tensor) -> Tensor:
-        """The bristles z, (..., n, K), of joints that have long gone this way."""
+        """The bristles z, (..., n, K), of joints that have long gone this way.
+
+        Near the smoothing velocity they bear up to 7.4 % more than friction without z, far above it the same.
+        """
         # bent as far as they go a few widths on: the rest of an algebraic turn would be a stiff transient
         direction = (qd / self.prepare().coulomb_smoothing_velocity).tanh()
         return direction.unsqueeze(-1) * self.bristles.reach

@@ -138,11 +138,14 @@ def body_directions(model: EmittedModel, q: torch.Tensor) -> torch.Tensor:
 
 def inertial_slopes(model: EmittedModel) -> torch.Tensor:
     """Return the derivative of the ten parameters of all bodies by the parameters that are trained, (10 B, 10 B)."""
-    bodies, raw = model.bodies, body_parameters(model).detach()
-
-    def inertial(flat: torch.Tensor) -> torch.Tensor:
-        parameters: torch.Tensor = functional_call(bodies, {"raw": flat.view_as(raw)}, ())
-        return parameters.flatten()
-
-    slopes: torch.Tensor = jacfwd(inertial)(raw.flatten())
+    raw = body_parameters(model).detach()
+    slopes: torch.Tensor = jacfwd(lambda flat: inertial_parameters(model, flat.view_as(raw)).flatten())(
+        raw.flatten()
+    )
     return slopes.detach()
+
+
+def inertial_parameters(model: EmittedModel, raw: torch.Tensor) -> torch.Tensor:
+    """Return the ten parameters of all bodies, (B, 10), made of trained ones (B, 10)."""
+    parameters: torch.Tensor = functional_call(model.bodies, {"raw": raw}, ())
+    return parameters

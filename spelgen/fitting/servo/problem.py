@@ -26,7 +26,7 @@ from spelgen.fitting.servo.parameters import (
     ServoParameters,
     body_directions,
     body_parameters,
-    inertial_slopes,
+    inertial_parameters,
 )
 from spelgen.fitting.servo.windows import Path, ServoWindows, body_load
 from spelgen.settings.tuning.servo import ServoCostTuning
@@ -92,8 +92,9 @@ class ServoProblem:
     def linearise(self, x: ServoParameters, path: Path) -> None:
         """Take the bodies' load as it is at x, moving along this path."""
         self.write(x)
-        self._bodies, self.along = x.bodies, path
-        self.load = body_load(self.model, path, inertial_slopes(self.model) @ self.directions)
+        self.along = path
+        self._inertial = inertial_parameters(self.model, body_parameters(self.model).detach()).flatten()
+        self.load = body_load(self.model, path)
 
     def weigh(self, x: ServoParameters) -> None:
         """Take the likelihood of errors as they are at x."""
@@ -198,8 +199,17 @@ class ServoProblem:
         tensors = {name: tensor.detach() for name, tensor in named.items()}
         with torch.inference_mode():  # small operations, of which each takes a tenth less so
             drives, armature = self._functional.under(tensors, _drives)
-            change = torch.einsum("wknr,pr->pwkn", self.load.slopes, bodies - self._bodies)
+            change = torch.einsum("wkni,pi->pwkn", self.load.slopes, self._changed(bodies))
             return self._integrate(drives, armature, change, commands)
+
+    def _changed(self, bodies: torch.Tensor) -> torch.Tensor:
+        """Return by how much inertial parameters differ from those of the load, (P, 10 B), at bodies (P, r)."""
+        distinct, which = bodies.unique(dim=0, return_inverse=True)
+        changes = []
+        for point in distinct:
+            raw = self._raw_bodies + (self.directions @ point).view_as(self._raw_bodies)
+            changes.append(inertial_parameters(self.model, raw).flatten() - self._inertial)
+        return torch.stack(changes)[which]
 
     def _integrate(
         self, drives: ServoDrives, armature: torch.Tensor, change: torch.Tensor, commands: torch.Tensor

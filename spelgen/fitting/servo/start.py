@@ -12,7 +12,6 @@ import numpy as np
 import torch
 
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
-from spelgen.fitting.servo.parameters import body_parameters
 from spelgen.fitting.servo.windows import ServoWindows, body_load
 from spelgen.settings.tuning.servo import ServoStartTuning
 
@@ -29,7 +28,7 @@ def start_servos(model: EmittedModel, windows: ServoWindows) -> None:
     model.servo.delay.fill_(delay)
     friction, servo = model.friction, model.servo
     path = windows.path()
-    load = body_load(model, path, torch.zeros(body_parameters(model).numel(), 0).double())
+    load = body_load(model, path)
     bristles = np.stack([bristles_along(q.numpy(), bristle_reach(model)) for q in windows.q])
     direction = (torch.from_numpy(bristles) / friction.bristles.reach).mean(dim=-1)[:, :-1]
     columns = torch.stack([path.qd, path.qdd, direction, load.bias, torch.ones_like(direction)], dim=-1)

@@ -136,7 +136,7 @@ class BodyLoad(NamedTuple):
     """Hold what the bodies are to the drives along windows.
 
     inertia: (W, K-1, n) of each joint by itself, without the drives'. bias: the torque (W, K-1, n) that everything else
-    takes, gravity: its part of that. slopes: of the torque by the bodies' directions, (W, K-1, n, r).
+    takes, gravity: its part of that. slopes: of the torque by the ten parameters of all bodies, (W, K-1, n, 10 B).
     """
 
     inertia: torch.Tensor
@@ -145,9 +145,8 @@ class BodyLoad(NamedTuple):
     slopes: torch.Tensor
 
 
-def body_load(model: EmittedModel, path: Path, directions: torch.Tensor) -> BodyLoad:
-    """Return that of the model as it is; directions: of the ten parameters of all bodies, (10 B, r)."""
-
+def body_load(model: EmittedModel, path: Path) -> BodyLoad:
+    """Return that of the model as it is."""
     blocks: list[BodyLoad] = []
     with torch.no_grad():
         prepared, armature = model.prepare(), model.armature
@@ -158,7 +157,7 @@ def body_load(model: EmittedModel, path: Path, directions: torch.Tensor) -> Body
             inertia = mass.diagonal(dim1=-2, dim2=-1) - armature
             coupling = (mass @ qdd.unsqueeze(-1)).squeeze(-1) - (inertia + armature) * qdd
             bias = model.nonlinear_at(at, qd) + coupling
-            slopes = regressor_of(model.chain, q, qd, qdd) @ directions
+            slopes = regressor_of(model.chain, q, qd, qdd)
             blocks.append(BodyLoad(inertia, bias, model.gravity_at(at), slopes))
     shape = path.q.shape[:2]
     return BodyLoad(*(torch.cat(columns).unflatten(0, shape) for columns in zip(*blocks, strict=True)))
