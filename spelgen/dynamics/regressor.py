@@ -71,7 +71,7 @@ def regressor(arm: Arm, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.nd
 
 def urdf_parameters(arm: Arm) -> np.ndarray:
     """The URDF's own inertial parameters, (10 B,); zero for a body without."""
-    return np.array([[float(x) for x in body.inertia or (0,) * 10] for body in arm.bodies]).ravel()
+    return np.array([body.inertia or (0,) * 10 for body in arm.bodies], dtype=float).ravel()
 
 
 def _moved(
@@ -80,8 +80,8 @@ def _moved(
     factor = float(body.multiplier)
     value = factor * q[:, body.coordinate] + body.offset
     speed, rise = (factor * x[:, body.coordinate, None] for x in (qd, qdd))
-    pose = np.array([[float(x) for x in row] for row in body.rotation])
-    position = np.broadcast_to(np.array([float(x) for x in body.translation]), (len(q), 3))
+    pose = np.array(body.rotation, dtype=float)
+    position = np.broadcast_to(np.array(body.translation, dtype=float), (len(q), 3))
     axis = np.array([0.0, 0.0, 1.0])
     if body.kind == "revolute":
         rotation = pose @ _turn(value)
@@ -90,7 +90,7 @@ def _moved(
         position = position + value[:, None] * pose[:, 2]
     if body.parent < 0:
         velocity = angular = np.zeros((len(q), 3))
-        acceleration = np.broadcast_to(-np.array([float(x) for x in arm.gravity]), (len(q), 3))
+        acceleration = np.broadcast_to(-np.array(arm.gravity, dtype=float), (len(q), 3))
     else:
         parent = states[body.parent]
         velocity, angular = parent.velocity, parent.angular

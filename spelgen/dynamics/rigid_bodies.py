@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,18 +17,13 @@ PER_BODY = 10  # inertial parameters
 
 def body_chain(arm: Arm) -> BodyChain:
     """Return how the arm's bodies may move, for q (..., n) [rad; m]."""
-    bodies = Bodies(
-        parent=tuple(body.parent for body in arm.bodies),
-        joint=tuple(body.coordinate for body in arm.bodies),
-        revolute=tuple(body.kind == "revolute" for body in arm.bodies),
-        ratio=tuple(float(body.multiplier) for body in arm.bodies),
-        offset=tuple(body.offset for body in arm.bodies),
-        rotation=tuple(
-            (_row(body.rotation[0]), _row(body.rotation[1]), _row(body.rotation[2])) for body in arm.bodies
-        ),
-        position=tuple(_row(body.translation) for body in arm.bodies),
-        inertia=((),) * len(arm.bodies),  # a chain is geometry
-    )
+    rows: list[tuple[Any, ...]] = []
+    for body in arm.bodies:
+        geometry = tuple(map(_row, body.rotation)), _row(body.translation)
+        is_revolute, ratio = body.kind == "revolute", float(body.multiplier)
+        # a chain is geometry: inertia stays empty
+        rows.append((body.parent, body.coordinate, is_revolute, ratio, body.offset, *geometry, ()))
+    bodies = Bodies(*zip(*rows, strict=True))
     return BodyChain(len(arm.coordinates), bodies, _row(arm.gravity))
 
 

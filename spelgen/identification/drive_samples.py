@@ -59,7 +59,7 @@ class DriveLog:
             return
         motion, tau = samples[0], np.stack([x.tau for x in samples])
         self._samples.append(DriveSamples(motion.q, motion.qd, motion.qdd, tau).thinned(self._every))
-        while sum(len(x.q) for x in self._samples) > 2 * HINTS.samples:
+        while self._count > 2 * HINTS.samples:
             if len(self._samples) > HINTS.trajectories:
                 self._samples = self._samples[1::2]
                 self._step *= 2
@@ -67,11 +67,15 @@ class DriveLog:
                 self._samples = [x.thinned(2) for x in self._samples]
                 self._every *= 2
 
+    @property
+    def _count(self) -> int:
+        return sum(len(x.q) for x in self._samples)
+
     def samples(self) -> DriveSamples | None:
         """Return all together; None where there are too few to tell anything."""
-        count = sum(len(x.q) for x in self._samples)
+        count = self._count
         if count < HINTS.fewest_samples:
             return None
-        q, qd, qdd = (np.concatenate([x[k] for x in self._samples]) for k in range(3))
-        tau = np.concatenate([x.tau for x in self._samples], axis=1)
-        return DriveSamples(q, qd, qdd, tau).thinned(-(-count // HINTS.samples))
+        *motion, tau = zip(*self._samples, strict=True)
+        q, qd, qdd = map(np.concatenate, motion)
+        return DriveSamples(q, qd, qdd, np.concatenate(tau, axis=1)).thinned(-(-count // HINTS.samples))

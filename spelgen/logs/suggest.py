@@ -66,15 +66,17 @@ def suggest_mapping(file: Path, joints: Sequence[str]) -> Suggestion:
         suffixes = [x.suffixes[0] for x in FORMATS if x.columns is not None]
         raise LogError(f"a file of kind {file.suffix!r}", file=file, expected=" or ".join(suffixes))
     columns = _columns(log_format.columns(file))
-    times = [column for column in columns if column.quantity == "t"]
-    if not times:
+    by_quantity: dict[str | None, list[Column]] = {}
+    for column in columns:
+        by_quantity.setdefault(column.quantity, []).append(column)
+    if "t" not in by_quantity:
         names = shortened([column.name for column in columns], LogTuning().listed)
         raise LogError(f"only the columns {names}", file=file, expected="one of times, called t or time")
     # `time` before `timestamp_of_receipt`: what has the fewest words is the plain clock
-    clock = min(times, key=lambda column: len(column.words))
+    clock = min(by_quantity["t"], key=lambda column: len(column.words))
     by_joint: dict[str, dict[str, Column]] = {}
     for quantity in ("q", "qd", "tau"):
-        by_joint[quantity] = _by_joint([x for x in columns if x.quantity == quantity], joints)
+        by_joint[quantity] = _by_joint(by_quantity.get(quantity, []), joints)
     units = {"t": clock.unit or "s"}
     for column in by_joint["tau"].values():
         if column.unit is not None:
