@@ -7,7 +7,6 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
-from functools import partial
 from importlib.util import find_spec
 from typing import Any, Protocol, TypeVar
 
@@ -43,11 +42,11 @@ def run_here(
 
 
 @contextmanager
-def workers(jobs: int, address: str | None = None, gpus: float = 0.0) -> Iterator[RunTasks]:
+def workers(jobs: int, address: str | None = None) -> Iterator[RunTasks]:
     """Give a function that runs tasks, ``jobs`` at a time on a Ray of this machine, or on the cluster at an address.
 
-    One job at a time needs no Ray. address: of a cluster that runs already, "auto" for this machine's. gpus: what
-    each task needs. Raises RunError without Ray, and where no cluster answers.
+    One job at a time needs no Ray. address: of a cluster that runs already, "auto" for this machine's. Raises
+    RunError without Ray, and where no cluster answers.
     """
     if jobs == 1 and address is None:
         yield run_here
@@ -75,18 +74,18 @@ def workers(jobs: int, address: str | None = None, gpus: float = 0.0) -> Iterato
         ) from error
     try:
         with redirect_stdout(sys.stderr):  # Ray reports workers that died there: stdout is for results
-            yield partial(_run_on_ray, gpus=gpus)
+            yield _run_on_ray
     finally:
         ray.shutdown()
 
 
 def _run_on_ray(
-    work: Callable[[Task], Result], tasks: Sequence[Task], *, gpus: float
+    work: Callable[[Task], Result], tasks: Sequence[Task]
 ) -> Iterator[tuple[Task, Result | Exception]]:
     """Run tasks of one processor core each. A task may run again after its worker died, so it must be able to."""
     import ray
 
-    remote: Any = ray.remote(num_cpus=1, num_gpus=gpus, max_retries=RETRIES)(_work_or_die)
+    remote: Any = ray.remote(num_cpus=1, max_retries=RETRIES)(_work_or_die)
     waiting = {remote.remote(work, task): task for task in tasks}
     try:
         while waiting:

@@ -46,7 +46,7 @@ def fleet(
     # of a container or a job of a scheduler, which may own fewer cores than the machine has
     count = jobs or len(os.sched_getaffinity(0))
     # two fleets in one folder would overwrite the runs of one another
-    with locked(folder), termination_as_interrupt(), workers(count, address, settings.gpus) as run_tasks:
+    with locked(folder), termination_as_interrupt(), workers(count, address) as run_tasks:
         results = run_fleet(settings, folder, run_tasks, note)
     listings = fleet_listings(results)
     for listing in listings:

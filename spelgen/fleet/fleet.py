@@ -113,7 +113,6 @@ def _job(fleet: Fleet, folder: Path, arm: PreparedArm, preset: str, seed: int, s
         width=fleet.width,
         depth=fleet.depth,
         training=fleet.training,
-        device="cuda" if fleet.gpus else "cpu",
     )
 
 

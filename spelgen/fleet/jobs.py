@@ -61,7 +61,6 @@ class Job(Group):
     width: int = 64
     depth: int = 2
     training: TrainingSettings = TrainingSettings()
-    device: str = "cpu"
 
     @property
     def name(self) -> str:
@@ -108,7 +107,7 @@ def run_job(job: Job) -> RunResult:
         "preprocessing": Preprocessing(**training.preprocessing),
         "validation": training.validation_fraction,
         "seed": job.seed,
-        "options": RunOptions(device=job.device, mapping=job.mapping, resume=resume, force=not resume),
+        "options": RunOptions(mapping=job.mapping, resume=resume, force=not resume),
     }
     if resume:
         fit = train(run.module, job.train, job.folder, **common)

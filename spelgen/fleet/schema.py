@@ -12,7 +12,7 @@ from spelgen.design import PRESET_NAMES
 from spelgen.errors import SettingsError, collect, suggestion
 from spelgen.settings.messages import dotted, explain
 from spelgen.settings.training import TrainingSettings
-from spelgen.settings.values import Count, Group, NonNegative
+from spelgen.settings.values import Count, Group
 from spelgen.settings.yaml_document import Document, Location, read_document
 
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,60}$")]
@@ -36,8 +36,7 @@ class Fleet(Group):
     """Every arm with every preset, seed and split.
 
     splits: 1 takes train.* and test.* of the logs, or a quarter of the trajectories for the test where there are none;
-    k: k-fold cross-validation over whole trajectories. training: options as in a robot's settings, for all. gpus:
-    what each run needs of one, 0: none.
+    k: k-fold cross-validation over whole trajectories. training: options as in a robot's settings, for all.
     """
 
     robots: Annotated[dict[Name, FleetRobot], Field(min_length=1)]
@@ -47,7 +46,6 @@ class Fleet(Group):
     width: Count = 64
     depth: Count = 2
     training: TrainingSettings = Field(default_factory=TrainingSettings)
-    gpus: NonNegative = 0.0
 
 
 def load_fleet(path: Path) -> Fleet:
