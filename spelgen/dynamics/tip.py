@@ -17,9 +17,6 @@ from spelgen.urdf.read import read_urdf
 from spelgen.urdf.robot import Robot
 
 _ROUNDING = 1e-15  # what cos(pi / 2) leaves of zero
-EYE = torch.eye(4, dtype=torch.float64)
-TURN, SLIDE = torch.zeros(2, 4, 4, dtype=torch.float64)  # derivatives of motions about and along z
-TURN[1, 0], TURN[0, 1], SLIDE[2, 3] = 1, -1, 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +79,9 @@ class TipKinematics:
         self.link = link
         self._chain, end = tip_chain(robot, joints, link)
         self._end = torch.from_numpy(end)
+        # derivatives of motions about and along z
+        self._turn, self._slide = torch.zeros(2, 4, 4, dtype=torch.float64)
+        self._turn[1, 0], self._turn[0, 1], self._slide[2, 3] = 1, -1, 1
         self._jacobian = torch.from_numpy(np.array([joint.row for joint in self._chain]))  # (joints, n)
         self._offset = torch.tensor([joint.offset for joint in self._chain], dtype=torch.float64)
         missing = [name for name, column in zip(joints, self._jacobian.T, strict=True) if not column.any()]
@@ -113,12 +113,13 @@ class TipKinematics:
     def _frames(self, q: Tensor) -> list[Tensor]:
         """Return the pose of each joint's frame behind its motion, (..., 4, 4)."""
         displacements = q.double() @ self._jacobian.mT + self._offset
-        pose, frames = EYE, []
+        still = torch.eye(4, dtype=torch.float64)
+        pose, frames = still, []
         for joint, displacement in zip(self._chain, displacements.unbind(-1), strict=True):
             size = displacement[..., None, None]
-            motion = EYE + size * SLIDE
+            motion = still + size * self._slide
             if joint.revolute:
-                motion = EYE + size.sin() * TURN + (1 - size.cos()) * (TURN @ TURN)
+                motion = still + size.sin() * self._turn + (1 - size.cos()) * (self._turn @ self._turn)
             pose = pose @ torch.from_numpy(joint.origin) @ motion
             frames.append(pose)
         return frames
