@@ -51,13 +51,6 @@ class ResidualSamples(NamedTuple):
     friction: torch.Tensor
 
 
-class LeastSquaresFit(NamedTuple):
-    """The sums of squares (n,) of the torque that least squares miss, and how many weights a torque determines (n,)."""
-
-    squares: torch.Tensor
-    weights: torch.Tensor
-
-
 @dataclass(frozen=True, eq=False)
 class _Directions:
     """Directions in which one weight of every joint changes at once, but of joints with a coupling only one.
@@ -115,8 +108,12 @@ class TorqueJacobian:
             descent[columns] += slope.mT @ (missing / noise[joint])
         return curvature, descent
 
-    def least_squares(self, x: torch.Tensor, noise: torch.Tensor, free: torch.Tensor) -> LeastSquaresFit:
-        """Return what least squares by the free weights (K,) leave of torques that are taken as linear about x (K,)."""
+    def least_squares(
+        self, x: torch.Tensor, noise: torch.Tensor, free: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return sums of squares (n,) that least squares by the free weights (K,) leave, and how many weights each
+        torque determines (n,); torques are taken as linear about x (K,).
+        """
         curvature, descent = self.normal_equations(x, noise)
         inverse = torch.zeros_like(curvature)
         inverse[free[:, None] & free] = _pseudo_inverse(curvature[free][:, free]).flatten()
@@ -125,7 +122,7 @@ class TorqueJacobian:
         for joint, columns, slope, missing in self._slopes(x):
             squares[joint] += (missing - slope @ step[columns]).square().sum()
             weights[joint] += ((slope @ inverse[columns[:, None], columns]) * slope).sum() / noise[joint] ** 2
-        return LeastSquaresFit(squares, weights)
+        return squares, weights
 
     def _slopes(self, x: torch.Tensor) -> Iterator[tuple[int, torch.Tensor, torch.Tensor, torch.Tensor]]:
         """Yield block by block each joint, the weights (C,) that move its torque, J (T, C) and what is missing (T,)."""
@@ -330,10 +327,8 @@ def _colours(coupled: torch.Tensor) -> list[int]:
 
 def _pseudo_inverse(curvature: torch.Tensor) -> torch.Tensor:
     """Return the inverse (K, K) of a curvature in the directions that samples show."""
-    diagonal = curvature.diagonal()
-    scale = torch.where(diagonal > TUNING.seen * diagonal.max(), diagonal, torch.inf).rsqrt()
-    values, vectors = torch.linalg.eigh(curvature * scale * scale[:, None])
-    seen = values > TUNING.seen * values.max()
-    vectors = vectors[:, seen] * scale[:, None]
-    inverse: torch.Tensor = vectors / values[seen] @ vectors.mT
-    return inverse
+    length = curvature.diagonal().sqrt()
+    scale = torch.where(length > 0, 1 / length, 0.0)
+    scale = scale * scale[:, None]
+    inverse: torch.Tensor = torch.linalg.pinv(curvature * scale, rtol=TUNING.seen, hermitian=True)
+    return inverse * scale

@@ -43,7 +43,6 @@ class TorqueProblem:
         self.kinds = adapted_kinds(rigid.start, rigid.kinds)
         self._use(jacobian)
         self.set_prior(prior)
-        self.noise = self.correlation**0.5 * self.range
 
     def _use(self, jacobian: TorqueJacobian) -> None:
         self.jacobian, self.count = jacobian, jacobian.samples.count
@@ -76,11 +75,11 @@ class TorqueProblem:
     def _set_least_squares_noise(self, x: torch.Tensor) -> None:
         """Take for noise what least squares miss, which no prior holds; of torques that are linear about x (K,)."""
         self.noise = self.correlation**0.5 * self.range
-        for _ in range(TUNING.least_squares_rounds):
+        for _ in range(TUNING.last_rounds):
             squares, weights = self.jacobian.least_squares(x, self.noise, self.free)
-            # of errors that last, a weight takes as many samples
-            determined = (self.correlation * weights / self.count).clamp(max=TUNING.most_determined)
-            self.set_noise(squares / (1 - determined))
+            # each weight takes an independent sample, of which one is left at least
+            independent = self.count / self.correlation
+            self.set_noise(squares * independent / (independent - weights).clamp(min=1.0))
 
     def _first_fit(self, x: torch.Tensor, steps: int) -> State:
         """Return the end of all steps from weights x (K,), under the noise of least squares.

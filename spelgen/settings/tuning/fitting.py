@@ -75,8 +75,7 @@ class TorqueTuning:
     first_steps: int = 60  # at most, before noise and prior are found
     # twice the logarithm of a likelihood ratio: strong evidence (Kass and Raftery, J. Am. Stat. Assoc. 90:773, 1995)
     memory_evidence: float = 6.0
-    least_squares_rounds: int = 3  # of finding the noise of least squares
-    last_rounds: int = 2  # where all but the last digits are fitted
+    last_rounds: int = 2  # where all but the last digits are fitted, and of least squares
     longer: int = 4  # times as many rounds at most, while some joint's noise falls
     noise_settled: float = 0.98  # [1] noise by that of the round before: what falls by less is settled
     steps: int = 5  # at most in a round
@@ -86,7 +85,6 @@ class TorqueTuning:
     windows: int = 2**12  # at most, of 5 samples, on which the model is measured after the fit
     residual_samples: int = 2**14  # that what stands beside rigid bodies is selected on
     seen: float = 1e-10  # [1] of the largest curvature: directions with less are not seen in the samples
-    most_determined: float = 0.9  # [1] of the samples, that least squares can take for weights
     least_noise: float = (
         1e-4  # [1] of it: noise-free samples are fitted to four digits of their torque's range
     )
