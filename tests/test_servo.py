@@ -237,14 +237,6 @@ def test_what_is_told_covers_the_truth(fitted):
     assert told[0]["dry"]["determined"] and "dry/kp of elbow" in servo_text(fitted.record["servo"])
 
 
-def test_what_logs_will_tell_is_said_before_the_fit(fitted):
-    (note,) = [x.message for x in fitted.diagnostics if x.code == "identifiability"]
-    assert "these logs determine kd/kp of shoulder, " in note and "unless one kp, mass or load is" in note
-    assert {"kd/kp of elbow", "static error of elbow"} <= {
-        *fitted.record["expected_identifiability"]["determined"]
-    }
-
-
 @pytest.mark.parametrize(
     ("robot", "groups", "left"),
     [

@@ -25,14 +25,7 @@ from spelgen.fitting.servo.laws import select_dead_zones, without_faint
 from spelgen.fitting.servo.linear_servos import fit_linear_servos
 from spelgen.fitting.servo.parameters import ServoParameters
 from spelgen.fitting.servo.problem import ServoProblem
-from spelgen.fitting.servo.report import (
-    expected_solution,
-    expected_text,
-    identifiability,
-    joint_records,
-    servo_record,
-    solution,
-)
+from spelgen.fitting.servo.report import servo_record, solution
 from spelgen.fitting.servo.start import start_servos
 from spelgen.fitting.servo.windows import servo_windows
 from spelgen.fitting.streaming import LargeLogs
@@ -85,19 +78,13 @@ class ServoObjective:
         )
 
     def begin(self) -> list[Diagnostic]:
-        """Start servos by least squares, and say what the logs will determine."""
+        """Start servos by least squares."""
         model, self._since = self.request.model, time.monotonic()
         start_servos(model, self._windows)
         self._start = {name: x.clone() for name, x in model.state_dict().items()}
         self._problem = self._new_problem()
         self._begin_round(self._problem.start)
-        expected = expected_solution(self._problem, self._problem.start, len(self._windows.q))
-        determined, undetermined = identifiability(joint_records(self._problem, expected))
-        self._problem.write(self._problem.start)
-        self._results = {"expected_identifiability": {"determined": determined, "open": undetermined}}
-        known_kp = bool((model.servo.trained == 0).any())
-        text = expected_text(determined, undetermined, known_kp=known_kp)
-        return [Diagnostic("info", "identifiability", "logs", None, text)]
+        return []
 
     def resume(self, checkpoint: Content, history: list[Content], record: Content) -> None:
         """Go on from the beginning of the last round."""
@@ -109,7 +96,6 @@ class ServoObjective:
         self._steps = state["steps"]
         for parameters in state["rounds"]:
             self._begin_round(ServoParameters(**parameters))
-        self._results = {"expected_identifiability": record.get("expected_identifiability")}
 
     def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
         """See `Objective`."""
@@ -157,7 +143,7 @@ class ServoObjective:
         return self._checkpoint
 
     def results(self) -> dict[str, object]:
-        """Return what the logs were to determine, and at the end what they did."""
+        """Return at the end what the logs determine."""
         return self._results
 
     def _new_problem(self) -> ServoProblem:

@@ -58,7 +58,7 @@ ServoRecord = Mapping[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class ServoSolution:
-    """Hold what windows determine where a fit ended, or begins: their normal equations by stretch of the logs, of dead
+    """Hold what windows determine where a fit ended: their normal equations by stretch of the logs, of dead
     zones at all joints too, the precision (k,) of the prior, and the covariance (k, k) of the parameters.
     """
 
@@ -85,23 +85,6 @@ def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters
     # where the fit ends, the slopes of all windows and of the prior add up to nothing
     windows = windows._replace(descent=windows.descent - windows.curvature @ step)
     return x.moved(step), ServoSolution(windows, precision, covariance(windows, precision, step))
-
-
-def expected_solution(problem: ServoProblem, x: ServoParameters, count: int) -> ServoSolution:
-    """Return what so many windows will determine, by the slopes of errors before the fit, were these errors as small as
-    the first step promises.
-    """
-    x = problem.rows.with_dead_zones(x)
-    errors, precision = problem.residuals(x), problem.rows.precision(x)
-    windows, prior = problem.window_equations(x, errors), torch.diag(precision)
-    descent = windows.descent.sum(dim=0)
-    gain = float(descent @ torch.linalg.solve(windows.curvature.sum(dim=0) + prior, descent))
-    squares = float((problem.likelihood.weights(errors) * errors.square()).sum())
-    remaining = max(1 - gain / squares, TUNING.least_remaining)
-    # smaller errors weigh more, and the problem has some of the windows
-    weight = count / len(windows.curvature) / remaining
-    windows = windows._replace(curvature=weight * windows.curvature)
-    return ServoSolution(windows, precision, torch.linalg.inv(windows.curvature.sum(dim=0) + prior))
 
 
 def ratios(model: EmittedModel, qd: torch.Tensor, gravity: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -244,18 +227,6 @@ def identifiability(joints: Sequence[JointRecord]) -> tuple[list[str], list[str]
             names = determined if joint[ratio]["determined"] else undetermined
             names.append(f"{LABELS[ratio]} of {joint['joint']}")
     return determined, undetermined
-
-
-def expected_text(determined: Sequence[str], undetermined: Sequence[str], *, known_kp: bool) -> str:
-    """Say in a sentence what logs will determine."""
-    scale = (
-        "only ratios of kp and masses are determined, unless one kp, mass or load is known; kp is scaled by the "
-        "URDF's masses"
-    )
-    if known_kp:
-        scale = "kp of at least one joint is known, which determines the masses"
-    names, others = ", ".join(determined) or "nothing", ", ".join(undetermined) or "nothing"
-    return f"by the rank of the equations, these logs determine {names}; not determined: {others}; {scale}"
 
 
 def _shown(interval: Interval | None) -> str:
