@@ -32,7 +32,7 @@ def frames(links, q):
 
 
 @pytest.mark.parametrize("robot", ["rpr", "scara", "panda", "ur10e"])
-def test_links_stand_where_the_kinematics_of_the_tip_has_them(robots, robot):
+def test_links_stand_where_pytorch_kinematics_has_them(robots, robot):
     import torch
 
     arm = load_arm(robots / f"{robot}.urdf")

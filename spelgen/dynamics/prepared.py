@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
 from spelgen.dynamics.pose import poses
-from spelgen.dynamics.protocol import TipMotion, known_past, memory_after, sliding_memory
+from spelgen.dynamics.protocol import known_past, memory_after, sliding_memory
 from spelgen.dynamics.residuals import without_idle_residuals
 from spelgen.dynamics.runge_kutta import runge_kutta
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
+
+if TYPE_CHECKING:
+    from spelgen.dynamics.tip import TipKinematics
 
 
 class State(NamedTuple):
@@ -35,7 +38,7 @@ class PreparedModel:
     def __init__(
         self,
         model: PortHamiltonian,
-        tip: TipMotion | None = None,
+        tip: TipKinematics | None = None,
         *,
         dtype: torch.dtype = torch.float64,
     ) -> None:
@@ -138,11 +141,13 @@ class PreparedModel:
 
     def pose(self, q: Tensor) -> Tensor:
         """The tip's homogeneous transform in the root link's frame, (..., 4, 4). Raises ValueError without a tip."""
-        return self._kinematics().pose(q)
+        result: Tensor = self._kinematics().pose(q)
+        return result
 
     def jacobian(self, q: Tensor) -> Tensor:
         """The tip's linear, then angular velocity by qd, (..., 6, n). Raises ValueError without a tip."""
-        return self._kinematics().jacobian(q)
+        result: Tensor = self._kinematics().jacobian(q)
+        return result
 
     def compile(self) -> PreparedModel:
         """Itself, its forward and inverse dynamics compiled by ``torch.compile`` at their first calls."""
@@ -153,7 +158,7 @@ class PreparedModel:
             setattr(result, name, compiled)
         return result
 
-    def _kinematics(self) -> TipMotion:
+    def _kinematics(self) -> TipKinematics:
         if self._tip is None:
             raise ValueError("no tip: give model.prepared(tip=spelgen.tip_kinematics(arm))")
         return self._tip

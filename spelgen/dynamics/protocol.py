@@ -43,16 +43,6 @@ class RigidDynamics(Protocol):
         """The inputs, (..., n), that make qdd; those of a passive joint are the torques that it lacks."""
 
 
-class TipMotion(Protocol):
-    """Where the tip of an arm is and how it moves, by q (..., n)."""
-
-    def pose(self, q: Tensor) -> Tensor:
-        """The homogeneous transform in the root link's frame, (..., 4, 4)."""
-
-    def jacobian(self, q: Tensor) -> Tensor:
-        """Linear, then angular velocity by qd, (..., 6, n)."""
-
-
 class PosedDynamics(Protocol):
     """Dynamics that work out once what depends on positions alone."""
 

@@ -27,7 +27,7 @@ METHODS = (
 _EXPECTED = "a module written by this version of `spelgen build`"
 
 if TYPE_CHECKING:
-    from spelgen.dynamics.protocol import TipMotion
+    from spelgen.dynamics.tip import TipKinematics
     from spelgen.runtime.port_hamiltonian import PortHamiltonian
 
     class EmittedModel(PortHamiltonian):
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any: ...  # what a preset has beside this
         def prepared(
-            self, tip: TipMotion | None = None, *, dtype: torch.dtype = torch.float64
+            self, tip: TipKinematics | None = None, *, dtype: torch.dtype = torch.float64
         ) -> PreparedModel: ...
 
 
@@ -101,7 +101,7 @@ def _page(model: EmittedModel) -> str:
 
 
 def _prepared(
-    model: EmittedModel, tip: TipMotion | None = None, *, dtype: torch.dtype = torch.float64
+    model: EmittedModel, tip: TipKinematics | None = None, *, dtype: torch.dtype = torch.float64
 ) -> PreparedModel:
     """The model as it is now, ready for many calls; see ``PreparedModel``."""
     return PreparedModel(model, tip, dtype=dtype)

@@ -30,7 +30,7 @@ from spelgen.exporting.description import (
     Splines,
     TrainedModel,
 )
-from spelgen.exporting.tip_chain import arm_tip
+from spelgen.exporting.tip_chain import tip_chain
 from spelgen.loaded_arm import LoadedArm
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
     if not has_rigid_bodies(exact):
         raise _unsupported(f"the preset {preset}, which is not of rigid bodies")
     weights = exact.prepare()
-    tip_link, tip, end = arm_tip(loaded)
+    tip_link, tip, end = tip_chain(loaded)
     # what does not depend on q is one matrix, whatever it comes from
     constant_mass = array(weights.armature)
     residuals = _no_residuals()

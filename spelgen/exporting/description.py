@@ -7,7 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from spelgen.arm.arm import Arm
-from spelgen.dynamics.tip import TipJoint
+
+
+@dataclass(frozen=True, eq=False)
+class TipJoint:
+    """A joint on the way to the tip: origin (4, 4), then a turn about z or a slide along it by row @ q + offset."""
+
+    name: str
+    origin: np.ndarray
+    revolute: bool
+    row: np.ndarray
+    offset: float
 
 
 @dataclass(frozen=True, eq=False)
