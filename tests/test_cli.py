@@ -426,10 +426,7 @@ def test_help_shows_whole_sentences(spelgen):
         (["train", "--objectve", "rollout"], "No such option: --objectve. Did you mean --objective?"),
         (["train", "m.py", "--set", "epoch=3"], "--set: unknown key 'epoch'; did you mean 'epochs'?"),
         (["train", "m.py", "--set", "epochs"], "--set: got 'epochs', expected KEY=VALUE"),
-        (
-            ["train", "m.py", "--set", "optimizer=sgd"],
-            "--set optimizer: got 'sgd', expected 'adamw' or 'lbfgs'",
-        ),
+        (["train", "m.py", "--set", "solver=rk5"], "--set solver: got 'rk5', expected 'rk4' or 'dopri5'"),
         (
             ["train", "m.py", "--set", "prior.body=1"],
             "--set prior: unknown key 'body'; did you mean 'bodies'?",

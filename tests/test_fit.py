@@ -1,27 +1,33 @@
-"""Fits in memory: the same as those of files, saved and loaded again; torques predicted and scored."""
+"""Fits in memory: the same as those of files, saved and loaded again; torques predicted and scored; both solvers."""
 
 import json
 
 import numpy as np
 import pytest
 import torch
+from emitted import random_model
 
 import spelgen
 from spelgen.errors import LogError, RunError
+from spelgen.fitting.adaptive import TUNING as ADAPTIVE
 from spelgen.fitting.fit import RunOptions
+from spelgen.fitting.rollout import loss_scales, roll_out, rollout_loss
 from spelgen.fitting.train import train
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import write_logs
 from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.windows import Windows, cut_windows
 from spelgen.settings.fits import MomentumFit, Rollout, TorqueFit
 from tests.test_closed_form import FOLLOWED
 from tests.test_training import (
     JOINTS,
     QUICK,
     STAND_IN,
+    Oscillator,
     lines,
     motions,
     quick,
+    random_windows,
     truth,
 )
 
@@ -97,7 +103,7 @@ def test_what_was_used_is_recorded_and_nothing_else(tmp_path):
     assert found.record["objective"] == "rollout"
     assert found.record["config"] == {
         "window": 5, "stride": 1, "momentum_steps": 0, "optimizer": "lbfgs", "weight_decay": 2e-5,
-        "urdf_weight": 1.0, "epochs": 1, "patience": 60,
+        "urdf_weight": 1.0, "epochs": 1, "patience": 60, "solver": "rk4",
     }  # fmt: skip
     assert found.record["preprocessing"] == {"cutoff": None, "decimation": 1, "gap": 4.0}
     json.dumps(found.record)
@@ -184,6 +190,49 @@ def test_a_fit_tells_what_it_is():
     told = f"<Fit of 'stand_in' to momentum: finished after 0 epochs, validation loss {found.best_validation:.3g}>"
     assert repr(found) == told
     assert "momentum steps" in found._repr_html_()
+
+
+@pytest.mark.parametrize(
+    "samples, preset", [(4, "spel"), (4, "closed-form"), (ADAPTIVE.adjoint_samples + 2, "phnode")]
+)
+def test_both_solvers_agree(tmp_path, samples, preset):
+    """In what they predict and in its gradient, which over long horizons comes from the adjoint equation."""
+    model = random_model("two_link", tmp_path, seed=0, preset=preset)
+    torch.manual_seed(0)
+    q, qd, tau = torch.rand(3, 5, samples, model.n, dtype=torch.float64)
+    windows = Windows(0.01 + 0.01 * torch.rand(5, samples - 1).double(), q, qd, tau[:, 1:])
+    scales, losses, gradients = loss_scales(windows, model.joint_types), [], []
+    for solver, substeps in (("rk4", 8), ("dopri5", 1)):
+        model.zero_grad()
+        loss = rollout_loss(model, windows, scales, substeps, solver)
+        loss.backward()
+        losses.append(loss.item())
+        found = [torch.zeros_like(x) if x.grad is None else x.grad for x in model.parameters()]
+        gradients.append(torch.cat([x.flatten() for x in found]))
+    assert losses[1] == pytest.approx(losses[0], rel=1e-5)
+    torch.testing.assert_close(
+        gradients[1], gradients[0], rtol=1e-3, atol=1e-5 * gradients[0].abs().max().item()
+    )
+
+
+def test_dopri5_is_the_exact_solution():
+    windows = random_windows()
+    pairs = zip(roll_out(Oscillator(), windows, solver="dopri5"), Oscillator().solve(windows), strict=True)
+    assert max((got - exact).abs().max().item() for got, exact in pairs) < 1e-6
+
+
+@pytest.mark.usefixtures("short_epochs")
+def test_windows_are_fitted_by_dopri5():
+    config = Rollout(epochs=2, momentum_steps=0, solver="dopri5", optimizer="lbfgs")
+    found = spelgen.fit(spelgen.load_module(STAND_IN), motions(), config)
+    plain = spelgen.fit(
+        spelgen.load_module(STAND_IN), motions(), Rollout(epochs=2, momentum_steps=0, substeps=8)
+    )
+    assert found.record["config"]["solver"] == "dopri5"
+    assert found.best_validation == pytest.approx(plain.best_validation, rel=0.05)
+    windows = cut_windows(motions(), 5, measured=False)
+    scales = loss_scales(windows, ("revolute", "revolute"))
+    assert rollout_loss(truth(), windows, scales, 1, "dopri5") < 1e-12
 
 
 @pytest.mark.usefixtures("short_epochs")

@@ -21,7 +21,7 @@ from tests.test_training import JOINTS, STAND_IN, motions
 VALUES = {
     "prior": {"bodies": 1.0}, "adapt": "friction", "evaluations": 40, "weight_decay": 0.1, "urdf_weight": 0.5,
     "window": 7, "stride": 2, "momentum_steps": 10, "optimizer": "adamw", "batch": 16, "learning_rate": 0.01,
-    "max_minutes": 2.0, "torque_first": True, "epochs": 3, "patience": 2, "substeps": 2,
+    "max_minutes": 2.0, "torque_first": True, "epochs": 3, "patience": 2, "solver": "rk4", "substeps": 2,
 }  # fmt: skip
 OF_CLOSED_FORM = {"torque": {"prior"}, "rollout": {"torque_first"}}
 OF_NETWORKS = {"torque": {"evaluations", "weight_decay", "urdf_weight"}}
@@ -62,6 +62,8 @@ def test_options_of_another_option():
     for option in ("batch", "learning_rate"):
         with pytest.raises(OptionError, match=f"{option}: belongs to the optimizer adamw, this is lbfgs"):
             MomentumFit(optimizer="lbfgs", **{option: VALUES[option]})
+    with pytest.raises(OptionError, match="substeps: belongs to the solver rk4, this is dopri5"):
+        Rollout(solver="dopri5", substeps=2)
 
 
 def test_from_python_too():
@@ -89,8 +91,8 @@ def test_what_a_robot_settles_for_another_objective_is_left_out():
         objective, rigid_bodies=False, options=chosen, defaults=settled
     ).record(rigid_bodies=False)
     assert make("torque") == {"evaluations": 2000, "weight_decay": 0.3, "urdf_weight": 1.0}
-    found = make("rollout", optimizer="lbfgs")
-    assert (found["window"], "batch" in found, found["substeps"]) == (9, False, 4)
+    found = make("rollout", solver="dopri5", optimizer="lbfgs")
+    assert (found["window"], "batch" in found, "substeps" in found) == (9, False, False)
     assert make("momentum", batch=4)["batch"] == 4
 
 

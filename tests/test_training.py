@@ -178,7 +178,7 @@ def test_the_weak_form_tends_to_zero_with_the_step():
 
 
 def test_standing_still_has_loss_one(monkeypatch):
-    def still(model, windows, substeps):
+    def still(model, windows, substeps, solver):
         return tuple(x[:, :1].expand_as(x[:, 1:]) for x in (windows.q, windows.qd))
 
     monkeypatch.setattr("spelgen.fitting.rollout.roll_out", still)
@@ -283,7 +283,7 @@ def test_resuming_drops_epochs_after_the_checkpoint(logs, tmp_path):
 def test_numbers_that_blow_up_are_rolled_back_at_half_the_rate(logs, tmp_path, monkeypatch):
     calls = []
 
-    def blown_up_once(model, windows, scales, substeps):
+    def blown_up_once(model, windows, scales, substeps, solver):
         loss = rollout_loss(model, windows, scales, substeps)
         calls.append(torch.is_grad_enabled())
         return loss * math.nan if sum(calls) == 25 and calls[-1] else loss
@@ -300,7 +300,7 @@ def test_numbers_that_blow_up_are_rolled_back_at_half_the_rate(logs, tmp_path, m
 @pytest.mark.usefixtures("short_epochs")
 @pytest.mark.parametrize("optimizer", ["adamw", "lbfgs"])
 def test_numbers_that_never_recover_end_the_run(logs, tmp_path, monkeypatch, optimizer):
-    def blown_up(model, windows, scales, substeps):
+    def blown_up(model, windows, scales, substeps, solver):
         loss = rollout_loss(model, windows, scales, substeps)
         return loss * math.nan if torch.is_grad_enabled() else loss
 

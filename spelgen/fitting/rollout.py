@@ -18,8 +18,10 @@ from spelgen.dynamics.protocol import (
 )
 from spelgen.dynamics.runge_kutta import runge_kutta
 from spelgen.errors import LogError
+from spelgen.fitting.adaptive import roll_out_adaptive
 from spelgen.logs.windows import Windows
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
+from spelgen.settings.fits import Solver
 from spelgen.settings.tuning.fitting import IntegrationTuning
 
 if TYPE_CHECKING:
@@ -30,14 +32,18 @@ AT_REST = 1e-6  # [rad, m] finer than encoders
 
 
 def roll_out(
-    model: PortHamiltonian, windows: Windows, substeps: int = 1
+    model: PortHamiltonian, windows: Windows, substeps: int = 1, solver: Solver = "rk4"
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return positions and velocities (W, K-1, n) predicted for samples 1..K-1 of each window from its sample 0.
 
     The state is (q, p), p = M(q) qd, so that no derivative of M in time is needed. Windows make one batch, each with
-    its own sample times, and every interval between samples is solved by itself, by `substeps` steps of the classical
-    Runge-Kutta method: the input jumps at its ends.
+    its own sample times, and every interval between samples is solved by itself: the input jumps at its ends.
+    solver: "rk4" takes `substeps` steps of the classical Runge-Kutta method in each. Written out here and not left
+    to torchdiffeq, which cannot know that the weights stay the same over the whole window: `prepare` readies them
+    once. "dopri5": see `adaptive.roll_out_adaptive`.
     """
+    if solver == "dopri5":
+        return roll_out_adaptive(model, windows)
     prepared = model.prepare()
     q = windows.q[:, 0]
     p = model.momentum(q, windows.qd[:, 0], prepared)
@@ -125,20 +131,24 @@ def _scale(mean_square: torch.Tensor) -> torch.Tensor:
     return torch.maximum(root, smallest)
 
 
-def rollout_errors(model: EmittedModel, windows: Windows, scales: LossScales, substeps: int) -> torch.Tensor:
+def rollout_errors(
+    model: EmittedModel, windows: Windows, scales: LossScales, substeps: int, solver: Solver = "rk4"
+) -> torch.Tensor:
     """Return scaled errors (W, K-1, 2n) of the rollout: of the positions, then of the velocities."""
-    q, qd = roll_out(model, windows, substeps)
+    q, qd = roll_out(model, windows, substeps, solver)
     position = position_difference(q, windows.q[:, 1:], model.joint_types) / scales.q
     return torch.cat([position, (qd - windows.qd[:, 1:]) / scales.qd], dim=-1)
 
 
-def rollout_loss(model: EmittedModel, windows: Windows, scales: LossScales, substeps: int) -> torch.Tensor:
+def rollout_loss(
+    model: EmittedModel, windows: Windows, scales: LossScales, substeps: int, solver: Solver = "rk4"
+) -> torch.Tensor:
     """SPEL eq. 8: squared geodesic distance plus squared velocity error, here scaled per joint and averaged.
 
     The paper sums over joints and samples in rad and rad/s; scaled, a wrist counts as much as a shoulder and
     the next sample as much as the last, and 1 is the loss of predicting that nothing changes.
     """
-    return rollout_errors(model, windows, scales, substeps).square().mean()
+    return rollout_errors(model, windows, scales, substeps, solver).square().mean()
 
 
 def momentum_loss(model: EmittedModel, windows: Windows, scales: LossScales) -> torch.Tensor:

@@ -13,7 +13,7 @@ from spelgen.fitting.dataset import TrainingData
 from spelgen.fitting.rollout import TUNING as INTEGRATION
 from spelgen.fitting.rollout import choose_substeps, integration_error, rollout_loss
 from spelgen.fitting.run_record import Content
-from spelgen.settings.fits import DEFAULTS
+from spelgen.settings.fits import DEFAULTS, Solver
 from spelgen.settings.tuning.fitting import ValidationTuning
 
 if TYPE_CHECKING:
@@ -35,10 +35,11 @@ class Validation:
         device: str = "cpu",
         *,
         batch: int = DEFAULTS.batch,
+        solver: Solver = "rk4",
         substeps: int | None = None,
     ) -> None:
         self.model = model.to(device)
-        self.prescribed = substeps
+        self.solver, self.prescribed = solver, substeps
         self.size = len(data.validation)
         self.scales = data.scales.to(device)
         self.batches = data.validation.to(device).split(4 * batch)
@@ -50,7 +51,7 @@ class Validation:
         try:
             with torch.no_grad():
                 for windows in self.batches:
-                    loss = rollout_loss(self.model, windows, self.scales, substeps)
+                    loss = rollout_loss(self.model, windows, self.scales, substeps, self.solver)
                     total += loss.item() * len(windows)
         except torch.linalg.LinAlgError:
             return math.inf
@@ -60,6 +61,8 @@ class Validation:
         """Return the integrator's steps per sample interval: those prescribed, or as many as the model now needs;
         never fewer than the present ones.
         """
+        if self.solver != "rk4":
+            return 1
         if self.prescribed is not None:
             return self.prescribed
         if present is None:

@@ -93,7 +93,8 @@ def training_facts(config: Record, metrics: Sequence[Record], identified: Record
         facts["length"] = f"{last['epoch']} epochs, {last['step']:,} steps, {_duration(last['seconds'])}"
         facts["kept"] = f"the model of {origin}, validation loss {number(last['best'])}"
         facts["setbacks"] = f"{last['rollbacks']} epochs undone" if last["rollbacks"] else "none"
-        facts["integrator"] = f"rk4, {last['substeps']} steps between samples"
+        if options.get("solver", "rk4") == "rk4":
+            facts["integrator"] = f"rk4, {last['substeps']} steps between samples"
         chart = loss_chart(metrics, best_epoch)
     if options.get("momentum_steps"):
         facts["start"] = f"{options['momentum_steps']:,} steps on the momentum along the logs"

@@ -18,11 +18,16 @@ from spelgen.settings.values import Count, Group, NonNegative, Positive, Whole
 Objective = Literal["torque", "momentum", "rollout", "servo"]
 Optimizer = Literal["adamw", "lbfgs"]
 Adaptation = Literal["load", "friction", "unit"]
+Solver = Literal["rk4", "dopri5"]
 Window = Annotated[Count, Field(ge=2)]
 Substeps = Annotated[Count, Field(le=1000)]  # more never end
 
 DEFAULTS = FitDefaults()
-OF_ADAMW = ("batch", "learning_rate")  # options that L-BFGS has no use for
+UNLESS = {  # options that belong to one value of another option
+    "batch": ("optimizer", "adamw", "lbfgs"),
+    "learning_rate": ("optimizer", "adamw", "lbfgs"),
+    "substeps": ("solver", "rk4", "dopri5"),
+}
 
 
 class GaussianPrior(Group):
@@ -173,8 +178,8 @@ class Rollout(OnWindows):
     """Fit predicted windows, in up to three stages: torque, momentum, windows (SPEL, Algorithm 1, no PD penalty).
 
     First, with `torque_first`, rigid bodies are fitted to torques as `TorqueFit` does. Then come
-    `momentum_steps` as of `MomentumFit`, kept where they help. Then windows are predicted by rk4, with
-    `substeps` per sample interval; None: as many as the robot needs.
+    `momentum_steps` as of `MomentumFit`, kept where they help. Then windows are predicted by `solver`: rk4 with
+    `substeps` per sample interval (None: as many as the robot needs) or dopri5 of torchdiffeq.
     epochs: passes over all windows, at most. patience: epochs without a better validation loss before the end.
     """
 
@@ -184,6 +189,7 @@ class Rollout(OnWindows):
     torque_first: bool = True
     epochs: Count = 400
     patience: Count = 60
+    solver: Solver = "rk4"
     substeps: Substeps | None = None
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, ValidationInfo, field_validator
 
-from spelgen.settings.fits import OWNERS, GaussianPrior, Objective, Optimizer, Substeps, Window
+from spelgen.settings.fits import OWNERS, GaussianPrior, Objective, Optimizer, Solver, Substeps, Window
 from spelgen.settings.values import Count, Group, NonNegative, Number, Positive, Whole
 
 
@@ -33,6 +33,7 @@ class TrainingSettings(Group):
     batch: Count | None = None
     learning_rate: Positive | None = None
     weight_decay: NonNegative | None = None
+    solver: Solver | None = None
     substeps: Substeps | None = None
     max_minutes: NonNegative | None = None
     cutoff: NonNegative | None = None

@@ -96,8 +96,8 @@ class TrainingLoop:
         self.seconds = self.clock.seconds
 
     def _rollout_loss(self, windows: Windows) -> torch.Tensor:
-        loss = rollout_loss(self.model, windows, self.problem.scales, self.substeps)
-        return loss + self.problem.penalty()
+        scales, solver = self.problem.scales, self.config.solver
+        return rollout_loss(self.model, windows, scales, self.substeps, solver) + self.problem.penalty()
 
     def _end(self) -> Status | None:
         if self.epoch >= self.config.epochs or self.optimizer.stalled:

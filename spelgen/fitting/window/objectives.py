@@ -138,6 +138,7 @@ class RolloutObjective(WindowObjective):
             self.data,
             request.device,
             batch=problem.batch,
+            solver=config.solver,
             substeps=config.substeps,
         )
         self.loop = TrainingLoop(
