@@ -74,9 +74,9 @@ class FitConfig(Group):
 
     @model_validator(mode="after")
     def _agree(self) -> Self:
-        for name in OF_ADAMW:
-            if getattr(self, name, None) is not None and getattr(self, "optimizer", None) == "lbfgs":
-                raise OptionError(name, "belongs to the optimizer adamw, this is lbfgs")
+        for name, (other, needed, against) in UNLESS.items():
+            if getattr(self, name, None) is not None and getattr(self, other, None) == against:
+                raise OptionError(name, f"belongs to the {other} {needed}, this is {against}")
         return self
 
     def require(self, *, rigid_bodies: bool) -> None:
@@ -233,9 +233,11 @@ def fit_config(
     kind, options = CONFIGS[objective], dict(options or {})
     applicable = set(kind.model_fields) - set(kind.unused(rigid_bodies=rigid_bodies))
     settings = {name: value for name, value in (defaults or {}).items() if name in applicable}
-    if options.get("optimizer", settings.get("optimizer")) == "lbfgs":
-        for name in OF_ADAMW:
+    for name, (other, _, against) in UNLESS.items():
+        if options.get(other, settings.get(other)) == against:
             settings.pop(name, None)
+        elif name in options and other not in options and settings.get(other) == against:
+            settings.pop(other)
     config = make_config(kind, settings | options)
     config.require(rigid_bodies=rigid_bodies)
     return config
