@@ -386,8 +386,8 @@ def summary(rows: Sequence[dict[str, Any]]) -> str:
         ratio = np.array([by_better_least_squares(row, key) for row in good])
         lines.append(
             f"{key}: hybrid by the better least squares: median {np.median(ratio):.2f}; "
-            f"at most 1.2 on {100 * (ratio <= 1.2).mean():.0f} %, "
-            f"at most 1 on {100 * (ratio <= 1).mean():.0f} % of {len(good)}"
+            + ", ".join(f"at most {most} on {100 * (ratio <= most).mean():.0f} %" for most in (1.2, 1.02, 1))
+            + f" of {len(good)}"
         )
         for cause in ("urdf_error", "friction", "motion", "seconds", "sample_rate", "noise"):
             values = [row[cause] for row in good]
