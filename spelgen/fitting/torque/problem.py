@@ -7,7 +7,8 @@ few constants of each joint: seconds are enough, and no step size is to be chose
 
 half of it, with the covariance of a Gaussian prior (see ``covariance``). Where gains between logged and joint torques
 are trained, what is missed is in the logged ones, else all torques would shrink with their gains. The noise of a joint
-is what is left of its torque, found in rounds, and so is how far the start is to be trusted (see ``most_probable``).
+is what least squares leave of its torque, and then what the fit leaves, found in rounds, as is how far the start is to
+be trusted (see ``most_probable``).
 """
 
 from __future__ import annotations
