@@ -59,7 +59,7 @@ class Bristled(Slider):
         return qd.sign().unsqueeze(-1) * self.reach
 
     def memory_after(self, z, displacement):
-        return moved_bristles(z, displacement, self.reach)
+        return moved_bristles(z, displacement.unsqueeze(-1), self.reach)
 
 
 def pushed(steps=20, dt=0.05, push=2.0):

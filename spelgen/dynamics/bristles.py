@@ -63,13 +63,13 @@ def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
     turned_at = np.take_along_axis(path, corners, axis=0)
     at_corners = [torch.zeros_like(reach)]
     for way in torch.from_numpy(np.diff(turned_at, axis=0)):
-        at_corners.append(moved_bristles(at_corners[-1], way, reach))
+        at_corners.append(moved_bristles(at_corners[-1], way[:, None], reach))
     turned_with, z = torch.stack(at_corners), np.empty((*q.shape, bristles.elements))
     for start in range(0, len(q), BLOCK):
         block = slice(start, start + BLOCK)
         corner = latest[block], drives
         moved = torch.from_numpy(path[block] - turned_at[corner])
-        z[block] = moved_bristles(turned_with[corner], moved, reach).numpy()
+        z[block] = moved_bristles(turned_with[corner], moved[..., None], reach).numpy()
     return z
 
 

@@ -104,4 +104,5 @@ class RegressorDynamics:
     def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
         """z after joints went one way by (..., n)."""
         assert self.bristle_reach is not None
-        return moved_bristles(z, displacement @ self.motors.mT.to(displacement), self.bristle_reach)
+        moved = displacement @ self.motors.mT.to(displacement)
+        return moved_bristles(z, moved.unsqueeze(-1), self.bristle_reach)

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from spelgen.runtime.bristles import bristle_slope, moved_bristles
 from spelgen.runtime.friction_laws import FrictionConstants, FrictionLaws
 from spelgen.runtime.position_servo import ServoConstants, beyond
 
@@ -21,16 +22,22 @@ ServoArm = Any  # an emitted model with servos: emission comes after this room
 
 
 class ServoDrives(NamedTuple):
-    """Hold what servos and friction do at joints: their constants, (..., n), and the laws that these belong to."""
+    """Hold what servos and friction do at joints: their constants, (..., n), and the laws that these belong to.
+
+    Bristles are (K, ..., n) here, so that numbers of an element lie side by side in memory: with (..., n, K) a step
+    takes half as long again.
+    """
 
     servo: ServoConstants
     laws: FrictionLaws
     friction: FrictionConstants
     offset: Tensor  # torque that the drives lack [Nm, N]
+    reach: Tensor  # of bristles, (K, ..., n) [rad, m]
+    steepness: Tensor  # of dry friction's direction by displacement, (K, ..., n) [1/rad, 1/m]
 
 
 class ServoState(NamedTuple):
-    """Hold q and qd, (..., n), and the state z of friction's bristles, (..., n, K)."""
+    """Hold q and qd, (..., n), and the state z of friction's bristles, (K, ..., n)."""
 
     q: Tensor
     qd: Tensor
@@ -52,8 +59,15 @@ class Load(NamedTuple):
 
 def servo_drives(model: ServoArm) -> ServoDrives:
     """Return those of a model with servos."""
-    friction = model.friction
-    return ServoDrives(model.servo.prepare(), friction, friction.prepare(), model.torque_offset)
+    laws, constants = model.friction, model.friction.prepare()
+    reach = laws.bristles.reach.T.contiguous()
+    steepness = (constants.bristle_fractions / laws.bristles.reach).movedim(-1, 0).contiguous()
+    batch = steepness.shape[1:-1] or (1,)  # of constants
+    shape = len(reach), *[1] * len(batch), model.n
+    steepness = steepness.reshape(len(reach), *batch, model.n)
+    return ServoDrives(
+        model.servo.prepare(), laws, constants, model.torque_offset, reach.view(shape), steepness
+    )
 
 
 def balanced(drives: ServoDrives, q: Tensor, qd: Tensor, u: Tensor, load: Load) -> ServoState:
@@ -65,21 +79,20 @@ def balanced(drives: ServoDrives, q: Tensor, qd: Tensor, u: Tensor, load: Load) 
     torque = torque.clamp(-servo.limit, servo.limit) - drives.offset
     excess = torque - load.bias - laws.viscosity(qd, drives.friction) * qd
     direction = (excess / laws.dry(qd, load.gravity, drives.friction)).clamp(-1.0, 1.0)
-    return ServoState(q, qd, direction.unsqueeze(-1) * laws.bristles.reach)
+    return ServoState(q, qd, direction * drives.reach)
 
 
 def advanced(drives: ServoDrives, state: ServoState, u: Tensor, load: Load, h: Tensor) -> ServoState:
     """Return the state one step ``h`` (..., 1) [s] later, under the delayed command u (..., n)."""
     (q, qd, z), servo, laws = state, drives.servo, drives.laws
-    reach, fractions = laws.bristles.reach, drives.friction.bristle_fractions
     dry = laws.dry(qd, load.gravity, drives.friction)
-    stiffness = dry * (fractions / reach * laws.bristles.slope(qd, z)).sum(dim=-1)
+    stiffness = dry * (drives.steepness * bristle_slope(z, qd, drives.reach)).sum(dim=0)
     spring = servo.kp * beyond(u - q, servo.dead_zone)
     torque = spring - servo.kd * qd
     free = (torque.abs() < servo.limit).to(q)  # 0 where the servo is saturated: it neither stiffens nor damps
     servo_stiffness = free * servo.kp * (spring != 0)
     torque = torch.where(free > 0, spring, servo.limit * torque.sign())
-    force = torque - drives.offset - load.bias - dry * (fractions / reach * z).sum(dim=-1)
+    force = torque - drives.offset - load.bias - dry * (drives.steepness * z).sum(dim=0)
     damping = free * servo.kd + laws.viscosity(qd, drives.friction)
     inertia = load.inertia
     if load.coupled:
@@ -96,7 +109,7 @@ def advanced(drives: ServoDrives, state: ServoState, u: Tensor, load: Load, h: T
         velocity = (load.inertia * qd + impulse) / (load.inertia + damping)
     displacement = h * velocity
     qd = qd + (velocity - qd) / theta
-    return ServoState(q + displacement, qd, laws.bristles.moved(z, displacement))
+    return ServoState(q + displacement, qd, moved_bristles(z, displacement, drives.reach))
 
 
 def replayed(model: ServoArm, q: Tensor, qd: Tensor, commands: Tensor, dt: Tensor) -> Tensor:

@@ -24,13 +24,16 @@ def delayed_commands(trajectory: Trajectory, rows: slice, delay: float, steps: i
 
     Means, not values: so what follows from them is smooth in the delay.
     """
-    t, u = trajectory.t, require_commands(trajectory)
+    samples = trajectory.t[rows]
+    earliest, latest = np.searchsorted(trajectory.t, samples[[0, -1]] - delay)
+    # from the command that stood then
+    held_rows = slice(max(0, earliest - 1), latest + 1)
+    t, u = trajectory.t[held_rows], require_commands(trajectory)[held_rows]
     durations = np.diff(t, prepend=t[0] - BEFORE)
     held = np.concatenate([u[:1], u[:-1]])  # until each sample
     integral = np.zeros((len(t) + 1, u.shape[1]))
     integral[1:] = np.cumsum(durations[:, None] * held, axis=0)
     corners = np.concatenate([t[:1] - BEFORE, t])
-    samples = t[rows]
     edges = samples[:-1, None] + np.diff(samples)[:, None] * np.arange(steps) / steps
     edges = np.append(edges.ravel(), samples[-1])
     means = np.zeros((len(edges) - 1, u.shape[1]))

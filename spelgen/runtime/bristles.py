@@ -22,21 +22,22 @@ class Bristles(nn.Module):
         super().__init__()
         self.register_buffer("reach", torch.tensor(reach, dtype=torch.float64))
 
-    def slope(self, qd: Tensor, z: Tensor) -> Tensor:
-        """dz/dq, (..., n, K), from 0 to 2, of joints that go the way of qd."""
-        return 1 - qd.sign().unsqueeze(-1) * z / self.reach
-
     def rate(self, qd: Tensor, z: Tensor) -> Tensor:
         """z', (..., n, K)."""
-        return qd.unsqueeze(-1) * self.slope(qd, z)
+        return qd.unsqueeze(-1) * bristle_slope(z, qd.unsqueeze(-1), self.reach)
 
     def moved(self, z: Tensor, displacement: Tensor) -> Tensor:
         """z after joints went one way by (..., n), exactly."""
-        return moved_bristles(z, displacement, self.reach)
+        return moved_bristles(z, displacement.unsqueeze(-1), self.reach)
+
+
+def bristle_slope(z: Tensor, qd: Tensor, reach: Tensor) -> Tensor:
+    """dz/dq, from 0 to 2, of joints that go the way of qd; shapes as z, or broadcast to it."""
+    return 1 - qd.sign() * z / reach
 
 
 def moved_bristles(z: Tensor, displacement: Tensor, reach: Tensor) -> Tensor:
-    """z, (..., n, K), after joints went one way by (..., n), exactly."""
-    end = displacement.sign().unsqueeze(-1) * reach
+    """z after joints went one way by a displacement, exactly; shapes as z, or broadcast to it."""
+    end = displacement.sign() * reach
     # to all digits of small displacements
-    return z + (z - end) * (-displacement.abs().unsqueeze(-1) / reach).expm1()
+    return z + (z - end) * (-displacement.abs() / reach).expm1()

@@ -18,7 +18,8 @@ import torch
 from spelgen.dynamics.bristles import encoder_step
 from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.dataset import digest
-from spelgen.fitting.levenberg_marquardt import levenberg_marquardt, start
+from spelgen.fitting.levenberg_marquardt import TUNING as DAMPING
+from spelgen.fitting.levenberg_marquardt import SolverState, levenberg_marquardt
 from spelgen.fitting.objective import FitRequest, PreparedLogs, Status
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.servo.laws import select_dead_zones, without_faint
@@ -102,9 +103,11 @@ class ServoObjective:
         problem = self._problem
         while True:
             number = len(self._rounds)
-            first = start(problem, self._rounds[-1], steps=self._steps)
+            x, damping = self._rounds[-1], DAMPING.first
             if number > 1:  # near the minimum from where the round before ended
-                first = replace(first, damping=TUNING.later_damping)
+                damping = TUNING.later_damping
+            cost = problem.cost(x, self._errors)
+            first = SolverState(x, self._errors, cost, damping, self._steps)
             for state in levenberg_marquardt(
                 problem,
                 first,
@@ -161,11 +164,12 @@ class ServoObjective:
             problem.windows = replace(problem.windows, steps=self._windows.steps)
         if self._rounds:
             problem.linearise(x, problem.predicted_path(x))
-        problem.weigh(x)
+        self._errors = problem.residuals(x)
+        problem.weigh(self._errors)
         problem.write(x)  # for the checkpoint: an interrupted fit is usable
         self._rounds.append(x)
         self._first_steps = self._steps
-        self._take_checkpoint(float(problem.residuals(x).square().mean().sqrt()))
+        self._take_checkpoint(float(self._errors.square().mean().sqrt()))
 
     def _take_checkpoint(self, rms: float) -> None:
         weights = {name: x.clone() for name, x in self.request.model.state_dict().items()}

@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
-from torch.func import functional_call, jacfwd
+from torch.autograd.functional import jacobian
+from torch.func import functional_call
 
 from spelgen.dynamics.body_regressor import regressor_of
 from spelgen.dynamics.parameters import parameters_of_kind
@@ -139,10 +140,13 @@ def body_directions(model: EmittedModel, q: torch.Tensor) -> torch.Tensor:
 def inertial_slopes(model: EmittedModel) -> torch.Tensor:
     """Return the derivative of the ten parameters of all bodies by the parameters that are trained, (10 B, 10 B)."""
     raw = body_parameters(model).detach()
-    slopes: torch.Tensor = jacfwd(lambda flat: inertial_parameters(model, flat.view_as(raw)).flatten())(
-        raw.flatten()
-    )
-    return slopes.detach()
+
+    def inertial(trained: torch.Tensor) -> torch.Tensor:
+        return inertial_parameters(model, trained)
+
+    # torch.func's jacobians import a compiler for more than a second
+    slopes: torch.Tensor = jacobian(inertial, raw)
+    return slopes.reshape(raw.numel(), raw.numel())
 
 
 def inertial_parameters(model: EmittedModel, raw: torch.Tensor) -> torch.Tensor:

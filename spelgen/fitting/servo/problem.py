@@ -96,10 +96,10 @@ class ServoProblem:
         self._inertial = inertial_parameters(self.model, body_parameters(self.model).detach()).flatten()
         self.load = body_load(self.model, path)
 
-    def weigh(self, x: ServoParameters) -> None:
-        """Take the likelihood of errors as they are at x."""
+    def weigh(self, errors: torch.Tensor) -> None:
+        """Take the likelihood of errors like these, (W, K', n)."""
         span = max(1, round(TUNING.correlation_time * self.windows.rate))
-        self.likelihood = Likelihood.of(self.residuals(x), self._noise, span)
+        self.likelihood = Likelihood.of(errors, self._noise, span)
 
     def write(self, x: ServoParameters) -> None:
         """Give the model the parameters."""
