@@ -137,7 +137,7 @@ def find_urdf(module: Path, name: str) -> Path:
         if (folder / name).is_file():
             return folder / name
     raise ModuleError(
-        f"its URDF {name!r} is in none of " + ", ".join(dict.fromkeys(str(folder) for folder in folders)),
+        f"its URDF {name!r} is in none of " + ", ".join(dict.fromkeys(map(str, folders))),
         file=module,
         do="name it with --robot",
     )

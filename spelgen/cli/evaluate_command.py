@@ -69,7 +69,7 @@ def evaluate(
     """
     # a misspelt limit is refused before minutes of rollouts
     paths = options.logs(data, extra_logs)
-    limits = [_limit(text) for text in limit or []]
+    limits = list(map(_limit, limit or []))
     from spelgen.evaluation.evaluate import SECONDS, STEPS
     from spelgen.evaluation.evaluate import evaluate as evaluate_model
     from spelgen.evaluation.subject import read_test_logs

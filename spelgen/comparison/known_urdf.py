@@ -39,7 +39,7 @@ def with_wrong_inertials(robot: Path, error: float) -> bytes:
         origin = inertial.find("origin")
         if origin is None:
             origin = etree.SubElement(inertial, "origin")
-        center = [float(x) for x in origin.get("xyz", "0 0 0").split()]
+        center = list(map(float, origin.get("xyz", "0 0 0").split()))
         origin.set("xyz", " ".join(repr(float(x)) for x in np.add(center, size * moved)))
     return _written(tree)
 

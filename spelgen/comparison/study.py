@@ -151,7 +151,7 @@ def prepare_study(
     settings = settings.model_copy(
         update={"seeds": seeds or settings.seeds, "steps": steps or settings.steps}
     )
-    ranges = [working_range(coordinate) for coordinate in loaded.arm.coordinates]
+    ranges = list(map(working_range, loaded.arm.coordinates))
     training = None
     if urdf_error is None:
         training = _training(loaded.settings, settings)

@@ -32,7 +32,7 @@ def pinocchio_model(arm: Arm, settings: Settings) -> pin.Model:
     Reflected rotor inertia is the model's armature. Raises ArmError when a body has no inertial.
     """
     bare = [body.name for body in arm.bodies if body.inertia is None]
-    collect([_without_inertial(name) for name in bare])
+    collect(list(map(_without_inertial, bare)))
     model = pin.Model()
     model.name = arm.name
     model.gravity.linear = np.array(arm.gravity, dtype=float)

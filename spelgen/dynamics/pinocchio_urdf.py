@@ -36,9 +36,8 @@ def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) ->
     if missing:
         raise ValueError(f"Pinocchio sees no joint {', '.join(missing)}")
     by_joint = settings.joints if drives else {}
-    damping, coulomb = (
-        np.array([getattr(robot.joint[name], what) for name in joints]) for what in ("damping", "friction")
-    )
+    damping = np.array([robot.joint[name].damping for name in joints])
+    coulomb = np.array([robot.joint[name].friction for name in joints])
     forward, backward = coulomb, -coulomb
     for k, name in enumerate(joints):
         if name in by_joint:

@@ -45,5 +45,5 @@ class RigidBodies:
 
 
 def _row(values: tuple[object, object, object]) -> Row:
-    x, y, z = (float(value) for value in values)  # type: ignore[arg-type]
+    x, y, z = map(float, values)  # type: ignore[arg-type]
     return x, y, z

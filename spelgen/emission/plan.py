@@ -63,7 +63,7 @@ def plan_model(
     potential = structure.potential
     if design.potential == "dense":
         potential = everything
-    x, y, z = (float(g) for g in arm.gravity)
+    x, y, z = map(float, arm.gravity)
     return ModelSpec(
         robot=arm.name,
         urdf=urdf,

@@ -20,12 +20,12 @@ def number(value: float) -> float | None:
 
 def series(values: np.ndarray | torch.Tensor) -> Series:
     """Return (T,) as a list."""
-    return [number(value) for value in values.tolist()]
+    return list(map(number, values.tolist()))
 
 
 def rows(values: np.ndarray | torch.Tensor) -> Rows:
     """Return (T, n) as a list of lists."""
-    return [series(row) for row in values]
+    return list(map(series, values))
 
 
 def finite(values: np.ndarray | torch.Tensor) -> tuple[float | None, ...]:

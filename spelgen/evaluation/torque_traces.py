@@ -190,10 +190,14 @@ def _trace(which: str, name: str, dynamics: Mapping[str, RigidDynamics], motion:
         rows(qd[::stride]),
         rows(measured[::stride]),
         rows((predicted[MODEL] - parts["friction"])[::stride]),
-        {label: rows(torque[::stride]) for label, torque in predicted.items()},
-        {label: rows(torque[::stride]) for label, torque in parts.items()},
+        _thinned(predicted, stride),
+        _thinned(parts, stride),
         {label: series(work[::stride]) for label, work in energy.items()},
     )
+
+
+def _thinned(torques: Mapping[str, Tensor], stride: int) -> dict[str, Rows]:
+    return {label: rows(torque[::stride]) for label, torque in torques.items()}
 
 
 def _energy(

@@ -89,7 +89,7 @@ def called_by_state(functions: Mapping[str, ca.Function]) -> Called:
         function = functions[name]
         states = zip(*(inputs[key] for key in function.name_in()), strict=True)
         # one by one: a map over states would compile another function
-        results = [function.call([ca.DM(x) for x in state]) for state in states]
+        results = [function.call(list(map(ca.DM, state))) for state in states]
         outputs: Values = {}
         for k, key in enumerate(function.name_out()):
             values = np.array([result[k].full() for result in results])

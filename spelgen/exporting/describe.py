@@ -96,7 +96,7 @@ def servos_of(model: EmittedModel) -> Servos | None:
     """Return the position servos of a model, None where it has none."""
     if not has_servos(model):
         return None
-    kp, kd, limit, dead_zone = (array(x) for x in model.servo.prepare())
+    kp, kd, limit, dead_zone = map(array, model.servo.prepare())
     return Servos(kp, kd, limit, dead_zone, float(model.servo.delay))
 
 
@@ -178,7 +178,7 @@ def _splines(terms: ResidualTerms, weights: Tensor) -> Splines:
 def _ripple(terms: ResidualTerms, weights: Tensor) -> tuple[Harmonics, ...]:
     """Return by joint the multiples of a turn, then, where they stand for themselves, those of the motor's turn."""
     ripple: list[Harmonics] = []
-    cosines, sines = (array(half) for half in weights.chunk(2, dim=-1))
+    cosines, sines = map(array, weights.chunk(2, dim=-1))
     for joint, frequencies in enumerate(array(terms.frequencies)):
         count = len(frequencies)
         # how many follow one another from one on

@@ -128,4 +128,4 @@ def readme(title: str, use: str, joints: Sequence[str], conventions: str, checke
     """Return the five lines beside an export: title, use, joints in their order, conventions, result of the check."""
     # names come from a file that anyone may have written
     lines = [f"# {title}", use, f"Joints, in this order: {', '.join(joints)}.", conventions, checked]
-    return ("\n".join(printable(line) for line in lines) + "\n").encode()
+    return ("\n".join(map(printable, lines)) + "\n").encode()

@@ -125,4 +125,4 @@ def _plain(value: np.ndarray) -> float | list[float]:
     """Return a number, or a row of numbers, for YAML."""
     if value.ndim == 0:
         return rounded(float(value))
-    return [rounded(x) for x in value.tolist()]
+    return list(map(rounded, value.tolist()))

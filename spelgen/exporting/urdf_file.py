@@ -101,7 +101,7 @@ def _set_inertial(link: etree._Element, inertia: np.ndarray, rotation: np.ndarra
     etree.SubElement(inertial, "origin", xyz=" ".join(map(_number, center)), rpy="0 0 0")
     etree.SubElement(inertial, "mass", value=_number(mass))
     names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    moments = [_number(x) for x in tensor[np.triu_indices(3)]]
+    moments = list(map(_number, tensor[np.triu_indices(3)]))
     etree.SubElement(inertial, "inertia", dict(zip(names, moments, strict=True)))
     # first, as most URDFs have it
     link.insert(0, inertial)

@@ -73,7 +73,7 @@ def prepare_streamed(
     counts = [sum(map(cutting.count, pieces)) for pieces in contents.pieces]
     usable = np.flatnonzero(counts).tolist()
     chosen = _split(usable, cutting, choice)
-    training, validating = ([contents.chunks[k] for k in numbers] for numbers in chosen)
+    training, validating = (list(map(contents.chunks.__getitem__, numbers)) for numbers in chosen)
     windows = _sample(training, cutting)
     message = (
         f"larger than memory: read in {len(contents.chunks)} chunks; validation on {len(validating)} chunks, "

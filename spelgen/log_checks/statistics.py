@@ -69,7 +69,7 @@ def statistics(trajectory: Trajectory) -> Statistics:
     for name in trajectory.quantities:
         signals: np.ndarray = getattr(trajectory, name)
         low[name], high[name] = signals.min(axis=0), signals.max(axis=0)
-        steps[name] = np.array([quantisation_step(column) for column in signals.T])
+        steps[name] = np.array(list(map(quantisation_step, signals.T)))
         if dense:
             noise[name] = noise_level(trajectory.t, signals)
     agreement = velocity_agreement(trajectory)

@@ -165,7 +165,7 @@ def _matrix_columns(arrays: NpzArrays, matrix: str, joints: Sequence[str], file:
                 expected=f"{len(joints)}, one for each joint", do=f"name them by an array {JOINT_NAMES!r}",
             )  # fmt: skip
         return list(range(width))
-    names = [str(x) for x in arrays[JOINT_NAMES].ravel()]
+    names = list(map(str, arrays[JOINT_NAMES].ravel()))
     for joint in joints:
         if joint not in names or len(names) != width:
             raise LogError(

@@ -268,9 +268,8 @@ def _log_steps(low: float, high: float) -> tuple[list[float], list[str]]:
     first, last = math.ceil(math.log10(low) - 1e-9), math.floor(math.log10(high) + 1e-9)
     powers = range(first, last + 1, max(1, (last - first) // 5 + 1))
     if len(powers) >= 3:
-        return [10.0**power for power in powers], [
-            f"10{str(power).translate(_SUPERSCRIPTS)}" for power in powers
-        ]
+        labels = [f"10{str(power).translate(_SUPERSCRIPTS)}" for power in powers]
+        return (10.0 ** np.array(powers)).tolist(), labels
     values = np.outer(10.0 ** np.arange(first - 1, last + 1), [1, 2, 5]).ravel()
     values = values[(values >= low) & (values <= high)]
     if len(values) < 3:

@@ -42,7 +42,7 @@ def charts(log: Trajectory, arm: Arm, inputs: np.ndarray) -> list[Panel]:
     if log.u is not None:
         quantities["position"].append(("commanded", _joined(pieces, "u"), "predicted"))
     else:
-        slope = np.concatenate([_slope(piece) for piece in pieces])
+        slope = np.concatenate(list(map(_slope, pieces)))
         quantities["velocity"] = [("logged", _joined(pieces, "qd"), "truth"), ("dq/dt", slope, "predicted")]
         quantities["torque"] = [("logged", _joined(pieces, "tau") @ inputs.T, "truth")]
         if any(body.inertia for body in arm.bodies):

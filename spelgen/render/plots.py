@@ -173,7 +173,7 @@ def _error_limits(errors: Mapping[str, Record]) -> tuple[float, float] | None:
 
 
 def _positive(columns: Sequence[object]) -> np.ndarray:
-    values = np.concatenate([numbers(column) for column in columns])
+    values = np.concatenate(list(map(numbers, columns)))
     positive: np.ndarray = values[values > 0]
     return positive
 

@@ -102,7 +102,7 @@ def report_data(folder: Path | str) -> Record:
         if bodies is not None:
             data["bodies"] = bodies.tolist()
     tables = parameter_tables(run.model, run.arm, run.identified)
-    data["tables"] = [asdict(table) for table in tables]
+    data["tables"] = list(map(asdict, tables))
     return data | {"evaluation": run.evaluation, "least_squares": run.identified}
 
 

@@ -16,11 +16,15 @@ def make_friction(arm: Arm, settings: Settings, speeds: np.ndarray | None = None
     speeds: C (n, n) of the drives. Where they move several joints, a joint's friction is that of its drive, as in the
     models.
     """
-    joints = [_losses(coordinate, settings) for coordinate in arm.coordinates]
+    losses = []
+    for coordinate in arm.coordinates:
+        joint = _losses(coordinate, settings)
+        losses.append((joint.viscous, *joint.coulomb))
+    viscous, forward, backward = np.array(losses).T
     return Friction(
-        viscous=np.array([joint.viscous for joint in joints]),
-        forward=np.array([joint.coulomb[0] for joint in joints]),
-        backward=np.array([joint.coulomb[1] for joint in joints]),
+        viscous=viscous,
+        forward=forward,
+        backward=backward,
         smoothing_velocity=settings.simulation.coulomb_smoothing_velocity,
         speeds=None if speeds is None or np.array_equal(speeds, np.eye(len(speeds))) else speeds,
     )

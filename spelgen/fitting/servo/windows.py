@@ -86,7 +86,7 @@ class ServoWindows:
         q, qd: predicted, of which only what they miss is smoothed: so fast motion stays.
         """
         missed = self.q if q is None else self.q - q
-        slow_qd, slow_qdd = (torch.from_numpy(x) for x in smoothed(missed.numpy(), self.rate))
+        slow_qd, slow_qdd = map(torch.from_numpy, smoothed(missed.numpy(), self.rate))
         path = Path(_midpoints(self.q), _midpoints(slow_qd), _midpoints(slow_qdd))
         if qd is None:
             return path
