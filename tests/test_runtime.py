@@ -33,7 +33,7 @@ NUMBERS = Path(__file__).parent / "golden" / "numbers.json"
 FIRST_STAGE = (  # friction's laws then: |gravity torque|, tanh and exp
     ("LEAST_LOAD = 0.01", "LEAST_LOAD = 0.0"),
     ("velocity * torch.rsqrt(velocity * velocity + width**2)", "(velocity / width).tanh()"),
-    ("(1 + (qd / c.stribeck_velocity).square() / 16).pow(-16)", "(-((qd / c.stribeck_velocity) ** 2)).exp()"),
+    ("fall.square().square().square().square()", "(-((qd / c.stribeck_velocity) ** 2)).exp()"),
     ("torch.rsqrt(qd * qd + c.saturation_velocity**2)", "(qd / c.saturation_velocity).tanh() / qd"),
 )
 PRESETS = (
