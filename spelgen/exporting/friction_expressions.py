@@ -10,6 +10,8 @@ import numpy as np
 
 from spelgen.exporting.description import Bristles, FrictionLaw
 
+_NEGLIGIBLE = 1e-30  # of a bristle's way to its end; its power of ten is still a normal number
+
 
 def law_torque(law: FrictionLaw, qd: ca.SX, gravity: ca.SX, direction: ca.SX) -> ca.SX:
     """Return the torque of friction, (n, 1) [Nm, N], under this gravity torque.
@@ -52,30 +54,21 @@ def bristle_step(bristles: Bristles, z: ca.SX, dq: ca.SX) -> ca.SX:
     decays = []
     for joint, reach in enumerate(bristles.reach):
         moved = ca.fabs(dq[joint])
-        by_element = [ca.expm1(-moved / reach[-1])]
+        decay = ca.expm1(-moved / reach[-1])
+        by_element, remaining = [decay], 1 + decay
         for longer, shorter in pairwise(reach[::-1]):
             ratio = round(longer / shorter)
-            decay = ca.expm1(-moved / shorter)
             if math.isclose(longer, ratio * shorter, rel_tol=1e-12):
-                # one exponential a joint: a power of it takes a fraction of the time
-                decay = _raised(by_element[0], ratio)
-            by_element.insert(0, decay)
+                # one exponential a joint: powers of it take a fraction of its time, but not among subnormal numbers
+                remaining = ca.fmax(remaining, _NEGLIGIBLE) ** ratio
+            else:
+                remaining = ca.exp(-moved / shorter)
+            by_element.insert(0, remaining - 1)
         decays += by_element
     # no branch; which sign a zero has is no matter, for nothing is added then
     end = ca.copysign(1, _by_element(bristles, dq)) * bristles.reach.ravel()
     z_next: ca.SX = z + (z - end) * ca.vertcat(*decays)
     return z_next
-
-
-def _raised(decay: ca.SX, power: int) -> ca.SX:
-    """Return (1 + decay)^power - 1 to all digits of small decays."""
-    result = ca.SX(0)
-    while power:
-        if power % 2:
-            result = result + decay + result * decay
-        decay = decay * (2 + decay)
-        power //= 2
-    return result
 
 
 def _by_element(bristles: Bristles, values: ca.SX) -> ca.SX:
