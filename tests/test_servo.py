@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import sys
 from dataclasses import replace
 
@@ -21,8 +22,10 @@ from spelgen.cli.main import app
 from spelgen.dynamics.servo_rank import servo_rank
 from spelgen.dynamics.servo_rollout import replayed
 from spelgen.errors import LogError, OptionError, RunError, SettingsError
+from spelgen.evaluation import keep
 from spelgen.evaluation.keep import read_followers
 from spelgen.files import write_json
+from spelgen.fitting.dataset import digest
 from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.servo import objective
@@ -109,6 +112,27 @@ def test_actuators_of_mujoco_are_what_it_has_to_beat(fitted, logs, monkeypatch):
     assert read_followers(run) == {}
     alone = spelgen.evaluate(run.path, logs[4][:40])
     assert "no-position-actuators" in {x.code for x in alone.diagnostics}
+
+
+def test_actuators_of_mujoco_are_fitted_to_files_when_they_are_needed(
+    fitted, logs, arm, tmp_path, monkeypatch
+):
+    pytest.importorskip("mujoco")
+    monkeypatch.setattr(keep, "_fit_position_actuators", lambda run, logs, used: {"fitted to": len(logs)})
+    run = RunFolder(tmp_path / "run")
+    shutil.copytree(fitted.folder, run.path)
+    path = spelgen.write_logs(tmp_path / "logs.parquet", logs[:4], arm)
+    read = spelgen.read_logs(path, arm, {"input": "position"})  # where no zero is negative
+    write_json(run.config, run.read_config() | {"data_digest": digest(read)})
+    spelgen.keep_baseline(run.path, [path])
+    assert read_followers(run) == {}
+    assert run.read_json(run.baseline)["fitted to"] == 4
+    spelgen.keep_baseline(run.path, [path])
+    spelgen.write_logs(path, logs[:3], arm)
+    assert read_followers(run) == {}
+    assert "fitted to" not in run.read_json(run.baseline)  # other logs than the model was fitted to
+    path.unlink()
+    assert read_followers(run) == {}
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ of an arm under position servos, of MuJoCo's actuators.
 from __future__ import annotations
 
 import importlib.util
+import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -12,8 +13,9 @@ from spelgen.baselines.baseline import CommandFollower
 from spelgen.baselines.names import POSITION_ACTUATORS
 from spelgen.baselines.registry import BASELINES
 from spelgen.baselines.run_arm import run_arm
-from spelgen.errors import RunError
+from spelgen.errors import LogError, RunError
 from spelgen.files import write_json
+from spelgen.fitting.dataset import digest
 from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.fitting.servo.windows import servo_windows
 from spelgen.fitting.streaming import LargeLogs
@@ -29,7 +31,8 @@ def keep_baseline(folder: Path | str, logs: Iterable[Path | str] | Sequence[Traj
 
     What the logs cover is kept beside it. A run without URDF and logs larger than memory are left as they are; logs
     that are too sparse for accelerations give no parameters. Of an arm under position servos MuJoCo's actuators are
-    fitted instead, where MuJoCo is installed.
+    fitted instead, where MuJoCo is installed: to files when an evaluation first needs them, for it takes as long as
+    the fit.
     """
     run = RunFolder(Path(folder))
     record = run.read_config()
@@ -39,6 +42,7 @@ def keep_baseline(folder: Path | str, logs: Iterable[Path | str] | Sequence[Traj
             trajectories.append(log)
         else:
             paths.append(log)
+    only_files = not trajectories
     if paths:
         opened = open_logs(run.load_module(), paths, LogMapping(**record["mapping"]))
         if isinstance(opened, LargeLogs):  # least squares takes all samples at once
@@ -49,7 +53,10 @@ def keep_baseline(folder: Path | str, logs: Iterable[Path | str] | Sequence[Traj
     baselines: dict[str, object] = {"coverage": coverage(trajectories)}
     preprocessing = Preprocessing(**record["preprocessing"])
     if record["objective"] == "servo":
-        baselines |= _fit_position_actuators(run, trajectories, preprocessing)
+        if only_files:
+            baselines["files"] = [os.path.abspath(path) for path in paths]
+        else:
+            baselines |= _fit_position_actuators(run, trajectories, preprocessing)
     else:
         for baseline in BASELINES:
             baselines |= baseline.fit(run, trajectories, preprocessing)
@@ -70,17 +77,34 @@ def _fit_position_actuators(
     return {"position_actuators": actuators.to_dict()}
 
 
+def _fitted_to_files(run: RunFolder, files: Sequence[str]) -> dict[str, object]:
+    """Return MuJoCo's actuators, fitted to the files that the run was trained on; none where these have changed."""
+    record = run.read_config()
+    try:
+        logs = open_logs(run.load_module(), files, LogMapping(**record["mapping"]))
+    except LogError:  # moved or removed
+        return {}
+    if isinstance(logs, LargeLogs) or digest(logs) != record["data_digest"]:
+        return {}
+    return _fit_position_actuators(run, logs, Preprocessing(**record["preprocessing"]))
+
+
 def _has_mujoco() -> bool:
     return importlib.util.find_spec("mujoco") is not None
 
 
 def read_followers(run: RunFolder) -> dict[str, CommandFollower]:
-    """Return the actuators of MuJoCo that `keep_baseline` fitted, by name; none where it fitted none, or where MuJoCo
-    is not installed.
+    """Return the actuators of MuJoCo that were fitted to the run's training logs, or are now, by name; none where
+    these logs are gone, or where MuJoCo is not installed.
     """
     path = run.baseline
     record = run.read_json(path) if path.exists() else {}
-    if "position_actuators" not in record or not _has_mujoco():
+    if not _has_mujoco():
+        return {}
+    if "files" in record and "position_actuators" not in record:
+        record |= _fitted_to_files(run, record["files"])
+        write_json(path, record)
+    if "position_actuators" not in record:
         return {}
     from spelgen.evaluation.position_actuators import PositionActuators
 

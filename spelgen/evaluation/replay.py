@@ -26,7 +26,8 @@ MISSING = {
     LINEAR_SERVOS: ("no-linear-servos", "no linear servos to compare with: they are fitted by `train`"),
     POSITION_ACTUATORS: (
         "no-position-actuators",
-        "no actuators of MuJoCo to compare with: `spelgen train` fits them where MuJoCo is installed",
+        "no actuators of MuJoCo to compare with: they are fitted where MuJoCo is installed, to the training logs "
+        "as long as these stay where they are",
     ),
 }
 
