@@ -52,10 +52,9 @@ class Likelihood:
         # a Gaussian deviates by 1.4826 times its median; a table under the arm is not in the median
         scale = torch.maximum(1.4826 * errors.abs().flatten(0, 1).median(dim=0).values, noise)
         robust = errors / (1 + (errors / scale).square() / 4)
-        span = min(span, robust.shape[1])  # of windows of a second no block is longer
         # errors that say the same add up: the variance of their sum is so many times that of a sample
         span = min(span, errors.shape[1])
-        blocks = robust[:, : robust.shape[1] // span * span].unflatten(1, (-1, span))
+        blocks = robust[:, : errors.shape[1] // span * span].unflatten(1, (-1, span))
         of_sums = blocks.sum(dim=2).square().mean(dim=(0, 1))
         of_samples = blocks.square().sum(dim=2).mean(dim=(0, 1))
         return cls(scale, (of_sums / of_samples.clamp(min=1e-300)).clamp(1.0, float(span)))
@@ -104,9 +103,8 @@ class ServoProblem:
     def write(self, x: ServoParameters) -> None:
         """Give the model the parameters."""
         self.rows.write(x)
-        bodies = self._raw_bodies + (self.directions @ x.bodies).view_as(self._raw_bodies)
         with torch.no_grad():
-            body_parameters(self.model).copy_(bodies)
+            body_parameters(self.model).copy_(self._bodies_at(x.bodies))
             self.model.servo.delay.fill_(x.delay)
 
     def residuals(self, x: ServoParameters) -> torch.Tensor:
@@ -207,9 +205,13 @@ class ServoProblem:
         distinct, which = bodies.unique(dim=0, return_inverse=True)
         changes = []
         for point in distinct:
-            raw = self._raw_bodies + (self.directions @ point).view_as(self._raw_bodies)
-            changes.append(inertial_parameters(self.model, raw).flatten() - self._inertial)
+            inertial = inertial_parameters(self.model, self._bodies_at(point))
+            changes.append(inertial.flatten() - self._inertial)
         return torch.stack(changes)[which]
+
+    def _bodies_at(self, bodies: torch.Tensor) -> torch.Tensor:
+        """Return the bodies' raw parameters, (B, 10), this far (r,) along their directions."""
+        return self._raw_bodies + (self.directions @ bodies).view_as(self._raw_bodies)
 
     def _integrate(
         self, drives: ServoDrives, armature: torch.Tensor, change: torch.Tensor, commands: torch.Tensor
