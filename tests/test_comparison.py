@@ -206,7 +206,7 @@ def test_begun_anew_nothing_of_the_old_runs_goes_on(study, robot, tmp_path):
 def test_tables_stand_beside_published_figures(study):
     results = list(study.results())
     tables = comparison_tables(results, time_steps(study), study.settings.published)
-    rows = {row.label: [cell.text for cell in row.cells] for table in tables for row in table.rows}
+    rows = {row.label: list(map(row.text, table.columns)) for table in tables for row in table.rows}
     assert rows["outputs of M"] == ["21", "1"]
     assert rows["published: prediction loss"] == ["0.194", ""]
     base, ours = (result.prediction.loss for result in results)
@@ -252,7 +252,7 @@ def test_a_run_that_is_not_finite_counts_as_worst(study):
     (result,) = (x for x in study.results() if x.variant == "hybrid")
     broken = replace(result, seed=1, prediction=metrics.Prediction(None, None, None))
     table = comparison_tables([result, broken, broken], {"hybrid": 1.0}, {})[1]
-    assert {row.label: row.cells[0].text for row in table.rows}["prediction loss, 1 s"] == "-"
+    assert {row.label: row.text("hybrid") for row in table.rows}["prediction loss, 1 s"] == "-"
 
 
 def test_windows_and_examples_of_every_fourth_sample_begin_with_a_fourth_one():

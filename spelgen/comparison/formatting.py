@@ -7,7 +7,7 @@ import statistics
 from collections.abc import Callable, Mapping, Sequence
 
 from spelgen.comparison.results import RunResult
-from spelgen.evaluation.tables import Cell, Row, Table, known, table
+from spelgen.evaluation.tables import Numbers, Row, Table, known, table
 from spelgen.listing import number
 from spelgen.settings.comparison import PublishedFigures
 
@@ -62,32 +62,32 @@ def _sizes(runs: Runs, step_seconds: Mapping[str, float], published: Published) 
     sizes = {name: of_seeds[0].sizes for name, of_seeds in runs.items()}
     rows = []
     for k, matrix in enumerate("MDGV"):
-        cells = [Cell(str(size.outputs[k])) for size in sizes.values()]
-        rows.append(Row(f"outputs of {matrix}", tuple(cells)))
-    rows.append(Row("inputs of M", tuple(Cell(str(size.inputs)) for size in sizes.values())))
-    rows.append(_row("parameters", {name: size.parameters for name, size in sizes.items()}, "{:,.0f}"))
-    rows.append(_row("training step [ms]", {name: 1e3 * step_seconds[name] for name in runs}, "{:.1f}"))
-    rows += _published(runs, published, "parameters", "parameters", "{:,.0f}")
-    rows += _published(runs, published, "training step [s]", "step_seconds", "{:.2f}")
-    title = "Sizes, and the time of a training step here; below, what is published"
-    return Table(title, tuple(runs), tuple(rows))
+        outputs = {name: size.outputs[k] for name, size in sizes.items()}
+        rows.append(Row(f"outputs of {matrix}", outputs, ranked=False))
+    rows += [
+        Row("inputs of M", {name: size.inputs for name, size in sizes.items()}, ranked=False),
+        Row("parameters", {name: size.parameters for name, size in sizes.items()}, "{:,.0f}".format),
+        Row("training step [ms]", {name: 1e3 * step_seconds[name] for name in runs}, "{:.1f}".format),
+        *_published(runs, published, "parameters", "parameters", "{:,.0f}".format),
+        *_published(runs, published, "training step [s]", "step_seconds", "{:.2f}".format),
+    ]
+    return Table("Sizes, and the time of a training step here; below, what is published", tuple(rows))
 
 
 def _losses(runs: Runs, published: Published) -> Table:
     rows = []
     for label, quantity in LOSSES.items():
         medians = {name: _median(of_seeds, quantity) for name, of_seeds in runs.items()}
-        rows.append(_row(label, medians))
+        rows.append(Row(label, medians))
         if BASELINE in runs and label in RATIOS:
-            ratios = tuple(_ratio(medians[BASELINE], median) for median in medians.values())
-            rows.append(Row(f"{BASELINE}'s {RATIOS[label]} / this", ratios))
+            rows.append(Row(f"{BASELINE}'s {RATIOS[label]} / this", _ratios(medians), ranked=False))
     for label, field in PUBLISHED.items():
         rows += _published(runs, published, label, field)
     title = (
         "Squared errors summed over joints [rad, m, s], mean over samples and windows, and the error of M, "
         "relative to M; median over seeds; below, what is published"
     )
-    return Table(title, tuple(runs), tuple(rows))
+    return Table(title, tuple(rows))
 
 
 def _by_seed(runs: Runs) -> Table:
@@ -102,20 +102,22 @@ def _by_seed(runs: Runs) -> Table:
 def _invariants(runs: Runs) -> Table:
     rows = []
     for label, (quantity, worst) in INVARIANTS.items():
-        cells = []
-        for of_seeds in runs.values():
+        worst_values: dict[str, float | None] = {}
+        for name, of_seeds in runs.items():
             values = known(map(quantity, of_seeds))
-            all_finite = len(values) == len(of_seeds)
-            cells.append(Cell(number(worst(values) if all_finite else None)))
-        rows.append(Row(label, tuple(cells)))
-    return Table("Invariants, worst over seeds; a negative rise is a fall", tuple(runs), tuple(rows))
+            worst_values[name] = worst(values) if len(values) == len(of_seeds) else None
+        rows.append(Row(label, worst_values, ranked=False))
+    return Table("Invariants, worst over seeds; a negative rise is a fall", tuple(rows))
 
 
-def _ratio(baseline: float | None, median: float | None) -> Cell:
-    """How many times worse than this variant the baseline predicts."""
-    if baseline is None or not median:
-        return Cell("-")
-    return Cell(f"{baseline / median:.3g}")
+def _ratios(medians: Numbers) -> Numbers:
+    """Return how many times worse than each variant the baseline predicts."""
+    baseline = medians[BASELINE]
+    ratios: dict[str, float | None] = dict.fromkeys(medians)
+    for name, median in medians.items():
+        if baseline is not None and median:
+            ratios[name] = baseline / median
+    return ratios
 
 
 def _median(runs: Sequence[RunResult], quantity: Quantity) -> float | None:
@@ -129,30 +131,10 @@ def _median(runs: Sequence[RunResult], quantity: Quantity) -> float | None:
     return middle if math.isfinite(middle) else None
 
 
-def _row(label: str, values: Mapping[str, float | None], form: str | None = None) -> Row:
-    """Return a row of numbers, the least marked."""
-    (row,) = table("", [label], [values]).rows
-    if form is None:
-        return row
-    cells = []
-    for value, cell in zip(values.values(), row.cells, strict=True):
-        cells.append(Cell(form.format(value), cell.best))
-    return Row(label, tuple(cells))
-
-
 def _published(
-    runs: Runs, published: Published, label: str, field: str, form: str | None = None
+    runs: Runs, published: Published, label: str, field: str, form: Callable[[float | None], str] = number
 ) -> list[Row]:
     """Return a row of published figures, or none where there are none for this robot."""
-    texts = []
-    for name in runs:
-        value = getattr(published[name], field) if name in published else None
-        if value is None:
-            texts.append("")
-        elif form is None:
-            texts.append(number(value))
-        else:
-            texts.append(form.format(value))
-    if not any(texts):
-        return []
-    return [Row(f"published: {label}", tuple(map(Cell, texts)))]
+    figures = {name: getattr(published[name], field) for name in runs if name in published}
+    figures = {name: figure for name, figure in figures.items() if figure is not None}
+    return [Row(f"published: {label}", figures, form, ranked=False)] if figures else []

@@ -18,7 +18,6 @@ def csv_text(results: Figures) -> str:
     writer.writerow(HEAD)
     for table in result_tables(results):
         for row in table.rows:
-            for predictor, cell in zip(table.columns, row.cells, strict=True):
-                if cell.text:
-                    writer.writerow((table.title, row.label, predictor, cell.value))
+            for predictor, value in row.values.items():
+                writer.writerow((table.title, row.label, predictor, value))
     return file.getvalue()

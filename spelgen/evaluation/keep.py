@@ -35,7 +35,6 @@ def keep_baseline(folder: Path | str, logs: Iterable[Path | str] | Sequence[Traj
     the fit.
     """
     run = RunFolder(Path(folder))
-    record = run.read_config()
     trajectories, paths = [], []
     for log in logs:
         if isinstance(log, Trajectory):
@@ -44,33 +43,39 @@ def keep_baseline(folder: Path | str, logs: Iterable[Path | str] | Sequence[Traj
             paths.append(log)
     only_files = not trajectories
     if paths:
-        opened = open_logs(run.load_module(), paths, LogMapping(**record["mapping"]))
+        opened = _opened(run, paths)
         if isinstance(opened, LargeLogs):  # least squares takes all samples at once
             return
         trajectories += opened
     if not run.urdf.exists():  # without an arm there is nothing to identify
         return
     baselines: dict[str, object] = {"coverage": coverage(trajectories)}
-    preprocessing = Preprocessing(**record["preprocessing"])
-    if record["objective"] == "servo":
+    if run.read_config()["objective"] == "servo":
         if only_files:
             baselines["files"] = [os.path.abspath(path) for path in paths]
         else:
-            baselines |= _fit_position_actuators(run, trajectories, preprocessing)
+            baselines |= _fit_position_actuators(run, trajectories)
     else:
         for baseline in BASELINES:
-            baselines |= baseline.fit(run, trajectories, preprocessing)
+            baselines |= baseline.fit(run, trajectories, _preprocessing(run))
     write_json(run.baseline, baselines)
 
 
-def _fit_position_actuators(
-    run: RunFolder, trajectories: Sequence[Trajectory], preprocessing: Preprocessing
-) -> dict[str, object]:
+def _opened(run: RunFolder, paths: Iterable[Path | str]) -> Sequence[Trajectory] | LargeLogs:
+    """Return log files read as those that the run was trained on. Raises LogError."""
+    return open_logs(run.load_module(), paths, LogMapping(**run.read_config()["mapping"]))
+
+
+def _preprocessing(run: RunFolder) -> Preprocessing:
+    return Preprocessing(**run.read_config()["preprocessing"])
+
+
+def _fit_position_actuators(run: RunFolder, trajectories: Sequence[Trajectory]) -> dict[str, object]:
     if not _has_mujoco():
         return {}
     from spelgen.evaluation.position_actuators import TUNING, fit_position_actuators
 
-    windows = servo_windows(trajectories, preprocessing, TUNING.windows)
+    windows = servo_windows(trajectories, _preprocessing(run), TUNING.windows)
     actuators = fit_position_actuators(run_arm(run), windows, trained_model(run))
     if actuators is None:
         return {}
@@ -79,14 +84,13 @@ def _fit_position_actuators(
 
 def _fitted_to_files(run: RunFolder, files: Sequence[str]) -> dict[str, object]:
     """Return MuJoCo's actuators, fitted to the files that the run was trained on; none where these have changed."""
-    record = run.read_config()
     try:
-        logs = open_logs(run.load_module(), files, LogMapping(**record["mapping"]))
+        logs = _opened(run, files)
     except LogError:  # moved or removed
         return {}
-    if isinstance(logs, LargeLogs) or digest(logs) != record["data_digest"]:
+    if isinstance(logs, LargeLogs) or digest(logs) != run.read_config()["data_digest"]:
         return {}
-    return _fit_position_actuators(run, logs, Preprocessing(**record["preprocessing"]))
+    return _fit_position_actuators(run, logs)
 
 
 def _has_mujoco() -> bool:

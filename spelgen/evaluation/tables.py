@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, TypeVar
 
 from spelgen.baselines.names import MODEL, observed
-from spelgen.labels import thousandths
+from spelgen.labels import UNITS, thousandths
 from spelgen.listing import Listing, number
 
 if TYPE_CHECKING:
@@ -17,28 +17,33 @@ OBSERVER = (
     "+ observer: with the constant disturbance that a momentum observer estimates from the 0.1 s before; "
     "all others are open-loop"
 )
-UNITS = {"revolute": ("rad", "rad/s", "Nm"), "prismatic": ("m", "m/s", "N")}
-POSITION, VELOCITY, TORQUE = range(3)  # in these
 
-
-@dataclass(frozen=True)
-class Cell:
-    """A number as text; `best`: the smallest of its row, where there is something to compare it with.
-
-    value: all its digits; None where it is not known.
-    """
-
-    text: str
-    best: bool = False
-    value: float | None = None
+Numbers = Mapping[str, float | None]
+"""By column; None where a number is not known."""
+Errors = TypeVar("Errors")
+Value = TypeVar("Value")
 
 
 @dataclass(frozen=True)
 class Row:
-    """One quantity, in every column."""
+    """One quantity, in every column that has it. form: of its numbers. ranked: whether the least of them is best."""
 
     label: str
-    cells: tuple[Cell, ...]
+    values: Numbers
+    form: Callable[[float | None], str] = number
+    ranked: bool = True
+
+    def text(self, column: str) -> str:
+        """Return the number of a column; nothing where it has none."""
+        return self.form(self.values[column]) if column in self.values else ""
+
+    @property
+    def best(self) -> list[str]:
+        """Return the columns with the smallest number, where there is something to compare it with."""
+        if not self.ranked or len(self.values) < 2:
+            return []
+        smallest = min(known(self.values.values()), default=None)
+        return [name for name, value in self.values.items() if value is not None and value == smallest]
 
 
 @dataclass(frozen=True)
@@ -46,9 +51,16 @@ class Table:
     """Quantities down, predictors or models across; `title` says what the numbers are, `note` what rows mean."""
 
     title: str
-    columns: tuple[str, ...]
     rows: tuple[Row, ...]
     note: str = ""
+
+    @property
+    def columns(self) -> list[str]:
+        """Return the names of all columns, in the order in which rows have them."""
+        names: dict[str, None] = {}
+        for row in self.rows:
+            names |= dict.fromkeys(row.values)
+        return list(names)
 
     def text(self) -> str:
         """Return it for a terminal; the best of each row is starred."""
@@ -59,41 +71,16 @@ class Table:
         lines = []
         for row in self.rows:
             texts = [row.label]
-            for cell in row.cells:
-                texts.append(f"{cell.text} *" if cell.best else f"{cell.text}  ")
+            for name in self.columns:
+                texts.append(f"{row.text(name)} {'*' if name in row.best else ' '}")
             lines.append(tuple(texts))
         head = ("", *(f"{name}  " for name in self.columns))
         return Listing(self.title, head, tuple(lines), self.note)
 
 
-Numbers = Mapping[str, float | None]
-"""By column."""
-Errors = TypeVar("Errors")
-Value = TypeVar("Value")
-
-
 def table(title: str, labels: Sequence[str], rows: Iterable[Numbers], note: str = "") -> Table:
     """Return rows of numbers by column, the least of each marked."""
-    numbers = list(rows)
-    columns: dict[str, None] = {}
-    for row in numbers:
-        columns |= dict.fromkeys(row)
-    lines = []
-    for label, row in zip(labels, numbers, strict=True):
-        lines.append(Row(label, _cells(row, columns)))
-    return Table(title, tuple(columns), tuple(lines), note)
-
-
-def _cells(row: Numbers, columns: Iterable[str]) -> tuple[Cell, ...]:
-    smallest = None
-    if len(row) > 1:  # alone it would be the best of nothing
-        smallest = min(known(row.values()), default=None)
-    cells = []
-    for name in columns:
-        value = row.get(name)
-        text = number(value) if name in row else ""
-        cells.append(Cell(text, value is not None and value == smallest, value))
-    return tuple(cells)
+    return Table(title, tuple(map(Row, labels, rows)), note)
 
 
 def result_tables(results: Figures) -> list[Table]:
@@ -103,17 +90,14 @@ def result_tables(results: Figures) -> list[Table]:
 
 
 def _without_empty_columns(table: Table) -> Table:
-    """Return the table without baselines whose cells are all dashes or empty."""
-    filled: set[int] = {table.columns.index(MODEL)} if MODEL in table.columns else set()
+    """Return the table without the columns of baselines that have no number."""
+    empty = {*table.columns} - {MODEL}
     for row in table.rows:
-        for k, cell in enumerate(row.cells):
-            if cell.text not in ("", "-"):
-                filled.add(k)
-    chosen = sorted(filled)
+        empty -= {name for name, value in row.values.items() if value is not None}
     rows = []
     for row in table.rows:
-        rows.append(Row(row.label, tuple(row.cells[k] for k in chosen)))
-    return replace(table, columns=tuple(table.columns[k] for k in chosen), rows=tuple(rows))
+        rows.append(replace(row, values={name: row.values[name] for name in row.values if name not in empty}))
+    return replace(table, rows=tuple(rows))
 
 
 def _values(errors: Mapping[str, Errors], value: Callable[[Errors], Value]) -> dict[str, Value]:
@@ -141,8 +125,8 @@ def _horizon_tables(results: Figures) -> list[Table]:
         tables.append(table("Error of the tip's position [mm]", heads, tips))
     last = results.horizons[-1].errors
     positions, velocities = _values(last, lambda x: x.q), _values(last, lambda x: x.qd)
-    tables.append(_by_joint(results, "Position error{} after " + heads[-1], POSITION, positions))
-    tables.append(_by_joint(results, "Velocity error{} after " + heads[-1], VELOCITY, velocities))
+    tables += _by_joint(results, f"Position error{{}} after {heads[-1]}", "position", positions)
+    tables += _by_joint(results, f"Velocity error{{}} after {heads[-1]}", "velocity", velocities)
     return tables
 
 
@@ -153,21 +137,16 @@ def _torque_tables(results: Figures) -> list[Table]:
     rows = {
         "mean of joints": _values(torque, lambda x: x.mean_nmse),
         "with pauses": _values(torque, lambda x: x.nmse_with_pauses),
-        "worst joint": _values(torque, lambda x: _largest(x.joint_nmse)),
+        "worst joint": _values(torque, lambda x: max(known(x.joint_nmse), default=None)),
     }
-    by_joint = _by_joint(results, "Torque error by joint, RMSE{}", TORQUE, _values(torque, lambda x: x.rmse))
+    note = ""
     if results.torque_steps:
-        by_joint = replace(
-            by_joint, note=f"logged in steps of their own size: {', '.join(results.torque_steps)}"
-        )
+        note = f"logged in steps of their own size: {', '.join(results.torque_steps)}"
+    rmse = _values(torque, lambda x: x.rmse)
     return [
         table("Torque error of the inverse dynamics, nMSE over all test samples", list(rows), rows.values()),
-        by_joint,
+        *_by_joint(results, "Torque error by joint, RMSE{}", "torque", rmse, note),
     ]
-
-
-def _largest(values: Sequence[float | None]) -> float | None:
-    return max(known(values), default=None)
 
 
 def known(values: Iterable[float | None]) -> list[float]:
@@ -179,30 +158,36 @@ def _replay_tables(results: Figures) -> list[Table]:
     """Return those of commands replayed: by trajectory and by joint."""
     tables, unit = [], thousandths(results.joint_types)
     for replay in results.replays:
-        trajectories = list(replay.errors[MODEL].trajectories)
-        rows = []
-        for trajectory in trajectories:
-            rows.append(_values(replay.errors, lambda x: 1000 * x.trajectories[trajectory]))  # noqa: B023
-        rows.append(_values(replay.errors, lambda x: 1000 * x.mean))
+        rows = {}
+        replayed, *others = [errors.trajectories for errors in replay.errors.values()]
+        # several runs may have replayed other logs
+        for trajectory in [name for name in replayed if all(name in other for other in others)]:
+            rows[trajectory] = _values(replay.errors, lambda x: 1000 * x.trajectories[trajectory])  # noqa: B023
+        rows["mean of all"] = _values(replay.errors, lambda x: 1000 * x.mean)
         title = f"Commands replayed, {replay.name}: RMS of positions over all joints [{unit}]"
-        tables.append(table(title, [*trajectories, "mean of these"], rows))
+        tables.append(table(title, list(rows), rows.values()))
         by_joint = []
         for k in range(len(results.joints)):
             by_joint.append(_values(replay.errors, lambda x: 1000 * x.joints[k]))  # noqa: B023
-        tables.append(table(f"The same by joint, over all trajectories [{unit}]", results.joints, by_joint))
+        if by_joint:
+            title = f"The same by joint, over all trajectories [{unit}]"
+            tables.append(table(title, results.joints, by_joint))
     return tables
 
 
 def _by_joint(
-    results: Figures, title: str, quantity: int, values: Mapping[str, Sequence[float | None]]
-) -> Table:
-    """Return a row for each joint; the unit stands in the title where all have the same, else beside each joint."""
-    units = [UNITS[kind][quantity] for kind in results.joint_types]
+    results: Figures, title: str, quantity: str, values: Mapping[str, Sequence[float | None]], note: str = ""
+) -> list[Table]:
+    """Return a row for each joint; the unit stands in the title where all have the same, else beside each joint.
+
+    There is no table where results are of several arms, which have no joints in common.
+    """
+    units = [getattr(UNITS[kind], quantity) for kind in results.joint_types]
     labels = list(results.joints)
     common = ""
     if len(set(units)) == 1:
         common = f" [{units[0]}]"
     else:
-        labels = [f"{joint} [{unit}]" for joint, unit in zip(labels, units, strict=True)]
+        labels = [f"{joint} [{unit}]" for joint, unit in zip(labels, units, strict=False)]
     rows = [_values(values, lambda x: x[k]) for k in range(len(labels))]  # noqa: B023
-    return table(title.format(common), labels, rows)
+    return [table(title.format(common), labels, rows, note)] if labels else []

@@ -54,9 +54,8 @@ def _verdict(tables: Sequence[Table]) -> str:
     rows = 0
     for table in tables:
         for row in table.rows:
-            best = [name for name, cell in zip(table.columns, row.cells, strict=True) if cell.best]
-            wins.update(best)
-            rows += bool(best)
+            wins.update(row.best)
+            rows += bool(row.best)
     if not wins:
         return "Nothing was compared."
     ((name, count),) = wins.most_common(1)
