@@ -11,9 +11,9 @@ from textwrap import wrap
 import numpy as np
 from scipy.interpolate import PPoly
 
-from spelgen.exporting.description import Network, Splines, TrainedModel
+from spelgen.exporting.description import Splines, TrainedModel
 from spelgen.exporting.model_expressions import RESIDUAL
-from spelgen.exporting.residual_expressions import entry_indices, residual_symbols
+from spelgen.exporting.residual_expressions import residual_symbols
 from spelgen.templates import render
 
 _WIDTH = 112  # characters of a line
@@ -58,13 +58,8 @@ def network_source(model: TrainedModel) -> list[str]:
     """Return the C text of all networks, nothing where there are none."""
     n = model.n
     residuals = model.residuals
-    indices = entry_indices(model)
-    networks: dict[str, Network] = {}
-    if residuals.mass is not None:
-        rows = [row * n + column for row, column in indices]
-        networks["mass"] = _with_outputs(residuals.mass, rows)
-    if residuals.potential is not None:
-        networks["potential"] = _with_outputs(residuals.potential, [0])
+    named = {"mass": residuals.mass, "potential": residuals.potential}
+    networks = {name: network for name, network in named.items() if network is not None}
     if not networks:
         return []
     encoding = residuals.encoding
@@ -74,7 +69,7 @@ def network_source(model: TrainedModel) -> list[str]:
         tables += [_table("center", encoding.center), _table("reach", encoding.reach)]
     layers: dict[str, list[str]] = {}
     # buffers are of one size, that of the widest layer
-    width = max(len(indices), encoded)
+    width = encoded
     for name, network in networks.items():
         layers[name] = []
         for k, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True), start=1):
@@ -94,17 +89,11 @@ def network_source(model: TrainedModel) -> list[str]:
         scaled=encoding.prismatic,
         tables=tables,
         networks=layers,
-        entries=len(indices),
-        places=", ".join(f"{{{row}, {column}}}" for row, column in indices),
+        entries=len(residuals.entries),
+        places=", ".join(f"{{{row}, {column}}}" for row, column in residuals.entries),
         potential=residuals.potential is not None,
     )
     return [text.rstrip()]
-
-
-def _with_outputs(network: Network, rows: list[int]) -> Network:
-    """Return the network with these of its outputs alone."""
-    weights = (*network.weights[:-1], network.weights[-1][rows])
-    return Network(weights, (*network.biases[:-1], network.biases[-1][rows]))
 
 
 def _layer_tables(name: str, weight: np.ndarray, bias: np.ndarray) -> list[str]:

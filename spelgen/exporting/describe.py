@@ -121,21 +121,28 @@ def _bristles(model: Any, weights: Any) -> Bristles | None:
 
 def _no_residuals() -> Residuals:
     none = Splines((), np.zeros(0), np.zeros(0), np.zeros((0, 4)))
-    return Residuals(Encoding(False, np.zeros(0), np.zeros(0)), None, None, none, (), none)
+    return Residuals(Encoding(False, np.zeros(0), np.zeros(0)), (), None, None, none, (), none)
 
 
 def _residuals(model: ResidualModel) -> Residuals:
     """Return the residuals without those that are zero. Raises RunError for Kolmogorov-Arnold networks."""
     terms, weights = model.residuals, model.prepare().residual
-    mass = _network(terms.mass, weights.mass)
+    mass, potential = _network(terms.mass, weights.mass), _network(terms.potential, weights.potential)
+    entries: np.ndarray = np.zeros((0, 2), dtype=int)
     if mass is not None:
         mass = _tanh_then(mass, array(weights.functions))
+        reached = mass.weights[-1].any(axis=1).reshape(model.n, model.n)
+        entries = np.argwhere(np.tril(reached))
+        mass = _with_outputs(mass, entries @ (model.n, 1))
+    if potential is not None:
+        potential = _with_outputs(potential, np.zeros(1, dtype=int))
     return Residuals(
         encoding=Encoding(
             terms.encoding.prismatic, array(terms.encoding.center), array(terms.encoding.reach)
         ),
+        entries=tuple(map(tuple, entries.tolist())),
         mass=mass,
-        potential=_network(terms.potential, weights.potential),
+        potential=potential,
         torque=_splines(terms, terms.unit * terms.raw_torque_splines),
         ripple=_ripple(terms, weights.ripple),
         friction=_splines(terms, terms.friction_logarithms()),
@@ -150,6 +157,12 @@ def _network(network: object, layers: Layers | None) -> Network | None:
     if type(network).__name__ != "MaskedMLP":
         raise _unsupported("Kolmogorov-Arnold networks beside rigid bodies")
     return Network(tuple(map(array, layers.weights)), tuple(map(array, layers.biases)))
+
+
+def _with_outputs(network: Network, rows: np.ndarray) -> Network:
+    """Return the network with these of its outputs alone."""
+    weights = (*network.weights[:-1], network.weights[-1][rows])
+    return Network(weights, (*network.biases[:-1], network.biases[-1][rows]))
 
 
 def _tanh_then(network: Network, functions: np.ndarray) -> Network:

@@ -99,11 +99,12 @@ class Harmonics:
 class Residuals:
     """The parts of a model beside its rigid bodies, as far as they are not zero.
 
-    mass: is added to M, (n n) rows; potential: to V, one row. torque and ripple: dV/dq by joint [Nm, N].
-    friction: the logarithm of a factor on a drive's friction.
+    mass: is added to M at these entries of its lower triangle, a row each; potential: to V, one row. torque and ripple:
+    dV/dq by joint [Nm, N]. friction: the logarithm of a factor on a drive's friction.
     """
 
     encoding: Encoding
+    entries: tuple[tuple[int, int], ...]
     mass: Network | None
     potential: Network | None
     torque: Splines

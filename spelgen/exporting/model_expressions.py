@@ -12,7 +12,6 @@ from spelgen.exporting.description import TrainedModel
 from spelgen.exporting.entry_points import EntryPoint
 from spelgen.exporting.residual_expressions import (
     coriolis,
-    entry_indices,
     residual_symbols,
     symbol_slopes,
     symmetric,
@@ -50,7 +49,7 @@ class ModelExpressions:
     @cached_property
     def _added_mass(self) -> ca.SX:
         """What drives and residuals add to M."""
-        network = symmetric(self.n, entry_indices(self.model), self.residuals["mass"])
+        network = symmetric(self.model, self.residuals["mass"])
         return constant(self.model.constant_mass) + network
 
     @cached_property

@@ -23,7 +23,7 @@ Symbols = dict[str, ca.SX]
 def residual_symbols(model: TrainedModel) -> Symbols:
     """Return symbols for all that a model may have; those of what it has not are empty."""
     n = model.n
-    entries = len(entry_indices(model))
+    entries = len(model.residuals.entries)
     pairs = n * (n + 1) // 2
     potential = int(model.residuals.potential is not None)
     torque = int(model.residuals.has_torque)
@@ -48,34 +48,23 @@ def residual_symbols(model: TrainedModel) -> Symbols:
     return {name: ca.SX.sym(name, *size) for name, size in sizes.items()}
 
 
-def entry_indices(model: TrainedModel) -> list[tuple[int, int]]:
-    """Return the places in M's lower triangle that a network reaches."""
-    network = model.residuals.mass
-    if network is None:
-        return []
-    outputs = network.weights[-1].any(axis=1)  # (n n,)
-    reached = outputs.reshape(model.n, model.n)
-    return [(int(row), int(column)) for row, column in np.argwhere(np.tril(reached))]
-
-
-def symmetric(n: int, indices: list[tuple[int, int]], values: ca.SX) -> ca.SX:
-    """Return the symmetric matrix, (n, n), with these entries at their places."""
-    matrix = ca.SX(n, n)
-    for k, (row, column) in enumerate(indices):
+def symmetric(model: TrainedModel, values: ca.SX) -> ca.SX:
+    """Return the symmetric matrix, (n, n), with the values at the entries that the networks' part of M has."""
+    matrix = ca.SX(model.n, model.n)
+    for k, (row, column) in enumerate(model.residuals.entries):
         matrix[row, column] = matrix[column, row] = values[k]
     return matrix
 
 
 def coriolis(model: TrainedModel, symbols: Symbols, qd: ca.SX, *, derivatives: bool) -> ca.SX:
     """Return dR/dt qd - d/dq (1/2 qd^T R qd), (n, 1), of the networks' part R of M."""
-    n, indices = model.n, entry_indices(model)
     if not derivatives:
-        return symmetric(n, indices, symbols["rate"]) @ qd - symbols["kinetic"]
-    kinetic = ca.SX(n, 1)
-    for joint in range(n):
-        slope = symmetric(n, indices, symbols["first"][:, joint])
+        return symmetric(model, symbols["rate"]) @ qd - symbols["kinetic"]
+    kinetic = ca.SX(model.n, 1)
+    for joint in range(model.n):
+        slope = symmetric(model, symbols["first"][:, joint])
         kinetic[joint] = 0.5 * ca.dot(qd, slope @ qd)
-    return symmetric(n, indices, symbols["first"] @ qd) @ qd - kinetic
+    return symmetric(model, symbols["first"] @ qd) @ qd - kinetic
 
 
 def symbol_slopes(model: TrainedModel, symbols: Symbols) -> list[tuple[ca.SX, ca.SX]]:
@@ -110,19 +99,17 @@ def residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[str
     values: dict[str, ca.MX] = {}
     encoded = _encoded(residuals.encoding, q)
     if residuals.mass is not None:
-        indices = entry_indices(model)
-        rows = [row * model.n + column for row, column in indices]
-        mass = values["mass"] = _network(residuals.mass, rows, encoded)
+        mass = values["mass"] = _network(residuals.mass, encoded)
         if qd is not None:
             values["rate"] = ca.jtimes(mass, q, qd)
             # an entry beside the diagonal stands in M twice
             products = []
-            for row, column in indices:
+            for row, column in residuals.entries:
                 weight = 0.5 if row == column else 1.0
                 products.append(weight * qd[row] * qd[column])
             values["kinetic"] = ca.jtimes(mass, q, ca.vertcat(*products), True)
     if residuals.potential is not None:
-        values["energy"] = _network(residuals.potential, [0], encoded)
+        values["energy"] = _network(residuals.potential, encoded)
         # reverse sweep of CasADi: as cheap as the network itself
         values["gravity"] = ca.gradient(values["energy"], q)
     if residuals.has_torque:
@@ -142,12 +129,12 @@ def _encoded(encoding: Encoding, q: ca.MX) -> ca.MX:
     return ca.vertcat(waves, (q - encoding.center) / encoding.reach)
 
 
-def _network(network: Network, rows: list[int], encoded: ca.MX) -> ca.MX:
+def _network(network: Network, encoded: ca.MX) -> ca.MX:
     layer = encoded
     for weight, bias in zip(network.weights[:-1], network.biases[:-1], strict=True):
         # CasADi has no sigmoid
         layer = 1 / (1 + ca.exp(-(constant(weight) @ layer + bias)))
-    return constant(network.weights[-1][rows]) @ layer + network.biases[-1][rows]
+    return constant(network.weights[-1]) @ layer + network.biases[-1]
 
 
 def _torque_energy(residuals: Residuals, q: ca.MX) -> ca.MX:
