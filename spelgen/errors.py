@@ -153,6 +153,9 @@ class Diagnostic:
     line: int | None
     message: str
 
+    def __str__(self) -> str:
+        return f"{self.severity}: {self.where}: {self.message}"
+
     def to_dict(self) -> dict[str, object]:
         """Return the five fields as a JSON object, in the order of the public contract."""
         return asdict(self)

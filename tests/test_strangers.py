@@ -30,7 +30,8 @@ from spelgen.logs import bags
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.pipeline import generate
-from spelgen.settings.fits import MomentumFit, Rollout, make_config
+from spelgen.settings.fits import MomentumFit, Rollout
+from spelgen.settings.messages import validated
 
 JOINTS = ("joint1", "joint2")
 SAMPLES = 60
@@ -178,7 +179,7 @@ def test_a_line_break_in_a_name_is_shown_as_one():
 
 def test_an_impossible_learning_rate_is_told_without_words_of_pydantic():
     with pytest.raises(SettingsError) as caught:
-        make_config(Rollout, {"learning_rate": 1e30})
+        validated(Rollout, {"learning_rate": 1e30})
     assert str(caught.value) == "learning_rate: got 1e+30, expected a number within +-1e+12"
 
 

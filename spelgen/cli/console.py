@@ -16,7 +16,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from spelgen.cli.command import name_values
-from spelgen.errors import Diagnostic, SpelgenError
+from spelgen.errors import SpelgenError
 from spelgen.files import local, with_addresses, write_text
 from spelgen.labels import counted, printable
 
@@ -127,14 +127,9 @@ def say(text: str) -> None:
     print(printable(with_addresses(text), "\n"))
 
 
-def note(text: str) -> None:
-    """Print progress, a remark or an error to stderr."""
-    print(printable(with_addresses(text), "\n"), file=sys.stderr, flush=True)
-
-
-def note_diagnostic(diagnostic: Diagnostic) -> None:
-    """Print a warning or a remark of an analysis to stderr."""
-    note(f"{diagnostic.severity}: {diagnostic.where}: {diagnostic.message}")
+def note(text: object) -> None:
+    """Print progress, a diagnostic or an error to stderr."""
+    print(printable(with_addresses(str(text)), "\n"), file=sys.stderr, flush=True)
 
 
 def answer(form: str, record: Mapping[str, object], *lines: str) -> None:

@@ -11,7 +11,7 @@ import typer
 
 from spelgen.baselines.names import MODEL
 from spelgen.cli import options
-from spelgen.cli.console import deliver, note, note_diagnostic, progress_bar, say
+from spelgen.cli.console import deliver, note, progress_bar, say
 from spelgen.cli.options import Data, Filter, Mapping, MoreData, Output, Run, Trust
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ def evaluate(
     # before anything is printed: a closed pipe must not lose the result
     write_json(RunFolder(run).evaluation, record)
     for diagnostic in results.diagnostics:
-        note_diagnostic(diagnostic)
+        note(diagnostic)
     chosen = options.choose_format(format, output, Format)
     if chosen == "csv":
         from spelgen.evaluation.csv_file import csv_text

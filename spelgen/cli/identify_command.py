@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from spelgen.cli import options
-from spelgen.cli.console import deliver, note_diagnostic
+from spelgen.cli.console import deliver, note
 from spelgen.cli.options import (
     Accept,
     AngleTolerance,
@@ -74,10 +74,10 @@ def identify(
     logs = read_logs(paths, arm, log_mapping, role="train")
     # least squares would fit wrong units without a word
     for diagnostic in require_sound_logs(logs, arm, log_mapping):
-        note_diagnostic(diagnostic)
+        note(diagnostic)
     result = identify_arm(arm, logs, method, preprocessing=Preprocessing(cutoff=filter))
     for diagnostic in result.diagnostics:
-        note_diagnostic(diagnostic)
+        note(diagnostic)
     # pages and charts are imported where they are asked for
     chosen = options.choose_format(format, output, Format)
     if chosen == "html":

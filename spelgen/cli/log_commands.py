@@ -112,7 +112,7 @@ def logs(
     if html is not None:
         note(f"wrote {write_text(html, page(result, arm.arm, arm.actuation.matrix()))}")
     if result.errors:
-        note(str(SpelgenErrors(result.errors)))
+        note(SpelgenErrors(result.errors))
     # what is wrong comes first: a warning is no news beside an error
     if strict:
         refuse_warnings("", len(result.warnings))

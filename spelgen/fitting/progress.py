@@ -44,7 +44,7 @@ class TrainingProgress:
     def note(self, diagnostic: Diagnostic) -> None:
         """Tell a diagnostic above the bar."""
         if self._show:
-            text = f"{diagnostic.severity}: {diagnostic.where}: {diagnostic.message}"
+            text = str(diagnostic)
             self._console.print("".join(c if c.isprintable() else "?" for c in text), markup=False)
 
     def momentum(self, step: int, steps: int, loss: float) -> None:

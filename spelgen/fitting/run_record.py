@@ -10,8 +10,9 @@ from pydantic import BaseModel, ValidationError
 
 from spelgen.errors import RunError, SpelgenError
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.settings.fits import CONFIGS, FitConfig, Objective, Substeps, make_config
+from spelgen.settings.fits import CONFIGS, FitConfig, Objective, Substeps
 from spelgen.settings.log_mapping import LogMapping
+from spelgen.settings.messages import validated
 from spelgen.settings.values import Count, NonNegative, Positive, Whole
 
 Content = dict[str, Any]
@@ -85,7 +86,7 @@ def require_record(content: Content, file: Path) -> Content:
     """Return what config.json says. Raises RunError as `require`, and for a configuration that cannot be."""
     record = require(Record, content, file)
     try:
-        make_config(CONFIGS[record.objective], record.config)
+        validated(CONFIGS[record.objective], record.config)
     except SpelgenError as error:
         raise RunError(f"config: {error}", file=file) from error
     return content
@@ -93,7 +94,7 @@ def require_record(content: Content, file: Path) -> Content:
 
 def recorded_config(record: Content, **changed: object) -> FitConfig:
     """Return the configuration in config.json, with some options changed. Raises OptionError as `FitConfig`."""
-    return make_config(CONFIGS[record["objective"]], record["config"] | changed)
+    return validated(CONFIGS[record["objective"]], record["config"] | changed)
 
 
 def require_same(started: Content, now: Content, folder: Path) -> None:

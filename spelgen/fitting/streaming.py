@@ -134,9 +134,9 @@ def _read_once(logs: LargeLogs) -> LogContents:
         clock_notes += clock_diagnostics(trajectory)
         for array in (trajectory.t, trajectory.q, trajectory.qd, trajectory.tau):
             numbers.update(np.ascontiguousarray(array).data)
-    notes, errors = summarised(problems, logs.joints, len(chunks))
-    collect(errors)
+    summary = summarised(problems, logs.joints, len(chunks))
+    collect(summary.errors)
     # the last samples of a recording may be a chunk of their own, too short to tell a rate
     lengths = np.array(list(map(sum, pieces)))
     reliable = np.array(rates)[lengths > lengths.max() / 10].tolist()
-    return LogContents(chunks, reliable, [*clock_notes[:1], *notes], numbers.hexdigest(), pieces)
+    return LogContents(chunks, reliable, [*clock_notes[:1], *summary.notes], numbers.hexdigest(), pieces)

@@ -6,11 +6,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field, StringConstraints, ValidationError
+from pydantic import Field, StringConstraints
 
 from spelgen.design import PRESET_NAMES
 from spelgen.errors import SettingsError, collect, suggestion
-from spelgen.settings.messages import dotted, explain
+from spelgen.settings.messages import dotted, validated
 from spelgen.settings.training import TrainingSettings
 from spelgen.settings.values import Count, Group
 from spelgen.settings.yaml_document import Document, Location, read_document
@@ -55,12 +55,7 @@ def load_fleet(path: Path) -> Fleet:
     """
     # YAML that knows its lines, for messages
     document = read_document(path)
-    content = document.value()
-    try:
-        fleet = Fleet.model_validate({} if content is None else content)
-    except ValidationError as error:
-        collect([explain(detail, document, Fleet) for detail in error.errors(include_url=False)])
-        raise
+    fleet = validated(Fleet, document.value(), document)
     collect([*_preset_errors(fleet, document), *_path_errors(fleet, document)])
     folder = path.parent
     presets = tuple(name if name in PRESET_NAMES else str(folder / name) for name in fleet.presets)

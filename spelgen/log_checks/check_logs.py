@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from spelgen.arm.arm import Coordinate
-from spelgen.errors import Diagnostic, LogError, SpelgenError, collect
-from spelgen.identification.drive_hints import DriveProblem, drive_hints, drive_problem, find_wrong_torques
+from spelgen.errors import Diagnostic, LogError, collect
+from spelgen.identification.drive_hints import drive_hints, drive_problem, find_wrong_torques
 from spelgen.identification.drive_samples import DriveLog
 from spelgen.log_checks.check_servo_logs import check_servo_logs
 from spelgen.log_checks.gravity import (
@@ -73,8 +73,7 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping |
         raise LogError("no trajectory", expected="at least one")
     # what files declare by themselves holds where all of them do
     accepted = set(mapping.accept) | set.intersection(*declared_codes)
-    summaries, errors = summarised(odd, joints, len(measured))
-    notes += summaries
+    summary = summarised(odd, joints, len(measured))
     reports = []
     for index, (coordinate, gravity) in enumerate(
         zip(coordinates, fit_gravity(arm.arm, samples), strict=True)
@@ -82,29 +81,33 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping |
         report = _joint_report(index, coordinate, gravity, measured)
         reports.append(report)
         evidence = JointEvidence(coordinate, report.low, report.high, report.steps, gravity)
+        passed = accepted
         # a unit that somebody wrote down is taken as right
-        declared = mapping.unit("tau", coordinate.name) is not None
-        robot_notes, robot_errors = _against_robot(evidence, accepted | set(UNIT_CODES if declared else ()))
-        notes += robot_notes
-        errors += robot_errors
+        if mapping.unit("tau", coordinate.name) is not None:
+            passed = accepted.union(UNIT_CODES)
+        where = f"joint {coordinate.name!r}"
+        for check, message in run_checks(CHECKS, evidence, passed):
+            summary.add(check, message, where + ", tau" * (check.severity == "error"))
     problem = drive_problem(arm, drives)
-    is_odd = any(note.code == "velocity-is-no-derivative" for note in notes)
+    is_odd = any(note.code == "velocity-is-no-derivative" for note in summary.notes)
     # beside wrong velocities friction is wrong too, and of wrong torques hints about drives would be wrong
-    if not errors and not is_odd:
+    if not summary.errors and not is_odd:
         opposed = find_opposed_inertia(arm.arm, samples, arm.actuation.drives().speeds)
         if opposed is not None and SENSE.code not in accepted:
-            errors.append(SENSE.error(opposed, "tau"))
-    if problem is not None and not errors and not is_odd:
-        errors += _wrong_torques(problem, joints, accepted)
-        if not errors:
-            notes += drive_hints(arm, problem, mapping)
+            summary.add(SENSE, opposed, "tau")
+    if problem is not None and not summary.errors and not is_odd:
+        for wrong in find_wrong_torques(problem, joints):
+            if wrong.code not in accepted:
+                summary.add(WRONG_TORQUES[wrong.code], wrong.got, f"joint {joints[wrong.joint]!r}, tau")
+        if not summary.errors:
+            summary.notes.extend(drive_hints(arm, problem, mapping))
     return LogReport(
         robot=arm.arm.name,
         files=len({x.clock.file for x in measured} - {None}),
         trajectories=tuple(x.clock for x in measured),
         joints=tuple(reports),
-        findings=tuple(notes),
-        errors=tuple(errors),
+        findings=(*notes, *summary.notes),
+        errors=tuple(summary.errors),
         examples=tuple(examples),
     )
 
@@ -118,33 +121,6 @@ def require_sound_logs(
     collect(report.errors)
     # a fit itself tells what logs show without the arm
     return [note for note in report.findings if note.code in ABOUT_ARM]
-
-
-def _against_robot(
-    evidence: JointEvidence, accepted: Collection[str]
-) -> tuple[list[Diagnostic], list[LogError]]:
-    """Return what the checks against the robot find of one joint: notes, and why it cannot be trained on."""
-    notes: list[Diagnostic] = []
-    errors: list[LogError] = []
-    where = f"joint {evidence.coordinate.name!r}"
-    for check, message in run_checks(CHECKS, evidence, accepted):
-        if check.severity == "error":
-            errors.append(check.error(message, f"{where}, tau"))
-        else:
-            notes.append(check.diagnostic(message, where))
-    return notes, errors
-
-
-def _wrong_torques(
-    problem: DriveProblem, joints: Sequence[str], accepted: Collection[str]
-) -> list[SpelgenError]:
-    """Return the errors that least squares of all joints finds in their torques."""
-    errors: list[SpelgenError] = []
-    for wrong in find_wrong_torques(problem, joints):
-        if wrong.code not in accepted:
-            check = WRONG_TORQUES[wrong.code]
-            errors.append(check.error(wrong.got, f"joint {joints[wrong.joint]!r}, tau"))
-    return errors
 
 
 def _joint_report(

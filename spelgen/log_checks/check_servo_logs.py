@@ -47,8 +47,7 @@ def check_servo_logs(logs: Iterable[Trajectory], arm: LoadedArm) -> ServoLogRepo
         require_commands(log)
         odd += findings(log, joints, kinds)
         notes += clock_diagnostics(log)
-    summaries, errors = summarised(odd, joints, len(logs))
-    notes += summaries
+    summary = summarised(odd, joints, len(logs))
     following = measure_following(logs, _saturation(arm))
     measured = list(map(statistics, logs))
     clocks = [x.clock for x in measured]
@@ -61,20 +60,20 @@ def check_servo_logs(logs: Iterable[Trajectory], arm: LoadedArm) -> ServoLogRepo
         if wrong is None:
             # some loggers write measured positions in place of commands
             copied = all(np.array_equal(log.q[:, k], require_commands(log)[:, k]) for log in logs)
-            notes += _odd_command(k, report, following, copied=copied)
+            summary.notes.extend(_odd_command(k, report, following, copied=copied))
             evidence = JointEvidence(coordinate, signals.low, signals.high, signals.steps, GravityFit())
             for check, message in run_checks(POSITION_CHECKS, evidence):
-                notes.append(check.diagnostic(message, f"joint {coordinate.name!r}"))
+                summary.add(check, message, f"joint {coordinate.name!r}")
         else:
-            errors.append(wrong)
-    notes += _sparse(clocks)
+            summary.errors.append(wrong)
+    summary.notes.extend(_sparse(clocks))
     return ServoLogReport(
         robot=arm.arm.name,
         files=len({clock.file for clock in clocks} - {None}),
         trajectories=tuple(clocks),
         joints=(),
-        findings=tuple(notes),
-        errors=tuple(errors),
+        findings=(*notes, *summary.notes),
+        errors=tuple(summary.errors),
         examples=tuple(logs[: CHECKS.examples]),
         servos=tuple(reports),
     )

@@ -182,8 +182,7 @@ def _percent(fraction: float | None) -> str:
 
 
 def _wrapped(finding: Diagnostic) -> str:
-    summary = f"{finding.severity}: {finding.where}: {finding.message}"
-    return textwrap.fill(summary, WIDTH, initial_indent="  ", subsequent_indent="    ")
+    return textwrap.fill(str(finding), WIDTH, initial_indent="  ", subsequent_indent="    ")
 
 
 def _counted(count: int, singular: str, plural: str) -> str:

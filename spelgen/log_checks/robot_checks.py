@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import nan
 
 from spelgen.arm.arm import Coordinate
+from spelgen.labels import UNITS
 from spelgen.log_checks.gravity import GravityFit
 from spelgen.logs.checks import Check
 from spelgen.logs.trajectory import QUANTITIES
 from spelgen.settings.tuning.log_checks import LogCheckTuning
 
 TUNING = LogCheckTuning()
-UNITS = {"revolute": ("rad", "rad/s", "Nm"), "prismatic": ("m", "m/s", "N")}
 SAY_UNIT = "write 'units: {tau: ...}' or a 'gain' under 'logs' in the robot's YAML; 'Nm' confirms the unit"
 TORQUE_ERRORS = ("torque-sense", "torque-unit", "torque-beyond-drive")
 
@@ -34,14 +35,12 @@ class JointEvidence:
         """Return the largest size of "q", "qd" or "tau"."""
         return max(abs(self.low[quantity]), abs(self.high[quantity]))
 
-    def gravity_in_torque(self) -> tuple[float, float] | None:
-        """Return factor and correlation of the URDF's gravity in the torque; None where it is too small to be seen."""
+    def gravity_in_torque(self) -> tuple[float, float]:
+        """Return factor and correlation of the URDF's gravity in the torque; NaN where it is too small to be seen."""
         fit = self.gravity
         # of a joint that gravity hardly loads the factor is chance
-        if fit.factor is None or fit.correlation is None:
-            return None
-        if (fit.relative_deviation or 0.0) < TUNING.loaded:
-            return None
+        if fit.factor is None or fit.correlation is None or (fit.relative_deviation or 0.0) < TUNING.loaded:
+            return nan, nan  # which no comparison takes for odd
         return fit.factor, fit.correlation
 
 
@@ -50,7 +49,7 @@ def find_beyond_limits(joint: JointEvidence) -> str | None:
     coordinate, findings = joint.coordinate, []
     if coordinate.continuous:
         return None
-    unit = UNITS[coordinate.kind][0]
+    unit = UNITS[coordinate.kind].position
     for name in ("q", "u"):
         if name not in joint.low:
             continue
@@ -65,12 +64,16 @@ def find_beyond_limits(joint: JointEvidence) -> str | None:
 
 def find_speed_above(joint: JointEvidence) -> str | None:
     """Find speeds above the limit."""
-    return _above("velocity", joint.largest("qd"), joint.coordinate.velocity, UNITS[joint.coordinate.kind][1])
+    return _above(
+        "velocity", joint.largest("qd"), joint.coordinate.velocity, UNITS[joint.coordinate.kind].velocity
+    )
 
 
 def find_effort_above(joint: JointEvidence) -> str | None:
     """Find torques above the limit."""
-    return _above("effort", joint.largest("tau"), joint.coordinate.effort, UNITS[joint.coordinate.kind][2])
+    return _above(
+        "effort", joint.largest("tau"), joint.coordinate.effort, UNITS[joint.coordinate.kind].torque
+    )
 
 
 def _above(name: str, value: float, limit: float | None, unit: str) -> str | None:
@@ -81,20 +84,22 @@ def _above(name: str, value: float, limit: float | None, unit: str) -> str | Non
 
 def find_wrong_sense(joint: JointEvidence) -> str | None:
     """Find torques that certainly move against gravity."""
-    fit = joint.gravity_in_torque()
-    if fit is None or fit[1] >= -TUNING.agreement:
-        return None
-    return f"torques that move against gravity, {fit[0]:.3g} times the URDF's"
+    factor, correlation = joint.gravity_in_torque()
+    if correlation < -TUNING.agreement:
+        return f"torques that move against gravity, {factor:.3g} times the URDF's"
+    return None
 
 
 def find_wrong_unit(joint: JointEvidence) -> str | None:
     """Find torques that certainly move with gravity, by a factor that only another unit has."""
-    fit = joint.gravity_in_torque()
-    if fit is None or fit[1] <= TUNING.agreement:
-        return None
-    if 1 / TUNING.impossible_factor < fit[0] < TUNING.impossible_factor:
-        return None
-    return f"torques that move with {fit[0]:.3g} times the URDF's gravity torque"
+    factor, correlation = joint.gravity_in_torque()
+    if correlation > TUNING.agreement and not _is_within(factor, TUNING.impossible_factor):
+        return f"torques that move with {factor:.3g} times the URDF's gravity torque"
+    return None
+
+
+def _is_within(factor: float, largest: float) -> bool:
+    return 1 / largest < factor < largest
 
 
 def find_beyond_drive(joint: JointEvidence) -> str | None:
@@ -134,34 +139,32 @@ def find_stop(joint: JointEvidence) -> str | None:
 
 def find_no_gravity(joint: JointEvidence) -> str | None:
     """Find torques without gravity in them."""
-    fit = joint.gravity_in_torque()
-    if fit is None or abs(fit[1]) >= 1 - TUNING.seen:
-        return None
-    return (
-        f"tau does not move with gravity: their correlation is {fit[1]:.2g}, while the URDF's gravity torque varies "
-        f"{joint.gravity.relative_deviation:.2g} times as much as tau; is it compensated in the log?"
-    )
+    correlation = joint.gravity_in_torque()[1]
+    if abs(correlation) < 1 - TUNING.seen:
+        return (
+            f"tau does not move with gravity: their correlation is {correlation:.2g}, while the URDF's gravity torque "
+            f"varies {joint.gravity.relative_deviation:.2g} times as much as tau; is it compensated in the log?"
+        )
+    return None
 
 
 def find_against_gravity(joint: JointEvidence) -> str | None:
     """Find torques that seem to move against gravity."""
-    fit = joint.gravity_in_torque()
-    if fit is None or fit[1] >= -TUNING.seen:
-        return None
-    return f"tau moves against gravity: {fit[0]:.3g} times the URDF's; a sign of tau or q is wrong"
+    factor, correlation = joint.gravity_in_torque()
+    if correlation < -TUNING.seen:
+        return f"tau moves against gravity: {factor:.3g} times the URDF's; a sign of tau or q is wrong"
+    return None
 
 
 def find_unusual_scale(joint: JointEvidence) -> str | None:
     """Find torques that move with gravity, by a factor that errors of inertials do not explain."""
-    fit = joint.gravity_in_torque()
-    if fit is None or fit[1] <= TUNING.seen:
-        return None
-    if 1 / TUNING.unusual_factor < fit[0] < TUNING.unusual_factor:
-        return None
-    return (
-        f"tau moves with {fit[0]:.3g} times the URDF's gravity torque; check its unit and gain, or let the "
-        f"gain be found: 'torque: motor', and 'gear: {1 / fit[0]:.3g}' with 'gain: trained' of this joint"
-    )
+    factor, correlation = joint.gravity_in_torque()
+    if correlation > TUNING.seen and not _is_within(factor, TUNING.unusual_factor):
+        return (
+            f"tau moves with {factor:.3g} times the URDF's gravity torque; check its unit and gain, or let the "
+            f"gain be found: 'torque: motor', and 'gear: {1 / factor:.3g}' with 'gain: trained' of this joint"
+        )
+    return None
 
 
 # these need no torques: of arms under position servos, too

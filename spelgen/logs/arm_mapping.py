@@ -6,11 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple, Protocol, runtime_checkable
 
-from pydantic import ValidationError
-
-from spelgen.errors import LogError, collect
+from spelgen.errors import LogError
 from spelgen.settings.log_mapping import LogMapping
-from spelgen.settings.messages import explain
+from spelgen.settings.messages import validated
 from spelgen.settings.settings import Settings, load_mapping
 from spelgen.settings.yaml_document import Document
 from spelgen.spec import logged_joints
@@ -77,9 +75,4 @@ def _mapping(mapping: GivenMapping, joints: Sequence[str]) -> LogMapping:
         return mapping
     if isinstance(mapping, str | Path):
         return load_mapping(mapping, joints)
-    try:
-        return LogMapping.model_validate(dict(mapping))
-    except ValidationError as error:
-        keys = Document(Path("mapping"), None)
-        collect([explain(x, keys, LogMapping) for x in error.errors(include_url=False)])
-        raise
+    return validated(LogMapping, dict(mapping), Document(Path("mapping"), None))

@@ -7,7 +7,7 @@ so that logs need not lie in memory together. `log_checks` has the checks that t
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Generic, Literal, TypeVar
@@ -45,15 +45,22 @@ class Check(Generic[Subject]):
     expected: str | None = None
     do: str | None = None
 
-    def error(self, message: str, element: str, file: Path | None = None) -> LogError:
-        """Return the finding of an error as it is raised."""
-        do = f"{self.do}; --accept {self.code} if it is right"
-        return LogError(message, file=file, element=element, expected=self.expected, do=do)
 
-    def diagnostic(self, message: str, where: str) -> Diagnostic:
-        """Return the finding of a remark or a warning."""
-        assert self.severity != "error"
-        return Diagnostic(self.severity, self.code, where, None, message)
+@dataclass(frozen=True)
+class Findings:
+    """Gather what checks find: notes, and errors, which prevent training."""
+
+    notes: list[Diagnostic] = field(default_factory=list)
+    errors: list[SpelgenError] = field(default_factory=list)
+
+    def add(self, check: Check[Subject], message: str, where: str, file: Path | None = None) -> None:
+        """Add what a check says; of an error, how to have it accepted."""
+        if check.severity == "error":
+            do = f"{check.do}; --accept {check.code} if it is right"
+            error = LogError(message, file=file, element=where, expected=check.expected, do=do)
+            self.errors.append(error)
+        else:
+            self.notes.append(Diagnostic(check.severity, check.code, where, None, message))
 
 
 def run_checks(
@@ -298,9 +305,9 @@ def check(
         notes += clock_diagnostics(trajectory)
         results += findings(trajectory, joints, joint_types)
         count += 1
-    summaries, errors = summarised(results, joints, count)
-    collect(errors)
-    return [*notes, *summaries]
+    summary = summarised(results, joints, count)
+    collect(summary.errors)
+    return [*notes, *summary.notes]
 
 
 def clock_diagnostics(trajectory: Trajectory) -> list[Diagnostic]:
@@ -341,15 +348,12 @@ def findings(
     return results
 
 
-def summarised(
-    results: Sequence[Finding], joints: Sequence[str], trajectories: int
-) -> tuple[list[Diagnostic], list[SpelgenError]]:
+def summarised(results: Sequence[Finding], joints: Sequence[str], trajectories: int) -> Findings:
     """Return notes and errors about so many trajectories: a sentence for each joint and check."""
     groups: dict[tuple[str, str], list[Finding]] = {}
     for finding in results:
         groups.setdefault((finding.joint, finding.check.code), []).append(finding)
-    notes: list[Diagnostic] = []
-    errors: list[SpelgenError] = []
+    summary = Findings()
     for joint in joints:
         for odd in CHECKS:
             alike = groups.get((joint, odd.code), [])
@@ -359,12 +363,8 @@ def summarised(
             message = alike[0].message
             if len(alike) > 1:
                 message += f" (and in {len(alike) - 1} more trajectories)"
-            where = f"trajectory {alike[0].trajectory}, joint {joint!r}"
-            if odd.severity == "error":
-                errors.append(odd.error(message, where, alike[0].file))
-            else:
-                notes.append(odd.diagnostic(message, where))
-    return notes, errors
+            summary.add(odd, message, f"trajectory {alike[0].trajectory}, joint {joint!r}", alike[0].file)
+    return summary
 
 
 def velocity_agreement(trajectory: Trajectory) -> VelocityAgreement:

@@ -8,10 +8,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, ClassVar, Literal, Self
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
-from spelgen.errors import OptionError, SettingsError, collect, suggestion
-from spelgen.settings.messages import expected_text
+from spelgen.errors import OptionError, SettingsError, suggestion
+from spelgen.settings.messages import validated
 from spelgen.settings.tuning.fit_defaults import FitDefaults
 from spelgen.settings.values import Count, Group, NonNegative, Positive, Whole
 
@@ -238,23 +238,9 @@ def fit_config(
             settings.pop(name, None)
         elif name in options and other not in options and settings.get(other) == against:
             settings.pop(other)
-    config = make_config(kind, settings | options)
+    config = validated(kind, settings | options)
     config.require(rigid_bodies=rigid_bodies)
     return config
-
-
-def make_config(kind: type[FitConfig], options: Mapping[str, object]) -> FitConfig:
-    """Return the configuration with these options. Raises SettingsError for values that cannot be."""
-    try:
-        return kind.model_validate(dict(options))
-    except ValidationError as error:
-        problems = []
-        for detail in error.errors(include_url=False):
-            element = ".".join(map(str, detail["loc"]))
-            expected = expected_text(detail["msg"])
-            problems.append(SettingsError(repr(detail["input"]), element=element, expected=expected))
-        collect(problems)
-        raise
 
 
 def _foreign(name: str, config: type[FitConfig]) -> SettingsError:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any, get_args
+from typing import Any, TypeVar, get_args
 
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 
-from spelgen.errors import SettingsError, suggestion
+from spelgen.errors import SettingsError, collect, suggestion
 from spelgen.settings.yaml_document import Document, Location
 
 LONGEST_VALUE = 60  # characters of a value that a message repeats
@@ -16,6 +16,20 @@ EXPECTED = {
     "model_type": "keys with values",
     "dict_type": "keys with values",
 }
+
+Checked = TypeVar("Checked", bound=BaseModel)
+
+
+def validated(group: type[Checked], content: object, document: Document | None = None) -> Checked:
+    """Return what a file or a caller says as a group of settings, the defaults of None.
+
+    Raises SettingsError, or SpelgenErrors with all that is wrong; see `explain`.
+    """
+    try:
+        return group.model_validate({} if content is None else content)
+    except ValidationError as error:
+        collect([explain(detail, document, group) for detail in error.errors(include_url=False)])
+        raise
 
 
 def explain(detail: Mapping[str, Any], document: Document | None, group: type[BaseModel]) -> SettingsError:
@@ -27,7 +41,9 @@ def explain(detail: Mapping[str, Any], document: Document | None, group: type[Ba
     if kind == "extra_forbidden":
         names = _group_at(group, location[:-1]).model_fields
         return unknown_name(location, "key", str(location[-1]), names, document)
-    expected = EXPECTED.get(kind) or expected_text(detail["msg"])
+    expected = EXPECTED.get(kind) or detail["msg"].removeprefix("Input should be ").removeprefix(
+        "Value error, "
+    )
     # pydantic has this place for a key of a dict that is none
     if location[-1:] == ("[key]",):
         location, expected = location[:-1], "a name; write it in quotes"
@@ -51,11 +67,6 @@ def unknown_name(
     fields = _place(location, document)
     fields["element"] = dotted(location[:-1])
     return SettingsError(f"unknown {kind} {name!r}", do=suggestion(name, names), **fields)
-
-
-def expected_text(message: str) -> str:
-    """Return what pydantic expected, without the words before it."""
-    return message.removeprefix("Input should be ").removeprefix("Value error, ")
 
 
 def dotted(location: Location) -> str | None:

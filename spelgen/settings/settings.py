@@ -7,21 +7,20 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
-from spelgen.errors import Diagnostic, SettingsError, collect
+from spelgen.errors import Diagnostic, SettingsError, SpelgenError, SpelgenErrors, collect
 from spelgen.settings.comparison import ComparisonSettings
 from spelgen.settings.joint import Coupling, JointSettings
 from spelgen.settings.log_mapping import LogMapping
-from spelgen.settings.messages import explain, unknown_name
+from spelgen.settings.messages import unknown_name, validated
 from spelgen.settings.simulation import SimulationSettings, TrackingSettings
 from spelgen.settings.training import TrainingSettings
 from spelgen.settings.values import Group, Number
 from spelgen.settings.yaml_document import Document, Location, read_document
 
-GroupType = TypeVar("GroupType", bound=BaseModel)
 OF_A_STEP = ("simulation", "tracking", "training", "comparison", "logs")
 """Groups that one step reads; all others belong to the arm."""
 
@@ -29,7 +28,7 @@ OF_A_STEP = ("simulation", "tracking", "training", "comparison", "logs")
 class Unusable:
     """Stand in the place of a group that cannot be read: whoever reads it gets the errors."""
 
-    def __init__(self, errors: Sequence[SettingsError]) -> None:
+    def __init__(self, errors: Sequence[SpelgenError]) -> None:
         self.errors = tuple(errors)
 
     def __getattr__(self, name: str) -> Any:
@@ -119,7 +118,7 @@ def load_settings(urdf_path: Path | str, joints: Iterable[str] | None = None) ->
     joint_names = None if joints is None else list(joints)
     # a group that one step reads must not stop the others: it is taken out and read by itself
     groups: dict[str, object] = {}
-    step_errors: list[SettingsError] = []
+    step_errors: list[SpelgenError] = []
     for name in OF_A_STEP:
         if isinstance(content, dict) and name in content:
             settings, errors = _read(document, {name: content.pop(name)}, joint_names)
@@ -143,18 +142,23 @@ def load_mapping(path: Path | str, joints: Iterable[str]) -> LogMapping:
     Raises SettingsError as `load_settings` does, and for joints that are not among `joints`.
     """
     document, joint_names = read_document(Path(path)), list(joints)
-    mapping, errors = _validated(document, document.value(), LogMapping)
+    mapping = validated(LogMapping, document.value(), document)
     unknown = [name for name in mapping.joints if name not in joint_names]
-    errors += [unknown_name(("joints", name), "joint", name, joint_names, document) for name in unknown]
-    collect(errors)
+    collect([unknown_name(("joints", name), "joint", name, joint_names, document) for name in unknown])
     return mapping
 
 
 def _read(
     document: Document, content: object, joint_names: list[str] | None
-) -> tuple[Settings, list[SettingsError]]:
+) -> tuple[Settings, list[SpelgenError]]:
     """Return the settings in ``content``, the defaults where they cannot be read, and what is wrong with them."""
-    settings, errors = _validated(document, content, Settings)
+    try:
+        settings = validated(Settings, content, document)
+    except SpelgenErrors as several:
+        return Settings(), list(several.errors)
+    except SettingsError as error:
+        return Settings(), [error]
+    errors: list[SpelgenError] = []
     if joint_names is not None:
         for location, name in _joint_names(settings):
             if name not in joint_names:
@@ -173,12 +177,3 @@ def _joint_names(settings: Settings) -> Iterator[tuple[Location, str]]:
     for number, coupling in enumerate(settings.couplings):
         for index, name in enumerate(coupling.joints):
             yield ("couplings", number, "joints", index), name
-
-
-def _validated(
-    document: Document, content: object, group: type[GroupType]
-) -> tuple[GroupType, list[SettingsError]]:
-    try:
-        return group.model_validate({} if content is None else content), []
-    except ValidationError as error:
-        return group(), [explain(detail, document, group) for detail in error.errors(include_url=False)]

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pydantic import ValidationError
-
-from spelgen.errors import collect
-from spelgen.settings.messages import explain
+from spelgen.settings.messages import validated
 from spelgen.settings.settings import Settings
 from spelgen.settings.simulation import ControlledSimulation, ServoSimulation, SimulationSettings
 from spelgen.settings.tuning.simulation import SimulationTuning
@@ -49,7 +46,8 @@ def simulate(
         "test_fraction": test_fraction, "seed": seed,
     }  # fmt: skip
     changes = {key: value for key, value in arguments.items() if value is not None}
-    changed = _changed(arm.settings.simulation, changes)
+    values = arm.settings.simulation.model_dump(exclude_unset=True) | changes
+    changed = validated(SimulationSettings, values, Document(Path("simulate"), None))
     settings = _controlled(arm.settings.model_copy(update={"simulation": changed}))
     run = servo_motions if settings.input == "position" else PROTOCOLS[settings.simulation.protocol]
     return run(arm.arm, settings, arm.actuation.drives(), progress=progress)
@@ -76,12 +74,3 @@ def _controlled(settings: Settings) -> Settings:
         changes.pop(name, None)
     tracking = tracking.model_copy(update=changes)
     return settings.model_copy(update={"simulation": simulation, "tracking": tracking})
-
-
-def _changed(settings: SimulationSettings, changes: Mapping[str, object]) -> SimulationSettings:
-    try:
-        return SimulationSettings.model_validate({**settings.model_dump(exclude_unset=True), **changes})
-    except ValidationError as error:
-        keys = Document(Path("simulate"), None)
-        collect([explain(detail, keys, SimulationSettings) for detail in error.errors(include_url=False)])
-        raise

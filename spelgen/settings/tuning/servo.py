@@ -97,9 +97,6 @@ class ServoIntervalTuning:
         0.015  # [1] of ratios, by what friction's laws are not: benchmarks/servo_recovery.py
     )
     open_factor: float = 1.25  # [1] what may be larger by this factor within its interval is not determined
-    least_remaining: float = (
-        0.01  # [1] of the cost after the first step; its second derivatives may promise more
-    )
 
 
 @dataclass(frozen=True)
