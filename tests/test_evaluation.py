@@ -18,7 +18,7 @@ from spelgen.dynamics.bristles import bristle_reach
 from spelgen.dynamics.pinocchio_urdf import urdf_dynamics
 from spelgen.dynamics.tip import tip_kinematics
 from spelgen.emission.loading import load_module
-from spelgen.errors import LogError, RunError
+from spelgen.errors import Diagnostic, LogError, RunError
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.evaluation.invariants import energy_drift
 from spelgen.evaluation.rollout import rollout
@@ -199,7 +199,7 @@ def test_the_same_run_and_logs_give_the_same_file(run):
     assert files[0] == files[1]
     assert "stand_in on 4 test trajectories; * marks the best of a row" in shown.stdout
     found = json.loads(files[0], parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
-    assert found["schema"] == 8
+    assert found["schema"] == 9
     shown = found["traces"]["trajectories"]
     assert [x["which"] for x in shown] == ["typical", "worst"]
     assert len(shown[0]["q"]) == len(shown[0]["t"]) == 21 and len(shown[0]["q"][0]) == 2
@@ -406,7 +406,9 @@ def test_torques_in_steps_of_their_own_size_are_found():
     t, random = np.arange(2000) / 100, np.random.default_rng(1)
     tau = np.stack([np.sin(t), 2 * np.sin(3 * t)], axis=1) + 0.01 * random.standard_normal((2000, 2))
     log = Trajectory(t, tau, tau, np.stack([np.round(tau[:, 0] / 0.5) * 0.5, tau[:, 1]], axis=1), "coarse")
-    assert coarse_torques([log], ["a", "b"]) == {"a": pytest.approx(0.5)}
+    notes: list[Diagnostic] = []
+    assert coarse_torques([log], ["a", "b"], notes) == {"a": pytest.approx(0.5)}
+    assert [(note.code, "torque of a" in note.message) for note in notes] == [("coarse-torque", True)]
 
 
 def test_only_moving_samples_of_dense_logs_count():

@@ -35,12 +35,11 @@ def traces(name):
         "trajectories": [{"which": "typical", "trajectory": name, "start": 0.0, "error": 0.1, "t": t, "q": wave,
                           "qd": wave, "predicted_q": near, "predicted_qd": [[None] * 3, *near[1:]]}],
         "torques": [{"which": "typical", "trajectory": name, "t": t, "q": wave, "qd": wave, "measured": near,
-                     "without_friction": wave, "predicted": both,
+                     "predicted": both,
                      "parts": dict.fromkeys(("inertia", "Coriolis", "gravity", "friction"), wave),
                      "energy": dict.fromkeys(("work of the drives", "stored", "friction", "not explained"), one)}],
         "mass": {"trajectory": name, "t": t, "by": {"model": {"entries": entries, "eigenvalues": [one] * 3}}},
-        "friction": {"qd": [[-1, 0, 1]] * 3, "by": {"model": [[-2, 0, 2]] * 3},
-                     "measured": [{"qd": [-1, 1], "torque": [-2, 2]}] * 3},
+        "friction": {"qd": [[-1, 0, 1]] * 3, "by": {"model": [[-2, 0, 2]] * 3}},
     }  # fmt: skip
 
 

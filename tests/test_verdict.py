@@ -51,7 +51,7 @@ def torques(slow, fast):
     measured = [[float(k % 7), 10 * x[1] + r[1]] for k, (x, r) in enumerate(zip(qd, residual, strict=True))]
     predicted = [[m[0], m[1] - r[1]] for m, r in zip(measured, residual, strict=True)]
     trace = {"which": "typical", "trajectory": "x", "t": [], "q": [], "qd": qd, "measured": measured,
-             "without_friction": [], "predicted": {"model": predicted}, "parts": {}, "energy": {}}  # fmt: skip
+             "predicted": {"model": predicted}, "parts": {}, "energy": {}}  # fmt: skip
     return {"torques": [trace]}
 
 

@@ -124,7 +124,7 @@ def _evaluate_torques(
             expected=f"motion at {SLOWEST:g} Hz or more, {SHORTEST:g} s without a gap",
             do="omit --quick",
         )
-    steps = _coarse_torques(logs, judged, notes) if torque else {}
+    steps = coarse_torques(logs, judged.joints, notes) if torque else {}
     return replace(
         _results(judged, logs, motion_traces(predictors, tests, longest, tip), notes),
         cutoff=used.cutoff or None,
@@ -162,18 +162,6 @@ def _torque_errors(
             if predictor.dynamics is not None:
                 errors[predictor.name] = torque_errors(predictor.dynamics, samples)
     return errors
-
-
-def _coarse_torques(logs: Sequence[Trajectory], judged: Subject, notes: list[Diagnostic]) -> dict[str, float]:
-    """Return the steps of joints whose torque is logged in steps of its own size, and note them."""
-    steps = coarse_torques(logs, judged.joints)
-    for joint, step in steps.items():
-        message = (
-            f"the torque of {joint} is logged in steps of {step:.3g}, as large as the torque itself: "
-            "its error is that of the log, and the verdict omits this joint"
-        )
-        notes.append(Diagnostic("warning", "coarse-torque", "logs", None, message))
-    return steps
 
 
 def _evaluate_servos(judged: Subject, logs: Sequence[Trajectory], notes: list[Diagnostic]) -> Results:

@@ -12,7 +12,7 @@ from spelgen.evaluation.replay import Replay
 from spelgen.evaluation.torque import TorqueErrors
 from spelgen.evaluation.traces import Traces
 
-SCHEMA = 8
+SCHEMA = 9
 
 
 @dataclass(frozen=True, repr=False)

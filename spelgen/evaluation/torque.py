@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from spelgen.dynamics.protocol import known_past
+from spelgen.errors import Diagnostic
 from spelgen.evaluation.plain import finite
 from spelgen.log_checks.statistics import quantisation_step
 from spelgen.logs.dynamics_samples import DynamicsSamples, is_moving
@@ -76,8 +77,10 @@ def _mean(nmse: np.ndarray) -> float | None:
     return finite(varying.mean(keepdims=True))[0] if varying.size else None
 
 
-def coarse_torques(logs: Sequence[Trajectory], joints: Sequence[str]) -> dict[str, float]:
-    """Return by name the steps [Nm, N] of torques that are logged in steps of their own size."""
+def coarse_torques(
+    logs: Sequence[Trajectory], joints: Sequence[str], notes: list[Diagnostic]
+) -> dict[str, float]:
+    """Return by name the steps [Nm, N] of torques that are logged in steps of their own size, and note them."""
     steps = {}
     for k, joint in enumerate(joints):
         # infinite where a log is not quantised: most of them must be
@@ -85,4 +88,9 @@ def coarse_torques(logs: Sequence[Trajectory], joints: Sequence[str]) -> dict[st
         torque = np.concatenate([log.tau[:, k] for log in logs])
         if np.isfinite(step) and np.ptp(torque) < LEVELS * step:
             steps[joint] = step
+            message = (
+                f"the torque of {joint} is logged in steps of {step:.3g}, as large as the torque itself: "
+                "its error is that of the log, and the verdict omits this joint"
+            )
+            notes.append(Diagnostic("warning", "coarse-torque", "logs", None, message))
     return steps

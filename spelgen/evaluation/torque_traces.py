@@ -32,8 +32,8 @@ TUNING = TraceTuning()
 class TorqueTrace:
     """Torques (T, n) along ten seconds of the log of middle ("typical") or largest ("worst") error.
 
-    without_friction: what the model's rigid bodies make. predicted: by predictor. parts: of the model's torque. energy:
-    by where the drives' work went since the start, (T,) [J].
+    predicted: by predictor. parts: of the model's torque. energy: by where the drives' work went since the start, (T,)
+    [J].
     """
 
     which: str
@@ -42,7 +42,6 @@ class TorqueTrace:
     q: Rows
     qd: Rows
     measured: Rows
-    without_friction: Rows
     predicted: dict[str, Rows]
     parts: dict[str, Rows]
     energy: dict[str, Series]
@@ -189,7 +188,6 @@ def _trace(which: str, name: str, dynamics: Mapping[str, RigidDynamics], motion:
         rows(q[::stride]),
         rows(qd[::stride]),
         rows(measured[::stride]),
-        rows((predicted[MODEL] - parts["friction"])[::stride]),
         _thinned(predicted, stride),
         _thinned(parts, stride),
         {label: series(work[::stride]) for label, work in energy.items()},

@@ -104,20 +104,11 @@ class MassTrace:
 
 
 @dataclass(frozen=True)
-class FrictionSamples:
-    """What the model's rigid bodies leave of a joint's torque, at its velocity."""
-
-    qd: Series
-    torque: Series
-
-
-@dataclass(frozen=True)
 class FrictionTrace:
-    """Friction by velocity: (n, T) by predictor, each joint alone at the mean position; and what was measured."""
+    """Friction by velocity: (n, T) by predictor, each joint alone at the mean position."""
 
     qd: Rows
     by: dict[str, Rows]
-    measured: list[FrictionSamples]
 
 
 @dataclass(frozen=True)
@@ -153,7 +144,7 @@ def motion_traces(
         trajectories=examples,
         torques=torques,
         mass=_mass_trace(dynamics, (*torques, *examples)),
-        friction=_friction_trace(dynamics, logs.pieces, torques),
+        friction=_friction_trace(dynamics, logs.pieces),
     )
 
 
@@ -270,9 +261,7 @@ def _mass_trace(
     return MassTrace(along.trajectory, along.t[::stride], curves)
 
 
-def _friction_trace(
-    dynamics: Mapping[str, RigidDynamics], pieces: Sequence[Trajectory], torques: Sequence[TorqueTrace]
-) -> FrictionTrace:
+def _friction_trace(dynamics: Mapping[str, RigidDynamics], pieces: Sequence[Trajectory]) -> FrictionTrace:
     q = np.concatenate([piece.q for piece in pieces])
     fast = np.quantile(np.abs(np.concatenate([piece.qd for piece in pieces])), 0.995, axis=0)
     middle = torch.from_numpy(q.mean(axis=0))
@@ -286,13 +275,4 @@ def _friction_trace(
             alone = torch.diag_embed(speeds)  # one joint at a time
             torque = torch.as_tensor(predictor.friction_torque(middle.expand(len(speeds), n, n), alone))
         curves[name] = rows(torch.diagonal(torque, dim1=-2, dim2=-1).mT)
-    return FrictionTrace(rows(speeds.mT), curves, [_friction_samples(torques, joint) for joint in range(n)])
-
-
-def _friction_samples(torques: Sequence[TorqueTrace], joint: int) -> FrictionSamples:
-    velocity, friction = [], []
-    for trace in torques:
-        measured, without = np.array(trace.measured, float), np.array(trace.without_friction, float)
-        velocity += series(np.array(trace.qd, float)[:, joint])
-        friction += series((measured - without)[:, joint])
-    return FrictionSamples(velocity, friction)
+    return FrictionTrace(rows(speeds.mT), curves)

@@ -276,15 +276,19 @@ def friction_panels(friction: Record, torques: Sequence[Record], joints: Sequenc
     """
     panels = []
     for k, joint in enumerate(joints):
-        dots = friction["measured"][k]
-        marks: list[Mark] = [Dots("measured", numbers(dots["qd"]), numbers(dots["torque"]), "truth")]
-        # one trajectory is enough: loops of two would cover each other
-        for trace in torques[:1]:
-            qd = numbers(trace["qd"])[:, k]
-            measured = numbers(trace["measured"])[:, k] - numbers(trace["without_friction"])[:, k]
+        speeds, measured = [np.zeros(0)], [np.zeros(0)]
+        loops: list[Mark] = []
+        for trace in torques:
+            speeds.append(numbers(trace["qd"])[:, k])
             modelled = numbers(trace["parts"]["friction"])[:, k]
-            marks.append(Line("measured, over time", qd, measured, "loop"))
-            marks.append(Line("model, over time", qd, modelled, "loop model"))
+            residual = numbers(trace["measured"])[:, k] - numbers(trace["predicted"][MODEL])[:, k]
+            measured.append(modelled + residual)
+            # one trajectory is enough: loops of two would cover each other
+            if not loops:
+                loops.append(Line("measured, over time", speeds[-1], measured[-1], "loop"))
+                loops.append(Line("model, over time", speeds[-1], modelled, "loop model"))
+        torque = np.concatenate(measured)
+        marks: list[Mark] = [Dots("measured", np.concatenate(speeds), torque, "truth"), *loops]
         for name, curves in friction["by"].items():
             marks.append(Line(name, friction["qd"][k], numbers(curves[k]), style(name)))
         model = friction["by"].get(MODEL)
@@ -293,7 +297,7 @@ def friction_panels(friction: Record, torques: Sequence[Record], joints: Sequenc
             f"Friction of {joint.name}",
             joint.axis("velocity"),
             f"friction [{joint.units.torque}]",
-            limits=_friction_limits(numbers(dots["torque"]), numbers(model[k]) if model else np.zeros(1)),
+            limits=_friction_limits(torque, numbers(model[k]) if model else np.zeros(1)),
             height=220,
         )
         panels.append(Panel(joint.name, (chart,)))

@@ -45,6 +45,7 @@ class Run:
     config: Record | None
     metrics: Sequence[Record]
     evaluation: Record | None
+    results: Results | None
     identified: Record | None
     arm: LoadedArm | None
     model: EmittedModel | None
@@ -60,19 +61,11 @@ class Run:
         return limits
 
     @property
-    def results(self) -> Results | None:
-        """Return the evaluation; None before there is one."""
-        if self.evaluation is None:
-            return None
-        return Results.from_dict(self.evaluation)
-
-    @property
     def verdict(self) -> Verdict | None:
         """Return what the model is good for; None before it is evaluated."""
-        results = self.results
-        if results is None:
+        if self.results is None:
             return None
-        return verdict(results, self.identified, self.limits)
+        return verdict(self.results, self.identified, self.limits)
 
 
 def write_report(
@@ -130,12 +123,14 @@ def _read(folder: RunFolder) -> Run:
         arm = run_arm(folder)
     except SpelgenError:
         arm = None
+    evaluation = _json(folder, folder.evaluation)
     return Run(
         folder,
         read_facts(folder.module),
         config=folder.read_config() if folder.config.is_file() else None,
         metrics=folder.read_metrics(),
-        evaluation=_json(folder, folder.evaluation),
+        evaluation=evaluation,
+        results=None if evaluation is None else Results.from_dict(evaluation),
         identified=_json(folder, folder.baseline),
         arm=arm,
         model=trained_model(folder) if folder.weights.is_file() else None,
@@ -150,8 +145,8 @@ def _json(folder: RunFolder, path: Path) -> Record | None:
 
 
 def _rendered(run: Run, robot: Path | str | None) -> str:
-    facts, config, evaluation = run.facts, run.config or {}, run.evaluation or {}
-    traces = evaluation.get("traces") or {}
+    facts, config = run.facts, run.config or {}
+    traces = (run.evaluation or {}).get("traces") or {}
     arm, cells, training, tables, constants = None, None, None, [], []
     if config:
         training = training_facts(config, run.metrics, run.identified)
@@ -169,7 +164,7 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
         cells=cells,
         arm=arm,
         units=UNITS,
-        numbers=head_numbers(run.model, config, run.metrics, evaluation),
+        numbers=head_numbers(run.model, config, run.metrics, run.results),
         verdict=run.verdict,
         config=run.config,
         training=training,

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from spelgen.baselines.names import MODEL
+from spelgen.evaluation.results import Results
 from spelgen.fitting.objectives import fit_summary
 from spelgen.labels import share, thousandths
 from spelgen.listing import number
@@ -36,26 +37,10 @@ class Training:
 
 
 def head_numbers(
-    model: EmittedModel | None, config: Record, metrics: Sequence[Record], evaluation: Record
+    model: EmittedModel | None, config: Record, metrics: Sequence[Record], results: Results | None
 ) -> list[Number]:
     """Return the figures a reader wants first, as far as the run has come; records are empty where there are none."""
-    figures = []
-    torque = evaluation.get("torque", {}).get(MODEL)
-    if torque and torque["mean_nmse"] is not None:
-        value = share(torque["mean_nmse"])
-        figures.append(Number(value, "torque error relative to its variance (nMSE)"))
-    # the longest horizon is the hardest, and what a simulation needs
-    for horizon in evaluation.get("horizons", ())[-1:]:
-        error = horizon["errors"][MODEL]
-        if error["mean_relative_rms"] is not None:
-            figures.append(
-                Number(share(error["mean_relative_rms"], "motion"), f"rollout error after {horizon['name']}")
-            )
-        if error["tip_mm"] is not None:
-            figures.append(Number(f"{number(error['tip_mm'])} mm", f"tip error after {horizon['name']}"))
-    for replay in evaluation.get("replays", ()):
-        value = f"{number(1000 * replay['errors'][MODEL]['mean'])} {thousandths(evaluation['joint_types'])}"
-        figures.append(Number(value, f"position error, commands replayed, {replay['name']}"))
+    figures = _errors(results) if results is not None else []
     summary = fit_summary(config)
     if summary is not None:
         figures.append(Number(*summary.headline))
@@ -65,6 +50,25 @@ def head_numbers(
     if metrics:
         label = f"of training, {metrics[-1]['step']:,} steps"
         figures.append(Number(_duration(metrics[-1]["seconds"]), label))
+    return figures
+
+
+def _errors(results: Results) -> list[Number]:
+    figures = []
+    torque = results.torque.get(MODEL)
+    if torque is not None and torque.mean_nmse is not None:
+        figures.append(Number(share(torque.mean_nmse), "torque error relative to its variance (nMSE)"))
+    # the longest horizon is the hardest, and what a simulation needs
+    for horizon in results.horizons[-1:]:
+        error = horizon.errors[MODEL]
+        if error.mean_relative_rms is not None:
+            value = share(error.mean_relative_rms, "motion")
+            figures.append(Number(value, f"rollout error after {horizon.name}"))
+        if error.tip_mm is not None:
+            figures.append(Number(f"{number(error.tip_mm)} mm", f"tip error after {horizon.name}"))
+    for replay in results.replays:
+        value = f"{number(1000 * replay.errors[MODEL].mean)} {thousandths(results.joint_types)}"
+        figures.append(Number(value, f"position error, commands replayed, {replay.name}"))
     return figures
 
 
