@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
+
+LONGEST_NAME = 36
 
 
 @dataclass(frozen=True)
@@ -111,6 +114,11 @@ def printable(text: str, allowed: str = "") -> str:
             character = character.encode("unicode_escape").decode()
         characters.append(character)
     return "".join(characters)
+
+
+def short_name(name: str) -> str:
+    """Return a name from a file as one line of a table shows it: control characters would move the cursor."""
+    return textwrap.shorten(printable(name), LONGEST_NAME, placeholder="...") or '""'
 
 
 def thousandths(joint_types: Sequence[str]) -> str:

@@ -6,9 +6,7 @@ import textwrap
 
 from spelgen.certificate.formulas import WRITABLE, Formula, Formulas
 from spelgen.certificate.printing import Text
-from spelgen.labels import printable
-
-_LONGEST_NAME = 36
+from spelgen.labels import printable, short_name
 
 
 def text(formulas: Formulas, width: int = 80) -> str:
@@ -89,13 +87,9 @@ def _legend(formulas: Formulas) -> str:
     bodies: set[int] = set()
     for base in formulas.base:
         bodies.update(index // 10 for index, _ in base.weights)  # ten inertial parameters a body
-    names = [f"{body + 1} {_short(formulas.arm.bodies[body].name)}" for body in sorted(bodies)]
+    names = [f"{body + 1} {short_name(formulas.arm.bodies[body].name)}" for body in sorted(bodies)]
     return (
         "m is the mass [kg], h = m c the first moment [kg m] and I the inertia tensor [kg m2] about the "
         "origin of the joint's frame, turned so that z is the joint's axis, of all that moves rigidly with "
         f"the joint: {', '.join(names)}. q is the joint's position [rad, m]."
     )
-
-
-def _short(name: str) -> str:
-    return textwrap.shorten(printable(name), _LONGEST_NAME, placeholder="...") or '""'

@@ -13,7 +13,7 @@ from spelgen.arm.arm import Arm, Coordinate
 from spelgen.certificate.facts import Fact, facts
 from spelgen.dynamics.servo_rank import servo_rank
 from spelgen.errors import Diagnostic
-from spelgen.labels import counted, joint_ranges, joints_in_ranges, printable
+from spelgen.labels import LONGEST_NAME, counted, joint_ranges, joints_in_ranges, printable, short_name
 from spelgen.listing import Listing
 from spelgen.structure.structure import Entry, Structure
 
@@ -178,9 +178,8 @@ class Inspection:
     def _joint_table(self) -> str:
         lines = ["Joints"]
         for index, coordinate in enumerate(self.arm.coordinates):
-            # names come from a file: control characters would move the cursor
-            name = textwrap.shorten(printable(coordinate.name), 36, placeholder="...") or '""'
-            line = f"  {index + 1:>2}  {name:<36}  {coordinate.kind:<9}  {reach(coordinate)}"
+            name = f"{short_name(coordinate.name):<{LONGEST_NAME}}"
+            line = f"  {index + 1:>2}  {name}  {coordinate.kind:<9}  {reach(coordinate)}"
             if index in self.structure.passive:
                 line += ", passive"
             lines.append(line)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import reduce
+from operator import add
 from typing import TYPE_CHECKING
 
 from spelgen.arm.arm import Coordinate
@@ -128,9 +130,7 @@ def _joint_report(
 ) -> JointReport:
     """Put together what all trajectories show of one joint."""
     signals = joint_statistics(index, measured)
-    agreement = measured[0].agreement
-    for other in measured[1:]:
-        agreement += other.agreement
+    agreement = reduce(add, [x.agreement for x in measured])
     return JointReport(
         name=coordinate.name,
         kind=coordinate.kind,

@@ -38,7 +38,7 @@ def floats(values: pa.ChunkedArray | pa.Array, column: str, file: Path, row: int
         # Arrow does not say which row
         if pa.types.is_string(values.type):
             for index, text in enumerate(values.to_pylist()):
-                if not _is_number(text):
+                if text and not is_number(text):
                     raise LogError(
                         repr(text[:60]), file=file, line=line_of(file, row + index),
                         element=f"row {row + index + 1}, column {column}", expected="a number",
@@ -47,9 +47,10 @@ def floats(values: pa.ChunkedArray | pa.Array, column: str, file: Path, row: int
         raise LogError(got, file=file, element=f"column {column}", expected="numbers") from error
 
 
-def _is_number(text: str | None) -> bool:
+def is_number(text: str) -> bool:
+    """Whether a text is a number, as Python writes it."""
     try:
-        float(text or "nan")
+        float(text)
     except ValueError:
         return False
     return True

@@ -12,6 +12,7 @@ import pyarrow.csv
 
 from spelgen.errors import LogError
 from spelgen.logs.bags import FIELDS
+from spelgen.logs.columns import is_number
 from spelgen.logs.tables import LogFormat, LogTable, reading, table_layout
 from spelgen.settings.log_mapping import PLAIN, LogMapping
 from spelgen.settings.tuning.logs import LogTuning
@@ -36,7 +37,7 @@ def csv_columns(file: Path) -> pa.Table:
         names, _, rows = head.partition("\n")
         delimiter = max(",;\t", key=names.count)
         header = None
-        if _is_number(names.split(delimiter)[0]):
+        if is_number(names.split(delimiter)[0]):
             header = _joint_state_header(names.split(delimiter), file)
         decimal_point = "."
         if delimiter != "," and re.search(rf"(^|{delimiter}) *-?\d+,\d", rows, re.MULTILINE):
@@ -54,14 +55,6 @@ def csv_columns(file: Path) -> pa.Table:
     return table.append_column(PLAIN["t"], times.cast(pa.duration("ns")))
 
 
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
 def _joint_state_header(cells: Sequence[str], file: Path) -> list[str]:
     """Return names for the columns of joint states as `ros2 topic echo --csv` writes them, which has no header.
 
@@ -69,7 +62,7 @@ def _joint_state_header(cells: Sequence[str], file: Path) -> list[str]:
     """
     names: list[str] = []
     for cell in cells[len(STAMP) + 1 :]:
-        if _is_number(cell):
+        if is_number(cell):
             break
         names.append(cell)
     values = len(cells) - len(STAMP) - 1 - len(names)
