@@ -51,7 +51,12 @@ def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
     tip_link, tip, end = tip_chain(loaded)
     # what does not depend on q is one matrix, whatever it comes from
     constant_mass = array(weights.armature)
-    residuals = _no_residuals()
+    none = Splines((), np.zeros(0), np.zeros(0), np.zeros((0, 4)))
+    residuals = Residuals(Encoding(False, np.zeros(0), np.zeros(0)), (), None, None, none, (), none)
+    bristles = None
+    if has_friction_state(exact):
+        reach: Tensor = exact.friction.bristles.reach
+        bristles = Bristles(array(reach), array(weights.friction.bristle_fractions))
     if has_residuals(exact):
         constant_mass += array(weights.residual.constant).reshape(exact.n, exact.n)
         residuals = _residuals(exact)
@@ -65,7 +70,7 @@ def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
         motors=array(exact.motors),
         residuals=residuals,
         friction=_friction(weights.friction),
-        bristles=_bristles(exact, weights),
+        bristles=bristles,
         inputs=array(exact.input_matrix(torch.zeros(exact.n).double())),
         actuated=array(exact.actuated),
         torque_offset=array(exact.torque_offset),
@@ -111,17 +116,6 @@ def _unsupported(subject: str) -> RunError:
 def _friction(constants: Any) -> FrictionLaw:
     values = constants._asdict()
     return FrictionLaw(**{name: array(values[name]) for name in FrictionLaw.__annotations__})
-
-
-def _bristles(model: Any, weights: Any) -> Bristles | None:
-    if not has_friction_state(model):
-        return None
-    return Bristles(array(model.friction.bristles.reach), array(weights.friction.bristle_fractions))
-
-
-def _no_residuals() -> Residuals:
-    none = Splines((), np.zeros(0), np.zeros(0), np.zeros((0, 4)))
-    return Residuals(Encoding(False, np.zeros(0), np.zeros(0)), (), None, None, none, (), none)
 
 
 def _residuals(model: ResidualModel) -> Residuals:

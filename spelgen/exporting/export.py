@@ -18,11 +18,6 @@ from spelgen.loaded_arm import LoadedArm, arm_of_module
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
-_CHOOSE = ("c", "casadi", "onnx", "torch")
-"""The formats of which functions can be chosen."""
-_DERIVATIVES = ("c", "casadi")
-"""Those that have derivatives as well, which are written where they are named."""
-
 
 def export(
     trained: Fit | EmittedModel | Path | str,
@@ -55,13 +50,15 @@ def export(
         model, arm = trained.model, arm or trained.urdf
     else:
         model = trained
-    if entries and to not in _CHOOSE:
-        raise RunError(f"functions for --to {to}", expected=f"--to {listed(_CHOOSE)}, which have a choice")
+    exporter = EXPORTERS[to]
+    if entries and not exporter.choice:
+        formats = [name for name, other in EXPORTERS.items() if other.choice]
+        raise RunError(f"functions for --to {to}", expected=f"--to {listed(formats)}, which have a choice")
     chosen = Trained(model, _loaded(model, arm), tuple(entries))
     # derivatives are two thirds of the code, and few need them
-    if to in _DERIVATIVES and not entries:
+    if exporter.derivatives and not entries:
         chosen = replace(chosen, entries=without_derivatives(chosen.described))
-    exported = EXPORTERS[to].function()(chosen)
+    exported = exporter.function()(chosen)
     if path is not None:
         exported.write(path, force=force)
     return exported

@@ -51,7 +51,8 @@ def ranking(robot: str, runs: Sequence[RunResult]) -> Listing:
         seconds = statistics.median(run["seconds"] for run in of_preset)
         facts = (f"{of_preset[0]['parameters']:,}", f"{len(of_preset):,}", number(seconds))
         lines.append(_Line(preset, _medians(of_preset, MODEL, horizons), facts))
-    for name in _common(_predictors(run) for run in runs):
+    # judged at every horizon, or by torque
+    for name in _common([*_common(run["errors"].values()), *run["torque"]] for run in runs):
         if name != MODEL:
             lines.append(_Line(f"({name})", _medians(runs, name, horizons)))
     # baselines stand among the models: a model below one of them is not worth its training
@@ -92,11 +93,6 @@ def _medians(runs: Sequence[RunResult], predictor: str, horizons: Sequence[str])
             # an error that is not finite counts as infinitely bad
             columns.setdefault(name, []).append(math.inf if error is None else error)
     return tuple(map(statistics.median, columns.values()))
-
-
-def _predictors(run: RunResult) -> list[str]:
-    """Return the names of all predictors that are judged at every horizon, or by torque."""
-    return [*_common(run["errors"].values()), *run["torque"]]
 
 
 def _common(lists: Iterable[Iterable[str]]) -> list[str]:
