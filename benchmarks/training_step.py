@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
@@ -30,6 +30,7 @@ from published_phnode import ByJvp, Published
 
 from spelgen.building import build
 from spelgen.design import Design
+from spelgen.dynamics.unbounded import Unbounded
 from spelgen.fitting.rollout import position_difference
 
 if TYPE_CHECKING:
@@ -72,20 +73,12 @@ def rk4(rate: Callable[..., tuple[Tensor, Tensor]], q: Tensor, p: Tensor) -> tup
     return q, p, k1[0]
 
 
-class Unbounded(nn.Module):
-    """Stands in for what keeps M positive definite: all of M as it comes."""
-
-    def forward(self, mass: Tensor) -> tuple[Tensor, Tensor]:
-        """M, and the part of it that is taken: one."""
-        return mass, mass.new_ones(mass.shape[:-2])
-
-
 def unbounded(model: EmittedModel) -> EmittedModel | None:
     """The model with M as it comes; None where nothing is done to it."""
     if not hasattr(getattr(model, "mass", None), "bound"):
         return None
     plain = copy.deepcopy(model)
-    plain.mass.bound = Unbounded()
+    plain.mass.bound = Unbounded(plain.mass.bound.center)
     return plain
 
 
@@ -113,7 +106,7 @@ def networks_alone(model: EmittedModel, data: Data) -> None:
     total = torch.zeros((), dtype=torch.float64)
     for _ in range(4 * (SAMPLES - 1)):
         features = network_inputs(model, q).requires_grad_()
-        layers = prepared.mass[0] if hasattr(dynamics.mass, "bound") else prepared.mass
+        layers = prepared.mass
         total = total + dynamics.mass.network(features, layers)[0].sum()
         total = total + dynamics.potential(features, prepared.potential)[0].sum()
         total = total + dynamics.friction(features, qd, prepared.friction).sum()

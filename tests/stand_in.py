@@ -100,7 +100,7 @@ class Model(nn.Module):
     def forward_dynamics(self, q, qd, tau, z=None):
         return self.velocity(q, tau - self.inverse_dynamics(q, qd, torch.zeros_like(qd)))
 
-    def prepare(self, definite=True):
+    def prepare(self):
         return None
 
     @property

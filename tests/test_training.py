@@ -115,7 +115,7 @@ class Oscillator:
     def velocity(self, q, p, prepared=None):
         return p
 
-    def prepare(self, definite=True):
+    def prepare(self):
         return None
 
     def port_hamiltonian_rhs(self, q, p, tau, prepared, z=None):

@@ -154,7 +154,7 @@ class VelocityState:
         z = self.dynamics.memory_after(z, displacement)
         return z
 
-    def prepare(self, definite: bool = True) -> None:
+    def prepare(self) -> None:
         """Nothing."""
 
     def momentum(self, q: Tensor, qd: Tensor, prepared: None = None) -> Tensor:

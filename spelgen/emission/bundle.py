@@ -18,6 +18,7 @@ class Definition:
 
     text: str
     uses: frozenset[str]
+    is_block: bool  # a class or function, not a constant
 
 
 @dataclass(frozen=True)
@@ -45,11 +46,14 @@ def bundle(tailored: str) -> tuple[str, str]:
         new = runtime.definitions[name].uses - used
         used |= new
         pending += new
-    texts = []
+    text, previous_is_block = "", True
     for name, definition in runtime.definitions.items():
         if name in used and name not in defined_here:
-            texts.append(definition.text)
-    return _imports(used, runtime.imports), "\n\n\n".join(texts)
+            # constants stand line below line, as a person writes them
+            separate = definition.is_block or previous_is_block
+            text += ("\n\n\n" if separate else "\n") + definition.text
+            previous_is_block = definition.is_block
+    return _imports(used, runtime.imports), text.strip()
 
 
 @cache
@@ -71,7 +75,9 @@ def load_runtime() -> Runtime:
                 runtime.imports.update(_bound(node))
             elif (defined := _defined(node)) is not None:
                 uses = frozenset(names_in(node))
-                runtime.definitions[defined] = Definition(_text(node, texts[name]), uses)
+                runtime.definitions[defined] = Definition(
+                    _text(node, texts[name]), uses, not isinstance(node, ast.Assign)
+                )
     return runtime
 
 

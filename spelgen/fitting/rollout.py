@@ -17,6 +17,7 @@ from spelgen.dynamics.protocol import (
     sliding_memory,
 )
 from spelgen.dynamics.runge_kutta import runge_kutta
+from spelgen.dynamics.unbounded import mass_as_learned
 from spelgen.errors import LogError
 from spelgen.fitting.adaptive import roll_out_adaptive
 from spelgen.logs.windows import Windows
@@ -163,8 +164,8 @@ def momentum_loss(model: EmittedModel, windows: Windows, scales: LossScales) -> 
     q, qd, tau = windows.q, windows.qd, windows.tau  # (W, K, n), (W, K, n), (W, K-1, n)
     dynamics, dt = model, windows.dt.unsqueeze(-1)
     # velocities are measured, so M need not be positive definite on the way; kept so, descent stops where it is not
-    prepared = model.prepare(definite=False)
-    at = dynamics.configuration(q, prepared)
+    with mass_as_learned(model):
+        at = dynamics.configuration(q, model.prepare())
     p = (at.mass @ qd.unsqueeze(-1)).squeeze(-1)
     force = dynamics.lagrangian_gradient(at, qd)
     past = known_past(model, memory_along(model, q, qd, windows.z))

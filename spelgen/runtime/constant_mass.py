@@ -27,7 +27,7 @@ class ConstantMass(nn.Module):
         self.constant_scale = nn.Buffer(vector(unit for _, unit in constants))
         self.raw_constants = nn.Parameter(vector(start / unit for start, unit in constants))
         self.nominal_armature = nn.Buffer(vector(joints.armature))
-        self.raw_armature = nn.Parameter(torch.zeros(joints.n, dtype=torch.float64))  # its logarithm
+        self.raw_armature = nn.Parameter(torch.zeros_like(self.nominal_armature))  # its logarithm
 
     def armature(self) -> Tensor:
         """Return the drives' part of M's diagonal, (n,) [kg m^2, kg]."""
@@ -37,7 +37,7 @@ class ConstantMass(nn.Module):
         """Return the constants of M, (constants,), in their units."""
         return self.constant_scale * (self.raw_constants.abs() + 1e-6)
 
-    def prepare(self, definite: bool = True) -> Tensor:
+    def prepare(self) -> Tensor:
         """Return M, (n, n)."""
         return self.entries((), self.constants().unbind()) + torch.diag(self.armature())
 

@@ -3,20 +3,13 @@
 from __future__ import annotations
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from spelgen.runtime.joints import Joints, vector
 from spelgen.runtime.parts import Layers, Network
 
 FACTOR_START = 0.35  # diagonal of L, relative to the root of the joints' usual friction by speed
-
-
-def lower_entries(rows: int) -> Tensor:
-    """Spreads the numbers of a lower triangle, row by row, over a matrix: (rows, rows, numbers)."""
-    row, column = torch.tril_indices(rows, rows)
-    spread = torch.zeros(rows, rows, len(row), dtype=torch.float64)
-    spread[row, column, torch.arange(len(row))] = 1.0
-    return spread
 
 
 class DenseFriction(nn.Module):
@@ -27,11 +20,14 @@ class DenseFriction(nn.Module):
 
     def __init__(self, joints: Joints, network: Network, axes: int) -> None:
         super().__init__()
-        rows = axes * joints.n
+        rows = axes * len(joints.revolute)
         self.speed = nn.Buffer(vector(joints.speed))
         self.nominal = nn.Buffer(vector(joints.friction))
         moving = slice(axes - 1, None, axes)
-        self.entries = nn.Buffer(lower_entries(rows)[moving])
+        row, column = torch.tril_indices(rows, rows)
+        # spreads the numbers of a lower triangle, row by row, over a matrix: (rows, rows, numbers)
+        spread = F.one_hot(row * rows + column, rows * rows).mT.reshape(rows, rows, -1)
+        self.entries = nn.Buffer(spread[moving].double())
         self.start = nn.Buffer(FACTOR_START * torch.eye(rows).double()[moving])
         self.network = network
 

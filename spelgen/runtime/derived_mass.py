@@ -41,7 +41,7 @@ class DerivedMass(nn.Module):
         self.function_scale = nn.Buffer(vector(scale for _, scale in functions))
         self.raw_constants = nn.Parameter(vector(start / unit for start, unit in constants))
         self.nominal_armature = nn.Buffer(vector(joints.armature))
-        self.raw_armature = nn.Parameter(torch.zeros(joints.n, dtype=torch.float64))  # its logarithm
+        self.raw_armature = nn.Parameter(torch.zeros_like(self.nominal_armature))  # its logarithm
         self.bound = PositiveDefiniteBound(self._by_outputs()[-1].detach(), margin)
 
     def armature(self) -> Tensor:
@@ -58,23 +58,16 @@ class DerivedMass(nn.Module):
         constants = F.pad(self.constants().unsqueeze(-1), (len(functions), 0))
         return self.entries(functions.unbind(), constants.unbind())
 
-    def prepare(self, definite: bool = True) -> tuple[Layers, bool]:
-        """Return the network's layers, which give M's entries; ``definite``: keep M positive definite."""
+    def prepare(self) -> Layers:
+        """Return the network's layers, which give M's entries."""
         rows = self._by_outputs()
         offset = rows[-1] + torch.diag(self.armature())
-        return self.network.prepare(rows[:-1].flatten(1).mT, offset.flatten()), definite
+        return self.network.prepare(rows[:-1].flatten(1).mT, offset.flatten())
 
-    def forward(
-        self, encoded: Tensor, prepared: tuple[Layers, bool]
-    ) -> tuple[Tensor, tuple[Intermediates, Tensor]]:
+    def forward(self, encoded: Tensor, layers: Layers) -> tuple[Tensor, tuple[Intermediates, Tensor]]:
         """Return M(q), what the network's derivatives need, and how much of its changes M takes."""
-        layers, definite = prepared
         rows, intermediates = self.network.forward(encoded, layers)
-        mass = rows.reshape(*rows.shape[:-1], *self.bound.center.shape)
-        if definite:
-            mass, fraction = self.bound.forward(mass)
-        else:
-            fraction = torch.ones_like(mass[..., 0, 0])
+        mass, fraction = self.bound.forward(rows.reshape(*rows.shape[:-1], *self.bound.center.shape))
         return mass, (intermediates, fraction)
 
     def kinetic_vjp(self, qd: Tensor, intermediates: tuple[Intermediates, Tensor]) -> Tensor:

@@ -6,9 +6,12 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from spelgen.runtime.joints import Joints, vector
+
+Units = Sequence[tuple[int, ...]]  # of a layer: the joints that each may read
 
 
 class JointEncoding(nn.Module):
@@ -51,7 +54,7 @@ class NetworkInput(NamedTuple):
 
 def joint_input(joints: Joints, chosen: Iterable[int], sensitivity: Sequence[float]) -> NetworkInput:
     """cos q and sin q of revolute joints, the scaled q of prismatic ones, times a joint's sensitivity."""
-    n, encoded = joints.n, (2 if all(joints.revolute) else 3) * joints.n
+    n, encoded = len(joints.revolute), (2 if all(joints.revolute) else 3) * len(joints.revolute)
     chosen = list(chosen)
     turning = [joint for joint in chosen if joints.revolute[joint]]
     sliding = [joint for joint in chosen if not joints.revolute[joint]]
@@ -66,7 +69,7 @@ def lie_group_input(joints: Joints, sensitivity: Sequence[float]) -> NetworkInpu
 
     z is the joint's axis, so R = [[cos q, -sin q, 0], [sin q, cos q, 0], [0, 0, 1]].
     """
-    n = joints.n
+    n = len(joints.revolute)
     owners = [joint for joint in range(n) for _ in range(9 if joints.revolute[joint] else 3)]
     matrix = torch.zeros(len(owners), (2 if all(joints.revolute) else 3) * n, dtype=torch.float64)
     offset = torch.zeros(len(owners), dtype=torch.float64)
@@ -85,17 +88,19 @@ def with_velocities(inputs: NetworkInput, joints: Joints, axes: int) -> NetworkI
 
     The network then reads the encoding and, behind it, the velocities, (..., encoded + n).
     """
-    n, (rows, encoded) = joints.n, inputs.matrix.shape
-    matrix = torch.zeros(rows + axes * n, encoded + n, dtype=torch.float64)
-    matrix[:rows, :encoded] = inputs.matrix
-    matrix[rows + axes - 1 :: axes, encoded:] = torch.eye(n, dtype=torch.float64)
-    velocities = torch.ones(axes * n, dtype=torch.float64)
+    n = len(joints.revolute)
+    last = torch.eye(axes, dtype=torch.float64)[:, -1:]
+    velocities = torch.kron(torch.eye(n, dtype=torch.float64), last)
     owners = (*inputs.joints, *(joint for joint in range(n) for _ in range(axes)))
-    sensitivity = torch.cat([inputs.sensitivity, velocities])
-    return NetworkInput(owners, sensitivity, matrix, torch.cat([inputs.offset, 0 * velocities]))
+    return NetworkInput(
+        owners,
+        sensitivity=F.pad(inputs.sensitivity, (0, axes * n), value=1.0),
+        matrix=torch.block_diag(inputs.matrix, velocities),
+        offset=F.pad(inputs.offset, (0, axes * n)),
+    )
 
 
-def joint_mask(units: Sequence[tuple[int, ...]], below: Sequence[tuple[int, ...]]) -> Tensor:
+def joint_mask(units: Units, below: Units) -> Tensor:
     """Return 1 where a unit may read a unit below it, which reads no other joints; (units, units below)."""
     rows = [[float(set(joints) <= set(unit)) for joints in below] for unit in units]
     return torch.tensor(rows, dtype=torch.float64)

@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from spelgen.runtime.encoding import NetworkInput, joint_mask
+from spelgen.runtime.encoding import NetworkInput, Units, joint_mask
 from spelgen.runtime.parts import Layers
 
 GRID = 4  # bumps on an edge
@@ -37,12 +37,7 @@ class MaskedKAN(nn.Module):
     has no path to a joint it must not depend on.
     """
 
-    def __init__(
-        self,
-        inputs: NetworkInput,
-        layers: Sequence[Sequence[tuple[int, ...]]],
-        generator: torch.Generator,
-    ) -> None:
+    def __init__(self, inputs: NetworkInput, layers: Sequence[Units], generator: torch.Generator) -> None:
         super().__init__()
         grid = torch.linspace(-1, 1, GRID, dtype=torch.float64)
         self.grid = nn.Buffer(grid / SPACING)
@@ -54,7 +49,7 @@ class MaskedKAN(nn.Module):
         self.offset = nn.Buffer((still * self._bumps(inputs.offset).height).flatten())
         self.weights = nn.ParameterList()
         self.biases = nn.ParameterList()
-        below: Sequence[tuple[int, ...]] = [(joint,) for joint in inputs.joints]
+        below: Units = [(joint,) for joint in inputs.joints]
         for index, units in enumerate(layers):
             mask = joint_mask(units, below).unsqueeze(-1)
             slope = torch.randn(mask.shape, dtype=torch.float64, generator=generator)

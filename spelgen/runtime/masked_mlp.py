@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from spelgen.runtime.encoding import NetworkInput, joint_mask
+from spelgen.runtime.encoding import NetworkInput, Units, joint_mask
 from spelgen.runtime.parts import Layers
 
 MLPIntermediates = tuple[tuple[Tensor, ...], Layers]  # the hidden layers, and the weights
@@ -27,18 +27,13 @@ class MaskedMLP(nn.Module):
     others are masked, so that a unit has no path to a joint it must not depend on.
     """
 
-    def __init__(
-        self,
-        inputs: NetworkInput,
-        layers: Sequence[Sequence[tuple[int, ...]]],
-        generator: torch.Generator,
-    ) -> None:
+    def __init__(self, inputs: NetworkInput, layers: Sequence[Units], generator: torch.Generator) -> None:
         super().__init__()
         self.matrix = nn.Buffer(inputs.matrix)
         self.offset = nn.Buffer(inputs.offset)
         self.weights = nn.ParameterList()
         self.biases = nn.ParameterList()
-        below: Sequence[tuple[int, ...]] = [(joint,) for joint in inputs.joints]
+        below: Units = [(joint,) for joint in inputs.joints]
         for index, units in enumerate(layers):
             mask = joint_mask(units, below)
             weight = torch.randn(mask.shape, dtype=torch.float64, generator=generator)

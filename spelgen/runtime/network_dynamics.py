@@ -42,12 +42,12 @@ class NetworkDynamics(PortHamiltonian):
         self.potential, self.friction = potential, friction
         self.scale = nn.Buffer(torch.full((1, 1), scale, dtype=torch.float64))
 
-    def prepare(self, definite: bool = True) -> NetworkPrepared:
-        """Return all that depends on the weights alone; M is kept ``definite``, or is as learned."""
+    def prepare(self) -> NetworkPrepared:
+        """Return all that depends on the weights alone."""
         layers = None
         if self.potential is not None:
             layers = self.potential.prepare(self.scale, 0 * self.scale[0])
-        return NetworkPrepared(self.mass.prepare(definite), layers, self.friction.prepare())
+        return NetworkPrepared(self.mass.prepare(), layers, self.friction.prepare())
 
     def configuration(self, q: Tensor, prepared: NetworkPrepared) -> NetworkPose:
         """Return what depends on q alone."""

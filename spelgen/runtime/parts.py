@@ -38,8 +38,8 @@ class Network(Protocol):
 class Mass(Protocol):
     """What gives M(q) and its derivatives."""
 
-    def prepare(self, definite: bool = True) -> Prepared:
-        """Return all that depends on the weights alone; ``definite``: keep M positive definite."""
+    def prepare(self) -> Prepared:
+        """Return all that depends on the weights alone."""
 
     def forward(self, encoded: Tensor, prepared: Prepared) -> tuple[Tensor, Intermediates]:
         """Return M(q), (..., n, n), and what its derivatives need."""

@@ -27,9 +27,9 @@ class ResidualDynamics(RigidBodyDynamics):
         super().__init__(joints, bodies, gravity, reach, motors)
         self.residuals = residuals
 
-    def prepare(self, definite: bool = True) -> RigidPrepared:
+    def prepare(self) -> RigidPrepared:
         """Return all that depends on the weights alone; holds until they change."""
-        prepared = super().prepare(definite)
+        prepared = super().prepare()
         if self.residuals is None:
             return prepared
         return prepared._replace(residual=self.residuals.prepare(prepared.armature))

@@ -47,7 +47,7 @@ class ResidualPose(NamedTuple):
 
 def ripple_frequencies(joints: Joints) -> Tensor:
     """Return how often in a turn of the joint a ripple may come again, (n, HARMONICS + 2)."""
-    frequencies = torch.arange(1.0, HARMONICS + 3).double().repeat(joints.n, 1)
+    frequencies = torch.arange(1.0, HARMONICS + 3).double().repeat(len(joints.revolute), 1)
     for joint, gear in enumerate(joints.gear):
         if gear > HARMONICS:
             frequencies[joint, HARMONICS:] = vector((gear, 2 * gear))
@@ -84,7 +84,7 @@ class ResidualTerms(nn.Module):
         scale: float,
     ) -> None:
         super().__init__()
-        n, zeros = joints.n, torch.zeros(joints.n, SPLINES, dtype=torch.float64)
+        n, zeros = len(joints.revolute), torch.zeros(len(joints.revolute), SPLINES, dtype=torch.float64)
         self.encoding = JointEncoding(joints)
         spacing = 2 * vector(joints.reach).unsqueeze(-1) / (SPLINES - 3)
         knots = torch.arange(SPLINES).double() - (SPLINES - 1) / 2
@@ -136,7 +136,7 @@ class ResidualTerms(nn.Module):
         if self.potential is not None:
             potential = self.potential.prepare(self.scale, 0 * self.scale[0])
         return ResidualWeights(
-            splines=torch.stack(splines, dim=-1) / 6,
+            splines=torch.stack(splines, dim=-1),
             ripple=self.unit * self.revolute * self.raw_torque_ripple,
             constant=self.raw_constants.tanh() @ constants,
             functions=functions,
@@ -147,7 +147,7 @@ class ResidualTerms(nn.Module):
     def at(self, q: Tensor, weights: ResidualWeights) -> ResidualPose:
         """Return what the terms are at q."""
         encoded = self.encoding.forward(q)
-        splines = torch.einsum("...ik,ikm->...im", self._cubes(q), weights.splines)
+        splines = torch.einsum("...ik,ikm->...im", self.splines(q), weights.splines)
         smooth, friction = splines.unbind(-1)
         torque = smooth + (self._waves(q) * weights.ripple).sum(dim=-1)
         mass, slope, intermediates = weights.constant.expand(*q.shape[:-1], -1), None, None
@@ -193,7 +193,8 @@ class ResidualTerms(nn.Module):
 
     def splines(self, q: Tensor) -> Tensor:
         """Return the cubic B-splines at q, (..., n, SPLINES), each 2/3 high."""
-        return self._cubes(q) / 6
+        wide = (2 - self._places(q).abs()).relu()
+        return torch.sub(wide**3, (wide - 1).relu() ** 3, alpha=4) / 6
 
     def ripple(self, q: Tensor) -> Tensor:
         """Return cosines, then sines of frequency times q, (..., n, 2 HARMONICS + 4); zero if prismatic."""
@@ -202,11 +203,6 @@ class ResidualTerms(nn.Module):
     def _waves(self, q: Tensor) -> Tensor:
         phase = q.unsqueeze(-1) * self.frequencies
         return torch.cat([phase.cos(), phase.sin()], dim=-1)
-
-    def _cubes(self, q: Tensor) -> Tensor:
-        """Return six times the splines."""
-        wide = (2 - self._places(q).abs()).relu()
-        return torch.sub(wide**3, (wide - 1).relu() ** 3, alpha=4)
 
     def _places(self, q: Tensor) -> Tensor:
         """Return how far q is from each spline's middle, in spacings, (..., n, SPLINES)."""

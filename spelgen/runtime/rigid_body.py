@@ -46,12 +46,12 @@ def motion_table(bodies: Bodies) -> tuple[Tensor, Tensor]:
     for index, revolute in enumerate(bodies.revolute):
         # (w, v) at the frame of a body that has not moved
         rotation = torch.stack([vector(row) for row in bodies.rotation[index]]).mT
-        start = block_diagonal(rotation.expand(2, 3, 3)).clone()
+        start = torch.block_diag(rotation, rotation)
         start[3:, :3] = -rotation @ skew(vector(bodies.position[index]))
         # a motion takes it to (constant + cos terms[0] + sin terms[1] + value terms[2]) start
         constant, terms = torch.eye(6, dtype=torch.float64), torch.zeros(3, 6, 6, dtype=torch.float64)
         if revolute:
-            terms[1] = block_diagonal(-turn.expand(2, 3, 3))
+            terms[1] = torch.block_diag(-turn, -turn)
             terms[0] = -terms[1] @ terms[1]
             constant = constant - terms[0]
         else:
@@ -73,13 +73,6 @@ def pushed_along(twists: Tensor, momenta: Tensor) -> Tensor:
     (w, u), (n, f) = twists.chunk(2, dim=-2), momenta.chunk(2, dim=-2)
     angular = torch.linalg.cross(w, n, dim=-2) + torch.linalg.cross(u, f, dim=-2)
     return torch.cat([angular, torch.linalg.cross(w, f, dim=-2)], dim=-2)
-
-
-def block_diagonal(blocks: Tensor) -> Tensor:
-    """Return the matrix, (k m, k m), with these blocks, (k, m, m), on its diagonal."""
-    k, m, _ = blocks.shape
-    identity = torch.eye(k, dtype=blocks.dtype, device=blocks.device)
-    return (identity[:, None, :, None] * blocks[:, :, None, :]).reshape(k * m, k * m)
 
 
 def inertia_basis() -> Tensor:

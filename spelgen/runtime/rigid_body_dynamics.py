@@ -11,7 +11,7 @@ from spelgen.runtime.body_chain import BodyChain, Chain
 from spelgen.runtime.friction_laws import FrictionConstants, FrictionLaws
 from spelgen.runtime.joints import Joints, Rows, vector
 from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied, combined
-from spelgen.runtime.rigid_body import Bodies, InertialParameters, Row, block_diagonal, inertia_basis
+from spelgen.runtime.rigid_body import Bodies, InertialParameters, Row, inertia_basis
 
 
 class RigidPrepared(NamedTuple):
@@ -52,16 +52,16 @@ class RigidBodyDynamics(PortHamiltonian):
         self, joints: Joints, bodies: Bodies, gravity: Row, reach: Rows = (), motors: Rows = ()
     ) -> None:
         super().__init__(joints)
-        zeros = torch.zeros(joints.n, dtype=torch.float64)
+        zeros = torch.zeros(len(joints.revolute), dtype=torch.float64)
         self.elements = len(reach[0]) if reach else 0
-        self.chain = BodyChain(joints.n, bodies, gravity)
+        self.chain = BodyChain(len(joints.revolute), bodies, gravity)
         self.basis = nn.Buffer(inertia_basis())
         self.bodies, self.friction = InertialParameters(bodies), FrictionLaws(joints, reach)
         self.nominal_armature = nn.Buffer(vector(joints.armature))
         self.raw_armature = nn.Parameter(zeros.clone())  # its logarithm
         # C, (n, n), and its inverse; each drive moves its own joint alone where it is not given
         rows = [vector(row) for row in motors]
-        self.motors = nn.Buffer(torch.stack(rows) if rows else torch.eye(joints.n).double())
+        self.motors = nn.Buffer(torch.stack(rows) if rows else torch.eye(len(joints.revolute)).double())
         self.loads = nn.Buffer(torch.linalg.inv(self.motors))
         # of the measured torque, in units of the joints' usual friction
         self.raw_offset = nn.Parameter(zeros.clone())
@@ -98,9 +98,9 @@ class RigidBodyDynamics(PortHamiltonian):
         """What the drives add by velocity, unseen in the measured torque, (n,) [Nm s/rad, N s/m]."""
         return self.raw_friction_compensation * self.friction.nominal / self.friction.speed * self.actuated
 
-    def prepare(self, definite: bool = True) -> RigidPrepared:
+    def prepare(self) -> RigidPrepared:
         """Return all that depends on the weights alone; holds until they change."""
-        inertia = block_diagonal(torch.tensordot(self.inertial_parameters, self.basis, dims=1))
+        inertia = torch.block_diag(*torch.tensordot(self.inertial_parameters, self.basis, dims=1))
         armature = self.motors.mT @ (self.armature.unsqueeze(-1) * self.motors)
         return RigidPrepared(inertia, armature, self.friction.prepare())
 

@@ -90,10 +90,8 @@ def make_parts(seed: int) -> tuple[Joints, Bodies, Row, Rows, Rows, ResidualTerm
     )  # fmt: skip
 
 
-# ---- this arm's model ----
+# ---- this arm's model, and what its parts are ----
 
-
-# what the parts of this arm's model are
 Network = MaskedMLP
 Pose = Motion
 Prepared = RigidPrepared

@@ -73,10 +73,8 @@ def make_parts(seed: int) -> tuple[Joints, Mass, Network, float, Friction]:
     return (joints, mass, potential, 0.703291, friction)
 
 
-# ---- this arm's model ----
+# ---- this arm's model, and what its parts are ----
 
-
-# what the parts of this arm's model are
 Network = MaskedMLP
 Pose = NetworkPose
 Prepared = NetworkPrepared
@@ -102,11 +100,9 @@ class Model(NetworkDynamics):
     @property
     def armature(self) -> Tensor:
         """Armature, the drives' part of M's diagonal, (n,) [kg m^2, kg]."""
-        value: Tensor = self.mass.armature()
-        return value
+        return self.mass.armature()
 
     @property
     def viscous(self) -> Tensor:
         """Friction torque by velocity, (n,) [Nm s/rad, N s/m]."""
-        value: Tensor = self.friction.viscous()
-        return value
+        return self.friction.viscous()

@@ -75,10 +75,8 @@ def make_parts(seed: int) -> tuple[Joints, Mass, Network, float, Friction, Netwo
     return (joints, mass, potential, 0.703291, friction, network)
 
 
-# ---- this arm's model ----
+# ---- this arm's model, and what its parts are ----
 
-
-# what the parts of this arm's model are
 Network = MaskedMLP
 Pose = NetworkPose
 Prepared = NetworkPrepared

@@ -79,10 +79,8 @@ def make_parts(seed: int) -> tuple[Joints, Mass, Network, float, Friction]:
     return (joints, mass, potential, 0.703291, friction)
 
 
-# ---- this arm's model ----
+# ---- this arm's model, and what its parts are ----
 
-
-# what the parts of this arm's model are
 Network = MaskedMLP
 Pose = NetworkPose
 Prepared = NetworkPrepared
@@ -108,5 +106,4 @@ class Model(NetworkDynamics):
     @property
     def armature(self) -> Tensor:
         """Armature, the drives' part of M's diagonal, (n,) [kg m^2, kg]."""
-        value: Tensor = self.mass.armature()
-        return value
+        return self.mass.armature()
