@@ -95,7 +95,7 @@ def with_velocities(inputs: NetworkInput, joints: Joints, axes: int) -> NetworkI
     return NetworkInput(
         owners,
         sensitivity=F.pad(inputs.sensitivity, (0, axes * n), value=1.0),
-        matrix=torch.block_diag(inputs.matrix, velocities),
+        matrix=torch.ops.aten.block_diag([inputs.matrix, velocities]),
         offset=F.pad(inputs.offset, (0, axes * n)),
     )
 

@@ -46,12 +46,12 @@ def motion_table(bodies: Bodies) -> tuple[Tensor, Tensor]:
     for index, revolute in enumerate(bodies.revolute):
         # (w, v) at the frame of a body that has not moved
         rotation = torch.stack([vector(row) for row in bodies.rotation[index]]).mT
-        start = torch.block_diag(rotation, rotation)
+        start = torch.ops.aten.block_diag([rotation, rotation])
         start[3:, :3] = -rotation @ skew(vector(bodies.position[index]))
         # a motion takes it to (constant + cos terms[0] + sin terms[1] + value terms[2]) start
         constant, terms = torch.eye(6, dtype=torch.float64), torch.zeros(3, 6, 6, dtype=torch.float64)
         if revolute:
-            terms[1] = torch.block_diag(-turn, -turn)
+            terms[1] = torch.ops.aten.block_diag([-turn, -turn])
             terms[0] = -terms[1] @ terms[1]
             constant = constant - terms[0]
         else:

@@ -100,7 +100,7 @@ class RigidBodyDynamics(PortHamiltonian):
 
     def prepare(self) -> RigidPrepared:
         """Return all that depends on the weights alone; holds until they change."""
-        inertia = torch.block_diag(*torch.tensordot(self.inertial_parameters, self.basis, dims=1))
+        inertia = torch.ops.aten.block_diag([*torch.tensordot(self.inertial_parameters, self.basis, dims=1)])
         armature = self.motors.mT @ (self.armature.unsqueeze(-1) * self.motors)
         return RigidPrepared(inertia, armature, self.friction.prepare())
 
