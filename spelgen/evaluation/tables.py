@@ -159,9 +159,9 @@ def _replay_tables(results: Figures) -> list[Table]:
     tables, unit = [], thousandths(results.joint_types)
     for replay in results.replays:
         rows = {}
-        replayed, *others = [errors.trajectories for errors in replay.errors.values()]
+        replayed = [errors.trajectories for errors in replay.errors.values()]
         # several runs may have replayed other logs
-        for trajectory in [name for name in replayed if all(name in other for other in others)]:
+        for trajectory in [name for name in replayed[0] if all(name in logs for logs in replayed)]:
             rows[trajectory] = _values(replay.errors, lambda x: 1000 * x.trajectories[trajectory])  # noqa: B023
         rows["mean of all"] = _values(replay.errors, lambda x: 1000 * x.mean)
         title = f"Commands replayed, {replay.name}: RMS of positions over all joints [{unit}]"

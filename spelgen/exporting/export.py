@@ -52,7 +52,7 @@ def export(
         model = trained
     exporter = EXPORTERS[to]
     if entries and not exporter.choice:
-        formats = [name for name, other in EXPORTERS.items() if other.choice]
+        formats = [name for name, row in EXPORTERS.items() if row.choice]
         raise RunError(f"functions for --to {to}", expected=f"--to {listed(formats)}, which have a choice")
     chosen = Trained(model, _loaded(model, arm), tuple(entries))
     # derivatives are two thirds of the code, and few need them

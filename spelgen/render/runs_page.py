@@ -89,15 +89,15 @@ def _read(folder: Path, name: str, style: str) -> EvaluatedRun:
 
 def _merged(runs: Sequence[EvaluatedRun]) -> Results:
     """Return what all runs were evaluated on, with the errors of their models by the runs' names."""
-    first, *others = runs
-    joints, torque = first.results.joints, {}
+    first = runs[0].results
+    joints, torque = first.joints, {}
     # joints of other arms have nothing to be compared with
-    if any(run.results.joints != joints for run in others):
+    if any(run.results.joints != joints for run in runs):
         joints = ()
     if all(MODEL in run.results.torque for run in runs):
         torque = {run.name: run.results.torque[MODEL] for run in runs}
     return replace(
-        first.results,
+        first,
         joints=joints,
         torque=torque,
         torque_steps={},
@@ -111,10 +111,10 @@ def _common(by_run: Mapping[str, Sequence[Judged]]) -> tuple[Judged, ...]:
     common = []
     for judged in next(iter(by_run.values())):
         errors = {}
-        for run, others in by_run.items():
-            for other in others:
-                if other.name == judged.name:
-                    errors[run] = other.errors[MODEL]
+        for run, candidates in by_run.items():
+            for candidate in candidates:
+                if candidate.name == judged.name:
+                    errors[run] = candidate.errors[MODEL]
         if len(errors) == len(by_run):
             common.append(replace(judged, errors=errors))
     return tuple(common)
