@@ -74,17 +74,21 @@ class ServoSolution:
 
 def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters, ServoSolution]:
     """Return where one more step leads from x, of a fit with longer steps of the rollouts, and what windows determine
-    there; what the step changes is added to the covariance.
+    there; what the step changes is added to the covariance. Parameters stay at x where the step raises the cost.
     """
     # a dead zone that a joint does not have makes its dry friction no better known
-    free = problem.rows.with_dead_zones(x)
-    windows = problem.window_equations(free, problem.residuals(x))
+    free, errors = problem.rows.with_dead_zones(x), problem.residuals(x)
+    windows = problem.window_equations(free, errors)
     windows = by_stretch(windows, problem.windows.stretches(TUNING.stretches))
     precision = problem.rows.precision(free)
     step = problem.with_prior(windows, x).step()
     # where the fit ends, the slopes of all windows and of the prior add up to nothing
     windows = windows._replace(descent=windows.descent - windows.curvature @ step)
-    return x.moved(step), ServoSolution(windows, precision, covariance(windows, precision, step))
+    end = x.moved(step)
+    # where joints just slip, errors are far from linear in the parameters
+    if problem.cost(end, problem.residuals(end)) > problem.cost(x, errors):
+        end = x
+    return end, ServoSolution(windows, precision, covariance(windows, precision, step))
 
 
 def ratios(model: EmittedModel, qd: torch.Tensor, gravity: torch.Tensor) -> dict[str, torch.Tensor]:
