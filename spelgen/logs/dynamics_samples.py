@@ -52,8 +52,9 @@ def dynamics_samples(
     At 100 Hz (logs from 24 Hz on are interpolated, see `resample`), through the zero-phase low-pass of
     ``preprocessing``, by default of 8 Hz, on q, qd and tau (before the change of rate where the log is denser, after
     it where not), qdd by central differences of the filtered qd, only samples with some |qd| > 0.02 rad/s; pieces
-    between gaps separately. ``pauses``: all samples from the first that moves to the last, standstill between them
-    included. ``reach``: of the bristles whose states z are wanted, through the same filter; see ``bristles_along``.
+    between gaps separately, without what the filter makes up at both ends. ``pauses``: all samples from the first that
+    moves to the last, standstill between them included. ``reach``: of the bristles whose states z are wanted, through
+    the same filter; see ``bristles_along``.
     """
     samples = []
     for trajectory in trajectories:
@@ -92,6 +93,9 @@ def _columns(
     smooth = _at_common_rate(piece, cutoff)
     qdd = np.gradient(smooth.qd, smooth.t, axis=0)
     selected = is_moving(smooth.qd)
+    if cutoff is not None:  # a filter that begins or ends within a motion makes up what it does not see
+        unsettled = round(TUNING.unsettled * FREQUENCY / cutoff)
+        selected[:unsettled] = selected[-unsettled:] = False
     if pauses and selected.any():
         moving = np.flatnonzero(selected)
         selected[moving[0] : moving[-1]] = True

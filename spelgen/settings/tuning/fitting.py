@@ -73,8 +73,6 @@ class TorqueTuning:
     )
     rounds: int = 5  # after the first ones, of finding noise and prior anew
     first_steps: int = 60  # at most, before noise and prior are found
-    # twice the logarithm of a likelihood ratio: strong evidence (Kass and Raftery, J. Am. Stat. Assoc. 90:773, 1995)
-    memory_evidence: float = 6.0
     last_rounds: int = 2  # where all but the last digits are fitted, and of least squares
     longer: int = 4  # times as many rounds at most, while some joint's noise falls
     noise_settled: float = 0.98  # [1] noise by that of the round before: what falls by less is settled

@@ -12,6 +12,8 @@ class IdentificationTuning:
     sample_rate: float = 100.0  # [Hz] of the common grid: twelve times the low-pass, as is usual
     moving: float = 0.02  # [rad/s, m/s] joints that are slower rest, and say nothing of dynamics
     shortest_piece: float = 1.0  # [s] shorter pieces are all filter transient
+    # [periods of the filter's cutoff] at both ends of a piece, where the filter is off by 20 times what noise is
+    unsettled: float = 0.75
     rounds: int = 4  # of weighing joints by what is left of their torque; later ones change no digit (UR10e)
     least_noise: float = 0.02  # of a joint's torque range: few samples may be fitted better than deserved
     largest_lag: int = 500  # [samples] over which residuals are followed in time: 5 s
