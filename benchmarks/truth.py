@@ -37,6 +37,7 @@ from spelgen.dynamics.bristles import bristle_reach
 from spelgen.dynamics.protocol import memory_along
 from spelgen.errors import SpelgenError
 from spelgen.fitting.torque.fit import fit_torque
+from spelgen.fitting.torque.objective import torque_delay
 from spelgen.logs.dynamics_samples import dynamics_samples
 
 FRICTIONS = ("none", "coulomb", "stribeck", "bristles", "load", "asymmetric")
@@ -337,7 +338,9 @@ def measure(dynamics: Any, truth: Truth, test: tuple[np.ndarray, ...]) -> dict[s
 def fit_hybrid(urdf: Path, logs: list[spelgen.Trajectory]) -> Any:
     """The default model, fitted to torques as `spelgen train` does, without its measurement of windows."""
     model = spelgen.build(urdf, "hybrid")
-    fit_torque(model, dynamics_samples(logs, reach=bristle_reach(model)))
+    late = torque_delay(model, logs, spelgen.Preprocessing())
+    moved = spelgen.Preprocessing(torque_delay=late.delay)
+    fit_torque(model, dynamics_samples(logs, preprocessing=moved, reach=bristle_reach(model)))
     return model
 
 

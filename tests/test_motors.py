@@ -14,6 +14,7 @@ from spelgen.arm.actuation import motor_speeds
 from spelgen.building import build
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.dynamics.regressor import regressor, urdf_parameters
+from spelgen.fitting.fit import fit
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.fitting.torque.jacobian import TorqueJacobian
 from spelgen.fitting.torque.samples import TorqueSamples
@@ -22,6 +23,7 @@ from spelgen.identification.method import LeastSquares
 from spelgen.loaded_arm import load_arm
 from spelgen.log_checks.check_logs import check_logs
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
+from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.pipeline import generate, inspect
@@ -221,9 +223,9 @@ def test_logs_show_a_coupling_and_what_is_said_then_mends_it(uncoupled, tmp_path
 def test_logs_show_torques_that_are_late_or_early(uncoupled, tmp_path, late):
     log = recorded(uncoupled, "joints", 0.0, late=late)
     (message,) = told(check_logs([log], uncoupled), "torque-delay")
-    assert f"ms {'later' if late > 0 else 'earlier'} than they act" in message
-    delay = float(message.split("torque_delay: ")[1].split("'")[0])
-    assert delay == pytest.approx(late, abs=0.0015)
+    assert f"ms {'later' if late > 0 else 'earlier'} than positions" in message
+    delay = float(message.split("torque_delay=")[1].split("'")[0])
+    assert delay == pytest.approx(late, abs=0.0005)
     names = [x.name for x in uncoupled.arm.coordinates]
     table = {"t": log.t} | {
         f"{key}_{name}": getattr(log, key)[:, k] for key in ("q", "qd", "tau") for k, name in enumerate(names)
@@ -231,8 +233,21 @@ def test_logs_show_torques_that_are_late_or_early(uncoupled, tmp_path, late):
     pq.write_table(pa.table(table), tmp_path / "late.parquet")
     read = read_logs(tmp_path / "late.parquet", uncoupled, LogMapping(torque_delay=delay))
     assert not told(check_logs(read, uncoupled), "torque-delay")
-    before, after = (identify(uncoupled, x).nmse.mean() for x in (log, read))
-    assert after < 0.7 * before  # noise is the rest
+    as_logged = identify(uncoupled, log, preprocessing=Preprocessing(torque_delay=0.0))
+    moved = identify(uncoupled, log)
+    assert moved.torque_delay.delay == pytest.approx(late, abs=moved.torque_delay.interval + 1e-4)
+    for aligned in (identify(uncoupled, read), moved):
+        assert aligned.nmse.mean() < 0.7 * as_logged.nmse.mean()  # noise is the rest
+
+
+def test_a_fit_moves_late_torques_and_its_evaluation_too(uncoupled):
+    log = recorded(uncoupled, "joints", 0.0, late=0.004)
+    model = build(ROBOTS / "six_dof.urdf", "closed-form")
+    fitted = fit(model, [log])
+    assert fitted.preprocessing.torque_delay == pytest.approx(0.004, abs=0.0005)
+    assert [x.code for x in fitted.diagnostics].count("torque-delay") == 1
+    misses = 1 - fitted.score(log)
+    assert misses < 1 - replace(fitted, preprocessing=Preprocessing()).score(log)
 
 
 def test_logs_of_plain_drives_suggest_nothing(uncoupled):

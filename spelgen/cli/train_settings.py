@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from spelgen.settings.log_mapping import LogMapping
 
 TIME_LIMIT = "max_minutes"
-PREPROCESSING = ("cutoff", "decimation", "gap")
+PREPROCESSING = ("cutoff", "decimation", "gap", "torque_delay")
 FIELD_SEPARATOR = "."
 
 

@@ -95,7 +95,10 @@ def _evaluate_torques(
     model, types = judged.model, judged.model.joint_types
     used = judged.preprocessing
     if preprocessing is not None or used is None:
-        used = (preprocessing or Preprocessing()).resolved([trajectory.sample_rate for trajectory in logs])
+        preprocessing = preprocessing or Preprocessing()
+        if used is not None and preprocessing.torque_delay is None:  # of the logger, whatever the filter
+            preprocessing = replace(preprocessing, torque_delay=used.torque_delay)
+        used = preprocessing.resolved([trajectory.sample_rate for trajectory in logs])
     # a rollout takes a start and a sample after it
     tests = JudgedLogs(used.pieces(logs, shortest=2), used, judged.reach, types)
     lengths = horizon_lengths(tests, *ahead, notes)

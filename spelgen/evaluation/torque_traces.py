@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,7 +17,6 @@ from spelgen.dynamics.protocol import known_past
 from spelgen.evaluation.horizons import JudgedLogs
 from spelgen.evaluation.plain import Rows, Series, rows, series
 from spelgen.logs.dynamics_samples import FREQUENCY, dynamics_samples
-from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.rates import shows_accelerations
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.tuning.evaluation import TraceTuning
@@ -109,8 +108,8 @@ def _motion(piece: Trajectory, logs: JudgedLogs) -> Motion | None:
 
 def _dense_motion(piece: Trajectory, logs: JudgedLogs) -> Motion | None:
     used = logs.used
-    if used.filtered:  # pieces are so already
-        used = Preprocessing(cutoff=0, gap=used.gap)
+    # pieces are filtered and their torques moved already
+    used = replace(used, torque_delay=0.0, cutoff=0.0 if used.filtered else used.cutoff)
     samples = dynamics_samples([piece], pauses=True, preprocessing=used, reach=logs.reach)
     if not samples or len(samples[0].q) < 2:
         return None

@@ -1,4 +1,4 @@
-"""Find what logs show of drives that no file says: torques logged too late, and motors that move several joints.
+"""Find what logs show of drives that no file says: motors that move several joints, and wrong torques.
 
 Both are asked of least squares with friction without memory, on samples of all logs, thinned: would the torques be
 explained better, in blocks of time that the parameters were not fitted to?
@@ -22,13 +22,12 @@ from spelgen.arm.arm import Arm
 from spelgen.dynamics.regressor import regressor
 from spelgen.errors import Diagnostic
 from spelgen.identification.base_parameters import base_parameters
-from spelgen.identification.drive_samples import DELAYS, NO_DELAY, DriveLog, DriveSamples
+from spelgen.identification.drive_samples import DriveLog, DriveSamples
 from spelgen.identification.friction import FrictionModel
 from spelgen.settings.tuning.identification import DriveHintTuning, IdentificationTuning
 
 if TYPE_CHECKING:
     from spelgen.loaded_arm import LoadedArm
-    from spelgen.settings.log_mapping import LogMapping
 
 TUNING = DriveHintTuning()
 FRICTION = FrictionModel(coulomb_smoothing_velocity=IdentificationTuning().moving)
@@ -67,15 +66,6 @@ def drive_problem(arm: LoadedArm, log: DriveLog) -> DriveProblem | None:
     return make_problem(arm.arm, samples, arm.actuation.drives().speeds)
 
 
-def drive_hints(arm: LoadedArm, problem: DriveProblem, mapping: LogMapping) -> list[Diagnostic]:
-    """Return what the logs show of drives that the sidecar does not say: at most one thing, the coupling first."""
-    coupled = find_coupling(problem)
-    if coupled is not None:
-        return [_coupling_hint(arm, *coupled)]
-    late = find_torque_delay(problem)
-    return [] if late is None else [_delay_hint(mapping, *late)]
-
-
 @dataclass(frozen=True, eq=False)
 class DriveProblem:
     """Least squares of joint torques: rows (S, n, K) of the regressor, of the parameters that the torques show.
@@ -93,7 +83,7 @@ class DriveProblem:
     @property
     def tau(self) -> np.ndarray:
         """Torques as logged, (S, n)."""
-        return np.asarray(self.samples.tau[NO_DELAY])
+        return self.samples.tau
 
     def thinned(self, stride: int) -> DriveProblem:
         """Return the problem on one of so many samples."""
@@ -171,31 +161,6 @@ def find_wrong_torques(problem: DriveProblem, joints: Sequence[str]) -> list[Wro
     return [result for _, result in sorted(results, key=lambda result: result[0])[:1]]
 
 
-def find_torque_delay(problem: DriveProblem) -> tuple[float, float] | None:
-    """Return how much later torques are logged than they act [s], and what is left of the squared error if mended.
-
-    None: nothing that is sure.
-    """
-    tau = problem.samples.tau
-    cost = [held_out_errors(problem.rows, x).mean() for x in tau]
-    best = int(np.argmin(cost))
-    # at the end of the range nothing says that it ends there
-    if best in (0, len(DELAYS) - 1):
-        return None
-    earlier_cost, least, later_cost = cost[best - 1 : best + 2]  # a parabola through them
-    step = DELAYS[1] - DELAYS[0]
-    delay = DELAYS[best] + 0.5 * (earlier_cost - later_cost) / (earlier_cost - 2 * least + later_cost) * step
-    # torques are smooth from one delay to the next
-    earlier = int(np.searchsorted(DELAYS, delay)) - 1
-    fraction = (delay - DELAYS[earlier]) / step
-    moved = (1 - fraction) * tau[earlier] + fraction * tau[earlier + 1]
-    logged = held_out_errors(problem.rows, tau[NO_DELAY]).mean(axis=1)
-    mended = held_out_errors(problem.rows, moved).mean(axis=1)
-    if not _is_sure(logged, mended, TUNING.delay_gain, len(DELAYS)):
-        return None
-    return float(delay), float(mended.mean() / logged.mean())
-
-
 def find_coupling(problem: DriveProblem) -> tuple[Coupling, float] | None:
     """Return the coupling between two joints' motors that explains torques best, and what it leaves of the error.
 
@@ -269,17 +234,7 @@ def _varies(tau: np.ndarray) -> np.ndarray:
     return varies
 
 
-def _delay_hint(mapping: LogMapping, late: float, remaining: float) -> Diagnostic:
-    when = "later" if late > 0 else "earlier"
-    message = (
-        f"torques are logged {abs(late) * 1e3:.3g} ms {when} than they act: so moved, least squares misses "
-        f"{remaining:.0%} of what it missed (mean square); say 'torque_delay: {mapping.torque_delay + late:.4g}' "
-        "under 'logs' in the robot's YAML"
-    )
-    return Diagnostic("warning", "torque-delay", "logs", None, message)
-
-
-def _coupling_hint(arm: LoadedArm, coupling: Coupling, remaining: float) -> Diagnostic:
+def coupling_hint(arm: LoadedArm, coupling: Coupling, remaining: float) -> Diagnostic:
     """Return a coupling that the logs show, in the sidecar's words."""
     names = arm.arm.joint_names
     pair = [coupling.moved_by, coupling.joint]

@@ -1,24 +1,20 @@
-"""Hold samples of motion with torques moved in time, thinned while logs go by, for `drive_hints`."""
+"""Hold samples of motion, thinned while logs go by, for `drive_hints`."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from spelgen.logs.dynamics_samples import TUNING, dynamics_samples
-from spelgen.logs.recording import earlier
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.tuning.identification import DriveHintTuning
 
 HINTS = DriveHintTuning()
-DELAYS = np.array(HINTS.delays)
-NO_DELAY = int(np.abs(DELAYS).argmin())
 
 
 class DriveSamples(NamedTuple):
-    """Hold samples (S, n) of motion, and the torques (D, S, n) logged later by `DELAYS`."""
+    """Hold samples (S, n) of motion with the torques at the joints."""
 
     q: np.ndarray
     qd: np.ndarray
@@ -27,7 +23,7 @@ class DriveSamples(NamedTuple):
 
     def thinned(self, stride: int) -> DriveSamples:
         """Return one of so many samples."""
-        return DriveSamples(self.q[::stride], self.qd[::stride], self.qdd[::stride], self.tau[:, ::stride])
+        return DriveSamples(*(column[::stride] for column in self))
 
 
 class DriveLog:
@@ -50,14 +46,11 @@ class DriveLog:
         self._number += 1
         if self._number % self._step:
             return
-        joint_torque = trajectory.tau @ self._inputs.T
-        moved = []
-        for delay in DELAYS:
-            moved.append(replace(trajectory, tau=earlier(trajectory.t, joint_torque, delay)))
-        samples = dynamics_samples(moved)
+        samples = dynamics_samples([trajectory])
         if not samples:
             return
-        motion, tau = samples[0], np.stack([x.tau for x in samples])
+        motion = samples[0]
+        tau = motion.tau @ self._inputs.T
         self._samples.append(DriveSamples(motion.q, motion.qd, motion.qdd, tau).thinned(self._every))
         while self._count > 2 * HINTS.samples:
             if len(self._samples) > HINTS.trajectories:
@@ -76,6 +69,5 @@ class DriveLog:
         count = self._count
         if count < HINTS.fewest_samples:
             return None
-        *motion, tau = zip(*self._samples, strict=True)
-        q, qd, qdd = map(np.concatenate, motion)
-        return DriveSamples(q, qd, qdd, np.concatenate(tau, axis=1)).thinned(-(-count // HINTS.samples))
+        columns = zip(*self._samples, strict=True)
+        return DriveSamples(*map(np.concatenate, columns)).thinned(-(-count // HINTS.samples))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 
 import numpy as np
@@ -18,6 +18,7 @@ from spelgen.errors import Diagnostic
 from spelgen.identification.base_parameters import BaseParameters
 from spelgen.identification.friction import FrictionModel
 from spelgen.identification.method import LeastSquares
+from spelgen.identification.torque_delay import NO_DELAY, TorqueDelay
 from spelgen.listing import WIDTH, Listing
 from spelgen.settings.tuning.identification import IdentificationTuning
 
@@ -40,6 +41,7 @@ class Identification:
     (r,) of the base parameters. condition: of the regressor (columns of length one, joints weighted). unseen:
     directions of the base parameters that these logs do not excite. residual: (n,) root mean square [Nm, N];
     nmse: (n,) its square by the torque's variance. drives: between logged torques and joints; None: nothing is.
+    torque_delay: by which logged torques were moved.
     """
 
     arm: Arm
@@ -56,6 +58,7 @@ class Identification:
     samples: int
     drives: Drives | None = None
     diagnostics: tuple[Diagnostic, ...] = ()
+    torque_delay: TorqueDelay = NO_DELAY
 
     @cached_property
     def dynamics(self) -> RegressorDynamics:
@@ -91,6 +94,7 @@ class Identification:
                 "coulomb_smoothing_velocity": friction.coulomb_smoothing_velocity,
                 "effects": list(friction.effects),
             },
+            "torque_delay": asdict(self.torque_delay),
             "condition": _finite(self.condition),
             "unseen_directions": self.unseen,
             "base_parameters": self._records(),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from spelgen.identification.friction import FrictionModel
 from spelgen.identification.identification import Identification
 from spelgen.identification.least_squares import Columns, Solution, Triangles, deviations, reduce, solve
 from spelgen.identification.method import LeastSquares
+from spelgen.identification.torque_delay import TorqueDelay, find_torque_delay
 from spelgen.loaded_arm import LoadedArm, load_arm
 from spelgen.logs.checks import check
 from spelgen.logs.dynamics_samples import SHORTEST, DynamicsSamples, dynamics_samples
@@ -61,6 +62,11 @@ def identify_by(
     reach = None
     if any(method.friction.memory for method in methods):
         reach = reach_of(kinds, drives.speeds)
+    late = TorqueDelay(preprocessing.torque_delay or 0.0)
+    if preprocessing.torque_delay is None:
+        late = torque_delay(arm, logs, preprocessing)
+        preprocessing = replace(preprocessing, torque_delay=late.delay)
+        notes += late.notes
     samples = dynamics_samples(logs, preprocessing=preprocessing, reach=reach)
     unused = sorted({x.name for x in logs} - {x.name for x in samples})
     if unused:
@@ -71,8 +77,16 @@ def identify_by(
     bodies = _BodyRows(arm.arm, at_joints)
     results = []
     for method in methods:
-        results.append(replace(_least_squares(bodies, method, drives), diagnostics=tuple(notes)))
+        found = _least_squares(bodies, method, drives)
+        results.append(replace(found, diagnostics=tuple(notes), torque_delay=late))
     return results
+
+
+def torque_delay(arm: LoadedArm, logs: Sequence[Trajectory], preprocessing: Preprocessing) -> TorqueDelay:
+    """Return how much later than positions these logs show torques; see `find_torque_delay`."""
+    drives = arm.actuation.drives()
+    kinds, body_rows = arm.arm.joint_types, partial(regressor, arm.arm)
+    return find_torque_delay(logs, kinds, drives.inputs, drives.speeds, body_rows, preprocessing)
 
 
 def least_squares(

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 
 from spelgen.arm.arm import Coordinate
 from spelgen.errors import Diagnostic, LogError, collect
-from spelgen.identification.drive_hints import drive_hints, drive_problem, find_wrong_torques
+from spelgen.identification.drive_hints import coupling_hint, drive_problem, find_coupling, find_wrong_torques
 from spelgen.identification.drive_samples import DriveLog
+from spelgen.identification.identify import torque_delay
 from spelgen.log_checks.check_servo_logs import check_servo_logs
 from spelgen.log_checks.gravity import (
     GravityFit,
@@ -24,6 +25,7 @@ from spelgen.log_checks.report import TUNING, JointReport, LogReport, range_frac
 from spelgen.log_checks.robot_checks import CHECKS, JointEvidence
 from spelgen.log_checks.statistics import Statistics, joint_statistics, statistics
 from spelgen.logs.checks import Finding, clock_diagnostics, findings, run_checks, summarised
+from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.tables import UNIT_CODES
 from spelgen.logs.trajectory import Trajectory, require_joints, require_torques
 
@@ -36,7 +38,7 @@ ORDER = replace(
     SENSE, code="torque-order", expected="its own", do="change the names of the columns under 'logs'"
 )
 WRONG_TORQUES = {"torque-sense": SENSE, "torque-order": ORDER}
-ABOUT_ARM = {check.code for check in CHECKS} | {"torque-delay", "coupled-motors"}
+ABOUT_ARM = {check.code for check in CHECKS} | {"coupled-motors"}
 
 
 def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping | None = None) -> LogReport:
@@ -102,7 +104,11 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping |
             if wrong.code not in accepted:
                 summary.add(WRONG_TORQUES[wrong.code], wrong.got, f"joint {joints[wrong.joint]!r}, tau")
         if not summary.errors:
-            summary.notes.extend(drive_hints(arm, problem, mapping))
+            coupled = find_coupling(problem)
+            if coupled is not None:  # without it any delay would be wrong
+                summary.notes.append(coupling_hint(arm, *coupled))
+            else:
+                summary.notes.extend(torque_delay(arm, examples, Preprocessing()).notes)
     return LogReport(
         robot=arm.arm.name,
         files=len({x.clock.file for x in measured} - {None}),

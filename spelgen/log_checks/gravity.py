@@ -89,8 +89,8 @@ def find_opposed_inertia(arm: Arm, samples: Sequence[StateSamples], speeds: np.n
     if len(q) < TUNING.gravity_samples / 4 or not np.ptp(tau, axis=0).all():
         return None
     unit = tau.std(axis=0)
-    moving = make_problem(arm, DriveSamples(q, qd, qdd, tau[None]), speeds).rows
-    steady = make_problem(arm, DriveSamples(q, qd, np.zeros_like(qdd), tau[None]), speeds).rows
+    moving = make_problem(arm, DriveSamples(q, qd, qdd, tau), speeds).rows
+    steady = make_problem(arm, DriveSamples(q, qd, np.zeros_like(qdd), tau), speeds).rows
     flat = (moving / unit[:, None]).reshape(tau.size, -1)
     parameters = np.linalg.lstsq(flat, (tau / unit).ravel(), rcond=TUNING.dependent)[0]
     inertia = (moving - steady) @ parameters

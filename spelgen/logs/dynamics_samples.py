@@ -57,7 +57,7 @@ def dynamics_samples(
     the same filter; see ``bristles_along``.
     """
     samples = []
-    for trajectory in trajectories:
+    for trajectory in preprocessing.moved(trajectories):
         if not shows_accelerations(trajectory.sample_rate):
             continue
         pieces = _long_pieces(trajectory, preprocessing.gap)

@@ -9,6 +9,7 @@ from math import isfinite
 from spelgen.errors import Diagnostic, SettingsError
 from spelgen.logs.filtering import prepare
 from spelgen.logs.rates import automatic_cutoff, automatic_decimation
+from spelgen.logs.recording import earlier
 from spelgen.logs.trajectory import GAP, Trajectory
 from spelgen.settings.tuning.logs import LogTuning
 
@@ -24,11 +25,13 @@ class Preprocessing:
     decimation: samples from one sample of a window to the next; None: as many as filtered logs can spare (see
     `automatic_decimation`).
     gap: a step longer than so many median steps is a hole in the recording, at which it is cut.
+    torque_delay: how much later than positions the logs show torques [s]; None: found where torques are fitted.
     """
 
     cutoff: float | None = None
     decimation: int | None = None
     gap: float = GAP
+    torque_delay: float | None = None
 
     def __post_init__(self) -> None:
         if self.cutoff is not None and not (isfinite(self.cutoff) and self.cutoff >= 0):
@@ -48,7 +51,8 @@ class Preprocessing:
         rates = list(rates)
         cutoff = automatic_cutoff(rates) if self.cutoff is None else self.cutoff
         decimation = self.decimation or automatic_decimation(rates, cutoff or None)
-        return replace(self, cutoff=cutoff, decimation=decimation)
+        delay = self.torque_delay or 0.0
+        return replace(self, cutoff=cutoff, decimation=decimation, torque_delay=delay)
 
     @property
     def acceleration_cutoff(self) -> float | None:
@@ -72,4 +76,10 @@ class Preprocessing:
 
     def pieces(self, trajectories: Sequence[Trajectory], *, shortest: int) -> list[Trajectory]:
         """Return gap-free pieces of at least so many samples, filtered; of a ``resolved`` one. Raises LogError."""
-        return prepare(trajectories, shortest=shortest, cutoff=self.cutoff or None, gap=self.gap)
+        moved = self.moved(trajectories)
+        return prepare(moved, shortest=shortest, cutoff=self.cutoff or None, gap=self.gap)
+
+    def moved(self, trajectories: Sequence[Trajectory]) -> list[Trajectory]:
+        """Return trajectories with torques at the times at which they act."""
+        delay = self.torque_delay or 0.0
+        return [replace(x, tau=earlier(x.t, x.tau, delay)) for x in trajectories]

@@ -66,9 +66,13 @@ def earlier(t: np.ndarray, values: np.ndarray, delay: float) -> np.ndarray:
     """Return what is logged so much later [s], (T, n), held at the ends of each gap-free piece."""
     if not delay:
         return values
+    from scipy.interpolate import CubicSpline  # takes long to import, as in `low_pass`
+
     moved = values.copy()
     for start, stop in pairwise(gap_ends(t)):
-        piece = slice(start, stop)
-        for joint in range(values.shape[1]):
-            moved[piece, joint] = np.interp(t[piece] + delay, t[piece], values[piece, joint])
+        if stop - start > 1:
+            times = t[start:stop]
+            # a line from sample to sample would damp torques at times between samples, and noise with them
+            at = CubicSpline(times, values[start:stop])
+            moved[start:stop] = at(np.clip(times + delay, times[0], times[-1]))
     return moved

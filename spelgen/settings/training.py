@@ -8,6 +8,7 @@ from typing import Annotated, Any
 from pydantic import Field, ValidationInfo, field_validator
 
 from spelgen.settings.fits import OWNERS, GaussianPrior, Objective, Optimizer, Solver, Substeps, Window
+from spelgen.settings.log_mapping import LONGEST_DELAY
 from spelgen.settings.values import Count, Group, NonNegative, Number, Positive, Whole
 
 
@@ -39,6 +40,7 @@ class TrainingSettings(Group):
     cutoff: NonNegative | None = None
     decimation: Count | None = None
     gap: Annotated[Number, Field(gt=1)] | None = None
+    torque_delay: Annotated[Number, Field(ge=-LONGEST_DELAY, le=LONGEST_DELAY)] | None = None
     validation_fraction: Annotated[Number, Field(gt=0, lt=1)] = 0.25
     seed: Whole = 0
 
@@ -60,7 +62,7 @@ class TrainingSettings(Group):
     @property
     def preprocessing(self) -> dict[str, Any]:
         """Options of `Preprocessing` that are set."""
-        return self._set(("cutoff", "decimation", "gap"))
+        return self._set(("cutoff", "decimation", "gap", "torque_delay"))
 
     def _set(self, names: Iterable[str]) -> dict[str, Any]:
         values = {}

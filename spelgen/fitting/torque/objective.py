@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import chain
 from typing import TYPE_CHECKING, ClassVar
 
+import numpy as np
+import torch
+
+from spelgen.dynamics.body_regressor import regressor_of
 from spelgen.dynamics.bristles import bristle_reach
 from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.dataset import TrainingData
-from spelgen.fitting.objective import FitRequest, PreparedLogs, Status
+from spelgen.fitting.objective import FitRequest, Logs, PreparedLogs, Status
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.streaming import LargeLogs
 from spelgen.fitting.torque.fit import fit_torque
@@ -22,7 +27,9 @@ from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque_logs import TorqueLogObjective
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer
 from spelgen.fitting.validation import Validation, measure
+from spelgen.identification.torque_delay import HINTS, NO_DELAY, TorqueDelay, find_torque_delay
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
+from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.rates import SLOWEST
 from spelgen.settings.fits import TorqueFit
 
@@ -48,9 +55,15 @@ class TorqueObjective(TorqueLogObjective):
         assert isinstance(request.config, TorqueFit)
         self.config = request.config
         self._checkpoint: Content = {}
+        self._late = NO_DELAY
 
     def prepare(self) -> PreparedLogs:
         """See `Objective`."""
+        preprocessing = self.request.preprocessing
+        if preprocessing.torque_delay is None and has_rigid_bodies(self.model):
+            self._late = torque_delay(self.model, self.request.logs, preprocessing)
+            preprocessing = replace(preprocessing, torque_delay=self._late.delay)
+            self.request = replace(self.request, preprocessing=preprocessing)
         stride = 1
         if not isinstance(self.request.logs, LargeLogs):  # windows only measure the model: few are enough
             stride = -(-sum(map(len, self.request.logs)) // TUNING.windows)
@@ -60,7 +73,7 @@ class TorqueObjective(TorqueLogObjective):
     def begin(self) -> list[Diagnostic]:
         """Fit the model. Raises LogError where no log is sampled densely enough for accelerations."""
         model = self.model
-        notes: list[Diagnostic] = []
+        notes = self._late.notes
         samples = torque_samples(model, self.data)
         if samples is None:
             what = "to adapt to" if self.config.adapt else "to fit torques to"
@@ -97,6 +110,21 @@ class TorqueObjective(TorqueLogObjective):
     def checkpoint(self) -> Content:
         """See `Objective`."""
         return self._checkpoint
+
+
+def torque_delay(model: EmittedModel, logs: Logs, preprocessing: Preprocessing) -> TorqueDelay:
+    """Return how much later than positions these logs show torques, by the bodies of a model."""
+    if isinstance(logs, LargeLogs):
+        chunks = logs.contents.chunks
+        logs = [chunk.load() for chunk in chunks[:: -(-len(chunks) // HINTS.trajectories)]]
+
+    def body_rows(*motion: np.ndarray) -> np.ndarray:
+        rows = regressor_of(model.chain, *map(torch.from_numpy, motion))
+        return np.asarray(rows.detach())
+
+    with torch.no_grad():
+        inputs = model.input_matrix(torch.zeros(1, model.n).double())[0].numpy()
+    return find_torque_delay(logs, model.joint_types, inputs, model.motors.numpy(), body_rows, preprocessing)
 
 
 def torque_samples(model: EmittedModel, data: TrainingData) -> TorqueSamples | None:

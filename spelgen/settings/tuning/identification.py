@@ -38,8 +38,9 @@ class DriveHintTuning:
     blocks: int = 10  # of time, each judged by what the others say
     coarse: int = 4  # one of so many samples begins the search for couplings
     refined: int = 4  # couplings whose ratio is searched for
-    delay_gain: float = 0.8  # of the squared error, what is left at most where a delay is worth telling
-    coupling_gain: float = 0.5  # likewise of a coupling; that of the TX40's wrist leaves 0.05
+    coupling_gain: float = (
+        0.5  # of the squared error, what a coupling leaves at most; the TX40's wrist leaves 0.05
+    )
     wrong_gain: float = (
         0.25  # likewise of a swapped or negated torque; recorded arms lose a factor of 4 by either
     )
@@ -47,10 +48,11 @@ class DriveHintTuning:
     simple_ratio: float = 0.02  # of the squared error, what a ratio of small numbers may cost
     # that begin the search for couplings: each covers half of it to twice
     ratios: tuple[float, ...] = (1.0, -1.0, 0.4, -0.4, 2.5, -2.5)
-    # [s] loggers and field buses are late by less; a filter of 8 Hz bends at 20 ms
-    delays: tuple[float, ...] = (
-        -0.06, -0.05, -0.04, -0.03, -0.02, -0.01, 0.0, 0.01, 0.02, 0.03, 0.04, 0.05, 0.06
-    )  # fmt: skip
+    # [s] by which a fit moves torques to find a delay: of loggers and field buses; friction passes for longer ones
+    shifts: tuple[float, ...] = (-0.03, -0.02, -0.01, 0.0, 0.01, 0.02, 0.03)
+    # [1] of the squares without friction's memory: memory that leaves more does not count (recorded arms: 0.3 to 0.8)
+    unlikely_form: float = 2.0
+    delay_chance: float = 0.05  # [1] outside a delay's interval
     samples: int = 1500  # that are kept: six joints have some 70 parameters
     fewest_samples: int = 400  # that hints and errors need
     trajectories: int = 8  # of more, whole ones are left out
