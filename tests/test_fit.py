@@ -105,7 +105,7 @@ def test_what_was_used_is_recorded_and_nothing_else(tmp_path):
         "window": 5, "stride": 1, "momentum_steps": 0, "optimizer": "lbfgs", "weight_decay": 2e-5,
         "urdf_weight": 1.0, "epochs": 1, "patience": 60, "solver": "rk4",
     }  # fmt: skip
-    assert found.record["preprocessing"] == {"cutoff": None, "decimation": 1, "gap": 4.0}
+    assert found.record["preprocessing"] == {"cutoff": None, "decimation": 1, "gap": 4.0, "torque_delay": 0.0}
     json.dumps(found.record)
 
 

@@ -31,7 +31,7 @@ def test_every_option_has_a_value_here_and_a_place_in_the_settings():
     assert OWNERS.keys() == VALUES.keys()
     in_a_file = OWNERS.keys() - {"adapt"}  # of one run, not of a robot
     assert in_a_file <= TrainingSettings.model_fields.keys()
-    beside = {"objective", "cutoff", "decimation", "gap", "validation_fraction", "seed"}
+    beside = {"objective", "cutoff", "decimation", "gap", "torque_delay", "validation_fraction", "seed"}
     assert TrainingSettings.model_fields.keys() == in_a_file | beside
 
 

@@ -69,7 +69,9 @@ def find_torque_delay(
     kinds: the joints' types. inputs: G, (n, n), of logged torques. speeds: C, (n, n), of the drives. The value is that
     of the form of friction that leaves less of the torque.
     """
-    reach = replace(reach_of(kinds, speeds), smoothing_velocity=FRICTION.coulomb_smoothing_velocity)
+    reach = replace(
+        reach_of(kinds, speeds), smoothing_velocity=np.full(len(kinds), FRICTION.coulomb_smoothing_velocity)
+    )
     samples, moved = [], []
     for log in logs[:: -(-len(logs) // HINTS.trajectories)]:
         shifted: list[DynamicsSamples] = []
