@@ -282,19 +282,16 @@ def test_the_tip_is_missed_by_millimetres():
     assert errors.tip_mm == pytest.approx(6.0, rel=1e-5)
 
 
-def test_friction_forgets_on_evidence_alone():
-    """Without memory of friction the samples of both joints are more probable: by luck, and by far."""
-    friction = SimpleNamespace(memoryless=torch.ones(2), bristles=SimpleNamespace(reach=torch.ones(2, 4)))
-    independent, gains = 2000 / 20, torch.tensor([1.0, 20.0])
+def test_friction_forgets_where_that_explains_a_joint_better():
+    """Memory leaves less of the first joint's torque, and more of the second's."""
+    friction = SimpleNamespace(memoryless=torch.ones(2))
     state = SimpleNamespace(residuals=torch.ones(2), x=None, steps=0)
-    remembering = SimpleNamespace(residuals=(gains / independent).exp())
+    remembering = SimpleNamespace(residuals=torch.tensor([0.9, 1.1]))
     problem = SimpleNamespace(
         jacobian=SimpleNamespace(model=SimpleNamespace(friction=friction)),
         noise=None,
         prior=None,
         covariance=torch.eye(1),
-        count=2000,
-        correlation=20.0,
         set_samples=lambda state, jacobian: state,
         _first_fit=lambda x, steps: state,
         solve=lambda state, rounds: remembering,

@@ -118,7 +118,7 @@ def test_actuators_of_mujoco_are_fitted_to_files_when_they_are_needed(
     fitted, logs, arm, tmp_path, monkeypatch
 ):
     pytest.importorskip("mujoco")
-    monkeypatch.setattr(keep, "_fit_position_actuators", lambda run, logs, used: {"fitted to": len(logs)})
+    monkeypatch.setattr(keep, "_fit_position_actuators", lambda run, logs: {"fitted to": len(logs)})
     run = RunFolder(tmp_path / "run")
     shutil.copytree(fitted.folder, run.path)
     path = spelgen.write_logs(tmp_path / "logs.parquet", logs[:4], arm)

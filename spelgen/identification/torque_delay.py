@@ -28,7 +28,7 @@ BodyRows = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class TorqueDelay:
-    """How much later than positions torques are logged, and half of the 95 % interval [s]; zeros: nothing is sure."""
+    """How much later than positions torques are logged, and half of the 99 % interval [s]; zeros: nothing is sure."""
 
     delay: float = 0.0
     interval: float = 0.0

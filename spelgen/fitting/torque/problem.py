@@ -88,11 +88,24 @@ class TorqueProblem:
         Bodies that are far off leave much of the torque, which is taken for noise, and noise asks for no better bodies.
         """
         self._set_least_squares_noise(x)
-        squares = self.jacobian.squares(x)
-        state = State(x, squares, self.cost(x, squares), DAMPING.first, steps)
-        for step in levenberg_marquardt(self, state, max_steps=TUNING.first_steps, relative_gain=TUNING.gain):
-            state = step
-        return state
+        state = State(x, self.jacobian.squares(x), 0.0, DAMPING.first, steps)
+        return self._steps(state, TUNING.first_steps)
+
+    def _fit_from_start(self, steps: int) -> State:
+        """Return the first fit from the start, where bodies may be far off.
+
+        Under the noise of least squares these wind along a narrow valley: noise falls to it with what is missed.
+        """
+        self._set_least_squares_noise(self.start)
+        least = self.noise
+        state = State(self.start, self.jacobian.squares(self.start), 0.0, DAMPING.first, steps)
+        for _ in range(TUNING.first_rounds):
+            missed = (self.correlation * state.residuals / self.count).sqrt()
+            self.noise = torch.maximum(least, TUNING.first_noise * missed)
+            if (self.noise == least).all():
+                break
+            state = self._steps(state, TUNING.steps)
+        return self._first_fit(state.x, state.steps)
 
     @property
     def free(self) -> torch.Tensor:
@@ -103,9 +116,9 @@ class TorqueProblem:
         """As `solve`, all rounds from the start; from there anew while further joints want a compensation, for what a
         fit made of their torque without one leads astray.
         """
-        state = self._first_fit(self.start, 0)
+        state = self._fit_from_start(0)
         while self.adapt is None and self._compensate(state.x):
-            state = self._first_fit(self.start, state.steps)
+            state = self._fit_from_start(state.steps)
         return self.solve(state, TUNING.rounds)
 
     def select_memory(self, state: State) -> State:
@@ -146,9 +159,7 @@ class TorqueProblem:
     def solve(self, state: State, rounds: int) -> State:
         """Take steps in rounds, after each of which noise and prior are found anew, while much is gained."""
         for number in range(TUNING.longer * rounds):
-            state = replace(state, cost=self.cost(state.x, state.residuals), converged=False)
-            for step in levenberg_marquardt(self, state, max_steps=TUNING.steps, relative_gain=TUNING.gain):
-                state = step
+            state = self._steps(state, TUNING.steps)
             previous = self.noise
             self.set_noise(state.residuals)
             free = self.free
@@ -158,6 +169,13 @@ class TorqueProblem:
                 self.set_prior(most_probable(self.prior, self.guess, self.kinds, away, variance))
             if number + 1 >= rounds and (self.noise > TUNING.noise_settled * previous).all():
                 break
+        return state
+
+    def _steps(self, state: State, most: int) -> State:
+        """Take steps under the noise and prior of now."""
+        state = replace(state, cost=self.cost(state.x, state.residuals), converged=False)
+        for step in levenberg_marquardt(self, state, max_steps=most, relative_gain=TUNING.gain):
+            state = step
         return state
 
     def residuals(self, x: torch.Tensor) -> torch.Tensor:

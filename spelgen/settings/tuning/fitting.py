@@ -73,6 +73,10 @@ class TorqueTuning:
     )
     rounds: int = 5  # after the first ones, of finding noise and prior anew
     first_steps: int = 60  # at most, before noise and prior are found
+    first_rounds: int = 12  # at most, while noise falls to that of least squares
+    first_noise: float = (
+        0.03  # [1] of what is missed (a low_cost_robot from placeholders: M(q) 0.44 -> 0.005)
+    )
     last_rounds: int = 2  # where all but the last digits are fitted, and of least squares
     longer: int = 4  # times as many rounds at most, while some joint's noise falls
     noise_settled: float = 0.98  # [1] noise by that of the round before: what falls by less is settled

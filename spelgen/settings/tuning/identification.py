@@ -52,7 +52,7 @@ class DriveHintTuning:
     shifts: tuple[float, ...] = (-0.03, -0.02, -0.01, 0.0, 0.01, 0.02, 0.03)
     # [1] of the squares without friction's memory: memory that leaves more does not count (recorded arms: 0.3 to 0.8)
     unlikely_form: float = 2.0
-    delay_chance: float = 0.05  # [1] outside a delay's interval
+    delay_chance: float = 0.01  # [1] outside a delay's interval: a log without delay must not get one
     samples: int = 1500  # that are kept: six joints have some 70 parameters
     fewest_samples: int = 400  # that hints and errors need
     trajectories: int = 8  # of more, whole ones are left out
