@@ -23,7 +23,7 @@ class MotorInput(PortHamiltonian):
 
     def __init__(self, joints: Joints) -> None:
         super().__init__(joints)
-        constant, trained = torch.zeros(2, len(joints.revolute), len(joints.revolute), dtype=torch.float64)
+        constant, trained = torch.zeros(2, joints.n, joints.n, dtype=torch.float64)
         for joint, motor, value, is_trained in joints.gains:
             (trained if is_trained else constant)[joint, motor] = value
         self.constant_gains = nn.Buffer(constant)
@@ -66,7 +66,7 @@ class DenseInput(NetworkDynamics):
         network: Network,
     ) -> None:
         super().__init__(joints, mass, potential, scale, friction)
-        self.moving = nn.Buffer(torch.eye(3 * len(joints.revolute)).double()[2::3])
+        self.moving = nn.Buffer(torch.eye(3 * joints.n).double()[2::3])
         self.input_network = network
 
     def prepare(self) -> NetworkPrepared:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from spelgen.runtime.joints import Joints, vector
@@ -20,14 +19,15 @@ class DenseFriction(nn.Module):
 
     def __init__(self, joints: Joints, network: Network, axes: int) -> None:
         super().__init__()
-        rows = axes * len(joints.revolute)
+        rows = axes * joints.n
         self.speed = nn.Buffer(vector(joints.speed))
         self.nominal = nn.Buffer(vector(joints.friction))
         moving = slice(axes - 1, None, axes)
         row, column = torch.tril_indices(rows, rows)
         # spreads the numbers of a lower triangle, row by row, over a matrix: (rows, rows, numbers)
-        spread = F.one_hot(row * rows + column, rows * rows).mT.reshape(rows, rows, -1)
-        self.entries = nn.Buffer(spread[moving].double())
+        spread = torch.zeros(rows, rows, len(row), dtype=torch.float64)
+        spread[row, column, torch.arange(len(row))] = 1.0
+        self.entries = nn.Buffer(spread[moving])
         self.start = nn.Buffer(FACTOR_START * torch.eye(rows).double()[moving])
         self.network = network
 

@@ -54,7 +54,7 @@ class NetworkInput(NamedTuple):
 
 def joint_input(joints: Joints, chosen: Iterable[int], sensitivity: Sequence[float]) -> NetworkInput:
     """cos q and sin q of revolute joints, the scaled q of prismatic ones, times a joint's sensitivity."""
-    n, encoded = len(joints.revolute), (2 if all(joints.revolute) else 3) * len(joints.revolute)
+    n, encoded = joints.n, (2 if all(joints.revolute) else 3) * joints.n
     chosen = list(chosen)
     turning = [joint for joint in chosen if joints.revolute[joint]]
     sliding = [joint for joint in chosen if not joints.revolute[joint]]
@@ -69,7 +69,7 @@ def lie_group_input(joints: Joints, sensitivity: Sequence[float]) -> NetworkInpu
 
     z is the joint's axis, so R = [[cos q, -sin q, 0], [sin q, cos q, 0], [0, 0, 1]].
     """
-    n = len(joints.revolute)
+    n = joints.n
     owners = [joint for joint in range(n) for _ in range(9 if joints.revolute[joint] else 3)]
     matrix = torch.zeros(len(owners), (2 if all(joints.revolute) else 3) * n, dtype=torch.float64)
     offset = torch.zeros(len(owners), dtype=torch.float64)
@@ -88,7 +88,7 @@ def with_velocities(inputs: NetworkInput, joints: Joints, axes: int) -> NetworkI
 
     The network then reads the encoding and, behind it, the velocities, (..., encoded + n).
     """
-    n = len(joints.revolute)
+    n = joints.n
     last = torch.eye(axes, dtype=torch.float64)[:, -1:]
     velocities = torch.kron(torch.eye(n, dtype=torch.float64), last)
     owners = (*inputs.joints, *(joint for joint in range(n) for _ in range(axes)))

@@ -75,8 +75,8 @@ class FrictionLaws(nn.Module):
         super().__init__()
         self.register_buffer("nominal", vector(joints.friction))
         self.register_buffer("speed", vector(joints.speed))
-        self.bristles = Bristles(reach or [[]] * len(joints.revolute))
-        start = torch.zeros(len(joints.revolute), dtype=torch.float64)
+        self.bristles = Bristles(reach or [[]] * joints.n)
+        start = torch.zeros(joints.n, dtype=torch.float64)
         # no parameter: a fit to torques compares both forms
         self.register_buffer("memoryless", torch.full_like(start, 0.0 if reach else 1.0))
         self.raw_viscous = nn.Parameter(start.clone())

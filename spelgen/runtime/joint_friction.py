@@ -37,7 +37,7 @@ class JointFriction(nn.Module):
 
     def __init__(self, joints: Joints, generator: torch.Generator) -> None:
         super().__init__()
-        n, inputs = len(joints.revolute), 4
+        n, inputs = joints.n, 4
         encoded = (2 if all(joints.revolute) else 3) * n
         matrix = torch.zeros(n, inputs, encoded + 2 * n, dtype=torch.float64)
         for i, revolute in enumerate(joints.revolute):

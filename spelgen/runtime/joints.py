@@ -26,6 +26,11 @@ class Joints(NamedTuple):
     gains: tuple[tuple[int, int, float, bool], ...] = ()  # joint, motor, torque by torque, whether trained
     gear: tuple[float, ...] = ()  # turns of the motor in a turn of the joint
 
+    @property
+    def n(self) -> int:
+        """The number of joints."""
+        return len(self.revolute)
+
 
 def vector(values: Iterable[float]) -> Tensor:
     """The values as a float64 tensor."""

@@ -47,7 +47,7 @@ class ResidualPose(NamedTuple):
 
 def ripple_frequencies(joints: Joints) -> Tensor:
     """Return how often in a turn of the joint a ripple may come again, (n, HARMONICS + 2)."""
-    frequencies = torch.arange(1.0, HARMONICS + 3).double().repeat(len(joints.revolute), 1)
+    frequencies = torch.arange(1.0, HARMONICS + 3).double().repeat(joints.n, 1)
     for joint, gear in enumerate(joints.gear):
         if gear > HARMONICS:
             frequencies[joint, HARMONICS:] = vector((gear, 2 * gear))
@@ -84,7 +84,7 @@ class ResidualTerms(nn.Module):
         scale: float,
     ) -> None:
         super().__init__()
-        n, zeros = len(joints.revolute), torch.zeros(len(joints.revolute), SPLINES, dtype=torch.float64)
+        n, zeros = joints.n, torch.zeros(joints.n, SPLINES, dtype=torch.float64)
         self.encoding = JointEncoding(joints)
         spacing = 2 * vector(joints.reach).unsqueeze(-1) / (SPLINES - 3)
         knots = torch.arange(SPLINES).double() - (SPLINES - 1) / 2

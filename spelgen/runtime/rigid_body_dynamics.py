@@ -52,16 +52,16 @@ class RigidBodyDynamics(PortHamiltonian):
         self, joints: Joints, bodies: Bodies, gravity: Row, reach: Rows = (), motors: Rows = ()
     ) -> None:
         super().__init__(joints)
-        zeros = torch.zeros(len(joints.revolute), dtype=torch.float64)
+        zeros = torch.zeros(joints.n, dtype=torch.float64)
         self.elements = len(reach[0]) if reach else 0
-        self.chain = BodyChain(len(joints.revolute), bodies, gravity)
+        self.chain = BodyChain(joints.n, bodies, gravity)
         self.basis = nn.Buffer(inertia_basis())
         self.bodies, self.friction = InertialParameters(bodies), FrictionLaws(joints, reach)
         self.nominal_armature = nn.Buffer(vector(joints.armature))
         self.raw_armature = nn.Parameter(zeros.clone())  # its logarithm
         # C, (n, n), and its inverse; each drive moves its own joint alone where it is not given
         rows = [vector(row) for row in motors]
-        self.motors = nn.Buffer(torch.stack(rows) if rows else torch.eye(len(joints.revolute)).double())
+        self.motors = nn.Buffer(torch.stack(rows) if rows else torch.eye(joints.n).double())
         self.loads = nn.Buffer(torch.linalg.inv(self.motors))
         # of the measured torque, in units of the joints' usual friction
         self.raw_offset = nn.Parameter(zeros.clone())
