@@ -91,7 +91,8 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping |
             passed = accepted.union(UNIT_CODES)
         where = f"joint {coordinate.name!r}"
         for check, message in run_checks(CHECKS, evidence, passed):
-            summary.add(check, message, where + ", tau" * (check.severity == "error"))
+            place = f"{where}, tau" if check.severity == "error" else where
+            summary.add(check, message, place)
     problem = drive_problem(arm, drives)
     is_odd = any(note.code == "velocity-is-no-derivative" for note in summary.notes)
     # beside wrong velocities friction is wrong too, and of wrong torques hints about drives would be wrong
