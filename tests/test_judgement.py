@@ -282,22 +282,28 @@ def test_the_tip_is_missed_by_millimetres():
     assert errors.tip_mm == pytest.approx(6.0, rel=1e-5)
 
 
-def test_friction_forgets_where_that_explains_a_joint_better():
-    """Memory leaves less of the first joint's torque, and more of the second's."""
+@pytest.mark.parametrize(
+    ("gains", "memoryless"), [((1.0, 20.0), [1, 1]), ((1.0, -20.0), [0, 0]), ((-9.0, 20.0), [0, 1])]
+)
+def test_weak_evidence_of_a_joint_yields_to_that_of_all(gains, memoryless):
+    """Without memory of friction the samples of two joints are this much more probable."""
     friction = SimpleNamespace(memoryless=torch.ones(2))
     state = SimpleNamespace(residuals=torch.ones(2), x=None, steps=0)
-    remembering = SimpleNamespace(residuals=torch.tensor([0.9, 1.1]))
+    remembering = SimpleNamespace(residuals=(torch.tensor(gains) * 20 / 2000).exp())
     problem = SimpleNamespace(
         jacobian=SimpleNamespace(model=SimpleNamespace(friction=friction)),
         noise=None,
         prior=None,
         covariance=torch.eye(1),
+        count=2000,
+        correlation=20.0,
+        set_prior=lambda prior: None,
         set_samples=lambda state, jacobian: state,
         _first_fit=lambda x, steps: state,
         solve=lambda state, rounds: remembering,
     )
     torque_problem.TorqueProblem.select_memory(problem, state)
-    assert friction.memoryless.tolist() == [0.0, 1.0]
+    assert friction.memoryless.tolist() == memoryless
 
 
 def test_energy_that_only_changes_its_kind_is_no_rise(robots):

@@ -95,7 +95,7 @@ def _columns(
     selected = is_moving(smooth.qd)
     if cutoff is not None:  # a filter that begins or ends within a motion makes up what it does not see
         unsettled = round(TUNING.unsettled * FREQUENCY / cutoff)
-        selected[:unsettled] = selected[-unsettled:] = False
+        selected[:unsettled] = selected[len(selected) - unsettled :] = False
     if pauses and selected.any():
         moving = np.flatnonzero(selected)
         selected[moving[0] : moving[-1]] = True

@@ -72,6 +72,8 @@ class TorqueTuning:
         5.0  # samples, 0.1 s: so many in a row err alike and count once; 20 costs 20 % of M(q)
     )
     rounds: int = 5  # after the first ones, of finding noise and prior anew
+    # twice the logarithm of a likelihood ratio: strong evidence (Kass and Raftery, J. Am. Stat. Assoc. 90:773, 1995)
+    memory_evidence: float = 6.0
     first_steps: int = 60  # at most, before noise and prior are found
     first_rounds: int = 12  # at most, while noise falls to that of least squares
     first_noise: float = (
