@@ -17,6 +17,7 @@ from spelgen.identification.least_squares import correlation_time
 from spelgen.identification.method import LeastSquares
 from spelgen.loaded_arm import load_arm
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
+from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.pipeline import inspect
 from spelgen.structure.pseudo_inertia import parameters_of, pseudo_inertia, reference_factor
@@ -261,6 +262,19 @@ def test_ur10e_gives_the_published_figures(shared):
         arm, training, LeastSquares("range", friction=FrictionModel(stribeck=True, polynomial=True))
     )
     assert np.mean([nmse(more, sample) for sample in tests]) == pytest.approx(0.0087, rel=0.05)
+
+
+@pytest.mark.parametrize("cutoff", [1.0, 8.0, 45.0, 160.0])
+def test_samples_leave_out_what_a_filter_makes_up_at_both_ends(cutoff):
+    """A log that begins and ends in motion; no filter above 50 Hz leaves nothing to leave out."""
+    t = np.arange(0.0, 10.0, 1e-3)
+    q = np.column_stack([1.5 * np.sin(t)])
+    log = Trajectory(t, q, 1.5 * np.column_stack([np.cos(t)]), -q, "swing")
+    (sample,) = dynamics_samples([log], preprocessing=Preprocessing(cutoff=cutoff))
+    left_out = 1000 - len(sample.q)
+    moving = np.abs(1.5 * np.cos(np.arange(0.0, 10.0, 0.01))) > 0.02
+    assert left_out == pytest.approx((~moving).sum() + 2 * 75 / cutoff, abs=3)
+    assert np.abs(sample.qdd + sample.q).max() < 0.1
 
 
 def test_panda_gives_the_published_figure(shared):
