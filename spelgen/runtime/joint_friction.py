@@ -68,7 +68,7 @@ class JointFriction(nn.Module):
     def prepare(self) -> FrictionLayers:
         """All joints' networks as one: block matrices are faster than a loop over joints.
 
-        Their tanh x is computed as 2 sigmoid(2 x) - 1, which takes a fraction of the time.
+        Their tanh x is computed as 2 sigmoid(2 x) - 1, whose slope takes one pass.
         """
         identity = torch.eye(self.out.shape[0], dtype=self.out.dtype, device=self.out.device)
         return FrictionLayers(

@@ -47,7 +47,7 @@ class MaskedMLP(nn.Module):
     def prepare(self, output_map: Tensor, offset: Tensor) -> Layers:
         """The weights for the encoding as it is, and for offset + output_map y in place of y.
 
-        tanh x is computed as 2 sigmoid(2 x) - 1, which takes a fraction of the time.
+        tanh x is computed as 2 sigmoid(2 x) - 1, whose slope takes one pass.
         """
         weights, biases = [], []
         for index, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
