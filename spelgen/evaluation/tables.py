@@ -182,12 +182,14 @@ def _by_joint(
 
     There is no table where results are of several arms, which have no joints in common.
     """
+    if not results.joints:
+        return []
     units = [getattr(UNITS[kind], quantity) for kind in results.joint_types]
     labels = list(results.joints)
     common = ""
     if len(set(units)) == 1:
         common = f" [{units[0]}]"
     else:
-        labels = [f"{joint} [{unit}]" for joint, unit in zip(labels, units, strict=False)]
+        labels = [f"{joint} [{unit}]" for joint, unit in zip(labels, units, strict=True)]
     rows = [_values(values, lambda x: x[k]) for k in range(len(labels))]  # noqa: B023
-    return [table(title.format(common), labels, rows, note)] if labels else []
+    return [table(title.format(common), labels, rows, note)]

@@ -41,13 +41,16 @@ WRONG_TORQUES = {"torque-sense": SENSE, "torque-order": ORDER}
 ABOUT_ARM = {check.code for check in CHECKS} | {"coupled-motors"}
 
 
-def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping | None = None) -> LogReport:
+def check_logs(
+    logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping | None = None, *, delay: bool = True
+) -> LogReport:
     """Report all about the logs of an arm, read once, one trajectory after another; nothing is repaired or raised.
 
     The report's `errors` prevent training. mapping: that of the logs, by default from the arm's settings; units that
     it declares and errors that it accepts are not checked. The arm's input matrix converts logged torques to those of
     the joints. Raises LogError without any trajectory, or with one of another number of joints, and
     where an arm's settings say 'input: position', without commands.
+    delay: whether that of the torques is looked for too.
     """
     if arm.settings.input == "position":
         return check_servo_logs(logs, arm)
@@ -108,7 +111,7 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping |
             coupled = find_coupling(problem)
             if coupled is not None:  # without it any delay would be wrong
                 summary.notes.append(coupling_hint(arm, *coupled))
-            else:
+            elif delay:
                 summary.notes.extend(torque_delay(arm, examples, Preprocessing()).notes)
     return LogReport(
         robot=arm.arm.name,
@@ -126,9 +129,9 @@ def require_sound_logs(
 ) -> list[Diagnostic]:
     """Return what `check_logs` finds of logs beside their arm; raise LogError where they cannot be trained on."""
     # the same checks as the command, so that a fit refuses what `spelgen logs` refuses
-    report = check_logs(logs, arm, mapping)
+    report = check_logs(logs, arm, mapping, delay=False)
     collect(report.errors)
-    # a fit itself tells what logs show without the arm
+    # a fit itself tells what logs show without the arm, and finds the delay of torques
     return [note for note in report.findings if note.code in ABOUT_ARM]
 
 

@@ -79,7 +79,9 @@ class Preprocessing:
         moved = self.moved(trajectories)
         return prepare(moved, shortest=shortest, cutoff=self.cutoff or None, gap=self.gap)
 
-    def moved(self, trajectories: Sequence[Trajectory]) -> list[Trajectory]:
+    def moved(self, trajectories: Sequence[Trajectory]) -> Sequence[Trajectory]:
         """Return trajectories with torques at the times at which they act."""
-        delay = self.torque_delay or 0.0
+        delay = self.torque_delay
+        if not delay:  # most logs have none, and a copy is checked anew
+            return trajectories
         return [replace(x, tau=earlier(x.t, x.tau, delay)) for x in trajectories]
