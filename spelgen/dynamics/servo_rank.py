@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from spelgen.arm.arm import Arm
-from spelgen.dynamics.regressor import regressor
+from spelgen.structure.recursion import triangle
+from spelgen.structure.sampling import float_energies
 
 PARAMETERS = ("kp", "kd", "armature", "dry")
 ROUNDING = 1e-9  # of the largest singular value
@@ -36,7 +37,7 @@ def servo_rank(arm: Arm) -> ServoRank:
     random, n = np.random.default_rng(0), len(arm.coordinates)
     samples = 2 * (10 * len(arm.bodies) // n + len(PARAMETERS)) + 20
     q, qd, qdd = random.normal(size=(3, samples, n))
-    columns = regressor(arm, q, qd, qdd).reshape(samples * n, -1)
+    columns = torque_rows(arm, q, qd, qdd).reshape(samples * n, -1)
     identifiable, _ = _row_and_null_space(columns)
     bodies = columns @ (
         identifiable * random.uniform(0.5, 2.0, identifiable.shape[1])
@@ -65,6 +66,29 @@ def servo_rank(arm: Arm) -> ServoRank:
         in_no_ratio += [(PARAMETERS[k], joint) for k in np.flatnonzero(apart)]
     in_no_ratio.sort(key=lambda entry: PARAMETERS.index(entry[0]))
     return ServoRank(tuple(map(tuple, groups)), tuple(in_no_ratio))
+
+
+def torque_rows(arm: Arm, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
+    """Return by which (S, n, 10 B) the bodies' inertial parameters make torques, by Lagrange's equations.
+
+    Derivatives by complex steps (Squire and Trapp, SIAM Review 40:110, 1998), which lose no digit. It is `regressor`
+    without torch, which a derivation does not load.
+    """
+    n, step = q.shape[1], 1e-30
+    units = np.eye(10 * len(arm.bodies))
+    moved = q[:, None] + 1j * step * np.eye(n)  # (S, n, n), row k with coordinate k moved
+    inertias = np.split(units, len(arm.bodies))
+    triangles, potential = float_energies(arm, moved[:, :, None], [list(ten) for ten in inertias])
+    mass = np.zeros((*potential.shape, n, n), dtype=complex)  # (S, n, 10 B, n, n)
+    for entry, (row, column) in enumerate(triangle(n)):
+        mass[..., row, column] = mass[..., column, row] = triangles[..., entry]
+    slopes = mass.imag / step
+    accelerated = np.einsum("spij,sj->sip", mass[:, 0].real, qdd)
+    quadratic = (
+        np.einsum("skpij,sk,sj->sip", slopes, qd, qd) - np.einsum("sipjk,sj,sk->sip", slopes, qd, qd) / 2
+    )
+    torque: np.ndarray = accelerated + quadratic + potential.imag / step
+    return torque
 
 
 def _row_and_null_space(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

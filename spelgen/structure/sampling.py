@@ -120,15 +120,17 @@ def float_samples(arm: Arm, assume: Assume, samples: int, seed: int = 2) -> Samp
 
 
 def float_energies(arm: Arm, q: np.ndarray, inertias: Sequence[Ten]) -> tuple[np.ndarray, np.ndarray]:
-    """Return lower triangles of M, (..., n(n+1)/2), and V [J], (...), at ``q`` (..., n) [rad, m]."""
+    """Return lower triangles of M, (..., n(n+1)/2), and V [J], (...), at ``q`` (..., n) [rad, m], real or complex."""
     positions = []
     for index, base in enumerate(base_denominators(arm)):
         value = q[..., index]
         positions.append(Position(np.cos(value / base), np.sin(value / base), value))
     result = energies(arm, motions(arm, positions, float), inertias, float)
-    shape = q.shape[:-1]
+    shape = np.broadcast_shapes(q.shape[:-1], *map(np.shape, inertias[0]))
     entries = [np.broadcast_to(result.mass[key], shape) for key in triangle(q.shape[-1])]
-    return np.stack(entries, axis=-1).astype(float), np.broadcast_to(result.potential, shape).astype(float)
+    return np.stack(entries, axis=-1).astype(q.dtype), np.broadcast_to(result.potential, shape).astype(
+        q.dtype
+    )
 
 
 def motions(arm: Arm, positions: Sequence[Position], number: Callable[[Fraction], Element]) -> list[Motion]:
