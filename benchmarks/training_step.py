@@ -30,7 +30,7 @@ from published_phnode import ByJvp, Published
 
 from spelgen.building import build
 from spelgen.design import Design
-from spelgen.dynamics.unbounded import Unbounded
+from spelgen.dynamics.unbounded import whole_part
 from spelgen.fitting.rollout import position_difference
 
 if TYPE_CHECKING:
@@ -75,10 +75,10 @@ def rk4(rate: Callable[..., tuple[Tensor, Tensor]], q: Tensor, p: Tensor) -> tup
 
 def unbounded(model: EmittedModel) -> EmittedModel | None:
     """The model with M as it comes; None where nothing is done to it."""
-    if not hasattr(getattr(model, "mass", None), "bound"):
+    if not hasattr(getattr(model, "mass", None), "part"):
         return None
     plain = copy.deepcopy(model)
-    plain.mass.bound = Unbounded(plain.mass.bound.center)
+    plain.mass.part = whole_part
     return plain
 
 
@@ -109,7 +109,7 @@ def networks_alone(model: EmittedModel, data: Data) -> None:
         layers = prepared.mass
         total = total + dynamics.mass.network(features, layers)[0].sum()
         total = total + dynamics.potential(features, prepared.potential)[0].sum()
-        total = total + dynamics.friction(features, qd, prepared.friction).sum()
+        total = total + dynamics.friction(features, qd, prepared.friction, qd.unsqueeze(-1)).sum()
         if hasattr(dynamics, "input_network"):
             total = total + dynamics.input_network(features, prepared.input)[0].sum()
     total.backward()

@@ -19,12 +19,12 @@ from spelgen.dynamics.parameters import parameter_table, parameters_of_kind
 from spelgen.dynamics.protocol import has_friction_state, sliding_memory
 from spelgen.emission.bundle import bundle, load_runtime, names_in
 from spelgen.emission.unit_joints import hidden_units
+from spelgen.runtime.derived_mass import DerivedMass
 from spelgen.runtime.encoding import JointEncoding, joint_input, lie_group_input
 from spelgen.runtime.friction_laws import FrictionLaws, turned
 from spelgen.runtime.joints import Joints, vector
 from spelgen.runtime.masked_kan import MaskedKAN
 from spelgen.runtime.masked_mlp import MaskedMLP
-from spelgen.runtime.regularisation import PositiveDefiniteBound
 from spelgen.runtime.residual_terms import HARMONICS, SPLINES, ResidualTerms
 from spelgen.runtime.rigid_body import Bodies, InertialParameters, pseudo_inertia
 from spelgen.runtime.symmetric import symmetric
@@ -72,7 +72,7 @@ def test_encoding_is_cos_sin_and_scaled_distance_with_its_derivatives(joints):
     encoded, rate = jvp(encoding, (q,), (qd,))
     near(encoded[:, 0], q[:, 0].cos())
     near(encoded[:, 5], q[:, 2].sin())
-    if encoding.prismatic:
+    if not all(joints.revolute):
         near(encoded[:, 7], (q[:, 1] - 0.5) / 0.25)
     near(encoding.jvp(encoded, qd), rate)
     cotangent = draw(*encoded.shape, seed=2)
@@ -198,7 +198,21 @@ def test_entries_of_a_symmetric_matrix():
 
 def test_bound_leaves_what_is_positive_definite_and_mends_what_is_not():
     center = torch.diag(torch.tensor([5.0, 1.0, 1e-3], dtype=torch.float64))
-    bound = PositiveDefiniteBound(center, 1e-3)
+    constants = [(value, value) for value in center.diagonal().tolist()]
+    mass = DerivedMass(
+        JOINTS,
+        lambda f, c: symmetric([c[0]], [0, c[1]], [0, 0, c[2]]),
+        (),
+        constants,
+        torch.nn.Identity(),
+        1e-3,
+    )
+
+    def bound(matrix: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        part = mass.part(matrix)
+        return torch.lerp(center, matrix, part[:, None, None]), part
+
+    near(mass.center, center)
     root = draw(500, 3, 3)
     definite = root @ root.mT + 2e-3 * center
     kept, part = bound(definite)

@@ -121,10 +121,10 @@ def _friction(constants: Any) -> FrictionLaw:
 def _residuals(model: ResidualModel) -> Residuals:
     """Return the residuals without those that are zero. Raises RunError for Kolmogorov-Arnold networks."""
     terms, weights = model.residuals, model.prepare().residual
-    mass, potential = _network(terms.mass, weights.mass), _network(terms.potential, weights.potential)
+    mass = _network(terms.mass, weights.mass, array(weights.functions))
+    potential = _network(terms.potential, weights.potential)
     entries: np.ndarray = np.zeros((0, 2), dtype=int)
     if mass is not None:
-        mass = _tanh_then(mass, array(weights.functions))
         reached = mass.weights[-1].any(axis=1).reshape(model.n, model.n)
         entries = np.argwhere(np.tril(reached))
         mass = _with_outputs(mass, entries @ (model.n, 1))
@@ -132,7 +132,7 @@ def _residuals(model: ResidualModel) -> Residuals:
         potential = _with_outputs(potential, np.zeros(1, dtype=int))
     return Residuals(
         encoding=Encoding(
-            terms.encoding.prismatic, array(terms.encoding.center), array(terms.encoding.reach)
+            terms.encoding.columns == 3, array(terms.encoding.center), array(terms.encoding.reach)
         ),
         entries=tuple(map(tuple, entries.tolist())),
         mass=mass,
@@ -143,32 +143,34 @@ def _residuals(model: ResidualModel) -> Residuals:
     )
 
 
-def _network(network: object, layers: Layers | None) -> Network | None:
-    """Return a network, None where there is none or its last layer is zero."""
-    if layers is None or not (layers.weights[-1].any() or layers.biases[-1].any()):
+def _network(network: object, layers: Layers | None, functions: np.ndarray | None = None) -> Network | None:
+    """Return a network y, None where there is none or its last layer is zero; with functions, tanh(y) @ functions.
+
+    Its units are sigmoids, which C computes faster than tanh.
+    """
+    if layers is None or not any(tensor.any() for tensor in layers[-1]):
         return None
     # an emitted module brings classes of its own
     if type(network).__name__ != "MaskedMLP":
         raise _unsupported("Kolmogorov-Arnold networks beside rigid bodies")
-    return Network(tuple(map(array, layers.weights)), tuple(map(array, layers.biases)))
+    weights, biases = map(list, zip(*((array(weight), array(bias)) for weight, bias in layers), strict=True))
+    if functions is not None:
+        # outputs that are always zero would be units of the last hidden layer
+        used = weights[-1].any(axis=1) | (biases[-1] != 0)
+        weights[-1], biases[-1] = weights[-1][used], biases[-1][used]
+        weights.append(functions[used].T)
+        biases.append(np.zeros(functions.shape[1]))
+    # tanh x is 2 sigmoid(2 x) - 1
+    for k in range(1, len(weights)):
+        weights[k - 1], biases[k - 1] = 2 * weights[k - 1], 2 * biases[k - 1]
+        weights[k], biases[k] = 2 * weights[k], biases[k] - weights[k].sum(axis=1)
+    return Network(tuple(weights), tuple(biases))
 
 
 def _with_outputs(network: Network, rows: np.ndarray) -> Network:
     """Return the network with these of its outputs alone."""
     weights = (*network.weights[:-1], network.weights[-1][rows])
     return Network(weights, (*network.biases[:-1], network.biases[-1][rows]))
-
-
-def _tanh_then(network: Network, functions: np.ndarray) -> Network:
-    """Return the network of tanh(y) @ functions as one with a layer more: tanh x is 2 sigmoid(2 x) - 1."""
-    *weights, last_weight = network.weights
-    *biases, last_bias = network.biases
-    # outputs that are always zero would be units of the last hidden layer
-    used = last_weight.any(axis=1) | (last_bias != 0)
-    functions = functions[used]
-    weights += [2 * last_weight[used], 2 * functions.T]
-    biases += [2 * last_bias[used], -functions.sum(axis=0)]
-    return Network(tuple(weights), tuple(biases))
 
 
 def _splines(terms: ResidualTerms, weights: Tensor) -> Splines:

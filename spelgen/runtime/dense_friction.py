@@ -1,4 +1,4 @@
-"""Friction D = L L^T of all q and qd: a network gives L."""
+"""D(q, qd) = L L^T of a network: a full matrix over all axes of every joint."""
 
 from __future__ import annotations
 
@@ -19,34 +19,24 @@ class DenseFriction(nn.Module):
 
     def __init__(self, joints: Joints, network: Network, axes: int) -> None:
         super().__init__()
+        self.speed, self.nominal = nn.Buffer(vector(joints.speed)), nn.Buffer(vector(joints.friction))
         rows = axes * joints.n
-        self.speed = nn.Buffer(vector(joints.speed))
-        self.nominal = nn.Buffer(vector(joints.friction))
-        moving = slice(axes - 1, None, axes)
         row, column = torch.tril_indices(rows, rows)
         # spreads the numbers of a lower triangle, row by row, over a matrix: (rows, rows, numbers)
         spread = torch.zeros(rows, rows, len(row), dtype=torch.float64)
         spread[row, column, torch.arange(len(row))] = 1.0
-        self.entries = nn.Buffer(spread[moving])
-        self.start = nn.Buffer(FACTOR_START * torch.eye(rows).double()[moving])
+        self.entries = nn.Buffer(spread[axes - 1 :: axes])
+        self.start = nn.Buffer(FACTOR_START * torch.eye(rows).double()[axes - 1 :: axes])
         self.network = network
 
     def prepare(self) -> Layers:
-        """The network's weights made ready for many states."""
+        """Return the network's weights made ready for many states, for the rows of L."""
         size = torch.sqrt(self.nominal / self.speed).unsqueeze(-1)
         output_map = (size.unsqueeze(-1) * self.entries).flatten(0, 1)
         return self.network.prepare(output_map, (size * self.start).flatten())
 
-    def _factor(self, encoded: Tensor, qd: Tensor, layers: Layers) -> Tensor:
+    def forward(self, encoded: Tensor, qd: Tensor, layers: Layers, right: Tensor) -> Tensor:
+        """Return D(q, qd) right, (..., n, k)."""
         rows = self.network.forward(torch.cat([encoded, qd / self.speed], dim=-1), layers)[0]
-        return rows.reshape(*qd.shape[:-1], *self.start.shape)
-
-    def forward(self, encoded: Tensor, qd: Tensor, layers: Layers) -> Tensor:
-        """The friction torque D qd, (..., n) [Nm, N]."""
-        factor = self._factor(encoded, qd, layers)
-        return (factor @ (factor.mT @ qd.unsqueeze(-1))).squeeze(-1)
-
-    def dissipation(self, encoded: Tensor, qd: Tensor, layers: Layers) -> Tensor:
-        """D, (..., n, n)."""
-        factor = self._factor(encoded, qd, layers)
-        return factor @ factor.mT
+        factor = rows.reshape(*qd.shape[:-1], *self.start.shape)
+        return factor @ (factor.mT @ right)

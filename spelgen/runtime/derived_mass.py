@@ -8,7 +8,6 @@ from torch import Tensor, nn
 
 from spelgen.runtime.joints import Joints, Pairs, vector
 from spelgen.runtime.parts import Intermediates, Layers, Network
-from spelgen.runtime.regularisation import PositiveDefiniteBound
 from spelgen.runtime.symmetric import Entries
 
 
@@ -16,8 +15,12 @@ class DerivedMass(nn.Module):
     """M(q), (..., n, n): ``entries`` of functions f and constants c, and the armature.
 
     A function is its first number + the second times a network's output; a constant starts at its first
-    and is trained in units of the second. Where M would not exceed margin times its nominal mean, it is drawn
-    towards that mean (see PositiveDefiniteBound): M is positive definite for all q and weights.
+    and is trained in units of the second.
+
+    M is positive definite for all q and weights: where M - margin C is not, with C the nominal mean of M,
+    M' = C + t (M - C) takes its place. t = 2^-k is the first such power with t |M - C| <= 1 - margin, |.|
+    being at least the norm relative to C. t is constant in pieces, so that derivatives of M' are t times
+    those of M. C has M's own zeros and linear relations, which therefore hold in M'.
     """
 
     kinds = (
@@ -42,7 +45,13 @@ class DerivedMass(nn.Module):
         self.raw_constants = nn.Parameter(vector(start / unit for start, unit in constants))
         self.nominal_armature = nn.Buffer(vector(joints.armature))
         self.raw_armature = nn.Parameter(torch.zeros_like(self.nominal_armature))  # its logarithm
-        self.bound = PositiveDefiniteBound(self._by_outputs()[-1].detach(), margin)
+        center = self._by_outputs()[-1].detach()
+        self.center, self.smallest = nn.Buffer(center), nn.Buffer(margin * center)  # C and margin C
+        size = center.diagonal().rsqrt()
+        relative = size.unsqueeze(-1) * size
+        least = torch.linalg.eigvalsh(relative * center)[0]
+        # an entry's largest part in the norm relative to C, divided by 1 - margin
+        self.unit = nn.Buffer(relative / least / (1 - margin))
 
     def armature(self) -> Tensor:
         """Return the drives' part of M's diagonal, (n,) [kg m^2, kg]."""
@@ -65,19 +74,26 @@ class DerivedMass(nn.Module):
         return self.network.prepare(rows[:-1].flatten(1).mT, offset.flatten())
 
     def forward(self, encoded: Tensor, layers: Layers) -> tuple[Tensor, tuple[Intermediates, Tensor]]:
-        """Return M(q), what the network's derivatives need, and how much of its changes M takes."""
+        """Return M'(q), and, for its derivatives, what those of the network need and t."""
         rows, intermediates = self.network.forward(encoded, layers)
-        mass, fraction = self.bound.forward(rows.reshape(*rows.shape[:-1], *self.bound.center.shape))
-        return mass, (intermediates, fraction)
+        mass = rows.reshape(*rows.shape[:-1], *self.center.shape)
+        part = self.part(mass.detach())
+        return torch.lerp(self.center, mass, part[..., None, None]), (intermediates, part)
+
+    def part(self, mass: Tensor) -> Tensor:
+        """Return t, (...)."""
+        indefinite = torch.linalg.cholesky_ex(mass - self.smallest).info != 0
+        norm = torch.linalg.vector_norm(self.unit * (mass - self.center), dim=(-2, -1))
+        return torch.where(indefinite, torch.exp2(-torch.ceil(torch.log2(norm)).clamp(min=1.0)), 1.0)
 
     def kinetic_vjp(self, qd: Tensor, intermediates: tuple[Intermediates, Tensor]) -> Tensor:
         """Return the derivative of 1/2 qd^T M(q) qd by the encoding."""
-        network, fraction = intermediates
-        half = 0.5 * fraction.unsqueeze(-1) * qd
+        network, part = intermediates
+        half = 0.5 * part.unsqueeze(-1) * qd
         return self.network.vjp(network, (half.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2))
 
     def jvp(self, rate: Tensor, intermediates: tuple[Intermediates, Tensor]) -> Tensor:
         """Return dM/dt, (..., n, n), where the encoding changes at this rate."""
-        network, fraction = intermediates
-        rows = fraction.unsqueeze(-1) * self.network.jvp(network, rate)
-        return rows.reshape(*rows.shape[:-1], *self.bound.center.shape)
+        network, part = intermediates
+        rows = part.unsqueeze(-1) * self.network.jvp(network, rate)
+        return rows.reshape(*rows.shape[:-1], *self.center.shape)

@@ -19,28 +19,24 @@ class JointEncoding(nn.Module):
 
     def __init__(self, joints: Joints) -> None:
         super().__init__()
-        self.prismatic = not all(joints.revolute)
-        self.center = nn.Buffer(vector(joints.center))
-        self.reach = nn.Buffer(vector(joints.reach))
+        self.columns = 2 if all(joints.revolute) else 3
+        self.center, self.reach = nn.Buffer(vector(joints.center)), nn.Buffer(vector(joints.reach))
 
     def forward(self, q: Tensor) -> Tensor:
         """Return the encoding of q."""
-        columns = [q.cos(), q.sin()]
-        return torch.cat([*columns, (q - self.center) / self.reach] if self.prismatic else columns, dim=-1)
+        return torch.cat([q.cos(), q.sin(), (q - self.center) / self.reach][: self.columns], dim=-1)
 
     def jvp(self, encoded: Tensor, qd: Tensor) -> Tensor:
         """Return how fast the encoding changes along qd."""
-        cos, sin = encoded.chunk(3 if self.prismatic else 2, dim=-1)[:2]
-        columns = [-sin * qd, cos * qd]
-        return torch.cat([*columns, qd / self.reach] if self.prismatic else columns, dim=-1)
+        cos, sin, *_ = encoded.chunk(self.columns, dim=-1)
+        return torch.cat([-sin * qd, cos * qd, qd / self.reach][: self.columns], dim=-1)
 
     def vjp(self, encoded: Tensor, cotangent: Tensor) -> Tensor:
         """Return d/dq, (..., n), of what has the derivative ``cotangent`` by the encoding."""
-        columns = 3 if self.prismatic else 2
-        cos, sin = encoded.chunk(columns, dim=-1)[:2]
-        by_cos, by_sin, *by_scaled = cotangent.chunk(columns, dim=-1)
+        cos, sin, *_ = encoded.chunk(self.columns, dim=-1)
+        by_cos, by_sin, *by_scaled = cotangent.chunk(self.columns, dim=-1)
         by_joint = by_sin * cos - by_cos * sin
-        return by_joint + by_scaled[0] / self.reach if self.prismatic else by_joint
+        return by_joint + by_scaled[0] / self.reach if by_scaled else by_joint
 
 
 class NetworkInput(NamedTuple):
@@ -54,8 +50,7 @@ class NetworkInput(NamedTuple):
 
 def joint_input(joints: Joints, chosen: Iterable[int], sensitivity: Sequence[float]) -> NetworkInput:
     """cos q and sin q of revolute joints, the scaled q of prismatic ones, times a joint's sensitivity."""
-    n, encoded = joints.n, (2 if all(joints.revolute) else 3) * joints.n
-    chosen = list(chosen)
+    n, encoded, chosen = joints.n, (2 if all(joints.revolute) else 3) * joints.n, list(chosen)
     turning = [joint for joint in chosen if joints.revolute[joint]]
     sliding = [joint for joint in chosen if not joints.revolute[joint]]
     owners = (*turning, *turning, *sliding)
@@ -65,22 +60,22 @@ def joint_input(joints: Joints, chosen: Iterable[int], sensitivity: Sequence[flo
 
 
 def lie_group_input(joints: Joints, sensitivity: Sequence[float]) -> NetworkInput:
-    """Of each joint the nine numbers of R in SO(3) or the three of r in R^3, times its sensitivity.
-
-    z is the joint's axis, so R = [[cos q, -sin q, 0], [sin q, cos q, 0], [0, 0, 1]].
-    """
-    n = joints.n
-    owners = [joint for joint in range(n) for _ in range(9 if joints.revolute[joint] else 3)]
-    matrix = torch.zeros(len(owners), (2 if all(joints.revolute) else 3) * n, dtype=torch.float64)
-    offset = torch.zeros(len(owners), dtype=torch.float64)
+    """Of each joint, whose axis is z, the nine numbers of R in SO(3) or the three of r in R^3."""
+    columns = 2 if all(joints.revolute) else 3
+    cos, sin, *scaled = torch.eye(columns * joints.n, dtype=torch.float64).chunk(columns)
+    zero = torch.zeros_like(cos[0])
+    owners, rows, offset = [], [], []
     for joint, revolute in enumerate(joints.revolute):
-        first = owners.index(joint)
         if revolute:
-            matrix[[first, first + 4], joint], offset[first + 8] = 1.0, 1.0
-            matrix[first + 1, n + joint], matrix[first + 3, n + joint] = -1.0, 1.0
+            # R by its rows; the last number is one, an offset
+            inputs = [cos[joint], -sin[joint], zero, sin[joint], cos[joint], zero, zero, zero, zero]
         else:
-            matrix[first + 2, 2 * n + joint] = 1.0
-    return NetworkInput(tuple(owners), vector(sensitivity[joint] for joint in owners), matrix, offset)
+            inputs = [zero, zero, scaled[0][joint]]
+        owners += [joint] * len(inputs)
+        rows += inputs
+        offset += [0.0] * (len(inputs) - 1) + [float(revolute)]
+    scale = vector(sensitivity[joint] for joint in owners)
+    return NetworkInput(tuple(owners), scale, torch.stack(rows), vector(offset))
 
 
 def with_velocities(inputs: NetworkInput, joints: Joints, axes: int) -> NetworkInput:
@@ -88,15 +83,13 @@ def with_velocities(inputs: NetworkInput, joints: Joints, axes: int) -> NetworkI
 
     The network then reads the encoding and, behind it, the velocities, (..., encoded + n).
     """
-    n = joints.n
     last = torch.eye(axes, dtype=torch.float64)[:, -1:]
-    velocities = torch.kron(torch.eye(n, dtype=torch.float64), last)
-    owners = (*inputs.joints, *(joint for joint in range(n) for _ in range(axes)))
+    velocities = torch.kron(torch.eye(joints.n, dtype=torch.float64), last)
     return NetworkInput(
-        owners,
-        sensitivity=F.pad(inputs.sensitivity, (0, axes * n), value=1.0),
+        (*inputs.joints, *(joint for joint in range(joints.n) for _ in range(axes))),
+        sensitivity=F.pad(inputs.sensitivity, (0, len(velocities)), value=1.0),
         matrix=torch.ops.aten.block_diag([inputs.matrix, velocities]),
-        offset=F.pad(inputs.offset, (0, axes * n)),
+        offset=F.pad(inputs.offset, (0, len(velocities))),
     )
 
 

@@ -66,34 +66,21 @@ class JointFriction(nn.Module):
         return self.speed * (LEAST_SMOOTHING**2 + (SMOOTHING * self.raw_smoothing.exp()) ** 2).sqrt()
 
     def prepare(self) -> FrictionLayers:
-        """All joints' networks as one: block matrices are faster than a loop over joints.
-
-        Their tanh x is computed as 2 sigmoid(2 x) - 1, whose slope takes one pass.
-        """
+        """Return all joints' networks as one: block matrices are faster than a loop over joints."""
         identity = torch.eye(self.out.shape[0], dtype=self.out.dtype, device=self.out.device)
         return FrictionLayers(
-            weight=2 * (self.weight.mT @ self.matrix).flatten(0, 1),
-            bias=2 * self.bias.flatten(),
-            out=2 * (identity.unsqueeze(-1) * self.out).flatten(1),
-            offset=self.offset - self.out.sum(dim=1),
+            weight=(self.weight.mT @ self.matrix).flatten(0, 1),
+            bias=self.bias.flatten(),
+            out=(identity.unsqueeze(-1) * self.out).flatten(1),
+            offset=self.offset,
             viscous=self.viscous(),
             smoothing=self.coulomb_smoothing_velocity() ** 2,
         )
 
-    def _dry(self, encoded: Tensor, qd: Tensor, direction: Tensor, layers: FrictionLayers) -> Tensor:
-        """Dry friction relative to its usual size, (..., n)."""
-        inputs = torch.cat([encoded, qd, direction], dim=-1)
-        hidden = torch.sigmoid(F.linear(inputs, layers.weight, layers.bias))
-        return F.softplus(F.linear(hidden, layers.out, layers.offset))
-
-    def forward(self, encoded: Tensor, qd: Tensor, layers: FrictionLayers) -> Tensor:
-        """The friction torque D qd, (..., n) [Nm, N]."""
-        direction = qd * torch.rsqrt(qd * qd + layers.smoothing)  # -1 or 1, smooth at standstill
-        dry = self._dry(encoded, qd, direction, layers)
-        return layers.viscous * qd + self.nominal * direction * dry
-
-    def dissipation(self, encoded: Tensor, qd: Tensor, layers: FrictionLayers) -> Tensor:
-        """D, (..., n, n) [Nm s/rad, N s/m], diagonal."""
+    def forward(self, encoded: Tensor, qd: Tensor, layers: FrictionLayers, right: Tensor) -> Tensor:
+        """Return D(q, qd) right, (..., n, k)."""
         smooth_speed = torch.sqrt(qd * qd + layers.smoothing)
-        dry = self._dry(encoded, qd, qd / smooth_speed, layers)
-        return torch.diag_embed(layers.viscous + self.nominal * dry / smooth_speed)
+        inputs = torch.cat([encoded, qd, qd / smooth_speed], dim=-1)
+        hidden = torch.tanh(F.linear(inputs, layers.weight, layers.bias))
+        dry = F.softplus(F.linear(hidden, layers.out, layers.offset))  # relative to its usual size
+        return (layers.viscous + self.nominal * dry / smooth_speed).unsqueeze(-1) * right

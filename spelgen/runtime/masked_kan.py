@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from spelgen.runtime.encoding import NetworkInput, Units, joint_mask
-from spelgen.runtime.parts import Layers
+from spelgen.runtime.parts import Intermediates, Layers
 
 GRID = 4  # bumps on an edge
 SPACING = 2 / (GRID - 1)
@@ -21,9 +21,6 @@ class Bumps(NamedTuple):
 
     distance: Tensor  # distance from each grid point, in grid spacings
     height: Tensor
-
-
-KANIntermediates = tuple[tuple[Bumps, ...], tuple[Tensor, ...], Layers]
 
 
 class MaskedKAN(nn.Module):
@@ -47,58 +44,56 @@ class MaskedKAN(nn.Module):
         self.matrix = nn.Buffer(torch.kron(forth, bumps) + torch.kron(back, bumps.flip(0)))
         still = 1 - inputs.matrix.abs().sum(dim=1, keepdim=True)
         self.offset = nn.Buffer((still * self._bumps(inputs.offset).height).flatten())
-        self.weights = nn.ParameterList()
-        self.biases = nn.ParameterList()
+        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
         below: Units = [(joint,) for joint in inputs.joints]
         for index, units in enumerate(layers):
             mask = joint_mask(units, below).unsqueeze(-1)
             slope = torch.randn(mask.shape, dtype=torch.float64, generator=generator)
             self.weights.append(nn.Parameter(slope * grid / mask.sum(dim=1, keepdim=True).sqrt()))
+            self.biases.append(nn.Parameter(torch.zeros(len(units), dtype=torch.float64)))
             mask = mask * inputs.sensitivity.unsqueeze(-1) if index == 0 else mask
             self.register_buffer(f"mask{index}", mask)
-            self.biases.append(nn.Parameter(torch.zeros(len(units), dtype=torch.float64)))
             below = units
         nn.init.zeros_(self.weights[-1])  # so that nothing is learned yet
 
     def prepare(self, output_map: Tensor, offset: Tensor) -> Layers:
-        """The weights for the encoding as it is, and for offset + output_map y in place of y."""
+        """Return the weights for the encoding as it is, and for offset + output_map y in place of y."""
         weights = [(w * self.get_buffer(f"mask{i}")).flatten(1) for i, w in enumerate(self.weights)]
         biases = list(self.biases)
         biases[0] = biases[0] + weights[0] @ self.offset
         weights[0] = weights[0] @ self.matrix
         weights[-1], biases[-1] = output_map @ weights[-1], offset + output_map @ biases[-1]
-        return Layers(tuple(weights), tuple(biases))
+        return tuple(zip(weights, biases, strict=True))
 
     def _bumps(self, value: Tensor) -> Bumps:
         distance = (value / SPACING).unsqueeze(-1) - self.grid
         return Bumps(distance, torch.exp(-distance * distance))
 
-    def forward(self, encoded: Tensor, layers: Layers) -> tuple[Tensor, KANIntermediates]:
-        """offset + output_map y, (..., rows); and what ``vjp`` and ``jvp`` need."""
+    def forward(self, encoded: Tensor, layers: Layers) -> tuple[Tensor, Intermediates]:
+        """Return offset + output_map y, (..., rows), and what ``vjp`` and ``jvp`` need."""
         bumps, hidden = [self._bumps(encoded)], []
-        for weight, bias in zip(layers.weights[:-1], layers.biases, strict=False):
+        for weight, bias in layers[:-1]:
             hidden.append(torch.tanh(F.linear(bumps[-1].height.flatten(-2), weight, bias)))
             bumps.append(self._bumps(hidden[-1]))
-        y = F.linear(bumps[-1].height.flatten(-2), layers.weights[-1], layers.biases[-1])
-        return y, (tuple(bumps), tuple(hidden), layers)
+        return F.linear(bumps[-1].height.flatten(-2), *layers[-1]), (bumps, hidden, layers)
 
-    def vjp(self, intermediates: KANIntermediates, cotangent: Tensor) -> Tensor:
-        """The reverse sweep: cotangent, (..., rows), times d/d encoded; (..., encoded)."""
+    def vjp(self, intermediates: Intermediates, cotangent: Tensor) -> Tensor:
+        """Return, by the reverse sweep, cotangent, (..., rows), times d/d encoded; (..., encoded)."""
         bumps, hidden, layers = intermediates
-        layer = self._bumps_vjp(bumps[-1], cotangent @ layers.weights[-1])
+        layer = self._bumps_vjp(bumps[-1], cotangent @ layers[-1][0])
         for index in reversed(range(len(hidden))):
             layer = layer * (1 - hidden[index] * hidden[index])
-            layer = self._bumps_vjp(bumps[index], layer @ layers.weights[index])
+            layer = self._bumps_vjp(bumps[index], layer @ layers[index][0])
         return layer
 
     def _bumps_vjp(self, bumps: Bumps, cotangent: Tensor) -> Tensor:
         cotangent = cotangent.reshape(*cotangent.shape[:-1], *bumps.distance.shape[-2:])
         return (-2 / SPACING) * (bumps.distance * bumps.height * cotangent).sum(dim=-1)
 
-    def jvp(self, intermediates: KANIntermediates, tangent: Tensor) -> Tensor:
-        """The forward sweep: d/d encoded times the encoding's tangent; (..., rows)."""
+    def jvp(self, intermediates: Intermediates, tangent: Tensor) -> Tensor:
+        """Return, by the forward sweep, d/d encoded times the encoding's tangent; (..., rows)."""
         bumps, hidden, layers = intermediates
-        for index, weight in enumerate(layers.weights):
+        for index, (weight, _) in enumerate(layers):
             slopes = bumps[index].distance * bumps[index].height
             tangent = F.linear((-2 / SPACING) * (slopes * tangent.unsqueeze(-1)).flatten(-2), weight)
             if index < len(hidden):

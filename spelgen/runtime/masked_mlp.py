@@ -9,15 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from spelgen.runtime.encoding import NetworkInput, Units, joint_mask
-from spelgen.runtime.parts import Layers
-
-MLPIntermediates = tuple[tuple[Tensor, ...], Layers]  # the hidden layers, and the weights
-
-
-def sigmoid_vjp(cotangent: Tensor, value: Tensor) -> Tensor:
-    """cotangent * value (1 - value), the sigmoid's derivative, in one pass over memory."""
-    changed: Tensor = torch.ops.aten.sigmoid_backward(cotangent, value)
-    return changed
+from spelgen.runtime.parts import Intermediates, Layers
 
 
 class MaskedMLP(nn.Module):
@@ -29,58 +21,47 @@ class MaskedMLP(nn.Module):
 
     def __init__(self, inputs: NetworkInput, layers: Sequence[Units], generator: torch.Generator) -> None:
         super().__init__()
-        self.matrix = nn.Buffer(inputs.matrix)
-        self.offset = nn.Buffer(inputs.offset)
-        self.weights = nn.ParameterList()
-        self.biases = nn.ParameterList()
+        self.matrix, self.offset = nn.Buffer(inputs.matrix), nn.Buffer(inputs.offset)
+        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
         below: Units = [(joint,) for joint in inputs.joints]
         for index, units in enumerate(layers):
             mask = joint_mask(units, below)
             weight = torch.randn(mask.shape, dtype=torch.float64, generator=generator)
             self.weights.append(nn.Parameter(weight / mask.sum(dim=1, keepdim=True).sqrt()))
-            mask = mask * inputs.sensitivity if index == 0 else mask
-            self.register_buffer(f"mask{index}", mask)
             self.biases.append(nn.Parameter(torch.zeros(len(units), dtype=torch.float64)))
+            self.register_buffer(f"mask{index}", mask * inputs.sensitivity if index == 0 else mask)
             below = units
         nn.init.zeros_(self.weights[-1])  # so that nothing is learned yet
 
     def prepare(self, output_map: Tensor, offset: Tensor) -> Layers:
-        """The weights for the encoding as it is, and for offset + output_map y in place of y.
+        """Return the weights for the encoding as it is, and for offset + output_map y in place of y."""
+        weights = [weight * self.get_buffer(f"mask{index}") for index, weight in enumerate(self.weights)]
+        biases = list(self.biases)
+        biases[0] = biases[0] + weights[0] @ self.offset
+        weights[0] = weights[0] @ self.matrix
+        weights[-1], biases[-1] = output_map @ weights[-1], offset + output_map @ biases[-1]
+        return tuple(zip(weights, biases, strict=True))
 
-        tanh x is computed as 2 sigmoid(2 x) - 1, whose slope takes one pass.
-        """
-        weights, biases = [], []
-        for index, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            weight = weight * self.get_buffer(f"mask{index}")
-            if index == 0:
-                bias, weight = bias + weight @ self.offset, weight @ self.matrix
-            else:
-                bias, weight = bias - weight.sum(dim=1), 2 * weight
-            weights.append(2 * weight)
-            biases.append(2 * bias)
-        weights[-1] = 0.5 * output_map @ weights[-1]
-        biases[-1] = offset + 0.5 * output_map @ biases[-1]
-        return Layers(tuple(weights), tuple(biases))
-
-    def forward(self, encoded: Tensor, layers: Layers) -> tuple[Tensor, MLPIntermediates]:
-        """offset + output_map y, (..., rows); and what ``vjp`` and ``jvp`` need."""
+    def forward(self, encoded: Tensor, layers: Layers) -> tuple[Tensor, Intermediates]:
+        """Return offset + output_map y, (..., rows), and what ``vjp`` and ``jvp`` need."""
         layer, hidden = encoded, []
-        for weight, bias in zip(layers.weights[:-1], layers.biases, strict=False):
-            layer = torch.sigmoid(F.linear(layer, weight, bias))
+        for weight, bias in layers[:-1]:
+            layer = torch.tanh(F.linear(layer, weight, bias))
             hidden.append(layer)
-        return F.linear(layer, layers.weights[-1], layers.biases[-1]), (tuple(hidden), layers)
+        return F.linear(layer, *layers[-1]), (hidden, layers)
 
-    def vjp(self, intermediates: MLPIntermediates, cotangent: Tensor) -> Tensor:
-        """The reverse sweep: cotangent, (..., rows), times d/d encoded; (..., encoded)."""
+    def vjp(self, intermediates: Intermediates, cotangent: Tensor) -> Tensor:
+        """Return, by the reverse sweep, cotangent, (..., rows), times d/d encoded; (..., encoded)."""
         hidden, layers = intermediates
-        layer = cotangent @ layers.weights[-1]
-        for weight, value in zip(reversed(layers.weights[:-1]), reversed(hidden), strict=True):
-            layer = sigmoid_vjp(layer, value) @ weight
+        layer: Tensor = cotangent @ layers[-1][0]
+        for (weight, _), value in zip(reversed(layers[:-1]), reversed(hidden), strict=True):
+            # layer * (1 - value^2) in one pass over memory
+            layer = torch.ops.aten.tanh_backward(layer, value) @ weight
         return layer
 
-    def jvp(self, intermediates: MLPIntermediates, tangent: Tensor) -> Tensor:
-        """The forward sweep: d/d encoded times the encoding's tangent; (..., rows)."""
+    def jvp(self, intermediates: Intermediates, tangent: Tensor) -> Tensor:
+        """Return, by the forward sweep, d/d encoded times the encoding's tangent; (..., rows)."""
         hidden, layers = intermediates
-        for weight, value in zip(layers.weights[:-1], hidden, strict=True):
-            tangent = sigmoid_vjp(F.linear(tangent, weight), value)
-        return F.linear(tangent, layers.weights[-1])
+        for (weight, _), value in zip(layers[:-1], hidden, strict=True):
+            tangent = torch.ops.aten.tanh_backward(F.linear(tangent, weight), value)
+        return F.linear(tangent, layers[-1][0])

@@ -84,9 +84,9 @@ class NetworkDynamics(PortHamiltonian):
 
     def friction_at(self, pose: NetworkPose, qd: Tensor) -> Tensor:
         """Return D(q, qd) qd, (..., n) [Nm, N]."""
-        return self.friction.forward(pose.encoded, qd, pose.prepared.friction)
+        return self.friction.forward(pose.encoded, qd, pose.prepared.friction, qd.unsqueeze(-1)).squeeze(-1)
 
     def dissipation(self, q: Tensor, qd: Tensor) -> Tensor:
         """Return D(q, qd), (..., n, n) [Nm s/rad, N s/m]."""
         pose: NetworkPose = self.at(q, qd)
-        return self.friction.dissipation(pose.encoded, qd, pose.prepared.friction)
+        return self.friction.forward(pose.encoded, qd, pose.prepared.friction, torch.eye(self.n).to(q))

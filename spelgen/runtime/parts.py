@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 from torch import Tensor
 
@@ -10,13 +10,7 @@ from torch import Tensor
 Intermediates = Any  # what a part's derivatives need of the work done for its values
 Prepared = Any  # all that depends on the weights alone
 Pose = Any  # all that depends on q alone
-
-
-class Layers(NamedTuple):
-    """A network's weights made ready for many states."""
-
-    weights: tuple[Tensor, ...]
-    biases: tuple[Tensor, ...]
+Layers = tuple[tuple[Tensor, Tensor], ...]  # a network's weights and biases, ready for many states
 
 
 class Network(Protocol):
@@ -57,8 +51,5 @@ class Friction(Protocol):
     def prepare(self) -> Prepared:
         """Return all that depends on the weights alone."""
 
-    def forward(self, encoded: Tensor, qd: Tensor, prepared: Prepared) -> Tensor:
-        """Return D qd, (..., n) [Nm, N]."""
-
-    def dissipation(self, encoded: Tensor, qd: Tensor, prepared: Prepared) -> Tensor:
-        """Return D, (..., n, n)."""
+    def forward(self, encoded: Tensor, qd: Tensor, prepared: Prepared, right: Tensor) -> Tensor:
+        """Return D(q, qd) right, (..., n, k)."""
