@@ -230,7 +230,7 @@ def test_its_report_shows_servos_and_replays_and_no_torques(fitted, logs):
     write_json(RunFolder(fitted.folder).evaluation, spelgen.evaluate(fitted, logs[4:]).to_dict())
     page = render_report(fitted.folder)
     told = " ".join(page.split())
-    assert "Worst log replayed: motion 4" in page and told.count('class="line hold"') >= 2
+    assert "Typical log replayed: motion 4" in page and told.count('class="line hold"') >= 2
     kd = f"{number(TRUTH.kd[0] / TRUTH.kp[0])[:4]}"
     assert '<h2 id="servos">Servos</h2>' in page and f"<td>{kd}" in page and "dry/kp of elbow" in told
     assert "<td>command [rad]</td>" in page

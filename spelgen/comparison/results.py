@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
+
+from pydantic import TypeAdapter, ValidationError
 
 from spelgen.comparison.metrics import Prediction, Sizes
 from spelgen.errors import RunError
 from spelgen.evaluation.invariants import Invariants
+from spelgen.evaluation.plain import record
 from spelgen.evaluation.traces import PredictedMotion
 from spelgen.files import read_json, write_json
 
@@ -41,13 +44,11 @@ class RunResult:
 
     def save(self, path: Path) -> None:
         """Write it as JSON."""
-        write_json(path, asdict(self))
+        write_json(path, record(self))
 
     @classmethod
     def read(cls, path: Path) -> RunResult:
         """Read what `save` wrote. Raises RunError."""
-        from pydantic import TypeAdapter, ValidationError  # slow to import
-
         try:
             return TypeAdapter(cls).validate_python(read_json(path, RunError))
         except ValidationError as error:

@@ -15,6 +15,7 @@ from spelgen.comparison.study import Study, Variant
 from spelgen.comparison.truth import mass_error, true_mass
 from spelgen.emission.loading import load_module
 from spelgen.evaluation.invariants import invariants
+from spelgen.evaluation.plain import array, listed
 from spelgen.evaluation.traces import PredictedMotion, predicted_motion
 from spelgen.fitting.fit import RunOptions
 from spelgen.fitting.rollout import LossScales, loss_scales
@@ -89,7 +90,8 @@ def _measure(
     example = predict_example(of_dynamics(variant, model, far), testing, steps, decimation)
     along = []  # no test trajectory may be long enough
     if example is not None:
-        along = model.mass_matrix(torch.tensor(example.q, dtype=torch.float64)).tolist()
+        # at the positions as the file has them
+        along = model.mass_matrix(torch.from_numpy(array(listed(example.q)))).tolist()
     seen = far.q[:, 0]  # M is judged where the arm has been
     return RunResult(
         variant=variant,

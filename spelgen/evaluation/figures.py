@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Self
+
+from pydantic import TypeAdapter
 
 from spelgen.errors import Diagnostic
 from spelgen.evaluation.horizons import Horizon
+from spelgen.evaluation.plain import record
 from spelgen.evaluation.replay import Replay
 from spelgen.evaluation.torque import TorqueErrors
 from spelgen.evaluation.traces import Traces
@@ -41,11 +44,9 @@ class Figures:
 
     def to_dict(self) -> dict[str, object]:
         """Return the JSON form, versioned by `schema`."""
-        return {"schema": SCHEMA} | asdict(self)
+        return {"schema": SCHEMA} | record(self)
 
     @classmethod
-    def from_dict(cls, record: Mapping[str, object]) -> Self:
+    def from_dict(cls, content: Mapping[str, object]) -> Self:
         """Return what `to_dict` gave. Raises ValueError where it is something else."""
-        from pydantic import TypeAdapter  # slow to import
-
-        return TypeAdapter(cls).validate_python(record)
+        return TypeAdapter(cls).validate_python(content)

@@ -1,14 +1,13 @@
-"""Numbers as JSON has them: five digits, None where not finite."""
+"""Curves, and numbers as JSON has them: five digits, None where not finite."""
 
 from __future__ import annotations
 
 import math
+from typing import Annotated, Any
 
 import numpy as np
 import torch
-
-Series = list[float | None]
-Rows = list[Series]
+from pydantic import PlainSerializer, PlainValidator, TypeAdapter
 
 
 def number(value: float) -> float | None:
@@ -18,14 +17,26 @@ def number(value: float) -> float | None:
     return None
 
 
-def series(values: np.ndarray | torch.Tensor) -> Series:
-    """Return (T,) as a list."""
-    return list(map(number, values.tolist()))
+def listed(values: np.ndarray) -> Any:
+    """Return an array as numbers in nested lists."""
+    if values.ndim == 0:
+        return number(values.item())
+    return list(map(listed, values))
 
 
-def rows(values: np.ndarray | torch.Tensor) -> Rows:
-    """Return (T, n) as a list of lists."""
-    return list(map(series, values))
+def array(values: object) -> np.ndarray:
+    """Return what `listed` gave as an array, NaN where not finite."""
+    return np.array(values, dtype=float)
+
+
+Curve = Annotated[np.ndarray, PlainValidator(array), PlainSerializer(listed)]
+"""Numbers along a trajectory: an array here, nested lists in JSON."""
+
+
+def record(value: object) -> dict[str, Any]:
+    """Return the JSON form of a dataclass, which may have curves."""
+    fields: dict[str, Any] = TypeAdapter(type(value)).dump_python(value)
+    return fields
 
 
 def finite(values: np.ndarray | torch.Tensor) -> tuple[float | None, ...]:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from spelgen.dynamics.protocol import known_past
 from spelgen.errors import Diagnostic
@@ -41,13 +42,8 @@ def torque_errors(dynamics: Any, samples: Sequence[DynamicsSamples]) -> TorqueEr
     """Return the errors of an inverse dynamics on these samples, of which those of pauses count apart."""
     residuals, torques, moving, by_trajectory = [], [], [], {}
     for sample in samples:
-        q, qd, qdd = map(torch.from_numpy, (sample.q, sample.qd, sample.qdd))
-        z = None if sample.z is None else torch.from_numpy(sample.z)
-        direction = None if sample.direction is None else torch.from_numpy(sample.direction)
-        with torch.no_grad():
-            predicted = dynamics.inverse_dynamics(q, qd, qdd, *known_past(dynamics, z, direction))
-        residual, rows = predicted.numpy() - sample.tau, is_moving(sample.qd)
-        by_trajectory[sample.name] = _mean(_nmse(residual[rows], sample.tau[rows]))
+        residual, rows = predicted_torques(dynamics, sample) - sample.tau, is_moving(sample.qd)
+        by_trajectory[sample.name] = mean_nmse(residual[rows], sample.tau[rows])
         residuals.append(residual)
         torques.append(sample.tau)
         moving.append(rows)
@@ -58,8 +54,28 @@ def torque_errors(dynamics: Any, samples: Sequence[DynamicsSamples]) -> TorqueEr
         mean_nmse=_mean(by_joint),
         rmse=finite(np.sqrt(np.square(residual[rows]).mean(axis=0))),
         joint_nmse=finite(by_joint),
-        nmse_with_pauses=_mean(_nmse(residual, torque)),
+        nmse_with_pauses=mean_nmse(residual, torque),
     )
+
+
+def predicted_torques(dynamics: Any, samples: DynamicsSamples) -> np.ndarray:
+    """Return the torques of an inverse dynamics on these samples, (T, n)."""
+    q, qd, qdd = map(torch.from_numpy, (samples.q, samples.qd, samples.qdd))
+    with torch.no_grad():
+        torques: np.ndarray = dynamics.inverse_dynamics(q, qd, qdd, *friction_past(dynamics, samples)).numpy()
+    return torques
+
+
+def friction_past(dynamics: Any, samples: DynamicsSamples) -> tuple[Tensor, ...]:
+    """Return what dynamics take of the friction's state on these samples, see `known_past`."""
+    z = None if samples.z is None else torch.from_numpy(samples.z)
+    direction = None if samples.direction is None else torch.from_numpy(samples.direction)
+    return known_past(dynamics, z, direction)
+
+
+def mean_nmse(residual: np.ndarray, torque: np.ndarray) -> float | None:
+    """Return the nMSE as a mean over joints; None where no torque varies or an error is not finite."""
+    return _mean(_nmse(residual, torque))
 
 
 def _nmse(residual: np.ndarray, torque: np.ndarray) -> np.ndarray:

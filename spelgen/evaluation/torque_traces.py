@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from scipy.integrate import cumulative_trapezoid
 
 from spelgen.baselines.names import MODEL
 from spelgen.dynamics.bristles import bristles_along, direction_along
-from spelgen.dynamics.protocol import known_past
 from spelgen.evaluation.horizons import JudgedLogs
-from spelgen.evaluation.plain import Rows, Series, rows, series
-from spelgen.logs.dynamics_samples import FREQUENCY, dynamics_samples
+from spelgen.evaluation.plain import Curve
+from spelgen.evaluation.torque import friction_past, mean_nmse, predicted_torques
+from spelgen.logs.dynamics_samples import FREQUENCY, DynamicsSamples, dynamics_samples
 from spelgen.logs.rates import shows_accelerations
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.tuning.evaluation import TraceTuning
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 TUNING = TraceTuning()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TorqueTrace:
     """Torques (T, n) along ten seconds of the log of middle ("typical") or largest ("worst") error.
 
@@ -37,85 +37,69 @@ class TorqueTrace:
 
     which: str
     trajectory: str
-    t: Series
-    q: Rows
-    qd: Rows
-    measured: Rows
-    predicted: dict[str, Rows]
-    parts: dict[str, Rows]
-    energy: dict[str, Series]
+    t: Curve
+    q: Curve
+    qd: Curve
+    measured: Curve
+    predicted: dict[str, Curve]
+    parts: dict[str, Curve]
+    energy: dict[str, Curve]
 
 
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """What was measured at T times; z: the state of friction, with which it came there.
-
-    direction: (T, n) of dry friction without memory, filtered as tau was.
-    """
-
-    t: Tensor
-    q: Tensor
-    qd: Tensor
-    qdd: Tensor
-    tau: Tensor
-    z: Tensor
-    direction: Tensor
+Motion = tuple[np.ndarray, DynamicsSamples]
+"""Times (T,) [s], and the samples at them."""
 
 
 def torque_traces(dynamics: Mapping[str, RigidDynamics], logs: JudgedLogs) -> tuple[TorqueTrace, ...]:
     """Return the traces of the log of middle error and of that of largest error by the model, if there are two."""
-    model = dynamics[MODEL]
-    motions, errors = {}, {}
+    motions: list[Motion] = []
+    errors = []
     for piece in logs.pieces:
-        motion = _motion(piece, logs)
-        if motion is None:
+        motion = _sparse_motion(piece, logs)
+        if shows_accelerations(piece.sample_rate):
+            motion = _dense_motion(piece, logs)
+        if len(motion[0]) < 2:
             continue
-        with torch.no_grad():
-            missed = _inverse_dynamics(model, motion) - motion.tau
-        # a torque that never varies would weigh infinitely
-        nmse = missed.square().mean(dim=0) / motion.tau.var(dim=0).clamp(min=1e-12)
-        motions[piece.name] = motion
-        errors[piece.name] = nmse.mean().nan_to_num(nan=math.inf).item()
-    order = sorted(errors, key=lambda name: (errors[name], name))
-    if not order:
-        return ()
-    chosen = {"typical": order[(len(order) - 1) // 2]}
+        t, samples = _middle(*motion)
+        error = mean_nmse(predicted_torques(dynamics[MODEL], samples) - samples.tau, samples.tau)
+        motions.append((t, samples))
+        errors.append(math.inf if error is None else error)
+    chosen = typical_and_worst(errors)
+    return tuple(_trace(which, dynamics, *motions[k]) for which, k in chosen.items())
+
+
+def typical_and_worst(errors: Sequence[float]) -> dict[str, int]:
+    """Return which of these errors is in the middle, and which is the largest of several."""
+    # stable: the same logs give the same page
+    order = np.argsort(np.nan_to_num(errors, nan=math.inf), kind="stable").tolist()
+    chosen = {}
+    if order:
+        chosen["typical"] = order[(len(order) - 1) // 2]
     if len(order) > 1:
         chosen["worst"] = order[-1]
-    return tuple(_trace(which, name, dynamics, motions[name]) for which, name in chosen.items())
+    return chosen
 
 
-def _inverse_dynamics(dynamics: Any, motion: Motion) -> Tensor:
-    torque = dynamics.inverse_dynamics(
-        motion.q, motion.qd, motion.qdd, *known_past(dynamics, motion.z, motion.direction)
-    )
-    return torch.as_tensor(torque)
-
-
-def _motion(piece: Trajectory, logs: JudgedLogs) -> Motion | None:
-    """Return up to ten seconds from the middle of what moves; None where nothing does."""
-    motion: Motion | None = _sparse_motion(piece, logs)
-    if shows_accelerations(piece.sample_rate):
-        motion = _dense_motion(piece, logs)
-    if motion is None:
-        return None
-    t = motion.t - motion.t[0]
-    count = min(len(t), int(torch.searchsorted(t, TUNING.torque_seconds)) + 1)
-    start = (len(t) - count) // 2  # logs begin and end at rest
+def _middle(t: np.ndarray, samples: DynamicsSamples) -> Motion:
+    """Return up to ten seconds from the middle: logs begin and end at rest."""
+    count = min(len(t), int(np.searchsorted(t - t[0], TUNING.torque_seconds)) + 1)
+    start = (len(t) - count) // 2
     span = slice(start, start + count)
-    return Motion(t[span] - t[start], *(x[span] for x in list(vars(motion).values())[1:]))
+    columns: dict[str, Any] = {
+        name: x[span] for name, x in vars(samples).items() if isinstance(x, np.ndarray)
+    }
+    return t[span] - t[start], replace(samples, **columns)
 
 
-def _dense_motion(piece: Trajectory, logs: JudgedLogs) -> Motion | None:
+def _dense_motion(piece: Trajectory, logs: JudgedLogs) -> Motion:
+    """Return the samples that move, none where nothing does."""
     used = logs.used
     # pieces are filtered and their torques moved already
     used = replace(used, torque_delay=0.0, cutoff=0.0 if used.filtered else used.cutoff)
-    samples = dynamics_samples([piece], pauses=True, preprocessing=used, reach=logs.reach)
-    if not samples or len(samples[0].q) < 2:
-        return None
-    moving = samples[0]
-    t = np.arange(len(moving.q)) / FREQUENCY
-    return _tensors(t, moving.q, moving.qd, moving.qdd, moving.tau, moving.z, moving.direction)
+    moving = dynamics_samples([piece], pauses=True, preprocessing=used, reach=logs.reach)
+    if not moving:
+        return np.zeros(0), DynamicsSamples(piece.name, *[np.zeros(0)] * 4)
+    return np.arange(len(moving[0].q)) / FREQUENCY, moving[0]
 
 
 def _sparse_motion(piece: Trajectory, logs: JudgedLogs) -> Motion:
@@ -129,9 +113,8 @@ def _sparse_motion(piece: Trajectory, logs: JudgedLogs) -> Motion:
         tau = _midpoints(piece.tau)
     qd = _midpoints(piece.qd)
     qdd = np.diff(piece.qd, axis=0) / np.diff(piece.t)[:, None]
-    return _tensors(
-        _midpoints(piece.t), _midpoints(piece.q), qd, qdd, tau, z, direction_along(qd, logs.reach)
-    )
+    direction = direction_along(qd, logs.reach)
+    return _midpoints(piece.t), DynamicsSamples(piece.name, _midpoints(piece.q), qd, qdd, tau, z, direction)
 
 
 def _midpoints(x: np.ndarray) -> np.ndarray:
@@ -139,67 +122,58 @@ def _midpoints(x: np.ndarray) -> np.ndarray:
     return middle
 
 
-def _tensors(
-    t: np.ndarray,
-    q: np.ndarray,
-    qd: np.ndarray,
-    qdd: np.ndarray,
-    tau: np.ndarray,
-    z: np.ndarray | None,
-    direction: np.ndarray | None,
-) -> Motion:
-    """Return the motion; friction without a state takes no direction but that of qd."""
-    if z is None:
-        z = np.zeros((*q.shape, 0))
-    if direction is None:
-        direction = np.sign(qd)
-    arrays = map(np.ascontiguousarray, (t, q, qd, qdd, tau, z, direction))
-    return Motion(*map(torch.from_numpy, arrays))
-
-
-def _trace(which: str, name: str, dynamics: Mapping[str, RigidDynamics], motion: Motion) -> TorqueTrace:
-    t, q, qd = motion.t, motion.q, motion.qd
+def _trace(
+    which: str, dynamics: Mapping[str, RigidDynamics], t: np.ndarray, samples: DynamicsSamples
+) -> TorqueTrace:
     model: Any = dynamics[MODEL]
-    inputs = torch.eye(q.shape[-1], dtype=q.dtype)
+    q, qd, qdd = map(torch.from_numpy, (samples.q, samples.qd, samples.qdd))
+    inputs = np.eye(q.shape[-1])
     with torch.no_grad():
         if hasattr(model, "input_matrix"):  # gears may stand between a motor and a joint
-            inputs = model.input_matrix(q)
-        predicted = {}
-        for label, predictor in dynamics.items():
-            torque = _inverse_dynamics(predictor, motion)
-            predicted[label] = (inputs @ torque.unsqueeze(-1)).squeeze(-1)
-        measured = (inputs @ motion.tau.unsqueeze(-1)).squeeze(-1)
-        gravity = torch.as_tensor(model.gravity(q))
+            inputs = model.input_matrix(q).numpy()
+        gravity = model.gravity(q)
         parts = {
-            "inertia": (torch.as_tensor(model.mass_matrix(q)) @ motion.qdd.unsqueeze(-1)).squeeze(-1),
-            "Coriolis": torch.as_tensor(model.nonlinear_effects(q, qd)) - gravity,
-            "gravity": gravity,
-            "friction": torch.as_tensor(
-                model.friction_torque(q, qd, *known_past(model, motion.z, motion.direction))
-            ),
+            "inertia": (model.mass_matrix(q) @ qdd.unsqueeze(-1)).squeeze(-1).numpy(),
+            "Coriolis": (model.nonlinear_effects(q, qd) - gravity).numpy(),
+            "gravity": gravity.numpy(),
+            "friction": model.friction_torque(q, qd, *friction_past(model, samples)).numpy(),
         }
-    energy = _energy(t, qd, measured, predicted[MODEL], parts)
+    predicted = {}
+    for name, predictor in dynamics.items():
+        predicted[name] = _at_joints(inputs, predicted_torques(predictor, samples))
+    measured = _at_joints(inputs, samples.tau)
+    energy = _energy(t, samples.qd, measured, predicted[MODEL], parts)
     stride = -(-len(t) // TUNING.samples)
     return TorqueTrace(
-        which,
-        name,
-        series(t[::stride]),
-        rows(q[::stride]),
-        rows(qd[::stride]),
-        rows(measured[::stride]),
-        _thinned(predicted, stride),
-        _thinned(parts, stride),
-        {label: series(work[::stride]) for label, work in energy.items()},
+        which=which,
+        trajectory=samples.name,
+        t=t[::stride],
+        q=samples.q[::stride],
+        qd=samples.qd[::stride],
+        measured=measured[::stride],
+        predicted=_thinned(predicted, stride),
+        parts=_thinned(parts, stride),
+        energy=_thinned(energy, stride),
     )
 
 
-def _thinned(torques: Mapping[str, Tensor], stride: int) -> dict[str, Rows]:
-    return {label: rows(torque[::stride]) for label, torque in torques.items()}
+def _at_joints(inputs: np.ndarray, torques: np.ndarray) -> np.ndarray:
+    """Return the joints' torques of the motors'."""
+    by_joint: np.ndarray = (inputs @ torques[..., None])[..., 0]
+    return by_joint
+
+
+def _thinned(curves: Mapping[str, np.ndarray], stride: int) -> dict[str, np.ndarray]:
+    return {label: curve[::stride] for label, curve in curves.items()}
 
 
 def _energy(
-    t: Tensor, qd: Tensor, measured: Tensor, predicted: Tensor, parts: Mapping[str, Tensor]
-) -> dict[str, Tensor]:
+    t: np.ndarray,
+    qd: np.ndarray,
+    measured: np.ndarray,
+    predicted: np.ndarray,
+    parts: Mapping[str, np.ndarray],
+) -> dict[str, np.ndarray]:
     """Return where the drives' work went since the start, (T,) [J]: stored, lost to friction, not explained.
 
     Powers are of the model's torques on the measured motion; an offset of the torque is with the friction.
@@ -213,6 +187,5 @@ def _energy(
     }
     work = {}
     for name, torque in torques.items():
-        power = (torque * qd).sum(dim=-1)
-        work[name] = torch.cat([power.new_zeros(1), torch.cumulative_trapezoid(power, t)])
+        work[name] = cumulative_trapezoid((torque * qd).sum(axis=-1), t, initial=0)
     return work

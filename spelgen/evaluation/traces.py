@@ -1,6 +1,6 @@
 """The curves behind the figures of an evaluation: for pages, and for programs as `traces` of evaluation.json.
 
-All are plain lists and numbers [rad, m, s, Nm, N, kg m^2, J], rounded to five digits; None where not finite.
+All are arrays [rad, m, s, Nm, N, kg m^2, J], NaN where a number is not known; JSON has them to five digits.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from spelgen.baselines.names import MODEL, is_drawn
 from spelgen.baselines.predictor import Predictor
 from spelgen.baselines.solver import States
 from spelgen.evaluation.horizons import JudgedLogs, Predictions
-from spelgen.evaluation.plain import Rows, Series, number, rows, series
+from spelgen.evaluation.plain import Curve, number
 from spelgen.evaluation.replay import Missed
 from spelgen.evaluation.state_errors import TipPosition
-from spelgen.evaluation.torque_traces import TorqueTrace, torque_traces
+from spelgen.evaluation.torque_traces import TorqueTrace, torque_traces, typical_and_worst
 from spelgen.fitting.rollout import AT_REST, LossScales, loss_scales, position_difference
 from spelgen.logs.coverage import coverage
 from spelgen.logs.trajectory import Trajectory
@@ -33,91 +33,85 @@ if TYPE_CHECKING:
 TUNING = TraceTuning()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Quantiles:
     """10, 50 and 90 % of the starts have at most these errors, by time."""
 
-    low: Series
-    median: Series
-    high: Series
+    low: Curve
+    median: Curve
+    high: Curve
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Growth:
     """How errors grow with time [s], by predictor: relative to the motion, and of the tip [mm] where it is known."""
 
-    seconds: Series
+    seconds: Curve
     windows: int
     relative: dict[str, Quantiles]
     tip_mm: dict[str, Quantiles]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class PredictedMotion:
-    """A predicted piece of a trajectory beside what was measured, (T, n); t counts from its first sample [s]."""
+    """A piece of a trajectory beside what was measured, (T, n); t counts from its first sample [s].
 
-    t: Series
-    q: Rows
-    qd: Rows
-    predicted_q: Rows
-    predicted_qd: Rows
+    u: commands of position servos, whose velocities are not judged.
+    """
+
+    t: Curve
+    q: Curve
+    predicted_q: Curve
+    qd: Curve | None = None
+    predicted_qd: Curve | None = None
+    u: Curve | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class PredictedExample(PredictedMotion):
-    """A prediction of the model, of middle ("typical") or largest ("worst") error, that starts at this time [s]."""
+    """A prediction of the model, of middle ("typical") or largest ("worst") error, that starts at this time [s].
 
-    which: str
-    trajectory: str
-    start: float | None
-    error: float | None
-
-
-@dataclass(frozen=True)
-class ReplayedExample:
-    """A log replayed by a model of position servos: measured, commanded and predicted positions, (T, n)."""
+    start: None of a log that is replayed as a whole.
+    """
 
     which: str
     trajectory: str
     error: float | None
-    t: Series
-    q: Rows
-    u: Rows
-    predicted_q: Rows
+    start: float | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MassCurves:
     """The lower triangle of M, row by row, and its eigenvalues along a trajectory; (entries, T) and (n, T)."""
 
-    entries: Rows
-    eigenvalues: Rows
+    entries: Curve
+    eigenvalues: Curve
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MassTrace:
     """M along a trajectory by predictor."""
 
     trajectory: str
-    t: Series
+    t: Curve
     by: dict[str, MassCurves]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FrictionTrace:
     """Friction by velocity: (n, T) by predictor, each joint alone at the mean position."""
 
-    qd: Rows
-    by: dict[str, Rows]
+    qd: Curve
+    by: dict[str, Curve]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Traces:
     """All curves; coverage: of the test logs, see `logs.coverage`."""
 
     coverage: dict[str, object]
     growth: Growth | None = None
-    trajectories: tuple[PredictedExample | ReplayedExample, ...] = ()
+    trajectories: tuple[PredictedExample, ...] = ()
     torques: tuple[TorqueTrace, ...] = ()
     mass: MassTrace | None = None
     friction: FrictionTrace | None = None
@@ -152,30 +146,22 @@ def replay_traces(missed: Sequence[Missed]) -> Traces:
     """Return the logs of middle and of largest error of an arm under position servos."""
     errors = [float(np.sqrt(np.square(error).mean())) for _, error in missed]
     examples = []
-    for which, k in _typical_and_worst(torch.tensor(errors)).items():
+    for which, k in typical_and_worst(errors).items():
         log, error = missed[k]
         assert log.u is not None  # a log without commands cannot be replayed
         stride = -(-len(log) // TUNING.log_samples)
         predicted = np.concatenate([log.q[:1], log.q[1:] + error])
-        examples.append(
-            ReplayedExample(
-                which,
-                log.name,
-                number(errors[k]),
-                series((log.t - log.t[0])[::stride]),
-                rows(log.q[::stride]),
-                rows(log.u[::stride]),
-                rows(predicted[::stride]),
-            )
+        example = PredictedExample(
+            which=which,
+            trajectory=log.name,
+            error=number(errors[k]),
+            t=(log.t - log.t[0])[::stride],
+            q=log.q[::stride],
+            u=log.u[::stride],
+            predicted_q=predicted[::stride],
         )
+        examples.append(example)
     return Traces(coverage([log for log, _ in missed]), trajectories=tuple(examples))
-
-
-def _typical_and_worst(errors: Tensor) -> dict[str, int]:
-    """Return which of these (N,) is in the middle, and which the largest."""
-    # stable: the same logs give the same page
-    order = errors.nan_to_num(nan=torch.inf).argsort(stable=True)
-    return {"typical": int(order[len(order) // 2]), "worst": int(order[-1])}
 
 
 def _growth(predictions: Predictions, joint_types: Sequence[str], tip: TipPosition | None) -> Growth:
@@ -194,7 +180,7 @@ def _growth(predictions: Predictions, joint_types: Sequence[str], tip: TipPositi
             measured = tip(windows.q[:, 1:][:, times])
             tips[name] = _quantiles(1000 * (tip(states[0][:, times]) - measured).norm(dim=-1))
     seconds = windows.dt.cumsum(dim=1).mean(dim=0)[times]
-    return Growth(series(seconds), len(windows), relative, tips)
+    return Growth(seconds.numpy(), len(windows), relative, tips)
 
 
 def _relative_errors(
@@ -209,22 +195,27 @@ def _relative_errors(
 
 def _quantiles(values: Tensor) -> Quantiles:
     """Return those over windows of (W, T); what is not finite counts as infinite."""
-    ordered = values.nan_to_num(nan=torch.inf).sort(dim=0).values
+    ordered = values.nan_to_num(nan=torch.inf).sort(dim=0).values.numpy()
     last = len(ordered) - 1
-    return Quantiles(*(series(ordered[round(part * last)]) for part in (0.1, 0.5, 0.9)))
+    return Quantiles(*(ordered[round(part * last)] for part in (0.1, 0.5, 0.9)))
 
 
 def _examples(predictions: Predictions, joint_types: Sequence[str]) -> tuple[PredictedExample, ...]:
     windows, states = predictions.windows, predictions.states[MODEL]
-    errors = _relative_errors(states, windows, loss_scales(windows, joint_types), joint_types)[:, -1]
+    errors = _relative_errors(states, windows, loss_scales(windows, joint_types), joint_types)[:, -1].tolist()
     stride = -(-windows.dt.shape[1] // TUNING.samples)
     examples = []
-    for which, k in _typical_and_worst(errors).items():
+    for which, k in typical_and_worst(errors).items():
         piece, first = predictions.starts[k]
-        start, error = number(piece.t[first] - piece.t[0]), number(errors[k].item())
         motion = predicted_motion(windows, states, k, stride)
         examples.append(
-            PredictedExample(**vars(motion), which=which, trajectory=piece.name, start=start, error=error)
+            PredictedExample(
+                **vars(motion),
+                which=which,
+                trajectory=piece.name,
+                start=number(piece.t[first] - piece.t[0]),
+                error=number(errors[k]),
+            )
         )
     return tuple(examples)
 
@@ -233,11 +224,11 @@ def predicted_motion(windows: Windows, states: States, k: int = 0, stride: int =
     """Return window k with what was predicted of it."""
     predicted_q, predicted_qd = states
     return PredictedMotion(
-        t=series(torch.cat([windows.dt.new_zeros(1), windows.dt[k].cumsum(dim=0)])[::stride]),
-        q=rows(windows.q[k][::stride]),
-        qd=rows(windows.qd[k][::stride]),
-        predicted_q=rows(torch.cat([windows.q[k, :1], predicted_q[k]])[::stride]),
-        predicted_qd=rows(torch.cat([windows.qd[k, :1], predicted_qd[k]])[::stride]),
+        t=torch.cat([windows.dt.new_zeros(1), windows.dt[k].cumsum(dim=0)])[::stride].numpy(),
+        q=windows.q[k][::stride].numpy(),
+        qd=windows.qd[k][::stride].numpy(),
+        predicted_q=torch.cat([windows.q[k, :1], predicted_q[k]])[::stride].numpy(),
+        predicted_qd=torch.cat([windows.qd[k, :1], predicted_qd[k]])[::stride].numpy(),
     )
 
 
@@ -249,15 +240,14 @@ def _mass_trace(
         return None
     along = trajectories[0]
     stride = -(-len(along.t) // TUNING.samples)
-    q = torch.tensor(along.q, dtype=torch.float64)[::stride]
-    row, column = torch.tril_indices(q.shape[-1], q.shape[-1])
+    q = torch.from_numpy(along.q[::stride].copy())
+    row, column = np.tril_indices(q.shape[-1])
     curves = {}
     for name, predictor in dynamics.items():
         with torch.no_grad():
-            mass = torch.as_tensor(predictor.mass_matrix(q))
-        if mass.isfinite().all():  # else it has no eigenvalues
-            eigenvalues = torch.linalg.eigvalsh(mass)
-            curves[name] = MassCurves(rows(mass[:, row, column].mT), rows(eigenvalues.mT))
+            mass = torch.as_tensor(predictor.mass_matrix(q)).numpy()
+        if np.isfinite(mass).all():  # else it has no eigenvalues
+            curves[name] = MassCurves(mass[:, row, column].T, np.linalg.eigvalsh(mass).T)
     return MassTrace(along.trajectory, along.t[::stride], curves)
 
 
@@ -274,5 +264,5 @@ def _friction_trace(dynamics: Mapping[str, RigidDynamics], pieces: Sequence[Traj
         with torch.no_grad():
             alone = torch.diag_embed(speeds)  # one joint at a time
             torque = torch.as_tensor(predictor.friction_torque(middle.expand(len(speeds), n, n), alone))
-        curves[name] = rows(torch.diagonal(torque, dim1=-2, dim2=-1).mT)
-    return FrictionTrace(rows(speeds.mT), curves)
+        curves[name] = torch.diagonal(torque, dim1=-2, dim2=-1).mT.numpy()
+    return FrictionTrace(speeds.mT.numpy(), curves)

@@ -249,18 +249,12 @@ def _worst_joint(results: Figures) -> _Failure:
 
 def _slow_or_fast(results: Figures, k: int) -> str:
     """Return at which speed of joint k the residuals of its torque are larger, where they differ."""
-    traces = results.traces.torques
-    if not traces:
-        return ""
-    residuals, speeds = [], []
-    for trace in traces:
-        measured, predicted = (
-            np.array(x, dtype=float)[:, k] for x in (trace.measured, trace.predicted[MODEL])
-        )
-        residuals.append(measured - predicted)
-        speeds.append(np.abs(np.array(trace.qd, dtype=float)[:, k]))
+    residuals, speeds = [np.zeros(0)], [np.zeros(0)]
+    for trace in results.traces.torques:
+        residuals.append(trace.measured[:, k] - trace.predicted[MODEL][:, k])
+        speeds.append(np.abs(trace.qd[:, k]))
     residual, speed = np.concatenate(residuals), np.concatenate(speeds)
-    slow = speed < TUNING.slow * np.nanmax(speed)
+    slow = speed < TUNING.slow * np.nanmax(speed, initial=0.0)
     # a handful of samples tells no root mean square
     if not 5 < slow.sum() < len(slow) - 5:
         return ""

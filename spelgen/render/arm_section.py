@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,9 +14,11 @@ from spelgen.baselines.names import MODEL
 from spelgen.certificate.facts import facts
 from spelgen.certificate.formulas import formulas
 from spelgen.certificate.printing import Text
+from spelgen.evaluation.plain import Curve, record
+from spelgen.evaluation.traces import Traces
 from spelgen.labels import entry_name, joint_ranges, joints_in_ranges
 from spelgen.render.page import json_data
-from spelgen.render.plots import Record, numbers
+from spelgen.render.plots import Record
 from spelgen.render.scene import scene
 from spelgen.settings.tuning.render import TUNING
 from spelgen.structure.structure import Structure
@@ -38,16 +39,16 @@ class Cell:
     explanation: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Motion:
     """A motion for the script: t [s] and q, (T, n). error: by joint, 1 for the worst colour. predicted: of q."""
 
     name: str
     label: str
-    t: Sequence[float]
-    q: Sequence[Sequence[float]]
-    error: Sequence[Sequence[float | None]] | None = None
-    predicted: Sequence[Sequence[float | None]] | None = None
+    t: Curve
+    q: Curve
+    error: Curve | None = None
+    predicted: Curve | None = None
 
 
 @dataclass(frozen=True)
@@ -100,49 +101,45 @@ def _explanations(arm: Arm, structure: Structure) -> dict[str, str]:
 
 
 def arm_section(
-    arm: Arm, urdf: Path, traces: Record | None = None, identified: Record | None = None
+    arm: Arm, urdf: Path, traces: Traces | None = None, identified: Record | None = None
 ) -> ArmSection:
     """Return the arm with the motions of an evaluation's traces, or, without, one through its ranges."""
     drawn = scene(urdf, arm.joint_names)
-    motions = _motions(traces or {}) or [_sweep(arm)]
+    motions = [_sweep(arm)] if traces is None else _motions(traces) or [_sweep(arm)]
     unseen = _unseen(arm, identified or {})
     colours = []
     if motions[0].error is not None:
         colours.append("error")
     if unseen is not None:
         colours.append("known")
-    data = drawn.to_dict() | {"motions": list(map(vars, motions)), "identifiability": unseen}
+    data = drawn.to_dict() | {"motions": list(map(record, motions)), "identifiability": unseen}
     labels = tuple(motion.label for motion in motions)
     return ArmSection(json_data(data), labels, tuple(colours), drawn.has_meshes)
 
 
-def _motions(traces: Record) -> list[Motion]:
+def _motions(traces: Traces) -> list[Motion]:
     """Return predictions, coloured by the error of their positions; then torques, coloured by their residual."""
     motions = []
-    for example in traces.get("trajectories", ()):
-        q, predicted = numbers(example["q"]), numbers(example["predicted_q"])
-        extent = np.ptp(q, axis=0)
+    for example in traces.trajectories:
+        extent = np.ptp(example.q, axis=0)
         # a joint that hardly moved is measured by the motion of the others
-        error = np.abs(predicted - q) / np.maximum(extent, 1e-2 * extent.max() + 1e-9)
-        name = f"prediction {example['which']}"
-        label = f"{example['which']} prediction beside what was measured ({example['trajectory']})"
-        colour = _colour(error)
-        motions.append(Motion(name, label, example["t"], example["q"], colour, example["predicted_q"]))
-    for trace in traces.get("torques", ()):
-        measured, predicted = numbers(trace["measured"]), numbers(trace["predicted"][MODEL])
-        error = np.abs(measured - predicted) / np.maximum(measured.std(axis=0), 1e-9)
-        name = f"torque {trace['which']}"
-        label = f"residual torque, {trace['which']} trajectory ({trace['trajectory']})"
-        motions.append(Motion(name, label, trace["t"], trace["q"], _colour(error)))
+        size = np.maximum(extent, 1e-2 * extent.max() + 1e-9)
+        colour = _colour(example.predicted_q - example.q, size)
+        name = f"prediction {example.which}"
+        label = f"{example.which} prediction beside what was measured ({example.trajectory})"
+        motions.append(Motion(name, label, example.t, example.q, colour, example.predicted_q))
+    for trace in traces.torques:
+        size = np.maximum(trace.measured.std(axis=0), 1e-9)
+        colour = _colour(trace.measured - trace.predicted[MODEL], size)
+        name = f"torque {trace.which}"
+        label = f"residual torque, {trace.which} trajectory ({trace.trajectory})"
+        motions.append(Motion(name, label, trace.t, trace.q, colour))
     return motions
 
 
-def _colour(error: np.ndarray) -> list[list[float | None]]:
+def _colour(error: np.ndarray, size: np.ndarray) -> np.ndarray:
     """Return errors, (T, n), relative to the motion or to the torque, by the one of the worst colour."""
-    rows = (error / TUNING.worst_error).round(3).astype(object)
-    rows[~np.isfinite(error)] = None  # JSON has no NaN
-    colours: list[list[float | None]] = rows.tolist()
-    return colours
+    return np.asarray((np.abs(error) / size / TUNING.worst_error).round(3))
 
 
 def _sweep(arm: Arm) -> Motion:
@@ -153,7 +150,7 @@ def _sweep(arm: Arm) -> Motion:
         low, high = _range(coordinate)
         q[:, k] = (low + high) / 2 + 0.4 * (high - low) * np.sin(2 * np.pi * t / 12 * (1 + k % 3) + k)
     label = "a motion through the joints' ranges"
-    return Motion("sweep", label, t.round(3).tolist(), q.round(4).tolist())
+    return Motion("sweep", label, t.round(3), q.round(4))
 
 
 def _range(coordinate: Coordinate) -> tuple[float, float]:

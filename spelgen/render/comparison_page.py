@@ -17,7 +17,7 @@ from spelgen.evaluation.traces import PredictedMotion
 from spelgen.files import write_text
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.labels import named_joints
-from spelgen.render.charts import Chart, Line, Values, line_chart
+from spelgen.render.charts import Chart, Line, line_chart
 from spelgen.render.page import render_page
 from spelgen.render.plots import QUANTITIES, Panel, Row, mass_panels, numbers, stack
 from spelgen.spec import Facts, read_facts
@@ -35,7 +35,7 @@ def write_comparison(study: Study, tables: Sequence[Table]) -> Path:
     panels, entries = [], []
     if examples:
         panels = _prediction_panels(examples, styles, facts)
-        entries = _mass_panels(study, results, styles, facts.joint_types)
+        entries = _mass_panels(study, examples, results, styles, facts.joint_types)
     text = render_page(
         "comparison.html.jinja",
         study=study,
@@ -75,27 +75,22 @@ def _losses(study: Study, styles: Mapping[str, str]) -> Chart:
 
 
 def _mass_panels(
-    study: Study, results: Sequence[RunResult], styles: Mapping[str, str], joint_types: Sequence[str]
+    study: Study,
+    examples: Mapping[str, PredictedMotion],
+    results: Sequence[RunResult],
+    styles: Mapping[str, str],
+    joint_types: Sequence[str],
 ) -> list[Panel]:
     """Return M's lower triangle along the first example: the true robot's, and what every variant learned."""
-    masses: dict[str, list[list[list[float]]]] = {}
-    example = None
+    # the logs are the same for all, and so is their first motion
+    along = next(iter(examples.values()))
+    masses = {"true": true_mass(study.source, torch.from_numpy(along.q)).numpy()}
     for result in results:
-        if result.example is None:
-            continue
-        if example is None:
-            # the logs are the same for all, and so is their first motion
-            example = result.example
-            q = torch.tensor(example.q, dtype=torch.float64)
-            masses["true"] = true_mass(study.source, q).tolist()
-        masses[result.variant] = result.mass.along
-    if example is None:
-        return []
-    entries: dict[tuple[int, int], dict[str, Values]] = {}
+        if result.variant in examples:
+            masses[result.variant] = numbers(result.mass.along)
     rows, columns = np.tril_indices(len(joint_types))
-    for i, j in zip(rows.tolist(), columns.tolist(), strict=True):
-        entries[i, j] = {name: numbers(along)[:, i, j] for name, along in masses.items()}
-    return mass_panels(numbers(example.t), entries, {"true": "truth", **styles}, joint_types, width=400)
+    entries = {name: mass[:, rows, columns].T for name, mass in masses.items()}
+    return mass_panels(along.t, entries, {"true": "truth", **styles}, joint_types, width=400)
 
 
 def _prediction_panels(
@@ -103,15 +98,14 @@ def _prediction_panels(
 ) -> list[Panel]:
     """Return the first test trajectory of the results: what was measured, and what every variant predicts."""
     measured = next(iter(examples.values()))
-    t = numbers(measured.t)
     panels = []
     for k, joint in enumerate(named_joints(facts.joints, facts.joint_types)):
         rows = []
         for key, quantity in QUANTITIES.items():
-            lines = [Line("measured", t, numbers(getattr(measured, key))[:, k], "truth")]
+            lines = [Line("measured", measured.t, getattr(measured, key)[:, k], "truth")]
             for name, example in examples.items():
-                predicted = numbers(getattr(example, f"predicted_{key}"))[:, k]
-                lines.append(Line(name, numbers(example.t), predicted, styles[name]))
+                predicted = getattr(example, f"predicted_{key}")[:, k]
+                lines.append(Line(name, example.t, predicted, styles[name]))
             rows.append(Row(lines, f"{quantity} of {joint.name}", joint.axis(quantity), 150))
         panels.append(stack(joint.name, rows))
     return panels

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,12 +18,14 @@ from spelgen.baselines.names import (
     URDF_WITH_DRIVES,
     observed,
 )
+from spelgen.evaluation.torque_traces import TorqueTrace
+from spelgen.evaluation.traces import FrictionTrace, Growth, MassTrace, PredictedExample, Quantiles
 from spelgen.labels import UNITS, NamedJoint, entry_name
 from spelgen.render.charts import MARGINS, Band, Chart, Dots, Line, Mark, Values, line_chart
 from spelgen.settings.tuning.render import TUNING
 
 Record = Mapping[str, Any]
-"""A part of evaluation.json or of a trace in it."""
+"""A record of JSON."""
 Limits = Sequence[tuple[float, float] | None]
 """Lowest and highest position of each joint; None: it has no limits."""
 
@@ -37,7 +39,6 @@ STYLES = {
     CONSTANT_VELOCITY: "hold",
     observed(MODEL): "going-on",
 }
-COMPONENTS = ("inertia", "Coriolis", "gravity", "friction")
 ERRORS = {
     "relative": ("Relative error", "error / motion"),
     "tip_mm": ("Tip error", "tip error [mm]"),
@@ -104,34 +105,25 @@ def loss_chart(metrics: Sequence[Record], best_epoch: int) -> Chart:
     return line_chart(lines, "Loss by epoch", "epoch", "loss", log=True, width=560, height=240)
 
 
-@dataclass(frozen=True)
-class Growth:
-    """The errors of a predictor or of a run at horizons [s]: by measure low, median and high ones.
+def growth_panels(
+    growths: Mapping[str, tuple[Growth, str]], styles: Mapping[str, str], banded: Container[str]
+) -> list[Panel]:
+    """Return errors against the horizon, relative and of the tip.
 
-    banded: whether the range from low to high is drawn, 10 to 90 %.
+    growths: by the name of a line, and which predictor of a growth it is. banded: lines with the range from 10 to 90 %.
     """
-
-    name: str
-    style: str
-    banded: bool
-    seconds: Sequence[float]
-    errors: Mapping[str, Record]
-
-
-def growth_panels(growths: Sequence[Growth]) -> list[Panel]:
-    """Return errors against the horizon, relative and of the tip."""
     panels = []
     for measure, (title, label) in ERRORS.items():
         marks: list[Mark] = []
-        errors: dict[str, Record] = {}
-        for growth in growths:
-            if measure not in growth.errors:
+        errors: dict[str, Quantiles] = {}
+        for name, (growth, predictor) in growths.items():
+            error = getattr(growth, measure).get(predictor)
+            if error is None:
                 continue
-            error = errors[growth.name] = growth.errors[measure]
-            marks.append(Line(growth.name, growth.seconds, numbers(error["median"]), growth.style))
-            if growth.banded:
-                low, high = numbers(error["low"]), numbers(error["high"])
-                marks.append(Band(f"{growth.name}, 10 to 90 %", growth.seconds, low, high, growth.style))
+            errors[name] = error
+            marks.append(Line(name, growth.seconds, error.median, styles[name]))
+            if name in banded:
+                marks.append(Band(f"{name}, 10 to 90 %", growth.seconds, error.low, error.high, styles[name]))
         if marks:
             chart = line_chart(
                 marks,
@@ -148,156 +140,141 @@ def growth_panels(growths: Sequence[Growth]) -> list[Panel]:
     return panels
 
 
-def growth_charts(growth: Record) -> list[Panel]:
-    """Return how the errors of all predictors grow with the horizon, with bands of the model and of least squares."""
-    growths = []
-    for name in {**growth["relative"], **growth["tip_mm"]}:
-        errors = {measure: growth[measure][name] for measure in ERRORS if name in growth[measure]}
-        # bands of all would hide one another
-        banded = name in (MODEL, LEAST_SQUARES)
-        growths.append(Growth(name, style(name), banded, growth["seconds"], errors))
-    return growth_panels(growths)
-
-
-def _error_limits(errors: Mapping[str, Record]) -> tuple[float, float] | None:
+def _error_limits(errors: Mapping[str, Quantiles]) -> tuple[float, float] | None:
     """Return limits of medians and the model's band, baselines that are hopeless cut off; None without a model."""
     # pages of several runs have no baselines, and so nothing to cut off
     if MODEL not in errors:
         return None
-    model_errors = _positive([errors[MODEL]["low"], errors[MODEL]["high"]])
-    medians = _positive([error["median"] for error in errors.values()])
+    model_errors = _positive([errors[MODEL].low, errors[MODEL].high])
+    medians = _positive([error.median for error in errors.values()])
     if not model_errors.size or not medians.size:
         return None
     high = max(model_errors.max(), medians[medians < TUNING.outlier * model_errors.max()].max(initial=0.0))
     return float(min(model_errors.min(), medians.min())) / 1.3, 1.3 * float(high)
 
 
-def _positive(columns: Sequence[object]) -> np.ndarray:
-    values = np.concatenate(list(map(numbers, columns)))
+def _positive(columns: Sequence[np.ndarray]) -> np.ndarray:
+    values = np.concatenate(columns)
     positive: np.ndarray = values[values > 0]
     return positive
 
 
-def torque_panels(trace: Record, joints: Sequence[NamedJoint]) -> list[Panel]:
+def torque_panels(trace: TorqueTrace, joints: Sequence[NamedJoint]) -> list[Panel]:
     """Return by joint measured and predicted torque, the residual, and the components of the prediction."""
-    t, measured, predicted = trace["t"], numbers(trace["measured"]), numbers(trace["predicted"][MODEL])
+    measured, predicted = trace.measured, trace.predicted[MODEL]
+    residual = measured - predicted
     panels = []
     for k, joint in enumerate(joints):
         unit = joint.units.torque
         torques = [
-            Line("measured", t, measured[:, k], "truth"),
-            Line("predicted", t, predicted[:, k], "predicted"),
+            Line("measured", trace.t, measured[:, k], "truth"),
+            Line("predicted", trace.t, predicted[:, k], "predicted"),
         ]
-        residual = Line("residual", t, measured[:, k] - predicted[:, k], "model")
-        components = []
-        for name in COMPONENTS:
-            components.append(Line(name, t, numbers(trace["parts"][name])[:, k], name.lower()))
+        components = [Line(name, trace.t, part[:, k], name.lower()) for name, part in trace.parts.items()]
         rows = [
             Row(torques, f"Torque of {joint.name}", f"torque [{unit}]", 160),
-            Row([residual], f"Residual of {joint.name}", f"residual [{unit}]", 100),
+            Row(
+                [Line("residual", trace.t, residual[:, k], "model")],
+                f"Residual of {joint.name}",
+                f"residual [{unit}]",
+                100,
+            ),
             Row(components, f"Components of the torque of {joint.name}", f"components [{unit}]", 162),
         ]
-        panels.append(stack(joint.name, rows, f"torque {trace['which']}"))
+        panels.append(stack(joint.name, rows, f"torque {trace.which}"))
     return panels
 
 
-def trajectory_panels(example: Record, joints: Sequence[NamedJoint]) -> list[Panel]:
+def trajectory_panels(example: PredictedExample, joints: Sequence[NamedJoint]) -> list[Panel]:
     """Return by joint position and, where it is known, velocity: measured, predicted and, of servos, commanded, each
     above the difference of the first two.
     """
-    t = example["t"]
+    quantities = [("position", example.q, example.predicted_q)]
+    if example.qd is not None and example.predicted_qd is not None:
+        quantities.append(("velocity", example.qd, example.predicted_qd))
+    t = example.t
     panels = []
     for k, joint in enumerate(joints):
         rows = []
-        for key, quantity in QUANTITIES.items():
-            if key not in example:
-                continue
-            measured, predicted = numbers(example[key])[:, k], numbers(example[f"predicted_{key}"])[:, k]
-            lines = [Line("measured", t, measured, "truth"), Line("predicted", t, predicted, "predicted")]
-            if "u" in example:
-                lines.insert(0, Line("commanded", t, numbers(example["u"])[:, k], "hold"))
-            title = f"{quantity} of {joint.name}"
-            error = Line("error", t, predicted - measured, "model")
-            rows.append(Row(lines, title, joint.axis(quantity)))
-            rows.append(
-                Row([error], f"Error of the {title}", joint.axis(quantity).replace(quantity, "error"), 100)
-            )
-        panels.append(stack(joint.name, rows, f"prediction {example['which']}"))
+        for quantity, measured, predicted in quantities:
+            lines = [
+                Line("measured", t, measured[:, k], "truth"),
+                Line("predicted", t, predicted[:, k], "predicted"),
+            ]
+            if example.u is not None:
+                lines.insert(0, Line("commanded", t, example.u[:, k], "hold"))
+            title, axis = f"{quantity} of {joint.name}", joint.axis(quantity)
+            error = Line("error", t, (predicted - measured)[:, k], "model")
+            rows.append(Row(lines, title, axis))
+            rows.append(Row([error], f"Error of the {title}", axis.replace(quantity, "error"), 100))
+        panels.append(stack(joint.name, rows, f"prediction {example.which}"))
     return panels
 
 
 def mass_panels(
     t: Values,
-    entries: Mapping[tuple[int, int], Mapping[str, Values]],
+    masses: Mapping[str, np.ndarray],
     styles: Mapping[str, str],
     joint_types: Sequence[str],
     width: int = 330,
 ) -> list[Panel]:
-    """Return entries of M, by row and column, along a trajectory: a line for each name, as the style of that name."""
+    """Return the entries of M that are not zero along a trajectory.
+
+    masses: by the name of a line, the lower triangle of M, row by row, (entries, T). styles: by the same names.
+    """
     panels = []
-    for (i, j), by_name in entries.items():
+    rows, columns = np.tril_indices(len(joint_types))
+    # rounding leaves some of what is always zero
+    zero = TUNING.zero * max(np.nanmax(np.abs(mass)) for mass in masses.values())
+    for number, (i, j) in enumerate(zip(rows.tolist(), columns.tolist(), strict=True)):
+        if not any((np.abs(mass[number]) > zero).any() for mass in masses.values()):
+            continue
         name = entry_name(i, j)
-        lines = [Line(label, t, numbers(values), styles[label]) for label, values in by_name.items()]
+        lines = [Line(label, t, mass[number], styles[label]) for label, mass in masses.items()]
         unit = f"{name} [{inertia_unit(joint_types[i], joint_types[j])}]"
         panels.append(Panel(name, (line_chart(lines, name, "t [s]", unit, width=width),)))
     return panels
 
 
-def trace_mass_panels(mass: Record, joint_types: Sequence[str]) -> list[Panel]:
-    """Return the entries of M that are not zero along a trajectory, by the model and its baselines."""
-    entries = {}
-    # the lower triangle, row by row, as the trace lists it
-    rows, columns = np.tril_indices(len(joint_types))
-    largest = max(np.nanmax(np.abs(numbers(trace["entries"]))) for trace in mass["by"].values())
-    for number, (i, j) in enumerate(zip(rows.tolist(), columns.tolist(), strict=True)):
-        by_name = {name: numbers(trace["entries"][number]) for name, trace in mass["by"].items()}
-        # rounding leaves some of what is always zero
-        if any((np.abs(entry) > TUNING.zero * largest).any() for entry in by_name.values()):
-            entries[i, j] = by_name
-    styles = {name: style(name) for name in mass["by"]}
-    return mass_panels(mass["t"], entries, styles, joint_types)
-
-
-def eigenvalue_chart(mass: Record) -> Chart:
+def eigenvalue_chart(mass: MassTrace) -> Chart:
     """Return the smallest and the largest eigenvalue of M along a trajectory; what is not positive is not drawn."""
     lines = []
-    for name, trace in mass["by"].items():
+    for name, curves in mass.by.items():
         for row, label in ((0, "least"), (-1, "largest")):
-            eigenvalues = numbers(trace["eigenvalues"][row])
-            lines.append(Line(f"{name}, {label}", mass["t"], eigenvalues, style(name)))
+            lines.append(Line(f"{name}, {label}", mass.t, curves.eigenvalues[row], style(name)))
     return line_chart(lines, "Eigenvalues of M", "t [s]", "eigenvalue of M", log=True, width=520, height=230)
 
 
-def friction_panels(friction: Record, torques: Sequence[Record], joints: Sequence[NamedJoint]) -> list[Panel]:
+def friction_panels(
+    friction: FrictionTrace, torques: Sequence[TorqueTrace], joints: Sequence[NamedJoint]
+) -> list[Panel]:
     """Return by joint friction by velocity, and the loops that measured motion makes of it, measured and by the model.
 
     Measured friction is the torque less that of the model's rigid bodies. A model whose friction has no state makes no
     loop but for load.
     """
+    speeds, measured = [np.zeros((0, len(joints)))], [np.zeros((0, len(joints)))]
+    for trace in torques:
+        speeds.append(trace.qd)
+        measured.append(trace.parts["friction"] + trace.measured - trace.predicted[MODEL])
+    all_speeds, all_torques = np.concatenate(speeds), np.concatenate(measured)
     panels = []
     for k, joint in enumerate(joints):
-        speeds, measured = [np.zeros(0)], [np.zeros(0)]
-        loops: list[Mark] = []
-        for trace in torques:
-            speeds.append(numbers(trace["qd"])[:, k])
-            modelled = numbers(trace["parts"]["friction"])[:, k]
-            residual = numbers(trace["measured"])[:, k] - numbers(trace["predicted"][MODEL])[:, k]
-            measured.append(modelled + residual)
-            # one trajectory is enough: loops of two would cover each other
-            if not loops:
-                loops.append(Line("measured, over time", speeds[-1], measured[-1], "loop"))
-                loops.append(Line("model, over time", speeds[-1], modelled, "loop model"))
-        torque = np.concatenate(measured)
-        marks: list[Mark] = [Dots("measured", np.concatenate(speeds), torque, "truth"), *loops]
-        for name, curves in friction["by"].items():
-            marks.append(Line(name, friction["qd"][k], numbers(curves[k]), style(name)))
-        model = friction["by"].get(MODEL)
+        marks: list[Mark] = [Dots("measured", all_speeds[:, k], all_torques[:, k], "truth")]
+        # one trajectory is enough: loops of two would cover each other
+        for trace in torques[:1]:
+            marks.append(Line("measured, over time", speeds[1][:, k], measured[1][:, k], "loop"))
+            marks.append(
+                Line("model, over time", speeds[1][:, k], trace.parts["friction"][:, k], "loop model")
+            )
+        for name, curves in friction.by.items():
+            marks.append(Line(name, friction.qd[k], curves[k], style(name)))
         chart = line_chart(
             marks,
             f"Friction of {joint.name}",
             joint.axis("velocity"),
             f"friction [{joint.units.torque}]",
-            limits=_friction_limits(torque, numbers(model[k]) if model else np.zeros(1)),
+            limits=_friction_limits(all_torques[:, k], friction.by[MODEL][k]),
             height=220,
         )
         panels.append(Panel(joint.name, (chart,)))
@@ -356,11 +333,11 @@ def _histogram(name: str, histogram: Record) -> Band:
     return Band(f"{name} logs", np.repeat(edges, 2)[1:-1], np.zeros_like(heights), heights, style)
 
 
-def energy_chart(trace: Record) -> Chart:
+def energy_chart(trace: TorqueTrace) -> Chart:
     """Return the energy balance along a trajectory."""
     styles = ("truth", "urdf", "friction", "model")
     lines = []
-    for (name, energy), color in zip(trace["energy"].items(), styles, strict=True):
-        lines.append(Line(name, trace["t"], numbers(energy), color))
-    motion = f"torque {trace['which']}"
+    for (name, energy), color in zip(trace.energy.items(), styles, strict=True):
+        lines.append(Line(name, trace.t, energy, color))
+    motion = f"torque {trace.which}"
     return line_chart(lines, "Energy", "t [s]", "energy [J]", motion=motion, width=560, height=250)

@@ -14,6 +14,7 @@ from spelgen.baselines.run_arm import run_arm
 from spelgen.errors import RunError, SpelgenError
 from spelgen.evaluation.results import Results
 from spelgen.evaluation.tables import result_tables
+from spelgen.evaluation.traces import Traces
 from spelgen.evaluation.verdict import Verdict, verdict
 from spelgen.files import write_json, write_text
 from spelgen.fitting.objectives import fit_summary
@@ -44,7 +45,6 @@ class Run:
     facts: Facts
     config: Record | None
     metrics: Sequence[Record]
-    evaluation: Record | None
     results: Results | None
     identified: Record | None
     arm: LoadedArm | None
@@ -96,7 +96,8 @@ def report_data(folder: Path | str) -> Record:
             data["bodies"] = bodies.tolist()
     tables = parameter_tables(run.model, run.arm, run.identified)
     data["tables"] = list(map(asdict, tables))
-    return data | {"evaluation": run.evaluation, "least_squares": run.identified}
+    evaluation = _json(run.folder, run.folder.evaluation)
+    return data | {"evaluation": evaluation, "least_squares": run.identified}
 
 
 def render_report(folder: Path | str, robot: Path | str | None = None) -> str:
@@ -129,7 +130,6 @@ def _read(folder: RunFolder) -> Run:
         read_facts(folder.module),
         config=folder.read_config() if folder.config.is_file() else None,
         metrics=folder.read_metrics(),
-        evaluation=evaluation,
         results=None if evaluation is None else Results.from_dict(evaluation),
         identified=_json(folder, folder.baseline),
         arm=arm,
@@ -146,7 +146,7 @@ def _json(folder: RunFolder, path: Path) -> Record | None:
 
 def _rendered(run: Run, robot: Path | str | None) -> str:
     facts, config = run.facts, run.config or {}
-    traces = (run.evaluation or {}).get("traces") or {}
+    traces = Traces({}) if run.results is None else run.results.traces
     arm, cells, training, tables, constants = None, None, None, [], []
     if config:
         training = training_facts(config, run.metrics, run.identified)
@@ -168,7 +168,7 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
         verdict=run.verdict,
         config=run.config,
         training=training,
-        evaluation=run.evaluation,
+        evaluation=run.results,
         tables=tables,
         curves=curves(traces, facts),
         coverage=coverage(traces, run.identified, facts, run.limits),

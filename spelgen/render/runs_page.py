@@ -19,7 +19,7 @@ from spelgen.fitting.run_folder import RunFolder
 from spelgen.labels import listed, thousandths
 from spelgen.listing import number
 from spelgen.render.page import render_page
-from spelgen.render.plots import ERRORS, Growth, Panel, Record, growth_panels
+from spelgen.render.plots import growth_panels
 from spelgen.spec import Facts, read_facts
 
 STYLES = ("model", "train", "gravity", "coriolis", "friction", "hold")
@@ -28,7 +28,7 @@ Judged = TypeVar("Judged", Horizon, Replay)
 
 @dataclass(frozen=True)
 class EvaluatedRun:
-    """A run as the page tells of it; style: of its lines. growth: of evaluation.json, empty where it has none."""
+    """A run as the page tells of it; style: of its lines."""
 
     name: str
     style: str
@@ -36,7 +36,6 @@ class EvaluatedRun:
     objective: str
     verdict: str
     results: Results
-    growth: Record
 
 
 def write_runs(folders: Sequence[Path], output: Path) -> Path:
@@ -57,7 +56,11 @@ def render_runs(folders: Sequence[Path]) -> str:
         verdict=_verdict(results),
         robots=sorted({run.facts.robot for run in runs}),
         tables=result_tables(results),
-        growth=_growth(runs),
+        growth=growth_panels(
+            {run.name: (run.results.traces.growth, MODEL) for run in runs if run.results.traces.growth},
+            {run.name: run.style for run in runs},
+            [run.name for run in runs],
+        ),
     )
 
 
@@ -73,9 +76,8 @@ def _read(folder: Path, name: str, style: str) -> EvaluatedRun:
     config = run.read_config()
     if not run.evaluation.is_file():
         raise RunError("a run that is not evaluated", file=folder, do="spelgen evaluate")
-    evaluation = run.read_json(run.evaluation)
     identified = run.read_json(run.baseline) if run.baseline.is_file() else None
-    results = Results.from_dict(evaluation)
+    results = Results.from_dict(run.read_json(run.evaluation))
     return EvaluatedRun(
         name=name,
         style=style,
@@ -83,7 +85,6 @@ def _read(folder: Path, name: str, style: str) -> EvaluatedRun:
         objective=config["objective"],
         verdict=verdict(results, identified).sentence,
         results=results,
-        growth=evaluation["traces"].get("growth") or {},
     )
 
 
@@ -142,14 +143,3 @@ def _verdict(results: Results) -> str:
     if not sentences:
         return "These runs have no common horizons or logs."
     return f"{listed(sentences)}."
-
-
-def _growth(runs: Sequence[EvaluatedRun]) -> list[Panel]:
-    growths = []
-    for run in runs:
-        errors = {
-            measure: run.growth[measure][MODEL] for measure in ERRORS if MODEL in run.growth.get(measure, {})
-        }
-        if errors:
-            growths.append(Growth(run.name, run.style, True, run.growth["seconds"], errors))
-    return growth_panels(growths)
