@@ -86,13 +86,13 @@ def training_step(model: EmittedModel, data: Data) -> None:
     """Loss of the windows, and its gradient: geodesic distance and velocity, as in eq. 8 of the paper."""
     model.zero_grad()
     prepared = model.prepare()
-    q, p = data.q[:, 0], model.momentum(data.q[:, 0], data.qd[:, 0], prepared)
+    q, p = data.q[:, 0], model.momentum(model.at(data.q[:, 0], prepared=prepared), data.qd[:, 0])
     positions, velocities = [], []
     for tau in data.tau.unbind(dim=1):
         q, p, qd = rk4(lambda q, p, tau=tau: model.port_hamiltonian_rhs(q, p, tau, prepared), q, p)
         positions.append(q)
         velocities.append(qd)
-    velocities = [*velocities[1:], model.velocity(q, p, prepared)]
+    velocities = [*velocities[1:], model.velocity(model.at(q, prepared=prepared), p)]
     distance = position_difference(torch.stack(positions, dim=1), data.q[:, 1:], model.joint_types)
     velocity = torch.stack(velocities, dim=1) - data.qd[:, 1:]
     (distance.square().mean() + velocity.square().mean()).backward()

@@ -49,7 +49,7 @@ class Model(nn.Module):
         bc = b * q[..., 1].cos()
         return a + 2 * bc, d + bc, d
 
-    def mass_matrix(self, q, prepared=None):
+    def mass_matrix(self, q):
         m11, m12, m22 = self._entries(q)
         return torch.stack([m11, m12, m12, m22.expand(m12.shape)], -1).unflatten(-1, (2, 2))
 
@@ -66,10 +66,13 @@ class Model(nn.Module):
     def input_matrix(self, q):
         return torch.eye(2, dtype=q.dtype).expand(*q.shape, 2)
 
-    def momentum(self, q, qd, prepared=None):
+    def at(self, q, prepared=None):
+        return q
+
+    def momentum(self, q, qd):
         return (self.mass_matrix(q) @ qd.unsqueeze(-1)).squeeze(-1)
 
-    def velocity(self, q, p, prepared=None):
+    def velocity(self, q, p):
         (m11, m12, m22), (p1, p2) = self._entries(q), p.unbind(-1)
         scaled = torch.stack([m22 * p1 - m12 * p2, m11 * p2 - m12 * p1], -1)
         return scaled / (m11 * m22 - m12**2).unsqueeze(-1)
@@ -88,6 +91,7 @@ class Model(nn.Module):
         return torch.stack([2 * rate, rate, rate, torch.zeros_like(rate)], -1).unflatten(-1, (2, 2))
 
     def nonlinear_effects(self, q, qd):
+        q = q.q if isinstance(q, Pose) else q
         coriolis = (self._mass_rate(q, qd) @ qd.unsqueeze(-1)).squeeze(-1) - self._kinetic_slope(q, qd)
         return coriolis + self.gravity(q)
 
@@ -111,14 +115,8 @@ class Model(nn.Module):
     def configuration(self, q, prepared):
         return Pose(q, self.mass_matrix(q))
 
-    def nonlinear_at(self, pose, qd):
-        return self.nonlinear_effects(pose.q, qd)
-
     def lagrangian_gradient(self, pose, qd):
         return self._kinetic_slope(pose.q, qd) - self.gravity(pose.q)
-
-    def friction_at(self, pose, qd, z=None):
-        return self.friction_torque(pose.q, qd)
 
     def input_force(self, pose, qd, tau):
         return tau

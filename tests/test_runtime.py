@@ -144,7 +144,7 @@ def test_residual_terms_are_a_gradient_and_vanish_outside_the_range():
     def added(at: Tensor) -> Tensor:
         """1/2 qd^T R qd - V."""
         mass = terms.at(at, weights).mass
-        return 0.5 * torch.einsum("ti,tij,tj->", qd, mass, qd) - terms.energy(at, weights).sum()
+        return 0.5 * torch.einsum("ti,tij,tj->", qd, mass, qd) - terms.energy(terms.at(at, weights)).sum()
 
     gradient = vjp(added, q)[1](torch.ones((), dtype=torch.float64))[0]
     near(terms.gradient(pose, qd), gradient, 1e-10)

@@ -109,10 +109,13 @@ class Oscillator:
     joint_types = ("revolute", "prismatic")
     frequency = torch.tensor([2.0, 5.0], dtype=torch.float64)
 
-    def momentum(self, q, qd, prepared=None):
+    def at(self, q, prepared=None):
+        return q
+
+    def momentum(self, q, qd):
         return qd
 
-    def velocity(self, q, p, prepared=None):
+    def velocity(self, q, p):
         return p
 
     def prepare(self):

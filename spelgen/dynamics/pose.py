@@ -42,10 +42,10 @@ def _of_weights(model: PortHamiltonian, prepared: object, q: Tensor) -> Pose:
     pose = model.configuration(q, prepared)
 
     def friction(qd: Tensor, z: Tensor | None) -> Tensor:
-        return model.friction_at(pose, qd, *known_past(model, z))
+        return model.friction_torque(pose, qd, *known_past(model, z))
 
     def force(qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
-        return model.input_force(pose, qd, tau) - model.nonlinear_at(pose, qd) - friction(qd, z)
+        return model.input_force(pose, qd, tau) - model.nonlinear_effects(pose, qd) - friction(qd, z)
 
     return Pose(pose.mass, force, friction)
 

@@ -52,19 +52,19 @@ class PreparedModel:
 
     def mass_matrix(self, q: Tensor) -> Tensor:
         """M(q), (..., n, n) [kg m^2, kg m, kg]."""
-        return self._model.mass_matrix(q, prepared=self._weights)
+        return self._model.mass_matrix(self._at(q))
 
     def gravity(self, q: Tensor) -> Tensor:
         """dV/dq, (..., n) [Nm, N]."""
-        return self._model.gravity(q, prepared=self._weights)
+        return self._model.gravity(self._at(q))
 
     def bias(self, q: Tensor, qd: Tensor) -> Tensor:
         """Coriolis, centrifugal and gravity torque, (..., n) [Nm, N]."""
-        return self._model.nonlinear_effects(q, qd, prepared=self._weights)
+        return self._model.nonlinear_effects(self._at(q, qd), qd)
 
     def friction_torque(self, q: Tensor, qd: Tensor, z: Tensor | None = None) -> Tensor:
         """What friction takes, (..., n) [Nm, N]."""
-        return self._model.friction_torque(q, qd, *known_past(self._model, z), prepared=self._weights)
+        return self._model.friction_torque(self._at(q, qd), qd, *known_past(self._model, z))
 
     def memory(self, qd: Tensor) -> Tensor:
         """Friction's memory z, (..., n, K), of joints that have long gone the way of qd: zero at rest."""
@@ -72,15 +72,15 @@ class PreparedModel:
 
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
         """qdd, (..., n), under the input tau."""
-        return self._model.forward_dynamics(q, qd, tau, *known_past(self._model, z), prepared=self._weights)
+        return self._model.forward_dynamics(self._at(q, qd, tau), qd, tau, *known_past(self._model, z))
 
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None = None) -> Tensor:
         """The input, (..., n), that gives qdd."""
-        return self._model.inverse_dynamics(q, qd, qdd, *known_past(self._model, z), prepared=self._weights)
+        return self._model.inverse_dynamics(self._at(q, qd, qdd), qd, qdd, *known_past(self._model, z))
 
     def momentum(self, q: Tensor, qd: Tensor) -> Tensor:
         """p = M(q) qd, (..., n) [Nm s, N s]."""
-        return self._model.momentum(q, qd, prepared=self._weights)
+        return self._model.momentum(self._at(q, qd), qd)
 
     def momentum_rate(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
         """p', (..., n) [Nm, N], under the input tau: what a momentum observer compares with."""
@@ -157,6 +157,10 @@ class PreparedModel:
             compiled = torch.compile(getattr(self, name), fullgraph=True, options={"size_asserts": False})
             setattr(result, name, compiled)
         return result
+
+    def _at(self, q: Tensor, *others: Tensor) -> object:
+        """Return the model's pose at q, vectors of the state checked."""
+        return self._model.at(q, *others, prepared=self._weights)
 
     def _kinematics(self) -> TipKinematics:
         if self._tip is None:

@@ -157,11 +157,15 @@ class VelocityState:
     def prepare(self) -> None:
         """Nothing."""
 
-    def momentum(self, q: Tensor, qd: Tensor, prepared: None = None) -> Tensor:
+    def at(self, q: Tensor, prepared: None = None) -> Tensor:
+        """q."""
+        return q
+
+    def momentum(self, q: Tensor, qd: Tensor) -> Tensor:
         """qd."""
         return qd
 
-    def velocity(self, q: Tensor, p: Tensor, prepared: None = None) -> Tensor:
+    def velocity(self, q: Tensor, p: Tensor) -> Tensor:
         """qd."""
         return p
 

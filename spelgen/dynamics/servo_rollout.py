@@ -123,11 +123,11 @@ def replayed(model: ServoArm, q: Tensor, qd: Tensor, commands: Tensor, dt: Tenso
         state, previous_bias = None, None
         for now, interval in zip(commands.unbind(1), dt.unbind(1), strict=True):
             pose = model.configuration(q, prepared)
-            bias = middle_bias = model.nonlinear_at(pose, qd)
+            bias = middle_bias = model.nonlinear_effects(pose, qd)
             if previous_bias is not None:  # of the interval's middle
                 middle_bias = bias + (bias - previous_bias) / 2
             previous_bias = bias
-            load = Load(pose.mass, middle_bias, model.gravity_at(pose), coupled=True)
+            load = Load(pose.mass, middle_bias, model.gravity(pose), coupled=True)
             if state is None:
                 state = balanced(drives, q, qd, now[:, 0], load)
             h = interval.unsqueeze(-1) / now.shape[1]

@@ -42,7 +42,7 @@ def observe(dynamics: Any, windows: Windows, past: int) -> tuple[Windows, Tensor
     tau = windows.tau[:, :past]
     z = memory_along(dynamics, q, qd, windows.z)
     cache = dynamics.prepare()
-    p = dynamics.momentum(q, qd, cache)
+    p = dynamics.momentum(dynamics.at(q, prepared=cache), qd)
     # the input jumps at samples: each interval has its own at both ends
     _, at_start = dynamics.port_hamiltonian_rhs(
         q[:, :-1], p[:, :-1], tau, cache, *known_past(dynamics, z[:, :-1])

@@ -47,7 +47,7 @@ def roll_out(
         return roll_out_adaptive(model, windows)
     prepared = model.prepare()
     q = windows.q[:, 0]
-    p = model.momentum(q, windows.qd[:, 0], prepared)
+    p = model.momentum(model.at(q, prepared=prepared), windows.qd[:, 0])
     z = sliding_memory(model, windows.qd[:, 0]) if windows.z is None else windows.z
     positions, velocities = [], []
     for dt, tau in zip(windows.dt.unbind(1), windows.tau.unbind(1), strict=True):
@@ -59,7 +59,7 @@ def roll_out(
             if substep == 0:
                 velocities.append(qd)  # of the sample that the interval starts at
         positions.append(q)
-    velocities = [*velocities[1:], model.velocity(q, p, prepared)]
+    velocities = [*velocities[1:], model.velocity(model.at(q, prepared=prepared), p)]
     return torch.stack(positions, dim=1), torch.stack(velocities, dim=1)  # each (W, K-1, n)
 
 
@@ -169,7 +169,7 @@ def momentum_loss(model: EmittedModel, windows: Windows, scales: LossScales) -> 
     p = (at.mass @ qd.unsqueeze(-1)).squeeze(-1)
     force = dynamics.lagrangian_gradient(at, qd)
     past = known_past(model, memory_along(model, q, qd, windows.z))
-    force = force - dynamics.friction_at(at, qd, *past)
+    force = force - dynamics.friction_torque(at, qd, *past)
     driven = [
         dynamics.input_force(at, qd, torch.cat(held, dim=1))
         for held in ((tau, tau[:, -1:]), (tau[:, :1], tau))  # over the interval after each sample, and before

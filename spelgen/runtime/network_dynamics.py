@@ -55,38 +55,39 @@ class NetworkDynamics(PortHamiltonian):
         mass, intermediates = self.mass.forward(encoded, prepared.mass)
         return NetworkPose(encoded, mass, intermediates, prepared)
 
-    def potential_energy(self, q: Tensor) -> Tensor:
+    def potential_energy(self, q: Tensor | NetworkPose) -> Tensor:
         """Return V(q), (...) [J]."""
         pose: NetworkPose = self.at(q)
         if self.potential is None:
-            return pose.encoded.new_zeros(q.shape[:-1])
+            return pose.encoded.new_zeros(pose.encoded.shape[:-1])
         return self.potential.forward(pose.encoded, pose.prepared.potential)[0].squeeze(-1)
 
-    def gravity_at(self, pose: NetworkPose) -> Tensor:
+    def gravity(self, q: Tensor | NetworkPose) -> Tensor:
         """Return dV/dq, (..., n) [Nm, N]."""
-        return -self._downhill(pose, torch.zeros_like(pose.encoded))
+        pose: NetworkPose = self.at(q)
+        return -self.lagrangian_gradient(pose, torch.zeros_like(pose.mass[..., 0]))
 
-    def _downhill(self, pose: NetworkPose, kinetic: Tensor) -> Tensor:
-        """Return the derivative by q of what has the derivative ``kinetic`` by the encoding, less dV/dq."""
+    def lagrangian_gradient(self, q: Tensor | NetworkPose, qd: Tensor) -> Tensor:
+        """Return d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
+        pose: NetworkPose = self.at(q, qd)
+        by_encoded = self.mass.kinetic_vjp(qd, pose.intermediates)
         if self.potential is not None:
             intermediates = self.potential.forward(pose.encoded, pose.prepared.potential)[1]
-            kinetic = kinetic - self.potential.vjp(intermediates, kinetic.new_ones(1))
-        return self.encoding.vjp(pose.encoded, kinetic)
+            by_encoded = by_encoded - self.potential.vjp(intermediates, qd.new_ones(1))
+        return self.encoding.vjp(pose.encoded, by_encoded)
 
-    def lagrangian_gradient(self, pose: NetworkPose, qd: Tensor) -> Tensor:
-        """Return d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
-        return self._downhill(pose, self.mass.kinetic_vjp(qd, pose.intermediates))
-
-    def nonlinear_at(self, pose: NetworkPose, qd: Tensor) -> Tensor:
+    def nonlinear_effects(self, q: Tensor | NetworkPose, qd: Tensor) -> Tensor:
         """Return dM/dt qd - d/dq (1/2 qd^T M qd) + dV/dq, (..., n)."""
+        pose: NetworkPose = self.at(q, qd)
         mass_rate = self.mass.jvp(self.encoding.jvp(pose.encoded, qd), pose.intermediates)
         return applied(mass_rate, qd) - self.lagrangian_gradient(pose, qd)
 
-    def friction_at(self, pose: NetworkPose, qd: Tensor) -> Tensor:
+    def friction_torque(self, q: Tensor | NetworkPose, qd: Tensor) -> Tensor:
         """Return D(q, qd) qd, (..., n) [Nm, N]."""
+        pose: NetworkPose = self.at(q, qd)
         return self.friction.forward(pose.encoded, qd, pose.prepared.friction, qd.unsqueeze(-1)).squeeze(-1)
 
-    def dissipation(self, q: Tensor, qd: Tensor) -> Tensor:
+    def dissipation(self, q: Tensor | NetworkPose, qd: Tensor) -> Tensor:
         """Return D(q, qd), (..., n, n) [Nm s/rad, N s/m]."""
         pose: NetworkPose = self.at(q, qd)
-        return self.friction.forward(pose.encoded, qd, pose.prepared.friction, torch.eye(self.n).to(q))
+        return self.friction.forward(pose.encoded, qd, pose.prepared.friction, torch.eye(self.n).to(qd))

@@ -34,8 +34,9 @@ class PortHamiltonian(nn.Module):
     """q' = dH/dp and p' = -dH/dq - D dH/dp + G tau, with H = 1/2 p^T M(q)^-1 p + V(q).
 
     The port-Hamiltonian form (van der Schaft and Jeltsema, Port-Hamiltonian Systems Theory, 2014).
-    Shapes: q, qd, qdd, tau and p are (..., n). ``prepared`` is what ``prepare`` gave: all that
-    depends on the weights alone. ``pose`` is what ``at`` gave: all that depends on q, M as ``mass``.
+    q, qd, qdd, tau and p are (..., n). In place of q methods take a pose, too: all that depends on q, M as
+    ``mass``, which ``at`` works out once for several of them. ``prepared`` is what ``prepare`` gave: all
+    that depends on the weights alone, worked out once for many poses.
     """
 
     n: int
@@ -45,19 +46,21 @@ class PortHamiltonian(nn.Module):
     # networks and rigid bodies have these each of their own
     prepare: Callable[..., Prepared]
     configuration: Callable[[Tensor, Prepared], Pose]
-    potential_energy: Callable[[Tensor], Tensor]  # V, (...) [J]
-    gravity_at: Callable[[Pose], Tensor]  # dV/dq
-    lagrangian_gradient: Callable[[Pose, Tensor], Tensor]  # d/dq of 1/2 qd^T M qd - V
-    nonlinear_at: Callable[[Pose, Tensor], Tensor]  # Coriolis, centrifugal and gravity torque
-    friction_at: Callable[..., Tensor]  # D(q, qd) qd
+    potential_energy: Callable[[Tensor | Pose], Tensor]  # V, (...) [J]
+    gravity: Callable[[Tensor | Pose], Tensor]  # dV/dq
+    lagrangian_gradient: Callable[[Tensor | Pose, Tensor], Tensor]  # d/dq of 1/2 qd^T M qd - V
+    nonlinear_effects: Callable[[Tensor | Pose, Tensor], Tensor]  # Coriolis, centrifugal, gravity torque
+    friction_torque: Callable[..., Tensor]  # D(q, qd) qd
 
     def __init__(self, joints: Joints) -> None:
         super().__init__()
         # 1 where a joint is driven, 0 where it is passive
         self.actuated = nn.Buffer(vector(float(x) for x in joints.actuated))
 
-    def at(self, q: Tensor, *others: Tensor, prepared: Prepared | None = None) -> Pose:
+    def at(self, q: Tensor | Pose, *others: Tensor, prepared: Prepared | None = None) -> Pose:
         """Return the pose at q. Raises TypeError or ValueError for vectors not as q and the weights."""
+        if isinstance(q, tuple):
+            return q  # a pose already
         expected = self.actuated.dtype
         for x in (q, *others):
             if not isinstance(x, Tensor) or x.dtype != expected:
@@ -70,24 +73,10 @@ class PortHamiltonian(nn.Module):
                 raise ValueError(f"got shapes {shapes}, expected (..., {self.n}) of all alike; {advice}")
         return self.configuration(q, self.prepare() if prepared is None else prepared)
 
-    def mass_matrix(self, q: Tensor, prepared: Prepared | None = None) -> Tensor:
+    def mass_matrix(self, q: Tensor | Pose) -> Tensor:
         """Return M(q), (..., n, n) [kg m^2, kg m, kg]."""
-        mass: Tensor = self.at(q, prepared=prepared).mass
+        mass: Tensor = self.at(q).mass
         return mass
-
-    def gravity(self, q: Tensor, prepared: Prepared | None = None) -> Tensor:
-        """Return dV/dq, (..., n) [Nm, N]."""
-        return self.gravity_at(self.at(q, prepared=prepared))
-
-    def nonlinear_effects(self, q: Tensor, qd: Tensor, prepared: Prepared | None = None) -> Tensor:
-        """Return the Coriolis, centrifugal and gravity torque, (..., n) [Nm, N]."""
-        return self.nonlinear_at(self.at(q, qd, prepared=prepared), qd)
-
-    def friction_torque(
-        self, q: Tensor, qd: Tensor, *state: Tensor | None, prepared: Prepared | None = None
-    ) -> Tensor:
-        """Return D(q, qd) qd, (..., n) [Nm, N]."""
-        return self.friction_at(self.at(q, qd, prepared=prepared), qd, *state)
 
     def input_matrix(self, q: Tensor) -> Tensor:
         """Return G(q), (..., n, n): an input is the torque of its own joint, none of a passive one."""
@@ -101,33 +90,30 @@ class PortHamiltonian(nn.Module):
         """Return the tau, (..., n), that makes this force; a passive joint shows the torque it lacks."""
         return force
 
-    def momentum(self, q: Tensor, qd: Tensor, prepared: Prepared | None = None) -> Tensor:
+    def momentum(self, q: Tensor | Pose, qd: Tensor) -> Tensor:
         """Return p = M(q) qd, (..., n)."""
-        return applied(self.at(q, qd, prepared=prepared).mass, qd)
+        return applied(self.at(q, qd).mass, qd)
 
-    def velocity(self, q: Tensor, p: Tensor, prepared: Prepared | None = None) -> Tensor:
+    def velocity(self, q: Tensor | Pose, p: Tensor) -> Tensor:
         """Return qd = M(q)^-1 p, (..., n)."""
-        return solved(self.at(q, p, prepared=prepared).mass, p)
+        return solved(self.at(q, p).mass, p)
 
-    def hamiltonian(self, q: Tensor, p: Tensor) -> Tensor:
+    def hamiltonian(self, q: Tensor | Pose, p: Tensor) -> Tensor:
         """Return H, (...) [J]."""
-        return 0.5 * (p * self.velocity(q, p)).sum(dim=-1) + self.potential_energy(q)
+        pose = self.at(q, p)
+        return 0.5 * (p * self.velocity(pose, p)).sum(dim=-1) + self.potential_energy(pose)
 
-    def forward_dynamics(
-        self, q: Tensor, qd: Tensor, tau: Tensor, *state: Tensor | None, prepared: Prepared | None = None
-    ) -> Tensor:
+    def forward_dynamics(self, q: Tensor | Pose, qd: Tensor, tau: Tensor, *state: Tensor | None) -> Tensor:
         """Return qdd, (..., n), under the input tau."""
-        pose = self.at(q, qd, tau, prepared=prepared)
-        force = self.input_force(pose, qd, tau) - self.nonlinear_at(pose, qd)
-        return solved(pose.mass, force - self.friction_at(pose, qd, *state))
+        pose = self.at(q, qd, tau)
+        force = self.input_force(pose, qd, tau) - self.nonlinear_effects(pose, qd)
+        return solved(pose.mass, force - self.friction_torque(pose, qd, *state))
 
-    def inverse_dynamics(
-        self, q: Tensor, qd: Tensor, qdd: Tensor, *state: Tensor | None, prepared: Prepared | None = None
-    ) -> Tensor:
+    def inverse_dynamics(self, q: Tensor | Pose, qd: Tensor, qdd: Tensor, *state: Tensor | None) -> Tensor:
         """Return the input tau, (..., n), that gives qdd."""
-        pose = self.at(q, qd, qdd, prepared=prepared)
-        force = applied(pose.mass, qdd) + self.nonlinear_at(pose, qd)
-        return self.input_torque(pose, qd, force + self.friction_at(pose, qd, *state))
+        pose = self.at(q, qd, qdd)
+        force = applied(pose.mass, qdd) + self.nonlinear_effects(pose, qd)
+        return self.input_torque(pose, qd, force + self.friction_torque(pose, qd, *state))
 
     def port_hamiltonian_rhs(
         self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Prepared, *state: Tensor | None
@@ -135,7 +121,7 @@ class PortHamiltonian(nn.Module):
         """Return q' and p', (..., n), under the input tau; without one, of the arm left to itself."""
         pose = self.at(q, p, p if tau is None else tau, prepared=prepared)
         qd = solved(pose.mass, p)
-        force = self.lagrangian_gradient(pose, qd) - self.friction_at(pose, qd, *state)
+        force = self.lagrangian_gradient(pose, qd) - self.friction_torque(pose, qd, *state)
         return qd, force if tau is None else force + self.input_force(pose, qd, tau)
 
     def forward(self, t: Tensor, state: Tensor) -> Tensor:

@@ -42,25 +42,27 @@ class ResidualDynamics(RigidBodyDynamics):
         residual = self.residuals.at(q, prepared.residual)
         return pose._replace(mass=pose.mass + residual.mass, varied=residual.friction, residual=residual)
 
-    def potential_energy(self, q: Tensor) -> Tensor:
+    def potential_energy(self, q: Tensor | Motion) -> Tensor:
         """Return V(q), (...) [J]."""
-        energy = super().potential_energy(q)
-        if self.residuals is None:
-            return energy
-        return energy + self.residuals.energy(q, self.prepare().residual)
+        pose: Motion = self.at(q)
+        energy = super().potential_energy(pose)
+        return energy if self.residuals is None else energy + self.residuals.energy(pose.residual)
 
-    def gravity_at(self, pose: Motion) -> Tensor:
+    def gravity(self, q: Tensor | Motion) -> Tensor:
         """Return dV/dq, (..., n) [Nm, N]."""
+        pose: Motion = self.at(q)
         if self.residuals is None:
             return pose.gravity
         return pose.gravity - self.residuals.gradient(pose.residual, 0 * pose.gravity)
 
-    def lagrangian_gradient(self, pose: Motion, qd: Tensor) -> Tensor:
+    def lagrangian_gradient(self, q: Tensor | Motion, qd: Tensor) -> Tensor:
         """Return d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
+        pose: Motion = self.at(q, qd)
         gradient = super().lagrangian_gradient(pose, qd)
         return gradient if self.residuals is None else gradient + self.residuals.gradient(pose.residual, qd)
 
-    def nonlinear_at(self, pose: Motion, qd: Tensor) -> Tensor:
+    def nonlinear_effects(self, q: Tensor | Motion, qd: Tensor) -> Tensor:
         """Return the torque that holds qd steady without friction, (..., n)."""
-        torque = super().nonlinear_at(pose, qd)
+        pose: Motion = self.at(q, qd)
+        torque = super().nonlinear_effects(pose, qd)
         return torque if self.residuals is None else torque + self.residuals.nonlinear(pose.residual, qd)

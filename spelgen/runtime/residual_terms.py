@@ -36,6 +36,7 @@ class ResidualWeights(NamedTuple):
 class ResidualPose(NamedTuple):
     """What the terms are at a position."""
 
+    q: Tensor
     encoded: Tensor
     torque: Tensor  # dV/dq of the joints' own functions, (..., n) [Nm, N]
     friction: Tensor  # the factor on friction, (..., n)
@@ -156,20 +157,20 @@ class ResidualTerms(nn.Module):
             height = y.tanh()
             mass, slope = F.linear(height, weights.functions.mT, weights.constant), 1 - height * height
         mass = mass.reshape(*q.shape, self.n)
-        return ResidualPose(encoded, torque, friction.exp(), mass, slope, intermediates, weights)
+        return ResidualPose(q, encoded, torque, friction.exp(), mass, slope, intermediates, weights)
 
-    def energy(self, q: Tensor, weights: ResidualWeights) -> Tensor:
+    def energy(self, pose: ResidualPose) -> Tensor:
         """Return what is added to V, (...) [J]; a spline's part is zero in its middle."""
-        distance = self._places(q)
+        distance = self._places(pose.q)
         away = distance.abs()
         step = 0.5 - (2 - away).relu() ** 4 / 24 + (1 - away).relu() ** 4 / 6
         smooth = (self.spacing * distance.sign() * step * self.raw_torque_splines).sum(dim=-1)
-        by_cos, by_sin = (self.ripple(q) / self.frequencies.repeat(1, 2)).chunk(2, dim=-1)
+        by_cos, by_sin = (self.ripple(pose.q) / self.frequencies.repeat(1, 2)).chunk(2, dim=-1)
         turned = torch.cat([by_sin, -by_cos], dim=-1)
         ripple = (turned * self.raw_torque_ripple).sum(dim=-1)
         energy = (self.unit.squeeze(-1) * (smooth + ripple)).sum(dim=-1)
-        if self.potential is not None and weights.potential is not None:
-            energy = energy + self.potential.forward(self.encoding(q), weights.potential)[0].squeeze(-1)
+        if self.potential is not None and pose.weights.potential is not None:
+            energy = energy + self.potential.forward(pose.encoded, pose.weights.potential)[0].squeeze(-1)
         return energy
 
     def gradient(self, pose: ResidualPose, qd: Tensor) -> Tensor:

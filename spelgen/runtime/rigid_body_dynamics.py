@@ -111,42 +111,46 @@ class RigidBodyDynamics(PortHamiltonian):
         mass = momenta @ chain.twists.mT + prepared.armature
         return Motion(chain, momenta, mass, applied(momenta, chain.weight), prepared)
 
-    def potential_energy(self, q: Tensor) -> Tensor:
+    def potential_energy(self, q: Tensor | Motion) -> Tensor:
         """Return V(q), (...) [J]; zero for a mass at the base's origin."""
         pose: Motion = self.at(q)
         return self.chain.energy(pose.chain, pose.prepared.inertia)
 
-    def gravity_at(self, pose: Motion) -> Tensor:
+    def gravity(self, q: Tensor | Motion) -> Tensor:
         """Return dV/dq, (..., n) [Nm, N]."""
+        pose: Motion = self.at(q)
         return pose.gravity
 
-    def lagrangian_gradient(self, pose: Motion, qd: Tensor) -> Tensor:
+    def lagrangian_gradient(self, q: Tensor | Motion, qd: Tensor) -> Tensor:
         """Return d/dq of 1/2 qd^T M(q) qd - V(q), (..., n).
 
         The kinetic part: the momentum of all that a joint carries, by what its displacement adds to
         their twist.
         """
+        pose: Motion = self.at(q, qd)
         momenta = self.chain.at_base(pose.chain, combined(qd, pose.momenta))
         return self.chain.by_joints(self.chain.turning(pose.chain, qd)[1], momenta) - pose.gravity
 
-    def nonlinear_at(self, pose: Motion, qd: Tensor) -> Tensor:
+    def nonlinear_effects(self, q: Tensor | Motion, qd: Tensor) -> Tensor:
         """Return the torque that holds qd steady without friction, (..., n), by Newton and Euler."""
+        pose: Motion = self.at(q, qd)
         return self.chain.steady_torque(pose.chain, qd, pose.momenta)
 
-    def friction_at(self, pose: Motion, qd: Tensor, *state: Tensor | None) -> Tensor:
+    def friction_torque(self, q: Tensor | Motion, qd: Tensor, *state: Tensor | None) -> Tensor:
         """Return the friction torque C^T f(C qd), (..., n) [Nm, N]; state: z and direction of `friction`."""
+        pose: Motion = self.at(q, qd)
         loads = pose.gravity @ self.loads
         torque = self.friction.forward(qd @ self.motors.mT, loads, pose.prepared.friction, *state)
         return (pose.varied * torque) @ self.motors
 
-    def dissipation(self, q: Tensor, qd: Tensor) -> Tensor:
+    def dissipation(self, q: Tensor | Motion, qd: Tensor) -> Tensor:
         """Return D(q, qd), (..., n, n) [Nm s/rad, N s/m], diagonal where each drive moves its own joint."""
         pose: Motion = self.at(q, qd)
         loads = pose.gravity @ self.loads
         resistance = self.friction.resistance(qd @ self.motors.mT, loads, pose.prepared.friction)
         return self.motors.mT @ ((pose.varied * resistance).unsqueeze(-1) * self.motors)
 
-    def hamiltonian(self, q: Tensor, p: Tensor, z: Tensor | None = None) -> Tensor:
+    def hamiltonian(self, q: Tensor | Motion, p: Tensor, z: Tensor | None = None) -> Tensor:
         """Return H, (...) [J]."""
         energy = super().hamiltonian(q, p)
         return energy if z is None else energy + self.friction.stored_energy(z, self.friction.prepare())

@@ -156,8 +156,8 @@ def body_load(model: EmittedModel, path: Path) -> BodyLoad:
             mass = at.mass
             inertia = mass.diagonal(dim1=-2, dim2=-1) - armature
             coupling = (mass @ qdd.unsqueeze(-1)).squeeze(-1) - (inertia + armature) * qdd
-            bias = model.nonlinear_at(at, qd) + coupling
+            bias = model.nonlinear_effects(at, qd) + coupling
             slopes = regressor_of(model.chain, q, qd, qdd)
-            blocks.append(BodyLoad(inertia, bias, model.gravity_at(at), slopes))
+            blocks.append(BodyLoad(inertia, bias, model.gravity(at), slopes))
     shape = path.q.shape[:2]
     return BodyLoad(*(torch.cat(columns).unflatten(0, shape) for columns in zip(*blocks, strict=True)))
