@@ -10,7 +10,8 @@ import torch
 
 from spelgen.arm.arm import Arm
 from spelgen.runtime.body_chain import BodyChain
-from spelgen.runtime.rigid_body import Bodies, Row, inertia_basis
+from spelgen.runtime.parts import Row
+from spelgen.runtime.rigid_body import Bodies, inertia_basis
 
 PER_BODY = 10  # inertial parameters
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from spelgen.runtime.joints import Joints, Pairs, vector
-from spelgen.runtime.symmetric import Entries
+from spelgen.runtime.joints import Joints, vector
+from spelgen.runtime.parts import Entries, Pairs
 
 
 class ConstantMass(nn.Module):

@@ -6,9 +6,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from spelgen.runtime.joints import Joints, Pairs, vector
-from spelgen.runtime.parts import Intermediates, Layers, Network
-from spelgen.runtime.symmetric import Entries
+from spelgen.runtime.joints import Joints, vector
+from spelgen.runtime.parts import Entries, Intermediates, Layers, Network, Pairs
 
 
 class DerivedMass(nn.Module):

@@ -10,8 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from spelgen.runtime.joints import Joints, vector
-
-Units = Sequence[tuple[int, ...]]  # of a layer: the joints that each may read
+from spelgen.runtime.parts import Units
 
 
 class JointEncoding(nn.Module):

@@ -2,29 +2,17 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from spelgen.runtime.joints import Joints, vector
+from spelgen.runtime.parts import Layers
 
 HIDDEN = 8  # units of a joint's network
 POSITION_SENSITIVITY = 0.1  # of friction's networks, relative to velocity
 SMOOTHING = 0.03  # below this fraction of its usual speed dry friction fades to zero, to start from
 LEAST_SMOOTHING = 0.001  # and at the least
-
-
-class FrictionLayers(NamedTuple):
-    """The weights made ready for many states, all joints' networks in one."""
-
-    weight: Tensor
-    bias: Tensor
-    out: Tensor
-    offset: Tensor
-    viscous: Tensor  # [Nm s/rad, N s/m]
-    smoothing: Tensor  # coulomb smoothing velocity squared [rad^2/s^2, m^2/s^2]
 
 
 class JointFriction(nn.Module):
@@ -65,22 +53,21 @@ class JointFriction(nn.Module):
         """Where dry friction has turned around, (n,) [rad/s, m/s]."""
         return self.speed * (LEAST_SMOOTHING**2 + (SMOOTHING * self.raw_smoothing.exp()) ** 2).sqrt()
 
-    def prepare(self) -> FrictionLayers:
-        """Return all joints' networks as one: block matrices are faster than a loop over joints."""
-        identity = torch.eye(self.out.shape[0], dtype=self.out.dtype, device=self.out.device)
-        return FrictionLayers(
-            weight=(self.weight.mT @ self.matrix).flatten(0, 1),
-            bias=self.bias.flatten(),
-            out=(identity.unsqueeze(-1) * self.out).flatten(1),
-            offset=self.offset,
-            viscous=self.viscous(),
-            smoothing=self.coulomb_smoothing_velocity() ** 2,
-        )
+    def prepare(self) -> tuple[Layers, Tensor, Tensor]:
+        """Return all joints' networks as one, the viscous friction and the smoothing velocity squared."""
+        # block matrices are faster than a loop over joints
+        hidden = (self.weight.mT @ self.matrix).flatten(0, 1), self.bias.flatten()
+        identity = torch.eye(len(self.out), dtype=self.out.dtype, device=self.out.device)
+        out = (identity.unsqueeze(-1) * self.out).flatten(1), self.offset
+        return (hidden, out), self.viscous(), self.coulomb_smoothing_velocity() ** 2
 
-    def forward(self, encoded: Tensor, qd: Tensor, layers: FrictionLayers, right: Tensor) -> Tensor:
+    def forward(
+        self, encoded: Tensor, qd: Tensor, prepared: tuple[Layers, Tensor, Tensor], right: Tensor
+    ) -> Tensor:
         """Return D(q, qd) right, (..., n, k)."""
-        smooth_speed = torch.sqrt(qd * qd + layers.smoothing)
+        (hidden, out), viscous, smoothing = prepared
+        smooth_speed = torch.sqrt(qd * qd + smoothing)
         inputs = torch.cat([encoded, qd, qd / smooth_speed], dim=-1)
-        hidden = torch.tanh(F.linear(inputs, layers.weight, layers.bias))
-        dry = F.softplus(F.linear(hidden, layers.out, layers.offset))  # relative to its usual size
-        return (layers.viscous + self.nominal * dry / smooth_speed).unsqueeze(-1) * right
+        # dry friction relative to its usual size
+        dry = F.softplus(F.linear(torch.tanh(F.linear(inputs, *hidden)), *out))
+        return (viscous + self.nominal * dry / smooth_speed).unsqueeze(-1) * right

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
-
-Pairs = Sequence[tuple[float, float]]
-Rows = Sequence[Sequence[float]]
 
 
 class Joints(NamedTuple):

@@ -9,8 +9,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from spelgen.runtime.encoding import NetworkInput, Units, joint_mask
-from spelgen.runtime.parts import Intermediates, Layers
+from spelgen.runtime.encoding import NetworkInput, joint_mask
+from spelgen.runtime.parts import Intermediates, Layers, Units
 
 GRID = 4  # bumps on an edge
 SPACING = 2 / (GRID - 1)

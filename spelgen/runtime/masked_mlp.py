@@ -8,8 +8,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from spelgen.runtime.encoding import NetworkInput, Units, joint_mask
-from spelgen.runtime.parts import Intermediates, Layers
+from spelgen.runtime.encoding import NetworkInput, joint_mask
+from spelgen.runtime.parts import Intermediates, Layers, Units
 
 
 class MaskedMLP(nn.Module):

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 from torch import Tensor
 
-# what a part keeps is its own; an emitted module has the type of its own part under each of these names
+Row = tuple[float, float, float]
+Rows = Sequence[Sequence[float]]
+Pairs = Sequence[tuple[float, float]]
+Entries = Callable[[Sequence[Tensor], Sequence[Tensor]], Tensor]  # a matrix by functions and constants
+Units = Sequence[tuple[int, ...]]  # of a layer: the joints that each may read
+Layers = tuple[tuple[Tensor, Tensor], ...]  # a network's weights and biases, ready for many states
 Intermediates = Any  # what a part's derivatives need of the work done for its values
+# an emitted module has the type of its own dynamics under each of these names
 Prepared = Any  # all that depends on the weights alone
 Pose = Any  # all that depends on q alone
-Layers = tuple[tuple[Tensor, Tensor], ...]  # a network's weights and biases, ready for many states
 
 
 class Network(Protocol):

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from spelgen.runtime.joints import Joints, Rows
+from spelgen.runtime.joints import Joints
+from spelgen.runtime.parts import Row, Rows
 from spelgen.runtime.residual_terms import ResidualTerms
-from spelgen.runtime.rigid_body import Bodies, Row
+from spelgen.runtime.rigid_body import Bodies
 from spelgen.runtime.rigid_body_dynamics import Motion, RigidBodyDynamics, RigidPrepared
 
 

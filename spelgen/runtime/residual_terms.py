@@ -11,9 +11,8 @@ from torch import Tensor, nn
 
 from spelgen.runtime.encoding import JointEncoding
 from spelgen.runtime.joints import Joints, vector
-from spelgen.runtime.parts import Intermediates, Layers, Network
+from spelgen.runtime.parts import Entries, Intermediates, Layers, Network
 from spelgen.runtime.port_hamiltonian import applied
-from spelgen.runtime.symmetric import Entries
 
 SPLINES = 34  # over the range of a joint
 HARMONICS = 64  # of a turn of the joint, and the first two of a turn of the motor: teeth and poles come again
@@ -164,11 +163,10 @@ class ResidualTerms(nn.Module):
         distance = self._places(pose.q)
         away = distance.abs()
         step = 0.5 - (2 - away).relu() ** 4 / 24 + (1 - away).relu() ** 4 / 6
-        smooth = (self.spacing * distance.sign() * step * self.raw_torque_splines).sum(dim=-1)
-        by_cos, by_sin = (self.ripple(pose.q) / self.frequencies.repeat(1, 2)).chunk(2, dim=-1)
-        turned = torch.cat([by_sin, -by_cos], dim=-1)
-        ripple = (turned * self.raw_torque_ripple).sum(dim=-1)
-        energy = (self.unit.squeeze(-1) * (smooth + ripple)).sum(dim=-1)
+        smooth = (self.spacing * distance.sign() * step * pose.weights.splines[..., 0]).sum(dim=-1)
+        by_cos, by_sin = (self._waves(pose.q) / self.frequencies.repeat(1, 2)).chunk(2, dim=-1)
+        ripple = (torch.cat([by_sin, -by_cos], dim=-1) * pose.weights.ripple).sum(dim=-1)
+        energy = (smooth + ripple).sum(dim=-1)
         if self.potential is not None and pose.weights.potential is not None:
             energy = energy + self.potential.forward(pose.encoded, pose.weights.potential)[0].squeeze(-1)
         return energy

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from spelgen.runtime.joints import vector
-
-Row = tuple[float, float, float]
+from spelgen.runtime.parts import Row
 
 
 class Bodies(NamedTuple):

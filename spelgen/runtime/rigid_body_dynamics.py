@@ -9,9 +9,10 @@ from torch import Tensor, nn
 
 from spelgen.runtime.body_chain import BodyChain, Chain
 from spelgen.runtime.friction_laws import FrictionConstants, FrictionLaws
-from spelgen.runtime.joints import Joints, Rows, vector
+from spelgen.runtime.joints import Joints, vector
+from spelgen.runtime.parts import Row, Rows
 from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied, combined
-from spelgen.runtime.rigid_body import Bodies, InertialParameters, Row, inertia_basis
+from spelgen.runtime.rigid_body import Bodies, InertialParameters, inertia_basis
 
 
 class RigidPrepared(NamedTuple):

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
-
-Entries = Callable[[Sequence[Tensor], Sequence[Tensor]], Tensor]
 
 
 def symmetric(*rows: Sequence[Tensor | float]) -> Tensor:
