@@ -93,7 +93,7 @@ def test_a_function_of_one_joint_stays_with_it():
     functions.raw_torque_ripple[0, [2, 65]] = torch.tensor([1.0, 2.0], dtype=torch.float64)  # twice the gear
     functions.raw_torque_ripple[2, 3] = 1.0  # of a prismatic joint: no turns, no ripple
     found = describe(model, arm_of("scara")).residuals
-    assert (found.torque.joints, found.friction.joints) == ((1,), ())
+    assert (list(found.torque), list(found.friction)) == ([1], [])
     assert [(each.joint, each.frequency, len(each.cosines)) for each in found.ripple] == [
         (0, 1, 3),
         (0, 80, 2),

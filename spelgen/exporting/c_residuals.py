@@ -5,13 +5,13 @@ Splines are a polynomial for each interval, harmonics turn a phasor. An entry po
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from textwrap import wrap
 
 import numpy as np
-from scipy.interpolate import PPoly
+from scipy.interpolate import BSpline, PPoly
 
-from spelgen.exporting.description import Splines, TrainedModel
+from spelgen.exporting.description import TrainedModel, spline_energy
 from spelgen.exporting.model_expressions import RESIDUAL
 from spelgen.exporting.residual_expressions import residual_symbols
 from spelgen.templates import render
@@ -120,14 +120,19 @@ def joint_function_source(model: TrainedModel) -> list[str]:
     residuals = model.residuals
     torque = residuals.torque
     factor = residuals.friction
-    if not (residuals.has_torque or factor.joints):
+    if not (residuals.has_torque or factor):
         return []
     tables: list[str] = []
-    if torque.joints:
-        tables.append(_table("torque_pieces", _pieces(torque).reshape(-1, 4)))
-        tables.append(_table("torque_energy", _energies(torque)))
-    if factor.joints:
-        tables.append(_table("factor_pieces", _pieces(factor).reshape(-1, 4)))
+    intervals = 0
+    for name, splines in (("torque", torque), ("factor", factor)):
+        if splines:
+            pieces = list(map(_pieces, splines.values()))
+            intervals = len(pieces[0])
+            tables.append(_table(f"{name}_pieces", np.concatenate(pieces)))
+    if torque:
+        # up to where each interval begins
+        energies = [spline_energy(spline)(spline.t[3:-4]) for spline in torque.values()]
+        tables.append(_table("torque_energy", np.concatenate(energies)))
     ripples: list[str] = []
     for k, ripple in enumerate(residuals.ripple, start=1):
         tables.append(_table(f"ripple_{k}", np.stack([ripple.cosines, ripple.sines], axis=1)))
@@ -135,7 +140,7 @@ def joint_function_source(model: TrainedModel) -> list[str]:
     text = render(
         "joint_functions.c.jinja",
         n=model.n,
-        intervals=_pieces(factor).shape[1],
+        intervals=intervals,
         tables=tables,
         torque=_spline_fields(torque),
         factor=_spline_fields(factor),
@@ -144,38 +149,20 @@ def joint_function_source(model: TrainedModel) -> list[str]:
     return [text.rstrip()]
 
 
-def _pieces(splines: Splines) -> np.ndarray:
-    """Return coefficients by spline, interval and power of s, from 0 to 1 on it, (splines, S + 3, 4).
-
-    The intervals begin two spacings before the first middle.
-    """
-    # three weights of zero at either end: there the curve comes from zero and goes to it
-    size = splines.weights.shape[1] + 6
-    knots = np.arange(size + 4)
-    pieces = []
-    for weights in splines.weights:
-        curve = PPoly.from_spline((knots, np.pad(weights, 3), 3))
-        # its intervals outside of these have no meaning
-        pieces.append(curve.c[::-1, 3:size].T)
-    return np.array(pieces).reshape(-1, size - 3, 4)
+def _pieces(spline: BSpline) -> np.ndarray:
+    """Return coefficients by interval and power of s, from 0 to 1 on it, (intervals, 4)."""
+    curve = PPoly.from_spline((np.arange(len(spline.t)), spline.c, 3))
+    # intervals outside of these have no meaning
+    pieces: np.ndarray = curve.c[::-1, 3 : len(spline.c)].T
+    return pieces
 
 
-def _energies(splines: Splines) -> np.ndarray:
-    """Return the integral by q up to where each interval begins, (splines (S + 3),), zero in a spline's middle."""
-    intervals = _pieces(splines) @ (1 / np.arange(1, 5)) * splines.spacing[:, None]
-    # as in the runtime: half of a spline's area on either side of its middle
-    half = 0.5 * splines.weights.sum(axis=1) * splines.spacing
-    energies: np.ndarray = np.cumsum(intervals, axis=1) - intervals - half[:, None]
-    return energies.ravel()
-
-
-def _spline_fields(splines: Splines) -> list[str]:
+def _spline_fields(splines: Mapping[int, BSpline]) -> list[str]:
     """Return by spline: joint, start, spacing."""
     fields: list[str] = []
-    size = splines.weights.shape[1]
-    for joint, center, spacing in zip(splines.joints, splines.center, splines.spacing, strict=True):
-        start = center - spacing * ((size - 1) / 2 + 2)
-        fields.append(f"{joint}, {float(start)!r}, {float(spacing)!r}")
+    for joint, spline in splines.items():
+        spacing = np.ptp(spline.t) / (len(spline.t) - 1)
+        fields.append(f"{joint}, {float(spline.t[3])!r}, {float(spacing)!r}")
     return fields
 
 

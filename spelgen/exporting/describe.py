@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from scipy.interpolate import BSpline
 from torch import Tensor
 
 from spelgen.dynamics.protocol import (
@@ -27,7 +28,6 @@ from spelgen.exporting.description import (
     Network,
     Residuals,
     Servos,
-    Splines,
     TrainedModel,
 )
 from spelgen.exporting.tip_chain import tip_chain
@@ -51,8 +51,7 @@ def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
     tip_link, tip, end = tip_chain(loaded)
     # what does not depend on q is one matrix, whatever it comes from
     constant_mass = array(weights.armature)
-    none = Splines((), np.zeros(0), np.zeros(0), np.zeros((0, 4)))
-    residuals = Residuals(Encoding(False, np.zeros(0), np.zeros(0)), (), None, None, none, (), none)
+    residuals = Residuals(Encoding(False, np.zeros(0), np.zeros(0)), (), None, None, {}, (), {})
     bristles = None
     if has_friction_state(exact):
         reach: Tensor = exact.friction.bristles.reach
@@ -173,15 +172,16 @@ def _with_outputs(network: Network, rows: np.ndarray) -> Network:
     return Network(weights, (*network.biases[:-1], network.biases[-1][rows]))
 
 
-def _splines(terms: ResidualTerms, weights: Tensor) -> Splines:
+def _splines(terms: ResidualTerms, weights: Tensor) -> dict[int, BSpline]:
     """Return the sums of splines of the joints that have one."""
-    joints = torch.nonzero(weights.any(dim=1)).flatten().tolist()
-    return Splines(
-        joints=tuple(joints),
-        center=array(terms.middles[joints].mean(dim=-1)),
-        spacing=array(terms.spacing[joints, 0]),
-        weights=array(weights[joints]),
-    )
+    splines = {}
+    for joint in torch.nonzero(weights.any(dim=1)).flatten().tolist():
+        # three weights of zero at either end: there the curve comes from zero and goes to it
+        padded = np.pad(array(weights[joint]), 3)
+        steps = np.arange(len(padded) + 4) - 5
+        knots = float(terms.middles[joint, 0]) + float(terms.spacing[joint, 0]) * steps
+        splines[joint] = BSpline(knots, padded, 3)
+    return splines
 
 
 def _ripple(terms: ResidualTerms, weights: Tensor) -> tuple[Harmonics, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.interpolate import BSpline
 
 from spelgen.arm.arm import Arm
 
@@ -73,19 +74,6 @@ class Encoding:
 
 
 @dataclass(frozen=True, eq=False)
-class Splines:
-    """Sums of cubic B-splines, one for each of some joints, as in ``runtime.residual_terms``.
-
-    The k-th of S splines is 2/3 high at center + spacing (k - (S - 1) / 2); weights: (joints, S).
-    """
-
-    joints: tuple[int, ...]
-    center: np.ndarray
-    spacing: np.ndarray
-    weights: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
 class Harmonics:
     """A joint's torque [Nm]: cosines @ cos(k frequency q) + sines @ sin(k frequency q), k from 1 on."""
 
@@ -100,24 +88,33 @@ class Residuals:
     """The parts of a model beside its rigid bodies, as far as they are not zero.
 
     mass: is added to M at these entries of its lower triangle, a row each; potential: to V, one row. torque and ripple:
-    dV/dq by joint [Nm, N]. friction: the logarithm of a factor on a drive's friction.
+    dV/dq by joint [Nm, N]. friction: by joint, the logarithm of a factor on its drive's friction. Splines are cubic,
+    with zero where they begin and end, and beyond.
     """
 
     encoding: Encoding
     entries: tuple[tuple[int, int], ...]
     mass: Network | None
     potential: Network | None
-    torque: Splines
+    torque: dict[int, BSpline]
     ripple: tuple[Harmonics, ...]
-    friction: Splines
+    friction: dict[int, BSpline]
 
     def __bool__(self) -> bool:
-        return bool(self.mass or self.potential or self.has_torque or self.friction.joints)
+        return bool(self.mass or self.potential or self.has_torque or self.friction)
 
     @property
     def has_torque(self) -> bool:
         """Whether some joint has a torque of its own."""
-        return bool(self.torque.joints or self.ripple)
+        return bool(self.torque or self.ripple)
+
+
+def spline_energy(spline: BSpline) -> BSpline:
+    """Return the integral of a torque's spline; as in the runtime, half of its area lies on either side of zero."""
+    energy = spline.antiderivative()
+    count = len(energy.t) - energy.k - 1
+    half = energy(spline.t[-4]) / 2
+    return BSpline(energy.t, energy.c[:count] - half, energy.k)
 
 
 @dataclass(frozen=True, eq=False)

@@ -102,7 +102,7 @@ class ModelExpressions:
         if bristles is not None:
             direction += friction_expressions.bristle_direction(bristles, self.z)
         torque = friction_expressions.law_torque(law, speed, load, direction)
-        for k, joint in enumerate(self.model.residuals.friction.joints):
+        for k, joint in enumerate(self.model.residuals.friction):
             torque[joint] *= ca.exp(self.residuals["factor"][k])
         return constant(motors.T) @ torque
 

@@ -13,8 +13,9 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
+from scipy.interpolate import BSpline
 
-from spelgen.exporting.description import Encoding, Network, Residuals, Splines, TrainedModel
+from spelgen.exporting.description import Encoding, Network, Residuals, TrainedModel, spline_energy
 from spelgen.exporting.rigid_expressions import constant
 
 Symbols = dict[str, ca.SX]
@@ -27,7 +28,7 @@ def residual_symbols(model: TrainedModel) -> Symbols:
     pairs = n * (n + 1) // 2
     potential = int(model.residuals.potential is not None)
     torque = int(model.residuals.has_torque)
-    factors = len(model.residuals.friction.joints)
+    factors = len(model.residuals.friction)
     sizes = {
         "mass": (entries, 1),
         # first derivatives along qd: a program takes them in one sweep, without n^2 numbers
@@ -71,7 +72,7 @@ def symbol_slopes(model: TrainedModel, symbols: Symbols) -> list[tuple[ca.SX, ca
     """Return the symbols that depend on q, (k, 1) each, with their derivatives by it, (k, n)."""
     pairs = [_second_derivatives(model.n, joint) for joint in range(model.n)]
     # the factor of a joint depends on that joint alone
-    joints = np.eye(model.n)[list(model.residuals.friction.joints)]
+    joints = np.eye(model.n)[list(model.residuals.friction)]
     slopes = [(symbols["factor"], symbols["factor_slope"] * ca.SX(joints))]
     if model.residuals.mass is not None:
         second = [symbols["second"][:, pair] for pair in pairs]
@@ -115,8 +116,9 @@ def residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[str
     if residuals.has_torque:
         values["torque_energy"] = _torque_energy(residuals, q)
         values["torque"] = ca.gradient(values["torque_energy"], q)
-    if residuals.friction.joints:
-        values["factor"] = _spline_values(residuals.friction, q)
+    if residuals.friction:
+        factors = [_spline(spline, q[joint]) for joint, spline in residuals.friction.items()]
+        values["factor"] = ca.vertcat(*factors)
     return values
 
 
@@ -138,15 +140,10 @@ def _network(network: Network, encoded: ca.MX) -> ca.MX:
 
 
 def _torque_energy(residuals: Residuals, q: ca.MX) -> ca.MX:
-    """Return V of single joints; as in the runtime, a spline's energy is zero in its middle."""
-    energy, splines = ca.MX(0), residuals.torque
-    if splines.joints:
-        distance = _spline_distances(splines, q)
-        # beyond its reach a spline's energy is constant
-        wide = _cubic_integral(ca.fmin(ca.fmax(distance, -2), 2), 2)
-        narrow = _cubic_integral(ca.fmin(ca.fmax(distance, -1), 1), 1)
-        weights = splines.weights * splines.spacing[:, None]
-        energy += ca.dot(weights.ravel(), wide / 6 - narrow * (4 / 6))
+    """Return V of single joints."""
+    energy = ca.MX(0)
+    for joint, spline in residuals.torque.items():
+        energy += _spline(spline_energy(spline), q[joint])
     for ripple in residuals.ripple:
         frequencies = ripple.frequency * np.arange(1, len(ripple.cosines) + 1)
         # (harmonics,)
@@ -156,28 +153,8 @@ def _torque_energy(residuals: Residuals, q: ca.MX) -> ca.MX:
     return energy
 
 
-def _spline_values(splines: Splines, q: ca.MX) -> ca.MX:
-    """Return the sums of B-splines, (joints, 1)."""
-    away = ca.fabs(_spline_distances(splines, q))
-    wide = ca.fmax(2 - away, 0) ** 3
-    narrow = ca.fmax(1 - away, 0) ** 3
-    height = (wide - 4 * narrow) / 6
-    count, size = splines.weights.shape
-    # a joint's splines are a column, since CasADi reshapes column by column
-    terms = ca.reshape(splines.weights.ravel() * height, size, count)
-    values: ca.MX = ca.sum1(terms).T
-    return values
-
-
-def _spline_distances(splines: Splines, q: ca.MX) -> ca.MX:
-    """Return how far q is from each spline's middle, in spacings, (joints S, 1)."""
-    count, size = splines.weights.shape
-    scaled = (q[list(splines.joints)] - splines.center) / splines.spacing
-    knots = np.tile(np.arange(size) - (size - 1) / 2, count)
-    return ca.vec(ca.repmat(scaled.T, size, 1)) - knots
-
-
-def _cubic_integral(x: ca.MX, size: float) -> ca.MX:
-    """Return the integral from zero to x of (size - |x|)^3."""
-    away = ca.fabs(x)
-    return x * (size**3 - 1.5 * size**2 * away + size * away**2 - 0.25 * away**3)
+def _spline(spline: BSpline, q: ca.MX) -> ca.MX:
+    """Return the value at q; beyond the ends it stays as it is there."""
+    knots, degree = spline.t, spline.k
+    inside = ca.fmin(ca.fmax(q, knots[degree]), knots[-degree - 1])
+    return ca.bspline(inside, ca.DM(spline.c), [knots.tolist()], [degree], 1, {})
